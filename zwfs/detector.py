@@ -1,0 +1,125 @@
+"""A camera: photons, noise, saturation and quantisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs.pupil import Pupil
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Camera that turns frames into counts, and counts back into frames.
+
+    Every default is that of a camera without the effect. Light is detected first (photon noise), then the
+    electronics add read noise, then the converter saturates and rounds.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    photons : float, photons / frame
+        Photons detected within the pupil in one frame with the mask taken out; those of one mask's image.
+    photon_noise : bool
+        Draw the number of electrons of each pixel from the Poisson distribution.
+    read_noise : float, electrons rms / pixel
+    background : float, electrons / pixel
+        Dark and stray light; it has photon noise, too.
+    full_well : float, electrons / pixel
+        A pixel holds no more than this.
+    gain : float, electrons / count
+        Counts are rounded to integers; 0 leaves electrons as they are.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of the wrong kind or out of range.
+    """
+
+    pupil: Pupil
+    photons: float
+    photon_noise: bool = True
+    read_noise: float = 0.0
+    background: float = 0.0
+    full_well: float = np.inf
+    gain: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.pupil, Pupil):
+            raise TypeError(f"pupil is a {type(self.pupil).__name__}: expected a Pupil")
+        _check.number("photons", self.photons, 0, open_low=True)
+        _check.number("read_noise", self.read_noise, 0)
+        _check.number("background", self.background, 0)
+        if self.full_well != np.inf:
+            _check.number("full_well", self.full_well, 0, open_low=True)
+        _check.number("gain", self.gain, 0)
+
+    @property
+    def photons_per_pixel(self) -> float:
+        """Photons that an intensity of 1 puts into a pixel."""
+        return self.photons / self.pupil.n_points
+
+    def expose(
+        self, frames: ArrayLike, seed: int | np.random.Generator | np.random.SeedSequence | None = None
+    ) -> NDArray[np.float64]:
+        """Counts of a camera that looks at noiseless frames.
+
+        Parameters
+        ----------
+        frames : array_like, any shape
+            Intensity, 1 = mean of the pupil with the mask out.
+        seed : int, Generator or SeedSequence, optional
+
+        Returns
+        -------
+        ndarray, the shape of `frames`
+            Counts, or electrons where `gain` is 0. Pixels at the full well are told by `saturated`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the frames are complex, not finite or negative.
+        """
+        frames = _check.real_array("frames", frames)
+        _check.finite("frames", frames)
+        _check.non_negative("frames", frames)
+        rng = np.random.default_rng(seed)
+        electrons = frames.astype(np.float64) * self.photons_per_pixel + self.background
+        if self.photon_noise:
+            electrons = rng.poisson(electrons).astype(np.float64)
+        if self.read_noise:
+            electrons += rng.normal(0, self.read_noise, electrons.shape)
+        electrons = np.minimum(electrons, self.full_well)
+        return np.rint(electrons / self.gain) if self.gain else electrons
+
+    def saturated(self, counts: ArrayLike) -> NDArray[np.bool_]:
+        """Where the full well is reached, to half a count."""
+        counts = _check.real_array("counts", counts)
+        return counts * (self.gain or 1.0) >= self.full_well - self.gain / 2
+
+    def normalise(self, counts: ArrayLike, floor: float | None = None) -> NDArray[np.float64]:
+        """Frames of counts: background taken off, 1 = mean intensity of the pupil with the mask out.
+
+        Parameters
+        ----------
+        counts : array_like, any shape
+        floor : float, optional
+            Raise intensities below this value to it. Noise makes some negative, which reconstructors refuse;
+            they are left as they are unless you ask.
+
+        Returns
+        -------
+        ndarray, the shape of `counts`
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the counts are complex or not finite.
+        """
+        counts = _check.real_array("counts", counts)
+        _check.finite("counts", counts)
+        frames = (counts.astype(np.float64) * (self.gain or 1.0) - self.background) / self.photons_per_pixel
+        return frames if floor is None else np.maximum(frames, _check.number("floor", floor))

@@ -1,0 +1,155 @@
+"""The numerical experiments behind the figures: reconstructors go in, tables of errors come out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs.metrics import dynamic_range, reconstruction_error, strehl
+from zwfs.modes import power_law_screens
+
+
+@dataclass(frozen=True)
+class LinearityCurves:
+    """Error of several reconstructors against the input.
+
+    Attributes
+    ----------
+    rms : ndarray, shape (n_rms,), radian rms
+        Input.
+    errors : dict of ndarray, shape (n_rms, n_screens), radian rms
+        Error of each reconstructor on each screen.
+    converged : dict of ndarray of bool, shape (n_rms, n_screens)
+    wrapped : ndarray, shape (n_rms, n_screens)
+        Fraction of the points of each screen whose phase, piston removed, is outside (-pi, pi].
+    folded : ndarray, shape (n_rms, n_screens)
+        Fraction of the points of each screen below -pi/4, which an arcsine at +pi/2 folds back.
+    strehl : ndarray, shape (n_rms, n_screens)
+        Strehl ratio of each screen: what is left of the light that makes the reference wave.
+    """
+
+    rms: NDArray[np.float64]
+    errors: dict[str, NDArray[np.float64]]
+    converged: dict[str, NDArray[np.bool_]]
+    wrapped: NDArray[np.float64]
+    folded: NDArray[np.float64]
+    strehl: NDArray[np.float64]
+
+    def mean(self, name: str) -> NDArray[np.float64]:
+        """Mean error over the screens, shape (n_rms,)."""
+        return self.errors[name].mean(axis=1)
+
+    def std(self, name: str) -> NDArray[np.float64]:
+        """Standard deviation of the error over the screens, shape (n_rms,)."""
+        return self.errors[name].std(axis=1)
+
+    def dynamic_range(self, name: str, threshold: float = 0.05) -> float:
+        """Input at which the mean error leaves `threshold` times the input; see `zwfs.dynamic_range`."""
+        return dynamic_range(self.rms, self.mean(name), threshold)
+
+    def recovered(self, name: str, threshold: float = 0.05) -> NDArray[np.float64]:
+        """Fraction of the screens with an error of at most `threshold` times the input, shape (n_rms,)."""
+        return np.mean(self.errors[name] <= threshold * self.rms[:, np.newaxis], axis=1)
+
+
+def screens_at(
+    modes: NDArray, rms: float, n_screens: int, seed: int, task: int, exponent: float = -2.0
+) -> NDArray[np.floating]:
+    """Screens of one task of an experiment: they depend on the seed and the task's number, not on the order."""
+    return power_law_screens(modes, rms, n_screens, exponent, np.random.SeedSequence(seed, spawn_key=(task,)))
+
+
+def linearity_curves(
+    reconstructors: Mapping[str, Any],
+    modes: NDArray,
+    rms: ArrayLike,
+    n_screens: int,
+    *,
+    exponent: float = -2.0,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> LinearityCurves:
+    """Error of reconstructors on random screens of growing rms: the experiment of section 4.1.
+
+    Each input rms has screens of its own; all reconstructors see the same ones, each through its own sensor.
+
+    Parameters
+    ----------
+    reconstructors : mapping of str to reconstructor
+        For sensors on the same pupil.
+    modes : ndarray, shape (n_modes, ny, nx)
+        Modes that the screens are made of.
+    rms : array_like, shape (n_rms,), radian rms
+    n_screens : int
+        Screens for each rms.
+    exponent : float
+        Exponent of the power spectral density of the screens.
+    seed : int
+    progress : callable, optional
+        Called with the number of inputs done and their total.
+
+    Returns
+    -------
+    LinearityCurves
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 4.1 and Figure 3.
+    """
+    rms = _check.real_array("rms", rms)
+    n_screens = _check.integer("n_screens", n_screens, 1)
+    if not reconstructors:
+        raise ValueError("reconstructors is empty: expected at least one")
+    errors = {name: np.empty((len(rms), n_screens)) for name in reconstructors}
+    converged = {name: np.empty((len(rms), n_screens), bool) for name in reconstructors}
+    wrapped, folded, strehls = np.empty((3, len(rms), n_screens))
+    pupil = next(iter(reconstructors.values())).settings.sensor.pupil
+    for index, value in enumerate(rms):
+        screens = screens_at(modes, value, n_screens, seed, index, exponent)
+        wrapped[index] = np.mean(np.abs(pupil.gather(screens)) > np.pi, axis=-1)
+        folded[index] = np.mean(pupil.gather(screens) < -np.pi / 4, axis=-1)
+        strehls[index] = strehl(pupil, screens)
+        for name, reconstructor in reconstructors.items():
+            sensor = reconstructor.settings.sensor
+            found = reconstructor(sensor.measure(screens))
+            errors[name][index] = reconstruction_error(pupil, found.phase, screens)
+            converged[name][index] = found.converged
+        if progress is not None:
+            progress(index + 1, len(rms))
+    return LinearityCurves(rms, errors, converged, wrapped, folded, strehls)
+
+
+def convergence(
+    reconstructor: Any, modes: NDArray, rms: float, n_screens: int, *, exponent: float = -2.0, seed: int = 0
+) -> NDArray[np.float64]:
+    """Error of a reconstructor on random screens, iteration by iteration.
+
+    Parameters
+    ----------
+    reconstructor : reconstructor
+    modes : ndarray, shape (n_modes, ny, nx)
+        Modes that the screens are made of.
+    rms : float, radian rms
+    n_screens : int
+    exponent : float
+        Exponent of the power spectral density of the screens.
+    seed : int
+
+    Returns
+    -------
+    ndarray, shape (n_screens, n_iterations + 1), radian rms
+        Before the first iteration (a flat wavefront) and after each one.
+    """
+    screens = screens_at(modes, rms, n_screens, seed, 0, exponent)
+    sensor = reconstructor.settings.sensor
+    errors = np.empty((n_screens, reconstructor.settings.n_iterations + 1))
+    # One screen at a time: the history of all of them would take much memory.
+    for index, screen in enumerate(screens):
+        history = reconstructor(sensor.measure(screen), history=True).history
+        errors[index] = reconstruction_error(sensor.pupil, history, screen)
+    return errors

@@ -1,0 +1,44 @@
+"""The focal plane, for pictures and for the design of masks; no sensor or reconstructor needs it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs.pupil import Pupil
+
+
+def focal_field(pupil: Pupil, field: ArrayLike, u: ArrayLike, v: ArrayLike) -> NDArray[np.complexfloating]:
+    """Field in the focal plane: the Fourier sum over the pupil, at any frequencies.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    field : array_like of complex, shape (..., ny, nx)
+        Field in the pupil plane; the stop blocks what lies outside the pupil.
+    u, v : array_like, shapes (nu,) and (nv,), lambda/D
+        Horizontal and vertical coordinates of the grid.
+
+    Returns
+    -------
+    ndarray of complex, shape (..., nv, nu)
+        In units of the field of a flat wavefront on the axis times the mean amplitude: 1 at (0, 0) for a uniform
+        pupil and a flat wavefront.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong or a value is not finite.
+    """
+    field = _check.complex_array("field", field)
+    _check.trailing_shape("field", field, pupil.shape, "the shape of the pupil")
+    _check.finite("field", field)
+    u, v = (_check.real_array(name, axis) for name, axis in (("u", u), ("v", v)))
+    for name, axis in (("u", u), ("v", v)):
+        if axis.ndim != 1:
+            raise ValueError(f"{name} has shape {axis.shape}: expected one dimension")
+        _check.finite(name, axis)
+    from_x = np.exp(-2j * np.pi * np.outer(pupil.x, u))
+    from_y = np.exp(-2j * np.pi * np.outer(v, pupil.y))
+    return from_y @ (field * pupil.mask) @ from_x / pupil.n_points

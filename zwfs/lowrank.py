@@ -1,0 +1,219 @@
+"""The reference wave as a product of small real matrices: no Fourier transform is ever taken.
+
+A mask differs from 1 on a patch of a few lambda/D only, so the operator that makes the reference wave out of the
+incoming field is smooth and numerically of very low rank: a dozen numbers carry it. `factorise` finds them to a
+tolerance; `Operator` applies the factors and their exact adjoint.
+
+The functions that the factors are made of are products of one-dimensional ones along y and x (Slepian's prolate
+functions of the two axes), so projecting a map of N x N pixels costs two thin matrix products, and nothing
+larger than N x a dozen is ever stored.
+
+Complex fields are handled as two maps of reals: "split" fields have shape (..., 2, ny, nx), real part first.
+Every product is then one real matrix product for a whole batch and all masks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zwfs.masks import Mask
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Real functions on a grid: products of functions of y and of x, and combinations of these.
+
+    Attributes
+    ----------
+    along_y : ndarray, shape (a, ny)
+    along_x : ndarray, shape (b, nx)
+    combine : ndarray, shape (a * b, r)
+    """
+
+    along_y: NDArray
+    along_x: NDArray
+    combine: NDArray
+
+    @property
+    def rank(self) -> int:
+        """Number of functions."""
+        return self.combine.shape[1]
+
+    def project(self, maps: NDArray) -> NDArray:
+        """Inner products with maps: (k, ny, nx) to (k, r)."""
+        rows = maps.reshape(-1, maps.shape[-1]) @ self.along_x.T
+        pairs = self.along_y @ rows.reshape(len(maps), -1, len(self.along_x))
+        return pairs.reshape(len(maps), -1) @ self.combine
+
+    def expand(self, coefficients: NDArray) -> NDArray:
+        """Maps of given coefficients: (k, r) to (k, ny, nx)."""
+        pairs = (coefficients @ self.combine.T).reshape(-1, len(self.along_y), len(self.along_x))
+        rows = self.along_y.T @ pairs
+        maps = rows.reshape(-1, len(self.along_x)) @ self.along_x
+        return maps.reshape(len(coefficients), -1, self.along_x.shape[1])
+
+    def cut(self, rows: slice, columns: slice) -> Plane:
+        """The same functions on a part of the grid."""
+        return Plane(
+            np.ascontiguousarray(self.along_y[:, rows]),
+            np.ascontiguousarray(self.along_x[:, columns]),
+            self.combine,
+        )
+
+    def astype(self, dtype: np.dtype) -> Plane:
+        """The same functions in another precision."""
+        return Plane(*(array.astype(dtype) for array in (self.along_y, self.along_x, self.combine)))
+
+
+@dataclass(frozen=True)
+class Factors:
+    """Low-rank factors of the operator from the pupil to the reference waves (`eq-low-rank`).
+
+    Attributes
+    ----------
+    pupil, detector : Plane
+        Functions on the two planes, of rank r and q.
+    core : ndarray of complex, shape (n_masks, q, r)
+    """
+
+    pupil: Plane
+    detector: Plane
+    core: NDArray[np.complex128]
+
+
+class Operator:
+    """The factors in one precision, with the products that sensors and reconstructors are made of.
+
+    Parameters
+    ----------
+    factors : Factors
+    window : (slice, slice)
+        Where the grid of the pupil lies on the detector.
+    dtype : float32 or float64
+    """
+
+    def __init__(self, factors: Factors, window: tuple[slice, slice], dtype: np.dtype) -> None:
+        self.n_masks = len(factors.core)
+        self._pupil = factors.pupil.astype(dtype)
+        self._detector = factors.detector.astype(dtype)
+        self._window = self._detector.cut(*window)
+        # Acts from the right on coefficients (2, r) that are flattened, and gives (n_masks, 2, q) flattened.
+        real, imag = factors.core.real, factors.core.imag
+        block = np.block([[real, -imag], [imag, real]])
+        self._core = np.ascontiguousarray(block.reshape(-1, block.shape[-1]).T, dtype)
+
+    def reference(self, psi: NDArray, *, in_window: bool = False) -> NDArray:
+        """Reference waves of split fields on the pupil, (k, 2, ny, nx) to (k, n_masks, 2, ny', nx').
+
+        The primed sizes are those of the detector, or those of the pupil's grid if `in_window`.
+        """
+        plane = self._window if in_window else self._detector
+        coefficients = self._pupil.project(psi.reshape(-1, *psi.shape[-2:]))
+        coefficients = coefficients.reshape(len(psi), -1) @ self._core
+        waves = plane.expand(coefficients.reshape(-1, plane.rank))
+        return waves.reshape(len(psi), self.n_masks, 2, *waves.shape[-2:])
+
+    def reference_adjoint(self, waves: NDArray) -> NDArray:
+        """Adjoint of `reference` on the whole detector: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
+        coefficients = self._detector.project(waves.reshape(-1, *waves.shape[-2:]))
+        coefficients = coefficients.reshape(len(waves), -1) @ self._core.T
+        psi = self._pupil.expand(coefficients.reshape(-1, self._pupil.rank))
+        return psi.reshape(len(waves), 2, *psi.shape[-2:])
+
+
+def factorise(
+    masks: Sequence[Mask],
+    pupil_axes: tuple[NDArray, NDArray],
+    detector_axes: tuple[NDArray, NDArray],
+    pixel_area: float,
+    tolerance: float,
+) -> Factors:
+    """Factors of the reference-wave operators of several masks, with functions common to all of them.
+
+    The integral over each patch (`eq-kernel`) is replaced by a quadrature that is exact to well below the
+    tolerance; its outcome is truncated where singular values fall below the tolerance times the largest.
+
+    Parameters
+    ----------
+    masks : sequence of Mask
+    pupil_axes, detector_axes : (ndarray, ndarray), D
+        Coordinates y of the rows and x of the columns.
+    pixel_area : float, D^2
+    tolerance : float
+
+    Returns
+    -------
+    Factors
+    """
+    radius = max(mask.diameter for mask in masks) / 2
+    pupil_y, pupil_x = (_axis_functions(axis, radius, tolerance) for axis in pupil_axes)
+    detector_y, detector_x = (_axis_functions(axis, radius, tolerance) for axis in detector_axes)
+    reach = math.hypot(*(np.ptp(np.concatenate(pair)) for pair in zip(pupil_axes, detector_axes, strict=True)))
+    core = []
+    for mask in masks:
+        u, v, weights = _quadrature(mask, reach, tolerance)
+        change = pixel_area * weights * (mask.transmission(u, v) - 1)
+        from_pupil = _spectra(pupil_y, pupil_axes[0], v, pupil_x, pupil_axes[1], u)
+        to_detector = _spectra(detector_y, detector_axes[0], v, detector_x, detector_axes[1], u)
+        core.append(to_detector.conj() * change @ from_pupil.T)
+    left, core, right = _compress(np.array(core), tolerance)
+    return Factors(Plane(pupil_y, pupil_x, right), Plane(detector_y, detector_x, left), core)
+
+
+def _axis_functions(axis: NDArray, radius: float, tolerance: float) -> NDArray:
+    """Orthonormal functions on an axis that hold all waves of frequencies up to `radius`: (a, n)."""
+    n_nodes = _bandwidth(2 * np.pi * radius * np.ptp(axis), tolerance)
+    unit, weights = np.polynomial.legendre.leggauss(n_nodes)
+    angle = np.pi * radius * np.outer(unit + 1, axis)
+    waves = np.sqrt(weights)[:, np.newaxis] * np.stack([np.cos(angle), np.sin(angle)])
+    _, strength, functions = np.linalg.svd(waves.reshape(-1, axis.size), full_matrices=False)
+    return functions[: _rank(strength, max(tolerance / 10, 1e-16))]
+
+
+def _quadrature(mask: Mask, reach: float, tolerance: float) -> tuple[NDArray, NDArray, NDArray]:
+    """Nodes u, v and weights on the patch: Gauss-Legendre along the radius, equispaced around the axis."""
+    edges = np.array([0.0, *mask.breaks, mask.diameter]) / 2
+    n_angles = max(_bandwidth(2 * np.pi * edges[-1] * reach, tolerance), mask.n_samples + mask.n_samples % 2)
+    unit, unit_weights = np.polynomial.legendre.leggauss(n_angles // 2)
+    low, high = edges[:-1, np.newaxis], edges[1:, np.newaxis]
+    radius = (low + (high - low) * (unit + 1) / 2).ravel()
+    ring = radius * ((high - low) / 2 * unit_weights).ravel()
+    angle = 2 * np.pi * np.arange(n_angles) / n_angles
+    u, v = np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))
+    return u.ravel(), v.ravel(), np.repeat(ring * 2 * np.pi / n_angles, n_angles)
+
+
+def _bandwidth(argument: float, tolerance: float) -> int:
+    """Even order from which on the Bessel functions J_n(`argument`) stay far below the tolerance."""
+    target = math.log(max(1e-3 * tolerance, 1e-18))
+    n = 8
+    while n * math.log(argument / 2) - math.lgamma(n + 1) > target:
+        n += 2
+    return n
+
+
+def _spectra(along_y: NDArray, y: NDArray, v: NDArray, along_x: NDArray, x: NDArray, u: NDArray) -> NDArray:
+    """Fourier sums of all products of two axis functions at the nodes (u, v): (a * b, n_nodes)."""
+    spectrum_y = along_y @ np.exp(-2j * np.pi * np.outer(y, v))
+    spectrum_x = along_x @ np.exp(-2j * np.pi * np.outer(x, u))
+    return (spectrum_y[:, np.newaxis] * spectrum_x).reshape(-1, u.size)
+
+
+def _compress(core: NDArray[np.complex128], tolerance: float) -> tuple[NDArray, NDArray, NDArray]:
+    """Split (n_masks, q0, r0) into real left (q0, q), core (n_masks, q, r) and real right (r0, r)."""
+    parts = np.concatenate([core.real, core.imag])
+    left, strength, _ = np.linalg.svd(np.concatenate(list(parts), axis=1), full_matrices=False)
+    left = left[:, : _rank(strength, tolerance)]
+    _, strength, right = np.linalg.svd(np.concatenate(list(left.T @ parts)), full_matrices=False)
+    right = right[: _rank(strength, tolerance)].T
+    return left, left.T @ core @ right, right
+
+
+def _rank(strength: NDArray, tolerance: float) -> int:
+    """Number of singular values above the tolerance; 1 at least, for masks that change nothing."""
+    return max(1, np.count_nonzero(strength > tolerance * strength[0]))

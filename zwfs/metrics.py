@@ -1,0 +1,130 @@
+"""How good a reconstruction is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs.pupil import Pupil
+
+
+def wrapped_residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.floating]:
+    """Difference of two phases, on the circle and without piston.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    estimate, truth : array_like, shapes (..., ny, nx) that broadcast, radian
+
+    Returns
+    -------
+    ndarray, shape (..., ny, nx), radian
+        In (-pi, pi], NaN outside the pupil. The piston is the argument of the mean phasor of the difference.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong or a value inside the pupil is not finite.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 4.1; `eq-error` of the theory page.
+    """
+    return pupil.scatter(_residual(pupil, estimate, truth))
+
+
+def reconstruction_error(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.floating]:
+    """Rms over the pupil of the `wrapped_residual`, whose parameters and errors it has.
+
+    Returns
+    -------
+    ndarray, shape (...), radian rms
+    """
+    return np.sqrt(np.mean(_residual(pupil, estimate, truth) ** 2, axis=-1))
+
+
+def strehl(pupil: Pupil, phase: ArrayLike) -> NDArray[np.floating]:
+    """Strehl ratio: intensity on the axis of the focal plane over that of a flat wavefront.
+
+    Parameters
+    ----------
+    pupil : Pupil
+        Its amplitude weighs the points.
+    phase : array_like, shape (..., ny, nx), radian
+
+    Returns
+    -------
+    ndarray, shape (...)
+
+    Raises
+    ------
+    ValueError
+        If the shape is wrong or a value inside the pupil is not finite.
+    """
+    values = _inside(pupil, "phase", phase)
+    weight = pupil.gather(pupil.amplitude)
+    return np.abs(np.exp(1j * values) @ weight / weight.sum()) ** 2
+
+
+def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> float:
+    """Input rms at which the error of a reconstructor leaves a fraction of the input.
+
+    The ratio of error to input is interpolated linearly between the samples around the place where it crosses the
+    threshold for the first time. Samples at an input of 0 have no ratio and are left out.
+
+    Parameters
+    ----------
+    rms : array_like, shape (n,), radian rms
+        Input, increasing.
+    error : array_like, shape (n,), radian rms
+        Error of the reconstruction, such as the mean over the screens.
+    threshold : float
+        Largest ratio of error to input that counts as satisfactory: 5 % in the paper.
+
+    Returns
+    -------
+    float, radian rms
+        0 if already the smallest input is above the threshold, infinity if no input is.
+
+    Raises
+    ------
+    ValueError
+        If the arrays differ in shape, hold no positive input, or are not finite, or if `rms` does not increase.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 4.1.
+    """
+    rms, error = _check.real_array("rms", rms), _check.real_array("error", error)
+    if rms.ndim != 1 or rms.shape != error.shape:
+        raise ValueError(f"rms and error have shapes {rms.shape} and {error.shape}: expected the same (n,)")
+    threshold = _check.number("threshold", threshold, 0, open_low=True)
+    _check.finite("rms", rms)
+    _check.finite("error", error)
+    _check.non_negative("rms", rms)
+    if np.any(np.diff(rms) <= 0) or not np.any(rms > 0):
+        raise ValueError(f"rms = {rms}: expected increasing values, some of them above 0")
+    ratio = error[rms > 0] / rms[rms > 0]
+    rms = rms[rms > 0]
+    above = np.flatnonzero(ratio > threshold)
+    if not above.size:
+        return np.inf
+    last = above[0]
+    if last == 0:
+        return 0.0
+    step = (threshold - ratio[last - 1]) / (ratio[last] - ratio[last - 1])
+    return float(rms[last - 1] + step * (rms[last] - rms[last - 1]))
+
+
+def _inside(pupil: Pupil, name: str, maps: ArrayLike) -> NDArray[np.floating]:
+    maps = _check.real_array(name, maps)
+    _check.trailing_shape(name, maps, pupil.shape, "the shape of the pupil")
+    values = pupil.gather(maps)
+    _check.finite(name, values, " inside the pupil")
+    return values
+
+
+def _residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.floating]:
+    phasor = np.exp(1j * (_inside(pupil, "estimate", estimate) - _inside(pupil, "truth", truth)))
+    return np.angle(phasor * np.conj(phasor.mean(axis=-1, keepdims=True)))

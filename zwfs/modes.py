@@ -1,0 +1,182 @@
+"""Zernike modes and random phase screens made of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs.pupil import Pupil
+
+
+def noll_to_nm(j: int) -> tuple[int, int]:
+    """Radial order n and azimuthal order m of Noll's mode j.
+
+    Positive m stands for cos(m theta), negative m for sin(|m| theta); j = 1 is piston.
+
+    Raises
+    ------
+    ValueError
+        If j is below 1.
+
+    References
+    ----------
+    Noll 1976, J. Opt. Soc. Am. 66, 207, table I.
+    """
+    j = _check.integer("j", j, 1)
+    n = int((np.sqrt(8 * j - 7) - 1) / 2)
+    position = j - n * (n + 1) // 2
+    m = 2 * (position // 2) if n % 2 == 0 else 2 * ((position - 1) // 2) + 1
+    return n, m if j % 2 == 0 else -m
+
+
+def zernike_basis(
+    pupil: Pupil, n_modes: int, *, orthonormal: bool = False, dtype: type = np.float64
+) -> NDArray[np.floating]:
+    """Zernike modes on a pupil: Noll 2 to `n_modes` + 1.
+
+    The radial part comes from the three-term recurrence of the Jacobi polynomials, the angular part from powers
+    of x + iy: neither loses digits beyond 1000 modes, where factorials do.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    n_modes : int
+        Number of modes, piston not counted.
+    orthonormal : bool
+        Make the modes orthonormal over the sampled pupil (Gram-Schmidt in Noll's order, piston first). On an
+        obscured or segmented pupil the plain modes are not.
+    dtype : float32 or float64
+
+    Returns
+    -------
+    ndarray, shape (n_modes, ny, nx)
+        0 outside. Each mode has zero mean and unit rms over the points inside.
+
+    Raises
+    ------
+    ValueError
+        If there are more modes than the points can tell apart, or points farther than D/2 from the axis.
+
+    References
+    ----------
+    Noll 1976, J. Opt. Soc. Am. 66, 207.
+    """
+    n_modes = _check.integer("n_modes", n_modes, 1)
+    if n_modes >= pupil.n_points:
+        raise ValueError(
+            f"n_modes = {n_modes}: expected fewer modes than the {pupil.n_points} points of the pupil"
+        )
+    disc = 2 * (pupil.points[:, 0] + 1j * pupil.points[:, 1])
+    reach = np.abs(disc).max() / 2
+    if reach > 0.5 + 1 / pupil.n_pixels:
+        raise ValueError(
+            f"pupil reaches {reach:.4g} D from its axis: expected at most 0.5 D; "
+            "give from_amplitude the n_pixels of the circle around it"
+        )
+    values = _unnormalised(disc, n_modes)
+    values -= values.mean(axis=1, keepdims=True)
+    if orthonormal:
+        values = _orthonormalise(values)
+    scale = values.std(axis=1, keepdims=True)
+    if not scale.min() > 1e-12:
+        raise ValueError(f"n_modes = {n_modes}: the {pupil.n_points} points of the pupil do not tell them apart")
+    return pupil.scatter((values / scale).astype(dtype), fill=0.0)
+
+
+def power_law_screens(
+    modes: ArrayLike,
+    rms: float,
+    n_screens: int,
+    exponent: float = -2.0,
+    seed: int | np.random.Generator | np.random.SeedSequence | None = None,
+) -> NDArray[np.floating]:
+    """Random phase screens whose power spectral density falls as a power of the spatial frequency.
+
+    How the sentence "an f^-2 power spectral density defined on the first 200 Zernike polynomials" is read here:
+    the coefficients are independent normal numbers, and a mode of radial order n, which oscillates n/2 times
+    across the diameter, has a variance proportional to n^`exponent`. Modes are spread evenly over the plane of
+    spatial frequencies, so the variance of a mode follows the density at its frequency.
+
+    Parameters
+    ----------
+    modes : array_like, shape (n_modes, ny, nx)
+        Modes in Noll's order from 2 on, of zero mean and unit rms, 0 outside the pupil, as `zernike_basis` gives
+        them.
+    rms : float, radian
+        Every screen is scaled to exactly this rms over the pupil, piston removed.
+    n_screens : int
+    exponent : float
+        Exponent of the power spectral density.
+    seed : int, Generator or SeedSequence, optional
+        Fewer screens from the same integer seed are the first of more.
+
+    Returns
+    -------
+    ndarray, shape (n_screens, ny, nx), radian
+        0 outside the pupil; the dtype of the modes.
+
+    Raises
+    ------
+    ValueError
+        If the modes are not three-dimensional, empty or of different rms, or a number is out of range.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 4.1; `eq-screens` of the theory page.
+    """
+    modes = _check.real_array("modes", modes)
+    if modes.ndim != 3 or 0 in modes.shape:
+        raise ValueError(f"modes has shape {modes.shape}: expected (n_modes, ny, nx)")
+    rms = _check.number("rms", rms, 0)
+    n_screens = _check.integer("n_screens", n_screens, 1)
+    exponent = _check.number("exponent", exponent)
+    flat = modes.reshape(len(modes), -1)
+    # The sum of squares of a mode of unit rms is the number of points inside.
+    n_points = np.einsum("ij,ij->i", flat, flat, dtype=np.float64)
+    if not np.allclose(n_points, n_points[0], rtol=1e-3):
+        raise ValueError("modes have different rms: expected unit rms each, as zernike_basis gives them")
+    orders = np.array([noll_to_nm(j)[0] for j in range(2, len(modes) + 2)])
+    coefficients = np.random.default_rng(seed).standard_normal((n_screens, len(modes)))
+    coefficients *= orders ** (exponent / 2)
+    screens = coefficients.astype(modes.dtype) @ flat
+    power = np.einsum("ij,ij->i", screens, screens, dtype=np.float64) / n_points[0]
+    screens *= (rms / np.sqrt(power)).astype(modes.dtype)[:, np.newaxis]
+    return screens.reshape(n_screens, *modes.shape[1:])
+
+
+def _unnormalised(disc: NDArray[np.complex128], n_modes: int) -> NDArray[np.float64]:
+    """Modes without their norm, at the points `disc` = x + iy of the unit disc: (n_modes, n_points)."""
+    orders = [noll_to_nm(j) for j in range(2, n_modes + 2)]
+    rows: dict[tuple[int, int], list[int]] = {}
+    for row, (n, m) in enumerate(orders):
+        rows.setdefault((n, abs(m)), []).append(row)
+    n_max = orders[-1][0]
+    t = 2 * np.abs(disc) ** 2 - 1
+    values = np.empty((n_modes, disc.size))
+    angular = np.ones_like(disc)
+    for m in range(n_max + 1):
+        for k, radial in enumerate(_jacobi(t, m, (n_max - m) // 2)):
+            for row in rows.get((m + 2 * k, m), ()):
+                values[row] = radial * (angular.real if orders[row][1] >= 0 else angular.imag)
+        angular *= disc
+    return values
+
+
+def _jacobi(t: NDArray, m: int, k_max: int) -> list[NDArray]:
+    """Jacobi polynomials P_k^(0,m)(t) for k = 0 to `k_max`, by their recurrence in k."""
+    found = [np.ones_like(t), (m + 2) / 2 * t - m / 2]
+    for k in range(2, k_max + 1):
+        c = 2 * k + m
+        rise = (c - 1) * (c * (c - 2) * t - m * m) * found[-1] - 2 * (k - 1) * (k + m - 1) * c * found[-2]
+        found.append(rise / (2 * k * (k + m) * (c - 2)))
+    return found[: k_max + 1]
+
+
+def _orthonormalise(values: NDArray) -> NDArray:
+    q, r = np.linalg.qr(values.T)
+    diagonal = np.diagonal(r)
+    if np.abs(diagonal).min() < 1e-10 * np.abs(diagonal).max():
+        raise ValueError(f"n_modes = {len(values)}: the modes are not independent on the points of this pupil")
+    # QR leaves the sign of each mode free: keep that of the mode it came from.
+    return (q * np.sign(diagonal)).T

@@ -1,0 +1,12 @@
+"""Reconstructors: built once for a sensor, then called on frames; all give a `Reconstruction`."""
+
+from zwfs.reconstructors._common import Reconstruction
+from zwfs.reconstructors.arcsine import Arcsine
+from zwfs.reconstructors.gerchberg_saxton import GerchbergSaxton
+from zwfs.reconstructors.gradient_descent import GradientDescent
+from zwfs.reconstructors.linear import Linear
+from zwfs.reconstructors.phase_shifted import PhaseShifted
+
+RECONSTRUCTORS = (Linear, Arcsine, PhaseShifted, GerchbergSaxton, GradientDescent)
+
+__all__ = ["RECONSTRUCTORS", "Reconstruction", *(method.__name__ for method in RECONSTRUCTORS)]

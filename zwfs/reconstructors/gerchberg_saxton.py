@@ -1,0 +1,60 @@
+"""Gerchberg-Saxton reconstruction, section 3.2 of the paper."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs.reconstructors._common import Reconstruction, iterate, settings, unit
+from zwfs.sensor import ZernikeSensor
+
+
+class GerchbergSaxton:
+    """Phase by going to and fro between the planes, with the measured amplitude put in at each.
+
+    One iteration propagates the estimate through every mask, puts the square root of the measured frames in the
+    place of the modelled amplitude, back-propagates, adds the fields of all masks, and puts A_in in the place of
+    the amplitude in the pupil.
+
+    The detector plane is that of the sensor. Light that leaves it is taken as 0 on the way back, which biases the
+    phase: choose the sensor's `extent` accordingly.
+
+    Parameters
+    ----------
+    sensor : ZernikeSensor
+        With any number of masks.
+    n_iterations, tolerance, amplitude
+        As for `PhaseShifted`.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 3.2, equations (14) and (15); Gerchberg & Saxton 1972.
+    """
+
+    def __init__(
+        self,
+        sensor: ZernikeSensor,
+        *,
+        n_iterations: int = 25,
+        tolerance: float = 1e-6,
+        amplitude: ArrayLike | None = None,
+    ) -> None:
+        self.settings = settings(sensor, n_iterations, tolerance, amplitude)
+
+    def __call__(
+        self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
+    ) -> Reconstruction:
+        """Reconstruct the phase of each frame set; parameters, result and errors are those of `PhaseShifted`."""
+        return iterate(self, frames, start, history)
+
+    def prepare(self, frames: NDArray, amplitude: NDArray, start: NDArray) -> dict[str, NDArray]:
+        """Measured amplitude on the detector."""
+        return {"amplitude": np.sqrt(frames)}
+
+    def step(self, phasor: NDArray, amplitude: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
+        """To the detector and back."""
+        sensor = self.settings.sensor
+        waves = sensor.propagate_split(phasor * amplitude)
+        # A modelled field of 0 has no phase; that of a bright pixel next to it would do as well as any.
+        waves = unit(waves, np.zeros_like(waves)) * data["amplitude"][:, :, np.newaxis]
+        return unit(sensor.adjoint_split(waves), phasor), np.zeros(len(phasor), int)

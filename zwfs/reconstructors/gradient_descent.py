@@ -1,0 +1,119 @@
+"""Reconstruction by gradient descent, section 3.3 of the paper."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+
+from zwfs.reconstructors._common import Reconstruction, check_frames, report, settings, start_phase
+from zwfs.reconstructors.linear import check_modes
+from zwfs.sensor import ZernikeSensor, split, square
+
+
+class GradientDescent:
+    """Phase whose modelled frames differ least from the measured ones.
+
+    The cost is half the mean over the detector of the squared difference: its minimum is that of the 2-norm in
+    the paper, but it is smooth there, where a norm has a kink that spoils the steps of the optimiser. The gradient
+    comes from back-propagation through the sensor; `scipy.optimize.minimize` takes the steps (L-BFGS-B).
+
+    Parameters
+    ----------
+    sensor : ZernikeSensor
+        With any number of masks.
+    modes : array_like, shape (n_modes, ny, nx), optional
+        Modes whose coefficients are sought; every point of the pupil on its own if left out.
+    n_iterations, tolerance, amplitude
+        As for `PhaseShifted`.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 3.3, equation (16); `eq-gradient` of the theory page.
+    """
+
+    def __init__(
+        self,
+        sensor: ZernikeSensor,
+        modes: ArrayLike | None = None,
+        *,
+        n_iterations: int = 25,
+        tolerance: float = 1e-6,
+        amplitude: ArrayLike | None = None,
+    ) -> None:
+        self.settings = settings(sensor, n_iterations, tolerance, amplitude)
+        self.modes = None if modes is None else check_modes(sensor, modes)
+
+    def __call__(
+        self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
+    ) -> Reconstruction:
+        """Reconstruct the phase of each frame set; parameters, result and errors are those of `PhaseShifted`."""
+        config = self.settings
+        pupil = config.sensor.pupil
+        frames, batch = check_frames(config.sensor, frames)
+        phase = start_phase(config.sensor, start, batch, frames.dtype)
+        n_used = np.zeros(len(frames), int)
+        converged = np.zeros(len(frames), bool)
+        record = np.empty((len(frames), config.n_iterations + 1, *pupil.shape), frames.dtype) if history else None
+        for index, frame in enumerate(frames):
+            path, converged[index] = self._descend(frame[np.newaxis], pupil.gather(phase[index]))
+            n_used[index] = len(path) - 1
+            phase[index] = pupil.scatter(path[-1], fill=0)
+            if record is not None:
+                path += [path[-1]] * (config.n_iterations + 1 - len(path))
+                record[index] = pupil.scatter(np.array(path), fill=0)
+        return report(config, frames, batch, phase, n_used, converged, np.zeros(len(frames), int), record)
+
+    def cost(self, phase: NDArray, frames: NDArray) -> tuple[float, NDArray]:
+        """Cost of a phase and its gradient.
+
+        Parameters
+        ----------
+        phase : ndarray, shape (n_points,), radian
+            Values at the points of the pupil.
+        frames : ndarray, shape (1, n_masks, ny', nx')
+
+        Returns
+        -------
+        cost : float
+        gradient : ndarray, shape (n_points,), 1 / radian
+        """
+        sensor = self.settings.sensor
+        maps = sensor.pupil.scatter(phase.astype(frames.dtype), fill=0)[np.newaxis]
+        psi = split(maps, self.settings.amplitude.astype(frames.dtype))
+        waves = sensor.propagate_split(psi)
+        mismatch = square(waves) - frames
+        back = sensor.adjoint_split(waves * mismatch[:, :, np.newaxis])
+        # 2 Im(conj(psi) back)
+        gradient = 2 * (psi[0, 0] * back[0, 1] - psi[0, 1] * back[0, 0]) / mismatch.size
+        return float(np.vdot(mismatch, mismatch)) / (2 * mismatch.size), sensor.pupil.gather(gradient)
+
+    def _descend(self, frames: NDArray, start: NDArray) -> tuple[list[NDArray], bool]:
+        """Phases at the points of the pupil after each iteration, and whether the last change was small."""
+        config = self.settings
+        n_points = config.sensor.pupil.n_points
+        path, latest = [start], start
+
+        def value(x: NDArray) -> tuple[float, NDArray]:
+            nonlocal latest
+            latest = start + (x if self.modes is None else x @ self.modes)
+            cost, gradient = self.cost(latest, frames)
+            return cost, np.asarray(gradient if self.modes is None else self.modes @ gradient, np.float64)
+
+        def follow(x: NDArray) -> None:
+            # The line search ends at the point that it accepts: its phase is the latest one.
+            path.append(latest)
+            if _rms(path[-1] - path[-2]) <= config.tolerance:
+                raise StopIteration
+
+        n = n_points if self.modes is None else len(self.modes)
+        found = minimize(
+            value, np.zeros(n), jac=True, method="L-BFGS-B", callback=follow,
+            options={"maxiter": config.n_iterations, "ftol": 0.0, "gtol": 0.0},
+        )  # fmt: skip
+        # Status 0: the gradient is exactly 0, as at a flat start of a flat wavefront.
+        return path, found.status == 0 or (len(path) > 1 and _rms(path[-1] - path[-2]) <= config.tolerance)
+
+
+def _rms(values: NDArray) -> float:
+    return float(np.sqrt(values @ values / values.size))

@@ -1,0 +1,135 @@
+"""Linear reconstruction with an interaction matrix."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs.reconstructors._common import Reconstruction, check_frames, report, settings, start_phase
+from zwfs.sensor import ZernikeSensor
+
+
+class Linear:
+    """Phase from the difference to the frames of a reference phase, by one matrix product.
+
+    The interaction matrix is measured on the model: each mode is pushed and pulled by a small amount around the
+    reference phase, and half the difference of the frames, inside the pupil, makes its column. Its pseudo-inverse
+    leaves out singular values below `conditioning` times the largest.
+
+    Parameters
+    ----------
+    sensor : ZernikeSensor
+        With any number of masks.
+    modes : array_like, shape (n_modes, ny, nx)
+        Modes that the phase is made of, such as those of `zernike_basis`.
+    poke : float, radian
+        Coefficient by which each mode is pushed and pulled.
+    conditioning : float
+        Smallest singular value that is inverted, relative to the largest one.
+    reference : array_like, shape (ny, nx), radian, optional
+        Phase around which the sensor is linearised; flat if left out.
+    amplitude : array_like, shape (ny, nx), optional
+        Measured amplitude A_in in the pupil; that of the sensor's pupil if left out.
+
+    Attributes
+    ----------
+    interaction_matrix : ndarray, shape (n_masks * n_points, n_modes), 1 / radian
+    n_inverted : int
+        Singular values above the conditioning.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of the wrong kind, shape or range, or if there are more modes than measurements.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 4.1 ("interaction matrix approach").
+    """
+
+    def __init__(
+        self,
+        sensor: ZernikeSensor,
+        modes: ArrayLike,
+        *,
+        poke: float = 0.01,
+        conditioning: float = 1e-3,
+        reference: ArrayLike | None = None,
+        amplitude: ArrayLike | None = None,
+    ) -> None:
+        self.settings = settings(sensor, 1, 0.0, amplitude)
+        self.modes = check_modes(sensor, modes)
+        poke = _check.number("poke", poke, 0, open_low=True)
+        conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
+        self._reference = start_phase(sensor, reference, (), np.dtype(np.float64))
+        self.interaction_matrix = self._push_pull(poke)
+        u, strength, vt = np.linalg.svd(self.interaction_matrix, full_matrices=False)
+        self.n_inverted = int(np.count_nonzero(strength > conditioning * strength[0]))
+        kept = slice(0, self.n_inverted)
+        self._inverse = (vt[kept].T / strength[kept]) @ u[:, kept].T
+        self._reference_signal = self._signal(self._model(self._reference))[0]
+
+    def __call__(self, frames: ArrayLike, *, history: bool = False) -> Reconstruction:
+        """Reconstruct the phase of each frame set.
+
+        Parameters
+        ----------
+        frames : array_like, shape (..., n_masks, ny', nx')
+            Intensity, 1 = mean of the pupil with the mask out.
+        history : bool
+            Keep the phase before, which is the reference phase, and after.
+
+        Returns
+        -------
+        Reconstruction
+            After one iteration; always converged.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the frames are of the wrong shape, complex, not finite, negative or dark.
+        """
+        config = self.settings
+        frames, batch = check_frames(config.sensor, frames)
+        coefficients = (self._signal(frames) - self._reference_signal) @ self._inverse.T
+        phase = coefficients @ self.modes + config.sensor.pupil.gather(self._reference)
+        phase = config.sensor.pupil.scatter(phase, fill=0).astype(frames.dtype)
+        n_frames = len(frames)
+        record = np.stack([np.broadcast_to(self._reference, phase.shape), phase], axis=1) if history else None
+        return report(
+            config, frames, batch, phase,
+            np.ones(n_frames, int), np.ones(n_frames, bool), np.zeros(n_frames, int), record,
+        )  # fmt: skip
+
+    def _push_pull(self, poke: float) -> NDArray[np.float64]:
+        pupil = self.settings.sensor.pupil
+        matrix = np.empty((self.settings.sensor.n_masks * pupil.n_points, len(self.modes)))
+        for column, mode in enumerate(self.modes):
+            push = pupil.scatter(np.stack([poke * mode, -poke * mode]), fill=0)
+            plus, minus = self._signal(self._model(self._reference + push))
+            matrix[:, column] = (plus - minus) / (2 * poke)
+        return matrix
+
+    def _model(self, phase: NDArray) -> NDArray:
+        return self.settings.sensor.intensity(phase, self.settings.amplitude[np.newaxis])
+
+    def _signal(self, frames: NDArray) -> NDArray:
+        """Values at the points of the pupil, all masks in a row: (k, n_masks * n_points)."""
+        window = frames[(..., *self.settings.sensor.window)]
+        return self.settings.sensor.pupil.gather(window).reshape(len(frames), -1)
+
+
+def check_modes(sensor: ZernikeSensor, modes: ArrayLike) -> NDArray[np.float64]:
+    """Checked modes at the points of the pupil, shape (n_modes, n_points)."""
+    modes = _check.real_array("modes", modes)
+    if modes.ndim != 3 or not len(modes):
+        raise ValueError(f"modes has shape {modes.shape}: expected (n_modes, ny, nx)")
+    _check.trailing_shape("modes", modes, sensor.pupil.shape, "the shape of the pupil")
+    values = sensor.pupil.gather(modes).astype(np.float64)
+    _check.finite("modes", values, " inside the pupil")
+    if len(values) > values.shape[1]:
+        raise ValueError(
+            f"modes: {len(values)} of them, expected at most the {values.shape[1]} points of the pupil"
+        )
+    return values

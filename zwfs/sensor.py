@@ -1,0 +1,293 @@
+"""The Zernike wavefront sensor: one pupil, one or more masks, one detector plane."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs.lowrank import Operator, factorise
+from zwfs.masks import Mask
+from zwfs.pupil import Pupil
+
+_DEGREES = 20.0  # radian rms; no phase map reaches it, the same map in degrees soon does
+
+
+class ZernikeSensor:
+    """A Zernike wavefront sensor with any number of masks.
+
+    One mask makes the classic sensor, two make the phase-shifted one. Detector pixels are as large as pupil
+    pixels and stand at the same places, so the detector of an extent of 1 D is the grid of the pupil.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    *masks : Dimple, Patch or any Mask
+    extent : float, D
+        Width of the detector plane, at least 1 (rounded to whole pixels on each side). Light leaves the
+        geometric pupil; a wider detector catches more of it.
+    tolerance : float
+        Error of the reference wave, relative to the strongest response of the masks (spectral norm). It decides
+        the rank; the speed hardly depends on it. At 1e-14 the kernel is exact to rounding.
+
+    Attributes
+    ----------
+    pupil, masks, extent, tolerance
+        As given; `extent` in D after rounding.
+    detector_shape : (int, int)
+    window : (slice, slice)
+        Where the grid of the pupil lies in a frame.
+    rank : int
+        Number of coefficients that the reference waves are made of.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there is no mask, or an argument is of the wrong kind or out of range.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, equations (1) to (5); `eq-low-rank` of the theory page.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(64)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(diameter=1.06, phase=np.pi / 2))
+    >>> sensor.measure(np.zeros(pupil.shape)).shape
+    (1, 64, 64)
+    """
+
+    def __init__(self, pupil: Pupil, *masks: Mask, extent: float = 1.0, tolerance: float = 1e-12) -> None:
+        if not isinstance(pupil, Pupil):
+            raise TypeError(f"pupil is a {type(pupil).__name__}: expected a Pupil")
+        if not masks:
+            raise ValueError("masks is empty: expected at least one mask, such as Dimple(1.06, np.pi / 2)")
+        for index, mask in enumerate(masks):
+            if not hasattr(mask, "transmission"):
+                raise TypeError(f"masks[{index}] is a {type(mask).__name__}: expected a Dimple or a Patch")
+        extent = _check.number("extent", extent, 1)
+        self.tolerance = _check.number("tolerance", tolerance, 1e-16, 0.1)
+        self.pupil = pupil
+        self.masks = masks
+        self._margin = round((extent - 1) * pupil.n_pixels / 2)
+        self.extent = 1 + 2 * self._margin / pupil.n_pixels
+        self.detector_shape = tuple(n + 2 * self._margin for n in pupil.shape)
+        self._stop = pupil.mask.astype(float)
+        m = self._margin
+        self.window = tuple(slice(m, m + n) for n in pupil.shape)
+        detector_axes = tuple(
+            axis[0] + (np.arange(axis.size + 2 * m) - m) / pupil.n_pixels for axis in (pupil.y, pupil.x)
+        )
+        self._factors = factorise(masks, (pupil.y, pupil.x), detector_axes, pupil.n_pixels**-2.0, self.tolerance)
+        self._operators: dict[np.dtype, Operator] = {}
+
+    def __repr__(self) -> str:
+        masks = ", ".join(map(repr, self.masks))
+        return f"ZernikeSensor({self.pupil.n_points} points, {masks}, extent={self.extent:g}, rank={self.rank})"
+
+    @property
+    def n_masks(self) -> int:
+        """Number of masks, and of frames that one measurement makes."""
+        return len(self.masks)
+
+    @property
+    def rank(self) -> int:
+        """Number of coefficients that the reference waves are made of."""
+        return self._factors.pupil.rank
+
+    def operator(self, dtype: np.dtype) -> Operator:
+        """Low-rank operator in float32 or float64, for those who write reconstructors; made once, then kept."""
+        dtype = np.dtype(dtype)
+        if dtype not in self._operators:
+            self._operators[dtype] = Operator(self._factors, self.window, dtype)
+        return self._operators[dtype]
+
+    def propagate(self, field: ArrayLike) -> NDArray[np.complexfloating]:
+        """Field on the detector behind each mask.
+
+        Parameters
+        ----------
+        field : array_like of complex, shape (..., ny, nx)
+            Field in the pupil plane. The stop blocks what lies outside the pupil.
+
+        Returns
+        -------
+        ndarray of complex, shape (..., n_masks, ny_detector, nx_detector)
+
+        Raises
+        ------
+        ValueError
+            If the shape is wrong or a value is not finite.
+
+        References
+        ----------
+        Chambouleyron et al. 2024, equations (1) to (3).
+        """
+        psi, batch = self._pupil_field(field)
+        return _join(self.propagate_split(psi), batch)
+
+    def reference_wave(self, field: ArrayLike) -> NDArray[np.complexfloating]:
+        """Reference wave of each mask: `propagate` less the field itself.
+
+        Parameters, shapes and errors are those of `propagate`.
+
+        References
+        ----------
+        Chambouleyron et al. 2024, equation (4).
+        """
+        psi, batch = self._pupil_field(field)
+        return _join(self.operator(psi.dtype).reference(psi), batch)
+
+    def adjoint(self, field: ArrayLike) -> NDArray[np.complexfloating]:
+        """Exact adjoint of `propagate`: back-propagation from the detector planes to the pupil.
+
+        Parameters
+        ----------
+        field : array_like of complex, shape (..., n_masks, ny_detector, nx_detector)
+
+        Returns
+        -------
+        ndarray of complex, shape (..., ny, nx)
+            Sum over the masks, 0 outside the pupil. With a mask of modulus 1 and an infinite detector it would
+            be the inverse, too.
+
+        Raises
+        ------
+        ValueError
+            If the shape is wrong or a value is not finite.
+
+        References
+        ----------
+        Chambouleyron et al. 2024, equation (14); `eq-adjoint` of the theory page.
+        """
+        field = _check.complex_array("field", field)
+        shape = (self.n_masks, *self.detector_shape)
+        _check.trailing_shape("field", field, shape, "masks and detector")
+        _check.finite("field", field)
+        waves = field.reshape(-1, *shape)
+        psi = self.adjoint_split(np.stack([waves.real, waves.imag], axis=2))
+        return _join(psi, field.shape[:-3])
+
+    def measure(self, phase: ArrayLike, amplitude: ArrayLike | None = None) -> NDArray[np.floating]:
+        """Frames without noise.
+
+        Parameters
+        ----------
+        phase : array_like, shape (..., ny, nx), radian
+            Only the points of the pupil count; NaN or anything else is allowed outside.
+        amplitude : array_like, shape (..., ny, nx), optional
+            Field amplitude; that of the pupil if left out. Points outside the pupil stay dark.
+
+        Returns
+        -------
+        ndarray, shape (..., n_masks, ny_detector, nx_detector)
+            Intensity; 1 is the mean intensity in the pupil with the mask taken out. float32 if the phase is.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If phase or amplitude are complex, of the wrong shape, or not finite inside the pupil, or if the
+            amplitude is negative.
+
+        Warns
+        -----
+        UserWarning
+            If the rms of a phase is above 20 rad: it may be in degrees or nanometres.
+
+        References
+        ----------
+        Chambouleyron et al. 2024, equation (5).
+        """
+        phase, batch = self.pupil_maps("phase", phase)
+        rms = self.pupil.rms(phase).max()
+        if rms > _DEGREES:
+            warnings.warn(
+                f"phase has an rms of {rms:.4g}: expected radian, less than {_DEGREES:g} rms; is it in degrees?",
+                UserWarning,
+                stacklevel=2,
+            )
+        strength, strength_batch = self.amplitude_maps(amplitude, phase.dtype)
+        if strength_batch:
+            full = np.broadcast_shapes(batch, strength_batch)
+            phase, strength = (
+                np.broadcast_to(maps.reshape(*shape, *self.pupil.shape), (*full, *self.pupil.shape))
+                for maps, shape in ((phase, batch), (strength, strength_batch))
+            )
+            batch, phase, strength = (
+                full,
+                phase.reshape(-1, *self.pupil.shape),
+                strength.reshape(-1, *self.pupil.shape),
+            )
+        return self.intensity(phase, strength).reshape(*batch, self.n_masks, *self.detector_shape)
+
+    # What follows is for reconstructors: one batch axis k, split fields, 0 outside the pupil, no further checks.
+
+    def pupil_maps(self, name: str, maps: ArrayLike) -> tuple[NDArray[np.floating], tuple[int, ...]]:
+        """Checked real maps, (k, ny, nx) with 0 outside the pupil, and the shape of the batch."""
+        maps = _check.real_array(name, maps)
+        _check.trailing_shape(name, maps, self.pupil.shape, "the shape of the pupil")
+        clean = np.where(self.pupil.mask, maps, 0).reshape(-1, *self.pupil.shape)
+        _check.finite(name, clean, " inside the pupil")
+        return clean.astype(maps.dtype, copy=False), maps.shape[:-2]
+
+    def amplitude_maps(
+        self, amplitude: ArrayLike | None, dtype: np.dtype
+    ) -> tuple[NDArray[np.floating], tuple[int, ...]]:
+        """Checked amplitude, (k, ny, nx) with 0 outside, and the shape of the batch; the pupil's for None."""
+        if amplitude is None:
+            return self.pupil.amplitude.astype(dtype)[np.newaxis], ()
+        maps, batch = self.pupil_maps("amplitude", amplitude)
+        _check.non_negative("amplitude", maps)
+        if not maps.any(axis=(-2, -1)).all():
+            raise ValueError("amplitude is 0 everywhere in the pupil: expected some light")
+        return maps.astype(dtype), batch
+
+    def intensity(self, phase: NDArray, amplitude: NDArray) -> NDArray:
+        """Frames of phases (k, ny, nx) and amplitudes (1 or k, ny, nx): (k, n_masks, ny', nx')."""
+        return square(self.propagate_split(split(phase, amplitude)))
+
+    def propagate_split(self, psi: NDArray) -> NDArray:
+        """Propagate split fields: (k, 2, ny, nx) to (k, n_masks, 2, ny', nx')."""
+        out = self.operator(psi.dtype).reference(psi)
+        out[(..., *self.window)] += psi[:, np.newaxis]
+        return out
+
+    def adjoint_split(self, waves: NDArray) -> NDArray:
+        """Adjoint of `propagate_split`: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
+        psi = self.operator(waves.dtype).reference_adjoint(waves)
+        psi += waves[(..., *self.window)].sum(axis=1)
+        psi *= self._stop
+        return psi
+
+    def _pupil_field(self, field: ArrayLike) -> tuple[NDArray, tuple[int, ...]]:
+        field = _check.complex_array("field", field)
+        _check.trailing_shape("field", field, self.pupil.shape, "the shape of the pupil")
+        flat = field.reshape(-1, *self.pupil.shape)
+        psi = np.empty((len(flat), 2, *self.pupil.shape), field.real.dtype)
+        np.multiply(flat.real, self._stop, out=psi[:, 0])
+        np.multiply(flat.imag, self._stop, out=psi[:, 1])
+        _check.finite("field", psi)
+        return psi, field.shape[:-2]
+
+
+def split(phase: NDArray, amplitude: NDArray) -> NDArray:
+    """Split field amplitude * exp(i phase): (k, ny, nx) to (k, 2, ny, nx)."""
+    out = np.empty((len(phase), 2, *phase.shape[1:]), phase.dtype)
+    np.multiply(np.cos(phase), amplitude, out=out[:, 0])
+    np.multiply(np.sin(phase), amplitude, out=out[:, 1])
+    return out
+
+
+def square(waves: NDArray) -> NDArray:
+    """Squared modulus of split fields: (..., 2, ny, nx) to (..., ny, nx)."""
+    return waves[..., 0, :, :] ** 2 + waves[..., 1, :, :] ** 2
+
+
+def _join(waves: NDArray, batch: tuple[int, ...]) -> NDArray[np.complexfloating]:
+    """Complex maps of split ones, with the batch axis in its shape again."""
+    out = np.empty((*waves.shape[:-3], *waves.shape[-2:]), np.result_type(waves.dtype, np.complex64))
+    out.real, out.imag = waves[..., 0, :, :], waves[..., 1, :, :]
+    return out.reshape(*batch, *out.shape[1:])

@@ -1,0 +1,44 @@
+"""Tables of results that notebooks show: few digits, the same on every machine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under a header; a notebook shows it as a table.
+
+    Floats are given `digits` significant digits, so that rounding errors do not show.
+
+    Attributes
+    ----------
+    header : sequence of str
+    rows : sequence of sequences
+        As long as the header each.
+    digits : int
+    """
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    digits: int = 3
+
+    def __post_init__(self) -> None:
+        for index, row in enumerate(self.rows):
+            if len(row) != len(self.header):
+                raise ValueError(f"rows[{index}] has {len(row)} cells: expected {len(self.header)}")
+
+    def __repr__(self) -> str:
+        return f"Table of {len(self.rows)} rows: {', '.join(self.header)}"
+
+    def _repr_markdown_(self) -> str:
+        lines = [self.header, ["---"] * len(self.header)]
+        lines += [[self._text(cell) for cell in row] for row in self.rows]
+        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+    def _text(self, cell: Any) -> str:
+        if isinstance(cell, bool):
+            return "yes" if cell else "no"
+        return f"{cell:.{self.digits}g}" if isinstance(cell, float) else str(cell)

@@ -1,0 +1,62 @@
+# Everything runs in .venv, which is set up from the lock when it is needed.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+LOCK := environment/requirements.lock
+READY := $(VENV)/.ready
+UV := $(BIN)/uv --quiet
+UV_REQUIREMENT := uv==0.13.8
+
+# One thread for each process: the same numbers on every machine, and no contention between notebooks.
+export OMP_NUM_THREADS = 1
+export OPENBLAS_NUM_THREADS = 1
+export MKL_NUM_THREADS = 1
+export VECLIB_MAXIMUM_THREADS = 1
+
+.DELETE_ON_ERROR:
+.PHONY: help book test figures lint bench lock clean
+
+help: ## list these commands
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
+
+book: $(READY) ## run the notebooks that changed and build the book in _build/html
+	@$(BIN)/python book/build.py book
+
+test: $(READY) ## test the package, the pipeline and the committed notebooks
+	$(BIN)/python -m pytest tests --benchmark-disable
+	$(BIN)/python -m pytest --nbval --nbval-current-env --nbval-cell-timeout 600 \
+		--nbval-sanitize-with tests/nbval.cfg notebooks
+
+figures: $(READY) ## replace the committed notebooks by freshly run ones
+	@$(BIN)/python book/build.py figures
+
+lint: $(READY) ## check style and formatting
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+bench: $(READY) ## time the sensor and the reconstructors
+	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
+
+lock: $(BIN)/uv ## pin the newest allowed version of every dependency
+	$(UV) pip compile pyproject.toml --extra book --extra test --upgrade \
+		--universal --python-version 3.11 --fork-strategy fewest --generate-hashes --no-emit-index-url \
+		--custom-compile-command "make lock" --output-file $(LOCK)
+
+clean: ## remove everything that these commands made
+	rm -rf _build $(VENV) *.egg-info .benchmarks .hypothesis .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/uv:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "zwfs needs Python 3.11 or newer, and $(PYTHON) is not: $$($(PYTHON) --version 2>&1)." \
+		"Name another: make PYTHON=python3.12" >&2; exit 1; }
+	@echo "setting up $(VENV)"
+	@$(PYTHON) -m venv --clear $(VENV)
+	@$(BIN)/python -m pip --quiet --disable-pip-version-check install $(UV_REQUIREMENT)
+
+# The stamp comes last, so that an interrupted set-up is taken up again.
+$(READY): $(LOCK) pyproject.toml | $(BIN)/uv
+	@rm -f $@
+	@$(UV) pip sync --python $(BIN)/python --require-hashes $(LOCK)
+	@$(UV) pip install --python $(BIN)/python --no-deps --no-build-isolation --editable .
+	@touch $@

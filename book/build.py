@@ -1,0 +1,88 @@
+"""Run the notebooks and build the book: the commands behind the Makefile."""
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+
+import compare
+import runner
+from pages import BookError, build_book
+from runner import NotebookError, Project
+
+
+def book(project: Project) -> int:
+    """Run the notebooks that changed and build the book."""
+    runner.run(project)
+    built = build_book(project)
+    index = project.build.relative_to(project.root) / "html" / "index.html"
+    print(f"book: {'built' if built else 'unchanged'}\nopen {index}")
+    return 0
+
+
+def run(project: Project) -> int:
+    """Run the notebooks that changed."""
+    runner.run(project)
+    return 0
+
+
+def figures(project: Project) -> int:
+    """Replace the committed notebooks by freshly run ones."""
+    runner.run(project)
+    for name in refresh(project):
+        print(f"notebooks/{name} is new")
+    return 0
+
+
+def refresh(project: Project) -> list[str]:
+    """Copy the executed notebooks over the committed ones, and name those that changed."""
+    changed = []
+    for committed in project.sources():
+        content = (project.executed / committed.name).read_bytes()
+        if content != committed.read_bytes():
+            runner.replace(committed, content)
+            changed.append(committed.name)
+    return changed
+
+
+def check(project: Project) -> int:
+    """Compare the committed notebooks with a fresh run."""
+    runner.run(project)
+    found = [line for notebook in project.sources() for line in check_notebook(project, notebook.stem)]
+    print("\n".join(found) or "the committed notebooks agree with the fresh run")
+    return 1 if found else 0
+
+
+def check_notebook(project: Project, name: str) -> list[str]:
+    """List what is wrong with a committed notebook, compared with its fresh run."""
+    committed = runner.read(project.notebooks / f"{name}.ipynb")
+    found = compare.faults(committed)
+    found += compare.differences(committed, runner.read(project.executed / f"{name}.ipynb"))
+    return [f"notebooks/{name}.ipynb: {line}" for line in found]
+
+
+COMMANDS = {command.__name__: command for command in (book, run, figures, check)}
+
+
+def main() -> int:
+    """Run the command that was asked for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="\n".join(f"{name:8} {command.__doc__}" for name, command in COMMANDS.items()),
+    )
+    parser.add_argument("command", choices=COMMANDS)
+    command = COMMANDS[parser.parse_args().command]
+    # Whoever stops the build by a signal gets the same clean end as by Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return command(Project(Path(__file__).resolve().parent.parent))
+    except (NotebookError, BookError) as failure:
+        print(failure, file=sys.stderr)
+    except KeyboardInterrupt:
+        print("interrupted: the earlier results are untouched", file=sys.stderr)
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

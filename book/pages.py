@@ -1,0 +1,113 @@
+"""Put the pages and the executed notebooks together and build the book from them."""
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from runner import Project, digest, digest_files, replace
+
+COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+JUPYTER_BOOK = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()"]
+
+
+class BookError(Exception):
+    """The book has warnings or errors; the message is what Sphinx said."""
+
+
+def mathjax_files() -> dict[str, Path]:
+    """The part of MathJax that a page loads, so that mathematics needs no network."""
+    package = importlib.util.find_spec("sphinx-mathjax-offline")
+    folder = Path(package.origin).parent / "static" / "mathjax"
+    files = [folder / "tex-chtml-full.js", *(folder / "output" / "chtml" / "fonts").rglob("*.woff")]
+    return {f"book/_static/mathjax/{file.relative_to(folder).as_posix()}": file for file in files}
+
+
+def staged_files(project: Project) -> dict[str, Path]:
+    """Everything that Sphinx reads, by its place in the staged sources."""
+    files = {name: project.root / name for name in ("_config.yml", "_toc.yml")}
+    for file in (project.root / "book").rglob("*"):
+        if file.is_file() and file.suffix not in (".py", ".pyc"):
+            files[file.relative_to(project.root).as_posix()] = file
+    for notebook in project.sources():
+        files[f"notebooks/{notebook.name}"] = project.executed / notebook.name
+    return files | mathjax_files()
+
+
+def build_book(project: Project) -> bool:
+    """Build the book in _build/html, unless it is there and nothing that it is made from changed.
+
+    Parameters
+    ----------
+    project : Project
+        Its notebooks have been run.
+
+    Returns
+    -------
+    bool
+        Whether it was built now.
+
+    Raises
+    ------
+    BookError
+        Sphinx gave a warning or an error. The earlier book stays.
+    """
+    html, record = project.build / "html", project.build / "html.json"
+    files = staged_files(project)
+    lock = project.root / "environment" / "requirements.lock"
+    made_from = digest_files(files | {"pages": Path(__file__), "lock": lock})
+    made_from = digest([made_from.encode(), str(sys.version_info[:2]).encode()])
+    try:
+        if html.is_dir() and json.loads(record.read_bytes()) == made_from:
+            return False
+    except (OSError, ValueError):
+        pass  # never built, or not to the end
+    source = _stage(project, files)
+    with tempfile.TemporaryDirectory(dir=project.build, prefix="building-") as scratch:
+        _jupyter_book(source, Path(scratch))
+        record.unlink(missing_ok=True)
+        _swap(Path(scratch) / "_build" / "html", html, Path(scratch) / "earlier")
+    replace(record, json.dumps(made_from).encode())
+    return True
+
+
+def _stage(project: Project, files: dict[str, Path]) -> Path:
+    """Copy the sources into one fresh folder; it is kept, for those who look for a warning's cause."""
+    source = project.build / "source"
+    shutil.rmtree(source, ignore_errors=True)
+    for name, file in files.items():
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, source / name)
+    return source
+
+
+def _jupyter_book(source: Path, output: Path) -> None:
+    """Run Jupyter Book with warnings as errors."""
+    options = ["-W", "-n", "--keep-going", "--path-output", str(output)]
+    done = subprocess.run(
+        [*JUPYTER_BOOK, "build", *options, str(source)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    if done.returncode:
+        lines = COLOUR.sub("", done.stdout).replace(f"{source}{os.sep}", "").splitlines()
+        marked = [line for line in lines if "WARNING:" in line or "ERROR:" in line]
+        raise BookError("\n".join(["the book was not built:", *(marked or lines[-40:])]))
+
+
+def _swap(new: Path, current: Path, earlier: Path) -> None:
+    """Put the new book in the place of the current one; put that back if it does not work."""
+    try:
+        if current.exists():
+            current.rename(earlier)
+        new.rename(current)
+    except BaseException:
+        if earlier.exists() and not current.exists():
+            earlier.rename(current)
+        raise

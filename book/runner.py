@@ -1,0 +1,353 @@
+"""Run the notebooks that changed, in parallel, and keep their results in one normal form."""
+
+import copy
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import nbformat
+from nbformat import NotebookNode
+from tqdm import tqdm
+
+HERE = Path(__file__).parent
+EXECUTE = HERE / "execute.py"
+
+# One thread for each kernel keeps numbers and timings the same however many notebooks run beside it.
+KERNEL_ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "VECLIB_MAXIMUM_THREADS": "1",
+    "PYTHONHASHSEED": "0",
+}
+
+
+class NotebookError(Exception):
+    """One or more notebooks did not run to their end; the message says which, where and why."""
+
+
+@dataclass(frozen=True)
+class Project:
+    """Where things lie.
+
+    Parameters
+    ----------
+    root : Path
+        The folder with notebooks/, zwfs/, book/ and the lock. Results go to its _build/.
+    """
+
+    root: Path
+
+    @property
+    def notebooks(self) -> Path:
+        """The committed notebooks."""
+        return self.root / "notebooks"
+
+    @property
+    def build(self) -> Path:
+        """All that is made from them."""
+        return self.root / "_build"
+
+    @property
+    def executed(self) -> Path:
+        """The executed notebooks, each with the record of what it was made from."""
+        return self.build / "notebooks"
+
+    def sources(self) -> list[Path]:
+        """The committed notebooks, in order."""
+        return sorted(self.notebooks.glob("*.ipynb"))
+
+    def shared_inputs(self) -> list[Path]:
+        """The files that the result of every notebook depends on."""
+        files = sorted((self.root / "zwfs").rglob("*.py"))
+        files.append(self.root / "environment" / "requirements.lock")
+        return [file for file in files if file.exists()]
+
+
+@dataclass
+class Children:
+    """The processes that run now, so that an interruption can end them."""
+
+    running: set[subprocess.Popen] = field(default_factory=set)
+    stopped: bool = False
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @contextmanager
+    def start(self, request: dict[str, Any], log: Path) -> Iterator[subprocess.Popen]:
+        """Start a notebook's process, and see that it is gone in the end."""
+        with self.lock, log.open("w") as errors:
+            if self.stopped:
+                raise InterruptedError
+            child = subprocess.Popen(
+                [sys.executable, str(EXECUTE), json.dumps(request)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+                env=os.environ | KERNEL_ENVIRONMENT,
+                # A session of its own: Ctrl-C reaches this process only, which then ends its children.
+                start_new_session=True,
+            )
+            self.running.add(child)
+        with child:
+            try:
+                yield child
+            finally:
+                child.terminate()
+                with self.lock:
+                    self.running.remove(child)
+
+    def stop(self) -> None:
+        """End all of them, and start no more."""
+        with self.lock:
+            self.stopped = True
+            for child in self.running:
+                child.terminate()
+
+
+def digest(parts: Iterable[bytes]) -> str:
+    """Return the sha256 of several byte strings; where one ends counts."""
+    total = hashlib.sha256()
+    for part in parts:
+        total.update(hashlib.sha256(part).digest())
+    return total.hexdigest()
+
+
+def digest_files(files: dict[str, Path]) -> str:
+    """Return the sha256 of files and of the names they are known by."""
+    return digest(part for name in sorted(files) for part in (name.encode(), files[name].read_bytes()))
+
+
+def read(path: Path) -> NotebookNode:
+    """Read a notebook in its normal form."""
+    return normalise(nbformat.read(path, as_version=4))
+
+
+def cell_sources(notebook: NotebookNode) -> list[list[Any]]:
+    """What a person wrote in each cell: kind, text, tags and other metadata; no outputs."""
+    return [[cell.cell_type, cell.source, cell.metadata] for cell in notebook.cells]
+
+
+def key(project: Project, name: str, parameters: dict[str, Any]) -> str:
+    """Return a digest of everything that the result of a notebook depends on."""
+    files = {str(file.relative_to(project.root)): file for file in project.shared_inputs()}
+    files |= {"runner": Path(__file__), "execute": EXECUTE}
+    own = [list(sys.version_info[:2]), parameters, cell_sources(read(project.notebooks / f"{name}.ipynb"))]
+    return digest([json.dumps(own, sort_keys=True).encode(), digest_files(files).encode()])
+
+
+def normalise(notebook: NotebookNode) -> NotebookNode:
+    """Return a notebook without what differs between two runs: times, versions, random names, chunking.
+
+    Parameters
+    ----------
+    notebook : NotebookNode
+        Any notebook of format 4; it is not changed.
+    """
+    result = copy.deepcopy(notebook)
+    result.nbformat, result.nbformat_minor = 4, 5
+    result.metadata.pop("papermill", None)
+    result.metadata.get("language_info", {}).pop("version", None)
+    result.metadata["kernelspec"] = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    for index, cell in enumerate(result.cells):
+        cell["id"] = f"cell-{index + 1:02d}"
+        for name in ("papermill", "execution"):
+            cell.metadata.pop(name, None)
+        if not cell.metadata.get("tags", True):
+            del cell.metadata["tags"]  # papermill gives every cell a list
+        if cell.cell_type == "code":
+            cell.outputs = [_without_date(output) for output in _merge_streams(cell.outputs)]
+    return result
+
+
+def _merge_streams(outputs: list[NotebookNode]) -> list[NotebookNode]:
+    """Join neighbouring pieces of one stream: where the kernel flushed is chance."""
+    merged: list[NotebookNode] = []
+    for output in outputs:
+        if merged and output.output_type == "stream" and merged[-1].get("name") == output.name:
+            merged[-1].text += output.text
+        else:
+            merged.append(output)
+    return merged
+
+
+def _without_date(output: NotebookNode) -> NotebookNode:
+    """Remove the time that matplotlib writes into an SVG."""
+    svg = output.get("data", {}).get("image/svg+xml")
+    if svg:
+        output.data["image/svg+xml"] = re.sub(r"\s*<dc:date>.*?</dc:date>", "", svg)
+    return output
+
+
+def to_bytes(notebook: NotebookNode) -> bytes:
+    """Write a notebook as it is stored: sorted keys, one newline at the end."""
+    return (nbformat.writes(notebook).rstrip("\n") + "\n").encode()
+
+
+def replace(path: Path, content: bytes) -> None:
+    """Write a file in one step: it is the old one or the new one, never half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        partial.write_bytes(content)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _record(project: Project, name: str) -> dict[str, Any]:
+    """What is known of the last result of a notebook; empty if there is none that can be trusted."""
+    result = project.executed / f"{name}.ipynb"
+    try:
+        record = json.loads(result.with_suffix(".json").read_bytes())
+        return record if record["result"] == digest([result.read_bytes()]) else {}
+    except (OSError, ValueError, KeyError):
+        return {}
+
+
+def run(
+    project: Project,
+    parameters: dict[str, dict[str, Any]] | None = None,
+    n_processes: int | None = None,
+    say: Callable[[str], None] = tqdm.write,
+) -> list[str]:
+    """Run every notebook whose result is not current.
+
+    Parameters
+    ----------
+    project : Project
+        Where the notebooks and the results are.
+    parameters : dict of dict, optional
+        Values that replace the defaults of a notebook's cell tagged ``parameters``, by its name.
+    n_processes : int, optional
+        Notebooks that run at the same time; by default as many as there are cores.
+    say : callable
+        Takes a line for each notebook that is finished.
+
+    Returns
+    -------
+    list of str
+        The names of the notebooks that were run.
+
+    Raises
+    ------
+    NotebookError
+        After all others were run. What was there from earlier runs of the failed ones stays.
+    """
+    parameters = parameters or {}
+    names = [path.stem for path in project.sources()]
+    if unknown := set(parameters) - set(names):
+        raise ValueError(f"parameters for unknown notebooks: {', '.join(sorted(unknown))}")
+    records = {name: _record(project, name) for name in names}
+    jobs = {name: parameters.get(name, {}) for name in names}
+    stale = [name for name in names if records[name].get("key") != key(project, name, jobs[name])]
+    # The longest first, as far as earlier runs tell: the others fill the gaps.
+    stale.sort(key=lambda name: -records[name].get("seconds", float("inf")))
+    if stale:
+        _run_all(project, {name: jobs[name] for name in stale}, n_processes, say)
+    say(f"notebooks: {len(stale)} run, {len(names) - len(stale)} unchanged")
+    return stale
+
+
+def _run_all(
+    project: Project,
+    jobs: dict[str, dict[str, Any]],
+    n_processes: int | None,
+    say: Callable[[str], None],
+) -> None:
+    """Run notebooks side by side, and store the result of each as soon as it is there."""
+    project.build.mkdir(parents=True, exist_ok=True)
+    children, failures = Children(), []
+    cells = sum(len(read(project.notebooks / f"{name}.ipynb").cells) for name in jobs)
+    with (
+        tempfile.TemporaryDirectory(dir=project.build, prefix="running-") as scratch,
+        ThreadPoolExecutor(n_processes or os.cpu_count()) as pool,
+        tqdm(total=cells, unit="cell", desc=f"0/{len(jobs)} notebooks", disable=None, leave=False) as bar,
+    ):
+        try:
+            futures = {
+                pool.submit(_run_one, project, name, values, Path(scratch), children, bar): name
+                for name, values in jobs.items()
+            }
+            for done, future in enumerate(as_completed(futures), start=1):
+                bar.set_description(f"{done}/{len(jobs)} notebooks")
+                try:
+                    say(f"{futures[future]}: {future.result():.1f} s")
+                except NotebookError as failure:
+                    say(f"{futures[future]}: failed")
+                    failures.append(str(failure))
+        except BaseException:
+            children.stop()
+            raise
+    if failures:
+        raise NotebookError("\n\n".join(failures))
+
+
+def _run_one(
+    project: Project,
+    name: str,
+    parameters: dict[str, Any],
+    scratch: Path,
+    children: Children,
+    bar: tqdm,
+) -> float:
+    """Run one notebook in a process of its own, store its result, and return the seconds it took."""
+    begin = time.perf_counter()
+    made_from = key(project, name, parameters)
+    source, target, log = (scratch / f"{name}{ending}" for ending in (".source.ipynb", ".ipynb", ".log"))
+    source.write_bytes(to_bytes(read(project.notebooks / f"{name}.ipynb")))
+    request = {
+        "notebook": str(source),
+        "target": str(target),
+        "folder": str(project.notebooks),
+        "parameters": parameters,
+    }
+    message: dict[str, Any] = {}
+    with children.start(request, log) as child:
+        for line in child.stdout:
+            message = json.loads(line)
+            bar.update("cell" in message)
+        status = child.wait()
+    if status:
+        failure = message.get("failure") or {
+            "where": message or None,
+            "parameters": parameters,
+            "error": f"its process ended with status {status}\n{log.read_text()[-2000:]}",
+        }
+        raise NotebookError(describe(f"notebooks/{name}.ipynb", failure))
+    seconds = time.perf_counter() - begin
+    result = to_bytes(read(target))
+    # Whoever edits while a notebook runs gets a result of unknown origin: it must not count as current.
+    unchanged = key(project, name, parameters) == made_from
+    record = {
+        "key": made_from if unchanged else None,
+        "result": digest([result]),
+        "seconds": round(seconds, 1),
+    }
+    replace(project.executed / f"{name}.ipynb", result)
+    replace(project.executed / f"{name}.json", json.dumps(record, indent=1).encode())
+    return seconds
+
+
+def describe(notebook: str, failure: dict[str, Any]) -> str:
+    """Say in which cell, with which parameters, and how a notebook failed."""
+    where = failure["where"]
+    lines = [f"{notebook} failed before its first cell"]
+    if where:
+        lines = [f"{notebook} failed in cell {where['cell']} of {where['of']}"]
+        lines += [f"  the cell begins: {where['first_line']}"] if "first_line" in where else []
+    values = ", ".join(f"{name} = {value}" for name, value in failure["parameters"].items())
+    lines += [f"  parameters in force: {values or '(none)'}", "", failure["error"]]
+    return "\n".join(lines)

@@ -1,0 +1,259 @@
+"""The pipeline, on notebooks of a few lines in folders of their own."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import build
+import nbformat
+import pages
+import pytest
+import runner
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+from runner import NotebookError, Project
+
+BOOK = Path(runner.__file__).parent
+
+
+def write(project, name, *cells, parameters="n = 2  # pixels\nwidth = 1.5  # metre"):
+    tagged = new_code_cell(parameters, metadata={"tags": ["parameters"]})
+    notebook = new_notebook(cells=[new_markdown_cell(f"# {name}"), tagged, *map(new_code_cell, cells)])
+    project.notebooks.mkdir(parents=True, exist_ok=True)
+    nbformat.write(notebook, project.notebooks / f"{name}.ipynb")
+
+
+def run(project, **options):
+    said = []
+    return runner.run(project, say=said.append, **options), said
+
+
+def results(project):
+    return {file.name: file.read_bytes() for file in sorted(project.executed.glob("*.ipynb"))}
+
+
+def printed(project, name):
+    notebook = runner.read(project.executed / f"{name}.ipynb")
+    return "".join(o.text for c in notebook.cells if c.cell_type == "code" for o in c.outputs if "text" in o)
+
+
+@pytest.fixture
+def project(tmp_path):
+    return Project(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory):
+    """A project whose two notebooks were run."""
+    project = Project(tmp_path_factory.mktemp("template"))
+    (project.root / "zwfs").mkdir()
+    (project.root / "zwfs" / "__init__.py").write_text("gain = 1\n")
+    noisy = "import sys, time\nfor i in range(3):\n    print(i, flush=True)\n    time.sleep(0.05)"
+    picture = (
+        "import matplotlib.pyplot as plt\nplt.rcParams['svg.hashsalt'] = 'fixed'\nplt.plot([1, 2])\nplt.show()"
+    )
+    write(project, "first", "print(n * width)", noisy)
+    write(project, "second", "%config InlineBackend.figure_formats = ['svg']", picture, "{n}")
+    (project.root / "environment").mkdir()
+    (project.root / "environment" / "requirements.lock").write_text("numpy==2\n")
+    run(project)
+    return project
+
+
+@pytest.fixture
+def ran(template, tmp_path):
+    """A copy of that project, to be changed."""
+    return Project(shutil.copytree(template.root, tmp_path / "copy"))
+
+
+def test_two_runs_give_identical_bytes(ran):
+    before = results(ran)
+    shutil.rmtree(ran.executed)
+    assert run(ran)[0]
+    assert results(ran) == before
+    assert len(before) == 2
+
+
+def test_unchanged_notebooks_are_not_run_again(ran):
+    assert run(ran) == ([], ["notebooks: 0 run, 2 unchanged"])
+
+
+def test_refreshed_notebooks_are_current_and_agree(ran):
+    assert build.refresh(ran) == ["first.ipynb", "second.ipynb"]
+    assert build.refresh(ran) == []
+    assert run(ran)[0] == []
+    assert build.check_notebook(ran, "first") == build.check_notebook(ran, "second") == []
+
+
+def test_committed_notebook_without_outputs_is_refused(ran):
+    found = build.check_notebook(ran, "first")
+    assert "notebooks/first.ipynb: no cell has any output" in found
+    assert "notebooks/first.ipynb: cell 2 was never run: it has no execution count" in found
+
+
+@pytest.mark.parametrize(
+    ("change", "stale"),
+    [
+        (lambda p: (p.root / "zwfs" / "__init__.py").write_text("gain = 2\n"), {"first", "second"}),
+        (lambda p: (p.root / "zwfs" / "more.py").write_text(""), {"first", "second"}),
+        (
+            lambda p: (p.root / "environment" / "requirements.lock").write_text("numpy==3\n"),
+            {"first", "second"},
+        ),
+        (lambda p: write(p, "first", "print(n)"), {"first"}),
+        (lambda p: (p.executed / "first.ipynb").write_text("half of a noteb"), {"first"}),
+        (lambda p: (p.executed / "first.json").unlink(), {"first"}),
+    ],
+)
+def test_what_changed_is_stale(ran, change, stale):
+    change(ran)
+    keys = {name: runner.key(ran, name, {}) for name in ("first", "second")}
+    assert {name for name in keys if runner._record(ran, name).get("key") != keys[name]} == stale
+
+
+def test_parameters_are_part_of_the_key(ran):
+    assert runner.key(ran, "first", {"n": 3}) != runner.key(ran, "first", {})
+
+
+def test_parameters_are_injected_after_the_defaults(ran):
+    assert run(ran, parameters={"first": {"n": 4}})[0] == ["first"]
+    assert printed(ran, "first").startswith("6.0\n")
+    injected = runner.read(ran.executed / "first.ipynb").cells[2]
+    assert injected.metadata.tags == ["injected-parameters"]
+    assert "n = 4" in injected.source
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"m": 4}, "unknown parameter 'm': expected one of n, width"),
+        ({"n": "4"}, "parameter n = '4': expected int, as in 2"),
+        ({"n": 4.0}, "parameter n = 4.0: expected int"),
+        ({"n": True}, "parameter n = True: expected int"),
+    ],
+)
+def test_bad_parameters_are_refused_before_the_first_cell(ran, parameters, message):
+    with pytest.raises(NotebookError, match="failed before its first cell") as caught:
+        run(ran, parameters={"first": parameters})
+    assert message in str(caught.value)
+
+
+def test_parameters_of_an_unknown_notebook_are_refused(ran):
+    with pytest.raises(ValueError, match="unknown notebooks: third"):
+        run(ran, parameters={"third": {}})
+
+
+def test_failure_is_named_and_leaves_earlier_results(ran):
+    before = results(ran)
+    write(ran, "first", "print(n)", "\nlight = 0\nraise ValueError('no light')", "print('never')")
+    with pytest.raises(NotebookError) as caught:
+        run(ran)
+    message = str(caught.value)
+    assert "notebooks/first.ipynb failed in cell 4 of 5" in message
+    assert "the cell begins: light = 0" in message
+    assert "parameters in force: n = 2, width = 1.5" in message
+    assert message.endswith("ValueError: no light")
+    assert results(ran) == before
+    assert sorted(os.listdir(ran.build)) == ["notebooks"]
+
+
+def test_dead_kernel_is_named(project):
+    write(project, "dies", "import os\nos._exit(3)")
+    with pytest.raises(NotebookError, match=r"notebooks/dies.ipynb failed in cell 3 of 3"):
+        run(project)
+    assert results(project) == {}
+
+
+def test_interruption_leaves_no_kernel_and_no_pieces(project):
+    write(
+        project,
+        "sleeps",
+        "import os, pathlib, time\npathlib.Path('pid').write_text(str(os.getpid()))",
+        "time.sleep(99)",
+    )
+    code = f"import pathlib, runner; runner.run(runner.Project(pathlib.Path({str(project.root)!r})))"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(BOOK)}, stderr=subprocess.DEVNULL
+    )
+    pid = project.notebooks / "pid"
+    wait_until(lambda: pid.exists() and pid.read_text(), seconds=60)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(20) != 0
+    assert list(project.build.iterdir()) == []
+    wait_until(lambda: not alive(int(pid.read_text())), seconds=20)
+
+
+def wait_until(condition, seconds):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.1)
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return (
+        "Z (zombie)" not in (Path("/proc") / str(pid) / "status").read_text() if Path("/proc").exists() else True
+    )
+
+
+def test_result_of_a_notebook_that_was_edited_meanwhile_is_not_current(project):
+    edit = "p.write_text(p.read_text().replace('# edited', '# later'))"
+    write(project, "edited", f"import pathlib\np = pathlib.Path('edited.ipynb')\n{edit}")
+    assert run(project)[0] == ["edited"]
+    assert runner._record(project, "edited")["key"] is None
+
+
+def test_normal_form_keeps_glued_values_and_drops_times():
+    glued = {"application/papermill.record/text/plain": "1.5"}
+    output = nbformat.v4.new_output("display_data", data=glued, metadata={"scrapbook": {"name": "x"}})
+    cell = new_code_cell("glue('x', 1.5)", outputs=[output], metadata={"tags": [], "papermill": {"duration": 1}})
+    notebook = new_notebook(
+        cells=[cell], metadata={"papermill": {}, "language_info": {"name": "python", "version": "3.11"}}
+    )
+    normal = runner.normalise(notebook)
+    assert normal.cells[0].outputs == [output]
+    assert normal.cells[0].metadata == {}
+    assert "papermill" not in normal.metadata
+    assert normal.metadata.language_info == {"name": "python"}
+    assert runner.to_bytes(normal).endswith(b"}\n")
+    assert runner.to_bytes(runner.normalise(normal)) == runner.to_bytes(normal)
+
+
+@pytest.fixture
+def small_book(ran):
+    """A book of one page and one notebook."""
+    (ran.root / "book").mkdir()
+    (ran.root / "book" / "index.md").write_text("# A book\n\n$a = b$, {doc}`/notebooks/first`\n")
+    (ran.root / "_toc.yml").write_text("format: jb-book\nroot: book/index\nchapters:\n- file: notebooks/first\n")
+    (ran.root / "_config.yml").write_text(
+        "title: small\nonly_build_toc_files: true\nexecute:\n  execute_notebooks: 'off'\n"
+    )
+    (ran.root / "environment").mkdir()
+    (ran.root / "environment" / "requirements.lock").write_text("")
+    return ran
+
+
+def test_book_is_built_once_and_a_failure_leaves_it(small_book):
+    assert pages.build_book(small_book)
+    page = small_book.build / "html" / "book" / "index.html"
+    before = page.read_bytes()
+    assert not pages.build_book(small_book)
+    (small_book.root / "book" / "index.md").write_text("# A book\n\n{doc}`nowhere`\n")
+    with pytest.raises(pages.BookError, match=r"book/index.md:3: WARNING: unknown document"):
+        pages.build_book(small_book)
+    assert page.read_bytes() == before
+    assert sorted(os.listdir(small_book.build)) == ["html", "html.json", "notebooks", "source"]
+
+
+def test_record_says_what_a_result_was_made_from(ran):
+    record = json.loads((ran.executed / "first.json").read_text())
+    assert record["key"] == runner.key(ran, "first", {})
+    assert record["seconds"] > 0

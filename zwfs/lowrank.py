@@ -8,8 +8,9 @@ The functions that the factors are made of are products of one-dimensional ones 
 functions of the two axes), so projecting a map of N x N pixels costs two thin matrix products, and nothing
 larger than N x a dozen is ever stored.
 
-Complex fields are handled as two maps of reals: "split" fields have shape (..., 2, ny, nx), real part first.
-Every product is then one real matrix product for a whole batch and all masks.
+The functions are real. A complex map is therefore two real ones, which the large products see side by side. Where
+arithmetic on every pixel follows, as in the reconstructors, it is kept as two maps throughout: "split" fields have
+shape (..., 2, ny, nx), real part first.
 """
 
 from __future__ import annotations
@@ -45,17 +46,17 @@ class Plane:
         return self.combine.shape[1]
 
     def project(self, maps: NDArray) -> NDArray:
-        """Inner products with maps: (k, ny, nx) to (k, r)."""
-        rows = maps.reshape(-1, maps.shape[-1]) @ self.along_x.T
-        pairs = self.along_y @ rows.reshape(len(maps), -1, len(self.along_x))
+        """Inner products with real or complex maps: (k, ny, nx) to (k, r)."""
+        rows = (self.along_y @ maps.view(maps.real.dtype)).view(maps.dtype)
+        pairs = rows.reshape(-1, rows.shape[-1]) @ self.along_x.T
         return pairs.reshape(len(maps), -1) @ self.combine
 
     def expand(self, coefficients: NDArray) -> NDArray:
-        """Maps of given coefficients: (k, r) to (k, ny, nx)."""
-        pairs = (coefficients @ self.combine.T).reshape(-1, len(self.along_y), len(self.along_x))
-        rows = self.along_y.T @ pairs
-        maps = rows.reshape(-1, len(self.along_x)) @ self.along_x
-        return maps.reshape(len(coefficients), -1, self.along_x.shape[1])
+        """Maps of real or complex coefficients: (k, r) to (k, ny, nx)."""
+        pairs = coefficients @ self.combine.T
+        rows = pairs.reshape(-1, len(self.along_x)) @ self.along_x
+        rows = rows.reshape(len(coefficients), len(self.along_y), -1)
+        return (self.along_y.T @ rows.view(rows.real.dtype)).view(rows.dtype)
 
     def cut(self, rows: slice, columns: slice) -> Plane:
         """The same functions on a part of the grid."""
@@ -105,23 +106,36 @@ class Operator:
         # Acts from the right on coefficients (2, r) that are flattened, and gives (n_masks, 2, q) flattened.
         real, imag = factors.core.real, factors.core.imag
         block = np.block([[real, -imag], [imag, real]])
-        self._core = np.ascontiguousarray(block.reshape(-1, block.shape[-1]).T, dtype)
+        self._split_core = np.ascontiguousarray(block.reshape(-1, block.shape[-1]).T, dtype)
+        self._core = factors.core.reshape(-1, factors.core.shape[-1]).T.astype(np.result_type(dtype, np.complex64))
 
-    def reference(self, psi: NDArray, *, in_window: bool = False) -> NDArray:
+    def reference(self, psi: NDArray) -> NDArray:
+        """Reference waves of complex fields on the pupil: (k, ny, nx) to (k, n_masks, ny', nx')."""
+        coefficients = self._pupil.project(psi) @ self._core
+        waves = self._detector.expand(coefficients.reshape(-1, self._detector.rank))
+        return waves.reshape(len(psi), self.n_masks, *waves.shape[-2:])
+
+    def adjoint(self, waves: NDArray) -> NDArray:
+        """Adjoint of `reference`: (k, n_masks, ny', nx') to (k, ny, nx)."""
+        coefficients = self._detector.project(waves.reshape(-1, *waves.shape[-2:]))
+        coefficients = coefficients.reshape(len(waves), -1) @ self._core.conj().T
+        return self._pupil.expand(coefficients)
+
+    def split_reference(self, psi: NDArray, *, in_window: bool = False) -> NDArray:
         """Reference waves of split fields on the pupil, (k, 2, ny, nx) to (k, n_masks, 2, ny', nx').
 
         The primed sizes are those of the detector, or those of the pupil's grid if `in_window`.
         """
         plane = self._window if in_window else self._detector
         coefficients = self._pupil.project(psi.reshape(-1, *psi.shape[-2:]))
-        coefficients = coefficients.reshape(len(psi), -1) @ self._core
+        coefficients = coefficients.reshape(len(psi), -1) @ self._split_core
         waves = plane.expand(coefficients.reshape(-1, plane.rank))
         return waves.reshape(len(psi), self.n_masks, 2, *waves.shape[-2:])
 
-    def reference_adjoint(self, waves: NDArray) -> NDArray:
-        """Adjoint of `reference` on the whole detector: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
+    def split_adjoint(self, waves: NDArray) -> NDArray:
+        """Adjoint of `split_reference` on the whole detector: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
         coefficients = self._detector.project(waves.reshape(-1, *waves.shape[-2:]))
-        coefficients = coefficients.reshape(len(waves), -1) @ self._core.T
+        coefficients = coefficients.reshape(len(waves), -1) @ self._split_core.T
         psi = self._pupil.expand(coefficients.reshape(-1, self._pupil.rank))
         return psi.reshape(len(waves), 2, *psi.shape[-2:])
 
@@ -172,7 +186,7 @@ def _axis_functions(axis: NDArray, radius: float, tolerance: float) -> NDArray:
     angle = np.pi * radius * np.outer(unit + 1, axis)
     waves = np.sqrt(weights)[:, np.newaxis] * np.stack([np.cos(angle), np.sin(angle)])
     _, strength, functions = np.linalg.svd(waves.reshape(-1, axis.size), full_matrices=False)
-    return functions[: _rank(strength, max(tolerance / 10, 1e-16))]
+    return functions[: _rank(strength, max(tolerance, 1e-16))]
 
 
 def _quadrature(mask: Mask, reach: float, tolerance: float) -> tuple[NDArray, NDArray, NDArray]:

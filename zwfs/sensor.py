@@ -60,7 +60,7 @@ class ZernikeSensor:
     (1, 64, 64)
     """
 
-    def __init__(self, pupil: Pupil, *masks: Mask, extent: float = 1.0, tolerance: float = 1e-12) -> None:
+    def __init__(self, pupil: Pupil, *masks: Mask, extent: float = 1.0, tolerance: float = 1e-10) -> None:
         if not isinstance(pupil, Pupil):
             raise TypeError(f"pupil is a {type(pupil).__name__}: expected a Pupil")
         if not masks:
@@ -76,6 +76,7 @@ class ZernikeSensor:
         self.extent = 1 + 2 * self._margin / pupil.n_pixels
         self.detector_shape = tuple(n + 2 * self._margin for n in pupil.shape)
         self._stop = pupil.mask.astype(float)
+        self._stop_parts = np.repeat(self._stop, 2, axis=-1)
         m = self._margin
         self.window = tuple(slice(m, m + n) for n in pupil.shape)
         detector_axes = tuple(
@@ -127,7 +128,9 @@ class ZernikeSensor:
         Chambouleyron et al. 2024, equations (1) to (3).
         """
         psi, batch = self._pupil_field(field)
-        return _join(self.propagate_split(psi), batch)
+        waves = self.operator(psi.real.dtype).reference(psi)
+        waves[(..., *self.window)] += psi[:, np.newaxis]
+        return waves.reshape(*batch, *waves.shape[1:])
 
     def reference_wave(self, field: ArrayLike) -> NDArray[np.complexfloating]:
         """Reference wave of each mask: `propagate` less the field itself.
@@ -139,7 +142,8 @@ class ZernikeSensor:
         Chambouleyron et al. 2024, equation (4).
         """
         psi, batch = self._pupil_field(field)
-        return _join(self.operator(psi.dtype).reference(psi), batch)
+        waves = self.operator(psi.real.dtype).reference(psi)
+        return waves.reshape(*batch, *waves.shape[1:])
 
     def adjoint(self, field: ArrayLike) -> NDArray[np.complexfloating]:
         """Exact adjoint of `propagate`: back-propagation from the detector planes to the pupil.
@@ -167,9 +171,10 @@ class ZernikeSensor:
         shape = (self.n_masks, *self.detector_shape)
         _check.trailing_shape("field", field, shape, "masks and detector")
         _check.finite("field", field)
-        waves = field.reshape(-1, *shape)
-        psi = self.adjoint_split(np.stack([waves.real, waves.imag], axis=2))
-        return _join(psi, field.shape[:-3])
+        waves = np.ascontiguousarray(field).reshape(-1, *shape)
+        psi = self.operator(waves.real.dtype).adjoint(waves)
+        psi += waves[(..., *self.window)].sum(axis=1)
+        return (psi * self._stop).reshape(*field.shape[:-3], *self.pupil.shape).astype(field.dtype, copy=False)
 
     def measure(self, phase: ArrayLike, amplitude: ArrayLike | None = None) -> NDArray[np.floating]:
         """Frames without noise.
@@ -251,13 +256,13 @@ class ZernikeSensor:
 
     def propagate_split(self, psi: NDArray) -> NDArray:
         """Propagate split fields: (k, 2, ny, nx) to (k, n_masks, 2, ny', nx')."""
-        out = self.operator(psi.dtype).reference(psi)
+        out = self.operator(psi.dtype).split_reference(psi)
         out[(..., *self.window)] += psi[:, np.newaxis]
         return out
 
     def adjoint_split(self, waves: NDArray) -> NDArray:
         """Adjoint of `propagate_split`: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
-        psi = self.operator(waves.dtype).reference_adjoint(waves)
+        psi = self.operator(waves.dtype).split_adjoint(waves)
         psi += waves[(..., *self.window)].sum(axis=1)
         psi *= self._stop
         return psi
@@ -265,12 +270,11 @@ class ZernikeSensor:
     def _pupil_field(self, field: ArrayLike) -> tuple[NDArray, tuple[int, ...]]:
         field = _check.complex_array("field", field)
         _check.trailing_shape("field", field, self.pupil.shape, "the shape of the pupil")
-        flat = field.reshape(-1, *self.pupil.shape)
-        psi = np.empty((len(flat), 2, *self.pupil.shape), field.real.dtype)
-        np.multiply(flat.real, self._stop, out=psi[:, 0])
-        np.multiply(flat.imag, self._stop, out=psi[:, 1])
-        _check.finite("field", psi)
-        return psi, field.shape[:-2]
+        _check.finite("field", field)
+        # Real and imaginary parts side by side: twice as fast as a product of complex with real numbers.
+        parts = np.ascontiguousarray(field).view(field.real.dtype)
+        psi = np.multiply(parts, self._stop_parts, dtype=parts.dtype).view(field.dtype)
+        return psi.reshape(-1, *self.pupil.shape), field.shape[:-2]
 
 
 def split(phase: NDArray, amplitude: NDArray) -> NDArray:
@@ -284,10 +288,3 @@ def split(phase: NDArray, amplitude: NDArray) -> NDArray:
 def square(waves: NDArray) -> NDArray:
     """Squared modulus of split fields: (..., 2, ny, nx) to (..., ny, nx)."""
     return waves[..., 0, :, :] ** 2 + waves[..., 1, :, :] ** 2
-
-
-def _join(waves: NDArray, batch: tuple[int, ...]) -> NDArray[np.complexfloating]:
-    """Complex maps of split ones, with the batch axis in its shape again."""
-    out = np.empty((*waves.shape[:-3], *waves.shape[-2:]), np.result_type(waves.dtype, np.complex64))
-    out.real, out.imag = waves[..., 0, :, :], waves[..., 1, :, :]
-    return out.reshape(*batch, *out.shape[1:])

@@ -56,7 +56,7 @@ class Arcsine:
         """Intensity less that of the incoming light, and the side of the reference wave to look on."""
         sensor = self.settings.sensor
         psi = split(start, amplitude)
-        wave = sensor.operator(start.dtype).reference(psi, in_window=True)[:, 0]
+        wave = sensor.operator(start.dtype).split_reference(psi, in_window=True)[:, 0]
         # The side is fixed once: the piston of the estimate, which no intensity shows, may drift past the wave.
         ahead = wave[:, 0] * psi[:, 1] - wave[:, 1] * psi[:, 0] >= 0
         return {
@@ -67,7 +67,9 @@ class Arcsine:
     def step(self, phasor: NDArray, amplitude: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
         """Reference wave of the estimate, then the cosine of the angle to it at every point."""
         pupil = self.settings.sensor.pupil
-        wave = self.settings.sensor.operator(phasor.dtype).reference(phasor * amplitude, in_window=True)[:, 0]
+        wave = self.settings.sensor.operator(phasor.dtype).split_reference(phasor * amplitude, in_window=True)[
+            :, 0
+        ]
         power = square(wave)
         contrast = 2 * amplitude * np.sqrt(power)
         solvable = contrast > 0

@@ -89,7 +89,7 @@ class PhaseShifted:
     def step(self, phasor: NDArray, amplitude: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
         """Reference waves of the estimate, then the linear system of every point."""
         operator = self.settings.sensor.operator(phasor.dtype)
-        waves = operator.reference(phasor * amplitude, in_window=True)
+        waves = operator.split_reference(phasor * amplitude, in_window=True)
         solved, singular = self._solve(waves, data["excess"])
         if singular.any():
             solved = np.where(singular[:, np.newaxis], phasor, solved)
@@ -121,7 +121,7 @@ class PhaseShifted:
     def _refuse_equal_masks(self) -> None:
         config = self.settings
         flat = split(np.zeros((1, *config.sensor.pupil.shape)), config.amplitude)
-        waves = config.sensor.operator(np.float64).reference(flat, in_window=True)
+        waves = config.sensor.operator(np.float64).split_reference(flat, in_window=True)
         _, singular = self._solve(waves, np.zeros((1, config.sensor.n_masks, *config.sensor.pupil.shape)))
         if singular[0][config.sensor.pupil.mask].all():
             raise ValueError(

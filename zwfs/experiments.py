@@ -102,6 +102,8 @@ def linearity_curves(
     Chambouleyron et al. 2024, section 4.1 and Figure 3.
     """
     rms = _check.real_array("rms", rms)
+    if rms.ndim != 1:
+        raise ValueError(f"rms has shape {rms.shape}: expected (n_rms,)")
     n_screens = _check.integer("n_screens", n_screens, 1)
     if not reconstructors:
         raise ValueError("reconstructors is empty: expected at least one")

@@ -206,7 +206,7 @@ def _bandwidth(argument: float, tolerance: float) -> int:
     """Even order from which on the Bessel functions J_n(`argument`) stay far below the tolerance."""
     target = math.log(max(1e-3 * tolerance, 1e-18))
     n = 8
-    while n * math.log(argument / 2) - math.lgamma(n + 1) > target:
+    while argument and n * math.log(argument / 2) - math.lgamma(n + 1) > target:
         n += 2
     return n
 

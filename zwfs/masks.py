@@ -66,7 +66,8 @@ class Patch:
     """Patch of any complex transmission, the general mask of section 2.1 of the paper.
 
     The transmission is integrated by Gauss-Legendre nodes along the radius and equispaced ones around the axis.
-    It should be smooth, except at circles, which are to be named in `breaks`.
+    It should be smooth, except at circles, which are to be named in `breaks`; a function with structure finer than
+    that of the diffraction pattern of the pupil needs a larger `n_samples`.
 
     Parameters
     ----------

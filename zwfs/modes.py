@@ -63,6 +63,8 @@ def zernike_basis(
     Noll 1976, J. Opt. Soc. Am. 66, 207.
     """
     n_modes = _check.integer("n_modes", n_modes, 1)
+    if np.dtype(dtype) not in (np.float32, np.float64):
+        raise TypeError(f"dtype = {dtype!r}: expected float32 or float64")
     if n_modes >= pupil.n_points:
         raise ValueError(
             f"n_modes = {n_modes}: expected fewer modes than the {pupil.n_points} points of the pupil"

@@ -36,6 +36,9 @@ class Pupil:
     segments: NDArray[np.int64]
     center: tuple[float, float]
 
+    def __repr__(self) -> str:
+        return f"Pupil({self.n_points} points, {self.n_pixels:g} pixels across, shape={self.shape})"
+
     @classmethod
     def circular(
         cls,
@@ -108,6 +111,8 @@ class Pupil:
         pitch = whole / 2 / np.sqrt(n_rings**2 + n_rings + 1 / 3)
         gap = _check.number("gap", gap, 0, pitch, open_high=True)
         centers = _hexagon_centers(n_rings) * pitch
+        if not isinstance(missing, Iterable):
+            raise TypeError(f"missing = {missing!r}: expected segment numbers, such as (21,)")
         missing = {_check.integer("missing", number, 1) for number in missing}
         if missing and max(missing) > len(centers):
             raise ValueError(f"missing = {sorted(missing)}: expected segment numbers from 1 to {len(centers)}")
@@ -147,14 +152,42 @@ class Pupil:
             If the image is not two-dimensional, holds NaN, infinite or negative values, or is dark everywhere.
         """
         image = _check.real_array("image", image).astype(np.float64)
-        if image.ndim != 2:
-            raise ValueError(f"image has shape {image.shape}: expected (ny, nx)")
+        if image.ndim != 2 or not image.size:
+            raise ValueError(f"image has shape {image.shape}: expected (ny, nx), not empty")
         threshold = _check.number("threshold", threshold, 0, 1, open_high=True)
         n_pixels = max(image.shape) if n_pixels is None else _check.number("n_pixels", n_pixels, 0, open_low=True)
         _check.finite("image", image)
         _check.non_negative("image", image)
         inside = image > threshold * image.max(initial=0.0)
         return _assemble(np.where(inside, image, 0.0), n_pixels, inside.astype(int), center)
+
+    @classmethod
+    def from_segments(cls, segments: ArrayLike, amplitude: ArrayLike = 1.0) -> Pupil:
+        """Pupil of a given map of segment numbers, D wide.
+
+        Parameters
+        ----------
+        segments : array_like of int, shape (n, n)
+            0 where there is no light.
+        amplitude : array_like, broadcasts to (n, n)
+            Field amplitude on the segments.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the numbers are no integers, or an amplitude on a segment is not positive.
+        """
+        segments = np.asarray(segments)
+        if segments.dtype.kind not in "iu" or segments.ndim != 2:
+            raise TypeError(
+                f"segments is {segments.ndim}-dimensional {segments.dtype}: expected a map of integers"
+            )
+        amplitude = np.broadcast_to(_check.real_array("amplitude", amplitude), segments.shape)
+        _check.finite("amplitude", amplitude)
+        lowest = amplitude[segments > 0].min(initial=np.inf)
+        if lowest <= 0:
+            raise ValueError(f"amplitude reaches down to {lowest:.6g} on a segment: expected positive values")
+        return _assemble(np.where(segments > 0, amplitude, 0.0), max(segments.shape), segments.astype(np.int64))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -217,6 +250,8 @@ def _assemble(
         raise ValueError("the pupil is empty: expected at least one point with an amplitude above 0")
     if center is None:
         center = tuple((n - 1) / 2 for n in amplitude.shape)
+    if np.shape(center) != (2,):
+        raise ValueError(f"center = {center!r}: expected a pair (row, column)")
     center = tuple(_check.number("center", value) for value in center)
     amplitude = amplitude / np.sqrt(np.mean(amplitude[inside] ** 2))
     for array in (amplitude, segments):
@@ -237,7 +272,8 @@ def _vane(x: NDArray, y: NDArray, index: int, spider: tuple[float, float]) -> ND
     angle = _check.number(f"spiders[{index}] angle", angle)
     width = _check.number(f"spiders[{index}] width", width, 0, 1)
     along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
-    return (along >= 0) & (np.abs(across) < width / 2)
+    # Rounding must not decide on which side of the centre a point lies.
+    return (along >= -1e-12) & (np.abs(across) < width / 2)
 
 
 def _hexagon_centers(n_rings: int) -> NDArray:

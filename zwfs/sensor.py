@@ -66,8 +66,10 @@ class ZernikeSensor:
         if not masks:
             raise ValueError("masks is empty: expected at least one mask, such as Dimple(1.06, np.pi / 2)")
         for index, mask in enumerate(masks):
-            if not hasattr(mask, "transmission"):
-                raise TypeError(f"masks[{index}] is a {type(mask).__name__}: expected a Dimple or a Patch")
+            if isinstance(mask, type) or not hasattr(mask, "transmission"):
+                raise TypeError(
+                    f"masks[{index}] is {mask!r}, a {type(mask).__name__}: expected a Dimple or a Patch"
+                )
         extent = _check.number("extent", extent, 1)
         self.tolerance = _check.number("tolerance", tolerance, 1e-16, 0.1)
         self.pupil = pupil
@@ -216,7 +218,13 @@ class ZernikeSensor:
             )
         strength, strength_batch = self.amplitude_maps(amplitude, phase.dtype)
         if strength_batch:
-            full = np.broadcast_shapes(batch, strength_batch)
+            try:
+                full = np.broadcast_shapes(batch, strength_batch)
+            except ValueError:
+                raise ValueError(
+                    f"amplitude has shape {np.shape(amplitude)}: expected one that broadcasts with {np.shape(phase)}, "
+                    "the shape of the phase"
+                ) from None
             phase, strength = (
                 np.broadcast_to(maps.reshape(*shape, *self.pupil.shape), (*full, *self.pupil.shape))
                 for maps, shape in ((phase, batch), (strength, strength_batch))
@@ -234,6 +242,8 @@ class ZernikeSensor:
         """Checked real maps, (k, ny, nx) with 0 outside the pupil, and the shape of the batch."""
         maps = _check.real_array(name, maps)
         _check.trailing_shape(name, maps, self.pupil.shape, "the shape of the pupil")
+        if not maps.size:
+            raise ValueError(f"{name} has shape {maps.shape}: expected at least one map")
         clean = np.where(self.pupil.mask, maps, 0).reshape(-1, *self.pupil.shape)
         _check.finite(name, clean, " inside the pupil")
         return clean.astype(maps.dtype, copy=False), maps.shape[:-2]

@@ -15,6 +15,7 @@ class Arcsine:
     A cosine has two inverses, one on each side of the phase of the reference wave. Taken at every point, in all
     iterations, is the side on which the starting phase lies of its own reference wave. For a dimple of +pi/2 and a
     flat start that covers about -pi/4 to 3 pi/4; a true phase beyond is folded back, which limits this method.
+    The reference wave goes with the mean phase, so both are counted from the piston of the wavefront.
     Cosines beyond +-1 are taken as +-1 and counted.
 
     Parameters

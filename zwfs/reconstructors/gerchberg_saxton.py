@@ -17,7 +17,8 @@ class GerchbergSaxton:
     the amplitude in the pupil.
 
     The detector plane is that of the sensor. Light that leaves it is taken as 0 on the way back, which biases the
-    phase: choose the sensor's `extent` accordingly.
+    phase: give the sensor an `extent` of 2 D or more. On a detector as wide as the pupil the iteration improves a
+    few times and then diverges.
 
     Parameters
     ----------

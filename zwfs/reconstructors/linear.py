@@ -65,6 +65,9 @@ class Linear:
         self._reference = start_phase(sensor, reference, (), np.dtype(np.float64))
         self.interaction_matrix = self._push_pull(poke)
         u, strength, vt = np.linalg.svd(self.interaction_matrix, full_matrices=False)
+        # A frame of unit intensity is rounded at 1e-16, which the poke divides.
+        if strength[0] <= 1e-14 * np.sqrt(len(u)) / poke:
+            raise ValueError("modes: the sensor sees none of them: expected modes other than piston")
         self.n_inverted = int(np.count_nonzero(strength > conditioning * strength[0]))
         kept = slice(0, self.n_inverted)
         self._inverse = (vt[kept].T / strength[kept]) @ u[:, kept].T
@@ -96,7 +99,8 @@ class Linear:
         phase = coefficients @ self.modes + config.sensor.pupil.gather(self._reference)
         phase = config.sensor.pupil.scatter(phase, fill=0).astype(frames.dtype)
         n_frames = len(frames)
-        record = np.stack([np.broadcast_to(self._reference, phase.shape), phase], axis=1) if history else None
+        before = np.broadcast_to(self._reference.astype(frames.dtype), phase.shape)
+        record = np.stack([before, phase], axis=1) if history else None
         return report(
             config, frames, batch, phase,
             np.ones(n_frames, int), np.ones(n_frames, bool), np.zeros(n_frames, int), record,

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs.reconstructors._common import Reconstruction, iterate, settings, unit
 from zwfs.sensor import ZernikeSensor, split
 
-_SINGULAR = 1e-6  # sine of the angle between two reference waves below which they count as parallel
+_PARALLEL = 1e-6  # sine of the angle between two reference waves below which they count as parallel
+_DARK = 1e-9  # amplitude of a reference wave, in units of the mean of the pupil, below which it counts as absent
 
 
 class PhaseShifted:
@@ -116,7 +117,7 @@ class PhaseShifted:
             solved[:, 1] += determinant * (right[:, b] * real[:, a] - right[:, a] * real[:, b])
             strength += determinant**2
             scale += power[:, a] * power[:, b]
-        return solved, strength <= _SINGULAR**2 * scale
+        return solved, strength <= np.maximum(_PARALLEL**2 * scale, _DARK**2)
 
     def _refuse_equal_masks(self) -> None:
         config = self.settings

@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+from hypothesis import settings
+
+import zwfs
+
+settings.register_profile("zwfs", derandomize=True, deadline=None, max_examples=25)
+settings.load_profile("zwfs")
+
+
+@pytest.fixture(scope="session")
+def pupil():
+    return zwfs.Pupil.circular(40)
+
+
+@pytest.fixture(scope="session")
+def modes(pupil):
+    return zwfs.zernike_basis(pupil, 30)
+
+
+@pytest.fixture(scope="session")
+def screens(modes):
+    """Makes n screens of a given rms."""
+
+    def make(rms, n_screens=3, seed=1):
+        return zwfs.power_law_screens(modes, rms, n_screens, seed=seed)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def classic(pupil):
+    return zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
+
+
+@pytest.fixture(scope="session")
+def shifted(pupil):
+    return zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
+
+
+@pytest.fixture(scope="session")
+def rough_pupil():
+    """Uneven amplitude on an image that is no square, with the axis off its middle."""
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:34, :40]
+    image = rng.uniform(0.5, 1.5, x.shape) * (np.hypot(x - 20.3, y - 16) < 15)
+    return zwfs.Pupil.from_amplitude(image, n_pixels=31.4, center=(16, 20.3))
+
+
+@pytest.fixture(scope="session")
+def complex_field():
+    """Makes white complex fields on a pupil."""
+
+    def make(pupil, *batch, seed=0):
+        rng = np.random.default_rng(seed)
+        return rng.normal(size=(*batch, *pupil.shape)) + 1j * rng.normal(size=(*batch, *pupil.shape))
+
+    return make

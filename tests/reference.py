@@ -1,0 +1,70 @@
+"""The same physics by other means: the exact kernel of the dimple, and HCIPy."""
+
+import numpy as np
+from scipy.signal import fftconvolve
+from scipy.special import j1
+
+
+def airy(diameter, x, y):
+    """Kernel of a dimple without its factor exp(i theta) - 1, `eq-airy-kernel`."""
+    r = np.hypot(x, y)
+    far = np.where(r > 0, r, 1)
+    return np.where(r > 0, diameter / 2 * j1(np.pi * diameter * far) / far, np.pi * diameter**2 / 4)
+
+
+def exact_reference(pupil, dimple, field, margin=0, shift=(0.0, 0.0)):
+    """Reference wave by the exact kernel, on a detector `margin` pixels wider than the pupil on each side.
+
+    The kernel depends on the displacement only, which is why a convolution does it. With `shift` the kernel is
+    moved by so many D along (x, y).
+    """
+    y, x = (np.arange(-(n + margin - 1), n + margin) / pupil.n_pixels for n in pupil.shape)
+    kernel = airy(dimple.diameter, x + shift[0], y[:, np.newaxis] + shift[1])
+    change = dimple.amplitude * np.exp(1j * dimple.phase) - 1
+    return change * fftconvolve(kernel, np.where(pupil.mask, field, 0), mode="valid") / pupil.n_pixels**2
+
+
+def exact_frame(pupil, dimple, phase):
+    """Intensity by the exact kernel, on the grid of the pupil."""
+    field = pupil.amplitude * np.exp(1j * phase)
+    return np.abs(field + exact_reference(pupil, dimple, field)) ** 2
+
+
+class HcipySensor:
+    """HCIPy's Zernike sensor, one for each dimple, on the grid and with the amplitude of `pupil`."""
+
+    def __init__(self, pupil, *dimples, num_pix=128):
+        import hcipy
+
+        self._hcipy = hcipy
+        self.pupil = pupil
+        self.grid = hcipy.make_pupil_grid(pupil.shape[0], pupil.shape[0] / pupil.n_pixels)
+        self.optics = [
+            hcipy.ZernikeWavefrontSensorOptics(self.grid, dimple.phase, dimple.diameter, num_pix)
+            for dimple in dimples
+        ]
+
+    def wavefront(self, field):
+        """What HCIPy's optics take."""
+        return self._hcipy.Wavefront(self._hcipy.Field(field.ravel(), self.grid))
+
+    def propagate(self, field):
+        """Field behind each dimple, shape (n_masks, ny, nx)."""
+        incoming = self.wavefront(field)
+        return np.stack([optics.forward(incoming).electric_field.reshape(field.shape) for optics in self.optics])
+
+    def measure(self, phase):
+        """Frames, shape (n_masks, ny, nx)."""
+        return np.abs(self.propagate(self.pupil.amplitude * np.exp(1j * phase))) ** 2
+
+    def phase_shifted(self, frames, n_iterations):
+        """Section 3.1 with two dimples: equation (10) at every point, from a flat start."""
+        amplitude = self.pupil.amplitude
+        field = amplitude.astype(complex)
+        for _ in range(n_iterations):
+            a, b = self.propagate(field) - field
+            right_a, right_b = frames - np.abs([a, b]) ** 2 - amplitude**2
+            # The solution times the determinant, which is positive for the pair +-pi/2.
+            phasor = 1j * (right_b * a - right_a * b) * np.sign((np.conj(a) * b).imag)
+            field = amplitude * np.exp(1j * np.angle(phasor))
+        return np.angle(field)

@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+
+from zwfs import Linear, PhaseShifted, dynamic_range, reconstruction_error
+from zwfs.experiments import convergence, linearity_curves, screens_at
+
+RMS = (0.05, 0.3, 0.6)
+
+
+@pytest.fixture(scope="module")
+def methods(classic, shifted, modes):
+    return {"linear": Linear(classic, modes), "shifted": PhaseShifted(shifted)}
+
+
+@pytest.fixture(scope="module")
+def curves(methods, modes):
+    return linearity_curves(methods, modes, RMS, 4, seed=7)
+
+
+def test_errors_are_those_of_each_screen(curves, methods, modes, pupil, classic):
+    screens = screens_at(modes, 0.3, 4, seed=7, task=1)
+    np.testing.assert_allclose(pupil.rms(screens), 0.3)
+    found = methods["linear"](classic.measure(screens))
+    np.testing.assert_allclose(curves.errors["linear"][1], reconstruction_error(pupil, found.phase, screens))
+    assert curves.converged["shifted"].shape == (3, 4)
+    np.testing.assert_allclose(curves.mean("linear"), curves.errors["linear"].mean(axis=1))
+    np.testing.assert_allclose(curves.std("linear"), curves.errors["linear"].std(axis=1))
+
+
+def test_linear_leaves_its_range_before_the_phase_shifted(curves):
+    assert 0 < curves.dynamic_range("linear") < 0.3
+    assert curves.dynamic_range("shifted") == np.inf
+    assert curves.dynamic_range("linear") == dynamic_range(RMS, curves.mean("linear"))
+    assert np.all(np.diff(curves.mean("linear")) > 0)
+
+
+def test_a_point_depends_on_the_seed_and_its_place_only(curves, methods, modes):
+    alone = linearity_curves({"linear": methods["linear"]}, modes, RMS[:2], 4, seed=7)
+    np.testing.assert_allclose(alone.errors["linear"], curves.errors["linear"][:2], rtol=1e-9)
+    other = linearity_curves({"linear": methods["linear"]}, modes, RMS[:2], 4, seed=8)
+    assert not np.allclose(alone.errors["linear"], other.errors["linear"])
+
+
+def test_progress_is_told(methods, modes):
+    told = []
+    linearity_curves(methods, modes, RMS, 1, progress=lambda *n: told.append(n))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"reconstructors": {}}, "reconstructors is empty"),
+        ({"n_screens": 0}, "n_screens = 0"),
+        ({"rms": [0.1, -0.1]}, "rms"),
+        ({"rms": 0.1}, "rms"),
+    ],
+)
+def test_bad_input_is_named(methods, modes, change, message):
+    with pytest.raises(ValueError, match=message):
+        linearity_curves(**({"reconstructors": methods, "modes": modes, "rms": RMS, "n_screens": 1} | change))
+
+
+def test_shares_of_the_screens_are_counted(curves, modes, pupil):
+    for task, rms in enumerate(RMS):
+        phase = pupil.gather(screens_at(modes, rms, 4, seed=7, task=task))
+        np.testing.assert_allclose(curves.folded[task], np.mean(phase < -np.pi / 4, axis=1))
+        np.testing.assert_allclose(curves.wrapped[task], np.mean(np.abs(phase) > np.pi, axis=1))
+        np.testing.assert_allclose(curves.strehl[task], np.abs(np.exp(1j * phase).mean(axis=1)) ** 2)
+    assert curves.folded[-1].min() > 0
+
+
+def test_recovered_is_the_share_of_good_screens(curves):
+    np.testing.assert_array_equal(curves.recovered("shifted"), 1)
+    np.testing.assert_array_equal(curves.recovered("linear")[1:], 0)
+    middle = np.median(curves.errors["linear"][0] / RMS[0])
+    assert curves.recovered("linear", middle)[0] == 0.5
+
+
+def test_convergence_goes_from_the_input_to_the_result(methods, modes, pupil, shifted):
+    error = convergence(methods["shifted"], modes, 0.3, 2, seed=7)
+    assert error.shape == (2, 26)
+    np.testing.assert_allclose(error[:, 0], 0.3, rtol=1e-3)
+    screens = screens_at(modes, 0.3, 2, seed=7, task=0)
+    found = methods["shifted"](shifted.measure(screens))
+    np.testing.assert_allclose(error[:, -1], reconstruction_error(pupil, found.phase, screens), atol=1e-12)
+    assert np.all(error[:, -1] < 1e-6)

@@ -1,0 +1,159 @@
+import numpy as np
+import pytest
+from scipy.special import eval_jacobi
+
+import zwfs
+from zwfs import Pupil, noll_to_nm, power_law_screens, zernike_basis
+
+# Noll's table I; negative m for the sines.
+NOLL = {1: (0, 0), 2: (1, 1), 3: (1, -1), 4: (2, 0), 5: (2, -2), 6: (2, 2), 7: (3, -1), 8: (3, 1), 9: (3, -3),
+        10: (3, 3), 11: (4, 0)}  # fmt: skip
+
+POLYNOMIALS = {
+    2: lambda r, t: r * np.cos(t),
+    3: lambda r, t: r * np.sin(t),
+    4: lambda r, t: 2 * r**2 - 1,
+    5: lambda r, t: r**2 * np.sin(2 * t),
+    6: lambda r, t: r**2 * np.cos(2 * t),
+    7: lambda r, t: (3 * r**3 - 2 * r) * np.sin(t),
+    8: lambda r, t: (3 * r**3 - 2 * r) * np.cos(t),
+    9: lambda r, t: r**3 * np.sin(3 * t),
+    10: lambda r, t: r**3 * np.cos(3 * t),
+    11: lambda r, t: 6 * r**4 - 6 * r**2 + 1,
+    12: lambda r, t: (4 * r**4 - 3 * r**2) * np.cos(2 * t),
+    22: lambda r, t: 20 * r**6 - 30 * r**4 + 12 * r**2 - 1,
+}
+
+
+def polar(pupil):
+    x, y = pupil.points.T
+    return 2 * np.hypot(x, y), np.arctan2(y, x)
+
+
+def test_noll_table():
+    assert {j: noll_to_nm(j) for j in NOLL} == NOLL
+
+
+def test_noll_numbering_reaches_every_mode_once():
+    found = [noll_to_nm(j) for j in range(1, 2017)]  # 63 full radial orders
+    assert sorted(found) == sorted((n, m) for n in range(63) for m in range(-n, n + 1, 2))
+    assert [n for n, _ in found] == sorted(n for n, _ in found)
+    assert all(m == 0 or (m > 0) == (j % 2 == 0) for j, (_, m) in enumerate(found, start=1))
+
+
+def test_modes_are_the_polynomials_of_noll():
+    pupil = Pupil.circular(128)
+    values = pupil.gather(zernike_basis(pupil, 22))
+    for j, polynomial in POLYNOMIALS.items():
+        assert np.corrcoef(values[j - 2], polynomial(*polar(pupil)))[0, 1] > 1 - 1e-9, j
+
+
+@pytest.mark.parametrize("pupil", [Pupil.circular(60), Pupil.circular(60, 0.3, [(1, 0.03)]), Pupil.hexagonal(60)])
+@pytest.mark.parametrize("orthonormal", [False, True])
+def test_zero_mean_and_unit_rms_on_the_sampled_pupil(pupil, orthonormal):
+    modes = zernike_basis(pupil, 50, orthonormal=orthonormal)
+    values = pupil.gather(modes)
+    np.testing.assert_allclose(values.mean(axis=1), 0, atol=1e-12)
+    np.testing.assert_allclose(values.std(axis=1), 1, atol=1e-12)
+    assert not modes[:, ~pupil.mask].any()
+
+
+@pytest.mark.parametrize("pupil", [Pupil.circular(60), Pupil.circular(60, 0.3, [(1, 0.03)])])
+def test_orthonormal_on_request(pupil):
+    plain = pupil.gather(zernike_basis(pupil, 60))
+    values = pupil.gather(zernike_basis(pupil, 60, orthonormal=True))
+    np.testing.assert_allclose(values @ values.T / pupil.n_points, np.eye(60), atol=1e-10)
+    # Gram-Schmidt in Noll's order keeps the span of the first modes, and the sign of each.
+    np.testing.assert_allclose(np.linalg.lstsq(values[:9].T, plain[:9].T)[1], 0, atol=1e-18 * pupil.n_points)
+    assert np.all(np.einsum("ij,ij->i", values, plain) > 0)
+
+
+def test_1500_modes_are_accurate():
+    pupil = Pupil.circular(110)
+    values = pupil.gather(zernike_basis(pupil, 1500))
+    radius, theta = polar(pupil)
+    for j in (2, 100, 777, 1377, 1431, 1490, 1501):
+        n, m = noll_to_nm(j)
+        angular = np.cos(m * theta) if m >= 0 else np.sin(-m * theta)
+        exact = radius ** abs(m) * eval_jacobi((n - abs(m)) // 2, 0, abs(m), 2 * radius**2 - 1) * angular
+        exact -= exact.mean()
+        np.testing.assert_allclose(values[j - 2], exact / exact.std(), atol=1e-9)
+    assert np.isfinite(values).all()
+
+
+def test_single_precision_modes_are_the_rounded_ones():
+    pupil = Pupil.circular(24)
+    single = zernike_basis(pupil, 10, dtype=np.float32)
+    assert single.dtype == np.float32
+    np.testing.assert_array_equal(single, zernike_basis(pupil, 10).astype(np.float32))
+
+
+def test_every_screen_has_exactly_the_rms_asked_for(pupil, modes):
+    np.testing.assert_allclose(pupil.rms(power_law_screens(modes, 0.7, 20, seed=0)), 0.7, rtol=1e-12)
+    single = power_law_screens(modes.astype(np.float32), 0.7, 5, seed=0)
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(pupil.rms(single), 0.7, rtol=1e-5)
+
+
+def test_fewer_screens_are_the_first_of_more(modes):
+    few, many = (power_law_screens(modes, 1, n, seed=3) for n in (2, 7))
+    np.testing.assert_allclose(few, many[:2], rtol=0, atol=1e-12)
+
+
+def test_screens_depend_on_the_seed_only(modes):
+    state = np.random.get_state()[1].copy()
+    first = power_law_screens(modes, 1, 2, seed=3)
+    np.testing.assert_array_equal(first, power_law_screens(modes, 1, 2, seed=np.random.default_rng(3)))
+    np.testing.assert_array_equal(first, power_law_screens(modes, 1, 2, seed=np.random.SeedSequence(3)))
+    assert not np.allclose(first, power_law_screens(modes, 1, 2, seed=4))
+    np.testing.assert_array_equal(state, np.random.get_state()[1])
+
+
+@pytest.mark.parametrize("exponent", [-2.0, -11 / 3])
+def test_variance_of_the_coefficients_follows_the_power_law(exponent):
+    pupil = Pupil.circular(40)
+    modes = zernike_basis(pupil, 65, orthonormal=True)  # radial orders 1 to 10
+    screens = power_law_screens(modes, 1, 3000, exponent, seed=2)
+    coefficients = pupil.gather(screens) @ pupil.gather(modes).T / pupil.n_points
+    orders = np.array([noll_to_nm(j)[0] for j in range(2, 67)])
+    # The logarithm turns the scaling of each screen into an offset that all its modes share.
+    level = np.log(coefficients**2).mean(axis=0)
+    assert np.polyfit(np.log(orders), level, 1)[0] == pytest.approx(exponent, abs=0.03)
+
+
+def test_coefficients_are_independent(pupil):
+    modes = zernike_basis(pupil, 9, orthonormal=True)
+    screens = power_law_screens(modes, 1, 4000, 0.0, seed=1)
+    correlation = np.corrcoef(pupil.gather(screens) @ pupil.gather(modes).T, rowvar=False)
+    np.testing.assert_allclose(correlation, np.eye(9), atol=0.07)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda p, m: noll_to_nm(0), ValueError, "j = 0"),
+        (lambda p, m: zernike_basis(p, 0), ValueError, "n_modes = 0"),
+        (lambda p, m: zernike_basis(p, 2.0), TypeError, r"n_modes = 2\.0: expected an integer"),
+        (
+            lambda p, m: zernike_basis(Pupil.circular(4), 12),
+            ValueError,
+            "n_modes = 12: expected fewer .* 12 points",
+        ),
+        (lambda p, m: zernike_basis(Pupil.circular(2), 3), ValueError, "n_modes = 3: the 4 points"),
+        (lambda p, m: zernike_basis(Pupil.from_amplitude(np.ones((9, 9))), 3), ValueError, r"reaches 0\.6.* D"),
+        (lambda p, m: power_law_screens(m[0], 1, 1), ValueError, r"modes has shape \(40, 40\): expected"),
+        (lambda p, m: power_law_screens(m * 1j, 1, 1), TypeError, "modes is complex"),
+        (lambda p, m: power_law_screens(m * np.arange(1, 31)[:, None, None], 1, 1), ValueError, "different rms"),
+        (lambda p, m: power_law_screens(m, -1, 1), ValueError, "rms = -1"),
+        (lambda p, m: power_law_screens(m, 1, 0), ValueError, "n_screens = 0"),
+        (lambda p, m: power_law_screens(m, 1, 1, np.nan), ValueError, "exponent = nan"),
+        (lambda p, m: power_law_screens(m * np.nan, 1, 1), ValueError, "modes"),
+    ],
+)
+def test_bad_input_is_named(pupil, modes, make, error, message):
+    with pytest.raises(error, match=message):
+        make(pupil, modes)
+
+
+def test_zero_rms_makes_flat_screens(modes):
+    assert not zwfs.power_law_screens(modes, 0, 2, seed=0).any()

@@ -1,0 +1,161 @@
+"""Claims that hold for any pupil, mask, batch and precision."""
+
+import numpy as np
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from zwfs import (
+    Dimple,
+    GerchbergSaxton,
+    GradientDescent,
+    Linear,
+    PhaseShifted,
+    Pupil,
+    ZernikeSensor,
+    power_law_screens,
+    reconstruction_error,
+    zernike_basis,
+)
+
+seeds = st.integers(0, 2**16)
+batches = st.lists(st.integers(1, 3), max_size=2).map(tuple)
+dimples = st.builds(Dimple, st.floats(0.3, 4), st.floats(-3, 3), st.floats(0, 1))
+extents = st.sampled_from([1.0, 1.3, 2.0])
+
+
+@st.composite
+def pupils(draw):
+    """Discs with an obscuration, or images of an uneven amplitude."""
+    pupil = Pupil.circular(draw(st.integers(16, 24)), draw(st.sampled_from([0.0, 0.3])))
+    if draw(st.booleans()):
+        return pupil
+    rng = np.random.default_rng(draw(seeds))
+    image = rng.uniform(0.5, 1.5, pupil.shape) * pupil.mask
+    right, below = draw(st.integers(0, 4)), draw(st.integers(0, 4))
+    return Pupil.from_amplitude(np.pad(image, ((0, below), (0, right))), pupil.n_pixels, pupil.center)
+
+
+@st.composite
+def sensors(draw):
+    masks = draw(st.lists(dimples, min_size=1, max_size=3))
+    return ZernikeSensor(draw(pupils()), *masks, extent=draw(extents))
+
+
+@st.composite
+def useful_pairs(draw):
+    """Two dimples of a size whose determinant is far from 0."""
+    a, b = draw(st.floats(-6, 6)), draw(st.floats(-6, 6))
+    assume(abs(np.sin(a / 2) * np.sin(b / 2) * np.sin((b - a) / 2)) > 0.1)
+    diameter = draw(st.floats(0.6, 1.2))
+    return [Dimple(diameter, a), Dimple(diameter, b)]
+
+
+def white(shape, seed):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=shape) + 1j * rng.normal(size=shape)
+
+
+def smooth(pupil, rms, batch, seed):
+    n_screens = int(np.prod(batch))
+    screens = power_law_screens(zernike_basis(pupil, 12), rms, n_screens, seed=seed)
+    return screens.reshape(*batch, *pupil.shape)
+
+
+@given(sensors(), batches, seeds)
+def test_adjoint(sensor, batch, seed):
+    field = white((*batch, *sensor.pupil.shape), seed)
+    wave = white((*batch, sensor.n_masks, *sensor.detector_shape), seed + 1)
+    difference = np.vdot(wave, sensor.propagate(field)) - np.vdot(sensor.adjoint(wave), field)
+    assert abs(difference) < 1e-13 * np.linalg.norm(wave) * np.linalg.norm(field)
+
+
+@given(sensors(), st.complex_numbers(max_magnitude=10), seeds)
+def test_propagation_is_linear(sensor, factor, seed):
+    a, b = white((2, *sensor.pupil.shape), seed)
+    together = sensor.propagate(a + factor * b)
+    np.testing.assert_allclose(together, sensor.propagate(a) + factor * sensor.propagate(b), atol=1e-12)
+
+
+@given(sensors(), batches, seeds)
+def test_a_passive_mask_never_adds_light(sensor, batch, seed):
+    field = white((*batch, *sensor.pupil.shape), seed) * sensor.pupil.mask
+    flux = np.sum(np.abs(sensor.propagate(field)) ** 2, axis=(-2, -1))
+    incoming = np.sum(np.abs(field) ** 2, axis=(-2, -1))
+    assert np.all(flux <= incoming[..., np.newaxis] * (1 + 1e-12))
+
+
+@given(pupils(), st.builds(Dimple, st.floats(0.5, 3), st.floats(-3, 3)), seeds)
+def test_a_phase_mask_loses_no_light_on_a_wide_detector(pupil, dimple, seed):
+    field = white(pupil.shape, seed) * pupil.mask
+    sensor = ZernikeSensor(pupil, dimple, extent=6.0, tolerance=1e-8)
+    lost = 1 - np.sum(np.abs(sensor.propagate(field)) ** 2) / np.sum(np.abs(field) ** 2)
+    # What is scattered, |psi_ref|^2, falls with the cube of the distance.
+    scattered = np.sum(np.abs(sensor.reference_wave(field)) ** 2) / np.sum(np.abs(field) ** 2)
+    assert -1e-7 < lost < 0.2 * scattered + 1e-7
+
+
+@given(sensors(), batches, seeds)
+def test_batch_equals_loop(sensor, batch, seed):
+    phase = smooth(sensor.pupil, 0.5, batch, seed)
+    frames = sensor.measure(phase)
+    assert frames.shape == (*batch, sensor.n_masks, *sensor.detector_shape)
+    for where in np.ndindex(*batch):
+        np.testing.assert_allclose(frames[where], sensor.measure(phase[where]), atol=1e-12)
+
+
+@given(sensors(), batches, seeds)
+def test_single_precision_is_close_to_double(sensor, batch, seed):
+    phase = smooth(sensor.pupil, 0.5, batch, seed)
+    single = sensor.measure(phase.astype(np.float32))
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, sensor.measure(phase), atol=3e-5)
+
+
+@given(sensors(), seeds)
+def test_gradient(sensor, seed):
+    pupil = sensor.pupil
+    truth, guess, direction = smooth(pupil, 0.5, (3,), seed)
+    cost = GradientDescent(sensor).cost
+    frames = sensor.measure(truth)[np.newaxis]
+    step = 1e-3
+    a, b, c, d = (cost(pupil.gather(guess + k * step * direction), frames)[0] for k in (-2, -1, 1, 2))
+    slope = pupil.gather(direction) @ cost(pupil.gather(guess), frames)[1]
+    np.testing.assert_allclose((a - 8 * b + 8 * c - d) / (12 * step), slope, rtol=1e-6, atol=1e-10)
+
+
+@given(pupils(), useful_pairs(), batches, seeds)
+def test_phase_shifted_inverts_small_phases(pupil, masks, batch, seed):
+    sensor = ZernikeSensor(pupil, *masks)
+    phase = smooth(pupil, 0.01, batch, seed)
+    found = PhaseShifted(sensor, n_iterations=50, tolerance=1e-9)(sensor.measure(phase))
+    assert found.phase.shape == phase.shape
+    assert np.all(reconstruction_error(pupil, found.phase, phase) < 1e-6)
+
+
+@given(pupils(), useful_pairs(), seeds)
+def test_truth_is_a_fixed_point(pupil, masks, seed):
+    sensor = ZernikeSensor(pupil, *masks)
+    phase = smooth(pupil, 0.6, (), seed)
+    found = PhaseShifted(sensor, n_iterations=1)(sensor.measure(phase), start=phase)
+    assert reconstruction_error(pupil, found.phase, phase) < 1e-9
+
+
+@given(pupils(), useful_pairs(), seeds)
+def test_linear_and_descent_invert_small_phases(pupil, masks, seed):
+    sensor = ZernikeSensor(pupil, *masks)
+    modes = zernike_basis(pupil, 12)
+    phase = smooth(pupil, 0.01, (), seed)
+    frames = sensor.measure(phase)
+    for method in (Linear(sensor, modes), GradientDescent(sensor, modes, n_iterations=100)):
+        assert reconstruction_error(pupil, method(frames).phase, phase) < 0.03 * 0.01
+
+
+@given(sensors(), batches, seeds)
+def test_an_iteration_does_not_mix_frames(sensor, batch, seed):
+    frames = sensor.measure(smooth(sensor.pupil, 0.3, batch, seed))
+    reconstruct = GerchbergSaxton(sensor, n_iterations=3)
+    together = reconstruct(frames)
+    for where in np.ndindex(*batch):
+        alone = reconstruct(frames[where])
+        np.testing.assert_allclose(together.phase[where], alone.phase, atol=1e-8)
+        np.testing.assert_allclose(together.residual[where], alone.residual, atol=1e-8)

@@ -1,0 +1,173 @@
+import numpy as np
+import pytest
+
+from zwfs import Pupil
+
+CORNER = 3 * np.sqrt(3) / 2  # area of a hexagon of circumradius 1
+
+
+def test_points_of_the_paper_grid():
+    assert Pupil.circular(100).n_points == 7860
+
+
+@pytest.mark.parametrize("n", [7, 8])
+def test_coordinates_are_pixel_centres_in_diameters(n):
+    pupil = Pupil.circular(n)
+    centres = (np.arange(n) - (n - 1) / 2) / n
+    np.testing.assert_allclose(pupil.x, centres, atol=1e-15)
+    np.testing.assert_allclose(pupil.y, centres, atol=1e-15)
+    rows, columns = np.nonzero(pupil.mask)
+    np.testing.assert_array_equal(pupil.points, np.stack([pupil.x[columns], pupil.y[rows]], axis=-1))
+
+
+@pytest.mark.parametrize("n", [16, 25, 100])
+def test_disc_holds_the_centres_within_half_a_diameter(n):
+    pupil = Pupil.circular(n)
+    radius = np.hypot(pupil.x, pupil.y[:, np.newaxis])
+    np.testing.assert_array_equal(pupil.mask, radius <= 0.5)
+    np.testing.assert_array_equal(pupil.segments, pupil.mask)
+
+
+@pytest.mark.parametrize(
+    "pupil",
+    [
+        Pupil.circular(30),
+        Pupil.circular(30, 0.3, [(0.4, 0.05)]),
+        Pupil.hexagonal(60, gap=0.01),
+        Pupil.from_amplitude(np.random.default_rng(0).uniform(size=(9, 12))),
+    ],
+)
+def test_mean_square_amplitude_is_1_inside_and_0_outside(pupil):
+    assert np.mean(pupil.amplitude[pupil.mask] ** 2) == pytest.approx(1, abs=1e-12)
+    assert not pupil.amplitude[~pupil.mask].any()
+    assert pupil.n_points == np.count_nonzero(pupil.mask)
+
+
+def test_obscuration_takes_its_share_of_the_area():
+    assert Pupil.circular(200, 0.4).n_points / Pupil.circular(200).n_points == pytest.approx(1 - 0.4**2, rel=2e-3)
+
+
+def test_spider_is_dark_on_its_side_only():
+    pupil = Pupil.circular(101, spiders=[(np.pi / 2, 0.05)])
+    x, y = pupil.x, pupil.y[:, np.newaxis]
+    blocked = Pupil.circular(101).mask & ~pupil.mask
+    np.testing.assert_array_equal(blocked, (np.hypot(x, y) <= 0.5) & (np.abs(x) < 0.025) & (y > -1e-12))
+
+
+def test_three_rings_are_37_segments_of_equal_area():
+    pupil = Pupil.hexagonal(300, n_rings=3, gap=0.004)
+    numbers, areas = np.unique(pupil.segments[pupil.mask], return_counts=True)
+    np.testing.assert_array_equal(numbers, np.arange(1, 38))
+    pitch = 0.5 / np.sqrt(9 + 3 + 1 / 3)
+    expected = CORNER * ((pitch - 0.004) / np.sqrt(3)) ** 2 * 300**2
+    np.testing.assert_allclose(areas, expected, rtol=0.03)
+    assert areas.mean() == pytest.approx(expected, rel=3e-3)
+
+
+def test_segments_are_numbered_counter_clockwise_from_30_degrees():
+    pupil = Pupil.hexagonal(200, n_rings=2)
+    centre = {k: pupil.points[pupil.segments[pupil.mask] == k].mean(axis=0) @ (1, 1j) for k in range(1, 20)}
+    pitch = 0.5 / np.sqrt(4 + 2 + 1 / 3)
+    assert abs(centre[1]) < 0.01 * pitch
+    for ring, first in ((1, 2), (2, 8)):
+        found = [centre[first + k] for k in range(6 * ring)]
+        angles = np.unwrap(np.angle(found))
+        assert angles[0] == pytest.approx(np.pi / 6, abs=0.01)
+        assert np.all(np.diff(angles) > 0)
+        assert np.abs(found).max() == pytest.approx(ring * pitch, rel=0.01)
+
+
+def test_a_gap_is_as_wide_as_asked():
+    n, gap = 400, 0.03
+    column = Pupil.hexagonal(n, n_rings=1, gap=gap).mask[:, n // 2]
+    lit = np.flatnonzero(column)
+    assert np.diff(lit).max() - 1 == pytest.approx(gap * n, abs=1)
+
+
+def test_missing_segments_leave_the_others_as_they_are():
+    whole, broken = Pupil.hexagonal(100), Pupil.hexagonal(100, missing=(1, 37))
+    np.testing.assert_array_equal(broken.segments, np.where(np.isin(whole.segments, (1, 37)), 0, whole.segments))
+
+
+@pytest.mark.parametrize("n_rings", [0, 1, 3])
+def test_segments_reach_the_circle_of_diameter_D(n_rings):
+    reach = np.hypot(*Pupil.hexagonal(300, n_rings=n_rings).points.T).max()
+    assert 0.5 - 2 / 300 < reach <= 0.5 + 1e-12
+
+
+def test_stop_becomes_the_pupil():
+    pupil = Pupil.hexagonal(200, stop=0.85)
+    assert np.hypot(*pupil.points.T).max() <= 0.5
+    inner = Pupil.circular(200).mask
+    assert pupil.n_points / np.count_nonzero(inner) > 0.97
+
+
+def test_amplitude_image_keeps_its_relative_values():
+    image = np.array([[0.0, 1.0, 0.1], [2.0, 3.0, 0.0]])
+    pupil = Pupil.from_amplitude(image, threshold=0.1)
+    np.testing.assert_array_equal(pupil.mask, image > 0.3)
+    inside = pupil.amplitude[pupil.mask]
+    np.testing.assert_allclose(inside / inside[0], [1, 2, 3])
+    assert pupil.n_pixels == 3
+    assert pupil.center == (0.5, 1.0)
+
+
+def test_amplitude_image_with_its_own_axis_and_diameter():
+    pupil = Pupil.from_amplitude(np.ones((4, 6)), n_pixels=5.5, center=(1, 2.5))
+    np.testing.assert_allclose(pupil.y, (np.arange(4) - 1) / 5.5)
+    np.testing.assert_allclose(pupil.x, (np.arange(6) - 2.5) / 5.5)
+
+
+def test_scatter_undoes_gather():
+    pupil = Pupil.circular(12, 0.3)
+    maps = np.random.default_rng(0).normal(size=(2, 3, *pupil.shape)).astype(np.float32)
+    again = pupil.scatter(pupil.gather(maps))
+    assert again.dtype == np.float32
+    np.testing.assert_array_equal(again[..., pupil.mask], maps[..., pupil.mask])
+    assert np.isnan(again[..., ~pupil.mask]).all()
+
+
+def test_rms_ignores_piston_and_what_lies_outside():
+    pupil = Pupil.circular(20)
+    phase = np.where(pupil.x > 0, 1.0, -1.0) * np.ones(pupil.shape) + 7
+    assert pupil.rms(np.where(pupil.mask, phase, np.nan)) == pytest.approx(1)
+
+
+def test_pupil_cannot_be_changed():
+    pupil = Pupil.circular(10)
+    with pytest.raises(ValueError, match="read-only"):
+        pupil.amplitude[0, 0] = 1
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: Pupil.circular(1), ValueError, "n_pixels = 1: expected at least 2"),
+        (lambda: Pupil.circular(10.5), TypeError, r"n_pixels = 10\.5: expected an integer"),
+        (lambda: Pupil.circular(10, 1.0), ValueError, r"central_obscuration = 1\.0: .*\[0, 1\)"),
+        (lambda: Pupil.circular(10, spiders=[0.1]), TypeError, r"spiders\[0\] = 0\.1: expected a pair"),
+        (lambda: Pupil.circular(10, spiders=[(0, -1)]), ValueError, r"spiders\[0\] width = -1"),
+        (lambda: Pupil.circular(6, 0.99), ValueError, "pupil is empty"),
+        (lambda: Pupil.hexagonal(50, n_rings=-1), ValueError, "n_rings = -1"),
+        (lambda: Pupil.hexagonal(50, gap=1), ValueError, "gap = 1"),
+        (lambda: Pupil.hexagonal(50, missing=[38]), ValueError, r"missing = \[38\]: .* from 1 to 37"),
+        (lambda: Pupil.hexagonal(50, stop=1.5), ValueError, r"stop = 1\.5: .*\(0, 1\]"),
+        (lambda: Pupil.hexagonal(50, n_rings=0, missing=[1]), ValueError, "pupil is empty"),
+        (lambda: Pupil.from_amplitude(np.zeros((4, 4))), ValueError, "pupil is empty"),
+        (lambda: Pupil.from_amplitude(np.zeros((0, 4))), ValueError, "image|empty"),
+        (lambda: Pupil.from_amplitude(np.ones(4)), ValueError, r"image has shape \(4,\): expected \(ny, nx\)"),
+        (lambda: Pupil.from_amplitude([[1, np.nan]]), ValueError, "image holds 1 NaN or infinite"),
+        (
+            lambda: Pupil.from_amplitude([[1, -0.5]]),
+            ValueError,
+            "image reaches down to -0.5: expected no negative",
+        ),
+        (lambda: Pupil.from_amplitude([[1, 1j]]), TypeError, "image is complex"),
+        (lambda: Pupil.from_amplitude(np.ones((2, 2)), threshold=1), ValueError, "threshold = 1"),
+        (lambda: Pupil.from_amplitude(np.ones((2, 2)), n_pixels=0), ValueError, "n_pixels = 0"),
+        (lambda: Pupil.from_amplitude(np.ones((2, 2)), center=(1, 2, 3)), (TypeError, ValueError), "center"),
+    ],
+)
+def test_bad_input_is_named(make, error, message):
+    with pytest.raises(error, match=message):
+        make()

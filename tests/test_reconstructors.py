@@ -1,0 +1,590 @@
+import inspect
+
+import numpy as np
+import pytest
+
+import zwfs
+from zwfs import (
+    RECONSTRUCTORS,
+    Arcsine,
+    Dimple,
+    GerchbergSaxton,
+    GradientDescent,
+    Linear,
+    PhaseShifted,
+    ZernikeSensor,
+    reconstruction_error,
+)
+
+every = pytest.mark.parametrize("method", RECONSTRUCTORS)
+iterative = pytest.mark.parametrize("method", [method for method in RECONSTRUCTORS if method is not Linear])
+fixed_point = pytest.mark.parametrize("method", [Arcsine, PhaseShifted, GerchbergSaxton])
+
+
+def takes(method, name):
+    return name in inspect.signature(method).parameters
+
+
+def build(method, sensor, modes, **options):
+    return method(sensor, modes, **options) if takes(method, "modes") else method(sensor, **options)
+
+
+@pytest.fixture
+def sensor_of(classic, shifted):
+    """Sensor for a method: one mask for the arcsine, two for the others."""
+    return lambda method: classic if method is Arcsine else shifted
+
+
+@pytest.fixture
+def make(sensor_of, modes):
+    """Reconstructor of a method on its sensor, and that sensor."""
+
+    def make(method, **options):
+        sensor = sensor_of(method)
+        return build(method, sensor, modes, **options), sensor
+
+    return make
+
+
+def pair(pupil, a, b, **options):
+    return ZernikeSensor(pupil, Dimple(1.06, a), Dimple(1.06, b), **options)
+
+
+def errors(reconstruct, sensor, phase):
+    return reconstruction_error(sensor.pupil, reconstruct(sensor.measure(phase)).phase, phase)
+
+
+# What each method can do.
+
+
+@pytest.mark.parametrize(
+    ("method", "n_masks", "extent", "bound"),
+    [
+        (Linear, 1, 1, 1e-2),
+        (Linear, 2, 1, 1e-2),
+        (Arcsine, 1, 1, 1e-6),
+        (PhaseShifted, 2, 1, 1e-6),
+        (PhaseShifted, 3, 1, 1e-6),
+        (GerchbergSaxton, 2, 8, 0.1),
+        (GradientDescent, 1, 1, 1e-2),
+        (GradientDescent, 2, 1, 1e-2),
+    ],
+)
+def test_small_phases_come_back(pupil, modes, screens, method, n_masks, extent, bound):
+    dimples = [Dimple(1.06, phase) for phase in (np.pi / 2, -np.pi / 2, 2.0)[:n_masks]]
+    sensor = ZernikeSensor(pupil, *dimples, extent=extent)
+    options = {} if method is Linear else {"n_iterations": 50, "tolerance": 1e-10}
+    assert errors(build(method, sensor, modes, **options), sensor, screens(0.01)).max() < bound * 0.01
+
+
+@pytest.mark.parametrize("phases", [(np.pi / 2, -np.pi / 2), (np.pi / 2, np.pi), (0.3, -2.0), (1.5, -1.5, 2.5)])
+def test_phase_shifted_is_exact_at_08_rad(pupil, screens, phases):
+    sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in phases))
+    assert errors(PhaseShifted(sensor, n_iterations=60), sensor, screens(0.8)).max() < 1e-6
+
+
+def test_phase_shifted_needs_25_iterations_at_the_resolution_of_the_paper():
+    pupil = zwfs.Pupil.circular(100)
+    phase = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 200), 0.8, 4, seed=1)
+    sensor = pair(pupil, np.pi / 2, -np.pi / 2)
+    assert errors(PhaseShifted(sensor), sensor, phase).max() < 1e-6
+
+
+@pytest.mark.parametrize("phases", [(np.pi / 2, -np.pi / 2), (0.3, -2.0), (0.5, 1.0), (1.5, -1.5, 2.5)])
+@pytest.mark.parametrize(("diameter", "factor"), [(0.7, 0.08), (1.06, 0.19), (1.5, 0.41), (2.5, 1.02)])
+def test_diameter_alone_decides_how_fast_the_phase_shifted_converges(screens, pupil, phases, diameter, factor):
+    sensor = ZernikeSensor(pupil, *(Dimple(diameter, phase) for phase in phases))
+    phase = screens(1e-3, 1)[0]
+    history = PhaseShifted(sensor, n_iterations=9, tolerance=0)(sensor.measure(phase), history=True).history
+    error = reconstruction_error(pupil, history, phase)
+    assert (error[9] / error[5]) ** 0.25 == pytest.approx(factor, abs=0.02)
+
+
+@pytest.mark.parametrize("phases", [(np.pi / 2, -np.pi / 2), (0.3, -2.0), (1.5, -1.5, 2.5)])
+def test_truth_is_a_fixed_point_of_the_phase_shifted_over_the_whole_circle(pupil, screens, phases):
+    sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in phases))
+    phase = screens(1.5)
+    assert np.abs(phase).max() > np.pi
+    found = PhaseShifted(sensor, n_iterations=1, tolerance=1e-8)(sensor.measure(phase), start=phase)
+    assert reconstruction_error(pupil, found.phase, phase).max() < 1e-10
+    assert found.converged.all()
+
+
+def test_more_than_two_masks_are_combined_by_least_squares(pupil, screens):
+    sensor = ZernikeSensor(pupil, *(Dimple(d, phase) for d, phase in ((1.06, 1.5), (1.3, -1.5), (0.9, 2.5))))
+    frames = sensor.measure(screens(0.3, 1)[0])
+    frames *= np.random.default_rng(0).uniform(0.8, 1.2, frames.shape)  # no field explains all three
+    found = PhaseShifted(sensor, n_iterations=1)(frames).phase
+    waves = sensor.reference_wave(pupil.amplitude)
+    right = frames - np.abs(waves) ** 2 - pupil.amplitude**2
+    for point in ((20, 20), (3, 18), (30, 9)):
+        wave = waves[:, *point]
+        real, imag = np.linalg.lstsq(2 * np.stack([wave.real, wave.imag], axis=1), right[:, *point])[0]
+        assert found[point] == pytest.approx(np.arctan2(imag, real), abs=1e-9)
+
+
+def test_phase_shifted_on_an_uneven_pupil(rough_pupil):
+    phase = zwfs.power_law_screens(zwfs.zernike_basis(rough_pupil, 30), 0.5, 3, seed=1)
+    sensor = pair(rough_pupil, np.pi / 2, -np.pi / 2)
+    assert errors(PhaseShifted(sensor), sensor, phase).max() < 1e-6
+
+
+def test_masks_of_different_size_work_together(pupil, screens):
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.8, -np.pi / 2, 0.8))
+    assert errors(PhaseShifted(sensor, n_iterations=60), sensor, screens(0.5)).max() < 1e-6
+
+
+@every
+def test_measured_amplitude_is_used(sensor_of, modes, method, screens, pupil):
+    sensor = ZernikeSensor(pupil, *sensor_of(method).masks, extent=4)  # Gerchberg-Saxton needs the light beside
+    amplitude = np.random.default_rng(0).uniform(0.7, 1.3, pupil.shape)
+    frames = sensor.measure(screens(0.01), amplitude)
+    right, wrong = build(method, sensor, modes, amplitude=amplitude), build(method, sensor, modes)
+    assert np.all(right(frames).residual < 0.01 * wrong(frames).residual)
+
+
+@pytest.mark.parametrize("height", [-0.7, 2.2])
+def test_arcsine_covers_its_branch(classic, pupil, height):
+    # From -pi/4 to 3 pi/4 about the phase of the reference wave, which a narrow peak hardly moves.
+    phase = height * np.exp(-0.5 * (pupil.x**2 + pupil.y[:, np.newaxis] ** 2) / 0.05**2)
+    assert errors(Arcsine(classic), classic, phase) < 1e-5
+
+
+def test_arcsine_folds_what_lies_beyond_minus_pi_over_4(classic, pupil):
+    phase = np.zeros(pupil.shape)
+    phase[20, 20] = -1.1
+    frames = classic.measure(phase)
+    assert Arcsine(classic)(frames).phase[20, 20] == pytest.approx(-np.pi / 2 + 1.1, abs=0.02)
+    # Told on which side the phase lies, it finds it.
+    assert Arcsine(classic)(frames, start=phase).phase[20, 20] == pytest.approx(-1.1, abs=1e-5)
+
+
+def test_the_piston_of_the_start_does_not_move_the_arcsine(classic, screens):
+    # Folded phases let the piston of the estimate drift from step to step: no side may change for it.
+    frames = classic.measure(screens(1.0))
+    plain = Arcsine(classic, tolerance=0.0)(frames)
+    for piston in (-2.0, 1.0, 3.0):
+        moved = Arcsine(classic, tolerance=0.0)(frames, start=np.full(classic.pupil.shape, piston))
+        assert reconstruction_error(classic.pupil, moved.phase, plain.phase).max() < 1e-9
+
+
+def test_arcsine_is_mirrored_with_the_dimple(classic, pupil, screens):
+    opposite = ZernikeSensor(pupil, Dimple(1.06, -np.pi / 2))
+    phase = screens(0.6)
+    plus = Arcsine(classic)(classic.measure(phase)).phase
+    minus = Arcsine(opposite)(opposite.measure(-phase)).phase
+    np.testing.assert_allclose(minus, -plus, atol=1e-8)
+
+
+def test_arcsine_counts_cosines_beyond_1(classic, pupil):
+    frames = classic.measure(np.zeros(pupil.shape))
+    frames[0, 20, 18:22] += 50
+    frames[0, 0, :3] += 50  # outside the pupil
+    assert Arcsine(classic, n_iterations=1)(frames).n_unsolved == 4
+
+
+@pytest.mark.parametrize("n_masks", [1, 2])
+@pytest.mark.parametrize("poke", [0.1, 0.05, 1e-3])
+def test_interaction_matrix_is_the_derivative_of_the_frames(pupil, modes, screens, n_masks, poke):
+    sensor = ZernikeSensor(pupil, *[Dimple(1.06, phase) for phase in (np.pi / 2, -2.0)[:n_masks]], extent=1.3)
+    reference = screens(0.4, 1)[0]
+    field = np.exp(1j * reference)
+    slope = 2 * np.real(np.conj(sensor.propagate(field)) * sensor.propagate(1j * field * modes))
+    exact = pupil.gather(slope[(..., *sensor.window)]).reshape(len(modes), -1).T
+    found = Linear(sensor, modes, poke=poke, reference=reference).interaction_matrix
+    # The third derivative of a frame with respect to a mode is of order 1, where the mode is.
+    assert np.abs(found - exact).max() < 3 * poke**2 * np.abs(modes).max() ** 3
+
+
+def test_linear_is_exact_to_second_order_around_its_reference(pupil, modes, shifted, screens):
+    reference = screens(0.5, 1)[0]
+    reconstruct = Linear(shifted, modes, reference=reference, conditioning=1e-6, poke=1e-4)
+    error = [
+        errors(reconstruct, shifted, reference + small)
+        for small in screens(1.0, seed=2) * np.array([[[[0.02]]], [[[0.01]]]])
+    ]
+    assert np.max(error) < 0.1 * 0.02
+    np.testing.assert_allclose(error[0] / error[1], 4, rtol=0.2)
+
+
+def test_conditioning_drops_what_the_sensor_does_not_see(pupil, modes, shifted, screens):
+    with_piston = np.concatenate([modes, pupil.mask[np.newaxis]])
+    assert Linear(shifted, modes).n_inverted == len(modes)
+    assert Linear(shifted, with_piston).n_inverted == len(modes)
+    few = Linear(shifted, modes, conditioning=0.9)
+    assert 0 < few.n_inverted < len(modes)
+    strength = np.linalg.svd(few.interaction_matrix, compute_uv=False)
+    assert few.n_inverted == np.count_nonzero(strength > 0.9 * strength[0])
+
+
+def test_linear_refuses_modes_that_no_mask_shows(pupil, shifted):
+    with pytest.raises(ValueError, match="modes"):
+        Linear(shifted, pupil.mask[np.newaxis].astype(float))
+
+
+def test_gerchberg_saxton_offset_falls_with_the_extent(pupil, screens):
+    phase = screens(0.3)
+    offset = []
+    for extent in (1, 2, 4, 8):
+        sensor = pair(pupil, np.pi / 2, -np.pi / 2, extent=extent)
+        found = GerchbergSaxton(sensor, n_iterations=30)(sensor.measure(phase), start=phase)
+        offset.append(reconstruction_error(pupil, found.phase, phase).mean())
+    assert np.all(np.divide(offset[1:], offset[:-1]) < 0.8)
+
+
+@pytest.mark.parametrize("on_modes", [False, True])
+@pytest.mark.parametrize("n_masks", [1, 2])
+def test_gradient_agrees_with_finite_differences(pupil, modes, screens, n_masks, on_modes):
+    sensor = ZernikeSensor(pupil, *[Dimple(1.06, phase) for phase in (np.pi / 2, -2.0)[:n_masks]], extent=1.4)
+    amplitude = np.random.default_rng(3).uniform(0.5, 1.5, pupil.shape)
+    descent = GradientDescent(sensor, amplitude=amplitude)
+    frames = sensor.measure(screens(0.5, 1))
+    phase = pupil.gather(screens(0.7, 1, seed=9)[0])
+    directions = pupil.gather(modes)[:6] if on_modes else np.eye(pupil.n_points)[::200]
+    _, gradient = descent.cost(phase, frames)
+    step = 1e-3 if on_modes else 1e-2
+    for direction in directions:
+        a, b, c, d = (descent.cost(phase + k * step * direction, frames)[0] for k in (-2, -1, 1, 2))
+        assert (a - 8 * b + 8 * c - d) / (12 * step) == pytest.approx(direction @ gradient, rel=1e-6, abs=1e-10)
+
+
+def test_cost_is_half_the_mean_square_of_the_mismatch(pupil, shifted, screens):
+    truth, guess = screens(0.4, 2)
+    expected = np.mean((shifted.measure(truth) - shifted.measure(guess)) ** 2) / 2
+    cost, _ = GradientDescent(shifted).cost(pupil.gather(guess), shifted.measure(truth)[np.newaxis])
+    assert cost == pytest.approx(expected, rel=1e-12)
+
+
+def test_descent_never_climbs(pupil, shifted, screens):
+    frames = shifted.measure(screens(0.5, 1)[0])
+    descent = GradientDescent(shifted, tolerance=0)
+    path = descent(frames, history=True).history
+    cost = [descent.cost(pupil.gather(phase), frames[np.newaxis])[0] for phase in path]
+    assert np.all(np.diff(cost) < 0)
+    assert cost[-1] < 1e-4 * cost[0]
+
+
+def test_descent_on_modes_stays_within_them(pupil, modes, shifted, screens):
+    found = GradientDescent(shifted, modes[:7])(shifted.measure(screens(0.3, 1)[0])).phase
+    basis = pupil.gather(modes[:7]).T
+    inside = pupil.gather(found)
+    np.testing.assert_allclose(basis @ np.linalg.lstsq(basis, inside)[0], inside, atol=1e-10)
+
+
+# What all have in common.
+
+
+@every
+def test_residual_is_the_mismatch_of_the_frames_in_the_pupil(make, method, screens, pupil):
+    reconstruct, sensor = make(method)
+    frames = sensor.measure(screens(0.6))
+    found = reconstruct(frames)
+    mismatch = (sensor.measure(found.phase) - frames)[..., pupil.mask]
+    np.testing.assert_allclose(found.residual, np.sqrt(np.mean(mismatch**2, axis=(-2, -1))), atol=1e-10)
+
+
+def test_residual_of_a_wide_detector_is_that_of_the_pupil(pupil, screens):
+    sensor = pair(pupil, np.pi / 2, -np.pi / 2, extent=1.5)
+    frames = sensor.measure(screens(0.6))
+    found = GerchbergSaxton(sensor)(frames)
+    mismatch = (sensor.measure(found.phase) - frames)[(..., *sensor.window)][..., pupil.mask]
+    np.testing.assert_allclose(found.residual, np.sqrt(np.mean(mismatch**2, axis=(-2, -1))), atol=1e-10)
+
+
+@every
+def test_batch_equals_loop(make, method, screens, pupil):
+    reconstruct, sensor = make(method)
+    phase = np.concatenate([screens(0.05, 2), screens(0.4, 4)]).reshape(2, 3, *pupil.shape)
+    frames = sensor.measure(phase)
+    together = reconstruct(frames, history=True)
+    assert together.phase.shape == phase.shape
+    for where in np.ndindex(2, 3):
+        alone = reconstruct(frames[where], history=True)
+        np.testing.assert_allclose(together.phase[where], alone.phase, atol=1e-9)
+        np.testing.assert_allclose(together.history[where], alone.history, atol=1e-9)
+        np.testing.assert_allclose(together.residual[where], alone.residual, atol=1e-9)
+        for name in ("n_iterations", "converged", "n_unsolved"):
+            assert getattr(together, name)[where] == getattr(alone, name), name
+            assert np.shape(getattr(alone, name)) == ()
+
+
+@every
+def test_many_frames_at_once_equal_few(make, method, screens):
+    # More than are handled together.
+    reconstruct, sensor = make(method, **({} if method is Linear else {"n_iterations": 3}))
+    frames = sensor.measure(screens(0.3, 60))
+    np.testing.assert_allclose(reconstruct(frames).phase[-3:], reconstruct(frames[-3:]).phase, atol=1e-9)
+
+
+@every
+def test_phase_is_nan_outside_and_finite_inside(make, method, screens, pupil):
+    reconstruct, sensor = make(method)
+    found = reconstruct(sensor.measure(screens(0.3)), history=True)
+    for maps in (found.phase, found.history):
+        np.testing.assert_array_equal(np.isfinite(maps), np.broadcast_to(pupil.mask, maps.shape))
+
+
+@every
+def test_single_precision_in_single_precision_out(make, method, screens, pupil):
+    reconstruct, sensor = make(method, **({} if method is Linear else {"n_iterations": 8, "tolerance": 0}))
+    frames = sensor.measure(screens(0.3))
+    single = reconstruct(frames.astype(np.float32), history=True)
+    assert single.phase.dtype == single.residual.dtype == single.history.dtype == np.float32
+    np.testing.assert_allclose(single.phase, reconstruct(frames).phase, atol=1e-3)
+
+
+@every
+def test_inputs_are_left_alone(sensor_of, modes, method, screens, pupil):
+    sensor, options = sensor_of(method), {"amplitude": np.ones(pupil.shape)}
+    frames, modes, start = sensor.measure(screens(0.3)), modes.copy(), screens(0.1)
+    for array in (frames, modes, start, *options.values()):
+        array.setflags(write=False)  # writing to one of them raises
+    reconstruct = build(method, sensor, modes, **options)
+    reconstruct(frames, *([] if method is Linear else [start]), history=True)
+
+
+@every
+def test_whole_numbers_are_good_frames(make, method, pupil):
+    reconstruct, sensor = make(method)
+    frames = np.ones((sensor.n_masks, *pupil.shape), int)
+    np.testing.assert_array_equal(reconstruct(frames).phase, reconstruct(frames.astype(float)).phase)
+
+
+@every
+def test_one_wavefront_is_solved_by_the_truth(make, method, pupil):
+    reconstruct, sensor = make(method)
+    found = reconstruct(sensor.measure(np.zeros(pupil.shape)))
+    if method is not GerchbergSaxton:  # which needs the light beside the pupil
+        assert reconstruction_error(pupil, found.phase, np.zeros(pupil.shape)) < 1e-7
+        assert found.residual < 1e-7
+        assert found.converged
+
+
+@every
+def test_history_leads_from_the_start_to_the_result(make, method, screens):
+    reconstruct, sensor = make(method)
+    frames = sensor.measure(screens(0.3))
+    found = reconstruct(frames, history=True)
+    n_iterations = 1 if method is Linear else 25
+    assert found.history.shape == (3, n_iterations + 1, 40, 40)
+    assert np.nanmax(np.abs(found.history[:, 0])) == 0
+    np.testing.assert_array_equal(found.history[:, -1], found.phase)
+    assert reconstruct(frames).history is None
+
+
+# What the iterative ones have in common.
+
+
+@iterative
+def test_history_holds_the_results_of_shorter_runs(make, method, screens):
+    frames = make(method)[1].measure(screens(0.4))
+    history = make(method, n_iterations=6, tolerance=0)[0](frames, history=True).history
+    for n in (1, 2, 5, 6):
+        shorter = make(method, n_iterations=n, tolerance=0)[0](frames)
+        np.testing.assert_allclose(history[:, n], shorter.phase, atol=1e-9)
+        np.testing.assert_array_equal(shorter.n_iterations, n)
+
+
+@iterative
+def test_tolerance_stops_early(make, method, screens, pupil):
+    frames = make(method)[1].measure(screens(0.2))
+    loose = make(method, n_iterations=500, tolerance=1e-3)[0](frames, history=True)
+    tight = make(method, n_iterations=500, tolerance=1e-5)[0](frames)
+    assert loose.converged.all()
+    assert np.all(loose.n_iterations < tight.n_iterations)
+    for history, n in zip(loose.history, loose.n_iterations, strict=True):
+        change = pupil.gather(np.diff(history, axis=0))
+        size = np.sqrt(np.mean(change**2, axis=1))
+        assert size[n - 1] <= 1e-3 * (1 + 1e-6)
+        assert np.all(size[: n - 1] > 1e-3 * (1 - 1e-6))
+        assert not size[n:].any()
+
+
+@iterative
+def test_not_converged_is_said(make, method, screens):
+    reconstruct, sensor = make(method, n_iterations=2, tolerance=1e-9)
+    found = reconstruct(sensor.measure(screens(0.6)))
+    assert not found.converged.any()
+    np.testing.assert_array_equal(found.n_iterations, 2)
+
+
+@iterative
+def test_start_is_where_it_starts(make, method, screens, pupil):
+    reconstruct, sensor = make(method, n_iterations=3, tolerance=0)
+    phase = screens(0.4)
+    frames = sensor.measure(phase)
+    each = reconstruct(frames, start=phase, history=True)
+    np.testing.assert_allclose(each.history[:, 0][:, pupil.mask], phase[:, pupil.mask])
+    same = reconstruct(frames, start=phase[0], history=True)
+    np.testing.assert_allclose(same.history[0], each.history[0], atol=1e-9)
+    np.testing.assert_allclose(same.history[1, 0][pupil.mask], phase[0][pupil.mask])
+    # Its own result, NaN outside, can be handed back in.
+    again = reconstruct(frames, start=reconstruct(frames).phase)
+    longer = make(method, n_iterations=6, tolerance=0)[0](frames)
+    if method in (PhaseShifted, GerchbergSaxton):  # the arcsine picks its branch and the descent its steps anew
+        np.testing.assert_allclose(again.phase, longer.phase, atol=1e-8)
+
+
+@fixed_point
+def test_phase_lies_on_the_circle(make, method, screens):
+    reconstruct, sensor = make(method)
+    phase = reconstruct(sensor.measure(screens(1.5))).phase
+    assert np.nanmax(np.abs(phase)) <= np.pi
+
+
+@iterative
+def test_piston_of_the_start_is_kept(make, method, screens, pupil):
+    reconstruct, sensor = make(method)
+    frames = sensor.measure(screens(0.1, 1)[0])
+    plain, moved = reconstruct(frames).phase, reconstruct(frames, start=np.full(pupil.shape, 0.3)).phase
+    np.testing.assert_allclose(moved[pupil.mask], plain[pupil.mask] + 0.3, atol=1e-6)
+
+
+# Points without an equation.
+
+
+def test_singular_points_keep_their_value_and_are_counted():
+    # For a flat start the reference waves of these two masks mirror each other, so on the middle column they are
+    # the same: the determinant vanishes there, and only there.
+    pupil = zwfs.Pupil.circular(31)
+    masks = [zwfs.Patch(1.06, lambda u, v, sign=sign: np.exp(1j * (np.pi / 2 + sign * u))) for sign in (1, -1)]
+    sensor = ZernikeSensor(pupil, *masks)
+    frames = sensor.measure(zwfs.zernike_basis(pupil, 1)[0] * 0.1)
+    start = np.full(pupil.shape, 0.3)
+    found = PhaseShifted(sensor, n_iterations=1)(frames, start=start)
+    assert found.n_unsolved == np.count_nonzero(pupil.mask[:, 15])
+    np.testing.assert_allclose(found.phase[pupil.mask[:, 15], 15], 0.3, atol=1e-12)
+    assert np.abs(found.phase - 0.3)[:, :15][pupil.mask[:, :15]].min() > 1e-4
+
+
+def test_points_of_no_amplitude_do_no_harm(pupil, shifted, screens):
+    amplitude = np.ones(pupil.shape)
+    amplitude[15:18, 10:30] = 0
+    phase = screens(0.4)
+    found = PhaseShifted(shifted, amplitude=amplitude)(shifted.measure(phase, amplitude))
+    assert np.isfinite(found.phase[:, pupil.mask]).all()
+    lit = (amplitude > 0) & pupil.mask
+    error = np.angle(np.exp(1j * (found.phase - phase)))[:, lit]
+    np.testing.assert_allclose(error - error.mean(axis=1, keepdims=True), 0, atol=1e-5)
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    "phases",
+    [(0.0, np.pi), (np.pi / 2, np.pi / 2), (0.4, 0.4 + 2 * np.pi), (-np.pi, np.pi), (2 * np.pi, np.pi), (0, 0, 0)],
+)
+def test_masks_without_diversity_are_refused(pupil, phases):
+    sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in phases))
+    with pytest.raises(ValueError, match=r"determinant .*equation \(10\) is 0.*expected .*2 pi"):
+        PhaseShifted(sensor)
+
+
+def test_a_useless_mask_among_three_is_accepted(pupil, screens):
+    sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in (0.0, np.pi / 2, -np.pi / 2)))
+    assert errors(PhaseShifted(sensor), sensor, screens(0.3)).max() < 1e-6
+
+
+def test_number_of_masks_is_checked(classic, shifted):
+    with pytest.raises(ValueError, match="sensor has 2 masks: expected one"):
+        Arcsine(shifted)
+    with pytest.raises(ValueError, match="sensor has 1 mask: expected two or more"):
+        PhaseShifted(classic)
+
+
+@every
+@pytest.mark.parametrize(
+    ("spoil", "error", "message"),
+    [
+        (lambda f: f[0], ValueError, r"frames has shape .*: expected \(\.\.\., [12], 40, 40\)"),
+        (lambda f: np.concatenate([f, f]), ValueError, r"frames has shape .*: expected \(\.\.\., [12], 40, 40\)"),
+        (lambda f: f[:, 1:], ValueError, "frames has shape"),
+        (lambda f: f[np.newaxis][:0], ValueError, r"frames has shape .*: expected at least one frame"),
+        (
+            lambda f: np.where(f == f.max(), np.nan, f),
+            ValueError,
+            "frames holds .* NaN or inf.*expected finite",
+        ),
+        (
+            lambda f: np.where(f == f.max(), np.inf, f),
+            ValueError,
+            "frames holds .* NaN or inf.*expected finite",
+        ),
+        (lambda f: f - 0.5, ValueError, "frames reaches down to -.*: expected no negative"),
+        (lambda f: 0 * f, ValueError, "frames: .* hold no light: expected some flux"),
+        (lambda f: f + 0j, TypeError, r"frames is complex \(complex128\): expected real"),
+        (lambda f: f.astype(str), TypeError, "frames has dtype"),
+    ],
+)
+def test_bad_frames_are_named(make, method, pupil, spoil, error, message):
+    reconstruct, sensor = make(method)
+    frames = sensor.measure(np.zeros(pupil.shape))
+    with pytest.raises(error, match=message):
+        reconstruct(spoil(frames))
+
+
+@iterative
+@pytest.mark.parametrize(
+    ("start", "error", "message"),
+    [
+        (np.zeros((3, 3)), ValueError, r"start has shape \(3, 3\): expected \(\.\.\., 40, 40\)"),
+        (
+            np.zeros((2, 40, 40)),
+            ValueError,
+            r"start has shape \(2, 40, 40\): expected \(40, 40\) or \(3, 40, 40\)",
+        ),
+        (np.full((40, 40), np.nan), ValueError, "start holds .* inside the pupil"),
+        (np.zeros((40, 40), complex), TypeError, "start is complex"),
+    ],
+)
+def test_bad_start_is_named(make, method, screens, start, error, message):
+    reconstruct, sensor = make(method)
+    with pytest.raises(error, match=message):
+        reconstruct(sensor.measure(screens(0.1)), start=start)
+
+
+OPTIONS = [
+    ({"n_iterations": 0}, ValueError, "n_iterations = 0: expected at least 1"),
+    ({"n_iterations": 2.5}, TypeError, r"n_iterations = 2\.5: expected an integer"),
+    ({"n_iterations": True}, TypeError, "n_iterations = True: expected an integer"),
+    ({"tolerance": -1e-6}, ValueError, r"tolerance = -1e-06: .*\[0, inf"),
+    ({"tolerance": np.nan}, ValueError, "tolerance = nan"),
+    ({"amplitude": np.ones((3, 3))}, ValueError, r"amplitude has shape \(3, 3\)"),
+    ({"amplitude": np.ones((2, 40, 40))}, ValueError, r"amplitude has shape \(2, 40, 40\): expected \(40, 40\)"),
+    ({"amplitude": -np.ones((40, 40))}, ValueError, "amplitude reaches down to -1"),
+    ({"amplitude": np.zeros((40, 40))}, ValueError, "amplitude is 0 everywhere in the pupil"),
+    ({"amplitude": np.full((40, 40), np.nan)}, ValueError, "amplitude holds"),
+    ({"amplitude": np.ones((40, 40)) * 1j}, TypeError, "amplitude is complex"),
+    ({"poke": 0}, ValueError, r"poke = 0: .*\(0, inf"),
+    ({"conditioning": 1.0}, ValueError, r"conditioning = 1\.0: .*\[0, 1\)"),
+    ({"reference": np.zeros((3, 3))}, ValueError, r"\(3, 3\): expected \(\.\.\., 40, 40\)"),
+    ({"modes": np.ones((40, 40))}, ValueError, r"modes has shape \(40, 40\): expected \(n_modes, ny, nx\)"),
+    ({"modes": np.ones((2, 40, 41))}, ValueError, r"modes has shape \(2, 40, 41\): expected \(\.\.\., 40, 40\)"),
+    ({"modes": np.full((2, 40, 40), np.nan)}, ValueError, "modes holds .* inside the pupil"),
+    ({"modes": np.ones((2, 40, 40), complex)}, TypeError, "modes is complex"),
+    ({"modes": np.empty((0, 40, 40))}, ValueError, r"modes has shape \(0, 40, 40\)"),
+    ({"modes": np.ones((1265, 40, 40))}, ValueError, "modes: 1265 of them, expected at most the 1264 points"),
+]
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "error", "message"),
+    [
+        (method, *case)
+        for method in RECONSTRUCTORS
+        for case in OPTIONS
+        if all(takes(method, name) for name in case[0])
+    ],
+)
+def test_bad_options_are_named(sensor_of, modes, method, options, error, message):
+    if takes(method, "modes"):
+        options = {"modes": modes} | options
+    with pytest.raises(error, match=message):
+        method(sensor_of(method), **options)
+
+
+@every
+def test_sensor_is_checked(modes, pupil, method):
+    with pytest.raises(TypeError, match="sensor is a Pupil: expected a ZernikeSensor"):
+        build(method, pupil, modes)

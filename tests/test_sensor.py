@@ -1,0 +1,359 @@
+import warnings
+
+import numpy as np
+import pytest
+
+import zwfs
+from zwfs import Dimple, Patch, Pupil, ZernikeSensor, zernike_basis
+
+from .reference import exact_reference
+
+TILT = (1.7, -0.6)  # radian per lambda/D
+
+
+def tilted(u, v):
+    return np.exp(1j * (TILT[0] * u + TILT[1] * v))
+
+
+def ramp(u, v):
+    """A transmission without any symmetry."""
+    return (0.8 + 0.1 * u) * np.exp(1j * (0.9 + 1.3 * u - 0.4 * v + 0.2 * u * v))
+
+
+MASKS = {
+    "dimple": (Dimple(1.06, np.pi / 2),),
+    "two dimples": (Dimple(1.06, np.pi / 2), Dimple(2.0, -1.0, 0.7)),
+    "patch": (Patch(1.5, ramp), Dimple(1.06, -np.pi / 2), Patch(3.0, lambda u, v: 0.3j, breaks=[1.0])),
+}
+
+
+@pytest.mark.parametrize("extent", [1, 2])
+@pytest.mark.parametrize("diameter", [0.5, 1.06, 2.2, 5])
+def test_dimple_has_the_airy_kernel(complex_field, diameter, extent):
+    pupil, dimple = Pupil.circular(64), Dimple(diameter, 0.7, 0.8)
+    sensor = ZernikeSensor(pupil, dimple, extent=extent, tolerance=1e-14)
+    for field in (pupil.amplitude, complex_field(pupil)):
+        exact = exact_reference(pupil, dimple, field, margin=32 * (extent - 1))
+        np.testing.assert_allclose(sensor.reference_wave(field)[0], exact, rtol=0, atol=1e-12)
+
+
+def test_dimple_has_the_airy_kernel_on_an_uneven_pupil(rough_pupil, complex_field):
+    dimple = Dimple(1.06, np.pi / 2)
+    sensor = ZernikeSensor(rough_pupil, dimple, tolerance=1e-14)
+    field = complex_field(rough_pupil)
+    exact = exact_reference(rough_pupil, dimple, field)
+    np.testing.assert_allclose(sensor.reference_wave(field)[0], exact, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("masks", MASKS.values(), ids=MASKS)
+def test_error_stays_at_the_tolerance(masks):
+    pupil = Pupil.circular(12)
+    points = pupil.scatter(np.eye(pupil.n_points), fill=0)
+
+    def matrices(tolerance):
+        sensor = ZernikeSensor(pupil, *masks, extent=1.5, tolerance=tolerance)
+        return sensor.rank, sensor.reference_wave(points).reshape(len(points), len(masks), -1).swapaxes(0, 1)
+
+    _, exact = matrices(1e-15)
+    strongest = np.linalg.norm(exact, 2, axis=(1, 2)).max()
+    ranks = []
+    for tolerance in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
+        rank, found = matrices(tolerance)
+        ranks.append(rank)
+        assert np.linalg.norm(found - exact, 2, axis=(1, 2)).max() < 3 * tolerance * strongest
+    assert np.all(np.diff(ranks) > 0)
+
+
+def test_a_dozen_numbers_carry_the_reference_wave():
+    pupil = Pupil.circular(100)
+    assert ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), tolerance=1e-4).rank <= 12
+    one, two = (ZernikeSensor(pupil, *[Dimple(1.06, t) for t in phases]) for phases in ([1.0], [1.0, -2.0]))
+    assert one.rank == two.rank <= 40  # the phase of a dimple costs nothing
+
+
+def test_patch_with_a_ramp_of_phase_moves_the_kernel(complex_field):
+    pupil, diameter, margin = Pupil.circular(32), 2.2, 16
+    sensor = ZernikeSensor(pupil, Patch(diameter, tilted), extent=2, tolerance=1e-14)
+    field = complex_field(pupil)
+    # The ramp moves the kernel of the opening by a / (2 pi); the mask's change is that less the opening itself.
+    moved, centred = (
+        exact_reference(pupil, Dimple(diameter, np.pi), field, margin, shift) / -2
+        for shift in (np.divide(TILT, 2 * np.pi), (0, 0))
+    )
+    np.testing.assert_allclose(sensor.reference_wave(field)[0], moved - centred, rtol=0, atol=1e-12)
+
+
+def test_patch_equals_a_direct_fourier_sum_on_a_fine_grid(complex_field):
+    pupil = Pupil.circular(16)
+    # A Gaussian spot that is over within the patch, so that a plain sum over a Cartesian grid converges.
+
+    def change(u, v):
+        return -np.exp(-40 * ((u - 0.1) ** 2 + v**2)) * (1 - 0.9j * v)
+
+    patch = Patch(2.0, lambda u, v: 1 + change(u, v), n_samples=64)
+    sensor = ZernikeSensor(pupil, patch, tolerance=1e-14)
+    u = np.arange(-1, 1, 0.01)
+    field = complex_field(pupil) * pupil.mask
+    to_u, to_v = (np.exp(-2j * np.pi * np.outer(u, axis)) for axis in (pupil.x, pupil.y))
+    focal = to_v @ field @ to_u.T / 16**2
+    summed = to_v.conj().T @ (change(u, u[:, np.newaxis]) * focal) @ to_u.conj() * 0.01**2
+    np.testing.assert_allclose(sensor.reference_wave(field)[0], summed, rtol=0, atol=1e-12)
+
+
+def test_annular_patch_is_the_difference_of_two_dimples(pupil, complex_field):
+    ring = Patch(2.0, lambda u, v: np.where(np.hypot(u, v) < 0.5, 1, np.exp(0.9j)), breaks=[1.0])
+    waves = ZernikeSensor(pupil, ring, Dimple(2.0, 0.9), Dimple(1.0, 0.9), tolerance=1e-14).reference_wave(
+        complex_field(pupil)
+    )
+    np.testing.assert_allclose(waves[0], waves[1] - waves[2], rtol=0, atol=1e-12)
+
+
+def test_masks_do_not_disturb_each_other(pupil, complex_field):
+    masks = MASKS["patch"]
+    field = complex_field(pupil)
+    together = ZernikeSensor(pupil, *masks, tolerance=1e-14).propagate(field)
+    for mask, wave in zip(masks, together, strict=True):
+        alone = ZernikeSensor(pupil, mask, tolerance=1e-14).propagate(field)[0]
+        np.testing.assert_allclose(wave, alone, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("extent", [1, 1.5])
+def test_detector_sees_incoming_field_plus_reference_wave(pupil, complex_field, extent):
+    sensor = ZernikeSensor(pupil, *MASKS["two dimples"], extent=extent)
+    field = complex_field(pupil)
+    rest = sensor.propagate(field) - sensor.reference_wave(field)
+    np.testing.assert_allclose(rest[(..., *sensor.window)], [field * pupil.mask] * 2, atol=1e-14)
+    rest[(..., *sensor.window)] = 0
+    assert not rest.any()
+
+
+def test_two_wave_interference(pupil, screens):
+    sensor = ZernikeSensor(pupil, *MASKS["patch"])
+    phase = screens(0.9)
+    reference = sensor.reference_wave(np.exp(1j * phase))
+    power = np.abs(reference) ** 2
+    incoming = pupil.amplitude**2
+    fringe = 2 * np.sqrt(power * incoming) * np.cos(phase[:, np.newaxis] - np.angle(reference))
+    np.testing.assert_allclose(sensor.measure(phase), power + incoming + fringe, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("masks", MASKS.values(), ids=MASKS)
+@pytest.mark.parametrize("extent", [1, 1.6])
+def test_adjoint_passes_the_dot_product_test(rough_pupil, complex_field, masks, extent):
+    sensor = ZernikeSensor(rough_pupil, *masks, extent=extent)
+    field = complex_field(rough_pupil)
+    wave = sensor.propagate(complex_field(rough_pupil, seed=1)).conj() + 1
+    forward, back = np.vdot(wave, sensor.propagate(field)), np.vdot(sensor.adjoint(wave), field)
+    assert abs(forward - back) < 1e-13 * np.linalg.norm(wave) * np.linalg.norm(field)
+    assert not sensor.adjoint(wave)[~rough_pupil.mask].any()
+
+
+def test_adjoint_is_nearly_the_inverse_on_a_wide_detector(complex_field):
+    pupil = Pupil.circular(20)
+    field = zernike_basis(pupil, 5)[4] * pupil.mask + 0j
+    loss = [
+        np.abs(sensor.adjoint(sensor.propagate(field)) - field).max()
+        for sensor in (ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), extent=extent) for extent in (2, 16))
+    ]
+    assert loss[1] < 0.2 * loss[0]
+
+
+@pytest.mark.parametrize("phases", [(np.pi / 2, -np.pi / 2), (np.pi / 2, np.pi), (0.3, -2.0)])
+def test_reference_phases_differ_by_half_the_phases_of_the_dimples(pupil, screens, phases):
+    sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in phases))
+    a, b = np.moveaxis(sensor.reference_wave(np.exp(1j * screens(0.8))), 1, 0)
+    excess = (np.angle(b / a) - (phases[1] - phases[0]) / 2)[:, pupil.mask]
+    np.testing.assert_allclose(np.sin(excess), 0, atol=1e-10)
+
+
+@pytest.mark.parametrize("phase", [np.pi / 2, -np.pi / 2, 2.5])
+def test_reference_phase_of_a_flat_wavefront(pupil, phase):
+    wave = ZernikeSensor(pupil, Dimple(1.06, phase)).reference_wave(pupil.amplitude)[0]
+    np.testing.assert_allclose(np.angle(wave), phase / 2 + np.sign(phase) * np.pi / 2, atol=1e-10)
+
+
+def test_positive_phase_delays_the_centre_and_not_the_rest():
+    # exp(+i theta) on axis: for a small positive bump and +pi/2 the frame gets brighter there.
+    pupil = Pupil.circular(40)
+    bump = np.zeros(pupil.shape)
+    bump[20, 20] = 0.01
+    plus, minus = (
+        ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
+        .measure([0 * bump, bump])
+        .swapaxes(0, 1)
+    )
+    assert (plus[1] - plus[0])[20, 20] > 0.005
+    assert (minus[1] - minus[0])[20, 20] < -0.005
+
+
+def test_axes_are_not_mixed_up():
+    # An odd phase along x seen through a mask that differs from left to right: mirrored only together.
+    pupil = Pupil.circular(24)
+    phase = zernike_basis(pupil, 8)[5:8].sum(axis=0) * 0.3
+    left, right = (
+        ZernikeSensor(pupil, Patch(1.5, ramp), Patch(1.5, lambda u, v: ramp(-u, v)))
+        .measure([phase, phase[:, ::-1]])
+        .swapaxes(0, 1)
+    )
+    np.testing.assert_allclose(left[0], right[1][:, ::-1], atol=1e-12)
+    assert np.abs(left[0] - right[0]).max() > 0.01
+
+
+def test_piston_is_invisible(pupil, shifted, screens):
+    phase = screens(0.5)
+    np.testing.assert_allclose(shifted.measure(phase + 1.234), shifted.measure(phase), rtol=0, atol=1e-13)
+
+
+def test_a_mask_of_no_phase_leaves_the_pupil_as_it_is(pupil, screens):
+    frames = ZernikeSensor(pupil, Dimple(1.06, 0.0)).measure(screens(0.5))[:, 0]
+    np.testing.assert_allclose(frames, np.broadcast_to(pupil.amplitude**2, frames.shape), atol=1e-14)
+
+
+def test_half_of_the_light_leaves_the_pupil():
+    pupil = Pupil.circular(100)
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), extent=2)
+    frame = sensor.measure(np.zeros(pupil.shape))[0] / pupil.n_points
+    assert frame[sensor.window][pupil.mask].sum() == pytest.approx(0.505, abs=5e-4)
+    assert frame.sum() == pytest.approx(0.890, abs=5e-4)
+
+
+def test_missing_light_falls_as_one_over_the_extent():
+    pupil = Pupil.circular(24)
+    missing = [
+        1
+        - ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), extent=extent).measure(np.zeros(pupil.shape)).sum()
+        / pupil.n_points
+        for extent in (2, 4, 8, 16)
+    ]
+    np.testing.assert_allclose(np.divide(missing[1:], missing[:-1]), 0.5, rtol=0.1)
+
+
+def test_wide_detector_shows_the_same_pupil(pupil, screens):
+    phase = screens(0.5)
+    wide = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), extent=1.7)
+    assert wide.detector_shape == (68, 68)
+    assert wide.extent == pytest.approx(1.7)
+    frames = wide.measure(phase)
+    assert frames.shape == (3, 1, 68, 68)
+    narrow = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2)).measure(phase)
+    np.testing.assert_allclose(frames[(..., *wide.window)], narrow, atol=1e-11)
+
+
+def test_batches_of_any_depth(shifted, screens, complex_field, pupil):
+    phase = screens(0.5, 6)
+    frames = shifted.measure(phase)
+    assert shifted.measure(phase[0]).shape == (2, 40, 40)
+    np.testing.assert_allclose(shifted.measure(phase[0]), frames[0], atol=1e-14)
+    np.testing.assert_allclose(shifted.measure(phase.reshape(1, 3, 2, 40, 40))[0, 1, 1], frames[3], atol=1e-14)
+    field = complex_field(pupil, 3, 2)
+    waves = shifted.propagate(field)
+    np.testing.assert_allclose(waves[2, 1], shifted.propagate(field[2, 1]), atol=1e-13)
+    back = shifted.adjoint(waves)
+    assert back.shape == field.shape
+    np.testing.assert_allclose(back[1, 0], shifted.adjoint(waves[1, 0]), atol=1e-13)
+
+
+def test_an_empty_batch_is_refused(shifted):
+    with pytest.raises(ValueError, match=r"phase has shape \(0, 40, 40\): expected at least one map"):
+        shifted.measure(np.empty((0, 40, 40)))
+
+
+def test_amplitudes_in_a_batch(shifted, screens, pupil):
+    phase = screens(0.5, 4).reshape(2, 2, *pupil.shape)
+    amplitude = np.random.default_rng(0).uniform(0.5, 1.5, phase.shape)
+    frames = shifted.measure(phase, amplitude)
+    np.testing.assert_allclose(frames[1, 0], shifted.measure(phase[1, 0], amplitude[1, 0]), atol=1e-13)
+    np.testing.assert_allclose(
+        shifted.measure(phase[0, 0], amplitude)[0, 1], shifted.measure(phase[0, 0], amplitude[0, 1]), atol=1e-13
+    )
+    np.testing.assert_allclose(
+        shifted.measure(phase, amplitude[0])[1, 1], shifted.measure(phase[1, 1], amplitude[0, 1])
+    )
+    np.testing.assert_allclose(
+        frames[0, 0], np.abs(shifted.propagate(amplitude[0, 0] * np.exp(1j * phase[0, 0]))) ** 2
+    )
+
+
+def test_amplitude_is_that_of_the_pupil_unless_given(rough_pupil):
+    sensor = ZernikeSensor(rough_pupil, Dimple(1.06, np.pi / 2))
+    flat = np.zeros(rough_pupil.shape)
+    np.testing.assert_allclose(sensor.measure(flat), np.abs(sensor.propagate(rough_pupil.amplitude)) ** 2)
+    assert np.abs(sensor.measure(flat) - sensor.measure(flat, np.ones(flat.shape))).max() > 0.1
+
+
+def test_single_precision_in_single_precision_out(shifted, screens, pupil):
+    phase = screens(0.5)
+    single = shifted.measure(phase.astype(np.float32))
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, shifted.measure(phase), atol=1e-5)
+    field = np.exp(1j * phase)
+    for function in (shifted.propagate, shifted.reference_wave):
+        waves = function(field.astype(np.complex64))
+        assert waves.dtype == np.complex64
+        np.testing.assert_allclose(waves, function(field), atol=1e-5)
+    assert shifted.adjoint(waves).dtype == np.complex64
+
+
+def test_what_lies_outside_the_pupil_does_not_matter(shifted, screens, pupil):
+    phase = screens(0.5)
+    np.testing.assert_array_equal(shifted.measure(np.where(pupil.mask, phase, np.nan)), shifted.measure(phase))
+    field = np.exp(1j * phase) * pupil.mask
+    np.testing.assert_array_equal(shifted.propagate(np.where(pupil.mask, field, 5)), shifted.propagate(field))
+
+
+def test_inputs_are_left_alone(shifted, screens, pupil):
+    phase = screens(0.5)
+    amplitude = np.ones(pupil.shape)
+    field = np.exp(1j * phase)
+    waves = shifted.propagate(field)
+    for array in (phase, amplitude, field, waves):
+        array.setflags(write=False)  # writing to one of them raises
+    shifted.measure(phase, amplitude)
+    shifted.propagate(field)
+    shifted.adjoint(waves)
+
+
+def test_phase_in_degrees_draws_a_warning(shifted, screens):
+    with pytest.warns(UserWarning, match=r"phase has an rms of 28\.65: expected radian, less than 20 rms"):
+        shifted.measure(np.degrees(screens(0.5)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        shifted.measure(screens(19.0) + 1000)  # piston does not count
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda s: ZernikeSensor(np.ones((4, 4)), Dimple(1, 1)), TypeError, "pupil is a ndarray: expected"),
+        (lambda s: ZernikeSensor(s.pupil), ValueError, "masks is empty: expected at least one"),
+        (lambda s: ZernikeSensor(s.pupil, [Dimple(1, 1)]), TypeError, r"masks\[0\] .* a list: expected a Dimple"),
+        (lambda s: ZernikeSensor(s.pupil, Dimple), TypeError, r"masks\[0\] .*expected a Dimple"),
+        (lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), extent=0.9), ValueError, r"extent = 0\.9: .*\[1, inf"),
+        (lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), tolerance=0), ValueError, "tolerance = 0"),
+        (lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), tolerance=1.0), ValueError, r"tolerance = 1\.0"),
+        (lambda s: ZernikeSensor(s.pupil, Patch(1, lambda u, v: 2.0)), ValueError, "reaches a modulus of 2"),
+        (lambda s: s.measure(np.zeros((39, 40))), ValueError, r"phase has shape \(39, 40\): expected .* 40, 40"),
+        (lambda s: s.measure(np.zeros(40)), ValueError, r"phase has shape \(40,\)"),
+        (lambda s: s.measure(np.zeros((40, 40), complex)), TypeError, "phase is complex"),
+        (lambda s: s.measure(np.full((40, 40), "0")), TypeError, "phase has dtype"),
+        (lambda s: s.measure(np.full((40, 40), np.nan)), ValueError, "phase holds 1264 NaN .*inside the pupil"),
+        (lambda s: s.measure(np.full((40, 40), np.inf)), ValueError, "phase holds"),
+        (lambda s: s.measure(np.zeros((40, 40)), np.ones((3, 3))), ValueError, r"amplitude has shape \(3, 3\)"),
+        (lambda s: s.measure(np.zeros((40, 40)), -np.ones((40, 40))), ValueError, "amplitude reaches down to -1"),
+        (lambda s: s.measure(np.zeros((40, 40)), np.zeros((40, 40))), ValueError, "amplitude is 0 everywhere"),
+        (lambda s: s.measure(np.zeros((40, 40)), np.ones((40, 40)) * 1j), TypeError, "amplitude is complex"),
+        (lambda s: s.measure(np.zeros((2, 40, 40)), np.ones((3, 40, 40))), ValueError, "amplitude"),
+        (lambda s: s.propagate(np.ones((40, 41))), ValueError, r"field has shape \(40, 41\)"),
+        (lambda s: s.propagate(np.full((40, 40), np.nan)), ValueError, "field holds"),
+        (lambda s: s.adjoint(np.ones((1, 40, 40))), ValueError, r"field has shape \(1, 40, 40\): .* 2, 40"),
+        (lambda s: s.adjoint(np.full((2, 40, 40), np.inf)), ValueError, "field holds 3200"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_named(shifted, call, error, message):
+    with pytest.raises(error, match=message):
+        call(shifted)
+
+
+def test_pupil_of_a_single_row_is_a_pupil():
+    sensor = zwfs.ZernikeSensor(Pupil.from_amplitude(np.ones((1, 8))), Dimple(1.06, np.pi / 2))
+    assert sensor.measure(np.zeros((1, 8))).shape == (1, 1, 8)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import compare
 import runner
+from claims import ClaimError
 from pages import BookError, build_book
 from runner import NotebookError, Project
 
@@ -77,7 +78,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return command(Project(Path(__file__).resolve().parent.parent))
-    except (NotebookError, BookError) as failure:
+    except (NotebookError, BookError, ClaimError) as failure:
         print(failure, file=sys.stderr)
     except KeyboardInterrupt:
         print("interrupted: the earlier results are untouched", file=sys.stderr)

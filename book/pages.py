@@ -10,6 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+import claims
 from runner import Project, digest, digest_files, replace
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
@@ -36,6 +37,11 @@ def staged_files(project: Project) -> dict[str, Path]:
             files[file.relative_to(project.root).as_posix()] = file
     for notebook in project.sources():
         files[f"notebooks/{notebook.name}"] = project.executed / notebook.name
+        for file in project.files(notebook.stem):
+            place = f"notebooks/downloads/{file.name}"
+            if place in files:
+                raise BookError(f"{files[place].parent.stem} and {notebook.stem} both publish {file.name}")
+            files[place] = file
     return files | mathjax_files()
 
 
@@ -56,11 +62,13 @@ def build_book(project: Project) -> bool:
     ------
     BookError
         Sphinx gave a warning or an error. The earlier book stays.
+    ClaimError
+        A claim is judged by a number that no notebook gives.
     """
     html, record = project.build / "html", project.build / "html.json"
     files = staged_files(project)
     lock = project.root / "environment" / "requirements.lock"
-    made_from = digest_files(files | {"pages": Path(__file__), "lock": lock})
+    made_from = digest_files(files | {"pages": Path(__file__), "claims": Path(claims.__file__), "lock": lock})
     made_from = digest([made_from.encode(), str(sys.version_info[:2]).encode()])
     try:
         if html.is_dir() and json.loads(record.read_bytes()) == made_from:
@@ -68,6 +76,9 @@ def build_book(project: Project) -> bool:
     except (OSError, ValueError):
         pass  # never built, or not to the end
     source = _stage(project, files)
+    if claims.PAGE in files:
+        for name, text in claims.fragments(project.executed).items():
+            (source / name).write_text(text, "utf-8")
     with tempfile.TemporaryDirectory(dir=project.build, prefix="building-") as scratch:
         _jupyter_book(source, Path(scratch))
         record.unlink(missing_ok=True)

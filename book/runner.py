@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -32,6 +33,9 @@ KERNEL_ENVIRONMENT = {
     "VECLIB_MAXIMUM_THREADS": "1",
     "PYTHONHASHSEED": "0",
 }
+
+# Names the folder in which a notebook leaves its figures and tables, see `zwfs.results`.
+RESULTS = "ZWFS_RESULTS"
 
 
 class NotebookError(Exception):
@@ -62,8 +66,12 @@ class Project:
 
     @property
     def executed(self) -> Path:
-        """The executed notebooks, each with the record of what it was made from."""
+        """The executed notebooks, each with its files and the record of what it was made from."""
         return self.build / "notebooks"
+
+    def files(self, name: str) -> list[Path]:
+        """The figures and tables that the last run of a notebook left, in order."""
+        return sorted((self.executed / f"{name}.files").glob("[!.]*"))
 
     def sources(self) -> list[Path]:
         """The committed notebooks, in order."""
@@ -96,7 +104,7 @@ class Children:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
-                env=os.environ | KERNEL_ENVIRONMENT,
+                env=os.environ | KERNEL_ENVIRONMENT | {RESULTS: request["files"]},
                 # A session of its own: Ctrl-C reaches this process only, which then ends its children.
                 start_new_session=True,
             )
@@ -207,12 +215,17 @@ def replace(path: Path, content: bytes) -> None:
         partial.unlink(missing_ok=True)
 
 
+def _digest_result(notebook: bytes, files: list[Path]) -> str:
+    """Return a digest of an executed notebook and of the files that it left."""
+    return digest([notebook, digest_files({file.name: file for file in files}).encode()])
+
+
 def _record(project: Project, name: str) -> dict[str, Any]:
     """What is known of the last result of a notebook; empty if there is none that can be trusted."""
     result = project.executed / f"{name}.ipynb"
     try:
         record = json.loads(result.with_suffix(".json").read_bytes())
-        return record if record["result"] == digest([result.read_bytes()]) else {}
+        return record if record["result"] == _digest_result(result.read_bytes(), project.files(name)) else {}
     except (OSError, ValueError, KeyError):
         return {}
 
@@ -307,9 +320,12 @@ def _run_one(
     begin = time.perf_counter()
     made_from = key(project, name, parameters)
     source, target, log = (scratch / f"{name}{ending}" for ending in (".source.ipynb", ".ipynb", ".log"))
+    files = scratch / f"{name}.files"
+    files.mkdir()
     source.write_bytes(to_bytes(read(project.notebooks / f"{name}.ipynb")))
     request = {
         "notebook": str(source),
+        "files": str(files),
         "target": str(target),
         "folder": str(project.notebooks),
         "parameters": parameters,
@@ -333,10 +349,13 @@ def _run_one(
     unchanged = key(project, name, parameters) == made_from
     record = {
         "key": made_from if unchanged else None,
-        "result": digest([result]),
+        "result": _digest_result(result, sorted(files.glob("[!.]*"))),
         "seconds": round(seconds, 1),
     }
+    # Pieces of two runs may lie together for a moment; only the record, which comes last, makes them a result.
     replace(project.executed / f"{name}.ipynb", result)
+    shutil.rmtree(project.executed / files.name, ignore_errors=True)
+    files.rename(project.executed / files.name)
     replace(project.executed / f"{name}.json", json.dumps(record, indent=1).encode())
     return seconds
 

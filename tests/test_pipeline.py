@@ -27,6 +27,11 @@ def write(project, name, *cells, parameters="n = 2  # pixels\nwidth = 1.5  # met
     nbformat.write(notebook, project.notebooks / f"{name}.ipynb")
 
 
+def leave(name, text):
+    """Write a cell that leaves a file among the results."""
+    return f"import os, pathlib\n(pathlib.Path(os.environ['ZWFS_RESULTS']) / '{name}').write_text('{text}');"
+
+
 def run(project, **options):
     said = []
     return runner.run(project, say=said.append, **options), said
@@ -48,7 +53,7 @@ def project(tmp_path):
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory):
-    """A project whose two notebooks were run."""
+    """A project whose three notebooks were run."""
     project = Project(tmp_path_factory.mktemp("template"))
     (project.root / "zwfs").mkdir()
     (project.root / "zwfs" / "__init__.py").write_text("gain = 1\n")
@@ -58,6 +63,7 @@ def template(tmp_path_factory):
     )
     write(project, "first", "print(n * width)", noisy)
     write(project, "second", "%config InlineBackend.figure_formats = ['svg']", picture, "{n}")
+    write(project, "third", leave("numbers.csv", "1"))
     (project.root / "environment").mkdir()
     (project.root / "environment" / "requirements.lock").write_text("numpy==2\n")
     run(project)
@@ -75,15 +81,15 @@ def test_two_runs_give_identical_bytes(ran):
     shutil.rmtree(ran.executed)
     assert run(ran)[0]
     assert results(ran) == before
-    assert len(before) == 2
+    assert len(before) == 3
 
 
 def test_unchanged_notebooks_are_not_run_again(ran):
-    assert run(ran) == ([], ["notebooks: 0 run, 2 unchanged"])
+    assert run(ran) == ([], ["notebooks: 0 run, 3 unchanged"])
 
 
 def test_refreshed_notebooks_are_current_and_agree(ran):
-    assert build.refresh(ran) == ["first.ipynb", "second.ipynb"]
+    assert build.refresh(ran) == ["first.ipynb", "second.ipynb", "third.ipynb"]
     assert build.refresh(ran) == []
     assert run(ran)[0] == []
     assert build.check_notebook(ran, "first") == build.check_notebook(ran, "second") == []
@@ -98,20 +104,22 @@ def test_committed_notebook_without_outputs_is_refused(ran):
 @pytest.mark.parametrize(
     ("change", "stale"),
     [
-        (lambda p: (p.root / "zwfs" / "__init__.py").write_text("gain = 2\n"), {"first", "second"}),
-        (lambda p: (p.root / "zwfs" / "more.py").write_text(""), {"first", "second"}),
+        (lambda p: (p.root / "zwfs" / "__init__.py").write_text("gain = 2\n"), {"first", "second", "third"}),
+        (lambda p: (p.root / "zwfs" / "more.py").write_text(""), {"first", "second", "third"}),
         (
             lambda p: (p.root / "environment" / "requirements.lock").write_text("numpy==3\n"),
-            {"first", "second"},
+            {"first", "second", "third"},
         ),
         (lambda p: write(p, "first", "print(n)"), {"first"}),
         (lambda p: (p.executed / "first.ipynb").write_text("half of a noteb"), {"first"}),
         (lambda p: (p.executed / "first.json").unlink(), {"first"}),
+        (lambda p: p.files("third")[0].unlink(), {"third"}),
+        (lambda p: p.files("third")[0].write_text("2"), {"third"}),
     ],
 )
 def test_what_changed_is_stale(ran, change, stale):
     change(ran)
-    keys = {name: runner.key(ran, name, {}) for name in ("first", "second")}
+    keys = {name: runner.key(ran, name, {}) for name in ("first", "second", "third")}
     assert {name for name in keys if runner._record(ran, name).get("key") != keys[name]} == stale
 
 
@@ -143,8 +151,8 @@ def test_bad_parameters_are_refused_before_the_first_cell(ran, parameters, messa
 
 
 def test_parameters_of_an_unknown_notebook_are_refused(ran):
-    with pytest.raises(ValueError, match="unknown notebooks: third"):
-        run(ran, parameters={"third": {}})
+    with pytest.raises(ValueError, match="unknown notebooks: fourth"):
+        run(ran, parameters={"fourth": {}})
 
 
 def test_failure_is_named_and_leaves_earlier_results(ran):
@@ -159,6 +167,20 @@ def test_failure_is_named_and_leaves_earlier_results(ran):
     assert message.endswith("ValueError: no light")
     assert results(ran) == before
     assert sorted(os.listdir(ran.build)) == ["notebooks"]
+
+
+def test_failure_leaves_the_files_of_the_earlier_run(ran):
+    write(ran, "third", leave("numbers.csv", "2"), "raise ValueError")
+    with pytest.raises(NotebookError):
+        run(ran)
+    assert [file.read_text() for file in ran.files("third")] == ["1"]
+
+
+def test_new_files_replace_the_old_ones(ran):
+    write(ran, "third", leave("others.csv", "2"))
+    run(ran)
+    assert [file.name for file in ran.files("third")] == ["others.csv"]
+    assert ran.files("first") == []
 
 
 def test_dead_kernel_is_named(project):
@@ -236,9 +258,29 @@ def small_book(ran):
     (ran.root / "_config.yml").write_text(
         "title: small\nonly_build_toc_files: true\nexecute:\n  execute_notebooks: 'off'\n"
     )
-    (ran.root / "environment").mkdir()
-    (ran.root / "environment" / "requirements.lock").write_text("")
     return ran
+
+
+def test_files_of_notebooks_are_staged(small_book):
+    staged = pages.staged_files(small_book)
+    assert staged["notebooks/downloads/numbers.csv"] == small_book.executed / "third.files" / "numbers.csv"
+
+
+def test_two_notebooks_may_not_publish_the_same_file(small_book):
+    write(small_book, "second", leave("numbers.csv", "3"))
+    run(small_book)
+    with pytest.raises(pages.BookError, match=r"second and third both publish numbers.csv"):
+        pages.staged_files(small_book)
+
+
+def test_link_to_a_file_that_is_not_published_fails(small_book):
+    page = small_book.root / "book" / "index.md"
+    page.write_text("# A book\n\n{download}`data <../notebooks/downloads/numbers.csv>`\n")
+    assert pages.build_book(small_book)
+    assert list((small_book.build / "html" / "_downloads").rglob("numbers.csv"))
+    page.write_text("# A book\n\n{download}`data <../notebooks/downloads/missing.csv>`\n")
+    with pytest.raises(pages.BookError, match=r"not readable.*missing.csv"):
+        pages.build_book(small_book)
 
 
 def test_book_is_built_once_and_a_failure_leaves_it(small_book):

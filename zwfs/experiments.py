@@ -56,6 +56,14 @@ class LinearityCurves:
         """Fraction of the screens with an error of at most `threshold` times the input, shape (n_rms,)."""
         return np.mean(self.errors[name] <= threshold * self.rms[:, np.newaxis], axis=1)
 
+    def columns(self) -> dict[str, NDArray[np.float64]]:
+        """Input, and mean and standard deviation of every reconstructor, as columns for `zwfs.results.publish`."""
+        columns = {"input (rad rms)": self.rms}
+        for name in self.errors:
+            columns[f"{name}: mean error (rad rms)"] = self.mean(name)
+            columns[f"{name}: standard deviation (rad rms)"] = self.std(name)
+        return columns
+
 
 def screens_at(
     modes: NDArray, rms: float, n_screens: int, seed: int, task: int, exponent: float = -2.0

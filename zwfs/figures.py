@@ -1,4 +1,4 @@
-"""Figures of the book. The only module that needs matplotlib; `import zwfs` does not import it."""
+"""Figures of the book. Only this module and `zwfs.drawings` need matplotlib; `import zwfs` imports neither."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from dataclasses import dataclass
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.patches import Circle, Ellipse, FancyArrowPatch, Polygon
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from zwfs import _check
 from zwfs.experiments import LinearityCurves
-from zwfs.focal import focal_field
 from zwfs.pupil import Pupil
-from zwfs.sensor import ZernikeSensor
+from zwfs.variations import DARK_RING, DiameterCurve, PairMaps
 
 PHASE_MAP, INTENSITY_MAP = "RdBu_r", "viridis"
 
@@ -188,98 +187,55 @@ def estimates(
     return figure
 
 
-def sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:
-    """Figure 1: the planes of a sensor with one mask, with the fields computed for `phase` (radian)."""
-    pupil, mask = sensor.pupil, sensor.masks[0]
-    field = pupil.amplitude * np.exp(1j * np.where(pupil.mask, phase, 0))
-    axis = np.linspace(-4, 4, 161)
-    focus = np.abs(focal_field(pupil, field, axis, axis)) ** 2
-    wave = sensor.reference_wave(field)[0]
-    frame = np.abs(sensor.propagate(field)[0]) ** 2
-    inside = np.where(pupil.mask, 1, np.nan)
+def approximation(
+    rms: Sequence[float], wave: Mapping[str, Sequence[float]], steps: Mapping[str, Sequence[float]]
+) -> Figure:
+    """Error of approximate reference waves against the input, and of one step of reconstruction with each.
 
-    figure = plt.figure(figsize=(9, 4.7), layout="none")
-    scene = figure.add_axes((0, 0, 1, 1))
-    scene.set(xlim=(0, 9), ylim=(0, 4.7))
-    scene.set_axis_off()
-    _draw_beam(scene)
-
-    limit = np.nanmax(np.abs(phase * inside))
-    _plane(
-        figure, scene, 1.15, "pupil plane", r"phase of $\psi_{in}$ (rad)", PHASE_MAP, phase * inside, -limit, limit
-    )
-    with np.errstate(divide="ignore"):
-        halo = np.log10(focus / focus.max())
-    focal = _plane(figure, scene, 4.5, "focal plane", r"$|\hat\psi_{in}|^2$ (log$_{10}$)", "magma", halo, -4, 0)
-    # The axis runs from -4 to 4 lambda/D over 161 samples.
-    focal.add_patch(Circle((80, 80), mask.diameter / 2 * 20, fill=False, ec="white", ls="--", lw=1.3))
-    shift = _in_pi(np.angle(mask.transmission(0.0, 0.0)))
-    focal.text(
-        80, 146, f"mask: {mask.diameter:g} $\\lambda/D$, {shift} rad", color="white", ha="center", fontsize=8
-    )
-    focal.plot([80, 80], [80 + mask.diameter * 10, 142], color="white", lw=0.8)
-    focal.plot([20, 60], [12, 12], color="white", lw=1.5)
-    focal.text(40, 17, r"2 $\lambda/D$", color="white", ha="center", fontsize=8)
-    _plane(figure, scene, 7.85, "detector plane", r"intensity $I_{out}$", INTENSITY_MAP, frame, 0, frame.max())
-
-    interference = 2 * np.abs(pupil.amplitude * wave) * np.cos(np.angle(field * wave.conj()))
-    terms = (
-        (r"$I_{out}$", "=", frame, INTENSITY_MAP, 0),
-        (r"$I_{in}$", "+", pupil.amplitude**2, INTENSITY_MAP, 0),
-        (r"$I_{ref}$", "+", np.abs(wave) ** 2, INTENSITY_MAP, 0),
-        (r"$2\sqrt{I_{in}I_{ref}}\,\cos(\phi_{in}-\phi_{ref})$", "", interference, PHASE_MAP, -frame.max()),
-    )
-    for x, (title, sign, image, colors, low) in zip((1.15, 3.1, 5.05, 7.0), terms, strict=True):
-        inset = figure.add_axes(((x - 0.55) / 9, 0.36 / 4.7, 1.1 / 9, 1.1 / 4.7))
-        shown = _show(inset, image, colors, low, frame.max())
-        scene.text(x, 0.1, title, ha="center", fontsize=10)
-        scene.text(x + 0.97, 0.9, sign, ha="center", va="center", fontsize=15)
-    bar = figure.add_axes((7.75 / 9, 0.36 / 4.7, 0.08 / 9, 1.1 / 4.7))
-    figure.colorbar(shown, cax=bar).set_label("intensity", fontsize=8)
-    bar.tick_params(labelsize=7, length=2, pad=1)
+    Parameters
+    ----------
+    rms : sequence of float, radian rms
+        Input.
+    wave : mapping of label to sequence
+        Errors of the reference wave.
+    steps : mapping of label to sequence
+        Error of the reconstructed phase over the input.
+    """
+    figure, panels = plt.subplots(1, 2, figsize=(9, 4.1))
+    for axes, curves in zip(panels, (wave, steps), strict=True):
+        for (label, values), look in zip(curves.items(), LOOKS.values(), strict=False):
+            style = {"color": look.color, "marker": look.marker, "linestyle": look.line}
+            axes.plot(rms, values, markersize=4, label=label, **style)
+        axes.set(xlabel="input phase (rad rms)", xlim=(0, None), ylim=(0, None))
+        axes.legend(fontsize=8)
+    panels[0].set_ylabel("error of the reference wave")
+    panels[1].set_ylabel("error of the phase / input")
     return figure
 
 
-def _draw_beam(scene: Axes) -> None:
-    """Optical axis, beam and two lenses between the three planes."""
-    y, half = 3.0, 0.8 * 0.98
-    low = [(0.1, y - half), (2.82, y - half), (4.5, y), (6.18, y - half), (8.9, y - half)]
-    high = [(x, 2 * y - height) for x, height in reversed(low)]
-    scene.add_patch(Polygon(low + high, closed=True, fc="#f3d9a4", ec="none", alpha=0.6))
-    scene.plot([0.1, 8.9], [y, y], color="#888888", lw=0.7, ls=(0, (8, 3, 2, 3)))
-    for x in (2.82, 6.18):
-        scene.add_patch(Ellipse((x, y), 0.22, 1.95, fc="#cfe3f2", ec="#33658a", lw=1.2))
-        scene.text(x, y - 1.2, "lens", ha="center", fontsize=9)
-    for height in (-0.4, 0.4):
-        scene.add_patch(
-            FancyArrowPatch(
-                (2.05, y + height), (2.6, y + height), arrowstyle="-|>", mutation_scale=9, color="#a8742a"
-            )
-        )
+def diversity(difference: NDArray, determinant: NDArray, strength: NDArray, named: Mapping[str, int]) -> Figure:
+    """Determinant of equation (10) and the one weighted with both reference waves, for many pairs of masks.
 
-
-def _plane(
-    figure: Figure,
-    scene: Axes,
-    x: float,
-    title: str,
-    scale: str,
-    colors: str,
-    image: NDArray,
-    low: float,
-    high: float,
-) -> Axes:
-    """Picture of a plane on the optical axis, its name above and its colour scale below."""
-    axes = figure.add_axes(((x - 0.8) / 9, (3.0 - 0.8) / 4.7, 1.6 / 9, 1.6 / 4.7))
-    shown = _show(axes, image, colors, low, high)
-    axes.spines[:].set_visible(True)
-    scene.text(x, 4.38, title, ha="center", fontsize=11, weight="bold")
-    bar = figure.add_axes(((x - 0.6) / 9, 2.02 / 4.7, 1.2 / 9, 0.07 / 4.7))
-    figure.colorbar(shown, cax=bar, orientation="horizontal")
-    bar.tick_params(labelsize=7, length=2, pad=1)
-    bar.locator_params(nbins=4)
-    scene.text(x, 4.0, scale, ha="center", fontsize=9)
-    return axes
+    Parameters
+    ----------
+    difference : ndarray, shape (n_pairs,), radian
+        Of the phase shifts.
+    determinant, strength : ndarray, shape (n_pairs,)
+    named : mapping of label to index
+        Pairs to point out.
+    """
+    figure, panels = plt.subplots(1, 2, figsize=(9, 3.9), sharex=True)
+    for axes, values in zip(panels, (determinant, strength), strict=True):
+        axes.plot(difference, values, ".", color="#56B4E9", ms=4)
+        for (label, index), look in zip(named.items(), LOOKS.values(), strict=False):
+            style = {"color": look.color, "marker": look.marker, "linestyle": "none"}
+            axes.plot(difference[index], values[index], label=label, markersize=7, **style)
+        axes.set(xlabel=r"difference of the phase shifts, $\theta_b-\theta_a$ (rad)", ylim=(0, None))
+        axes.set_xticks(np.pi / 2 * np.arange(5), ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"])
+    panels[0].set_ylabel(r"$|\det M|$")
+    panels[1].set_ylabel("determinant with the waves' strength")
+    panels[1].legend(fontsize=9)
+    return figure
 
 
 def _looks(methods: Mapping | Sequence) -> list[tuple[str, Look]]:
@@ -294,12 +250,188 @@ def _short(value: float) -> str:
     return f"{value:.2g}" if value >= 1e-6 else "below $10^{-6}$"
 
 
-def _in_pi(angle: float) -> str:
-    """Angle as a multiple of pi where it is a simple one."""
-    angle = _check.number("angle", float(angle))
-    for parts in (1, 2, 3, 4, 6):
-        times = angle / np.pi * parts
-        if abs(times - round(times)) < 1e-9 and round(times):
-            top = {1: "", -1: "-"}.get(round(times), str(round(times)))
-            return f"${top}\\pi$" if parts == 1 else f"${top}\\pi/{parts}$"
-    return f"{angle:.3g}"
+def dimple_diameter(curves: Mapping[int, DiameterCurve], rms: float, threshold: float, claimed: float) -> Figure:
+    """Figure 4: mean error and its standard deviation against the diameter of the dimple, on both kinds of axis.
+
+    Parameters
+    ----------
+    curves : mapping of number of iterations to DiameterCurve
+        The first is that of the paper; the others are drawn on the logarithmic axis only.
+    rms : float, radian rms
+        Input.
+    threshold : float
+        Ratio of error to input that is marked.
+    claimed : float, lambda/D
+        Diameter at which the error rises according to the paper, marked.
+    """
+    figure, (plain, log) = plt.subplots(1, 2, figsize=(9, 4.2))
+    look, floor = LOOKS["PhaseShifted"], 1e-7
+    (number, curve), *others = curves.items()
+    for axes, bottom in ((plain, 0), (log, floor)):
+        low, high = (np.maximum(curve.mean + sign * curve.std, bottom) for sign in (-1, 1))
+        axes.plot(
+            curve.diameters, curve.mean, color=look.color, marker=look.marker, ms=4, label=f"{number} iterations"
+        )
+        axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0)
+        _diameters(axes, curve.diameters[-1], claimed)
+        axes.set_ylabel("error (rad rms)")
+    for (number, other), dashes in zip(others, ("--", ":", "-."), strict=False):
+        log.plot(other.diameters, other.mean, color="#555555", ls=dashes, lw=1.5, label=f"{number} iterations")
+    log.axhline(threshold * rms, color="#555555", lw=1)
+    log.text(0.1, threshold * rms * 1.3, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
+    plain.set_ylim(0, None)
+    log.set(yscale="log", ylim=(floor, 4))
+    log.legend(loc="upper left", bbox_to_anchor=(0, 0.72), fontsize=9)
+    return figure
+
+
+def diameter_methods(curves: Mapping[str, DiameterCurve], rms: float, threshold: float, claimed: float) -> Figure:
+    """Mean error of several methods against the diameter of the dimple; parameters as for `dimple_diameter`."""
+    figure, axes = plt.subplots(figsize=(9, 4.6))
+    floor = 1e-7
+    for name, look in _looks(curves):
+        curve = curves[name]
+        axes.semilogy(
+            curve.diameters, np.maximum(curve.mean, floor), color=look.color, marker=look.marker,
+            linestyle=look.line, ms=4.5, label=look.label,
+        )  # fmt: skip
+    axes.axhline(threshold * rms, color="#555555", lw=1)
+    axes.text(0.05, threshold * rms * 1.2, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
+    _diameters(axes, max(curve.diameters[-1] for curve in curves.values()), claimed)
+    axes.set(ylabel="mean error (rad rms)", ylim=(floor, 4))
+    figure.legend(loc="outside lower center", ncols=3, fontsize=9)
+    return figure
+
+
+def diameter_reasons(
+    diameters: NDArray,
+    flat: NDArray,
+    aberrated: NDArray,
+    measured: Mapping[float, float],
+    sensitivity: Mapping[str, NDArray],
+    claimed: float,
+) -> Figure:
+    """Factor of one iteration, and sensitivity to single modes, against the diameter of the dimple.
+
+    Parameters
+    ----------
+    diameters : ndarray, shape (n,), lambda/D
+    flat : ndarray, shape (n,)
+        Factor around a flat wavefront.
+    aberrated : ndarray, shape (n, n_screens)
+        Factor around screens.
+    measured : mapping of diameter to factor
+        Observed on the first screen.
+    sensitivity : mapping of name to ndarray, shape (n,), 1 / radian
+    claimed : float, lambda/D
+        As for `dimple_diameter`.
+    """
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2))
+    color = LOOKS["PhaseShifted"].color
+    left.plot(diameters, flat, color="#000000", lw=1.5, label="flat wavefront")
+    left.fill_between(
+        diameters,
+        aberrated.min(axis=1),
+        aberrated.max(axis=1),
+        color=color,
+        alpha=0.3,
+        lw=0,
+        label="screens, range",
+    )
+    left.plot(diameters, aberrated[:, 0], color=color, lw=1.5, label="first screen")
+    left.plot(
+        list(measured), list(measured.values()), "o", mfc="none", mec="#D55E00", label="first screen, observed"
+    )
+    left.axhline(1, color="#555555", lw=1)
+    left.text(0.05, 1.015, "diverges above, converges below", color="#555555", fontsize=9)
+    left.set(ylabel="factor of the error, one iteration", ylim=(0, 1.2))
+    left.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
+    styles = zip(("#000000", "#D55E00", "#009E73", "#CC79A7"), ("-", "--", "-.", ":"), strict=True)
+    for (name, values), (shade, dashes) in zip(sensitivity.items(), styles, strict=False):
+        right.plot(diameters, values, color=shade, ls=dashes, lw=1.8, label=name)
+    right.set(ylabel="sensitivity of the two frames (1/rad)", ylim=(0, 2.8))
+    right.legend(loc="upper right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
+    for axes in (left, right):
+        _diameters(axes, diameters[-1], claimed)
+    return figure
+
+
+def _diameters(axes: Axes, end: float, claimed: float) -> None:
+    """Axis of the diameter, with the one of the paper and that of the dark ring."""
+    axes.axvline(claimed, color="#E69F00", lw=1.2, ls="--", zorder=0.5)
+    axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
+    above = {"transform": axes.get_xaxis_transform(), "va": "bottom", "fontsize": 9}
+    axes.text(claimed, 1.005, f"paper: {claimed:g} ", ha="right", color="#A36F00", **above)
+    axes.text(DARK_RING, 1.005, " dark ring", ha="left", color="#666666", **above)
+    axes.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=(0, end))
+
+
+def pair_maps(maps: PairMaps, best: Sequence[tuple[float, float]]) -> Figure:
+    """Error, and photon noise for a flat and for an aberrated wavefront, for all pairs of phase shifts.
+
+    Parameters
+    ----------
+    maps : PairMaps
+        For evenly spaced angles.
+    best : sequence of (theta_a, theta_b), radian
+        Pair that is marked by a star on each of the two maps of noise.
+    """
+    figure, panels = plt.subplots(1, 3, figsize=(9, 4.1), sharey=True)
+    half = (maps.angles[1] - maps.angles[0]) / 2 / np.pi
+    ends = np.array([maps.angles[0], maps.angles[-1]]) / np.pi + np.array([-half, half])
+    noise = Normalize(0.5, 3)
+    for axes, image, norm, title in (
+        (panels[0], maps.error, LogNorm(1e-8, 1), "error, no noise"),
+        (panels[1], maps.flat, noise, "photon noise, flat"),
+        (panels[2], maps.aberrated, noise, "photon noise, aberrated"),
+    ):
+        axes.grid(False)
+        axes.set_facecolor("#d0d0d0")
+        axes.add_patch(Rectangle((-3, -3), 6, 6, fc="#d0d0d0", ec="#888888", hatch="//////", lw=0, zorder=0))
+        shown = axes.imshow(image, cmap="cividis_r", norm=norm, extent=(*ends, *ends), zorder=1)
+        angle = {"ticks": (-1, -0.5, 0, 0.5, 1), "labels": ("−π", "−π/2", "0", "π/2", "π")}
+        axes.set_xticks(**angle)
+        axes.set_yticks(**angle)
+        axes.set(xlim=ends, ylim=ends)
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel(r"$\theta_a$ (rad)")
+        axes.plot([-0.5, 0.5], [0.5, -0.5], "o", mfc="none", mec="#000000", mew=1.5, ms=8, zorder=3)
+        scale = r"rad rms" if axes is panels[0] else r"rad $\sqrt{\mathrm{photon}}$"
+        more = "neither" if axes is panels[0] else "max"
+        figure.colorbar(shown, ax=axes, location="bottom", label=scale, extend=more, aspect=16)
+    for axes, (theta_a, theta_b) in zip(panels[1:], best, strict=True):
+        pairs = np.array([[theta_a, theta_b], [theta_b, theta_a]]) / np.pi
+        axes.plot(*pairs.T, "*", mfc="#ffffff", mec="#000000", ms=12, zorder=4)
+    panels[0].set_ylabel(r"$\theta_b$ (rad)")
+    return figure
+
+
+def pair_noise(
+    angles: NDArray, curves: Mapping[str, NDArray], drawn: Mapping[str, Sequence[tuple[float, float, float]]]
+) -> Figure:
+    """Noise of the pairs (theta, -theta) against theta, relative to its value at pi/2.
+
+    Parameters
+    ----------
+    angles : ndarray, shape (n,), radian
+    curves : mapping of name to ndarray, shape (n,)
+        Noise over that of the pair of +-pi/2.
+    drawn : mapping of name to sequence of (theta, noise, error)
+        The same from draws of noise, with its standard error; drawn in the colour of the curve.
+    """
+    figure, axes = plt.subplots(figsize=(9, 4.2))
+    styles = zip(("#0072B2", "#D55E00", "#009E73", "#000000"), ("-", "--", "-.", ":"), strict=True)
+    for (name, values), (shade, dashes) in zip(curves.items(), styles, strict=False):
+        axes.plot(angles / np.pi, values, color=shade, ls=dashes, lw=1.8, label=name)
+        least = int(np.argmin(values))
+        axes.plot(angles[least] / np.pi, values[least], "*", color=shade, ms=12)
+        if name in drawn:
+            theta, noise, error = np.array(drawn[name]).T
+            axes.errorbar(theta / np.pi, noise, error, fmt="o", mfc="none", color=shade, ms=6, capsize=3)
+    axes.axhline(1, color="#555555", lw=1)
+    axes.axvline(0.5, color="#555555", lw=1)
+    axes.set_xticks((0, 0.25, 0.5, 0.75, 1), ("0", "π/4", "π/2", "3π/4", "π"))
+    axes.set(xlabel=r"$\theta$ of the pair $(\theta, -\theta)$ (rad)", ylabel="noise / noise at ±π/2")
+    axes.set(xlim=(0, 1), ylim=(0.6, 2))
+    axes.legend(loc="lower left", fontsize=9)
+    return figure

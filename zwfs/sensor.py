@@ -222,8 +222,8 @@ class ZernikeSensor:
                 full = np.broadcast_shapes(batch, strength_batch)
             except ValueError:
                 raise ValueError(
-                    f"amplitude has shape {np.shape(amplitude)}: expected one that broadcasts with {np.shape(phase)}, "
-                    "the shape of the phase"
+                    f"amplitude has a batch of {strength_batch}: expected one that broadcasts with {batch}, the "
+                    "batch of the phase"
                 ) from None
             phase, strength = (
                 np.broadcast_to(maps.reshape(*shape, *self.pupil.shape), (*full, *self.pupil.shape))

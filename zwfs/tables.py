@@ -41,4 +41,5 @@ class Table:
     def _text(self, cell: Any) -> str:
         if isinstance(cell, bool):
             return "yes" if cell else "no"
-        return f"{cell:.{self.digits}g}" if isinstance(cell, float) else str(cell)
+        # A bar would end the cell.
+        return f"{cell:.{self.digits}g}" if isinstance(cell, float) else str(cell).replace("|", "\\|")

@@ -186,20 +186,22 @@ def report(
     )  # fmt: skip
 
 
-def check_frames(sensor: ZernikeSensor, frames: ArrayLike) -> tuple[NDArray[np.floating], tuple[int, ...]]:
+def check_frames(
+    sensor: ZernikeSensor, frames: ArrayLike, name: str = "frames"
+) -> tuple[NDArray[np.floating], tuple[int, ...]]:
     """Checked frames, (k, n_masks, ny', nx'), and the shape of the batch."""
-    frames = _check.real_array("frames", frames)
+    frames = _check.real_array(name, frames)
     shape = (sensor.n_masks, *sensor.detector_shape)
-    _check.trailing_shape("frames", frames, shape, "masks and detector of the sensor")
+    _check.trailing_shape(name, frames, shape, "masks and detector of the sensor")
     batch, flat = frames.shape[:-3], frames.reshape(-1, *shape)
     if not len(flat):
-        raise ValueError(f"frames has shape {frames.shape}: expected at least one frame")
-    _check.finite("frames", flat)
-    _check.non_negative("frames", flat, "; after subtracting a background, raise them to 0 explicitly")
+        raise ValueError(f"{name} has shape {frames.shape}: expected at least one frame")
+    _check.finite(name, flat)
+    _check.non_negative(name, flat, "; after subtracting a background, raise them to 0 explicitly")
     dark = ~flat.any(axis=(-2, -1))
     if dark.any():
         raise ValueError(
-            f"frames: {np.count_nonzero(dark)} of {dark.size} hold no light: expected some flux in each"
+            f"{name}: {np.count_nonzero(dark)} of {dark.size} hold no light: expected some flux in each"
         )
     return flat, batch
 

@@ -13,9 +13,10 @@ from zwfs.sensor import ZernikeSensor
 class Linear:
     """Phase from the difference to the frames of a reference phase, by one matrix product.
 
-    The interaction matrix is measured on the model: each mode is pushed and pulled by a small amount around the
-    reference phase, and half the difference of the frames, inside the pupil, makes its column. Its pseudo-inverse
-    leaves out singular values below `conditioning` times the largest.
+    Each mode is pushed and pulled by a small amount around the reference phase, and half the difference of the
+    frames, inside the pupil, makes its column of the interaction matrix. The frames are those of the model, or,
+    with `calibration`, those of a bench. The pseudo-inverse leaves out singular values below `conditioning` times
+    the largest.
 
     Parameters
     ----------
@@ -31,6 +32,9 @@ class Linear:
         Phase around which the sensor is linearised; flat if left out.
     amplitude : array_like, shape (ny, nx), optional
         Measured amplitude A_in in the pupil; that of the sensor's pupil if left out.
+    calibration : (flat, pushed, pulled), optional
+        Frames recorded with the reference phase, (n_masks, ny', nx'), and with each mode pushed and pulled,
+        (n_modes, n_masks, ny', nx').
 
     Attributes
     ----------
@@ -57,13 +61,16 @@ class Linear:
         conditioning: float = 1e-3,
         reference: ArrayLike | None = None,
         amplitude: ArrayLike | None = None,
+        calibration: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
     ) -> None:
         self.settings = settings(sensor, 1, 0.0, amplitude)
         self.modes = check_modes(sensor, modes)
         poke = _check.number("poke", poke, 0, open_low=True)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
         self._reference = start_phase(sensor, reference, (), np.dtype(np.float64))
-        self.interaction_matrix = self._push_pull(poke)
+        flat, difference = self._simulated(poke) if calibration is None else self._recorded(*calibration)
+        self._reference_signal = flat
+        self.interaction_matrix = difference.T / (2 * poke)
         u, strength, vt = np.linalg.svd(self.interaction_matrix, full_matrices=False)
         # A frame of unit intensity is rounded at 1e-16, which the poke divides.
         if strength[0] <= 1e-14 * np.sqrt(len(u)) / poke:
@@ -71,7 +78,6 @@ class Linear:
         self.n_inverted = int(np.count_nonzero(strength > conditioning * strength[0]))
         kept = slice(0, self.n_inverted)
         self._inverse = (vt[kept].T / strength[kept]) @ u[:, kept].T
-        self._reference_signal = self._signal(self._model(self._reference))[0]
 
     def __call__(self, frames: ArrayLike, *, history: bool = False) -> Reconstruction:
         """Reconstruct the phase of each frame set.
@@ -106,14 +112,28 @@ class Linear:
             np.ones(n_frames, int), np.ones(n_frames, bool), np.zeros(n_frames, int), record,
         )  # fmt: skip
 
-    def _push_pull(self, poke: float) -> NDArray[np.float64]:
+    def _simulated(self, poke: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Signal of the reference phase, and push less pull of each mode, (n_modes, n_masks * n_points)."""
         pupil = self.settings.sensor.pupil
-        matrix = np.empty((self.settings.sensor.n_masks * pupil.n_points, len(self.modes)))
-        for column, mode in enumerate(self.modes):
+        difference = np.empty((len(self.modes), self.settings.sensor.n_masks * pupil.n_points))
+        for row, mode in zip(difference, self.modes, strict=True):
             push = pupil.scatter(np.stack([poke * mode, -poke * mode]), fill=0)
-            plus, minus = self._signal(self._model(self._reference + push))
-            matrix[:, column] = (plus - minus) / (2 * poke)
-        return matrix
+            np.subtract(*self._signal(self._model(self._reference + push)), out=row)
+        return self._signal(self._model(self._reference))[0], difference
+
+    def _recorded(
+        self, flat: ArrayLike, pushed: ArrayLike, pulled: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The same from frames of a bench."""
+        signals = []
+        for name, frames, n_frames in (("flat", flat, 1), ("pushed", pushed, None), ("pulled", pulled, None)):
+            checked, batch = check_frames(self.settings.sensor, frames, f"calibration {name}")
+            if len(checked) != (n_frames or len(self.modes)):
+                raise ValueError(
+                    f"calibration {name} has a batch of {batch}: expected {n_frames or len(self.modes)}"
+                )
+            signals.append(self._signal(checked.astype(np.float64)))
+        return signals[0][0], signals[1] - signals[2]
 
     def _model(self, phase: NDArray) -> NDArray:
         return self.settings.sensor.intensity(phase, self.settings.amplitude[np.newaxis])

@@ -1,0 +1,626 @@
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from zwfs import (
+    Arcsine,
+    Dimple,
+    GradientDescent,
+    PhaseShifted,
+    Pupil,
+    ZernikeSensor,
+    power_law_screens,
+    zernike_basis,
+)
+from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
+from zwfs.bench_trials import find_pistons
+
+N = 68  # half the camera: 11 pixels of margin
+EXTENT = 180 / 136
+MARGIN = 11
+LAYOUT = Pupil.hexagonal(N, 3, 0.02, (21,), 0.8)
+
+
+def ideal(**changes):
+    return Bench.ideal(n_pixels=N, **changes)
+
+
+def design(bench, diameter=1.06):
+    """Sensor of an ideal bench, made without it."""
+    pupil = Pupil.from_segments(LAYOUT.segments, np.sqrt(1 + bench.illumination * LAYOUT.x))
+    return ZernikeSensor(pupil, Dimple(diameter, np.pi / 2), Dimple(diameter, -np.pi / 2), extent=EXTENT)
+
+
+def inner(images):
+    return images[..., MARGIN:-MARGIN, MARGIN:-MARGIN]
+
+
+def phase_of(bench):
+    """Phase that a bench adds to the flat command, as a perfect sensor would see it: NaN outside."""
+    return PhaseShifted(design(bench), n_iterations=50, tolerance=1e-10)(bench.frames()).phase
+
+
+@pytest.fixture(scope="module")
+def perfect():
+    return ideal()
+
+
+@pytest.fixture(scope="module")
+def model(perfect):
+    return BenchModel.from_images(perfect)
+
+
+@pytest.fixture(scope="module")
+def commands(perfect):
+    """Two random commands of 0.5 rad rms."""
+    return segment_screens(perfect, 0.5, 2, seed=1)
+
+
+# Layout
+
+
+def test_layout_is_36_segments_six_across_with_one_missing_at_the_top_right():
+    bench = Bench.ideal()
+    assert bench.n_segments == 36
+    np.testing.assert_array_equal(bench.numbers, np.setdiff1d(np.arange(1, 38), [21]))
+    rows, columns = np.nonzero(Pupil.hexagonal(136, 3, 0.02, (), 0.8).segments == 21)
+    assert columns.min() > 80  # +x
+    assert rows.min() > 80  # +y, at the top as the figures show it
+    assert not bench.segments[rows, columns].any()
+    centres = {k: np.mean(np.nonzero(bench.segments == k), axis=1) for k in range(1, 8)}
+    pitches = [np.hypot(*(centres[k] - centres[1])) for k in range(2, 8)]
+    np.testing.assert_allclose(pitches, np.mean(pitches), rtol=0.01)
+    assert 5.5 < 136 / np.mean(pitches) < 6.5
+
+
+def test_camera_sees_a_margin_around_the_pupil(perfect):
+    assert Bench.ideal().frames().shape == (2, 180, 180)
+    for images in (perfect.frames(), perfect.pupil_images(), perfect.dark()):
+        assert images.shape == (2, N + 2 * MARGIN, N + 2 * MARGIN)
+    assert perfect.segments.shape == (N, N)
+
+
+def test_errors_are_named_and_0_on_an_ideal_bench(perfect):
+    names = Bench.errors()
+    assert names == (
+        "leakage", "focus_difference", "misregistration", "flux_imbalance", "dimple_error", "static", "quilting",
+    )  # fmt: skip
+    assert all(getattr(perfect, name) == 0 for name in (*names, "photons", "read_noise", "background"))
+    assert all(getattr(Bench(n_pixels=N), name) > 0 for name in names)
+    assert ideal(leakage=0.1).leakage == 0.1
+
+
+# Without errors
+
+
+@pytest.mark.parametrize("illumination", [0, 0.5, 1.2])
+def test_ideal_bench_is_the_sensor(illumination, commands):
+    bench = ideal(illumination=illumination)
+    sensor = design(bench)
+    expected = sensor.measure(bench.commanded_phase(commands))
+    np.testing.assert_allclose(bench.frames(commands), expected, rtol=0, atol=1e-10)
+    flat = sensor.measure(np.zeros(LAYOUT.shape))
+    np.testing.assert_allclose(bench.frames(), flat, rtol=0, atol=1e-10)
+    lit = np.pad(sensor.pupil.amplitude**2, MARGIN)
+    np.testing.assert_allclose(bench.pupil_images(), [lit, lit], rtol=0, atol=1e-14)
+    assert not bench.dark().any()
+
+
+@pytest.mark.parametrize("extent", [1, EXTENT, 2.5])
+def test_frames_do_not_depend_on_the_width_of_the_camera(perfect, extent, commands):
+    frames = ideal(extent=extent).frames(commands)
+    margin = (frames.shape[-1] - N) // 2
+    assert margin == round((extent - 1) * N / 2)
+    centre = frames[..., margin : margin + N, margin : margin + N]
+    np.testing.assert_allclose(centre, inner(perfect.frames(commands)), rtol=0, atol=1e-9)
+
+
+def test_reconstructors_find_the_commands_on_an_ideal_bench(perfect, model, commands):
+    frames = model.normalise(perfect.frames(commands))
+    exact = PhaseShifted(model.shifted, tolerance=1e-9), GradientDescent(model.shifted, model.modes)
+    for reconstruct, tolerance in zip(exact, (1e-5, 1e-4), strict=True):
+        found = find_pistons(reconstruct, model, frames)
+        np.testing.assert_allclose(segment_residual(found, commands), 0, atol=tolerance)
+    small = 0.1 * commands
+    found = find_pistons(Arcsine(model.classic), model, model.normalise(perfect.frames(small)))
+    np.testing.assert_allclose(segment_residual(found, small), 0, atol=1e-5)
+
+
+# Each error alone
+
+
+@pytest.mark.parametrize("leakage", [0.03, 0.2, 0.5])
+def test_leakage_mixes_the_images_by_that_fraction(perfect, commands, leakage):
+    bench = ideal(leakage=leakage)
+    plus, minus = np.moveaxis(perfect.frames(commands), 1, 0)
+    mixed = np.stack([(1 - leakage) * plus + leakage * minus, (1 - leakage) * minus + leakage * plus], axis=1)
+    np.testing.assert_allclose(bench.frames(commands), mixed, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(bench.pupil_images(), perfect.pupil_images(), rtol=0, atol=1e-13)
+    assert np.abs(plus - minus).max() > 0.5
+
+
+@pytest.mark.parametrize("leakage", [0.03, 0.1])
+def test_leakage_makes_the_phase_too_small(perfect, model, commands, leakage):
+    # What is left of the difference of the images, which is the sine of the phase, is 1 - 2 leakage.
+    small = 0.05 * commands
+    found = find_pistons(PhaseShifted(model.shifted), model, ideal(leakage=leakage).frames(small))
+    gain = np.sum((small + segment_residual(found, small)) * small) / np.sum(small**2)
+    assert gain == pytest.approx(1 - 2 * leakage, abs=0.005)
+
+
+@pytest.mark.parametrize("imbalance", [-0.3, 0.05])
+def test_flux_imbalance_shows_in_the_pupil_images_and_drops_out(perfect, commands, imbalance):
+    bench = ideal(flux_imbalance=imbalance)
+    share = np.array([1 + imbalance, 1 - imbalance])[:, np.newaxis, np.newaxis]
+    np.testing.assert_allclose(bench.pupil_images(), share * perfect.pupil_images(), rtol=1e-13)
+    np.testing.assert_allclose(bench.frames(commands), share * perfect.frames(commands), rtol=1e-13)
+    scaled = BenchModel.from_images(bench).normalise(bench.frames(commands))
+    np.testing.assert_allclose(scaled, perfect.frames(commands), rtol=1e-12)
+
+
+@pytest.mark.parametrize("distance", [0.2, 1.3, 3.0])
+def test_misregistration_moves_the_images_apart(perfect, distance):
+    def centroids(images):
+        rows, columns = np.mgrid[: images.shape[-2], : images.shape[-1]]
+        return np.stack([(images * grid).sum(axis=(1, 2)) / images.sum(axis=(1, 2)) for grid in (rows, columns)])
+
+    images = ideal(misregistration=distance).pupil_images()
+    moved = centroids(images) - centroids(perfect.pupil_images())
+    np.testing.assert_allclose(moved, np.array([[0.5, -0.5]] * 2) * distance, atol=0.02)
+    np.testing.assert_allclose(images.sum(axis=(1, 2)), perfect.pupil_images().sum(axis=(1, 2)), rtol=2e-3)
+
+
+def test_misregistration_moves_frames_as_it_moves_pupil_images(perfect, commands):
+    frames, moved = perfect.frames(commands), ideal(misregistration=2).frames(commands)
+    for arm, step in enumerate((1, -1)):
+        expected = np.roll(frames[:, arm], (step, step), axis=(-2, -1))
+        np.testing.assert_allclose(inner(moved[:, arm]), inner(expected), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("distance", [0.2, 1])
+def test_misregistration_does_not_blur(distance):
+    # A shift leaves the modulus of the spectrum alone: here at the quilting, 22 / D along either axis.
+    bench = {"n_rings": 0, "missing": (), "illumination": 0, "quilting": 0.3}
+    still, moved = (np.abs(np.fft.fft2(ideal(misregistration=d, **bench).frames())) for d in (0, distance))
+    frequency = np.abs(np.fft.fftfreq(still.shape[-1], 1 / N))
+    line = np.argmin(np.abs(frequency - 22))
+    for row, column in ((0, line), (line, 0)):
+        np.testing.assert_allclose(moved[:, row, column], still[:, row, column], rtol=0.05)
+
+
+def fresnel(field, distance, n_wide):
+    """Angular spectrum by plain matrices, on a plane n_wide pixels wide."""
+    pad = (n_wide - len(field)) // 2
+    axis = np.arange(n_wide) / N
+    frequency = (np.arange(n_wide) - n_wide // 2) * N / n_wide
+    fourier = np.exp(-2j * np.pi * np.outer(frequency, axis))
+    one = np.exp(-1j * np.pi * distance * frequency**2)
+    operator = fourier.conj().T @ (one[:, np.newaxis] * fourier) / n_wide
+    wide = operator @ np.pad(field, pad) @ operator.T
+    return wide[pad : pad + len(field), pad : pad + len(field)]
+
+
+@pytest.mark.parametrize("distance", [1e-4, 2e-3])
+def test_focus_difference_is_free_space_to_either_side(perfect, commands, distance):
+    bench = ideal(focus_difference=distance)
+    sensor = design(bench)
+    wide = ZernikeSensor(sensor.pupil, *sensor.masks, extent=2)
+    waves = wide.propagate(sensor.pupil.amplitude * np.exp(1j * bench.commanded_phase(commands[0])))
+    expected = np.stack(
+        [np.abs(fresnel(w, s * distance / 2, 2 * N)) ** 2 for w, s in zip(waves, (1, -1), strict=True)]
+    )
+    cut = N // 2 - MARGIN
+    # The sensor's tolerance is all that differs.
+    np.testing.assert_allclose(bench.frames(commands[0]), expected[:, cut:-cut, cut:-cut], rtol=0, atol=1e-9)
+    unlike = np.abs(bench.frames(commands[0]) - perfect.frames(commands[0])).max()
+    assert unlike > 50 * distance
+
+
+@pytest.mark.parametrize("distance", [3e-4, 1e-3])
+def test_focus_difference_turns_a_phase_grating_into_opposite_contrasts(distance):
+    # Talbot: exp(i q cos(2 pi f x)) becomes 1 + 2 q sin(pi z f^2) cos(2 pi f x) in intensity, for a small q.
+    q, f = 0.01, 22
+    open_pupil = {"n_rings": 0, "missing": (), "illumination": 0, "focus_difference": distance}
+    graved, plain = (ideal(**open_pupil, quilting=value).pupil_images() for value in (q, 0))
+    x, y = np.meshgrid(LAYOUT.x, LAYOUT.x)
+    centre = np.hypot(x, y) < 0.25
+    waves = np.stack([np.cos(2 * np.pi * f * x), np.cos(2 * np.pi * f * y), np.ones_like(x)])[:, centre]
+    for arm, sign in enumerate((1, -1)):
+        found = np.linalg.lstsq(waves.T, inner(graved - plain)[arm][centre])[0]
+        expected = 2 * q * np.sin(sign * np.pi * distance / 2 * f**2)
+        np.testing.assert_allclose(found[:2], expected, rtol=0.05)
+
+
+@pytest.mark.parametrize("distance", [1e-4, 1e-2])
+def test_focus_difference_loses_no_light(distance):
+    images = ideal(extent=4, focus_difference=distance).pupil_images()
+    np.testing.assert_allclose(images.sum(axis=(1, 2)), np.count_nonzero(LAYOUT.mask), rtol=1e-10)
+    # Nor does it come back from the other side on the narrower plane.
+    narrow = ideal(focus_difference=distance).pupil_images()
+    cut = 3 * N // 2 - MARGIN
+    np.testing.assert_allclose(
+        narrow, images[:, cut:-cut, cut:-cut], rtol=0, atol=2e-2 if distance > 1e-3 else 1e-3
+    )
+
+
+def test_a_flat_wavefront_looks_the_same_on_either_side_of_focus(perfect):
+    one, other = ideal(focus_difference=1e-3).pupil_images()
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-13)
+    assert np.abs(one - perfect.pupil_images()[0]).max() > 0.1
+
+
+def test_dimple_error_changes_the_dimple_only(perfect, commands):
+    bench = ideal(dimple_error=0.25)
+    np.testing.assert_array_equal(bench.pupil_images(), perfect.pupil_images())
+    expected = design(bench, 1.06 * 1.25).measure(bench.commanded_phase(commands))
+    np.testing.assert_allclose(bench.frames(commands), expected, rtol=0, atol=1e-10)
+    assert np.abs(expected - perfect.frames(commands)).max() > 0.05
+
+
+def test_static_aberration_is_smooth_and_has_its_rms(perfect):
+    bench = ideal(static=0.3)
+    np.testing.assert_allclose(bench.pupil_images(), perfect.pupil_images(), rtol=0, atol=1e-14)
+    phase = phase_of(bench)
+    assert LAYOUT.rms(phase) == pytest.approx(0.3, abs=1e-6)
+    low = zernike_basis(LAYOUT, 27)[:, LAYOUT.mask]
+    values = phase[LAYOUT.mask] - phase[LAYOUT.mask].mean()
+    rest = values - low.T @ np.linalg.lstsq(low.T, values)[0]
+    assert rest.std() < 1e-5
+    # It belongs to the bench: half of it has the same shape, another seed another one.
+    half, other = phase_of(ideal(static=0.15))[LAYOUT.mask], phase_of(ideal(static=0.3, seed=1))[LAYOUT.mask]
+    np.testing.assert_allclose(2 * (half - half.mean()), values, atol=1e-5)
+    assert abs(np.corrcoef(other, values)[0, 1]) < 0.9
+
+
+def test_quilting_has_its_rms_and_22_periods(perfect):
+    bench = ideal(quilting=0.06)
+    np.testing.assert_allclose(bench.pupil_images(), perfect.pupil_images(), rtol=0, atol=1e-14)
+    values = phase_of(bench)[LAYOUT.mask]
+    assert values.std() == pytest.approx(0.06, rel=0.03)
+    x, y = LAYOUT.points.T
+    grid = np.cos(2 * np.pi * 22 * x) + np.cos(2 * np.pi * 22 * y)
+    assert np.corrcoef(values, grid)[0, 1] > 0.99999
+
+
+def test_static_and_quilting_add_to_the_commands(commands):
+    bench = ideal(static=0.2, quilting=0.06)
+    flat, phase = (
+        PhaseShifted(design(bench), n_iterations=60, tolerance=1e-10)(bench.frames(pistons)).phase[LAYOUT.mask]
+        for pistons in (None, commands[0])
+    )
+    excess = np.exp(1j * (phase - flat - bench.commanded_phase(commands[0])[LAYOUT.mask]))
+    assert abs(excess.mean()) == pytest.approx(1, abs=1e-9)
+
+
+@pytest.mark.parametrize("illumination", [0.5, 1.5])
+def test_illumination_shows_in_the_pupil_images(illumination):
+    left, right = ideal(illumination=illumination).pupil_images()
+    np.testing.assert_array_equal(left, right)
+    values = inner(left)[LAYOUT.mask]
+    slope, mean = np.polyfit(LAYOUT.points[:, 0], values, 1)
+    assert slope / mean == pytest.approx(illumination)
+    assert values.mean() == pytest.approx(1)
+
+
+# Noise
+
+
+def test_counts_scatter_as_those_of_a_camera(perfect):
+    photons, read_noise, background = 1e6, 20.0, 300.0
+    bench = ideal(photons=photons, read_noise=read_noise, background=background, flux_imbalance=0.2)
+    share = np.array([1.2, 0.8])[:, np.newaxis, np.newaxis]
+    expected = perfect.frames() * share * photons / LAYOUT.n_points + background
+    frames = bench.frames(np.zeros((200, 36)), seed=3)
+    score = (frames.mean(axis=0) - expected) / np.sqrt((expected + read_noise**2) / 200)
+    assert np.abs(score).max() < 5.5
+    assert score.std() == pytest.approx(1, abs=0.05)
+    assert np.mean(frames.var(axis=0, ddof=1) / (expected + read_noise**2)) == pytest.approx(1, abs=0.01)
+    dark = bench.dark(4)
+    assert dark.mean() == pytest.approx(background, abs=5 * np.sqrt((background + read_noise**2) / dark.size))
+    assert dark.var() == pytest.approx(background + read_noise**2, rel=0.05)
+
+
+def test_a_frame_holds_the_photons_that_it_should():
+    bench = ideal(photons=1e9, flux_imbalance=0.1)
+    np.testing.assert_allclose(bench.pupil_images(1).sum(axis=(1, 2)), [1.1e9, 0.9e9], rtol=3e-4)
+
+
+@pytest.mark.parametrize("shoot", [Bench.frames, Bench.pupil_images, Bench.dark])
+def test_noise_follows_the_seed(shoot):
+    bench = Bench(n_pixels=N)
+    before = np.random.get_state()[1].copy()
+    first = shoot(bench, seed=5)
+    np.testing.assert_array_equal(shoot(bench, seed=5), first)
+    np.testing.assert_array_equal(shoot(bench, seed=np.random.SeedSequence(5)), first)
+    assert np.mean(shoot(bench, seed=6) != first) > 0.9
+    assert np.mean(shoot(bench) != first) > 0.9
+    rng = np.random.default_rng(5)
+    np.testing.assert_array_equal(shoot(bench, seed=rng), first)
+    assert np.mean(shoot(bench, seed=rng) != first) > 0.9
+    np.testing.assert_array_equal(np.random.get_state()[1], before)
+
+
+# Commands
+
+
+def test_commands_by_array_and_by_number(perfect):
+    pistons = np.zeros(36)
+    pistons[[4, 20]] = 0.3, -0.2  # numbers 5 and 22: 21 is missing
+    phase = perfect.commanded_phase(pistons)
+    expected = 0.3 * (LAYOUT.segments == 5) - 0.2 * (LAYOUT.segments == 22)
+    np.testing.assert_array_equal(phase, expected)
+    np.testing.assert_array_equal(perfect.commanded_phase({22: -0.2, 5: 0.3}), expected)
+    np.testing.assert_array_equal(perfect.frames({5: 0.3, 22: -0.2}), perfect.frames(pistons))
+    np.testing.assert_array_equal(perfect.frames({}), perfect.frames())
+
+
+def test_commands_in_batches_of_any_depth(perfect):
+    pistons = np.random.default_rng(0).normal(size=(2, 3, 36))
+    frames = perfect.frames(pistons)
+    assert frames.shape == (2, 3, 2, N + 2 * MARGIN, N + 2 * MARGIN)
+    np.testing.assert_allclose(frames[1, 2], perfect.frames(pistons[1, 2]), atol=1e-13)
+    phase = perfect.commanded_phase(pistons)
+    for index, number in enumerate(perfect.numbers):
+        assert (phase[..., LAYOUT.segments == number] == pistons[..., index, np.newaxis]).all()
+    assert not phase[..., LAYOUT.segments == 0].any()
+
+
+# What the bench hands out
+
+
+def test_bench_keeps_its_aberrations_to_itself():
+    one, other = (
+        Bench(n_pixels=N, static=value, quilting=value, seed=seed) for value, seed in ((0.1, 1), (0.5, 2))
+    )
+    own = {"static", "quilting", "seed"}
+    names = [name for name in dir(one) if not name.startswith("_") and name not in own]
+    assert {"segments", "numbers", "n_pixels"} <= set(names)
+    shown = [name for name in names if not callable(getattr(one, name))]
+    for name in shown:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), name)
+    np.testing.assert_array_equal(one.commanded_phase({3: 1.0}), other.commanded_phase({3: 1.0}))
+
+
+def test_model_knows_no_more_than_the_images_show(perfect, model):
+    hidden = ideal(leakage=0.1, dimple_error=0.3, static=0.4, quilting=0.2, seed=7)
+    blind = BenchModel.from_images(hidden)
+    np.testing.assert_allclose(blind.shifted.pupil.amplitude, model.shifted.pupil.amplitude, atol=1e-12)
+    np.testing.assert_allclose(blind.scale, model.scale)
+    for sensor, masks in ((blind.shifted, 2), (blind.classic, 1)):
+        assert [mask.diameter for mask in sensor.masks] == [1.06] * masks
+        assert [mask.phase for mask in sensor.masks] == [np.pi / 2, -np.pi / 2][:masks]
+    assert not any(isinstance(value, Bench) for value in vars(blind).values())
+
+
+def test_model_has_the_layout_and_amplitude_of_an_ideal_bench(perfect, model):
+    truth = design(perfect).pupil.amplitude
+    np.testing.assert_allclose(model.shifted.pupil.amplitude, truth, atol=1e-12)
+    np.testing.assert_array_equal(model.segments, LAYOUT.segments)
+    np.testing.assert_array_equal(model.modes.argmax(axis=0)[LAYOUT.mask], model.segments[LAYOUT.mask] - 1
+                                  - (model.segments[LAYOUT.mask] > 21))  # fmt: skip
+    np.testing.assert_array_equal(model.modes.sum(axis=0), LAYOUT.mask)
+
+
+def test_model_amplitude_is_close_to_the_truth_on_the_bench_as_it_is():
+    bench = Bench()
+    layout = Pupil.hexagonal(136, 3, 0.02, (21,), 0.8)
+    truth = Pupil.from_segments(layout.segments, np.sqrt(1 + 0.5 * layout.x)).amplitude
+    found = BenchModel.from_images(bench, seed=1).shifted.pupil
+    assert found.mask[layout.mask].mean() > 0.999
+    missing = Pupil.hexagonal(136, 3, 0.02, (), 0.8).segments == 21
+    assert found.mask[missing].mean() < 0.35  # its edges catch some light
+    ratio = (found.amplitude / truth.clip(0.1))[layout.mask]
+    assert ratio.std() / ratio.mean() < 0.1
+    # Away from gaps and edges, where diffraction is at home, it is much closer.
+    deep = ndimage.binary_erosion(layout.mask, iterations=4)[layout.mask]
+    assert ratio[deep].std() / ratio[deep].mean() < 0.04
+    assert not found.mask[np.hypot(layout.x, layout.y[:, np.newaxis]) > 0.5].any()
+
+
+def test_model_follows_the_seed():
+    bench = Bench(n_pixels=N)
+    one, again, other = (BenchModel.from_images(bench, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.shifted.pupil.amplitude, again.shifted.pupil.amplitude)
+    np.testing.assert_array_equal(one.dark, again.dark)
+    assert np.mean(one.dark != other.dark) > 0.9
+
+
+def test_normalised_counts_are_1_on_average_in_the_pupil():
+    bench = ideal(photons=1e9, read_noise=30, background=5000, flux_imbalance=0.2)
+    found = BenchModel.from_images(bench, 1)
+    off = found.normalise(bench.pupil_images(2))
+    np.testing.assert_allclose(inner(off)[:, LAYOUT.mask].mean(axis=1), 1, atol=1e-3)
+    assert off.min() == 0  # noise around 0 is raised, not left negative
+    np.testing.assert_array_equal(found.normalise(found.dark - 1), 0)
+    frames = bench.frames(np.zeros((3, 36)), 2)
+    np.testing.assert_array_equal(found.normalise(frames)[1], found.normalise(frames[1]))
+
+
+# Pistons
+
+
+def test_pistons_are_circular_means_over_finite_points(model):
+    rng = np.random.default_rng(2)
+    truth = rng.uniform(-np.pi, np.pi, (2, 36))
+    phase = np.einsum("bk,kyx->byx", truth, model.modes)
+    noisy = phase + np.where(rng.uniform(size=phase.shape) < 0.5, 0.8, -0.8)
+    wrapped = np.angle(np.exp(1j * noisy))
+    found = model.pistons(wrapped)
+    for batch in range(2):
+        for index, number in enumerate(model.numbers):
+            values = wrapped[batch][model.segments == number]
+            expected = np.arctan2(np.sin(values).sum(), np.cos(values).sum())
+            assert found[batch, index] == pytest.approx(expected, abs=1e-12)
+    np.testing.assert_allclose(np.cos(found - truth), 1, atol=0.2)
+    holes = np.where(rng.uniform(size=phase.shape) < 0.3, np.nan, phase)
+    holes[:, model.segments == 0] = np.nan
+    np.testing.assert_allclose(model.pistons(holes), truth, atol=1e-12)
+    np.testing.assert_allclose(np.exp(1j * model.pistons(phase + 40)), np.exp(1j * (truth + 40)), atol=1e-10)
+
+
+def test_segment_residual_is_blind_to_piston_and_turns():
+    rng = np.random.default_rng(3)
+    commanded, error = rng.normal(size=(2, 4, 36))
+    error *= 0.2
+    turns = 2 * np.pi * rng.integers(-2, 3, error.shape)
+    found = segment_residual(commanded + error + turns + 1.7, commanded)
+    np.testing.assert_allclose(np.exp(1j * (found - error)) / np.exp(1j * (found - error))[:, :1], 1, atol=1e-12)
+    np.testing.assert_allclose(np.angle(np.exp(1j * found).mean(axis=1)), 0, atol=1e-12)
+    single = np.zeros(36)
+    single[3] = 3.0
+    assert segment_residual(single, np.zeros(36))[3] == pytest.approx(3.0, abs=0.1)
+    np.testing.assert_allclose(segment_residual(commanded, commanded[0]).shape, (4, 36))
+
+
+def test_segment_screens_are_averaged_power_law_screens(perfect):
+    screens = segment_screens(perfect, 0.8, 6, seed=4)
+    assert screens.shape == (6, 36)
+    np.testing.assert_allclose(screens.std(axis=1), 0.8, rtol=1e-12)
+    np.testing.assert_allclose(screens.mean(axis=1), 0, atol=1e-12)
+    np.testing.assert_array_equal(segment_screens(perfect, 0.8, 6, seed=4), screens)
+    np.testing.assert_allclose(segment_screens(perfect, 0.8, 2, seed=4), screens[:2], atol=1e-12)
+    np.testing.assert_allclose(segment_screens(perfect, 0.4, 6, seed=4), screens / 2, atol=1e-12)
+    assert np.abs(segment_screens(perfect, 0.8, 6, seed=5) - screens).max() > 0.1
+    # The errors of a bench do not change what it is commanded.
+    np.testing.assert_array_equal(segment_screens(Bench(n_pixels=N, seed=3), 0.8, 6, seed=4), screens)
+    maps = power_law_screens(zernike_basis(Pupil.circular(N), 200), 1.0, 6, seed=4)
+    means = np.stack([maps[:, LAYOUT.segments == k].mean(axis=1) for k in perfect.numbers], axis=1)
+    for mean, screen in zip(means, screens, strict=True):
+        assert np.corrcoef(mean, screen)[0, 1] == pytest.approx(1, abs=1e-12)
+    assert not segment_screens(perfect, 0, 1, seed=4).any()
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"leakage": -0.1}, ValueError, r"leakage = -0\.1: expected .*\[0, 0\.5\]"),
+        ({"leakage": 0.6}, ValueError, r"leakage = 0\.6: expected .*\[0, 0\.5\]"),
+        ({"leakage": np.nan}, ValueError, "leakage = nan: expected a finite number"),
+        ({"leakage": "3 %"}, TypeError, "leakage = '3 %': expected a real number"),
+        ({"flux_imbalance": -1.5}, ValueError, r"flux_imbalance = -1\.5: expected .*\(-1, 1\)"),
+        ({"flux_imbalance": 1}, ValueError, r"flux_imbalance = 1: expected .*\(-1, 1\)"),
+        ({"photons": -1}, ValueError, r"photons = -1: expected .*\[0, inf"),
+        (
+            {"photons": 0},
+            ValueError,
+            "photons = 0 with read_noise = 30 and background = 5000: expected 0 for both",
+        ),
+        ({"photons": np.inf}, ValueError, "photons = inf: expected a finite number"),
+        ({"read_noise": -1}, ValueError, "read_noise = -1"),
+        ({"background": -1}, ValueError, "background = -1"),
+        ({"static": -0.1}, ValueError, r"static = -0\.1"),
+        ({"quilting": "a"}, TypeError, "quilting = 'a': expected a real number"),
+        ({"focus_difference": -1e-4}, ValueError, r"focus_difference = -0\.0001: expected .*\[0, 0\.01\]"),
+        ({"focus_difference": 1}, ValueError, "focus_difference = 1"),
+        ({"misregistration": -1}, ValueError, r"misregistration = -1: expected .*\[0, 10\]"),
+        ({"dimple_error": -1}, ValueError, r"dimple_error = -1: expected .*\[-0\.9, 10\]"),
+        ({"illumination": 2}, ValueError, r"illumination = 2: expected .*\[0, 2\)"),
+        ({"n_pixels": 10.5}, TypeError, r"n_pixels = 10\.5: expected an integer"),
+        ({"n_rings": -1}, ValueError, "n_rings = -1"),
+        ({"gap": 0.5}, ValueError, r"gap = 0\.5"),
+        ({"stop": 0}, ValueError, r"stop = 0: expected .*\(0, 1\]"),
+        ({"missing": (38,)}, ValueError, r"missing = \[38\]: .* from 1 to 37"),
+        ({"missing": 21}, TypeError, r"missing = 21: expected segment numbers, such as \(21,\)"),
+        ({"phase": np.nan}, ValueError, "phase = nan"),
+        ({"seed": -1}, ValueError, "seed = -1: expected at least 0"),
+        ({"seed": 1.5}, TypeError, r"seed = 1\.5: expected an integer"),
+        ({"diameter": -1}, ValueError, r"diameter = -1: expected"),
+        ({"diameter": "a"}, TypeError, "diameter = 'a': expected a real number"),
+        ({"extent": 0.5}, ValueError, r"extent = 0\.5: expected .*\[1, inf"),
+        ({"extent": np.nan}, ValueError, "extent = nan: expected a finite number"),
+        ({"extent": "a"}, TypeError, "extent = 'a': expected a real number"),
+    ],
+)
+def test_bad_parameters_are_named(changes, error, message):
+    with pytest.raises(error, match=message):
+        Bench(**{"n_pixels": N, **changes})
+
+
+@pytest.mark.parametrize(
+    ("pistons", "error", "message"),
+    [
+        (np.zeros(37), ValueError, r"pistons has shape \(37,\): expected \(\.\.\., 36\), a command for each"),
+        (np.zeros((2, 35)), ValueError, r"pistons has shape \(2, 35\): expected \(\.\.\., 36\)"),
+        (0.0, ValueError, r"pistons has shape \(\): expected \(\.\.\., 36\)"),
+        (np.full(36, np.nan), ValueError, "pistons holds 36 NaN or infinite values: expected finite numbers"),
+        (np.full(36, np.inf), ValueError, "pistons holds 36"),
+        (np.zeros(36, complex), TypeError, "pistons is complex"),
+        (["a"] * 36, TypeError, "pistons has dtype"),
+        (np.zeros((0, 36)), ValueError, r"pistons has shape \(0, 36\): expected at least one"),
+        ({21: 0.1}, ValueError, r"pistons names segment 21, which is missing: expected some of \[1, 2, .* 37\]"),
+        ({38: 0.1}, ValueError, "pistons names segment 38"),
+        ({"a": 0.1}, ValueError, "pistons names segment 'a'"),
+        ({(1, 2): 0.1}, ValueError, r"pistons names segment \(1, 2\)"),
+        ({5: np.nan}, ValueError, r"pistons\[5\] = nan: expected a finite number"),
+        ({5: "x"}, TypeError, r"pistons\[5\] = 'x': expected a real number"),
+    ],
+)  # fmt: skip
+def test_bad_commands_are_named(perfect, pistons, error, message):
+    with pytest.raises(error, match=message):
+        perfect.frames(pistons)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda m, b: m.normalise(np.zeros((2, N, N))), ValueError, r"counts has shape \(2, 68, 68\): .*, 90, 90"),
+        (lambda m, b: m.normalise(np.full((2, 90, 90), np.nan)), ValueError, "counts holds 16200 NaN"),
+        (lambda m, b: m.pistons(np.zeros((5, 5))), ValueError, r"phase has shape \(5, 5\): expected .*68, 68"),
+        (lambda m, b: m.pistons(np.full((N, N), np.nan)), ValueError, "phase is NaN all over a segment"),
+        (lambda m, b: m.pistons(np.zeros((N, N), complex)), TypeError, "phase is complex"),
+        (lambda m, b: segment_residual([np.nan], [0.0]), ValueError, "found holds 1 NaN"),
+        (lambda m, b: segment_residual([0.0], [np.inf]), ValueError, "commanded holds 1 NaN"),
+        (lambda m, b: segment_residual([0.0, 1], [0.0, 1, 2]), ValueError, "found and commanded have shapes"),
+        (lambda m, b: segment_screens(b, -1, 2), ValueError, r"rms = -1: expected .*\[0, inf"),
+        (lambda m, b: segment_screens(b, 1, 0), ValueError, "n_screens = 0: expected at least 1"),
+        (lambda m, b: segment_screens(b, 1, 1, np.nan), ValueError, "exponent = nan"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_named(perfect, model, call, error, message):
+    with pytest.raises(error, match=message):
+        call(model, perfect)
+
+
+# The pupil of a bench
+
+
+def test_pupil_from_segments():
+    segments = np.array([[0, 1, 1], [2, 2, 0], [0, 3, 3]])
+    amplitude = np.array([[9, 1, 2], [3, 4, -9], [9, 5, 6.0]])
+    pupil = Pupil.from_segments(segments, amplitude)
+    np.testing.assert_array_equal(pupil.segments, segments)
+    np.testing.assert_array_equal(pupil.mask, segments > 0)
+    inside = pupil.amplitude[pupil.mask]
+    np.testing.assert_allclose(inside / inside[0], [1, 2, 3, 4, 5, 6])
+    assert np.mean(inside**2) == pytest.approx(1)
+    assert pupil.n_pixels == 3
+    segments[0, 1] = 0  # the pupil keeps its own copy
+    assert pupil.segments[0, 1] == 1
+
+
+def test_pupil_from_the_segments_of_another_is_that_pupil():
+    again = Pupil.from_segments(LAYOUT.segments)
+    np.testing.assert_array_equal(again.amplitude, LAYOUT.amplitude)
+    assert (again.n_pixels, again.center) == (LAYOUT.n_pixels, LAYOUT.center)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: Pupil.from_segments(np.ones((3, 3))), TypeError, "segments is .*float64: expected a map of int"),
+        (lambda: Pupil.from_segments(np.ones(3, int)), (TypeError, ValueError), "segments is 1-dimensional"),
+        (lambda: Pupil.from_segments(np.zeros((3, 3), int)), ValueError, "pupil is empty"),
+        (lambda: Pupil.from_segments(np.eye(3, dtype=int), 0.0), ValueError, "amplitude reaches down to 0"),
+        (lambda: Pupil.from_segments(np.eye(3, dtype=int), -np.ones((3, 3))), ValueError, "reaches down to -1"),
+        (lambda: Pupil.from_segments(np.eye(3, dtype=int), np.nan), ValueError, "amplitude holds"),
+        (lambda: Pupil.from_segments(np.eye(3, dtype=int), 1j), TypeError, "amplitude is complex"),
+        (lambda: Pupil.from_segments(np.eye(3, dtype=int), np.ones(2)), ValueError, r"amplitude has shape \(2,\)"),
+        (lambda: Pupil.from_segments(-np.eye(3, dtype=int)), ValueError, "segments reaches down to -1"),
+    ],
+)  # fmt: skip
+def test_bad_segments_are_named(make, error, message):
+    with pytest.raises(error, match=message):
+        make()

@@ -1,0 +1,282 @@
+import numpy as np
+import pytest
+
+from zwfs import Linear, PhaseShifted, dynamic_range
+from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
+from zwfs.bench_trials import BenchCurves, bench_curves, bench_reconstructors, error_budget, find_pistons
+
+N = 68
+RMS = (0, 0.05, 0.5)
+NAMES = ("Linear", "Arcsine", "GerchbergSaxton", "GradientDescent", "PhaseShifted")
+
+
+def ideal(**changes):
+    return Bench.ideal(n_pixels=N, **changes)
+
+
+@pytest.fixture(scope="module")
+def perfect():
+    return ideal()
+
+
+@pytest.fixture(scope="module")
+def model(perfect):
+    return BenchModel.from_images(perfect)
+
+
+@pytest.fixture(scope="module")
+def known(perfect, model):
+    return bench_reconstructors(perfect, model)
+
+
+@pytest.fixture(scope="module")
+def curves(perfect, model, known):
+    return bench_curves(perfect, model, known, RMS, 3, seed=2)
+
+
+@pytest.fixture(scope="module")
+def budget():
+    sizes = {"static": 0.1, "quilting": 0.1, "leakage": 0.05, "photons": 1e9}
+    return error_budget(Bench(n_pixels=N, **sizes), ("PhaseShifted", "Linear"), RMS, 2, seed=1)
+
+
+# Linear reconstruction with a recorded calibration
+
+
+def recordings(bench, model, poke=0.01):
+    """Frames of the first mask: flat, and with every segment pushed and pulled."""
+    pokes = poke * np.eye(bench.n_segments)
+    return tuple(model.normalise(bench.frames(c))[..., :1, :, :] for c in (None, pokes, -pokes))
+
+
+def test_calibration_on_an_ideal_bench_is_that_of_the_model(perfect, model, known):
+    recorded = Linear(model.classic, model.modes, calibration=recordings(perfect, model))
+    made = Linear(model.classic, model.modes)
+    np.testing.assert_allclose(recorded.interaction_matrix, made.interaction_matrix, rtol=0, atol=1e-8)
+    assert np.abs(made.interaction_matrix).max() > 0.5
+    frames = model.normalise(perfect.frames(segment_screens(perfect, 0.2, 2, seed=1)))[:, :1]
+    np.testing.assert_allclose(recorded(frames).phase, made(frames).phase, rtol=0, atol=1e-6)
+
+
+def test_calibration_takes_up_the_errors_of_the_bench():
+    # What the model does not know is in the recorded frames: no offset, and no loss of gain for a small input.
+    bench = ideal(leakage=0.2, static=0.3, dimple_error=0.1)
+    model = BenchModel.from_images(bench)
+    small = segment_screens(bench, 0.005, 2, seed=1)
+    frames = [model.normalise(bench.frames(c))[..., :1, :, :] for c in (np.zeros((1, 36)), small)]
+    calibrated, modelled = (
+        Linear(model.classic, model.modes, conditioning=0.1, calibration=c)
+        for c in (recordings(bench, model), None)
+    )
+    flat, found = (model.pistons(calibrated(one).phase) for one in frames)
+    np.testing.assert_allclose(flat, 0, atol=1e-10)
+    np.testing.assert_allclose(segment_residual(found, small), 0, atol=5e-4)
+    assert segment_residual(model.pistons(modelled(frames[0]).phase), np.zeros(36)).std() > 0.1
+
+
+def test_calibration_is_divided_by_the_poke(perfect, model):
+    one, other = (
+        Linear(
+            model.classic, model.modes, poke=poke, calibration=recordings(perfect, model, 0.01)
+        ).interaction_matrix
+        for poke in (0.01, 0.02)
+    )
+    np.testing.assert_allclose(one, 2 * other, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "message"),
+    [
+        (lambda f, p, q: (f[:, :5], p, q), ValueError, r"calibration flat has shape \(1, 5, 90\)"),
+        (lambda f, p, q: (np.stack([f, f]), p, q), ValueError, r"calibration flat has a batch of \(2,\): exp"),
+        (lambda f, p, q: (f, p[:-1], q), ValueError, r"calibration pushed has a batch of \(35,\): expected 36"),
+        (lambda f, p, q: (f, p, f), ValueError, r"calibration pulled has a batch of \(\): expected 36"),
+        (lambda f, p, q: (f, p, np.concatenate([q, q], 1)), ValueError, r"calibration pulled has shape \(36, 2, "),
+        (lambda f, p, q: (f, p, -q), ValueError, "calibration pulled reaches down to -"),
+        (lambda f, p, q: (f, p * np.nan, q), ValueError, "calibration pushed holds"),
+        (lambda f, p, q: (0 * f, p, q), ValueError, "calibration flat: 1 of 1 hold no light"),
+        (lambda f, p, q: (f, p, p), ValueError, "sensor sees none of them"),
+        (lambda f, p, q: (f, p), ValueError, r"calibration (is|has) .*expected .*flat, pushed, pulled"),
+        (lambda f, p, q: 3, (TypeError, ValueError), r"calibration (is|has|=) .*expected .*flat, pushed, pulled"),
+    ],
+)  # fmt: skip
+def test_bad_calibration_is_named(perfect, model, spoil, error, message):
+    with pytest.raises(error, match=message):
+        Linear(model.classic, model.modes, calibration=spoil(*recordings(perfect, model)))
+
+
+# Reconstructors of a bench
+
+
+def test_reconstructors_of_a_bench(perfect, model, known):
+    assert tuple(known) == NAMES
+    assert [known[name].settings.sensor.n_masks for name in NAMES] == [1, 1, 2, 2, 2]
+    assert known["Linear"].n_inverted == 35  # all but the common piston
+    few = bench_reconstructors(perfect, model, n_iterations=3)
+    frames = model.normalise(perfect.frames(segment_screens(perfect, 0.5, 1, seed=1)))
+    for name in NAMES[1:]:
+        n_used = few[name](frames[:, : few[name].settings.sensor.n_masks]).n_iterations
+        assert np.max(n_used) <= 3
+
+
+def test_found_pistons_have_the_shape_of_the_batch(perfect, model, known):
+    commands = segment_screens(perfect, 0.05, 4, seed=3).reshape(2, 2, 36)
+    frames = model.normalise(perfect.frames(commands))
+    for name in NAMES:
+        found = find_pistons(known[name], model, frames)
+        assert found.shape == (2, 2, 36)
+        np.testing.assert_allclose(found[1, 0], find_pistons(known[name], model, frames[1, 0]), atol=1e-12)
+        if name != "GerchbergSaxton":  # which lacks the light beyond the camera
+            error = segment_residual(found, commands).std(axis=-1)
+            assert error.max() < {"Linear": 0.005}.get(name, 1e-4), name
+
+
+# Curves
+
+
+def test_curves_have_commands_of_the_rms_asked_for(curves):
+    assert tuple(curves.residuals) == NAMES
+    assert curves.commanded.shape == (3, 3, 36)
+    np.testing.assert_allclose(curves.commanded.std(axis=-1), np.repeat([RMS], 3, axis=0).T, atol=1e-12)
+    for name in NAMES:
+        assert curves.residuals[name].shape == (3, 3, 36)
+        assert curves.errors[name].shape == (3, 3)
+        assert np.abs(curves.residuals[name]).max() <= np.pi
+
+
+def test_curves_are_what_one_gets_by_hand(perfect, model, known, curves):
+    found = find_pistons(known["GradientDescent"], model, model.normalise(perfect.frames(curves.commanded[2])))
+    residual = segment_residual(found, curves.commanded[2])
+    np.testing.assert_allclose(curves.residuals["GradientDescent"][2], residual, atol=1e-10)
+    linear = curves.residuals["Linear"]
+    np.testing.assert_allclose(curves.errors["Linear"], np.sqrt(np.mean(linear**2, axis=2)))
+    np.testing.assert_allclose(curves.mean("Linear"), curves.errors["Linear"].mean(axis=1))
+    np.testing.assert_allclose(curves.std("Linear"), curves.errors["Linear"].std(axis=1))
+    assert curves.errors["Linear"][2].min() > 0.05
+
+
+def test_curves_follow_the_seed_with_noise():
+    bench = Bench(n_pixels=N, photons=1e8)
+    model = BenchModel.from_images(bench, 1)
+    method = {"PhaseShifted": PhaseShifted(model.shifted)}
+    one, again, other = (bench_curves(bench, model, method, [0, 0.3], 2, seed=s) for s in (4, 4, 5))
+    np.testing.assert_array_equal(one.residuals["PhaseShifted"], again.residuals["PhaseShifted"])
+    assert np.abs(one.residuals["PhaseShifted"][0] - other.residuals["PhaseShifted"][0]).max() > 1e-5
+    assert np.abs(one.commanded[1] - other.commanded[1]).max() > 0.1
+    # Noise is drawn anew for every screen.
+    assert np.abs(np.diff(one.residuals["PhaseShifted"][0], axis=0)).max() > 1e-5
+    # The first input does not depend on those that follow it.
+    short = bench_curves(bench, model, method, [0], 2, seed=4)
+    np.testing.assert_array_equal(short.residuals["PhaseShifted"][0], one.residuals["PhaseShifted"][0])
+
+
+@pytest.mark.parametrize("inputs", [(0, 0.1, 0.5), (0.1, 0.5)])
+def test_gain_is_the_slope_of_found_against_commanded(inputs):
+    rng = np.random.default_rng(1)
+    rms = np.array(inputs)
+    commanded = rng.normal(size=(len(rms), 4, 36)) * rms[:, np.newaxis, np.newaxis]
+    gains = np.array([1, 0.9, 0.7])[-len(rms) :]
+    found = commanded * gains[:, np.newaxis, np.newaxis] + 0.02 * rng.normal(size=commanded.shape)
+    offset = 0.3 * rng.normal(size=36) * (0 in inputs)  # known where there is an input of 0, and then taken off
+    curves = BenchCurves(rms, commanded, {"A": found + offset - commanded})
+    if 0 in inputs:
+        found = found - found[0].mean(axis=0)
+    slopes = [
+        np.linalg.lstsq(x.reshape(-1, 1), y.ravel())[0][0] if x.any() else np.nan
+        for x, y in zip(commanded, found, strict=True)
+    ]
+    np.testing.assert_allclose(curves.gain("A"), slopes, atol=1e-12)
+    np.testing.assert_allclose(slopes[-2:], [0.9, 0.7], atol=0.05)
+
+
+def test_dynamic_range_is_that_of_the_mean_error(curves):
+    assert curves.dynamic_range("PhaseShifted", 0.05) == np.inf
+    expected = dynamic_range(curves.rms, curves.mean("Linear"), 0.1)
+    assert 0.05 < expected < 0.5
+    assert curves.dynamic_range("Linear", 0.1) == expected
+
+
+def test_ideal_bench_holds_no_error_for_the_exact_methods(curves):
+    for name, tolerance in (("PhaseShifted", 1e-5), ("GradientDescent", 1e-4)):
+        assert curves.errors[name].max() < tolerance
+        np.testing.assert_allclose(curves.gain(name)[1:], 1, atol=tolerance * 10)
+    # Beyond its range the linear method sees too little.
+    assert curves.gain("Linear")[2] < 0.9
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda b, m, k: bench_curves(b, m, k, 0.1, 1), ValueError, r"rms has shape \(\): expected \(n_rms,\)"),
+        (lambda b, m, k: bench_curves(b, m, k, [[0.1]], 1), ValueError, r"rms has shape \(1, 1\): expected"),
+        (lambda b, m, k: bench_curves(b, m, k, [-0.1], 1), ValueError, r"rms .*-0\.1"),
+        (lambda b, m, k: bench_curves(b, m, k, [np.nan], 1), ValueError, "rms .*nan"),
+        (lambda b, m, k: bench_curves(b, m, k, [0.1], 0), ValueError, "n_screens = 0: expected at least 1"),
+        (lambda b, m, k: bench_reconstructors(b, m, poke=0), ValueError, r"poke = 0: expected .*\(0, inf"),
+        (lambda b, m, k: bench_reconstructors(b, m, n_iterations=0), ValueError, "n_iterations = 0"),
+        (lambda b, m, k: bench_reconstructors(b, m, conditioning=1), ValueError, "conditioning = 1"),
+        (
+            lambda b, m, k: error_budget(b, ["Foo"], [0.1], 1),
+            ValueError,
+            r"names .*'Foo'.*: expected some of .*'Linear'.*'PhaseShifted'",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_input_is_named(perfect, model, known, call, error, message):
+    with pytest.raises(error, match=message):
+        call(perfect, model, known)
+
+
+# Error budget
+
+
+def test_budget_takes_each_error_alone(budget):
+    assert tuple(budget) == ("none", *Bench.errors(), "noise", "all")
+    for curves in budget.values():
+        assert tuple(curves.residuals) == ("PhaseShifted", "Linear")
+        np.testing.assert_array_equal(curves.commanded, budget["none"].commanded)
+
+
+def test_budget_without_errors_is_exact(budget):
+    assert budget["none"].errors["PhaseShifted"].max() < 1e-5
+
+
+def test_budget_names_the_static_aberration_for_the_offset(budget):
+    offset = {case: curves.mean("PhaseShifted")[0] for case, curves in budget.items()}
+    static = offset.pop("static")
+    assert 0.06 < static < 0.11  # 0.1 rad rms over the pupil, a little less between segments
+    del offset["all"]
+    assert max(offset.values()) < 0.1 * static
+    # Small inputs add to it and do not change it.
+    np.testing.assert_allclose(budget["static"].mean("PhaseShifted"), static, rtol=1e-3)
+    np.testing.assert_allclose(budget["static"].gain("PhaseShifted")[1:], 1, atol=1e-4)
+
+
+def test_budget_names_the_leakage_for_the_underestimation(budget):
+    gain = {case: curves.gain("PhaseShifted")[1] for case, curves in budget.items()}
+    assert gain["leakage"] == pytest.approx(0.9, abs=0.01)  # 1 - 2 leakage
+    assert min(gain, key=lambda case: gain[case] + (case == "all")) == "leakage"
+    assert gain["none"] == pytest.approx(1, abs=1e-5)
+    assert gain["flux_imbalance"] == pytest.approx(1, abs=1e-5)
+
+
+def test_budget_keeps_the_calibrated_method_free_of_offset(budget):
+    for case in ("none", *Bench.errors()):
+        assert budget[case].mean("Linear")[0] < 1e-9, case
+
+
+def test_budget_of_noise_falls_with_the_photons(budget):
+    bench = Bench(n_pixels=N, photons=1e7, read_noise=0, background=0)
+    few = error_budget(bench, ["PhaseShifted"], [0.05], 4)["noise"].mean("PhaseShifted")[0]
+    many = budget["noise"].mean("PhaseShifted")[1]
+    assert 5 < few / many < 15  # as the square root; read noise and background take a little
+
+
+def test_budget_belongs_to_the_layout_of_the_bench():
+    bench = ideal(n_rings=2, missing=(3,), gap=0.01, stop=0.9, diameter=1.5, phase=1.2, leakage=0.05)
+    curves = error_budget(bench, ["PhaseShifted"], [0.05], 1)
+    assert {case: one.commanded.shape for case, one in curves.items()} == dict.fromkeys(curves, (1, 1, 18))
+    # Nothing but the leakage is switched on: alone and all together are the same bench.
+    np.testing.assert_allclose(
+        curves["leakage"].residuals["PhaseShifted"], curves["all"].residuals["PhaseShifted"], atol=1e-10
+    )

@@ -1,0 +1,256 @@
+import io
+import warnings
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.colors import same_color
+
+import zwfs
+from zwfs import drawings, figures
+from zwfs.bench import Bench, segment_screens
+
+
+@pytest.fixture(autouse=True)
+def style():
+    with plt.rc_context():
+        figures.use_style(vector=True)
+        yield
+    plt.close("all")
+
+
+@pytest.fixture(scope="module")
+def pupil():
+    return zwfs.Pupil.circular(40)
+
+
+@pytest.fixture(scope="module")
+def phase(pupil):
+    return zwfs.power_law_screens(zwfs.zernike_basis(pupil, 30), 0.5, 1, seed=3)[0]
+
+
+@pytest.fixture(scope="module")
+def classic(pupil):
+    return zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
+
+
+@pytest.fixture(scope="module")
+def vector(pupil):
+    return zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Bench(n_pixels=60)
+
+
+@pytest.fixture(scope="module")
+def pistons(bench):
+    return segment_screens(bench, 0.5, 1, seed=4)[0]
+
+
+@pytest.fixture(scope="module")
+def frames(bench, pistons):
+    return bench.frames(pistons, seed=1)
+
+
+@pytest.fixture(params=["sensor_layout", "vector_sensor", "bench_layout"])
+def draw(request, classic, vector, phase, bench, pistons, frames):
+    calls = {
+        "sensor_layout": lambda: drawings.sensor_layout(classic, phase),
+        "vector_sensor": lambda: drawings.vector_sensor(vector, phase),
+        "bench_layout": lambda: drawings.bench_layout(bench, pistons, frames),
+    }
+    return calls[request.param]
+
+
+def pictures(figure):
+    """Data of each picture, with NaN where nothing is drawn."""
+    return [np.ma.filled(image.get_array(), np.nan) for axes in figure.axes for image in axes.images]
+
+
+def holds(figure, expected):
+    return sum(
+        picture.shape == expected.shape and np.array_equal(picture, expected, equal_nan=True)
+        for picture in pictures(figure)
+    )
+
+
+def texts(figure):
+    return {text.get_text() for text in figure.findobj(plt.Text) if text.get_visible() and text.get_text()}
+
+
+def saved(figure):
+    stream = io.BytesIO()
+    figure.savefig(stream, format="svg", metadata={"Date": None})
+    return stream.getvalue()
+
+
+def test_drawn_twice_gives_the_same_bytes(draw):
+    assert saved(draw()) == saved(draw())
+
+
+def test_saving_is_silent_and_repeatable(draw):
+    figure = draw()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        first = saved(figure)
+        assert saved(figure) == first
+
+
+def test_is_wide_enough_and_in_type_that_can_be_read(draw):
+    figure = draw()
+    assert figure.get_figwidth() == 9
+    assert min(text.get_fontsize() for text in figure.findobj(plt.Text) if text.get_text()) >= 8
+
+
+def test_texts_stay_inside_and_apart(draw):
+    figure = draw()
+    figure.canvas.draw()
+    scene = figure.axes[0]
+    boxes = [(text.get_text(), text.get_window_extent()) for text in scene.texts]
+    for text, box in boxes:
+        assert figure.bbox.contains(box.x0, box.y0), text
+        assert figure.bbox.contains(box.x1, box.y1), text
+    for index, (text, box) in enumerate(boxes):
+        assert not [other for other, more in boxes[index + 1 :] if box.shrunk(0.98, 0.9).overlaps(more)], text
+        for axes in figure.axes[1:]:
+            if axes.images:
+                assert not box.shrunk(0.98, 0.9).overlaps(axes.bbox), text
+
+
+def test_pictures_are_upright_and_sharp(draw):
+    for axes in draw().axes:
+        for image in axes.images:
+            assert image.origin == "lower"
+            assert image.get_interpolation() == "none"
+
+
+def test_sensor_layout_shows_what_is_computed(classic, pupil, phase):
+    figure = drawings.sensor_layout(classic, phase)
+    field = pupil.amplitude * np.exp(1j * phase)
+    assert holds(figure, np.where(pupil.mask, phase, np.nan)) == 1
+    assert holds(figure, np.abs(classic.propagate(field)[0]) ** 2) == 2
+    assert holds(figure, np.abs(classic.reference_wave(field)[0]) ** 2) == 1
+    assert {"pupil plane", "focal plane", "detector plane", "lens"} <= texts(figure)
+    assert r"mask: 1.06 $\lambda/D$, $\pi/2$ rad" in texts(figure)
+
+
+def test_terms_of_sensor_layout_add_up(classic, phase):
+    total, incoming, reference, interference = pictures(drawings.sensor_layout(classic, phase))[3:7]
+    assert np.abs(total - incoming - reference - interference).max() < 1e-12
+
+
+def test_vector_sensor_shows_the_frames_in_both_rows(vector, pupil, phase):
+    figure = drawings.vector_sensor(vector, phase)
+    for frame in vector.measure(phase):
+        assert holds(figure, frame) == 2
+    assert holds(figure, np.where(pupil.mask, phase, np.nan)) == 2
+
+
+def test_vector_sensor_shows_both_masks(vector, phase):
+    shown = pictures(drawings.vector_sensor(vector, phase))
+    for mask in vector.masks:
+        maps = [picture for picture in shown if np.nanmax(picture) == np.nanmin(picture) == mask.phase]
+        assert len(maps) == 2
+        # The field of view is 4.4 lambda/D wide.
+        area = np.isfinite(maps[0]).mean() * (4.4 * 161 / 160) ** 2
+        assert area == pytest.approx(np.pi / 4 * mask.diameter**2, rel=0.03)
+
+
+def test_vector_sensor_names_its_elements(vector, phase):
+    found = texts(drawings.vector_sensor(vector, phase))
+    named = {
+        "Liquid crystal",
+        "Metasurface",
+        "quarter-\nwave plate",
+        "Wollaston\nprism",
+        "detector",
+        "focus shift",
+    }
+    assert named <= found
+    assert {r"left circular: $+$$\pi/2$", r"right circular: $-\pi/2$"} <= found
+    assert {r"linear: $+$$\pi/2$", r"linear: $-\pi/2$"} <= found
+
+
+def test_only_liquid_crystal_needs_a_quarter_wave_plate(vector, phase):
+    scene = drawings.vector_sensor(vector, phase).axes[0]
+    assert sum("quarter" in text.get_text() for text in scene.texts) == 1
+    assert sum("Wollaston" in text.get_text() for text in scene.texts) == 2
+
+
+def test_polarisations_differ_by_dashes_too(vector, phase):
+    scene = drawings.vector_sensor(vector, phase).axes[0]
+    solid = [line for line in scene.lines if same_color(line.get_color(), "#D55E00")]
+    dashed = [line for line in scene.lines if same_color(line.get_color(), "#0072B2")]
+    rays = [
+        sum(line.get_linestyle() == style for line in lines) for lines, style in ((solid, "-"), (dashed, "--"))
+    ]
+    assert min(rays) >= 8
+
+
+def test_vector_sensor_refuses_another_number_of_masks(classic, phase):
+    with pytest.raises(ValueError, match="sensor has 1 masks: expected two"):
+        drawings.vector_sensor(classic, phase)
+
+
+def test_bench_layout_shows_the_camera(bench, pistons, frames):
+    figure = drawings.bench_layout(bench, pistons, frames)
+    for frame in frames:
+        assert holds(figure, frame) == 1
+    flat = Bench.ideal(n_pixels=60, quilting=bench.quilting).frames()[0]
+    assert holds(figure, flat) == 1
+
+
+def test_bench_layout_shows_the_segments(bench, pistons, frames):
+    figure = drawings.bench_layout(bench, pistons, frames)
+    commanded = np.where(bench.segments > 0, bench.commanded_phase(pistons), np.nan)
+    assert holds(figure, commanded) == 1
+    pupil = zwfs.Pupil.from_segments(bench.segments)
+    assert holds(figure, pupil.amplitude**2) == 1
+    # The missing segment is at the top right: up is the last row.
+    full = zwfs.Pupil.hexagonal(60, bench.n_rings, bench.gap, (), bench.stop)
+    row, column = np.nonzero(full.mask & ~pupil.mask)
+    assert row.mean() > 40
+    assert column.mean() > 35
+
+
+def test_bench_layout_of_flat_segments(bench, frames):
+    figure = drawings.bench_layout(bench, np.zeros(bench.n_segments), frames)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        saved(figure)
+
+
+def test_bench_layout_names_its_elements(bench, pistons, frames):
+    named = {"source", "635 nm", "pupil stop", "IrisAO segmented mirror", "BMC deformable mirror", "camera"}
+    named |= {"vector-Zernike\nmask", "quarter-\nwave plate", "Wollaston\nprism"}
+    assert named <= texts(drawings.bench_layout(bench, pistons, frames))
+
+
+def test_bench_layout_refuses_what_does_not_fit(bench, pistons, frames):
+    with pytest.raises(ValueError, match="pistons"):
+        drawings.bench_layout(bench, pistons[:-1], frames)
+    with pytest.raises(ValueError, match="frames has 1 images: expected two"):
+        drawings.bench_layout(bench, pistons, frames[:1])
+
+
+@pytest.mark.parametrize(
+    ("angle", "text"),
+    [
+        (np.pi, r"$\pi$"),
+        (-np.pi, r"$-\pi$"),
+        (np.pi / 2, r"$\pi/2$"),
+        (-np.pi / 2, r"$-\pi/2$"),
+        (3 * np.pi / 4, r"$3\pi/4$"),
+        (-2 * np.pi / 3, r"$-2\pi/3$"),
+        (1.0, "1"),
+        (0.0, "0"),
+    ],
+)
+def test_angles_in_pi(angle, text):
+    assert drawings._in_pi(angle) == text

@@ -1,0 +1,91 @@
+import csv
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from zwfs.results import FOLDER, publish
+
+matplotlib.use("agg")
+
+
+@pytest.fixture
+def figure():
+    """Two panels with a colour bar: their constrained layout changes each time it is computed."""
+    figure, axes = plt.subplots(2, 2, layout="constrained", figsize=(4, 3))
+    figure.colorbar(axes[0, 0].imshow(np.eye(5)), ax=axes[0])
+    axes[1, 0].set_title("two\nlines")
+    yield figure
+    plt.close(figure)
+
+
+def published(folder, monkeypatch, figure, name="plot", columns=None):
+    folder.mkdir()
+    monkeypatch.setenv(FOLDER, str(folder))
+    publish(figure, name, columns or {"x (D)": [1.0, 2.0]})
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def test_nothing_is_written_unless_a_folder_is_named(figure, tmp_path, monkeypatch):
+    monkeypatch.delenv(FOLDER, raising=False)
+    monkeypatch.chdir(tmp_path)
+    publish(figure, "plot", {"x (D)": [1.0]})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_three_files_are_the_same_from_run_to_run(figure, tmp_path, monkeypatch):
+    first = published(tmp_path / "first", monkeypatch, figure)
+    assert sorted(first) == ["plot.csv", "plot.pdf", "plot.png"]
+    assert published(tmp_path / "second", monkeypatch, figure) == first
+    assert b"CreationDate" not in first["plot.pdf"]
+    assert b"Software" not in first["plot.png"]
+    assert (tmp_path / "first" / "plot.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_png_has_200_dots_per_inch(figure, tmp_path, monkeypatch):
+    published(tmp_path / "files", monkeypatch, figure)
+    assert plt.imread(tmp_path / "files" / "plot.png").shape[:2] == (600, 800)
+
+
+def test_figure_without_layout_keeps_its_place(tmp_path, monkeypatch, recwarn):
+    with plt.rc_context({"figure.constrained_layout.use": True}):
+        figure = plt.figure(layout="none")
+        axes = figure.add_axes((0.1, 0.2, 0.3, 0.4))
+        published(tmp_path / "files", monkeypatch, figure)
+    assert axes.get_position().bounds == pytest.approx((0.1, 0.2, 0.3, 0.4))
+    assert not recwarn.list
+
+
+def test_columns_are_written_in_order_with_nine_digits(figure, tmp_path, monkeypatch):
+    columns = {
+        "x, y (rad)": np.array([np.pi, np.nan]),
+        "n": np.array([1, 2]),
+        "d (lambda/D)": 1.06,
+        "method": "linear",
+        "single": np.float32([0.5, 1e-30]),
+    }
+    published(tmp_path / "files", monkeypatch, figure, columns=columns)
+    rows = list(csv.reader((tmp_path / "files" / "plot.csv").read_text().splitlines()))
+    assert rows == [
+        list(columns),
+        ["3.14159265", "1", "1.06", "linear", "0.5"],
+        ["nan", "2", "1.06", "linear", "1e-30"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "columns", "error", "message"),
+    [
+        ("Plot", {"x": [1]}, ValueError, "name = 'Plot'"),
+        ("../plot", {"x": [1]}, ValueError, "name = '../plot'"),
+        ("plot", {}, ValueError, "columns is empty"),
+        ("plot", {"x": [1, 2], "y": [1]}, ValueError, "differ in length: 'x': 2, 'y': 1"),
+        ("plot", {"x": [[1]]}, ValueError, r"column 'x' has shape \(1, 1\)"),
+        ("plot", {"x": [1j]}, TypeError, "column 'x' is complex"),
+    ],
+)
+def test_bad_arguments_are_refused(figure, monkeypatch, name, columns, error, message):
+    monkeypatch.delenv(FOLDER, raising=False)
+    with pytest.raises(error, match=message):
+        publish(figure, name, columns)

@@ -1,0 +1,248 @@
+import numpy as np
+import pytest
+from scipy.special import j1, jn_zeros
+
+import zwfs
+from zwfs.variations import (
+    DARK_RING,
+    DiameterCurve,
+    DimpleLight,
+    crossing,
+    diameter_curve,
+    drawn_noise,
+    iteration_spectrum,
+    linearised_step,
+    measured_factor,
+    mode_sensitivity,
+    pair_maps,
+    phase_noise,
+)
+
+HALF = np.pi / 2
+
+
+@pytest.fixture(scope="module")
+def small():
+    return zwfs.Pupil.circular(16)
+
+
+def pair(pupil, diameter, a=HALF, b=-HALF):
+    return zwfs.ZernikeSensor(pupil, zwfs.Dimple(diameter, a), zwfs.Dimple(diameter, b), tolerance=1e-13)
+
+
+def test_the_frames_of_every_mask_are_made_of_one_complex_map(pupil, screens):
+    phase = screens(0.7, 1)[0]
+    psi = pupil.gather(pupil.amplitude * np.exp(1j * phase))
+    beta = DimpleLight(pupil, 1.7)(psi[np.newaxis])[0]
+    W = beta.conj() * (psi - beta)
+    for theta in (0.3, HALF, -2.0, np.pi):
+        frame = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.7, theta)).measure(phase)[0]
+        modelled = np.abs(psi) ** 2 + 2 * np.real((np.exp(-1j * theta) - 1) * W)
+        np.testing.assert_allclose(pupil.gather(frame), modelled, atol=1e-8)
+
+
+def test_the_iteration_is_the_same_for_every_pair(pupil, screens):
+    phase = screens(0.8, 2)
+    wanted = None
+    for a, b in [(HALF, -HALF), (0.4, 0.9), (np.pi, 1.0), (-0.2, 3.0)]:
+        sensor = pair(pupil, 1.3, a, b)
+        method = zwfs.PhaseShifted(sensor, n_iterations=4, tolerance=0.0)
+        history = pupil.gather(np.exp(1j * method(sensor.measure(phase), history=True).history))
+        wanted = history if wanted is None else wanted
+        np.testing.assert_allclose(history, wanted, atol=1e-10)
+
+
+@pytest.mark.parametrize("rms", [0.0, 0.6])
+def test_linearised_step_is_the_derivative_of_a_step(rough_pupil, rms):
+    modes = zwfs.zernike_basis(rough_pupil, 20)
+    phase = zwfs.power_law_screens(modes, rms, 1, seed=3)[0]
+    error = zwfs.power_law_screens(modes, 1.0, 1, seed=4)[0] + 0.5
+    sensor = pair(rough_pupil, 1.8, 1.9, -1.0)
+    method = zwfs.PhaseShifted(sensor, n_iterations=1)
+    frames, h = sensor.measure(phase), 1e-4
+    plus, minus = (method(frames, start=phase + s * h * error).phase for s in (1, -1))
+    measured = rough_pupil.gather(np.angle(np.exp(1j * (plus - minus)))) / (2 * h)
+    expected = linearised_step(rough_pupil, 1.8, phase, error)
+    np.testing.assert_allclose(rough_pupil.gather(expected), measured, atol=2e-6)
+    assert np.isnan(expected[~rough_pupil.mask]).all()
+
+
+def test_flat_wavefront_gives_a_weighted_mean(pupil, modes):
+    light = DimpleLight(pupil, 1.06)
+    ones = np.ones((1, pupil.n_points))
+    b = light(ones)[0]
+    assert b.real.min() > 0
+    np.testing.assert_allclose(b.imag, 0, atol=1e-12)
+    expected = light(pupil.gather(modes[:3])) / b
+    after = pupil.gather(linearised_step(pupil, 1.06, np.zeros(pupil.shape), modes[:3]))
+    np.testing.assert_allclose(after, expected.real, atol=1e-10)
+    piston = linearised_step(pupil, 1.06, modes[4], np.ones(pupil.shape))
+    np.testing.assert_allclose(pupil.gather(piston), 1, atol=1e-9)
+
+
+def test_a_mean_contracts():
+    # The kernel is positive over the whole pupil up to this diameter, so the step takes a weighted mean.
+    pupil = zwfs.Pupil.circular(30)
+    for diameter in (0.3, 0.8, 1.2):
+        values = iteration_spectrum(pupil, diameter)
+        np.testing.assert_allclose(values.imag, 0, atol=1e-8)
+        assert 0 < values[0].real < 1
+
+
+@pytest.mark.parametrize("rms", [0.0, 0.5])
+def test_spectrum_is_that_of_the_whole_matrix(small, rms):
+    phase = zwfs.power_law_screens(zwfs.zernike_basis(small, 20), rms, 1, seed=2)[0]
+    points = small.scatter(np.eye(small.n_points), fill=0)
+    matrix = small.gather(linearised_step(small, 2.2, phase, points)).T
+    whole = np.sort(np.abs(np.linalg.eigvals(matrix)))[::-1]
+    found = iteration_spectrum(small, 2.2, phase)
+    everything = np.sort(np.append(np.abs(found), 1))[::-1]
+    np.testing.assert_allclose(everything[:8], whole[:8], rtol=1e-6)
+
+
+@pytest.mark.parametrize("diameter", [1.06, 2.2, 2.8])
+def test_spectrum_tells_the_rate(pupil, screens, diameter):
+    phase = screens(0.5, 1)[0]
+    away = 1e-4 * screens(1.0, 1, seed=9)[0]
+    factor = np.abs(iteration_spectrum(pupil, diameter, phase)[0])
+    assert measured_factor(pupil, diameter, phase, away) == pytest.approx(factor, rel=0.001)
+
+
+def test_rate_of_nothing_is_refused(pupil):
+    flat = np.zeros(pupil.shape)
+    with pytest.raises(ValueError, match="away"):
+        measured_factor(pupil, 1.0, flat, flat)
+
+
+def test_tilt_is_lost_where_the_dimple_ends_on_the_dark_ring():
+    assert pytest.approx(2 * jn_zeros(1, 1)[0] / np.pi) == DARK_RING
+    assert abs(j1(np.pi * DARK_RING / 2)) < 1e-12
+    left = []
+    for n_pixels in (40, 160):
+        pupil = zwfs.Pupil.circular(n_pixels)
+        tilt = zwfs.zernike_basis(pupil, 1)
+        left.append(mode_sensitivity(pupil, DARK_RING, tilt)[0] / mode_sensitivity(pupil, 1.06, tilt)[0])
+        step = linearised_step(pupil, DARK_RING, np.zeros(pupil.shape), tilt)[0]
+        np.testing.assert_allclose(pupil.gather(step), pupil.gather(tilt[0]), atol=0.6 / n_pixels)
+        assert iteration_spectrum(pupil, DARK_RING)[0] == pytest.approx(1, abs=0.2 / n_pixels)
+    # What is left is the staircase of the pupil's edge.
+    assert left[1] < left[0] < 0.02
+    assert left[1] < 0.004
+
+
+@pytest.mark.parametrize("rms", [0.0, 0.5])
+def test_sensitivity_is_the_derivative_of_the_frames(pupil, modes, screens, rms):
+    phase, h = screens(rms, 1)[0], 1e-5
+    shifts = (HALF, -1.2)
+    sensor = pair(pupil, 1.5, *shifts)
+    slope = (sensor.measure(phase + h * modes[:4]) - sensor.measure(phase - h * modes[:4])) / (2 * h)
+    expected = np.sqrt(np.mean(pupil.gather(slope) ** 2, axis=-1).sum(axis=-1))
+    np.testing.assert_allclose(mode_sensitivity(pupil, 1.5, modes[:4], shifts, phase), expected, rtol=1e-6)
+
+
+def test_signal_and_iteration_are_one_operator(pupil, modes):
+    b = DimpleLight(pupil, 2.0)(np.ones((1, pupil.n_points)))[0].real
+    step = linearised_step(pupil, 2.0, np.zeros(pupil.shape), modes[:5])
+    expected = np.sqrt(8 * np.mean((b * pupil.gather(modes[:5] - step)) ** 2, axis=-1))
+    np.testing.assert_allclose(mode_sensitivity(pupil, 2.0, modes[:5]), expected, rtol=1e-8)
+
+
+def test_noise_of_the_symmetric_pair_on_a_flat_wavefront(pupil):
+    flat = np.zeros(pupil.shape)
+    b = DimpleLight(pupil, 1.06)(np.ones((1, pupil.n_points)))[0].real
+    for theta in (HALF, 2.3):
+        noise = phase_noise(pair(pupil, 1.06, theta, -theta), flat)
+        intensity = 1 - 2 * b * (1 - b) * (1 - np.cos(theta))
+        expected = np.sqrt(intensity) / (2 * b * np.sin(theta))
+        np.testing.assert_allclose(noise.photon, expected, rtol=1e-8)
+        np.testing.assert_allclose(noise.bound, expected, rtol=1e-8)
+        np.testing.assert_allclose(noise.read, 1 / (np.sqrt(8) * b * np.sin(theta)), rtol=1e-8)
+
+
+def test_no_estimate_is_better_than_the_bound(pupil, screens):
+    for a, b in [(HALF, -HALF), (2.5, 0.7), (-1.0, 3.0)]:
+        noise = phase_noise(pair(pupil, 1.06, a, b), screens(0.6, 1)[0])
+        assert np.all(noise.bound <= noise.photon * (1 + 1e-9))
+
+
+@pytest.mark.parametrize("shifts", [(HALF, -HALF), (2.3, -2.3), (HALF, -1.0)])
+def test_noise_is_that_of_noisy_frames(pupil, screens, shifts):
+    phase = screens(0.4, 1)[0]
+    sensor = pair(pupil, 1.06, *shifts)
+    noise, error = drawn_noise(sensor, phase, 1e6, 12, seed=1)
+    expected = np.sqrt(np.mean(phase_noise(sensor, phase).photon ** 2))
+    # The reference waves, held fixed in the expectation, take part in the noise of a few modes.
+    assert noise == pytest.approx(expected, abs=3 * error + 0.01 * expected)
+    assert error < 0.01 * noise
+
+
+def test_noise_needs_two_masks_on_the_pupil(pupil, classic):
+    flat = np.zeros(pupil.shape)
+    wide = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1, 1.0), zwfs.Dimple(1, -1.0), extent=2)
+    for sensor in (classic, wide):
+        with pytest.raises(ValueError, match="expected two masks and an extent of 1"):
+            phase_noise(sensor, flat)
+    assert np.isinf(phase_noise(pair(pupil, 1.0, 0.0, 1.0), flat).photon).all()
+
+
+def test_pair_maps(small):
+    screens = zwfs.power_law_screens(zwfs.zernike_basis(small, 20), 0.5, 2, seed=1)
+    angles = np.linspace(-np.pi, np.pi, 9)
+    maps = pair_maps(small, 1.06, angles, screens)
+    np.testing.assert_array_equal(maps.singular, maps.forbidden)
+    # The diagonal, both lines of 0 (once on the diagonal), and the two corners.
+    assert maps.singular.sum() == 9 + 16 + 2
+    for name in ("error", "flat", "aberrated", "bound", "read"):
+        values = getattr(maps, name)
+        np.testing.assert_array_equal(values, values.T)
+    assert np.nanmax(maps.error) == pytest.approx(np.nanmin(maps.error), rel=1e-6)
+    assert np.nanmax(maps.error) < 1e-6
+    # Read noise: +-pi/2 is best on a flat wavefront; photon noise: a larger shift is.
+    assert maps.best("read")[:2] == pytest.approx((HALF, -HALF))
+    assert maps.best("flat")[:2] == pytest.approx((0.75 * np.pi, -0.75 * np.pi))
+
+
+def test_diameter_curve(pupil, screens):
+    phases = screens(0.5)
+    curve = diameter_curve(lambda d: zwfs.PhaseShifted(pair(pupil, d)), [1.0, 2.0, 2.5], phases)
+    assert curve.errors.shape == (3, 3)
+    assert np.all(np.diff(curve.mean) > 0)
+    assert curve.at(1.95) == curve.mean[1]
+    assert 2.0 < curve.leaves(0.025) < 2.5
+    assert curve.leaves(0.025, start=2.2) == 2.5
+    np.testing.assert_allclose(curve.std, curve.errors.std(axis=1))
+
+
+def test_crossing_is_interpolated_on_the_logarithm():
+    assert crossing([1, 2, 3], [1e-4, 1e-2, 1e-4], 1e-3) == pytest.approx(1.5)
+    assert crossing([1, 2], [1.0, 2.0], 0.5) == 1
+    assert crossing([1, 2], [1.0, 2.0], 5) == np.inf
+    assert DiameterCurve(np.array([1.0]), np.array([[1.0, 3.0]])).mean == 2
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda p, z: crossing([1, 2], [1.0], 1), "shapes"),
+        (lambda p, z: crossing([2, 1], [1.0, 1.0], 1), "increasing"),
+        (lambda p, z: crossing([1, 2], [0.0, 1.0], 1), "positive"),
+        (lambda p, z: diameter_curve(None, [2.0, 1.0], z[np.newaxis]), "diameters"),
+        (lambda p, z: diameter_curve(None, [1.0], z), "screens"),
+        (lambda p, z: pair_maps(p, 1.0, 0.0, z[np.newaxis]), "angles"),
+        (lambda p, z: pair_maps(p, 1.0, [0.0], z), "screens"),
+        (lambda p, z: iteration_spectrum(p, 1.0, z[np.newaxis]), "phase has shape"),
+        (lambda p, z: iteration_spectrum(p, 1.0, z + np.nan), "NaN"),
+        (lambda p, z: linearised_step(p, 1.0, z, z[:3]), "error has shape"),
+        (lambda p, z: mode_sensitivity(p, 1.0, z[:3]), "modes has shape"),
+        (lambda p, z: phase_noise(pair(p, 1.0), z[:3]), "phase has shape"),
+        (lambda p, z: drawn_noise(pair(p, 1.0), z, 1e4, 1), "n_draws"),
+        (lambda p, z: drawn_noise(pair(p, 1.0), z, 0.0, 2), "photons"),
+    ],
+)
+def test_bad_input_is_named(small, call, message):
+    with pytest.raises(ValueError, match=message):
+        call(small, np.zeros(small.shape))
+
+
+def test_rank_is_that_of_the_low_rank_model(small):
+    assert DimpleLight(small, 1.0).rank < DimpleLight(small, 3.0).rank

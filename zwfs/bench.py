@@ -1,0 +1,438 @@
+"""A simulated bench: a vector-Zernike sensor behind a segmented mirror, with the errors of a real one.
+
+The bench stands for the one of section 5 of the paper. It hands out what a camera would: frames, off-mask pupil
+images and darks, in counts. What it knows of its own errors stays inside; `BenchModel` is the sensor that an
+experimenter would model from the images alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft, ndimage
+
+from zwfs import _check
+from zwfs.detector import Detector
+from zwfs.masks import Dimple
+from zwfs.modes import power_law_screens, zernike_basis
+from zwfs.pupil import Pupil
+from zwfs.sensor import ZernikeSensor
+
+Seed = int | np.random.Generator | np.random.SeedSequence | None
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """A vector-Zernike sensor with a segmented mirror, imperfect in ways that can be switched on one by one.
+
+    The first group of parameters is the layout, the second the errors: 0 is ideal for each of them.
+
+    Parameters
+    ----------
+    n_pixels : int, pixels
+        Camera pixels across a pupil image: 136 on the real bench.
+    extent : float, D
+        Width of what the camera records of each pupil image: 180 pixels of 136 on the real bench.
+    n_rings, gap, missing, stop
+        Layout of the segmented mirror, see `Pupil.hexagonal`. The defaults look like the real one: 37 segments,
+        six across the stop, gaps of 2 % of the diameter, and one segment missing at the top right.
+    diameter : float, lambda/D
+        Diameter of the dimple by design.
+    phase : float, radian
+        Phase shift of the mask, of opposite sign for the two polarisations.
+    illumination : float
+        Change of the intensity from the left edge of the pupil to the right one, as a fraction of the mean. The
+        off-mask image shows it, so it is no error.
+    leakage : float
+        Fraction of the light of each polarisation that ends in the image of the other. 3 % is what a quarter-wave
+        plate makes that is turned by 10 degrees (sin^2), or 20 degrees short of a quarter wave.
+    focus_difference : float
+        Distance between the planes that are in focus in the two images, times lambda / D^2; the camera is halfway.
+        1e-4 is 16 mm for a beam of 10 mm at 635 nm.
+    misregistration : float, pixels
+        Distance between the pupil images, along both axes, that is left after they were registered.
+    flux_imbalance : float
+        The two images hold 1 + and 1 - this of the mean flux. The off-mask images show it.
+    dimple_error : float
+        Relative error of the dimple's diameter. The real frames are explained best by 1.1 lambda/D, 4 % above the
+        design.
+    static : float, radian rms
+        Low-order aberration of the bench that the flat command leaves.
+    quilting : float, radian rms
+        Grid that the actuators print on the surface of the deformable mirror; 22 of them across the pupil, as seen
+        in the real frames. 6 nm at 635 nm is 0.06 rad.
+    photons : float, photons
+        Photons of each image with the mask out, in all the exposures that make a frame: a hundred of 1e8 each, for
+        the high signal-to-noise ratio of the paper. 0 for frames without noise.
+    read_noise : float, electrons rms
+    background : float, electrons
+        Stray light and dark current of a pixel; darks show it.
+    seed : int
+        Of the static aberration, which belongs to the bench.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a parameter is of the wrong kind or out of range, such as a leakage outside [0, 0.5].
+
+    References
+    ----------
+    Chambouleyron et al. 2024, sections 2.3 and 5.
+    """
+
+    n_pixels: int = 136
+    extent: float = 180 / 136
+    n_rings: int = 3
+    gap: float = 0.02
+    missing: tuple[int, ...] = (21,)
+    stop: float = 0.8
+    diameter: float = 1.06
+    phase: float = np.pi / 2
+    illumination: float = 0.5
+    leakage: float = 0.03
+    focus_difference: float = 1e-4
+    misregistration: float = 0.2
+    flux_imbalance: float = 0.05
+    dimple_error: float = 0.04
+    static: float = 0.05
+    quilting: float = 0.06
+    photons: float = 1e10
+    read_noise: float = 30.0
+    background: float = 5000.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _check.number("illumination", self.illumination, 0, 2, open_high=True)
+        _check.number("leakage", self.leakage, 0, 0.5)
+        _check.number("focus_difference", self.focus_difference, 0, 1e-2)
+        _check.number("misregistration", self.misregistration, 0, 10)
+        _check.number("flux_imbalance", self.flux_imbalance, -1, 1, open_low=True, open_high=True)
+        _check.number("dimple_error", self.dimple_error, -0.9, 10)
+        for name in ("static", "quilting", "photons", "read_noise", "background"):
+            _check.number(name, getattr(self, name), 0)
+        _check.integer("seed", self.seed, 0)
+        if not self.photons and (self.read_noise or self.background):
+            raise ValueError(
+                f"photons = 0 with read_noise = {self.read_noise:g} and background = {self.background:g}: "
+                "expected 0 for both where frames are to be without noise"
+            )
+        # Whatever else is out of range shows when the parts are made.
+        _ = self._sensor
+
+    @classmethod
+    def errors(cls) -> tuple[str, ...]:
+        """Names of the parameters that are errors: 0 is ideal for each."""
+        names = [field.name for field in fields(cls)]
+        return tuple(names[names.index("leakage") : names.index("photons")])
+
+    @classmethod
+    def ideal(cls, **changes: float) -> Bench:
+        """A bench without any error or noise, but for the `changes`."""
+        perfect = dict.fromkeys((*cls.errors(), "photons", "read_noise", "background"), 0)
+        return cls(**{**perfect, **changes})
+
+    @cached_property
+    def segments(self) -> NDArray[np.int64]:
+        """Number of the segment seen by each point of the pupil's grid, 0 in gaps and outside, (ny, nx)."""
+        return self._pupil.segments
+
+    @cached_property
+    def numbers(self) -> NDArray[np.int64]:
+        """Numbers of the segments that can be commanded, in the order of the commands, (n_segments,)."""
+        numbers = np.unique(self.segments)
+        return numbers[numbers > 0]
+
+    @property
+    def n_segments(self) -> int:
+        """Number of segments that can be commanded."""
+        return len(self.numbers)
+
+    def commanded_phase(self, pistons: ArrayLike | Mapping[int, float]) -> NDArray[np.float64]:
+        """Phase that segment commands ask for.
+
+        Parameters
+        ----------
+        pistons : array_like, shape (..., n_segments), or mapping of segment number to float, radian
+            Wavefront piston of each segment in the order of `numbers`; a mapping leaves the others at 0.
+
+        Returns
+        -------
+        ndarray, shape (..., ny, nx), radian
+            0 in gaps and outside.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the number of commands is wrong, a command is not finite, or a segment is missing.
+        """
+        values = self._commands(pistons)
+        index = np.searchsorted(self.numbers, self.segments)
+        return np.where(self.segments > 0, values[..., np.minimum(index, self.n_segments - 1)], 0.0)
+
+    def frames(self, pistons: ArrayLike | Mapping[int, float] | None = None, seed: Seed = None) -> NDArray:
+        """Counts of the camera with the mask in.
+
+        Parameters
+        ----------
+        pistons : as for `commanded_phase`, optional
+            Flat if left out.
+        seed : int, Generator or SeedSequence, optional
+            Of the noise.
+
+        Returns
+        -------
+        ndarray, shape (..., 2, ny', nx')
+            Image of the polarisation that sees +`phase`, then of the other one.
+        """
+        phase = 0.0 if pistons is None else self.commanded_phase(pistons)
+        field = self._field * np.exp(1j * phase)
+        flat = field.reshape(-1, *field.shape[-2:])
+        images = np.stack([self._image(self._sensor.propagate(one)) for one in flat])
+        return self._expose(images.reshape(*field.shape[:-2], *images.shape[1:]), seed)
+
+    def pupil_images(self, seed: Seed = None) -> NDArray:
+        """Counts of the camera with the mask taken out and a flat command, shape (2, ny', nx')."""
+        field = np.pad(self._field, self._margin)
+        return self._expose(self._image(np.stack([field, field])), seed)
+
+    def dark(self, seed: Seed = None) -> NDArray:
+        """Counts of the camera without light, shape (2, ny', nx')."""
+        return self._expose(np.zeros((2, *self._camera_shape)), seed)
+
+    @cached_property
+    def _pupil(self) -> Pupil:
+        whole = Pupil.hexagonal(self.n_pixels, self.n_rings, self.gap, self.missing, self.stop)
+        return Pupil.from_segments(whole.segments, np.sqrt(1 + self.illumination * whole.x))
+
+    @cached_property
+    def _sensor(self) -> ZernikeSensor:
+        diameter = self.diameter * (1 + self.dimple_error)
+        masks = Dimple(diameter, self.phase), Dimple(diameter, -self.phase)
+        # Defocus spreads light: on a plane wider than the camera it does not come back on the other side.
+        return ZernikeSensor(self._pupil, *masks, extent=max(2.0, self.extent))
+
+    @property
+    def _margin(self) -> int:
+        return self._sensor.window[0].start
+
+    @cached_property
+    def _field(self) -> NDArray[np.complex128]:
+        """Field of the flat command."""
+        phase = np.zeros(self._pupil.shape)
+        if self.static:
+            phase += power_law_screens(zernike_basis(self._pupil, 27), self.static, 1, seed=self.seed)[0]
+        if self.quilting:
+            x, y = np.meshgrid(self._pupil.x, self._pupil.y)
+            phase += self.quilting * (np.cos(2 * np.pi * 22 * x) + np.cos(2 * np.pi * 22 * y))
+        return self._pupil.amplitude * np.exp(1j * phase)
+
+    @property
+    def _camera_shape(self) -> tuple[int, int]:
+        margin = self._margin - round((self.extent - 1) * self.n_pixels / 2)
+        return tuple(n - 2 * margin for n in self._sensor.detector_shape)
+
+    def _image(self, waves: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Intensity on the camera of the two polarisations, (2, ny, nx) to (2, ny', nx')."""
+        images = np.empty(waves.shape)
+        for arm, sign in enumerate((1, -1)):
+            seen = np.abs(self._defocus(waves, sign * self.focus_difference / 2)) ** 2
+            image = (1 - self.leakage) * seen[arm] + self.leakage * seen[1 - arm]
+            images[arm] = ndimage.shift(image, sign * self.misregistration / 2, order=1, mode="nearest")
+        margin = (waves.shape[-1] - self._camera_shape[-1]) // 2
+        inner = slice(margin, waves.shape[-1] - margin)
+        return images[:, inner, inner]
+
+    def _defocus(self, waves: NDArray[np.complex128], distance: float) -> NDArray[np.complex128]:
+        """Fresnel propagation by a distance in units of D^2 / lambda."""
+        if not distance:
+            return waves
+        v, u = (fft.fftfreq(n, 1 / self.n_pixels) for n in waves.shape[-2:])
+        transfer = np.exp(-1j * np.pi * distance * (u**2 + v[:, np.newaxis] ** 2))
+        return fft.ifft2(fft.fft2(waves) * transfer)
+
+    def _expose(self, images: NDArray[np.float64], seed: Seed) -> NDArray[np.float64]:
+        flux = np.array([1 + self.flux_imbalance, 1 - self.flux_imbalance])[:, np.newaxis, np.newaxis]
+        if not self.photons:
+            return images * flux
+        camera = Detector(self._pupil, self.photons, read_noise=self.read_noise, background=self.background)
+        return camera.expose(images * flux, seed)
+
+    def _commands(self, pistons: ArrayLike | Mapping[int, float]) -> NDArray[np.float64]:
+        if isinstance(pistons, Mapping):
+            values = np.zeros(self.n_segments)
+            for number, piston in pistons.items():
+                if number not in self.numbers:
+                    known = self.numbers.tolist()
+                    raise ValueError(
+                        f"pistons names segment {number!r}, which is missing: expected some of {known}"
+                    )
+                values[np.searchsorted(self.numbers, number)] = _check.number(f"pistons[{number}]", piston)
+            return values
+        values = _check.real_array("pistons", pistons).astype(np.float64)
+        _check.trailing_shape("pistons", values, (self.n_segments,), "a command for each usable segment")
+        _check.finite("pistons", values)
+        return values
+
+
+@dataclass(frozen=True, eq=False)
+class BenchModel:
+    """The sensor as an experimenter models it: off-mask images, the design of the mask, Fraunhofer diffraction.
+
+    Make one with `from_images`.
+
+    Attributes
+    ----------
+    shifted, classic : ZernikeSensor
+        The sensor with both masks, and with the first one only.
+    segments : ndarray of int, shape (ny, nx)
+    numbers : ndarray of int, shape (n_segments,)
+    scale : ndarray, shape (2, 1, 1)
+        Counts of each image that make an intensity of 1.
+    dark : ndarray, shape (2, ny', nx')
+    """
+
+    shifted: ZernikeSensor
+    classic: ZernikeSensor
+    segments: NDArray[np.int64]
+    numbers: NDArray[np.int64]
+    scale: NDArray[np.float64]
+    dark: NDArray[np.float64]
+
+    @classmethod
+    def from_images(cls, bench: Bench, seed: Seed = None) -> BenchModel:
+        """Record off-mask images and a dark on a bench, and model the sensor from them.
+
+        The amplitude is the square root of the mean of the two images, each scaled to the same flux. The layout of
+        the segments, the dimple's design and its phase shifts are taken as known.
+
+        Parameters
+        ----------
+        bench : Bench
+        seed : int, Generator or SeedSequence, optional
+            Of the noise of the images.
+        """
+        rng = np.random.default_rng(seed)
+        dark = bench.dark(rng)
+        images = bench.pupil_images(rng) - dark
+        ny, nx = bench.segments.shape
+        top, left = (images.shape[-2] - ny) // 2, (images.shape[-1] - nx) // 2
+        inner = images[:, top : top + ny, left : left + nx]
+        inside = bench.segments > 0
+        scale = inner[:, inside].mean(axis=1)[:, np.newaxis, np.newaxis]
+        amplitude = np.sqrt(np.maximum((inner / scale).mean(axis=0), 0))
+        # The stop of the bench is known; what is dark within it, gaps and missing segments, the image shows.
+        y, x = ((np.arange(n) - (n - 1) / 2) / bench.n_pixels for n in (ny, nx))
+        stop = np.hypot(x, y[:, np.newaxis]) <= 0.5
+        pupil = Pupil.from_amplitude(np.where(stop, amplitude, 0), bench.n_pixels, threshold=0.1)
+        plus, minus = Dimple(bench.diameter, bench.phase), Dimple(bench.diameter, -bench.phase)
+        return cls(
+            ZernikeSensor(pupil, plus, minus, extent=bench.extent),
+            ZernikeSensor(pupil, plus, extent=bench.extent),
+            bench.segments,
+            bench.numbers,
+            scale * np.mean(amplitude[pupil.mask] ** 2),
+            dark,
+        )
+
+    def normalise(self, counts: ArrayLike) -> NDArray[np.float64]:
+        """Frames of counts, 1 = mean intensity of the model's pupil; what noise makes negative is raised to 0."""
+        counts = _check.real_array("counts", counts)
+        _check.trailing_shape("counts", counts, self.dark.shape, "the two images of the bench")
+        return np.maximum((counts - self.dark) / self.scale, 0)
+
+    @cached_property
+    def modes(self) -> NDArray[np.float64]:
+        """Map of each segment, 1 on it and 0 elsewhere, (n_segments, ny, nx)."""
+        return (self.segments == self.numbers[:, np.newaxis, np.newaxis]).astype(float)
+
+    def pistons(self, phase: ArrayLike) -> NDArray[np.float64]:
+        """Piston of each segment in a phase: the argument of its mean phasor.
+
+        Parameters
+        ----------
+        phase : array_like, shape (..., ny, nx), radian
+            Points that are NaN, since they are dark to the model, do not count.
+
+        Returns
+        -------
+        ndarray, shape (..., n_segments), radian
+
+        Raises
+        ------
+        ValueError
+            If the shape is wrong, or no point of a segment is finite.
+        """
+        phase = _check.real_array("phase", phase)
+        _check.trailing_shape("phase", phase, self.segments.shape, "the grid of the segments")
+        flat = phase.reshape(*phase.shape[:-2], -1)[..., self.segments.ravel() > 0]
+        sums = np.where(np.isfinite(flat), np.exp(1j * np.nan_to_num(flat)), 0) @ self._members.T
+        if not np.all(np.abs(sums) > 0):
+            raise ValueError("phase is NaN all over a segment: expected finite values")
+        return np.angle(sums)
+
+    @cached_property
+    def _members(self) -> NDArray[np.float64]:
+        numbers = self.segments[self.segments > 0]
+        return (numbers == self.numbers[:, np.newaxis]).astype(float)
+
+
+def segment_residual(found: ArrayLike, commanded: ArrayLike) -> NDArray[np.float64]:
+    """Difference of segment pistons on the circle, without their common piston.
+
+    Parameters
+    ----------
+    found, commanded : array_like, shapes (..., n_segments) that broadcast, radian
+
+    Returns
+    -------
+    ndarray, shape (..., n_segments), radian
+        In (-pi, pi].
+
+    Raises
+    ------
+    ValueError
+        If a value is not finite.
+    """
+    found, commanded = _check.real_array("found", found), _check.real_array("commanded", commanded)
+    _check.finite("found", found)
+    _check.finite("commanded", commanded)
+    phasor = np.exp(1j * (found - commanded))
+    return np.angle(phasor * phasor.mean(axis=-1, keepdims=True).conj())
+
+
+def segment_screens(
+    bench: Bench, rms: float, n_screens: int, exponent: float = -2.0, seed: Seed = None
+) -> NDArray[np.float64]:
+    """Random segment commands: power-law screens averaged over each segment.
+
+    Parameters
+    ----------
+    bench : Bench
+        Its layout is used, nothing else.
+    rms : float, radian
+        Every screen is scaled to exactly this rms over the segments, piston removed.
+    n_screens : int
+    exponent : float
+        Exponent of the power spectral density, see `power_law_screens`.
+    seed : int, Generator or SeedSequence, optional
+
+    Returns
+    -------
+    ndarray, shape (n_screens, n_segments), radian
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 5.2.
+    """
+    rms = _check.number("rms", rms, 0)
+    layout = Pupil.circular(bench.n_pixels)
+    screens = power_law_screens(zernike_basis(layout, 200), 1.0, n_screens, exponent, seed)
+    flat = screens.reshape(len(screens), -1)
+    members = bench.segments.ravel() == bench.numbers[:, np.newaxis]
+    pistons = flat @ (members / members.sum(axis=1, keepdims=True)).T
+    pistons -= pistons.mean(axis=1, keepdims=True)
+    return pistons * (rms / pistons.std(axis=1, keepdims=True))

@@ -1,0 +1,206 @@
+"""The experiments of section 5 on the simulated bench: commands go in, errors of the segments come out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
+from zwfs.metrics import dynamic_range
+from zwfs.reconstructors import Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
+
+
+@dataclass(frozen=True)
+class BenchCurves:
+    """Segment pistons commanded on a bench, and what several reconstructors found.
+
+    Attributes
+    ----------
+    rms : ndarray, shape (n_rms,), radian rms
+        Input.
+    commanded : ndarray, shape (n_rms, n_screens, n_segments), radian
+    residuals : dict of ndarray, shape (n_rms, n_screens, n_segments), radian
+        Found less commanded, wrapped and without piston, for each reconstructor.
+    """
+
+    rms: NDArray[np.float64]
+    commanded: NDArray[np.float64]
+    residuals: dict[str, NDArray[np.float64]]
+
+    @property
+    def errors(self) -> dict[str, NDArray[np.float64]]:
+        """Rms error over the segments, shape (n_rms, n_screens), radian rms."""
+        return {name: np.sqrt(np.mean(values**2, axis=-1)) for name, values in self.residuals.items()}
+
+    def mean(self, name: str) -> NDArray[np.float64]:
+        """Mean error over the screens, shape (n_rms,), radian rms."""
+        return self.errors[name].mean(axis=1)
+
+    def std(self, name: str) -> NDArray[np.float64]:
+        """Standard deviation of the error over the screens, shape (n_rms,), radian rms."""
+        return self.errors[name].std(axis=1)
+
+    def dynamic_range(self, name: str, threshold: float) -> float:
+        """Input at which the mean error leaves `threshold` times the input; see `zwfs.dynamic_range`."""
+        return dynamic_range(self.rms, self.mean(name), threshold)
+
+    def gain(self, name: str) -> NDArray[np.float64]:
+        """Slope of the found pistons against the commanded ones, (n_rms,); below 1 they are underestimated.
+
+        The offset of each segment, which is its residual at an input of 0 where there is one, is taken off first.
+        NaN at an input of 0.
+        """
+        residuals = self.residuals[name]
+        if np.any(self.rms == 0):
+            residuals = residuals - residuals[self.rms == 0].mean(axis=(0, 1))
+        power = np.sum(self.commanded**2, axis=(1, 2))
+        slope = np.sum(self.commanded * residuals, axis=(1, 2))
+        return 1 + np.divide(slope, power, out=np.full_like(power, np.nan), where=power > 0)
+
+
+def bench_reconstructors(
+    bench: Bench,
+    model: BenchModel,
+    *,
+    n_iterations: int = 25,
+    poke: float = 0.1,
+    conditioning: float = 0.1,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """The paper's reconstructors for a bench, from its model; the linear one is calibrated on the bench itself.
+
+    Parameters
+    ----------
+    bench : Bench
+        Gives frames of each segment pushed and pulled.
+    model : BenchModel
+    n_iterations : int
+        Of the iterative reconstructors.
+    poke : float, radian
+        Piston by which each segment is pushed and pulled for the interaction matrix.
+    conditioning : float
+        Smallest singular value of that matrix that is inverted, relative to the largest. The piston of all
+        segments together is seen by no sensor: in its place stands the noise of the calibration, to be left out.
+    seed : int
+        Of the noise of the calibration.
+
+    Returns
+    -------
+    dict of reconstructor
+        One mask's image makes "Linear" and "Arcsine", both the others. Gradient descent seeks segment pistons.
+    """
+    rng = np.random.default_rng(seed)
+    pokes = _check.number("poke", poke, 0, open_low=True) * np.eye(bench.n_segments)
+    calibration = tuple(
+        model.normalise(bench.frames(command, rng))[..., :1, :, :] for command in (None, pokes, -pokes)
+    )
+    steps = {"n_iterations": n_iterations}
+    return {
+        "Linear": Linear(
+            model.classic, model.modes, poke=poke, conditioning=conditioning, calibration=calibration
+        ),
+        "Arcsine": Arcsine(model.classic, **steps),
+        "GerchbergSaxton": GerchbergSaxton(model.shifted, **steps),
+        "GradientDescent": GradientDescent(model.shifted, model.modes, **steps),
+        "PhaseShifted": PhaseShifted(model.shifted, **steps),
+    }
+
+
+def find_pistons(reconstructor: Any, model: BenchModel, frames: ArrayLike) -> NDArray[np.float64]:
+    """Segment pistons that a reconstructor sees in normalised frames, (..., 2, ny', nx') to (..., n_segments)."""
+    n_images = reconstructor.settings.sensor.n_masks
+    return model.pistons(reconstructor(np.asarray(frames)[..., :n_images, :, :]).phase)
+
+
+def bench_curves(
+    bench: Bench,
+    model: BenchModel,
+    reconstructors: Mapping[str, Any],
+    rms: ArrayLike,
+    n_screens: int,
+    *,
+    exponent: float = -2.0,
+    seed: int = 0,
+) -> BenchCurves:
+    """Errors of reconstructors on random segment commands of growing rms: the experiment of section 5.2.
+
+    Parameters
+    ----------
+    bench : Bench
+    model : BenchModel
+        Model of that bench, or of another one, to see what that does.
+    reconstructors : mapping of str to reconstructor
+    rms : array_like, shape (n_rms,), radian rms
+    n_screens : int
+        Screens for each rms.
+    exponent : float
+        Exponent of the power spectral density of the screens.
+    seed : int
+        Of screens and noise.
+
+    Returns
+    -------
+    BenchCurves
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 5.2 and Figure 9.
+    """
+    rms = _check.real_array("rms", rms)
+    n_screens = _check.integer("n_screens", n_screens, 1)
+    commanded = np.empty((len(rms), n_screens, bench.n_segments))
+    residuals = {name: np.empty_like(commanded) for name in reconstructors}
+    for index, value in enumerate(rms):
+        screens, noise = np.random.SeedSequence(seed, spawn_key=(index,)).spawn(2)
+        commanded[index] = segment_screens(bench, value, n_screens, exponent, screens)
+        frames = model.normalise(bench.frames(commanded[index], noise))
+        for name, reconstructor in reconstructors.items():
+            residuals[name][index] = segment_residual(find_pistons(reconstructor, model, frames), commanded[index])
+    return BenchCurves(rms, commanded, residuals)
+
+
+def error_budget(
+    bench: Bench,
+    names: Sequence[str],
+    rms: ArrayLike,
+    n_screens: int,
+    *,
+    n_iterations: int = 25,
+    seed: int = 0,
+) -> dict[str, BenchCurves]:
+    """Each error of a bench alone, none, and all: what every one of them does to the reconstruction.
+
+    Parameters
+    ----------
+    bench : Bench
+        Holds the sizes of the errors.
+    names : sequence of str
+        Reconstructors to run.
+    rms : array_like, shape (n_rms,), radian rms
+    n_screens : int
+    n_iterations : int
+    seed : int
+        The same screens are commanded every time.
+
+    Returns
+    -------
+    dict of BenchCurves
+        By the name of the error, "none" first and "all" last.
+    """
+    layout = {name: getattr(bench, name) for name in ("n_pixels", "extent", "illumination", "seed")}
+    noise = {name: getattr(bench, name) for name in ("photons", "read_noise", "background")}
+    cases = {"none": Bench.ideal(**layout)}
+    cases |= {name: Bench.ideal(**layout, **{name: getattr(bench, name)}) for name in Bench.errors()}
+    cases |= {"noise": Bench.ideal(**layout, **noise), "all": bench}
+    budget = {}
+    for case, one in cases.items():
+        model = BenchModel.from_images(one, seed)
+        known = bench_reconstructors(one, model, n_iterations=n_iterations, seed=seed)
+        chosen = {name: known[name] for name in names}
+        budget[case] = bench_curves(one, model, chosen, rms, n_screens, seed=seed)
+    return budget

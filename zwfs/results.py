@@ -1,0 +1,112 @@
+"""Files of results for a reader to take away: each figure as a picture, and the numbers behind it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FOLDER = "ZWFS_RESULTS"  # environment variable that names the folder
+
+# Without dates and versions the same figure is the same file.
+_METADATA = {
+    "png": {"Software": None},
+    "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
+}
+
+
+def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike], *, dpi: float = 200) -> None:
+    """Write a figure and its numbers to the folder that the environment variable ZWFS_RESULTS names.
+
+    The files are NAME.png, NAME.pdf and NAME.csv; they are the same byte for byte from run to run. If the variable
+    is not set nothing is written, but the arguments are checked all the same.
+
+    Parameters
+    ----------
+    figure : matplotlib Figure
+        To be finished: its layout stays as it is saved.
+    name : str
+        Stem of the files: lower-case letters, digits, ``-`` and ``_``. No two notebooks may use the same.
+    columns : mapping of str to array_like, shape (n,), or scalar
+        Columns of the CSV file by their header, which holds the unit, as in ``"input (rad rms)"``. A scalar stands
+        for a column of equal values. Floats are written with at most 9 significant digits.
+    dpi : float, dots per inch
+        Resolution of the PNG file.
+
+    Raises
+    ------
+    TypeError
+        If a column is complex.
+    ValueError
+        If the name holds other characters, there is no column, or columns differ in length or have two axes.
+    """
+    if not re.fullmatch(r"[a-z0-9][a-z0-9_-]*", name):
+        raise ValueError(f"name = {name!r}: expected lower-case letters, digits, - and _")
+    contents = {"csv": _csv(columns)}
+    if folder := os.environ.get(FOLDER):
+        contents |= _pictures(figure, dpi)
+        for kind, content in contents.items():
+            _write(Path(folder) / f"{name}.{kind}", content)
+
+
+def _pictures(figure: Figure, dpi: float) -> dict[str, bytes]:
+    """Draw a figure in every format, with one layout."""
+    from matplotlib import rc_context
+
+    pictures = {}
+    # After a save matplotlib asks these settings for a layout, even if the figure was made without one.
+    with rc_context({"figure.constrained_layout.use": False, "figure.autolayout": False}):
+        for kind, metadata in _METADATA.items():
+            stream = io.BytesIO()
+            figure.savefig(stream, format=kind, dpi=dpi, metadata=metadata)
+            pictures[kind] = stream.getvalue()
+            if figure.get_layout_engine() is not None:
+                # Constrained layout goes on moving the axes each time it runs.
+                figure.set_layout_engine("none")
+    return pictures
+
+
+def _csv(columns: Mapping[str, ArrayLike]) -> bytes:
+    """Columns as the bytes of a CSV file."""
+    arrays = {header: np.asarray(column) for header, column in columns.items()}
+    for header, array in arrays.items():
+        if array.dtype.kind == "c":
+            raise TypeError(f"column {header!r} is complex: expected its parts in columns of their own")
+        if array.ndim > 1:
+            raise ValueError(f"column {header!r} has shape {array.shape}: expected (n,) or a scalar")
+    lengths = {header: array.size for header, array in arrays.items() if array.ndim}
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{header!r}: {length}" for header, length in lengths.items())
+        raise ValueError(f"columns differ in length: {told}")
+    if not arrays:
+        raise ValueError("columns is empty: expected at least one")
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(arrays)
+    filled = np.broadcast_arrays(*map(np.atleast_1d, arrays.values()))
+    writer.writerows(zip(*(map(_text, array) for array in filled), strict=True))
+    return stream.getvalue().encode()
+
+
+def _text(value: Any) -> str:
+    return f"{value:.9g}" if isinstance(value, np.floating) else str(value)
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file in one step: whoever looks sees all of it or nothing."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        partial.write_bytes(content)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)

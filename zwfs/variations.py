@@ -1,0 +1,579 @@
+"""Variations of the phase-shifted sensor, section 4.2 of the paper: diameter of the dimple, pair of phase shifts.
+
+Everything rests on one identity. With beta the part of the field psi that passes through the dimple and
+c_k = exp(i theta_k) - 1, the frame of mask k is |psi|^2 + 2 Re(conj(c_k) W) with
+
+    W = conj(beta) (psi - beta),
+
+because |c_k|^2 = -2 Re(c_k). Two frames of an allowed pair are equivalent to the complex map W, whatever the pair.
+A step of the phase-shifted iteration therefore solves conj(beta) (psi' - beta) = W for psi', with the beta of the
+estimate before, and keeps its phase: the phase shifts drop out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs.detector import Detector
+from zwfs.lowrank import factorise
+from zwfs.masks import Dimple
+from zwfs.metrics import reconstruction_error, wrapped_residual
+from zwfs.pupil import Pupil
+from zwfs.reconstructors import PhaseShifted
+from zwfs.sensor import ZernikeSensor
+
+DARK_RING = 2 * 1.2196698912665045
+"""Diameter of the first dark ring of the Airy pattern, lambda/D: twice the first zero of J1(pi r)."""
+
+_TOLERANCE = 1e-12  # of the low-rank factors, as the spectrum is to be exact where the iteration is
+
+
+@dataclass(frozen=True)
+class DiameterCurve:
+    """Error of a reconstructor against the diameter of the dimple.
+
+    Attributes
+    ----------
+    diameters : ndarray, shape (n_diameters,), lambda/D
+    errors : ndarray, shape (n_diameters, n_screens), radian rms
+    """
+
+    diameters: NDArray[np.float64]
+    errors: NDArray[np.float64]
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """Mean error over the screens, shape (n_diameters,), radian rms."""
+        return self.errors.mean(axis=1)
+
+    @property
+    def std(self) -> NDArray[np.float64]:
+        """Standard deviation of the error over the screens, shape (n_diameters,), radian rms."""
+        return self.errors.std(axis=1)
+
+    def at(self, diameter: float) -> float:
+        """Mean error at the sampled diameter (lambda/D) next to `diameter`, radian rms."""
+        return float(self.mean[np.argmin(np.abs(self.diameters - diameter))])
+
+    def leaves(self, limit: float, start: float = 0.0) -> float:
+        """Diameter, from `start` on, at which the mean error rises above `limit`; see `crossing`."""
+        used = self.diameters >= start - 1e-9
+        return crossing(self.diameters[used], self.mean[used], limit)
+
+
+def crossing(x: ArrayLike, y: ArrayLike, limit: float) -> float:
+    """Where a sampled positive curve rises above a limit for the first time.
+
+    Parameters
+    ----------
+    x : array_like, shape (n,)
+        Increasing.
+    y : array_like, shape (n,)
+        Positive; its logarithm is interpolated linearly.
+    limit : float
+        In the unit of `y`.
+
+    Returns
+    -------
+    float
+        In the unit of `x`; `x[0]` if the curve starts above the limit, infinity if it never gets there.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, `x` does not increase, or a value of `y` is not positive and finite.
+    """
+    x, y = _check.real_array("x", x), _check.real_array("y", y)
+    if x.ndim != 1 or x.shape != y.shape or not x.size:
+        raise ValueError(f"x and y have shapes {x.shape} and {y.shape}: expected the same (n,)")
+    limit = _check.number("limit", limit, 0, open_low=True)
+    _check.finite("y", y)
+    if np.any(np.diff(x) <= 0) or np.any(y <= 0):
+        raise ValueError("x, y: expected increasing x and positive y")
+    above = np.flatnonzero(y > limit)
+    if not above.size:
+        return np.inf
+    last = above[0]
+    if last == 0:
+        return float(x[0])
+    low, high = np.log(y[last - 1 : last + 1])
+    return float(x[last - 1] + (np.log(limit) - low) / (high - low) * (x[last] - x[last - 1]))
+
+
+def diameter_curve(make: Callable[[float], Any], diameters: ArrayLike, screens: NDArray) -> DiameterCurve:
+    """Error of a reconstructor on the same screens for dimples of several diameters: the experiment of Figure 4.
+
+    Parameters
+    ----------
+    make : callable
+        `make(diameter)` gives a reconstructor for a sensor with dimples of that diameter (lambda/D).
+    diameters : array_like, shape (n_diameters,), lambda/D
+    screens : ndarray, shape (n_screens, ny, nx), radian
+
+    Returns
+    -------
+    DiameterCurve
+
+    Raises
+    ------
+    ValueError
+        If there are no screens, or the diameters are not a list of positive, increasing numbers.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 4.2 and Figure 4.
+    """
+    diameters = _check.real_array("diameters", diameters)
+    if diameters.ndim != 1 or not diameters.size or diameters[0] <= 0 or np.any(np.diff(diameters) <= 0):
+        raise ValueError(f"diameters = {diameters}: expected positive, increasing values")
+    if np.ndim(screens) != 3 or not len(screens):
+        raise ValueError(f"screens has shape {np.shape(screens)}: expected (n_screens, ny, nx)")
+    errors = np.empty((diameters.size, len(screens)))
+    for row, diameter in zip(errors, diameters, strict=True):
+        reconstructor = make(float(diameter))
+        sensor = reconstructor.settings.sensor
+        row[:] = reconstruction_error(sensor.pupil, reconstructor(sensor.measure(screens)).phase, screens)
+    return DiameterCurve(diameters, errors)
+
+
+class DimpleLight:
+    """The part of a field that passes through a dimple, beta, at the points of the pupil.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    diameter : float, lambda/D
+
+    References
+    ----------
+    Chambouleyron et al. 2024, equation (11); `eq-dimple-reference` and `eq-low-rank` of the theory page.
+    """
+
+    def __init__(self, pupil: Pupil, diameter: float) -> None:
+        self.pupil = pupil
+        axes = (pupil.y, pupil.x)
+        # For a phase shift of pi the reference wave is -2 beta.
+        factors = factorise((Dimple(diameter, np.pi),), axes, axes, pupil.n_pixels**-2.0, _TOLERANCE)
+        self._factors = factors
+        self._core = factors.core[0].T.real / -2
+
+    @property
+    def rank(self) -> int:
+        """Number of coefficients that beta is made of."""
+        return self._factors.pupil.rank
+
+    def __call__(self, field: NDArray) -> NDArray[np.complex128]:
+        """Beta of complex fields at the points of the pupil, (k, n_points) to (k, n_points)."""
+        return self.expand(self.project(field) @ self._core)
+
+    def project(self, field: NDArray) -> NDArray[np.complex128]:
+        """Coefficients of fields, (k, n_points) to (k, rank)."""
+        return self._factors.pupil.project(self.pupil.scatter(np.asarray(field, np.complex128), fill=0))
+
+    def expand(self, coefficients: NDArray) -> NDArray:
+        """Fields of coefficients on the detector side, (k, rank) to (k, n_points)."""
+        return self.pupil.gather(self._factors.detector.expand(coefficients))
+
+    def functions(self) -> NDArray[np.float64]:
+        """Beta of a unit coefficient each, shape (rank, n_points)."""
+        return self.expand(np.ascontiguousarray(self._core))
+
+
+def linearised_step(pupil: Pupil, diameter: float, phase: ArrayLike, error: ArrayLike) -> NDArray[np.float64]:
+    """What one phase-shifted step makes of a small error of its estimate, whatever the pair of phase shifts.
+
+    With delta = i K[psi error], the change of beta (K being the dimple), the error after the step is
+    Im(delta / beta) - 2 Re(delta / beta) Im(conj(beta) psi) / |psi|^2. Around a flat wavefront and a real
+    positive beta = b this is K[A error] / b, a weighted mean of the error where the kernel is positive.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    diameter : float, lambda/D
+    phase : array_like, shape (ny, nx), radian
+        True phase, at which the iteration is linearised.
+    error : array_like, shape (..., ny, nx), radian
+        Error of the estimate before the step.
+
+    Returns
+    -------
+    ndarray, shape (..., ny, nx), radian
+        Error after it, NaN outside the pupil. A piston comes back unchanged.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 3.1; `eq-linear-system` of the theory page.
+    """
+    light = DimpleLight(pupil, diameter)
+    psi, beta = _field(light, phase)
+    error = _check.real_array("error", error)
+    _check.trailing_shape("error", error, pupil.shape, "the shape of the pupil")
+    change = pupil.gather(error).reshape(-1, pupil.n_points)
+    after = _after(psi, beta, light(1j * psi * change))
+    return pupil.scatter(after.reshape(*error.shape[:-2], -1))
+
+
+def iteration_spectrum(pupil: Pupil, diameter: float, phase: ArrayLike | None = None) -> NDArray[np.complex128]:
+    """Eigenvalues of the linearised phase-shifted step, piston left out.
+
+    The step only sees the few coefficients of beta, so all eigenvalues but zeros are those of a matrix of twice
+    their number. The iteration converges to the true phase from nearby if the first one is inside the unit
+    circle, and its modulus is the factor by which an iteration then multiplies the error.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    diameter : float, lambda/D
+    phase : array_like, shape (ny, nx), radian, optional
+        True phase; flat if left out.
+
+    Returns
+    -------
+    ndarray of complex, shape (2 rank - 1,)
+        Largest modulus first.
+
+    Raises
+    ------
+    ValueError
+        If the shape of the phase is wrong.
+    """
+    light = DimpleLight(pupil, diameter)
+    psi, beta = _field(light, np.zeros(pupil.shape) if phase is None else phase)
+    functions = light.functions()
+    # Real and imaginary parts of the coefficients of the change of the field, before and after.
+    after = np.concatenate([_after(psi, beta, functions), _after(psi, beta, 1j * functions)])
+    coefficients = light.project(1j * psi * after)
+    values = np.linalg.eigvals(np.concatenate([coefficients.real, coefficients.imag], axis=1))
+    # A piston comes back unchanged: its eigenvalue is exactly 1, and no frame shows a piston.
+    values = np.delete(values, np.argmin(np.abs(values - 1)))
+    return values[np.argsort(-np.abs(values), kind="stable")]
+
+
+def measured_factor(
+    pupil: Pupil, diameter: float, phase: ArrayLike, away: ArrayLike, n_iterations: int = 400
+) -> float:
+    """Factor by which an iteration of `PhaseShifted` multiplies a small error, observed.
+
+    After each iteration the error is scaled back to the size that it had at the start, so that it stays small
+    where the iteration diverges and above rounding where it converges.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    diameter : float, lambda/D
+    phase : array_like, shape (ny, nx), radian
+        True phase.
+    away : array_like, shape (ny, nx), radian
+        Small error of the start.
+    n_iterations : int
+
+    Returns
+    -------
+    float
+        Geometric mean over the second half of the iterations.
+
+    Raises
+    ------
+    ValueError
+        If the error of the start is 0, or an argument is out of range.
+    """
+    n_iterations = _check.integer("n_iterations", n_iterations, 2)
+    size = float(pupil.rms(away))
+    if size == 0:
+        raise ValueError("away is the same everywhere: expected an error of some size")
+    sensor = ZernikeSensor(pupil, *(Dimple(diameter, theta) for theta in (np.pi / 2, -np.pi / 2)), tolerance=1e-13)
+    method = PhaseShifted(sensor, n_iterations=1)
+    frames, error, factors = sensor.measure(phase), np.asarray(away), []
+    for _ in range(n_iterations):
+        error = wrapped_residual(pupil, method(frames, start=phase + error).phase, phase)
+        error = np.where(pupil.mask, error, 0)
+        factors.append(float(pupil.rms(error)) / size)
+        error /= factors[-1]
+    return float(np.exp(np.mean(np.log(factors[n_iterations // 2 :]))))
+
+
+def mode_sensitivity(
+    pupil: Pupil,
+    diameter: float,
+    modes: ArrayLike,
+    phase_shifts: tuple[float, ...] = (np.pi / 2, -np.pi / 2),
+    phase: ArrayLike | None = None,
+) -> NDArray[np.float64]:
+    """How strongly the frames answer to each mode, the change of the reference wave included.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    diameter : float, lambda/D
+    modes : array_like, shape (n_modes, ny, nx)
+        Of unit rms, as `zernike_basis` gives them.
+    phase_shifts : tuple of float, radian
+        One for each mask.
+    phase : array_like, shape (ny, nx), radian, optional
+        Around which the sensor is linearised; flat if left out.
+
+    Returns
+    -------
+    ndarray, shape (n_modes,), 1 / radian
+        Norm of the derivatives of the intensities: root of the sum over the masks of the mean square over the
+        points of the pupil. Around a flat wavefront and for the pair (pi/2, -pi/2) it is
+        sqrt(8) rms(b mode - K[mode]).
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 4.2.
+    """
+    light = DimpleLight(pupil, diameter)
+    psi, beta = _field(light, np.zeros(pupil.shape) if phase is None else phase)
+    modes = _check.real_array("modes", modes)
+    _check.trailing_shape("modes", modes, pupil.shape, "the shape of the pupil")
+    direct = 1j * psi * pupil.gather(modes).reshape(-1, pupil.n_points)
+    through = light(direct)
+    power = np.zeros(len(direct))
+    for theta in phase_shifts:
+        strength = np.exp(1j * theta) - 1
+        out = psi + strength * beta
+        power += np.mean((2 * np.real(out.conj() * (direct + strength * through))) ** 2, axis=-1)
+    return np.sqrt(power)
+
+
+@dataclass(frozen=True)
+class PhaseNoise:
+    """Error of the phase at each point of the pupil, with the reference waves held fixed.
+
+    Attributes
+    ----------
+    photon : ndarray, shape (n_points,), radian sqrt(photon)
+        Standard deviation for one photon per point, divided equally between the masks, when the linear system of
+        two frames is solved as `PhaseShifted` does; divide by the root of the number of photons per point.
+    bound : ndarray, shape (n_points,), radian sqrt(photon)
+        Least one for any unbiased estimate that knows the amplitude (Cramer-Rao).
+    read : ndarray, shape (n_points,), radian
+        As `photon`, for noise of standard deviation 1 in every pixel of both frames, where 1 is the mean intensity
+        of each mask's image of the pupil with the mask taken out.
+    """
+
+    photon: NDArray[np.float64]
+    bound: NDArray[np.float64]
+    read: NDArray[np.float64]
+
+
+def phase_noise(sensor: ZernikeSensor, phase: ArrayLike) -> PhaseNoise:
+    """Propagate noise of the frames to the phase, to first order, for a sensor of two masks.
+
+    With r_k the reference waves, held fixed, psi = 2i (s_b r_a - s_a r_b) / D with D = 4 Im(conj(r_a) r_b), so
+    the noise of a pixel's two intensities moves its phase by Im(conj(psi) dpsi/dI_k) / |psi|^2 each. The
+    information of both frames is the sum of (dI_k/dphi)^2 / I_k times half the photons. That the reference waves
+    are made from the estimate concerns a dozen numbers among thousands of pixels and is left out.
+
+    Parameters
+    ----------
+    sensor : ZernikeSensor
+        With two masks and a detector of 1 D.
+    phase : array_like, shape (ny, nx), radian
+        True phase.
+
+    Returns
+    -------
+    PhaseNoise
+        Infinite where the system is singular.
+
+    Raises
+    ------
+    ValueError
+        If the sensor has not two masks, its detector is wider than the pupil, or the phase has another shape.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, sections 2.2 and 4.2; `eq-linear-system` of the theory page.
+    """
+    if sensor.n_masks != 2 or sensor.detector_shape != sensor.pupil.shape:
+        raise ValueError(f"sensor = {sensor!r}: expected two masks and an extent of 1")
+    phase = _check.real_array("phase", phase)
+    _check.trailing_shape("phase", phase, sensor.pupil.shape, "the shape of the pupil")
+    field = sensor.pupil.amplitude * np.exp(1j * np.where(sensor.pupil.mask, phase, 0))
+    psi = sensor.pupil.gather(field)
+    waves = sensor.pupil.gather(sensor.reference_wave(field))
+    intensity = np.abs(psi + waves) ** 2
+    slope = 2 * np.real(waves.conj() * 1j * psi)
+    determinant = 4 * np.imag(waves[0].conj() * waves[1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # d psi / d s_a = -2i r_b / D, d psi / d s_b = 2i r_a / D
+        gain = 2j * np.stack([-waves[1], waves[0]]) / determinant
+        answer = np.imag(psi.conj() * gain) / np.abs(psi) ** 2
+        photon = np.sqrt(2 * np.sum(answer**2 * intensity, axis=0))
+        read = np.sqrt(np.sum(answer**2, axis=0))
+        bound = 1 / np.sqrt(np.sum(slope**2 / intensity, axis=0) / 2)
+    return PhaseNoise(*(np.where(np.isnan(values), np.inf, values) for values in (photon, bound, read)))
+
+
+def drawn_noise(
+    sensor: ZernikeSensor, phase: ArrayLike, photons: float, n_draws: int, seed: int = 0
+) -> tuple[float, float]:
+    """Photon noise of the phase-shifted iteration, from frames with drawn noise, to compare with `phase_noise`.
+
+    Parameters
+    ----------
+    sensor : ZernikeSensor
+        With two masks or more, between which the light is divided equally.
+    phase : array_like, shape (ny, nx), radian
+        True phase.
+    photons : float, photons
+        Per point of the pupil and frame set; many, as the comparison is to first order.
+    n_draws : int
+        At least 2.
+    seed : int
+
+    Returns
+    -------
+    noise, error : float, radian sqrt(photon)
+        Rms over the points and draws, and its standard error.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range.
+    """
+    n_draws = _check.integer("n_draws", n_draws, 2)
+    camera = Detector(sensor.pupil, _check.number("photons", photons) * sensor.pupil.n_points / sensor.n_masks)
+    frames = np.repeat(sensor.measure(phase)[np.newaxis], n_draws, axis=0)
+    found = PhaseShifted(sensor)(camera.normalise(camera.expose(frames, seed)))
+    power = photons * reconstruction_error(sensor.pupil, found.phase, phase) ** 2
+    noise = float(np.sqrt(power.mean()))
+    return noise, float(power.std(ddof=1) / np.sqrt(n_draws) / (2 * noise))
+
+
+@dataclass(frozen=True)
+class PairMaps:
+    """Error and noise for every pair of phase shifts; NaN where `PhaseShifted` refuses the pair.
+
+    Attributes
+    ----------
+    angles : ndarray, shape (n,), radian
+        Phase shifts of either mask.
+    error : ndarray, shape (n, n), radian rms
+        Mean error of the iteration on frames without noise.
+    flat, aberrated : ndarray, shape (n, n), radian sqrt(photon)
+        `PhaseNoise.photon`, rms over the pupil, for a flat wavefront and, rms over the screens too, for these.
+    bound : ndarray, shape (n, n), radian sqrt(photon)
+        `PhaseNoise.bound` for a flat wavefront, rms over the pupil.
+    read : ndarray, shape (n, n), radian
+        `PhaseNoise.read` for a flat wavefront, rms over the pupil.
+    """
+
+    angles: NDArray[np.float64]
+    error: NDArray[np.float64]
+    flat: NDArray[np.float64]
+    aberrated: NDArray[np.float64]
+    bound: NDArray[np.float64]
+    read: NDArray[np.float64]
+
+    @property
+    def singular(self) -> NDArray[np.bool_]:
+        """Pairs that were refused, shape (n, n)."""
+        return np.isnan(self.error)
+
+    @property
+    def forbidden(self) -> NDArray[np.bool_]:
+        """Pairs that the determinant excludes: equal mod 2 pi, or one of them 0 mod 2 pi; shape (n, n)."""
+        turn = np.exp(1j * self.angles)
+        none = np.abs(turn - 1) < 1e-9
+        return (np.abs(turn[:, np.newaxis] - turn) < 1e-9) | none[:, np.newaxis] | none
+
+    def best(self, name: str) -> tuple[float, float, float]:
+        """Pair (radian, the larger first) with the lowest value of the map `name`, and that value."""
+        values = getattr(self, name)
+        row, column = np.unravel_index(np.nanargmin(values), values.shape)
+        angles = sorted((float(self.angles[row]), float(self.angles[column])), reverse=True)
+        return angles[0], angles[1], float(values[row, column])
+
+
+def pair_maps(
+    pupil: Pupil, diameter: float, angles: ArrayLike, screens: NDArray, n_iterations: int = 25
+) -> PairMaps:
+    """Phase-shifted iteration and its noise for all pairs of phase shifts, the experiment of section 4.2.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    diameter : float, lambda/D
+    angles : array_like, shape (n,), radian
+    screens : ndarray, shape (n_screens, ny, nx), radian
+    n_iterations : int
+
+    Returns
+    -------
+    PairMaps
+        Symmetric: the order of the masks does not matter, so each pair is computed once.
+
+    Raises
+    ------
+    ValueError
+        If there are no screens or no angles.
+
+    References
+    ----------
+    Chambouleyron et al. 2024, section 4.2.
+    """
+    angles = _check.real_array("angles", angles)
+    if angles.ndim != 1 or not angles.size:
+        raise ValueError(f"angles has shape {angles.shape}: expected (n,)")
+    if np.ndim(screens) != 3 or not len(screens):
+        raise ValueError(f"screens has shape {np.shape(screens)}: expected (n_screens, ny, nx)")
+    maps = np.full((5, angles.size, angles.size), np.nan)
+    for row, theta_a in enumerate(angles):
+        for column, theta_b in enumerate(angles[:row]):
+            sensor = ZernikeSensor(pupil, Dimple(diameter, float(theta_a)), Dimple(diameter, float(theta_b)))
+            values = _pair(sensor, screens, n_iterations)
+            maps[:, row, column] = maps[:, column, row] = values
+    return PairMaps(angles, *maps)
+
+
+def _pair(sensor: ZernikeSensor, screens: NDArray, n_iterations: int) -> tuple[float, ...]:
+    """Error and the four noises of one pair, NaN if it is refused."""
+    try:
+        method = PhaseShifted(sensor, n_iterations=n_iterations)
+    except ValueError:
+        return (np.nan,) * 5
+    error = reconstruction_error(sensor.pupil, method(sensor.measure(screens)).phase, screens).mean()
+    flat = phase_noise(sensor, np.zeros(sensor.pupil.shape))
+    aberrated = np.array([phase_noise(sensor, screen).photon for screen in screens])
+    return error, _rms(flat.photon), _rms(aberrated), _rms(flat.bound), _rms(flat.read)
+
+
+def _rms(values: NDArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _field(light: DimpleLight, phase: ArrayLike) -> tuple[NDArray, NDArray]:
+    """Field and its beta at the points of the pupil, (n_points,) each."""
+    phase = _check.real_array("phase", phase)
+    _check.trailing_shape("phase", phase, light.pupil.shape, "the shape of the pupil")
+    if phase.ndim != 2:
+        raise ValueError(f"phase has shape {phase.shape}: expected {light.pupil.shape}")
+    values = light.pupil.gather(phase)
+    _check.finite("phase", values, " inside the pupil")
+    psi = light.pupil.gather(light.pupil.amplitude) * np.exp(1j * values)
+    return psi, light(psi[np.newaxis])[0]
+
+
+def _after(psi: NDArray, beta: NDArray, change: NDArray) -> NDArray[np.float64]:
+    """Error of the phase after a step that was made with beta + change in the place of beta."""
+    relative = change / beta
+    return relative.imag - 2 * relative.real * np.imag(beta.conj() * psi) / np.abs(psi) ** 2

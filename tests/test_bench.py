@@ -16,13 +16,14 @@ from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.bench_trials import find_pistons
 
 N = 68  # half the camera: 11 pixels of margin
+SMALL = {"n_pixels": N, "gap": 0.02, "stop": 0.8}
 EXTENT = 180 / 136
 MARGIN = 11
 LAYOUT = Pupil.hexagonal(N, 3, 0.02, (21,), 0.8)
 
 
 def ideal(**changes):
-    return Bench.ideal(n_pixels=N, **changes)
+    return Bench.ideal(**{**SMALL, **changes})
 
 
 def design(bench, diameter=1.06):
@@ -70,7 +71,7 @@ def test_layout_is_36_segments_six_across_with_one_missing_at_the_top_right():
     centres = {k: np.mean(np.nonzero(bench.segments == k), axis=1) for k in range(1, 8)}
     pitches = [np.hypot(*(centres[k] - centres[1])) for k in range(2, 8)]
     np.testing.assert_allclose(pitches, np.mean(pitches), rtol=0.01)
-    assert 5.5 < 136 / np.mean(pitches) < 6.5
+    assert 5.4 < 136 / np.mean(pitches) < 6.5  # 24.9 pixels, as in the real frames
 
 
 def test_camera_sees_a_margin_around_the_pupil(perfect):
@@ -80,13 +81,25 @@ def test_camera_sees_a_margin_around_the_pupil(perfect):
     assert perfect.segments.shape == (N, N)
 
 
+def test_blur_widens_the_images_and_loses_no_light(perfect):
+    def moments(image):
+        axes = np.indices(image.shape).reshape(2, -1)
+        return image.sum(), np.cov(axes, aweights=image.ravel(), ddof=0).diagonal()
+
+    for sharp, blurred in zip(perfect.pupil_images(), ideal(blur=1.5).pupil_images(), strict=True):
+        (light, width), (same, wider) = moments(sharp), moments(blurred)
+        assert same == pytest.approx(light)
+        np.testing.assert_allclose(wider - width, 1.5**2, rtol=0.01)
+
+
 def test_errors_are_named_and_0_on_an_ideal_bench(perfect):
     names = Bench.errors()
     assert names == (
-        "leakage", "focus_difference", "misregistration", "flux_imbalance", "dimple_error", "static", "quilting",
+        "leakage", "focus_difference", "misregistration", "blur", "flux_imbalance", "dimple_error", "static",
+        "quilting",
     )  # fmt: skip
     assert all(getattr(perfect, name) == 0 for name in (*names, "photons", "read_noise", "background"))
-    assert all(getattr(Bench(n_pixels=N), name) > 0 for name in names)
+    assert all(getattr(Bench(**SMALL), name) > 0 for name in names)
     assert ideal(leakage=0.1).leakage == 0.1
 
 
@@ -327,7 +340,7 @@ def test_a_frame_holds_the_photons_that_it_should():
 
 @pytest.mark.parametrize("shoot", [Bench.frames, Bench.pupil_images, Bench.dark])
 def test_noise_follows_the_seed(shoot):
-    bench = Bench(n_pixels=N)
+    bench = Bench(**SMALL)
     before = np.random.get_state()[1].copy()
     first = shoot(bench, seed=5)
     np.testing.assert_array_equal(shoot(bench, seed=5), first)
@@ -369,9 +382,7 @@ def test_commands_in_batches_of_any_depth(perfect):
 
 
 def test_bench_keeps_its_aberrations_to_itself():
-    one, other = (
-        Bench(n_pixels=N, static=value, quilting=value, seed=seed) for value, seed in ((0.1, 1), (0.5, 2))
-    )
+    one, other = (Bench(**SMALL, static=value, quilting=value, seed=seed) for value, seed in ((0.1, 1), (0.5, 2)))
     own = {"static", "quilting", "seed"}
     names = [name for name in dir(one) if not name.startswith("_") and name not in own]
     assert {"segments", "numbers", "n_pixels"} <= set(names)
@@ -418,7 +429,7 @@ def test_model_amplitude_is_close_to_the_truth_on_the_bench_as_it_is():
 
 
 def test_model_follows_the_seed():
-    bench = Bench(n_pixels=N)
+    bench = Bench(**SMALL)
     one, again, other = (BenchModel.from_images(bench, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.shifted.pupil.amplitude, again.shifted.pupil.amplitude)
     np.testing.assert_array_equal(one.dark, again.dark)
@@ -482,7 +493,7 @@ def test_segment_screens_are_averaged_power_law_screens(perfect):
     np.testing.assert_allclose(segment_screens(perfect, 0.4, 6, seed=4), screens / 2, atol=1e-12)
     assert np.abs(segment_screens(perfect, 0.8, 6, seed=5) - screens).max() > 0.1
     # The errors of a bench do not change what it is commanded.
-    np.testing.assert_array_equal(segment_screens(Bench(n_pixels=N, seed=3), 0.8, 6, seed=4), screens)
+    np.testing.assert_array_equal(segment_screens(Bench(**SMALL, seed=3), 0.8, 6, seed=4), screens)
     maps = power_law_screens(zernike_basis(Pupil.circular(N), 200), 1.0, 6, seed=4)
     means = np.stack([maps[:, LAYOUT.segments == k].mean(axis=1) for k in perfect.numbers], axis=1)
     for mean, screen in zip(means, screens, strict=True):
@@ -506,7 +517,7 @@ def test_segment_screens_are_averaged_power_law_screens(perfect):
         (
             {"photons": 0},
             ValueError,
-            "photons = 0 with read_noise = 30 and background = 5000: expected 0 for both",
+            "photons = 0 with read_noise = 30 and background = 60000: expected 0 for both",
         ),
         ({"photons": np.inf}, ValueError, "photons = inf: expected a finite number"),
         ({"read_noise": -1}, ValueError, "read_noise = -1"),
@@ -536,7 +547,7 @@ def test_segment_screens_are_averaged_power_law_screens(perfect):
 )
 def test_bad_parameters_are_named(changes, error, message):
     with pytest.raises(error, match=message):
-        Bench(**{"n_pixels": N, **changes})
+        Bench(**{**SMALL, **changes})
 
 
 @pytest.mark.parametrize(

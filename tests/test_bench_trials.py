@@ -6,12 +6,13 @@ from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.bench_trials import BenchCurves, bench_curves, bench_reconstructors, error_budget, find_pistons
 
 N = 68
+SMALL = {"n_pixels": N, "gap": 0.02, "stop": 0.8}
 RMS = (0, 0.05, 0.5)
 NAMES = ("Linear", "Arcsine", "GerchbergSaxton", "GradientDescent", "PhaseShifted")
 
 
 def ideal(**changes):
-    return Bench.ideal(n_pixels=N, **changes)
+    return Bench.ideal(**{**SMALL, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def curves(perfect, model, known):
 @pytest.fixture(scope="module")
 def budget():
     sizes = {"static": 0.1, "quilting": 0.1, "leakage": 0.05, "photons": 1e9}
-    return error_budget(Bench(n_pixels=N, **sizes), ("PhaseShifted", "Linear"), RMS, 2, seed=1)
+    return error_budget(Bench(**SMALL, **sizes), ("PhaseShifted", "Linear"), RMS, 2, seed=1)
 
 
 # Linear reconstruction with a recorded calibration
@@ -156,7 +157,7 @@ def test_curves_are_what_one_gets_by_hand(perfect, model, known, curves):
 
 
 def test_curves_follow_the_seed_with_noise():
-    bench = Bench(n_pixels=N, photons=1e8)
+    bench = Bench(**SMALL, photons=1e8)
     model = BenchModel.from_images(bench, 1)
     method = {"PhaseShifted": PhaseShifted(model.shifted)}
     one, again, other = (bench_curves(bench, model, method, [0, 0.3], 2, seed=s) for s in (4, 4, 5))
@@ -266,7 +267,7 @@ def test_budget_keeps_the_calibrated_method_free_of_offset(budget):
 
 
 def test_budget_of_noise_falls_with_the_photons(budget):
-    bench = Bench(n_pixels=N, photons=1e7, read_noise=0, background=0)
+    bench = Bench(**SMALL, photons=1e7, read_noise=0, background=0)
     few = error_budget(bench, ["PhaseShifted"], [0.05], 4)["noise"].mean("PhaseShifted")[0]
     many = budget["noise"].mean("PhaseShifted")[1]
     assert 5 < few / many < 15  # as the square root; read noise and background take a little

@@ -39,7 +39,7 @@ class Bench:
         Width of what the camera records of each pupil image: 180 pixels of 136 on the real bench.
     n_rings, gap, missing, stop
         Layout of the segmented mirror, see `Pupil.hexagonal`. The defaults look like the real one: 37 segments,
-        six across the stop, gaps of 2 % of the diameter, and one segment missing at the top right.
+        six across the stop, narrow gaps, and one segment missing at the top right, as in the paper.
     diameter : float, lambda/D
         Diameter of the dimple by design.
     phase : float, radian
@@ -52,9 +52,13 @@ class Bench:
         plate makes that is turned by 10 degrees (sin^2), or 20 degrees short of a quarter wave.
     focus_difference : float
         Distance between the planes that are in focus in the two images, times lambda / D^2; the camera is halfway.
-        1e-4 is 16 mm for a beam of 10 mm at 635 nm.
+        3e-4 is 12 mm for a beam of 5 mm at 635 nm; much more would put bright rims on the segments, which the real
+        frames do not have.
     misregistration : float, pixels
-        Distance between the pupil images, along both axes, that is left after they were registered.
+        Distance between the pupil images, along both axes, that is left after registration; those of the real bench
+        are 0.8 and 0.35 pixels apart.
+    blur : float, pixels rms
+        Gaussian blur of the relay optics and the camera. The power spectrum of the real frames asks for 0.8.
     flux_imbalance : float
         The two images hold 1 + and 1 - this of the mean flux. The off-mask images show it.
     dimple_error : float
@@ -70,7 +74,7 @@ class Bench:
         the high signal-to-noise ratio of the paper. 0 for frames without noise.
     read_noise : float, electrons rms
     background : float, electrons
-        Stray light and dark current of a pixel; darks show it.
+        Stray light and dark current of a pixel, 7 % of the light of one in the pupil; darks show it.
     seed : int
         Of the static aberration, which belongs to the bench.
 
@@ -87,32 +91,35 @@ class Bench:
     n_pixels: int = 136
     extent: float = 180 / 136
     n_rings: int = 3
-    gap: float = 0.02
+    gap: float = 0.008
     missing: tuple[int, ...] = (21,)
-    stop: float = 0.8
+    stop: float = 0.78
     diameter: float = 1.06
     phase: float = np.pi / 2
     illumination: float = 0.5
     leakage: float = 0.03
-    focus_difference: float = 1e-4
-    misregistration: float = 0.2
+    focus_difference: float = 3e-4
+    misregistration: float = 0.5
+    blur: float = 0.8
     flux_imbalance: float = 0.05
     dimple_error: float = 0.04
     static: float = 0.05
     quilting: float = 0.06
     photons: float = 1e10
     read_noise: float = 30.0
-    background: float = 5000.0
+    background: float = 60000.0
     seed: int = 0
 
     def __post_init__(self) -> None:
+        _check.number("extent", self.extent, 1)
+        _check.number("diameter", self.diameter, 0, open_low=True)
         _check.number("illumination", self.illumination, 0, 2, open_high=True)
         _check.number("leakage", self.leakage, 0, 0.5)
         _check.number("focus_difference", self.focus_difference, 0, 1e-2)
         _check.number("misregistration", self.misregistration, 0, 10)
         _check.number("flux_imbalance", self.flux_imbalance, -1, 1, open_low=True, open_high=True)
         _check.number("dimple_error", self.dimple_error, -0.9, 10)
-        for name in ("static", "quilting", "photons", "read_noise", "background"):
+        for name in ("blur", "static", "quilting", "photons", "read_noise", "background"):
             _check.number(name, getattr(self, name), 0)
         _check.integer("seed", self.seed, 0)
         if not self.photons and (self.read_noise or self.background):
@@ -239,19 +246,21 @@ class Bench:
         """Intensity on the camera of the two polarisations, (2, ny, nx) to (2, ny', nx')."""
         images = np.empty(waves.shape)
         for arm, sign in enumerate((1, -1)):
-            seen = np.abs(self._defocus(waves, sign * self.focus_difference / 2)) ** 2
+            shift = sign * self.misregistration / 2 / self.n_pixels
+            seen = np.abs(self._relay(waves, sign * self.focus_difference / 2, shift)) ** 2
             image = (1 - self.leakage) * seen[arm] + self.leakage * seen[1 - arm]
-            images[arm] = ndimage.shift(image, sign * self.misregistration / 2, order=1, mode="nearest")
+            images[arm] = ndimage.gaussian_filter(image, self.blur, mode="nearest")
         margin = (waves.shape[-1] - self._camera_shape[-1]) // 2
         inner = slice(margin, waves.shape[-1] - margin)
         return images[:, inner, inner]
 
-    def _defocus(self, waves: NDArray[np.complex128], distance: float) -> NDArray[np.complex128]:
-        """Fresnel propagation by a distance in units of D^2 / lambda."""
-        if not distance:
+    def _relay(self, waves: NDArray[np.complex128], distance: float, shift: float) -> NDArray[np.complex128]:
+        """Fresnel propagation by a distance in units of D^2 / lambda, and a shift along both axes in D."""
+        if not distance and not shift:
             return waves
         v, u = (fft.fftfreq(n, 1 / self.n_pixels) for n in waves.shape[-2:])
-        transfer = np.exp(-1j * np.pi * distance * (u**2 + v[:, np.newaxis] ** 2))
+        v = v[:, np.newaxis]
+        transfer = np.exp(-1j * np.pi * (distance * (u**2 + v**2) + 2 * shift * (u + v)))
         return fft.ifft2(fft.fft2(waves) * transfer)
 
     def _expose(self, images: NDArray[np.float64], seed: Seed) -> NDArray[np.float64]:
@@ -265,8 +274,8 @@ class Bench:
         if isinstance(pistons, Mapping):
             values = np.zeros(self.n_segments)
             for number, piston in pistons.items():
-                if number not in self.numbers:
-                    known = self.numbers.tolist()
+                known = self.numbers.tolist()
+                if isinstance(number, bool) or number not in known:
                     raise ValueError(
                         f"pistons names segment {number!r}, which is missing: expected some of {known}"
                     )
@@ -274,6 +283,8 @@ class Bench:
             return values
         values = _check.real_array("pistons", pistons).astype(np.float64)
         _check.trailing_shape("pistons", values, (self.n_segments,), "a command for each usable segment")
+        if not values.size:
+            raise ValueError(f"pistons has shape {values.shape}: expected at least one command")
         _check.finite("pistons", values)
         return values
 
@@ -342,6 +353,7 @@ class BenchModel:
         """Frames of counts, 1 = mean intensity of the model's pupil; what noise makes negative is raised to 0."""
         counts = _check.real_array("counts", counts)
         _check.trailing_shape("counts", counts, self.dark.shape, "the two images of the bench")
+        _check.finite("counts", counts)
         return np.maximum((counts - self.dark) / self.scale, 0)
 
     @cached_property
@@ -398,6 +410,12 @@ def segment_residual(found: ArrayLike, commanded: ArrayLike) -> NDArray[np.float
         If a value is not finite.
     """
     found, commanded = _check.real_array("found", found), _check.real_array("commanded", commanded)
+    try:
+        np.broadcast_shapes(found.shape, commanded.shape)
+    except ValueError:
+        raise ValueError(
+            f"found and commanded have shapes {found.shape} and {commanded.shape}: expected ones that broadcast"
+        ) from None
     _check.finite("found", found)
     _check.finite("commanded", commanded)
     phasor = np.exp(1j * (found - commanded))

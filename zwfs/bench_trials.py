@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.metrics import dynamic_range
-from zwfs.reconstructors import Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
+from zwfs.reconstructors import RECONSTRUCTORS, Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
 
 
 @dataclass(frozen=True)
@@ -152,6 +152,8 @@ def bench_curves(
     Chambouleyron et al. 2024, section 5.2 and Figure 9.
     """
     rms = _check.real_array("rms", rms)
+    if rms.ndim != 1:
+        raise ValueError(f"rms has shape {rms.shape}: expected (n_rms,)")
     n_screens = _check.integer("n_screens", n_screens, 1)
     commanded = np.empty((len(rms), n_screens, bench.n_segments))
     residuals = {name: np.empty_like(commanded) for name in reconstructors}
@@ -192,15 +194,19 @@ def error_budget(
     dict of BenchCurves
         By the name of the error, "none" first and "all" last.
     """
-    layout = {name: getattr(bench, name) for name in ("n_pixels", "extent", "illumination", "seed")}
-    noise = {name: getattr(bench, name) for name in ("photons", "read_noise", "background")}
+    known = {method.__name__ for method in RECONSTRUCTORS}
+    if isinstance(names, str) or not set(names) <= known:
+        raise ValueError(f"names = {names!r}: expected some of {sorted(known)}")
+    values = {field.name: getattr(bench, field.name) for field in fields(bench)}
+    noise = {name: values[name] for name in ("photons", "read_noise", "background")}
+    layout = {name: value for name, value in values.items() if name not in (*Bench.errors(), *noise)}
     cases = {"none": Bench.ideal(**layout)}
-    cases |= {name: Bench.ideal(**layout, **{name: getattr(bench, name)}) for name in Bench.errors()}
+    cases |= {name: Bench.ideal(**layout, **{name: values[name]}) for name in Bench.errors()}
     cases |= {"noise": Bench.ideal(**layout, **noise), "all": bench}
     budget = {}
     for case, one in cases.items():
         model = BenchModel.from_images(one, seed)
-        known = bench_reconstructors(one, model, n_iterations=n_iterations, seed=seed)
-        chosen = {name: known[name] for name in names}
+        methods = bench_reconstructors(one, model, n_iterations=n_iterations, seed=seed)
+        chosen = {name: methods[name] for name in names}
         budget[case] = bench_curves(one, model, chosen, rms, n_screens, seed=seed)
     return budget

@@ -182,7 +182,13 @@ class Pupil:
             raise TypeError(
                 f"segments is {segments.ndim}-dimensional {segments.dtype}: expected a map of integers"
             )
-        amplitude = np.broadcast_to(_check.real_array("amplitude", amplitude), segments.shape)
+        if segments.min(initial=0) < 0:
+            raise ValueError(f"segments reaches down to {segments.min()}: expected numbers from 0 on")
+        amplitude = _check.real_array("amplitude", amplitude)
+        try:
+            amplitude = np.broadcast_to(amplitude, segments.shape)
+        except ValueError:
+            raise ValueError(f"amplitude has shape {amplitude.shape}: expected {segments.shape}") from None
         _check.finite("amplitude", amplitude)
         lowest = amplitude[segments > 0].min(initial=np.inf)
         if lowest <= 0:

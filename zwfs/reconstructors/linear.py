@@ -68,7 +68,7 @@ class Linear:
         poke = _check.number("poke", poke, 0, open_low=True)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
         self._reference = start_phase(sensor, reference, (), np.dtype(np.float64))
-        flat, difference = self._simulated(poke) if calibration is None else self._recorded(*calibration)
+        flat, difference = self._simulated(poke) if calibration is None else self._recorded(calibration)
         self._reference_signal = flat
         self.interaction_matrix = difference.T / (2 * poke)
         u, strength, vt = np.linalg.svd(self.interaction_matrix, full_matrices=False)
@@ -122,9 +122,14 @@ class Linear:
         return self._signal(self._model(self._reference))[0], difference
 
     def _recorded(
-        self, flat: ArrayLike, pushed: ArrayLike, pulled: ArrayLike
+        self, calibration: tuple[ArrayLike, ArrayLike, ArrayLike]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The same from frames of a bench."""
+        if not isinstance(calibration, tuple | list):
+            raise TypeError(f"calibration is a {type(calibration).__name__}: expected (flat, pushed, pulled)")
+        if len(calibration) != 3:
+            raise ValueError(f"calibration has {len(calibration)} parts: expected (flat, pushed, pulled)")
+        flat, pushed, pulled = calibration
         signals = []
         for name, frames, n_frames in (("flat", flat, 1), ("pushed", pushed, None), ("pulled", pulled, None)):
             checked, batch = check_frames(self.settings.sensor, frames, f"calibration {name}")

@@ -360,7 +360,7 @@ def others_alike(
         "gradient descent on modes": claim17_descent_ratio,
         "gradient descent on points": claim17_descent_points_ratio,
     }
-    told = ", ".join(f"{name} {ratio:.2g}" for name, ratio in ratios.items())
+    told = ", ".join(f"{name} {ratio:.{0 if ratio >= 10 else 1}f}" for name, ratio in ratios.items())
     measured = f"error at 2.6 over that at 2.0 $\\lambda/D$: {told}"
     other = [name for name, ratio in ratios.items() if ratio <= 10]
     if not other:

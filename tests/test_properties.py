@@ -84,7 +84,8 @@ def test_a_passive_mask_never_adds_light(sensor, batch, seed):
     assert np.all(flux <= incoming[..., np.newaxis] * (1 + 1e-12))
 
 
-@given(pupils(), st.builds(Dimple, st.floats(0.5, 3), st.floats(-3, 3)), seeds)
+# The wave of a dimple is 1 / diameter wide: smaller ones would need a wider detector.
+@given(pupils(), st.builds(Dimple, st.floats(1, 3), st.floats(-3, 3)), seeds)
 def test_a_phase_mask_loses_no_light_on_a_wide_detector(pupil, dimple, seed):
     field = white(pupil.shape, seed) * pupil.mask
     sensor = ZernikeSensor(pupil, dimple, extent=6.0, tolerance=1e-8)
@@ -144,10 +145,11 @@ def test_truth_is_a_fixed_point(pupil, masks, seed):
 def test_linear_and_descent_invert_small_phases(pupil, masks, seed):
     sensor = ZernikeSensor(pupil, *masks)
     modes = zernike_basis(pupil, 12)
-    phase = smooth(pupil, 0.01, (), seed)
+    phase = smooth(pupil, 1e-3, (), seed)
     frames = sensor.measure(phase)
+    # What is left is of second order in the phase; near a shift of pi it outweighs the first at a few hundredths.
     for method in (Linear(sensor, modes), GradientDescent(sensor, modes, n_iterations=100)):
-        assert reconstruction_error(pupil, method(frames).phase, phase) < 0.03 * 0.01
+        assert reconstruction_error(pupil, method(frames).phase, phase) < 0.03 * 1e-3
 
 
 @given(sensors(), batches, seeds)

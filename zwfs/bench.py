@@ -55,8 +55,8 @@ class Bench:
         3e-4 is 12 mm for a beam of 5 mm at 635 nm; much more would put bright rims on the segments, which the real
         frames do not have.
     misregistration : float, pixels
-        Distance between the pupil images, along both axes, that is left after registration; those of the real bench
-        are 0.8 and 0.35 pixels apart.
+        Distance between the pupil images, along both axes, that is left after registration; those of the real
+        bench are 0.8 and 0.35 pixels apart.
     blur : float, pixels rms
         Gaussian blur of the relay optics and the camera. The power spectrum of the real frames asks for 0.8.
     flux_imbalance : float

@@ -39,7 +39,8 @@ class Bench:
         Width of what the camera records of each pupil image: 180 pixels of 136 on the real bench.
     n_rings, gap, missing, stop
         Layout of the segmented mirror, see `Pupil.hexagonal`. The defaults look like the real one: 37 segments,
-        six across the stop, narrow gaps, and one segment missing at the top right, as in the paper.
+        six across the stop, gaps of two pixels (those of the real mirror are narrower, and would be sampled
+        unevenly), and one segment missing at the top right.
     diameter : float, lambda/D
         Diameter of the dimple by design.
     phase : float, radian
@@ -91,7 +92,7 @@ class Bench:
     n_pixels: int = 136
     extent: float = 180 / 136
     n_rings: int = 3
-    gap: float = 0.008
+    gap: float = 0.015
     missing: tuple[int, ...] = (21,)
     stop: float = 0.78
     diameter: float = 1.06

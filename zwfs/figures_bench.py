@@ -17,7 +17,7 @@ _ARMS = ("+θ", "−θ")
 
 def reference_intensities(frames: NDArray, pupil_images: NDArray) -> Figure:
     """Figure 6: the two images of a flat command, mask in, and the off-mask images, (2, ny, nx) each."""
-    figure, panels = plt.subplots(1, 4, figsize=(9, 2.9))
+    figure, panels = plt.subplots(1, 4, figsize=(9, 3.4))
     for pair, images, label in ((panels[:2], frames, "mask in"), (panels[2:], pupil_images, "mask out")):
         top = np.quantile(images, 0.9995)
         for axes, image, arm in zip(pair, images, _ARMS, strict=True):

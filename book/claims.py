@@ -17,14 +17,14 @@ SIGNS = {HOLDS: "✔", REMARK: "◐", FAILS: "✘", UNTESTED: "○"}
 
 ROUNDING = 1e-12  # an identity must hold to this; the notebooks give no smaller errors, see their `at_least`
 
-THEORY = "theory.md"
+# The page that treats a section of the paper.
 SECTIONS = {
-    "2.1": "#two-wave-interference",
-    "2.2": "#phase-diversity-with-two-masks",
-    "2.3": "#the-vector-sensor",
-    "4.1": "#reconstruction-errors",
-    "4.2": "#phase-diversity-with-two-masks",
-    "5.2": "#the-vector-sensor",
+    "2.1": "sensor.md#two-wave-interference",
+    "2.2": "phase_shifted.md#phase-diversity-with-two-masks",
+    "2.3": "phase_shifted.md#the-vector-sensor",
+    "4.1": "theory.md#reconstruction-errors",
+    "4.2": "phase_shifted.md#phase-diversity-with-two-masks",
+    "5.2": "phase_shifted.md#the-vector-sensor",
 }
 
 
@@ -670,8 +670,8 @@ def table(findings: dict[Claim, Finding]) -> str:
 
 def _row(claim: Claim, finding: Finding) -> list[str]:
     section = f"section {claim.section}"
-    if anchor := SECTIONS.get(claim.section):
-        section = f"[{section}]({THEORY}{anchor})"
+    if page := SECTIONS.get(claim.section):
+        section = f"[{section}]({page})"
     measured = [
         f"{finding.measured[:1].upper()}{finding.measured[1:]}." if finding.measured else "",
         finding.remark,

@@ -10,6 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+import api
 import claims
 from runner import Project, digest, digest_files, replace
 
@@ -67,8 +68,9 @@ def build_book(project: Project) -> bool:
     """
     html, record = project.build / "html", project.build / "html.json"
     files = staged_files(project)
-    lock = project.root / "environment" / "requirements.lock"
-    made_from = digest_files(files | {"pages": Path(__file__), "claims": Path(claims.__file__), "lock": lock})
+    code = [Path(module.__file__) for module in (sys.modules[__name__], api, claims)]
+    inputs = {str(file): file for file in (*code, *project.shared_inputs())}
+    made_from = digest_files(files | inputs)
     made_from = digest([made_from.encode(), str(sys.version_info[:2]).encode()])
     try:
         if html.is_dir() and json.loads(record.read_bytes()) == made_from:
@@ -77,8 +79,9 @@ def build_book(project: Project) -> bool:
         pass  # never built, or not to the end
     source = _stage(project, files)
     if claims.PAGE in files:
-        for name, text in claims.fragments(project.executed).items():
-            (source / name).write_text(text, "utf-8")
+        _write(source, claims.fragments(project.executed))
+    if api.PAGE in files:
+        _write(source, api.fragments())
     with tempfile.TemporaryDirectory(dir=project.build, prefix="building-") as scratch:
         _jupyter_book(source, Path(scratch))
         record.unlink(missing_ok=True)
@@ -97,6 +100,11 @@ def _stage(project: Project, files: dict[str, Path]) -> Path:
     return source
 
 
+def _write(source: Path, fragments: dict[str, str]) -> None:
+    for name, text in fragments.items():
+        (source / name).write_text(text, "utf-8")
+
+
 def _jupyter_book(source: Path, output: Path) -> None:
     """Run Jupyter Book with warnings as errors."""
     options = ["-W", "-n", "--keep-going", "--path-output", str(output)]
@@ -105,6 +113,8 @@ def _jupyter_book(source: Path, output: Path) -> None:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        # One extension of Sphinx is ours: `api`.
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
     )
     if done.returncode:
         lines = COLOUR.sub("", done.stdout).replace(f"{source}{os.sep}", "").splitlines()

@@ -491,7 +491,7 @@ class PairMaps:
 
     @property
     def forbidden(self) -> NDArray[np.bool_]:
-        """Pairs that the determinant excludes: equal mod 2 pi, or one of them 0 mod 2 pi; shape (n, n)."""
+        """Pairs that the determinant excludes, equal mod 2 pi or one of them 0 mod 2 pi; shape (n, n)."""
         turn = np.exp(1j * self.angles)
         none = np.abs(turn - 1) < 1e-9
         return (np.abs(turn[:, np.newaxis] - turn) < 1e-9) | none[:, np.newaxis] | none

@@ -11,8 +11,9 @@ import tempfile
 from pathlib import Path
 
 import api
+import cards
 import claims
-from runner import Project, digest, digest_files, replace
+from runner import Project, digest, digest_files, read, replace, to_bytes
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 JUPYTER_BOOK = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()"]
@@ -37,8 +38,9 @@ def staged_files(project: Project) -> dict[str, Path]:
         if file.is_file() and file.suffix not in (".py", ".pyc"):
             files[file.relative_to(project.root).as_posix()] = file
     for notebook in project.sources():
-        files[f"notebooks/{notebook.name}"] = project.executed / notebook.name
-        for file in project.files(notebook.stem):
+        executed = project.executed / notebook.name
+        files[f"notebooks/{notebook.name}"] = executed
+        for file in (executed, *project.files(notebook.stem)):
             place = f"notebooks/downloads/{file.name}"
             if place in files:
                 raise BookError(f"{files[place].parent.stem} and {notebook.stem} both publish {file.name}")
@@ -68,16 +70,22 @@ def build_book(project: Project) -> bool:
     """
     html, record = project.build / "html", project.build / "html.json"
     files = staged_files(project)
-    code = [Path(module.__file__) for module in (sys.modules[__name__], api, claims)]
-    inputs = {str(file): file for file in (*code, *project.shared_inputs())}
-    made_from = digest_files(files | inputs)
-    made_from = digest([made_from.encode(), str(sys.version_info[:2]).encode()])
+    code = [Path(module.__file__) for module in (sys.modules[__name__], api, cards, claims)]
+    inputs = {f"{file.parent.name}/{file.name}": file for file in (*code, *project.shared_inputs())}
+    origin = {notebook.stem: cards.versions_of(project, notebook.stem) for notebook in project.sources()}
+    commit = cards.commit_of(project.root)
+    told = [sys.version_info[:2], commit, origin]
+    made_from = digest([digest_files(files | inputs).encode(), json.dumps(told, sort_keys=True).encode()])
     try:
         if html.is_dir() and json.loads(record.read_bytes()) == made_from:
             return False
     except (OSError, ValueError):
         pass  # never built, or not to the end
     source = _stage(project, files)
+    for name, versions in origin.items():
+        page = source / "notebooks" / f"{name}.ipynb"
+        # The notebook to take away, among the downloads, stays as it was run.
+        page.write_bytes(to_bytes(cards.with_cards(read(page), name, versions, commit)))
     if claims.PAGE in files:
         _write(source, claims.fragments(project.executed))
     if api.PAGE in files:

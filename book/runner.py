@@ -4,6 +4,7 @@ import copy
 import hashlib
 import json
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -351,6 +353,7 @@ def _run_one(
         "key": made_from if unchanged else None,
         "result": _digest_result(result, sorted(files.glob("[!.]*"))),
         "seconds": round(seconds, 1),
+        "versions": versions(),
     }
     # Pieces of two runs may lie together for a moment; only the record, which comes last, makes them a result.
     replace(project.executed / f"{name}.ipynb", result)
@@ -358,6 +361,12 @@ def _run_one(
     files.rename(project.executed / files.name)
     replace(project.executed / f"{name}.json", json.dumps(record, indent=1).encode())
     return seconds
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide what a notebook shows."""
+    packages = {"NumPy": "numpy", "SciPy": "scipy", "Matplotlib": "matplotlib", "zwfs": "zwfs"}
+    return {"Python": platform.python_version()} | {name: metadata.version(p) for name, p in packages.items()}
 
 
 def describe(notebook: str, failure: dict[str, Any]) -> str:

@@ -9,6 +9,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from sphinx.pycode import ModuleAnalyzer
+
 import zwfs
 
 PAGE = "book/api.md"
@@ -43,7 +45,7 @@ GROUPS = {
 PAPER = ("sensor.md", "phase_shifted.md", "methods.md")
 
 LABEL = re.compile(r"`(eq-[a-z-]+)`")
-THEORY = re.compile(r"\s+of\s+the\s+theory\s+page")
+OF_THE_BOOK = re.compile(r"(:eq:`[a-z-]+`)\s+of\s+the\s+(?:book|theory\s+page)")
 NUMBERED = re.compile(r"(?<=Chambouleyron)[^;]*?equations?\s[^;.\n]*")
 CODE = re.compile(r"(?<![`:\w])`([^`\n]+)`(?![`_])")
 
@@ -59,13 +61,20 @@ def modules() -> list[str]:
 
 
 def public_names(module: ModuleType) -> list[str]:
-    """Return what a module defines or names in its ``__all__``, without what begins with an underscore."""
+    """Return the functions, classes and documented constants of a module that do not begin with an underscore."""
     own = [
         name
         for name, thing in vars(module).items()
         if (inspect.isclass(thing) or inspect.isfunction(thing)) and thing.__module__ == module.__name__
     ]
-    return [name for name in dict.fromkeys([*getattr(module, "__all__", ()), *own]) if not name.startswith("_")]
+    names = dict.fromkeys([*getattr(module, "__all__", ()), *own, *constants(module)])
+    return [name for name in names if not name.startswith("_")]
+
+
+def constants(module: ModuleType) -> dict[str, str]:
+    """Return the docstrings of a module's constants: the string after the assignment."""
+    found = ModuleAnalyzer.for_module(module.__name__).find_attr_docs()
+    return {name: " ".join(lines).strip() for (owner, name), lines in found.items() if not owner}
 
 
 def targets() -> dict[str, dict[str, str]]:
@@ -85,17 +94,18 @@ def targets() -> dict[str, dict[str, str]]:
         module = importlib.import_module(name)
         found[name] = {}
         for own in public_names(module):
-            path = f"zwfs.{own}" if own in zwfs.__all__ else f"{name}.{own}"
+            thing = getattr(module, own)
+            path = f"zwfs.{own}" if getattr(zwfs, own, None) is thing else f"{name}.{own}"
             if path not in seen:
                 seen.add(path)
-                found[name][path] = _directive(getattr(module, own))
+                found[name][path] = _directive(thing)
     return found
 
 
 def _directive(thing: Any) -> str:
     if inspect.isclass(thing):
         return "autoclass"
-    return "autofunction" if inspect.isfunction(thing) else "autodata"
+    return "autofunction" if inspect.isfunction(thing) else "py:data"
 
 
 def fragments() -> dict[str, str]:
@@ -108,14 +118,16 @@ def fragments() -> dict[str, str]:
                 continue
             summary = (importlib.import_module(name).__doc__ or "").strip().splitlines()[0]
             lines += [f"### `{name}`", "", "```{eval-rst}", f".. py:module:: {name}", "", linked(summary), ""]
+            told = constants(importlib.import_module(name))
             for path, directive in found[name].items():
-                lines += [f".. {directive}:: {path}", *_options(directive), ""]
+                owner, own = path.rsplit(".", 1)
+                if directive == "py:data":
+                    lines += [f".. py:data:: {own}", f"   :module: {owner}", "", f"   {linked(told[own])}", ""]
+                else:
+                    members = ["   :members:"] if directive == "autoclass" else []
+                    lines += [f".. {directive}:: {path}", *members, ""]
             lines += ["```", ""]
     return {"book/_api.md": "\n".join(lines)}
-
-
-def _options(directive: str) -> list[str]:
-    return {"autoclass": ["   :members:"], "autodata": ["   :no-value:"]}.get(directive, [])
 
 
 @cache
@@ -131,9 +143,9 @@ def linked(text: str) -> str:
     Parameters
     ----------
     text : str
-        Mentions of the paper's equations by number, and of any by label: ``eq-low-rank of the theory page``.
+        Mentions of the paper's equations by number, and of any by label: ``eq-low-rank of the book``.
     """
-    text = THEORY.sub("", LABEL.sub(r":eq:`\1`", text))
+    text = OF_THE_BOOK.sub(r"\1", LABEL.sub(r":eq:`\1`", text))
     text = NUMBERED.sub(lambda match: re.sub(r"\((\d+)\)", _numbered, match[0]), text)
     return re.sub(r"``[^`]*``|\|", _escaped, CODE.sub(_reference, text))
 

@@ -110,7 +110,7 @@ def arccosine_phase(
         Intensity, and the amplitude of the incoming field, at points of the pupil.
     reference : ndarray of complex, shape (..., n)
     sign : int
-        Of the arccosine: -1 for a dimple of positive phase, see `eq-branch` of the theory page.
+        Of the arccosine: -1 for a dimple of positive phase, see `eq-branch` of the book.
 
     Returns
     -------

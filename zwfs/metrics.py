@@ -29,7 +29,7 @@ def wrapped_residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDA
 
     References
     ----------
-    Chambouleyron et al. 2024, section 4.1; `eq-error` of the theory page.
+    Chambouleyron et al. 2024, section 4.1; `eq-error` of the book.
     """
     return pupil.scatter(_residual(pupil, estimate, truth))
 

@@ -125,7 +125,7 @@ def power_law_screens(
 
     References
     ----------
-    Chambouleyron et al. 2024, section 4.1; `eq-screens` of the theory page.
+    Chambouleyron et al. 2024, section 4.1; `eq-screens` of the book.
     """
     modes = _check.real_array("modes", modes)
     if modes.ndim != 3 or 0 in modes.shape:

@@ -49,7 +49,7 @@ class ZernikeSensor:
 
     References
     ----------
-    Chambouleyron et al. 2024, equations (1) to (5); `eq-low-rank` of the theory page.
+    Chambouleyron et al. 2024, equations (1) to (5); `eq-low-rank` of the book.
 
     Examples
     --------
@@ -167,7 +167,7 @@ class ZernikeSensor:
 
         References
         ----------
-        Chambouleyron et al. 2024, equation (14); `eq-adjoint` of the theory page.
+        Chambouleyron et al. 2024, equation (14); `eq-adjoint` of the book.
         """
         field = _check.complex_array("field", field)
         shape = (self.n_masks, *self.detector_shape)

@@ -152,7 +152,7 @@ class DimpleLight:
 
     References
     ----------
-    Chambouleyron et al. 2024, equation (11); `eq-dimple-reference` and `eq-low-rank` of the theory page.
+    Chambouleyron et al. 2024, equation (11); `eq-dimple-reference` and `eq-low-rank` of the book.
     """
 
     def __init__(self, pupil: Pupil, diameter: float) -> None:
@@ -213,7 +213,7 @@ def linearised_step(pupil: Pupil, diameter: float, phase: ArrayLike, error: Arra
 
     References
     ----------
-    Chambouleyron et al. 2024, section 3.1; `eq-linear-system` of the theory page.
+    Chambouleyron et al. 2024, section 3.1; `eq-linear-system` of the book.
     """
     light = DimpleLight(pupil, diameter)
     psi, beta = _field(light, phase)
@@ -401,7 +401,7 @@ def phase_noise(sensor: ZernikeSensor, phase: ArrayLike) -> PhaseNoise:
 
     References
     ----------
-    Chambouleyron et al. 2024, sections 2.2 and 4.2; `eq-linear-system` of the theory page.
+    Chambouleyron et al. 2024, sections 2.2 and 4.2; `eq-linear-system` of the book.
     """
     if sensor.n_masks != 2 or sensor.detector_shape != sensor.pupil.shape:
         raise ValueError(f"sensor = {sensor!r}: expected two masks and an extent of 1")

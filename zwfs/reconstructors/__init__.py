@@ -8,5 +8,6 @@ from zwfs.reconstructors.linear import Linear
 from zwfs.reconstructors.phase_shifted import PhaseShifted
 
 RECONSTRUCTORS = (Linear, Arcsine, PhaseShifted, GerchbergSaxton, GradientDescent)
+"""All reconstructors, in the order in which the book lists them."""
 
 __all__ = ["RECONSTRUCTORS", "Reconstruction", *(method.__name__ for method in RECONSTRUCTORS)]

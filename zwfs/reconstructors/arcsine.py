@@ -32,7 +32,7 @@ class Arcsine:
 
     References
     ----------
-    Chambouleyron et al. 2024, equation (6); Steeves et al. 2020; Haffert 2024; `eq-branch` of the theory page.
+    Chambouleyron et al. 2024, equation (6); Steeves et al. 2020; Haffert 2024; `eq-branch` of the book.
     """
 
     def __init__(

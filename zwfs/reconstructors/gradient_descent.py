@@ -29,7 +29,7 @@ class GradientDescent:
 
     References
     ----------
-    Chambouleyron et al. 2024, section 3.3, equation (16); `eq-gradient` of the theory page.
+    Chambouleyron et al. 2024, section 3.3, equation (16); `eq-gradient` of the book.
     """
 
     def __init__(

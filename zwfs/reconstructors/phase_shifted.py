@@ -41,7 +41,7 @@ class PhaseShifted:
     References
     ----------
     Chambouleyron et al. 2024, section 3.1, equations (9) and (10); `eq-linear-system` and `eq-many-masks` of the
-    theory page.
+    book.
     """
 
     def __init__(

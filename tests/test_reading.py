@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import api
+import cards
 import nbformat
 import pytest
 import yaml
@@ -105,11 +106,12 @@ def documents(toc):
 def test_the_book_has_the_order_of_the_paper():
     parts = documents(yaml.safe_load((ROOT / "_toc.yml").read_text()))
     order = ["The problem", "The sensor", "The phase-shifted sensor", "Reconstruction methods", "Simulations"]
-    order += ["The bench", "Conclusions", "Claims", "Where we differ", "Reference"]
+    order += ["The bench", "Conclusions", "Claims", "Reference"]
     assert [caption for caption in parts if caption in order] == order
     pages = [page for chapters in parts.values() for page in chapters]
     figures = [page for page in pages if re.match(r"notebooks/fig\d", page)]
     assert figures == sorted(figures)
+    assert parts["Claims"] == ["book/claims", "book/differences"]
     assert parts["Reference"][-3:] == ["book/notation", "book/api", "book/bibliography"]
     committed = {f"notebooks/{notebook.stem}" for notebook in NOTEBOOKS}
     assert len(pages) == len(set(pages))
@@ -127,6 +129,20 @@ def test_every_page_says_what_comes_next():
             cells = nbformat.read(ROOT / f"{page}.ipynb", 4).cells
             last[page] = cells[-1].source.rsplit("\n\n", 1)[-1] if cells[-1].cell_type == "markdown" else ""
     assert not [page for page, text in last.items() if not re.match(r"Next: .*(\]\(|\{doc\})", text, re.DOTALL)]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_cells_that_set_up_or_draw_are_folded_and_one_that_computes_is_not(path):
+    cells = [cell for cell in nbformat.read(path, 4).cells if cell.cell_type == "code"]
+    folded = [
+        bool({"hide-input", "hide-cell", "remove-cell"} & set(cell.metadata.get("tags", ()))) for cell in cells
+    ]
+    for cell, hidden in zip(cells, folded, strict=True):
+        assert hidden or not re.match(r"import |from |glue\(", cell.source), cell.source
+        assert hidden or not cards.published(cell.source), cell.source
+    assert not all(
+        hidden or "parameters" in cell.metadata.get("tags", ()) for cell, hidden in zip(cells, folded, strict=True)
+    )
 
 
 def test_the_papers_equations_have_its_numbers():

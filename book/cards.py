@@ -117,12 +117,12 @@ def card(notebook: str, figure: str, known: dict[str, Parameter], versions: dict
     told = ", ".join(f"{package} {version}" for package, version in versions.items())
     return "\n".join(
         [
-            "`````{div} run-card",
+            "::::{div} run-card",
             f"{origin(notebook, figure)} · {_link('notebook', f'{notebook}.ipynb')} · "
             + " · ".join(_link(word, f"{figure}.{word.lower()}") for word in ("PNG", "PDF"))
             + f" · {_link('data (CSV)', f'{figure}.csv')}",
             "",
-            f"````{{dropdown}} How {_called(notebook, figure)} was made",
+            f":::{{dropdown}} How {_called(notebook, figure)} was made",
             "To make it again, from the root of a clone:",
             "",
             "```sh",
@@ -132,8 +132,8 @@ def card(notebook: str, figure: str, known: dict[str, Parameter], versions: dict
             f"Seed: {seed}. Commit: {commit}. Versions: {told or 'not known'}.",
             "",
             *rows,
-            "````",
-            "`````",
+            ":::",
+            "::::",
         ]
     )
 

@@ -103,6 +103,7 @@ def test_every_figure_has_a_card_whose_links_work():
         names = [name for source in code for name in cards.published(source)]
         page = HTML / "notebooks" / f"{path.stem}.html"
         found = Cards(page)
+        assert len(found.titles) == len(names), path.stem
         titles += [title.strip() for title in found.titles]
         for name, links in zip(names, found.links, strict=True):
             files = [(page.parent / link).resolve() for link in links]

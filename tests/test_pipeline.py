@@ -264,6 +264,7 @@ def small_book(ran):
 def test_files_of_notebooks_are_staged(small_book):
     staged = pages.staged_files(small_book)
     assert staged["notebooks/downloads/numbers.csv"] == small_book.executed / "third.files" / "numbers.csv"
+    assert staged["notebooks/downloads/third.ipynb"] == small_book.executed / "third.ipynb"
 
 
 def test_two_notebooks_may_not_publish_the_same_file(small_book):
@@ -299,3 +300,4 @@ def test_record_says_what_a_result_was_made_from(ran):
     record = json.loads((ran.executed / "first.json").read_text())
     assert record["key"] == runner.key(ran, "first", {})
     assert record["seconds"] > 0
+    assert {"Python", "NumPy", "SciPy", "Matplotlib", "zwfs"} == set(record["versions"])

@@ -1,14 +1,18 @@
 """Execute one notebook with papermill: the process that `runner` starts for each notebook.
 
 It takes a request as JSON (see `main`) and writes a message, a line of JSON, to standard output:
-``{"cell": 3, "of": 12}`` when a cell begins, ``{"failure": {...}}`` when the notebook failed.
+``{"cell": 3, "of": 12}`` when a cell begins, ``{"name": "linearity_curves", "done": 3, "total": 22}`` when work
+within a cell goes on, ``{"failure": {...}}`` when the notebook failed.
 """
 
-import ast
 import json
 import os
 import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TextIO
 
 import papermill
@@ -16,6 +20,11 @@ from papermill.engines import NBClientEngine, papermill_engines
 from papermill.exceptions import PapermillExecutionError, strip_color
 
 TRACEBACK_LINES = 12
+
+# Names the file to which work within a cell adds a line of JSON for each piece that is done.
+PROGRESS = "ZWFS_PROGRESS"
+PERIOD = 0.2  # of looking into it, second
+SENDING = threading.Lock()
 
 
 class ReportingEngine(NBClientEngine):
@@ -41,38 +50,45 @@ class ReportingEngine(NBClientEngine):
 
 
 def send(messages: TextIO, message: dict[str, Any]) -> None:
-    """Write one message and make sure that it arrives now."""
-    print(json.dumps(message), file=messages, flush=True)
+    """Write one message, whole, and make sure that it arrives now."""
+    with SENDING:
+        messages.write(f"{json.dumps(message)}\n")
+        messages.flush()
 
 
-def check_parameters(parameters: dict[str, Any], known: dict[str, Any]) -> None:
-    """Refuse what papermill lets pass: a name that the notebook does not have, a value of another type.
+@contextmanager
+def watch(path: Path, messages: TextIO) -> Iterator[None]:
+    """Pass on what work within a cell says of its progress, as long as the context lasts."""
+    over = threading.Event()
 
-    Parameters
-    ----------
-    parameters : dict
-        Values by name.
-    known : dict
-        What `papermill.inspect_notebook` says of the notebook.
+    def look() -> None:
+        seen = 0
+        while not over.wait(PERIOD):
+            if path.exists():
+                with path.open("rb") as file:
+                    file.seek(seen)
+                    # What follows the last newline is not yet complete.
+                    whole, newline, _ = file.read().rpartition(b"\n")
+                seen += len(whole + newline)
+                if step := progress(whole.rpartition(b"\n")[2]):
+                    send(messages, step)
 
-    Raises
-    ------
-    ValueError
-        The notebook has no parameter of that name.
-    TypeError
-        The value is not of the default's type. An int may stand for a float.
-    """
-    for name, value in parameters.items():
-        if name not in known:
-            raise ValueError(f"unknown parameter {name!r}: expected one of {', '.join(known) or '(none)'}")
-        try:
-            default = ast.literal_eval(known[name]["default"])
-        except (SyntaxError, ValueError):
-            continue  # an expression: its type is known only to the kernel
-        same = type(value) is type(default) or (type(value), type(default)) == (int, float)
-        if default is not None and not same:
-            kind = type(default).__name__
-            raise TypeError(f"parameter {name} = {value!r}: expected {kind}, as in {default!r}")
+    thread = threading.Thread(target=look, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def progress(line: bytes) -> dict[str, Any] | None:
+    """Return what a line says of progress; None if it says nothing that can be understood."""
+    try:
+        said = json.loads(line)
+        return {"name": str(said["name"]), "done": int(said["done"]), "total": int(said["total"])}
+    except (ValueError, KeyError, TypeError):
+        return None
 
 
 def last_lines(error: BaseException) -> str:
@@ -91,18 +107,18 @@ def execute(request: dict[str, Any], messages: TextIO) -> bool:
     try:
         known = papermill.inspect_notebook(request["notebook"])
         in_force = {name: p["default"] for name, p in known.items()} | in_force
-        check_parameters(request["parameters"], known)
-        papermill.execute_notebook(
-            request["notebook"],
-            request["target"],
-            parameters=request["parameters"],
-            cwd=request["folder"],
-            engine_name="reporting",
-            kernel_name="python3",
-            progress_bar=False,
-            request_save_on_cell_execute=False,
-            shutdown_kernel="immediate",
-        )
+        with watch(Path(os.environ[PROGRESS]), messages):
+            papermill.execute_notebook(
+                request["notebook"],
+                request["target"],
+                parameters=request["parameters"],
+                cwd=request["folder"],
+                engine_name="reporting",
+                kernel_name="python3",
+                progress_bar=False,
+                request_save_on_cell_execute=False,
+                shutdown_kernel="immediate",
+            )
     except Exception as error:
         failure = {"where": ReportingEngine.cell, "parameters": in_force, "error": last_lines(error)}
         send(messages, {"failure": failure})

@@ -13,7 +13,7 @@ from pathlib import Path
 import api
 import cards
 import claims
-from runner import Project, digest, digest_files, read, replace, to_bytes
+from runner import Project, digest, digest_files, read, replace, swap, to_bytes
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 JUPYTER_BOOK = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()"]
@@ -93,7 +93,7 @@ def build_book(project: Project) -> bool:
     with tempfile.TemporaryDirectory(dir=project.build, prefix="building-") as scratch:
         _jupyter_book(source, Path(scratch))
         record.unlink(missing_ok=True)
-        _swap(Path(scratch) / "_build" / "html", html, Path(scratch) / "earlier")
+        swap(Path(scratch) / "_build" / "html", html, Path(scratch) / "earlier")
     replace(record, json.dumps(made_from).encode())
     return True
 
@@ -128,15 +128,3 @@ def _jupyter_book(source: Path, output: Path) -> None:
         lines = COLOUR.sub("", done.stdout).replace(f"{source}{os.sep}", "").splitlines()
         marked = [line for line in lines if "WARNING:" in line or "ERROR:" in line]
         raise BookError("\n".join(["the book was not built:", *(marked or lines[-40:])]))
-
-
-def _swap(new: Path, current: Path, earlier: Path) -> None:
-    """Put the new book in the place of the current one; put that back if it does not work."""
-    try:
-        if current.exists():
-            current.rename(earlier)
-        new.rename(current)
-    except BaseException:
-        if earlier.exists() and not current.exists():
-            earlier.rename(current)
-        raise

@@ -38,6 +38,8 @@ KERNEL_ENVIRONMENT = {
 
 # Names the folder in which a notebook leaves its figures and tables, see `zwfs.results`.
 RESULTS = "ZWFS_RESULTS"
+# Names the file to which work within a cell writes how far it is, see `execute.watch`.
+PROGRESS = "ZWFS_PROGRESS"
 
 
 class NotebookError(Exception):
@@ -106,7 +108,9 @@ class Children:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
-                env=os.environ | KERNEL_ENVIRONMENT | {RESULTS: request["files"]},
+                env=os.environ
+                | KERNEL_ENVIRONMENT
+                | {RESULTS: request["files"], PROGRESS: str(log.with_suffix(".progress"))},
                 # A session of its own: Ctrl-C reaches this process only, which then ends its children.
                 start_new_session=True,
             )
@@ -217,6 +221,24 @@ def replace(path: Path, content: bytes) -> None:
         partial.unlink(missing_ok=True)
 
 
+def swap(new: Path, current: Path, earlier: Path) -> None:
+    """Put a new folder in the place of the current one; put that back if it does not work."""
+    try:
+        if current.exists():
+            current.rename(earlier)
+        new.rename(current)
+    except BaseException:
+        if earlier.exists() and not current.exists():
+            earlier.rename(current)
+        raise
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide what a notebook shows."""
+    packages = {"NumPy": "numpy", "SciPy": "scipy", "Matplotlib": "matplotlib", "zwfs": "zwfs"}
+    return {"Python": platform.python_version()} | {name: metadata.version(p) for name, p in packages.items()}
+
+
 def _digest_result(notebook: bytes, files: list[Path]) -> str:
     """Return a digest of an executed notebook and of the files that it left."""
     return digest([notebook, digest_files({file.name: file for file in files}).encode()])
@@ -234,18 +256,15 @@ def _record(project: Project, name: str) -> dict[str, Any]:
 
 def run(
     project: Project,
-    parameters: dict[str, dict[str, Any]] | None = None,
     n_processes: int | None = None,
     say: Callable[[str], None] = tqdm.write,
 ) -> list[str]:
-    """Run every notebook whose result is not current.
+    """Run every notebook whose result is not current, with its defaults.
 
     Parameters
     ----------
     project : Project
         Where the notebooks and the results are.
-    parameters : dict of dict, optional
-        Values that replace the defaults of a notebook's cell tagged ``parameters``, by its name.
     n_processes : int, optional
         Notebooks that run at the same time; by default as many as there are cores.
     say : callable
@@ -261,43 +280,86 @@ def run(
     NotebookError
         After all others were run. What was there from earlier runs of the failed ones stays.
     """
-    parameters = parameters or {}
     names = [path.stem for path in project.sources()]
-    if unknown := set(parameters) - set(names):
-        raise ValueError(f"parameters for unknown notebooks: {', '.join(sorted(unknown))}")
     records = {name: _record(project, name) for name in names}
-    jobs = {name: parameters.get(name, {}) for name in names}
-    stale = [name for name in names if records[name].get("key") != key(project, name, jobs[name])]
+    stale = [name for name in names if records[name].get("key") != key(project, name, {})]
     # The longest first, as far as earlier runs tell: the others fill the gaps.
     stale.sort(key=lambda name: -records[name].get("seconds", float("inf")))
     if stale:
-        _run_all(project, {name: jobs[name] for name in stale}, n_processes, say)
+        _run_all(project, stale, n_processes, say)
     say(f"notebooks: {len(stale)} run, {len(names) - len(stale)} unchanged")
     return stale
 
 
+@dataclass
+class Progress:
+    """A bar that counts the cells of notebooks and tells how far each one is that runs now.
+
+    Parameters
+    ----------
+    project : Project
+    names : list of str
+        The notebooks.
+    title : str
+        What stands before the bar.
+    """
+
+    project: Project
+    names: list[str]
+    title: str
+    now: dict[str, list[str]] = field(default_factory=dict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def __enter__(self) -> "Progress":
+        cells = sum(len(read(self.project.notebooks / f"{name}.ipynb").cells) for name in self.names)
+        self.bar = tqdm(total=cells, unit="cell", desc=self.title, disable=None, leave=False, dynamic_ncols=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.close()
+
+    def heard(self, name: str, message: dict[str, Any]) -> None:
+        """Take a message of a notebook's process."""
+        with self.lock:
+            if "cell" in message:
+                self.now[name] = [f"cell {message['cell']}/{message['of']}"]
+                self.bar.update()
+            elif "done" in message and name in self.now:
+                self.now[name][1:] = [f"{message['name']} {message['done']}/{message['total']}"]
+            self._show()
+
+    def over(self, name: str) -> None:
+        """Forget a notebook that has ended."""
+        with self.lock:
+            self.now.pop(name, None)
+            self._show()
+
+    def _show(self) -> None:
+        several = len(self.names) > 1
+        told = [", ".join([name.split("_")[0], *now] if several else now) for name, now in self.now.items()]
+        self.bar.set_postfix_str("; ".join(told))
+
+
 def _run_all(
     project: Project,
-    jobs: dict[str, dict[str, Any]],
+    names: list[str],
     n_processes: int | None,
     say: Callable[[str], None],
 ) -> None:
     """Run notebooks side by side, and store the result of each as soon as it is there."""
     project.build.mkdir(parents=True, exist_ok=True)
     children, failures = Children(), []
-    cells = sum(len(read(project.notebooks / f"{name}.ipynb").cells) for name in jobs)
     with (
         tempfile.TemporaryDirectory(dir=project.build, prefix="running-") as scratch,
         ThreadPoolExecutor(n_processes or os.cpu_count()) as pool,
-        tqdm(total=cells, unit="cell", desc=f"0/{len(jobs)} notebooks", disable=None, leave=False) as bar,
+        Progress(project, names, f"0/{len(names)} notebooks") as progress,
     ):
         try:
             futures = {
-                pool.submit(_run_one, project, name, values, Path(scratch), children, bar): name
-                for name, values in jobs.items()
+                pool.submit(_run_one, project, name, Path(scratch), children, progress): name for name in names
             }
             for done, future in enumerate(as_completed(futures), start=1):
-                bar.set_description(f"{done}/{len(jobs)} notebooks")
+                progress.bar.set_description(f"{done}/{len(names)} notebooks")
                 try:
                     say(f"{futures[future]}: {future.result():.1f} s")
                 except NotebookError as failure:
@@ -310,15 +372,56 @@ def _run_all(
         raise NotebookError("\n\n".join(failures))
 
 
-def _run_one(
+@dataclass(frozen=True)
+class Execution:
+    """The result of one run.
+
+    Attributes
+    ----------
+    notebook : NotebookNode
+        Executed, in its normal form.
+    files : list of Path
+        The figures and tables that it left.
+    key : str or None
+        What it was made from; None if that changed meanwhile.
+    seconds : float
+    """
+
+    notebook: NotebookNode
+    files: list[Path]
+    key: str | None
+    seconds: float
+
+
+def execute(
     project: Project,
     name: str,
     parameters: dict[str, Any],
     scratch: Path,
     children: Children,
-    bar: tqdm,
-) -> float:
-    """Run one notebook in a process of its own, store its result, and return the seconds it took."""
+    progress: Progress,
+) -> Execution:
+    """Run one notebook in a process of its own.
+
+    Parameters
+    ----------
+    project : Project
+    name : str
+        The stem of the notebook's file.
+    parameters : dict
+        Values that replace defaults in its cell tagged ``parameters``.
+    scratch : Path
+        A folder for everything that the run writes.
+    children : Children
+        Takes the process.
+    progress : Progress
+        Hears its messages.
+
+    Raises
+    ------
+    NotebookError
+        If it did not come to its end.
+    """
     begin = time.perf_counter()
     made_from = key(project, name, parameters)
     source, target, log = (scratch / f"{name}{ending}" for ending in (".source.ipynb", ".ipynb", ".log"))
@@ -332,41 +435,47 @@ def _run_one(
         "folder": str(project.notebooks),
         "parameters": parameters,
     }
-    message: dict[str, Any] = {}
-    with children.start(request, log) as child:
-        for line in child.stdout:
-            message = json.loads(line)
-            bar.update("cell" in message)
-        status = child.wait()
+    failure, place = None, None
+    try:
+        with children.start(request, log) as child:
+            for line in child.stdout:
+                message = json.loads(line)
+                failure = message.get("failure")
+                place = message if "cell" in message else place
+                progress.heard(name, message)
+            status = child.wait()
+    finally:
+        progress.over(name)
     if status:
-        failure = message.get("failure") or {
-            "where": message or None,
-            "parameters": parameters,
-            "error": f"its process ended with status {status}\n{log.read_text()[-2000:]}",
-        }
+        ended = f"its process ended with status {status}\n{log.read_text()[-2000:]}"
+        failure = failure or {"where": place, "parameters": parameters, "error": ended}
         raise NotebookError(describe(f"notebooks/{name}.ipynb", failure))
-    seconds = time.perf_counter() - begin
-    result = to_bytes(read(target))
     # Whoever edits while a notebook runs gets a result of unknown origin: it must not count as current.
     unchanged = key(project, name, parameters) == made_from
+    return Execution(
+        notebook=read(target),
+        files=sorted(files.glob("[!.]*")),
+        key=made_from if unchanged else None,
+        seconds=round(time.perf_counter() - begin, 1),
+    )
+
+
+def _run_one(project: Project, name: str, scratch: Path, children: Children, progress: Progress) -> float:
+    """Run one notebook with its defaults, store its result, and return the seconds it took."""
+    done = execute(project, name, {}, scratch, children, progress)
+    result = to_bytes(done.notebook)
     record = {
-        "key": made_from if unchanged else None,
-        "result": _digest_result(result, sorted(files.glob("[!.]*"))),
-        "seconds": round(seconds, 1),
+        "key": done.key,
+        "result": _digest_result(result, done.files),
+        "seconds": done.seconds,
         "versions": versions(),
     }
     # Pieces of two runs may lie together for a moment; only the record, which comes last, makes them a result.
     replace(project.executed / f"{name}.ipynb", result)
-    shutil.rmtree(project.executed / files.name, ignore_errors=True)
-    files.rename(project.executed / files.name)
+    shutil.rmtree(project.executed / f"{name}.files", ignore_errors=True)
+    (scratch / f"{name}.files").rename(project.executed / f"{name}.files")
     replace(project.executed / f"{name}.json", json.dumps(record, indent=1).encode())
-    return seconds
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that decide what a notebook shows."""
-    packages = {"NumPy": "numpy", "SciPy": "scipy", "Matplotlib": "matplotlib", "zwfs": "zwfs"}
-    return {"Python": platform.python_version()} | {name: metadata.version(p) for name, p in packages.items()}
+    return done.seconds
 
 
 def describe(notebook: str, failure: dict[str, Any]) -> str:

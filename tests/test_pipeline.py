@@ -127,34 +127,6 @@ def test_parameters_are_part_of_the_key(ran):
     assert runner.key(ran, "first", {"n": 3}) != runner.key(ran, "first", {})
 
 
-def test_parameters_are_injected_after_the_defaults(ran):
-    assert run(ran, parameters={"first": {"n": 4}})[0] == ["first"]
-    assert printed(ran, "first").startswith("6.0\n")
-    injected = runner.read(ran.executed / "first.ipynb").cells[2]
-    assert injected.metadata.tags == ["injected-parameters"]
-    assert "n = 4" in injected.source
-
-
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"m": 4}, "unknown parameter 'm': expected one of n, width"),
-        ({"n": "4"}, "parameter n = '4': expected int, as in 2"),
-        ({"n": 4.0}, "parameter n = 4.0: expected int"),
-        ({"n": True}, "parameter n = True: expected int"),
-    ],
-)
-def test_bad_parameters_are_refused_before_the_first_cell(ran, parameters, message):
-    with pytest.raises(NotebookError, match="failed before its first cell") as caught:
-        run(ran, parameters={"first": parameters})
-    assert message in str(caught.value)
-
-
-def test_parameters_of_an_unknown_notebook_are_refused(ran):
-    with pytest.raises(ValueError, match="unknown notebooks: fourth"):
-        run(ran, parameters={"fourth": {}})
-
-
 def test_failure_is_named_and_leaves_earlier_results(ran):
     before = results(ran)
     write(ran, "first", "print(n)", "\nlight = 0\nraise ValueError('no light')", "print('never')")

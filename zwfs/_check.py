@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def integer(name: str, value: Any, low: int) -> int:
-    """Return `value` as an int of at least `low`."""
+def integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
+    """Return `value` as an int between `low` and `high`."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, Integral):
-        raise TypeError(f"{name} = {value!r}: expected an integer")
-    if value < low:
-        raise ValueError(f"{name} = {value}: expected at least {low}")
+        whole = isinstance(value, float) and value.is_integer()
+        raise TypeError(f"{name} = {value!r}: expected an integer{f', as in {int(value)}' if whole else ''}")
+    if not low <= value <= high:
+        expected = f"at least {low}" if high == math.inf else f"an integer in [{low}, {high}]"
+        raise ValueError(f"{name} = {value}: expected {expected}")
     return int(value)
 
 

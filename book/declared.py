@@ -1,0 +1,221 @@
+"""What a notebook declares of its parameters, read without running it, and values for them from outside."""
+
+import ast
+import difflib
+import io
+import re
+import tokenize
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+from nbformat import NotebookNode
+
+from zwfs.parameters import check_parameters
+
+# What may stand behind the last comma of a parameter's comment; all else there belongs to the meaning.
+UNITS = ("rad", "rad rms", "lambda/D", "D", "D²/lambda", "nm", "m", "s", "Hz", "pixels", "electrons", "photons")
+
+
+class ParameterError(Exception):
+    """A value for a parameter that the notebook does not take; the message is one line."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a notebook.
+
+    Attributes
+    ----------
+    default : Any
+        A literal.
+    meaning, unit : str
+        From the comment behind it, ``# meaning, unit``; the unit of a pure number is empty.
+    limits : Any
+        See `zwfs.parameters.check_parameters`; None if the notebook gives none.
+    """
+
+    default: Any
+    meaning: str
+    unit: str
+    limits: Any
+
+    @property
+    def kind(self) -> str:
+        """Its type, as a reader calls it."""
+        if isinstance(self.default, list):
+            return f"list of {type(_scalar(self.limits)).__name__}"
+        return type(self.default).__name__
+
+    @property
+    def allowed(self) -> str:
+        """Its limits, as a reader calls them."""
+        limits = self.limits[0] if isinstance(self.limits, list) else self.limits
+        if limits is None:
+            return ""
+        return ", ".join(limits) if isinstance(limits[0], str) else f"{limits[0]:g} to {limits[1]:.10g}"
+
+
+def _scalar(limits: Any) -> Any:
+    """Return a value of the type that single values within some limits have."""
+    if isinstance(limits, list):
+        return _scalar(limits[0])
+    floats = [limit for limit in limits or () if isinstance(limit, float)]
+    return floats[0] if floats else limits[0] if limits else None
+
+
+def parameters(notebook: NotebookNode) -> dict[str, Parameter]:
+    """Read the cell tagged ``parameters`` and the call of `check_parameters`.
+
+    Raises
+    ------
+    ParameterError
+        If a default or a limit is no literal.
+    """
+    source = next((c.source for c in notebook.cells if "parameters" in c.metadata.get("tags", ())), "")
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    comments = {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
+    limits = _limits(notebook)
+    return {
+        target.id: Parameter(
+            _literal(node.value), *_meaning_and_unit(comments.get(node.end_lineno, "")), limits.get(target.id)
+        )
+        for node in ast.parse(source).body
+        if isinstance(node, ast.Assign)
+        for target in node.targets
+    }
+
+
+def _meaning_and_unit(comment: str) -> tuple[str, str]:
+    """Split a comment; a remark behind a semicolon belongs to the meaning."""
+    told, semicolon, remark = comment.partition(";")
+    meaning, _, unit = told.rpartition(",")
+    if unit.strip() not in UNITS:
+        return (comment, "") if comment not in UNITS else ("", comment)
+    return meaning + semicolon + remark, unit.strip()
+
+
+def _limits(notebook: NotebookNode) -> dict[str, Any]:
+    """Return the limits by the name of the parameter."""
+    for cell in notebook.cells:
+        # A cell of another kind need not be Python: it may hold a command of the notebook.
+        if cell.cell_type == "code" and f"{check_parameters.__name__}(" in cell.source:
+            for node in ast.walk(ast.parse(cell.source)):
+                if isinstance(node, ast.Call) and getattr(node.func, "id", "") == check_parameters.__name__:
+                    return {keyword.arg: _literal(keyword.value) for keyword in node.keywords}
+    return {}
+
+
+def _literal(node: ast.expr) -> Any:
+    try:
+        return ast.literal_eval(node)
+    except ValueError:
+        raise ParameterError(f"{ast.unparse(node)} is no literal: it cannot be read without running it") from None
+
+
+def accept(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]:
+    """Check values, and return those that are not the defaults.
+
+    Parameters
+    ----------
+    given : dict
+        Values by name. An int may stand for a float, and becomes one.
+    known : dict of Parameter
+        The parameters of the notebook.
+
+    Raises
+    ------
+    ParameterError
+        If a name is unknown, or a value is not of the type or within the limits that the notebook asks for.
+    """
+    for name in given:
+        if name not in known:
+            raise ParameterError(f"unknown parameter {name!r}: {nearest(name, known)}")
+        if known[name].limits is None:
+            raise ParameterError(f"parameter {name!r} has no limits: add them to the notebook's check_parameters")
+    try:
+        check_parameters(given, **{name: known[name].limits for name in given})
+    except (TypeError, ValueError) as error:
+        raise ParameterError(str(error)) from None
+    # In the notebook's order: what came first on the command line makes no difference.
+    typed = {name: _typed(given[name], one.limits) for name, one in known.items() if name in given}
+    return {name: value for name, value in typed.items() if value != known[name].default}
+
+
+def nearest(name: str, known: Any) -> str:
+    """Ask for the known name that is most like a given one, or tell them all."""
+    found = difflib.get_close_matches(str(name), known, n=1)
+    return f"did you mean {found[0]!r}?" if found else f"expected one of {', '.join(known) or '(none)'}"
+
+
+def _typed(value: Any, limits: Any) -> Any:
+    """Return a value that was checked, with integers turned to floats where numbers are asked for."""
+    if isinstance(value, list):
+        return [_typed(item, limits[0]) for item in value]
+    return float(value) if isinstance(_scalar(limits), float) else value
+
+
+class Loader(yaml.SafeLoader):
+    """YAML as of version 1.2, in which 1e3 is a number, 010 is ten and yes is a word; no name may come twice."""
+
+    yaml_implicit_resolvers: dict = {}  # noqa: RUF012 - PyYAML keeps them in the class
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        """Return a mapping, after a look at its names."""
+        names = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for index, name in enumerate(names):
+            if name in names[:index]:
+                raise yaml.constructor.ConstructorError(None, None, f"{name!r} is given twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def _float(loader: Loader, node: yaml.ScalarNode) -> float:
+    return float(re.sub(r"\.(?=inf|nan)", "", node.value.lower()))
+
+
+for _kind, _form, _make in (
+    ("null", r"~|null|Null|NULL|", yaml.SafeLoader.construct_yaml_null),
+    ("bool", r"true|True|TRUE|false|False|FALSE", yaml.SafeLoader.construct_yaml_bool),
+    ("int", r"[-+]?[0-9]+", lambda loader, node: int(node.value)),
+    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", _float),
+):
+    Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", re.compile(rf"(?:{_form})\Z"), None)
+    Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _make)
+
+
+def load(text: str, origin: str) -> Any:
+    """Return what a text in YAML says.
+
+    Raises
+    ------
+    ParameterError
+        If it cannot be read; `origin` says where it came from.
+    """
+    try:
+        return yaml.load(text, Loader)  # a safe one
+    except yaml.YAMLError as error:
+        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+        where = f", line {mark.line + 1}" if mark and "\n" in text else ""
+        raise ParameterError(f"{origin}{where}: {problem or 'it cannot be read as YAML'}") from None
+
+
+def mapping(text: str, origin: str) -> dict[str, Any]:
+    """Return the parameters that a file in YAML gives, by name."""
+    found = load(text, origin)
+    if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
+        raise ParameterError(f"{origin}: expected a mapping of names to values, as in 'n_screens: 50'")
+    return found
+
+
+def assignments(texts: list[str]) -> dict[str, Any]:
+    """Return the parameters that texts of the form ``name=value`` give, the value in YAML."""
+    found: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        name = name.strip()
+        if not equals or not name:
+            raise ParameterError(f"-p {text}: expected name=value, as in n_screens=50")
+        if name in found:
+            raise ParameterError(f"-p {text}: {name!r} is given twice")
+        found[name] = load(value, f"-p {text}")
+    return found

@@ -1,0 +1,94 @@
+"""Limits of parameters: what is let through, and what is said of the rest."""
+
+import ast
+import math
+from pathlib import Path
+
+import declared
+import numpy as np
+import pytest
+import runner
+
+from zwfs.parameters import check_parameters
+
+NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.parametrize(
+    ("value", "limits"),
+    [
+        (1, (1, 5)),
+        (5, (1, 5)),
+        (np.int64(3), (1, 5)),
+        (0.0, (0.0, 4.0)),
+        (4, (0.0, 4.0)),
+        (-2, (-6, 0.0)),
+        ([0.1, 2], [(0.0, 4.0)]),
+        ([], [(0.0, 4.0), ...]),
+        ((1, 2), [(1, 2)]),
+        ("low", ("low", "high")),
+        (["low", "high"], [("low", "high")]),
+    ],
+)
+def test_values_within_limits_pass(value, limits):
+    check_parameters({"x": value, "other": object()}, x=limits)
+
+
+@pytest.mark.parametrize(
+    ("value", "limits", "error", "message"),
+    [
+        (0, (1, 5), ValueError, r"x = 0: expected an integer in \[1, 5\]"),
+        (6, (1, 5), ValueError, r"x = 6: expected an integer in \[1, 5\]"),
+        (3.0, (1, 5), TypeError, "x = 3.0: expected an integer, as in 3"),
+        (3.5, (1, 5), TypeError, "x = 3.5: expected an integer$"),
+        (True, (0, 5), TypeError, "x = True: expected an integer"),
+        ("3", (1, 5), TypeError, "x = '3': expected an integer"),
+        (None, (1, 5), TypeError, "x = None: expected an integer"),
+        (4.1, (0.0, 4.0), ValueError, r"x = 4.1: expected a finite number in \[0, 4\]"),
+        (math.nan, (0.0, 4.0), ValueError, "x = nan: expected a finite number"),
+        (math.inf, (0.0, math.inf), ValueError, "x = inf: expected a finite number"),
+        (True, (0.0, 4.0), TypeError, "x = True: expected a real number"),
+        ("1", (0.0, 4.0), TypeError, "x = '1': expected a real number"),
+        ([1.0], (0.0, 4.0), TypeError, r"x = \[1.0\]: expected a real number"),
+        (1.0, [(0.0, 4.0)], TypeError, "x = 1.0: expected a list"),
+        ("12", [(0, 4)], TypeError, "x = '12': expected a list"),
+        ([], [(0.0, 4.0)], ValueError, r"x = \[\]: expected at least one value"),
+        ([1.0, 5.0], [(0.0, 4.0), ...], ValueError, r"x\[1\] = 5.0: expected a finite number in \[0, 4\]"),
+        ("middle", ("low", "high"), ValueError, "x = 'middle': expected one of 'low', 'high'"),
+        (1, ("low", "high"), TypeError, "x = 1: expected one of 'low', 'high'"),
+        (1, (1,), TypeError, r"limits of x = \(1,\): expected"),
+        (1, [(1, 2), (3, 4)], TypeError, "limits of x = "),
+    ],
+)
+def test_values_beyond_limits_are_refused(value, limits, error, message):
+    with pytest.raises(error, match=message):
+        check_parameters({"x": value}, x=limits)
+
+
+def test_limits_without_a_value_are_refused():
+    with pytest.raises(ValueError, match="y has limits but no value"):
+        check_parameters({"x": 1}, x=(0, 1), y=(0, 1))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_every_parameter_of_a_notebook_has_a_meaning_and_limits(path):
+    notebook = runner.read(path)
+    known = declared.parameters(notebook)
+    assert known
+    assert [name for name, one in known.items() if not one.meaning] == []
+    assert [name for name, one in known.items() if one.limits is None] == []
+    # No limits for what is no parameter, and defaults within them.
+    [tagged] = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", ())]
+    after = notebook.cells[notebook.cells.index(tagged) + 1]
+    [call] = [node for node in ast.walk(ast.parse(after.source)) if isinstance(node, ast.Call) and node.keywords]
+    assert {keyword.arg for keyword in call.keywords} == set(known)
+    assert declared.accept({name: one.default for name, one in known.items()}, known) == {}
+
+
+def test_notebook_refuses_bad_values_in_its_second_cell_of_code():
+    notebook = runner.read(next(path for path in NOTEBOOKS if path.stem.startswith("fig01")))
+    [tagged] = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", ())]
+    after = notebook.cells[notebook.cells.index(tagged) + 1]
+    exec(f"{tagged.source}\n{after.source}", {})
+    with pytest.raises(ValueError, match="rms = 40"):
+        exec(f"{tagged.source}\nrms = 40\n{after.source}", {})

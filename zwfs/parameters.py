@@ -1,0 +1,63 @@
+"""The limits of a notebook's parameters: what a reader may put in place of its defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from zwfs import _check
+
+
+def check_parameters(values: Mapping[str, Any], /, **limits: Any) -> None:
+    """Refuse parameters of the wrong type or out of range.
+
+    A notebook calls it in the cell after its parameters, with literals, so that the limits can also be read
+    without running it: ``check_parameters(globals(), n_screens=(1, 1000), rms=(0.0, 4.0), inputs=[(0.0, 4.0)])``.
+
+    Parameters
+    ----------
+    values : mapping of str
+        Parameters by name; it may hold more than those with limits.
+    **limits
+        What is allowed, by the name of the parameter. Either end of a range belongs to it.
+
+        - ``(low, high)``, both int: an integer between them;
+        - ``(low, high)``, one a float: a finite number between them;
+        - a tuple of str: one of these;
+        - ``[limits]``: a list of one or more values, each within the limits;
+        - ``[limits, ...]``: the same, or an empty list.
+
+    Raises
+    ------
+    TypeError
+        If a value is of another type, or limits have none of these forms.
+    ValueError
+        If a value is out of range, or there is no value for a name.
+    """
+    for name, limit in limits.items():
+        if name not in values:
+            raise ValueError(f"{name} has limits but no value: expected a parameter of that name")
+        _check_value(name, values[name], limit)
+
+
+def _check_value(name: str, value: Any, limit: Any) -> None:
+    match limit:
+        case [within, *more] if isinstance(limit, list) and more in ([], [...]):
+            if not isinstance(value, list | tuple):
+                raise TypeError(f"{name} = {value!r}: expected a list")
+            if not value and not more:
+                raise ValueError(f"{name} = {value!r}: expected at least one value")
+            for index, item in enumerate(value):
+                _check_value(f"{name}[{index}]", item, within)
+        case (str(), *_) if all(isinstance(choice, str) for choice in limit):
+            if value not in limit:
+                error = ValueError if isinstance(value, str) else TypeError
+                raise error(f"{name} = {value!r}: expected one of {', '.join(map(repr, limit))}")
+        case (int() as low, int() as high):
+            _check.integer(name, value, low, high)
+        case (float() | int() as low, float() | int() as high):
+            _check.number(name, value, low, high)
+        case _:
+            raise TypeError(
+                f"limits of {name} = {limit!r}: expected (low, high), strings, or a list of one of these"
+            )

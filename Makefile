@@ -14,7 +14,7 @@ export MKL_NUM_THREADS = 1
 export VECLIB_MAXIMUM_THREADS = 1
 
 .DELETE_ON_ERROR:
-.PHONY: help book test figures lint bench lock clean
+.PHONY: help book test figures rerun lint bench lock clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -29,6 +29,9 @@ test: $(READY) ## test the package, the pipeline and the committed notebooks
 
 figures: $(READY) ## replace the committed notebooks by freshly run ones
 	@$(BIN)/python book/build.py figures
+
+rerun: $(READY) ## run one notebook with other parameters: make rerun FIGURE=3 ARGS="-p rms_max=2.0"
+	@$(BIN)/python book/rerun.py $(FIGURE) $(ARGS)
 
 lint: $(READY) ## check style and formatting
 	$(BIN)/ruff check .

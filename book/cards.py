@@ -14,7 +14,7 @@ from nbformat.v4 import new_markdown_cell
 from runner import Project
 
 # Makes a figure again, from the root of a clone.
-RERUN = "papermill --cwd notebooks notebooks/{notebook}.ipynb out.ipynb"
+RERUN = "make rerun FIGURE={notebook}"
 
 MARKDOWN = re.compile(r"([\\`*_{}\[\]<>$|#])")
 

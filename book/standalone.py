@@ -1,0 +1,176 @@
+"""One executed notebook as one HTML file that opens by itself: pictures and mathematics are in it."""
+
+import base64
+import copy
+import importlib.util
+import io
+import mimetypes
+import re
+import shutil
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import bs4
+from cards import published
+from nbformat import NotebookNode
+from nbformat.v4 import new_markdown_cell
+from runner import Project, to_bytes
+
+HERE = Path(__file__).parent
+COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+# What in the book serves its navigation; the page has none.
+LEFT_OUT = {
+    "api", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_book_theme", "sphinx_comments",
+    "sphinx_copybutton", "sphinx_togglebutton",
+}  # fmt: skip
+FRAME = """<!DOCTYPE html>
+<html lang="en" data-theme="light">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<link rel="icon" href="data:,">
+<title>{title}</title>
+<style>{style}</style>
+{script}</head>
+<body>
+<main>{body}</main>
+</body>
+</html>
+"""
+MATHJAX = """<script>
+window.MathJax = {{
+  tex: {{tags: "none"}},
+  svg: {{fontCache: "global"}},
+  options: {{enableMenu: false, ignoreHtmlClass: "tex2jax_ignore|document", processHtmlClass: "math"}}
+}};
+</script>
+<script>{code}</script>
+"""
+
+
+def page(project: Project, name: str, notebook: NotebookNode, files: list[Path], scratch: Path) -> tuple[str, str]:
+    """Build the page of a notebook.
+
+    The book's own Sphinx settings are used, and its other pages are read beside this one: equations have the
+    numbers that they have there. Links to other pages become plain text.
+
+    Parameters
+    ----------
+    project : Project
+    name : str
+        The stem of the notebook's file.
+    notebook : NotebookNode
+        Executed.
+    files : list of Path
+        What it published: the page links to them by their name, as files beside it.
+    scratch : Path
+        A folder to work in.
+
+    Returns
+    -------
+    html : str
+    warnings : str
+        What Sphinx says of this page, a line each.
+    """
+    source, output = scratch / "source", scratch / "html"
+    _stage(project, name, notebook, files, source)
+    warnings = _sphinx(source, output, f"notebooks/{name}.ipynb")
+    html = _embed(output / "notebooks" / f"{name}.html", {file.name for file in files})
+    marked = [line for line in warnings.splitlines() if f"notebooks/{name}.ipynb" in line]
+    return html, "\n".join(line.replace(f"{source}/", "") for line in marked)
+
+
+def _stage(project: Project, name: str, notebook: NotebookNode, files: list[Path], source: Path) -> None:
+    """Lay out what Sphinx reads: the book as it is committed, with this notebook in its place."""
+    for file in (project.root / "_config.yml", project.root / "_toc.yml", *(project.root / "book").rglob("*")):
+        if file.is_file() and file.suffix in (".yml", ".md", ".bib"):
+            place = source / file.relative_to(project.root)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, place)
+    downloads = source / "notebooks" / "downloads"
+    downloads.mkdir(parents=True)
+    for other in project.sources():
+        shutil.copyfile(other, source / "notebooks" / other.name)
+    (source / "notebooks" / f"{name}.ipynb").write_bytes(to_bytes(_with_downloads(notebook, files)))
+    for file in files:
+        shutil.copyfile(file, downloads / file.name)
+
+
+def _with_downloads(notebook: NotebookNode, files: list[Path]) -> NotebookNode:
+    """Return the notebook with links to the files of each figure under it."""
+    result = copy.copy(notebook)
+    result.cells = []
+    for cell in notebook.cells:
+        result.cells.append(cell)
+        for figure in published(cell.source) if cell.cell_type == "code" else []:
+            links = (f"{{download}}`{file.name} <downloads/{file.name}>`" for file in files if file.stem == figure)
+            result.cells.append(new_markdown_cell("Download: " + " · ".join(links), id=f"files-{figure}"[:64]))
+    return result
+
+
+def _sphinx(source: Path, output: Path, document: str) -> str:
+    """Let Sphinx write one document, and return its warnings."""
+    from jupyter_book.config import get_final_config
+    from sphinx.application import Sphinx
+    from sphinx.util.docutils import docutils_namespace, patch_docutils
+
+    config, _ = get_final_config(
+        user_yaml=source / "_config.yml",
+        cli_config={"external_toc_path": str(source / "_toc.yml"), "latex_individualpages": False},
+        sourcedir=source,
+    )
+    config |= {
+        "extensions": [name for name in config["extensions"] if name not in LEFT_OUT],
+        "html_theme": "basic",
+        "html_theme_options": {},
+        "html_static_path": [],
+        "html_css_files": [],
+        "html_copy_source": False,
+        "html_permalinks": False,
+        "pygments_style": "tango",
+    }
+    warnings = io.StringIO()
+    with patch_docutils(), docutils_namespace():
+        app = Sphinx(
+            source, None, output, output.with_name("doctrees"), "html", config, status=None, warning=warnings
+        )
+        app.build(filenames=[str(source / document)])
+    return COLOUR.sub("", warnings.getvalue())
+
+
+def _embed(file: Path, beside: set[str]) -> str:
+    """Return the content of a page that Sphinx wrote, with everything that it loads in it."""
+    soup = bs4.BeautifulSoup(file.read_text("utf-8"), "html.parser")
+    body = soup.find("div", class_="body")
+    for picture in body.find_all("img"):
+        picture["src"] = _data(file.parent / unquote(picture["src"]))
+    for script in body.find_all("script"):
+        script.decompose()
+    for link in body.find_all("a"):
+        target = urlsplit(link.get("href", ""))
+        filename = unquote(target.path).rpartition("/")[2]
+        if "download" in link.get("class", ()) and filename in beside:
+            link["href"] = filename
+        elif target.path and not target.scheme:
+            link.unwrap()
+    sheets = [sheet["href"].partition("?")[0] for sheet in soup.find_all("link", rel="stylesheet")]
+    style = [(file.parent / sheet).read_text("utf-8") for sheet in sheets if not urlsplit(sheet).scheme]
+    return FRAME.format(
+        title=body.find("h1").get_text(),
+        style="\n".join([*style, (HERE / "standalone.css").read_text("utf-8")]),
+        script=_mathjax() if body.find(class_="math") else "",
+        body="".join(map(str, body.contents)),
+    )
+
+
+def _data(file: Path) -> str:
+    """Return a file as an address that holds it."""
+    kind = mimetypes.guess_type(file.name)[0]
+    return f"data:{kind};base64,{base64.b64encode(file.read_bytes()).decode()}"
+
+
+def _mathjax() -> str:
+    """MathJax in one piece: the letters are drawn, so it loads no fonts."""
+    package = importlib.util.find_spec("sphinx-mathjax-offline")
+    code = Path(package.origin).parent / "static" / "mathjax" / "tex-svg-full.js"
+    return MATHJAX.format(code=code.read_text("utf-8").replace("</script", "<\\/script"))

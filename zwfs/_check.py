@@ -21,6 +21,13 @@ def integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
     return int(value)
 
 
+def flag(name: str, value: Any) -> bool:
+    """Return `value` as a bool."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} = {value!r}: expected True or False")
+    return bool(value)
+
+
 def number(
     name: str,
     value: Any,

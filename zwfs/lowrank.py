@@ -103,10 +103,7 @@ class Operator:
         self._pupil = factors.pupil.astype(dtype)
         self._detector = factors.detector.astype(dtype)
         self._window = self._detector.cut(*window)
-        # Acts from the right on coefficients (2, r) that are flattened, and gives (n_masks, 2, q) flattened.
-        real, imag = factors.core.real, factors.core.imag
-        block = np.block([[real, -imag], [imag, real]])
-        self._split_core = np.ascontiguousarray(block.reshape(-1, block.shape[-1]).T, dtype)
+        self._split_core = split_core(factors.core).astype(dtype)
         self._core = factors.core.reshape(-1, factors.core.shape[-1]).T.astype(np.result_type(dtype, np.complex64))
 
     def reference(self, psi: NDArray) -> NDArray:
@@ -126,11 +123,17 @@ class Operator:
 
         The primed sizes are those of the detector, or those of the pupil's grid if `in_window`.
         """
+        return self.split_expand(self.split_project(psi) @ self._split_core, in_window=in_window)
+
+    def split_project(self, psi: NDArray) -> NDArray:
+        """Coefficients of split fields on the pupil: (k, 2, ny, nx) to (k, 2 r), real parts first."""
+        return self._pupil.project(psi.reshape(-1, *psi.shape[-2:])).reshape(len(psi), -1)
+
+    def split_expand(self, coefficients: NDArray, *, in_window: bool = False) -> NDArray:
+        """Split waves of coefficients, (k, n 2 q) to (k, n, 2, ny', nx'); sizes as for `split_reference`."""
         plane = self._window if in_window else self._detector
-        coefficients = self._pupil.project(psi.reshape(-1, *psi.shape[-2:]))
-        coefficients = coefficients.reshape(len(psi), -1) @ self._split_core
         waves = plane.expand(coefficients.reshape(-1, plane.rank))
-        return waves.reshape(len(psi), self.n_masks, 2, *waves.shape[-2:])
+        return waves.reshape(len(coefficients), -1, 2, *waves.shape[-2:])
 
     def split_adjoint(self, waves: NDArray) -> NDArray:
         """Adjoint of `split_reference` on the whole detector: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
@@ -138,6 +141,12 @@ class Operator:
         coefficients = coefficients.reshape(len(waves), -1) @ self._split_core.T
         psi = self._pupil.expand(coefficients.reshape(-1, self._pupil.rank))
         return psi.reshape(len(waves), 2, *psi.shape[-2:])
+
+
+def split_core(core: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Cores (n, q, r) as a real matrix that acts from the right: coefficients (k, 2 r) to (k, n 2 q)."""
+    block = np.block([[core.real, -core.imag], [core.imag, core.real]])
+    return np.ascontiguousarray(block.reshape(-1, block.shape[-1]).T)
 
 
 def factorise(

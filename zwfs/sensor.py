@@ -101,6 +101,11 @@ class ZernikeSensor:
         """Number of coefficients that the reference waves are made of."""
         return self._factors.pupil.rank
 
+    @property
+    def cores(self) -> NDArray[np.complex128]:
+        """What makes the reference waves' coefficients out of those of the field, shape (n_masks, q, r)."""
+        return self._factors.core
+
     def operator(self, dtype: np.dtype) -> Operator:
         """Low-rank operator in float32 or float64, for those who write reconstructors; made once, then kept."""
         dtype = np.dtype(dtype)

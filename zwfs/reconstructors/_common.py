@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs.sensor import ZernikeSensor, split
+from zwfs.sensor import ZernikeSensor, split, square
 
 _CHUNK = 80_000  # detector pixels handled together: few enough for the fast memory, enough to vectorise
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Reconstruction:
     """What a reconstructor found; `...` is the batch of the frames.
 
@@ -22,9 +24,6 @@ class Reconstruction:
     ----------
     phase : ndarray, shape (..., ny, nx), radian
         NaN outside the pupil. Wrapped to (-pi, pi], except by `Linear` and `GradientDescent`.
-    residual : ndarray, shape (...)
-        Rms difference, over all masks and the points of the pupil, between measured frames and those modelled
-        from the phase; the unit is the mean intensity of the pupil.
     n_iterations : ndarray of int, shape (...)
         Iterations used.
     converged : ndarray of bool, shape (...)
@@ -34,17 +33,49 @@ class Reconstruction:
         of the iteration before, or cosines beyond +-1.
     history : ndarray, shape (..., n_iterations + 1, ny, nx), radian, or None
         Phase at the start and after each iteration, if asked for; repeated once converged.
+    settings : Settings
+        Of the reconstructor.
+    frames : ndarray, shape (..., n_masks, ny, nx)
+        Copy of what was reconstructed, on the grid of the pupil.
     """
 
     phase: NDArray[np.floating]
-    residual: NDArray[np.floating]
     n_iterations: NDArray[np.int64]
     converged: NDArray[np.bool_]
     n_unsolved: NDArray[np.int64]
-    history: NDArray[np.floating] | None = None
+    history: NDArray[np.floating] | None
+    settings: Settings = field(repr=False)
+    frames: NDArray[np.floating] = field(repr=False)
+
+    @cached_property
+    def residual(self) -> NDArray[np.floating]:
+        """Mismatch of the frames, shape (...), computed when it is first asked for.
+
+        Rms difference, over all masks and the points of the pupil, between the measured frames and those modelled
+        from the phase; the unit is the mean intensity of the pupil.
+        """
+        sensor = self.settings.sensor
+        amplitude, inside, _ = self.settings.maps(self.phase.dtype)
+        frames = self.frames.reshape(-1, *self.frames.shape[-3:])
+        phase = np.where(sensor.pupil.mask, self.phase, 0).reshape(-1, *sensor.pupil.shape)
+        residual = np.empty(len(frames), frames.dtype)
+        for piece in pieces(frames):
+            psi = split(phase[piece], amplitude)
+            waves = sensor.operator(psi.dtype).split_reference(psi, in_window=True) + psi[:, np.newaxis]
+            mismatch = ((square(waves) - frames[piece]) * inside).reshape(len(psi), -1)
+            residual[piece] = np.vecdot(mismatch, mismatch)
+        return np.sqrt(residual / (sensor.n_masks * sensor.pupil.n_points)).reshape(self.phase.shape[:-2])[()]
 
 
-@dataclass(frozen=True)
+class Maps(NamedTuple):
+    """Maps on the pupil in one precision, shape (ny, nx)."""
+
+    amplitude: NDArray[np.floating]
+    inside: NDArray[np.floating]  # 1 inside, 0 outside
+    outside: NDArray[np.floating]  # 0 inside, NaN outside
+
+
+@dataclass(frozen=True, eq=False)
 class Settings:
     """Checked arguments that every reconstructor takes; see `settings`."""
 
@@ -52,6 +83,15 @@ class Settings:
     n_iterations: int
     tolerance: float
     amplitude: NDArray[np.float64]
+    _maps: dict[np.dtype, Maps] = field(default_factory=dict, init=False, repr=False)
+
+    def maps(self, dtype: np.dtype) -> Maps:
+        """Maps in float32 or float64; made once, then kept."""
+        if dtype not in self._maps:
+            mask = self.sensor.pupil.mask
+            maps = self.amplitude, mask, np.where(mask, 0, np.nan)
+            self._maps[dtype] = Maps(*(values.astype(dtype) for values in maps))
+        return self._maps[dtype]
 
 
 def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLike | None) -> Settings:
@@ -83,34 +123,35 @@ def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLik
 
 
 class FixedPoint(Protocol):
-    """An iterative reconstructor: each step makes a better phasor out of the one before."""
+    """An iterative reconstructor: each step makes a better phasor out of the one before.
+
+    A phasor is exp(i phase), split, shape (k, 2, ny, nx), and 0 outside the pupil.
+    """
 
     settings: Settings
 
-    def prepare(self, frames: NDArray, amplitude: NDArray, start: NDArray) -> dict[str, NDArray]:
-        """What the steps need, computed once: arrays with the frames (k, n_masks, ny', nx') on the first axis."""
+    def prepare(self, frames: NDArray, phasor: NDArray) -> dict[str, NDArray]:
+        """What the steps need and keep: arrays with the frames (k, n_masks, ny', nx') on the first axis."""
 
-    def step(self, phasor: NDArray, amplitude: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
-        """Next unit phasor exp(i phase), split, (k, 2, ny, nx), and the number of unsolved points (k,)."""
+    def step(self, phasor: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
+        """Next phasor, and the number of unsolved points (k,)."""
 
 
 def iterate(method: FixedPoint, frames: ArrayLike, start: ArrayLike | None, history: bool) -> Reconstruction:
     """Run the steps of `method` on every frame until it converges or the iterations are used up."""
     config = method.settings
     frames, batch = check_frames(config.sensor, frames)
-    phase = start_phase(config.sensor, start, batch, frames.dtype)
     n_frames, shape = len(frames), config.sensor.pupil.shape
+    first = None if start is None else start_phase(config.sensor, start, batch, frames.dtype)
+    phase = np.empty((n_frames, *shape), frames.dtype)
     n_used = np.zeros(n_frames, int)
     converged = np.zeros(n_frames, bool)
     n_unsolved = np.zeros(n_frames, int)
     record = np.empty((n_frames, config.n_iterations + 1, *shape), frames.dtype) if history else None
-    amplitude = config.amplitude.astype(frames.dtype)
-    size = max(1, _CHUNK // frames[0].size)
-    for first in range(0, n_frames, size):
-        piece = slice(first, first + size)
+    for piece in pieces(frames):
         _iterate_piece(
-            method, frames[piece], amplitude, phase[piece], n_used[piece], converged[piece], n_unsolved[piece],
-            None if record is None else record[piece],
+            method, frames[piece], None if first is None else first[piece], phase[piece], n_used[piece],
+            converged[piece], n_unsolved[piece], None if record is None else record[piece],
         )  # fmt: skip
     return report(config, frames, batch, phase, n_used, converged, n_unsolved, record)
 
@@ -118,36 +159,47 @@ def iterate(method: FixedPoint, frames: ArrayLike, start: ArrayLike | None, hist
 def _iterate_piece(
     method: FixedPoint,
     frames: NDArray,
-    amplitude: NDArray,
+    start: NDArray | None,
     phase: NDArray,
     n_used: NDArray,
     converged: NDArray,
     n_unsolved: NDArray,
     record: NDArray | None,
 ) -> None:
-    """Iterate a few frames; the last five arguments and `phase` are written to."""
+    """Iterate a few frames; the last five arguments are written to."""
     config = method.settings
-    inside = config.sensor.pupil.mask.astype(frames.dtype)
-    data = method.prepare(frames, amplitude, phase)
-    phasor = split(phase, inside)
+    inside = config.maps(frames.dtype).inside
+    if start is None:
+        phasor = np.zeros((len(frames), 2, *inside.shape), inside.dtype)
+        phasor[:, 0] = inside
+    else:
+        phasor = split(start, inside)
+    if record is not None:
+        record[:, 0] = 0 if start is None else start
+    data = method.prepare(frames, phasor)
+    limit = config.tolerance**2 * config.sensor.pupil.n_points
     # Frames that are done leave the loop, so a frame's result does not depend on its neighbours.
     active = np.arange(len(frames))
-    if record is not None:
-        record[:, 0] = phase
     for iteration in range(1, config.n_iterations + 1):
-        new, unsolved = method.step(phasor, amplitude, data)
-        n_unsolved[active], n_used[active] = unsolved, iteration
-        done = _rms_change(new, phasor, inside) <= config.tolerance
+        new, unsolved = method.step(phasor, data)
+        # To the change of the phase, for small changes.
+        change = (new - phasor).reshape(len(new), -1)
+        done = np.vecdot(change, change) <= limit
         phasor = new
         if record is not None:
             record[active, iteration:] = angle(phasor)[:, np.newaxis]
-        if done.any():
-            phase[active[done]], converged[active[done]] = angle(phasor[done]), True
-            active, phasor = active[~done], phasor[~done]
-            data = {name: values[~done] for name, values in data.items()}
-            if not active.size:
-                return
-    phase[active] = angle(phasor)
+        leaving = done if iteration < config.n_iterations else np.ones_like(done)
+        if not leaving.any():
+            continue
+        where = active[leaving]
+        phase[where] = angle(phasor[leaving])
+        n_used[where], converged[where], n_unsolved[where] = iteration, done[leaving], unsolved[leaving]
+        staying = ~leaving
+        active, phasor = active[staying], phasor[staying]
+        if not active.size:
+            return
+        for name, values in data.items():
+            data[name] = values[staying]
 
 
 def report(
@@ -160,30 +212,27 @@ def report(
     n_unsolved: NDArray,
     record: NDArray | None,
 ) -> Reconstruction:
-    """Result in the shape of the batch, with the mismatch of the frames modelled from the phase."""
-    sensor = config.sensor
-    pupil = sensor.pupil
-    residual = np.empty(len(frames), frames.dtype)
-    amplitude = config.amplitude.astype(frames.dtype)[np.newaxis]
-    size = max(1, _CHUNK // frames[0].size)
-    for first in range(0, len(frames), size):
-        piece = slice(first, first + size)
-        mismatch = sensor.intensity(phase[piece], amplitude) - frames[piece]
-        mismatch = mismatch[(..., *sensor.window)] * pupil.mask
-        residual[piece] = np.sqrt(
-            np.mean(mismatch**2, axis=(-3, -2, -1)) * (pupil.amplitude.size / pupil.n_points)
-        )
+    """Result in the shape of the batch; `phase` and `record` are written to."""
+    outside = config.maps(phase.dtype).outside
+    phase += outside
+    if record is not None:
+        record += outside
+    # A copy, since the residual is computed later: a camera may write the next frame to the same place.
+    window = np.array(frames[(..., *config.sensor.window)])
 
     def shaped(values: NDArray) -> NDArray:
         return values.reshape((*batch, *values.shape[1:]))
 
-    def public(maps: NDArray) -> NDArray:
-        return shaped(np.where(pupil.mask, maps, np.nan).astype(maps.dtype, copy=False))
-
     return Reconstruction(
-        public(phase), shaped(residual), shaped(n_used), shaped(converged), shaped(n_unsolved),
-        None if record is None else public(record),
+        shaped(phase), shaped(n_used), shaped(converged), shaped(n_unsolved),
+        None if record is None else shaped(record), config, shaped(window),
     )  # fmt: skip
+
+
+def pieces(frames: NDArray) -> Iterator[slice]:
+    """Slices of frames (n, ...) that are handled together."""
+    size = max(1, _CHUNK // frames[0].size)
+    return (slice(first, first + size) for first in range(0, len(frames), size))
 
 
 def check_frames(
@@ -196,9 +245,12 @@ def check_frames(
     batch, flat = frames.shape[:-3], frames.reshape(-1, *shape)
     if not len(flat):
         raise ValueError(f"{name} has shape {frames.shape}: expected at least one frame")
-    _check.finite(name, flat)
+    light = flat.sum(axis=(-2, -1))
+    # A sum is finite only if all its terms are.
+    if not np.isfinite(light).all():
+        _check.finite(name, flat)
     _check.non_negative(name, flat, "; after subtracting a background, raise them to 0 explicitly")
-    dark = ~flat.any(axis=(-2, -1))
+    dark = light == 0
     if dark.any():
         raise ValueError(
             f"{name}: {np.count_nonzero(dark)} of {dark.size} hold no light: expected some flux in each"
@@ -225,15 +277,12 @@ def angle(phasor: NDArray) -> NDArray:
     return np.arctan2(phasor[..., 1, :, :], phasor[..., 0, :, :])
 
 
-def unit(field: NDArray, fallback: NDArray) -> NDArray:
-    """Phasor of a split field; that of `fallback` where the field vanishes."""
-    modulus = np.sqrt(field[..., 0, :, :] ** 2 + field[..., 1, :, :] ** 2)[..., np.newaxis, :, :]
-    if modulus.min() > 0:
-        return field / modulus
-    return np.where(modulus > 0, field / np.where(modulus > 0, modulus, 1), fallback)
-
-
-def _rms_change(new: NDArray, old: NDArray, inside: NDArray) -> NDArray:
-    """Rms over the pupil of the change of the phase, for small changes: (k,)."""
-    change = ((new - old) * inside).reshape(len(new), -1)
-    return np.sqrt(np.einsum("ki,ki->k", change, change) / np.count_nonzero(inside))
+def unit(field: NDArray, fallback: NDArray, modulus: NDArray) -> NDArray:
+    """Split field with another modulus, (..., ny, nx); `fallback` where the field vanishes. `field` is reused."""
+    power = square(field)
+    if power.min() > 0:
+        field *= (modulus / np.sqrt(power))[..., np.newaxis, :, :]
+        return field
+    dark = power == 0
+    scale = modulus / np.sqrt(np.where(dark, 1, power))
+    return np.where(dark[..., np.newaxis, :, :], fallback, field * scale[..., np.newaxis, :, :])

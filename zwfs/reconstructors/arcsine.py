@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zwfs.reconstructors._common import Reconstruction, iterate, settings
-from zwfs.sensor import ZernikeSensor, split, square
+from zwfs.reconstructors._common import Reconstruction, iterate, settings, unit
+from zwfs.sensor import ZernikeSensor, square
 
 
 class Arcsine:
@@ -46,6 +46,10 @@ class Arcsine:
         self.settings = settings(sensor, n_iterations, tolerance, amplitude)
         if sensor.n_masks != 1:
             raise ValueError(f"sensor has {sensor.n_masks} masks: expected one; PhaseShifted takes more")
+        amplitude, mask = self.settings.amplitude, sensor.pupil.mask
+        # Where there is no light inside the pupil the field comes out as 0, and the phase stays what it was.
+        self._dark = mask & (amplitude == 0)
+        self._gain = np.where(self._dark, 0, 1 / (2 * np.where(amplitude > 0, amplitude, 1)))
 
     def __call__(
         self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
@@ -53,37 +57,32 @@ class Arcsine:
         """Reconstruct the phase of each frame; parameters, result and errors are those of `PhaseShifted`."""
         return iterate(self, frames, start, history)
 
-    def prepare(self, frames: NDArray, amplitude: NDArray, start: NDArray) -> dict[str, NDArray]:
+    def prepare(self, frames: NDArray, phasor: NDArray) -> dict[str, NDArray]:
         """Intensity less that of the incoming light, and the side of the reference wave to look on."""
-        sensor = self.settings.sensor
-        psi = split(start, amplitude)
-        wave = sensor.operator(start.dtype).split_reference(psi, in_window=True)[:, 0]
+        amplitude = self.settings.maps(phasor.dtype).amplitude
+        psi = phasor * amplitude
+        wave = self._reference(psi)
         # The side is fixed once: the piston of the estimate, which no intensity shows, may drift past the wave.
         ahead = wave[:, 0] * psi[:, 1] - wave[:, 1] * psi[:, 0] >= 0
         return {
-            "excess": frames[:, 0][(..., *sensor.window)] - amplitude**2,
-            "side": np.where(ahead, 1, -1).astype(start.dtype),
+            "excess": frames[:, 0][(..., *self.settings.sensor.window)] - amplitude**2,
+            "side": np.where(self._dark, 0, np.where(ahead, 1, -1)).astype(phasor.dtype),
         }
 
-    def step(self, phasor: NDArray, amplitude: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
-        """Reference wave of the estimate, then the cosine of the angle to it at every point."""
-        pupil = self.settings.sensor.pupil
-        wave = self.settings.sensor.operator(phasor.dtype).split_reference(phasor * amplitude, in_window=True)[
-            :, 0
-        ]
+    def step(self, phasor: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
+        """Reference wave of the estimate, then both parts of the field along it, times its modulus."""
+        wave = self._reference(phasor * self.settings.maps(phasor.dtype).amplitude)
         power = square(wave)
-        contrast = 2 * amplitude * np.sqrt(power)
-        solvable = contrast > 0
-        cosine = np.divide(data["excess"] - power, contrast, out=np.full_like(power, 2.0), where=solvable)
-        n_unsolved = np.count_nonzero((np.abs(cosine) > 1) & pupil.mask, axis=(-2, -1))
-        cosine = np.clip(cosine, -1, 1)
-        sine = data["side"] * np.sqrt(1 - cosine**2)
-        # exp(i phase) = exp(i phi_ref) (cosine + i sine)
-        direction = np.divide(
-            wave, np.sqrt(power)[:, np.newaxis], out=phasor.copy(), where=solvable[:, np.newaxis]
+        along = (data["excess"] - power) * self._gain.astype(phasor.dtype, copy=False)
+        across = power - along**2
+        n_unsolved = np.count_nonzero((across < 0) & self.settings.sensor.pupil.mask, axis=(-2, -1))
+        across = data["side"] * np.sqrt(np.maximum(across, 0))
+        new = along[:, np.newaxis] * wave
+        new[:, 0] -= across * wave[:, 1]
+        new[:, 1] += across * wave[:, 0]
+        return unit(new, phasor, self.settings.maps(phasor.dtype).inside), n_unsolved + np.count_nonzero(
+            self._dark
         )
-        new = np.stack(
-            [direction[:, 0] * cosine - direction[:, 1] * sine, direction[:, 1] * cosine + direction[:, 0] * sine],
-            axis=1,
-        )
-        return np.where(solvable[:, np.newaxis], new, phasor), n_unsolved
+
+    def _reference(self, psi: NDArray) -> NDArray:
+        return self.settings.sensor.operator(psi.dtype).split_reference(psi, in_window=True)[:, 0]

@@ -74,6 +74,10 @@ class Maps(NamedTuple):
     inside: NDArray[np.floating]  # 1 inside, 0 outside
     outside: NDArray[np.floating]  # 0 inside, NaN outside
 
+    def field(self, phasor: NDArray) -> NDArray:
+        """Split field of a phasor that is 0 outside."""
+        return phasor if self.amplitude is self.inside else phasor * self.amplitude
+
 
 @dataclass(frozen=True, eq=False)
 class Settings:
@@ -89,8 +93,9 @@ class Settings:
         """Maps in float32 or float64; made once, then kept."""
         if dtype not in self._maps:
             mask = self.sensor.pupil.mask
-            maps = self.amplitude, mask, np.where(mask, 0, np.nan)
-            self._maps[dtype] = Maps(*(values.astype(dtype) for values in maps))
+            inside = mask.astype(dtype)
+            amplitude = inside if np.array_equal(self.amplitude, mask) else self.amplitude.astype(dtype)
+            self._maps[dtype] = Maps(amplitude, inside, np.where(mask, 0, np.nan).astype(dtype))
         return self._maps[dtype]
 
 
@@ -130,8 +135,11 @@ class FixedPoint(Protocol):
 
     settings: Settings
 
-    def prepare(self, frames: NDArray, phasor: NDArray) -> dict[str, NDArray]:
-        """What the steps need and keep: arrays with the frames (k, n_masks, ny', nx') on the first axis."""
+    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool) -> dict[str, NDArray]:
+        """What the steps need and keep: arrays with the frames (k, n_masks, ny', nx') on the first axis.
+
+        `flat` says that the starting phasor is flat.
+        """
 
     def step(self, phasor: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
         """Next phasor, and the number of unsolved points (k,)."""
@@ -176,21 +184,20 @@ def _iterate_piece(
         phasor = split(start, inside)
     if record is not None:
         record[:, 0] = 0 if start is None else start
-    data = method.prepare(frames, phasor)
+    data = method.prepare(frames, phasor, start is None)
     limit = config.tolerance**2 * config.sensor.pupil.n_points
     # Frames that are done leave the loop, so a frame's result does not depend on its neighbours.
     active = np.arange(len(frames))
     for iteration in range(1, config.n_iterations + 1):
         new, unsolved = method.step(phasor, data)
-        # To the change of the phase, for small changes.
-        change = (new - phasor).reshape(len(new), -1)
-        done = np.vecdot(change, change) <= limit
+        last = iteration == config.n_iterations
+        done = _small(new - phasor, limit) if limit or last else np.zeros(len(new), bool)
         phasor = new
         if record is not None:
             record[active, iteration:] = angle(phasor)[:, np.newaxis]
-        leaving = done if iteration < config.n_iterations else np.ones_like(done)
-        if not leaving.any():
+        if not (last or done.any()):
             continue
+        leaving = done | last
         where = active[leaving]
         phase[where] = angle(phasor[leaving])
         n_used[where], converged[where], n_unsolved[where] = iteration, done[leaving], unsolved[leaving]
@@ -200,6 +207,12 @@ def _iterate_piece(
             return
         for name, values in data.items():
             data[name] = values[staying]
+
+
+def _small(change: NDArray, limit: float) -> NDArray[np.bool_]:
+    """Whether phasors change by no more than the limit of the squared norm: for small changes that of the phase."""
+    change = change.reshape(len(change), -1)
+    return np.vecdot(change, change) <= limit
 
 
 def report(

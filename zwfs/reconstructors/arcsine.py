@@ -57,21 +57,21 @@ class Arcsine:
         """Reconstruct the phase of each frame; parameters, result and errors are those of `PhaseShifted`."""
         return iterate(self, frames, start, history)
 
-    def prepare(self, frames: NDArray, phasor: NDArray) -> dict[str, NDArray]:
+    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool) -> dict[str, NDArray]:
         """Intensity less that of the incoming light, and the side of the reference wave to look on."""
-        amplitude = self.settings.maps(phasor.dtype).amplitude
-        psi = phasor * amplitude
+        maps = self.settings.maps(phasor.dtype)
+        psi = maps.field(phasor)
         wave = self._reference(psi)
         # The side is fixed once: the piston of the estimate, which no intensity shows, may drift past the wave.
         ahead = wave[:, 0] * psi[:, 1] - wave[:, 1] * psi[:, 0] >= 0
         return {
-            "excess": frames[:, 0][(..., *self.settings.sensor.window)] - amplitude**2,
+            "excess": frames[:, 0][(..., *self.settings.sensor.window)] - maps.amplitude**2,
             "side": np.where(self._dark, 0, np.where(ahead, 1, -1)).astype(phasor.dtype),
         }
 
     def step(self, phasor: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
         """Reference wave of the estimate, then both parts of the field along it, times its modulus."""
-        wave = self._reference(phasor * self.settings.maps(phasor.dtype).amplitude)
+        wave = self._reference(self.settings.maps(phasor.dtype).field(phasor))
         power = square(wave)
         along = (data["excess"] - power) * self._gain.astype(phasor.dtype, copy=False)
         across = power - along**2

@@ -48,15 +48,15 @@ class GerchbergSaxton:
         """Reconstruct the phase of each frame set; parameters, result and errors are those of `PhaseShifted`."""
         return iterate(self, frames, start, history)
 
-    def prepare(self, frames: NDArray, phasor: NDArray) -> dict[str, NDArray]:
+    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool) -> dict[str, NDArray]:
         """Measured amplitude on the detector."""
         return {"amplitude": np.sqrt(frames)}
 
     def step(self, phasor: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
         """To the detector and back."""
         sensor = self.settings.sensor
-        amplitude, inside, _ = self.settings.maps(phasor.dtype)
-        waves = sensor.propagate_split(phasor * amplitude)
+        maps = self.settings.maps(phasor.dtype)
+        waves = sensor.propagate_split(maps.field(phasor))
         # A modelled field of 0 has no phase; that of a bright pixel next to it would do as well as any.
         waves = unit(waves, np.zeros((), waves.dtype), data["amplitude"])
-        return unit(sensor.adjoint_split(waves), phasor, inside), np.zeros(len(phasor), int)
+        return unit(sensor.adjoint_split(waves), phasor, maps.inside), np.zeros(len(phasor), int)

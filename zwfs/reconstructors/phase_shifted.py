@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +16,7 @@ from zwfs.sensor import ZernikeSensor, split
 
 _PARALLEL = 1e-6  # sine of the angle between two reference waves below which they count as parallel
 _DARK = 1e-9  # amplitude of a reference wave, in units of the mean of the pupil, below which it counts as absent
+_RELAXATION = 1.3  # of a step: the factors of convergence lie between 0 and about 0.4
 _DIMMEST = 0.01  # least intensity of the first reference wave, relative to that of a flat wavefront
 
 
@@ -68,9 +70,10 @@ class PhaseShifted:
         self._accelerate = _check.flag("accelerate", accelerate)
         self._refuse_equal_masks()
         self._shared = _SharedWave.of(sensor.cores)
-        self._core = split_core(sensor.cores if self._shared is None else self._shared.core[np.newaxis])
         flat = sensor.intensity(np.zeros((1, *sensor.pupil.shape)), self.settings.amplitude[np.newaxis])
-        self._flat_loss = self._loss(flat)[0]
+        self._incoming = float(sensor.n_masks * np.sum(self.settings.amplitude**2))
+        self._flat_loss = float(self._loss(flat)[0])
+        self._constants: dict[np.dtype, _Constants] = {}
 
     def __call__(
         self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
@@ -97,17 +100,18 @@ class PhaseShifted:
         """
         return iterate(self, frames, start, history)
 
-    def prepare(self, frames: NDArray, phasor: NDArray) -> dict[str, NDArray]:
-        """What the frames give to the linear system, and how far they dim the first reference wave."""
+    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool) -> dict[str, NDArray]:
+        """What the frames give to the linear system, and the coefficients of a flat start."""
+        constants = self._in_precision(frames.dtype)
         light = frames[(..., *self.settings.sensor.window)]
-        excess = self.settings.maps(frames.dtype).amplitude ** 2
         if self._shared is None:
-            data = {"excess": light - excess}
+            data = {"excess": light - constants.offset}
         else:
-            data = {"signal": self._shared.signal(light, excess)}
-        if self._accelerate:
-            flat = ~phasor[:, 1].any(axis=(-2, -1))
-            data["dimming"] = np.where(flat, self._dimming(frames), 1).astype(frames.dtype)
+            mixed = constants.weights @ light.reshape(*light.shape[:2], -1)
+            data = {"signal": mixed.reshape(len(light), *constants.offset.shape) - constants.offset}
+        if flat:
+            dimming = self._dimming(frames)[:, np.newaxis] if self._accelerate else np.ones((len(frames), 1))
+            data["first"] = constants.flat * dimming.astype(frames.dtype)
         return data
 
     def step(self, phasor: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
@@ -115,11 +119,12 @@ class PhaseShifted:
         sensor = self.settings.sensor
         maps = self.settings.maps(phasor.dtype)
         operator = sensor.operator(phasor.dtype)
-        coefficients = operator.split_project(phasor * maps.amplitude)
+        coefficients = data.pop("first", None)
+        if coefficients is None:
+            coefficients = operator.split_project(maps.field(phasor))
         if self._accelerate:
             coefficients = _extrapolate(coefficients, data)
-        core = self._core.astype(phasor.dtype, copy=False)
-        waves = operator.split_expand(coefficients @ core, in_window=True)
+        waves = operator.split_expand(coefficients @ self._in_precision(phasor.dtype).core, in_window=True)
         if self._shared is None:
             solved, singular = self._solve(waves, data["excess"])
         else:
@@ -130,17 +135,29 @@ class PhaseShifted:
             n_singular = np.count_nonzero(singular & sensor.pupil.mask, axis=(-2, -1))
         return unit(solved, phasor, maps.inside), n_singular
 
+    def _in_precision(self, dtype: np.dtype) -> _Constants:
+        """Constants in float32 or float64; made once, then kept."""
+        if dtype not in self._constants:
+            sensor, incoming = self.settings.sensor, self.settings.amplitude
+            psi = split(np.zeros((1, *incoming.shape)), incoming)
+            cores, weights, offset = sensor.cores, np.ones((1, 1)), incoming**2
+            if self._shared is not None:
+                cores, weights = self._shared.core[np.newaxis], self._shared.weights
+                offset = weights.sum(axis=1)[:, np.newaxis, np.newaxis] * offset
+            values = split_core(cores), weights, offset, sensor.operator(np.float64).split_project(psi)
+            self._constants[dtype] = _Constants(*(array.astype(dtype) for array in values))
+        return self._constants[dtype]
+
     def _loss(self, frames: NDArray) -> NDArray:
-        """Light of all masks inside the pupil less what came in, shape (k,)."""
-        maps = self.settings.maps(frames.dtype)
+        """Light that is missing from the frames inside the pupil, all masks together, shape (k,)."""
         light = frames[(..., *self.settings.sensor.window)].reshape(*frames.shape[:2], -1)
-        return (light @ maps.inside.ravel()).sum(axis=1) - light.shape[1] * (maps.amplitude**2).sum()
+        return self._incoming - (light @ self.settings.maps(frames.dtype).inside.ravel()).sum(axis=1)
 
     def _dimming(self, frames: NDArray) -> NDArray:
         """Modulus of the reference waves relative to that of a flat wavefront (`eq-dimming`), shape (k,)."""
-        if abs(self._flat_loss) <= _PARALLEL * self.settings.sensor.pupil.n_points:
+        if abs(self._flat_loss) <= _PARALLEL * self._incoming:
             return np.ones(len(frames))
-        return np.sqrt(np.clip(self._loss(frames) / self._flat_loss, _DIMMEST, 1))
+        return np.sqrt(np.minimum(np.maximum(self._loss(frames) / self._flat_loss, _DIMMEST), 1))
 
     def _solve(self, waves: NDArray, excess: NDArray) -> tuple[NDArray, NDArray]:
         """A multiple of the field at every point, and where the determinant vanishes.
@@ -174,6 +191,15 @@ class PhaseShifted:
                 "sensor: the determinant sin(phi_ref_b - phi_ref_a) of equation (10) is 0 at every point for "
                 "its masks: expected phase shifts that differ by other than 0 mod 2 pi, none of them 0"
             )
+
+
+class _Constants(NamedTuple):
+    """What all frames share, in one precision."""
+
+    core: NDArray[np.floating]  # coefficients of the field (k, 2 r) to those of the waves
+    weights: NDArray[np.floating]  # (2, n_masks), of the intensities in the signal
+    offset: NDArray[np.floating]  # (2, ny, nx), the signal of the incoming light; (ny, nx) without shared wave
+    flat: NDArray[np.floating]  # (1, 2 r), coefficients of a flat wavefront
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,13 +242,6 @@ class _SharedWave:
         determinants = [(a.conj() * b).imag for a, b in combinations(factors, 2)]
         return cls(-bend * base, np.stack([weights.real, weights.imag]), _DARK / np.linalg.norm(determinants))
 
-    def signal(self, light: NDArray, incoming: NDArray) -> NDArray:
-        """Weighted sums of the frames less the incoming light: (k, n_masks, ny, nx) to (k, 2, ny, nx)."""
-        weights = self.weights.astype(light.dtype)
-        mixed = (weights @ light.reshape(*light.shape[:2], -1)).reshape(len(light), 2, *incoming.shape)
-        mixed -= weights.sum(axis=1)[:, np.newaxis, np.newaxis] * incoming
-        return mixed
-
     def solve(self, wave: NDArray, signal: NDArray) -> tuple[NDArray, NDArray]:
         """A multiple of the field at every point, (k, 2, ny, nx), and where the system is singular."""
         real, imag = wave[:, 0], wave[:, 1]
@@ -239,15 +258,17 @@ class _SharedWave:
 
 def _extrapolate(found: NDArray, data: dict[str, NDArray]) -> NDArray:
     """Next coefficients (k, 2 r) by the secant through the last two steps (`eq-secant`), kept in `data`."""
-    if "tried" not in data:
-        new = found * data["dimming"][:, np.newaxis]
-    else:
-        new, change = found, found - data["tried"]
-        if "found" in data:
-            turn = change - data["change"]
-            size = np.vecdot(turn, turn)
-            factor = np.vecdot(turn, change) / np.where(size > 0, size, 1)
-            new = found - factor[:, np.newaxis] * (found - data["found"])
-        data.update(found=found, change=change)
-    data["tried"] = new
+    tried = data.get("tried")
+    if tried is None:
+        data["tried"] = found
+        return found
+    change = found - tried
+    new = tried + _RELAXATION * change
+    if "change" in data:
+        turn = change - data["change"]
+        size = np.vecdot(turn, turn)
+        size[size == 0] = 1
+        factor = np.vecdot(turn, change) / size
+        new -= factor[:, np.newaxis] * (tried - data["before"] + _RELAXATION * turn)
+    data.update(tried=new, before=tried, change=change)
     return new

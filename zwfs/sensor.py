@@ -302,4 +302,5 @@ def split(phase: NDArray, amplitude: NDArray) -> NDArray:
 
 def square(waves: NDArray) -> NDArray:
     """Squared modulus of split fields: (..., 2, ny, nx) to (..., ny, nx)."""
-    return waves[..., 0, :, :] ** 2 + waves[..., 1, :, :] ** 2
+    squares = waves * waves
+    return squares[..., 0, :, :] + squares[..., 1, :, :]

@@ -186,8 +186,13 @@ def _iterate_piece(
         record[:, 0] = 0 if start is None else start
     data = method.prepare(frames, phasor, start is None)
     limit = config.tolerance**2 * config.sensor.pupil.n_points
-    # Frames that are done leave the loop, so a frame's result does not depend on its neighbours.
     active = np.arange(len(frames))
+
+    def write(which: NDArray | slice) -> None:
+        where = active[which]
+        phase[where] = angle(phasor[which])
+        n_used[where], converged[where], n_unsolved[where] = iteration, done[which], unsolved[which]
+
     for iteration in range(1, config.n_iterations + 1):
         new, unsolved = method.step(phasor, data)
         last = iteration == config.n_iterations
@@ -195,22 +200,18 @@ def _iterate_piece(
         phasor = new
         if record is not None:
             record[active, iteration:] = angle(phasor)[:, np.newaxis]
-        if not (last or done.any()):
-            continue
-        leaving = done | last
-        where = active[leaving]
-        phase[where] = angle(phasor[leaving])
-        n_used[where], converged[where], n_unsolved[where] = iteration, done[leaving], unsolved[leaving]
-        staying = ~leaving
-        active, phasor = active[staying], phasor[staying]
-        if not active.size:
-            return
-        for name, values in data.items():
-            data[name] = values[staying]
+        if last or (limit and done.all()):
+            break
+        if limit and done.any():
+            # Frames that are done leave the loop, so a frame's result does not depend on its neighbours.
+            write(done)
+            active, phasor = active[~done], phasor[~done]
+            data = {name: values[~done] for name, values in data.items()}
+    write(slice(None))
 
 
 def _small(change: NDArray, limit: float) -> NDArray[np.bool_]:
-    """Whether phasors change by no more than the limit of the squared norm: for small changes that of the phase."""
+    """Whether the squared norm of a change of the phasors, nearly that of the phases, is within the limit."""
     change = change.reshape(len(change), -1)
     return np.vecdot(change, change) <= limit
 
@@ -259,14 +260,13 @@ def check_frames(
     if not len(flat):
         raise ValueError(f"{name} has shape {frames.shape}: expected at least one frame")
     light = flat.sum(axis=(-2, -1))
-    # A sum is finite only if all its terms are.
+    # A sum is finite only if all its terms are, and costs a tenth of the full test.
     if not np.isfinite(light).all():
         _check.finite(name, flat)
     _check.non_negative(name, flat, "; after subtracting a background, raise them to 0 explicitly")
-    dark = light == 0
-    if dark.any():
+    if not light.all():
         raise ValueError(
-            f"{name}: {np.count_nonzero(dark)} of {dark.size} hold no light: expected some flux in each"
+            f"{name}: {np.count_nonzero(light == 0)} of {light.size} hold no light: expected some flux in each"
         )
     return flat, batch
 

@@ -290,6 +290,12 @@ def angle(phasor: NDArray) -> NDArray:
     return np.arctan2(phasor[..., 1, :, :], phasor[..., 0, :, :])
 
 
+def count(points: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Number of points that are true in each map: (k, ny, nx) to (k,)."""
+    # Along an axis NumPy turns all of them into integers first.
+    return np.array([np.count_nonzero(one) for one in points])
+
+
 def unit(field: NDArray, fallback: NDArray, modulus: NDArray) -> NDArray:
     """Split field with another modulus, (..., ny, nx); `fallback` where the field vanishes. `field` is reused."""
     power = square(field)

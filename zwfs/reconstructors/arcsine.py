@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zwfs.reconstructors._common import Reconstruction, iterate, settings, unit
+from zwfs.reconstructors._common import Reconstruction, count, iterate, settings, unit
 from zwfs.sensor import ZernikeSensor, square
 
 
@@ -75,7 +75,7 @@ class Arcsine:
         power = square(wave)
         along = (data["excess"] - power) * self._gain.astype(phasor.dtype, copy=False)
         across = power - along**2
-        n_unsolved = np.count_nonzero((across < 0) & self.settings.sensor.pupil.mask, axis=(-2, -1))
+        n_unsolved = count((across < 0) & self.settings.sensor.pupil.mask)
         across = data["side"] * np.sqrt(np.maximum(across, 0))
         new = along[:, np.newaxis] * wave
         new[:, 0] -= across * wave[:, 1]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs.lowrank import split_core
-from zwfs.reconstructors._common import Reconstruction, iterate, settings, unit
+from zwfs.reconstructors._common import Reconstruction, count, iterate, settings, unit
 from zwfs.sensor import ZernikeSensor, split
 
 _PARALLEL = 1e-6  # sine of the angle between two reference waves below which they count as parallel
@@ -132,7 +132,7 @@ class PhaseShifted:
         n_singular = np.zeros(len(phasor), int)
         if singular.any():
             solved = np.where(singular[:, np.newaxis], phasor, solved)
-            n_singular = np.count_nonzero(singular & sensor.pupil.mask, axis=(-2, -1))
+            n_singular = count(singular & sensor.pupil.mask)
         return unit(solved, phasor, maps.inside), n_singular
 
     def _in_precision(self, dtype: np.dtype) -> _Constants:

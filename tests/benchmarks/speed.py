@@ -1,0 +1,205 @@
+"""How fast the reconstructors are, one thread: python -m tests.benchmarks.speed [seconds for each] prints JSON.
+
+Set OMP_NUM_THREADS=1, as `make bench` does. Times are those that the thread spends on the processor: on an idle
+machine what the clock shows, on a busy one hardly more.
+"""
+
+import json
+import resource
+import sys
+from time import perf_counter, thread_time
+
+import numpy as np
+
+from zwfs import (
+    Arcsine,
+    Dimple,
+    GerchbergSaxton,
+    GradientDescent,
+    Linear,
+    PhaseShifted,
+    Pupil,
+    ZernikeSensor,
+    reconstruction_error,
+    zernike_basis,
+)
+from zwfs.experiments import screens_at
+from zwfs.reconstructors import _common
+
+DIMPLES = (Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
+REAL_TIME = {"n_iterations": 3, "tolerance": 0.0, "accelerate": True}
+
+
+def best(function, seconds):
+    """Shortest time of a call, in seconds."""
+    function()  # precisions are converted at the first call
+    shortest, end = np.inf, perf_counter() + seconds
+    while perf_counter() < end or shortest == np.inf:
+        start = thread_time()
+        function()
+        shortest = min(shortest, thread_time() - start)
+    return shortest
+
+
+def real_time(n_pixels, seconds, rms=0.8):
+    """Rates and errors of one frame pair at a time, 20 screens as those of Figure 3, by precision and options."""
+    pupil = Pupil.circular(n_pixels)
+    sensor = ZernikeSensor(pupil, *DIMPLES)
+    screens = screens_at(zernike_basis(pupil, 200), rms, 20, 2024, 7)
+    rows = []
+    for dtype in (np.float32, np.float64):
+        frames = sensor.measure(screens).astype(dtype)
+        for accelerate, numbers in ((False, (4, 5, 6)), (True, (3, 4, 5))):
+            for n in numbers:
+                method = PhaseShifted(sensor, n_iterations=n, tolerance=0.0, accelerate=accelerate)
+                error = reconstruction_error(pupil, method(frames).phase, screens)
+                time = best(lambda: method(frames[0]), seconds)  # noqa: B023 (called at once)
+                rows.append(
+                    {
+                        "n_pixels": n_pixels, "dtype": np.dtype(dtype).name, "accelerate": accelerate,
+                        "n_iterations": n, "time": time, "rate": 1 / time,
+                        "median error": float(np.median(error)), "largest error": float(error.max()),
+                    }
+                )  # fmt: skip
+    return rows
+
+
+def closed_loop(n_pixels, seconds):
+    """Rate and error when each estimate starts from the one before, while a screen turns into another one."""
+    pupil = Pupil.circular(n_pixels)
+    sensor = ZernikeSensor(pupil, *DIMPLES)
+    one, other = screens_at(zernike_basis(pupil, 200), 0.8, 2, 2024, 7)
+    method = PhaseShifted(sensor, n_iterations=1, tolerance=0.0)
+    phase, errors = None, []
+    for angle in np.linspace(0, np.pi / 2, 101):
+        truth = np.cos(angle) * one + np.sin(angle) * other
+        frames = sensor.measure(truth).astype(np.float32)
+        phase = method(frames, phase).phase
+        errors.append(float(reconstruction_error(pupil, phase, truth)))
+    time = best(lambda: method(frames, phase), seconds)
+    return {"n_pixels": n_pixels, "time": time, "rate": 1 / time, "median error": float(np.median(errors[10:]))}
+
+
+def breakdown(n_pixels, seconds):
+    """Time of each part of one accelerated step, and of what comes before and after all steps."""
+    sensor = ZernikeSensor(Pupil.circular(n_pixels), *DIMPLES)
+    frames = sensor.measure(np.zeros(sensor.pupil.shape)).astype(np.float32)
+    method = PhaseShifted(sensor, **REAL_TIME)
+    maps = method.settings.maps(frames.dtype)
+    operator = sensor.operator(frames.dtype)
+    phasor = np.stack([maps.inside, 0 * maps.inside])[np.newaxis]
+    flat, batch = _common.check_frames(sensor, frames)
+    data = method.prepare(flat, phasor, True)
+    core = method._in_precision(frames.dtype).core
+    coefficients = operator.split_project(phasor) @ core
+    wave = operator.split_expand(coefficients, in_window=True)[:, 0]
+    field, _ = method._shared.solve(wave, data["signal"])
+    found = method(frames)
+    one = np.zeros(1, int)
+    parts = {
+        "check of the frames": lambda: _common.check_frames(sensor, frames),
+        "signal and dimming": lambda: method.prepare(flat, phasor, True),
+        "step: projection": lambda: operator.split_project(phasor) @ core,
+        "step: expansion": lambda: operator.split_expand(coefficients, in_window=True),
+        "step: linear system": lambda: method._shared.solve(wave, data["signal"]),
+        "step: modulus": lambda: _common.unit(field, phasor, maps.inside),
+        "angle": lambda: _common.angle(phasor),
+        "report": lambda: _common.report(
+            method.settings, flat, batch, found.phase[np.newaxis], one, one, one, None
+        ),
+        "whole call": lambda: method(frames),
+    }
+    return {name: best(part, seconds) for name, part in parts.items()}
+
+
+def slope(seconds, sizes=(32, 64, 128, 256, 512, 1024)):
+    """Time of 5 iterations and of a residual against the number of pixels, and the slope of its logarithm."""
+    times = []
+    for n_pixels in sizes:
+        sensor = ZernikeSensor(Pupil.circular(n_pixels), *DIMPLES)
+        method = PhaseShifted(sensor, n_iterations=5, tolerance=0.0)
+        frames = sensor.measure(np.zeros(sensor.pupil.shape)).astype(np.float32)
+        times.append(best(lambda: method(frames).residual, seconds))  # noqa: B023
+    pixels = 2 * np.log(sizes)
+    return {
+        "n_pixels": list(sizes),
+        "times": times,
+        "slope": float(np.polyfit(pixels, np.log(times), 1)[0]),
+        "slope from 128 on": float(np.polyfit(pixels[2:], np.log(times[2:]), 1)[0]),
+    }
+
+
+def batches(seconds, sizes=(1, 10, 100, 1000)):
+    """Time per frame pair of batches, and the largest memory of the process beyond frames and results."""
+    pupil = Pupil.circular(100)
+    sensor = ZernikeSensor(pupil, *DIMPLES)
+    method = PhaseShifted(sensor, n_iterations=5, tolerance=0.0)
+    screen = screens_at(zernike_basis(pupil, 200), 0.8, 1, 2024, 7)
+    frame, rows = sensor.measure(screen).astype(np.float32), []
+    for n in sizes:
+        frames = np.repeat(frame, n, axis=0)
+        before = _peak()
+        time = best(lambda: method(frames), seconds) / n  # noqa: B023
+        own = frames.nbytes + n * frames[0, 0].nbytes  # the copy of the frames, and the phases
+        # The result of the call before is alive while the next one is made.
+        rows.append({"n_frames": n, "time per frame": time, "memory beyond": max(_peak() - before - 2 * own, 0)})
+    return rows
+
+
+def others(seconds):
+    """Time per screen of each method, 25 iterations, one screen at a time, residual included; seconds."""
+    pupil = Pupil.circular(100)
+    modes = zernike_basis(pupil, 200)
+    classic, shifted, wide = (
+        ZernikeSensor(pupil, *masks, extent=extent)
+        for masks, extent in ((DIMPLES[:1], 1), (DIMPLES, 1), (DIMPLES, 2))
+    )
+    steps = {"n_iterations": 25, "tolerance": 0.0}
+    methods = {
+        "Linear": Linear(classic, modes),
+        "Arcsine": Arcsine(classic, **steps),
+        "PhaseShifted": PhaseShifted(shifted, **steps),
+        "GerchbergSaxton, detector of 2 D": GerchbergSaxton(wide, **steps),
+        "GradientDescent, 200 modes, one mask": GradientDescent(classic, modes, **steps),
+        "GradientDescent, 200 modes, two masks": GradientDescent(shifted, modes, **steps),
+    }
+    screen = screens_at(modes, 0.3, 1, 2024, 2)[0]
+    times = {}
+    for name, method in methods.items():
+        frames = method.settings.sensor.measure(screen)
+        times[name] = best(lambda: method(frames).residual, seconds)  # noqa: B023
+    return times
+
+
+def set_up(seconds):
+    """Time to make sensors of 100 and of 1000 pixels across, and the peak memory of the process so far, bytes."""
+    small, large = Pupil.circular(100), Pupil.circular(1000)
+    return {
+        "100 pixels": best(lambda: ZernikeSensor(small, *DIMPLES), seconds),
+        "1000 pixels": best(lambda: ZernikeSensor(large, *DIMPLES), seconds),
+        "1000 pixels, pupil and reconstructor included": best(
+            lambda: PhaseShifted(ZernikeSensor(Pupil.circular(1000), *DIMPLES)), seconds
+        ),
+        "peak memory": _peak(),
+    }
+
+
+def _peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def results(seconds=2.0):
+    """All of the above: numbers, lists and dictionaries only."""
+    return {
+        "set-up": set_up(seconds),
+        "batches": batches(seconds),
+        "real time": [row for n_pixels in (100, 40) for row in real_time(n_pixels, seconds)],
+        "closed loop": [closed_loop(n_pixels, seconds) for n_pixels in (100, 40)],
+        "breakdown": {str(n_pixels): breakdown(n_pixels, seconds) for n_pixels in (100, 40)},
+        "slope": slope(seconds),
+        "others": others(seconds),
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps(results(*map(float, sys.argv[1:2])), indent=1))

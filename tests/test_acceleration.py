@@ -1,0 +1,125 @@
+"""The accelerated phase-shifted iteration: the same answers, sooner."""
+
+import numpy as np
+import pytest
+
+import zwfs
+from zwfs import Dimple, PhaseShifted, ZernikeSensor, reconstruction_error
+from zwfs.reconstructors.phase_shifted import _SharedWave
+
+
+def pair(pupil, diameter=1.06):
+    return ZernikeSensor(pupil, Dimple(diameter, np.pi / 2), Dimple(diameter, -np.pi / 2))
+
+
+@pytest.mark.parametrize("diameter", [0.5, 1.06, 1.5, 2.0])
+@pytest.mark.parametrize("rms", [0.1, 0.8])
+def test_same_fixed_point(pupil, screens, diameter, rms):
+    sensor, phase = pair(pupil, diameter), screens(rms, 5)
+    plain, faster = (
+        PhaseShifted(sensor, n_iterations=200, tolerance=1e-9, accelerate=accelerate)(sensor.measure(phase))
+        for accelerate in (False, True)
+    )
+    assert reconstruction_error(pupil, faster.phase, phase).max() < 1e-7
+    # A small dimple leaves nothing to gain, and the relaxation then costs an iteration.
+    assert np.all(faster.n_iterations <= plain.n_iterations + 1)
+
+
+@pytest.mark.parametrize(
+    "masks",
+    [
+        (Dimple(1.06, 0.3), Dimple(1.06, -2.0)),
+        (Dimple(1.06, 1.5), Dimple(1.06, -1.5), Dimple(1.06, 2.5)),
+        (Dimple(1.06, np.pi / 2), Dimple(1.8, -np.pi / 2, 0.8)),  # no shared wave
+    ],
+)
+def test_any_masks(pupil, screens, masks):
+    sensor, phase = ZernikeSensor(pupil, *masks), screens(0.5)
+    options = {"n_iterations": 100, "tolerance": 1e-8}
+    plain, faster = (PhaseShifted(sensor, accelerate=a, **options)(sensor.measure(phase)) for a in (False, True))
+    assert reconstruction_error(pupil, faster.phase, phase).max() < 1e-7
+    assert np.all(faster.n_iterations < plain.n_iterations)
+
+
+def test_wider_range_than_the_plain_iteration():
+    pupil = zwfs.Pupil.circular(48)
+    sensor = pair(pupil)
+    phase = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 200), 1.9, 40, seed=3)
+    frames = sensor.measure(phase)
+    found = []
+    for accelerate in (False, True):
+        estimate = PhaseShifted(sensor, accelerate=accelerate)(frames).phase
+        found.append(np.count_nonzero(reconstruction_error(pupil, estimate, phase) < 0.1))
+    assert found[1] > found[0] + 5
+
+
+def test_real_time_setting_meets_its_error():
+    pupil = zwfs.Pupil.circular(100)
+    sensor = pair(pupil)
+    phase = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 200), 0.8, 20, seed=4)
+    reconstruct = PhaseShifted(sensor, n_iterations=3, tolerance=0, accelerate=True)
+    found = reconstruct(sensor.measure(phase).astype(np.float32))
+    assert np.median(reconstruction_error(pupil, found.phase, phase)) < 0.01
+
+
+def test_batch_equals_loop_when_accelerated(pupil, screens):
+    sensor = pair(pupil)
+    frames = sensor.measure(np.concatenate([screens(0.05, 3), screens(1.0, 70)]))  # some leave early
+    reconstruct = PhaseShifted(sensor, accelerate=True)
+    together = reconstruct(frames)
+    for index in (0, 4, 72):
+        alone = reconstruct(frames[index])
+        np.testing.assert_allclose(together.phase[index], alone.phase, atol=1e-9)
+        assert together.n_iterations[index] == alone.n_iterations
+
+
+def test_a_start_is_not_dimmed(pupil, screens):
+    sensor, phase = pair(pupil), screens(0.8, 1)[0]
+    frames = sensor.measure(phase)
+    assert errors_after_one(sensor, frames, phase, start=phase) < 1e-10
+    flat = np.zeros(pupil.shape)
+    plain = PhaseShifted(sensor, n_iterations=1)(frames).phase
+    np.testing.assert_allclose(PhaseShifted(sensor, n_iterations=1, accelerate=True)(frames, flat).phase, plain)
+    assert errors_after_one(sensor, frames, phase) < 0.7 * reconstruction_error(pupil, plain, phase)
+
+
+def errors_after_one(sensor, frames, phase, **options):
+    found = PhaseShifted(sensor, n_iterations=1, accelerate=True)(frames, **options)
+    return reconstruction_error(sensor.pupil, found.phase, phase)
+
+
+@pytest.mark.parametrize("phases", [(1.5, -1.5), (0.3, -2.0), (1.5, -1.5, 2.5), (0.0, 1.0, -0.4)])
+def test_shared_wave_solves_the_general_system(pupil, screens, phases):
+    rng = np.random.default_rng(1)
+    sensor = ZernikeSensor(pupil, *(Dimple(1.3, phase, 0.9) for phase in phases))
+    method = PhaseShifted(sensor)
+    shared = method._shared
+    light = sensor.measure(screens(0.3, 2)) * rng.uniform(0.8, 1.2, (2, len(phases), *pupil.shape))
+    field = rng.normal(size=(2, 2, *pupil.shape))
+    operator = sensor.operator(np.float64)
+    general, _ = method._solve(operator.split_reference(field), light - pupil.amplitude**2)
+    data = method.prepare(light, field, True)
+    waves = operator.split_expand(operator.split_project(field) @ method._in_precision(light.dtype).core)
+    special, _ = shared.solve(waves[:, 0], data["signal"])
+    ratio = (special[:, 0] + 1j * special[:, 1]) / (general[:, 0] + 1j * general[:, 1])
+    assert np.abs(ratio.imag)[:, pupil.mask].max() < 1e-8 * np.abs(ratio)[:, pupil.mask].max()
+    assert ratio.real[:, pupil.mask].min() > 0
+
+
+def test_masks_of_different_size_share_no_wave(pupil):
+    assert _SharedWave.of(pair(pupil).cores) is not None
+    assert _SharedWave.of(ZernikeSensor(pupil, Dimple(1.06, 1.5), Dimple(1.07, -1.5)).cores) is None
+
+
+def test_residual_is_that_of_the_frames_given(pupil, screens):
+    sensor = pair(pupil)
+    frames = sensor.measure(screens(0.5))
+    expected = PhaseShifted(sensor, n_iterations=2)(frames).residual
+    found = PhaseShifted(sensor, n_iterations=2)(frames)
+    frames[:] = 0  # as a camera does that writes the next frame to the same place
+    np.testing.assert_array_equal(found.residual, expected)
+
+
+def test_accelerate_is_checked(shifted):
+    with pytest.raises(TypeError, match="accelerate = 1: expected True or False"):
+        PhaseShifted(shifted, accelerate=1)

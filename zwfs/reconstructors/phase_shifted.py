@@ -27,6 +27,9 @@ class PhaseShifted:
     and imaginary part of its field; solving them gives the next estimate. No branch has to be chosen: the phase
     comes back over the whole circle. More than two masks are combined by least squares.
 
+    In real time, take frames in float32, `tolerance=0` and `accelerate=True` with 3 or 4 iterations; or, in a
+    control loop, one iteration that starts from the phase of the frames before.
+
     Parameters
     ----------
     sensor : ZernikeSensor
@@ -34,13 +37,14 @@ class PhaseShifted:
     n_iterations : int
         Largest number of iterations.
     tolerance : float, radian
-        An iteration that changes the phase by no more than this (rms over the pupil) is the last one.
+        An iteration that changes the phase by no more than this (rms over the pupil) is the last one. With 0 all
+        are done.
     amplitude : array_like, shape (ny, nx), optional
         Measured amplitude A_in in the pupil; that of the sensor's pupil if left out.
     accelerate : bool
-        Same fixed point in fewer iterations: after a flat start the first reference wave is dimmed to the light
+        Same fixed point in fewer iterations: without a start, the first reference wave is dimmed to the light
         that the frames miss, and then the coefficients of the waves are extrapolated by the secant method. The
-        paper does neither. For a control loop: 4 iterations, and frames in float32.
+        paper does neither.
 
     Raises
     ------

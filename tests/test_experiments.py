@@ -41,12 +41,6 @@ def test_a_point_depends_on_the_seed_and_its_place_only(curves, methods, modes):
     assert not np.allclose(alone.errors["linear"], other.errors["linear"])
 
 
-def test_progress_is_told(methods, modes):
-    told = []
-    linearity_curves(methods, modes, RMS, 1, progress=lambda *n: told.append(n))
-    assert told == [(1, 3), (2, 3), (3, 3)]
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

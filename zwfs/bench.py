@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from zwfs import _check
+from zwfs._pickle import uncached_state
 from zwfs.detector import Detector
 from zwfs.masks import Dimple
 from zwfs.modes import power_law_screens, zernike_basis
@@ -313,6 +314,8 @@ class BenchModel:
     numbers: NDArray[np.int64]
     scale: NDArray[np.float64]
     dark: NDArray[np.float64]
+
+    __getstate__ = uncached_state
 
     @classmethod
     def from_images(cls, bench: Bench, seed: Seed = None) -> BenchModel:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zwfs import _check
+from zwfs import _check, sweeps
 from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.metrics import dynamic_range
 from zwfs.reconstructors import RECONSTRUCTORS, Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
@@ -129,6 +129,8 @@ def bench_curves(
 ) -> BenchCurves:
     """Errors of reconstructors on random segment commands of growing rms: the experiment of section 5.2.
 
+    An input is a task of the sweep "bench_curves", see `zwfs.sweeps`.
+
     Parameters
     ----------
     bench : Bench
@@ -154,16 +156,37 @@ def bench_curves(
     rms = _check.real_array("rms", rms)
     if rms.ndim != 1:
         raise ValueError(f"rms has shape {rms.shape}: expected (n_rms,)")
+    _check.finite("rms", rms)
+    _check.non_negative("rms", rms)
     n_screens = _check.integer("n_screens", n_screens, 1)
-    commanded = np.empty((len(rms), n_screens, bench.n_segments))
-    residuals = {name: np.empty_like(commanded) for name in reconstructors}
-    for index, value in enumerate(rms):
-        screens, noise = np.random.SeedSequence(seed, spawn_key=(index,)).spawn(2)
-        commanded[index] = segment_screens(bench, value, n_screens, exponent, screens)
-        frames = model.normalise(bench.frames(commanded[index], noise))
-        for name, reconstructor in reconstructors.items():
-            residuals[name][index] = segment_residual(find_pistons(reconstructor, model, frames), commanded[index])
-    return BenchCurves(rms, commanded, residuals)
+    shared = bench, model, dict(reconstructors), n_screens, exponent, seed
+    points = sweeps.run(_bench_point, enumerate(rms.tolist()), *shared, name="bench_curves")
+    commanded, residuals = zip(*points, strict=True)
+    return BenchCurves(
+        rms,
+        np.array(commanded),
+        {name: np.array([point[name] for point in residuals]) for name in reconstructors},
+    )
+
+
+def _bench_point(
+    point: tuple[int, float],
+    bench: Bench,
+    model: BenchModel,
+    reconstructors: Mapping[str, Any],
+    n_screens: int,
+    exponent: float,
+    seed: int,
+) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+    """One input of the bench curves: what is commanded, and the residuals, (n_screens, n_segments) each."""
+    task, rms = point
+    screens, noise = np.random.SeedSequence(seed, spawn_key=(task,)).spawn(2)
+    commanded = segment_screens(bench, rms, n_screens, exponent, screens)
+    frames = model.normalise(bench.frames(commanded, noise))
+    return commanded, {
+        name: segment_residual(find_pistons(reconstructor, model, frames), commanded)
+        for name, reconstructor in reconstructors.items()
+    }
 
 
 def error_budget(
@@ -176,6 +199,8 @@ def error_budget(
     seed: int = 0,
 ) -> dict[str, BenchCurves]:
     """Each error of a bench alone, none, and all: what every one of them does to the reconstruction.
+
+    An error is a task of the sweep "error_budget", see `zwfs.sweeps`.
 
     Parameters
     ----------
@@ -203,10 +228,15 @@ def error_budget(
     cases = {"none": Bench.ideal(**layout)}
     cases |= {name: Bench.ideal(**layout, **{name: values[name]}) for name in Bench.errors()}
     cases |= {"noise": Bench.ideal(**layout, **noise), "all": bench}
-    budget = {}
-    for case, one in cases.items():
-        model = BenchModel.from_images(one, seed)
-        methods = bench_reconstructors(one, model, n_iterations=n_iterations, seed=seed)
-        chosen = {name: methods[name] for name in names}
-        budget[case] = bench_curves(one, model, chosen, rms, n_screens, seed=seed)
-    return budget
+    shared = list(names), rms, n_screens, n_iterations, seed
+    curves = sweeps.run(_budget_case, cases.values(), *shared, name="error_budget")
+    return dict(zip(cases, curves, strict=True))
+
+
+def _budget_case(
+    bench: Bench, names: Sequence[str], rms: ArrayLike, n_screens: int, n_iterations: int, seed: int
+) -> BenchCurves:
+    """Curves of one bench, with a model and reconstructors of its own."""
+    model = BenchModel.from_images(bench, seed)
+    methods = bench_reconstructors(bench, model, n_iterations=n_iterations, seed=seed)
+    return bench_curves(bench, model, {name: methods[name] for name in names}, rms, n_screens, seed=seed)

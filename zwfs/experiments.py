@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zwfs import _check
+from zwfs import _check, sweeps
 from zwfs.metrics import dynamic_range, reconstruction_error, strehl
 from zwfs.modes import power_law_screens
 
@@ -80,11 +80,11 @@ def linearity_curves(
     *,
     exponent: float = -2.0,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
 ) -> LinearityCurves:
     """Error of reconstructors on random screens of growing rms: the experiment of section 4.1.
 
-    Each input rms has screens of its own; all reconstructors see the same ones, each through its own sensor.
+    Each input rms has screens of its own; all reconstructors see the same ones, each through its own sensor. An
+    input is a task of the sweep "linearity_curves", see `zwfs.sweeps`.
 
     Parameters
     ----------
@@ -98,8 +98,6 @@ def linearity_curves(
     exponent : float
         Exponent of the power spectral density of the screens.
     seed : int
-    progress : callable, optional
-        Called with the number of inputs done and their total.
 
     Returns
     -------
@@ -112,26 +110,42 @@ def linearity_curves(
     rms = _check.real_array("rms", rms)
     if rms.ndim != 1:
         raise ValueError(f"rms has shape {rms.shape}: expected (n_rms,)")
+    _check.finite("rms", rms)
+    _check.non_negative("rms", rms)
     n_screens = _check.integer("n_screens", n_screens, 1)
     if not reconstructors:
         raise ValueError("reconstructors is empty: expected at least one")
-    errors = {name: np.empty((len(rms), n_screens)) for name in reconstructors}
-    converged = {name: np.empty((len(rms), n_screens), bool) for name in reconstructors}
-    wrapped, folded, strehls = np.empty((3, len(rms), n_screens))
+    shared = dict(reconstructors), modes, n_screens, exponent, seed
+    points = sweeps.run(_linearity_point, enumerate(rms.tolist()), *shared, name="linearity_curves")
+    errors, converged, *light = zip(*points, strict=True)
+    return LinearityCurves(
+        rms,
+        {name: np.array([point[name] for point in errors]) for name in reconstructors},
+        {name: np.array([point[name] for point in converged]) for name in reconstructors},
+        *map(np.array, light),
+    )
+
+
+def _linearity_point(
+    point: tuple[int, float],
+    reconstructors: Mapping[str, Any],
+    modes: NDArray,
+    n_screens: int,
+    exponent: float,
+    seed: int,
+) -> tuple[dict[str, NDArray], dict[str, NDArray], NDArray, NDArray, NDArray]:
+    """One input of the linearity curves: errors, converged, wrapped, folded and Strehl, (n_screens,) each."""
+    task, rms = point
+    screens = screens_at(modes, rms, n_screens, seed, task, exponent)
     pupil = next(iter(reconstructors.values())).settings.sensor.pupil
-    for index, value in enumerate(rms):
-        screens = screens_at(modes, value, n_screens, seed, index, exponent)
-        wrapped[index] = np.mean(np.abs(pupil.gather(screens)) > np.pi, axis=-1)
-        folded[index] = np.mean(pupil.gather(screens) < -np.pi / 4, axis=-1)
-        strehls[index] = strehl(pupil, screens)
-        for name, reconstructor in reconstructors.items():
-            sensor = reconstructor.settings.sensor
-            found = reconstructor(sensor.measure(screens))
-            errors[name][index] = reconstruction_error(pupil, found.phase, screens)
-            converged[name][index] = found.converged
-        if progress is not None:
-            progress(index + 1, len(rms))
-    return LinearityCurves(rms, errors, converged, wrapped, folded, strehls)
+    phase = pupil.gather(screens)
+    errors, converged = {}, {}
+    for name, reconstructor in reconstructors.items():
+        found = reconstructor(reconstructor.settings.sensor.measure(screens))
+        errors[name] = reconstruction_error(pupil, found.phase, screens)
+        converged[name] = found.converged
+    wrapped, folded = np.mean(np.abs(phase) > np.pi, axis=-1), np.mean(phase < -np.pi / 4, axis=-1)
+    return errors, converged, wrapped, folded, strehl(pupil, screens)
 
 
 def convergence(

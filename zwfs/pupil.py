@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
+from zwfs._pickle import uncached_state
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,8 @@ class Pupil:
     n_pixels: float
     segments: NDArray[np.int64]
     center: tuple[float, float]
+
+    __getstate__ = uncached_state
 
     def __repr__(self) -> str:
         return f"Pupil({self.n_points} points, {self.n_pixels:g} pixels across, shape={self.shape})"

@@ -56,7 +56,7 @@ def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike], *, dpi:
     if folder := os.environ.get(FOLDER):
         contents |= _pictures(figure, dpi)
         for kind, content in contents.items():
-            _write(Path(folder) / f"{name}.{kind}", content)
+            write_file(Path(folder) / f"{name}.{kind}", content)
 
 
 def _pictures(figure: Figure, dpi: float) -> dict[str, bytes]:
@@ -102,7 +102,7 @@ def _text(value: Any) -> str:
     return f"{value:.9g}" if isinstance(value, np.floating) else str(value)
 
 
-def _write(path: Path, content: bytes) -> None:
+def write_file(path: Path, content: bytes) -> None:
     """Write a file in one step: whoever looks sees all of it or nothing."""
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:

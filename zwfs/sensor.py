@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,6 +87,9 @@ class ZernikeSensor:
         )
         self._factors = factorise(masks, (pupil.y, pupil.x), detector_axes, pupil.n_pixels**-2.0, self.tolerance)
         self._operators: dict[np.dtype, Operator] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_operators": {}}
 
     def __repr__(self) -> str:
         masks = ", ".join(map(repr, self.masks))

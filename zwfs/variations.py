@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zwfs import _check
+from zwfs import _check, sweeps
 from zwfs.detector import Detector
 from zwfs.lowrank import factorise
 from zwfs.masks import Dimple
@@ -109,6 +109,8 @@ def crossing(x: ArrayLike, y: ArrayLike, limit: float) -> float:
 def diameter_curve(make: Callable[[float], Any], diameters: ArrayLike, screens: NDArray) -> DiameterCurve:
     """Error of a reconstructor on the same screens for dimples of several diameters: the experiment of Figure 4.
 
+    A diameter is a task of the sweep "diameter_curve", see `zwfs.sweeps`.
+
     Parameters
     ----------
     make : callable
@@ -134,12 +136,15 @@ def diameter_curve(make: Callable[[float], Any], diameters: ArrayLike, screens: 
         raise ValueError(f"diameters = {diameters}: expected positive, increasing values")
     if np.ndim(screens) != 3 or not len(screens):
         raise ValueError(f"screens has shape {np.shape(screens)}: expected (n_screens, ny, nx)")
-    errors = np.empty((diameters.size, len(screens)))
-    for row, diameter in zip(errors, diameters, strict=True):
-        reconstructor = make(float(diameter))
-        sensor = reconstructor.settings.sensor
-        row[:] = reconstruction_error(sensor.pupil, reconstructor(sensor.measure(screens)).phase, screens)
-    return DiameterCurve(diameters, errors)
+    rows = sweeps.run(_diameter_point, diameters.tolist(), make, screens, name="diameter_curve")
+    return DiameterCurve(diameters, np.array(rows))
+
+
+def _diameter_point(diameter: float, make: Callable[[float], Any], screens: NDArray) -> NDArray[np.float64]:
+    """One diameter of the curve: error on each screen, (n_screens,)."""
+    reconstructor = make(diameter)
+    sensor = reconstructor.settings.sensor
+    return reconstruction_error(sensor.pupil, reconstructor(sensor.measure(screens)).phase, screens)
 
 
 class DimpleLight:
@@ -509,6 +514,8 @@ def pair_maps(
 ) -> PairMaps:
     """Phase-shifted iteration and its noise for all pairs of phase shifts, the experiment of section 4.2.
 
+    A pair is a task of the sweep "pair_maps", see `zwfs.sweeps`.
+
     Parameters
     ----------
     pupil : Pupil
@@ -537,16 +544,18 @@ def pair_maps(
     if np.ndim(screens) != 3 or not len(screens):
         raise ValueError(f"screens has shape {np.shape(screens)}: expected (n_screens, ny, nx)")
     maps = np.full((5, angles.size, angles.size), np.nan)
-    for row, theta_a in enumerate(angles):
-        for column, theta_b in enumerate(angles[:row]):
-            sensor = ZernikeSensor(pupil, Dimple(diameter, float(theta_a)), Dimple(diameter, float(theta_b)))
-            values = _pair(sensor, screens, n_iterations)
-            maps[:, row, column] = maps[:, column, row] = values
+    below = np.tril_indices(angles.size, -1)
+    pairs = zip(*(angles[side].tolist() for side in below), strict=True)
+    values = sweeps.run(_pair, pairs, pupil, diameter, screens, n_iterations, name="pair_maps")
+    maps[:, *below] = maps[:, *below[::-1]] = np.reshape(values, (-1, 5)).T
     return PairMaps(angles, *maps)
 
 
-def _pair(sensor: ZernikeSensor, screens: NDArray, n_iterations: int) -> tuple[float, ...]:
+def _pair(
+    pair: tuple[float, float], pupil: Pupil, diameter: float, screens: NDArray, n_iterations: int
+) -> tuple[float, ...]:
     """Error and the four noises of one pair, NaN if it is refused."""
+    sensor = ZernikeSensor(pupil, *(Dimple(diameter, theta) for theta in pair))
     try:
         method = PhaseShifted(sensor, n_iterations=n_iterations)
     except ValueError:

@@ -220,7 +220,7 @@ def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, 
     with tempfile.TemporaryDirectory(dir=within, prefix="rerunning-") as place:
         scratch, new = Path(place), Path(place) / "new"
         with Progress(project, [name], name) as progress:
-            done = runner.execute(project, name, changed, scratch, Children(), progress)
+            done = runner.execute(project, name, changed, scratch, Children(os.cpu_count()), progress)
         new.mkdir()
         for file in done.files:
             file.rename(new / file.name)

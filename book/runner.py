@@ -40,6 +40,8 @@ KERNEL_ENVIRONMENT = {
 RESULTS = "ZWFS_RESULTS"
 # Names the file to which work within a cell writes how far it is, see `execute.watch`.
 PROGRESS = "ZWFS_PROGRESS"
+# Holds the number of cores that the sweeps of a notebook use, see `zwfs.sweeps`.
+CORES = "LOKY_MAX_CPU_COUNT"
 
 
 class NotebookError(Exception):
@@ -92,6 +94,7 @@ class Project:
 class Children:
     """The processes that run now, so that an interruption can end them."""
 
+    cores: int = 1  # for the sweeps of each
     running: set[subprocess.Popen] = field(default_factory=set)
     stopped: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -110,7 +113,8 @@ class Children:
                 text=True,
                 env=os.environ
                 | KERNEL_ENVIRONMENT
-                | {RESULTS: request["files"], PROGRESS: str(log.with_suffix(".progress"))},
+                | {RESULTS: request["files"], PROGRESS: str(log.with_suffix(".progress"))}
+                | {CORES: str(max(1, self.cores))},
                 # A session of its own: Ctrl-C reaches this process only, which then ends its children.
                 start_new_session=True,
             )
@@ -348,7 +352,7 @@ def _run_all(
 ) -> None:
     """Run notebooks side by side, and store the result of each as soon as it is there."""
     project.build.mkdir(parents=True, exist_ok=True)
-    children, failures = Children(), []
+    children, failures = Children(os.cpu_count() // min(n_processes or os.cpu_count(), len(jobs))), []
     with (
         tempfile.TemporaryDirectory(dir=project.build, prefix="running-") as scratch,
         ThreadPoolExecutor(n_processes or os.cpu_count()) as pool,

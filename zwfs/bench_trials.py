@@ -156,8 +156,8 @@ def bench_curves(
     rms = _check.real_array("rms", rms)
     if rms.ndim != 1:
         raise ValueError(f"rms has shape {rms.shape}: expected (n_rms,)")
-    _check.finite("rms", rms)
-    _check.non_negative("rms", rms)
+    for value in rms.tolist():
+        _check.number("rms", value, 0)
     n_screens = _check.integer("n_screens", n_screens, 1)
     shared = bench, model, dict(reconstructors), n_screens, exponent, seed
     points = sweeps.run(_bench_point, enumerate(rms.tolist()), *shared, name="bench_curves")

@@ -110,8 +110,8 @@ def linearity_curves(
     rms = _check.real_array("rms", rms)
     if rms.ndim != 1:
         raise ValueError(f"rms has shape {rms.shape}: expected (n_rms,)")
-    _check.finite("rms", rms)
-    _check.non_negative("rms", rms)
+    for value in rms.tolist():
+        _check.number("rms", value, 0)
     n_screens = _check.integer("n_screens", n_screens, 1)
     if not reconstructors:
         raise ValueError("reconstructors is empty: expected at least one")

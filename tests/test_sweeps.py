@@ -1,0 +1,389 @@
+"""Sweeps give the same bits on one core, two, or a cluster that loses a worker; and they can be taken up again."""
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import joblib
+import numpy as np
+import pytest
+from distributed import Client, LocalCluster
+
+from zwfs import (
+    Arcsine,
+    Dimple,
+    GradientDescent,
+    Linear,
+    PhaseShifted,
+    Pupil,
+    ZernikeSensor,
+    sweeps,
+    zernike_basis,
+)
+from zwfs.bench import Bench, BenchModel
+from zwfs.bench_trials import bench_curves, bench_reconstructors, error_budget
+from zwfs.experiments import linearity_curves
+from zwfs.variations import diameter_curve, pair_maps
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two worker processes, each watched by a nanny that starts another one when it dies."""
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        client.wait_for_workers(2, timeout=120)
+        yield client
+
+
+@pytest.fixture(scope="module")
+def pupil():
+    return Pupil.circular(24)
+
+
+@pytest.fixture(scope="module")
+def modes(pupil):
+    return zernike_basis(pupil, 12)
+
+
+def figure_3(pupil, modes):
+    plus, minus = Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2)
+    classic, shifted = ZernikeSensor(pupil, plus), ZernikeSensor(pupil, plus, minus)
+    methods = {
+        "Linear": Linear(classic, modes),
+        "Arcsine": Arcsine(classic),
+        "GradientDescent": GradientDescent(shifted, modes),
+        "PhaseShifted": PhaseShifted(shifted),
+    }
+    curves = linearity_curves(methods, modes, [0.1, 0.5, 1.0], 4, seed=3)
+    return [curves.rms, *curves.errors.values(), *curves.converged.values(), curves.wrapped, curves.strehl]
+
+
+def figure_4(pupil, modes):
+    def make(diameter):
+        return PhaseShifted(ZernikeSensor(pupil, *(Dimple(diameter, sign * np.pi / 2) for sign in (1, -1))))
+
+    return [diameter_curve(make, [0.8, 1.06, 2.3], modes[:3]).errors]
+
+
+def figure_9(pupil, modes):
+    bench = Bench(n_pixels=40)
+    model = BenchModel.from_images(bench, 1)
+    methods = bench_reconstructors(bench, model, n_iterations=2)
+    curves = bench_curves(bench, model, methods, [0, 0.3, 0.6], 1, seed=1)
+    return [curves.commanded, *curves.residuals.values()]
+
+
+def budget(pupil, modes):
+    found = error_budget(Bench(n_pixels=40), ["PhaseShifted"], [0.0, 0.3], 1, n_iterations=2, seed=1)
+    return [curves.residuals["PhaseShifted"] for curves in found.values()]
+
+
+def maps(pupil, modes):
+    found = pair_maps(pupil, 1.06, np.linspace(-np.pi, np.pi, 5), 0.3 * modes[:2])
+    return [found.error, found.flat, found.aberrated, found.bound, found.read]
+
+
+@pytest.mark.parametrize("experiment", [figure_3, figure_4, figure_9, budget, maps])
+def test_one_core_two_cores_and_a_cluster_agree_to_the_last_bit(experiment, pupil, modes, cluster):
+    found = {}
+    for where in ({"n_jobs": 1}, {"n_jobs": 2}, {"backend": "dask"}):
+        with joblib.parallel_config(**where):
+            found[str(where)] = [array.tobytes() for array in experiment(pupil, modes)]
+    one, two, dask = found.values()
+    assert one == two
+    assert one == dask
+
+
+def test_large_arrays_are_shared_and_change_no_bit():
+    pupil = Pupil.circular(80)
+    modes = zernike_basis(pupil, 60)  # 3 MB: joblib maps it into the memory of the workers
+    method = Linear(ZernikeSensor(pupil, Dimple(1.06, np.pi / 2)), modes)
+    found = []
+    for n_jobs in (1, 2):
+        with joblib.parallel_config(n_jobs=n_jobs):
+            found.append(linearity_curves({"Linear": method}, modes, [0.1, 0.5], 2, seed=3).errors["Linear"])
+    assert found[0].tobytes() == found[1].tobytes()
+
+
+def threads_of_blas(value):
+    from threadpoolctl import threadpool_info
+
+    return os.getpid(), max(library["num_threads"] for library in threadpool_info())
+
+
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_blas_has_one_thread_in_every_task(n_jobs):
+    # A process of its own, which may use two: the variables are read when NumPy is loaded.
+    script = (
+        "import joblib\nfrom zwfs import sweeps\nfrom tests.test_sweeps import threads_of_blas\n"
+        f"with joblib.parallel_config(n_jobs={n_jobs}, inner_max_num_threads={2 if n_jobs > 1 else None}):\n"
+        "    found = sweeps.run(threads_of_blas, range(4), name='threads')\n"
+        "print(threads_of_blas(0)[1], *(threads for _, threads in found))"
+    )
+    limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2")
+    ended = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, env=os.environ | limits, capture_output=True, text=True
+    )
+    assert ended.stdout.split() == ["2", "1", "1", "1", "1"], ended.stderr
+
+
+def process_after(seconds, *_):
+    time.sleep(0.2)
+    return os.getpid()
+
+
+@pytest.mark.parametrize(("limit", "expected"), [("1", 1), ("2", 2)])
+def test_all_cores_by_default_and_fewer_if_told(limit, expected, monkeypatch):
+    monkeypatch.setenv("LOKY_MAX_CPU_COUNT", limit)
+    used = set(sweeps.run(process_after, range(6), name="default"))
+    assert len(used) == min(expected, os.cpu_count())
+    assert (os.getpid() in used) == (expected == 1)
+
+
+def test_a_single_task_stays_here():
+    assert sweeps.run(process_after, [0], name="single") == [os.getpid()]
+
+
+def test_results_are_in_the_order_of_the_inputs():
+    def late_first(value):
+        time.sleep(0.3 if value == 0 else 0)
+        return value
+
+    with joblib.parallel_config(n_jobs=2):
+        assert sweeps.run(late_first, range(5), name="order") == [0, 1, 2, 3, 4]
+    assert sweeps.run(late_first, [], name="order") == []
+
+
+def test_a_sweep_within_a_task_is_done_there(tmp_path, monkeypatch):
+    monkeypatch.setenv(sweeps.PROGRESS, str(tmp_path / "progress"))
+
+    def outer(value):
+        return {os.getpid(), *sweeps.run(process_after, range(2), name="inner")}
+
+    with joblib.parallel_config(n_jobs=2):
+        assert all(len(used) == 1 for used in sweeps.run(outer, range(3), name="outer"))
+    assert "inner" not in (tmp_path / "progress").read_text()
+
+
+def fails_at_three(value):
+    if value == 3:
+        raise ArithmeticError("no such thing")
+    return value
+
+
+@pytest.mark.parametrize("where", [{"n_jobs": 1}, {"n_jobs": 2}, {"backend": "dask"}])
+def test_an_error_names_the_task_and_its_input(where, cluster):
+    with joblib.parallel_config(**where), pytest.raises(ArithmeticError, match="no such thing") as failure:
+        sweeps.run(fails_at_three, [5, 3, 4], name="broken")
+    assert "in task 1 of the sweep broken, with the input 3" in failure.value.__notes__
+
+
+def test_a_name_that_is_no_name_is_refused():
+    with pytest.raises(ValueError, match=r"name = '\.\./elsewhere'"):
+        sweeps.run(pow, [1], 2, name="../elsewhere")
+
+
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_progress_is_written_as_tasks_finish(n_jobs, tmp_path, monkeypatch):
+    monkeypatch.setenv(sweeps.PROGRESS, str(tmp_path / "progress"))
+    with joblib.parallel_config(n_jobs=n_jobs):
+        sweeps.run(pow, range(3), 2, name="squares")
+    lines = [json.loads(line) for line in (tmp_path / "progress").read_text().splitlines()]
+    assert lines == [{"name": "squares", "done": done, "total": 3} for done in (1, 2, 3)]
+
+
+def slow(value, folder, table):
+    """Say which process does this task, take a while, and give something that depends on both arguments."""
+    (Path(folder) / f"{value}-{os.getpid()}").touch()
+    time.sleep(0.4)
+    return value + float(table.sum())
+
+
+def began(folder):
+    """Value and process of each task that began."""
+    return [file.name.split("-") for file in sorted(Path(folder).iterdir())]
+
+
+@pytest.mark.parametrize("n_lost", [1, 2])
+def test_a_cluster_that_loses_workers_gives_the_full_result(cluster, n_lost, tmp_path):
+    table = np.linspace(0, 1, 300_000)
+    lost = list(cluster.run(os.getpid).values())[:n_lost]
+
+    def kill_when_all_work():
+        while any(sum(process == str(pid) for _, process in began(tmp_path)) < 2 for pid in lost):
+            time.sleep(0.05)
+        for pid in lost:
+            os.kill(pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill_when_all_work)
+    killer.start()
+    with joblib.parallel_config(backend="dask"):
+        found = sweeps.run(slow, range(12), str(tmp_path), table, name="survivor")
+    killer.join()
+    assert found == [value + float(table.sum()) for value in range(12)]
+    assert len(began(tmp_path)) > 12  # what they were at was done again
+    cluster.wait_for_workers(2, timeout=120)
+    assert not set(lost) & set(cluster.run(os.getpid).values())
+
+
+SWEEP = """
+import sys
+import numpy as np
+from tests.test_sweeps import slow
+from zwfs import sweeps
+
+factor = 2.0
+
+def task(value, *shared):
+    return factor * slow(value, *shared)
+
+print(sweeps.run(task, range(8), sys.argv[1], np.linspace(0, 1, 1000), name="stopped"))
+"""
+
+
+def start_sweep(folder, store, script=SWEEP):
+    return subprocess.Popen(
+        [sys.executable, "-c", script, str(folder)], cwd=ROOT, env=os.environ | {sweeps.STORE: str(store)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+
+
+def test_an_interrupted_sweep_is_taken_up_again(tmp_path):
+    log, store = tmp_path / "log", tmp_path / "store"
+    log.mkdir()
+    with start_sweep(log, store) as stopped:
+        while len(list(store.glob("*/*.pickle"))) < 3:
+            assert stopped.poll() is None, stopped.communicate()
+            time.sleep(0.02)
+        os.killpg(stopped.pid, signal.SIGINT)  # as Ctrl-C does: to the workers as well
+        assert "KeyboardInterrupt" in stopped.communicate()[1]
+    kept = {file: file.stat().st_mtime_ns for file in store.glob("*/*.pickle")}
+    assert 3 <= len(kept) < 8
+    for file in log.iterdir():
+        file.unlink()
+    with start_sweep(log, store) as again:
+        found, errors = again.communicate()
+    assert again.returncode == 0, errors
+    assert len(began(log)) == 8 - len(kept)
+    assert {file: file.stat().st_mtime_ns for file in kept} == kept
+    with start_sweep(log, tmp_path / "other") as whole:
+        assert whole.communicate()[0] == found
+    # All of them from the store now, but not for other code.
+    for file in log.iterdir():
+        file.unlink()
+    with start_sweep(log, store) as third:
+        assert third.communicate()[0] == found
+    assert not began(log)
+    with start_sweep(log, store, SWEEP.replace("factor * slow", "factor + slow")) as changed:
+        assert changed.communicate()[0] != found
+    assert len(began(log)) == 8
+
+
+def square(value, offset):
+    square.calls.append(value)
+    return np.array([value**2 + offset])
+
+
+@pytest.fixture
+def store(tmp_path, monkeypatch):
+    monkeypatch.setenv(sweeps.STORE, str(tmp_path))
+    monkeypatch.setattr(square, "calls", [], raising=False)
+    with joblib.parallel_config(n_jobs=1):
+        yield tmp_path
+
+
+@pytest.mark.parametrize("damage", [lambda content: content[:-1], lambda content: b"", lambda content: b"x" * 99])
+def test_a_damaged_file_is_made_again(store, damage):
+    first = sweeps.run(square, range(4), 1, name="squares")
+    file = sorted(store.glob("squares-*/*.pickle"))[2]
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    square.calls.clear()
+    assert sweeps.run(square, range(4), 1, name="squares") == first
+    assert len(square.calls) == 1
+    assert file.read_bytes() == whole
+
+
+def test_other_inputs_are_other_tasks(store, tmp_path, monkeypatch):
+    monkeypatch.setenv(sweeps.PROGRESS, str(tmp_path / "progress"))
+    sweeps.run(square, range(4), 1, name="squares")
+    sweeps.run(square, range(5), 1, name="squares")
+    assert square.calls == [0, 1, 2, 3, 4]
+    told = [json.loads(line)["done"] for line in (tmp_path / "progress").read_text().splitlines()]
+    assert told == [1, 2, 3, 4, 4, 5]
+    sweeps.run(square, range(4), 2, name="squares")
+    assert len(square.calls) == 9
+
+
+def test_nothing_is_kept_unless_asked(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(square, "calls", [], raising=False)
+    sweeps.run(square, [1], 1, name="squares")
+    assert not list(tmp_path.iterdir())
+
+
+def test_results_of_other_code_are_not_taken(tmp_path, monkeypatch):
+    """The digest changes with a module that a task comes from; lambdas differ by what they do and hold."""
+    module = tmp_path / "users_module.py"
+    module.write_text("def task(value):\n    return value\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    task = __import__("users_module").task
+    before = sweeps._digest(task)
+    assert sweeps._digest(task) == before
+    module.write_text("def task(value):\n    return helper(value)\n")
+    assert sweeps._digest(task) != before
+
+    def adder(step):
+        return lambda value: value + step
+
+    assert sweeps._digest(adder(1)) == sweeps._digest(adder(1))
+    assert sweeps._digest(adder(1)) != sweeps._digest(adder(2))
+    assert sweeps._digest(lambda value: value + 1) != sweeps._digest(lambda value: value - 1)
+
+
+def test_the_digest_covers_all_of_zwfs(monkeypatch):
+    before, read = sweeps._digest(1), Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda file: read(file) + b"#" * (file.name == "gradient_descent.py"))
+    assert sweeps._digest(1) != before
+
+
+def test_what_was_looked_at_does_not_change_a_pickle(modes):
+    pupil = Pupil.circular(40)
+    bench = Bench(n_pixels=40)
+    sensor, model = ZernikeSensor(pupil, Dimple(1.06, 1.5)), BenchModel.from_images(bench, 1)
+    method = PhaseShifted(model.shifted)
+    before = [pickle.dumps(thing) for thing in (sensor, model, method)]
+    digest = sweeps._digest((sensor, model, method))
+    frames = sensor.measure(modes[0])
+    model.pistons(method(model.normalise(bench.frames())).phase)
+    assert pupil.points.size
+    assert model.modes.size
+    assert [pickle.dumps(thing) for thing in (sensor, model, method)] == before
+    assert sweeps._digest((sensor, model, method)) == digest
+    copy = pickle.loads(pickle.dumps(sensor))
+    np.testing.assert_array_equal(copy.measure(modes[0]), frames)
+    np.testing.assert_array_equal(copy.pupil.points, pupil.points)
+
+
+def test_the_package_does_without_joblib():
+    unwanted = "{'joblib', 'cloudpickle', 'threadpoolctl', 'distributed'}"
+    script = f"import sys, zwfs, zwfs.experiments; assert not {unwanted} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_the_script_on_the_page_runs():
+    script = ROOT / "book" / "sweep_on_dask.py"
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
+    lines = ended.stdout.splitlines()
+    assert lines[0] == "0.1 rad rms: 100% of the screens recovered"
+    assert len(lines) == 10

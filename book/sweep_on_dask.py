@@ -9,6 +9,7 @@ from zwfs.experiments import linearity_curves
 
 
 def main():
+    """Run the sweep on a cluster of two processes, and print how many screens were recovered."""
     pupil = zwfs.Pupil.circular(64)
     modes = zwfs.zernike_basis(pupil, 100)
     dimples = zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2)

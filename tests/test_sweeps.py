@@ -126,7 +126,7 @@ def test_blas_has_one_thread_in_every_task(n_jobs):
     # A process of its own, which may use two: the variables are read when NumPy is loaded.
     script = (
         "import joblib\nfrom zwfs import sweeps\nfrom tests.test_sweeps import threads_of_blas\n"
-        f"with joblib.parallel_config(n_jobs={n_jobs}, inner_max_num_threads={2 if n_jobs > 1 else None}):\n"
+        f"with joblib.parallel_config(backend='loky', n_jobs={n_jobs}, inner_max_num_threads=2):\n"
         "    found = sweeps.run(threads_of_blas, range(4), name='threads')\n"
         "print(threads_of_blas(0)[1], *(threads for _, threads in found))"
     )
@@ -214,26 +214,40 @@ def began(folder):
     return [file.name.split("-") for file in sorted(Path(folder).iterdir())]
 
 
-@pytest.mark.parametrize("n_lost", [1, 2])
-def test_a_cluster_that_loses_workers_gives_the_full_result(cluster, n_lost, tmp_path):
+@pytest.mark.parametrize("all_of_them", [False, True])
+def test_a_cluster_that_loses_workers_gives_the_full_result(cluster, all_of_them, tmp_path):
     table = np.linspace(0, 1, 300_000)
-    lost = list(cluster.run(os.getpid).values())[:n_lost]
+    pids = set(cluster.run(os.getpid).values())
+    lost = set()
 
-    def kill_when_all_work():
-        while any(sum(process == str(pid) for _, process in began(tmp_path)) < 2 for pid in lost):
-            time.sleep(0.05)
+    def kill_in_the_middle():
+        while len(began(tmp_path)) < 4:
+            time.sleep(0.02)
+        lost.update(pids if all_of_them else {int(began(tmp_path)[-1][1])})
         for pid in lost:
             os.kill(pid, signal.SIGKILL)
+        done_by_now.append(len(began(tmp_path)))
 
-    killer = threading.Thread(target=kill_when_all_work)
+    done_by_now = []
+    killer = threading.Thread(target=kill_in_the_middle)
     killer.start()
     with joblib.parallel_config(backend="dask"):
-        found = sweeps.run(slow, range(12), str(tmp_path), table, name="survivor")
+        found = sweeps.run(slow, range(16), str(tmp_path), table, name="survivor")
     killer.join()
-    assert found == [value + float(table.sum()) for value in range(12)]
-    assert len(began(tmp_path)) > 12  # what they were at was done again
+    assert found == [value + float(table.sum()) for value in range(16)]
+    assert done_by_now[0] < 16
     cluster.wait_for_workers(2, timeout=120)
-    assert not set(lost) & set(cluster.run(os.getpid).values())
+    assert lost
+    assert not lost & set(cluster.run(os.getpid).values())
+
+
+def test_a_cluster_of_one_core_works_too():
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as single,
+        Client(single, set_as_default=False) as client,
+        joblib.parallel_config(backend="dask", client=client),
+    ):
+        assert sweeps.run(pow, range(4), 2, name="squares") == [0, 1, 4, 9]
 
 
 SWEEP = """

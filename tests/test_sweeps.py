@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -395,8 +396,11 @@ def test_the_package_does_without_joblib():
     subprocess.run([sys.executable, "-c", script], check=True)
 
 
-def test_the_script_on_the_page_runs():
-    script = ROOT / "book" / "sweep_on_dask.py"
+def test_the_script_on_the_page_runs(tmp_path):
+    page = (ROOT / "book" / "sweeps.md").read_text("utf-8")
+    (block,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.S) if " LocalCluster(" in block]
+    script = tmp_path / "script.py"
+    script.write_text(block)
     ended = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
     lines = ended.stdout.splitlines()
     assert lines[0] == "0.1 rad rms: 100% of the screens recovered"

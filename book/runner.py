@@ -352,7 +352,7 @@ def _run_all(
 ) -> None:
     """Run notebooks side by side, and store the result of each as soon as it is there."""
     project.build.mkdir(parents=True, exist_ok=True)
-    children, failures = Children(os.cpu_count() // min(n_processes or os.cpu_count(), len(jobs))), []
+    children, failures = Children(os.cpu_count() // min(n_processes or os.cpu_count(), len(names))), []
     with (
         tempfile.TemporaryDirectory(dir=project.build, prefix="running-") as scratch,
         ThreadPoolExecutor(n_processes or os.cpu_count()) as pool,

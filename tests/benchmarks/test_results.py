@@ -1,0 +1,27 @@
+"""What the speed is measured of: right answers, at any speed."""
+
+import json
+
+from . import speed
+
+
+def test_real_time_settings_meet_their_errors():
+    rows = speed.real_time(40, seconds=0)
+    json.dumps(rows)
+    fewest = {row["n_iterations"]: row["median error"] for row in rows if row["accelerate"]}
+    assert fewest[3] < 0.01
+    assert fewest[5] < fewest[4] < fewest[3]
+    assert all(row["rate"] > 0 for row in rows)
+
+
+def test_one_iteration_follows_a_slow_wavefront():
+    assert speed.closed_loop(40, seconds=0)["median error"] < 0.01
+
+
+def test_every_part_of_a_step_can_be_run_alone():
+    assert set(speed.breakdown(40, seconds=0)) > {"check of the frames", "step: modulus", "whole call"}
+
+
+def test_growth_is_that_of_the_pixels_listed():
+    found = speed.slope(0, sizes=(32, 48, 64, 96))
+    assert len(found["times"]) == 4

@@ -7,6 +7,7 @@ machine what the clock shows, on a busy one hardly more.
 import json
 import resource
 import sys
+import tracemalloc
 from time import perf_counter, thread_time
 
 import numpy as np
@@ -83,7 +84,8 @@ def closed_loop(n_pixels, seconds):
 def breakdown(n_pixels, seconds):
     """Time of each part of one accelerated step, and of what comes before and after all steps."""
     sensor = ZernikeSensor(Pupil.circular(n_pixels), *DIMPLES)
-    frames = sensor.measure(np.zeros(sensor.pupil.shape)).astype(np.float32)
+    screen = screens_at(zernike_basis(sensor.pupil, 200), 0.8, 1, 2024, 7)[0]
+    frames = sensor.measure(screen).astype(np.float32)
     method = PhaseShifted(sensor, **REAL_TIME)
     maps = method.settings.maps(frames.dtype)
     operator = sensor.operator(frames.dtype)
@@ -102,7 +104,7 @@ def breakdown(n_pixels, seconds):
         "step: projection": lambda: operator.split_project(phasor) @ core,
         "step: expansion": lambda: operator.split_expand(coefficients, in_window=True),
         "step: linear system": lambda: method._shared.solve(wave, data["signal"]),
-        "step: modulus": lambda: _common.unit(field, phasor, maps.inside),
+        "step: modulus": lambda: _common.unit(field.copy(), phasor, maps.inside),
         "angle": lambda: _common.angle(phasor),
         "report": lambda: _common.report(
             method.settings, flat, batch, found.phase[np.newaxis], one, one, one, None
@@ -130,7 +132,7 @@ def slope(seconds, sizes=(32, 64, 128, 256, 512, 1024)):
 
 
 def batches(seconds, sizes=(1, 10, 100, 1000)):
-    """Time per frame pair of batches, and the largest memory of the process beyond frames and results."""
+    """Time per frame pair of batches, and the memory that a call takes beyond its frames and results, bytes."""
     pupil = Pupil.circular(100)
     sensor = ZernikeSensor(pupil, *DIMPLES)
     method = PhaseShifted(sensor, n_iterations=5, tolerance=0.0)
@@ -138,11 +140,14 @@ def batches(seconds, sizes=(1, 10, 100, 1000)):
     frame, rows = sensor.measure(screen).astype(np.float32), []
     for n in sizes:
         frames = np.repeat(frame, n, axis=0)
-        before = _peak()
         time = best(lambda: method(frames), seconds) / n  # noqa: B023
-        own = frames.nbytes + n * frames[0, 0].nbytes  # the copy of the frames, and the phases
-        # The result of the call before is alive while the next one is made.
-        rows.append({"n_frames": n, "time per frame": time, "memory beyond": max(_peak() - before - 2 * own, 0)})
+        tracemalloc.start()
+        found = method(frames)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        rows.append(
+            {"n_frames": n, "time per frame": time, "memory": peak - found.phase.nbytes - found.frames.nbytes}
+        )
     return rows
 
 

@@ -22,6 +22,10 @@ def test_every_part_of_a_step_can_be_run_alone():
     assert set(speed.breakdown(40, seconds=0)) > {"check of the frames", "step: modulus", "whole call"}
 
 
+def test_memory_stays_flat_as_batches_grow():
+    few, many = speed.batches(0, sizes=(10, 200))
+    assert many["memory"] < 1.2 * few["memory"] + 100_000
+
+
 def test_growth_is_that_of_the_pixels_listed():
-    found = speed.slope(0, sizes=(32, 48, 64, 96))
-    assert len(found["times"]) == 4
+    assert len(speed.slope(0, sizes=(32, 48, 64, 96))["times"]) == 4

@@ -148,6 +148,8 @@ class PhaseShifted:
             if self._shared is not None:
                 cores, weights = self._shared.core[np.newaxis], self._shared.weights
                 offset = weights.sum(axis=1)[:, np.newaxis, np.newaxis] * offset
+                # Outside the field is 0, and would have to be kept from being divided by its modulus.
+                offset[0, ~sensor.pupil.mask] = -1
             values = split_core(cores), weights, offset, sensor.operator(np.float64).split_project(psi)
             self._constants[dtype] = _Constants(*(array.astype(dtype) for array in values))
         return self._constants[dtype]

@@ -39,7 +39,7 @@ ROOT = Path(__file__).parent.parent
 def cluster():
     """Two worker processes, each watched by a nanny that starts another one when it dies."""
     with (
-        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
         Client(cluster) as client,
     ):
         client.wait_for_workers(2, timeout=120)
@@ -244,7 +244,7 @@ def test_a_cluster_that_loses_workers_gives_the_full_result(cluster, all_of_them
 
 def test_a_cluster_of_one_core_works_too():
     with (
-        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as single,
+        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0") as single,
         Client(single, set_as_default=False) as client,
         joblib.parallel_config(backend="dask", client=client),
     ):
@@ -373,7 +373,7 @@ def test_the_digest_covers_all_of_zwfs(monkeypatch):
 
 
 def test_what_was_looked_at_does_not_change_a_pickle(modes):
-    pupil = Pupil.circular(40)
+    pupil = Pupil.circular(24)  # at which nobody has looked
     bench = Bench(n_pixels=40)
     sensor, model = ZernikeSensor(pupil, Dimple(1.06, 1.5)), BenchModel.from_images(bench, 1)
     method = PhaseShifted(model.shifted)

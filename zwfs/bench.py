@@ -18,6 +18,7 @@ from scipy import fft, ndimage
 from zwfs import _check
 from zwfs._pickle import uncached_state
 from zwfs.detector import Detector
+from zwfs.frames import measured_pupil
 from zwfs.masks import Dimple
 from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
@@ -336,20 +337,15 @@ class BenchModel:
         ny, nx = bench.segments.shape
         top, left = (images.shape[-2] - ny) // 2, (images.shape[-1] - nx) // 2
         inner = images[:, top : top + ny, left : left + nx]
-        inside = bench.segments > 0
-        scale = inner[:, inside].mean(axis=1)[:, np.newaxis, np.newaxis]
-        amplitude = np.sqrt(np.maximum((inner / scale).mean(axis=0), 0))
-        # The stop of the bench is known; what is dark within it, gaps and missing segments, the image shows.
-        y, x = ((np.arange(n) - (n - 1) / 2) / bench.n_pixels for n in (ny, nx))
-        stop = np.hypot(x, y[:, np.newaxis]) <= 0.5
-        pupil = Pupil.from_amplitude(np.where(stop, amplitude, 0), bench.n_pixels, threshold=0.1)
+        # The stop of the bench is known; what is dark within it, gaps and missing segments, the images show.
+        pupil, unit = measured_pupil(inner, bench.segments > 0, bench.n_pixels)
         plus, minus = Dimple(bench.diameter, bench.phase), Dimple(bench.diameter, -bench.phase)
         return cls(
             ZernikeSensor(pupil, plus, minus, extent=bench.extent),
             ZernikeSensor(pupil, plus, extent=bench.extent),
             bench.segments,
             bench.numbers,
-            scale * np.mean(amplitude[pupil.mask] ** 2),
+            unit[:, np.newaxis, np.newaxis],
             dark,
         )
 

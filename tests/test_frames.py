@@ -1,0 +1,598 @@
+import hashlib
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from scipy import ndimage
+
+from zwfs import Dimple, Pupil, ZernikeSensor, camera, power_law_screens, zernike_basis
+from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
+from zwfs.frames import Optics, fit, measure, predict_other, reconstruct, steps
+from zwfs.registration import Image, find_pupils, record, register
+
+SEAL = "ZWFS_SEAL_FRAMES"
+D, MARGIN = 68, 12
+COUNTS = 2e4
+SHIFT = np.array([0.4, -0.7])  # of the second image, pixels
+EXACT = {"centers": [[45.5, 45.5], [45.5, 137.5]], "diameter": D}
+SECOND = SHIFT + np.array([0, 92])  # where it stands beside the first
+
+
+def image(counts, name="camera.fits", bad=None):
+    return Image(counts, np.zeros(counts.shape, bool) if bad is None else bad, name)
+
+
+def shifted(frame, shift):
+    """A frame moved by a fraction of a pixel, exactly as far as it is band-limited."""
+    return np.fft.ifft2(ndimage.fourier_shift(np.fft.fft2(frame), shift)).real
+
+
+def pair(phase=None, dark=500.0, flux=(1.0, 0.8), gap=0.03):
+    """Two frames and two mask-out images with both pupils on one camera: (64 + 24) x 2 columns, without noise."""
+    pupil = Pupil.from_segments(layout := Pupil.hexagonal(D, 3, gap, (21,), 0.8).segments, 1 + 0.1 * (layout > 7))
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1 + 2 * MARGIN / D)
+    masked = sensor.measure(np.zeros(pupil.shape) if phase is None else phase)
+    bare = np.stack([np.pad(pupil.amplitude**2, MARGIN)] * 2)
+    both = []
+    for images in (masked, bare):
+        images = [ndimage.gaussian_filter(one, 0.7) * part for one, part in zip(images, flux, strict=True)]
+        images[1] = shifted(images[1], SHIFT)
+        both.append(np.hstack(images) * COUNTS + dark)
+    return pupil, *both
+
+
+@pytest.fixture(scope="module")
+def screen():
+    return power_law_screens(zernike_basis(Pupil.circular(D), 60), 0.4, 1, seed=3)[0]
+
+
+@pytest.fixture(scope="module")
+def recorded(screen):
+    return pair(screen)
+
+
+def on_grid(found, recording):
+    """The phase on the grid of `pair`."""
+    canvas = np.full(recording.pupil_images[0].counts.shape, np.nan)
+    row, column = recording.corner
+    n = recording.n_pixels
+    canvas[row : row + n, column : column + n] = found.phase
+    return canvas[MARGIN : MARGIN + D, MARGIN : MARGIN + D]
+
+
+def error(found, recording, truth):
+    phase = on_grid(found, recording)
+    left = np.exp(1j * (phase - truth)[np.isfinite(phase)])
+    return np.sqrt(np.mean(np.angle(left * np.conj(left.mean())) ** 2))
+
+
+# Registration
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.45), (-2.6, 3.35)])
+def test_register_finds_a_known_shift(shift):
+    segments = Pupil.hexagonal(100, 3, 0.03, stop=0.8).segments
+    reference = ndimage.gaussian_filter(np.pad((segments > 0).astype(float), 10), 1.0)
+    noise = np.random.default_rng(1).normal(0, 0.02, (2, *reference.shape))
+    inside = np.hypot(*(np.mgrid[:120, :120] - 59.5)) < 45
+    found = register(shifted(reference, shift) + noise[0], reference + noise[1], inside)
+    np.testing.assert_allclose(found, shift, atol=0.03)
+
+
+def test_register_refuses_a_shift_out_of_reach():
+    reference = ndimage.gaussian_filter(np.random.default_rng(1).random((100, 100)), 2)
+    inside = np.hypot(*(np.mgrid[:100, :100] - 49.5)) < 35
+    with pytest.raises(ValueError, match="the end of the search"):
+        register(np.roll(reference, 9, axis=0), reference, inside)
+
+
+@pytest.mark.parametrize("illumination", [0.0, 0.5])
+@pytest.mark.parametrize("center", [(50.0, 52.0), (49.3, 51.75)])
+def test_circle_through_the_outline(center, illumination):
+    rows, columns = np.mgrid[:104, :105]
+    distance = np.hypot(rows - center[0], columns - center[1])
+    disc = np.clip(34.2 - distance + 0.5, 0, 1) * (1 + illumination * (columns - 52) / 68)
+    (circle,) = find_pupils(image(COUNTS * disc + 300), 1)
+    assert np.hypot(circle.row - center[0], circle.column - center[1]) < 0.1 + 0.3 * illumination
+    assert circle.diameter == pytest.approx(68.4, abs=0.3)
+
+
+def test_outline_of_segments_with_one_missing(recorded):
+    _, _, bare = recorded
+    left, right = find_pupils(image(bare), 2)
+    assert [left.row, left.column, left.diameter] == pytest.approx([45.5, 45.5, D], abs=0.6)
+    assert right.column - left.column == pytest.approx(92 + SHIFT[1], abs=0.1)
+    assert right.row - left.row == pytest.approx(SHIFT[0], abs=0.1)
+
+
+def test_second_image_is_registered_to_a_tenth_of_a_pixel(recorded):
+    _, masked, bare = recorded
+    recording = record([image(masked)], [image(bare)])
+    np.testing.assert_allclose(recording.origins, [[0, 0], SECOND, [0, 0], SECOND], atol=0.1)
+    whole = record([image(masked)], [image(bare)], subpixel=False)
+    assert not np.any(whole.shifts)
+
+
+def test_two_frames_are_one_frame_cut_in_two(recorded):
+    _, masked, bare = recorded
+    halves = [[image(half, f"{name}{i}") for i, half in enumerate(np.hsplit(one, 2))]
+              for name, one in (("masked", masked), ("bare", bare))]  # fmt: skip
+    one, two = record([image(masked)], [image(bare)]), record(*halves)
+    np.testing.assert_allclose(two.origins[:, 1], one.origins[:, 1] - [0, 92, 0, 92], atol=0.01)
+    found = [reconstruct(measure(r, Optics()), Optics()) for r in (one, two)]
+    assert np.nanstd(found[0].phase - found[1].phase) < 0.01
+
+
+def test_stacked_pupils_and_given_centers(recorded):
+    _, masked, bare = recorded
+    turned = [image(np.vstack(np.hsplit(one, 2))) for one in (masked, bare)]
+    recording = record(turned[:1], turned[1:])
+    np.testing.assert_allclose(recording.origins[1], [92 + SHIFT[0], SHIFT[1]], atol=0.1)
+    given = record([image(masked)], [image(bare)], centers=[[45.5, 45.5], [46, 137]], diameter=D)
+    np.testing.assert_allclose(given.origins[1], SECOND, atol=0.1)
+
+
+def test_cropped_mask_out_images_are_found_on_the_frames():
+    _, masked, bare = pair()
+    crops = [np.pad(half[10:-10, 10:-10], 0) for half in np.hsplit(bare, 2)]
+    recording = record([image(masked)], [image(crop, f"crop{i}") for i, crop in enumerate(crops)])
+    # The mask moves the outline; content of a flat wavefront brings it back.
+    np.testing.assert_allclose(recording.origins[:2] - 10, [[0, 0], SECOND], atol=1.0)
+
+
+# Measurement
+
+
+def test_phase_is_recovered(recorded, screen):
+    _, masked, bare = recorded
+    recording = record([image(masked)], [image(bare)])
+    found = reconstruct(measure(recording, Optics()), Optics())
+    # Blur and interpolation, which the model knows nothing of, leave most of it, at the gaps.
+    assert error(found, recording, screen) < 0.1
+    assert found.correlation.min() > 0.97
+    worse = record([image(masked)], [image(bare)], subpixel=False)
+    assert error(reconstruct(measure(worse, Optics()), Optics()), worse, screen) > error(found, recording, screen)
+
+
+def test_background_and_flux_are_measured(recorded):
+    _, masked, bare = recorded
+    measurement = measure(record([image(masked)], [image(bare)]), Optics())
+    np.testing.assert_allclose(measurement.background, 500, rtol=0.02)
+    assert measurement.flux_ratio[1] == pytest.approx(1.25, rel=0.01)
+    # Mask in, the light of two opposite masks is the same: the frames show the same ratio.
+    assert measurement.flux_ratio[0] == pytest.approx(1.25, rel=0.02)
+    assert measurement.counts[0] == pytest.approx(COUNTS, rel=0.1)
+
+
+def test_opposite_masks_send_the_same_light_into_the_pupil(screen):
+    pupil, _, _ = pair()
+    sensor = ZernikeSensor(pupil, Dimple(1.3, 1.1), Dimple(1.3, -1.1))
+    plus, minus = sensor.measure(3 * screen)
+    assert plus[pupil.mask].sum() == pytest.approx(minus[pupil.mask].sum(), rel=1e-9)
+
+
+def test_exchanged_phase_shifts_change_the_sign(recorded):
+    _, masked, bare = recorded
+    recording = record([image(masked)], [image(bare)])
+    optics = Optics()
+    found = reconstruct(measure(recording, optics), optics)
+    swapped = replace(optics, phase_shifts=optics.phase_shifts[::-1])
+    other = reconstruct(measure(recording, swapped), swapped)
+    np.testing.assert_allclose(np.nan_to_num(other.phase), -np.nan_to_num(found.phase), atol=1e-6)
+    np.testing.assert_allclose(other.correlation, found.correlation, atol=1e-9)
+
+
+def test_masked_pixels_are_left_out_and_do_little_harm(recorded, screen):
+    _, masked, bare = recorded
+    rng = np.random.default_rng(5)
+    bad = rng.random(masked.shape) < 0.01
+    spoilt = np.where(bad, 0.0, masked)
+    recording = record([image(spoilt, bad=bad)], [image(bare)])
+    measurement = measure(recording, Optics())
+    found = reconstruct(measurement, Optics())
+    # Each one spoils up to four points of the grid, in one image or the other.
+    assert 60 < measurement.n_masked < 500
+    assert np.count_nonzero(np.isfinite(found.phase)) == measurement.pupil.n_points - measurement.n_masked
+    clean = record([image(masked)], [image(bare)])
+    best = error(reconstruct(measure(clean, Optics()), Optics()), clean, screen)
+    assert error(found, recording, screen) < best + 0.02
+
+
+def test_leakage_and_unmasked_light_are_undone(screen):
+    pupil, *_ = pair()
+    optics = Optics(leakage=0.1, unmasked=0.2)
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1 + 2 * MARGIN / D)
+    ideal = sensor.measure(screen)
+    bare = np.stack([np.pad(pupil.amplitude**2, MARGIN)] * 2)
+    mixed = 0.8 * (0.9 * ideal + 0.1 * ideal[::-1]) + 0.2 * bare
+    recording = record([image(np.hstack(mixed))], [image(np.hstack(bare))], subpixel=False, **EXACT)
+    found = reconstruct(measure(recording, optics), optics, 100)
+    assert error(found, recording, screen) < 1e-3
+    np.testing.assert_allclose(found.correlation, 1, atol=1e-5)
+    plain = Optics()
+    assert error(reconstruct(measure(recording, plain), plain, 100), recording, screen) > 0.03
+
+
+def test_fit_finds_the_diameter_and_the_scale(screen):
+    pupil, *_ = pair()
+    sensor = ZernikeSensor(pupil, Dimple(1.2, np.pi / 2), Dimple(1.2, -np.pi / 2), extent=1 + 2 * MARGIN / D)
+    frames, bare = 1.3 * sensor.measure(screen) + 0.04, np.stack([np.pad(pupil.amplitude**2, MARGIN)] * 2)
+    recording = record([image(np.hstack(frames))], [image(np.hstack(bare))], subpixel=False, **EXACT)
+    _, optics = fit(recording, Optics(), ["diameter", "scale", "background"], n_steps=20)
+    assert optics.diameter == pytest.approx(1.2, abs=0.02)
+    assert optics.scale == pytest.approx(1 / 1.3, abs=0.02)
+    assert optics.background == pytest.approx(0.04 / 1.3, abs=0.01)
+
+
+def test_prediction_tells_a_pair_from_a_mere_juxtaposition(recorded):
+    _, masked, bare = recorded
+    left, right = np.hsplit(masked, 2)
+    scores = []
+    for frame in (masked, np.hstack([left, right[::-1]])):
+        measurement = measure(record([image(frame)], [image(bare)]), Optics())
+        scores.append((predict_other(measurement, Optics()).min(),
+                       reconstruct(measurement, Optics()).correlation.min()))  # fmt: skip
+    (right_pair, correlation), (wrong_pair, spurious) = scores
+    assert right_pair > 0.9
+    assert wrong_pair < 0.7
+    assert spurious > wrong_pair  # the iteration explains much of what makes no sense
+    assert correlation > spurious
+
+
+def test_steps_name_what_they_do(recorded):
+    _, masked, bare = recorded
+    work = steps([image(masked)], [image(bare)], Optics(), ["scale"], n_iterations=10)
+    assert [step.name for step in work][0::4] == ["outlines of the pupils", "fit of scale"]
+    assert work[-1].found.misfit <= work[-2].found.misfit
+    assert work[1].found.correlation.mean() > work[0].found.correlation.mean()
+
+
+# Bad frames
+
+
+def test_frames_without_a_pupil_are_refused(recorded):
+    _, masked, bare = recorded
+    with pytest.raises(ValueError, match=r"empty\.fits: every pixel is 0: expected light"):
+        record([image(masked)], [image(np.zeros_like(bare), "empty.fits")])
+    with pytest.raises(ValueError, match=r"empty\.fits: every pixel is 7: expected light"):
+        record([image(np.full_like(masked, 7), "empty.fits")], [image(bare)])
+    with pytest.raises(ValueError, match="bright regions as large as a pupil: expected 2"):
+        record([image(masked)], [image(np.hsplit(bare, 2)[0])])
+
+
+@pytest.mark.parametrize(
+    ("cut", "side"),
+    [(np.s_[30:, :], "top"), (np.s_[:-30, :], "bottom"), (np.s_[:, 30:], "left"), (np.s_[:, :-30], "right")],
+)
+def test_cut_pupil_is_refused(recorded, cut, side):
+    _, masked, bare = recorded
+    with pytest.raises(ValueError, match=f"is cut off at the {side}"):
+        record([image(masked[cut])], [image(bare[cut])])
+
+
+def test_pupils_of_different_size_are_refused(recorded):
+    _, _, bare = recorded
+    left, right = np.hsplit(bare, 2)
+    small = ndimage.zoom(right, 0.9, order=1)
+    with pytest.raises(
+        ValueError, match=r"the two pupils are 61\.\d and 6\d\.\d pixels wide: expected the same size"
+    ):
+        record([image(left), image(right)], [image(left, "left"), image(small, "right")])
+
+
+def test_too_many_masked_points_are_refused(recorded):
+    _, masked, bare = recorded
+    bad = np.zeros(masked.shape, bool)
+    bad[:, 30:50] = True
+    with pytest.raises(ValueError, match=r"points of the pupil are bad or saturated: expected at most 20%"):
+        measure(record([image(masked, bad=bad)], [image(bare)]), Optics())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"centers": [[45, 45]]}, "expected \\(row, column\\) of each of two pupils"),
+        ({"centers": [[45, 45], [45, 137]]}, "centers without a diameter"),
+        ({"centers": [[10, 45], [45, 137]], "diameter": 68}, "is cut off at the top"),
+        ({"diameter": -1}, "diameter = -1"),
+        ({"exposure": 0}, "exposure = 0"),
+    ],
+)
+def test_settings_out_of_range(recorded, settings, message):
+    _, masked, bare = recorded
+    with pytest.raises(ValueError, match=message):
+        record([image(masked)], [image(bare)], **settings)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"diameter": 0}, "diameter = 0"),
+        ({"phase_shifts": (1.0,)}, "expected one for each"),
+        ({"leakage": 0.5}, "leakage = 0.5"),
+        ({"unmasked": 1.0}, "unmasked = 1.0"),
+        ({"scale": 0.0}, "scale = 0.0"),
+    ],
+)
+def test_optics_out_of_range(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        Optics(**wrong)
+
+
+def test_unknown_fit_is_refused(recorded):
+    _, masked, bare = recorded
+    with pytest.raises(ValueError, match=r"names = \['colour'\]"):
+        fit(record([image(masked)], [image(bare)]), Optics(), ["colour"])
+
+
+# Files
+
+
+FRAME = np.arange(600, dtype=np.int64).reshape(20, 30) % 250
+
+
+@pytest.mark.parametrize("dtype", [">i2", "<i2", ">u2", "u1", ">i4", ">f4", "<f8", ">f8"])
+def test_every_type_of_number_reads_the_same(tmp_path, dtype):
+    np.save(tmp_path / "a.npy", FRAME.astype(dtype))
+    fits.PrimaryHDU(FRAME.astype(dtype)).writeto(tmp_path / "a.fits")
+    for name in ("a.npy", "a.fits"):
+        file = camera.read(tmp_path / name)
+        assert file.images.dtype == np.float64
+        assert file.images.dtype.isnative
+        np.testing.assert_array_equal(file.images, FRAME[np.newaxis])
+        assert file.sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
+
+
+def test_bzero_and_extension_and_stack(tmp_path):
+    unsigned = (FRAME + 40_000).astype(np.uint16)
+    hdu = fits.ImageHDU(unsigned)
+    hdu.header["WAVELEN"] = 633.0
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "a.fits")
+    file = camera.read(tmp_path / "a.fits")
+    assert fits.getheader(tmp_path / "a.fits", 1)["BZERO"] == 32768
+    np.testing.assert_array_equal(file.images[0], FRAME + 40_000.0)
+    assert file.full_scale == 65535
+    assert file.keyword("WAVELEN") == 633
+    np.save(tmp_path / "two.npy", np.stack([FRAME, FRAME + 1]))
+    first, second = camera.images([camera.read(tmp_path / "two.npy")])
+    assert [first.name, second.name] == ["two.npy[0]", "two.npy[1]"]
+    np.testing.assert_array_equal(second.counts - first.counts, 1)
+
+
+def broken(tmp_path, kind):
+    path = tmp_path / f"{kind}.fits"
+    whole = tmp_path / "whole.fits"
+    fits.PrimaryHDU(FRAME.astype(float)).writeto(whole)
+    np.save(tmp_path / "whole.npy", FRAME)
+    contents = {
+        "text": b"not a picture",
+        "empty": b"",
+        "truncated": whole.read_bytes()[:4000],
+        "header": b"SIMPLE  = nonsense",
+        "npy": (tmp_path / "whole.npy").read_bytes()[:300],
+    }
+    if kind in contents:
+        path.write_bytes(contents[kind])
+    elif kind == "table":
+        column = fits.Column(name="x", format="D", array=np.zeros(3))
+        fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns([column])]).writeto(path)
+    elif kind == "cube":
+        fits.PrimaryHDU(np.zeros((5, 20, 30))).writeto(path)
+    elif kind == "complex":
+        with path.open("wb") as stream:
+            np.save(stream, FRAME + 1j)
+    elif kind == "pickle":
+        with path.open("wb") as stream:
+            np.save(stream, np.array([{}], dtype=object))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("text", r"text\.fits: its first bytes are those of neither a FITS nor an NPY file"),
+        ("empty", r"empty\.fits: its first bytes"),
+        ("truncated", r"truncated\.fits: a broken FITS file"),
+        ("header", r"header\.fits: a "),
+        ("npy", r"npy\.fits: a broken NPY file"),
+        ("table", r"table\.fits: a FITS file without an image"),
+        ("cube", r"cube\.fits: its shape is \(5, 20, 30\): expected \(ny, nx\)"),
+        ("pickle", r"pickle\.fits: a broken NPY file"),
+    ],
+)
+def test_files_that_are_no_image_are_refused(tmp_path, kind, message):
+    with pytest.raises(ValueError, match=message):
+        camera.read(broken(tmp_path, kind))
+
+
+def test_complex_and_missing_files_are_refused(tmp_path):
+    with pytest.raises(TypeError, match=r"its numbers are complex128"):
+        camera.read(broken(tmp_path, "complex"))
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.fits: no such file"):
+        camera.read(tmp_path / "nowhere.fits")
+
+
+def test_missing_keyword_is_named(tmp_path):
+    fits.PrimaryHDU(FRAME).writeto(tmp_path / "a.fits")
+    with pytest.raises(ValueError, match=r"a\.fits: its header has no WAVELEN: give the value as a parameter"):
+        camera.read(tmp_path / "a.fits").keyword("WAVELEN")
+
+
+def file_of(counts, header=None, full_scale=np.inf, name="a.fits"):
+    return camera.CameraFile(np.asarray(counts, float)[np.newaxis], name, "", header or {}, full_scale)
+
+
+def test_nan_dark_and_bad_pixel_map():
+    counts = FRAME.astype(float)
+    counts[3, 4], counts[5, 6] = np.nan, np.inf
+    marked = np.zeros(FRAME.shape)
+    marked[7, 8] = 1
+    dark = np.full(FRAME.shape, 10.0)
+    dark[9, 9] = np.nan
+    (found,) = camera.images([file_of(counts)], [file_of(dark)], [file_of(marked)], saturation=1e5)
+    assert np.argwhere(found.bad).tolist() == [[3, 4], [5, 6], [7, 8], [9, 9]]
+    assert np.isfinite(found.counts).all()
+    assert found.counts[0, 5] == FRAME[0, 5] - 10
+
+
+def test_saturation_is_given_in_the_header_of_the_type_or_seen():
+    counts = FRAME.astype(float)
+    top = counts == 249
+    assert np.count_nonzero(top) == 2
+    (plain,) = camera.images([file_of(counts)])
+    assert not plain.bad.any()
+    for settings in ({"header": {"SATURATE": 249}}, {"full_scale": 249.0}):
+        (found,) = camera.images([file_of(counts, **settings)])
+        np.testing.assert_array_equal(found.bad, top)
+    (found,) = camera.images([file_of(counts)], saturation=240)
+    np.testing.assert_array_equal(found.bad, counts >= 240)
+    clipped = np.minimum(counts, 200)
+    (found,) = camera.images([file_of(clipped)])
+    np.testing.assert_array_equal(found.bad, clipped == 200)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: camera.images([]), "no file: 0 images: expected one or two"),
+        (lambda: camera.images([file_of(FRAME)] * 3), "3 images: expected one or two"),
+        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME[1:])]), r"dark: its shape is \(19, 30\)"),
+        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME)] * 2), "dark: 2 images for the 1 of"),
+        (lambda: camera.images([file_of(FRAME)], [], [file_of(FRAME.T)]), "bad-pixel map: its shape is"),
+        (lambda: camera.images([file_of(FRAME + 1.0)], saturation=0.5), "all pixels are bad or saturated"),
+        (lambda: camera.images([file_of(FRAME)], saturation=-1), "saturation = -1"),
+    ],
+)
+def test_files_that_do_not_fit_together(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_astropy_is_named_where_it_is_missing(monkeypatch, tmp_path):
+    fits.PrimaryHDU(FRAME).writeto(tmp_path / "a.fits")
+    monkeypatch.setitem(__import__("sys").modules, "astropy.io", None)
+    with pytest.raises(ImportError, match=r"pip install zwfs\[frames\]"):
+        camera.read(tmp_path / "a.fits")
+
+
+# The simulated bench
+
+
+SMALL = {"n_pixels": D, "gap": 0.02, "stop": 0.8}
+
+
+def bench_images(folder, bench, pistons, **settings):
+    files = {name: camera.read(path) for name, path in
+             camera.write_bench(folder, bench, pistons, **settings).items()}  # fmt: skip
+    shared = [files["dark"]], [files["bad_pixels"]]
+    return files, camera.images([files["frame"]], *shared), camera.images([files["pupils"]], *shared)
+
+
+def test_bench_writes_what_the_pipeline_reads(tmp_path):
+    bench = Bench(**SMALL)
+    commanded = segment_screens(bench, 0.3, 1, seed=2)[0]
+    files, frames, pupil_images = bench_images(tmp_path, bench, commanded, n_bad=40, seed=1)
+    assert files["frame"].keyword("WAVELEN") == 635
+    assert files["frame"].keyword("DIMPLE") == 1.06
+    assert fits.getheader(tmp_path / "frame.fits")["BITPIX"] == 16
+    assert np.count_nonzero(frames[0].bad) == 40
+    recording = record(frames, pupil_images)
+    # The bench sets the images half a pixel apart.
+    np.testing.assert_allclose(recording.origins[3], [-0.5, 89.5], atol=0.1)
+    found = reconstruct(measure(recording, Optics()), Optics())
+    margin = (frames[0].counts.shape[0] - D) // 2
+    canvas = np.full(frames[0].counts.shape, np.nan)
+    row, column = recording.corner
+    canvas[row : row + recording.n_pixels, column : column + recording.n_pixels] = found.phase
+    own = canvas[margin : margin + D, margin : margin + D]
+    model = BenchModel.from_images(bench, 1)
+    error = segment_residual(model.pistons(own), commanded).std()
+    known = reconstruct_with(model, bench, commanded)
+    assert error < known + 0.03  # as good as one who knows where the pupils stand
+    assert error < 0.15
+
+
+def reconstruct_with(model, bench, commanded):
+    from zwfs import PhaseShifted
+
+    phase = PhaseShifted(model.shifted)(model.normalise(bench.frames(commanded, 1))).phase
+    return segment_residual(model.pistons(phase), commanded).std()
+
+
+def test_bench_files_are_the_same_byte_for_byte(tmp_path):
+    bench = Bench(**SMALL)
+    contents = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        paths = camera.write_bench(tmp_path / name, bench, n_bad=10, seed=4)
+        contents.append([path.read_bytes() for path in paths.values()])
+    assert contents[0] == contents[1]
+
+
+def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
+    _, masked, bare = recorded
+    bad = np.zeros(masked.shape, bool)
+    bad[40, 50] = True
+    recording = record([image(masked, bad=bad)], [image(bare)])
+    optics = Optics(diameter=1.1)
+    found = reconstruct(measure(recording, optics), optics)
+    source = camera.CameraFile(masked[np.newaxis], "frame.fits", "ab" * 32, {"DATE-OBS": "2023-05-01"})
+    for name in ("a.fits", "b.fits"):
+        camera.write_phase(tmp_path / name, found, recording, 635.0, [source])
+    assert (tmp_path / "a.fits").read_bytes() == (tmp_path / "b.fits").read_bytes()
+    with fits.open(tmp_path / "a.fits") as units:
+        units.verify("exception")
+        header = units[0].header
+        np.testing.assert_array_equal(units[0].data, found.phase)
+        np.testing.assert_allclose(units["PHASE_NM"].data, found.phase * 635 / (2 * np.pi))
+        assert units["MASKED"].data.sum() == found.measurement.n_masked == header["NMASKED"] > 0
+        assert (header["BUNIT"], units["PHASE_NM"].header["BUNIT"]) == ("rad", "nm")
+        assert (header["WAVELEN"], header["DIMPLE"]) == (635, 1.1)
+        assert header["CORR1"] == pytest.approx(found.correlation[0])
+        assert (header["FILE1"], header["SHA1"], header["DATE-OBS"]) == ("frame.fits", "ab" * 32, "2023-05-01")
+        assert header["CREATOR"].startswith("zwfs ")
+        assert not {"DATE", "CHECKSUM"} & set(header)
+    with pytest.raises(ValueError, match="wavelength = 0"):
+        camera.write_phase(tmp_path / "c.fits", found, recording, 0)
+    assert not (tmp_path / "c.fits").exists()
+
+
+# The real bench
+
+
+@pytest.fixture(scope="module")
+def seal():
+    folder = os.environ.get(SEAL)
+    if not folder:
+        pytest.skip(f"{SEAL} is not set: the frames of the SEAL bench carry no licence and are not part of this")
+    read = lambda name: camera.read(Path(folder) / f"{name}_ZWFS_SEAL.npy")  # noqa: E731
+    frames = camera.images([read("img_onDimple")])
+    return frames, camera.images([read("img_offDimpleLeft"), read("img_offDimpleRight")])
+
+
+@pytest.mark.slow
+def test_seal_frames_are_explained(seal):
+    work = steps(*seal, Optics(), ["registration", "background", "scale"], diameter=136.0)
+    named = {step.name: step.found for step in work}
+    # Already the light of the two frames, balanced, and nothing fitted.
+    assert named["balance of the flux"].correlation == pytest.approx([0.83, 0.90], abs=0.02)
+    left, right = work[-1].found.correlation
+    assert left > 0.89
+    assert right > 0.93
+    assert work[-1].found.measurement.n_masked == 0
+    # One frame predicts the other one far better than the outlines alone let it.
+    assert np.all(work[-1].predicted > work[0].predicted + 0.1)
+
+
+@pytest.mark.slow
+def test_seal_frames_that_do_not_belong_together_are_explained_worse(seal):
+    (frame,), pupil_images = seal
+    left, right = np.hsplit(frame.counts, 2)
+    nonsense = Image(np.hstack([left, right[::-1]]), frame.bad, "nonsense")
+    names = ["registration", "background", "scale"]
+    true, false = (steps(one, pupil_images, Optics(), names, diameter=136.0)[-1] for one in ([frame], [nonsense]))
+    assert np.all(true.found.correlation > false.found.correlation + 0.03)
+    assert np.all(true.predicted > false.predicted + 0.2)

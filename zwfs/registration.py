@@ -1,0 +1,437 @@
+"""Where the pupils stand on a camera: find them, and register them to a fraction of a pixel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, optimize
+
+from zwfs import _check
+
+_REACH = 6  # pixels by which an image may be off its neighbour before sub-pixel registration
+_MARGIN = 0.25  # of the diameter: more of the dark surroundings tells nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One image of a camera.
+
+    Attributes
+    ----------
+    counts : ndarray of float, shape (ny, nx)
+        Finite everywhere; pixels that are `bad` hold the value of their nearest good neighbour.
+    bad : ndarray of bool, shape (ny, nx)
+        Pixels that are NaN, saturated, or named by a bad-pixel map.
+    name : str
+        For messages.
+    cut : bool
+        Whether the surroundings of the pupil were set to 0 by software: they tell nothing of the background.
+    """
+
+    counts: NDArray[np.float64]
+    bad: NDArray[np.bool_]
+    name: str = "image"
+    cut: bool = False
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Where a pupil stands: row and column of its centre, and its diameter, all in pixels."""
+
+    row: float
+    column: float
+    diameter: float
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Two frames and two mask-out images on the camera, and where the pupils stand on them.
+
+    Make one with `record`.
+
+    Attributes
+    ----------
+    frames, pupil_images : (Image, Image)
+        Counts, less the dark. One camera image with two pupils stands here twice.
+    pupils : (Circle, Circle)
+        On the mask-out images.
+    origins : ndarray, shape (4, 2), pixels
+        Place of the first mask-out image's pixel (0, 0) on each image: frames first, then mask-out images. What
+        registration finds.
+    background, balance : bool
+        Whether to subtract what is seen beside the pupils of the mask-out images, and whether to balance.
+    exposure : float
+        Exposure of the frames over that of the mask-out images.
+    """
+
+    frames: tuple[Image, Image]
+    pupil_images: tuple[Image, Image]
+    pupils: tuple[Circle, Circle]
+    origins: NDArray[np.float64]
+    background: bool = True
+    balance: bool = True
+    exposure: float = 1.0
+
+    @property
+    def images(self) -> tuple[Image, ...]:
+        """Frames, then mask-out images."""
+        return self.frames + self.pupil_images
+
+    @cached_property
+    def diameter(self) -> float:
+        """Diameter of the pupils in pixels: the mean of both."""
+        return sum(pupil.diameter for pupil in self.pupils) / 2
+
+    @cached_property
+    def n_pixels(self) -> int:
+        """Rows and columns of the grid of the pupil."""
+        return math.ceil(self.diameter) + 2
+
+    @cached_property
+    def corner(self) -> NDArray[np.int64]:
+        """First row and column of the grid of the pupil on the first mask-out image."""
+        first = self.pupils[0]
+        return np.round(np.array([first.row, first.column]) - (self.n_pixels - 1) / 2).astype(int)
+
+    @cached_property
+    def margin(self) -> int:
+        """Pixels around the grid of the pupil that both frames hold."""
+        room = [_MARGIN * self.diameter]
+        for image, origin in zip(self.frames, self.origins[:2], strict=True):
+            first = origin + self.corner
+            room += [*first, *(np.array(image.counts.shape) - first - self.n_pixels)]
+        if self.frames[0] is self.frames[1]:
+            # Light of the neighbour begins half-way.
+            room.append((np.abs(self.origins[1] - self.origins[0]).max() - self.n_pixels) / 2)
+        return max(0, math.floor(min(room)))
+
+    @property
+    def shifts(self) -> NDArray[np.float64]:
+        """Fractions of a pixel by which each image is moved, (4, 2)."""
+        return self.origins - np.round(self.origins)
+
+
+def record(
+    frames: Sequence[Image],
+    pupil_images: Sequence[Image],
+    *,
+    centers: Sequence[Sequence[float]] | None = None,
+    diameter: float | None = None,
+    exposure: float = 1.0,
+    subpixel: bool = True,
+    background: bool = True,
+    balance: bool = True,
+) -> Recording:
+    """Find the pupils on the images and register these to each other.
+
+    The second mask-out image is registered to the first. Frames of the same format as the mask-out images are
+    taken to stand where these do: the camera has not moved. If they are of another format, the pupils are found on
+    them, too, and each is registered to its mask-out image. That is less sure, because the phase changes what gaps
+    and edges look like.
+
+    Parameters
+    ----------
+    frames : sequence of one or two Images
+        With the mask in: one that holds both pupils, side by side or one above the other, or one for each.
+    pupil_images : sequence of one or two Images
+        The same with the mask taken out. May be cropped closer than the frames.
+    centers : sequence of two (row, column), pixels, optional
+        Centres of the pupils on the mask-out images; found if left out.
+    diameter : float, pixels, optional
+        Diameter of the pupils; found if left out.
+    exposure : float
+        Exposure of the frames over that of the mask-out images.
+    subpixel : bool
+        Register to a fraction of a pixel. If not, pupils are put on each other by their outlines, to whole pixels.
+    background, balance : bool
+        See `Recording`.
+
+    Returns
+    -------
+    Recording
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the number of images is wrong, the pupils are not found, cut, or of different size.
+    """
+    if diameter is not None:
+        diameter = _check.number("diameter", diameter, 8)
+    exposure = _check.number("exposure", exposure, 0, open_low=True)
+    for argument, images in (("frames", frames), ("pupil_images", pupil_images)):
+        if len(images) not in (1, 2) or not all(isinstance(image, Image) for image in images):
+            raise ValueError(f"{argument} holds {len(images)} things: expected one Image or two")
+    places = None if centers is None else _check.real_array("centers", centers)
+    if places is not None and places.shape != (2, 2):
+        raise ValueError(f"centers has shape {places.shape}: expected (row, column) of each of two pupils")
+    pupil_images, pupils = _locate("pupil_images", pupil_images, places, diameter)
+    same_size(pupils, " and ".join(dict.fromkeys(image.name for image in pupil_images)))
+    pairs = _pair(frames), pupil_images
+    formats = [(pair[0] is pair[1], *(image.counts.shape for image in pair)) for pair in pairs]
+    moved = formats[0] != formats[1]
+    if moved:
+        frames, seen = _locate("frames", frames, places, diameter or pupils[0].diameter)
+    else:
+        frames, seen = _pair(frames), pupils
+        for image in frames:
+            if not np.ptp(image.counts) > 0:
+                raise ValueError(f"{image.name}: every pixel is {image.counts.flat[0]:.6g}: expected light")
+    first = np.array([pupils[0].row, pupils[0].column])
+    origins = np.array([[circle.row, circle.column] for circle in (*seen, *pupils)]) - first
+    rough = Recording(frames, pupil_images, pupils, np.round(origins), background, balance, exposure)
+    return _register(rough, frames_too=moved) if subpixel else rough
+
+
+def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> tuple[Circle, ...]:
+    """Find the bright discs on an image from their outline.
+
+    A threshold between dark and bright (Otsu's) gives the outline; a circle goes through it, without the points
+    that a missing segment or a vane pushes inwards.
+
+    Parameters
+    ----------
+    image : Image
+    n_pupils : int
+        Discs that the image holds. They come back from left to right, or from top to bottom if they stand so.
+    diameter : float, pixels, optional
+        Put in the place of the one found.
+
+    Returns
+    -------
+    tuple of Circle
+
+    Raises
+    ------
+    ValueError
+        If there is no light, another number of discs, or one that is cut by the edge.
+    """
+    smooth = ndimage.gaussian_filter(image.counts, 1.0)
+    if np.ptp(smooth) <= 1e-9 * np.abs(smooth).max(initial=1e-300):
+        raise ValueError(f"{image.name}: every pixel is {smooth.flat[0]:.6g}: expected light in a pupil")
+    level = _threshold(smooth)
+    bright = ndimage.binary_opening(smooth > level, iterations=2)
+    # Gaps between segments, and vanes, divide a pupil.
+    bright = ndimage.binary_closing(np.pad(bright, 8), iterations=6)[8:-8, 8:-8]
+    labels, n_found = ndimage.label(bright)
+    areas = np.asarray(ndimage.sum_labels(bright, labels, np.arange(1, n_found + 1)))
+    largest = np.flatnonzero(areas > 0.25 * areas.max(initial=0)) + 1
+    if areas.max(initial=0) < 50 or len(largest) != n_pupils:
+        count = len(largest) if areas.max(initial=0) >= 50 else 0
+        raise ValueError(
+            f"{image.name}: {count} bright regions as large as a pupil: expected {n_pupils}; "
+            "give the positions, or look for stray light"
+        )
+    circles = [_outline(smooth, labels == label, level) for label in largest]
+    for circle in circles:
+        _not_cut(circle, image)
+    if diameter is not None:
+        circles = [replace(circle, diameter=diameter) for circle in circles]
+    places = np.array([(circle.row, circle.column) for circle in circles])
+    return tuple(circles[index] for index in np.argsort(places[:, np.argmax(np.ptp(places, axis=0))]))
+
+
+def same_size(circles: Sequence[Circle], name: str) -> None:
+    """Refuse two pupils of different size: both images must have the same magnification."""
+    small, large = sorted(circle.diameter for circle in circles)
+    if large - small > max(2.0, 0.03 * large):
+        raise ValueError(
+            f"{name}: the two pupils are {small:.1f} and {large:.1f} pixels wide: expected the same size, to 3 %"
+        )
+
+
+def register(image: NDArray, reference: NDArray, inside: NDArray, blur: float = 2.0) -> NDArray[np.float64]:
+    """Shift between two images of one pupil, to a fraction of a pixel.
+
+    Maximises the correlation of the two, after a band-pass that keeps gaps, vanes and edges but takes away noise,
+    the illumination, and the grid of a deformable mirror, whose contrast depends on the focus of the camera.
+
+    Parameters
+    ----------
+    image, reference : ndarray, shape (ny, nx)
+    inside : ndarray of bool, shape (ny, nx)
+        Points of the pupil on the reference, clear of its edge.
+    blur : float, pixels rms
+        Finest detail that counts.
+
+    Returns
+    -------
+    ndarray, shape (2,), pixels
+        How far (rows, columns) the image stands from the reference.
+
+    Raises
+    ------
+    ValueError
+        If no shift of up to 6 pixels makes a maximum.
+    """
+    wide = 4 * blur
+    detail = ndimage.gaussian_filter(image, blur) - ndimage.gaussian_filter(image, wide)
+    target = (ndimage.gaussian_filter(reference, blur) - ndimage.gaussian_filter(reference, wide))[inside]
+    spline = ndimage.spline_filter(detail, order=3, mode="nearest")
+    points = np.argwhere(inside).T.astype(float)
+
+    def mismatch(shift: NDArray) -> float:
+        moved = ndimage.map_coordinates(
+            spline, points + np.reshape(shift, (2, 1)), order=3, mode="nearest", prefilter=False
+        )
+        return -correlations(moved[np.newaxis], target[np.newaxis])[0]
+
+    steps = range(-_REACH, _REACH + 1)
+    start = min(((y, x) for y in steps for x in steps), key=lambda shift: mismatch(np.array(shift, float)))
+    if max(map(abs, start)) == _REACH:
+        raise ValueError(
+            f"the best shift of the images is {start} pixels, the end of the search: expected less than {_REACH}"
+        )
+    simplex = np.array(start) + np.array([[0, 0], [0.5, 0], [0, 0.5]])
+    options = {"xatol": 1e-3, "fatol": 1e-9, "initial_simplex": simplex}
+    return optimize.minimize(mismatch, start, method="Nelder-Mead", options=options).x
+
+
+def resample(
+    recording: Recording, images: Sequence[Image], origins: NDArray, margin: int
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Images, and their bad pixels, on the grid of the pupil with a margin around: (2, ny', nx') each."""
+    size = (recording.n_pixels + 2 * margin,) * 2
+    maps, bad = np.empty((2, *size)), np.empty((2, *size), bool)
+    for index, (image, origin) in enumerate(zip(images, origins, strict=True)):
+        start = recording.corner - margin + origin
+        grid = {"offset": start, "output_shape": size, "mode": "nearest"}
+        maps[index] = ndimage.affine_transform(image.counts, (1, 1), order=3, **grid)
+        # A bad pixel spoils the points on all its sides.
+        bad[index] = ndimage.affine_transform(image.bad.astype(float), (1, 1), order=1, **grid) > 0.01
+    return maps, bad
+
+
+def nearest_good(image: NDArray, good: NDArray) -> NDArray:
+    """An image with every pixel that is not good replaced by the nearest good one."""
+    if good.all():
+        return image
+    index = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
+    return image[tuple(index)]
+
+
+def radius(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[np.float64]:
+    """Distance of every pixel from the centre, in pixels."""
+    rows, columns = (np.arange(n) - middle for n, middle in zip(shape, center, strict=True))
+    return np.hypot(rows[:, np.newaxis], columns)
+
+
+def correlations(first: NDArray, second: NDArray) -> NDArray[np.float64]:
+    """Correlation coefficient of each row, (k, n) and (k, n) to (k,); 0 where one is constant."""
+    first, second = (rows - rows.mean(axis=1, keepdims=True) for rows in (first, second))
+    scale = np.sqrt(np.sum(first**2, axis=1) * np.sum(second**2, axis=1))
+    return np.divide(np.sum(first * second, axis=1), scale, out=np.zeros(len(scale)), where=scale > 0)
+
+
+def _threshold(image: NDArray) -> float:
+    """Otsu's level: it parts the pixels in two classes of the least variance."""
+    number, edges = np.histogram(image, 256)
+    middle = (edges[1:] + edges[:-1]) / 2
+    below, moment = np.cumsum(number), np.cumsum(number * middle)
+    above = below[-1] - below
+    between = (moment[-1] * below / below[-1] - moment) ** 2 / np.maximum(below * above, 1)
+    return float(middle[np.argmax(np.where(above > 0, between, 0))])
+
+
+def _outline(image: NDArray, region: NDArray, level: float) -> Circle:
+    """Circle through the points where rays from the middle of a region leave it."""
+    region = ndimage.binary_fill_holes(region)
+    row, column = ndimage.center_of_mass(region)
+    radius = np.sqrt(np.count_nonzero(region) / np.pi)
+    dark = np.median(image[image <= level])
+    angles = np.arange(720) * np.pi / 360
+    for _ in range(4):
+        # Nothing of a neighbour: the space between two pupils may be narrow.
+        reach = np.arange(0.7 * radius, 1.08 * radius, 0.05)
+        lines = np.array([row + np.outer(np.sin(angles), reach), column + np.outer(np.cos(angles), reach)])
+        light = ndimage.map_coordinates(image, lines, order=1, mode="constant", cval=dark)
+        # Half of what is bright on the same ray: the pupil may be lit unevenly.
+        bright = np.median(light[:, reach < 0.93 * radius], axis=1, keepdims=True)
+        above = light > (dark + bright) / 2
+        last = reach[above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)]
+        points = np.stack([row + last * np.sin(angles), column + last * np.cos(angles)], axis=1)
+        row, column, radius = _circle_through(points[above.any(axis=1)])
+    return Circle(float(row), float(column), float(2 * radius))
+
+
+def _circle_through(points: NDArray) -> tuple[float, float, float]:
+    """Least-squares circle (row, column, radius) through most of the points: outliers are left out in turn."""
+    keep = np.ones(len(points), bool)
+    for _ in range(10):
+        some = points[keep]
+        a, b, c = np.linalg.lstsq(np.c_[2 * some, np.ones(len(some))], np.sum(some**2, axis=1), rcond=None)[0]
+        radius = np.sqrt(c + a**2 + b**2)
+        distance = np.hypot(points[:, 0] - a, points[:, 1] - b) - radius
+        distance -= np.median(distance)
+        keep = np.abs(distance) <= 3 * (1.5 * np.median(np.abs(distance)) + 0.05)
+    return a, b, radius
+
+
+def _not_cut(circle: Circle, image: Image) -> None:
+    """Refuse a pupil that reaches beyond the image."""
+    ends = {
+        "top": circle.row - circle.diameter / 2 + 0.5,
+        "left": circle.column - circle.diameter / 2 + 0.5,
+        "bottom": image.counts.shape[0] - 0.5 - circle.row - circle.diameter / 2,
+        "right": image.counts.shape[1] - 0.5 - circle.column - circle.diameter / 2,
+    }
+    side, room = min(ends.items(), key=lambda item: item[1])
+    if room < -2:
+        raise ValueError(
+            f"{image.name}: the pupil at row {circle.row:.1f}, column {circle.column:.1f}, {circle.diameter:.1f} "
+            f"pixels wide, is cut off at the {side} (row 0 is at the top): expected all of it on the image"
+        )
+
+
+def _pair(images: Sequence[Image]) -> tuple[Image, Image]:
+    """Two images: the same twice if there is only one."""
+    return tuple(images) * (3 - len(images))
+
+
+def _locate(
+    argument: str, images: Sequence[Image], places: NDArray | None, diameter: float | None
+) -> tuple[tuple[Image, Image], tuple[Circle, Circle]]:
+    """Two images and the pupil on each."""
+    if places is None or argument == "frames":
+        if len(images) == 1:
+            circles = find_pupils(images[0], 2, diameter)
+        else:
+            circles = tuple(find_pupils(image, 1, diameter)[0] for image in images)
+    else:
+        if diameter is None:
+            raise ValueError("centers without a diameter: expected both, or neither")
+        circles = tuple(Circle(row, column, diameter) for row, column in places)
+        for circle, image in zip(circles, _pair(images), strict=True):
+            _not_cut(circle, image)
+    images = _pair(images)
+    if images[0] is images[1]:
+        return _pair([_extend(images[0], circles)]), circles
+    return tuple(_extend(image, [circle]) for image, circle in zip(images, circles, strict=True)), circles
+
+
+def _extend(image: Image, circles: Sequence[Circle]) -> Image:
+    """An image whose surroundings were set to 0 by software, continued by its edge: splines dislike steps."""
+    apart = [radius(image.counts.shape, (one.row, one.column)) / one.diameter for one in circles]
+    unlit = (image.counts == 0) & (np.min(apart, axis=0) > 0.48)
+    if np.count_nonzero(unlit) < 0.05 * unlit.size:
+        return image
+    return replace(image, counts=nearest_good(image.counts, ~unlit), cut=True)
+
+
+def _register(recording: Recording, frames_too: bool) -> Recording:
+    """Shift the second mask-out image to the first, and each frame to, or with, its mask-out image."""
+    images, _ = resample(recording, recording.pupil_images, recording.origins[2:], 0)
+    first = recording.pupils[0]
+    center = np.array([first.row, first.column]) - recording.corner
+    # Off the edge, which the mask makes bright or dark.
+    inside = radius(images.shape[1:], center) <= 0.45 * recording.diameter
+    shifts = np.zeros((4, 2))
+    shifts[[1, 3]] = register(images[1], images[0], inside)
+    if frames_too:
+        frames, _ = resample(recording, recording.frames, recording.origins[:2], 0)
+        shifts[:2] += [register(frame, image, inside) for frame, image in zip(frames, images, strict=True)]
+    return replace(recording, origins=recording.origins + shifts)

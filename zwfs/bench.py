@@ -378,18 +378,20 @@ class BenchModel:
         ValueError
             If the shape is wrong, or no point of a segment is finite.
         """
-        phase = _check.real_array("phase", phase)
-        _check.trailing_shape("phase", phase, self.segments.shape, "the grid of the segments")
-        flat = phase.reshape(*phase.shape[:-2], -1)[..., self.segments.ravel() > 0]
-        sums = np.where(np.isfinite(flat), np.exp(1j * np.nan_to_num(flat)), 0) @ self._members.T
-        if not np.all(np.abs(sums) > 0):
-            raise ValueError("phase is NaN all over a segment: expected finite values")
-        return np.angle(sums)
+        return segment_pistons(phase, self.segments, self.numbers)
 
-    @cached_property
-    def _members(self) -> NDArray[np.float64]:
-        numbers = self.segments[self.segments > 0]
-        return (numbers == self.numbers[:, np.newaxis]).astype(float)
+
+def segment_pistons(phase: ArrayLike, segments: NDArray, numbers: NDArray) -> NDArray[np.float64]:
+    """Piston of each segment in a phase, see `BenchModel.pistons`: on a map of segment numbers (ny, nx)."""
+    phase = _check.real_array("phase", phase)
+    _check.trailing_shape("phase", phase, segments.shape, "the grid of the segments")
+    on_segment = segments.ravel() > 0
+    flat = phase.reshape(*phase.shape[:-2], -1)[..., on_segment]
+    members = (segments.ravel()[on_segment] == numbers[:, np.newaxis]).astype(float)
+    sums = np.where(np.isfinite(flat), np.exp(1j * np.nan_to_num(flat)), 0) @ members.T
+    if not np.all(np.abs(sums) > 0):
+        raise ValueError("phase is NaN all over a segment: expected finite values")
+    return np.angle(sums)
 
 
 def segment_residual(found: ArrayLike, commanded: ArrayLike) -> NDArray[np.float64]:

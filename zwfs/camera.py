@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs.bench import Bench, Seed
+from zwfs.bench import Bench, Seed, segment_pistons, segment_residual
 from zwfs.frames import Found
 from zwfs.registration import Image, Recording, nearest_good
 from zwfs.results import write_file
@@ -194,7 +194,7 @@ def write_phase(
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
     measurement, optics = found.measurement, found.optics
     cards = [
-        ("BUNIT", "rad", "wrapped to (-pi, pi]; NaN outside and where masked"),
+        ("BUNIT", "rad", "in (-pi, pi]; NaN outside and where masked"),
         ("WAVELEN", wavelength, "[nm] wavelength"),
         ("PUPDIAM", measurement.diameter, "[pixel] diameter D of the pupil"),
         ("PIXSCALE", 1 / measurement.diameter, "[D] width of a pixel"),
@@ -298,6 +298,26 @@ def write_bench(
     paths["bad_pixels"] = Path(folder) / "bad_pixels.fits"
     write_file(paths["bad_pixels"], _fits_bytes(fits.HDUList([fits.PrimaryHDU(dead)])))
     return paths
+
+
+def bench_error(bench: Bench, commanded: ArrayLike, recording: Recording, found: Found) -> float:
+    """Rms error of the segment pistons in a phase found from frames that `write_bench` wrote, radian.
+
+    Parameters
+    ----------
+    bench : Bench
+    commanded : array_like, shape (n_segments,), radian
+    recording : Recording
+    found : Found
+    """
+    canvas = np.full(recording.pupil_images[0].counts.shape, np.nan)
+    row, column = recording.corner
+    canvas[row : row + recording.n_pixels, column : column + recording.n_pixels] = found.phase
+    # The pupil stands in the middle of the left half of the image.
+    (ny, nx), height = bench.segments.shape, canvas.shape[0]
+    top = (height - ny) // 2
+    pistons = segment_pistons(canvas[top : top + ny, top : top + nx], bench.segments, bench.numbers)
+    return float(segment_residual(pistons, commanded).std())
 
 
 def _fits() -> ModuleType:

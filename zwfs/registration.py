@@ -416,7 +416,7 @@ def _locate(
 def _extend(image: Image, circles: Sequence[Circle]) -> Image:
     """An image whose surroundings were set to 0 by software, continued by its edge: splines dislike steps."""
     apart = [radius(image.counts.shape, (one.row, one.column)) / one.diameter for one in circles]
-    unlit = (image.counts == 0) & (np.min(apart, axis=0) > 0.48)
+    unlit = (image.counts == 0) & (np.min(apart, axis=0) > 0.5)
     if np.count_nonzero(unlit) < 0.05 * unlit.size:
         return image
     return replace(image, counts=nearest_good(image.counts, ~unlit), cut=True)

@@ -1,0 +1,87 @@
+"""Figures of frames of a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from zwfs.figures import LOOKS, show_intensity, show_phase
+from zwfs.frames import Found, Step
+
+_MASKED = "#CC79A7"
+
+
+def explained(found: Found) -> Figure:
+    """Measured frames, modelled frames and their difference, all on one scale; masked pixels are marked."""
+    figure, panels = plt.subplots(2, 3, figsize=(9, 5.6))
+    top = np.quantile(found.measured[..., *found.measurement.window][:, found.measurement.good], 0.999)
+    for row, (measured, modelled, bad) in enumerate(
+        zip(found.measured, found.modelled, found.measurement.bad, strict=True)
+    ):
+        shown = show_intensity(panels[row, 0], measured, top)
+        show_intensity(panels[row, 1], modelled, top)
+        difference = show_phase(panels[row, 2], np.where(bad, np.nan, measured - modelled), top / 2)
+        for axes in panels[row, ::2]:
+            axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_MASKED, ms=1.2)
+        panels[row, 0].set_ylabel(f"image {row + 1}: correlation {found.correlation[row]:.3f}")
+    for axes, title in zip(panels[0], ("measured", "modelled", "measured − modelled"), strict=True):
+        axes.set_title(title, fontsize=10)
+    figure.colorbar(shown, ax=panels[:, :2], label="intensity", location="bottom", shrink=0.6, aspect=40)
+    figure.colorbar(
+        difference, ax=panels[:, 2], label="intensity", location="bottom", extend="both", shrink=0.9, aspect=20
+    )
+    return figure
+
+
+def phase_map(found: Found, wavelength: float) -> Figure:
+    """Phase in radian, with a second scale in nm; masked points are marked.
+
+    Parameters
+    ----------
+    found : Found
+    wavelength : float, nm
+    """
+    figure, axes = plt.subplots(figsize=(6.4, 5))
+    limit = np.nanmax(np.abs(found.phase))
+    shown = show_phase(axes, found.phase, limit)
+    masked = found.measurement.pupil.mask & ~found.measurement.good
+    if masked.any():
+        axes.plot(*np.argwhere(masked)[:, ::-1].T, "s", color=_MASKED, ms=2, label=f"{masked.sum()} masked points")
+        figure.legend(loc="outside lower center", fontsize=9)
+    bar = figure.colorbar(shown, ax=axes, label="phase (rad)")
+    nm = bar.ax.secondary_yaxis(
+        -0.9, functions=(lambda rad: rad * wavelength / (2 * np.pi), lambda nm: nm * 2 * np.pi / wavelength)
+    )
+    nm.set_ylabel("wavefront (nm)")
+    return figure
+
+
+def gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> Figure:
+    """Correlation, prediction of the other frame, and error where the truth is known, step by step.
+
+    Parameters
+    ----------
+    work : sequence of Step
+    errors : sequence of float, radian rms, optional
+        Of each step.
+    """
+    figure, panels = plt.subplots(1, 2 + (errors is not None), figsize=(9, 3.6), sharey=True)
+    rows = np.arange(len(work))[::-1]
+    looks = LOOKS["PhaseShifted"], LOOKS["Arcsine"]
+    for axes, title, values in (
+        (panels[0], "correlation of measured\nand modelled frames", [step.found.correlation for step in work]),
+        (panels[1], "correlation with the prediction\nfrom the other frame", [step.predicted for step in work]),
+    ):
+        for index, look in enumerate(looks):
+            points = np.array(values)[:, index]
+            axes.plot(points, rows, marker=look.marker, ls=look.line, color=look.color, label=f"image {index + 1}")
+        axes.set(xlabel=title)
+    if errors is not None:
+        panels[2].plot(errors, rows, "o-", color="#000000")
+        panels[2].set(xlabel="error of the segments\n(rad rms)", xlim=(0, None))
+    panels[0].set_yticks(rows, [step.name for step in work])
+    panels[0].legend(fontsize=9)
+    return figure

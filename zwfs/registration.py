@@ -383,7 +383,7 @@ def _not_cut(circle: Circle, image: Image) -> None:
     if room < -2:
         raise ValueError(
             f"{image.name}: the pupil at row {circle.row:.1f}, column {circle.column:.1f}, {circle.diameter:.1f} "
-            f"pixels wide, is cut off at the {side} (row 0 is at the top): expected all of it on the image"
+            f"pixels wide, is cut off at the {side} (row 0 is the top): expected all of it on the image"
         )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import api
 import cards
 import claims
+import live
 from runner import Project, digest, digest_files, read, replace, swap, to_bytes
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
@@ -70,7 +71,7 @@ def build_book(project: Project) -> bool:
     """
     html, record = project.build / "html", project.build / "html.json"
     files = staged_files(project)
-    code = [Path(module.__file__) for module in (sys.modules[__name__], api, cards, claims)]
+    code = [Path(module.__file__) for module in (sys.modules[__name__], api, cards, claims, live)]
     inputs = {f"{file.parent.name}/{file.name}": file for file in (*code, *project.shared_inputs())}
     origin = {notebook.stem: cards.versions_of(project, notebook.stem) for notebook in project.sources()}
     commit = cards.commit_of(project.root)
@@ -90,6 +91,8 @@ def build_book(project: Project) -> bool:
         _write(source, claims.fragments(project.executed))
     if api.PAGE in files:
         _write(source, api.fragments())
+    if live.PAGE in files:
+        _write(source, {live.DATA: live.script()})
     with tempfile.TemporaryDirectory(dir=project.build, prefix="building-") as scratch:
         _jupyter_book(source, Path(scratch))
         record.unlink(missing_ok=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs.lowrank import Operator, factorise
+from zwfs.lowrank import Factors, Operator, factorise
 from zwfs.masks import Mask
 from zwfs.pupil import Pupil
 
@@ -106,9 +106,9 @@ class ZernikeSensor:
         return self._factors.pupil.rank
 
     @property
-    def cores(self) -> NDArray[np.complex128]:
-        """What makes the reference waves' coefficients out of those of the field, shape (n_masks, q, r)."""
-        return self._factors.core
+    def factors(self) -> Factors:
+        """Matrices of `eq-low-rank`, common to all masks but for the cores: to compute with them elsewhere."""
+        return self._factors
 
     def operator(self, dtype: np.dtype) -> Operator:
         """Low-rank operator in float32 or float64, for those who write reconstructors; made once, then kept."""

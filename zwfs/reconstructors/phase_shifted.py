@@ -73,7 +73,7 @@ class PhaseShifted:
         self._pairs = tuple(combinations(range(sensor.n_masks), 2))
         self._accelerate = _check.flag("accelerate", accelerate)
         self._refuse_equal_masks()
-        self._shared = _SharedWave.of(sensor.cores)
+        self._shared = _SharedWave.of(sensor.factors.core)
         flat = sensor.intensity(np.zeros((1, *sensor.pupil.shape)), self.settings.amplitude[np.newaxis])
         self._incoming = float(sensor.n_masks * np.sum(self.settings.amplitude**2))
         self._flat_loss = float(self._loss(flat)[0])
@@ -144,7 +144,7 @@ class PhaseShifted:
         if dtype not in self._constants:
             sensor, incoming = self.settings.sensor, self.settings.amplitude
             psi = split(np.zeros((1, *incoming.shape)), incoming)
-            cores, weights, offset = sensor.cores, np.ones((1, 1)), incoming**2
+            cores, weights, offset = sensor.factors.core, np.ones((1, 1)), incoming**2
             if self._shared is not None:
                 cores, weights = self._shared.core[np.newaxis], self._shared.weights
                 offset = weights.sum(axis=1)[:, np.newaxis, np.newaxis] * offset

@@ -1,0 +1,85 @@
+"""What the script of the live sensor is told by zwfs: its dimples, its screens and the colours of the figures."""
+
+import base64
+import json
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from numpy.typing import NDArray
+
+import zwfs
+from zwfs.figures import INTENSITY_MAP, PHASE_MAP
+from zwfs.lowrank import Factors, Plane
+
+PAGE = "book/live.md"
+DATA = "book/_static/live-data.js"
+
+N_PIXELS = 64
+N_MODES = 200
+N_SEEDS = 50
+DIAMETERS = (0.5, 2.5)  # lambda/D
+# The dimple's core is an entire function of its diameter: 14 samples of it give all others to 2e-9.
+N_DIAMETERS = 14
+TOLERANCE = 1e-8  # of the reference waves; single precision, in which they are handed over, is not much finer
+
+
+def script() -> str:
+    """Script that declares the data, for pages that may not fetch a file."""
+    return f"window.zwfsLiveData = {json.dumps(data())};\n"
+
+
+def data() -> dict[str, Any]:
+    """Everything that book/_static/live-model.js computes with, ready for JSON."""
+    pupil = zwfs.Pupil.circular(N_PIXELS)
+    diameters, factors = dimples(pupil)
+    return {
+        "inside": _encode(pupil.mask.astype(np.uint8)),
+        "diameters": diameters.tolist(),
+        "pupil": _plane(factors.pupil.astype(np.float32)),
+        "detector": _plane(factors.detector.astype(np.float32)),
+        "cores": [_encode(-core.real.astype(np.float32)) for core in factors.core],
+        "screens": _plane(screens(pupil)),
+        "colors": {
+            "phase": _encode(colormaps[PHASE_MAP](np.arange(256), bytes=True)),
+            "intensity": _encode(colormaps[INTENSITY_MAP](np.arange(256), bytes=True)),
+        },
+    }
+
+
+def dimples(pupil: zwfs.Pupil) -> tuple[NDArray, Factors]:
+    """Chebyshev points in the range of diameters, and the factors of dark dimples of these diameters.
+
+    A dark dimple takes away the light that goes through it: its reference wave is minus that light, and its core
+    minus the core of the kernel without the factor exp(i theta) - 1. It is real.
+    """
+    low, high = DIAMETERS
+    angles = np.pi * (np.arange(N_DIAMETERS) + 0.5) / N_DIAMETERS
+    diameters = (low + high) / 2 - (high - low) / 2 * np.cos(angles)
+    dark = [zwfs.Dimple(diameter, phase=0.0, amplitude=0.0) for diameter in diameters]
+    return diameters, zwfs.ZernikeSensor(pupil, *dark, tolerance=TOLERANCE).factors
+
+
+def screens(pupil: zwfs.Pupil) -> Plane:
+    """The screens of unit rms of the seeds from 1 on, as combinations of products of Legendre polynomials.
+
+    Zernike modes are polynomials in x and y, whose degree is at most the radial order of the last mode. In the
+    corners of the square, where there is no pupil, they are huge: the coefficients need double precision.
+    """
+    degree = zwfs.noll_to_nm(N_MODES + 1)[0]
+    modes = zwfs.zernike_basis(pupil, N_MODES)
+    maps = np.concatenate([zwfs.power_law_screens(modes, 1.0, 1, seed=1 + k) for k in range(N_SEEDS)])
+    along_y, along_x = (np.polynomial.legendre.legvander(2 * axis, degree).T for axis in (pupil.y, pupil.x))
+    products = np.einsum("iy,jx->ijyx", along_y, along_x).reshape(-1, *pupil.shape)
+    combine = np.linalg.lstsq(pupil.gather(products).T, pupil.gather(maps).T)[0]
+    return Plane(along_y, along_x, combine)
+
+
+def _plane(plane: Plane) -> dict[str, Any]:
+    return {"y": _encode(plane.along_y), "x": _encode(plane.along_x), "combine": _encode(plane.combine)}
+
+
+def _encode(array: NDArray) -> dict[str, Any]:
+    """Shape, type, and the values in base64, little-endian."""
+    values = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
+    return {"shape": array.shape, "type": array.dtype.name, "values": base64.b64encode(values).decode()}

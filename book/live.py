@@ -18,10 +18,10 @@ DATA = "book/_static/live-data.js"
 N_PIXELS = 64
 N_MODES = 200
 N_SEEDS = 50
-DIAMETERS = (0.5, 2.5)  # lambda/D
-# The dimple's core is an entire function of its diameter: 14 samples of it give all others to 2e-9.
+DIAMETERS = (0.5, 3.0)  # lambda/D
+# The dimple's core is an entire function of its diameter: 14 samples of it give all others to 1e-7.
 N_DIAMETERS = 14
-TOLERANCE = 1e-8  # of the reference waves; single precision, in which they are handed over, is not much finer
+TOLERANCE = 1e-7  # of the reference waves; single precision, in which they are handed over, is not much finer
 
 
 def script() -> str:

@@ -107,8 +107,8 @@ def test_shared_wave_solves_the_general_system(pupil, screens, phases):
 
 
 def test_masks_of_different_size_share_no_wave(pupil):
-    assert _SharedWave.of(pair(pupil).cores) is not None
-    assert _SharedWave.of(ZernikeSensor(pupil, Dimple(1.06, 1.5), Dimple(1.07, -1.5)).cores) is None
+    assert _SharedWave.of(pair(pupil).factors.core) is not None
+    assert _SharedWave.of(ZernikeSensor(pupil, Dimple(1.06, 1.5), Dimple(1.07, -1.5)).factors.core) is None
 
 
 def test_residual_is_that_of_the_frames_given(pupil, screens):

@@ -21,7 +21,8 @@ window.zwfsLive = (() => {
   }
 
   function transpose({ rows, columns, values }) {
-    return { rows: columns, columns: rows, values: values.map((_, k) => values[(k % rows) * columns + ((k / rows) | 0)]) };
+    const place = (k) => (k % rows) * columns + Math.floor(k / rows);
+    return { rows: columns, columns: rows, values: values.map((_, k) => values[place(k)]) };
   }
 
   function multiply({ rows, columns: inner, values: a }, { columns, values: b }) {
@@ -190,6 +191,8 @@ window.zwfsLive = (() => {
     return mean[0] ** 2 + mean[1] ** 2;
   }
 
+  let kept = {}; // the core of the last diameter
+
   /* settings: rms (radian), seed (1 to nSeeds), diameter (lambda/D), shifts (two, radian), photons (in each image;
      Infinity: no noise), iterations. Maps are rows of ny x nx numbers, 0 outside the pupil:
      phase         input, radian
@@ -200,7 +203,6 @@ window.zwfsLive = (() => {
      residual      estimate less input, on the circle and without piston, radian
      errors        rms of the residual at the start and after each iteration, radian
      unsolved      points without a solution in the last iteration */
-  let kept = {};
   function compute({ rms, seed, diameter, shifts, photons, iterations }) {
     if (kept.diameter !== diameter) kept = { diameter, core: coreOf(diameter) };
     const { core } = kept;
@@ -213,7 +215,8 @@ window.zwfsLive = (() => {
 
     const estimate = phasors(new Float64Array(ny * nx));
     if (improve(phasors(phase.map(() => 0)), core, frames, steps) === nInside) {
-      return { ...made, singular: true, estimate: null, piston: null, residual: null, errors: null, unsolved: null };
+      const none = { estimate: null, piston: null, residual: null, errors: null, unsolved: null };
+      return { ...made, singular: true, ...none };
     }
     let found = compare(estimate, truth);
     const errors = [found.rms];

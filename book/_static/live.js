@@ -1,11 +1,12 @@
-// The page of the live sensor (live.md): sliders in, maps and numbers out. What is shown is computed by live-model.js.
+// The page of the live sensor (live.md): sliders in, maps and numbers out. live-model.js computes what is shown.
 "use strict";
 
 (() => {
   const { compute, colors, inside, shape, sizes } = window.zwfsLive;
   const PHASE_LIMITS = [0.2, 0.5, 1, 2, Math.PI];
-  const ERROR_LIMITS = [1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1, Math.PI];
-  const INTENSITY_LIMITS = [2, 4, 8, 16, 32];
+  const ERROR_LIMITS = [-6, -5, -4, -3, -2, -1, 0].flatMap((n) => [1, 2, 5].map((digit) => digit * 10 ** n));
+  const INTENSITY_LIMITS = [1, 1.5, 2, 3, 4, 6, 8, 12, 16];
+  const BRIGHT = 0.995; // part of the pixels that the colours of the images tell apart
   const SMALLEST = 1e-6; // errors below it are rounding and differ from machine to machine
   const PAUSE = 800; // ms without a change before the numbers are read out
 
@@ -15,15 +16,18 @@
   const signed = (number, digits) => `${number < 0 ? "−" : "+"}${Math.abs(number).toFixed(digits)}`;
 
   function power(number) {
-    const superscript = [...String(Math.round(Math.log10(number)))].map((c) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[c] ?? "⁻").join("");
-    return `10${superscript}`;
+    const exponent = String(Math.round(Math.log10(number)));
+    return `10${[...exponent].map((digit) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[digit] ?? "⁻").join("")}`;
   }
 
-  function scientific(number) {
-    if (number >= 0.01) return number.toPrecision(3);
+  function scientific(number, decimals = 1, times = " × ") {
+    const [digits, exponent] = number.toExponential(decimals).split("e");
+    return `${digits}${times}${power(10 ** Number(exponent))}`;
+  }
+
+  function error(number) {
     if (number < SMALLEST) return `< ${power(SMALLEST)}`;
-    const [digits, exponent] = number.toExponential(1).split("e");
-    return `${digits} × ${power(10 ** Number(exponent))}`;
+    return number < 0.01 ? scientific(number) : number.toPrecision(3);
   }
 
   // What a slider says beside itself, and what a screen reader says.
@@ -34,14 +38,9 @@
     diameter: (v) => [`${v.toFixed(2)} λ/D`, `${v.toFixed(2)} lambda over D`],
     "shift-a": (v) => [`${signed(v, 2)} π`, `${v.toFixed(2)} pi`],
     "shift-b": (v) => [`${signed(v, 2)} π`, `${v.toFixed(2)} pi`],
-    photons: () => (photons() === Infinity ? ["no noise"] : [scientificPhotons(), photons().toPrecision(2)]),
+    photons: () => (photons() === Infinity ? ["no noise"] : [scientific(photons())]),
     iterations: (v) => [`${v}`],
   };
-
-  function scientificPhotons() {
-    const [digits, exponent] = photons().toExponential(1).split("e");
-    return `${digits} × ${power(10 ** Number(exponent))}`;
-  }
 
   function caption(slider) {
     const [seen, spoken] = captions[slider.id.replace("live-", "")](Number(slider.value));
@@ -50,7 +49,7 @@
   }
 
   const limitOf = (limits, size) => limits.find((limit) => limit >= size) ?? limits.at(-1);
-  const named = (limit) => (limit === Math.PI ? "π" : limit < 0.1 ? power(limit) : String(limit));
+  const named = (limit) => (limit === Math.PI ? "π" : limit < 0.01 ? scientific(limit, 0, "·") : String(limit));
 
   // Paint a map (row 0 at the bottom), transparent outside the pupil unless all of it is shown.
   function paint(name, map, palette, low, high, points = inside) {
@@ -76,15 +75,15 @@
     paint(name, map ?? [], palette, low, high, map ? points : []);
   }
 
-  const phasePanel = (name, map, limit) =>
-    panel(name, map, colors.phase, [`−${named(limit)}`, "rad", `+${named(limit)}`], -limit, limit);
+  const phasePanel = (name, map, limit, unit) =>
+    panel(name, map, colors.phase, [`−${named(limit)}`, unit, `+${named(limit)}`], -limit, limit);
 
   const all = Array.from({ length: shape[0] * shape[1] }, (_, k) => k);
   const imagePanel = (name, map, limit) =>
     panel(name, map, colors.intensity, ["0", "", String(limit)], 0, limit, all);
 
   function curve(errors) {
-    const places = (errors ?? []).map((error, i) => `${i},${1 - Math.log10(Math.max(error, SMALLEST))}`);
+    const places = (errors ?? []).map((size, i) => `${i},${1 - Math.log10(Math.max(size, SMALLEST))}`);
     document.querySelector(".live-line").setAttribute("points", places.join(" "));
     document.querySelector(".live-dot").setAttribute("d", places.length ? `M${places.at(-1)}h0` : "");
   }
@@ -92,17 +91,18 @@
   const wrapped = (angle) => angle - 2 * Math.PI * Math.round(angle / (2 * Math.PI));
 
   function describe(made, settings) {
-    const shown = `${scientific(settings.rms)} radian rms`;
+    const shown = `${settings.rms.toFixed(2)} radian rms`;
     find("phase").setAttribute("aria-label", `Input phase, ${shown}`);
     for (const [k, letter] of ["a", "b"].entries()) {
       const largest = made.frames[k].reduce((a, b) => Math.max(a, b));
-      find(`image-${letter}`).setAttribute("aria-label", `Image of mask ${letter}, brightest ${largest.toFixed(2)}`);
+      find(`image-${letter}`).setAttribute("aria-label", `Image ${letter}, brightest ${largest.toFixed(2)}`);
     }
-    const error = made.singular ? "no reconstruction: singular" : `error ${scientific(made.errors.at(-1))} radian rms`;
-    find("found").setAttribute("aria-label", `Phase found, ${error}`);
-    find("error").setAttribute("aria-label", `Error of the phase found, ${error}`);
-    find("curve").setAttribute("aria-label", `Error by iteration, ${error} after ${settings.iterations}`);
-    find("announced").textContent = `Input ${shown}, ${error} after ${settings.iterations} iterations`;
+    const last = made.singular ? null : made.errors.at(-1);
+    const outcome = made.singular ? "no reconstruction: singular" : `error ${error(last)} radian rms`;
+    find("found").setAttribute("aria-label", `Phase found, ${outcome}`);
+    find("error").setAttribute("aria-label", `Error of the phase found, ${outcome}`);
+    find("curve").setAttribute("aria-label", `Error by iteration, ${outcome} after ${settings.iterations}`);
+    find("announced").textContent = `Input ${shown}, ${outcome} after ${settings.iterations} iterations`;
   }
 
   let pause;
@@ -120,24 +120,24 @@
     const time = performance.now() - start;
 
     const limit = limitOf(PHASE_LIMITS, 2.6 * settings.rms);
-    phasePanel("phase", made.phase, limit);
-    phasePanel("found", made.estimate?.map((angle) => wrapped(angle - made.piston)), limit);
-    phasePanel("error", made.residual, limitOf(ERROR_LIMITS, 3 * (made.errors?.at(-1) ?? 0)));
-    const brightest = made.frames.flatMap((frame) => [...frame]).sort((a, b) => a - b);
-    const top = limitOf(INTENSITY_LIMITS, brightest[Math.floor(0.998 * brightest.length)]);
+    phasePanel("phase", made.phase, limit, "rad");
+    phasePanel("found", made.estimate?.map((angle) => wrapped(angle - made.piston)), limit, "rad");
+    phasePanel("error", made.residual, limitOf(ERROR_LIMITS, 2.5 * (made.errors?.at(-1) ?? 0)), "");
+    const sorted = Float64Array.from(made.frames.flatMap((frame) => [...frame])).sort();
+    const top = limitOf(INTENSITY_LIMITS, sorted[Math.floor(BRIGHT * sorted.length)]);
     imagePanel("image-a", made.frames[0], top);
     imagePanel("image-b", made.frames[1], top);
     curve(made.errors);
 
     find("input-rms").textContent = `${settings.rms.toFixed(2)} rad rms`;
     find("strehl").textContent = made.strehl.toFixed(3);
-    find("error-rms").textContent = made.singular ? "none: singular" : `${scientific(made.errors.at(-1))} rad`;
+    find("error-rms").textContent = made.singular ? "singular" : `${error(made.errors.at(-1))} rad`;
     find("unsolved").textContent = made.singular ? "all" : `${made.unsolved}`;
     find("time").textContent = `${time.toFixed(1)} ms`;
     find("says").textContent = made.singular
       ? "Singular: for these two shifts the determinant is 0 at every point. No reconstruction."
-      : `Computing two images and ${settings.iterations} iterations at ${inside.length} points. The light through ` +
-        `the dimple is made of ${sizes.rank} numbers, by ${sizes.functions} functions along each axis.`;
+      : `Computing two images and ${settings.iterations} iterations at ${inside.length} points. The light ` +
+        `through a dimple is made of ${sizes.rank} numbers, by ${sizes.functions} functions along each axis.`;
     clearTimeout(pause);
     pause = setTimeout(() => describe(made, settings), PAUSE);
   }
@@ -164,8 +164,9 @@
   let running;
   function run(on) {
     clearInterval(running);
-    running = on ? setInterval(() => set(find("seed"), (value("seed") % Number(find("seed").max)) + 1), 500) : null;
-    find("run").textContent = on ? "Stop" : "Run through seeds";
+    const next = () => set(find("seed"), (value("seed") % Number(find("seed").max)) + 1);
+    running = on ? setInterval(next, 500) : null;
+    find("run").textContent = on ? "Stop" : "Run seeds";
   }
 
   function set(slider, wanted) {
@@ -181,9 +182,8 @@
   });
 
   for (const bar of document.querySelectorAll("#live canvas.live-bar")) {
-    const phase = !bar.parentElement.querySelector("[id^=live-image]");
     const image = bar.getContext("2d").createImageData(256, 1);
-    image.data.set(phase ? colors.phase : colors.intensity);
+    image.data.set(bar.parentElement.querySelector("[id^=live-image]") ? colors.intensity : colors.phase);
     bar.getContext("2d").putImageData(image, 0, 0);
   }
   update();

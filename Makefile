@@ -14,13 +14,19 @@ export MKL_NUM_THREADS = 1
 export VECLIB_MAXIMUM_THREADS = 1
 
 .DELETE_ON_ERROR:
-.PHONY: help book test figures rerun lint bench lock clean
+.PHONY: help book pdf lab test figures rerun lint bench lock clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
 
 book: $(READY) ## run the notebooks that changed and build the book in _build/html
 	@$(BIN)/python book/build.py book
+
+pdf: $(READY) ## build the book and its PDF, _build/html/zwfs.pdf: needs Chromium
+	@$(BIN)/python book/build.py pdf
+
+lab: $(READY) ## open the notebooks in JupyterLab
+	$(BIN)/jupyter lab notebooks
 
 test: $(READY) ## test the package, the pipeline and the committed notebooks
 	$(BIN)/python -m pytest tests --benchmark-disable
@@ -41,7 +47,7 @@ bench: $(READY) ## time the sensor and the reconstructors
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
 
 lock: $(BIN)/uv ## pin the newest allowed version of every dependency
-	$(UV) pip compile pyproject.toml --extra book --extra test --upgrade \
+	$(UV) pip compile pyproject.toml --extra book --extra lab --extra test --upgrade \
 		--universal --python-version 3.11 --fork-strategy fewest --generate-hashes --no-emit-index-url \
 		--custom-compile-command "make lock" --output-file $(LOCK)
 

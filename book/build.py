@@ -6,9 +6,11 @@ import sys
 from pathlib import Path
 
 import compare
+import printing
 import runner
 from claims import ClaimError
 from pages import BookError, build_book
+from printing import PrintError
 from runner import NotebookError, Project
 
 
@@ -16,8 +18,20 @@ def book(project: Project) -> int:
     """Run the notebooks that changed and build the book."""
     runner.run(project)
     built = build_book(project)
-    index = project.build.relative_to(project.root) / "html" / "index.html"
-    print(f"book: {'built' if built else 'unchanged'}\nopen {index}")
+    html = project.build.relative_to(project.root) / "html"
+    print(f"book: {'built' if built else 'unchanged'}\nopen {html / 'index.html'}")
+    if not printing.find_chromium():
+        print(f"without the PDF: {printing.MISSING}")
+    return 0
+
+
+def pdf(project: Project) -> int:
+    """Build the book, and insist on its PDF."""
+    if not printing.find_chromium():
+        raise PrintError(printing.MISSING)
+    runner.run(project)
+    build_book(project)
+    print(f"open {project.build.relative_to(project.root) / 'html' / printing.NAME}")
     return 0
 
 
@@ -62,7 +76,7 @@ def check_notebook(project: Project, name: str) -> list[str]:
     return [f"notebooks/{name}.ipynb: {line}" for line in found]
 
 
-COMMANDS = {command.__name__: command for command in (book, run, figures, check)}
+COMMANDS = {command.__name__: command for command in (book, pdf, run, figures, check)}
 
 
 def main() -> int:
@@ -78,7 +92,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return command(Project(Path(__file__).resolve().parent.parent))
-    except (NotebookError, BookError, ClaimError) as failure:
+    except (NotebookError, BookError, ClaimError, PrintError) as failure:
         print(failure, file=sys.stderr)
     except KeyboardInterrupt:
         print("interrupted: the earlier results are untouched", file=sys.stderr)

@@ -14,6 +14,7 @@ import api
 import cards
 import claims
 import live
+import printing
 from runner import Project, digest, digest_files, read, replace, swap, to_bytes
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
@@ -66,16 +67,20 @@ def build_book(project: Project) -> bool:
     ------
     BookError
         Sphinx gave a warning or an error. The earlier book stays.
+    PrintError
+        The PDF would not be whole. The earlier book stays.
     ClaimError
         A claim is judged by a number that no notebook gives.
     """
     html, record = project.build / "html", project.build / "html.json"
     files = staged_files(project)
-    code = [Path(module.__file__) for module in (sys.modules[__name__], api, cards, claims, live)]
-    inputs = {f"{file.parent.name}/{file.name}": file for file in (*code, *project.shared_inputs())}
+    chromium = printing.find_chromium() if printing.STYLE in files else None
+    code = [Path(module.__file__) for module in (sys.modules[__name__], api, cards, claims, live, printing)]
+    about = [file for file in (project.root / "pyproject.toml",) if file.exists()]
+    inputs = {f"{file.parent.name}/{file.name}": file for file in (*code, *about, *project.shared_inputs())}
     origin = {notebook.stem: cards.versions_of(project, notebook.stem) for notebook in project.sources()}
     commit = cards.commit_of(project.root)
-    told = [sys.version_info[:2], commit, origin]
+    told = [sys.version_info[:2], bool(chromium), commit, origin]
     made_from = digest([digest_files(files | inputs).encode(), json.dumps(told, sort_keys=True).encode()])
     try:
         if html.is_dir() and json.loads(record.read_bytes()) == made_from:
@@ -93,10 +98,15 @@ def build_book(project: Project) -> bool:
         _write(source, api.fragments())
     if live.PAGE in files:
         _write(source, {live.DATA: live.script()})
+    if printing.STYLE in files:
+        _write(source, {printing.LINK: printing.link(chromium)})
     with tempfile.TemporaryDirectory(dir=project.build, prefix="building-") as scratch:
         _jupyter_book(source, Path(scratch))
+        built = Path(scratch) / "_build" / "html"
+        if chromium:
+            (built / printing.NAME).write_bytes(printing.print_book(project.root, built, chromium))
         record.unlink(missing_ok=True)
-        swap(Path(scratch) / "_build" / "html", html, Path(scratch) / "earlier")
+        swap(built, html, Path(scratch) / "earlier")
     replace(record, json.dumps(made_from).encode())
     return True
 

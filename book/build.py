@@ -13,6 +13,8 @@ from pages import BookError, build_book
 from printing import PrintError
 from runner import NotebookError, Project
 
+FRONT_FIGURE = "fig03_dynamic_range"  # stands in the README, as book/_static/front.png
+
 
 def book(project: Project) -> int:
     """Run the notebooks that changed and build the book."""
@@ -45,27 +47,50 @@ def figures(project: Project) -> int:
     """Replace the committed notebooks by freshly run ones."""
     runner.run(project)
     for name in refresh(project):
-        print(f"notebooks/{name} is new")
+        print(f"{name} is new")
     return 0
 
 
 def refresh(project: Project) -> list[str]:
-    """Copy the executed notebooks over the committed ones, and name those that changed."""
+    """Copy the executed notebooks, and the front figure, over the committed ones; name those that changed."""
     changed = []
-    for committed in project.sources():
-        content = (project.executed / committed.name).read_bytes()
-        if content != committed.read_bytes():
+    for committed, fresh in committed_files(project).items():
+        content = fresh.read_bytes()
+        if not committed.exists() or content != committed.read_bytes():
             runner.replace(committed, content)
-            changed.append(committed.name)
+            changed.append(str(committed.relative_to(project.root)))
     return changed
 
 
+def committed_files(project: Project) -> dict[Path, Path]:
+    """Every committed file that a run makes, with the file that the last run made."""
+    files = {committed: project.executed / committed.name for committed in project.sources()}
+    picture = project.executed / f"{FRONT_FIGURE}.files" / f"{FRONT_FIGURE}.png"
+    if picture.exists():
+        files[project.root / "book" / "_static" / "front.png"] = picture
+    return files
+
+
 def check(project: Project) -> int:
-    """Compare the committed notebooks with a fresh run."""
+    """Compare the committed notebooks and the front figure with a fresh run."""
     runner.run(project)
     found = [line for notebook in project.sources() for line in check_notebook(project, notebook.stem)]
-    print("\n".join(found) or "the committed notebooks agree with the fresh run")
+    found += check_front(project)
+    print("\n".join(found) or "what is committed agrees with the fresh run")
     return 1 if found else 0
+
+
+def check_front(project: Project) -> list[str]:
+    """Say how the committed front figure differs from its fresh run."""
+    pictures = {old: new for old, new in committed_files(project).items() if old.suffix == ".png"}
+    found = []
+    for old, new in pictures.items():
+        name = old.relative_to(project.root).as_posix()
+        if not old.exists():
+            found.append(f"{name} is not there: make figures")
+        elif told := compare.picture_difference(old.read_bytes(), new.read_bytes(), compare.Tolerance()):
+            found.append(f"{name}: {told}")
+    return found
 
 
 def check_notebook(project: Project, name: str) -> list[str]:

@@ -29,6 +29,12 @@ def test_committed_notebook_agrees_with_a_fresh_run(fresh_run, name):
     assert not found, "\n".join(found)
 
 
+@pytest.mark.slow
+def test_committed_front_figure_agrees_with_a_fresh_run(fresh_run):
+    assert build.check_front(PROJECT) == []
+    assert "(book/_static/front.png)" in (PROJECT.root / "README.md").read_text("utf-8")
+
+
 def png(value=255, changed=0, shape=(40, 50)):
     pixels = np.full((*shape, 3), value, dtype=np.uint8)
     pixels[:changed, 0] = 0

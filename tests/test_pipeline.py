@@ -1,5 +1,6 @@
 """The pipeline, on notebooks of a few lines in folders of their own."""
 
+import io
 import json
 import os
 import shutil
@@ -15,6 +16,7 @@ import pages
 import pytest
 import runner
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+from PIL import Image
 from runner import NotebookError, Project
 
 BOOK = Path(runner.__file__).parent
@@ -30,6 +32,12 @@ def write(project, name, *cells, parameters="n = 2  # pixels\nwidth = 1.5  # met
 def leave(name, text):
     """Write a cell that leaves a file among the results."""
     return f"import os, pathlib\n(pathlib.Path(os.environ['ZWFS_RESULTS']) / '{name}').write_text('{text}');"
+
+
+def png_of(value):
+    file = io.BytesIO()
+    Image.new("RGB", (40, 30), (value, value, value)).save(file, "png")
+    return file.getvalue()
 
 
 def run(project, **options):
@@ -89,10 +97,24 @@ def test_unchanged_notebooks_are_not_run_again(ran):
 
 
 def test_refreshed_notebooks_are_current_and_agree(ran):
-    assert build.refresh(ran) == ["first.ipynb", "second.ipynb", "third.ipynb"]
+    names = [f"notebooks/{name}.ipynb" for name in ("first", "second", "third")]
+    assert build.refresh(ran) == names
     assert build.refresh(ran) == []
     assert run(ran)[0] == []
     assert build.check_notebook(ran, "first") == build.check_notebook(ran, "second") == []
+
+
+def test_front_figure_is_refreshed_and_checked(ran, monkeypatch):
+    picture = ran.executed / "third.files" / "third.png"
+    runner.replace(picture, png_of(255))
+    monkeypatch.setattr(build, "FRONT_FIGURE", "third")
+    assert build.check_front(ran) == ["book/_static/front.png is not there: make figures"]
+    assert "book/_static/front.png" in build.refresh(ran)
+    assert build.check_front(ran) == []
+    runner.replace(picture, png_of(250))
+    assert build.check_front(ran) == [
+        "book/_static/front.png: the pictures differ by 4.33 of 255 rms, and 0.5 is allowed"
+    ]
 
 
 def test_committed_notebook_without_outputs_is_refused(ran):

@@ -1,0 +1,185 @@
+"""All files that name a version of Python or of a package agree."""
+
+import re
+import sys
+import tomllib
+from importlib.metadata import version
+from itertools import chain
+from pathlib import Path
+
+import nbformat
+import pybtex.database
+import pytest
+import yaml
+from packaging.markers import default_environment
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+import zwfs
+
+ROOT = Path(__file__).parent.parent
+LOCK = "environment/requirements.lock"
+INSTALLERS = [
+    "environment/environment.yml",
+    "environment/Dockerfile",
+    ".binder/requirements.txt",
+    ".binder/postBuild",
+    ".ci/run",
+    ".github/workflows/ci.yml",
+    "Makefile",
+]
+
+
+def read(name):
+    return (ROOT / name).read_text("utf-8")
+
+
+PROJECT = tomllib.loads(read("pyproject.toml"))["project"]
+CONFIG = yaml.safe_load(read("_config.yml"))
+PINS = re.findall(r"(?m)^([\w.-]+)==([^\s;]+)", read(LOCK))
+LOCKED = {canonicalize_name(name): version for name, version in PINS}
+
+
+def found(pattern, name):
+    """All that a pattern finds in a file, and it finds something."""
+    matches = re.findall(pattern, read(name))
+    assert matches, f"{name} no longer says {pattern}"
+    return set(matches)
+
+
+def supported():
+    """The versions of Python that the package says it runs on, in order."""
+    named = [re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", line) for line in PROJECT["classifiers"]]
+    return sorted((match[1] for match in named if match), key=Version)
+
+
+def test_oldest_python_is_the_same_everywhere():
+    oldest = supported()[0]
+    assert PROJECT["requires-python"] == f">={oldest}"
+    assert found(r"--python-version (\S+)", "Makefile") == {oldest}
+    assert found(r"zwfs needs Python (\S+)", "Makefile") == {oldest}
+    assert found(r"sys.version_info < \((\d+), (\d+)\)", "Makefile") == {tuple(oldest.split("."))}
+    assert found(r'target-version = "py(\d+)"', "pyproject.toml") == {oldest.replace(".", "")}
+
+
+def test_every_supported_python_is_tested():
+    workflow = yaml.safe_load(read(".github/workflows/ci.yml"))
+    assert workflow["jobs"]["check"]["strategy"]["matrix"]["python"] == supported()
+    *others, last = supported()
+    assert f"Python {', '.join(others)} or {last}" in read("README.md")
+
+
+def test_environments_have_the_newest_python():
+    newest = {supported()[-1]}
+    assert found(r"(?m)^  - python=(\S+)$", "environment/environment.yml") == newest
+    assert found(r"(?m)^FROM python:(\d+\.\d+)-slim", "environment/Dockerfile") == newest
+    assert found(r"^python-(\d+\.\d+)\s*$", ".binder/runtime.txt") == newest
+
+
+def test_environments_install_the_lock():
+    assert found(r"(?m)^      - -r (\S+)$", "environment/environment.yml") == {Path(LOCK).name}
+    assert found(r"(?m)^-r (\S+)$", ".binder/requirements.txt") == {f"../{LOCK}"}
+    assert found(r"(?m)^RUN (make .+)$", "environment/Dockerfile") == {"make .venv/.ready"}
+    assert found(r"(?m)^LOCK := (\S+)$", "Makefile") == {LOCK}
+
+
+def pins(text):
+    """Versions that a file asks for by name: name==1.2 of pip, - name=1.2 of conda."""
+    lines = "\n".join(line.split("#")[0] for line in text.splitlines())
+    found = re.findall(r"([A-Za-z][\w.-]*) ?== ?(\d[\w.]*)", lines)
+    found += re.findall(r"(?m)^\s*- ([\w.-]+)=(\d[\w.]*)", lines)
+    return {canonicalize_name(name): version for name, version in found}
+
+
+@pytest.mark.parametrize("name", INSTALLERS)
+def test_environments_ask_for_no_version_but_the_locked(name):
+    known = LOCKED | {"python": supported()[-1], "uv": found(r"uv==(\S+)", "Makefile").pop()}
+    assert {n: v for n, v in pins(read(name)).items() if known.get(n) != v} == {}
+
+
+def test_other_versions_would_be_found():
+    text = "RUN pip install numpy==1.0 'papermill == 2' --port=80\n  - scipy=1.2 # not astropy==3\n"
+    assert pins(text) == {"numpy": "1.0", "papermill": "2", "scipy": "1.2"}
+
+
+def test_lock_has_what_the_package_and_its_extras_ask_for():
+    extras = PROJECT["optional-dependencies"]
+    asked = [Requirement(line) for line in [*PROJECT["dependencies"], *chain(*extras.values())]]
+    wrong = [
+        str(r)
+        for r in asked
+        if r.name != PROJECT["name"]
+        and not ((v := LOCKED.get(canonicalize_name(r.name))) and r.specifier.contains(v, prereleases=True))
+    ]
+    assert not wrong
+    used = {extra for r in asked if r.name == PROJECT["name"] for extra in r.extras}
+    assert used | found(r"--extra (\w+)", "Makefile") == set(extras)
+
+
+def test_this_environment_is_the_locked_one():
+    here = default_environment()["python_version"]
+    names = ["numpy", "scipy", "matplotlib", "papermill", "jupyter-book", "jupyterlab", "playwright"]
+    assert here in supported()
+    assert {name: version(name) for name in names} == {name: LOCKED[name] for name in names}
+
+
+def test_version_of_the_package_is_the_same_everywhere():
+    citation = yaml.safe_load(read("CITATION.cff"))
+    latest = re.findall(r"(?m)^## \[?(?:Unreleased\] - )?(\d+\.\d+\.\d+)", read("CHANGELOG.md"))[0]
+    assert {PROJECT["version"], citation["version"], zwfs.__version__, latest} == {PROJECT["version"]}
+
+
+def test_repository_is_the_same_everywhere():
+    owner, name = CONFIG["repository"]["url"].removeprefix("https://github.com/").split("/")
+    for file in ("README.md", "CITATION.cff"):
+        told = re.findall(r"https://(?:github\.com/|mybinder\.org/v2/gh/)([\w.-]+/[\w.-]+)", read(file))
+        told += ["/".join(site) for site in re.findall(r"https://([\w-]+)\.github\.io/([\w.-]+)", read(file))]
+        assert told
+        assert set(told) == {f"{owner}/{name}"}
+    assert f"/{CONFIG['repository']['branch']}?urlpath" in read("README.md")
+
+
+def test_citation_names_the_paper_as_the_bibliography_does():
+    citation = yaml.safe_load(read("CITATION.cff"))
+    entry = pybtex.database.parse_file(ROOT / "book" / "references.bib").entries["Chambouleyron:24"]
+    paper = citation["preferred-citation"]
+    names = [str(person.rich_last_names[-1]) for person in entry.persons["author"]]
+    assert [author["family-names"] for author in paper["authors"]] == names
+    assert paper["title"] == re.sub("[{}]", "", entry.fields["title"])
+    assert str(paper["year"]) == entry.fields["year"]
+    assert paper["url"].endswith(entry.fields["eprint"])
+    assert paper["doi"].endswith(entry.fields["eprint"])
+
+
+def test_both_licences_are_there_and_in_the_package():
+    assert PROJECT["license-files"] == ["LICENSE", "LICENSE-TEXT"]
+    assert read("LICENSE").startswith("MIT License")
+    assert "CC-BY-4.0" in read("LICENSE-TEXT")
+    assert yaml.safe_load(read("CITATION.cff"))["license"] == ["MIT", "CC-BY-4.0"]
+
+
+def test_every_make_command_is_in_the_guide():
+    targets = found(r"(?m)^([a-z]+):.*##", "Makefile") - {"help"}
+    assert {target for target in targets if f"`make {target}`" not in read("CONTRIBUTING.md")} == set()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+def test_notebook_installs_the_package_on_colab_and_nowhere_else(path):
+    cell = next(cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code")
+    condition, command = 'if "google.colab" in sys.modules:', f"git+{CONFIG['repository']['url']}"
+    assert cell.source == f'import sys\n\n{condition}\n    %pip install -q "zwfs[notebooks] @ {command}"'
+    assert cell.metadata.tags == ["remove-cell"]
+    assert not cell.outputs
+
+
+def imported(source):
+    return re.findall(r"(?m)^\s*(?:from|import) (\w+)", source)
+
+
+def test_notebooks_import_no_more_than_is_installed_on_colab():
+    known = {"numpy", "scipy", "matplotlib", "astropy", "joblib", "myst_nb", "zwfs", "IPython"}
+    cells = [c for p in (ROOT / "notebooks").glob("*.ipynb") for c in nbformat.read(p, as_version=4).cells]
+    names = {name for cell in cells if cell.cell_type == "code" for name in imported(cell.source)}
+    assert "myst_nb" in names
+    assert names - set(sys.stdlib_module_names) <= known

@@ -52,7 +52,7 @@ lock: $(BIN)/uv ## pin the newest allowed version of every dependency
 		--custom-compile-command "make lock" --output-file $(LOCK)
 
 clean: ## remove everything that these commands made
-	rm -rf _build $(VENV) *.egg-info .benchmarks .hypothesis .pytest_cache .ruff_cache
+	rm -rf _build build $(VENV) *.egg-info .benchmarks .hypothesis .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/uv:

@@ -290,6 +290,19 @@ def test_book_is_built_once_and_a_failure_leaves_it(small_book):
     assert sorted(os.listdir(small_book.build)) == ["html", "html.json", "notebooks", "source"]
 
 
+def test_pdf_is_made_and_linked_where_there_is_a_browser(small_book, monkeypatch):
+    (small_book.root / "book" / "print.css").write_text("")
+    (small_book.root / "book" / "index.md").write_text("# A book\n\n```{include} _pdf_link.md\n```\n")
+    pdf, page = (small_book.build / "html" / name for name in (pages.printing.NAME, "book/index.html"))
+    monkeypatch.setattr(pages.printing, "print_book", lambda *_: b"%PDF")
+    for browser in (None, "a browser"):
+        monkeypatch.setattr(pages.printing, "find_chromium", lambda browser=browser: browser)
+        assert pages.build_book(small_book)
+        assert pdf.exists() == bool(browser)
+        assert (f'href="../{pdf.name}"' in page.read_text("utf-8")) == bool(browser)
+        assert not pages.build_book(small_book)
+
+
 def test_record_says_what_a_result_was_made_from(ran):
     record = json.loads((ran.executed / "first.json").read_text())
     assert record["key"] == runner.key(ran, "first", {})

@@ -1,0 +1,148 @@
+"""The PDF of a book of three pages."""
+
+import io
+
+import build
+import printing
+import pytest
+from bs4 import BeautifulSoup
+from pypdf import PdfReader
+
+CHROMIUM = printing.find_chromium()
+needs_chromium = pytest.mark.skipif(not CHROMIUM, reason=printing.MISSING)
+
+FILES = {
+    "_toc.yml": """
+        format: jb-book
+        root: book/index
+        parts:
+          - caption: The sensor
+            chapters:
+              - file: book/theory
+                sections:
+                  - file: notebooks/one""",
+    "_config.yml": "{title: A book, author: Some & others, repository: {url: 'https://example.org'}}",
+    "pyproject.toml": "[project]\nversion = '1.2.3'",
+    "book/print.css": "article { break-before: page }",
+}
+PAGES = {
+    "book/index": "<h1>A book</h1><p>Begin with <a href='theory.html'>the theory</a>.</p>",
+    "book/theory": "<h1>Theory<a class='headerlink' href='#theory'>#</a></h1><p id='here'>Some text.</p>"
+    + "<p>More.</p>" * 80,
+    "notebooks/one": "<h1>One notebook</h1><p>See <a href='../book/theory.html#here'>there</a>.</p>",
+}
+
+
+def page(article):
+    return f"<html><body><nav>Elsewhere</nav><article class='bd-article'>{article}</article></body></html>"
+
+
+@pytest.fixture
+def book(tmp_path):
+    """A project and its built pages."""
+    built = tmp_path / "html"
+    files = {tmp_path / name: text for name, text in FILES.items()}
+    files |= {built / f"{name}.html": page(article) for name, article in PAGES.items()}
+    for file, text in files.items():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text, "utf-8")
+    return tmp_path, built
+
+
+def printed(book):
+    return PdfReader(io.BytesIO(printing.print_book(*book, CHROMIUM)))
+
+
+def chapter(article, name="notebooks/one"):
+    known = {f"{name}.html" for name in PAGES}
+    return str(printing._chapter(BeautifulSoup(page(article), "html.parser"), name, known))
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ('<a href="../book/theory.html">x</a>', '<a href="#book/theory">x</a>'),
+        ('<a href="../book/theory.html#here">x</a>', '<a href="#book/theory--here">x</a>'),
+        ('<a href="#here">x</a>', '<a href="#notebooks/one--here">x</a>'),
+        ('<a href="https://example.org/a#b">x</a>', '<a href="https://example.org/a#b">x</a>'),
+        ('<b><a href="../_downloads/data.csv">x</a></b>', "<b>x</b>"),
+        ('<img src="../_images/a.png"/>', '<img src="_images/a.png"/>'),
+        ('<p id="here">x</p>', '<p id="notebooks/one--here">x</p>'),
+        ("<h1>x</h1>", "<h2>x</h2>"),
+        ("<h5>x</h5>", "<h6>x</h6>"),
+        ("<details><summary>x</summary>y</details>", '<details open=""><summary>x</summary>y</details>'),
+    ],
+)
+def test_pages_are_made_fit_for_one_file(before, after):
+    assert after in chapter(before)
+
+
+@pytest.mark.parametrize(
+    "left_out",
+    [
+        "<script>x</script>",
+        "<button>x</button>",
+        '<p class="d-print-none">x</p>',
+        '<details class="above-input">x</details>',
+        '<p>Download: <a class="download" href="../_downloads/x.csv">x</a></p>',
+    ],
+)
+def test_what_needs_a_screen_is_left_out(left_out):
+    assert "x" not in BeautifulSoup(chapter(f"<h1>One</h1>{left_out}"), "html.parser").get_text()
+
+
+def test_parts_hold_their_pages_and_the_sections_below_them(book):
+    toc = printing.parse_toc_yaml(book[0] / "_toc.yml")
+    assert printing._parts(toc) == [(None, ["book/index"]), ("The sensor", ["book/theory", "notebooks/one"])]
+
+
+@needs_chromium
+def test_chapters_are_bookmarked_and_listed_with_their_page(book):
+    pdf = printed(book)
+    assert pdf.metadata == {"/Title": "A book", "/Author": "Some & others"}
+    introduction, part, chapters = pdf.outline
+    assert [entry.title for entry in (introduction, part, *chapters)] == [
+        "Introduction",
+        "The sensor",
+        "Theory",
+        "One notebook",
+    ]
+    text = [page.extract_text() for page in pdf.pages]
+    listed = "".join("".join(text).split("Contents")[1].split())
+    for entry in chapters:
+        place = pdf.get_destination_page_number(entry)
+        assert entry.title in text[place]
+        assert "".join(entry.title.split()) + str(place + 1) in listed
+
+
+@needs_chromium
+def test_same_pages_give_the_same_file(book):
+    assert printing.print_book(*book, CHROMIUM) == printing.print_book(*book, CHROMIUM)
+    assert not list(book[1].glob(".*"))
+
+
+@needs_chromium
+def test_wide_things_are_made_smaller_and_stay_whole(book):
+    cells = "".join(f"<td>column-{n}</td>" for n in range(60))
+    (book[1] / "notebooks" / "one.html").write_text(page(f"<h1>One</h1><table><tr>{cells}</tr></table>"), "utf-8")
+    assert "column-59" in printed(book).pages[-1].extract_text()
+
+
+@needs_chromium
+def test_what_cannot_be_made_to_fit_is_refused(book):
+    table = '<table class="lost" style="margin-left: 900px"><tr><td>1</td></tr></table>'
+    (book[1] / "notebooks" / "one.html").write_text(page(f"<h1>One</h1>{table}"), "utf-8")
+    with pytest.raises(printing.PrintError, match='too wide for a page:\n<table class="lost"'):
+        printing.print_book(*book, CHROMIUM)
+    assert not list(book[1].glob(".*"))
+
+
+def test_front_page_links_the_pdf_only_if_there_is_one():
+    assert printing.link(None) == ""
+    assert f'href="../{printing.NAME}"' in printing.link("/usr/bin/chromium")
+
+
+def test_without_a_browser_the_reason_is_told(monkeypatch, tmp_path):
+    monkeypatch.setattr(printing, "find_chromium", lambda: None)
+    with pytest.raises(printing.PrintError, match="install one"):
+        build.pdf(build.Project(tmp_path))

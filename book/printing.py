@@ -29,7 +29,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 MISSING = "a PDF needs Chromium: install one, or run .venv/bin/playwright install chromium"
 
 # What makes sense on a screen only.
-SCREEN_ONLY = ["script", "style", "button", ".headerlink", ".d-print-none", "details.above-input"]
+SCREEN_ONLY = [".run-card", "script", "style", "button", ".headerlink", ".d-print-none", "details.above-input"]
 HEADINGS = [f"h{level}" for level in range(1, 7)]
 STYLES = ["pygments.css", "sphinx-design.min.css", "custom.css"]
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import api
 import cards
 import claims
+import finish
 import live
 import printing
 from runner import Project, digest, digest_files, read, replace, swap, to_bytes
@@ -75,7 +76,9 @@ def build_book(project: Project) -> bool:
     html, record = project.build / "html", project.build / "html.json"
     files = staged_files(project)
     chromium = printing.find_chromium() if printing.STYLE in files else None
-    code = [Path(module.__file__) for module in (sys.modules[__name__], api, cards, claims, live, printing)]
+    code = [
+        Path(module.__file__) for module in (sys.modules[__name__], api, cards, claims, finish, live, printing)
+    ]
     about = [file for file in (project.root / "pyproject.toml",) if file.exists()]
     inputs = {f"{file.parent.name}/{file.name}": file for file in (*code, *about, *project.shared_inputs())}
     origin = {notebook.stem: cards.versions_of(project, notebook.stem) for notebook in project.sources()}
@@ -101,8 +104,7 @@ def build_book(project: Project) -> bool:
     if printing.STYLE in files:
         _write(source, {printing.LINK: printing.link(chromium)})
     with tempfile.TemporaryDirectory(dir=project.build, prefix="building-") as scratch:
-        _jupyter_book(source, Path(scratch))
-        built = Path(scratch) / "_build" / "html"
+        built = write_pages(source, Path(scratch))
         if chromium:
             (built / printing.NAME).write_bytes(printing.print_book(project.root, built, chromium))
         record.unlink(missing_ok=True)
@@ -126,8 +128,8 @@ def _write(source: Path, fragments: dict[str, str]) -> None:
         (source / name).write_text(text, "utf-8")
 
 
-def _jupyter_book(source: Path, output: Path) -> None:
-    """Run Jupyter Book with warnings as errors."""
+def write_pages(source: Path, output: Path) -> Path:
+    """Run Jupyter Book with warnings as errors, finish its pages and return their folder, which is in `output`."""
     options = ["-W", "-n", "--keep-going", "--path-output", str(output)]
     done = subprocess.run(
         [*JUPYTER_BOOK, "build", *options, str(source)],
@@ -141,3 +143,6 @@ def _jupyter_book(source: Path, output: Path) -> None:
         lines = COLOUR.sub("", done.stdout).replace(f"{source}{os.sep}", "").splitlines()
         marked = [line for line in lines if "WARNING:" in line or "ERROR:" in line]
         raise BookError("\n".join(["the book was not built:", *(marked or lines[-40:])]))
+    html = output / "_build" / "html"
+    finish.finish(source, html)
+    return html

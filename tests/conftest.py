@@ -1,3 +1,6 @@
+import os
+import shutil
+
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -56,3 +59,18 @@ def complex_field():
         return rng.normal(size=(*batch, *pupil.shape)) + 1j * rng.normal(size=(*batch, *pupil.shape))
 
     return make
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A Chromium, driven by Playwright; it is closed with the module, whose event loop others could not share."""
+    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+    program = os.environ.get("ZWFS_CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    if program is None:
+        missing = "no Chromium on the path: install one, or name it in ZWFS_CHROMIUM"
+        (pytest.fail if os.environ.get("ZWFS_REQUIRE_BROWSER") else pytest.skip)(missing)
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()

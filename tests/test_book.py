@@ -26,7 +26,8 @@ class Page(HTMLParser):
         self.names |= {attributes[key] for key in ("id", "name") if attributes.get(key)}
         self.loads |= {attributes[key] for key in ("src", "poster", "data") if attributes.get(key)}
         if attributes.get("href"):
-            (self.loads if tag == "link" else self.links).add(attributes["href"])
+            loaded = tag == "link" and attributes.get("rel") != "canonical"
+            (self.loads if loaded else self.links).add(attributes["href"])
         if tag == "meta" and (attributes.get("http-equiv") or "").lower() == "refresh":
             self.links.add(attributes["content"].split("url=")[1])
 

@@ -1,13 +1,18 @@
+import inspect
+import json
 import subprocess
 import sys
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import zwfs
-from zwfs import figures
+from zwfs import figures, figures_bench
+from zwfs.bench_trials import BenchCurves
 from zwfs.experiments import linearity_curves
+from zwfs.variations import DiameterCurve
 
 
 @pytest.fixture(autouse=True)
@@ -38,6 +43,41 @@ def test_every_method_has_a_look_of_its_own():
     assert {method.__name__ for method in zwfs.RECONSTRUCTORS} <= set(figures.LOOKS)
     for part in ("color", "marker", "label"):
         assert len({getattr(look, part) for look in figures.LOOKS.values()}) == len(figures.LOOKS)
+
+
+def test_colours_of_methods_stand_for_nothing_else():
+    """Whoever draws a method asks LOOKS for its colour; black is also the colour of ink."""
+    source = inspect.getsource(figures) + inspect.getsource(figures_bench)
+    notebooks = (Path(__file__).parent.parent / "notebooks").glob("*.ipynb")
+    cells = (cell for file in notebooks for cell in json.loads(file.read_bytes())["cells"])
+    source += "".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    methods = {look.color for look in figures.LOOKS.values()} - {"#000000"}
+    assert {color: source.upper().count(color) for color in methods} == dict.fromkeys(methods, 1)
+    others = {part: {style[part] for style in figures.OTHER_STYLES} for part in ("color", "marker")}
+    for part, values in others.items():
+        assert len(values) == len(figures.OTHER_STYLES)
+        assert not values & {getattr(look, part) for look in figures.LOOKS.values()}
+
+
+def test_a_method_looks_the_same_in_every_figure(curves):
+    trials = {name: DiameterCurve(np.array([1.0, 2]), np.full((2, 3), 0.1)) for name in figures.LOOKS}
+    steps = {name: {0.2: np.geomspace(1, 1e-6, 8) * np.ones((3, 8))} for name in figures.LOOKS}
+    two = ["Linear", "PhaseShifted"]
+    pistons = np.linspace(-1, 1, 24).reshape(2, 3, 4)
+    bench = BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(two, 0.1 * pistons))
+    segments = figures_bench.segment_errors(np.arange(4), dict.fromkeys(two, pistons[0, 0]), {"map": np.eye(4)})
+    shown = [
+        (figures.linearity(curves, 0.05, two, rms_max=0.4), two),
+        (figures.convergence(steps), list(figures.LOOKS)),
+        (figures.diameter_methods(trials, 0.5, 0.05, 2.2), list(figures.LOOKS)),
+        (figures_bench.bench_linearity(bench, two), two),
+        (segments, two),
+    ]
+    for figure, names in shown:
+        for look in map(figures.LOOKS.get, names):
+            lines = [line for axes in figure.axes for line in axes.lines]
+            found = {(line.get_color(), line.get_marker()) for line in lines if look.label in line.get_label()}
+            assert found == {(look.color, look.marker)}
 
 
 def test_linearity_draws_the_means_and_marks_where_they_leave(curves):

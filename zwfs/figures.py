@@ -47,6 +47,17 @@ LOOKS = {
     "PhaseShifted": Look("phase-shifted", "two pupils", "#0072B2", "v", ":"),
 }
 
+# Curves that stand for no method have colours of their own, of Tol's muted palette, and markers of their own.
+OTHER_STYLES = tuple(
+    {"color": color, "marker": marker, "linestyle": line}
+    for color, marker, line in (
+        ("#332288", "P", "-"),
+        ("#AA4499", "X", "--"),
+        ("#44AA99", "p", "-."),
+        ("#999933", "h", ":"),
+    )
+)
+
 _RC = {
     "figure.dpi": 100,
     "savefig.dpi": 200,
@@ -203,9 +214,8 @@ def approximation(
     """
     figure, panels = plt.subplots(1, 2, figsize=(9, 4.1))
     for axes, curves in zip(panels, (wave, steps), strict=True):
-        for (label, values), look in zip(curves.items(), LOOKS.values(), strict=False):
-            style = {"color": look.color, "marker": look.marker, "linestyle": look.line}
-            axes.plot(rms, values, markersize=4, label=label, **style)
+        for (label, values), style in zip(curves.items(), OTHER_STYLES, strict=False):
+            axes.plot(rms, values, markersize=4.5, label=label, **style)
         axes.set(xlabel="input phase (rad rms)", xlim=(0, None), ylim=(0, None))
         axes.legend(fontsize=8)
     panels[0].set_ylabel("error of the reference wave")
@@ -227,9 +237,8 @@ def diversity(difference: NDArray, determinant: NDArray, strength: NDArray, name
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.9), sharex=True)
     for axes, values in zip(panels, (determinant, strength), strict=True):
         axes.plot(difference, values, ".", color="#56B4E9", ms=4)
-        for (label, index), look in zip(named.items(), LOOKS.values(), strict=False):
-            style = {"color": look.color, "marker": look.marker, "linestyle": "none"}
-            axes.plot(difference[index], values[index], label=label, markersize=7, **style)
+        for (label, index), style in zip(named.items(), OTHER_STYLES, strict=False):
+            axes.plot(difference[index], values[index], label=label, markersize=8, **style | {"linestyle": "none"})
         axes.set(xlabel=r"difference of the phase shifts, $\theta_b-\theta_a$ (rad)", ylim=(0, None))
         axes.set_xticks(np.pi / 2 * np.arange(5), ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"])
     panels[0].set_ylabel(r"$|\det M|$")
@@ -328,7 +337,8 @@ def diameter_reasons(
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2))
     color = LOOKS["PhaseShifted"].color
-    left.plot(diameters, flat, color="#000000", lw=1.5, label="flat wavefront")
+    flat_color, ring_color, *_ = (style["color"] for style in OTHER_STYLES)
+    left.plot(diameters, flat, color=flat_color, lw=1.5, label="flat wavefront")
     left.fill_between(
         diameters,
         aberrated.min(axis=1),
@@ -340,15 +350,14 @@ def diameter_reasons(
     )
     left.plot(diameters, aberrated[:, 0], color=color, lw=1.5, label="first screen")
     left.plot(
-        list(measured), list(measured.values()), "o", mfc="none", mec="#D55E00", label="first screen, observed"
+        list(measured), list(measured.values()), "o", mfc="none", mec=ring_color, label="first screen, observed"
     )
     left.axhline(1, color="#555555", lw=1)
     left.text(0.05, 1.015, "diverges above, converges below", color="#555555", fontsize=9)
     left.set(ylabel="factor of the error, one iteration", ylim=(0, 1.2))
     left.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
-    styles = zip(("#000000", "#D55E00", "#009E73", "#CC79A7"), ("-", "--", "-.", ":"), strict=True)
-    for (name, values), (shade, dashes) in zip(sensitivity.items(), styles, strict=False):
-        right.plot(diameters, values, color=shade, ls=dashes, lw=1.8, label=name)
+    for (name, values), style in zip(sensitivity.items(), OTHER_STYLES, strict=False):
+        right.plot(diameters, values, lw=1.8, label=name, **style | {"marker": "none"})
     right.set(ylabel="sensitivity of the two frames (1/rad)", ylim=(0, 2.8))
     right.legend(loc="upper right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
     for axes in (left, right):
@@ -358,11 +367,11 @@ def diameter_reasons(
 
 def _diameters(axes: Axes, end: float, claimed: float) -> None:
     """Axis of the diameter, with the one of the paper and that of the dark ring."""
-    axes.axvline(claimed, color="#E69F00", lw=1.2, ls="--", zorder=0.5)
+    axes.axvline(claimed, color="#555555", lw=1.2, ls="--", zorder=0.5)
     axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
     above = {"transform": axes.get_xaxis_transform(), "va": "bottom", "fontsize": 9}
-    axes.text(claimed, 1.005, f"paper: {claimed:g} ", ha="right", color="#A36F00", **above)
-    axes.text(DARK_RING, 1.005, " dark ring", ha="left", color="#666666", **above)
+    axes.text(claimed, 1.005, f"paper: {claimed:g} ", ha="right", color="#555555", **above)
+    axes.text(DARK_RING, 1.005, " dark ring", ha="left", color="#555555", **above)
     axes.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=(0, end))
 
 
@@ -420,9 +429,9 @@ def pair_noise(
         The same from draws of noise, with its standard error; drawn in the colour of the curve.
     """
     figure, axes = plt.subplots(figsize=(9, 4.2))
-    styles = zip(("#0072B2", "#D55E00", "#009E73", "#000000"), ("-", "--", "-.", ":"), strict=True)
-    for (name, values), (shade, dashes) in zip(curves.items(), styles, strict=False):
-        axes.plot(angles / np.pi, values, color=shade, ls=dashes, lw=1.8, label=name)
+    for (name, values), style in zip(curves.items(), OTHER_STYLES, strict=False):
+        shade = style["color"]
+        axes.plot(angles / np.pi, values, lw=1.8, label=name, **style | {"marker": "none"})
         least = int(np.argmin(values))
         axes.plot(angles[least] / np.pi, values[least], "*", color=shade, ms=12)
         if name in drawn:

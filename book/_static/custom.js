@@ -1,0 +1,13 @@
+// Tables that are wider than the page scroll: only those are a stop for the Tab key, with a name.
+function nameWideTables() {
+  for (const box of document.querySelectorAll(".pst-scrollable-table-container")) {
+    const wide = box.scrollWidth > box.clientWidth;
+    for (const [name, value] of Object.entries({ tabindex: "0", role: "group", "aria-label": "Table" })) {
+      if (wide) box.setAttribute(name, value);
+      else box.removeAttribute(name);
+    }
+  }
+}
+
+addEventListener("load", nameWideTables);
+addEventListener("resize", nameWideTables);

@@ -1,0 +1,270 @@
+"""The built book in a real browser, opened from the file system, as wide as a screen and as a phone."""
+
+import threading
+from dataclasses import dataclass
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image, ImageChops, ImageStat
+
+ROOT = Path(__file__).parent.parent
+HTML = ROOT / "_build" / "html"
+WIDTHS = (1280, 390)
+PAGES = sorted(
+    file.relative_to(HTML).as_posix()
+    for file in HTML.rglob("*.html")
+    if file.relative_to(HTML).parts[0] != "_static" and file != HTML / "index.html"
+)
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not HTML.is_dir(), reason="the book is not built: make book"),
+]
+
+# What moved without being asked to, by the measure of web.dev/cls.
+SHIFTS = """
+window.moved = 0;
+new PerformanceObserver((list) => {
+  for (const entry of list.getEntries()) window.moved += entry.value;
+}).observe({ type: "layout-shift", buffered: true });
+"""
+
+
+def address(name):
+    return (HTML / name).as_uri()
+
+
+def watch(page):
+    """Everything that a page says, and everything that it asks of others than the file system."""
+    said, asked = [], []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    return said, asked
+
+
+def outside(asked):
+    return [url for url in asked if not url.startswith(("file:", "data:", "blob:"))]
+
+
+def settle(page):
+    """Wait until the mathematics is set."""
+    page.evaluate("() => window.MathJax?.startup?.promise?.then(() => null)")
+    page.evaluate("() => document.fonts.ready.then(() => null)")
+
+
+@pytest.fixture(scope="module", params=WIDTHS)
+def window(request, browser):
+    context = browser.new_context(viewport={"width": request.param, "height": 900}, color_scheme="light")
+    context.add_init_script(SHIFTS)
+    yield context
+    context.close()
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A page, and what it said, asked and moved while it was loaded."""
+
+    page: Any
+    said: list[str]
+    asked: list[str]
+    moved: float
+
+
+@pytest.fixture(scope="module", params=PAGES)
+def opened(request, window):
+    page = window.new_page()
+    said, asked = watch(page)
+    page.goto(address(request.param))
+    settle(page)
+    yield Opened(page, list(said), list(asked), page.evaluate("window.moved"))
+    page.close()
+
+
+@pytest.fixture
+def page(browser):
+    """A fresh window, wide, with the front page."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900}, color_scheme="light")
+    page = context.new_page()
+    page.goto(address("book/index.html"))
+    yield page
+    context.close()
+
+
+def test_says_nothing_and_asks_nobody(opened):
+    assert opened.said == []
+    assert opened.asked
+    assert outside(opened.asked) == []
+
+
+def test_equations_are_rendered(opened):
+    page = opened.page
+    written = page.locator(".math").count()
+    assert page.locator(".math mjx-container").count() >= written
+    assert page.locator("mjx-merror").count() == 0
+    sizes = page.eval_on_selector_all(".math mjx-container", "all => all.map(one => one.offsetWidth)")
+    assert all(sizes)
+
+
+def test_pictures_are_shown_and_figures_can_be_read(opened):
+    page = opened.page
+    page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+    pictures = page.eval_on_selector_all(
+        "article img",
+        """all => all.map(one => {
+            const { width, height } = one.getBoundingClientRect();
+            return { name: one.src, natural: one.naturalWidth, width, height,
+                ratio: one.getAttribute("width") / one.getAttribute("height"),
+                figure: one.closest(".wide-figure") !== null };
+        })""",
+    )
+    for picture in pictures:
+        assert picture["natural"] > 0, picture
+        assert picture["height"] > 0, picture
+        assert picture["width"] / picture["height"] == pytest.approx(picture["ratio"], rel=0.02), picture
+        # Type of 9 points on a figure of 9 inches is then 8 pixels tall.
+        assert not picture["figure"] or picture["width"] >= 576, picture
+
+
+def test_the_page_does_not_scroll_sideways(opened):
+    page = opened.page
+    assert page.evaluate("document.documentElement.scrollWidth - window.innerWidth") <= 0
+    cut = page.eval_on_selector_all(
+        "article table",
+        """all => all.filter(one => one.getBoundingClientRect().right > window.innerWidth
+            && getComputedStyle(one.parentElement).overflowX !== "auto").length""",
+    )
+    assert cut == 0
+
+
+def test_hardly_anything_moves_while_it_loads(opened):
+    assert opened.moved < 0.1  # what is called good; setting the mathematics moves lines a little
+
+
+@pytest.mark.parametrize("mode", ["light", "dark"])
+def test_axe_finds_no_serious_fault(opened, mode):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    page = opened.page
+    page.add_style_tag(content="* { transition: none !important }")
+    page.emulate_media(color_scheme=mode)
+    page.wait_for_function("mode => document.documentElement.dataset.theme === mode", arg=mode)
+    # Code has thousands of coloured words, the same at every width: they are looked at once.
+    context = {"exclude": [".highlight pre"]} if page.viewport_size["width"] < max(WIDTHS) else None
+    found = axe.run(page, context=context, options={"resultTypes": ["violations"]}).response["violations"]
+    faults = [
+        f"{fault['id']}: {node['html'][:120]}: {node['failureSummary']}"
+        for fault in found
+        if fault["impact"] in ("serious", "critical")
+        for node in fault["nodes"]
+    ]
+    assert faults == []
+
+
+def test_root_leads_to_the_front_page(page):
+    page.goto(address("index.html"))
+    page.wait_for_url(address("book/index.html"))
+
+
+def test_search_finds_a_name(page):
+    said, asked = watch(page)
+    page.goto(f"{address('search.html')}?q=Gerchberg")
+    results = page.locator("#search-results li a")
+    results.first.wait_for()
+    page.wait_for_function("document.querySelector('.search-summary').textContent.includes('found')")
+    assert results.count() >= 3
+    results.first.click()
+    page.wait_for_url("**/notebooks/*")
+    assert "Gerchberg" in page.locator("article").inner_text()
+    assert said == outside(asked) == []
+
+
+def test_colour_switch(page):
+    background = "getComputedStyle(document.body).backgroundColor"
+    seen = {}
+    for _ in range(3):
+        page.locator(".theme-switch-button:visible").click()
+        seen[page.evaluate("document.documentElement.dataset.mode")] = page.evaluate(background)
+    assert set(seen) == {"light", "dark", "auto"}
+    assert seen["light"] == seen["auto"] != seen["dark"]
+    logos = page.eval_on_selector_all(".logo__image", "all => all.filter(one => one.offsetWidth).length")
+    assert logos == 1
+
+
+def test_keyboard_alone_reads_switches_and_searches(page):
+    focus = "document.activeElement"
+    page.keyboard.press("Tab")
+    assert page.evaluate(f"{focus}.textContent") == "Skip to main content"
+    page.keyboard.press("Enter")
+    assert page.url.endswith("#main-content")
+    for _ in range(30):
+        page.keyboard.press("Tab")
+        if page.evaluate(f"{focus}.matches('.theme-switch-button')"):
+            break
+    before = page.evaluate("document.documentElement.dataset.mode")
+    page.keyboard.press("Enter")
+    assert page.evaluate("document.documentElement.dataset.mode") != before
+    outline = page.evaluate(f"(style => style.outlineStyle + style.boxShadow)(getComputedStyle({focus}))")
+    assert outline != "nonenone"
+    page.keyboard.press("Control+k")
+    page.keyboard.type("Gerchberg")
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/search.html?q=Gerchberg")
+
+
+def test_a_phone_has_the_contents_in_a_menu(browser):
+    context = browser.new_context(viewport={"width": 390, "height": 900}, has_touch=True)
+    page = context.new_page()
+    page.goto(address("book/index.html"))
+    entry = page.locator("#pst-primary-sidebar-modal a, #pst-primary-sidebar a", has_text="Figure 3").first
+    assert not entry.is_visible()
+    page.locator("button.primary-toggle:visible").tap()
+    page.locator("a:visible", has_text="Figure 3").first.tap()
+    page.wait_for_url("**/fig03_dynamic_range.html")
+    context.close()
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def served():
+    """Address of the book on a server of this machine: from the file system a browser opens what it would save."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=HTML)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+@pytest.mark.parametrize("kind", ["PNG", "PDF", "data (CSV)"])
+def test_downloads_give_files(page, served, kind):
+    page.goto(f"{served}/notebooks/fig03_dynamic_range.html")
+    link = page.locator("article a.download", has_text=kind).first
+    with page.expect_download() as download:
+        link.click()
+    content = Path(download.value.path()).read_bytes()
+    beginning = {"PNG": b"\x89PNG", "PDF": b"%PDF-", "data (CSV)": b"input (rad rms),"}[kind]
+    assert content.startswith(beginning)
+
+
+def test_figures_open_alone(page):
+    page.goto(address("notebooks/fig03_dynamic_range.html"))
+    page.locator(".wide-figure a").first.click()
+    page.wait_for_url("**/_images/*.png")
+    assert page.evaluate("document.images[0].naturalWidth") == 1800
+
+
+def test_the_logo_is_the_same_in_both_formats(browser, tmp_path):
+    static = ROOT / "book" / "_static"
+    page = browser.new_page(viewport={"width": 256, "height": 256})
+    page.set_content(f"<style>body {{ margin: 0 }}</style>{(static / 'logo.svg').read_text('utf-8')}")
+    page.screenshot(path=tmp_path / "drawn.png", omit_background=True)
+    page.close()
+    with Image.open(tmp_path / "drawn.png") as drawn, Image.open(static / "logo.png") as stored:
+        assert drawn.size == stored.size
+        difference = ImageChops.difference(drawn.convert("RGBA"), stored.convert("RGBA"))
+    assert max(ImageStat.Stat(difference).mean) < 2

@@ -115,7 +115,7 @@ def summary(page: BeautifulSoup) -> str:
 
 def describe(page: BeautifulSoup, book: str, text: str, address: str, name: str) -> None:
     """Tell search engines and whoever links to a page what it is about, and what to show."""
-    title = plain(page.h1) if page.h1 else book
+    title = (plain(page.h1) if page.h1 else "") or book
     tags = [
         {"name": "description", "content": text},
         {"name": "twitter:card", "content": "summary_large_image"},

@@ -64,8 +64,8 @@ def complex_field():
 @pytest.fixture(scope="module")
 def browser():
     """A Chromium, driven by Playwright; it is closed with the module, whose event loop others could not share."""
-    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-    program = os.environ.get("ZWFS_CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    names = (os.environ.get("ZWFS_CHROMIUM", "chromium"), "chromium-browser", "google-chrome")
+    program = next(filter(None, map(shutil.which, names)), None)
     if program is None:
         missing = "no Chromium on the path: install one, or name it in ZWFS_CHROMIUM"
         (pytest.fail if os.environ.get("ZWFS_REQUIRE_BROWSER") else pytest.skip)(missing)

@@ -1,11 +1,17 @@
 """The built book: it needs nothing but its own files, and its links lead somewhere."""
 
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
+import finish
+import pages
 import pytest
+import yaml
+from bs4 import BeautifulSoup
+from PIL import Image
 
 ROOT = Path(__file__).parent.parent
 HTML = ROOT / "_build" / "html"
@@ -65,6 +71,62 @@ def test_links_inside_the_book_resolve(book_pages):
             if not target.is_file() or (name and known and name not in known.names):
                 broken.append(f"{file.relative_to(HTML)} -> {address}")
     assert not broken
+
+
+def test_links_out_of_the_book_are_addresses(book_pages):
+    links = {link for page in book_pages.values() for link in page.links if urlsplit(link).scheme}
+    whole = re.compile(r"https?://[\w.-]+\.[a-z]+(/[^\s<>\"]*)?|mailto:[^\s@]+@[^\s@]+")
+    assert links
+    assert [link for link in links if not whole.fullmatch(link)] == []
+
+
+def test_figures_say_what_they_show_and_keep_their_place():
+    shown = []
+    for file in HTML.rglob("notebooks/*.html"):
+        soup = BeautifulSoup(file.read_text("utf-8"), "html.parser")
+        outputs = soup.select(".cell_output img")
+        assert outputs == soup.select(".wide-figure > a > img"), file.name
+        for image in outputs:
+            shown.append(image["alt"])
+            assert len(image["alt"].split()) >= 15, file.name
+            assert image.parent["href"] == image["src"]
+            assert (int(image["width"]), int(image["height"])) == finish.size(file.parent / image["src"])
+    assert len(set(shown)) == len(shown) >= len(list((ROOT / "notebooks").glob("*.ipynb")))
+
+
+def test_pages_tell_what_they_are_about(book_pages):
+    config = yaml.safe_load((ROOT / "_config.yml").read_text("utf-8"))
+    seen = {}
+    for file in book_pages:
+        head = BeautifulSoup(file.read_text("utf-8"), "html.parser").head
+        told = {
+            tag.get("property") or tag.get("name"): tag["content"] for tag in head.find_all("meta", content=True)
+        }
+        assert told["og:url"] == config["html"]["baseurl"] + file.relative_to(HTML).as_posix()
+        assert told["og:image"] == config["html"]["baseurl"] + finish.CARD
+        assert told["og:title"]
+        seen[file.relative_to(HTML).as_posix()] = told.get("description")
+    assert 60 < len(seen["index.html"]) <= 250
+    assert seen["index.html"] == seen["book/index.html"]
+    described = [text for name, text in seen.items() if name.startswith(("book/", "notebooks/"))]
+    assert len(set(described)) == len(described)
+    assert not [text for text in described if not text or "\\" in text]
+
+
+def test_card_is_what_social_networks_show():
+    with Image.open(HTML / finish.CARD) as card:
+        assert card.size == finish.CARD_SIZE
+        assert len(card.convert("RGB").getcolors(1 << 20)) > 100
+
+
+@pytest.mark.slow
+def test_a_second_clean_build_gives_the_same_bytes(tmp_path):
+    """From the same executed notebooks, in folders of another name."""
+    source = shutil.copytree(ROOT / "_build" / "source", tmp_path / "elsewhere")
+    built = pages.write_pages(source, tmp_path)
+    files = [{file.relative_to(top) for file in top.rglob("*") if file.is_file()} for top in (HTML, built)]
+    assert files[0] == files[1]
+    assert [name for name in sorted(files[0]) if (HTML / name).read_bytes() != (built / name).read_bytes()] == []
 
 
 def test_front_page_leads_to_the_book(book_pages):

@@ -1,3 +1,10 @@
+// Text that holds mathematics appears once that is set, so that nothing moves afterwards.
+document.documentElement.classList.add("setting");
+addEventListener("load", async () => {
+  await window.MathJax?.startup?.promise;
+  document.documentElement.classList.remove("setting");
+});
+
 // Tables that are wider than the page scroll: only those are a stop for the Tab key, with a name.
 function nameWideTables() {
   for (const box of document.querySelectorAll(".pst-scrollable-table-container")) {

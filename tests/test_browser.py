@@ -81,7 +81,11 @@ def opened(request, window):
     said, asked = watch(page)
     page.goto(address(request.param))
     settle(page)
-    yield Opened(page, list(said), list(asked), page.evaluate("window.moved"))
+    loaded = Opened(page, list(said), list(asked), page.evaluate("window.moved"))
+    # What is folded is looked at too, and nothing while it changes its colour.
+    page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+    page.add_style_tag(content="* { animation: none !important; transition: none !important }")
+    yield loaded
     page.close()
 
 
@@ -112,7 +116,6 @@ def test_equations_are_rendered(opened):
 
 def test_pictures_are_shown_and_figures_can_be_read(opened):
     page = opened.page
-    page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
     pictures = page.eval_on_selector_all(
         "article img",
         """all => all.map(one => {
@@ -149,7 +152,6 @@ def test_hardly_anything_moves_while_it_loads(opened):
 def test_axe_finds_no_serious_fault(opened, mode):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     page = opened.page
-    page.add_style_tag(content="* { transition: none !important }")
     page.emulate_media(color_scheme=mode)
     page.wait_for_function("mode => document.documentElement.dataset.theme === mode", arg=mode)
     # Code has thousands of coloured words, the same at every width: they are looked at once.

@@ -1,0 +1,140 @@
+import numpy as np
+import pytest
+
+from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
+from zwfs.closed_loop import FrozenFlow, close_loop
+
+PLUS, MINUS = Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2)
+
+
+@pytest.fixture(scope="module")
+def pupil():
+    return Pupil.circular(32)
+
+
+@pytest.fixture(scope="module")
+def modes(pupil):
+    return zernike_basis(pupil, 60)
+
+
+@pytest.fixture(scope="module")
+def shifted(pupil):
+    return PhaseShifted(ZernikeSensor(pupil, PLUS, MINUS))
+
+
+def test_screens_have_the_rms_asked_for_at_the_start_and_no_piston(pupil):
+    screens = FrozenFlow(pupil, 0.8, 5, seed=1)(0.0)
+    np.testing.assert_allclose(pupil.rms(screens), 0.8)
+    np.testing.assert_allclose(pupil.gather(screens).mean(axis=-1), 0, atol=1e-12)
+    assert not screens[:, ~pupil.mask].any()
+
+
+def test_screens_move_with_the_wind():
+    pupil = Pupil.circular(128)
+    flow = FrozenFlow(pupil, 1.0, 3, speed=2.0, cutoff=1.0, seed=2)
+    step, now, middle = 1e-4, 0.3, np.s_[:, 40:-40, 40:-40]
+    change = (flow(now + step) - flow(now - step)) / (2 * step)
+    slope = np.stack(np.gradient(flow(now), 1 / pupil.n_pixels, axis=(1, 2)), axis=-1)
+    expected = -np.einsum("kyxi,ki->kyx", slope, flow.velocity)
+    np.testing.assert_allclose(np.hypot(*flow.velocity.T), 2.0)
+    # The piston that is taken out of each screen changes with time, too.
+    difference = change[middle] - expected[middle]
+    difference -= difference.mean(axis=(1, 2), keepdims=True)
+    assert np.abs(difference).max() < 2e-3 * np.abs(change).max()
+
+
+def test_no_frequency_lies_beyond_the_cutoff(pupil):
+    flow = FrozenFlow(pupil, 1.0, 2, cutoff=2.0, exponent=0.0, seed=3)
+    x, y = np.meshgrid(pupil.x, pupil.y)
+    waves = []
+    for ky in range(-6, 7):
+        for kx in range(-6, 7):
+            if 0 < np.hypot(kx, ky) / 3 <= 2.0:
+                angle = 2 * np.pi * (kx * x + ky * y) / 3
+                waves += [np.cos(angle)[pupil.mask], np.sin(angle)[pupil.mask]]
+    waves = np.array([np.ones(pupil.n_points), *waves]).T
+    values = pupil.gather(flow(0.7)).T
+    left = values - waves @ np.linalg.lstsq(waves, values, rcond=1e-13)[0]
+    assert np.abs(left).max() < 1e-6
+
+
+def test_a_still_screen_is_corrected_by_the_gain_in_each_step(pupil, modes, shifted):
+    flow = FrozenFlow(pupil, 0.3, 2, speed=0.0, cutoff=1.0, seed=4)
+    screens = pupil.gather(flow(0.0))
+    flat = pupil.gather(modes)
+    fitted = np.linalg.lstsq(flat.T, screens.T, rcond=None)[0].T
+    run = close_loop(shifted, modes, flow, 6, gain=0.5, delay=1)
+    for step in range(6):
+        left = screens - (1 - 0.5**step) * fitted @ flat
+        np.testing.assert_allclose(run.residual[:, step], left.std(axis=-1), rtol=1e-4)
+    np.testing.assert_allclose(run.open_loop, 0.3)
+
+
+def test_a_correction_takes_the_delay(pupil, modes, shifted):
+    flow = FrozenFlow(pupil, 0.3, 1, speed=0.0, cutoff=1.0, seed=4)
+    residual = close_loop(shifted, modes, flow, 5, gain=0.5, delay=3).residual[0]
+    np.testing.assert_allclose(residual[:3], 0.3)
+    assert residual[3] < 0.2
+
+
+def test_noise_falls_with_the_root_of_the_photons(pupil, modes, shifted):
+    flow = FrozenFlow(pupil, 0.0, 4, seed=1)
+    few, many = (
+        close_loop(shifted, modes, flow, 40, photons=photons, seed=5).settled(20).mean() for photons in (1e6, 1e8)
+    )
+    assert few / many == pytest.approx(10, rel=0.15)
+
+
+def test_the_phase_shifted_loop_closes_where_the_linear_one_does_not(pupil, modes):
+    plain = Linear(ZernikeSensor(pupil, PLUS), modes)
+    few = PhaseShifted(ZernikeSensor(pupil, PLUS, MINUS), n_iterations=5)
+    flow = FrozenFlow(pupil, 0.9, 6, seed=1)
+    options = {"gain": 0.4, "delay": 2, "stroke": 4.0}
+    assert close_loop(few, modes, flow, 80, **options).closed(20).all()
+    lost = close_loop(plain, modes, flow, 80, **options)
+    assert not lost.closed(20).all()
+    assert np.all(lost.residual <= 4.0 + lost.open_loop + 1e-9)
+
+
+def test_the_same_seed_gives_the_same_run(pupil, modes, shifted):
+    runs = [
+        close_loop(shifted, modes, FrozenFlow(pupil, 0.5, 2, seed=1), 5, photons=1e4, seed=seed)
+        for seed in (2, 2, 3)
+    ]
+    assert np.array_equal(runs[0].residual, runs[1].residual)
+    assert not np.array_equal(runs[0].residual, runs[2].residual)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"n_steps": 0}, "n_steps = 0"),
+        ({"gain": 2.0}, "gain = 2.0"),
+        ({"delay": 0}, "delay = 0"),
+        ({"rate": 0.0}, "rate = 0.0"),
+        ({"stroke": 0.0}, "stroke = 0.0"),
+        ({"photons": -1.0}, "photons = -1.0"),
+        ({"modes": np.zeros((3, 8, 8))}, "modes has shape"),
+    ],
+)
+def test_bad_input_is_refused(pupil, modes, shifted, change, message):
+    arguments = {"modes": modes, "flow": FrozenFlow(pupil, 0.5, 1, seed=1), "n_steps": 3} | change
+    with pytest.raises(ValueError, match=message):
+        close_loop(shifted, **arguments)
+
+
+def test_a_flow_for_another_pupil_is_refused(modes, shifted):
+    with pytest.raises(ValueError, match="flow has Pupil"):
+        close_loop(shifted, modes, FrozenFlow(Pupil.circular(16), 0.5, 1), 3)
+    with pytest.raises(TypeError, match="flow is a float"):
+        close_loop(shifted, modes, 0.5, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [((-1.0, 1), "rms = -1.0"), ((1.0, 0), "n_screens = 0"), ((1.0, 1, {"cutoff": 0.5}), "cutoff = 0.5")],
+)
+def test_a_bad_flow_is_refused(pupil, arguments, message):
+    *values, options = (*arguments, {}) if len(arguments) == 2 else arguments
+    with pytest.raises(ValueError, match=message):
+        FrozenFlow(pupil, *values, **options)

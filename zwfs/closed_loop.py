@@ -1,0 +1,211 @@
+"""A second stage of adaptive optics: a screen that drifts, a sensor, an integrator and a mirror of modes."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs.detector import Detector
+from zwfs.metrics import strehl
+from zwfs.pupil import Pupil
+from zwfs.reconstructors.linear import check_modes
+
+_BOX = 3.0  # D; the screens repeat after this length
+
+
+class FrozenFlow:
+    """Random screens that a wind carries across the pupil without a change of form.
+
+    Each screen is a sum of plane waves on a square lattice of frequencies, with a power spectral density that
+    falls as a power of the frequency. Moving it turns their phases, so it is moved by any distance exactly. It
+    repeats after 3 D.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    rms : float, radian
+        Of every screen over the pupil at the start, piston removed.
+    n_screens : int
+        Each has a wind direction of its own.
+    speed : float, D / second
+    cutoff : float, cycles / D
+        Highest spatial frequency, at least 1.
+    exponent : float
+        Exponent of the power spectral density.
+    seed : int, Generator or SeedSequence, optional
+
+    Attributes
+    ----------
+    velocity : ndarray, shape (n_screens, 2), D / second
+        Of each screen, along y and x.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of the wrong kind or out of range.
+    """
+
+    def __init__(
+        self,
+        pupil: Pupil,
+        rms: float,
+        n_screens: int,
+        *,
+        speed: float = 2.5,
+        cutoff: float = 5.0,
+        exponent: float = -2.0,
+        seed: int | np.random.Generator | np.random.SeedSequence | None = None,
+    ) -> None:
+        if not isinstance(pupil, Pupil):
+            raise TypeError(f"pupil is a {type(pupil).__name__}: expected a Pupil")
+        rms = _check.number("rms", rms, 0)
+        self.n_screens = _check.integer("n_screens", n_screens, 1)
+        speed = _check.number("speed", speed, 0)
+        cutoff = _check.number("cutoff", cutoff, 1)
+        exponent = _check.number("exponent", exponent)
+        self.pupil = pupil
+        rng = np.random.default_rng(seed)
+        n = int(cutoff * _BOX)
+        axis = np.arange(-n, n + 1) / _BOX
+        frequency = np.hypot(axis[:, np.newaxis], axis)
+        used = (frequency > 0) & (frequency <= cutoff)
+        weight = np.where(used, np.where(used, frequency, 1) ** (exponent / 2), 0)
+        waves = rng.standard_normal((2, self.n_screens, *weight.shape))
+        self._waves = weight * (waves[0] + 1j * waves[1])
+        direction = rng.uniform(0, 2 * np.pi, self.n_screens)
+        self.velocity = speed * np.stack([np.sin(direction), np.cos(direction)], axis=-1)
+        along_y, along_x = self.velocity.T[..., np.newaxis, np.newaxis]
+        self._turn = -2j * np.pi * (along_y * axis[:, np.newaxis] + along_x * axis)
+        self._along_y = np.exp(2j * np.pi * np.outer(pupil.y, axis))
+        self._along_x = np.exp(2j * np.pi * np.outer(axis, pupil.x))
+        self._waves *= (rms / pupil.rms(self(0.0)))[:, np.newaxis, np.newaxis]
+
+    def __call__(self, time: float) -> NDArray[np.float64]:
+        """Screens at a time in seconds, (n_screens, ny, nx), radian: without piston, 0 outside the pupil."""
+        waves = self._waves * np.exp(self._turn * _check.number("time", time))
+        inside = self.pupil.gather((self._along_y @ waves @ self._along_x).real)
+        return self.pupil.scatter(inside - inside.mean(axis=-1, keepdims=True), fill=0)
+
+
+@dataclass(frozen=True)
+class LoopRun:
+    """What a closed loop left, step by step.
+
+    Attributes
+    ----------
+    times : ndarray, shape (n_steps,), second
+    open_loop : ndarray, shape (n_screens, n_steps), radian rms
+        Screens without correction.
+    residual : ndarray, shape (n_screens, n_steps), radian rms
+        Screens less the mirror, not wrapped, piston removed.
+    strehl : ndarray, shape (n_screens, n_steps)
+        Of the residual.
+    """
+
+    times: NDArray[np.float64]
+    open_loop: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    strehl: NDArray[np.float64]
+
+    def settled(self, n_steps: int) -> NDArray[np.float64]:
+        """Rms of the residual over the last steps, shape (n_screens,), radian rms."""
+        n_steps = _check.integer("n_steps", n_steps, 1)
+        return np.sqrt(np.mean(self.residual[:, -n_steps:] ** 2, axis=1))
+
+    def closed(self, n_steps: int) -> NDArray[np.bool_]:
+        """Whether each loop settled below half of what it started from, shape (n_screens,)."""
+        return self.settled(n_steps) < self.open_loop[:, 0] / 2
+
+
+def close_loop(
+    reconstructor: Any,
+    modes: ArrayLike,
+    flow: FrozenFlow,
+    n_steps: int,
+    *,
+    rate: float = 1000.0,
+    gain: float = 0.5,
+    delay: int = 1,
+    stroke: float | None = None,
+    photons: float | None = None,
+    seed: int | np.random.Generator | np.random.SeedSequence | None = None,
+) -> LoopRun:
+    """Correct drifting screens with an integrator that a Zernike sensor feeds.
+
+    In each step the sensor measures what the mirror leaves; the reconstructed phase, its piston removed on the
+    circle, is fitted by the modes, and the mirror gets `gain` times that more, `delay` steps later.
+
+    Parameters
+    ----------
+    reconstructor : reconstructor
+    modes : array_like, shape (n_modes, ny, nx)
+        Of the mirror, linearly independent, such as those of `zernike_basis`.
+    flow : FrozenFlow
+        On the pupil of the reconstructor; its screens are corrected side by side.
+    n_steps : int
+    rate : float, 1 / second
+    gain : float
+        In (0, 2); the loop is stable for any estimate that is right below that, with a delay of 1.
+    delay : int, steps
+        From a measurement to its correction, at least 1.
+    stroke : float, radian rms, optional
+        Largest figure of the mirror; a command beyond it is scaled down to it. Any figure if left out.
+    photons : float, photons / step, optional
+        Detected within the pupil with the mask out, divided equally among the masks; no noise if left out.
+    seed : int, Generator or SeedSequence, optional
+        Of the noise.
+
+    Returns
+    -------
+    LoopRun
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of the wrong kind, shape or range.
+    """
+    sensor = reconstructor.settings.sensor
+    pupil = sensor.pupil
+    if not isinstance(flow, FrozenFlow):
+        raise TypeError(f"flow is a {type(flow).__name__}: expected a FrozenFlow")
+    if flow.pupil.shape != pupil.shape or np.any(flow.pupil.mask != pupil.mask):
+        raise ValueError(f"flow has {flow.pupil!r}: expected that of the reconstructor, {pupil!r}")
+    modes = check_modes(sensor, modes)
+    n_steps = _check.integer("n_steps", n_steps, 1)
+    rate = _check.number("rate", rate, 0, open_low=True)
+    gain = _check.number("gain", gain, 0, 2, open_low=True, open_high=True)
+    delay = _check.integer("delay", delay, 1)
+    stroke = np.inf if stroke is None else _check.number("stroke", stroke, 0, open_low=True)
+    camera = None
+    if photons is not None:
+        photons = _check.number("photons", photons, 0, open_low=True)
+        camera = Detector(pupil, photons / sensor.n_masks)
+    rng = np.random.default_rng(seed)
+    times = np.arange(n_steps) / rate
+    open_loop, residual, ratio = np.empty((3, flow.n_screens, n_steps))
+    fit = np.linalg.pinv(modes)
+    mirror = deque([np.zeros((flow.n_screens, pupil.n_points))] * delay)
+    for step, time in enumerate(times):
+        screens = pupil.gather(flow(time))
+        left = pupil.scatter(screens - mirror[0], fill=0)
+        open_loop[:, step] = screens.std(axis=-1)
+        residual[:, step], ratio[:, step] = pupil.rms(left), strehl(pupil, left)
+        frames = sensor.measure(left)
+        if camera is not None:
+            frames = camera.normalise(camera.expose(frames, rng), floor=0.0)
+        found = _without_piston(pupil.gather(reconstructor(frames).phase))
+        figure = mirror[-1] + gain * (found @ fit) @ modes
+        mirror.append(figure / np.maximum(figure.std(axis=-1, keepdims=True) / stroke, 1))
+        mirror.popleft()
+    return LoopRun(times, open_loop, residual, ratio)
+
+
+def _without_piston(phase: NDArray) -> NDArray:
+    """Phase on the circle around its mean phasor, in (-pi, pi]."""
+    phasor = np.exp(1j * phase)
+    return np.angle(phasor * np.conj(phasor.mean(axis=-1, keepdims=True)))

@@ -1,0 +1,43 @@
+"""Numbers of the book from what pytest-benchmark measured: python -m tests.benchmarks.report MEASURED.json.
+
+The shortest time of each contestant is divided by that of zwfs with its own settings at the same task, so that
+what is kept depends little on the machine.
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+KEPT = Path(__file__).parents[2] / "book" / "performance.json"
+
+
+def digits(value, n):
+    return float(f"{value:.{n}g}")
+
+
+def peers(measured):
+    """One row for each contestant: task, package, setting, default, ratio of times, error."""
+    rows = [(one["extra_info"], one["stats"]["min"], one["group"]) for one in measured["benchmarks"]]
+    rows = [row for row in rows if "package" in row[0]]
+    own = {task: seconds for info, seconds, task in rows if info["package"] == "zwfs" and info["default"]}
+    return [
+        {"task": task, **info, "error": digits(info["error"], 2), "ratio": digits(seconds / own[task], 3)}
+        for info, seconds, task in rows
+    ]
+
+
+def main(path):
+    measured = json.loads(Path(path).read_text())
+    kept = {"machine": measured["machine_info"]["cpu"]["brand_raw"], "peers": peers(measured)}
+    partial = KEPT.with_suffix(".partial")
+    partial.write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n")
+    os.replace(partial, KEPT)
+    for row in kept["peers"]:
+        mark = "*" if row["default"] else " "
+        name = f"{row['package']}, {row['setting']}"
+        print(f"{row['task']:36}{mark}{name:32}{row['ratio']:9.3g}{row['error']:10.2g}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -43,8 +43,10 @@ lint: $(READY) ## check style and formatting
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-bench: $(READY) ## time the sensor and the reconstructors
-	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
+bench: $(READY) ## time the reconstructors, beside other packages too, for the performance page
+	@mkdir -p _build
+	$(BIN)/python -m pytest tests/benchmarks --benchmark-only --benchmark-json=_build/measured.json
+	$(BIN)/python -m tests.benchmarks.report _build/measured.json
 
 lock: $(BIN)/uv ## pin the newest allowed version of every dependency
 	$(UV) pip compile pyproject.toml --extra book --extra lab --extra test --upgrade \

@@ -28,16 +28,20 @@ GROUPS = {
         "zwfs.reconstructors.gradient_descent",
     ),
     "Metrics": ("zwfs.metrics",),
-    "Experiments": ("zwfs.experiments", "zwfs.variations"),
+    "Experiments": ("zwfs.experiments", "zwfs.variations", "zwfs.closed_loop", "zwfs.sweeps"),
     "Bench": ("zwfs.bench", "zwfs.bench_trials"),
+    "Frames of a camera": ("zwfs.camera", "zwfs.registration", "zwfs.frames"),
     "Equations of the paper": ("zwfs.interference", "zwfs.focal"),
     "Low-rank factors": ("zwfs.lowrank",),
     "Figures, tables and files": (
         "zwfs.figures",
         "zwfs.figures_bench",
+        "zwfs.figures_frames",
+        "zwfs.figures_loop",
         "zwfs.drawings",
         "zwfs.tables",
         "zwfs.results",
+        "zwfs.parameters",
     ),
 }
 

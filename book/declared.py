@@ -17,6 +17,10 @@ from zwfs.parameters import check_parameters
 UNITS = ("rad", "rad rms", "lambda/D", "D", "D²/lambda", "nm", "m", "s", "Hz", "pixels", "electrons", "photons")
 
 
+# Limits that are types.
+TYPES = {"str": str, "bool": bool}
+
+
 class ParameterError(Exception):
     """A value for a parameter that the notebook does not take; the message is one line."""
 
@@ -50,8 +54,10 @@ class Parameter:
     @property
     def allowed(self) -> str:
         """Its limits, as a reader calls them."""
-        limits = self.limits[0] if isinstance(self.limits, list) else self.limits
-        if limits is None:
+        limits = self.limits
+        while isinstance(limits, list):
+            limits = limits[0]
+        if limits is None or isinstance(limits, type):
             return ""
         return ", ".join(limits) if isinstance(limits[0], str) else f"{limits[0]:g} to {limits[1]:.10g}"
 
@@ -60,6 +66,8 @@ def _scalar(limits: Any) -> Any:
     """Return a value of the type that single values within some limits have."""
     if isinstance(limits, list):
         return _scalar(limits[0])
+    if isinstance(limits, type):
+        return limits()
     floats = [limit for limit in limits or () if isinstance(limit, float)]
     return floats[0] if floats else limits[0] if limits else None
 
@@ -102,8 +110,15 @@ def _limits(notebook: NotebookNode) -> dict[str, Any]:
         if cell.cell_type == "code" and f"{check_parameters.__name__}(" in cell.source:
             for node in ast.walk(ast.parse(cell.source)):
                 if isinstance(node, ast.Call) and getattr(node.func, "id", "") == check_parameters.__name__:
-                    return {keyword.arg: _literal(keyword.value) for keyword in node.keywords}
+                    return {keyword.arg: _limit(keyword.value) for keyword in node.keywords}
     return {}
+
+
+def _limit(node: ast.expr) -> Any:
+    """Return limits, which are literals but for the types that stand for any text or truth value."""
+    if isinstance(node, ast.List):
+        return [_limit(item) for item in node.elts]
+    return TYPES[node.id] if isinstance(node, ast.Name) and node.id in TYPES else _literal(node)
 
 
 def _literal(node: ast.expr) -> Any:

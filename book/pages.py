@@ -15,6 +15,7 @@ import cards
 import claims
 import finish
 import live
+import performance
 import printing
 from runner import Project, digest, digest_files, read, replace, swap, to_bytes
 
@@ -76,9 +77,8 @@ def build_book(project: Project) -> bool:
     html, record = project.build / "html", project.build / "html.json"
     files = staged_files(project)
     chromium = printing.find_chromium() if printing.STYLE in files else None
-    code = [
-        Path(module.__file__) for module in (sys.modules[__name__], api, cards, claims, finish, live, printing)
-    ]
+    modules = (sys.modules[__name__], api, cards, claims, finish, live, performance, printing)
+    code = [Path(module.__file__) for module in modules]
     about = [file for file in (project.root / "pyproject.toml",) if file.exists()]
     inputs = {f"{file.parent.name}/{file.name}": file for file in (*code, *about, *project.shared_inputs())}
     origin = {notebook.stem: cards.versions_of(project, notebook.stem) for notebook in project.sources()}
@@ -95,14 +95,16 @@ def build_book(project: Project) -> bool:
         page = source / "notebooks" / f"{name}.ipynb"
         # The notebook to take away, among the downloads, stays as it was run.
         page.write_bytes(to_bytes(cards.with_cards(read(page), name, versions, commit)))
-    if claims.PAGE in files:
-        _write(source, claims.fragments(project.executed))
-    if api.PAGE in files:
-        _write(source, api.fragments())
-    if live.PAGE in files:
-        _write(source, {live.DATA: live.script()})
-    if printing.STYLE in files:
-        _write(source, {printing.LINK: printing.link(chromium)})
+    made = {
+        claims.PAGE: lambda: claims.fragments(project.executed),
+        api.PAGE: api.fragments,
+        live.PAGE: lambda: {live.DATA: live.script()},
+        performance.PAGE: lambda: performance.fragments(source),
+        printing.STYLE: lambda: {printing.LINK: printing.link(chromium)},
+    }
+    for page, fragments in made.items():
+        if page in files:
+            _write(source, fragments())
     with tempfile.TemporaryDirectory(dir=project.build, prefix="building-") as scratch:
         built = write_pages(source, Path(scratch))
         if chromium:
@@ -123,9 +125,9 @@ def _stage(project: Project, files: dict[str, Path]) -> Path:
     return source
 
 
-def _write(source: Path, fragments: dict[str, str]) -> None:
-    for name, text in fragments.items():
-        (source / name).write_text(text, "utf-8")
+def _write(source: Path, fragments: dict[str, str | bytes]) -> None:
+    for name, content in fragments.items():
+        (source / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
 def write_pages(source: Path, output: Path) -> Path:

@@ -28,6 +28,10 @@ NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
         ((1, 2), [(1, 2)]),
         ("low", ("low", "high")),
         (["low", "high"], [("low", "high")]),
+        ("any", str),
+        ([], [str, ...]),
+        (False, bool),
+        ([[1.0, 2.0], [3, 4]], [[(0.0, 9.0)], ...]),
     ],
 )
 def test_values_within_limits_pass(value, limits):
@@ -56,6 +60,9 @@ def test_values_within_limits_pass(value, limits):
         ([1.0, 5.0], [(0.0, 4.0), ...], ValueError, r"x\[1\] = 5.0: expected a finite number in \[0, 4\]"),
         ("middle", ("low", "high"), ValueError, "x = 'middle': expected one of 'low', 'high'"),
         (1, ("low", "high"), TypeError, "x = 1: expected one of 'low', 'high'"),
+        (1, str, TypeError, "x = 1: expected a text"),
+        (0, bool, TypeError, "x = 0: expected True or False"),
+        (["a", 1], [str], TypeError, r"x\[1\] = 1: expected a text"),
         (1, (1,), TypeError, r"limits of x = \(1,\): expected"),
         (1, [(1, 2), (3, 4)], TypeError, "limits of x = "),
     ],

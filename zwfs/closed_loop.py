@@ -198,14 +198,14 @@ def close_loop(
         frames = sensor.measure(left)
         if camera is not None:
             frames = camera.normalise(camera.expose(frames, rng), floor=0.0)
-        found = _without_piston(pupil.gather(reconstructor(frames).phase))
+        found = without_piston(pupil.gather(reconstructor(frames).phase))
         figure = mirror[-1] + gain * (found @ fit) @ modes
         mirror.append(figure / np.maximum(figure.std(axis=-1, keepdims=True) / stroke, 1))
         mirror.popleft()
     return LoopRun(times, open_loop, residual, ratio)
 
 
-def _without_piston(phase: NDArray) -> NDArray:
-    """Phase on the circle around its mean phasor, in (-pi, pi]."""
+def without_piston(phase: NDArray) -> NDArray:
+    """Phases on the circle around their mean phasor: (..., n_points) to the same, radian, in (-pi, pi]."""
     phasor = np.exp(1j * phase)
     return np.angle(phasor * np.conj(phasor.mean(axis=-1, keepdims=True)))

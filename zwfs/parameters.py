@@ -24,6 +24,7 @@ def check_parameters(values: Mapping[str, Any], /, **limits: Any) -> None:
         - ``(low, high)``, both int: an integer between them;
         - ``(low, high)``, one a float: a finite number between them;
         - a tuple of str: one of these;
+        - ``str`` or ``bool``: any text, or True or False;
         - ``[limits]``: a list of one or more values, each within the limits;
         - ``[limits, ...]``: the same, or an empty list.
 
@@ -42,6 +43,9 @@ def check_parameters(values: Mapping[str, Any], /, **limits: Any) -> None:
 
 def _check_value(name: str, value: Any, limit: Any) -> None:
     match limit:
+        case type() if limit in (str, bool):
+            if not isinstance(value, limit):
+                raise TypeError(f"{name} = {value!r}: expected {'a text' if limit is str else 'True or False'}")
         case [within, *more] if isinstance(limit, list) and more in ([], [...]):
             if not isinstance(value, list | tuple):
                 raise TypeError(f"{name} = {value!r}: expected a list")
@@ -59,5 +63,5 @@ def _check_value(name: str, value: Any, limit: Any) -> None:
             _check.number(name, value, low, high)
         case _:
             raise TypeError(
-                f"limits of {name} = {limit!r}: expected (low, high), strings, or a list of one of these"
+                f"limits of {name} = {limit!r}: expected (low, high), strings, a type, or a list of one of these"
             )

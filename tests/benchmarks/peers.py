@@ -25,7 +25,7 @@ from zwfs import (
     zernike_basis,
 )
 
-from ..reference import HcipySensor, exact_frame
+from ..reference import HcipySensor, exact_frame, exact_reference
 
 DIAMETER, N_ITERATIONS = 1.06, 25
 PLUS, MINUS = Dimple(DIAMETER, np.pi / 2), Dimple(DIAMETER, -np.pi / 2)
@@ -74,11 +74,28 @@ class Field:
         self.pupil = Pupil.circular(100)
         self.modes = zernike_basis(self.pupil, 200)
         self.screen, self.faint = (power_law_screens(self.modes, rms, 1, seed=1)[0] for rms in (0.8, 0.1))
+        self.field = self.pupil.amplitude * np.exp(1j * self.screen)
+        self.behind = self.field + exact_reference(self.pupil, PLUS, self.field)
         self.frame = exact_frame(self.pupil, PLUS, self.screen)
         self.frames = np.stack([exact_frame(self.pupil, dimple, self.screen) for dimple in (PLUS, MINUS)])
 
     def contestants(self):
-        return [*self.images(), *self.image_pairs(), *self.single_reconstructions(), *self.iterations()]
+        return [
+            *self.propagations(),
+            *self.images(),
+            *self.image_pairs(),
+            *self.single_reconstructions(),
+            *self.iterations(),
+        ]
+
+    def propagations(self):
+        """A field through the mask to the camera."""
+        task, error = "one propagation", lambda field: self._worst(field - self.behind)
+        run = prepared(self._zwfs_field)
+        yield Contestant(task, "zwfs", "tolerance 1e-10", True, run, error)
+        for n in SAMPLES:
+            run = prepared(partial(self._hcipy_field, n))
+            yield Contestant(task, "HCIPy", f"{n} samples", n == 128, run, error)
 
     def images(self):
         """One frame of a classic sensor."""
@@ -130,6 +147,15 @@ class Field:
     def _zwfs(self, tolerance, *dimples):
         sensor = ZernikeSensor(self.pupil, *dimples, tolerance=tolerance)
         return lambda: sensor.measure(self.screen).squeeze()
+
+    def _zwfs_field(self):
+        sensor = ZernikeSensor(self.pupil, PLUS)
+        return lambda: sensor.propagate(self.field)[0]
+
+    def _hcipy_field(self, n_samples):
+        sensor = HcipySensor(self.pupil, PLUS, num_pix=n_samples)
+        wavefront = sensor.wavefront(self.field)
+        return lambda: sensor.optics[0].forward(wavefront).electric_field.reshape(self.pupil.shape)
 
     def _zwfs_single(self, setting):
         sensor = ZernikeSensor(self.pupil, PLUS)

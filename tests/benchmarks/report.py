@@ -1,5 +1,7 @@
 """Numbers of the book from what pytest-benchmark measured: python -m tests.benchmarks.report MEASURED.json.
 
+It also runs `tests.benchmarks.speed`, and writes both to book/performance.json, from which the page is made.
+
 The shortest time of each contestant is divided by that of zwfs with its own settings at the same task, so that
 what is kept depends little on the machine.
 """
@@ -9,11 +11,22 @@ import os
 import sys
 from pathlib import Path
 
+from . import speed
+
 KEPT = Path(__file__).parents[2] / "book" / "performance.json"
 
 
 def digits(value, n):
     return float(f"{value:.{n}g}")
+
+
+def rounded(values):
+    """The same numbers with three digits; whole numbers stay."""
+    if isinstance(values, dict):
+        return {name: rounded(value) for name, value in values.items()}
+    if isinstance(values, list):
+        return [rounded(value) for value in values]
+    return digits(values, 3) if isinstance(values, float) else values
 
 
 def peers(measured):
@@ -29,7 +42,11 @@ def peers(measured):
 
 def main(path):
     measured = json.loads(Path(path).read_text())
-    kept = {"machine": measured["machine_info"]["cpu"]["brand_raw"], "peers": peers(measured)}
+    kept = {
+        "machine": measured["machine_info"]["cpu"]["brand_raw"],
+        "peers": peers(measured),
+        "speed": rounded(speed.results(0.5)),
+    }
     partial = KEPT.with_suffix(".partial")
     partial.write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n")
     os.replace(partial, KEPT)

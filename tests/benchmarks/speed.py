@@ -24,6 +24,7 @@ from zwfs import (
     reconstruction_error,
     zernike_basis,
 )
+from zwfs import closed_loop as loops
 from zwfs.experiments import screens_at
 from zwfs.reconstructors import _common
 
@@ -114,6 +115,62 @@ def breakdown(n_pixels, seconds):
     return {name: best(part, seconds) for name, part in parts.items()}
 
 
+def limit(n_pixels, seconds):
+    """Time of an accelerated call, and of what no such call can do without: products, passes, arctangent."""
+    sensor = ZernikeSensor(Pupil.circular(n_pixels), *DIMPLES)
+    screen = screens_at(zernike_basis(sensor.pupil, 200), 0.8, 1, 2024, 7)[0]
+    frames = sensor.measure(screen).astype(np.float32)
+    method = PhaseShifted(sensor, **REAL_TIME)
+    operator = sensor.operator(frames.dtype)
+    phasor = np.ones((1, 2, *frames.shape[1:]), frames.dtype)
+    coefficients = operator.split_project(phasor) @ method._in_precision(frames.dtype).core
+    steps = REAL_TIME["n_iterations"]
+    signal, target = np.ones_like(phasor), np.empty_like(phasor)
+
+    def passes():
+        np.add(frames, frames, out=target[0])  # the signal
+        for _ in range(steps):
+            np.multiply(signal, phasor, out=target)  # the system: field and signal in, field out
+
+    parts = {
+        "the whole call": lambda: method(frames),
+        # The first step needs no projection: its coefficients are those of a flat wavefront.
+        "its products with the low-rank functions": lambda: [
+            operator.split_project(phasor) if i else operator.split_expand(coefficients, in_window=True)
+            for _ in range(steps)
+            for i in range(2)
+        ][:-1],
+        "one pass over frames and, in each step, over signal and field": passes,
+        "the arctangent of the phase": lambda: _common.angle(phasor),
+    }
+    times = {name: best(part, seconds) for name, part in parts.items()}
+    return times | {"these three together": sum(times.values()) - times["the whole call"]}
+
+
+def loop_step(n_pixels, seconds):
+    """Time from frames to a new figure of the mirror, one screen, by reconstructor."""
+    pupil = Pupil.circular(n_pixels)
+    modes = zernike_basis(pupil, 200)
+    classic, shifted = ZernikeSensor(pupil, DIMPLES[0]), ZernikeSensor(pupil, *DIMPLES)
+    methods = {
+        "linear": Linear(classic, modes),
+        "phase-shifted, 5 iterations": PhaseShifted(shifted, n_iterations=5),
+        "phase-shifted, 3 iterations, accelerated": PhaseShifted(shifted, **REAL_TIME),
+    }
+    screen = screens_at(modes, 0.1, 1, 2024, 7)[0]
+    flat, times = pupil.gather(modes), {}
+    fit = np.linalg.pinv(flat)
+    for name, method in methods.items():
+        frames = method.settings.sensor.measure(screen).astype(np.float32)
+
+        def step(method=method, frames=frames):
+            found = loops.without_piston(pupil.gather(method(frames).phase))
+            return 0.4 * (found @ fit) @ flat
+
+        times[name] = best(step, seconds)
+    return times
+
+
 def slope(seconds, sizes=(32, 64, 128, 256, 512, 1024)):
     """Time of 5 iterations and of a residual against the number of pixels, and the slope of its logarithm."""
     times = []
@@ -201,6 +258,8 @@ def results(seconds=2.0):
         "real time": [row for n_pixels in (100, 40) for row in real_time(n_pixels, seconds)],
         "closed loop": [closed_loop(n_pixels, seconds) for n_pixels in (100, 40)],
         "breakdown": {str(n_pixels): breakdown(n_pixels, seconds) for n_pixels in (100, 40)},
+        "limit": limit(100, seconds),
+        "loop step": loop_step(40, seconds),
         "slope": slope(seconds),
         "others": others(seconds),
     }

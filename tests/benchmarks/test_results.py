@@ -29,3 +29,13 @@ def test_memory_stays_flat_as_batches_grow():
 
 def test_growth_is_that_of_the_pixels_listed():
     assert len(speed.slope(0, sizes=(32, 48, 64, 96))["times"]) == 4
+
+
+def test_what_a_call_cannot_do_without_is_part_of_it():
+    times = speed.limit(40, seconds=0)
+    assert next(iter(times)) == "the whole call"
+    assert all(time > 0 for time in times.values())
+
+
+def test_every_reconstructor_of_the_loop_makes_a_step():
+    assert len(speed.loop_step(32, seconds=0)) == 3

@@ -108,22 +108,32 @@ def execute(request: dict[str, Any], messages: TextIO) -> bool:
         known = papermill.inspect_notebook(request["notebook"])
         in_force = {name: p["default"] for name, p in known.items()} | in_force
         with watch(Path(os.environ[PROGRESS]), messages):
-            papermill.execute_notebook(
-                request["notebook"],
-                request["target"],
-                parameters=request["parameters"],
-                cwd=request["folder"],
-                engine_name="reporting",
-                kernel_name="python3",
-                progress_bar=False,
-                request_save_on_cell_execute=False,
-                shutdown_kernel="immediate",
-            )
+            try:
+                _run(request)
+            except RuntimeError:
+                # Two kernels that start at one time may choose the same port, and one of them never answers.
+                if ReportingEngine.cell is not None:
+                    raise
+                _run(request)
     except Exception as error:
         failure = {"where": ReportingEngine.cell, "parameters": in_force, "error": last_lines(error)}
         send(messages, {"failure": failure})
         return False
     return True
+
+
+def _run(request: dict[str, Any]) -> None:
+    papermill.execute_notebook(
+        request["notebook"],
+        request["target"],
+        parameters=request["parameters"],
+        cwd=request["folder"],
+        engine_name="reporting",
+        kernel_name="python3",
+        progress_bar=False,
+        request_save_on_cell_execute=False,
+        shutdown_kernel="immediate",
+    )
 
 
 def main() -> int:

@@ -197,9 +197,9 @@ class Found:
 
     @cached_property
     def mismatch(self) -> NDArray[np.float64]:
-        """Measured less modelled frames over the contrast, (2, ny', nx'): its squares sum up to `misfit` squared.
+        """Measured less modelled frames over the contrast, shape (2, ny', nx').
 
-        Pupil and surroundings weigh the same, however many pixels they have; what belongs to neither is 0.
+        Its squares sum up to that of `misfit`. Pupil and surroundings weigh the same, however many pixels they have; what belongs to neither is 0.
         """
         beside, inside = self.measurement.beside, np.zeros(self.measured.shape, bool)
         inside[(..., *self.measurement.window)] = self.measurement.good

@@ -84,7 +84,7 @@ class Recording:
 
     @cached_property
     def diameter(self) -> float:
-        """Diameter of the pupils in pixels: the mean of both."""
+        """Mean diameter of the two pupils, in pixels."""
         return sum(pupil.diameter for pupil in self.pupils) / 2
 
     @cached_property

@@ -199,7 +199,8 @@ class Found:
     def mismatch(self) -> NDArray[np.float64]:
         """Measured less modelled frames over the contrast, shape (2, ny', nx').
 
-        Its squares sum up to that of `misfit`. Pupil and surroundings weigh the same, however many pixels they have; what belongs to neither is 0.
+        Its squares sum up to that of `misfit`. Pupil and surroundings weigh the same, however many pixels they
+        have; what belongs to neither is 0.
         """
         beside, inside = self.measurement.beside, np.zeros(self.measured.shape, bool)
         inside[(..., *self.measurement.window)] = self.measurement.good

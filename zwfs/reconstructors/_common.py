@@ -89,6 +89,9 @@ class Settings:
     amplitude: NDArray[np.float64]
     _maps: dict[np.dtype, Maps] = field(default_factory=dict, init=False, repr=False)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_maps": {}}  # cheap to make again, and no part of what was asked for
+
     def maps(self, dtype: np.dtype) -> Maps:
         """Maps in float32 or float64; made once, then kept."""
         if dtype not in self._maps:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -78,6 +78,9 @@ class PhaseShifted:
         self._incoming = float(sensor.n_masks * np.sum(self.settings.amplitude**2))
         self._flat_loss = float(self._loss(flat)[0])
         self._constants: dict[np.dtype, _Constants] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_constants": {}}  # made again where they are needed
 
     def __call__(
         self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False

@@ -94,7 +94,7 @@ def size(picture: Path) -> tuple[int, int]:
 
 def open_figures(page: BeautifulSoup) -> None:
     """Let figures be opened alone, and scroll where the page is narrower than their labels need."""
-    for image in page.select(".cell_output > figure > img"):
+    for image in page.select("figure > img"):
         image.wrap(page.new_tag("a", href=image["src"], title="Open the figure alone"))
         image.parent.wrap(page.new_tag("div", **{"class": "wide-figure"}))
 

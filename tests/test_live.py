@@ -1,6 +1,5 @@
 """The live sensor: its script against zwfs, and its page, in a browser."""
 
-import os
 import re
 import shutil
 from pathlib import Path
@@ -15,9 +14,6 @@ from zwfs.lowrank import Plane
 ROOT = Path(__file__).parent.parent
 STATIC = ROOT / "book" / "_static"
 MARKUP = re.search(r"```\{raw\} html\n(.*?)```", (ROOT / live.PAGE).read_text("utf-8"), re.DOTALL)[1]
-CHROMIUM = os.environ.get("ZWFS_CHROMIUM") or next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
 # The simplest shifts, unequal ones, ones of one sign; wide and narrow dimples: rms, seed, diameter (lambda/D),
 # shifts (pi), iterations.
 SETTINGS = [
@@ -44,11 +40,8 @@ def modes(pupil):
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory):
+def page(browser, tmp_path_factory):
     """The page of the live sensor without the book around it, opened as a file."""
-    playwright = pytest.importorskip("playwright.sync_api")
-    if not CHROMIUM:
-        pytest.skip("no chromium found: install it, or name it in ZWFS_CHROMIUM")
     book = tmp_path_factory.mktemp("site")
     static = book / "_static"
     shutil.copytree(STATIC, static)
@@ -56,16 +49,13 @@ def page(tmp_path_factory):
     (book / "book").mkdir()
     file = book / "book" / "live.html"
     file.write_text(f'<!doctype html><html lang="en"><meta charset="utf-8"><body>{MARKUP}</body></html>', "utf-8")
-    with playwright.sync_playwright() as tool:
-        browser = tool.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1000, "height": 800})
-        page.said, page.asked = [], []
-        page.on("console", lambda message: page.said.append(message.text))
-        page.on("pageerror", lambda error: page.said.append(str(error)))
-        page.on("request", lambda request: page.asked.append(request.url))
-        page.goto(file.as_uri())
-        yield page
-        browser.close()
+    page = browser.new_page(viewport={"width": 1000, "height": 800})
+    page.said, page.asked = [], []
+    page.on("console", lambda message: page.said.append(message.text))
+    page.on("pageerror", lambda error: page.said.append(str(error)))
+    page.on("request", lambda request: page.asked.append(request.url))
+    page.goto(file.as_uri())
+    return page
 
 
 COMPUTE = """settings => {

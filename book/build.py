@@ -13,6 +13,8 @@ from pages import BookError, build_book
 from printing import PrintError
 from runner import NotebookError, Project
 
+from zwfs.results import write_file
+
 FRONT_FIGURE = "fig03_dynamic_range"  # stands in the README, as book/_static/front.png
 
 
@@ -57,7 +59,7 @@ def refresh(project: Project) -> list[str]:
     for committed, fresh in committed_files(project).items():
         content = fresh.read_bytes()
         if not committed.exists() or content != committed.read_bytes():
-            runner.replace(committed, content)
+            write_file(committed, content)
             changed.append(str(committed.relative_to(project.root)))
     return changed
 

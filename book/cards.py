@@ -1,14 +1,11 @@
 """The card under each published figure: what it regenerates, what made it, and how to make it again."""
 
 import ast
-import io
 import json
 import re
-import subprocess
-import tokenize
-from dataclasses import dataclass
-from pathlib import Path
 
+import runner
+from declared import assigned
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 from runner import Project
@@ -19,37 +16,21 @@ RERUN = "make rerun FIGURE={notebook}"
 MARKDOWN = re.compile(r"([\\`*_{}\[\]<>$|#])")
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """A value that a notebook was run with.
-
-    Parameters
-    ----------
-    value : str
-        As it is written.
-    meaning : str
-        The comment behind it: meaning and unit.
-    """
-
-    value: str
-    meaning: str
-
-
 def with_cards(notebook: NotebookNode, name: str, versions: dict[str, str], commit: str) -> NotebookNode:
     """Add a card under each figure of an executed notebook, in place, and return the notebook.
 
     Parameters
     ----------
     notebook : NotebookNode
-        A cell makes a figure if it calls ``publish(figure, "name", ...)``.
+        Run with its defaults. A cell makes a figure if it calls ``publish(figure, "name", ...)``.
     name : str
         The stem of its file.
     versions : dict of str
         Of Python and the packages that it was run with.
     commit : str
-        The state of the repository.
+        See `state_of`.
     """
-    known = parameters(notebook)
+    known = assigned(notebook)
     cells = []
     for cell in notebook.cells:
         cells.append(cell)
@@ -70,31 +51,9 @@ def published(source: str) -> list[str]:
     return [ast.literal_eval(call.args[1]) for call in named]
 
 
-def parameters(notebook: NotebookNode) -> dict[str, Parameter]:
-    """Return the parameters in force: the defaults, and over them what a run put in their place."""
-    found: dict[str, Parameter] = {}
-    for tag in ("parameters", "injected-parameters"):
-        for cell in notebook.cells:
-            if tag in cell.metadata.get("tags", ()):
-                for name, new in _assignments(cell.source).items():
-                    found[name] = Parameter(new.value, new.meaning or found.get(name, new).meaning)
-    return found
-
-
-def _assignments(source: str) -> dict[str, Parameter]:
-    """Return the values that a cell assigns, with the comments behind them."""
-    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
-    meanings = {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
-    return {
-        node.targets[0].id: Parameter(
-            ast.get_source_segment(source, node.value), meanings.get(node.end_lineno, "")
-        )
-        for node in ast.parse(source).body
-        if isinstance(node, ast.Assign)
-    }
-
-
-def card(notebook: str, figure: str, known: dict[str, Parameter], versions: dict[str, str], commit: str) -> str:
+def card(
+    notebook: str, figure: str, known: dict[str, tuple[str, str]], versions: dict[str, str], commit: str
+) -> str:
     """Return the card of one figure as MyST.
 
     Parameters
@@ -103,16 +62,14 @@ def card(notebook: str, figure: str, known: dict[str, Parameter], versions: dict
         The stem of the notebook's file.
     figure : str
         The stem of the figure's files.
-    known : dict of Parameter
-        All parameters in force, by name.
+    known : dict of (value, comment)
+        See `declared.assigned`.
     versions, commit
         See `with_cards`.
     """
-    seed = f"`{known['seed'].value}`" if "seed" in known else "none, nothing is random"
+    seed = f"`{known['seed'][0]}`" if "seed" in known else "none, nothing is random"
     rows = [
-        f"- `{name} = {parameter.value}`: {_plain(parameter.meaning)}"
-        for name, parameter in known.items()
-        if name != "seed"
+        f"- `{name} = {value}`: {_plain(comment)}" for name, (value, comment) in known.items() if name != "seed"
     ]
     told = ", ".join(f"{package} {version}" for package, version in versions.items())
     return "\n".join(
@@ -170,15 +127,7 @@ def versions_of(project: Project, name: str) -> dict[str, str]:
         return {}
 
 
-def commit_of(root: Path) -> str:
-    """Return the commit of a working tree, and say if it has changes; a copy without a history has none."""
-    if not (root / ".git").exists():
-        return "not known"
-    try:
-        head, changes = (
-            subprocess.run(["git", "-C", str(root), *command], capture_output=True, text=True, check=True).stdout
-            for command in (["rev-parse", "--short=12", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "not known"
-    return f"`{head.strip()}`{', with changes' if changes else ''}"
+def state_of(project: Project) -> str:
+    """Return the commit of the working tree, and say if it has changes."""
+    commit, changed = runner.commit(project.root)
+    return f"`{commit[:12]}`{', with changes' if changed else ''}" if commit else "not known"

@@ -80,14 +80,20 @@ def parameters(notebook: NotebookNode) -> dict[str, Parameter]:
     ParameterError
         If a default or a limit is no literal.
     """
+    limits = _limits(notebook)
+    return {
+        name: Parameter(_literal(_expression(value)), *_meaning_and_unit(comment), limits.get(name))
+        for name, (value, comment) in assigned(notebook).items()
+    }
+
+
+def assigned(notebook: NotebookNode) -> dict[str, tuple[str, str]]:
+    """Return, by name, what the cell tagged ``parameters`` assigns: value and comment, as they are written."""
     source = next((c.source for c in notebook.cells if "parameters" in c.metadata.get("tags", ())), "")
     tokens = tokenize.generate_tokens(io.StringIO(source).readline)
     comments = {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
-    limits = _limits(notebook)
     return {
-        target.id: Parameter(
-            _literal(node.value), *_meaning_and_unit(comments.get(node.end_lineno, "")), limits.get(target.id)
-        )
+        target.id: (ast.get_source_segment(source, node.value), comments.get(node.end_lineno, ""))
         for node in ast.parse(source).body
         if isinstance(node, ast.Assign)
         for target in node.targets
@@ -119,6 +125,11 @@ def _limit(node: ast.expr) -> Any:
     if isinstance(node, ast.List):
         return [_limit(item) for item in node.elts]
     return TYPES[node.id] if isinstance(node, ast.Name) and node.id in TYPES else _literal(node)
+
+
+def _expression(value: str) -> ast.expr:
+    # Of a value on several lines the parentheses may be missing.
+    return ast.parse(f"({value})", mode="eval").body
 
 
 def _literal(node: ast.expr) -> Any:

@@ -17,7 +17,9 @@ import finish
 import live
 import performance
 import printing
-from runner import Project, digest, digest_files, read, replace, swap, to_bytes
+from runner import Project, digest, digest_files, read, swap, to_bytes
+
+from zwfs.results import write_file
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 JUPYTER_BOOK = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()"]
@@ -82,7 +84,7 @@ def build_book(project: Project) -> bool:
     about = [file for file in (project.root / "pyproject.toml",) if file.exists()]
     inputs = {f"{file.parent.name}/{file.name}": file for file in (*code, *about, *project.shared_inputs())}
     origin = {notebook.stem: cards.versions_of(project, notebook.stem) for notebook in project.sources()}
-    commit = cards.commit_of(project.root)
+    commit = cards.state_of(project)
     told = [sys.version_info[:2], bool(chromium), commit, origin]
     made_from = digest([digest_files(files | inputs).encode(), json.dumps(told, sort_keys=True).encode()])
     try:
@@ -111,7 +113,7 @@ def build_book(project: Project) -> bool:
             (built / printing.NAME).write_bytes(printing.print_book(project.root, built, chromium))
         record.unlink(missing_ok=True)
         swap(built, html, Path(scratch) / "earlier")
-    replace(record, json.dumps(made_from).encode())
+    write_file(record, json.dumps(made_from).encode())
     return True
 
 

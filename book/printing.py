@@ -25,8 +25,11 @@ STYLE = "book/print.css"  # a book that has none is not printed
 LINK = "book/_pdf_link.md"  # the front page includes it
 NAME = "zwfs.pdf"
 
+CHROMIUM = "ZWFS_CHROMIUM"  # environment variable that names the browser to use
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-MISSING = "a PDF needs Chromium: install one, or run .venv/bin/playwright install chromium"
+MISSING = (
+    f"a PDF needs Chromium: install one, run .venv/bin/playwright install chromium, or name one in {CHROMIUM}"
+)
 
 # What makes sense on a screen only.
 SCREEN_ONLY = [".run-card", "script", "style", "button", ".headerlink", ".d-print-none", "details.above-input"]
@@ -70,7 +73,9 @@ class PrintError(Exception):
 
 @functools.cache
 def find_chromium() -> str | None:
-    """Return the path of a Chromium: the system's, else Playwright's own."""
+    """Return the path of a Chromium: the one in ``ZWFS_CHROMIUM``, else the system's, else Playwright's own."""
+    if named := os.environ.get(CHROMIUM):
+        return shutil.which(named)
     for name in BROWSERS:
         if path := shutil.which(name):
             return path

@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 import signal
-import subprocess
 import sys
 import tempfile
 from datetime import UTC, datetime
@@ -177,22 +176,6 @@ def notice(changed: dict[str, Any], known: dict[str, Parameter]) -> NotebookNode
     return new_markdown_cell("\n".join([*text, *rows]))
 
 
-def commit(root: Path) -> dict[str, Any]:
-    """Return the commit of the working tree, and whether it has changes; None where there is no history."""
-
-    def git(*command: str) -> str:
-        done = subprocess.run(["git", "-C", str(root), *command], capture_output=True, text=True, check=True)
-        return done.stdout.strip()
-
-    try:
-        # A copy without a history may lie within another repository.
-        if Path(git("rev-parse", "--show-toplevel")) == root.resolve():
-            return {"commit": git("rev-parse", "HEAD"), "changed_since": bool(git("status", "--porcelain"))}
-    except (OSError, subprocess.CalledProcessError):
-        pass
-    return {"commit": None, "changed_since": None}
-
-
 def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, Parameter], folder: Path) -> float:
     """Run a notebook, and put all that it makes into a folder in one step.
 
@@ -217,7 +200,7 @@ def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, 
 
     within = project.build if folder.is_relative_to(project.build) else folder.parent
     within.mkdir(parents=True, exist_ok=True)
-    origin = commit(project.root)
+    commit, changed_since = runner.commit(project.root)
     with tempfile.TemporaryDirectory(dir=within, prefix="rerunning-") as place:
         scratch, new = Path(place), Path(place) / "new"
         with Progress(project, [name], name) as progress:
@@ -242,7 +225,8 @@ def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, 
             "changed": changed,
             "seed": parameters.get("seed"),
             "versions": runner.versions(),
-            **origin,
+            "commit": commit,
+            "changed_since": changed_since,
             "key": done.key,
             "seconds": done.seconds,
             "files": digests(new, [file.name for file in new.iterdir()]),

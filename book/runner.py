@@ -24,6 +24,8 @@ import nbformat
 from nbformat import NotebookNode
 from tqdm import tqdm
 
+from zwfs.results import write_file
+
 HERE = Path(__file__).parent
 EXECUTE = HERE / "execute.py"
 
@@ -214,17 +216,6 @@ def to_bytes(notebook: NotebookNode) -> bytes:
     return (nbformat.writes(notebook).rstrip("\n") + "\n").encode()
 
 
-def replace(path: Path, content: bytes) -> None:
-    """Write a file in one step: it is the old one or the new one, never half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        partial.write_bytes(content)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
 def swap(new: Path, current: Path, earlier: Path) -> None:
     """Put a new folder in the place of the current one; put that back if it does not work."""
     try:
@@ -241,6 +232,25 @@ def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that decide what a notebook shows."""
     packages = {"NumPy": "numpy", "SciPy": "scipy", "Matplotlib": "matplotlib", "zwfs": "zwfs"}
     return {"Python": platform.python_version()} | {name: metadata.version(p) for name, p in packages.items()}
+
+
+def commit(root: Path) -> tuple[str | None, bool | None]:
+    """Return the commit of a working tree, and whether it has changes; None where there is no history.
+
+    A file that is in no commit is a change, too: it may be a notebook, or a module that one imports.
+    """
+
+    def git(*command: str) -> str:
+        done = subprocess.run(["git", "-C", str(root), *command], capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    try:
+        # A copy without a history may lie within another repository.
+        if Path(git("rev-parse", "--show-toplevel")) == root.resolve():
+            return git("rev-parse", "HEAD"), bool(git("status", "--porcelain"))
+    except (OSError, subprocess.CalledProcessError):
+        pass
+    return None, None
 
 
 def _digest_result(notebook: bytes, files: list[Path]) -> str:
@@ -475,10 +485,10 @@ def _run_one(project: Project, name: str, scratch: Path, children: Children, pro
         "versions": versions(),
     }
     # Pieces of two runs may lie together for a moment; only the record, which comes last, makes them a result.
-    replace(project.executed / f"{name}.ipynb", result)
+    write_file(project.executed / f"{name}.ipynb", result)
     shutil.rmtree(project.executed / f"{name}.files", ignore_errors=True)
     (scratch / f"{name}.files").rename(project.executed / f"{name}.files")
-    replace(project.executed / f"{name}.json", json.dumps(record, indent=1).encode())
+    write_file(project.executed / f"{name}.json", json.dumps(record, indent=1).encode())
     return done.seconds
 
 

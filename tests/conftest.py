@@ -1,5 +1,4 @@
 import os
-import shutil
 
 import numpy as np
 import pytest
@@ -64,13 +63,14 @@ def complex_field():
 @pytest.fixture(scope="module")
 def browser():
     """A Chromium, driven by Playwright; it is closed with the module, whose event loop others could not share."""
-    names = (os.environ.get("ZWFS_CHROMIUM", "chromium"), "chromium-browser", "google-chrome")
-    program = next(filter(None, map(shutil.which, names)), None)
+    from playwright.sync_api import sync_playwright
+    from printing import find_chromium
+
+    program = find_chromium()
     if program is None:
-        missing = "no Chromium on the path: install one, or name it in ZWFS_CHROMIUM"
+        missing = "no Chromium: install one, or name it in ZWFS_CHROMIUM"
         (pytest.fail if os.environ.get("ZWFS_REQUIRE_BROWSER") else pytest.skip)(missing)
-    playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as driver:
+    with sync_playwright() as driver:
         chromium = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
         yield chromium
         chromium.close()

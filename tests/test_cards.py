@@ -1,5 +1,6 @@
 """The cards under the figures: what they tell, and that their links work."""
 
+import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -22,12 +23,10 @@ def notebook(*sources):
 
 def test_a_card_tells_what_was_run():
     made = notebook("rms = 0.5  # input, rad rms\nseed = 3", 'publish(figure, "fig03_range", {})', "x = 1")
-    injected = nbformat.v4.new_code_cell("# Parameters\nrms = 0.7\n", metadata={"tags": ["injected-parameters"]})
-    made.cells.insert(1, injected)
     cards.with_cards(made, "fig03_range", {"Python": "3.12.1"}, "`abc`")
-    assert [cell.cell_type for cell in made.cells] == ["code", "code", "code", "markdown", "code"]
-    card = made.cells[3].source
-    told = ["Figure 3 of the paper", "`rms = 0.7`: input, rad rms", "Seed: `3`", "Commit: `abc`", "Python 3.12.1"]
+    assert [cell.cell_type for cell in made.cells] == ["code", "code", "markdown", "code"]
+    card = made.cells[2].source
+    told = ["Figure 3 of the paper", "`rms = 0.5`: input, rad rms", "Seed: `3`", "Commit: `abc`", "Python 3.12.1"]
     told += [
         "downloads/fig03_range.ipynb",
         "downloads/fig03_range.png",
@@ -55,8 +54,22 @@ def test_the_meaning_of_a_parameter_is_shown_as_it_is():
     assert r": \*not\* markup \| \$x\$ \[y\]" in card
 
 
-def test_a_folder_without_history_has_no_commit(tmp_path):
-    assert cards.commit_of(tmp_path) == "not known"
+def test_the_state_tells_commit_and_changes_of_this_folder_alone(tmp_path):
+    def git(*command):
+        names = ("-c", "user.name=Nobody", "-c", "user.email=nobody@example.org")
+        return subprocess.run(["git", "-C", tmp_path, *names, *command], capture_output=True, check=True).stdout
+
+    project = Project(tmp_path)
+    assert cards.state_of(project) == "not known"
+    git("init")
+    git("commit", "--allow-empty", "--message", "First")
+    head = git("rev-parse", "HEAD").decode()[:12]
+    assert cards.state_of(project) == f"`{head}`"
+    # Never committed, so the commit does not tell all that the book is made from.
+    (tmp_path / "new.ipynb").touch()
+    assert cards.state_of(project) == f"`{head}`, with changes"
+    (tmp_path / "within").mkdir()
+    assert cards.state_of(Project(tmp_path / "within")) == "not known"
 
 
 def test_a_record_of_an_earlier_kind_has_no_versions(tmp_path):

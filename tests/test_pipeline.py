@@ -19,6 +19,8 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from PIL import Image
 from runner import NotebookError, Project
 
+from zwfs.results import write_file
+
 BOOK = Path(runner.__file__).parent
 
 
@@ -106,12 +108,12 @@ def test_refreshed_notebooks_are_current_and_agree(ran):
 
 def test_front_figure_is_refreshed_and_checked(ran, monkeypatch):
     picture = ran.executed / "third.files" / "third.png"
-    runner.replace(picture, png_of(255))
+    write_file(picture, png_of(255))
     monkeypatch.setattr(build, "FRONT_FIGURE", "third")
     assert build.check_front(ran) == ["book/_static/front.png is not there: make figures"]
     assert "book/_static/front.png" in build.refresh(ran)
     assert build.check_front(ran) == []
-    runner.replace(picture, png_of(250))
+    write_file(picture, png_of(250))
     assert build.check_front(ran) == [
         "book/_static/front.png: the pictures differ by 4.33 of 255 rms, and 0.5 is allowed"
     ]

@@ -146,3 +146,11 @@ def test_without_a_browser_the_reason_is_told(monkeypatch, tmp_path):
     monkeypatch.setattr(printing, "find_chromium", lambda: None)
     with pytest.raises(printing.PrintError, match="install one"):
         build.pdf(build.Project(tmp_path))
+
+
+def test_the_browser_that_is_named_is_the_one(monkeypatch, tmp_path):
+    named = tmp_path / "browser"
+    monkeypatch.setenv(printing.CHROMIUM, str(named))
+    assert printing.find_chromium.__wrapped__() is None
+    named.touch(mode=0o755)
+    assert printing.find_chromium.__wrapped__() == str(named)

@@ -22,7 +22,6 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from runner import NotebookError, Project
 
 ROOT = Path(__file__).parent.parent
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 DEFAULTS = (
     "n = 2  # pixels across\nwidth = 1.5  # of the slit, rad\nsteps = [1, 2]  # tried, in turn\nseed = 7  # of it"
@@ -227,22 +226,17 @@ def test_page_has_everything_in_it(ran):
     assert "check_parameters" not in plain
 
 
-@pytest.mark.skipif(not CHROMIUM, reason="there is no browser")
-def test_page_opens_without_network_and_complaint(ran):
-    from playwright.sync_api import sync_playwright
-
+def test_page_opens_without_network_and_complaint(ran, browser):
     page_file = result(ran) / "fig01_small.html"
     requests, complaints = [], []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page()
-        page.on("request", lambda request: requests.append(request.url))
-        page.on("console", lambda message: complaints.append(message.text))
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.goto(page_file.as_uri())
-        page.wait_for_selector("mjx-container svg")
-        widths = page.evaluate("[...document.images].map(image => image.naturalWidth)")
-        browser.close()
+    page = browser.new_page()
+    page.on("request", lambda request: requests.append(request.url))
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto(page_file.as_uri())
+    page.wait_for_selector("mjx-container svg")
+    widths = page.evaluate("[...document.images].map(image => image.naturalWidth)")
+    page.close()
     assert [url for url in requests if not url.startswith("data:")] == [page_file.as_uri()]
     assert complaints == []
     assert widths
@@ -355,3 +349,22 @@ def test_real_figure_with_other_parameters(tmp_path):
     )
     assert "Figure 1 of the paper. Top" in plain
     assert "reference wave (3), so" in plain
+
+
+FEW = ["n_pixels=16", "n_screens=1"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("figure", "parameters"),
+    [
+        # Neither the inputs that the text quotes, nor the pairs of phase shifts that the figure points out.
+        ("identities", ["inputs=[4.0]", "n_modes=1", "n_shifts=5"]),
+        # Every method fails at every diameter.
+        ("4", ["n_screens_few=1", "rms=4", "n_iterations=1", "more_iterations=[1]", "step=2"]),
+    ],
+)
+def test_pages_of_unusual_parameters_have_no_gaps(tmp_path, capsys, figure, parameters):
+    values = [text for value in FEW + parameters for text in ("-p", value)]
+    rerun.rerun(Project(ROOT), [figure, *values, "--output", str(tmp_path / "figure")])
+    assert capsys.readouterr().err == ""

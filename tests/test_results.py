@@ -5,7 +5,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from zwfs.results import FOLDER, publish
+from zwfs.results import FOLDER, publish, write_file
 
 matplotlib.use("agg")
 
@@ -41,6 +41,16 @@ def test_three_files_are_the_same_from_run_to_run(figure, tmp_path, monkeypatch)
     assert b"CreationDate" not in first["plot.pdf"]
     assert b"Software" not in first["plot.png"]
     assert (tmp_path / "first" / "plot.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
+    file = tmp_path / "new" / "folder" / "data"
+    write_file(file, b"first")
+    write_file(file, b"second")
+    with pytest.raises(TypeError):
+        write_file(file, "text")
+    assert file.read_bytes() == b"second"
+    assert list(file.parent.iterdir()) == [file]
 
 
 def test_png_has_200_dots_per_inch(figure, tmp_path, monkeypatch):

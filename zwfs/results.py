@@ -103,7 +103,8 @@ def _text(value: Any) -> str:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file in one step: whoever looks sees all of it or nothing."""
+    """Write a file, and its folder if need be, in one step: whoever looks sees the old one or all of the new."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         partial.write_bytes(content)

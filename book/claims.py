@@ -6,6 +6,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -616,7 +617,9 @@ def glued(notebook: Path) -> dict[str, float]:
             name = output.get("metadata", {}).get("scrapbook", {}).get("name")
             if name:
                 texts = output["data"].values()
-                numbers[name] = float("".join(next(iter(texts))))
+                # What is no number is said on the notebook's own page, and judges nothing.
+                with suppress(ValueError):
+                    numbers[name] = float("".join(next(iter(texts))))
     return numbers
 
 

@@ -210,6 +210,7 @@ def test_ideal_bench_holds_no_error_for_the_exact_methods(curves):
     [
         (lambda b, m, k: bench_curves(b, m, k, 0.1, 1), ValueError, r"rms has shape \(\): expected \(n_rms,\)"),
         (lambda b, m, k: bench_curves(b, m, k, [[0.1]], 1), ValueError, r"rms has shape \(1, 1\): expected"),
+        (lambda b, m, k: bench_curves(b, m, k, [], 1), ValueError, r"rms has shape \(0,\): expected"),
         (lambda b, m, k: bench_curves(b, m, k, [-0.1], 1), ValueError, r"rms .*-0\.1"),
         (lambda b, m, k: bench_curves(b, m, k, [np.nan], 1), ValueError, "rms .*nan"),
         (lambda b, m, k: bench_curves(b, m, k, [0.1], 0), ValueError, "n_screens = 0: expected at least 1"),

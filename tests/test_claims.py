@@ -57,7 +57,7 @@ def small_claim(*notebooks):
 
 
 def test_numbers_come_from_the_notebooks(tmp_path):
-    glue(tmp_path, "one", gain=12.5, other=1.0)
+    glue(tmp_path, "one", gain=12.5, other=1.0, told="at 2 λ/D")
     glue(tmp_path, "two", limit=float("inf"), more=1e-12)
     assert claims.glued(tmp_path / "one.ipynb") == {"gain": 12.5, "other": 1.0}
     assert claims.judge(small_claim("one", "two"), tmp_path) == Finding(FAILS, "12.5")

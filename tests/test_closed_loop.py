@@ -105,6 +105,15 @@ def test_the_same_seed_gives_the_same_run(pupil, modes, shifted):
     assert not np.array_equal(runs[0].residual, runs[2].residual)
 
 
+def test_the_mirror_stays_where_no_photon_came(pupil, modes, shifted):
+    flow = FrozenFlow(pupil, 0.5, 8, seed=1)
+    dark = close_loop(shifted, modes, flow, 3, photons=1e-9, seed=2)
+    np.testing.assert_allclose(dark.residual, dark.open_loop)
+    faint = close_loop(shifted, modes, flow, 2, photons=3.0, seed=2)
+    stayed = np.isclose(faint.residual, faint.open_loop)[:, 1]
+    assert 0 < stayed.sum() < len(stayed)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

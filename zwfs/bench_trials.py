@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check, sweeps
 from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
+from zwfs.experiments import check_rms
 from zwfs.metrics import dynamic_range
 from zwfs.reconstructors import RECONSTRUCTORS, Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
 
@@ -153,11 +154,7 @@ def bench_curves(
     ----------
     Chambouleyron et al. 2024, section 5.2 and Figure 9.
     """
-    rms = _check.real_array("rms", rms)
-    if rms.ndim != 1:
-        raise ValueError(f"rms has shape {rms.shape}: expected (n_rms,)")
-    for value in rms.tolist():
-        _check.number("rms", value, 0)
+    rms = check_rms(rms)
     n_screens = _check.integer("n_screens", n_screens, 1)
     shared = bench, model, dict(reconstructors), n_screens, exponent, seed
     points = sweeps.run(_bench_point, enumerate(rms.tolist()), *shared, name="bench_curves")

@@ -138,7 +138,8 @@ def close_loop(
     """Correct drifting screens with an integrator that a Zernike sensor feeds.
 
     In each step the sensor measures what the mirror leaves; the reconstructed phase, its piston removed on the
-    circle, is fitted by the modes, and the mirror gets `gain` times that more, `delay` steps later.
+    circle, is fitted by the modes, and the mirror gets `gain` times that more, `delay` steps later. Frames without
+    a photon change nothing.
 
     Parameters
     ----------
@@ -198,7 +199,11 @@ def close_loop(
         frames = sensor.measure(left)
         if camera is not None:
             frames = camera.normalise(camera.expose(frames, rng), floor=0.0)
-        found = without_piston(pupil.gather(reconstructor(frames).phase))
+        found = np.zeros((flow.n_screens, pupil.n_points))
+        # A frame without a photon tells nothing: the mirror stays as it is.
+        seen = frames.any(axis=(-2, -1)).all(axis=-1)
+        if seen.any():
+            found[seen] = without_piston(pupil.gather(reconstructor(frames[seen]).phase))
         figure = mirror[-1] + gain * (found @ fit) @ modes
         mirror.append(figure / np.maximum(figure.std(axis=-1, keepdims=True) / stroke, 1))
         mirror.popleft()

@@ -72,6 +72,16 @@ def screens_at(
     return power_law_screens(modes, rms, n_screens, exponent, np.random.SeedSequence(seed, spawn_key=(task,)))
 
 
+def check_rms(rms: ArrayLike) -> NDArray[np.floating]:
+    """Return the inputs of an experiment as an array, shape (n_rms,)."""
+    rms = _check.real_array("rms", rms)
+    if rms.ndim != 1 or not rms.size:
+        raise ValueError(f"rms has shape {rms.shape}: expected (n_rms,), at least one")
+    for value in rms.tolist():
+        _check.number("rms", value, 0)
+    return rms
+
+
 def linearity_curves(
     reconstructors: Mapping[str, Any],
     modes: NDArray,
@@ -107,11 +117,7 @@ def linearity_curves(
     ----------
     Chambouleyron et al. 2024, section 4.1 and Figure 3.
     """
-    rms = _check.real_array("rms", rms)
-    if rms.ndim != 1:
-        raise ValueError(f"rms has shape {rms.shape}: expected (n_rms,)")
-    for value in rms.tolist():
-        _check.number("rms", value, 0)
+    rms = check_rms(rms)
     n_screens = _check.integer("n_screens", n_screens, 1)
     if not reconstructors:
         raise ValueError("reconstructors is empty: expected at least one")

@@ -243,7 +243,8 @@ def diversity(difference: NDArray, determinant: NDArray, strength: NDArray, name
         axes.set_xticks(np.pi / 2 * np.arange(5), ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"])
     panels[0].set_ylabel(r"$|\det M|$")
     panels[1].set_ylabel("determinant with the waves' strength")
-    panels[1].legend(fontsize=9)
+    if named:
+        panels[1].legend(fontsize=9)
     return figure
 
 

@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from zwfs.figures import LOOKS, show_intensity, show_phase
+from zwfs.figures import OTHER_STYLES, show_intensity, show_phase
 from zwfs.frames import Found, Step
 
 _MASKED = "#CC79A7"
@@ -70,17 +70,15 @@ def gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> Figure
     """
     figure, panels = plt.subplots(1, 2 + (errors is not None), figsize=(9, 3.6), sharey=True)
     rows = np.arange(len(work))[::-1]
-    looks = LOOKS["PhaseShifted"], LOOKS["Arcsine"]
     for axes, title, values in (
         (panels[0], "correlation of measured\nand modelled frames", [step.found.correlation for step in work]),
         (panels[1], "correlation with the prediction\nfrom the other frame", [step.predicted for step in work]),
     ):
-        for index, look in enumerate(looks):
-            points = np.array(values)[:, index]
-            axes.plot(points, rows, marker=look.marker, ls=look.line, color=look.color, label=f"image {index + 1}")
+        for index, (points, style) in enumerate(zip(np.transpose(values), OTHER_STYLES, strict=False), start=1):
+            axes.plot(points, rows, label=f"image {index}", **style)
         axes.set(xlabel=title)
     if errors is not None:
-        panels[2].plot(errors, rows, "o-", color="#000000")
+        panels[2].plot(errors, rows, **OTHER_STYLES[2])
         panels[2].set(xlabel="error of the segments\n(rad rms)", xlim=(0, None))
     panels[0].set_yticks(rows, [step.name for step in work])
     panels[0].legend(fontsize=9)

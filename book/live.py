@@ -9,6 +9,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 import zwfs
+from zwfs._arrays import Kind
 from zwfs.figures import INTENSITY_MAP, PHASE_MAP
 from zwfs.lowrank import Factors, Plane
 
@@ -36,8 +37,8 @@ def data() -> dict[str, Any]:
     return {
         "inside": _encode(pupil.mask.astype(np.uint8)),
         "diameters": diameters.tolist(),
-        "pupil": _plane(factors.pupil.astype(np.float32)),
-        "detector": _plane(factors.detector.astype(np.float32)),
+        "pupil": _plane(factors.pupil.to(Kind.numpy(np.float32))),
+        "detector": _plane(factors.detector.to(Kind.numpy(np.float32))),
         "cores": [_encode(-core.real.astype(np.float32)) for core in factors.core],
         "screens": _plane(screens(pupil)),
         "colors": {

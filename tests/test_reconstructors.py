@@ -7,6 +7,7 @@ import zwfs
 from zwfs import (
     RECONSTRUCTORS,
     Arcsine,
+    Detector,
     Dimple,
     GerchbergSaxton,
     GradientDescent,
@@ -15,6 +16,8 @@ from zwfs import (
     ZernikeSensor,
     reconstruction_error,
 )
+from zwfs._arrays import Kind
+from zwfs.sensor import split
 
 every = pytest.mark.parametrize("method", RECONSTRUCTORS)
 iterative = pytest.mark.parametrize("method", [method for method in RECONSTRUCTORS if method is not Linear])
@@ -182,6 +185,20 @@ def test_arcsine_counts_cosines_beyond_1(classic, pupil):
     frames[0, 20, 18:22] += 50
     frames[0, 0, :3] += 50  # outside the pupil
     assert Arcsine(classic, n_iterations=1)(frames).n_unsolved == 4
+
+
+def test_arcsine_knows_the_modulus_of_what_it_finds(classic, pupil, screens):
+    # Beside points with a solution there are dark ones, and too bright and too dark ones, in many frames.
+    amplitude = np.where(np.random.default_rng(0).uniform(size=pupil.shape) < 0.1, 0, 1.0)
+    detector = Detector(pupil, 3e3)
+    frames = detector.normalise(detector.expose(classic.measure(screens(0.5), amplitude), seed=1), floor=0)
+    method, kind = Arcsine(classic, amplitude=amplitude), Kind.numpy()
+    phasor = split(screens(0.3), method.settings.maps(kind).inside)
+    found = method.step(phasor, method.prepare(frames, phasor, True, kind), kind)
+    assert np.all(found.unsolved > (pupil.mask & (amplitude == 0)).sum() + 10)
+    modulus = np.hypot(found.field[:, 0], found.field[:, 1])
+    known = np.broadcast_to(found.modulus, modulus.shape)
+    np.testing.assert_allclose(known[:, pupil.mask], modulus[:, pupil.mask], rtol=1e-12)
 
 
 @pytest.mark.parametrize("n_masks", [1, 2])
@@ -384,6 +401,14 @@ def test_history_holds_the_results_of_shorter_runs(make, method, screens):
         shorter = make(method, n_iterations=n, tolerance=0)[0](frames)
         np.testing.assert_allclose(history[:, n], shorter.phase, atol=1e-9)
         np.testing.assert_array_equal(shorter.n_iterations, n)
+
+
+@iterative
+def test_history_begins_with_the_start_as_it_was_given(make, method, pupil, screens):
+    reconstruct, sensor = make(method, n_iterations=2)
+    start = np.where(pupil.mask, 4.0 + screens(0.1, 1)[0], np.nan)
+    found = reconstruct(sensor.measure(screens(0.1, 2)), start, history=True)
+    np.testing.assert_array_equal(found.history[0, 0], start)
 
 
 @iterative

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zwfs._arrays import any_array
+
 
 def integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
     """Return `value` as an int between `low` and `high`."""
@@ -49,48 +51,54 @@ def number(
 
 
 def real_array(name: str, value: Any) -> NDArray:
-    """Return `value` as a float32 or float64 array; integers become float64."""
-    array = np.asarray(value)
-    if array.dtype.kind == "c":
+    """Return `value` as a float32 or float64 array of NumPy; other real numbers become float64."""
+    return real_any(name, np.asarray(value))
+
+
+def real_any(name: str, value: Any) -> Any:
+    """Return `value` as a float32 or float64 array; those of a library of the array API stay there."""
+    array, xp = any_array(value)
+    if array.dtype in (xp.float32, xp.float64):
+        return array
+    if xp.isdtype(array.dtype, "complex floating"):
         raise TypeError(f"{name} is complex ({array.dtype}): expected real numbers")
-    return _floating(name, array)
-
-
-def complex_array(name: str, value: Any) -> NDArray:
-    """Return `value` as a complex64 or complex128 array."""
-    array = np.asarray(value)
-    if array.dtype.kind == "c":
-        return array if array.dtype in (np.complex64, np.complex128) else array.astype(np.complex128)
-    array = _floating(name, array)
-    return array.astype(np.result_type(array.dtype, np.complex64))
-
-
-def _floating(name: str, array: NDArray) -> NDArray:
-    if array.dtype.kind not in "fiu":
+    if not xp.isdtype(array.dtype, ("real floating", "integral")):
         raise TypeError(f"{name} has dtype {array.dtype}: expected real numbers")
-    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+    return xp.astype(array, xp.float64)
 
 
-def trailing_shape(name: str, array: NDArray, shape: tuple[int, ...], meaning: str) -> None:
+def complex_any(name: str, value: Any) -> Any:
+    """Return `value` as a complex64 or complex128 array; those of a library of the array API stay there."""
+    array, xp = any_array(value)
+    if array.dtype in (xp.complex64, xp.complex128):
+        return array
+    if xp.isdtype(array.dtype, "complex floating"):
+        return xp.astype(array, xp.complex128)
+    array = real_any(name, array)
+    return xp.astype(array, xp.result_type(array.dtype, xp.complex64))
+
+
+def trailing_shape(name: str, array: Any, shape: tuple[int, ...], meaning: str) -> None:
     """Require that the last axes of `array` are `shape`; `meaning` says what they stand for."""
-    if array.shape[-len(shape) :] != shape or array.ndim < len(shape):
+    if tuple(array.shape[-len(shape) :]) != shape or array.ndim < len(shape):
         expected = ", ".join(str(n) for n in shape)
-        raise ValueError(f"{name} has shape {array.shape}: expected (..., {expected}), {meaning}")
+        raise ValueError(f"{name} has shape {tuple(array.shape)}: expected (..., {expected}), {meaning}")
 
 
-def finite(name: str, array: NDArray, where: str = "") -> None:
+def finite(name: str, array: Any, where: str = "") -> None:
     """Require that every number of `array` is finite."""
+    xp = any_array(array)[1]
     # A sum is finite only if all its terms are, and costs a tenth of the full test.
     with np.errstate(over="ignore", invalid="ignore"):
-        if np.isfinite(array.sum()):
+        if xp.isfinite(xp.sum(array)):
             return
-    bad = array.size - np.count_nonzero(np.isfinite(array))
+    bad = math.prod(array.shape) - int(xp.count_nonzero(xp.isfinite(array)))
     if bad:
         raise ValueError(f"{name} holds {bad} NaN or infinite values{where}: expected finite numbers")
 
 
-def non_negative(name: str, array: NDArray, hint: str = "") -> None:
+def non_negative(name: str, array: Any, hint: str = "") -> None:
     """Require that no number of `array` is below 0."""
-    lowest = array.min()
+    lowest = float(any_array(array)[1].min(array))
     if lowest < 0:
         raise ValueError(f"{name} reaches down to {lowest:.6g}: expected no negative values{hint}")

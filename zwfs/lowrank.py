@@ -18,10 +18,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zwfs._arrays import Kind, any_array, product
 from zwfs.masks import Mask
 
 
@@ -31,9 +33,9 @@ class Plane:
 
     Attributes
     ----------
-    along_y : ndarray, shape (a, ny)
-    along_x : ndarray, shape (b, nx)
-    combine : ndarray, shape (a * b, r)
+    along_y : array, shape (a, ny)
+    along_x : array, shape (b, nx)
+    combine : array, shape (a * b, r)
     """
 
     along_y: NDArray
@@ -41,22 +43,26 @@ class Plane:
     combine: NDArray
 
     @property
+    def xp(self) -> Any:
+        """Namespace of the library that the arrays belong to."""
+        return any_array(self.combine)[1]
+
+    @property
     def rank(self) -> int:
         """Number of functions."""
         return self.combine.shape[1]
 
     def project(self, maps: NDArray) -> NDArray:
-        """Inner products with real or complex maps: (k, ny, nx) to (k, r)."""
-        rows = (self.along_y @ maps.view(maps.real.dtype)).view(maps.dtype)
-        pairs = rows.reshape(-1, rows.shape[-1]) @ self.along_x.T
-        return pairs.reshape(len(maps), -1) @ self.combine
+        """Inner products with real or complex maps: (..., ny, nx) to (..., r)."""
+        xp = self.xp
+        pairs = product(self.along_y, maps, xp) @ self.along_x.T
+        return xp.reshape(pairs, (*maps.shape[:-2], -1)) @ self.combine
 
     def expand(self, coefficients: NDArray) -> NDArray:
-        """Maps of real or complex coefficients: (k, r) to (k, ny, nx)."""
-        pairs = coefficients @ self.combine.T
-        rows = pairs.reshape(-1, len(self.along_x)) @ self.along_x
-        rows = rows.reshape(len(coefficients), len(self.along_y), -1)
-        return (self.along_y.T @ rows.view(rows.real.dtype)).view(rows.dtype)
+        """Maps of real or complex coefficients: (..., r) to (..., ny, nx)."""
+        xp, pairs = self.xp, coefficients @ self.combine.T
+        shape = (*coefficients.shape[:-1], self.along_y.shape[0], self.along_x.shape[0])
+        return product(self.along_y.T, xp.reshape(pairs, shape) @ self.along_x, xp)
 
     def cut(self, rows: slice, columns: slice) -> Plane:
         """The same functions on a part of the grid."""
@@ -66,9 +72,26 @@ class Plane:
             self.combine,
         )
 
-    def astype(self, dtype: np.dtype) -> Plane:
-        """The same functions in another precision."""
-        return Plane(*(array.astype(dtype) for array in (self.along_y, self.along_x, self.combine)))
+    def to(self, kind: Kind) -> Plane:
+        """The same functions in another library, precision or device."""
+        return Plane(*(kind.array(array) for array in (self.along_y, self.along_x, self.combine)))
+
+    def for_complex(self) -> Plane:
+        """The same functions, for complex maps."""
+        along_y = self.along_y if self.xp is np else self.along_y + 0j
+        return Plane(along_y, self.along_x + 0j, self.combine + 0j)
+
+    def products(self, other: Plane, weight: NDArray) -> NDArray:
+        """Weighted inner products of these functions with those of another plane on the same grid, (r, r')."""
+        along_y, along_x = (
+            (mine[:, np.newaxis] * others).reshape(-1, mine.shape[1])
+            for mine, others in ((self.along_y, other.along_y), (self.along_x, other.along_x))
+        )
+        pairs = (along_y @ weight @ along_x.T).reshape(
+            len(self.along_y), len(other.along_y), len(self.along_x), len(other.along_x)
+        )
+        pairs = pairs.transpose(0, 2, 1, 3).reshape(len(self.combine), len(other.combine))
+        return self.combine.T @ pairs @ other.combine
 
 
 @dataclass(frozen=True)
@@ -88,35 +111,36 @@ class Factors:
 
 
 class Operator:
-    """The factors in one precision, with the products that sensors and reconstructors are made of.
+    """The factors as arrays of one kind, with the products that sensors and reconstructors are made of.
 
     Parameters
     ----------
     factors : Factors
     window : (slice, slice)
         Where the grid of the pupil lies on the detector.
-    dtype : float32 or float64
+    kind : Kind
+        Of real numbers.
     """
 
-    def __init__(self, factors: Factors, window: tuple[slice, slice], dtype: np.dtype) -> None:
-        self.n_masks = len(factors.core)
-        self._pupil = factors.pupil.astype(dtype)
-        self._detector = factors.detector.astype(dtype)
-        self._window = self._detector.cut(*window)
-        self._split_core = split_core(factors.core).astype(dtype)
-        self._core = factors.core.reshape(-1, factors.core.shape[-1]).T.astype(np.result_type(dtype, np.complex64))
+    def __init__(self, factors: Factors, window: tuple[slice, slice], kind: Kind) -> None:
+        self._xp = kind.xp
+        self._pupil = factors.pupil.to(kind)
+        self._detector = factors.detector.to(kind)
+        self._window = factors.detector.cut(*window).to(kind)
+        self._complex_pupil, self._complex_detector = self._pupil.for_complex(), self._detector.for_complex()
+        self._split_core = kind.array(split_core(factors.core))
+        core = factors.core.reshape(-1, factors.core.shape[-1]).T
+        self._core = kind.array(core.real) + 1j * kind.array(core.imag)
 
     def reference(self, psi: NDArray) -> NDArray:
         """Reference waves of complex fields on the pupil: (k, ny, nx) to (k, n_masks, ny', nx')."""
-        coefficients = self._pupil.project(psi) @ self._core
-        waves = self._detector.expand(coefficients.reshape(-1, self._detector.rank))
-        return waves.reshape(len(psi), self.n_masks, *waves.shape[-2:])
+        coefficients = self._complex_pupil.project(psi) @ self._core
+        return self._complex_detector.expand(self._by_mask(coefficients, self._detector))
 
     def adjoint(self, waves: NDArray) -> NDArray:
         """Adjoint of `reference`: (k, n_masks, ny', nx') to (k, ny, nx)."""
-        coefficients = self._detector.project(waves.reshape(-1, *waves.shape[-2:]))
-        coefficients = coefficients.reshape(len(waves), -1) @ self._core.conj().T
-        return self._pupil.expand(coefficients)
+        coefficients = self._in_a_row(self._complex_detector.project(waves))
+        return self._complex_pupil.expand(coefficients @ self._xp.conj(self._core).T)
 
     def split_reference(self, psi: NDArray, *, in_window: bool = False) -> NDArray:
         """Reference waves of split fields on the pupil, (k, 2, ny, nx) to (k, n_masks, 2, ny', nx').
@@ -127,20 +151,23 @@ class Operator:
 
     def split_project(self, psi: NDArray) -> NDArray:
         """Coefficients of split fields on the pupil: (k, 2, ny, nx) to (k, 2 r), real parts first."""
-        return self._pupil.project(psi.reshape(-1, *psi.shape[-2:])).reshape(len(psi), -1)
+        return self._in_a_row(self._pupil.project(psi))
 
     def split_expand(self, coefficients: NDArray, *, in_window: bool = False) -> NDArray:
         """Split waves of coefficients, (k, n 2 q) to (k, n, 2, ny', nx'); sizes as for `split_reference`."""
         plane = self._window if in_window else self._detector
-        waves = plane.expand(coefficients.reshape(-1, plane.rank))
-        return waves.reshape(len(coefficients), -1, 2, *waves.shape[-2:])
+        return plane.expand(self._by_mask(coefficients, plane, 2))
 
     def split_adjoint(self, waves: NDArray) -> NDArray:
         """Adjoint of `split_reference` on the whole detector: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
-        coefficients = self._detector.project(waves.reshape(-1, *waves.shape[-2:]))
-        coefficients = coefficients.reshape(len(waves), -1) @ self._split_core.T
-        psi = self._pupil.expand(coefficients.reshape(-1, self._pupil.rank))
-        return psi.reshape(len(waves), 2, *psi.shape[-2:])
+        coefficients = self._in_a_row(self._detector.project(waves)) @ self._split_core.T
+        return self._pupil.expand(self._xp.reshape(coefficients, (-1, 2, self._pupil.rank)))
+
+    def _in_a_row(self, coefficients: NDArray) -> NDArray:
+        return self._xp.reshape(coefficients, (coefficients.shape[0], -1))
+
+    def _by_mask(self, coefficients: NDArray, plane: Plane, *parts: int) -> NDArray:
+        return self._xp.reshape(coefficients, (coefficients.shape[0], -1, *parts, plane.rank))
 
 
 def split_core(core: NDArray[np.complex128]) -> NDArray[np.float64]:

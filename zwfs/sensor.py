@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from math import prod, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
+from zwfs._arrays import Kind
 from zwfs.lowrank import Factors, Operator, factorise
 from zwfs.masks import Mask
 from zwfs.pupil import Pupil
@@ -18,6 +20,9 @@ _DEGREES = 20.0  # radian rms; no phase map reaches it, the same map in degrees 
 
 class ZernikeSensor:
     """A Zernike wavefront sensor with any number of masks.
+
+    Fields and phases may be arrays of NumPy or of any library that follows the Python array API and lets arrays be
+    changed in place, such as PyTorch and CuPy; what comes out is of the same library and on the same device.
 
     One mask makes the classic sensor, two make the phase-shifted one. Detector pixels are as large as pupil
     pixels and stand at the same places, so the detector of an extent of 1 D is the grid of the pupil.
@@ -78,18 +83,17 @@ class ZernikeSensor:
         self._margin = round((extent - 1) * pupil.n_pixels / 2)
         self.extent = 1 + 2 * self._margin / pupil.n_pixels
         self.detector_shape = tuple(n + 2 * self._margin for n in pupil.shape)
-        self._stop = pupil.mask.astype(float)
-        self._stop_parts = np.repeat(self._stop, 2, axis=-1)
         m = self._margin
         self.window = tuple(slice(m, m + n) for n in pupil.shape)
         detector_axes = tuple(
             axis[0] + (np.arange(axis.size + 2 * m) - m) / pupil.n_pixels for axis in (pupil.y, pupil.x)
         )
         self._factors = factorise(masks, (pupil.y, pupil.x), detector_axes, pupil.n_pixels**-2.0, self.tolerance)
-        self._operators: dict[np.dtype, Operator] = {}
+        self._operators: dict[Kind, Operator] = {}
+        self._maps: dict[Kind, PupilMaps] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_operators": {}}
+        return self.__dict__ | {"_operators": {}, "_maps": {}}
 
     def __repr__(self) -> str:
         masks = ", ".join(map(repr, self.masks))
@@ -110,12 +114,17 @@ class ZernikeSensor:
         """Matrices of `eq-low-rank`, common to all masks but for the cores: to compute with them elsewhere."""
         return self._factors
 
-    def operator(self, dtype: np.dtype) -> Operator:
-        """Low-rank operator in float32 or float64, for those who write reconstructors; made once, then kept."""
-        dtype = np.dtype(dtype)
-        if dtype not in self._operators:
-            self._operators[dtype] = Operator(self._factors, self.window, dtype)
-        return self._operators[dtype]
+    def operator(self, kind: Kind) -> Operator:
+        """Low-rank operator for arrays of one kind, for those who write reconstructors; made once, then kept."""
+        if kind not in self._operators:
+            self._operators[kind] = Operator(self._factors, self.window, kind)
+        return self._operators[kind]
+
+    def maps(self, kind: Kind) -> PupilMaps:
+        """Maps of the pupil for arrays of one kind; made once, then kept."""
+        if kind not in self._maps:
+            self._maps[kind] = PupilMaps.of(self.pupil.mask, self.pupil.amplitude, kind)
+        return self._maps[kind]
 
     def propagate(self, field: ArrayLike) -> NDArray[np.complexfloating]:
         """Field on the detector behind each mask.
@@ -138,10 +147,10 @@ class ZernikeSensor:
         ----------
         Chambouleyron et al. 2024, equations (1) to (3).
         """
-        psi, batch = self._pupil_field(field)
-        waves = self.operator(psi.real.dtype).reference(psi)
-        waves[(..., *self.window)] += psi[:, np.newaxis]
-        return waves.reshape(*batch, *waves.shape[1:])
+        psi, batch, kind = self._pupil_field(field)
+        waves = self.operator(kind).reference(psi)
+        waves[(..., *self.window)] += psi[:, np.newaxis, ...]
+        return kind.xp.reshape(waves, (*batch, *waves.shape[1:]))
 
     def reference_wave(self, field: ArrayLike) -> NDArray[np.complexfloating]:
         """Reference wave of each mask: `propagate` less the field itself.
@@ -152,9 +161,9 @@ class ZernikeSensor:
         ----------
         Chambouleyron et al. 2024, equation (4).
         """
-        psi, batch = self._pupil_field(field)
-        waves = self.operator(psi.real.dtype).reference(psi)
-        return waves.reshape(*batch, *waves.shape[1:])
+        psi, batch, kind = self._pupil_field(field)
+        waves = self.operator(kind).reference(psi)
+        return kind.xp.reshape(waves, (*batch, *waves.shape[1:]))
 
     def adjoint(self, field: ArrayLike) -> NDArray[np.complexfloating]:
         """Exact adjoint of `propagate`: back-propagation from the detector planes to the pupil.
@@ -178,14 +187,12 @@ class ZernikeSensor:
         ----------
         Chambouleyron et al. 2024, equation (14); `eq-adjoint` of the book.
         """
-        field = _check.complex_array("field", field)
         shape = (self.n_masks, *self.detector_shape)
-        _check.trailing_shape("field", field, shape, "masks and detector")
-        _check.finite("field", field)
-        waves = np.ascontiguousarray(field).reshape(-1, *shape)
-        psi = self.operator(waves.real.dtype).adjoint(waves)
-        psi += waves[(..., *self.window)].sum(axis=1)
-        return (psi * self._stop).reshape(*field.shape[:-3], *self.pupil.shape).astype(field.dtype, copy=False)
+        field, batch, kind = self._field(field, shape, "masks and detector")
+        psi = self.operator(kind).adjoint(field)
+        psi += kind.xp.sum(field[(..., *self.window)], axis=1)
+        psi *= self.maps(kind).stop
+        return kind.xp.reshape(psi, (*batch, *self.pupil.shape))
 
     def measure(self, phase: ArrayLike, amplitude: ArrayLike | None = None) -> NDArray[np.floating]:
         """Frames without noise.
@@ -218,14 +225,15 @@ class ZernikeSensor:
         Chambouleyron et al. 2024, equation (5).
         """
         phase, batch = self.pupil_maps("phase", phase)
-        rms = self.pupil.rms(phase).max()
+        kind = Kind.of(phase)
+        rms = self._largest_rms(phase, kind.xp)
         if rms > _DEGREES:
             warnings.warn(
                 f"phase has an rms of {rms:.4g}: expected radian, less than {_DEGREES:g} rms; is it in degrees?",
                 UserWarning,
                 stacklevel=2,
             )
-        strength, strength_batch = self.amplitude_maps(amplitude, phase.dtype)
+        strength, strength_batch = self.amplitude_maps(amplitude, kind)
         if strength_batch:
             try:
                 full = np.broadcast_shapes(batch, strength_batch)
@@ -235,39 +243,39 @@ class ZernikeSensor:
                     "batch of the phase"
                 ) from None
             phase, strength = (
-                np.broadcast_to(maps.reshape(*shape, *self.pupil.shape), (*full, *self.pupil.shape))
+                self._spread(maps, shape, full, kind.xp)
                 for maps, shape in ((phase, batch), (strength, strength_batch))
             )
-            batch, phase, strength = (
-                full,
-                phase.reshape(-1, *self.pupil.shape),
-                strength.reshape(-1, *self.pupil.shape),
-            )
-        return self.intensity(phase, strength).reshape(*batch, self.n_masks, *self.detector_shape)
+            batch = full
+        frames = self.intensity(phase, strength)
+        return kind.xp.reshape(frames, (*batch, self.n_masks, *self.detector_shape))
 
     # What follows is for reconstructors: one batch axis k, split fields, 0 outside the pupil, no further checks.
 
     def pupil_maps(self, name: str, maps: ArrayLike) -> tuple[NDArray[np.floating], tuple[int, ...]]:
         """Checked real maps, (k, ny, nx) with 0 outside the pupil, and the shape of the batch."""
-        maps = _check.real_array(name, maps)
+        maps = _check.real_any(name, maps)
         _check.trailing_shape(name, maps, self.pupil.shape, "the shape of the pupil")
-        if not maps.size:
-            raise ValueError(f"{name} has shape {maps.shape}: expected at least one map")
-        clean = np.where(self.pupil.mask, maps, 0).reshape(-1, *self.pupil.shape)
+        batch = tuple(maps.shape[:-2])
+        if not prod(batch):
+            raise ValueError(f"{name} has shape {tuple(maps.shape)}: expected at least one map")
+        kind = Kind.of(maps)
+        clean = kind.xp.where(self.maps(kind).mask, maps, kind.array(0.0))
         _check.finite(name, clean, " inside the pupil")
-        return clean.astype(maps.dtype, copy=False), maps.shape[:-2]
+        return kind.xp.reshape(clean, (-1, *self.pupil.shape)), batch
 
     def amplitude_maps(
-        self, amplitude: ArrayLike | None, dtype: np.dtype
+        self, amplitude: ArrayLike | None, kind: Kind
     ) -> tuple[NDArray[np.floating], tuple[int, ...]]:
         """Checked amplitude, (k, ny, nx) with 0 outside, and the shape of the batch; the pupil's for None."""
         if amplitude is None:
-            return self.pupil.amplitude.astype(dtype)[np.newaxis], ()
+            return self.maps(kind).amplitude[np.newaxis, ...], ()
         maps, batch = self.pupil_maps("amplitude", amplitude)
         _check.non_negative("amplitude", maps)
-        if not maps.any(axis=(-2, -1)).all():
+        xp = Kind.of(maps).xp
+        if not xp.all(xp.any(maps > 0, axis=(-2, -1))):
             raise ValueError("amplitude is 0 everywhere in the pupil: expected some light")
-        return maps.astype(dtype), batch
+        return kind.array(maps), batch
 
     def intensity(self, phase: NDArray, amplitude: NDArray) -> NDArray:
         """Frames of phases (k, ny, nx) and amplitudes (1 or k, ny, nx): (k, n_masks, ny', nx')."""
@@ -275,32 +283,83 @@ class ZernikeSensor:
 
     def propagate_split(self, psi: NDArray) -> NDArray:
         """Propagate split fields: (k, 2, ny, nx) to (k, n_masks, 2, ny', nx')."""
-        out = self.operator(psi.dtype).split_reference(psi)
-        out[(..., *self.window)] += psi[:, np.newaxis]
+        out = self.operator(Kind.of(psi)).split_reference(psi)
+        out[(..., *self.window)] += psi[:, np.newaxis, ...]
         return out
 
     def adjoint_split(self, waves: NDArray) -> NDArray:
         """Adjoint of `propagate_split`: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
-        psi = self.operator(waves.dtype).split_adjoint(waves)
-        psi += waves[(..., *self.window)].sum(axis=1)
-        psi *= self._stop
+        kind = Kind.of(waves)
+        psi = self.operator(kind).split_adjoint(waves)
+        psi += kind.xp.sum(waves[(..., *self.window)], axis=1)
+        psi *= self.maps(kind).inside
         return psi
 
-    def _pupil_field(self, field: ArrayLike) -> tuple[NDArray, tuple[int, ...]]:
-        field = _check.complex_array("field", field)
-        _check.trailing_shape("field", field, self.pupil.shape, "the shape of the pupil")
+    def _pupil_field(self, field: ArrayLike) -> tuple[NDArray, tuple[int, ...], Kind]:
+        """Checked complex maps, (k, ny, nx) with 0 outside the pupil, the batch, and the kind of their parts."""
+        psi, batch, kind = self._field(field, self.pupil.shape, "the shape of the pupil")
+        return psi * self.maps(kind).stop, batch, kind
+
+    def _field(
+        self, field: ArrayLike, shape: tuple[int, ...], meaning: str
+    ) -> tuple[NDArray, tuple[int, ...], Kind]:
+        """Checked complex maps with one batch axis, the batch, and the kind of their parts."""
+        field = _check.complex_any("field", field)
+        _check.trailing_shape("field", field, shape, meaning)
         _check.finite("field", field)
-        # Real and imaginary parts side by side: twice as fast as a product of complex with real numbers.
-        parts = np.ascontiguousarray(field).view(field.real.dtype)
-        psi = np.multiply(parts, self._stop_parts, dtype=parts.dtype).view(field.dtype)
-        return psi.reshape(-1, *self.pupil.shape), field.shape[:-2]
+        kind = Kind.of(field).real
+        if kind.xp is np:
+            field = np.ascontiguousarray(field)
+        return kind.xp.reshape(field, (-1, *shape)), tuple(field.shape[: -len(shape)]), kind
+
+    def _largest_rms(self, phase: NDArray, xp: Any) -> float:
+        """Largest rms of phases that are 0 outside the pupil, (k, ny, nx), piston removed."""
+        axes, n_points = (-2, -1), self.pupil.n_points
+        mean = xp.sum(phase, axis=axes) / n_points
+        return sqrt(max(float(xp.max(xp.sum(phase * phase, axis=axes) / n_points - mean * mean)), 0.0))
+
+    def _spread(self, maps: NDArray, batch: tuple[int, ...], full: tuple[int, ...], xp: Any) -> NDArray:
+        """Maps of a batch, (k, ny, nx), repeated for a larger batch."""
+        shape = self.pupil.shape
+        maps = xp.broadcast_to(xp.reshape(maps, (*batch, *shape)), (*full, *shape))
+        return xp.reshape(maps, (-1, *shape))
+
+
+class PupilMaps(NamedTuple):
+    """Maps of a pupil as arrays of one kind, shape (ny, nx)."""
+
+    mask: NDArray[np.bool_]
+    inside: NDArray[np.floating]  # 1 inside, 0 outside
+    stop: NDArray[np.complexfloating]  # the same for complex fields
+    outside: NDArray[np.floating]  # 0 inside, NaN outside
+    amplitude: NDArray[np.floating]
+    flat: NDArray[np.floating]  # (1, 2, ny, nx), phasor of a flat wavefront
+
+    @classmethod
+    def of(cls, mask: NDArray[np.bool_], amplitude: NDArray[np.float64], kind: Kind) -> PupilMaps:
+        """Convert those of NumPy."""
+        inside = kind.array(mask)
+        uniform = np.array_equal(amplitude, mask)
+        return cls(
+            kind.flags(mask),
+            inside,
+            inside + 0j,
+            kind.array(np.where(mask, 0, np.nan)),
+            inside if uniform else kind.array(amplitude),
+            kind.xp.stack((inside, 0 * inside))[np.newaxis, ...],
+        )
+
+    def field(self, phasor: NDArray) -> NDArray:
+        """Split field of a phasor that is 0 outside."""
+        return phasor if self.amplitude is self.inside else phasor * self.amplitude
 
 
 def split(phase: NDArray, amplitude: NDArray) -> NDArray:
     """Split field amplitude * exp(i phase): (k, ny, nx) to (k, 2, ny, nx)."""
-    out = np.empty((len(phase), 2, *phase.shape[1:]), phase.dtype)
-    np.multiply(np.cos(phase), amplitude, out=out[:, 0])
-    np.multiply(np.sin(phase), amplitude, out=out[:, 1])
+    kind = Kind.of(phase)
+    out = kind.xp.empty((phase.shape[0], 2, *phase.shape[1:]), dtype=kind.dtype, device=kind.device)
+    out[:, 0, ...] = kind.xp.cos(phase) * amplitude
+    out[:, 1, ...] = kind.xp.sin(phase) * amplitude
     return out
 
 

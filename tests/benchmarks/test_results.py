@@ -2,15 +2,15 @@
 
 import json
 
-from . import speed
+from . import arrays, speed
 
 
 def test_real_time_settings_meet_their_errors():
     rows = speed.real_time(40, seconds=0)
     json.dumps(rows)
     fewest = {row["n_iterations"]: row["median error"] for row in rows if row["accelerate"]}
-    assert fewest[3] < 0.01
-    assert fewest[5] < fewest[4] < fewest[3]
+    assert fewest[2] < 0.01
+    assert fewest[4] < fewest[3] < fewest[2]
     assert all(row["rate"] > 0 for row in rows)
 
 
@@ -39,3 +39,9 @@ def test_what_a_call_cannot_do_without_is_part_of_it():
 
 def test_every_reconstructor_of_the_loop_makes_a_step():
     assert len(speed.loop_step(32, seconds=0)) == 3
+
+
+def test_every_library_at_hand_finds_the_same():
+    found = list(arrays.rates(21, 40))
+    assert found[0][0] == "NumPy"
+    assert all(rate > 0 and error < 0.01 for _, rate, error in found)

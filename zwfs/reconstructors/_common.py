@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import prod
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs.sensor import ZernikeSensor, split, square
+from zwfs._arrays import Kind
+from zwfs.sensor import PupilMaps, ZernikeSensor, split, square
 
-_CHUNK = 80_000  # detector pixels handled together: few enough for the fast memory, enough to vectorise
+# Detector pixels handled together: on the processor few enough for its fast memory, enough to vectorise.
+_CHUNK, _CHUNK_ELSEWHERE = 80_000, 40_000_000
+_VANISHING = 1e-30  # modulus, or its square, of a field that counts as 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +31,7 @@ class Reconstruction:
     n_iterations : ndarray of int, shape (...)
         Iterations used.
     converged : ndarray of bool, shape (...)
-        Whether the last iteration changed the phase by no more than the tolerance.
+        Whether the last iteration changed the phase by no more than the tolerance; False for a tolerance of 0.
     n_unsolved : ndarray of int, shape (...)
         Points whose equation had no (unique) solution in the last iteration: singular ones, which kept the value
         of the iteration before, or cosines beyond +-1.
@@ -54,29 +58,20 @@ class Reconstruction:
         Rms difference, over all masks and the points of the pupil, between the measured frames and those modelled
         from the phase; the unit is the mean intensity of the pupil.
         """
-        sensor = self.settings.sensor
-        amplitude, inside, _ = self.settings.maps(self.phase.dtype)
-        frames = self.frames.reshape(-1, *self.frames.shape[-3:])
-        phase = np.where(sensor.pupil.mask, self.phase, 0).reshape(-1, *sensor.pupil.shape)
-        residual = np.empty(len(frames), frames.dtype)
-        for piece in pieces(frames):
-            psi = split(phase[piece], amplitude)
-            waves = sensor.operator(psi.dtype).split_reference(psi, in_window=True) + psi[:, np.newaxis]
-            mismatch = ((square(waves) - frames[piece]) * inside).reshape(len(psi), -1)
-            residual[piece] = np.vecdot(mismatch, mismatch)
-        return np.sqrt(residual / (sensor.n_masks * sensor.pupil.n_points)).reshape(self.phase.shape[:-2])[()]
-
-
-class Maps(NamedTuple):
-    """Maps on the pupil in one precision, shape (ny, nx)."""
-
-    amplitude: NDArray[np.floating]
-    inside: NDArray[np.floating]  # 1 inside, 0 outside
-    outside: NDArray[np.floating]  # 0 inside, NaN outside
-
-    def field(self, phasor: NDArray) -> NDArray:
-        """Split field of a phasor that is 0 outside."""
-        return phasor if self.amplitude is self.inside else phasor * self.amplitude
+        config, kind = self.settings, Kind.of(self.frames)
+        sensor, maps, xp = config.sensor, config.maps(kind), kind.xp
+        frames = xp.reshape(self.frames, (-1, *self.frames.shape[-3:]))
+        phase = xp.reshape(xp.where(maps.mask, self.phase, kind.array(0.0)), (-1, *sensor.pupil.shape))
+        found = []
+        for piece in pieces(frames, kind):
+            psi = split(phase[piece, ...], maps.amplitude)
+            waves = sensor.operator(kind).split_reference(psi, in_window=True) + psi[:, np.newaxis, ...]
+            mismatch = (square(waves) - frames[piece, ...]) * maps.inside
+            mismatch = xp.reshape(mismatch, (psi.shape[0], -1))
+            found.append(xp.vecdot(mismatch, mismatch))
+        mean = xp.concat(found) / (sensor.n_masks * sensor.pupil.n_points)
+        batch = self.phase.shape[:-2]
+        return xp.reshape(xp.sqrt(mean), batch) if batch else xp.sqrt(mean)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,19 +82,16 @@ class Settings:
     n_iterations: int
     tolerance: float
     amplitude: NDArray[np.float64]
-    _maps: dict[np.dtype, Maps] = field(default_factory=dict, init=False, repr=False)
+    _maps: dict[Kind, PupilMaps] = field(default_factory=dict, init=False, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_maps": {}}  # cheap to make again, and no part of what was asked for
 
-    def maps(self, dtype: np.dtype) -> Maps:
-        """Maps in float32 or float64; made once, then kept."""
-        if dtype not in self._maps:
-            mask = self.sensor.pupil.mask
-            inside = mask.astype(dtype)
-            amplitude = inside if np.array_equal(self.amplitude, mask) else self.amplitude.astype(dtype)
-            self._maps[dtype] = Maps(amplitude, inside, np.where(mask, 0, np.nan).astype(dtype))
-        return self._maps[dtype]
+    def maps(self, kind: Kind) -> PupilMaps:
+        """Maps of the pupil, with the amplitude of the settings, for arrays of one kind; made once, then kept."""
+        if kind not in self._maps:
+            self._maps[kind] = PupilMaps.of(self.sensor.pupil.mask, self.amplitude, kind)
+        return self._maps[kind]
 
 
 def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLike | None) -> Settings:
@@ -124,187 +116,228 @@ def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLik
         raise TypeError(f"sensor is a {type(sensor).__name__}: expected a ZernikeSensor")
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     tolerance = _check.number("tolerance", tolerance, 0)
-    maps, batch = sensor.amplitude_maps(amplitude, np.float64)
+    maps, batch = sensor.amplitude_maps(amplitude, Kind.numpy())
     if batch:
         raise ValueError(f"amplitude has shape {np.shape(amplitude)}: expected {sensor.pupil.shape}")
     return Settings(sensor, n_iterations, tolerance, maps[0])
 
 
 class FixedPoint(Protocol):
-    """An iterative reconstructor: each step makes a better phasor out of the one before.
+    """An iterative reconstructor: each step makes a better field out of the phasor before.
 
-    A phasor is exp(i phase), split, shape (k, 2, ny, nx), and 0 outside the pupil.
+    A phasor is exp(i phase), split, shape (k, 2, ny, nx), and 0 outside the pupil: all that is kept of a field.
     """
 
     settings: Settings
 
-    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool) -> dict[str, NDArray]:
+    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool, kind: Kind) -> dict[str, NDArray]:
         """What the steps need and keep: arrays with the frames (k, n_masks, ny', nx') on the first axis.
 
-        `flat` says that the starting phasor is flat.
+        `flat` says that the starting phasor is flat, `kind` what all arrays are.
         """
 
-    def step(self, phasor: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
-        """Next phasor, and the number of unsolved points (k,)."""
+    def step(self, phasor: NDArray, data: dict[str, NDArray], kind: Kind) -> Estimate:
+        """Next field."""
+
+
+class Estimate(NamedTuple):
+    """Field that a step found, (k, 2, ny, nx), of any modulus."""
+
+    field: NDArray[np.floating]
+    unsolved: NDArray[np.int64] | int = 0  # number of points, (k,) or the same for all
+    modulus: NDArray[np.floating] | None = None  # of the field, (1 or k, ny, nx), where the step knows it
 
 
 def iterate(method: FixedPoint, frames: ArrayLike, start: ArrayLike | None, history: bool) -> Reconstruction:
     """Run the steps of `method` on every frame until it converges or the iterations are used up."""
     config = method.settings
     frames, batch = check_frames(config.sensor, frames)
-    n_frames, shape = len(frames), config.sensor.pupil.shape
-    first = None if start is None else start_phase(config.sensor, start, batch, frames.dtype)
-    phase = np.empty((n_frames, *shape), frames.dtype)
-    n_used = np.zeros(n_frames, int)
-    converged = np.zeros(n_frames, bool)
-    n_unsolved = np.zeros(n_frames, int)
-    record = np.empty((n_frames, config.n_iterations + 1, *shape), frames.dtype) if history else None
-    for piece in pieces(frames):
-        _iterate_piece(
-            method, frames[piece], None if first is None else first[piece], phase[piece], n_used[piece],
-            converged[piece], n_unsolved[piece], None if record is None else record[piece],
+    kind = Kind.of(frames)
+    first = None if start is None else start_phase(config.sensor, start, batch, kind)
+
+    def run(piece: slice) -> Found:
+        return _iterate_piece(method, frames[piece, ...], None if first is None else first[piece, ...], history)
+
+    # Frames that leave early would leave gaps in a history, so each then is a piece of its own.
+    slices = list(pieces(frames, kind, 1 if history else None))
+    found = run(slices[0])
+    if len(slices) > 1:
+        whole = found.room_for(frames.shape[0], kind)
+        whole.put(slices[0], found)
+        for piece in slices[1:]:
+            whole.put(piece, run(piece))
+        found = whole
+    return report(config, frames, batch, found)
+
+
+class Found(NamedTuple):
+    """What was found for k frames; the meaning is that of `Reconstruction`, 0 outside the pupil."""
+
+    phase: NDArray[np.floating]
+    n_iterations: NDArray[np.int64]
+    converged: NDArray[np.bool_]
+    n_unsolved: NDArray[np.int64]
+    history: NDArray[np.floating] | None = None
+
+    def room_for(self, n_frames: int, kind: Kind) -> Found:
+        """Arrays of the same kind for more frames, yet to be filled."""
+        return Found(
+            *(
+                None if array is None
+                else kind.xp.empty((n_frames, *array.shape[1:]), dtype=array.dtype, device=kind.device)
+                for array in self
+            )
         )  # fmt: skip
-    return report(config, frames, batch, phase, n_used, converged, n_unsolved, record)
+
+    def put(self, piece: slice, some: Found) -> None:
+        """Put some of the frames in their places."""
+        for array, part in zip(self, some, strict=True):
+            if array is not None:
+                array[piece, ...] = part
 
 
-def _iterate_piece(
-    method: FixedPoint,
-    frames: NDArray,
-    start: NDArray | None,
-    phase: NDArray,
-    n_used: NDArray,
-    converged: NDArray,
-    n_unsolved: NDArray,
-    record: NDArray | None,
-) -> None:
-    """Iterate a few frames; the last five arguments are written to."""
-    config = method.settings
-    inside = config.maps(frames.dtype).inside
-    if start is None:
-        phasor = np.zeros((len(frames), 2, *inside.shape), inside.dtype)
-        phasor[:, 0] = inside
-    else:
-        phasor = split(start, inside)
-    if record is not None:
-        record[:, 0] = 0 if start is None else start
-    data = method.prepare(frames, phasor, start is None)
+def _iterate_piece(method: FixedPoint, frames: NDArray, start: NDArray | None, history: bool) -> Found:
+    """Iterate a few frames."""
+    config, kind = method.settings, Kind.of(frames)
+    xp, maps, n_frames = kind.xp, config.maps(kind), frames.shape[0]
+    phasor = maps.flat + kind.zeros(n_frames, 1, 1, 1) if start is None else split(start, maps.inside)
+    path = [angle(phasor, xp) if start is None else start] if history else []
+    data = method.prepare(frames, phasor, start is None, kind)
     limit = config.tolerance**2 * config.sensor.pupil.n_points
-    active = np.arange(len(frames))
+    none = kind.integers([0] * n_frames)
+    active, finished, done = None, [], none > 0
 
-    def write(which: NDArray | slice) -> None:
-        where = active[which]
-        phase[where] = angle(phasor[which])
-        n_used[where], converged[where], n_unsolved[where] = iteration, done[which], unsolved[which]
+    def result(iteration: int, phasor: NDArray, done: NDArray, unsolved: NDArray) -> Found:
+        return Found(angle(phasor, xp), none[: done.shape[0]] + iteration, done, unsolved)
 
     for iteration in range(1, config.n_iterations + 1):
-        new, unsolved = method.step(phasor, data)
+        field, unsolved, modulus = method.step(phasor, data, kind)
         last = iteration == config.n_iterations
-        done = _small(new - phasor, limit) if limit or last else np.zeros(len(new), bool)
-        phasor = new
-        if record is not None:
-            record[active, iteration:] = angle(phasor)[:, np.newaxis]
-        if last or (limit and done.all()):
+        if last and not limit:
+            phasor = field  # the modulus does not matter any more
+        else:
+            before, phasor = phasor, unit(field, maps.inside, xp, modulus)
+            done = _small(phasor - before, limit, xp) if limit else done
+        if history:
+            path.append(angle(phasor, xp))
+        if last or (limit and xp.all(done)):
             break
-        if limit and done.any():
+        if limit and xp.any(done):
             # Frames that are done leave the loop, so a frame's result does not depend on its neighbours.
-            write(done)
+            active = kind.integers(np.arange(n_frames)) if active is None else active
+            finished.append((active[done], result(iteration, phasor[done], done[done], (unsolved + none)[done])))
             active, phasor = active[~done], phasor[~done]
             data = {name: values[~done] for name, values in data.items()}
-    write(slice(None))
+            none = none[: phasor.shape[0]]
+    found = result(iteration, phasor, done, unsolved + none)
+    if finished:
+        order = xp.argsort(xp.concat([*(which for which, _ in finished), active]))
+        parts = zip(*(part[:4] for _, part in finished), found[:4], strict=True)
+        found = Found(*(xp.take(xp.concat(arrays), order, axis=0) for arrays in parts))
+    if history:
+        path += path[-1:] * (config.n_iterations + 1 - len(path))
+        found = found._replace(history=xp.stack(path, axis=1))
+    return found
 
 
-def _small(change: NDArray, limit: float) -> NDArray[np.bool_]:
+def _small(change: NDArray, limit: float, xp: Any) -> NDArray[np.bool_]:
     """Whether the squared norm of a change of the phasors, nearly that of the phases, is within the limit."""
-    change = change.reshape(len(change), -1)
-    return np.vecdot(change, change) <= limit
+    change = xp.reshape(change, (change.shape[0], -1))
+    return xp.vecdot(change, change) <= limit
 
 
-def report(
-    config: Settings,
-    frames: NDArray,
-    batch: tuple[int, ...],
-    phase: NDArray,
-    n_used: NDArray,
-    converged: NDArray,
-    n_unsolved: NDArray,
-    record: NDArray | None,
-) -> Reconstruction:
-    """Result in the shape of the batch; `phase` and `record` are written to."""
-    outside = config.maps(phase.dtype).outside
+def report(config: Settings, frames: NDArray, batch: tuple[int, ...], found: Found) -> Reconstruction:
+    """Result in the shape of the batch; the phases found are written to."""
+    kind = Kind.of(frames)
+    outside = config.maps(kind).outside
+    phase, n_iterations, converged, n_unsolved, history = found
     phase += outside
-    if record is not None:
-        record += outside
+    if history is not None:
+        history += outside
     # A copy, since the residual is computed later: a camera may write the next frame to the same place.
-    window = np.array(frames[(..., *config.sensor.window)])
+    window = kind.xp.asarray(frames[(..., *config.sensor.window)], copy=True)
 
     def shaped(values: NDArray) -> NDArray:
-        return values.reshape((*batch, *values.shape[1:]))
+        # A single frame is what a control loop hands in: no need to compute its shape.
+        return kind.xp.reshape(values, (*batch, *values.shape[1:])) if batch else values[0, ...]
 
     return Reconstruction(
-        shaped(phase), shaped(n_used), shaped(converged), shaped(n_unsolved),
-        None if record is None else shaped(record), config, shaped(window),
+        shaped(phase), shaped(n_iterations), shaped(converged), shaped(n_unsolved),
+        None if history is None else shaped(history), config, shaped(window),
     )  # fmt: skip
 
 
-def pieces(frames: NDArray) -> Iterator[slice]:
+def pieces(frames: NDArray, kind: Kind, size: int | None = None) -> Iterator[slice]:
     """Slices of frames (n, ...) that are handled together."""
-    size = max(1, _CHUNK // frames[0].size)
-    return (slice(first, first + size) for first in range(0, len(frames), size))
+    if size is None:
+        chunk = _CHUNK if kind.on_host else _CHUNK_ELSEWHERE
+        size = max(1, chunk // prod(frames.shape[1:]))
+    n = frames.shape[0]
+    return (slice(first, min(first + size, n)) for first in range(0, n, size))
 
 
 def check_frames(
     sensor: ZernikeSensor, frames: ArrayLike, name: str = "frames"
 ) -> tuple[NDArray[np.floating], tuple[int, ...]]:
     """Checked frames, (k, n_masks, ny', nx'), and the shape of the batch."""
-    frames = _check.real_array(name, frames)
+    frames = _check.real_any(name, frames)
     shape = (sensor.n_masks, *sensor.detector_shape)
     _check.trailing_shape(name, frames, shape, "masks and detector of the sensor")
-    batch, flat = frames.shape[:-3], frames.reshape(-1, *shape)
-    if not len(flat):
-        raise ValueError(f"{name} has shape {frames.shape}: expected at least one frame")
-    light = flat.sum(axis=(-2, -1))
-    # A sum is finite only if all its terms are, and costs a tenth of the full test.
-    if not np.isfinite(light).all():
+    batch, xp = tuple(frames.shape[:-3]), Kind.of(frames).xp
+    flat = xp.reshape(frames, (-1, *shape))
+    if not prod(batch):
+        raise ValueError(f"{name} has shape {tuple(frames.shape)}: expected at least one frame")
+    light = xp.sum(flat, axis=(-2, -1))
+    # A sum is finite only if all its terms are; one of nothing negative is 0 only if all of them are.
+    if not (xp.min(flat) >= 0 and xp.all((light > 0) & (light < np.inf))):
         _check.finite(name, flat)
-    _check.non_negative(name, flat, "; after subtracting a background, raise them to 0 explicitly")
-    if not light.all():
-        raise ValueError(
-            f"{name}: {np.count_nonzero(light == 0)} of {light.size} hold no light: expected some flux in each"
-        )
+        _check.non_negative(name, flat, "; after subtracting a background, raise them to 0 explicitly")
+        if not xp.all(light > 0):
+            n_dark = int(xp.count_nonzero(light == 0))
+            raise ValueError(f"{name}: {n_dark} of {prod(light.shape)} hold no light: expected some flux in each")
     return flat, batch
 
 
 def start_phase(
-    sensor: ZernikeSensor, start: ArrayLike | None, batch: tuple[int, ...], dtype: np.dtype
+    sensor: ZernikeSensor, start: ArrayLike | None, batch: tuple[int, ...], kind: Kind
 ) -> NDArray[np.floating]:
     """Checked starting phase of every frame, (k, ny, nx), 0 outside; flat for None."""
     shape = sensor.pupil.shape
     if start is None:
-        return np.zeros((int(np.prod(batch)), *shape), dtype)
+        return kind.xp.zeros((prod(batch), *shape), dtype=kind.dtype, device=kind.device)
     maps, start_batch = sensor.pupil_maps("start", start)
     if start_batch not in ((), batch):
         raise ValueError(f"start has shape {np.shape(start)}: expected {shape} or {(*batch, *shape)}")
-    maps = maps.reshape(*start_batch, *shape).astype(dtype)
-    return np.array(np.broadcast_to(maps, (*batch, *shape))).reshape(-1, *shape)
+    # As many copies as there are frames, of one map or of each.
+    return kind.array(maps) + kind.xp.zeros((prod(batch), 1, 1), dtype=kind.dtype, device=kind.device)
 
 
-def angle(phasor: NDArray) -> NDArray:
+def angle(phasor: NDArray, xp: Any) -> NDArray:
     """Phase of a split phasor: (..., 2, ny, nx) to (..., ny, nx)."""
-    return np.arctan2(phasor[..., 1, :, :], phasor[..., 0, :, :])
+    return xp.atan2(phasor[..., 1, :, :], phasor[..., 0, :, :])
 
 
-def count(points: NDArray[np.bool_]) -> NDArray[np.int64]:
+def count(points: NDArray[np.bool_], kind: Kind) -> NDArray[np.int64]:
     """Number of points that are true in each map: (k, ny, nx) to (k,)."""
-    # Along an axis NumPy turns all of them into integers first.
-    return np.array([np.count_nonzero(one) for one in points])
+    if kind.xp is np:  # along an axis NumPy turns all of them into integers first
+        return np.array([np.count_nonzero(one) for one in points])
+    return kind.xp.sum(kind.xp.astype(points, kind.xp.int64), axis=(-2, -1))
 
 
-def unit(field: NDArray, fallback: NDArray, modulus: NDArray) -> NDArray:
-    """Split field with another modulus, (..., ny, nx); `fallback` where the field vanishes. `field` is reused."""
-    power = square(field)
-    if power.min() > 0:
-        field *= (modulus / np.sqrt(power))[..., np.newaxis, :, :]
-        return field
-    dark = power == 0
-    scale = modulus / np.sqrt(np.where(dark, 1, power))
-    return np.where(dark[..., np.newaxis, :, :], fallback, field * scale[..., np.newaxis, :, :])
+def turn(wave: NDArray, along: NDArray, across: NDArray) -> NDArray:
+    """Split product (along + i across) wave, of two maps (k, ny, nx) and a split wave (k, 2, ny, nx)."""
+    turned = along[:, np.newaxis, ...] * wave
+    ahead = across[:, np.newaxis, ...] * wave
+    turned[:, 0, ...] -= ahead[:, 1, ...]
+    turned[:, 1, ...] += ahead[:, 0, ...]
+    return turned
+
+
+def unit(field: NDArray, modulus: NDArray, xp: Any, before: NDArray | None = None) -> NDArray:
+    """Split field with another modulus, (..., ny, nx); 0 where the field vanishes. `field` is reused.
+
+    `before` is the modulus that it has, if that is known.
+    """
+    before = xp.sqrt(square(field) + _VANISHING) if before is None else before + _VANISHING
+    field *= (modulus / before)[..., np.newaxis, :, :]
+    return field

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zwfs.reconstructors._common import Reconstruction, count, iterate, settings, unit
+from zwfs._arrays import Kind
+from zwfs.reconstructors._common import Estimate, Reconstruction, count, iterate, settings, turn
 from zwfs.sensor import ZernikeSensor, square
 
 
@@ -46,10 +49,10 @@ class Arcsine:
         self.settings = settings(sensor, n_iterations, tolerance, amplitude)
         if sensor.n_masks != 1:
             raise ValueError(f"sensor has {sensor.n_masks} masks: expected one; PhaseShifted takes more")
-        amplitude, mask = self.settings.amplitude, sensor.pupil.mask
-        # Where there is no light inside the pupil the field comes out as 0, and the phase stays what it was.
-        self._dark = mask & (amplitude == 0)
-        self._gain = np.where(self._dark, 0, 1 / (2 * np.where(amplitude > 0, amplitude, 1)))
+        self._constants: dict[Kind, _Constants] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_constants": {}}  # made again where they are needed
 
     def __call__(
         self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
@@ -57,32 +60,75 @@ class Arcsine:
         """Reconstruct the phase of each frame; parameters, result and errors are those of `PhaseShifted`."""
         return iterate(self, frames, start, history)
 
-    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool) -> dict[str, NDArray]:
-        """Intensity less that of the incoming light, and the side of the reference wave to look on."""
-        maps = self.settings.maps(phasor.dtype)
+    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool, kind: Kind) -> dict[str, NDArray]:
+        """Interference term of the frames, and the side of the reference wave to look on."""
+        maps, constants = self.settings.maps(kind), self._of(kind)
+        light = frames[:, 0, ...][(..., *self.settings.sensor.window)]
+        data = {"excess": (light - maps.amplitude**2) * constants.gain}
+        if flat:
+            return data | {
+                "wave": constants.flat_wave,
+                "side": constants.flat_side + kind.zeros(light.shape[0], 1, 1),
+            }
         psi = maps.field(phasor)
-        wave = self._reference(psi)
-        # The side is fixed once: the piston of the estimate, which no intensity shows, may drift past the wave.
-        ahead = wave[:, 0] * psi[:, 1] - wave[:, 1] * psi[:, 0] >= 0
-        return {
-            "excess": frames[:, 0][(..., *self.settings.sensor.window)] - maps.amplitude**2,
-            "side": np.where(self._dark, 0, np.where(ahead, 1, -1)).astype(phasor.dtype),
-        }
+        wave = self._reference(psi, kind)
+        return data | {"wave": wave, "side": _side(wave, psi, kind)}
 
-    def step(self, phasor: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
+    def step(self, phasor: NDArray, data: dict[str, NDArray], kind: Kind) -> Estimate:
         """Reference wave of the estimate, then both parts of the field along it, times its modulus."""
-        wave = self._reference(self.settings.maps(phasor.dtype).field(phasor))
+        xp, maps, constants = kind.xp, self.settings.maps(kind), self._of(kind)
+        wave = data.pop("wave", None)  # that of the start is known
+        if wave is None:
+            wave = self._reference(maps.field(phasor), kind)
         power = square(wave)
-        along = (data["excess"] - power) * self._gain.astype(phasor.dtype, copy=False)
-        across = power - along**2
-        n_unsolved = count((across < 0) & self.settings.sensor.pupil.mask)
-        across = data["side"] * np.sqrt(np.maximum(across, 0))
-        new = along[:, np.newaxis] * wave
-        new[:, 0] -= across * wave[:, 1]
-        new[:, 1] += across * wave[:, 0]
-        return unit(new, phasor, self.settings.maps(phasor.dtype).inside), n_unsolved + np.count_nonzero(
-            self._dark
-        )
+        along = data["excess"] - constants.gain * power
+        across = power - along * along
+        n_unsolved = constants.n_dark
+        if xp.min(across) < 0:
+            beyond = across < 0
+            n_unsolved = n_unsolved + count(beyond, kind)
+            along = xp.where(beyond, xp.sign(along) * xp.sqrt(power), along)
+            across = xp.where(beyond, kind.array(0.0), across)
+        new = turn(wave, along, data["side"] * xp.sqrt(across))
+        if constants.n_dark:
+            new = xp.where(constants.dark, phasor, new)
+            power = xp.where(constants.dark, kind.array(1.0), power)
+        # Both parts together are as long as the wave that they multiply, so the modulus is its square.
+        return Estimate(new, n_unsolved, power)
 
-    def _reference(self, psi: NDArray) -> NDArray:
-        return self.settings.sensor.operator(psi.dtype).split_reference(psi, in_window=True)[:, 0]
+    def _reference(self, psi: NDArray, kind: Kind) -> NDArray:
+        return self.settings.sensor.operator(kind).split_reference(psi, in_window=True)[:, 0, ...]
+
+    def _of(self, kind: Kind) -> _Constants:
+        """Constants for arrays of one kind; made once, then kept."""
+        if kind not in self._constants:
+            amplitude, mask = self.settings.amplitude, self.settings.sensor.pupil.mask
+            lit = mask & (amplitude > 0)
+            gain = np.where(lit, 1 / (2 * np.where(lit, amplitude, 1)), 0)
+            dark = mask & ~lit
+            exact = Kind.numpy()
+            maps = self.settings.maps(exact)
+            psi = maps.field(maps.flat)
+            wave = self._reference(psi, exact)
+            self._constants[kind] = _Constants(
+                kind.array(gain), kind.flags(dark), int(dark.sum()),
+                kind.array(wave), kind.array(_side(wave, psi, exact)),
+            )  # fmt: skip
+        return self._constants[kind]
+
+
+class _Constants(NamedTuple):
+    """What all frames share, as arrays of one kind."""
+
+    gain: NDArray[np.floating]  # (ny, nx), 1 / (2 A); 0 where there is no light
+    dark: NDArray[np.bool_]  # (ny, nx), no light inside the pupil: the phase stays what it was
+    n_dark: int
+    flat_wave: NDArray[np.floating]  # (1, 2, ny, nx), reference wave of a flat wavefront
+    flat_side: NDArray[np.floating]  # (1, ny, nx), side of it on which the flat wavefront lies
+
+
+def _side(wave: NDArray, psi: NDArray, kind: Kind) -> NDArray:
+    """Whether the phase of a field is ahead of its reference wave, 1, or behind, -1: (k, ny, nx)."""
+    # It is fixed once: the piston of the estimate, which no intensity shows, may drift past the wave.
+    ahead = wave[:, 0, ...] * psi[:, 1, ...] - wave[:, 1, ...] * psi[:, 0, ...] >= 0
+    return kind.xp.where(ahead, kind.array(1.0), kind.array(-1.0))

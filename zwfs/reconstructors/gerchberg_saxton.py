@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zwfs.reconstructors._common import Reconstruction, iterate, settings, unit
+from zwfs._arrays import Kind
+from zwfs.reconstructors._common import Estimate, Reconstruction, iterate, settings, unit
 from zwfs.sensor import ZernikeSensor
 
 
@@ -48,15 +48,14 @@ class GerchbergSaxton:
         """Reconstruct the phase of each frame set; parameters, result and errors are those of `PhaseShifted`."""
         return iterate(self, frames, start, history)
 
-    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool) -> dict[str, NDArray]:
+    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool, kind: Kind) -> dict[str, NDArray]:
         """Measured amplitude on the detector."""
-        return {"amplitude": np.sqrt(frames)}
+        return {"amplitude": kind.xp.sqrt(frames)}
 
-    def step(self, phasor: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
+    def step(self, phasor: NDArray, data: dict[str, NDArray], kind: Kind) -> Estimate:
         """To the detector and back."""
         sensor = self.settings.sensor
-        maps = self.settings.maps(phasor.dtype)
+        maps = self.settings.maps(kind)
         waves = sensor.propagate_split(maps.field(phasor))
         # A modelled field of 0 has no phase; that of a bright pixel next to it would do as well as any.
-        waves = unit(waves, np.zeros((), waves.dtype), data["amplitude"])
-        return unit(sensor.adjoint_split(waves), phasor, maps.inside), np.zeros(len(phasor), int)
+        return Estimate(sensor.adjoint_split(unit(waves, data["amplitude"], kind.xp)))

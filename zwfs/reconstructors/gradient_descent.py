@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
-from zwfs.reconstructors._common import Reconstruction, check_frames, report, settings, start_phase
+from zwfs import _check
+from zwfs._arrays import Kind
+from zwfs.reconstructors._common import Found, Reconstruction, check_frames, report, settings, start_phase
 from zwfs.reconstructors.linear import check_modes
 from zwfs.sensor import ZernikeSensor, split, square
 
@@ -50,8 +52,8 @@ class GradientDescent:
         """Reconstruct the phase of each frame set; parameters, result and errors are those of `PhaseShifted`."""
         config = self.settings
         pupil = config.sensor.pupil
-        frames, batch = check_frames(config.sensor, frames)
-        phase = start_phase(config.sensor, start, batch, frames.dtype)
+        frames, batch = check_frames(config.sensor, _check.real_array("frames", frames))
+        phase = start_phase(config.sensor, start, batch, Kind.of(frames))
         n_used = np.zeros(len(frames), int)
         converged = np.zeros(len(frames), bool)
         record = np.empty((len(frames), config.n_iterations + 1, *pupil.shape), frames.dtype) if history else None
@@ -62,7 +64,8 @@ class GradientDescent:
             if record is not None:
                 path += [path[-1]] * (config.n_iterations + 1 - len(path))
                 record[index] = pupil.scatter(np.array(path), fill=0)
-        return report(config, frames, batch, phase, n_used, converged, np.zeros(len(frames), int), record)
+        found = Found(phase, n_used, converged, np.zeros(len(frames), int), record)
+        return report(config, frames, batch, found)
 
     def cost(self, phase: NDArray, frames: NDArray) -> tuple[float, NDArray]:
         """Cost of a phase and its gradient.

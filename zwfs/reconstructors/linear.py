@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs.reconstructors._common import Reconstruction, check_frames, report, settings, start_phase
+from zwfs._arrays import Kind
+from zwfs.reconstructors._common import Found, Reconstruction, check_frames, report, settings, start_phase
 from zwfs.sensor import ZernikeSensor
 
 
@@ -67,7 +68,7 @@ class Linear:
         self.modes = check_modes(sensor, modes)
         poke = _check.number("poke", poke, 0, open_low=True)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
-        self._reference = start_phase(sensor, reference, (), np.dtype(np.float64))
+        self._reference = start_phase(sensor, reference, (), Kind.numpy())
         flat, difference = self._simulated(poke) if calibration is None else self._recorded(calibration)
         self._reference_signal = flat
         self.interaction_matrix = difference.T / (2 * poke)
@@ -100,17 +101,15 @@ class Linear:
             If the frames are of the wrong shape, complex, not finite, negative or dark.
         """
         config = self.settings
-        frames, batch = check_frames(config.sensor, frames)
+        frames, batch = check_frames(config.sensor, _check.real_array("frames", frames))
         coefficients = (self._signal(frames) - self._reference_signal) @ self._inverse.T
         phase = coefficients @ self.modes + config.sensor.pupil.gather(self._reference)
         phase = config.sensor.pupil.scatter(phase, fill=0).astype(frames.dtype)
         n_frames = len(frames)
         before = np.broadcast_to(self._reference.astype(frames.dtype), phase.shape)
         record = np.stack([before, phase], axis=1) if history else None
-        return report(
-            config, frames, batch, phase,
-            np.ones(n_frames, int), np.ones(n_frames, bool), np.zeros(n_frames, int), record,
-        )  # fmt: skip
+        once, always, none = np.ones(n_frames, int), np.ones(n_frames, bool), np.zeros(n_frames, int)
+        return report(config, frames, batch, Found(phase, once, always, none, record))
 
     def _simulated(self, poke: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Signal of the reference phase, and push less pull of each mode, (n_modes, n_masks * n_points)."""
@@ -132,7 +131,7 @@ class Linear:
         flat, pushed, pulled = calibration
         signals = []
         for name, frames, n_frames in (("flat", flat, 1), ("pushed", pushed, None), ("pulled", pulled, None)):
-            checked, batch = check_frames(self.settings.sensor, frames, f"calibration {name}")
+            checked, batch = check_frames(self.settings.sensor, np.asarray(frames), f"calibration {name}")
             if len(checked) != (n_frames or len(self.modes)):
                 raise ValueError(
                     f"calibration {name} has a batch of {batch}: expected {n_frames or len(self.modes)}"

@@ -10,14 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs.lowrank import split_core
-from zwfs.reconstructors._common import Reconstruction, count, iterate, settings, unit
-from zwfs.sensor import ZernikeSensor, split
+from zwfs._arrays import Kind
+from zwfs.lowrank import Operator, split_core
+from zwfs.reconstructors._acceleration import Acceleration, dimming
+from zwfs.reconstructors._common import Estimate, Reconstruction, count, iterate, settings, turn
+from zwfs.sensor import PupilMaps, ZernikeSensor, square
 
 _PARALLEL = 1e-6  # sine of the angle between two reference waves below which they count as parallel
 _DARK = 1e-9  # amplitude of a reference wave, in units of the mean of the pupil, below which it counts as absent
-_RELAXATION = 1.3  # of a step: the factors of convergence lie between 0 and about 0.4
-_DIMMEST = 0.01  # least intensity of the first reference wave, relative to that of a flat wavefront
+_SMALL_TILT = 1e-3  # radian per D, by which the speed of convergence is found
 
 
 class PhaseShifted:
@@ -27,8 +28,9 @@ class PhaseShifted:
     and imaginary part of its field; solving them gives the next estimate. No branch has to be chosen: the phase
     comes back over the whole circle. More than two masks are combined by least squares.
 
-    In real time, take frames in float32, `tolerance=0` and `accelerate=True` with 3 or 4 iterations; or, in a
-    control loop, one iteration that starts from the phase of the frames before.
+    In real time, take frames in float32, `tolerance=0` and `accelerate=True` with 2 or 3 iterations; or, in a
+    control loop, one iteration that starts from the phase of the frames before. On a GPU, hand in many frames at
+    once, as an array of PyTorch or CuPy: the phase comes back as one.
 
     Parameters
     ----------
@@ -42,9 +44,9 @@ class PhaseShifted:
     amplitude : array_like, shape (ny, nx), optional
         Measured amplitude A_in in the pupil; that of the sensor's pupil if left out.
     accelerate : bool
-        Same fixed point in fewer iterations: without a start, the first reference wave is dimmed to the light
-        that the frames miss, and then the coefficients of the waves are extrapolated by the secant method. The
-        paper does neither.
+        Same fixed point in fewer iterations: without a start, the first two reference waves are dimmed to the
+        light that the frames miss, and from then on the coefficients of the waves are extrapolated by the secant
+        method. The paper does neither.
 
     Raises
     ------
@@ -71,13 +73,11 @@ class PhaseShifted:
         if sensor.n_masks < 2:
             raise ValueError(f"sensor has {sensor.n_masks} mask: expected two or more with different phase shifts")
         self._pairs = tuple(combinations(range(sensor.n_masks), 2))
-        self._accelerate = _check.flag("accelerate", accelerate)
+        accelerate = _check.flag("accelerate", accelerate)
         self._refuse_equal_masks()
         self._shared = _SharedWave.of(sensor.factors.core)
-        flat = sensor.intensity(np.zeros((1, *sensor.pupil.shape)), self.settings.amplitude[np.newaxis])
-        self._incoming = float(sensor.n_masks * np.sum(self.settings.amplitude**2))
-        self._flat_loss = float(self._loss(flat)[0])
-        self._constants: dict[np.dtype, _Constants] = {}
+        self._acceleration = self._accelerated() if accelerate else None
+        self._constants: dict[Kind, _Constants] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_constants": {}}  # made again where they are needed
@@ -107,95 +107,111 @@ class PhaseShifted:
         """
         return iterate(self, frames, start, history)
 
-    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool) -> dict[str, NDArray]:
-        """What the frames give to the linear system, and the coefficients of a flat start."""
-        constants = self._in_precision(frames.dtype)
+    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool, kind: Kind) -> dict[str, NDArray]:
+        """What the frames give to the linear system, and the reference waves of a flat start."""
+        xp, constants = kind.xp, self._of(kind)
+        acceleration = constants.acceleration
         light = frames[(..., *self.settings.sensor.window)]
         if self._shared is None:
             data = {"excess": light - constants.offset}
         else:
-            mixed = constants.weights @ light.reshape(*light.shape[:2], -1)
-            data = {"signal": mixed.reshape(len(light), *constants.offset.shape) - constants.offset}
-        if flat:
-            dimming = self._dimming(frames)[:, np.newaxis] if self._accelerate else np.ones((len(frames), 1))
-            data["first"] = constants.flat * dimming.astype(frames.dtype)
-        return data
+            mixed = constants.weights @ xp.reshape(light, (*light.shape[:2], -1))
+            data = {"signal": xp.reshape(mixed, (light.shape[0], *constants.offset.shape)) - constants.offset}
+        if not flat:
+            return data
+        if acceleration is None or not acceleration.lost > 0:
+            return data | {"waves": constants.flat_waves}
+        lost = constants.incoming - xp.reshape(light, (light.shape[0], -1)) @ constants.inside
+        lost = acceleration.missing(lost, xp)
+        factor = dimming(lost, acceleration.lost, xp)
+        waves = constants.flat_waves * factor[..., np.newaxis, np.newaxis, np.newaxis]
+        return data | {"waves": waves, "tried": constants.flat * factor, "lost": lost}
 
-    def step(self, phasor: NDArray, data: dict[str, NDArray]) -> tuple[NDArray, NDArray]:
+    def step(self, phasor: NDArray, data: dict[str, NDArray], kind: Kind) -> Estimate:
         """Reference waves of the estimate, then the linear system of every point."""
-        sensor = self.settings.sensor
-        maps = self.settings.maps(phasor.dtype)
-        operator = sensor.operator(phasor.dtype)
-        coefficients = data.pop("first", None)
-        if coefficients is None:
-            coefficients = operator.split_project(maps.field(phasor))
-        if self._accelerate:
-            coefficients = _extrapolate(coefficients, data)
-        waves = operator.split_expand(coefficients @ self._in_precision(phasor.dtype).core, in_window=True)
+        constants = self._of(kind)
+        waves = data.pop("waves", None)
+        if waves is None:
+            operator = constants.operator
+            coefficients = operator.split_project(constants.maps.field(phasor))
+            if constants.acceleration is not None:
+                coefficients = constants.acceleration.extrapolate(coefficients, data, kind.xp)
+            waves = operator.split_expand(coefficients @ constants.core, in_window=True)
         if self._shared is None:
-            solved, singular = self._solve(waves, data["excess"])
+            solved, singular = self._solve(waves, data["excess"], kind)
         else:
-            solved, singular = self._shared.solve(waves[:, 0], data["signal"])
-        n_singular = np.zeros(len(phasor), int)
-        if singular.any():
-            solved = np.where(singular[:, np.newaxis], phasor, solved)
-            n_singular = count(singular & sensor.pupil.mask)
-        return unit(solved, phasor, maps.inside), n_singular
+            solved, singular = self._shared.solve(waves[:, 0, ...], data["signal"], kind)
+        if singular is None:
+            return Estimate(solved)
+        solved = kind.xp.where(singular[:, np.newaxis, ...], phasor, solved)
+        return Estimate(solved, count(singular & constants.maps.mask, kind))
 
-    def _in_precision(self, dtype: np.dtype) -> _Constants:
-        """Constants in float32 or float64; made once, then kept."""
-        if dtype not in self._constants:
-            sensor, incoming = self.settings.sensor, self.settings.amplitude
-            psi = split(np.zeros((1, *incoming.shape)), incoming)
-            cores, weights, offset = sensor.factors.core, np.ones((1, 1)), incoming**2
+    def _of(self, kind: Kind) -> _Constants:
+        """Constants for arrays of one kind; made once, then kept."""
+        if kind not in self._constants:
+            sensor, incoming, exact = self.settings.sensor, self.settings.amplitude**2, Kind.numpy()
+            cores, weights, offset = sensor.factors.core, np.ones((1, 1)), incoming
             if self._shared is not None:
                 cores, weights = self._shared.core[np.newaxis], self._shared.weights
                 offset = weights.sum(axis=1)[:, np.newaxis, np.newaxis] * offset
                 # Outside the field is 0, and would have to be kept from being divided by its modulus.
                 offset[0, ~sensor.pupil.mask] = -1
-            values = split_core(cores), weights, offset, sensor.operator(np.float64).split_project(psi)
-            self._constants[dtype] = _Constants(*(array.astype(dtype) for array in values))
-        return self._constants[dtype]
+            operator, core = sensor.operator(exact), split_core(cores)
+            flat = operator.split_project(self._flat())
+            flat_waves = operator.split_expand(flat @ core, in_window=True)
+            inside = np.tile(self.settings.maps(exact).inside.ravel(), sensor.n_masks)
+            self._constants[kind] = _Constants(
+                sensor.operator(kind),
+                self.settings.maps(kind),
+                *(kind.array(array) for array in (core, weights, offset, flat, flat_waves, inside)),
+                float(sensor.n_masks * incoming.sum()),
+                self._acceleration and self._acceleration.to(kind),
+            )
+        return self._constants[kind]
 
-    def _loss(self, frames: NDArray) -> NDArray:
-        """Light that is missing from the frames inside the pupil, all masks together, shape (k,)."""
-        light = frames[(..., *self.settings.sensor.window)].reshape(*frames.shape[:2], -1)
-        return self._incoming - (light @ self.settings.maps(frames.dtype).inside.ravel()).sum(axis=1)
+    def _flat(self) -> NDArray[np.float64]:
+        """Split field of a flat wavefront, (1, 2, ny, nx)."""
+        maps = self.settings.maps(Kind.numpy())
+        return maps.field(maps.flat)
 
-    def _dimming(self, frames: NDArray) -> NDArray:
-        """Modulus of the reference waves relative to that of a flat wavefront (`eq-dimming`), shape (k,)."""
-        if abs(self._flat_loss) <= _PARALLEL * self._incoming:
-            return np.ones(len(frames))
-        return np.sqrt(np.minimum(np.maximum(self._loss(frames) / self._flat_loss, _DIMMEST), 1))
+    def _accelerated(self) -> Acceleration:
+        sensor, amplitude = self.settings.sensor, self.settings.amplitude
+        tilt = np.where(sensor.pupil.mask, _SMALL_TILT * sensor.pupil.x, 0)
+        plain = PhaseShifted(sensor, n_iterations=1, tolerance=0.0, amplitude=amplitude)
+        found = sensor.pupil.gather(plain(sensor.measure(tilt, amplitude)).phase)
+        tilt = sensor.pupil.gather(tilt)
+        flat = sensor.operator(Kind.numpy()).split_project(self._flat())
+        return Acceleration.of(sensor, flat, 1 - float(found @ tilt / (tilt @ tilt)))
 
-    def _solve(self, waves: NDArray, excess: NDArray) -> tuple[NDArray, NDArray]:
-        """A multiple of the field at every point, and where the determinant vanishes.
+    def _solve(self, waves: NDArray, excess: NDArray, kind: Kind) -> tuple[NDArray, NDArray | None]:
+        """A multiple of the field at every point, and where the determinant vanishes, if anywhere.
 
         The equations are 2 Re(conj(r) psi) = I - A^2 - |r|^2. Each pair of masks gives Cramer's numerators and
         its determinant; weighting the pairs with their determinants makes the sum the least-squares solution.
         """
-        real, imag = waves[:, :, 0], waves[:, :, 1]
-        power = real**2
-        power += imag**2
+        xp, real, imag = kind.xp, waves[:, :, 0, ...], waves[:, :, 1, ...]
+        power = real * real + imag * imag
         right = excess - power
-        solved = np.zeros((len(waves), 2, *waves.shape[-2:]), waves.dtype)
-        strength = np.zeros((len(waves), *waves.shape[-2:]), waves.dtype)
-        scale = np.zeros_like(strength)
+        solved = kind.zeros(excess.shape[0], 2, *excess.shape[-2:])
+        strength = xp.zeros_like(solved[:, 0, ...])
+        scale = xp.zeros_like(strength)
         for a, b in self._pairs:
-            determinant = real[:, a] * imag[:, b]
-            determinant -= imag[:, a] * real[:, b]
-            solved[:, 0] += determinant * (right[:, a] * imag[:, b] - right[:, b] * imag[:, a])
-            solved[:, 1] += determinant * (right[:, b] * real[:, a] - right[:, a] * real[:, b])
-            strength += determinant**2
-            scale += power[:, a] * power[:, b]
-        return solved, strength <= np.maximum(_PARALLEL**2 * scale, _DARK**2)
+            real_a, imag_a, right_a, real_b, imag_b, right_b = (
+                array[:, mask, ...] for mask in (a, b) for array in (real, imag, right)
+            )
+            determinant = real_a * imag_b - imag_a * real_b
+            solved[:, 0, ...] += determinant * (right_a * imag_b - right_b * imag_a)
+            solved[:, 1, ...] += determinant * (right_b * real_a - right_a * real_b)
+            strength += determinant * determinant
+            scale += power[:, a, ...] * power[:, b, ...]
+        singular = (strength <= _DARK**2) | (strength <= _PARALLEL**2 * scale)
+        return solved, singular if xp.any(singular) else None
 
     def _refuse_equal_masks(self) -> None:
-        config = self.settings
-        flat = split(np.zeros((1, *config.sensor.pupil.shape)), config.amplitude)
-        waves = config.sensor.operator(np.float64).split_reference(flat, in_window=True)
-        _, singular = self._solve(waves, np.zeros((1, config.sensor.n_masks, *config.sensor.pupil.shape)))
-        if singular[0][config.sensor.pupil.mask].all():
+        sensor, kind = self.settings.sensor, Kind.numpy()
+        waves = sensor.operator(kind).split_reference(self._flat(), in_window=True)
+        _, singular = self._solve(waves, np.zeros((1, sensor.n_masks, *sensor.pupil.shape)), kind)
+        if singular is not None and singular[0][sensor.pupil.mask].all():
             raise ValueError(
                 "sensor: the determinant sin(phi_ref_b - phi_ref_a) of equation (10) is 0 at every point for "
                 "its masks: expected phase shifts that differ by other than 0 mod 2 pi, none of them 0"
@@ -203,12 +219,18 @@ class PhaseShifted:
 
 
 class _Constants(NamedTuple):
-    """What all frames share, in one precision."""
+    """What all frames share, as arrays of one kind."""
 
+    operator: Operator
+    maps: PupilMaps
     core: NDArray[np.floating]  # coefficients of the field (k, 2 r) to those of the waves
     weights: NDArray[np.floating]  # (2, n_masks), of the intensities in the signal
     offset: NDArray[np.floating]  # (2, ny, nx), the signal of the incoming light; (ny, nx) without shared wave
     flat: NDArray[np.floating]  # (1, 2 r), coefficients of a flat wavefront
+    flat_waves: NDArray[np.floating]  # (1, n, 2, ny, nx), its reference waves
+    inside: NDArray[np.floating]  # (n_masks * ny * nx,), 1 inside the pupil
+    incoming: float  # light in the pupil, all masks together
+    acceleration: Acceleration | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,35 +271,12 @@ class _SharedWave:
         weights = -bend.conj() * inverse
         factors = -factors / bend
         determinants = [(a.conj() * b).imag for a, b in combinations(factors, 2)]
-        return cls(-bend * base, np.stack([weights.real, weights.imag]), _DARK / np.linalg.norm(determinants))
+        return cls(
+            -bend * base, np.stack([weights.real, weights.imag]), _DARK / float(np.linalg.norm(determinants))
+        )
 
-    def solve(self, wave: NDArray, signal: NDArray) -> tuple[NDArray, NDArray]:
-        """A multiple of the field at every point, (k, 2, ny, nx), and where the system is singular."""
-        real, imag = wave[:, 0], wave[:, 1]
-        along = real**2
-        along += imag**2
-        singular = along <= self.darkest
-        along += signal[:, 0]
-        across = signal[:, 1]
-        solved = along[:, np.newaxis] * wave
-        solved[:, 0] -= across * imag
-        solved[:, 1] += across * real
-        return solved, singular
-
-
-def _extrapolate(found: NDArray, data: dict[str, NDArray]) -> NDArray:
-    """Next coefficients (k, 2 r) by the secant through the last two steps (`eq-secant`), kept in `data`."""
-    tried = data.get("tried")
-    if tried is None:
-        data["tried"] = found
-        return found
-    change = found - tried
-    new = tried + _RELAXATION * change
-    if "change" in data:
-        turn = change - data["change"]
-        size = np.vecdot(turn, turn)
-        size[size == 0] = 1
-        factor = np.vecdot(turn, change) / size
-        new -= factor[:, np.newaxis] * (tried - data["before"] + _RELAXATION * turn)
-    data.update(tried=new, before=tried, change=change)
-    return new
+    def solve(self, wave: NDArray, signal: NDArray, kind: Kind) -> tuple[NDArray, NDArray | None]:
+        """A multiple of the field at every point, (k, 2, ny, nx), and where the system is singular, if it is."""
+        power = square(wave)
+        solved = turn(wave, power + signal[:, 0, ...], signal[:, 1, ...])
+        return solved, None if kind.xp.min(power) > self.darkest else power <= self.darkest

@@ -1,0 +1,76 @@
+"""Arrays of NumPy, and of any other library that follows the Python array API standard.
+
+What runs on such arrays asks them for their `Kind`, calls the functions of its namespace `xp`, and keeps one copy
+of its constants for each kind that was met.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import array_api_compat
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Kind(NamedTuple):
+    """Library, precision and device of an array."""
+
+    xp: Any
+    dtype: Any
+    device: Any
+
+    @classmethod
+    def of(cls, array: Any) -> Kind:
+        """Kind of an array."""
+        if isinstance(array, np.ndarray):
+            return cls(np, array.dtype, None)
+        return cls(array_api_compat.array_namespace(array), array.dtype, array_api_compat.device(array))
+
+    @classmethod
+    def numpy(cls, dtype: Any = np.float64) -> Kind:
+        """Kind of the arrays of NumPy."""
+        return cls(np, np.dtype(dtype), None)
+
+    @property
+    def real(self) -> Kind:
+        """Kind of the real parts of complex arrays."""
+        dtype = self.xp.float32 if self.dtype == self.xp.complex64 else self.xp.float64
+        return Kind(self.xp, np.dtype(dtype) if self.xp is np else dtype, self.device)
+
+    @property
+    def on_host(self) -> bool:
+        """Whether such arrays lie in the memory of the processor."""
+        return self.device is None or "cpu" in str(self.device).lower()
+
+    def array(self, values: Any) -> Any:
+        """Real numbers as an array of this kind."""
+        return self.xp.asarray(values, dtype=self.dtype, device=self.device)
+
+    def flags(self, values: NDArray[np.bool_]) -> Any:
+        """Truth values beside arrays of this kind."""
+        return self.xp.asarray(values, dtype=self.xp.bool, device=self.device)
+
+    def zeros(self, *shape: int) -> Any:
+        """Zeros."""
+        return self.xp.zeros(shape, dtype=self.dtype, device=self.device)
+
+    def integers(self, values: Any) -> Any:
+        """Integers beside arrays of this kind."""
+        return self.xp.asarray(values, dtype=self.xp.int64, device=self.device)
+
+
+def any_array(value: Any) -> tuple[Any, Any]:
+    """An array, left in its library if that follows the standard, and made one of NumPy if not; its namespace."""
+    if isinstance(value, np.ndarray):
+        return np.asarray(value), np  # subclasses, which may carry masks or units, become plain arrays
+    if not isinstance(value, np.generic) and array_api_compat.is_array_api_obj(value):
+        return value, array_api_compat.array_namespace(value)
+    return np.asarray(value), np
+
+
+def product(real: Any, maps: Any, xp: Any) -> Any:
+    """Matrix product of real numbers with large maps, real or complex."""
+    if xp is np and real.dtype != maps.dtype:  # parts side by side: half the time of a product of complex numbers
+        return (real @ maps.view(real.dtype)).view(maps.dtype)
+    return real @ maps

@@ -61,7 +61,7 @@ def table(header: list[str], rows: Iterable[Iterable[str]]) -> str:
 def peers(task: str, rows: list[dict[str, Any]]) -> str:
     """Each package with its own settings, and with the quickest one that is accurate enough."""
     return table(
-        ["package and setting", "time (zwfs = 1)", ERRORS.get(task, PHASE)],
+        ["package and setting", "time (zwfs\u00a0=\u00a01)", ERRORS.get(task, PHASE)],
         (
             [
                 f"{row['package']}, {row['setting']}{' (its own)' if row['default'] else ''}",
@@ -117,7 +117,7 @@ def parts(times: dict[str, float]) -> str:
 def batches(rows: list[dict[str, Any]]) -> str:
     """Time and memory of batches."""
     return table(
-        ["frame pairs in a call", "time of each (ms)", "working memory (MB)"],
+        ["frame pairs in a call", "time of each (ms)", "memory beside frames and results (MB)"],
         ([str(r["n_frames"]), f"{1e3 * r['time per frame']:.2f}", f"{r['memory'] / 1e6:.1f}"] for r in rows),
     )
 

@@ -3,6 +3,7 @@
 import array_api_strict
 import numpy as np
 import pytest
+from astropy import units
 
 from zwfs import Arcsine, Dimple, GerchbergSaxton, Linear, PhaseShifted, ZernikeSensor, reconstruction_error
 from zwfs.reconstructors import _common
@@ -177,9 +178,23 @@ def test_bad_input_is_named(library, pupil):
 def test_subclasses_become_plain_arrays(pupil, screens):
     method = METHODS["plain"](pupil)
     frames = method.settings.sensor.measure(screens(0.4, 1)[0])
-    found = method(np.ma.masked_greater(frames, 1.0))
+    found = method(np.ma.array(frames))
     assert type(found.phase) is np.ndarray
     np.testing.assert_array_equal(found.phase, method(frames).phase)
+
+
+@pytest.mark.parametrize("method", ["measure", "propagate"])
+def test_what_would_be_lost_is_refused(pupil, classic, method):
+    name = {"measure": "phase", "propagate": "field"}[method]
+    phase = np.zeros(pupil.shape)
+    masked = np.ma.array(phase, mask=False)
+    masked[20, 18:21] = np.ma.masked
+    with pytest.raises(
+        ValueError, match=f"{name} is a masked array, 3 values of which are masked: expected plain"
+    ):
+        getattr(classic, method)(masked)
+    with pytest.raises(TypeError, match=f"{name} carries the unit deg: expected plain numbers"):
+        getattr(classic, method)(phase * units.deg)
 
 
 def test_others_take_arrays_of_numpy(pupil, modes, screens):

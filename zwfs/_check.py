@@ -52,11 +52,13 @@ def number(
 
 def real_array(name: str, value: Any) -> NDArray:
     """Return `value` as a float32 or float64 array of NumPy; other real numbers become float64."""
+    _plain(name, value)
     return real_any(name, np.asarray(value))
 
 
 def real_any(name: str, value: Any) -> Any:
     """Return `value` as a float32 or float64 array; those of a library of the array API stay there."""
+    _plain(name, value)
     array, xp = any_array(value)
     if array.dtype in (xp.float32, xp.float64):
         return array
@@ -67,8 +69,15 @@ def real_any(name: str, value: Any) -> Any:
     return xp.astype(array, xp.float64)
 
 
+def complex_array(name: str, value: Any) -> NDArray:
+    """Return `value` as a complex64 or complex128 array of NumPy."""
+    _plain(name, value)
+    return complex_any(name, np.asarray(value))
+
+
 def complex_any(name: str, value: Any) -> Any:
     """Return `value` as a complex64 or complex128 array; those of a library of the array API stay there."""
+    _plain(name, value)
     array, xp = any_array(value)
     if array.dtype in (xp.complex64, xp.complex128):
         return array
@@ -76,6 +85,19 @@ def complex_any(name: str, value: Any) -> Any:
         return xp.astype(array, xp.complex128)
     array = real_any(name, array)
     return xp.astype(array, xp.result_type(array.dtype, xp.complex64))
+
+
+def _plain(name: str, value: Any) -> None:
+    """Require that `value` holds nothing that an array of numbers would lose: masked values, or a unit."""
+    if np.ma.is_masked(value):
+        raise ValueError(
+            f"{name} is a masked array, {np.ma.count_masked(value)} values of which are masked: expected plain "
+            "numbers; fill them first"
+        )
+    if getattr(value, "unit", None) is not None:
+        raise TypeError(
+            f"{name} carries the unit {value.unit}: expected plain numbers in the unit that is documented"
+        )
 
 
 def trailing_shape(name: str, array: Any, shape: tuple[int, ...], meaning: str) -> None:

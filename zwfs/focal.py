@@ -31,7 +31,7 @@ def focal_field(pupil: Pupil, field: ArrayLike, u: ArrayLike, v: ArrayLike) -> N
     ValueError
         If a shape is wrong or a value is not finite.
     """
-    field = _check.complex_any("field", np.asarray(field))
+    field = _check.complex_array("field", field)
     _check.trailing_shape("field", field, pupil.shape, "the shape of the pupil")
     _check.finite("field", field)
     u, v = (_check.real_array(name, axis) for name, axis in (("u", u), ("v", v)))

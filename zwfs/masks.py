@@ -110,7 +110,7 @@ class Patch:
 
     def transmission(self, u: NDArray, v: NDArray) -> NDArray[np.complex128]:
         """Complex transmission at (u, v), checked."""
-        values = _check.complex_any("transmission", np.asarray(self.function(u, v)))
+        values = _check.complex_array("transmission", self.function(u, v))
         values = np.broadcast_to(values, np.shape(u)).astype(np.complex128)
         _check.finite("transmission", values)
         largest = np.abs(values).max(initial=0.0)

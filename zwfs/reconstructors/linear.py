@@ -131,7 +131,8 @@ class Linear:
         flat, pushed, pulled = calibration
         signals = []
         for name, frames, n_frames in (("flat", flat, 1), ("pushed", pushed, None), ("pulled", pulled, None)):
-            checked, batch = check_frames(self.settings.sensor, np.asarray(frames), f"calibration {name}")
+            what = f"calibration {name}"
+            checked, batch = check_frames(self.settings.sensor, _check.real_array(what, frames), what)
             if len(checked) != (n_frames or len(self.modes)):
                 raise ValueError(
                     f"calibration {name} has a batch of {batch}: expected {n_frames or len(self.modes)}"

@@ -20,9 +20,6 @@ from papermill.engines import NBClientEngine, papermill_engines
 from papermill.exceptions import PapermillExecutionError, strip_color
 
 TRACEBACK_LINES = 12
-
-# Names the file to which work within a cell adds a line of JSON for each piece that is done.
-PROGRESS = "ZWFS_PROGRESS"
 PERIOD = 0.2  # of looking into it, second
 SENDING = threading.Lock()
 
@@ -107,7 +104,7 @@ def execute(request: dict[str, Any], messages: TextIO) -> bool:
     try:
         known = papermill.inspect_notebook(request["notebook"])
         in_force = {name: p["default"] for name, p in known.items()} | in_force
-        with watch(Path(os.environ[PROGRESS]), messages):
+        with watch(Path(request["progress"]), messages):
             try:
                 _run(request)
             except RuntimeError:
@@ -137,7 +134,7 @@ def _run(request: dict[str, Any]) -> None:
 
 
 def main() -> int:
-    """Serve the request in the first argument: its notebook, target, folder and parameters."""
+    """Serve the request in the first argument: its notebook, target, folder, parameters and file of progress."""
     # The kernel inherits standard output: keep it for the messages, and send everything else to the log.
     messages = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)

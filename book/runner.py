@@ -24,6 +24,7 @@ import nbformat
 from nbformat import NotebookNode
 from tqdm import tqdm
 
+from zwfs import results, sweeps
 from zwfs.results import write_file
 
 HERE = Path(__file__).parent
@@ -38,10 +39,6 @@ KERNEL_ENVIRONMENT = {
     "PYTHONHASHSEED": "0",
 }
 
-# Names the folder in which a notebook leaves its figures and tables, see `zwfs.results`.
-RESULTS = "ZWFS_RESULTS"
-# Names the file to which work within a cell writes how far it is, see `execute.watch`.
-PROGRESS = "ZWFS_PROGRESS"
 # Holds the number of cores that the sweeps of a notebook use, see `zwfs.sweeps`.
 CORES = "LOKY_MAX_CPU_COUNT"
 
@@ -115,7 +112,7 @@ class Children:
                 text=True,
                 env=os.environ
                 | KERNEL_ENVIRONMENT
-                | {RESULTS: request["files"], PROGRESS: str(log.with_suffix(".progress"))}
+                | {results.FOLDER: request["files"], sweeps.PROGRESS: request["progress"]}
                 | {CORES: str(max(1, self.cores))},
                 # A session of its own: Ctrl-C reaches this process only, which then ends its children.
                 start_new_session=True,
@@ -447,6 +444,7 @@ def execute(
         "files": str(files),
         "target": str(target),
         "folder": str(project.notebooks),
+        "progress": str(scratch / f"{name}.progress"),
         "parameters": parameters,
     }
     failure, place = None, None

@@ -7,9 +7,10 @@ what is kept depends little on the machine.
 """
 
 import json
-import os
 import sys
 from pathlib import Path
+
+from zwfs.results import write_file
 
 from . import speed
 
@@ -53,9 +54,7 @@ def main(path):
         "peers": peers(measured),
         "speed": rounded(speed.results(1.0)),
     }
-    partial = KEPT.with_suffix(".partial")
-    partial.write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n")
-    os.replace(partial, KEPT)
+    write_file(KEPT, (json.dumps(kept, indent=1, ensure_ascii=False) + "\n").encode())
     for row in kept["peers"]:
         mark = "*" if row["default"] else " "
         name = f"{row['package']}, {row['setting']}"

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import zwfs
-from zwfs import Dimple, PhaseShifted, ZernikeSensor, reconstruction_error
+from zwfs import Dimple, PhaseShifted, Pupil, ZernikeSensor, reconstruction_error
 from zwfs._arrays import Kind
+from zwfs.reconstructors._acceleration import Acceleration
 from zwfs.reconstructors.phase_shifted import _SharedWave
 from zwfs.sensor import split
 
@@ -105,6 +106,41 @@ def test_relaxation_leaves_nothing_of_a_small_tilt(pupil, diameter):
         found = PhaseShifted(sensor, n_iterations=2, tolerance=0, accelerate=accelerate)(sensor.measure(tilt))
         left[accelerate] = reconstruction_error(pupil, found.phase, tilt) / pupil.rms(tilt)
     assert left[True] < 0.15 * left[False]
+
+
+def test_relaxation_does_not_depend_on_the_origin():
+    # The axis of the sensor may lie beside the middle of the pupil; piston is then in x, and in no frame.
+    y, x = np.mgrid[:32, :32] - 15.5
+    image = (np.hypot(x, y) < 14).astype(float)
+    pupils = [Pupil.from_amplitude(image, n_pixels=28, center=(15.5, 15.5 + shift)) for shift in (0, 1, 9)]
+    found = [PhaseShifted(pair(pupil), accelerate=True)._acceleration.relaxation for pupil in pupils]
+    np.testing.assert_allclose(found, found[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize(("left", "relaxation"), [(-0.1, 1), (0.2, 1.25), (0.9, 2)])
+def test_relaxation_is_bounded(shifted, left, relaxation):
+    flat = PhaseShifted(shifted, accelerate=True)._of(Kind.numpy()).flat
+    assert Acceleration.of(shifted, flat, left).relaxation == pytest.approx(relaxation)
+
+
+@pytest.mark.parametrize("flux", [0.01, 0.5, 2.0, 30.0])
+def test_a_wrong_flux_leaves_numbers(shifted, screens, pupil, flux):
+    method = PhaseShifted(shifted, accelerate=True, tolerance=0)
+    assert np.all(np.isfinite(method(flux * shifted.measure(screens(0.5))).phase[:, pupil.mask]))
+
+
+def test_coefficients_that_take_no_light_out_are_not_divided_by(shifted):
+    acceleration = PhaseShifted(shifted, accelerate=True)._acceleration
+    nothing = np.zeros((1, len(acceleration.form)))
+    new = acceleration.extrapolate(nothing, {"tried": nothing, "lost": np.full(1, acceleration.lost)}, np)
+    np.testing.assert_array_equal(new, nothing)
+
+
+def test_the_secant_ends_where_nothing_changes(shifted, screens, pupil):
+    method = PhaseShifted(shifted, accelerate=True, n_iterations=300, tolerance=0)
+    phase = screens(0.3)
+    found = method(shifted.measure(phase).astype(np.float32)).phase
+    assert reconstruction_error(pupil, found, phase).max() < 1e-5
 
 
 def errors_after_one(sensor, frames, phase, **options):

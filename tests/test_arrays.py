@@ -6,6 +6,7 @@ import pytest
 from astropy import units
 
 from zwfs import Arcsine, Dimple, GerchbergSaxton, Linear, PhaseShifted, ZernikeSensor, reconstruction_error
+from zwfs._arrays import Kind
 from zwfs.reconstructors import _common
 
 
@@ -53,9 +54,10 @@ def library(request):
 
 
 def same(library, found, expected, atol=1e-10):
-    """Values, precision, and the library that they come in."""
-    values = library.to_numpy(found)
-    assert type(found) is type(library.array(np.zeros(1)))
+    """Values, precision, and the library and device that they come in."""
+    values, like = library.to_numpy(found), library.array(np.zeros(1))
+    assert type(found) is type(like)
+    assert found.device == like.device
     assert values.dtype == np.asarray(expected).dtype
     np.testing.assert_allclose(values, expected, atol=atol, rtol=0)
 
@@ -173,6 +175,28 @@ def test_bad_input_is_named(library, pupil):
         method(library.array(frames[:, :5, :5]))
     with pytest.raises(TypeError, match="frames is complex"):
         method(library.array(frames + 1j))
+
+
+def test_arrays_on_the_wrong_device_are_named(pupil, classic, modes):
+    there = array_api_strict.asarray(np.ones(pupil.shape), device=array_api_strict.Device("device1"))
+    frames = classic.measure(np.zeros(pupil.shape))
+    for call, name in (
+        (lambda: Arcsine(classic, amplitude=there), "amplitude"),
+        (lambda: classic.measure(np.zeros(pupil.shape), there), "amplitude"),
+        (lambda: Arcsine(classic)(frames, there), "start"),
+        (lambda: Linear(classic, modes)(there[np.newaxis, ...]), "frames"),
+    ):
+        with pytest.raises(TypeError, match=f"{name} is a Array that makes no array here"):
+            call()
+
+
+def test_constants_are_not_shared_with_other_libraries(library):
+    array = np.zeros(3)
+    array.setflags(write=False)
+    copy = Kind.of(library.array(np.zeros(1))).array(array)
+    copy += 1.0
+    np.testing.assert_array_equal(array, 0)
+    np.testing.assert_array_equal(library.to_numpy(copy), 1)
 
 
 def test_subclasses_become_plain_arrays(pupil, screens):

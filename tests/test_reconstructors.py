@@ -1,4 +1,5 @@
 import inspect
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -187,6 +188,26 @@ def test_arcsine_counts_cosines_beyond_1(classic, pupil):
     assert Arcsine(classic, n_iterations=1)(frames).n_unsolved == 4
 
 
+def test_arcsine_leaves_dark_points_as_they_were(classic, pupil, screens):
+    amplitude = pupil.amplitude.copy()
+    amplitude[20, 10:20] = 0
+    found = Arcsine(classic, amplitude=amplitude, tolerance=0)(
+        classic.measure(screens(0.1)[0], amplitude), start=np.full(pupil.shape, 0.1)
+    )
+    np.testing.assert_allclose(found.phase[20, 10:20], 0.1)
+    assert found.n_unsolved == 10
+
+
+def test_unsolved_points_are_those_of_each_frame(classic, pupil, screens):
+    frames = classic.measure(screens(0.3, 3) * np.array([0, 1e-3, 1])[:, np.newaxis, np.newaxis])
+    frames[0, 0, 20, 18:22] += 50
+    frames[2, 0, 20, 18:24] += 50
+    found = Arcsine(classic, tolerance=1e-2)(frames)
+    assert found.n_iterations.tolist() == [2, 1, 3]  # some leave early
+    assert found.n_unsolved.tolist() == [Arcsine(classic, tolerance=1e-2)(frame).n_unsolved for frame in frames]
+    assert found.n_unsolved[0] == 4
+
+
 def test_arcsine_knows_the_modulus_of_what_it_finds(classic, pupil, screens):
     # Beside points with a solution there are dark ones, and too bright and too dark ones, in many frames.
     amplitude = np.where(np.random.default_rng(0).uniform(size=pupil.shape) < 0.1, 0, 1.0)
@@ -199,6 +220,45 @@ def test_arcsine_knows_the_modulus_of_what_it_finds(classic, pupil, screens):
     modulus = np.hypot(found.field[:, 0], found.field[:, 1])
     known = np.broadcast_to(found.modulus, modulus.shape)
     np.testing.assert_allclose(known[:, pupil.mask], modulus[:, pupil.mask], rtol=1e-12)
+
+
+def test_unsolved_points_are_counted_in_the_pupil(shifted, pupil):
+    method = PhaseShifted(shifted)
+    method._shared = replace(method._shared, darkest=np.inf)
+    start = np.where(pupil.mask, 0.3, np.nan)
+    found = method(shifted.measure(np.zeros(pupil.shape)), start)
+    assert found.n_unsolved == pupil.n_points
+    np.testing.assert_allclose(found.phase, start)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_weak_waves_of_different_size_are_solved(pupil, screens, dtype):
+    sensor = ZernikeSensor(pupil, Dimple(0.01, np.pi / 2), Dimple(0.012, -np.pi / 2))
+    frames, phase = sensor.measure(screens(0.4)), screens(0.4)
+    found = PhaseShifted(sensor, n_iterations=10, tolerance=0)(frames.astype(dtype))
+    assert np.all(found.n_unsolved == 0)
+    assert reconstruction_error(pupil, found.phase, phase).max() < {np.float32: 1e-3, np.float64: 1e-10}[dtype]
+
+
+@every
+def test_what_a_reconstructor_was_made_from_cannot_change(make, method):
+    reconstruct, sensor = make(method)
+    with pytest.raises(ValueError, match="read-only"):
+        reconstruct.settings.amplitude[:] = 0.5
+    assert not np.shares_memory(reconstruct.settings.amplitude, sensor.pupil.amplitude)
+
+
+def test_cost_is_checked(shifted, pupil):
+    descent, frames = GradientDescent(shifted), shifted.measure(np.zeros(pupil.shape))
+    phase = np.full(pupil.n_points, 0.3)
+    whole = np.ones(frames.shape, int)
+    assert descent.cost(phase, whole)[0] == descent.cost(phase, whole.astype(float))[0]
+    with pytest.raises(ValueError, match=r"phase has shape \(3,\): expected \(1264,\), the points of the pupil"):
+        descent.cost(phase[:3], frames)
+    with pytest.raises(ValueError, match=r"frames has a batch of \(2,\): expected one set of frames"):
+        descent.cost(phase, np.stack([frames, frames]))
+    with pytest.raises(ValueError, match="phase holds 1 NaN"):
+        descent.cost(np.where(np.arange(phase.size) == 3, np.nan, phase), frames)
 
 
 @pytest.mark.parametrize("n_masks", [1, 2])
@@ -584,7 +644,8 @@ OPTIONS = [
     ({"amplitude": np.ones((40, 40)) * 1j}, TypeError, "amplitude is complex"),
     ({"poke": 0}, ValueError, r"poke = 0: .*\(0, inf"),
     ({"conditioning": 1.0}, ValueError, r"conditioning = 1\.0: .*\[0, 1\)"),
-    ({"reference": np.zeros((3, 3))}, ValueError, r"\(3, 3\): expected \(\.\.\., 40, 40\)"),
+    ({"reference": np.zeros((3, 3))}, ValueError, r"reference has shape \(3, 3\): expected \(\.\.\., 40, 40\)"),
+    ({"reference": np.zeros((2, 40, 40))}, ValueError, r"reference has shape \(2, 40, 40\): expected \(40, 40\)$"),
     ({"modes": np.ones((40, 40))}, ValueError, r"modes has shape \(40, 40\): expected \(n_modes, ny, nx\)"),
     ({"modes": np.ones((2, 40, 41))}, ValueError, r"modes has shape \(2, 40, 41\): expected \(\.\.\., 40, 40\)"),
     ({"modes": np.full((2, 40, 40), np.nan)}, ValueError, "modes holds .* inside the pupil"),

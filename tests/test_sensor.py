@@ -256,6 +256,8 @@ def test_batches_of_any_depth(shifted, screens, complex_field, pupil):
 def test_an_empty_batch_is_refused(shifted):
     with pytest.raises(ValueError, match=r"phase has shape \(0, 40, 40\): expected at least one map"):
         shifted.measure(np.empty((0, 40, 40)))
+    with pytest.raises(ValueError, match=r"field has shape \(0, 40, 40\): expected at least one field"):
+        shifted.propagate(np.empty((0, 40, 40)))
 
 
 def test_amplitudes_in_a_batch(shifted, screens, pupil):
@@ -292,6 +294,21 @@ def test_single_precision_in_single_precision_out(shifted, screens, pupil):
         assert waves.dtype == np.complex64
         np.testing.assert_allclose(waves, function(field), atol=1e-5)
     assert shifted.adjoint(waves).dtype == np.complex64
+
+
+def test_bytes_in_another_order_keep_their_precision(shifted, screens):
+    phase = screens(0.3).astype(">f4")
+    frames = shifted.measure(phase)
+    assert frames.dtype == np.float32
+    np.testing.assert_array_equal(frames, shifted.measure(phase.astype(np.float32)))
+    assert shifted.propagate(np.exp(1j * phase).astype(">c8")).dtype == np.complex64
+
+
+def test_fields_in_another_order_of_memory(shifted, complex_field, pupil):
+    field = complex_field(pupil, 2)
+    waves = shifted.propagate(field)
+    np.testing.assert_allclose(shifted.propagate(np.asfortranarray(field)), waves, atol=1e-12)
+    np.testing.assert_allclose(shifted.adjoint(np.asfortranarray(waves)), shifted.adjoint(waves), atol=1e-12)
 
 
 def test_what_lies_outside_the_pupil_does_not_matter(shifted, screens, pupil):

@@ -376,17 +376,19 @@ def test_what_was_looked_at_does_not_change_a_pickle(modes):
     pupil = Pupil.circular(24)  # at which nobody has looked
     bench = Bench(n_pixels=40)
     sensor, model = ZernikeSensor(pupil, Dimple(1.06, 1.5)), BenchModel.from_images(bench, 1)
-    method = PhaseShifted(model.shifted)
-    before = [pickle.dumps(thing) for thing in (sensor, model, method)]
+    method, classic = PhaseShifted(model.shifted), Arcsine(sensor)
+    before = [pickle.dumps(thing) for thing in (sensor, model, method, classic)]
     digest = sweeps._digest((sensor, model, method))
     frames = sensor.measure(modes[0])
+    phase = classic(frames).phase
     model.pistons(method(model.normalise(bench.frames())).phase)
     assert pupil.points.size
     assert model.modes.size
-    assert [pickle.dumps(thing) for thing in (sensor, model, method)] == before
+    assert [pickle.dumps(thing) for thing in (sensor, model, method, classic)] == before
     assert sweeps._digest((sensor, model, method)) == digest
     copy = pickle.loads(pickle.dumps(sensor))
     np.testing.assert_array_equal(copy.measure(modes[0]), frames)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(classic))(frames).phase, phase)
     np.testing.assert_array_equal(copy.pupil.points, pupil.points)
 
 

@@ -44,7 +44,9 @@ class Kind(NamedTuple):
         return self.device is None or "cpu" in str(self.device).lower()
 
     def array(self, values: Any) -> Any:
-        """Real numbers as an array of this kind."""
+        """Real numbers as an array of this kind; no other library shares the memory of an array of NumPy."""
+        if self.xp is not np and isinstance(values, np.ndarray):
+            values = values.copy()
         return self.xp.asarray(values, dtype=self.dtype, device=self.device)
 
     def flags(self, values: NDArray[np.bool_]) -> Any:

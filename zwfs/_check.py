@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zwfs._arrays import any_array
+from zwfs._arrays import Kind, any_array
 
 
 def integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
@@ -52,43 +53,46 @@ def number(
 
 def real_array(name: str, value: Any) -> NDArray:
     """Return `value` as a float32 or float64 array of NumPy; other real numbers become float64."""
-    _plain(name, value)
-    return real_any(name, np.asarray(value))
+    return real_any(name, _made(name, value, np.asarray))
 
 
 def real_any(name: str, value: Any) -> Any:
     """Return `value` as a float32 or float64 array; those of a library of the array API stay there."""
-    _plain(name, value)
-    array, xp = any_array(value)
+    array, xp = _made(name, value, any_array)
     if array.dtype in (xp.float32, xp.float64):
         return array
     if xp.isdtype(array.dtype, "complex floating"):
         raise TypeError(f"{name} is complex ({array.dtype}): expected real numbers")
     if not xp.isdtype(array.dtype, ("real floating", "integral")):
         raise TypeError(f"{name} has dtype {array.dtype}: expected real numbers")
-    return xp.astype(array, xp.float64)
+    swapped = xp is np and array.dtype.newbyteorder("=") == np.float32  # as in FITS files
+    return xp.astype(array, xp.float32 if swapped else xp.float64)
 
 
 def complex_array(name: str, value: Any) -> NDArray:
     """Return `value` as a complex64 or complex128 array of NumPy."""
-    _plain(name, value)
-    return complex_any(name, np.asarray(value))
+    return complex_any(name, _made(name, value, np.asarray))
 
 
 def complex_any(name: str, value: Any) -> Any:
     """Return `value` as a complex64 or complex128 array; those of a library of the array API stay there."""
-    _plain(name, value)
-    array, xp = any_array(value)
+    array, xp = _made(name, value, any_array)
     if array.dtype in (xp.complex64, xp.complex128):
         return array
     if xp.isdtype(array.dtype, "complex floating"):
-        return xp.astype(array, xp.complex128)
+        swapped = xp is np and array.dtype.newbyteorder("=") == np.complex64
+        return xp.astype(array, xp.complex64 if swapped else xp.complex128)
     array = real_any(name, array)
     return xp.astype(array, xp.result_type(array.dtype, xp.complex64))
 
 
-def _plain(name: str, value: Any) -> None:
-    """Require that `value` holds nothing that an array of numbers would lose: masked values, or a unit."""
+def in_kind(name: str, array: Any, kind: Kind) -> Any:
+    """Return real numbers as an array of the kind that goes with it."""
+    return _made(name, array, kind.array)
+
+
+def _made(name: str, value: Any, make: Callable[[Any], Any]) -> Any:
+    """Make an array of `value`, which must hold nothing that it would lose: masked values, or a unit."""
     if np.ma.is_masked(value):
         raise ValueError(
             f"{name} is a masked array, {np.ma.count_masked(value)} values of which are masked: expected plain "
@@ -98,6 +102,10 @@ def _plain(name: str, value: Any) -> None:
         raise TypeError(
             f"{name} carries the unit {value.unit}: expected plain numbers in the unit that is documented"
         )
+    try:
+        return make(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name} is a {type(value).__name__} that makes no array here ({error})") from error
 
 
 def trailing_shape(name: str, array: Any, shape: tuple[int, ...], meaning: str) -> None:

@@ -275,7 +275,7 @@ class ZernikeSensor:
         xp = Kind.of(maps).xp
         if not xp.all(xp.any(maps > 0, axis=(-2, -1))):
             raise ValueError("amplitude is 0 everywhere in the pupil: expected some light")
-        return kind.array(maps), batch
+        return _check.in_kind("amplitude", maps, kind), batch
 
     def intensity(self, phase: NDArray, amplitude: NDArray) -> NDArray:
         """Frames of phases (k, ny, nx) and amplitudes (1 or k, ny, nx): (k, n_masks, ny', nx')."""
@@ -306,11 +306,14 @@ class ZernikeSensor:
         """Checked complex maps with one batch axis, the batch, and the kind of their parts."""
         field = _check.complex_any("field", field)
         _check.trailing_shape("field", field, shape, meaning)
+        batch = tuple(field.shape[: -len(shape)])
+        if not prod(batch):
+            raise ValueError(f"field has shape {tuple(field.shape)}: expected at least one field")
         _check.finite("field", field)
         kind = Kind.of(field).real
         if kind.xp is np:
-            field = np.ascontiguousarray(field)
-        return kind.xp.reshape(field, (-1, *shape)), tuple(field.shape[: -len(shape)]), kind
+            field = np.ascontiguousarray(field)  # numbers side by side can be viewed as pairs of real ones
+        return kind.xp.reshape(field, (-1, *shape)), batch, kind
 
     def _largest_rms(self, phase: NDArray, xp: Any) -> float:
         """Largest rms of phases that are 0 outside the pupil, (k, ny, nx), piston removed."""

@@ -110,7 +110,8 @@ def breakdown(n_pixels, seconds):
     phasor = maps.flat
     flat, batch = _common.check_frames(sensor, frames)
     data = method.prepare(flat, phasor, True, kind)
-    coefficients = operator.split_project(phasor) @ core
+    projected, acceleration = operator.split_project(phasor), method._of(kind).acceleration
+    coefficients = projected @ core
     wave = operator.split_expand(coefficients, in_window=True)[:, 0]
     field, _ = method._shared.solve(wave, data["signal"], kind)
     found = method(frames)
@@ -119,6 +120,7 @@ def breakdown(n_pixels, seconds):
         "check of the frames": lambda: _common.check_frames(sensor, frames),
         "signal and dimming": lambda: method.prepare(flat, phasor, True, kind),
         "step: projection": lambda: operator.split_project(phasor) @ core,
+        "step: extrapolation": lambda: acceleration.extrapolate(projected, dict(data), np),
         "step: expansion": lambda: operator.split_expand(coefficients, in_window=True),
         "step: linear system": lambda: method._shared.solve(wave, data["signal"], kind),
         "step: modulus": lambda: _common.unit(field.copy(), maps.inside, np),

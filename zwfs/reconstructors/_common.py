@@ -31,7 +31,8 @@ class Reconstruction:
     n_iterations : ndarray of int, shape (...)
         Iterations used.
     converged : ndarray of bool, shape (...)
-        Whether the last iteration changed the phase by no more than the tolerance; False for a tolerance of 0.
+        Whether the last iteration changed the phase by no more than the tolerance; with a tolerance of 0,
+        `Arcsine`, `PhaseShifted` and `GerchbergSaxton` do not look, and tell False. Always True for `Linear`.
     n_unsolved : ndarray of int, shape (...)
         Points whose equation had no (unique) solution in the last iteration: singular ones, which kept the value
         of the iteration before, or cosines beyond +-1.
@@ -119,7 +120,9 @@ def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLik
     maps, batch = sensor.amplitude_maps(amplitude, Kind.numpy())
     if batch:
         raise ValueError(f"amplitude has shape {np.shape(amplitude)}: expected {sensor.pupil.shape}")
-    return Settings(sensor, n_iterations, tolerance, maps[0])
+    own = maps[0].copy()
+    own.setflags(write=False)  # what is made of it would not follow
+    return Settings(sensor, n_iterations, tolerance, own)
 
 
 class FixedPoint(Protocol):
@@ -299,17 +302,20 @@ def check_frames(
 
 
 def start_phase(
-    sensor: ZernikeSensor, start: ArrayLike | None, batch: tuple[int, ...], kind: Kind
+    sensor: ZernikeSensor, start: ArrayLike | None, batch: tuple[int, ...], kind: Kind, name: str = "start"
 ) -> NDArray[np.floating]:
     """Checked starting phase of every frame, (k, ny, nx), 0 outside; flat for None."""
     shape = sensor.pupil.shape
     if start is None:
         return kind.xp.zeros((prod(batch), *shape), dtype=kind.dtype, device=kind.device)
-    maps, start_batch = sensor.pupil_maps("start", start)
+    maps, start_batch = sensor.pupil_maps(name, start)
     if start_batch not in ((), batch):
-        raise ValueError(f"start has shape {np.shape(start)}: expected {shape} or {(*batch, *shape)}")
+        expected = f"{shape} or {(*batch, *shape)}" if batch else f"{shape}"
+        raise ValueError(f"{name} has shape {(*start_batch, *shape)}: expected {expected}")
     # As many copies as there are frames, of one map or of each.
-    return kind.array(maps) + kind.xp.zeros((prod(batch), 1, 1), dtype=kind.dtype, device=kind.device)
+    return _check.in_kind(name, maps, kind) + kind.xp.zeros(
+        (prod(batch), 1, 1), dtype=kind.dtype, device=kind.device
+    )
 
 
 def angle(phasor: NDArray, xp: Any) -> NDArray:

@@ -57,5 +57,5 @@ class GerchbergSaxton:
         sensor = self.settings.sensor
         maps = self.settings.maps(kind)
         waves = sensor.propagate_split(maps.field(phasor))
-        # A modelled field of 0 has no phase; that of a bright pixel next to it would do as well as any.
+        # A modelled field of 0 has no phase: such a pixel adds nothing on the way back.
         return Estimate(sensor.adjoint_split(unit(waves, data["amplitude"], kind.xp)))

@@ -74,13 +74,28 @@ class GradientDescent:
         ----------
         phase : ndarray, shape (n_points,), radian
             Values at the points of the pupil.
-        frames : ndarray, shape (1, n_masks, ny', nx')
+        frames : ndarray, shape (n_masks, ny', nx') or (1, n_masks, ny', nx')
 
         Returns
         -------
         cost : float
         gradient : ndarray, shape (n_points,), 1 / radian
+
+        Raises
+        ------
+        TypeError, ValueError
+            If phase or frames are of the wrong shape, complex, not finite, or the frames negative or dark.
         """
+        frames, batch = check_frames(self.settings.sensor, _check.real_array("frames", frames))
+        if batch not in ((), (1,)):
+            raise ValueError(f"frames has a batch of {batch}: expected one set of frames")
+        phase, expected = _check.real_array("phase", phase), (self.settings.sensor.pupil.n_points,)
+        if phase.shape != expected:
+            raise ValueError(f"phase has shape {phase.shape}: expected {expected}, the points of the pupil")
+        _check.finite("phase", phase)
+        return self._cost(phase, frames)
+
+    def _cost(self, phase: NDArray, frames: NDArray) -> tuple[float, NDArray]:
         sensor = self.settings.sensor
         maps = sensor.pupil.scatter(phase.astype(frames.dtype), fill=0)[np.newaxis]
         psi = split(maps, self.settings.amplitude.astype(frames.dtype))
@@ -100,7 +115,7 @@ class GradientDescent:
         def value(x: NDArray) -> tuple[float, NDArray]:
             nonlocal latest
             latest = start + (x if self.modes is None else x @ self.modes)
-            cost, gradient = self.cost(latest, frames)
+            cost, gradient = self._cost(latest, frames)
             return cost, np.asarray(gradient if self.modes is None else self.modes @ gradient, np.float64)
 
         def follow(x: NDArray) -> None:

@@ -68,7 +68,7 @@ class Linear:
         self.modes = check_modes(sensor, modes)
         poke = _check.number("poke", poke, 0, open_low=True)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
-        self._reference = start_phase(sensor, reference, (), Kind.numpy())
+        self._reference = start_phase(sensor, reference, (), Kind.numpy(), "reference")
         flat, difference = self._simulated(poke) if calibration is None else self._recorded(calibration)
         self._reference_signal = flat
         self.interaction_matrix = difference.T / (2 * poke)

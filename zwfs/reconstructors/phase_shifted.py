@@ -154,8 +154,6 @@ class PhaseShifted:
             if self._shared is not None:
                 cores, weights = self._shared.core[np.newaxis], self._shared.weights
                 offset = weights.sum(axis=1)[:, np.newaxis, np.newaxis] * offset
-                # Outside the field is 0, and would have to be kept from being divided by its modulus.
-                offset[0, ~sensor.pupil.mask] = -1
             operator, core = sensor.operator(exact), split_core(cores)
             flat = operator.split_project(self._flat())
             flat_waves = operator.split_expand(flat @ core, in_window=True)
@@ -176,15 +174,16 @@ class PhaseShifted:
 
     def _accelerated(self) -> Acceleration:
         sensor, amplitude = self.settings.sensor, self.settings.amplitude
-        tilt = np.where(sensor.pupil.mask, _SMALL_TILT * sensor.pupil.x, 0)
+        x = sensor.pupil.gather(np.broadcast_to(sensor.pupil.x, sensor.pupil.shape))
+        tilt = _SMALL_TILT * (x - x.mean())  # without the piston, which no frame shows
+        frames = sensor.measure(sensor.pupil.scatter(tilt), amplitude)
         plain = PhaseShifted(sensor, n_iterations=1, tolerance=0.0, amplitude=amplitude)
-        found = sensor.pupil.gather(plain(sensor.measure(tilt, amplitude)).phase)
-        tilt = sensor.pupil.gather(tilt)
+        found = sensor.pupil.gather(plain(frames).phase)
         flat = sensor.operator(Kind.numpy()).split_project(self._flat())
         return Acceleration.of(sensor, flat, 1 - float(found @ tilt / (tilt @ tilt)))
 
     def _solve(self, waves: NDArray, excess: NDArray, kind: Kind) -> tuple[NDArray, NDArray | None]:
-        """A multiple of the field at every point, and where the determinant vanishes, if anywhere.
+        """The field at every point, and where the determinant vanishes, if anywhere.
 
         The equations are 2 Re(conj(r) psi) = I - A^2 - |r|^2. Each pair of masks gives Cramer's numerators and
         its determinant; weighting the pairs with their determinants makes the sum the least-squares solution.
@@ -205,6 +204,8 @@ class PhaseShifted:
             strength += determinant * determinant
             scale += power[:, a, ...] * power[:, b, ...]
         singular = (strength <= _DARK**2) | (strength <= _PARALLEL**2 * scale)
+        # Weak waves would make a solution too small to be told from none.
+        solved /= xp.where(singular, kind.array(1.0), strength)[:, np.newaxis, ...]
         return solved, singular if xp.any(singular) else None
 
     def _refuse_equal_masks(self) -> None:

@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from zwfs._arrays import Kind, any_array, product
 from zwfs.masks import Mask
 
+_NODES = 2048  # of a quadrature handled together: wide detectors and large masks have many
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -208,9 +210,12 @@ def factorise(
     for mask in masks:
         u, v, weights = _quadrature(mask, reach, tolerance)
         change = pixel_area * weights * (mask.transmission(u, v) - 1)
-        from_pupil = _spectra(pupil_y, pupil_axes[0], v, pupil_x, pupil_axes[1], u)
-        to_detector = _spectra(detector_y, detector_axes[0], v, detector_x, detector_axes[1], u)
-        core.append(to_detector.conj() * change @ from_pupil.T)
+        total = 0
+        for some in (slice(first, first + _NODES) for first in range(0, u.size, _NODES)):
+            from_pupil = _spectra(pupil_y, pupil_axes[0], v[some], pupil_x, pupil_axes[1], u[some])
+            to_detector = _spectra(detector_y, detector_axes[0], v[some], detector_x, detector_axes[1], u[some])
+            total = total + to_detector.conj() * change[some] @ from_pupil.T
+        core.append(total)
     left, core, right = _compress(np.array(core), tolerance)
     return Factors(Plane(pupil_y, pupil_x, right), Plane(detector_y, detector_x, left), core)
 

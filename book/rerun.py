@@ -46,7 +46,14 @@ def parser() -> Parser:
     )
     reads.add_argument("figure", nargs="?", help="number of a figure, or name of a notebook")
     reads.add_argument("-p", metavar="NAME=VALUE", action="append", default=[], help="a parameter, in YAML")
-    reads.add_argument("-f", metavar="FILE", type=Path, help="YAML file of parameters; -p wins over it")
+    reads.add_argument(
+        "-f",
+        metavar="FILE",
+        type=Path,
+        action="append",
+        default=[],
+        help="YAML file of parameters; -p wins over it",
+    )
     reads.add_argument("--list", action="store_true", help="list parameters, and run nothing")
     reads.add_argument("--force", action="store_true", help="run even if the result is there")
     reads.add_argument("--output", metavar="DIR", type=Path, help="folder for the results")
@@ -268,7 +275,9 @@ def rerun(project: Project, arguments: list[str]) -> None:
         print(describe(project, name))
         return
     known = declared.parameters(runner.read(project.notebooks / f"{name}.ipynb"))
-    given = declared.mapping(_text(asked.f), str(asked.f)) if asked.f else {}
+    if len(asked.f) > 1:
+        raise ParameterError(f"-f {' -f '.join(map(str, asked.f))}: expected one file")
+    given = declared.mapping(_text(asked.f[0]), str(asked.f[0])) if asked.f else {}
     changed = declared.accept(given | declared.assignments(asked.p), known)
     folder = asked.output or project.build / "rerun" / folder_name(name, changed)
     folder = folder.resolve()

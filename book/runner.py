@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -161,8 +161,20 @@ def key(project: Project, name: str, parameters: dict[str, Any]) -> str:
     """Return a digest of everything that the result of a notebook depends on."""
     files = {str(file.relative_to(project.root)): file for file in project.shared_inputs()}
     files |= {"runner": Path(__file__), "execute": EXECUTE}
+    files |= {f"parameter {file}": file for file in _named_files(project.notebooks, parameters)}
     own = [list(sys.version_info[:2]), parameters, cell_sources(read(project.notebooks / f"{name}.ipynb"))]
     return digest([json.dumps(own, sort_keys=True).encode(), digest_files(files).encode()])
+
+
+def _named_files(folder: Path, value: Any) -> Iterator[Path]:
+    """Find the files that parameters name: what is in them counts as much as their names."""
+    if isinstance(value, dict | list | tuple):
+        for one in value.values() if isinstance(value, dict) else value:
+            yield from _named_files(folder, one)
+    elif isinstance(value, str):
+        with suppress(OSError, ValueError):  # no text that names a file
+            if (folder / value).is_file():
+                yield folder / value
 
 
 def normalise(notebook: NotebookNode) -> NotebookNode:

@@ -1,3 +1,4 @@
+import gzip
 import hashlib
 import os
 from dataclasses import replace
@@ -299,6 +300,7 @@ def test_too_many_masked_points_are_refused(recorded):
         ({"centers": [[45, 45], [45, 137]]}, "centers without a diameter"),
         ({"centers": [[10, 45], [45, 137]], "diameter": 68}, "is cut off at the top"),
         ({"diameter": -1}, "diameter = -1"),
+        ({"diameter": 400}, "is cut off at the"),
         ({"exposure": 0}, "exposure = 0"),
     ],
 )
@@ -313,6 +315,8 @@ def test_settings_out_of_range(recorded, settings, message):
     [
         ({"diameter": 0}, "diameter = 0"),
         ({"phase_shifts": (1.0,)}, "expected one for each"),
+        ({"phase_shifts": (1.5, 1.5 + 2 * np.pi)}, "expected two that differ by other than 0 mod 2 pi"),
+        ({"phase_shifts": (0.0, 1.0)}, "none of them 0"),
         ({"leakage": 0.5}, "leakage = 0.5"),
         ({"unmasked": 1.0}, "unmasked = 1.0"),
         ({"scale": 0.0}, "scale = 0.0"),
@@ -363,6 +367,16 @@ def test_bzero_and_extension_and_stack(tmp_path):
     np.testing.assert_array_equal(second.counts - first.counts, 1)
 
 
+def test_compressed_files_are_read(tmp_path):
+    plain, packed = tmp_path / "plain.fits", tmp_path / "packed.fits.gz"
+    fits.PrimaryHDU(FRAME.astype(np.int16), fits.Header({"WAVELEN": 633.0})).writeto(plain)
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    one, other = camera.read(plain), camera.read(packed)
+    np.testing.assert_array_equal(other.images, one.images)
+    assert other.keyword("WAVELEN") == 633
+    assert other.sha256 == hashlib.sha256(packed.read_bytes()).hexdigest()
+
+
 def broken(tmp_path, kind):
     path = tmp_path / f"{kind}.fits"
     whole = tmp_path / "whole.fits"
@@ -373,6 +387,7 @@ def broken(tmp_path, kind):
         "empty": b"",
         "truncated": whole.read_bytes()[:4000],
         "header": b"SIMPLE  = nonsense",
+        "gzip": gzip.compress(whole.read_bytes())[:200],
         "npy": (tmp_path / "whole.npy").read_bytes()[:300],
     }
     if kind in contents:
@@ -399,6 +414,7 @@ def broken(tmp_path, kind):
         ("truncated", r"truncated\.fits: a broken FITS file"),
         ("header", r"header\.fits: a "),
         ("npy", r"npy\.fits: a broken NPY file"),
+        ("gzip", r"gzip\.fits: a broken gzip file"),
         ("table", r"table\.fits: a FITS file without an image"),
         ("cube", r"cube\.fits: its shape is \(5, 20, 30\): expected \(ny, nx\)"),
         ("pickle", r"pickle\.fits: a broken NPY file"),

@@ -178,6 +178,25 @@ def test_command_line_wins_over_the_file(project, monkeypatch):
     assert made == [{"n": 6, "width": 2.0}, {"steps": []}]
 
 
+def test_one_file_of_parameters_is_taken(project):
+    assert "-f a.yaml -f b.yaml: expected one file" in refused(project, "1", "-f", "a.yaml", "-f", "b.yaml")
+
+
+def test_files_that_parameters_name_count_by_what_is_in_them(project, tmp_path):
+    (project.notebooks / "beside.npy").write_bytes(b"one")
+    (tmp_path / "far.npy").write_bytes(b"one")
+    given = {
+        "files": ["beside.npy", str(tmp_path / "far.npy")],
+        "other": ["x" * 5000, "no\0file", "nowhere.npy", ""],
+    }
+    keys = [runner.key(project, "fig01_small", given)]
+    for file in (project.notebooks / "beside.npy", tmp_path / "far.npy", project.notebooks / "nowhere.npy"):
+        file.write_bytes(b"two")
+        keys.append(runner.key(project, "fig01_small", given))
+    assert len(set(keys)) == 4
+    assert runner.key(project, "fig01_small", given) == keys[-1]
+
+
 def test_lists_tell_titles_and_parameters(project, capsys):
     rerun.rerun(project, [])
     assert re.search(r"^1 +fig01_small +Title of fig01_small$", capsys.readouterr().out, re.MULTILINE)

@@ -340,6 +340,12 @@ def test_other_inputs_are_other_tasks(store, tmp_path, monkeypatch):
     assert len(square.calls) == 9
 
 
+def test_missing_packages_are_named(monkeypatch):
+    monkeypatch.setattr(sweeps, "find_spec", lambda package: None if package == "cloudpickle" else package)
+    with pytest.raises(ImportError, match=r"sweeps need cloudpickle: pip install zwfs\[sweeps\]"):
+        sweeps.run(square, range(4), 1, name="squares")
+
+
 def test_nothing_is_kept_unless_asked(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(square, "calls", [], raising=False)

@@ -41,7 +41,7 @@ class Bench:
         Width of what the camera records of each pupil image: 180 pixels of 136 on the real bench.
     n_rings, gap, missing, stop
         Layout of the segmented mirror, see `Pupil.hexagonal`. The defaults look like the real one: 37 segments,
-        six across the stop, gaps of two pixels (those of the real mirror are narrower, and would be sampled
+        5.5 across the stop, gaps of two pixels (those of the real mirror are narrower, and would be sampled
         unevenly), and one segment missing at the top right.
     diameter : float, lambda/D
         Diameter of the dimple by design.

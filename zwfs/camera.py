@@ -5,9 +5,11 @@ The only module that needs astropy, and only for FITS: `pip install zwfs[frames]
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import io
 import warnings
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -87,11 +89,17 @@ def read(path: str | Path) -> CameraFile:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    content = path.read_bytes()
+        where = "" if path.is_absolute() else f" in {Path.cwd()}"
+        raise FileNotFoundError(f"{path}: no such file{where}")
+    content = stored = path.read_bytes()
+    if content.startswith(b"\x1f\x8b"):
+        try:
+            content = gzip.decompress(content)
+        except (OSError, EOFError, zlib.error) as error:
+            raise ValueError(f"{path.name}: a broken gzip file: {error}") from None
     if content.startswith(b"\x93NUMPY"):
         data, header = _read_npy(content, path.name), {}
-    elif content.startswith((b"SIMPLE  =", b"\x1f\x8b")):
+    elif content.startswith(b"SIMPLE  ="):
         data, header = _read_fits(content, path.name)
     else:
         raise ValueError(f"{path.name}: its first bytes are those of neither a FITS nor an NPY file")
@@ -103,7 +111,7 @@ def read(path: str | Path) -> CameraFile:
         )
     full_scale = float(np.iinfo(data.dtype).max) if data.dtype.kind in "iu" else np.inf
     images = data.astype(np.float64).reshape(-1, *data.shape[-2:])
-    return CameraFile(images, path.name, hashlib.sha256(content).hexdigest(), header, full_scale)
+    return CameraFile(images, path.name, hashlib.sha256(stored).hexdigest(), header, full_scale)
 
 
 def images(

@@ -69,6 +69,12 @@ class Optics:
             raise ValueError(f"phase_shifts = {self.phase_shifts!r}: expected one for each of the two images")
         for index, value in enumerate(self.phase_shifts):
             _check.number(f"phase_shifts[{index}]", value)
+        first, second = np.exp(1j * np.array(self.phase_shifts))
+        if min(abs(first - second), abs(first - 1), abs(second - 1)) < 1e-9:
+            raise ValueError(
+                f"phase_shifts = {self.phase_shifts!r}: expected two that differ by other than 0 mod 2 pi, none "
+                "of them 0"
+            )
         _check.number("background", self.background, -1, 1, open_high=True)
         _check.number("pupil_background", self.pupil_background, -1, 1, open_high=True)
         _check.number("scale", self.scale, 0, open_low=True)

@@ -227,10 +227,10 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
             "give the positions, or look for stray light"
         )
     circles = [_outline(smooth, labels == label, level) for label in largest]
-    for circle in circles:
-        _not_cut(circle, image)
     if diameter is not None:
         circles = [replace(circle, diameter=diameter) for circle in circles]
+    for circle in circles:
+        _not_cut(circle, image)
     places = np.array([(circle.row, circle.column) for circle in circles])
     return tuple(circles[index] for index in np.argsort(places[:, np.argmax(np.ptp(places, axis=0))]))
 

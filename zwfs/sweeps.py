@@ -22,6 +22,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextvars import ContextVar
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
@@ -64,6 +65,8 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
     ------
     ValueError
         If the name is not an identifier.
+    ImportError
+        If joblib, cloudpickle or threadpoolctl is missing.
     Exception
         That of the first task that fails, with a note that names the sweep, the task and its input. What other
         tasks had finished stays in the folder of ``ZWFS_SWEEPS``.
@@ -79,6 +82,8 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
     inputs = list(inputs)
     if _IN_TASK.get():
         return [task(value, *shared) for value in inputs]
+    if missing := [package for package in ("joblib", "cloudpickle", "threadpoolctl") if not find_spec(package)]:
+        raise ImportError(f"sweeps need {', '.join(missing)}: pip install zwfs[sweeps]")
     store = _Store(name, (task, *shared))
     found = {index: kept for index, value in enumerate(inputs) if (kept := store.load(value)) is not None}
     if found:

@@ -215,7 +215,8 @@ class PhaseShifted:
         if singular is not None and singular[0][sensor.pupil.mask].all():
             raise ValueError(
                 "sensor: the determinant sin(phi_ref_b - phi_ref_a) of equation (10) is 0 at every point for "
-                "its masks: expected phase shifts that differ by other than 0 mod 2 pi, none of them 0"
+                "its masks: expected phase shifts that differ by other than 0 mod 2 pi, none of them 0, and "
+                "dimples that are large enough to make a reference wave"
             )
 
 

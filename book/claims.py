@@ -591,13 +591,12 @@ CLAIMS = (
 
 
 def below(error: float) -> str:
-    """Tell a rounding error: the notebooks give none below `ROUNDING`."""
-    exponent = f"{error:.0e}".split("e")
-    told = (
-        f"$10^{{{int(exponent[1])}}}$"
-        if exponent[0] == "1"
-        else f"${exponent[0]}\\times10^{{{int(exponent[1])}}}$"
-    )
+    """Tell a small error by one digit, rounded up: the notebooks give none below `ROUNDING`."""
+    exponent = math.floor(math.log10(error))
+    digit = math.ceil(error / 10**exponent - 1e-9)
+    if digit == 10:
+        digit, exponent = 1, exponent + 1
+    told = f"$10^{{{exponent}}}$" if digit == 1 else f"${digit}\\times10^{{{exponent}}}$"
     return f"at most {told}" if error <= ROUNDING else told
 
 

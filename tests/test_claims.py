@@ -247,6 +247,8 @@ def test_rules_at_their_boundaries_are_those_of_the_claims():
         (1e-12, "at most $10^{-12}$"),
         (2e-11, "$2\\times10^{-11}$"),
         (1e-3, "$10^{-3}$"),
+        (1.23e-7, "$2\\times10^{-7}$"),
+        (9.1e-7, "$10^{-6}$"),
         (0.26, "$3\\times10^{-1}$"),
     ],
 )

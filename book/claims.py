@@ -269,7 +269,7 @@ def real_time(fourier_functions: float, rank: float) -> Finding:
         return Finding(HOLDS, measured)
     remark = (
         f"The reason falls: the reference waves are made of {rank:.0f} numbers. "
-        "How fast that is depends on the machine: `make bench`."
+        "How fast that is depends on the machine: see [Performance](performance.md)."
     )
     return Finding(REMARK, measured, remark)
 

@@ -82,6 +82,17 @@ def test_dynamic_range_without_a_crossing():
         (lambda p: reconstruction_error(p, np.zeros(p.shape), 0.0), ValueError, r"truth has shape \(\)"),
         (lambda p: wrapped_residual(p, np.zeros(p.shape), np.full(p.shape, np.inf)), ValueError, "truth holds"),
         (lambda p: dynamic_range([1, 2], [0]), ValueError, r"rms and error have shapes \(2,\) and \(1,\)"),
+        (
+            lambda p: reconstruction_error(p.mask, p.mask, p.mask),
+            TypeError,
+            "pupil is a ndarray: expected a Pupil",
+        ),
+        (
+            lambda p: reconstruction_error(p, np.zeros((2, *p.shape)), np.zeros((3, *p.shape))),
+            ValueError,
+            r"estimate has a batch of \(2,\): expected one that broadcasts with that of the truth, \(3,\)",
+        ),
+        (lambda p: dynamic_range([], []), ValueError, "with n at least 1"),
         (lambda p: dynamic_range([2, 1], [0, 0]), ValueError, "rms = .*expected increasing"),
         (lambda p: dynamic_range([0.0], [0]), ValueError, "rms = .*above 0"),
         (lambda p: dynamic_range([-1, 1], [0, 0]), ValueError, "rms reaches down to -1"),

@@ -248,6 +248,13 @@ def test_what_a_reconstructor_was_made_from_cannot_change(make, method):
     assert not np.shares_memory(reconstruct.settings.amplitude, sensor.pupil.amplitude)
 
 
+def test_descent_that_starts_at_the_solution_has_converged(shifted, modes, screens):
+    phase = screens(0.3)[0]
+    found = GradientDescent(shifted, modes)(shifted.measure(phase), start=phase)
+    assert found.converged
+    np.testing.assert_allclose(found.residual, 0, atol=1e-12)
+
+
 def test_cost_is_checked(shifted, pupil):
     descent, frames = GradientDescent(shifted), shifted.measure(np.zeros(pupil.shape))
     phase = np.full(pupil.n_points, 0.3)

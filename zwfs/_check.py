@@ -13,6 +13,12 @@ from numpy.typing import NDArray
 from zwfs._arrays import Kind, any_array
 
 
+def instance(name: str, value: Any, kind: type) -> None:
+    """Require that `value` is of a class."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} is a {type(value).__name__}: expected a {kind.__name__}")
+
+
 def integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
     """Return `value` as an int between `low` and `high`."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, Integral):

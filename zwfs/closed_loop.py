@@ -61,8 +61,7 @@ class FrozenFlow:
         exponent: float = -2.0,
         seed: int | np.random.Generator | np.random.SeedSequence | None = None,
     ) -> None:
-        if not isinstance(pupil, Pupil):
-            raise TypeError(f"pupil is a {type(pupil).__name__}: expected a Pupil")
+        _check.instance("pupil", pupil, Pupil)
         rms = _check.number("rms", rms, 0)
         self.n_screens = _check.integer("n_screens", n_screens, 1)
         speed = _check.number("speed", speed, 0)
@@ -172,8 +171,7 @@ def close_loop(
     """
     sensor = reconstructor.settings.sensor
     pupil = sensor.pupil
-    if not isinstance(flow, FrozenFlow):
-        raise TypeError(f"flow is a {type(flow).__name__}: expected a FrozenFlow")
+    _check.instance("flow", flow, FrozenFlow)
     if flow.pupil.shape != pupil.shape or np.any(flow.pupil.mask != pupil.mask):
         raise ValueError(f"flow has {flow.pupil!r}: expected that of the reconstructor, {pupil!r}")
     modes = check_modes(sensor, modes)

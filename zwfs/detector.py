@@ -48,8 +48,7 @@ class Detector:
     gain: float = 0.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.pupil, Pupil):
-            raise TypeError(f"pupil is a {type(self.pupil).__name__}: expected a Pupil")
+        _check.instance("pupil", self.pupil, Pupil)
         _check.number("photons", self.photons, 0, open_low=True)
         _check.number("read_noise", self.read_noise, 0)
         _check.number("background", self.background, 0)

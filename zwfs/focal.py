@@ -31,6 +31,7 @@ def focal_field(pupil: Pupil, field: ArrayLike, u: ArrayLike, v: ArrayLike) -> N
     ValueError
         If a shape is wrong or a value is not finite.
     """
+    _check.instance("pupil", pupil, Pupil)
     field = _check.complex_array("field", field)
     _check.trailing_shape("field", field, pupil.shape, "the shape of the pupil")
     _check.finite("field", field)

@@ -97,8 +97,10 @@ def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> 
     Chambouleyron et al. 2024, section 4.1.
     """
     rms, error = _check.real_array("rms", rms), _check.real_array("error", error)
-    if rms.ndim != 1 or rms.shape != error.shape:
-        raise ValueError(f"rms and error have shapes {rms.shape} and {error.shape}: expected the same (n,)")
+    if rms.ndim != 1 or rms.shape != error.shape or not rms.size:
+        raise ValueError(
+            f"rms and error have shapes {rms.shape} and {error.shape}: expected the same (n,), with n at least 1"
+        )
     threshold = _check.number("threshold", threshold, 0, open_low=True)
     _check.finite("rms", rms)
     _check.finite("error", error)
@@ -118,6 +120,7 @@ def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> 
 
 
 def _inside(pupil: Pupil, name: str, maps: ArrayLike) -> NDArray[np.floating]:
+    _check.instance("pupil", pupil, Pupil)
     maps = _check.real_array(name, maps)
     _check.trailing_shape(name, maps, pupil.shape, "the shape of the pupil")
     values = pupil.gather(maps)
@@ -126,5 +129,12 @@ def _inside(pupil: Pupil, name: str, maps: ArrayLike) -> NDArray[np.floating]:
 
 
 def _residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.floating]:
-    phasor = np.exp(1j * (_inside(pupil, "estimate", estimate) - _inside(pupil, "truth", truth)))
+    found, true = _inside(pupil, "estimate", estimate), _inside(pupil, "truth", truth)
+    try:
+        phasor = np.exp(1j * (found - true))
+    except ValueError:
+        raise ValueError(
+            f"estimate has a batch of {found.shape[:-1]}: expected one that broadcasts with that of the truth, "
+            f"{true.shape[:-1]}"
+        ) from None
     return np.angle(phasor * np.conj(phasor.mean(axis=-1, keepdims=True)))

@@ -62,6 +62,7 @@ def zernike_basis(
     ----------
     Noll 1976, J. Opt. Soc. Am. 66, 207.
     """
+    _check.instance("pupil", pupil, Pupil)
     n_modes = _check.integer("n_modes", n_modes, 1)
     if np.dtype(dtype) not in (np.float32, np.float64):
         raise TypeError(f"dtype = {dtype!r}: expected float32 or float64")

@@ -67,8 +67,7 @@ class ZernikeSensor:
     """
 
     def __init__(self, pupil: Pupil, *masks: Mask, extent: float = 1.0, tolerance: float = 1e-10) -> None:
-        if not isinstance(pupil, Pupil):
-            raise TypeError(f"pupil is a {type(pupil).__name__}: expected a Pupil")
+        _check.instance("pupil", pupil, Pupil)
         if not masks:
             raise ValueError("masks is empty: expected at least one mask, such as Dimple(1.06, np.pi / 2)")
         for index, mask in enumerate(masks):

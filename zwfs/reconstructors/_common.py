@@ -113,8 +113,7 @@ def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLik
     TypeError, ValueError
         If an argument is of the wrong kind, shape or range.
     """
-    if not isinstance(sensor, ZernikeSensor):
-        raise TypeError(f"sensor is a {type(sensor).__name__}: expected a ZernikeSensor")
+    _check.instance("sensor", sensor, ZernikeSensor)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     tolerance = _check.number("tolerance", tolerance, 0)
     maps, batch = sensor.amplitude_maps(amplitude, Kind.numpy())

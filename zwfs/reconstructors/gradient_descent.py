@@ -129,8 +129,9 @@ class GradientDescent:
             value, np.zeros(n), jac=True, method="L-BFGS-B", callback=follow,
             options={"maxiter": config.n_iterations, "ftol": 0.0, "gtol": 0.0},
         )  # fmt: skip
-        # Status 0: the gradient is exactly 0, as at a flat start of a flat wavefront.
-        return path, found.status == 0 or (len(path) > 1 and _rms(path[-1] - path[-2]) <= config.tolerance)
+        # Status 0: the gradient is exactly 0. No step at all: none leads down, as at a start that is the solution.
+        stuck = found.status == 0 or len(path) == 1
+        return path, stuck or _rms(path[-1] - path[-2]) <= config.tolerance
 
 
 def _rms(values: NDArray) -> float:

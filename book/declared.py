@@ -223,6 +223,8 @@ def load(text: str, origin: str) -> Any:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         where = f", line {mark.line + 1}" if mark and "\n" in text else ""
         raise ParameterError(f"{origin}{where}: {problem or 'it cannot be read as YAML'}") from None
+    except ValueError as error:  # of a number: too many digits, or none
+        raise ParameterError(f"{origin}: {error}") from None
 
 
 def mapping(text: str, origin: str) -> dict[str, Any]:

@@ -178,6 +178,13 @@ def test_command_line_wins_over_the_file(project, monkeypatch):
     assert made == [{"n": 6, "width": 2.0}, {"steps": []}]
 
 
+@pytest.mark.parametrize(
+    ("value", "message"), [('!!int "abc"', "invalid literal for int"), ("1" * 5000, "Exceeds the limit")]
+)
+def test_numbers_that_are_none_are_refused(project, value, message):
+    assert message in refused(project, "1", "-p", f"n={value}")
+
+
 def test_one_file_of_parameters_is_taken(project):
     assert "-f a.yaml -f b.yaml: expected one file" in refused(project, "1", "-f", "a.yaml", "-f", "b.yaml")
 

@@ -64,11 +64,12 @@ class Kind(NamedTuple):
 
 def any_array(value: Any) -> tuple[Any, Any]:
     """An array, left in its library if that follows the standard, and made one of NumPy if not; its namespace."""
-    if isinstance(value, np.ndarray):
-        return np.asarray(value), np  # subclasses, which may carry masks or units, become plain arrays
-    if not isinstance(value, np.generic) and array_api_compat.is_array_api_obj(value):
+    if not isinstance(value, np.ndarray | np.generic) and array_api_compat.is_array_api_obj(value):
         return value, array_api_compat.array_namespace(value)
-    return np.asarray(value), np
+    array = np.asarray(value)  # subclasses become plain arrays
+    if not array.dtype.isnative:  # as in FITS files
+        array = array.astype(array.dtype.newbyteorder("="))
+    return array, np
 
 
 def product(real: Any, maps: Any, xp: Any) -> Any:

@@ -71,8 +71,7 @@ def real_any(name: str, value: Any) -> Any:
         raise TypeError(f"{name} is complex ({array.dtype}): expected real numbers")
     if not xp.isdtype(array.dtype, ("real floating", "integral")):
         raise TypeError(f"{name} has dtype {array.dtype}: expected real numbers")
-    swapped = xp is np and array.dtype.newbyteorder("=") == np.float32  # as in FITS files
-    return xp.astype(array, xp.float32 if swapped else xp.float64)
+    return xp.astype(array, xp.float64)
 
 
 def complex_array(name: str, value: Any) -> NDArray:
@@ -86,8 +85,7 @@ def complex_any(name: str, value: Any) -> Any:
     if array.dtype in (xp.complex64, xp.complex128):
         return array
     if xp.isdtype(array.dtype, "complex floating"):
-        swapped = xp is np and array.dtype.newbyteorder("=") == np.complex64
-        return xp.astype(array, xp.complex64 if swapped else xp.complex128)
+        return xp.astype(array, xp.complex128)
     array = real_any(name, array)
     return xp.astype(array, xp.result_type(array.dtype, xp.complex64))
 

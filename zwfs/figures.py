@@ -244,7 +244,7 @@ def diversity(difference: NDArray, determinant: NDArray, strength: NDArray, name
     panels[0].set_ylabel(r"$|\det M|$")
     panels[1].set_ylabel("determinant with the waves' strength")
     if named:
-        panels[1].legend(fontsize=9)
+        panels[0].legend(fontsize=9, loc="lower center")  # below the arch, where no pair is
     return figure
 
 

@@ -1,7 +1,6 @@
 """Run the notebooks and build the book: the commands behind the Makefile."""
 
 import argparse
-import signal
 import sys
 from pathlib import Path
 
@@ -115,8 +114,7 @@ def main() -> int:
     )
     parser.add_argument("command", choices=COMMANDS)
     command = COMMANDS[parser.parse_args().command]
-    # Whoever stops the build by a signal gets the same clean end as by Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    runner.end_cleanly_on_signals()
     try:
         return command(Project(Path(__file__).resolve().parent.parent))
     except (NotebookError, BookError, ClaimError, PrintError) as failure:

@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -133,6 +134,13 @@ def _run(request: dict[str, Any]) -> None:
     )
 
 
+def end_without(parent: int) -> None:
+    """End this process, and with it the kernel, when the process that started it is gone."""
+    while os.getppid() == parent:
+        time.sleep(PERIOD)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
 def main() -> int:
     """Serve the request in the first argument: its notebook, target, folder, parameters and file of progress."""
     # The kernel inherits standard output: keep it for the messages, and send everything else to the log.
@@ -140,6 +148,7 @@ def main() -> int:
     os.dup2(2, 1)
     # An exception, and not the end of this process, so that papermill ends the kernel first.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    threading.Thread(target=end_without, args=(os.getppid(),), daemon=True).start()
     return 0 if execute(json.loads(sys.argv[1]), messages) else 1
 
 

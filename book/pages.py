@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import api
@@ -17,7 +16,7 @@ import finish
 import live
 import performance
 import printing
-from runner import Project, digest, digest_files, read, swap, to_bytes
+from runner import Project, digest, digest_files, read, scratch_folder, swap, to_bytes
 
 from zwfs.results import write_file
 
@@ -107,12 +106,12 @@ def build_book(project: Project) -> bool:
     for page, fragments in made.items():
         if page in files:
             _write(source, fragments())
-    with tempfile.TemporaryDirectory(dir=project.build, prefix="building-") as scratch:
-        built = write_pages(source, Path(scratch))
+    with scratch_folder(project.build, "building-") as scratch:
+        built = write_pages(source, scratch)
         if chromium:
             (built / printing.NAME).write_bytes(printing.print_book(project.root, built, chromium))
         record.unlink(missing_ok=True)
-        swap(built, html, Path(scratch) / "earlier")
+        swap(built, html, scratch / "earlier")
     write_file(record, json.dumps(made_from).encode())
     return True
 

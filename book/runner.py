@@ -1,12 +1,14 @@
 """Run the notebooks that changed, in parallel, and keep their results in one normal form."""
 
 import copy
+import fcntl
 import hashlib
 import json
 import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -41,6 +43,8 @@ KERNEL_ENVIRONMENT = {
 
 # Holds the number of cores that the sweeps of a notebook use, see `zwfs.sweeps`.
 CORES = "LOKY_MAX_CPU_COUNT"
+
+LOCK = ".zwfs-lock"  # in a scratch folder; the process that uses the folder holds a lock on it
 
 
 class NotebookError(Exception):
@@ -225,6 +229,41 @@ def to_bytes(notebook: NotebookNode) -> bytes:
     return (nbformat.writes(notebook).rstrip("\n") + "\n").encode()
 
 
+def end_cleanly_on_signals() -> None:
+    """Treat SIGTERM and SIGHUP like Ctrl-C, which ends the notebooks and removes the scratch folders."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
+            signal.signal(number, signal.default_int_handler)
+
+
+@contextmanager
+def scratch_folder(parent: Path, prefix: str) -> Iterator[Path]:
+    """Create a folder for unfinished results; remove it in the end, and those of killed processes now.
+
+    The system releases a lock when the process that holds it ends, in whatever way. A folder whose lock is free
+    therefore belongs to no running process. Folders without a lock file are not touched.
+
+    Parameters
+    ----------
+    parent : Path
+        The folder to create it in; created if it is not there.
+    prefix : str
+        Start of the names of such folders.
+    """
+    parent.mkdir(parents=True, exist_ok=True)
+    for lock in parent.glob(f"{prefix}*/{LOCK}"):
+        with suppress(OSError), lock.open("r") as file:  # another process holds it, or has just removed it
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(lock.parent, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=parent, prefix=prefix) as name:
+        new = Path(name) / f"{LOCK}.new"
+        with new.open("w") as file:
+            with suppress(OSError):  # a file system without locks: nobody can remove the folder either
+                fcntl.flock(file, fcntl.LOCK_EX)
+            new.rename(new.with_name(LOCK))  # whoever sees the lock file finds it locked
+            yield Path(name)
+
+
 def swap(new: Path, current: Path, earlier: Path) -> None:
     """Put a new folder in the place of the current one; put that back if it does not work."""
     try:
@@ -370,17 +409,14 @@ def _run_all(
     say: Callable[[str], None],
 ) -> None:
     """Run notebooks side by side, and store the result of each as soon as it is there."""
-    project.build.mkdir(parents=True, exist_ok=True)
     children, failures = Children(os.cpu_count() // min(n_processes or os.cpu_count(), len(names))), []
     with (
-        tempfile.TemporaryDirectory(dir=project.build, prefix="running-") as scratch,
+        scratch_folder(project.build, "running-") as scratch,
         ThreadPoolExecutor(n_processes or os.cpu_count()) as pool,
         Progress(project, names, f"0/{len(names)} notebooks") as progress,
     ):
         try:
-            futures = {
-                pool.submit(_run_one, project, name, Path(scratch), children, progress): name for name in names
-            }
+            futures = {pool.submit(_run_one, project, name, scratch, children, progress): name for name in names}
             for done, future in enumerate(as_completed(futures), start=1):
                 progress.bar.set_description(f"{done}/{len(names)} notebooks")
                 try:

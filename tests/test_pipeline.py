@@ -186,23 +186,54 @@ def test_dead_kernel_is_named(project):
     assert results(project) == {}
 
 
-def test_interruption_leaves_no_kernel_and_no_pieces(project):
+INTERRUPTIBLE = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # in the background SIGINT is ignored
+
+
+def start_sleeping_run(project):
+    """Start a run in a process, wait until the notebook sleeps, and return the process and the kernel's id."""
+    pid = project.notebooks / "pid"
     write(
         project,
         "sleeps",
-        "import os, pathlib, time\npathlib.Path('pid').write_text(str(os.getpid()))",
+        f"import os, pathlib, time\npathlib.Path({str(pid)!r}).write_text(str(os.getpid()))",
         "time.sleep(99)",
     )
-    code = f"import pathlib, runner; runner.run(runner.Project(pathlib.Path({str(project.root)!r})))"
+    code = (
+        f"import pathlib, runner, signal; {INTERRUPTIBLE}; runner.end_cleanly_on_signals();"
+        f"runner.run(runner.Project(pathlib.Path({str(project.root)!r})))"
+    )
     process = subprocess.Popen(
         [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(BOOK)}, stderr=subprocess.DEVNULL
     )
-    pid = project.notebooks / "pid"
     wait_until(lambda: pid.exists() and pid.read_text(), seconds=60)
-    process.send_signal(signal.SIGINT)
+    return process, int(pid.read_text())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_interruption_leaves_no_kernel_and_no_pieces(project, number):
+    process, kernel = start_sleeping_run(project)
+    process.send_signal(number)
     assert process.wait(20) != 0
     assert list(project.build.iterdir()) == []
-    wait_until(lambda: not alive(int(pid.read_text())), seconds=20)
+    wait_until(lambda: not alive(kernel), seconds=20)
+
+
+def test_killed_run_leaves_no_kernel_and_the_next_run_removes_its_pieces(project):
+    process, kernel = start_sleeping_run(project)
+    process.kill()
+    process.wait()
+    assert [folder.name.startswith("running-") for folder in project.build.iterdir()] == [True]
+    wait_until(lambda: not alive(kernel), seconds=20)
+    write(project, "sleeps", "n")
+    run(project)
+    assert [folder.name for folder in project.build.iterdir()] == ["notebooks"]
+
+
+def test_scratch_folder_of_a_living_process_and_foreign_folders_stay(tmp_path):
+    (tmp_path / "running-of-somebody-else").mkdir()
+    with runner.scratch_folder(tmp_path, "running-") as first, runner.scratch_folder(tmp_path, "running-"):
+        assert first.is_dir()
+    assert [folder.name for folder in tmp_path.iterdir()] == ["running-of-somebody-else"]
 
 
 def wait_until(condition, seconds):

@@ -7,6 +7,19 @@ READY := $(VENV)/.ready
 UV := $(BIN)/uv --quiet
 UV_REQUIREMENT := uv==0.13.8
 
+# What the environment was set up for. In a folder that was moved, with another Python, or after a set-up that was
+# interrupted, this is not what $(READY) holds, and the environment is set up again.
+IDENTITY := $(BIN)/python -I -c 'import sys; print(sys.prefix, *sys.version_info[:2])'
+ifneq ($(shell $(IDENTITY) 2>/dev/null | cmp -s - $(READY) && echo same),same)
+.PHONY: $(BIN)/uv
+endif
+
+# Matplotlib, IPython, Jupyter and uv warn or fail if they cannot write to the home folder.
+ifneq ($(shell test -d "$$HOME" && test -w "$$HOME" && echo writable),writable)
+$(shell mkdir -p _build/home)
+export HOME := $(CURDIR)/_build/home
+endif
+
 # One thread for each process: the same numbers on every machine, and no contention between notebooks.
 export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
@@ -53,9 +66,12 @@ lock: $(BIN)/uv ## pin the newest allowed version of every dependency
 		--universal --python-version 3.11 --fork-strategy fewest --generate-hashes --no-emit-index-url \
 		--custom-compile-command "make lock" --output-file $(LOCK)
 
-clean: ## remove everything that these commands made
-	rm -rf _build build $(VENV) *.egg-info .benchmarks .hypothesis .pytest_cache .ruff_cache
-	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+# Everything else in _build belongs to the user, above all the results of make rerun.
+clean: ## remove what these commands made, but not the results of make rerun
+	rm -rf $(addprefix _build/,home html html.json measured.json notebooks source building-* running-* rerunning-*)
+	rm -rf build $(VENV) *.egg-info .benchmarks .hypothesis .pytest_cache .ruff_cache
+	find . -name _build -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+	@if [ -d _build ] && ! rmdir _build 2>/dev/null; then echo "kept: $$(echo _build/*)"; fi
 
 $(BIN)/uv:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -65,9 +81,10 @@ $(BIN)/uv:
 	@$(PYTHON) -m venv --clear $(VENV)
 	@$(BIN)/python -m pip --quiet --disable-pip-version-check install $(UV_REQUIREMENT)
 
-# The stamp comes last, so that an interrupted set-up is taken up again.
-$(READY): $(LOCK) pyproject.toml | $(BIN)/uv
+# The compatible mode puts this folder on the path of Python. The default mode fails in a folder with a folder zwfs.
+$(READY): $(LOCK) pyproject.toml $(BIN)/uv
 	@rm -f $@
 	@$(UV) pip sync --python $(BIN)/python --require-hashes $(LOCK)
-	@$(UV) pip install --python $(BIN)/python --no-deps --no-build-isolation --editable .
-	@touch $@
+	@$(UV) pip install --python $(BIN)/python --no-deps --no-build-isolation \
+		--config-settings editable_mode=compat --editable .
+	@$(IDENTITY) > $@

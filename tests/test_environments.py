@@ -1,6 +1,9 @@
 """All files that name a version of Python or of a package agree."""
 
+import os
 import re
+import shutil
+import subprocess
 import sys
 import tomllib
 from importlib.metadata import version
@@ -183,3 +186,106 @@ def test_notebooks_import_no_more_than_is_installed_on_colab():
     names = {name for cell in cells if cell.cell_type == "code" for name in imported(cell.source)}
     assert "myst_nb" in names
     assert names - set(sys.stdlib_module_names) <= known
+
+
+def test_package_can_be_imported_next_to_a_folder_of_its_name(tmp_path):
+    """As in the parent folder of a clone."""
+    (tmp_path / "zwfs" / "zwfs").mkdir(parents=True)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    code = "import zwfs; print(zwfs.Pupil.__name__)"
+    run = {"cwd": tmp_path, "env": environment, "check": True, "capture_output": True, "text": True}
+    assert subprocess.run([sys.executable, "-c", code], **run).stdout == "Pupil\n"
+
+
+def test_every_editable_installation_is_compatible():
+    for name in ("Makefile", ".binder/postBuild", "environment/environment.yml"):
+        assert found(r"(\S+ \S+) --editable \.", name) == {"--config-settings editable_mode=compat"}
+
+
+# In place of pip: it installs a uv that succeeds without doing anything, or is killed meanwhile, and make with it.
+PIP = """
+import os, pathlib, signal, sys
+
+uv = pathlib.Path(sys.executable).with_name("uv")
+uv.write_text("#!/bin/sh")
+if "KILLED" in os.environ:
+    os.killpg(0, signal.SIGKILL)
+uv.chmod(0o755)
+"""
+PYTHON = """#!/bin/sh
+[ "$2" = venv ] && set -- "$@" --without-pip
+exec {} "$@"
+"""
+
+
+@pytest.fixture
+def clone(tmp_path):
+    """A folder with what a set-up needs, and programs that do it without the network."""
+    folder = tmp_path / "clone"
+    (folder / "environment").mkdir(parents=True)
+    for name in ("Makefile", "pyproject.toml", LOCK):
+        shutil.copy(ROOT / name, folder / name)
+    (tmp_path / "pip.py").write_text(PIP)
+    (tmp_path / "python").write_text(PYTHON.format(sys.executable))
+    (tmp_path / "python").chmod(0o755)
+    return folder
+
+
+def make(folder, *arguments, **variables):
+    """Run make, and return its status and what it says."""
+    environment = os.environ | {"PYTHONPATH": str(folder.parent)} | variables
+    command = ["make", *arguments, f"PYTHON={folder.parent / 'python'}"]
+    done = subprocess.run(
+        command, cwd=folder, env=environment, start_new_session=True, capture_output=True, text=True
+    )
+    return done.returncode, done.stdout
+
+
+READY = "setting up .venv\n"
+
+
+def test_environment_is_set_up_once(clone):
+    assert make(clone, "-s", ".venv/.ready") == (0, READY)
+    assert make(clone, "-s", ".venv/.ready") == (0, "")
+
+
+def test_environment_is_set_up_again_after_a_kill(clone):
+    assert make(clone, "-s", ".venv/.ready", KILLED="yes")[0] != 0
+    assert (clone / ".venv" / "bin" / "uv").exists()
+    assert make(clone, "-s", ".venv/.ready") == (0, READY)
+
+
+def test_environment_is_set_up_again_in_a_moved_folder(clone):
+    make(clone, "-s", ".venv/.ready")
+    moved = clone.rename(clone.with_name("it's moved"))
+    assert make(moved, "-s", ".venv/.ready") == (0, READY)
+    assert make(moved, "-s", ".venv/.ready") == (0, "")
+
+
+def test_environment_is_set_up_again_when_its_python_is_gone(clone):
+    make(clone, "-s", ".venv/.ready")
+    python = clone / ".venv" / "bin" / "python"
+    python.unlink()
+    python.symlink_to("/usr/bin/python0")
+    assert make(clone, "-s", ".venv/.ready") == (0, READY)
+
+
+def test_clean_keeps_what_belongs_to_the_user(clone):
+    for name in ("html/index.html", "notebooks/a.ipynb", "running-1/a", "rerun/mine/record.json", "other/a"):
+        (clone / "_build" / name).parent.mkdir(parents=True, exist_ok=True)
+        (clone / "_build" / name).write_text("")
+    status, said = make(clone, "-s", "clean")
+    assert status == 0
+    assert said == "kept: _build/other _build/rerun\n"
+    assert sorted(os.listdir(clone / "_build")) == ["other", "rerun"]
+    assert (clone / "_build" / "rerun" / "mine" / "record.json").exists()
+    shutil.rmtree(clone / "_build")
+    assert make(clone, "-s", "clean") == (0, "")
+
+
+def test_home_folder_that_cannot_be_written_is_replaced(clone, tmp_path):
+    (clone / "show.mk").write_text("include Makefile\nshow:\n\t@echo $$HOME\n")
+    shown = make(clone, "-s", "-f", "show.mk", "show", HOME="/proc/nothing")[1].strip()
+    assert shown == str(clone / "_build" / "home")
+    assert Path(shown).is_dir()
+    assert make(clone, "-s", "-f", "show.mk", "show", HOME=str(tmp_path))[1].strip() == str(tmp_path)

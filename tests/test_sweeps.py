@@ -252,7 +252,10 @@ def test_a_cluster_of_one_core_works_too():
 
 
 SWEEP = """
+import signal
 import sys
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background SIGINT is ignored
 import numpy as np
 from tests.test_sweeps import slow
 from zwfs import sweeps

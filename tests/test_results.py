@@ -1,4 +1,6 @@
 import csv
+import io
+import pickle
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -32,6 +34,17 @@ def test_nothing_is_written_unless_a_folder_is_named(figure, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     publish(figure, "plot", {"x (D)": [1.0]})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_figure_looks_the_same_with_and_without_a_folder(figure, tmp_path, monkeypatch):
+    twin = pickle.loads(pickle.dumps(figure))
+    published(tmp_path / "files", monkeypatch, figure)
+    monkeypatch.delenv(FOLDER)
+    publish(twin, "plot", {"x (D)": [1.0, 2.0]})
+    shown = [io.BytesIO(), io.BytesIO()]
+    for stream, one in zip(shown, (figure, twin), strict=True):
+        one.savefig(stream, format="png", bbox_inches="tight", metadata={"Software": None})
+    assert shown[0].getvalue() == shown[1].getvalue()
 
 
 def test_three_files_are_the_same_from_run_to_run(figure, tmp_path, monkeypatch):

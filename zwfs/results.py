@@ -29,7 +29,8 @@ def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike], *, dpi:
     """Write a figure and its numbers to the folder that the environment variable ZWFS_RESULTS names.
 
     The files are NAME.png, NAME.pdf and NAME.csv; they are the same byte for byte from run to run. If the variable
-    is not set nothing is written, but the arguments are checked all the same.
+    is not set nothing is written, but the arguments are checked and the figure is drawn. Drawing fixes its layout,
+    so a notebook shows the same figure with and without a folder.
 
     Parameters
     ----------
@@ -52,9 +53,8 @@ def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike], *, dpi:
     """
     if not re.fullmatch(r"[a-z0-9][a-z0-9_-]*", name):
         raise ValueError(f"name = {name!r}: expected lower-case letters, digits, - and _")
-    contents = {"csv": _csv(columns)}
+    contents = {"csv": _csv(columns)} | _pictures(figure, dpi)
     if folder := os.environ.get(FOLDER):
-        contents |= _pictures(figure, dpi)
         for kind, content in contents.items():
             write_file(Path(folder) / f"{name}.{kind}", content)
 

@@ -8,7 +8,7 @@ import compare
 import printing
 import runner
 from claims import ClaimError
-from pages import BookError, build_book
+from pages import BookError, build_book, check_contents
 from printing import PrintError
 from runner import NotebookError, Project
 
@@ -19,6 +19,7 @@ FRONT_FIGURE = "fig03_dynamic_range"  # stands in the README, as book/_static/fr
 
 def book(project: Project) -> int:
     """Run the notebooks that changed and build the book."""
+    check_contents(project)
     runner.run(project)
     built = build_book(project)
     html = project.build.relative_to(project.root) / "html"
@@ -32,6 +33,7 @@ def pdf(project: Project) -> int:
     """Build the book, and insist on its PDF."""
     if not printing.find_chromium():
         raise PrintError(printing.MISSING)
+    check_contents(project)
     runner.run(project)
     build_book(project)
     print(f"open {project.build.relative_to(project.root) / 'html' / printing.NAME}")

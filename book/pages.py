@@ -7,7 +7,9 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import api
 import cards
@@ -16,6 +18,7 @@ import finish
 import live
 import performance
 import printing
+import yaml
 from runner import Project, digest, digest_files, read, scratch_folder, swap, to_bytes
 
 from zwfs.results import write_file
@@ -53,6 +56,34 @@ def staged_files(project: Project) -> dict[str, Path]:
     return files | mathjax_files()
 
 
+def check_contents(project: Project) -> None:
+    """Check that _toc.yml lists every page and every notebook, and nothing else.
+
+    Raises
+    ------
+    BookError
+        It does not: Sphinx would leave out a page without a warning.
+    """
+    listed = set(_entries(yaml.safe_load((project.root / "_toc.yml").read_text("utf-8"))))
+    pages = {file.relative_to(project.root) for file in (project.root / "book").glob("[!_]*.md")}
+    pages |= {file.relative_to(project.root) for file in project.sources()}
+    known = {page.with_suffix("").as_posix(): page.as_posix() for page in sorted(pages)}
+    wrong = [f"{page} is not listed in _toc.yml" for name, page in known.items() if not {name, page} & listed]
+    wrong += [f"_toc.yml lists {name}, which is no page" for name in sorted(listed - {*known, *known.values()})]
+    if wrong:
+        raise BookError("\n".join(["the book was not built:", *wrong]))
+
+
+def _entries(contents: Any) -> Iterator[str]:
+    """Find the pages that a table of contents names, at any depth."""
+    for key, value in contents.items():
+        if key in ("root", "file"):
+            yield value
+        elif isinstance(value, list):
+            for entry in value:
+                yield from _entries(entry)
+
+
 def build_book(project: Project) -> bool:
     """Build the book in _build/html, unless it is there and nothing that it is made from changed.
 
@@ -75,6 +106,7 @@ def build_book(project: Project) -> bool:
     ClaimError
         A claim is judged by a number that no notebook gives.
     """
+    check_contents(project)
     html, record = project.build / "html", project.build / "html.json"
     files = staged_files(project)
     chromium = printing.find_chromium() if printing.STYLE in files else None
@@ -91,6 +123,7 @@ def build_book(project: Project) -> bool:
             return False
     except (OSError, ValueError):
         pass  # never built, or not to the end
+    record.unlink(missing_ok=True)  # from here on the staged sources are not those of the book that is there
     source = _stage(project, files)
     for name, versions in origin.items():
         page = source / "notebooks" / f"{name}.ipynb"
@@ -110,7 +143,6 @@ def build_book(project: Project) -> bool:
         built = write_pages(source, scratch)
         if chromium:
             (built / printing.NAME).write_bytes(printing.print_book(project.root, built, chromium))
-        record.unlink(missing_ok=True)
         swap(built, html, scratch / "earlier")
     write_file(record, json.dumps(made_from).encode())
     return True

@@ -51,13 +51,22 @@ def svg(x="1.25", name="m1", word="rad", colour="#1f77b4", raster=None):
     )
 
 
-def notebook(text="rms 0.125 rad, 25 iterations\n", picture=None, vector=None, glued="0.5"):
+def inverted(n_pixels, shape=(800, 1200)):
+    """A large picture with a few inverted pixels, which hardly change the rms."""
+    pixels = np.full((*shape, 3), 255, dtype=np.uint8)
+    pixels[0, :n_pixels] = 0
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "png")
+    return base64.b64encode(file.getvalue()).decode()
+
+
+def notebook(text="rms 0.125 rad, 25 iterations\n", picture=None, vector=None, glued="0.5", key="x"):
     data = {"image/png": picture or png(), "image/svg+xml": vector or svg()}
     glue = {"application/papermill.record/text/plain": glued}
     outputs = [
         new_output("stream", text=text),
         new_output("display_data", data=data),
-        new_output("display_data", data=glue, metadata={"scrapbook": {"name": "x"}}),
+        new_output("display_data", data=glue, metadata={"scrapbook": {"name": key}}),
     ]
     parameters = new_code_cell("n = 1", execution_count=1, metadata={"tags": ["parameters"]})
     cell = new_code_cell("show()", execution_count=2, outputs=outputs)
@@ -109,6 +118,20 @@ def test_tampering_is_found(tampered, message):
     assert len(found) == 1
     assert found[0].startswith("cell 2, output ")
     assert message in found[0]
+
+
+def test_a_renamed_glued_value_is_found():
+    found = compare.differences(notebook(), notebook(key="y"))
+    assert len(found) == 1
+    assert "{'name': 'x'}" in found[0]
+    assert "{'name': 'y'}" in found[0]
+
+
+def test_a_few_changed_pixels_are_found():
+    found = compare.differences(notebook(picture=inverted(0)), notebook(picture=inverted(1)))
+    assert found == [
+        "cell 2, output 2 (image/png): a pixel of the pictures differs by 255 of 255, and 10 is allowed"
+    ]
 
 
 def test_missing_outputs_are_found():

@@ -281,7 +281,10 @@ def small_book(ran):
     """A book of one page and one notebook."""
     (ran.root / "book").mkdir()
     (ran.root / "book" / "index.md").write_text("# A book\n\n$a = b$, {doc}`/notebooks/first`\n")
-    (ran.root / "_toc.yml").write_text("format: jb-book\nroot: book/index\nchapters:\n- file: notebooks/first\n")
+    (ran.root / "_toc.yml").write_text(
+        "format: jb-book\nroot: book/index\nchapters:\n"
+        + "".join(f"- file: notebooks/{name}\n" for name in ("first", "second", "third"))
+    )
     (ran.root / "_config.yml").write_text(
         "title: small\nonly_build_toc_files: true\nexecute:\n  execute_notebooks: 'off'\n"
     )
@@ -320,7 +323,40 @@ def test_book_is_built_once_and_a_failure_leaves_it(small_book):
     with pytest.raises(pages.BookError, match=r"book/index.md:3: WARNING: unknown document"):
         pages.build_book(small_book)
     assert page.read_bytes() == before
-    assert sorted(os.listdir(small_book.build)) == ["html", "html.json", "notebooks", "source"]
+    assert sorted(os.listdir(small_book.build)) == ["html", "notebooks", "source"]
+
+
+def test_book_is_built_again_after_a_failure(small_book):
+    """Its staged sources are those of the failure, even if the change is taken back."""
+    index, staged = (folder / "book" / "index.md" for folder in (small_book.root, small_book.build / "source"))
+    pages.build_book(small_book)
+    before = index.read_text()
+    index.write_text("# A book\n\n{doc}`nowhere`\n")
+    with pytest.raises(pages.BookError):
+        pages.build_book(small_book)
+    index.write_text(before)
+    assert pages.build_book(small_book)
+    assert staged.read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda root: (root / "book" / "new.md").write_text("# New\n"), "book/new.md is not listed in _toc.yml"),
+        (
+            lambda root: (root / "notebooks" / "second.ipynb").unlink(),
+            "_toc.yml lists notebooks/second, which is no",
+        ),
+        (
+            lambda root: write(Project(root), "new", "n"),
+            "notebooks/new.ipynb is not listed in _toc.yml",
+        ),
+    ],
+)
+def test_contents_that_do_not_match_the_pages_are_refused(small_book, change, message):
+    change(small_book.root)
+    with pytest.raises(pages.BookError, match=message):
+        pages.build_book(small_book)
 
 
 def test_pdf_is_made_and_linked_where_there_is_a_browser(small_book, monkeypatch):

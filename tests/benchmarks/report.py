@@ -6,6 +6,7 @@ The shortest time of each contestant is divided by that of zwfs with its own set
 what is kept depends little on the machine.
 """
 
+import hashlib
 import json
 import sys
 from pathlib import Path
@@ -47,6 +48,12 @@ def machine(info):
     return f"{info['cpu']['brand_raw']}, {'with' if wide else 'without'} AVX-512"
 
 
+def fingerprint(kept):
+    """sha256 of all measured numbers: with it the file shows that nobody changed a number by hand."""
+    numbers = {name: value for name, value in kept.items() if name != "sha256"}
+    return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()
+
+
 def main(path):
     measured = json.loads(Path(path).read_text())
     kept = {
@@ -54,6 +61,7 @@ def main(path):
         "peers": peers(measured),
         "speed": rounded(speed.results(1.0)),
     }
+    kept["sha256"] = fingerprint(kept)
     write_file(KEPT, (json.dumps(kept, indent=1, ensure_ascii=False) + "\n").encode())
     for row in kept["peers"]:
         mark = "*" if row["default"] else " "

@@ -3,6 +3,14 @@
 import json
 
 from . import arrays, speed
+from .report import KEPT, fingerprint
+
+
+def test_numbers_of_the_performance_page_are_those_that_were_measured():
+    kept = json.loads(KEPT.read_text("utf-8"))
+    assert kept["sha256"] == fingerprint(kept)
+    kept["speed"]["slope"]["slope"] += 0.01
+    assert kept["sha256"] != fingerprint(kept)
 
 
 def test_real_time_settings_meet_their_errors():

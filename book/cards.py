@@ -10,10 +10,10 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 from runner import Project
 
+from zwfs.tables import plain
+
 # Makes a figure again, from the root of a clone.
 RERUN = "make rerun FIGURE={notebook}"
-
-MARKDOWN = re.compile(r"([\\`*_{}\[\]<>$|#])")
 
 
 def with_cards(notebook: NotebookNode, name: str, versions: dict[str, str], commit: str) -> NotebookNode:
@@ -69,7 +69,7 @@ def card(
     """
     seed = f"`{known['seed'][0]}`" if "seed" in known else "none, nothing is random"
     rows = [
-        f"- `{name} = {value}`: {_plain(comment)}" for name, (value, comment) in known.items() if name != "seed"
+        f"- `{name} = {value}`: {plain(comment)}" for name, (value, comment) in known.items() if name != "seed"
     ]
     told = ", ".join(f"{package} {version}" for package, version in versions.items())
     return "\n".join(
@@ -112,11 +112,6 @@ def _called(notebook: str, figure: str) -> str:
 
 def _link(text: str, file: str) -> str:
     return f"{{download}}`{text} <downloads/{file}>`"
-
-
-def _plain(text: str) -> str:
-    """Return text that Markdown shows as it is."""
-    return MARKDOWN.sub(r"\\\1", text)
 
 
 def versions_of(project: Project, name: str) -> dict[str, str]:

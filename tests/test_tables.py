@@ -1,4 +1,6 @@
 import pytest
+from bs4 import BeautifulSoup
+from markdown_it import MarkdownIt
 
 from zwfs.tables import Table
 
@@ -26,3 +28,23 @@ def test_a_bar_does_not_end_the_cell():
 def test_a_row_of_another_length_is_refused():
     with pytest.raises(ValueError, match=r"rows\[1\] has 1 cells: expected 2"):
         Table(["a", "b"], [[1, 2], [1]])
+
+
+def test_strings_are_shown_as_they_are():
+    texts = [
+        "<img src=x onload=y>",
+        "[a](javascript:b)",
+        "![a](/etc/passwd)",
+        "*a* _b_ `c` ~~d~~",
+        "&lt;",
+        "a|b\\|c",
+        "\\",
+    ]
+    html = MarkdownIt("gfm-like", {"linkify": False}).render(Table(texts, [texts])._repr_markdown_())
+    soup = BeautifulSoup(html, "html.parser")
+    assert [cell.get_text() for cell in soup.find_all(["th", "td"])] == 2 * texts
+    assert {element.name for element in soup.find_all()} == {"table", "thead", "tbody", "tr", "th", "td"}
+
+
+def test_string_of_several_lines_stays_in_its_cell():
+    assert Table(["a"], [["b\n\n# c\x1b"]])._repr_markdown_().splitlines()[2:] == ["| b\\\\n\\\\n\\# c\\\\x1b |"]

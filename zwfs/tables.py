@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,8 @@ from typing import Any
 class Table:
     """Rows under a header; a notebook shows it as a table.
 
-    Floats are given `digits` significant digits, so that rounding errors do not show.
+    Floats are given `digits` significant digits, so that rounding errors do not show. Strings are shown as they
+    are: the name of a file can hold neither a link nor HTML.
 
     Attributes
     ----------
@@ -34,12 +36,17 @@ class Table:
         return f"Table of {len(self.rows)} rows: {', '.join(self.header)}"
 
     def _repr_markdown_(self) -> str:
-        lines = [self.header, ["---"] * len(self.header)]
+        lines = [list(map(self._text, self.header)), ["---"] * len(self.header)]
         lines += [[self._text(cell) for cell in row] for row in self.rows]
         return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
     def _text(self, cell: Any) -> str:
         if isinstance(cell, bool):
             return "yes" if cell else "no"
-        # A bar would end the cell.
-        return f"{cell:.{self.digits}g}" if isinstance(cell, float) else str(cell).replace("|", "\\|")
+        return f"{cell:.{self.digits}g}" if isinstance(cell, float) else plain(str(cell))
+
+
+def plain(text: str) -> str:
+    """Return Markdown that shows a text as it is: one line, in which nothing is a link, a command or HTML."""
+    line = "".join(character if character.isprintable() else repr(character)[1:-1] for character in text)
+    return re.sub(r"([\\`*_{}\[\]<>$|#&~])", r"\\\1", line)

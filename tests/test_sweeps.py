@@ -273,6 +273,7 @@ def start_sweep(folder, store, script=SWEEP):
     return subprocess.Popen(
         [sys.executable, "-c", script, str(folder)], cwd=ROOT, env=os.environ | {sweeps.STORE: str(store)},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # in the background it is ignored
     )  # fmt: skip
 
 

@@ -3,13 +3,16 @@
 import ast
 import difflib
 import io
-import re
 import tokenize
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import yaml
 from nbformat import NotebookNode
+from ruamel.yaml import YAML
+from ruamel.yaml.constructor import SafeConstructor
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event
 
 from zwfs.parameters import check_parameters
 
@@ -21,8 +24,23 @@ UNITS = ("rad", "rad rms", "lambda/D", "D", "D²/lambda", "nm", "m", "s", "Hz", 
 TYPES = {"str": str, "bool": bool}
 
 
+# Of the YAML of parameters: a list of 1000 numbers is half as long, and no parameter is a list of lists of lists.
+LONGEST = 16384  # characters, which take a second to read
+DEEPEST = 8
+NOT_PLAIN = "tags (!), anchors (&), aliases (*), merges (<<) and directives (%) are not allowed; quote strings"
+
+
 class ParameterError(Exception):
     """A value for a parameter that the notebook does not take; the message is one line."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
+
+
+def one_line(text: str) -> str:
+    """Return a text for the terminal: on one line, without control characters, cut in the middle if it is long."""
+    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return line if len(line) <= 400 else f"{line[:250]} ... {line[-140:]}"
 
 
 @dataclass(frozen=True)
@@ -181,50 +199,54 @@ def _typed(value: Any, limits: Any) -> Any:
     return float(value) if isinstance(_scalar(limits), float) else value
 
 
-class Loader(yaml.SafeLoader):
-    """YAML as of version 1.2, in which 1e3 is a number, 010 is ten and yes is a word; no name may come twice."""
-
-    yaml_implicit_resolvers: dict = {}  # noqa: RUF012 - PyYAML keeps them in the class
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        """Return a mapping, after a look at its names."""
-        names = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for index, name in enumerate(names):
-            if name in names[:index]:
-                raise yaml.constructor.ConstructorError(None, None, f"{name!r} is given twice", node.start_mark)
-        return super().construct_mapping(node, deep)
+class _Constructor(SafeConstructor):
+    """One that leaves dates, which no parameter is, as strings."""
 
 
-def _float(loader: Loader, node: yaml.ScalarNode) -> float:
-    return float(re.sub(r"\.(?=inf|nan)", "", node.value.lower()))
-
-
-for _kind, _form, _make in (
-    ("null", r"~|null|Null|NULL|", yaml.SafeLoader.construct_yaml_null),
-    ("bool", r"true|True|TRUE|false|False|FALSE", yaml.SafeLoader.construct_yaml_bool),
-    ("int", r"[-+]?[0-9]+", lambda loader, node: int(node.value)),
-    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", _float),
-):
-    Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", re.compile(rf"(?:{_form})\Z"), None)
-    Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _make)
+_Constructor.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
 
 
 def load(text: str, origin: str) -> Any:
-    """Return what a text in YAML says.
+    """Read plain YAML 1.2: numbers, strings, lists and mappings, without tags, anchors and merged mappings.
+
+    Parameters
+    ----------
+    text : str
+    origin : str
+        Where the text comes from, for the error message.
 
     Raises
     ------
     ParameterError
-        If it cannot be read; `origin` says where it came from.
+        If the text is no such YAML, is longer than `LONGEST`, or is nested deeper than `DEEPEST`.
     """
+    if len(text) > LONGEST:
+        raise ParameterError(f"{origin}: {len(text)} characters: expected at most {LONGEST}")
+    yaml = YAML(typ="safe", pure=True)  # not the C parser: it reads YAML 1.1, in which yes is True and 010 is 8
+    yaml.Constructor = _Constructor
     try:
-        return yaml.load(text, Loader)  # a safe one
-    except yaml.YAMLError as error:
-        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
-        where = f", line {mark.line + 1}" if mark and "\n" in text else ""
-        raise ParameterError(f"{origin}{where}: {problem or 'it cannot be read as YAML'}") from None
-    except ValueError as error:  # of a number: too many digits, or none
+        _check_plain(yaml.parse(text))
+        return yaml.load(text)
+    except MarkedYAMLError as error:
+        where = f", line {error.problem_mark.line + 1}" if "\n" in text else ""
+        context = f" ({error.context})" if error.context else ""
+        raise ParameterError(f"{origin}{where}: {error.problem}{context}") from None
+    except (YAMLError, ValueError) as error:  # a character that is none, or a number with too many digits
         raise ParameterError(f"{origin}: {error}") from None
+
+
+def _check_plain(events: Iterator[Event]) -> None:
+    """Refuse all that is not plain while it is still a stream: a few characters can stand for gigabytes."""
+    depth = 0
+    for event in events:
+        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+        (getattr(event, "value", None) or "").encode()  # raises on half of a character, as in "\\ud800"
+        special = any(getattr(event, name, None) for name in ("anchor", "tag", "tags", "version"))
+        if special or isinstance(event, AliasEvent) or getattr(event, "value", None) == "<<":
+            raise MarkedYAMLError(problem=NOT_PLAIN, problem_mark=event.start_mark)
+        if depth > DEEPEST:
+            problem = f"expected lists and mappings at most {DEEPEST} deep"
+            raise MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
 
 
 def mapping(text: str, origin: str) -> dict[str, Any]:
@@ -240,7 +262,6 @@ def assignments(texts: list[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
-        name = name.strip()
         if not equals or not name:
             raise ParameterError(f"-p {text}: expected name=value, as in n_screens=50")
         if name in found:

@@ -26,6 +26,10 @@ export OPENBLAS_NUM_THREADS = 1
 export MKL_NUM_THREADS = 1
 export VECLIB_MAXIMUM_THREADS = 1
 
+# Make expands no $ in these, and the shell sees no more than the name of a variable: only rerun.py reads them.
+export RERUN := $(value FIGURE) $(value ARGS)
+unexport FIGURE ARGS
+
 .DELETE_ON_ERROR:
 .PHONY: help book pdf lab test figures rerun lint bench lock clean
 
@@ -50,7 +54,7 @@ figures: $(READY) ## replace the committed notebooks by freshly run ones
 	@$(BIN)/python book/build.py figures
 
 rerun: $(READY) ## run one notebook with other parameters: make rerun FIGURE=3 ARGS="-p rms_max=2.0"
-	@$(BIN)/python book/rerun.py $(FIGURE) $(ARGS)
+	@$(BIN)/python book/rerun.py "--line=$$RERUN"
 
 lint: $(READY) ## check style and formatting
 	$(BIN)/ruff check .

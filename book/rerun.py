@@ -1,13 +1,19 @@
 """Run one notebook with parameters of your own, and keep what it makes in a folder of its own."""
 
+import os
+import signal
+
+if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+    # The imports below take a second, and there is nothing to remove yet: Ctrl-C needs no traceback.
+    signal.signal(signal.SIGINT, lambda *_: (os.write(2, b"interrupted: nothing was written\n"), os._exit(1)))
+
 import argparse
 import json
-import os
 import re
 import shlex
-import signal
+import shutil
+import stat
 import sys
-import tempfile
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
@@ -20,9 +26,12 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 from runner import Children, NotebookError, Progress, Project
 
+from zwfs.tables import plain
+
 RECORD = "record.json"
 MAKER = "zwfs rerun"  # by this a folder is known to be ours
 READABLE = 60  # characters of a folder's name that tell the parameters
+ROOM = 50_000_000  # bytes on the disk that a run may need for its scratch files
 EXAMPLES = """examples:
   rerun                                     list the notebooks
   rerun 3 --list                            list the parameters of Figure 3
@@ -57,7 +66,24 @@ def parser() -> Parser:
     reads.add_argument("--list", action="store_true", help="list parameters, and run nothing")
     reads.add_argument("--force", action="store_true", help="run even if the result is there")
     reads.add_argument("--output", metavar="DIR", type=Path, help="folder for the results")
+    reads.add_argument("--line", metavar="TEXT", help="all arguments in one string, quoted as for a shell")
     return reads
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """Read the command line."""
+    for argument in arguments:
+        if re.search("[\ud800-\udfff]", argument):  # bytes that are no UTF-8
+            raise ParameterError(f"{argument}: expected UTF-8")
+    asked = parser().parse_args(arguments)
+    if asked.line is None:
+        return asked
+    if len(arguments) > 1:
+        raise ParameterError("--line stands for all other arguments: expected none but it")
+    try:
+        return parse(shlex.split(asked.line))
+    except ValueError as error:  # of a quotation without an end
+        raise ParameterError(f"{asked.line}: {error}") from None
 
 
 def resolve(project: Project, figure: str) -> str:
@@ -123,7 +149,7 @@ def folder_name(name: str, changed: dict[str, Any]) -> str:
     if not changed:
         return f"{name}-defaults"
     told = "-".join(f"{key}={json.dumps(value)}" for key, value in changed.items())
-    told = re.sub(r"[^\w.=,+-]+", "", told.replace(" ", ""))[:READABLE]
+    told = re.sub(r"[^\w.=,+-]+", "", told.replace(" ", ""), flags=re.ASCII)[:READABLE]
     return f"{name}-{told}-{sha256(json.dumps(changed, sort_keys=True).encode()).hexdigest()[:8]}"
 
 
@@ -168,8 +194,8 @@ def digests(folder: Path, names: Any) -> dict[str, str]:
 def notice(changed: dict[str, Any], known: dict[str, Parameter]) -> NotebookNode:
     """Return a cell that says what was run with other parameters."""
     rows = [
-        f"| `{name}` | `{json.dumps(value)}` | `{json.dumps(known[name].default)}` "
-        f"| {known[name].unit} | {known[name].meaning} |".replace("$", r"\$")
+        f"| `{name}` | {_code(value)} | {_code(known[name].default)} "
+        f"| {plain(known[name].unit)} | {plain(known[name].meaning)} |"
         for name, value in changed.items()
     ]
     text = [
@@ -181,6 +207,11 @@ def notice(changed: dict[str, Any], known: dict[str, Parameter]) -> NotebookNode
         "| --- | --- | --- | --- | --- |",
     ]
     return new_markdown_cell("\n".join([*text, *rows]))
+
+
+def _code(value: Any) -> str:
+    """Return a value as code in a table; it can hold neither the sign that ends the code nor that of the cell."""
+    return "`" + json.dumps(value).replace("`", r"\u0060").replace("|", r"\u007c") + "`"
 
 
 def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, Parameter], folder: Path) -> float:
@@ -206,10 +237,11 @@ def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, 
     import standalone  # its imports are slow, and a result that is there needs none of them
 
     within = project.build if folder.is_relative_to(project.build) else folder.parent
-    within.mkdir(parents=True, exist_ok=True)
     commit, changed_since = runner.commit(project.root)
-    with tempfile.TemporaryDirectory(dir=within, prefix="rerunning-") as place:
-        scratch, new = Path(place), Path(place) / "new"
+    with runner.scratch_folder(within, "rerunning-") as scratch:
+        if (free := shutil.disk_usage(scratch).free) < ROOM:
+            raise ParameterError(f"{within}: {free / 1e6:.0f} MB are free: expected at least {ROOM / 1e6:.0f} MB")
+        new = scratch / "new"
         with Progress(project, [name], name) as progress:
             done = runner.execute(project, name, changed, scratch, Children(os.cpu_count()), progress)
         new.mkdir()
@@ -262,7 +294,7 @@ def rerun(project: Project, arguments: list[str]) -> None:
     NotebookError
         If the notebook failed; nothing has been written.
     """
-    asked = parser().parse_args(arguments)
+    asked = parse(arguments)
     if asked.figure in (None, "list"):
         if asked.p or asked.f or asked.output or asked.force:
             raise ParameterError("name a figure, as in: rerun 3 -p n_screens=50")
@@ -280,7 +312,7 @@ def rerun(project: Project, arguments: list[str]) -> None:
     given = declared.mapping(_text(asked.f[0]), str(asked.f[0])) if asked.f else {}
     changed = declared.accept(given | declared.assignments(asked.p), known)
     folder = asked.output or project.build / "rerun" / folder_name(name, changed)
-    folder = folder.resolve()
+    folder = Path(os.path.realpath(folder))  # Path.resolve fails in a circle of links
     if not folder.is_relative_to(project.build.resolve()) and not folder.parent.is_dir():
         raise ParameterError(f"--output {asked.output}: {folder.parent} is not a folder")
     record = ours(folder, name)
@@ -299,22 +331,39 @@ def describe(project: Project, name: str) -> str:
 
 def _text(file: Path) -> str:
     try:
-        return file.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ParameterError(f"-f {file}: {getattr(error, 'strerror', None) or 'it is no text'}") from None
+        if not stat.S_ISREG(file.stat().st_mode):
+            raise ParameterError(f"-f {file}: expected a regular file")
+        with file.open("rb") as stream:
+            content = stream.read(declared.LONGEST + 1)
+        if len(content) > declared.LONGEST:
+            raise ParameterError(f"-f {file}: expected at most {declared.LONGEST} bytes")
+        return content.decode()
+    except OSError as error:
+        raise ParameterError(f"-f {file}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ParameterError(f"-f {file}: it is no text in UTF-8") from None
+
+
+def interruptible() -> None:
+    """End by a signal as by Ctrl-C; a signal that whoever started this process ignores stays ignored."""
+    runner.end_cleanly_on_signals()
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def main() -> int:
     """Serve the command line."""
-    # Whoever stops it by a signal gets the same clean end as by Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        interruptible()
         rerun(Project(Path(__file__).resolve().parent.parent), sys.argv[1:])
     except ParameterError as refused:
         print(f"rerun: {refused}", file=sys.stderr)
         return 2
     except NotebookError as failure:
         print(failure, file=sys.stderr)
+        return 1
+    except OSError as error:  # a full disk, a folder that is locked, a name that is too long
+        print(f"rerun: {declared.one_line(str(error))}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("interrupted: nothing was written", file=sys.stderr)

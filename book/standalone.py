@@ -2,13 +2,17 @@
 
 import base64
 import copy
+import html
 import importlib.util
 import io
 import mimetypes
+import os
 import re
 import shutil
+from hashlib import sha256
 from pathlib import Path
-from urllib.parse import unquote, urlsplit
+from typing import Any
+from urllib.parse import quote, unquote, urlsplit
 
 import bs4
 from cards import published
@@ -27,25 +31,27 @@ FRAME = """<!DOCTYPE html>
 <html lang="en" data-theme="light">
 <head>
 <meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <link rel="icon" href="data:,">
 <title>{title}</title>
 <style>{style}</style>
-{script}</head>
+{scripts}
+</head>
 <body>
 <main>{body}</main>
 </body>
 </html>
 """
-MATHJAX = """<script>
-window.MathJax = {{
-  tex: {{tags: "none"}},
-  svg: {{fontCache: "global"}},
-  options: {{enableMenu: false, ignoreHtmlClass: "tex2jax_ignore|document", processHtmlClass: "math"}}
-}};
-</script>
-<script>{code}</script>
+MATHJAX = """
+window.MathJax = {
+  tex: {tags: "none"},
+  svg: {fontCache: "global"},
+  options: {enableMenu: false, ignoreHtmlClass: "tex2jax_ignore|document", processHtmlClass: "math"}
+};
 """
+# Neither of the page's own; Markdown can hold any HTML.
+ACTIVE = ["script", "iframe", "object", "embed", "base", "meta", "link", "form"]
 
 
 def page(project: Project, name: str, notebook: NotebookNode, files: list[Path], scratch: Path) -> tuple[str, str]:
@@ -75,9 +81,9 @@ def page(project: Project, name: str, notebook: NotebookNode, files: list[Path],
     source, output = scratch / "source", scratch / "html"
     _stage(project, name, notebook, files, source)
     warnings = _sphinx(source, output, f"notebooks/{name}.ipynb")
-    html = _embed(output / "notebooks" / f"{name}.html", {file.name for file in files})
+    embedded = _embed(output, f"notebooks/{name}.html", {file.name for file in files})
     marked = [line for line in warnings.splitlines() if f"notebooks/{name}.ipynb" in line]
-    return html, "\n".join(line.replace(f"{source}/", "") for line in marked)
+    return embedded, "\n".join(line.replace(f"{source}/", "") for line in marked)
 
 
 def _stage(project: Project, name: str, notebook: NotebookNode, files: list[Path], source: Path) -> None:
@@ -134,32 +140,62 @@ def _sphinx(source: Path, output: Path, document: str) -> str:
         app = Sphinx(
             source, None, output, output.with_name("doctrees"), "html", config, status=None, warning=warnings
         )
+        app.connect("env-updated", _forget_foreign)
         app.build(filenames=[str(source / document)])
     return COLOUR.sub("", warnings.getvalue())
 
 
-def _embed(file: Path, beside: set[str]) -> str:
-    """Return the content of a page that Sphinx wrote, with everything that it loads in it."""
+def _forget_foreign(app: Any, env: Any) -> None:
+    """Drop pictures that lie neither among the sources nor among the results: Sphinx would copy any file."""
+    for picture in list(env.images):
+        if not _is_within(Path(app.srcdir).parent, Path(app.srcdir) / picture):
+            del env.images[picture]
+
+
+def _is_within(folder: Path, file: Path) -> bool:
+    """Say whether a file lies in a folder, also after every symbolic link is followed."""
+    return Path(os.path.realpath(file)).is_relative_to(os.path.realpath(folder))
+
+
+def _embed(output: Path, document: str, beside: set[str]) -> str:
+    """Return the content of a page that Sphinx wrote, with the pictures and styles that it loads in it."""
+    file = output / document
     soup = bs4.BeautifulSoup(file.read_text("utf-8"), "html.parser")
     body = soup.find("div", class_="body")
+    for element in body.find_all(ACTIVE):
+        element.decompose()
     for picture in body.find_all("img"):
-        picture["src"] = _data(file.parent / unquote(picture["src"]))
-    for script in body.find_all("script"):
-        script.decompose()
+        source = file.parent / unquote(picture.get("src", ""))
+        if _is_within(output, source) and source.is_file():
+            picture["src"] = _data(source)
+        else:
+            picture.replace_with(picture.get("alt", ""))
     for link in body.find_all("a"):
         target = urlsplit(link.get("href", ""))
         filename = unquote(target.path).rpartition("/")[2]
         if "download" in link.get("class", ()) and filename in beside:
-            link["href"] = filename
-        elif target.path and not target.scheme:
+            link["href"] = quote(filename)
+        elif target.scheme not in ("http", "https", "mailto") and (target.scheme or target.netloc or target.path):
             link.unwrap()
     sheets = [sheet["href"].partition("?")[0] for sheet in soup.find_all("link", rel="stylesheet")]
     style = [(file.parent / sheet).read_text("utf-8") for sheet in sheets if not urlsplit(sheet).scheme]
+    scripts = [MATHJAX, _mathjax()] if body.find(class_="math") else []
     return FRAME.format(
-        title=body.find("h1").get_text(),
+        policy=_policy(scripts),
+        title=html.escape(body.find("h1").get_text()),
         style="\n".join([*style, (HERE / "standalone.css").read_text("utf-8")]),
-        script=_mathjax() if body.find(class_="math") else "",
+        scripts="\n".join(f"<script>{script}</script>" for script in scripts),
         body="".join(map(str, body.contents)),
+    )
+
+
+def _policy(scripts: list[str]) -> str:
+    """Return what a browser may load and run: what is in the page, and of scripts only these."""
+    digests = (base64.b64encode(sha256(script.encode()).digest()).decode() for script in scripts)
+    allowed = " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
+    return (
+        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; img-src data:; font-src data:; "
+        "base-uri 'none'; form-action 'none'"
     )
 
 
@@ -173,4 +209,4 @@ def _mathjax() -> str:
     """MathJax in one piece: the letters are drawn, so it loads no fonts."""
     package = importlib.util.find_spec("sphinx-mathjax-offline")
     code = Path(package.origin).parent / "static" / "mathjax" / "tex-svg-full.js"
-    return MATHJAX.format(code=code.read_text("utf-8").replace("</script", "<\\/script"))
+    return code.read_text("utf-8").replace("</script", "<\\/script")

@@ -1,5 +1,7 @@
 """A notebook re-run with other parameters: what is refused, what is left, and that nothing is left half-done."""
 
+import base64
+import errno
 import json
 import os
 import pty
@@ -10,6 +12,7 @@ import subprocess
 import sys
 import termios
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import declared
@@ -17,6 +20,7 @@ import nbformat
 import pytest
 import rerun
 import runner
+import standalone
 from declared import ParameterError
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from runner import NotebookError, Project
@@ -28,6 +32,10 @@ DEFAULTS = (
 )
 LIMITS = """from zwfs.parameters import check_parameters
 check_parameters(globals(), n=(1, 9), width=(0.0, 4.0), steps=[(0, 9), ...], seed=(0, 99))"""
+# Each letter is a list of nine of the letter before: the last stands for 9 to the power of 11 strings.
+BOMB = "".join(
+    f"{b}: &{b} [{','.join(['*' + a if a != '`' else 'x'] * 9)}]\n" for a, b in pairwise("`abcdefghijk")
+)
 LEAVE = """import os, pathlib
 folder = pathlib.Path(os.environ["ZWFS_RESULTS"])
 _ = (folder / "numbers.csv").write_text(f"{n},{width}")"""
@@ -43,12 +51,12 @@ with open(os.environ["ZWFS_PROGRESS"], "a") as file:
         time.sleep(0.8)"""
 
 
-def write(project, name, *cells):
+def write(project, name, *cells, defaults=DEFAULTS, limits=LIMITS):
     tagged = [
         new_code_cell("%matplotlib inline"),
         new_markdown_cell(f"# Title of {name}\n\nWith $a^2$."),
-        new_code_cell(DEFAULTS, metadata={"tags": ["parameters"]}),
-        new_code_cell(LIMITS, metadata={"tags": ["remove-cell"]}),
+        new_code_cell(defaults, metadata={"tags": ["parameters"]}),
+        new_code_cell(limits, metadata={"tags": ["remove-cell"]}),
     ]
     project.notebooks.mkdir(exist_ok=True)
     nbformat.write(new_notebook(cells=[*tagged, *cells]), project.notebooks / f"{name}.ipynb")
@@ -56,6 +64,7 @@ def write(project, name, *cells):
 
 def make_project(root):
     project = Project(root)
+    root.mkdir(exist_ok=True)
     shutil.copyfile(ROOT / "_config.yml", root / "_config.yml")
     (root / "_toc.yml").write_text(
         "format: jb-book\nroot: book/index\nchapters:\n"
@@ -103,10 +112,13 @@ def result(project):
 
 
 def refused(project, *arguments):
+    begin = time.process_time()
     with pytest.raises(ParameterError) as caught:
         rerun.rerun(project, list(arguments))
+    assert time.process_time() - begin < 2
     assert not project.build.exists()
-    assert "\n" not in str(caught.value)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 500
     return str(caught.value)
 
 
@@ -131,10 +143,31 @@ def refused(project, *arguments):
         (["1", "-p", "steps=[1,"], "-p steps=[1,: expected the node content"),
         (["1", "-p", "n"], "-p n: expected name=value"),
         (["1", "-p", "n=1", "-p", "n=2"], "-p n=2: 'n' is given twice"),
+        (["1", "-p", "n =5"], "unknown parameter 'n ': did you mean 'n'?"),
+        (["1", "-p", "n=&a 5"], "anchors (&)"),
+        (["1", "-p", "n=*a"], "aliases (*)"),
+        (["1", "-p", 'n=!!int "5"'], "tags (!)"),
+        (["1", "-p", "n=!!int [1]"], "tags (!)"),
+        (["1", "-p", "n=!!bool maybe"], "tags (!)"),
+        (["1", "-p", "n=!!timestamp x"], "tags (!)"),
+        (["1", "-p", f"n={'1' * 5000}"], "Exceeds the limit"),
+        (["1", "-p", f"n={'[' * 9000}"], "at most 8 deep"),
+        (["1", "-p", f"n={'[1],' * 9000}"], "expected at most 16384"),
+        (["1", "-p", f"n={'x' * 9000}"], ": expected an integer"),
+        (["1", "-p", "n=\x1b[31m"], "special characters are not allowed"),
+        (["1", "-p", "n=2020-01-01"], "n = '2020-01-01': expected an integer"),
+        (["1", "-p", 'n="\\ud800"'], "surrogates not allowed"),
+        (["1", "-p", "n=\udcff"], "expected UTF-8"),
         (["-p", "n=1"], "name a figure"),
         (["1", "-f", "nowhere.yaml"], "-f nowhere.yaml: No such file"),
         (["1", "--output", "no/such/folder"], "is not a folder"),
         (["1", "--unknown"], "unrecognized arguments: --unknown"),
+        (["1", "-f", "/dev/zero"], "-f /dev/zero: expected a regular file"),
+        (["1", "-f", "."], "-f .: expected a regular file"),
+        (["1", "-f", "a" * 300], "File name too long"),
+        (["--line=1 -p n=10"], "n = 10: expected an integer in [1, 9]"),
+        (["--line=1 -p 'n=10"], "No closing quotation"),
+        (["--line=1", "--list"], "--line stands for all other arguments"),
     ],
 )
 def test_bad_requests_are_refused_before_anything_runs(project, arguments, message):
@@ -148,9 +181,16 @@ def test_bad_requests_are_refused_before_anything_runs(project, arguments, messa
         ("- n\n- 2\n", "expected a mapping of names to values"),
         ("", "expected a mapping of names to values"),
         ("1: 2", "expected a mapping of names to values"),
-        ("n: 2\nn: 3\n", "'n' is given twice"),
-        ("n: !!python/object/apply:os.getpid []", "could not determine a constructor"),
+        ("width: 1\n\nn: 2\nn: 3\n", 'mine.yaml, line 4: found duplicate key "n"'),
+        ("n: !!python/object/apply:os.getpid []", "tags (!)"),
         ("n: 20", "n = 20: expected an integer in [1, 9]"),
+        ("<<: {n: 5}", "merges (<<)"),
+        ("%YAML 1.1\n---\nn: 010", "directives (%)"),
+        ("n: 1\n---\nn: 2", "expected a single document"),
+        (BOMB, "line 1: tags (!), anchors (&)"),
+        ("".join(f"name{i}: 1\n" for i in range(60_000)), "expected at most 16384 bytes"),
+        ("".join(f"a{i}: 1\n" for i in range(1500)), "unknown parameter 'a0'"),
+        ("".join(f"{' ' * i}a:\n" for i in range(150)), "at most 8 deep"),
     ],
 )
 def test_bad_files_are_refused(project, text, message):
@@ -161,7 +201,17 @@ def test_bad_files_are_refused(project, text, message):
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("1e-3", 1e-3), ("1e3", 1000.0), ("010", 10), ("yes", "yes"), ("1:30", "1:30"), ("-.5", -0.5), ("~", None)],
+    [
+        ("1e-3", 1e-3),
+        ("1e3", 1000.0),
+        ("010", 10),
+        ("yes", "yes"),
+        ("1:30", "1:30"),
+        ("2020-01-01", "2020-01-01"),
+        ("'*.fits'", "*.fits"),
+        ("-.5", -0.5),
+        ("~", None),
+    ],
 )
 def test_values_are_read_as_people_mean_them(text, value):
     found = declared.load(text, "here")
@@ -178,15 +228,17 @@ def test_command_line_wins_over_the_file(project, monkeypatch):
     assert made == [{"n": 6, "width": 2.0}, {"steps": []}]
 
 
-@pytest.mark.parametrize(
-    ("value", "message"), [('!!int "abc"', "invalid literal for int"), ("1" * 5000, "Exceeds the limit")]
-)
-def test_numbers_that_are_none_are_refused(project, value, message):
-    assert message in refused(project, "1", "-p", f"n={value}")
-
-
 def test_one_file_of_parameters_is_taken(project):
     assert "-f a.yaml -f b.yaml: expected one file" in refused(project, "1", "-f", "a.yaml", "-f", "b.yaml")
+
+
+def test_pipes_are_not_waited_for(project):
+    os.mkfifo(project.root / "pipe")
+    assert "expected a regular file" in refused(project, "1", "-f", str(project.root / "pipe"))
+
+
+def test_names_of_folders_hold_bytes_that_every_disk_takes():
+    assert len(rerun.folder_name("fig", {"name": "\U0001d54f" * 99}).encode()) < 255
 
 
 def test_files_that_parameters_name_count_by_what_is_in_them(project, tmp_path):
@@ -313,11 +365,17 @@ def run_command(project, *arguments):
     ours, theirs = pty.openpty()
     termios.tcsetwinsize(ours, (24, 120))
     environment = os.environ | {"PYTHONPATH": str(ROOT / "book")}
+    command = [sys.executable, "-c", code, *arguments]
     process = subprocess.Popen(
-        [sys.executable, "-c", code, *arguments], env=environment, stdout=theirs, stderr=theirs
+        command, env=environment, stdout=theirs, stderr=theirs, preexec_fn=restore_interruption
     )
     os.close(theirs)
     return process, ours
+
+
+def restore_interruption():
+    """Undo what a shell does to processes in the background: they ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def heard(terminal):
@@ -340,17 +398,50 @@ def test_progress_within_a_cell_is_shown(project):
     assert "open " in said
 
 
-def test_interruption_leaves_nothing(project):
+def start_sleeping_run(project):
+    """Start the command, and return it and its terminal when its notebook sleeps."""
     write(project, "fig02_works", new_code_cell("import time\nopen('begun', 'w').close()\ntime.sleep(99)"))
     process, terminal = run_command(project, "2")
-    end = time.monotonic() + 60
+    end = time.monotonic() + 240
     while not (project.notebooks / "begun").exists():
         assert time.monotonic() < end, "it did not begin"
         time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
+    return process, terminal
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_interruption_leaves_nothing(project, number):
+    process, terminal = start_sleeping_run(project)
+    process.send_signal(number)
     assert "interrupted: nothing was written" in heard(terminal)
     assert process.wait(20) == 1
     assert list(project.build.iterdir()) == []
+
+
+def test_pieces_of_a_killed_run_are_removed_by_the_next(project):
+    process, terminal = start_sleeping_run(project)
+    process.kill()
+    process.wait()
+    heard(terminal)
+    assert [folder.name.partition("-")[0] for folder in project.build.iterdir()] == ["rerunning"]
+    rerun.rerun(project, ["1"])
+    assert [folder.name for folder in project.build.iterdir()] == ["rerun"]
+
+
+def test_interruption_while_the_program_is_loaded_needs_no_traceback():
+    command = [sys.executable, "-X", "importtime", str(ROOT / "book" / "rerun.py"), "--list"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=restore_interruption
+    )
+    while "difflib" not in process.stderr.readline():  # one of the first, and NumPy is still to come
+        assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    said, errors = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert [line for line in errors.splitlines() if not line.startswith("import time:")] == [
+        "interrupted: nothing was written"
+    ]
+    assert said == ""
 
 
 def test_command_line_ends_with_2_and_one_line():
@@ -359,6 +450,132 @@ def test_command_line_ends_with_2_and_one_line():
     assert done.returncode == 2
     assert done.stderr == "rerun: unknown parameter 'n_screen': did you mean 'n_screens'?\n"
     assert done.stdout == ""
+
+
+def in_one_line(project, *arguments):
+    """Run the command, which must fail, and return the one line that it says."""
+    process, terminal = run_command(project, *arguments)
+    [line] = heard(terminal).splitlines()
+    assert process.wait(20) == 1
+    assert line.startswith("rerun: ")
+    return line
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder in which nobody can write")
+def test_folders_that_cannot_be_written_are_told_in_one_line(project):
+    assert "/proc/" in in_one_line(project, "1", "--output", "/proc/result")
+    assert "File name too long" in in_one_line(project, "1", "--output", "x" * 300)
+    project.build.symlink_to(project.build)
+    assert str(project.build) in in_one_line(project, "1")
+
+
+def test_full_disk_is_noticed_before_the_run(project, monkeypatch):
+    full = shutil.disk_usage("/")._replace(free=1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: full)
+    with pytest.raises(ParameterError, match=r"_build: 0 MB are free: expected at least 50 MB"):
+        rerun.rerun(project, ["1"])
+    assert list(project.build.iterdir()) == []
+
+
+def test_disk_that_fills_up_leaves_nothing(project, monkeypatch, capsys):
+    def write_nothing(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(standalone, "page", write_nothing)
+    monkeypatch.setattr(rerun, "interruptible", lambda: None)
+    monkeypatch.setattr(rerun, "__file__", str(project.root / "book" / "rerun.py"))
+    monkeypatch.setattr(sys, "argv", ["rerun", "1"])
+    assert rerun.main() == 1
+    assert capsys.readouterr().err == "rerun: [Errno 28] No space left on device\n"
+    assert list(project.build.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["ARGS", "FIGURE"])
+@pytest.mark.parametrize(
+    "text",
+    ["$(touch x)", "$$(touch x)", "$(shell touch x)", "`touch x`", "; touch x", '\'"$HOME" > x', "a # b", "a\nb"],
+)
+def test_make_evaluates_no_argument(tmp_path, name, text):
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    python = tmp_path / ".venv" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.write_text("#!/bin/sh\nprintf '%s\\0' \"$@\"\n")
+    python.chmod(0o755)
+    command = ["make", "--silent", "--old-file=.venv/.ready", "rerun"]
+    expected = f"--line= {text}" if name == "ARGS" else f"--line={text} "
+    for given, environment in (([f"{name}={text}"], {}), ([], {name: text})):
+        done = subprocess.run(
+            [*command, *given], cwd=tmp_path, env=os.environ | environment, capture_output=True, text=True
+        )
+        assert done.stderr == ""
+        assert done.stdout.split("\0")[:2] == ["book/rerun.py", expected]
+        assert sorted(os.listdir(tmp_path)) == [".venv", "Makefile"]
+
+
+HOSTILE = {
+    "handler": "<img src=x onerror=document.title=666 onload=document.title=666>.fits",
+    "script": "<script>document.title=666</script>",
+    "link": "[x](javascript:document.title=666)",
+    "file": "![x](../../../SECRET)",
+    "html": "<img src=../../../SECRET><iframe src=../../../SECRET></iframe>",
+    "row": "a | b\n\n# A heading\n\n```{include} ../../../SECRET\n```\n",
+    "code": "`` ` ` <b>bold</b> | $x$ {math}`y` *z* &lt;",
+    "end": "</code></td></table></style><svg onload=document.title=666>",
+}
+SHOWN = """from zwfs.tables import Table
+Table(["name", *names], [[name, *[""] * len(names)] for name in names])"""
+# As if a notebook escaped nothing.
+UNESCAPED = "from IPython.display import Markdown, display\nfor name in names:\n    display(Markdown(name))"
+
+
+def hostile_page(tmp_path, source):
+    """Make a page of hostile names, and return it and the names."""
+    project = make_project(tmp_path / "project")
+    secret = tmp_path / "secret.txt"
+    secret.write_text("the password")
+    names = [name.replace("../../../SECRET", "../" * 20 + str(secret)[1:]) for name in HOSTILE.values()]
+    limits = "from zwfs.parameters import check_parameters\ncheck_parameters(globals(), names=[str, ...])"
+    write(project, "fig02_works", new_code_cell(source), defaults="names = []  # of files", limits=limits)
+    rerun.rerun(project, ["2", "-p", f"names={json.dumps(names)}"])
+    return result(project) / "fig02_works.html", names
+
+
+def opened(browser, file):
+    """Open a page, and return it with what it loaded and complained of."""
+    requests, complaints, page = [], [], browser.new_page()
+    page.on("request", lambda request: requests.append(request.url))
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto(file.as_uri())
+    page.wait_for_load_state("networkidle")
+    assert [url for url in requests if not url.startswith("data:")] == [file.as_uri()]
+    return page, complaints
+
+
+def test_hostile_names_are_shown_as_they_are(tmp_path, browser):
+    file, names = hostile_page(tmp_path, SHOWN)
+    page, complaints = opened(browser, file)
+    assert complaints == []
+    assert page.title() == "Title of fig02_works"
+    cells = page.locator(".cell_output td:first-child").all_inner_texts()
+    assert cells == [name.replace("\n", r"\n") for name in names]
+    told = page.locator("main > section > table td:nth-child(2), blockquote ~ table td:nth-child(2)").first
+    assert json.loads(told.inner_text()) == names
+    assert page.locator("img, iframe, h1 ~ h1, a[href^=javascript]").count() == 0
+    page.close()
+    secret = (tmp_path / "secret.txt").read_bytes()
+    assert base64.b64encode(secret).decode() not in file.read_text()
+    assert secret.decode() not in file.read_text()
+
+
+def test_page_runs_and_embeds_nothing_foreign_even_if_a_notebook_escapes_nothing(tmp_path, browser):
+    file, _ = hostile_page(tmp_path, UNESCAPED)
+    page, _ = opened(browser, file)  # the browser complains of what it does not run
+    page.wait_for_timeout(200)
+    assert page.title() == "Title of fig02_works"
+    assert page.locator("iframe, main script, a[href^=javascript], img:not([src^='data:'])").count() == 0
+    page.close()
+    assert base64.b64encode(b"the password").decode() not in file.read_text()
 
 
 @pytest.mark.slow

@@ -1,5 +1,3 @@
-import gzip
-import hashlib
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +10,13 @@ from scipy import ndimage
 from zwfs import Dimple, Pupil, ZernikeSensor, camera, power_law_screens, zernike_basis
 from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.frames import Optics, fit, measure, predict_other, reconstruct, steps
-from zwfs.registration import Image, find_pupils, record, register
+from zwfs.registration import Image, correlations, find_pupils, record, register
 
 SEAL = "ZWFS_SEAL_FRAMES"
 D, MARGIN = 68, 12
 COUNTS = 2e4
 SHIFT = np.array([0.4, -0.7])  # of the second image, pixels
-EXACT = {"centers": [[45.5, 45.5], [45.5, 137.5]], "diameter": D}
+EXACT = {"pupil_centers": [[45.5, 45.5], [45.5, 137.5]], "pupil_diameter": D}
 SECOND = SHIFT + np.array([0, 92])  # where it stands beside the first
 
 
@@ -90,6 +88,16 @@ def test_register_refuses_a_shift_out_of_reach():
         register(np.roll(reference, 9, axis=0), reference, inside)
 
 
+def test_correlation_of_each_row_is_that_row_alone():
+    rng = np.random.default_rng(2)
+    first = rng.normal([[0], [100], [-7]], 1, (3, 50))
+    second = first[:, ::-1] + 0.5 * first + np.array([[3], [-50], [1000]])
+    expected = [np.corrcoef(*pair)[0, 1] for pair in zip(first, second, strict=True)]
+    np.testing.assert_allclose(correlations(first, second), expected, rtol=1e-10)
+    second[1] = 4
+    np.testing.assert_allclose(correlations(first, second), [expected[0], 0, expected[2]], rtol=1e-10)
+
+
 @pytest.mark.parametrize("illumination", [0.0, 0.5])
 @pytest.mark.parametrize("center", [(50.0, 52.0), (49.3, 51.75)])
 def test_circle_through_the_outline(center, illumination):
@@ -132,7 +140,7 @@ def test_stacked_pupils_and_given_centers(recorded):
     turned = [image(np.vstack(np.hsplit(one, 2))) for one in (masked, bare)]
     recording = record(turned[:1], turned[1:])
     np.testing.assert_allclose(recording.origins[1], [92 + SHIFT[0], SHIFT[1]], atol=0.1)
-    given = record([image(masked)], [image(bare)], centers=[[45.5, 45.5], [46, 137]], diameter=D)
+    given = record([image(masked)], [image(bare)], pupil_centers=[[45.5, 45.5], [46, 137]], pupil_diameter=D)
     np.testing.assert_allclose(given.origins[1], SECOND, atol=0.1)
 
 
@@ -167,6 +175,26 @@ def test_background_and_flux_are_measured(recorded):
     assert measurement.flux_ratio[0] == pytest.approx(1.25, rel=0.02)
     # Blur spreads the same light over the gaps, too.
     assert measurement.counts[0] * measurement.pupil.n_points == pytest.approx(COUNTS * pupil.n_points, rel=0.02)
+
+
+def test_a_longer_exposure_of_the_frames_changes_no_intensity(recorded):
+    _, masked, bare = recorded
+    once = measure(record([image(masked)], [image(bare)]), Optics())
+    thrice = measure(record([image(3 * masked)], [image(bare)], exposure=3.0), Optics())
+    np.testing.assert_allclose(thrice.background, once.background * [3, 3, 1, 1], rtol=1e-12)
+    np.testing.assert_allclose(thrice.intensity, once.intensity, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("balance", [False, True])
+def test_balance_gives_both_frames_the_same_light_in_the_pupil(recorded, balance):
+    _, masked, bare = recorded
+    uneven = masked - 500
+    uneven[:, 92:] *= 0.9
+    measurement = measure(
+        record([image(uneven)], [image(bare - 500)], background=False, balance=balance), Optics()
+    )
+    light = measurement.intensity[(..., *measurement.window)][:, measurement.good].mean(axis=1)
+    assert light[0] / light[1] == pytest.approx(1 if balance else 1 / 0.9, rel=1e-12 if balance else 0.02)
 
 
 def test_opposite_masks_send_the_same_light_into_the_pupil(screen):
@@ -296,11 +324,11 @@ def test_too_many_masked_points_are_refused(recorded):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"centers": [[45, 45]]}, "expected \\(row, column\\) of each of two pupils"),
-        ({"centers": [[45, 45], [45, 137]]}, "centers without a diameter"),
-        ({"centers": [[10, 45], [45, 137]], "diameter": 68}, "is cut off at the top"),
-        ({"diameter": -1}, "diameter = -1"),
-        ({"diameter": 400}, "is cut off at the"),
+        ({"pupil_centers": [[45, 45]]}, "expected \\(row, column\\) of each of two pupils"),
+        ({"pupil_centers": [[45, 45], [45, 137]]}, "pupil_centers without a pupil_diameter"),
+        ({"pupil_centers": [[10, 45], [45, 137]], "pupil_diameter": 68}, "is cut off at the top"),
+        ({"pupil_diameter": -1}, "pupil_diameter = -1"),
+        ({"pupil_diameter": 400}, "is cut off at the"),
         ({"exposure": 0}, "exposure = 0"),
     ],
 )
@@ -331,168 +359,6 @@ def test_unknown_fit_is_refused(recorded):
     _, masked, bare = recorded
     with pytest.raises(ValueError, match=r"names = \['colour'\]"):
         fit(record([image(masked)], [image(bare)]), Optics(), ["colour"])
-
-
-# Files
-
-
-FRAME = np.arange(600, dtype=np.int64).reshape(20, 30) % 250
-
-
-@pytest.mark.parametrize("dtype", [">i2", "<i2", ">u2", "u1", ">i4", ">f4", "<f8", ">f8"])
-def test_every_type_of_number_reads_the_same(tmp_path, dtype):
-    np.save(tmp_path / "a.npy", FRAME.astype(dtype))
-    fits.PrimaryHDU(FRAME.astype(dtype)).writeto(tmp_path / "a.fits")
-    for name in ("a.npy", "a.fits"):
-        file = camera.read(tmp_path / name)
-        assert file.images.dtype == np.float64
-        assert file.images.dtype.isnative
-        np.testing.assert_array_equal(file.images, FRAME[np.newaxis])
-        assert file.sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
-
-
-def test_bzero_and_extension_and_stack(tmp_path):
-    unsigned = (FRAME + 40_000).astype(np.uint16)
-    hdu = fits.ImageHDU(unsigned)
-    hdu.header["WAVELEN"] = 633.0
-    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "a.fits")
-    file = camera.read(tmp_path / "a.fits")
-    assert fits.getheader(tmp_path / "a.fits", 1)["BZERO"] == 32768
-    np.testing.assert_array_equal(file.images[0], FRAME + 40_000.0)
-    assert file.full_scale == 65535
-    assert file.keyword("WAVELEN") == 633
-    np.save(tmp_path / "two.npy", np.stack([FRAME, FRAME + 1]))
-    first, second = camera.images([camera.read(tmp_path / "two.npy")])
-    assert [first.name, second.name] == ["two.npy[0]", "two.npy[1]"]
-    np.testing.assert_array_equal(second.counts - first.counts, 1)
-
-
-def test_compressed_files_are_read(tmp_path):
-    plain, packed = tmp_path / "plain.fits", tmp_path / "packed.fits.gz"
-    fits.PrimaryHDU(FRAME.astype(np.int16), fits.Header({"WAVELEN": 633.0})).writeto(plain)
-    packed.write_bytes(gzip.compress(plain.read_bytes()))
-    one, other = camera.read(plain), camera.read(packed)
-    np.testing.assert_array_equal(other.images, one.images)
-    assert other.keyword("WAVELEN") == 633
-    assert other.sha256 == hashlib.sha256(packed.read_bytes()).hexdigest()
-
-
-def broken(tmp_path, kind):
-    path = tmp_path / f"{kind}.fits"
-    whole = tmp_path / "whole.fits"
-    fits.PrimaryHDU(FRAME.astype(float)).writeto(whole)
-    np.save(tmp_path / "whole.npy", FRAME)
-    contents = {
-        "text": b"not a picture",
-        "empty": b"",
-        "truncated": whole.read_bytes()[:4000],
-        "header": b"SIMPLE  = nonsense",
-        "gzip": gzip.compress(whole.read_bytes())[:200],
-        "npy": (tmp_path / "whole.npy").read_bytes()[:300],
-    }
-    if kind in contents:
-        path.write_bytes(contents[kind])
-    elif kind == "table":
-        column = fits.Column(name="x", format="D", array=np.zeros(3))
-        fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns([column])]).writeto(path)
-    elif kind == "cube":
-        fits.PrimaryHDU(np.zeros((5, 20, 30))).writeto(path)
-    elif kind == "complex":
-        with path.open("wb") as stream:
-            np.save(stream, FRAME + 1j)
-    elif kind == "pickle":
-        with path.open("wb") as stream:
-            np.save(stream, np.array([{}], dtype=object))
-    return path
-
-
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [
-        ("text", r"text\.fits: its first bytes are those of neither a FITS nor an NPY file"),
-        ("empty", r"empty\.fits: its first bytes"),
-        ("truncated", r"truncated\.fits: a broken FITS file"),
-        ("header", r"header\.fits: a "),
-        ("npy", r"npy\.fits: a broken NPY file"),
-        ("gzip", r"gzip\.fits: a broken gzip file"),
-        ("table", r"table\.fits: a FITS file without an image"),
-        ("cube", r"cube\.fits: its shape is \(5, 20, 30\): expected \(ny, nx\)"),
-        ("pickle", r"pickle\.fits: a broken NPY file"),
-    ],
-)
-def test_files_that_are_no_image_are_refused(tmp_path, kind, message):
-    with pytest.raises(ValueError, match=message):
-        camera.read(broken(tmp_path, kind))
-
-
-def test_complex_and_missing_files_are_refused(tmp_path):
-    with pytest.raises(TypeError, match=r"its numbers are complex128"):
-        camera.read(broken(tmp_path, "complex"))
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.fits: no such file"):
-        camera.read(tmp_path / "nowhere.fits")
-
-
-def test_missing_keyword_is_named(tmp_path):
-    fits.PrimaryHDU(FRAME).writeto(tmp_path / "a.fits")
-    with pytest.raises(ValueError, match=r"a\.fits: its header has no WAVELEN: give the value as a parameter"):
-        camera.read(tmp_path / "a.fits").keyword("WAVELEN")
-
-
-def file_of(counts, header=None, full_scale=np.inf, name="a.fits"):
-    return camera.CameraFile(np.asarray(counts, float)[np.newaxis], name, "", header or {}, full_scale)
-
-
-def test_nan_dark_and_bad_pixel_map():
-    counts = FRAME.astype(float)
-    counts[3, 4], counts[5, 6] = np.nan, np.inf
-    marked = np.zeros(FRAME.shape)
-    marked[7, 8] = 1
-    dark = np.full(FRAME.shape, 10.0)
-    dark[9, 9] = np.nan
-    (found,) = camera.images([file_of(counts)], [file_of(dark)], [file_of(marked)], saturation=1e5)
-    assert np.argwhere(found.bad).tolist() == [[3, 4], [5, 6], [7, 8], [9, 9]]
-    assert np.isfinite(found.counts).all()
-    assert found.counts[0, 5] == FRAME[0, 5] - 10
-
-
-def test_saturation_is_given_in_the_header_of_the_type_or_seen():
-    counts = FRAME.astype(float)
-    top = counts == 249
-    assert np.count_nonzero(top) == 2
-    (plain,) = camera.images([file_of(counts)])
-    assert not plain.bad.any()
-    for settings in ({"header": {"SATURATE": 249}}, {"full_scale": 249.0}):
-        (found,) = camera.images([file_of(counts, **settings)])
-        np.testing.assert_array_equal(found.bad, top)
-    (found,) = camera.images([file_of(counts)], saturation=240)
-    np.testing.assert_array_equal(found.bad, counts >= 240)
-    clipped = np.minimum(counts, 200)
-    (found,) = camera.images([file_of(clipped)])
-    np.testing.assert_array_equal(found.bad, clipped == 200)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: camera.images([]), "no file: 0 images: expected one or two"),
-        (lambda: camera.images([file_of(FRAME)] * 3), "3 images: expected one or two"),
-        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME[1:])]), r"dark: its shape is \(19, 30\)"),
-        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME)] * 2), "dark: 2 images for the 1 of"),
-        (lambda: camera.images([file_of(FRAME)], [], [file_of(FRAME.T)]), "bad-pixel map: its shape is"),
-        (lambda: camera.images([file_of(FRAME + 1.0)], saturation=0.5), "all pixels are bad or saturated"),
-        (lambda: camera.images([file_of(FRAME)], saturation=-1), "saturation = -1"),
-    ],
-)
-def test_files_that_do_not_fit_together(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
-
-
-def test_astropy_is_named_where_it_is_missing(monkeypatch, tmp_path):
-    fits.PrimaryHDU(FRAME).writeto(tmp_path / "a.fits")
-    monkeypatch.setitem(__import__("sys").modules, "astropy.io", None)
-    with pytest.raises(ImportError, match=r"pip install zwfs\[frames\]"):
-        camera.read(tmp_path / "a.fits")
 
 
 # The simulated bench
@@ -571,6 +437,35 @@ def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
     assert not (tmp_path / "c.fits").exists()
 
 
+def test_phase_file_replaces_no_source_and_nothing_but_a_phase_map(tmp_path, recorded, monkeypatch):
+    _, masked, bare = recorded
+    recording = record([image(masked)], [image(bare)])
+    found = reconstruct(measure(recording, Optics()), Optics())
+    monkeypatch.chdir(tmp_path)
+    np.save("größe.npy", masked)
+    raw, target = (tmp_path / "größe.npy").read_bytes(), tmp_path / "a.fits"
+    source = camera.read("größe.npy")
+    os.link("größe.npy", "hard.npy")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    for name in ("../größe.npy", "../hard.npy"):
+        with pytest.raises(ValueError, match=r"output = .* is the input"):
+            camera.write_phase(name, found, recording, 635.0, [source], overwrite=True)
+    target.write_text("precious")
+    with pytest.raises(ValueError, match=r"output = .*a\.fits' exists and is no phase map"):
+        camera.write_phase(target, found, recording, 635.0, [source])
+    assert target.read_text() == "precious"
+    assert (tmp_path / "größe.npy").read_bytes() == (tmp_path / "hard.npy").read_bytes() == raw
+    camera.write_phase(target, found, recording, 635.0, [source], overwrite=True)
+    assert fits.getheader(target)["FILE1"] == r"gr\xf6\xdfe.npy"
+    (tmp_path / "link.fits").symlink_to("a.fits")
+    camera.write_phase(tmp_path / "link.fits", found, recording, 500.0)
+    assert (tmp_path / "link.fits").is_symlink()
+    assert fits.getheader(target)["WAVELEN"] == 500
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "a.fits", "elsewhere", "größe.npy", "hard.npy", "link.fits"]  # fmt: skip
+
+
 # The real bench
 
 
@@ -586,7 +481,7 @@ def seal():
 
 @pytest.mark.slow
 def test_seal_frames_are_explained(seal):
-    work = steps(*seal, Optics(), ["registration", "background", "scale"], diameter=136.0)
+    work = steps(*seal, Optics(), ["registration", "background", "scale"], pupil_diameter=136.0)
     named = {step.name: step.found for step in work}
     # Already the light of the two frames, balanced, and nothing fitted.
     assert named["balance of the flux"].correlation == pytest.approx([0.83, 0.90], abs=0.02)
@@ -604,6 +499,8 @@ def test_seal_frames_that_do_not_belong_together_are_explained_worse(seal):
     left, right = np.hsplit(frame.counts, 2)
     nonsense = Image(np.hstack([left, right[::-1]]), frame.bad, "nonsense")
     names = ["registration", "background", "scale"]
-    true, false = (steps(one, pupil_images, Optics(), names, diameter=136.0)[-1] for one in ([frame], [nonsense]))
+    true, false = (
+        steps(one, pupil_images, Optics(), names, pupil_diameter=136.0)[-1] for one in ([frame], [nonsense])
+    )
     assert np.all(true.found.correlation > false.found.correlation + 0.03)
     assert np.all(true.predicted > false.predicted + 0.15)

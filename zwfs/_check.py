@@ -95,6 +95,25 @@ def in_kind(name: str, array: Any, kind: Kind) -> Any:
     return _made(name, array, kind.array)
 
 
+def real_map(name: str, value: Any, n_axes: int = 2) -> NDArray:
+    """Return `value` as finite real numbers with so many axes, at least one number."""
+    array = real_array(name, value)
+    if array.ndim != n_axes or not array.size:
+        raise ValueError(f"{name} has shape {array.shape}: expected {n_axes} axes, none of them empty")
+    finite(name, array)
+    return array
+
+
+def flag_map(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return `value` as an array of bool of a shape."""
+    array = _made(name, value, np.asarray)
+    if array.dtype != bool:
+        raise TypeError(f"{name} has dtype {array.dtype}: expected bool")
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}: expected {shape}")
+    return array
+
+
 def _made(name: str, value: Any, make: Callable[[Any], Any]) -> Any:
     """Make an array of `value`, which must hold nothing that it would lose: masked values, or a unit."""
     if np.ma.is_masked(value):

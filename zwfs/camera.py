@@ -8,13 +8,15 @@ from __future__ import annotations
 import gzip
 import hashlib
 import io
+import math
+import os
 import warnings
-import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +29,14 @@ from zwfs.results import write_file
 
 _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do that, saturation does
 _FULL = 50_000  # counts of the brightest pixel of a simulated 16-bit camera
+_GZIP, _NPY, _FITS = b"\x1f\x8b", b"\x93NUMPY", b"SIMPLE  ="  # first bytes of a file
+# Header cards that show who wrote a file: only such a file is replaced.
+_PHASE_CARD, _BENCH_CARD = b"CREATOR = 'zwfs ", b"ORIGIN  = 'zwfs"
+_LONGEST = 240  # bytes of a file name; a partial file has a few more, and most file systems allow 255
+
+
+class FileError(ValueError):
+    """A camera file is broken, too large, or holds no image; the message names the file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +54,13 @@ class CameraFile:
         Of a FITS file; empty for NPY.
     full_scale : float
         Largest value that the type of the file's numbers can hold; infinity for floats.
+    path : Path, optional
+        Of the file, absolute. `write_phase` never replaces it.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of the wrong kind.
     """
 
     images: NDArray[np.float64]
@@ -51,6 +68,19 @@ class CameraFile:
     sha256: str
     header: Mapping[str, Any] = field(default_factory=dict)
     full_scale: float = np.inf
+    path: Path | None = None
+
+    def __post_init__(self) -> None:
+        images = _check.real_array("images", self.images)
+        if images.ndim != 3 or not images.size:
+            raise ValueError(f"images has shape {images.shape}: expected (n, ny, nx)")
+        _check.instance("name", self.name, str)
+        _check.instance("sha256", self.sha256, str)
+        _check.instance("header", self.header, Mapping)
+        if self.full_scale is not np.inf:
+            _check.number("full_scale", self.full_scale, 0, open_low=True)
+        if self.path is not None:
+            _check.instance("path", self.path, Path)
 
     def keyword(self, key: str) -> float:
         """Number under a keyword of the header.
@@ -60,19 +90,24 @@ class CameraFile:
         ValueError
             If the header lacks the keyword, or it is no number.
         """
+        _check.instance("key", key, str)
         if key not in self.header:
             raise ValueError(f"{self.name}: its header has no {key}: give the value as a parameter")
         return _check.number(f"{self.name}: {key}", self.header[key])
 
 
-def read(path: str | Path) -> CameraFile:
-    """Read a FITS or NPY file, told apart by their first bytes.
+def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
+    """Read a FITS or NPY file, plain or packed with gzip; the first bytes decide which.
 
     Integers, big-endian numbers, BZERO and BSCALE all become float64. Of a FITS file the first image is taken.
+    Header cards that do not follow the standard are left out.
 
     Parameters
     ----------
     path : str or Path
+    max_bytes : int
+        Largest size of the file, also when it is unpacked, and of its images as float64. A larger file is refused
+        before its images are in memory.
 
     Returns
     -------
@@ -83,35 +118,35 @@ def read(path: str | Path) -> CameraFile:
     FileNotFoundError
     ImportError
         If astropy is needed and missing.
-    TypeError, ValueError
-        If the file is of another kind, broken, holds no image, or one that is complex or not (ny, nx), (1, ny, nx)
-        or (2, ny, nx).
+    FileError
+        A ValueError: if the file is of another kind, broken, too large, holds no image, or one that is not
+        (ny, nx), (1, ny, nx) or (2, ny, nx).
+    TypeError
+        If an argument is of the wrong type, or the numbers of the file are not real.
     """
-    path = Path(path)
-    if not path.is_file():
+    path = _path("path", path)
+    max_bytes = _check.integer("max_bytes", max_bytes, 1)
+    if not os.path.isfile(path):
         where = "" if path.is_absolute() else f" in {Path.cwd()}"
         raise FileNotFoundError(f"{path}: no such file{where}")
-    content = stored = path.read_bytes()
-    if content.startswith(b"\x1f\x8b"):
-        try:
-            content = gzip.decompress(content)
-        except (OSError, EOFError, zlib.error) as error:
-            raise ValueError(f"{path.name}: a broken gzip file: {error}") from None
-    if content.startswith(b"\x93NUMPY"):
-        data, header = _read_npy(content, path.name), {}
-    elif content.startswith(b"SIMPLE  ="):
-        data, header = _read_fits(content, path.name)
+    name = path.name
+    with path.open("rb") as file:
+        content = _content(file, name, max_bytes)
+        file.seek(0)
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    if content.getbuffer()[: len(_NPY)] == _NPY:
+        with _broken(f"{name}: a broken NPY file"):
+            data, header = _read_npy(content, name, max_bytes), {}
     else:
-        raise ValueError(f"{path.name}: its first bytes are those of neither a FITS nor an NPY file")
+        fits = _fits()
+        with _broken(f"{name}: a broken FITS file"):
+            data, header = _read_fits(fits, content, name, max_bytes)
     if data.dtype.kind not in "biuf":
-        raise TypeError(f"{path.name}: its numbers are {data.dtype}: expected real ones")
-    if data.ndim not in (2, 3) or data.size == 0 or (data.ndim == 3 and data.shape[0] > 2):
-        raise ValueError(
-            f"{path.name}: its shape is {data.shape}: expected (ny, nx), or (2, ny, nx) for two images"
-        )
+        raise TypeError(f"{name}: its numbers are {data.dtype}: expected real ones")
     full_scale = float(np.iinfo(data.dtype).max) if data.dtype.kind in "iu" else np.inf
-    images = data.astype(np.float64).reshape(-1, *data.shape[-2:])
-    return CameraFile(images, path.name, hashlib.sha256(stored).hexdigest(), header, full_scale)
+    with np.errstate(over="ignore", invalid="ignore"):  # wider floats become infinite: bad pixels
+        images = data.astype(np.float64).reshape(-1, *data.shape[-2:])
+    return CameraFile(images, name, sha256, header, full_scale, path.resolve())
 
 
 def images(
@@ -140,8 +175,11 @@ def images(
     Raises
     ------
     ValueError
-        If the number of images or a shape is wrong, or every pixel of an image is bad.
+        If the number of images or a shape is wrong, every pixel of an image or of its dark is bad, or the
+        bad-pixel map marks all of them.
     """
+    for argument, given in (("files", files), ("darks", darks), ("bad_pixels", bad_pixels)):
+        _camera_files(argument, given)
     if saturation is not None:
         saturation = _check.number("saturation", saturation, 0, open_low=True)
     found = [(file, counts) for file in files for counts in file.images]
@@ -150,14 +188,15 @@ def images(
         raise ValueError(f"{names}: {len(found)} images: expected one or two")
     result = []
     for index, (file, counts) in enumerate(found):
-        dark = _companion("dark", darks, index, len(found), counts, file.name)
-        marked = _companion("bad-pixel map", bad_pixels, index, len(found), counts, file.name)
+        dark = _companion("dark", np.isfinite, darks, index, len(found), counts, file.name)
+        marked = _companion("bad-pixel map", np.logical_not, bad_pixels, index, len(found), counts, file.name)
         bad = ~np.isfinite(counts)
         level = saturation or _saturation(file, counts[~bad])
         bad |= np.where(bad, 0, counts) >= level
         if dark is not None:
-            bad |= ~np.isfinite(dark)
-            counts = counts - dark
+            with np.errstate(over="ignore", invalid="ignore"):
+                counts = counts - dark
+            bad |= ~np.isfinite(counts)
         if marked is not None:
             bad |= marked != 0
         if bad.all():
@@ -167,12 +206,65 @@ def images(
     return tuple(result)
 
 
+def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overwrite: bool = False) -> Path:
+    """Path of a phase map that is to be written, after a check that no other file is lost.
+
+    Links are followed. Call it before a long computation; `write_phase` calls it again.
+
+    Parameters
+    ----------
+    output : str or Path
+        May be an earlier phase map, which is recognised by its header.
+    inputs : sequence of str or Path
+        Files that are never replaced: camera frames, darks, and the like.
+    overwrite : bool
+        Whether `output` may also be a file that is no phase map; it may never be an input.
+
+    Returns
+    -------
+    Path
+        Absolute, and without links.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `output` is one of the inputs, also under another name or as a hard link, is a file that `write_phase`
+        did not write, is a folder, or cannot be written.
+    """
+    named = f"output = {str(output)!r}"
+    overwrite = _check.flag("overwrite", overwrite)
+    if isinstance(inputs, str | Path) or not isinstance(inputs, Sequence):
+        raise TypeError(f"inputs = {inputs!r}: expected a sequence of paths")
+    sources = [_path(f"inputs[{index}]", one) for index, one in enumerate(inputs)]
+    path = _path("output", output)
+    try:
+        path = path.resolve()
+        there = _is_there(path)
+    except (OSError, RuntimeError) as error:  # a name that is too long, or links in a circle
+        raise ValueError(f"{named}: {error}") from None
+    for source in sources:
+        if there and os.path.exists(source) and os.path.samefile(path, source):
+            raise ValueError(f"{named} is the input {str(source)!r}: expected another file")
+    if there and not path.is_file():
+        raise ValueError(f"{named}: expected a file, not a folder or a device")
+    if there and not overwrite and not _has_card(path, _PHASE_CARD):
+        raise ValueError(f"{named} exists and is no phase map of zwfs: expected a new name, or overwrite = True")
+    folder = next(parent for parent in path.parents if parent.exists())
+    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{named}: expected a file in a folder that can be written, not in {folder}")
+    if len(os.fsencode(path.name)) > _LONGEST:
+        raise ValueError(f"{named}: expected a name of at most {_LONGEST} bytes")
+    return path
+
+
 def write_phase(
-    path: str | Path,
+    output: str | Path,
     found: Found,
     recording: Recording,
     wavelength: float,
     sources: Sequence[CameraFile] = (),
+    *,
+    overwrite: bool = False,
 ) -> None:
     """Write a phase map as FITS: in radian, in nm as an extension, and the masked points as another.
 
@@ -181,24 +273,30 @@ def write_phase(
 
     Parameters
     ----------
-    path : str or Path
-        Replaced if it is there.
+    output : str or Path
+        See `check_output`. An earlier phase map is replaced.
     found : Found
     recording : Recording
     wavelength : float, nm
     sources : sequence of CameraFiles
-        Their names and checksums go into the header.
+        Their names and checksums go into the header. None of these files is replaced.
+    overwrite : bool
+        Whether any other file may be replaced.
 
     Raises
     ------
     ImportError
         If astropy is missing.
-    ValueError
-        If the wavelength is not above 0.
+    TypeError, ValueError
+        If the wavelength is not above 0, or `check_output` refuses the file.
     """
     from zwfs import __version__
 
     fits = _fits()
+    _check.instance("found", found, Found)
+    _check.instance("recording", recording, Recording)
+    _camera_files("sources", sources)
+    path = check_output(output, [source.path for source in sources if source.path], overwrite=overwrite)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
     measurement, optics = found.measurement, found.optics
     cards = [
@@ -236,11 +334,11 @@ def write_phase(
     cards.append(("CREATOR", f"zwfs {__version__}", ""))
     primary = fits.PrimaryHDU(found.phase)
     for key, value, comment in cards:
-        primary.header[key] = (_rounded(value), comment) if comment else value
+        primary.header[key] = (_card_value(value), comment) if comment else _card_value(value)
     nanometres = fits.ImageHDU(found.phase * wavelength / (2 * np.pi), name="PHASE_NM")
     nanometres.header["BUNIT"] = "nm"
     masked = fits.ImageHDU((measurement.pupil.mask & ~measurement.good).astype(np.uint8), name="MASKED")
-    write_file(Path(path), _fits_bytes(fits.HDUList([primary, nanometres, masked])))
+    write_file(path, _fits_bytes(fits.HDUList([primary, nanometres, masked])))
 
 
 def write_bench(
@@ -257,7 +355,7 @@ def write_bench(
     Parameters
     ----------
     folder : str or Path
-        It must be there.
+        It must exist. Files that `write_bench` wrote earlier are replaced.
     bench : Bench
         With photons.
     pistons : as for `Bench.commanded_phase`, optional
@@ -278,9 +376,23 @@ def write_bench(
     ------
     ImportError
         If astropy is missing.
+    TypeError, ValueError
+        If a value is of the wrong kind or out of range, or the folder holds another file of the same name.
     """
     fits = _fits()
-    n_bad = _check.integer("n_bad", n_bad, 0)
+    _check.instance("bench", bench, Bench)
+    wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
+    n_bad = _check.integer("n_bad", n_bad, 0, 2 * math.prod(bench.segments.shape))
+    folder = _path("folder", folder)
+    if not folder.is_dir():
+        raise ValueError(f"folder = {str(folder)!r}: expected a folder that exists")
+    paths = {name: folder / f"{name}.fits" for name in ("frame", "pupils", "dark", "bad_pixels")}
+    for path in paths.values():
+        if _is_there(path) and not (path.is_file() and _has_card(path, _BENCH_CARD)):
+            raise ValueError(
+                f"folder = {str(folder)!r} holds a {path.name} that the simulated bench did not write: "
+                "expected another folder"
+            )
     rng = np.random.default_rng(seed)
     counts = {"frame": bench.frames(pistons, rng), "pupils": bench.pupil_images(rng), "dark": bench.dark(rng)}
     gain = _FULL / max(pair.max() for pair in counts.values())
@@ -288,7 +400,6 @@ def write_bench(
     places = rng.choice(shape[0] * shape[1], n_bad, replace=False)
     dead = np.zeros(shape, np.uint8)
     dead.flat[places[: n_bad // 2]] = 1
-    paths = {}
     for name, pair in counts.items():
         image = np.clip(np.rint(np.hstack(pair) * gain), 0, 65535).astype(np.uint16)
         image[dead > 0] = 0
@@ -297,14 +408,14 @@ def write_bench(
         hdu.header["BUNIT"] = "adu"
         hdu.header["WAVELEN"] = (wavelength, "[nm] wavelength")
         hdu.header["DIMPLE"] = (bench.diameter, "[lambda/D] diameter of the dimple by design")
-        hdu.header["THETA1"] = (_rounded(bench.phase), "[rad] phase shift of the left image")
-        hdu.header["THETA2"] = (_rounded(-bench.phase), "[rad] phase shift of the right image")
+        hdu.header["THETA1"] = (_card_value(bench.phase), "[rad] phase shift of the left image")
+        hdu.header["THETA2"] = (_card_value(-bench.phase), "[rad] phase shift of the right image")
         hdu.header["SATURATE"] = (65535, "[adu] pixels that reach it are saturated")
         hdu.header["ORIGIN"] = ("zwfs", "simulated bench")
-        paths[name] = Path(folder) / f"{name}.fits"
         write_file(paths[name], _fits_bytes(fits.HDUList([hdu])))
-    paths["bad_pixels"] = Path(folder) / "bad_pixels.fits"
-    write_file(paths["bad_pixels"], _fits_bytes(fits.HDUList([fits.PrimaryHDU(dead)])))
+    marked = fits.PrimaryHDU(dead)
+    marked.header["ORIGIN"] = ("zwfs", "simulated bench")
+    write_file(paths["bad_pixels"], _fits_bytes(fits.HDUList([marked])))
     return paths
 
 
@@ -318,6 +429,9 @@ def bench_error(bench: Bench, commanded: ArrayLike, recording: Recording, found:
     recording : Recording
     found : Found
     """
+    _check.instance("bench", bench, Bench)
+    _check.instance("recording", recording, Recording)
+    _check.instance("found", found, Found)
     canvas = np.full(recording.pupil_images[0].counts.shape, np.nan)
     row, column = recording.corner
     canvas[row : row + recording.n_pixels, column : column + recording.n_pixels] = found.phase
@@ -336,42 +450,139 @@ def _fits() -> ModuleType:
     return fits
 
 
-def _read_npy(content: bytes, name: str) -> NDArray:
+def _path(name: str, value: Any) -> Path:
+    """A path that the operating system can have."""
     try:
-        return np.load(io.BytesIO(content), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise ValueError(f"{name}: a broken NPY file: {error}") from None
+        path = Path(value)
+        if b"\0" not in os.fsencode(path):
+            return path
+    except TypeError:
+        raise TypeError(f"{name} = {value!r}: expected a str or a Path") from None
+    except UnicodeEncodeError:
+        pass
+    raise ValueError(f"{name} = {str(value)!r}: expected the name of a file")
 
 
-def _read_fits(content: bytes, name: str) -> tuple[NDArray, dict[str, Any]]:
-    fits = _fits()
+def _is_there(path: Path) -> bool:
+    """Whether there is anything under a path, a link that leads nowhere included."""
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
+def _has_card(path: Path, card: bytes) -> bool:
+    """Whether a file is FITS and the header of its first unit has a card that begins like this."""
+    with path.open("rb") as file:
+        header = file.read(2880 * 32)
+    cards = (header[place : place + 80] for place in range(0, len(header), 80))
+    return header.startswith(_FITS) and any(one.startswith(card) for one in cards)
+
+
+def _camera_files(argument: str, files: Any) -> None:
+    """Require a sequence of CameraFiles."""
+    if not isinstance(files, Sequence) or not all(isinstance(file, CameraFile) for file in files):
+        raise TypeError(f"{argument} is a {type(files).__name__}: expected a sequence of CameraFiles")
+
+
+@contextmanager
+def _broken(message: str) -> Iterator[None]:
+    """Turn whatever a parser raises on broken bytes into one error that names the file; warnings are ignored."""
     try:
         with warnings.catch_warnings():
-            # Odd header cards are no reason to refuse a file; missing pixels are.
             warnings.simplefilter("ignore")
-            warnings.filterwarnings("error", message=".*truncated.*")
-            with fits.open(io.BytesIO(content), memmap=False) as units:
-                for unit in units:
-                    if unit.is_image and unit.data is not None:
-                        data = np.array(unit.data)
-                        return data, dict(units[0].header) | dict(unit.header)
-    except (OSError, ValueError, TypeError, Warning) as error:
-        raise ValueError(f"{name}: a broken FITS file: {error}") from None
-    raise ValueError(f"{name}: a FITS file without an image")
+            yield
+    except FileError:
+        raise
+    except Exception as error:  # astropy alone raises a dozen different ones
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise FileError(f"{message}: {reason}") from error
+
+
+def _content(file: BinaryIO, name: str, max_bytes: int) -> io.BytesIO:
+    """Bytes of a FITS or NPY file, unpacked; never much more than `max_bytes` are in memory."""
+    packed = file.read(len(_GZIP)) == _GZIP
+    file.seek(0)
+    size, content = os.fstat(file.fileno()).st_size, io.BytesIO()
+    with _broken(f"{name}: a broken gzip file" if packed else f"{name}: it cannot be read"):
+        stream = gzip.GzipFile(fileobj=file) if packed else file
+        while size <= max_bytes and (chunk := stream.read(2**20)):
+            if not content.tell() and not chunk.startswith((_NPY, _FITS)):
+                break
+            size = max(size, content.tell() + len(chunk))
+            content.write(chunk)
+    if size > max_bytes:
+        unpacked = "unpacked, it is" if packed else "it is"
+        raise FileError(f"{name}: {unpacked} larger than {max_bytes} bytes: expected at most max_bytes")
+    if not content.tell():
+        raise FileError(f"{name}: its first bytes are those of neither a FITS nor an NPY file")
+    content.seek(0)
+    return content
+
+
+def _accept(name: str, shape: tuple[int, ...], max_bytes: int) -> None:
+    """Refuse images of a shape that a header announces, before there is memory for them."""
+    if len(shape) not in (2, 3) or min(shape) < 1 or (len(shape) == 3 and shape[0] > 2):
+        raise FileError(f"{name}: its shape is {shape}: expected (ny, nx), or (2, ny, nx) for two images")
+    if 8 * math.prod(shape) > max_bytes:
+        raise FileError(
+            f"{name}: its shape is {shape}, {8 * math.prod(shape)} bytes as float64: "
+            f"expected at most max_bytes = {max_bytes}"
+        )
+
+
+def _read_npy(content: io.BytesIO, name: str, max_bytes: int) -> NDArray:
+    version = np.lib.format.read_magic(content)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
+        raise ValueError(f"version {version}: expected 1.0 or 2.0")
+    shape, columns_first, dtype = readers[version](content)
+    if dtype.hasobject:
+        raise ValueError("it holds objects of Python: expected numbers")
+    _accept(name, shape, max_bytes)
+    data = np.frombuffer(content.read(math.prod(shape) * dtype.itemsize), dtype)
+    return data.reshape(shape, order="F" if columns_first else "C")
+
+
+def _read_fits(fits: ModuleType, content: io.BytesIO, name: str, max_bytes: int) -> tuple[NDArray, dict[str, Any]]:
+    def cards(header: Any) -> dict[str, Any]:
+        values: dict[str, Any] = {}
+        for card in header.cards:
+            with suppress(fits.VerifyError):
+                values.setdefault(card.keyword, card.value)
+        return values
+
+    # Odd header cards are no reason to refuse a file; missing pixels are.
+    warnings.filterwarnings("error", message=".*truncated.*")
+    with fits.open(content, memmap=False) as units:
+        for unit in units:
+            if unit.is_image and unit.shape:
+                _accept(name, unit.shape, max_bytes)
+                return unit.data, cards(units[0].header) | cards(unit.header)
+    raise FileError(f"{name}: a FITS file without an image")
 
 
 def _companion(
-    what: str, files: Sequence[CameraFile], index: int, n_images: int, counts: NDArray, name: str
+    what: str,
+    good: Callable[[NDArray], NDArray],
+    files: Sequence[CameraFile],
+    index: int,
+    n_images: int,
+    counts: NDArray,
+    name: str,
 ) -> NDArray | None:
-    """Dark or bad-pixel map of image number `index`, checked; None if there is none."""
-    maps = [image for file in files for image in file.images]
+    """Dark or bad-pixel map of image number `index`, with at least one good pixel; None if there is none."""
+    maps = [(file.name, image) for file in files for image in file.images]
     if not maps:
         return None
     if len(maps) not in (1, n_images):
         raise ValueError(f"{what}: {len(maps)} images for the {n_images} of {name}: expected one, or one for each")
-    chosen = maps[0] if len(maps) == 1 else maps[index]
+    source, chosen = maps[0] if len(maps) == 1 else maps[index]
     if chosen.shape != counts.shape:
         raise ValueError(f"{what}: its shape is {chosen.shape}: expected {counts.shape}, that of {name}")
+    if not good(chosen).any():
+        raise ValueError(f"{source}: the {what} has no good pixel: expected some")
     return chosen
 
 
@@ -384,8 +595,10 @@ def _saturation(file: CameraFile, counts: NDArray) -> float:
     return min(file.full_scale, top if plateau else np.inf)
 
 
-def _rounded(value: Any) -> Any:
-    """Floats to nine digits: headers do not show rounding errors. FITS has no NaN."""
+def _card_value(value: Any) -> Any:
+    """What a header can hold: floats of nine digits, which hide rounding errors, no NaN, and strings in ASCII."""
+    if isinstance(value, str):
+        return value if value.isascii() and value.isprintable() else ascii(value)[1:-1]
     if isinstance(value, float | np.floating):
         return float(f"{value:.9g}") if np.isfinite(value) else "NaN"
     return bool(value) if isinstance(value, np.bool_) else value

@@ -236,7 +236,7 @@ def measure(recording: Recording, optics: Optics, margin: int | None = None) -> 
     optics : Optics
         Its `pupil_background` and whether the phase shifts are opposite count here.
     margin : int, pixels, optional
-        Of the frames around the grid of the pupil; all that both frames hold if left out.
+        Of the frames around the grid of the pupil; all that both frames hold if left out, which is the most.
 
     Returns
     -------
@@ -244,10 +244,19 @@ def measure(recording: Recording, optics: Optics, margin: int | None = None) -> 
 
     Raises
     ------
-    ValueError
-        If too much of the pupil is masked, or the mask-out images are dark.
+    TypeError, ValueError
+        If a value is of the wrong kind or out of range, too much of the pupil is masked, or the mask-out images
+        are dark.
     """
-    n, margin = recording.n_pixels, recording.margin if margin is None else margin
+    _check.instance("recording", recording, Recording)
+    _check.instance("optics", optics, Optics)
+    margin = recording.margin if margin is None else _check.integer("margin", margin, 0, recording.margin)
+    return _measure(recording, optics, margin)
+
+
+def _measure(recording: Recording, optics: Optics, margin: int) -> Measurement:
+    """Measure as `measure` does; the frames may end a little before the margin does."""
+    n = recording.n_pixels
     frames, frames_bad = resample(recording, recording.frames, recording.origins[:2], margin)
     images, images_bad = resample(recording, recording.pupil_images, recording.origins[2:], 0)
     levels = _backgrounds(recording) if recording.background else np.zeros(4)
@@ -303,8 +312,19 @@ def measured_pupil(
     -------
     Pupil
     ndarray, shape (2,)
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of the wrong kind or shape, or an image is dark.
     """
-    scale = images[:, inside].mean(axis=1)
+    images = _check.real_map("images", images, 3)
+    if len(images) != 2:
+        raise ValueError(f"images has shape {images.shape}: expected (2, ny, nx)")
+    inside = _check.flag_map("inside", inside, images.shape[1:])
+    n_pixels = _check.number("n_pixels", n_pixels, 0, open_low=True)
+    if not inside.any() or np.any((scale := images[:, inside].mean(axis=1)) <= 0):
+        raise ValueError("images hold no light inside: expected more than 0 counts on average")
     amplitude = np.sqrt(np.maximum((images / scale[:, None, None]).mean(axis=0), 0))
     middle = center or tuple((n - 1) / 2 for n in amplitude.shape)
     stop = radius(amplitude.shape, middle) <= n_pixels / 2
@@ -328,7 +348,13 @@ def reconstruct(measurement: Measurement, optics: Optics, n_iterations: int = 25
     Returns
     -------
     Found
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of the wrong kind or out of range.
     """
+    n_iterations = _check.integer("n_iterations", n_iterations, 1)
     sensor = model(measurement, optics)
     iterate = PhaseShifted(sensor, n_iterations=n_iterations, tolerance=1e-4)
     measured = measurement.intensity * optics.scale - optics.background
@@ -350,6 +376,8 @@ def reconstruct(measurement: Measurement, optics: Optics, n_iterations: int = 25
 
 def model(measurement: Measurement, optics: Optics) -> ZernikeSensor:
     """Sensor with the measured pupil, on the detector of the frames."""
+    _check.instance("measurement", measurement, Measurement)
+    _check.instance("optics", optics, Optics)
     masks = tuple(Dimple(optics.diameter, shift) for shift in optics.phase_shifts)
     extent = 1 + 2 * measurement.margin / measurement.diameter
     return ZernikeSensor(measurement.pupil, *masks, extent=extent, tolerance=1e-6)
@@ -363,6 +391,7 @@ def predict_other(measurement: Measurement, optics: Optics, n_iterations: int = 
 
     Parameters, as for `reconstruct`.
     """
+    n_iterations = _check.integer("n_iterations", n_iterations, 1)
     both = model(measurement, optics)
     frames = np.maximum(_unmix(measurement.intensity * optics.scale - optics.background, measurement, optics), 0)
     good, window = measurement.good, measurement.window
@@ -405,13 +434,14 @@ def fit(
 
     Raises
     ------
-    ValueError
-        If a name is unknown.
+    TypeError, ValueError
+        If a value is of the wrong kind, a name is unknown or there twice, or `optics` begins out of the range of a
+        fit.
     """
-    known = (*_RANGES, "registration")
-    unknown = [name for name in names if name not in known]
-    if unknown or isinstance(names, str):
-        raise ValueError(f"names = {names!r}: expected a list with some of {list(known)}")
+    _check.instance("recording", recording, Recording)
+    _check_fit("names", names, optics)
+    n_iterations = _check.integer("n_iterations", n_iterations, 1)
+    n_steps = _check.integer("n_steps", n_steps, 1)
     if not names:
         return recording, optics
     scalars = [name for name in names if name in _RANGES]
@@ -429,14 +459,31 @@ def fit(
 
     def mismatch(values: NDArray) -> NDArray:
         images, found = trial(values)
-        return reconstruct(measure(images, found, fixed), found, n_iterations).mismatch.ravel()
+        return reconstruct(_measure(images, found, fixed), found, n_iterations).mismatch.ravel()
 
     start = np.array([getattr(optics, name) for name in scalars] + [0.0] * (2 * len(moved)))
-    start = np.clip(start, low, high)
     best = optimize.least_squares(
         mismatch, start, bounds=(low, high), x_scale=scale, diff_step=1e-4, max_nfev=n_steps
     )
     return trial(best.x)
+
+
+def _check_fit(argument: str, names: Any, optics: Any) -> None:
+    """Require names of different parameters that `fit` knows, and optics from which it can start."""
+    _check.instance("optics", optics, Optics)
+    known = (*_RANGES, "registration")
+    listed = isinstance(names, Sequence) and not isinstance(names, str)
+    if not listed or not all(isinstance(name, str) and name in known for name in names):
+        raise ValueError(f"{argument} = {names!r}: expected a list with some of {list(known)}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"{argument} = {names!r}: expected each name once")
+    for name in set(names) & set(_RANGES):
+        low, high, _ = _RANGES[name]
+        if not low <= getattr(optics, name) <= high:
+            raise ValueError(
+                f"{argument} holds {name!r}, and {name} = {getattr(optics, name)}: "
+                f"expected a start in [{low:g}, {high:g}] for a fit"
+            )
 
 
 def _backgrounds(recording: Recording) -> NDArray[np.float64]:
@@ -510,7 +557,7 @@ def steps(
     n_iterations : int
         As for `reconstruct`.
     **settings
-        Of `record`: centers, diameter, exposure.
+        Of `record`: pupil_centers, pupil_diameter, exposure.
 
     Returns
     -------
@@ -522,6 +569,8 @@ def steps(
     TypeError, ValueError
         As `record`, `measure` and `fit` do.
     """
+    _check_fit("fitted", fitted, optics)
+    n_iterations = _check.integer("n_iterations", n_iterations, 1)
     switches = {"subpixel": False, "background": False, "balance": False}
     work = []
 

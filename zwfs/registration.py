@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from scipy import ndimage, optimize
 from zwfs import _check
 
 _REACH = 6  # pixels by which an image may be off its neighbour before sub-pixel registration
+_SMALLEST = 8  # pixels across a pupil: with fewer there is no outline
 _MARGIN = 0.25  # of the diameter: more of the dark surroundings tells nothing
 
 
@@ -31,6 +33,11 @@ class Image:
         For messages.
     cut : bool
         Whether the surroundings of the pupil were set to 0 by software: they tell nothing of the background.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of the wrong kind or shape, or a count is not finite.
     """
 
     counts: NDArray[np.float64]
@@ -38,14 +45,32 @@ class Image:
     name: str = "image"
     cut: bool = False
 
+    def __post_init__(self) -> None:
+        counts = _check.real_map("counts", self.counts, 2)
+        object.__setattr__(self, "counts", counts)
+        object.__setattr__(self, "bad", _check.flag_map("bad", self.bad, counts.shape))
+        _check.instance("name", self.name, str)
+        _check.flag("cut", self.cut)
+
 
 @dataclass(frozen=True)
 class Circle:
-    """Where a pupil stands: row and column of its centre, and its diameter, all in pixels."""
+    """Where a pupil stands: row and column of its centre, and its diameter, all in pixels.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If one is no finite number, or the diameter is not above 0.
+    """
 
     row: float
     column: float
     diameter: float
+
+    def __post_init__(self) -> None:
+        _check.number("row", self.row)
+        _check.number("column", self.column)
+        _check.number("diameter", self.diameter, 0, open_low=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +145,8 @@ def record(
     frames: Sequence[Image],
     pupil_images: Sequence[Image],
     *,
-    centers: Sequence[Sequence[float]] | None = None,
-    diameter: float | None = None,
+    pupil_centers: Sequence[Sequence[float]] | None = None,
+    pupil_diameter: float | None = None,
     exposure: float = 1.0,
     subpixel: bool = True,
     background: bool = True,
@@ -140,9 +165,9 @@ def record(
         With the mask in: one that holds both pupils, side by side or one above the other, or one for each.
     pupil_images : sequence of one or two Images
         The same with the mask taken out. May be cropped closer than the frames.
-    centers : sequence of two (row, column), pixels, optional
+    pupil_centers : sequence of two (row, column), pixels, optional
         Centres of the pupils on the mask-out images; found if left out.
-    diameter : float, pixels, optional
+    pupil_diameter : float, pixels, optional
         Diameter of the pupils; found if left out.
     exposure : float
         Exposure of the frames over that of the mask-out images.
@@ -160,15 +185,17 @@ def record(
     TypeError, ValueError
         If the number of images is wrong, the pupils are not found, cut, or of different size.
     """
-    if diameter is not None:
-        diameter = _check.number("diameter", diameter, 8)
+    diameter = None if pupil_diameter is None else _check.number("pupil_diameter", pupil_diameter, _SMALLEST)
     exposure = _check.number("exposure", exposure, 0, open_low=True)
-    for argument, images in (("frames", frames), ("pupil_images", pupil_images)):
-        if len(images) not in (1, 2) or not all(isinstance(image, Image) for image in images):
-            raise ValueError(f"{argument} holds {len(images)} things: expected one Image or two")
-    places = None if centers is None else _check.real_array("centers", centers)
+    subpixel = _check.flag("subpixel", subpixel)
+    background, balance = _check.flag("background", background), _check.flag("balance", balance)
+    _check_images("frames", frames)
+    _check_images("pupil_images", pupil_images)
+    places = None if pupil_centers is None else _check.real_map("pupil_centers", pupil_centers, 2)
     if places is not None and places.shape != (2, 2):
-        raise ValueError(f"centers has shape {places.shape}: expected (row, column) of each of two pupils")
+        raise ValueError(f"pupil_centers has shape {places.shape}: expected (row, column) of each of two pupils")
+    if places is not None and diameter is None:
+        raise ValueError("pupil_centers without a pupil_diameter: expected both, or neither")
     pupil_images, pupils = _locate("pupil_images", pupil_images, places, diameter)
     same_size(pupils, " and ".join(dict.fromkeys(image.name for image in pupil_images)))
     pairs = _pair(frames), pupil_images
@@ -199,7 +226,7 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
     n_pupils : int
         Discs that the image holds. They come back from left to right, or from top to bottom if they stand so.
     diameter : float, pixels, optional
-        Put in the place of the one found.
+        Put in the place of the one found; at least 8.
 
     Returns
     -------
@@ -207,9 +234,12 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
 
     Raises
     ------
-    ValueError
+    TypeError, ValueError
         If there is no light, another number of discs, or one that is cut by the edge.
     """
+    _check.instance("image", image, Image)
+    n_pupils = _check.integer("n_pupils", n_pupils, 1)
+    diameter = None if diameter is None else _check.number("diameter", diameter, _SMALLEST)
     smooth = ndimage.gaussian_filter(image.counts, 1.0)
     if np.ptp(smooth) <= 1e-9 * np.abs(smooth).max(initial=1e-300):
         raise ValueError(f"{image.name}: every pixel is {smooth.flat[0]:.6g}: expected light in a pupil")
@@ -237,6 +267,9 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
 
 def same_size(circles: Sequence[Circle], name: str) -> None:
     """Refuse two pupils of different size: both images must have the same magnification."""
+    if not isinstance(circles, Sequence) or [type(circle) for circle in circles] != [Circle, Circle]:
+        raise TypeError(f"circles = {circles!r}: expected two Circles")
+    _check.instance("name", name, str)
     small, large = sorted(circle.diameter for circle in circles)
     if large - small > max(2.0, 0.03 * large):
         raise ValueError(
@@ -265,9 +298,13 @@ def register(image: NDArray, reference: NDArray, inside: NDArray, blur: float = 
 
     Raises
     ------
-    ValueError
-        If no shift of up to 6 pixels makes a maximum.
+    TypeError, ValueError
+        If a value is of the wrong kind or shape, or no shift of up to 6 pixels makes a maximum.
     """
+    image, reference = _check.real_map("image", image, 2), _check.real_map("reference", reference, 2)
+    _check.trailing_shape("reference", reference, image.shape, "the shape of image")
+    inside = _check.flag_map("inside", inside, image.shape)
+    blur = _check.number("blur", blur, 0, open_low=True)
     wide = 4 * blur
     detail = ndimage.gaussian_filter(image, blur) - ndimage.gaussian_filter(image, wide)
     target = (ndimage.gaussian_filter(reference, blur) - ndimage.gaussian_filter(reference, wide))[inside]
@@ -294,7 +331,32 @@ def register(image: NDArray, reference: NDArray, inside: NDArray, blur: float = 
 def resample(
     recording: Recording, images: Sequence[Image], origins: NDArray, margin: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Images, and their bad pixels, on the grid of the pupil with a margin around: (2, ny', nx') each."""
+    """Images, and their bad pixels, on the grid of the pupil with a margin around.
+
+    Parameters
+    ----------
+    recording : Recording
+    images : sequence of two Images
+    origins : ndarray, shape (2, 2), pixels
+        Place of the first mask-out image's pixel (0, 0) on each image.
+    margin : int, pixels
+        Around the grid of the pupil. What lies beyond an image repeats its edge.
+
+    Returns
+    -------
+    ndarray, shape (2, ny', nx')
+    ndarray of bool, shape (2, ny', nx')
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of the wrong kind or shape.
+    """
+    _check.instance("recording", recording, Recording)
+    _check_images("images", images, (2,))
+    origins = _check.real_map("origins", origins)
+    _check.trailing_shape("origins", origins, (2, 2), "row and column on each of two images")
+    margin = _check.integer("margin", margin, 0)
     size = (recording.n_pixels + 2 * margin,) * 2
     maps, bad = np.empty((2, *size)), np.empty((2, *size), bool)
     for index, (image, origin) in enumerate(zip(images, origins, strict=True)):
@@ -307,7 +369,9 @@ def resample(
 
 
 def nearest_good(image: NDArray, good: NDArray) -> NDArray:
-    """An image with every pixel that is not good replaced by the nearest good one."""
+    """An image with every pixel that is not good replaced by the nearest good one, of which there must be one."""
+    image = _check.real_array("image", image)
+    good = _check.flag_map("good", good, image.shape)
     if good.all():
         return image
     index = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
@@ -315,16 +379,31 @@ def nearest_good(image: NDArray, good: NDArray) -> NDArray:
 
 
 def radius(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[np.float64]:
-    """Distance of every pixel from the centre, in pixels."""
+    """Distance of every pixel from the centre (row, column), in pixels."""
+    for name, pair in (("shape", shape), ("center", center)):
+        if np.shape(pair) != (2,):
+            raise ValueError(f"{name} = {pair!r}: expected rows and columns")
+    shape = [_check.integer(f"shape[{axis}]", n, 1) for axis, n in enumerate(shape)]
+    center = [_check.number(f"center[{axis}]", middle) for axis, middle in enumerate(center)]
     rows, columns = (np.arange(n) - middle for n, middle in zip(shape, center, strict=True))
     return np.hypot(rows[:, np.newaxis], columns)
 
 
 def correlations(first: NDArray, second: NDArray) -> NDArray[np.float64]:
     """Correlation coefficient of each row, (k, n) and (k, n) to (k,); 0 where one is constant."""
+    first, second = _check.real_map("first", first), _check.real_map("second", second)
+    _check.trailing_shape("second", second, first.shape, "the shape of first")
     first, second = (rows - rows.mean(axis=1, keepdims=True) for rows in (first, second))
     scale = np.sqrt(np.sum(first**2, axis=1) * np.sum(second**2, axis=1))
     return np.divide(np.sum(first * second, axis=1), scale, out=np.zeros(len(scale)), where=scale > 0)
+
+
+def _check_images(name: str, images: Any, allowed: tuple[int, ...] = (1, 2)) -> None:
+    """Require a sequence of so many Images."""
+    if not isinstance(images, Sequence) or not all(isinstance(image, Image) for image in images):
+        raise TypeError(f"{name} is a {type(images).__name__}: expected a sequence of Images")
+    if len(images) not in allowed:
+        raise ValueError(f"{name} holds {len(images)} images: expected {' or '.join(map(str, allowed))}")
 
 
 def _threshold(image: NDArray) -> float:
@@ -402,9 +481,7 @@ def _locate(
         else:
             circles = tuple(find_pupils(image, 1, diameter)[0] for image in images)
     else:
-        if diameter is None:
-            raise ValueError("centers without a diameter: expected both, or neither")
-        circles = tuple(Circle(row, column, diameter) for row, column in places)
+        circles = tuple(Circle(row, column, diameter) for row, column in places.tolist())
         for circle, image in zip(circles, _pair(images), strict=True):
             _not_cut(circle, image)
     images = _pair(images)

@@ -1,0 +1,416 @@
+"""Camera files: what is read, what is refused, and that no file is lost."""
+
+import gzip
+import hashlib
+import io
+import os
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from zwfs import camera
+from zwfs.bench import Bench
+
+# Reading
+
+
+FRAME = np.arange(600, dtype=np.int64).reshape(20, 30) % 250
+
+
+@pytest.mark.parametrize("dtype", [">i2", "<i2", ">u2", "u1", ">i4", ">f4", "<f8", ">f8"])
+def test_every_type_of_number_reads_the_same(tmp_path, dtype):
+    np.save(tmp_path / "a.npy", FRAME.astype(dtype))
+    fits.PrimaryHDU(FRAME.astype(dtype)).writeto(tmp_path / "a.fits")
+    for name in ("a.npy", "a.fits"):
+        file = camera.read(tmp_path / name)
+        assert file.images.dtype == np.float64
+        assert file.images.dtype.isnative
+        np.testing.assert_array_equal(file.images, FRAME[np.newaxis])
+        assert file.sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
+
+
+def test_bzero_and_extension_and_stack(tmp_path):
+    unsigned = (FRAME + 40_000).astype(np.uint16)
+    hdu = fits.ImageHDU(unsigned)
+    hdu.header["WAVELEN"] = 633.0
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "a.fits")
+    file = camera.read(tmp_path / "a.fits")
+    assert fits.getheader(tmp_path / "a.fits", 1)["BZERO"] == 32768
+    np.testing.assert_array_equal(file.images[0], FRAME + 40_000.0)
+    assert file.full_scale == 65535
+    assert file.keyword("WAVELEN") == 633
+    np.save(tmp_path / "two.npy", np.stack([FRAME, FRAME + 1]))
+    first, second = camera.images([camera.read(tmp_path / "two.npy")])
+    assert [first.name, second.name] == ["two.npy[0]", "two.npy[1]"]
+    np.testing.assert_array_equal(second.counts - first.counts, 1)
+
+
+def test_compressed_files_are_read(tmp_path):
+    plain, packed = tmp_path / "plain.fits", tmp_path / "packed.fits.gz"
+    fits.PrimaryHDU(FRAME.astype(np.int16), fits.Header({"WAVELEN": 633.0})).writeto(plain)
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    one, other = camera.read(plain), camera.read(packed)
+    np.testing.assert_array_equal(other.images, one.images)
+    assert other.keyword("WAVELEN") == 633
+    assert other.sha256 == hashlib.sha256(packed.read_bytes()).hexdigest()
+
+
+def broken(tmp_path, kind):
+    path = tmp_path / f"{kind}.fits"
+    whole = tmp_path / "whole.fits"
+    fits.PrimaryHDU(FRAME.astype(float)).writeto(whole)
+    np.save(tmp_path / "whole.npy", FRAME)
+    contents = {
+        "text": b"not a picture",
+        "empty": b"",
+        "truncated": whole.read_bytes()[:4000],
+        "header": b"SIMPLE  = nonsense",
+        "gzip": gzip.compress(whole.read_bytes())[:200],
+        "npy": (tmp_path / "whole.npy").read_bytes()[:300],
+    }
+    if kind in contents:
+        path.write_bytes(contents[kind])
+    elif kind == "table":
+        column = fits.Column(name="x", format="D", array=np.zeros(3))
+        fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns([column])]).writeto(path)
+    elif kind == "cube":
+        fits.PrimaryHDU(np.zeros((5, 20, 30))).writeto(path)
+    elif kind == "complex":
+        with path.open("wb") as stream:
+            np.save(stream, FRAME + 1j)
+    elif kind == "pickle":
+        with path.open("wb") as stream:
+            np.save(stream, np.array([{}], dtype=object))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("text", r"text\.fits: its first bytes are those of neither a FITS nor an NPY file"),
+        ("empty", r"empty\.fits: its first bytes"),
+        ("truncated", r"truncated\.fits: a broken FITS file"),
+        ("header", r"header\.fits: a "),
+        ("npy", r"npy\.fits: a broken NPY file"),
+        ("gzip", r"gzip\.fits: a broken gzip file"),
+        ("table", r"table\.fits: a FITS file without an image"),
+        ("cube", r"cube\.fits: its shape is \(5, 20, 30\): expected \(ny, nx\)"),
+        ("pickle", r"pickle\.fits: a broken NPY file"),
+    ],
+)
+def test_files_that_are_no_image_are_refused(tmp_path, kind, message):
+    with pytest.raises(ValueError, match=message):
+        camera.read(broken(tmp_path, kind))
+
+
+def test_complex_and_missing_files_are_refused(tmp_path):
+    with pytest.raises(TypeError, match=r"its numbers are complex128"):
+        camera.read(broken(tmp_path, "complex"))
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.fits: no such file"):
+        camera.read(tmp_path / "nowhere.fits")
+
+
+def test_missing_keyword_is_named(tmp_path):
+    fits.PrimaryHDU(FRAME).writeto(tmp_path / "a.fits")
+    with pytest.raises(ValueError, match=r"a\.fits: its header has no WAVELEN: give the value as a parameter"):
+        camera.read(tmp_path / "a.fits").keyword("WAVELEN")
+
+
+def file_of(counts, header=None, full_scale=np.inf, name="a.fits"):
+    return camera.CameraFile(np.asarray(counts, float)[np.newaxis], name, "", header or {}, full_scale)
+
+
+def test_nan_dark_and_bad_pixel_map():
+    counts = FRAME.astype(float)
+    counts[3, 4], counts[5, 6] = np.nan, np.inf
+    marked = np.zeros(FRAME.shape)
+    marked[7, 8] = 1
+    dark = np.full(FRAME.shape, 10.0)
+    dark[9, 9] = np.nan
+    (found,) = camera.images([file_of(counts)], [file_of(dark)], [file_of(marked)], saturation=1e5)
+    assert np.argwhere(found.bad).tolist() == [[3, 4], [5, 6], [7, 8], [9, 9]]
+    assert np.isfinite(found.counts).all()
+    assert found.counts[0, 5] == FRAME[0, 5] - 10
+
+
+def test_saturation_is_given_in_the_header_of_the_type_or_seen():
+    counts = FRAME.astype(float)
+    top = counts == 249
+    assert np.count_nonzero(top) == 2
+    (plain,) = camera.images([file_of(counts)])
+    assert not plain.bad.any()
+    for settings in ({"header": {"SATURATE": 249}}, {"full_scale": 249.0}):
+        (found,) = camera.images([file_of(counts, **settings)])
+        np.testing.assert_array_equal(found.bad, top)
+    (found,) = camera.images([file_of(counts)], saturation=240)
+    np.testing.assert_array_equal(found.bad, counts >= 240)
+    clipped = np.minimum(counts, 200)
+    (found,) = camera.images([file_of(clipped)])
+    np.testing.assert_array_equal(found.bad, clipped == 200)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: camera.images([]), "no file: 0 images: expected one or two"),
+        (lambda: camera.images([file_of(FRAME)] * 3), "3 images: expected one or two"),
+        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME[1:])]), r"dark: its shape is \(19, 30\)"),
+        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME)] * 2), "dark: 2 images for the 1 of"),
+        (lambda: camera.images([file_of(FRAME)], [], [file_of(FRAME.T)]), "bad-pixel map: its shape is"),
+        (lambda: camera.images([file_of(FRAME + 1.0)], saturation=0.5), "all pixels are bad or saturated"),
+        (lambda: camera.images([file_of(FRAME)], saturation=-1), "saturation = -1"),
+    ],
+)
+def test_files_that_do_not_fit_together(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_astropy_is_named_where_it_is_missing(monkeypatch, tmp_path):
+    fits.PrimaryHDU(FRAME).writeto(tmp_path / "a.fits")
+    monkeypatch.setitem(__import__("sys").modules, "astropy.io", None)
+    with pytest.raises(ImportError, match=r"pip install zwfs\[frames\]"):
+        camera.read(tmp_path / "a.fits")
+
+
+def fits_bytes(*units):
+    stream = io.BytesIO()
+    fits.HDUList(list(units)).writeto(stream)
+    return stream.getvalue()
+
+
+def npy_bytes(array):
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def npy_announcing(shape, dtype="<f8"):
+    """An NPY file whose header announces an image that is not there."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"shape": shape, "fortran_order": False, "descr": dtype})
+    return stream.getvalue() + bytes(100)
+
+
+def whole_files():
+    """Small files of every kind."""
+    plain = [
+        fits_bytes(fits.PrimaryHDU(FRAME.astype(float))),
+        fits_bytes(fits.PrimaryHDU((FRAME + 40_000).astype(np.uint16))),
+        fits_bytes(fits.PrimaryHDU(), fits.ImageHDU(FRAME.astype(">i2"))),
+        fits_bytes(fits.PrimaryHDU(), fits.CompImageHDU(FRAME.astype(np.int16), compression_type="RICE_1")),
+        npy_bytes(FRAME),
+        npy_bytes(np.asfortranarray(FRAME.astype(">f4"))),
+    ]
+    return plain + [gzip.compress(one, mtime=0) for one in plain]
+
+
+PIECES = [
+    *(b"NAXIS", b"BITPIX", b"9999999", b"-1", b"'", b"(((", b"|O", b"nan", b"(20, 30)", b"(99999999, 99999999)"),
+    *(card.ljust(80) for card in (b"END", b"NAXIS1  = 9999999999", b"BSCALE  = 1e308", b"ZTILE1  = 99999999")),
+    *(card.ljust(80) for card in (b"XTENSION= 'BINTABLE'", b"ZNAXIS1 = 99999999", b"PCOUNT  = 1e400")),
+]
+
+
+def fuzzed(content, rng):
+    """A file that is cut, or has flipped bits, other characters, wrong header cards, gaps or a tail."""
+    packed = content[:2] == b"\x1f\x8b" and rng.random() < 0.5
+    content = bytearray(gzip.decompress(content) if packed else content)
+    for _ in range(rng.integers(1, 4)):
+        size = len(content)
+        match rng.integers(6):
+            case 0:
+                del content[rng.integers(size + 1) :]
+            case 1:
+                for place in rng.integers(size, size=20) if size else ():
+                    content[place] ^= 1 << rng.integers(8)
+            case 2:
+                for place in rng.integers(min(size, rng.choice([128, 1000, 6000])), size=5) if size else ():
+                    content[place] = rng.integers(32, 127)
+            case 3:
+                piece = PIECES[rng.integers(len(PIECES))]
+                place = rng.integers(min(size, 6000) + 1)
+                place -= place % 80 if len(piece) == 80 else 0
+                content[place : place + len(piece)] = piece
+            case 4:
+                place = rng.integers(size + 1)
+                del content[place : place + 80 * rng.integers(1, 3)]
+            case 5:
+                content += rng.bytes(rng.integers(1, 3000))
+    return gzip.compress(content, 1, mtime=0) if packed else bytes(content)
+
+
+@pytest.mark.parametrize("part", range(10))
+def test_fuzzed_files_are_read_or_refused_by_name(tmp_path, recwarn, part):
+    rng, whole = np.random.default_rng([11, part]), whole_files()
+    unnamed, read = [], 0
+    for index in range(100):
+        path = tmp_path / f"case{index}.dat"
+        path.write_bytes(fuzzed(whole[rng.integers(len(whole))], rng))
+        try:
+            images = camera.images([camera.read(path)])
+        except (TypeError, ValueError) as error:
+            unnamed += [] if path.name in str(error) else [error]
+        else:
+            read += 1
+            assert all(np.isfinite(one.counts).all() for one in images)
+    assert not unnamed
+    assert 10 < read < 60
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (npy_announcing((60_000, 60_000)), r"its shape is \(60000, 60000\), 28800000000 bytes as float64"),
+        (npy_announcing((60_000, 60_000), "|u1"), "28800000000 bytes as float64: expected at most max_bytes"),
+        (npy_announcing((-20, 30)), r"its shape is \(-20, 30\)"),
+        (npy_announcing((20, 30)), "a broken NPY file"),
+        (b"\x93NUMPY\x01\x00v\x00{'descr': (((", "a broken NPY file"),
+        (gzip.compress(npy_announcing((60_000, 60_000))), "28800000000 bytes as float64"),
+    ],
+)
+def test_npy_headers_that_announce_what_is_not_there(tmp_path, content, message):
+    (tmp_path / "a.npy").write_bytes(content)
+    with pytest.raises(camera.FileError, match=rf"a\.npy: .*{message}"):
+        camera.read(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_fits_headers_that_announce_too_much(tmp_path, compressed):
+    kind = fits.CompImageHDU if compressed else fits.ImageHDU
+    content = fits_bytes(fits.PrimaryHDU(), kind(FRAME.astype(np.int16)))
+    old, new = (b"ZNAXIS1 =                   30", b"ZNAXIS1 =             60000000") if compressed else (
+        b"NAXIS1  =                   30", b"NAXIS1  =             60000000")  # fmt: skip
+    assert content.count(old) == 1
+    (tmp_path / "a.fits").write_bytes(content.replace(old, new))
+    with pytest.raises(camera.FileError, match=r"a\.fits: "):
+        camera.read(tmp_path / "a.fits")
+
+
+@pytest.mark.parametrize("start", [b"", b"\x93NUMPY", b"SIMPLE  =                    T"])
+def test_unpacking_stops_at_the_limit(tmp_path, start):
+    path = tmp_path / "bomb.fits.gz"
+    path.write_bytes(gzip.compress(start + bytes(64 << 20), 1))
+    assert path.stat().st_size < 1 << 20
+    tracemalloc.start()
+    with pytest.raises(camera.FileError, match=r"bomb\.fits\.gz: "):
+        camera.read(path, max_bytes=4 << 20)
+    assert tracemalloc.get_traced_memory()[1] < 16 << 20
+    tracemalloc.stop()
+
+
+def test_largest_size_counts_the_file_and_the_images(tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, FRAME.astype(np.uint8))
+    assert camera.read(path, max_bytes=8 * FRAME.size).images.nbytes == 8 * FRAME.size
+    with pytest.raises(camera.FileError, match=r"a\.npy: its shape is \(20, 30\), 4800 bytes"):
+        camera.read(path, max_bytes=8 * FRAME.size - 1)
+    with pytest.raises(camera.FileError, match=r"a\.npy: it is larger than 700 bytes"):
+        camera.read(path, max_bytes=700)
+    for wrong, kind in ((0, ValueError), (1e9, TypeError), (True, TypeError)):
+        with pytest.raises(kind, match=f"max_bytes = {wrong}"):
+            camera.read(path, max_bytes=wrong)
+
+
+def test_cards_that_do_not_follow_the_standard_are_left_out(tmp_path):
+    content = fits_bytes(fits.PrimaryHDU(FRAME, fits.Header({"EXPTIME": 4, "WAVELEN": 633.0})))
+    old = b"EXPTIME =                    4"
+    assert content.count(old) == 1
+    (tmp_path / "a.fits").write_bytes(content.replace(old, b"EXPTIME =             12:30:44"))
+    file = camera.read(tmp_path / "a.fits")
+    assert file.keyword("WAVELEN") == 633
+    with pytest.raises(ValueError, match=r"a\.fits: its header has no EXPTIME"):
+        file.keyword("EXPTIME")
+
+
+def test_dark_and_map_without_a_good_pixel_are_named():
+    nothing, marked = file_of(np.full(FRAME.shape, np.nan), name="dark.fits"), file_of(FRAME + 1, name="map.fits")
+    with pytest.raises(ValueError, match=r"dark\.fits: the dark has no good pixel"):
+        camera.images([file_of(FRAME)], [nothing])
+    with pytest.raises(ValueError, match=r"map\.fits: the bad-pixel map has no good pixel"):
+        camera.images([file_of(FRAME)], [], [marked])
+
+
+def test_difference_beyond_the_range_of_a_float_is_a_bad_pixel(recwarn):
+    counts, dark = FRAME.astype(float), np.zeros(FRAME.shape)
+    counts[2, 3], dark[2, 3] = 1.5e308, -1.5e308
+    (found,) = camera.images([file_of(counts)], [file_of(dark)])
+    assert np.argwhere(found.bad).tolist() == [[2, 3]]
+    assert not recwarn.list
+
+
+# Writing
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a camera frame, an earlier phase map, and a text; it is the current one."""
+    monkeypatch.chdir(tmp_path)
+    fits.PrimaryHDU(FRAME.astype(float)).writeto("frame.fits")
+    fits.PrimaryHDU(FRAME.astype(float), fits.Header({"CREATOR": "zwfs 0.1"})).writeto("phase.fits")
+    Path("notes.md").write_text("precious")
+    Path("sub").mkdir()
+    return tmp_path
+
+
+def test_output_that_is_new_or_an_earlier_phase_map(folder):
+    for name in ("new.fits", "deep/er/new.fits", "phase.fits", Path("sub/../phase.fits")):
+        assert camera.check_output(name, ["frame.fits"]) == (folder / name).resolve()
+    assert camera.check_output("notes.md", ["frame.fits"], overwrite=True) == folder / "notes.md"
+    assert not (folder / "deep").exists()
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("name", ["phase.fits", "sub/../phase.fits", "./phase.fits", "link.fits", "hard.fits"])
+def test_output_is_never_an_input(folder, name, overwrite):
+    (folder / "link.fits").symlink_to("sub/../phase.fits")
+    os.link(folder / "phase.fits", folder / "hard.fits")
+    for given in (name, folder / name):
+        for source in ("phase.fits", folder / "link.fits"):
+            with pytest.raises(ValueError, match=r"output = .* is the input"):
+                camera.check_output(given, ["frame.fits", source], overwrite=overwrite)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("frame.fits", "exists and is no phase map"),
+        ("notes.md", "exists and is no phase map"),
+        ("sub/../notes.md", "exists and is no phase map"),
+        ("link.md", "exists and is no phase map"),
+        ("sub", "expected a file, not a folder"),
+        ("/dev/null", "expected a file, not a folder"),
+        ("", "expected a file, not a folder"),
+        ("notes.md/phase.fits", "expected a file in a folder"),
+        ("x" * 250 + ".fits", "expected a name of at most 240 bytes"),
+        ("x" * 5000, "File name too long"),
+        ("circle", "output = 'circle'"),
+        ("a\0b", "expected the name of a file"),
+        ("\ud800", "expected the name of a file"),
+    ],
+)
+def test_output_that_would_lose_a_file_or_cannot_be_written(folder, name, message):
+    (folder / "link.md").symlink_to("notes.md")
+    (folder / "circle").symlink_to("circle")
+    with pytest.raises(ValueError, match=f"output = .*{message}|{message}"):
+        camera.check_output(name)
+    assert (folder / "notes.md").read_text() == "precious"
+
+
+def test_bench_files_replace_only_those_of_a_bench(tmp_path):
+    bench = Bench(n_pixels=40, gap=0.02)
+    before = [path.read_bytes() for path in camera.write_bench(tmp_path, bench, seed=1).values()]
+    after = [path.read_bytes() for path in camera.write_bench(tmp_path, bench, seed=2).values()]
+    assert before != after
+    fits.PrimaryHDU(FRAME).writeto(tmp_path / "dark.fits", overwrite=True)
+    raw = (tmp_path / "dark.fits").read_bytes()
+    with pytest.raises(ValueError, match=r"folder = .* holds a dark\.fits that the simulated bench did not write"):
+        camera.write_bench(tmp_path, bench, seed=3)
+    assert (tmp_path / "dark.fits").read_bytes() == raw
+    assert (tmp_path / "frame.fits").read_bytes() == after[0]
+    with pytest.raises(ValueError, match=r"folder = .*nowhere'"):
+        camera.write_bench(tmp_path / "nowhere", bench)

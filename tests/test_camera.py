@@ -155,11 +155,11 @@ def test_saturation_is_given_in_the_header_of_the_type_or_seen():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: camera.images([]), "no file: 0 images: expected one or two"),
+        (lambda: camera.images([]), "files: 0 images: expected one or two"),
         (lambda: camera.images([file_of(FRAME)] * 3), "3 images: expected one or two"),
-        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME[1:])]), r"dark: its shape is \(19, 30\)"),
-        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME)] * 2), "dark: 2 images for the 1 of"),
-        (lambda: camera.images([file_of(FRAME)], [], [file_of(FRAME.T)]), "bad-pixel map: its shape is"),
+        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME[1:])]), r"darks: a\.fits has shape \(19, 30\)"),
+        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME)] * 2), "darks: 2 images for the 1 of"),
+        (lambda: camera.images([file_of(FRAME)], [], [file_of(FRAME.T)]), r"bad_pixels: a\.fits has shape"),
         (lambda: camera.images([file_of(FRAME + 1.0)], saturation=0.5), "all pixels are bad or saturated"),
         (lambda: camera.images([file_of(FRAME)], saturation=-1), "saturation = -1"),
     ],
@@ -329,9 +329,9 @@ def test_cards_that_do_not_follow_the_standard_are_left_out(tmp_path):
 
 def test_dark_and_map_without_a_good_pixel_are_named():
     nothing, marked = file_of(np.full(FRAME.shape, np.nan), name="dark.fits"), file_of(FRAME + 1, name="map.fits")
-    with pytest.raises(ValueError, match=r"dark\.fits: the dark has no good pixel"):
+    with pytest.raises(ValueError, match=r"darks: dark\.fits has no good pixel"):
         camera.images([file_of(FRAME)], [nothing])
-    with pytest.raises(ValueError, match=r"map\.fits: the bad-pixel map has no good pixel"):
+    with pytest.raises(ValueError, match=r"bad_pixels: map\.fits has no good pixel"):
         camera.images([file_of(FRAME)], [], [marked])
 
 

@@ -9,8 +9,17 @@ from scipy import ndimage
 
 from zwfs import Dimple, Pupil, ZernikeSensor, camera, power_law_screens, zernike_basis
 from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
-from zwfs.frames import Optics, fit, measure, predict_other, reconstruct, steps
-from zwfs.registration import Image, correlations, find_pupils, record, register
+from zwfs.frames import Optics, fit, measure, measured_pupil, predict_other, reconstruct, steps
+from zwfs.registration import (
+    Circle,
+    Image,
+    correlations,
+    find_pupils,
+    nearest_good,
+    radius,
+    record,
+    register,
+)
 
 SEAL = "ZWFS_SEAL_FRAMES"
 D, MARGIN = 68, 12
@@ -342,7 +351,7 @@ def test_settings_out_of_range(recorded, settings, message):
     ("wrong", "message"),
     [
         ({"diameter": 0}, "diameter = 0"),
-        ({"phase_shifts": (1.0,)}, "expected one for each"),
+        ({"phase_shifts": (1.0,)}, "expected two numbers"),
         ({"phase_shifts": (1.5, 1.5 + 2 * np.pi)}, "expected two that differ by other than 0 mod 2 pi"),
         ({"phase_shifts": (0.0, 1.0)}, "none of them 0"),
         ({"leakage": 0.5}, "leakage = 0.5"),
@@ -355,10 +364,91 @@ def test_optics_out_of_range(wrong, message):
         Optics(**wrong)
 
 
-def test_unknown_fit_is_refused(recorded):
+@pytest.mark.parametrize("names", [["colour"], ["scale", "scale"], "scale", 3, [["scale"]]])
+def test_unknown_fit_is_refused_before_any_work(recorded, names):
     _, masked, bare = recorded
-    with pytest.raises(ValueError, match=r"names = \['colour'\]"):
-        fit(record([image(masked)], [image(bare)]), Optics(), ["colour"])
+    recording = record([image(masked)], [image(bare)], subpixel=False)
+    with pytest.raises(ValueError, match=r"names = "):
+        fit(recording, Optics(), names)
+    with pytest.raises(ValueError, match=r"fitted = "):
+        steps([image(masked)], [image(bare)], Optics(), names)
+
+
+def test_fit_that_starts_out_of_its_range_is_refused(recorded):
+    _, masked, bare = recorded
+    with pytest.raises(ValueError, match=r"diameter = 4.0: expected a start in \[0.3, 3\]"):
+        steps([image(masked)], [image(bare)], Optics(diameter=4.0), ["scale", "diameter"])
+
+
+GOOD = np.random.default_rng(0).random((40, 40))
+INSIDE = np.hypot(*(np.mgrid[:40, :40] - 19.5)) < 15
+NAN = np.where(INSIDE, GOOD, np.nan)
+
+
+@pytest.mark.parametrize("wrong", [-1, 0, 7.9, np.nan, np.inf, True, "68", 1j, [68]])
+def test_diameter_of_a_pupil_is_checked(recorded, wrong):
+    _, masked, bare = recorded
+    with pytest.raises((TypeError, ValueError), match=r"^diameter = "):
+        find_pupils(image(bare), 2, wrong)
+    with pytest.raises((TypeError, ValueError), match=r"^pupil_diameter = "):
+        record([image(masked)], [image(bare)], pupil_diameter=wrong)
+
+
+@pytest.mark.parametrize("name", ["subpixel", "background", "balance"])
+@pytest.mark.parametrize("wrong", [0, 1, "no", None, [], 0.0])
+def test_flags_are_true_or_false(recorded, name, wrong):
+    _, masked, bare = recorded
+    with pytest.raises(TypeError, match=f"{name} = .*: expected True or False"):
+        record([image(masked)], [image(bare)], **{name: wrong})
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda: Image(NAN, ~INSIDE), "counts"),
+        (lambda: Image(GOOD * 1e40, ~INSIDE), "counts"),
+        (lambda: Image(GOOD[0], ~INSIDE), "counts"),
+        (lambda: Image(GOOD, INSIDE[1:]), "bad"),
+        (lambda: Image(GOOD, GOOD), "bad"),
+        (lambda: Image(GOOD, ~INSIDE, cut="no"), "cut"),
+        (lambda: Circle(np.nan, 1, 2), "row"),
+        (lambda: Circle(1, 1, 0), "diameter"),
+        (lambda: record(3, [image(GOOD)]), "frames"),
+        (lambda: record([image(GOOD)], [image(GOOD)] * 3), "pupil_images"),
+        (lambda: record([image(GOOD)], [GOOD]), "pupil_images"),
+        (lambda: find_pupils(GOOD, 1), "image"),
+        (lambda: find_pupils(image(GOOD), 0), "n_pupils"),
+        (lambda: find_pupils(image(GOOD), 1.0), "n_pupils"),
+        (lambda: register(NAN, GOOD, INSIDE), "image"),
+        (lambda: register(GOOD, GOOD[1:], INSIDE), "reference"),
+        (lambda: register(GOOD, GOOD, INSIDE & ~INSIDE), "inside"),
+        (lambda: register(GOOD, GOOD, GOOD), "inside"),
+        (lambda: register(GOOD, GOOD, INSIDE, 0), "blur"),
+        (lambda: nearest_good(GOOD, INSIDE & ~INSIDE), "good"),
+        (lambda: radius((4,), (1, 2)), "shape"),
+        (lambda: radius((4, 5), (1, np.nan)), "center"),
+        (lambda: correlations(GOOD, GOOD[1:]), "second"),
+        (lambda: measured_pupil(np.zeros((2, 40, 40)), INSIDE, 30.0), "images"),
+        (lambda: measured_pupil(np.ones((3, 40, 40)), INSIDE, 30.0), "images"),
+        (lambda: measured_pupil(np.ones((2, 40, 40)), INSIDE, 30.0, (1,)), "center"),
+        (lambda: Optics(phase_shifts=[[1, 2], [3]]), "phase_shifts"),
+        (lambda: measure(3, Optics()), "recording"),
+        (lambda: steps([image(GOOD)], [image(GOOD)], 3), "optics"),
+        (lambda: steps([image(GOOD)], [image(GOOD)], Optics(), n_iterations=0), "n_iterations"),
+    ],
+)
+def test_wrong_arguments_are_named(call, name):
+    with pytest.raises((TypeError, ValueError), match=rf"^{name}\b"):
+        call()
+
+
+def test_margin_is_one_that_both_frames_hold(recorded):
+    _, masked, bare = recorded
+    recording = record([image(masked)], [image(bare)], subpixel=False)
+    assert measure(recording, Optics(), recording.margin).margin == recording.margin
+    for wrong in (-1, recording.margin + 1, 2.0):
+        with pytest.raises((TypeError, ValueError), match=f"margin = {wrong}"):
+            measure(recording, Optics(), wrong)
 
 
 # The simulated bench

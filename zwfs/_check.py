@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs._arrays import Kind, any_array
+
+LARGEST = 1e38  # number in a map: the square of its sum is far from the range of a float
 
 
 def instance(name: str, value: Any, kind: type) -> None:
@@ -95,22 +97,33 @@ def in_kind(name: str, array: Any, kind: Kind) -> Any:
     return _made(name, array, kind.array)
 
 
+def pair(name: str, value: Any, check: Callable[..., Any], *limits: float) -> tuple[Any, Any]:
+    """Return a sequence of two numbers, each of which passes a check such as `number`."""
+    if not isinstance(value, Sequence | np.ndarray) or getattr(value, "ndim", 1) == 0 or len(value) != 2:
+        raise ValueError(f"{name} = {value!r}: expected two numbers")
+    return tuple(check(f"{name}[{index}]", one, *limits) for index, one in enumerate(value))
+
+
 def real_map(name: str, value: Any, n_axes: int = 2) -> NDArray:
-    """Return `value` as finite real numbers with so many axes, at least one number."""
-    array = real_array(name, value)
+    """Return `value` as float64 with so many axes, none of them empty, and numbers of at most `LARGEST`."""
+    array = real_array(name, value).astype(np.float64, copy=False)
     if array.ndim != n_axes or not array.size:
         raise ValueError(f"{name} has shape {array.shape}: expected {n_axes} axes, none of them empty")
     finite(name, array)
+    if np.abs(array).max() > LARGEST:
+        raise ValueError(f"{name} reaches {np.abs(array).max():.3g}: expected at most {LARGEST:g}")
     return array
 
 
-def flag_map(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return `value` as an array of bool of a shape."""
+def flag_map(name: str, value: Any, shape: tuple[int, ...], *, some: bool = False) -> NDArray[np.bool_]:
+    """Return `value` as an array of bool of a shape, with `some` at least one of them True."""
     array = _made(name, value, np.asarray)
     if array.dtype != bool:
         raise TypeError(f"{name} has dtype {array.dtype}: expected bool")
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}: expected {shape}")
+    if some and not array.any():
+        raise ValueError(f"{name} is False everywhere: expected at least one True")
     return array
 
 

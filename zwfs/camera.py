@@ -157,9 +157,9 @@ def images(
 ) -> tuple[Image, ...]:
     """One or two images from files, less the dark, with their bad pixels.
 
-    Bad are pixels that are NaN or infinite, not 0 in the bad-pixel map, or saturated. Without a level, a pixel is
-    saturated at SATURATE of the header, at the largest number that an integer type can hold, or where ten or more
-    pixels share exactly the largest value.
+    Bad are pixels that are NaN, infinite or beyond 1e38, are not 0 in the bad-pixel map, or are saturated. Without
+    a level, a pixel is saturated at SATURATE of the header, at the largest number that an integer type can hold,
+    or where ten or more pixels share exactly the largest value.
 
     Parameters
     ----------
@@ -184,23 +184,25 @@ def images(
         saturation = _check.number("saturation", saturation, 0, open_low=True)
     found = [(file, counts) for file in files for counts in file.images]
     if len(found) not in (1, 2):
-        names = ", ".join(file.name for file in files) or "no file"
+        names = ", ".join(file.name for file in files) or "files"
         raise ValueError(f"{names}: {len(found)} images: expected one or two")
     result = []
     for index, (file, counts) in enumerate(found):
-        dark = _companion("dark", np.isfinite, darks, index, len(found), counts, file.name)
-        marked = _companion("bad-pixel map", np.logical_not, bad_pixels, index, len(found), counts, file.name)
-        bad = ~np.isfinite(counts)
+        dark = _companion("darks", _usable, darks, index, len(found), counts, file.name)
+        marked = _companion("bad_pixels", np.logical_not, bad_pixels, index, len(found), counts, file.name)
+        bad = ~_usable(counts)
         level = saturation or _saturation(file, counts[~bad])
         bad |= np.where(bad, 0, counts) >= level
         if dark is not None:
             with np.errstate(over="ignore", invalid="ignore"):
                 counts = counts - dark
-            bad |= ~np.isfinite(counts)
+            bad |= ~_usable(counts)
         if marked is not None:
             bad |= marked != 0
         if bad.all():
-            raise ValueError(f"{file.name}: all pixels are bad or saturated (level {level:g}): expected an image")
+            raise ValueError(
+                f"{file.name}: all pixels are bad or saturated (saturation = {level:g}): expected an image"
+            )
         name = file.name if len(file.images) == 1 else f"{file.name}[{index}]"
         result.append(Image(nearest_good(counts, ~bad), bad, name))
     return tuple(result)
@@ -384,7 +386,7 @@ def write_bench(
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
     n_bad = _check.integer("n_bad", n_bad, 0, 2 * math.prod(bench.segments.shape))
     folder = _path("folder", folder)
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise ValueError(f"folder = {str(folder)!r}: expected a folder that exists")
     paths = {name: folder / f"{name}.fits" for name in ("frame", "pupils", "dark", "bad_pixels")}
     for path in paths.values():
@@ -474,8 +476,11 @@ def _is_there(path: Path) -> bool:
 
 def _has_card(path: Path, card: bytes) -> bool:
     """Whether a file is FITS and the header of its first unit has a card that begins like this."""
-    with path.open("rb") as file:
-        header = file.read(2880 * 32)
+    try:
+        with path.open("rb") as file:
+            header = file.read(2880 * 32)
+    except OSError:
+        return False
     cards = (header[place : place + 80] for place in range(0, len(header), 80))
     return header.startswith(_FITS) and any(one.startswith(card) for one in cards)
 
@@ -502,8 +507,9 @@ def _broken(message: str) -> Iterator[None]:
 
 def _content(file: BinaryIO, name: str, max_bytes: int) -> io.BytesIO:
     """Bytes of a FITS or NPY file, unpacked; never much more than `max_bytes` are in memory."""
-    packed = file.read(len(_GZIP)) == _GZIP
-    file.seek(0)
+    with _broken(f"{name}: it cannot be read"):
+        packed = file.read(len(_GZIP)) == _GZIP
+        file.seek(0)
     size, content = os.fstat(file.fileno()).st_size, io.BytesIO()
     with _broken(f"{name}: a broken gzip file" if packed else f"{name}: it cannot be read"):
         stream = gzip.GzipFile(fileobj=file) if packed else file
@@ -563,6 +569,11 @@ def _read_fits(fits: ModuleType, content: io.BytesIO, name: str, max_bytes: int)
     raise FileError(f"{name}: a FITS file without an image")
 
 
+def _usable(counts: NDArray) -> NDArray[np.bool_]:
+    """Pixels that are numbers of a size that counts can have."""
+    return np.abs(counts) <= _check.LARGEST
+
+
 def _companion(
     what: str,
     good: Callable[[NDArray], NDArray],
@@ -580,9 +591,9 @@ def _companion(
         raise ValueError(f"{what}: {len(maps)} images for the {n_images} of {name}: expected one, or one for each")
     source, chosen = maps[0] if len(maps) == 1 else maps[index]
     if chosen.shape != counts.shape:
-        raise ValueError(f"{what}: its shape is {chosen.shape}: expected {counts.shape}, that of {name}")
+        raise ValueError(f"{what}: {source} has shape {chosen.shape}: expected {counts.shape}, that of {name}")
     if not good(chosen).any():
-        raise ValueError(f"{source}: the {what} has no good pixel: expected some")
+        raise ValueError(f"{what}: {source} has no good pixel: expected some")
     return chosen
 
 

@@ -65,10 +65,7 @@ class Optics:
 
     def __post_init__(self) -> None:
         _check.number("diameter", self.diameter, 0, open_low=True)
-        if np.shape(self.phase_shifts) != (2,):
-            raise ValueError(f"phase_shifts = {self.phase_shifts!r}: expected one for each of the two images")
-        for index, value in enumerate(self.phase_shifts):
-            _check.number(f"phase_shifts[{index}]", value)
+        _check.pair("phase_shifts", self.phase_shifts, _check.number)
         first, second = np.exp(1j * np.array(self.phase_shifts))
         if min(abs(first - second), abs(first - 1), abs(second - 1)) < 1e-9:
             raise ValueError(
@@ -321,10 +318,11 @@ def measured_pupil(
     images = _check.real_map("images", images, 3)
     if len(images) != 2:
         raise ValueError(f"images has shape {images.shape}: expected (2, ny, nx)")
-    inside = _check.flag_map("inside", inside, images.shape[1:])
+    inside = _check.flag_map("inside", inside, images.shape[1:], some=True)
     n_pixels = _check.number("n_pixels", n_pixels, 0, open_low=True)
-    if not inside.any() or np.any((scale := images[:, inside].mean(axis=1)) <= 0):
+    if np.any((scale := images[:, inside].mean(axis=1)) <= 0):
         raise ValueError("images hold no light inside: expected more than 0 counts on average")
+    center = None if center is None else _check.pair("center", center, _check.number)
     amplitude = np.sqrt(np.maximum((images / scale[:, None, None]).mean(axis=0), 0))
     middle = center or tuple((n - 1) / 2 for n in amplitude.shape)
     stop = radius(amplitude.shape, middle) <= n_pixels / 2
@@ -472,7 +470,7 @@ def _check_fit(argument: str, names: Any, optics: Any) -> None:
     """Require names of different parameters that `fit` knows, and optics from which it can start."""
     _check.instance("optics", optics, Optics)
     known = (*_RANGES, "registration")
-    listed = isinstance(names, Sequence) and not isinstance(names, str)
+    listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
     if not listed or not all(isinstance(name, str) and name in known for name in names):
         raise ValueError(f"{argument} = {names!r}: expected a list with some of {list(known)}")
     if len(set(names)) < len(names):

@@ -37,7 +37,7 @@ class Image:
     Raises
     ------
     TypeError, ValueError
-        If a value is of the wrong kind or shape, or a count is not finite.
+        If a value is of the wrong kind or shape, or a count is not finite or beyond 1e38.
     """
 
     counts: NDArray[np.float64]
@@ -303,7 +303,7 @@ def register(image: NDArray, reference: NDArray, inside: NDArray, blur: float = 
     """
     image, reference = _check.real_map("image", image, 2), _check.real_map("reference", reference, 2)
     _check.trailing_shape("reference", reference, image.shape, "the shape of image")
-    inside = _check.flag_map("inside", inside, image.shape)
+    inside = _check.flag_map("inside", inside, image.shape, some=True)
     blur = _check.number("blur", blur, 0, open_low=True)
     wide = 4 * blur
     detail = ndimage.gaussian_filter(image, blur) - ndimage.gaussian_filter(image, wide)
@@ -340,7 +340,7 @@ def resample(
     origins : ndarray, shape (2, 2), pixels
         Place of the first mask-out image's pixel (0, 0) on each image.
     margin : int, pixels
-        Around the grid of the pupil. What lies beyond an image repeats its edge.
+        Around the grid of the pupil, at most the size of an image. What lies beyond an image repeats its edge.
 
     Returns
     -------
@@ -356,7 +356,7 @@ def resample(
     _check_images("images", images, (2,))
     origins = _check.real_map("origins", origins)
     _check.trailing_shape("origins", origins, (2, 2), "row and column on each of two images")
-    margin = _check.integer("margin", margin, 0)
+    margin = _check.integer("margin", margin, 0, max(max(image.counts.shape) for image in images))
     size = (recording.n_pixels + 2 * margin,) * 2
     maps, bad = np.empty((2, *size)), np.empty((2, *size), bool)
     for index, (image, origin) in enumerate(zip(images, origins, strict=True)):
@@ -371,7 +371,7 @@ def resample(
 def nearest_good(image: NDArray, good: NDArray) -> NDArray:
     """An image with every pixel that is not good replaced by the nearest good one, of which there must be one."""
     image = _check.real_array("image", image)
-    good = _check.flag_map("good", good, image.shape)
+    good = _check.flag_map("good", good, image.shape, some=True)
     if good.all():
         return image
     index = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
@@ -380,11 +380,7 @@ def nearest_good(image: NDArray, good: NDArray) -> NDArray:
 
 def radius(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[np.float64]:
     """Distance of every pixel from the centre (row, column), in pixels."""
-    for name, pair in (("shape", shape), ("center", center)):
-        if np.shape(pair) != (2,):
-            raise ValueError(f"{name} = {pair!r}: expected rows and columns")
-    shape = [_check.integer(f"shape[{axis}]", n, 1) for axis, n in enumerate(shape)]
-    center = [_check.number(f"center[{axis}]", middle) for axis, middle in enumerate(center)]
+    shape, center = _check.pair("shape", shape, _check.integer, 1), _check.pair("center", center, _check.number)
     rows, columns = (np.arange(n) - middle for n, middle in zip(shape, center, strict=True))
     return np.hypot(rows[:, np.newaxis], columns)
 

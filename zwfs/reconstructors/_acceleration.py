@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from zwfs._arrays import Kind
 from zwfs.lowrank import split_core
+from zwfs.reconstructors._common import with_piston_of
 from zwfs.sensor import ZernikeSensor
 
 _DIMMEST = 0.01  # least light that frames are taken to miss, relative to those of a flat wavefront
@@ -68,12 +69,14 @@ class Acceleration:
         if tried is None:
             data["tried"] = found
             return found
-        change = found - tried
-        new = tried + self.relaxation * change
         if "lost" in data:  # a new start, and no point on the line of the secant
             lost = data.pop("lost")
+            new = tried + self.relaxation * (found - tried)
             data["tried"] = new * dimming(lost, xp.maximum(self.taken(new, xp), _DIMMEST * lost), xp)
             return data["tried"]
+        # A piston that turns in each iteration would be a change that never ends, which the secant magnifies.
+        change = with_piston_of(tried, found, xp) - tried
+        new = tried + self.relaxation * change
         if "change" in data:
             turn = change - data["change"]
             size = xp.vecdot(turn, turn)

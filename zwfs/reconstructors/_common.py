@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,16 +19,22 @@ from zwfs.sensor import PupilMaps, ZernikeSensor, split, square
 # Detector pixels handled together: on the processor few enough for its fast memory, enough to vectorise.
 _CHUNK, _CHUNK_ELSEWHERE = 80_000, 40_000_000
 _VANISHING = 1e-30  # modulus, or its square, of a field that counts as 0
+_BRIGHT = 10.0  # mean of a frame inside the pupil, relative to no mask: masks never exceed 1, raw counts soon do
+_MOST_ITERATIONS = 2**31 - 1
+_RANGE = 1e30  # of the light in the pupil, and of its inverse: its square is a number in single precision, too
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What a reconstructor found; `...` is the batch of the frames.
+    """Result of a reconstruction; `...` is the batch of the frames.
+
+    The arrays belong to the caller: they are writable and share no memory with the frames or the reconstructor.
 
     Attributes
     ----------
     phase : ndarray, shape (..., ny, nx), radian
-        NaN outside the pupil. Wrapped to (-pi, pi], except by `Linear` and `GradientDescent`.
+        NaN outside the pupil. Wrapped to (-pi, pi], except by `Linear` and `GradientDescent`. The frames do not
+        depend on the piston, so its value has no meaning: remove it on the circle before you fit modes.
     n_iterations : ndarray of int, shape (...)
         Iterations used.
     converged : ndarray of bool, shape (...)
@@ -83,6 +90,7 @@ class Settings:
     n_iterations: int
     tolerance: float
     amplitude: NDArray[np.float64]
+    light: float  # sum of the squared amplitude over the pupil: a frame without mask
     _maps: dict[Kind, PupilMaps] = field(default_factory=dict, init=False, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -114,14 +122,23 @@ def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLik
         If an argument is of the wrong kind, shape or range.
     """
     _check.instance("sensor", sensor, ZernikeSensor)
-    n_iterations = _check.integer("n_iterations", n_iterations, 1)
+    n_iterations = _check.integer("n_iterations", n_iterations, 1, _MOST_ITERATIONS)
     tolerance = _check.number("tolerance", tolerance, 0)
     maps, batch = sensor.amplitude_maps(amplitude, Kind.numpy())
     if batch:
         raise ValueError(f"amplitude has shape {np.shape(amplitude)}: expected {sensor.pupil.shape}")
-    own = maps[0].copy()
-    own.setflags(write=False)  # what is made of it would not follow
-    return Settings(sensor, n_iterations, tolerance, own)
+    own = read_only(maps[0].copy())
+    with np.errstate(over="ignore"):
+        light = float(np.sum(own * own))
+    if not 1 / _RANGE < light < _RANGE:
+        raise ValueError(f"amplitude: its squares add up to {light:.3g}: expected {1 / _RANGE:g} to {_RANGE:g}")
+    return Settings(sensor, n_iterations, tolerance, own, light)
+
+
+def read_only(array: NDArray) -> NDArray:
+    """The array itself, locked: what was computed from it would not follow a change."""
+    array.setflags(write=False)
+    return array
 
 
 class FixedPoint(Protocol):
@@ -147,13 +164,14 @@ class Estimate(NamedTuple):
 
     field: NDArray[np.floating]
     unsolved: NDArray[np.int64] | int = 0  # number of points, (k,) or the same for all
-    modulus: NDArray[np.floating] | None = None  # of the field, (1 or k, ny, nx), where the step knows it
+    modulus: NDArray[np.floating] | None = None  # of the field, (k, ny, nx), where the step knows it
 
 
 def iterate(method: FixedPoint, frames: ArrayLike, start: ArrayLike | None, history: bool) -> Reconstruction:
     """Run the steps of `method` on every frame until it converges or the iterations are used up."""
     config = method.settings
-    frames, batch = check_frames(config.sensor, frames)
+    history = _check.flag("history", history)
+    frames, batch = check_frames(config.sensor, frames, light=config.light, depth=4)
     kind = Kind.of(frames)
     first = None if start is None else start_phase(config.sensor, start, batch, kind)
 
@@ -205,7 +223,7 @@ def _iterate_piece(method: FixedPoint, frames: NDArray, start: NDArray | None, h
     phasor = maps.flat + kind.zeros(n_frames, 1, 1, 1) if start is None else split(start, maps.inside)
     path = [angle(phasor, xp) if start is None else start] if history else []
     data = method.prepare(frames, phasor, start is None, kind)
-    limit = config.tolerance**2 * config.sensor.pupil.n_points
+    limit = config.tolerance * config.tolerance * config.sensor.pupil.n_points
     none = kind.integers([0] * n_frames)
     active, finished, done = None, [], none > 0
 
@@ -279,9 +297,21 @@ def pieces(frames: NDArray, kind: Kind, size: int | None = None) -> Iterator[sli
 
 
 def check_frames(
-    sensor: ZernikeSensor, frames: ArrayLike, name: str = "frames"
+    sensor: ZernikeSensor, frames: ArrayLike, name: str = "frames", *, light: float = np.inf, depth: int = 3
 ) -> tuple[NDArray[np.floating], tuple[int, ...]]:
-    """Checked frames, (k, n_masks, ny', nx'), and the shape of the batch."""
+    """Checked frames, (k, n_masks, ny', nx'), and the shape of the batch.
+
+    Parameters
+    ----------
+    sensor : ZernikeSensor
+    frames : array_like, shape (..., n_masks, ny', nx')
+    name : str
+        Of the frames, in messages.
+    light : float
+        Sum over the pupil with the mask out. Frames that are far brighter cause a warning; none do if left out.
+    depth : int
+        Calls between the warning and the line that it names.
+    """
     frames = _check.real_any(name, frames)
     shape = (sensor.n_masks, *sensor.detector_shape)
     _check.trailing_shape(name, frames, shape, "masks and detector of the sensor")
@@ -289,15 +319,32 @@ def check_frames(
     flat = xp.reshape(frames, (-1, *shape))
     if not prod(batch):
         raise ValueError(f"{name} has shape {tuple(frames.shape)}: expected at least one frame")
-    light = xp.sum(flat, axis=(-2, -1))
+    total = xp.sum(flat, axis=(-2, -1))
     # A sum is finite only if all its terms are; one of nothing negative is 0 only if all of them are.
-    if not (xp.min(flat) >= 0 and xp.all((light > 0) & (light < np.inf))):
+    if not (xp.min(flat) >= 0 and xp.all((total > 0) & (total < _BRIGHT * light))):
         _check.finite(name, flat)
         _check.non_negative(name, flat, "; after subtracting a background, raise them to 0 explicitly")
-        if not xp.all(light > 0):
-            n_dark = int(xp.count_nonzero(light == 0))
-            raise ValueError(f"{name}: {n_dark} of {prod(light.shape)} hold no light: expected some flux in each")
+        if not xp.all(total > 0):
+            n_dark = int(xp.count_nonzero(total == 0))
+            raise ValueError(f"{name}: {n_dark} of {prod(total.shape)} hold no light: expected some flux in each")
+        _warn_of_counts(sensor, name, flat, light, depth + 1)
     return flat, batch
+
+
+def _warn_of_counts(sensor: ZernikeSensor, name: str, frames: NDArray, light: float, depth: int) -> None:
+    """Warn if frames (k, n_masks, ny', nx') are brighter inside the pupil than behind any mask."""
+    kind = Kind.of(frames)
+    inside = frames[(..., *sensor.window)] * sensor.maps(kind).inside
+    brightest = float(kind.xp.max(kind.xp.sum(inside, axis=(-2, -1)))) / sensor.pupil.n_points
+    expected = light / sensor.pupil.n_points
+    if brightest > _BRIGHT * expected:
+        warnings.warn(
+            f"{name}: the mean inside the pupil reaches {brightest:.4g}: expected at most about {expected:.4g}, "
+            "the mean with the mask taken out; are these raw counts? Subtract the background, then divide by the "
+            "mean count in the pupil with the mask taken out",
+            UserWarning,
+            stacklevel=depth,
+        )
 
 
 def start_phase(
@@ -336,6 +383,35 @@ def turn(wave: NDArray, along: NDArray, across: NDArray) -> NDArray:
     turned[:, 0, ...] -= ahead[:, 1, ...]
     turned[:, 1, ...] += ahead[:, 0, ...]
     return turned
+
+
+def for_each(array: NDArray, n_frames: int, xp: Any) -> NDArray:
+    """What all frames share, (1, ...), as a view of shape (n_frames, ...)."""
+    return xp.broadcast_to(array, (n_frames, *array.shape[1:]))
+
+
+def steady(found: NDArray, data: dict[str, NDArray], xp: Any) -> NDArray:
+    """Coefficients of an estimate, (k, 2 r), turned to the piston of those before; kept for the next ones."""
+    if "tried" in data:
+        found = with_piston_of(data["tried"], found, xp)
+    data["tried"] = found
+    return found
+
+
+def with_piston_of(before: NDArray, found: NDArray, xp: Any) -> NDArray:
+    """Coefficients (k, 2 r) turned by the constant phase that brings them nearest to those before.
+
+    The frames do not depend on a piston, and one iteration F obeys F(exp(i a) psi) = exp(i a) F(psi) for any a. It
+    therefore may settle at F(psi) = exp(i w) psi: if noise or a wrong model leaves no phase that explains the
+    frames, each iteration adds the piston w. The angle that makes <before, found> real and positive removes w and
+    changes nothing else. A fixed gauge, such as a real mean field, would fail where the mean field vanishes.
+    """
+    rank = found.shape[-1] // 2
+    real, imag = found[:, :rank], found[:, rank:]
+    across = xp.vecdot(before[:, :rank], imag) - xp.vecdot(before[:, rank:], real)
+    ahead = xp.atan2(across, xp.vecdot(before, found))[:, np.newaxis]
+    along, across = xp.cos(ahead), xp.sin(ahead)
+    return xp.concat([along * real + across * imag, along * imag - across * real], axis=-1)
 
 
 def unit(field: NDArray, modulus: NDArray, xp: Any, before: NDArray | None = None) -> NDArray:

@@ -8,8 +8,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs._arrays import Kind
-from zwfs.reconstructors._common import Estimate, Reconstruction, count, iterate, settings, turn
+from zwfs.lowrank import Operator, split_core
+from zwfs.reconstructors._common import (
+    Estimate,
+    Reconstruction,
+    Settings,
+    count,
+    for_each,
+    iterate,
+    settings,
+    steady,
+    turn,
+)
 from zwfs.sensor import ZernikeSensor, square
+
+_IN_LINE = 1e-6  # sine of the angle between a field and its reference wave below which they count as in line
 
 
 class Arcsine:
@@ -18,7 +31,8 @@ class Arcsine:
     A cosine has two inverses, one on each side of the phase of the reference wave. Taken at every point, in all
     iterations, is the side on which the starting phase lies of its own reference wave. For a dimple of +pi/2 and a
     flat start that covers about -pi/4 to 3 pi/4; a true phase beyond is folded back, which limits this method.
-    The reference wave goes with the mean phase, so both are counted from the piston of the wavefront.
+    The reference wave goes with the mean phase, so both are counted from the piston of the wavefront. A starting
+    phase in line with that of its reference wave counts as ahead of it. The piston is that of `PhaseShifted`.
     Cosines beyond +-1 are taken as +-1 and counted.
 
     Parameters
@@ -46,10 +60,15 @@ class Arcsine:
         tolerance: float = 1e-6,
         amplitude: ArrayLike | None = None,
     ) -> None:
-        self.settings = settings(sensor, n_iterations, tolerance, amplitude)
+        self._settings = settings(sensor, n_iterations, tolerance, amplitude)
         if sensor.n_masks != 1:
             raise ValueError(f"sensor has {sensor.n_masks} masks: expected one; PhaseShifted takes more")
         self._constants: dict[Kind, _Constants] = {}
+
+    @property
+    def settings(self) -> Settings:
+        """Checked arguments that every reconstructor takes."""
+        return self._settings
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_constants": {}}  # made again where they are needed
@@ -66,20 +85,19 @@ class Arcsine:
         light = frames[:, 0, ...][(..., *self.settings.sensor.window)]
         data = {"excess": (light - maps.amplitude**2) * constants.gain}
         if flat:
-            return data | {
-                "wave": constants.flat_wave,
-                "side": constants.flat_side + kind.zeros(light.shape[0], 1, 1),
-            }
-        psi = maps.field(phasor)
-        wave = self._reference(psi, kind)
-        return data | {"wave": wave, "side": _side(wave, psi, kind)}
+            start = constants.flat
+            return data | {name: for_each(array, frames.shape[0], kind.xp) for name, array in start.items()}
+        return data | _start(maps.field(phasor), constants.operator, constants.core, kind)
 
     def step(self, phasor: NDArray, data: dict[str, NDArray], kind: Kind) -> Estimate:
         """Reference wave of the estimate, then both parts of the field along it, times its modulus."""
         xp, maps, constants = kind.xp, self.settings.maps(kind), self._of(kind)
         wave = data.pop("wave", None)  # that of the start is known
         if wave is None:
-            wave = self._reference(maps.field(phasor), kind)
+            coefficients = constants.operator.split_project(maps.field(phasor))
+            if self.settings.tolerance:
+                coefficients = steady(coefficients, data, xp)
+            wave = _wave(coefficients, constants.operator, constants.core)
         power = square(wave)
         along = data["excess"] - constants.gain * power
         across = power - along * along
@@ -96,23 +114,19 @@ class Arcsine:
         # Both parts together are as long as the wave that they multiply, so the modulus is its square.
         return Estimate(new, n_unsolved, power)
 
-    def _reference(self, psi: NDArray, kind: Kind) -> NDArray:
-        return self.settings.sensor.operator(kind).split_reference(psi, in_window=True)[:, 0, ...]
-
     def _of(self, kind: Kind) -> _Constants:
         """Constants for arrays of one kind; made once, then kept."""
         if kind not in self._constants:
-            amplitude, mask = self.settings.amplitude, self.settings.sensor.pupil.mask
+            amplitude, sensor, exact = self.settings.amplitude, self.settings.sensor, Kind.numpy()
+            mask, core = sensor.pupil.mask, split_core(sensor.factors.core)
             lit = mask & (amplitude > 0)
             gain = np.where(lit, 1 / (2 * np.where(lit, amplitude, 1)), 0)
             dark = mask & ~lit
-            exact = Kind.numpy()
             maps = self.settings.maps(exact)
-            psi = maps.field(maps.flat)
-            wave = self._reference(psi, exact)
+            flat = _start(maps.field(maps.flat), sensor.operator(exact), core, exact)
             self._constants[kind] = _Constants(
-                kind.array(gain), kind.flags(dark), int(dark.sum()),
-                kind.array(wave), kind.array(_side(wave, psi, exact)),
+                sensor.operator(kind), kind.array(core), kind.array(gain), kind.flags(dark), int(dark.sum()),
+                {name: kind.array(array) for name, array in flat.items()},
             )  # fmt: skip
         return self._constants[kind]
 
@@ -120,15 +134,26 @@ class Arcsine:
 class _Constants(NamedTuple):
     """What all frames share, as arrays of one kind."""
 
+    operator: Operator
+    core: NDArray[np.floating]  # coefficients of the field (k, 2 r) to those of the wave
     gain: NDArray[np.floating]  # (ny, nx), 1 / (2 A); 0 where there is no light
     dark: NDArray[np.bool_]  # (ny, nx), no light inside the pupil: the phase stays what it was
     n_dark: int
-    flat_wave: NDArray[np.floating]  # (1, 2, ny, nx), reference wave of a flat wavefront
-    flat_side: NDArray[np.floating]  # (1, ny, nx), side of it on which the flat wavefront lies
+    flat: dict[str, NDArray[np.floating]]  # what a flat wavefront gives to the steps, (1, ...)
 
 
-def _side(wave: NDArray, psi: NDArray, kind: Kind) -> NDArray:
-    """Whether the phase of a field is ahead of its reference wave, 1, or behind, -1: (k, ny, nx)."""
-    # It is fixed once: the piston of the estimate, which no intensity shows, may drift past the wave.
-    ahead = wave[:, 0, ...] * psi[:, 1, ...] - wave[:, 1, ...] * psi[:, 0, ...] >= 0
-    return kind.xp.where(ahead, kind.array(1.0), kind.array(-1.0))
+def _start(psi: NDArray, operator: Operator, core: NDArray, kind: Kind) -> dict[str, NDArray]:
+    """What a starting field gives to the steps: its coefficients and reference wave, and its side of that."""
+    coefficients = operator.split_project(psi)
+    wave = _wave(coefficients, operator, core)
+    # The side is fixed once: later estimates may lie anywhere about their waves. A field in line with its wave
+    # counts as ahead, and not as rounding has it.
+    cross = wave[:, 0, ...] * psi[:, 1, ...] - wave[:, 1, ...] * psi[:, 0, ...]
+    ahead = cross >= -_IN_LINE * kind.xp.sqrt(square(wave) * square(psi))
+    side = kind.xp.where(ahead, kind.array(1.0), kind.array(-1.0))
+    return {"tried": coefficients, "wave": wave, "side": side}
+
+
+def _wave(coefficients: NDArray, operator: Operator, core: NDArray) -> NDArray:
+    """Reference wave, (k, 2, ny, nx), of coefficients of the field, (k, 2 r)."""
+    return operator.split_expand(coefficients @ core, in_window=True)[:, 0, ...]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs._arrays import Kind
-from zwfs.reconstructors._common import Estimate, Reconstruction, iterate, settings, unit
+from zwfs.reconstructors._common import Estimate, Reconstruction, Settings, iterate, settings, unit
 from zwfs.sensor import ZernikeSensor
 
 
@@ -19,6 +19,9 @@ class GerchbergSaxton:
     The detector plane is that of the sensor. Light that leaves it is taken as 0 on the way back, which biases the
     phase: give the sensor an `extent` of 2 D or more. On a detector as wide as the pupil the iteration improves a
     few times and then diverges.
+
+    The piston stays near that of the start: with the estimate psi, the measured amplitude a and the modelled field
+    o = A psi of each mask, <psi, next> = sum a |o|, which is real and positive.
 
     Parameters
     ----------
@@ -40,7 +43,12 @@ class GerchbergSaxton:
         tolerance: float = 1e-6,
         amplitude: ArrayLike | None = None,
     ) -> None:
-        self.settings = settings(sensor, n_iterations, tolerance, amplitude)
+        self._settings = settings(sensor, n_iterations, tolerance, amplitude)
+
+    @property
+    def settings(self) -> Settings:
+        """Checked arguments that every reconstructor takes."""
+        return self._settings
 
     def __call__(
         self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False

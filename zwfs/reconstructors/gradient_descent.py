@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from zwfs import _check
 from zwfs._arrays import Kind
-from zwfs.reconstructors._common import Found, Reconstruction, check_frames, report, settings, start_phase
+from zwfs.reconstructors._common import (
+    Found,
+    Reconstruction,
+    Settings,
+    check_frames,
+    report,
+    settings,
+    start_phase,
+)
 from zwfs.reconstructors.linear import check_modes
 from zwfs.sensor import ZernikeSensor, split, square
 
@@ -43,16 +51,26 @@ class GradientDescent:
         tolerance: float = 1e-6,
         amplitude: ArrayLike | None = None,
     ) -> None:
-        self.settings = settings(sensor, n_iterations, tolerance, amplitude)
-        self.modes = None if modes is None else check_modes(sensor, modes)
+        self._settings = settings(sensor, n_iterations, tolerance, amplitude)
+        self._modes = None if modes is None else check_modes(sensor, modes)
+
+    @property
+    def settings(self) -> Settings:
+        """Checked arguments that every reconstructor takes."""
+        return self._settings
+
+    @property
+    def modes(self) -> NDArray[np.float64] | None:
+        """Modes at the points of the pupil, shape (n_modes, n_points), if there are any."""
+        return self._modes
 
     def __call__(
         self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
     ) -> Reconstruction:
         """Reconstruct the phase of each frame set; parameters, result and errors are those of `PhaseShifted`."""
-        config = self.settings
+        config, history = self.settings, _check.flag("history", history)
         pupil = config.sensor.pupil
-        frames, batch = check_frames(config.sensor, _check.real_array("frames", frames))
+        frames, batch = check_frames(config.sensor, _check.real_array("frames", frames), light=config.light)
         phase = start_phase(config.sensor, start, batch, Kind.of(frames))
         n_used = np.zeros(len(frames), int)
         converged = np.zeros(len(frames), bool)
@@ -110,17 +128,17 @@ class GradientDescent:
         """Phases at the points of the pupil after each iteration, and whether the last change was small."""
         config = self.settings
         n_points = config.sensor.pupil.n_points
-        path, latest = [start], start
+        path = [start]
+
+        def phase(x: NDArray) -> NDArray:
+            return start + (x if self.modes is None else x @ self.modes)
 
         def value(x: NDArray) -> tuple[float, NDArray]:
-            nonlocal latest
-            latest = start + (x if self.modes is None else x @ self.modes)
-            cost, gradient = self._cost(latest, frames)
+            cost, gradient = self._cost(phase(x), frames)
             return cost, np.asarray(gradient if self.modes is None else self.modes @ gradient, np.float64)
 
-        def follow(x: NDArray) -> None:
-            # The line search ends at the point that it accepts: its phase is the latest one.
-            path.append(latest)
+        def follow(intermediate_result: OptimizeResult) -> None:  # SciPy goes by this name
+            path.append(phase(intermediate_result.x))
             if _rms(path[-1] - path[-2]) <= config.tolerance:
                 raise StopIteration
 

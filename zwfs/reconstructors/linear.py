@@ -7,7 +7,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind
-from zwfs.reconstructors._common import Found, Reconstruction, check_frames, report, settings, start_phase
+from zwfs.reconstructors._common import (
+    Found,
+    Reconstruction,
+    Settings,
+    check_frames,
+    read_only,
+    report,
+    settings,
+    start_phase,
+)
 from zwfs.sensor import ZernikeSensor
 
 
@@ -35,7 +44,7 @@ class Linear:
         Measured amplitude A_in in the pupil; that of the sensor's pupil if left out.
     calibration : (flat, pushed, pulled), optional
         Frames recorded with the reference phase, (n_masks, ny', nx'), and with each mode pushed and pulled,
-        (n_modes, n_masks, ny', nx').
+        (n_modes, n_masks, ny', nx'). Any unit will do if the frames to reconstruct come in the same.
 
     Attributes
     ----------
@@ -64,21 +73,43 @@ class Linear:
         amplitude: ArrayLike | None = None,
         calibration: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
     ) -> None:
-        self.settings = settings(sensor, 1, 0.0, amplitude)
-        self.modes = check_modes(sensor, modes)
+        self._settings = settings(sensor, 1, 0.0, amplitude)
+        self._modes = check_modes(sensor, modes)
         poke = _check.number("poke", poke, 0, open_low=True)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
         self._reference = start_phase(sensor, reference, (), Kind.numpy(), "reference")
+        # Recorded frames may come in any unit, which is then that of the interaction matrix.
+        self._light = self._settings.light if calibration is None else np.inf
         flat, difference = self._simulated(poke) if calibration is None else self._recorded(calibration)
         self._reference_signal = flat
-        self.interaction_matrix = difference.T / (2 * poke)
-        u, strength, vt = np.linalg.svd(self.interaction_matrix, full_matrices=False)
+        self._matrix = read_only(difference.T / (2 * poke))
+        u, strength, vt = np.linalg.svd(self._matrix, full_matrices=False)
         # A frame of unit intensity is rounded at 1e-16, which the poke divides.
         if strength[0] <= 1e-14 * np.sqrt(len(u)) / poke:
             raise ValueError("modes: the sensor sees none of them: expected modes other than piston")
-        self.n_inverted = int(np.count_nonzero(strength > conditioning * strength[0]))
-        kept = slice(0, self.n_inverted)
+        self._n_inverted = int(np.count_nonzero(strength > conditioning * strength[0]))
+        kept = slice(0, self._n_inverted)
         self._inverse = (vt[kept].T / strength[kept]) @ u[:, kept].T
+
+    @property
+    def settings(self) -> Settings:
+        """Checked arguments that every reconstructor takes."""
+        return self._settings
+
+    @property
+    def modes(self) -> NDArray[np.float64]:
+        """Modes at the points of the pupil, shape (n_modes, n_points)."""
+        return self._modes
+
+    @property
+    def interaction_matrix(self) -> NDArray[np.float64]:
+        """Response of the frames to each mode, shape (n_masks * n_points, n_modes), 1 / radian."""
+        return self._matrix
+
+    @property
+    def n_inverted(self) -> int:
+        """Number of singular values above the conditioning."""
+        return self._n_inverted
 
     def __call__(self, frames: ArrayLike, *, history: bool = False) -> Reconstruction:
         """Reconstruct the phase of each frame set.
@@ -99,11 +130,16 @@ class Linear:
         ------
         TypeError, ValueError
             If the frames are of the wrong shape, complex, not finite, negative or dark.
+
+        Warns
+        -----
+        UserWarning
+            If, without a `calibration`, a frame is more than 10 times as bright, inside the pupil, as with the mask out: raw counts?
         """
-        config = self.settings
-        frames, batch = check_frames(config.sensor, _check.real_array("frames", frames))
+        config, history = self.settings, _check.flag("history", history)
+        frames, batch = check_frames(config.sensor, _check.real_array("frames", frames), light=self._light)
         coefficients = (self._signal(frames) - self._reference_signal) @ self._inverse.T
-        phase = coefficients @ self.modes + config.sensor.pupil.gather(self._reference)
+        phase = coefficients @ self._modes + config.sensor.pupil.gather(self._reference)
         phase = config.sensor.pupil.scatter(phase, fill=0).astype(frames.dtype)
         n_frames = len(frames)
         before = np.broadcast_to(self._reference.astype(frames.dtype), phase.shape)
@@ -114,8 +150,8 @@ class Linear:
     def _simulated(self, poke: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Signal of the reference phase, and push less pull of each mode, (n_modes, n_masks * n_points)."""
         pupil = self.settings.sensor.pupil
-        difference = np.empty((len(self.modes), self.settings.sensor.n_masks * pupil.n_points))
-        for row, mode in zip(difference, self.modes, strict=True):
+        difference = np.empty((len(self._modes), self.settings.sensor.n_masks * pupil.n_points))
+        for row, mode in zip(difference, self._modes, strict=True):
             push = pupil.scatter(np.stack([poke * mode, -poke * mode]), fill=0)
             np.subtract(*self._signal(self._model(self._reference + push)), out=row)
         return self._signal(self._model(self._reference))[0], difference
@@ -133,9 +169,9 @@ class Linear:
         for name, frames, n_frames in (("flat", flat, 1), ("pushed", pushed, None), ("pulled", pulled, None)):
             what = f"calibration {name}"
             checked, batch = check_frames(self.settings.sensor, _check.real_array(what, frames), what)
-            if len(checked) != (n_frames or len(self.modes)):
+            if len(checked) != (n_frames or len(self._modes)):
                 raise ValueError(
-                    f"calibration {name} has a batch of {batch}: expected {n_frames or len(self.modes)}"
+                    f"calibration {name} has a batch of {batch}: expected {n_frames or len(self._modes)}"
                 )
             signals.append(self._signal(checked.astype(np.float64)))
         return signals[0][0], signals[1] - signals[2]
@@ -161,4 +197,4 @@ def check_modes(sensor: ZernikeSensor, modes: ArrayLike) -> NDArray[np.float64]:
         raise ValueError(
             f"modes: {len(values)} of them, expected at most the {values.shape[1]} points of the pupil"
         )
-    return values
+    return read_only(values)

@@ -13,7 +13,17 @@ from zwfs import _check
 from zwfs._arrays import Kind
 from zwfs.lowrank import Operator, split_core
 from zwfs.reconstructors._acceleration import Acceleration, dimming
-from zwfs.reconstructors._common import Estimate, Reconstruction, count, iterate, settings, turn
+from zwfs.reconstructors._common import (
+    Estimate,
+    Reconstruction,
+    Settings,
+    count,
+    for_each,
+    iterate,
+    settings,
+    steady,
+    turn,
+)
 from zwfs.sensor import PupilMaps, ZernikeSensor, square
 
 _PARALLEL = 1e-6  # sine of the angle between two reference waves below which they count as parallel
@@ -28,6 +38,10 @@ class PhaseShifted:
     and imaginary part of its field; solving them gives the next estimate. No branch has to be chosen: the phase
     comes back over the whole circle. More than two masks are combined by least squares.
 
+    The frames do not depend on the piston of the wavefront. Before each iteration the estimate is turned by the
+    piston that brings its reference waves nearest to those before. The phase therefore converges on noisy frames,
+    too, with a piston near that of the start.
+
     In real time, take frames in float32, `tolerance=0` and `accelerate=True` with 2 or 3 iterations; or, in a
     control loop, one iteration that starts from the phase of the frames before. On a GPU, hand in many frames at
     once, as an array of PyTorch or CuPy: the phase comes back as one.
@@ -40,7 +54,7 @@ class PhaseShifted:
         Largest number of iterations.
     tolerance : float, radian
         An iteration that changes the phase by no more than this (rms over the pupil) is the last one. With 0 all
-        are done.
+        are done; without acceleration, noise may then add some piston in each of them.
     amplitude : array_like, shape (ny, nx), optional
         Measured amplitude A_in in the pupil; that of the sensor's pupil if left out.
     accelerate : bool
@@ -69,7 +83,7 @@ class PhaseShifted:
         amplitude: ArrayLike | None = None,
         accelerate: bool = False,
     ) -> None:
-        self.settings = settings(sensor, n_iterations, tolerance, amplitude)
+        self._settings = settings(sensor, n_iterations, tolerance, amplitude)
         if sensor.n_masks < 2:
             raise ValueError(f"sensor has {sensor.n_masks} mask: expected two or more with different phase shifts")
         self._pairs = tuple(combinations(range(sensor.n_masks), 2))
@@ -78,6 +92,11 @@ class PhaseShifted:
         self._shared = _SharedWave.of(sensor.factors.core)
         self._acceleration = self._accelerated() if accelerate else None
         self._constants: dict[Kind, _Constants] = {}
+
+    @property
+    def settings(self) -> Settings:
+        """Checked arguments that every reconstructor takes."""
+        return self._settings
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_constants": {}}  # made again where they are needed
@@ -104,6 +123,11 @@ class PhaseShifted:
         ------
         TypeError, ValueError
             If frames or start are of the wrong shape, complex, not finite, negative or dark.
+
+        Warns
+        -----
+        UserWarning
+            If a frame is more than 10 times as bright, inside the pupil, as with the mask out: raw counts?
         """
         return iterate(self, frames, start, history)
 
@@ -111,17 +135,18 @@ class PhaseShifted:
         """What the frames give to the linear system, and the reference waves of a flat start."""
         xp, constants = kind.xp, self._of(kind)
         acceleration = constants.acceleration
-        light = frames[(..., *self.settings.sensor.window)]
+        light, n_frames = frames[(..., *self.settings.sensor.window)], frames.shape[0]
         if self._shared is None:
             data = {"excess": light - constants.offset}
         else:
             mixed = constants.weights @ xp.reshape(light, (*light.shape[:2], -1))
-            data = {"signal": xp.reshape(mixed, (light.shape[0], *constants.offset.shape)) - constants.offset}
+            data = {"signal": xp.reshape(mixed, (n_frames, *constants.offset.shape)) - constants.offset}
         if not flat:
             return data
         if acceleration is None or not acceleration.lost > 0:
-            return data | {"waves": constants.flat_waves}
-        lost = constants.incoming - xp.reshape(light, (light.shape[0], -1)) @ constants.inside
+            start = {"waves": constants.flat_waves, "tried": constants.flat}
+            return data | {name: for_each(array, n_frames, xp) for name, array in start.items()}
+        lost = constants.incoming - xp.reshape(light, (n_frames, -1)) @ constants.inside
         lost = acceleration.missing(lost, xp)
         factor = dimming(lost, acceleration.lost, xp)
         waves = constants.flat_waves * factor[..., np.newaxis, np.newaxis, np.newaxis]
@@ -136,6 +161,8 @@ class PhaseShifted:
             coefficients = operator.split_project(constants.maps.field(phasor))
             if constants.acceleration is not None:
                 coefficients = constants.acceleration.extrapolate(coefficients, data, kind.xp)
+            elif self.settings.tolerance:
+                coefficients = steady(coefficients, data, kind.xp)
             waves = operator.split_expand(coefficients @ constants.core, in_window=True)
         if self._shared is None:
             solved, singular = self._solve(waves, data["excess"], kind)
@@ -162,7 +189,7 @@ class PhaseShifted:
                 sensor.operator(kind),
                 self.settings.maps(kind),
                 *(kind.array(array) for array in (core, weights, offset, flat, flat_waves, inside)),
-                float(sensor.n_masks * incoming.sum()),
+                sensor.n_masks * self.settings.light,
                 self._acceleration and self._acceleration.to(kind),
             )
         return self._constants[kind]

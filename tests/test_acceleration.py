@@ -123,7 +123,33 @@ def test_relaxation_is_bounded(shifted, left, relaxation):
     assert Acceleration.of(shifted, flat, left).relaxation == pytest.approx(relaxation)
 
 
-@pytest.mark.parametrize("flux", [0.01, 0.5, 2.0, 30.0])
+@pytest.mark.parametrize("photons", [100, 1000, 1e4])
+def test_no_noisy_frame_is_worse_for_the_acceleration(photons):
+    pupil = zwfs.Pupil.circular(24)
+    modes = zwfs.zernike_basis(pupil, 60)
+    sensor, rng = pair(pupil), np.random.default_rng(3)
+    phase = np.concatenate([zwfs.power_law_screens(modes, rms, 100, seed=rng) for rms in (0.1, 0.3, 0.5, 0.8)])
+    frames = rng.poisson(photons * sensor.measure(phase)) / photons
+    plain, faster = (PhaseShifted(sensor, n_iterations=50, accelerate=a)(frames) for a in (False, True))
+    assert plain.converged.mean() > 0.99
+    assert faster.converged.mean() > 0.99
+    assert faster.n_iterations.mean() < 0.8 * plain.n_iterations.mean()
+    ratio = reconstruction_error(pupil, faster.phase, phase) / reconstruction_error(pupil, plain.phase, phase)
+    assert ratio.max() < 1.1
+
+
+@pytest.mark.parametrize("diameter", [1.06, 2.0])
+def test_acceleration_reaches_the_fixed_point_of_noisy_frames(pupil, screens, diameter):
+    sensor, phase = pair(pupil, diameter), screens(0.5, 20)
+    frames = np.random.default_rng(3).poisson(1e3 * pair(pupil, 1.02 * diameter).measure(phase)) / 1e3
+    options = {"n_iterations": 300, "tolerance": 1e-9}
+    plain, faster = (PhaseShifted(sensor, accelerate=a, **options)(frames) for a in (False, True))
+    assert plain.converged.all()
+    assert faster.converged.all()
+    assert reconstruction_error(pupil, faster.phase, plain.phase).max() < 1e-7
+
+
+@pytest.mark.parametrize("flux", [0.01, 0.5, 2.0, 9.0])
 def test_a_wrong_flux_leaves_numbers(shifted, screens, pupil, flux):
     method = PhaseShifted(shifted, accelerate=True, tolerance=0)
     assert np.all(np.isfinite(method(flux * shifted.measure(screens(0.5))).phase[:, pupil.mask]))

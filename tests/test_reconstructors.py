@@ -1,8 +1,10 @@
 import inspect
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 
 import zwfs
 from zwfs import (
@@ -18,6 +20,7 @@ from zwfs import (
     reconstruction_error,
 )
 from zwfs._arrays import Kind
+from zwfs.reconstructors import gradient_descent
 from zwfs.sensor import split
 
 every = pytest.mark.parametrize("method", RECONSTRUCTORS)
@@ -138,6 +141,28 @@ def test_masks_of_different_size_work_together(pupil, screens):
     assert errors(PhaseShifted(sensor, n_iterations=60), sensor, screens(0.5)).max() < 1e-6
 
 
+@pytest.mark.parametrize("diameters", [(1.06, 1.06), (1.06, 1.0600001)])
+def test_reference_waves_are_parallel_below_a_sine_of_1e_6(pupil, screens, diameters):
+    # The phase of a reference wave is half that of its dimple, plus a constant: so is the angle between two.
+    def sensor(sine):
+        return ZernikeSensor(pupil, *(Dimple(d, 1 + 2 * k * sine) for k, d in enumerate(diameters)))
+
+    apart = sensor(1.5e-6)
+    found = PhaseShifted(apart, n_iterations=3, tolerance=0)(apart.measure(screens(0.1)))
+    assert np.all(found.n_unsolved == 0)
+    with pytest.raises(ValueError, match="determinant"):
+        PhaseShifted(sensor(0.7e-6))
+
+
+def test_masks_whose_shared_wave_cannot_be_scaled_are_solved_one_by_one(pupil, screens):
+    # 1 + s exp(2 pi i k / 3): |t - 1|^2 is the same for all, and the weighted sum of it that scales the wave is 0.
+    def opened(k, scale=0.3, mean=0.7):
+        return zwfs.Patch(1.06, lambda u, v: np.full(u.shape, mean + scale * np.exp(2j * np.pi * k / 3)))
+
+    sensor = ZernikeSensor(pupil, *(opened(k) for k in range(3)))
+    assert errors(PhaseShifted(sensor, n_iterations=60), sensor, screens(0.3)).max() < 1e-6
+
+
 @every
 def test_measured_amplitude_is_used(sensor_of, modes, method, screens, pupil):
     sensor = ZernikeSensor(pupil, *sensor_of(method).masks, extent=4)  # Gerchberg-Saxton needs the light beside
@@ -171,6 +196,17 @@ def test_the_arcsine_does_not_change_its_side_as_the_piston_drifts(classic, scre
     assert np.abs(drift).max() > 2
     errors = reconstruction_error(classic.pupil, found.history, phase[:, np.newaxis])
     assert np.all(errors[:, 3:].max(axis=1) < 1.3 * np.median(errors[:, 3:], axis=1))
+
+
+@pytest.mark.parametrize("mask", [Dimple(1.06, np.pi), Dimple(1.06, -np.pi), Dimple(1.06, 0, 0.5)])
+def test_arcsine_takes_a_start_in_line_with_its_wave_as_ahead_of_it(pupil, mask):
+    # The wave of these masks has the phase pi, so phases of 0 are in line with it, and those ahead are negative.
+    sensor = ZernikeSensor(pupil, mask)
+    peak = -0.4 * np.exp(-0.5 * (pupil.x**2 + pupil.y[:, np.newaxis] ** 2) / 0.05**2)
+    for start in (None, np.zeros(pupil.shape)):
+        found = Arcsine(sensor, n_iterations=1)(sensor.measure(peak), start).phase[pupil.mask]
+        assert np.all((found <= 1e-6) | (found > np.pi - 1e-6))
+        assert found.min() < -0.35
 
 
 def test_arcsine_is_mirrored_with_the_dimple(classic, pupil, screens):
@@ -243,9 +279,31 @@ def test_weak_waves_of_different_size_are_solved(pupil, screens, dtype):
 @every
 def test_what_a_reconstructor_was_made_from_cannot_change(make, method):
     reconstruct, sensor = make(method)
+    public = [name for name in dir(reconstruct) if not name.startswith("_")]
+    values = {name: getattr(reconstruct, name) for name in public if not callable(getattr(reconstruct, name))}
+    assert "settings" in values
+    for name, value in values.items():
+        with pytest.raises(AttributeError):
+            setattr(reconstruct, name, value)
+        if isinstance(value, np.ndarray):
+            assert not value.flags.writeable, name
+    with pytest.raises(AttributeError):
+        reconstruct.settings.tolerance = 0.5
     with pytest.raises(ValueError, match="read-only"):
         reconstruct.settings.amplitude[:] = 0.5
     assert not np.shares_memory(reconstruct.settings.amplitude, sensor.pupil.amplitude)
+
+
+@every
+def test_a_result_belongs_to_the_caller(make, method, screens):
+    reconstruct, sensor = make(method)
+    frames = sensor.measure(screens(0.3, 2))
+    expected, found = (reconstruct(frames, history=True) for _ in range(2))
+    for name in ("phase", "n_iterations", "converged", "n_unsolved", "history", "frames", "residual"):
+        getattr(found, name)[...] = 0
+    again = reconstruct(frames, history=True)
+    for name in ("phase", "n_iterations", "converged", "n_unsolved", "history", "frames", "residual"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(expected, name))
 
 
 def test_descent_that_starts_at_the_solution_has_converged(shifted, modes, screens):
@@ -253,6 +311,24 @@ def test_descent_that_starts_at_the_solution_has_converged(shifted, modes, scree
     found = GradientDescent(shifted, modes)(shifted.measure(phase), start=phase)
     assert found.converged
     np.testing.assert_allclose(found.residual, 0, atol=1e-12)
+
+
+def test_descent_keeps_the_points_that_are_accepted(shifted, modes, screens, monkeypatch):
+    """An optimiser may look elsewhere after the point that it accepts."""
+    frames = shifted.measure(screens(0.5, 1)[0])
+    expected = GradientDescent(shifted, modes)(frames, history=True)
+
+    def restless(value, x, *, callback, **options):
+        def follow(intermediate_result):
+            value(intermediate_result.x + 1.0)
+            callback(intermediate_result=intermediate_result)
+
+        return scipy.optimize.minimize(value, x, callback=follow, **options)
+
+    monkeypatch.setattr(gradient_descent, "minimize", restless)
+    found = GradientDescent(shifted, modes)(frames, history=True)
+    np.testing.assert_array_equal(found.history, expected.history)
+    np.testing.assert_array_equal(found.converged, expected.converged)
 
 
 def test_cost_is_checked(shifted, pupil):
@@ -525,6 +601,77 @@ def test_phase_lies_on_the_circle(make, method, screens):
     assert np.nanmax(np.abs(phase)) <= np.pi
 
 
+@fixed_point
+@pytest.mark.parametrize("flat", [True, False])
+def test_what_the_steps_keep_is_that_of_each_frame(make, method, screens, flat):
+    reconstruct, sensor = make(method)
+    frames, kind = sensor.measure(screens(0.3, 5)), Kind.numpy()
+    phasor = split(screens(0.0 if flat else 0.3, 5), reconstruct.settings.maps(kind).inside)
+    data = reconstruct.prepare(frames, phasor, flat, kind)
+    for _ in range(3):
+        assert {name: array.shape[0] for name, array in data.items()} == dict.fromkeys(data, 5)
+        reconstruct.step(phasor, data, kind)
+
+
+def mean_phasor(pupil, phase):
+    return np.mean(np.exp(1j * pupil.gather(phase)), axis=-1)
+
+
+NOISE = {
+    "100 photons": lambda frames, rng: rng.poisson(100 * frames) / 100,
+    "10000 photons": lambda frames, rng: rng.poisson(1e4 * frames) / 1e4,
+    "read noise": lambda frames, rng: np.maximum(frames + rng.normal(0, 0.1, frames.shape), 0),
+    "one frame brighter": lambda frames, rng: frames * np.array([1.2, 1.0])[: frames.shape[1], None, None],
+}
+
+
+@pytest.mark.parametrize("noise", NOISE)
+@pytest.mark.parametrize(
+    ("method", "options"), [(Arcsine, {}), (PhaseShifted, {}), (PhaseShifted, {"accelerate": True})]
+)
+def test_noisy_frames_converge(pupil, modes, sensor_of, method, options, noise):
+    # The dimple is 2 % larger than the model has it.
+    sensor = sensor_of(method)
+    real = ZernikeSensor(pupil, *(Dimple(1.02 * mask.diameter, mask.phase) for mask in sensor.masks))
+    phase = np.concatenate([zwfs.power_law_screens(modes, rms, 40, seed=1) for rms in (0.1, 0.5, 0.8)])
+    frames = NOISE[noise](real.measure(phase), np.random.default_rng(2))
+    found = method(sensor, n_iterations=50, **options)(frames)
+    # A single frame that is 20 % too bright has cosines beyond 1 at up to two thirds of the points.
+    assert found.converged.mean() > (0.95 if method is Arcsine else 0.99)
+    assert found.n_iterations.mean() < (10 if options else 16)
+    if method is PhaseShifted:  # the arcsine picks its branch anew
+        # What has converged is a fixed point but for a piston.
+        after = method(sensor, n_iterations=1, **options)(frames, found.phase).phase
+        change = reconstruction_error(pupil, after, found.phase)
+        assert np.all(change[found.converged] < 2e-6)
+        piston = np.angle(mean_phasor(pupil, after) * np.conj(mean_phasor(pupil, found.phase)))
+        assert np.median(np.abs(piston)) > 1e-5  # a piston that is added in each iteration unless it is held
+
+
+@pytest.mark.parametrize("options", [{}, {"accelerate": True}])
+def test_piston_of_the_estimate_stays_near_that_of_the_start(shifted, pupil, screens, options):
+    phase = screens(0.3)
+    frames = shifted.measure(phase) * np.array([1.2, 1.0])[:, np.newaxis, np.newaxis]
+    method = PhaseShifted(shifted, n_iterations=100, tolerance=1e-12, **options)
+    for start in (None, phase + 0.5, phase - 2.0):
+        piston = np.angle(mean_phasor(pupil, method(frames, start).phase))
+        expected = 0.0 if start is None else np.angle(mean_phasor(pupil, start))
+        assert np.abs(piston - expected).max() < 0.2
+
+
+@pytest.mark.parametrize("options", [{}, {"accelerate": True}])
+def test_any_piston_of_the_start_gives_the_same_phase(shifted, pupil, screens, options):
+    # Whatever the mean field of the start is: that of the first one here vanishes.
+    start = np.where(pupil.x < 0, 0.0, np.pi) + np.zeros((pupil.shape[0], 1)) + screens(0.02)
+    frames = NOISE["100 photons"](shifted.measure(screens(1.0)), np.random.default_rng(0))
+    method = PhaseShifted(shifted, n_iterations=8, tolerance=1e-12, **options)
+    assert np.abs(mean_phasor(pupil, start)).max() < 0.1
+    expected = method(frames, start).phase
+    for piston in (0.3, 1.7, 3.1, -2.0):
+        turned = np.angle(np.exp(1j * (method(frames, start + piston).phase - expected - piston)))
+        np.testing.assert_allclose(turned[:, pupil.mask], 0, atol=1e-8)
+
+
 @iterative
 def test_piston_of_the_start_is_kept(make, method, screens, pupil):
     reconstruct, sensor = make(method)
@@ -577,6 +724,65 @@ def test_masks_without_diversity_are_refused(pupil, phases):
 def test_a_useless_mask_among_three_is_accepted(pupil, screens):
     sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in (0.0, np.pi / 2, -np.pi / 2)))
     assert errors(PhaseShifted(sensor), sensor, screens(0.3)).max() < 1e-6
+
+
+@every
+@pytest.mark.parametrize("scale", [30.0, 4e3])
+def test_raw_counts_are_warned_of(make, method, screens, scale):
+    reconstruct, sensor = make(method)
+    counts = sensor.measure(screens(0.3))
+    counts[1] *= scale
+    mean = counts[1][:, sensor.pupil.mask].mean(axis=-1).max()
+    message = f"frames: the mean inside the pupil reaches {mean:.4g}: expected at most about 1, .*raw counts"
+    with pytest.warns(UserWarning, match=message) as caught:
+        reconstruct(counts)
+    assert caught[0].filename == __file__
+
+
+@every
+@pytest.mark.parametrize("extent", [1.0, 2.0])
+@pytest.mark.parametrize("dimple", [Dimple(1.06, np.pi / 2), Dimple(1.06, np.pi), Dimple(2.5, 1.0, 0.3)])
+def test_no_frame_of_a_mask_is_taken_for_raw_counts(pupil, modes, screens, method, extent, dimple):
+    sensor = ZernikeSensor(pupil, dimple, *[Dimple(1.06, -2.0)] * (method is not Arcsine), extent=extent)
+    reconstruct = build(method, sensor, modes, **({} if method is Linear else {"n_iterations": 1}))
+    phase = np.concatenate([screens(0.0, 1), screens(0.5), screens(3.0)])
+    rng = np.random.default_rng(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for photons in (np.inf, 1e4, 1.0):
+            frames = 1.5 * sensor.measure(phase)  # a brighter star than that of the calibration
+            if photons < np.inf:
+                frames = np.maximum(rng.poisson(frames * photons) + rng.normal(0, 3, frames.shape), 0) / photons
+            reconstruct(frames)
+        if method is not Linear:
+            bright = build(method, sensor, modes, n_iterations=1, amplitude=100 * pupil.amplitude)
+            bright(1e4 * sensor.measure(phase))
+
+
+def test_frames_may_come_in_the_unit_of_their_calibration(shifted, modes, screens):
+    calibration = [1e4 * shifted.measure(phase) for phase in (0 * modes[0], 0.01 * modes, -0.01 * modes)]
+    phase = screens(0.05)
+    frames = 1e4 * shifted.measure(phase)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = Linear(shifted, modes, calibration=calibration)(frames)
+    np.testing.assert_allclose(found.phase, Linear(shifted, modes)(frames / 1e4).phase, atol=1e-9)
+
+
+@every
+@pytest.mark.parametrize("history", [1, 0, None, "no"])
+def test_history_is_a_flag(make, method, screens, history):
+    reconstruct, sensor = make(method)
+    with pytest.raises(TypeError, match=f"history = {history!r}: expected True or False"):
+        reconstruct(sensor.measure(screens(0.1)), history=history)
+
+
+@iterative
+def test_any_change_is_within_a_huge_tolerance(make, method, screens):
+    reconstruct, sensor = make(method, tolerance=1e200)
+    found = reconstruct(sensor.measure(screens(0.3)))
+    assert found.converged.all()
+    assert np.all(found.n_iterations == 1)
 
 
 def test_number_of_masks_is_checked(classic, shifted):
@@ -638,7 +844,7 @@ def test_bad_start_is_named(make, method, screens, start, error, message):
 
 
 OPTIONS = [
-    ({"n_iterations": 0}, ValueError, "n_iterations = 0: expected at least 1"),
+    ({"n_iterations": 0}, ValueError, r"n_iterations = 0: expected an integer in \[1, "),
     ({"n_iterations": 2.5}, TypeError, r"n_iterations = 2\.5: expected an integer"),
     ({"n_iterations": True}, TypeError, "n_iterations = True: expected an integer"),
     ({"tolerance": -1e-6}, ValueError, r"tolerance = -1e-06: .*\[0, inf"),
@@ -649,7 +855,24 @@ OPTIONS = [
     ({"amplitude": np.zeros((40, 40))}, ValueError, "amplitude is 0 everywhere in the pupil"),
     ({"amplitude": np.full((40, 40), np.nan)}, ValueError, "amplitude holds"),
     ({"amplitude": np.ones((40, 40)) * 1j}, TypeError, "amplitude is complex"),
-    ({"poke": 0}, ValueError, r"poke = 0: .*\(0, inf"),
+    ({"poke": 0}, ValueError, r"poke = 0: .*\[1e-10, 3\.14"),
+    ({"poke": 1e308}, ValueError, r"poke = 1e\+308: .*\[1e-10, 3\.14"),
+    (
+        {"reference": np.full((40, 40), 1e100)},
+        ValueError,
+        "modes: .* none of them around the reference",
+    ),
+    ({"n_iterations": 10**400}, ValueError, r"n_iterations = 10+: expected an integer in \[1, 2147483647\]"),
+    (
+        {"amplitude": np.full((40, 40), 1e200)},
+        ValueError,
+        "amplitude: its squares add up to inf: expected",
+    ),
+    (
+        {"amplitude": np.full((40, 40), 1e-200)},
+        ValueError,
+        "amplitude: its squares add up to 0: expected",
+    ),
     ({"conditioning": 1.0}, ValueError, r"conditioning = 1\.0: .*\[0, 1\)"),
     ({"reference": np.zeros((3, 3))}, ValueError, r"reference has shape \(3, 3\): expected \(\.\.\., 40, 40\)"),
     ({"reference": np.zeros((2, 40, 40))}, ValueError, r"reference has shape \(2, 40, 40\): expected \(40, 40\)$"),

@@ -35,7 +35,7 @@ class Linear:
     modes : array_like, shape (n_modes, ny, nx)
         Modes that the phase is made of, such as those of `zernike_basis`.
     poke : float, radian
-        Coefficient by which each mode is pushed and pulled.
+        Coefficient by which each mode is pushed and pulled, from 1e-10 to pi.
     conditioning : float
         Smallest singular value that is inverted, relative to the largest one.
     reference : array_like, shape (ny, nx), radian, optional
@@ -75,7 +75,7 @@ class Linear:
     ) -> None:
         self._settings = settings(sensor, 1, 0.0, amplitude)
         self._modes = check_modes(sensor, modes)
-        poke = _check.number("poke", poke, 0, open_low=True)
+        poke = _check.number("poke", poke, 1e-10, np.pi)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
         self._reference = start_phase(sensor, reference, (), Kind.numpy(), "reference")
         # Recorded frames may come in any unit, which is then that of the interaction matrix.
@@ -86,7 +86,8 @@ class Linear:
         u, strength, vt = np.linalg.svd(self._matrix, full_matrices=False)
         # A frame of unit intensity is rounded at 1e-16, which the poke divides.
         if strength[0] <= 1e-14 * np.sqrt(len(u)) / poke:
-            raise ValueError("modes: the sensor sees none of them: expected modes other than piston")
+            around = "" if reference is None else " around the reference"
+            raise ValueError(f"modes: the sensor sees none of them{around}: expected modes other than piston")
         self._n_inverted = int(np.count_nonzero(strength > conditioning * strength[0]))
         kept = slice(0, self._n_inverted)
         self._inverse = (vt[kept].T / strength[kept]) @ u[:, kept].T
@@ -134,7 +135,7 @@ class Linear:
         Warns
         -----
         UserWarning
-            If, without a `calibration`, a frame is more than 10 times as bright, inside the pupil, as with the mask out: raw counts?
+            As for `PhaseShifted`, but with a `calibration`, whose unit is free.
         """
         config, history = self.settings, _check.flag("history", history)
         frames, batch = check_frames(config.sensor, _check.real_array("frames", frames), light=self._light)

@@ -532,7 +532,7 @@ def test_segment_screens_are_averaged_power_law_screens(perfect):
         ({"n_pixels": 10.5}, TypeError, r"n_pixels = 10\.5: expected an integer"),
         ({"n_rings": -1}, ValueError, "n_rings = -1"),
         ({"gap": 0.5}, ValueError, r"gap = 0\.5"),
-        ({"stop": 0}, ValueError, r"stop = 0: expected .*\(0, 1\]"),
+        ({"stop": 0}, ValueError, r"stop = 0: expected .*, 1\]"),
         ({"missing": (38,)}, ValueError, r"missing = \[38\]: .* from 1 to 37"),
         ({"missing": 21}, TypeError, r"missing = 21: expected segment numbers, such as \(21,\)"),
         ({"phase": np.nan}, ValueError, "phase = nan"),

@@ -133,16 +133,42 @@ def test_rms_ignores_piston_and_what_lies_outside():
     assert pupil.rms(np.where(pupil.mask, phase, np.nan)) == pytest.approx(1)
 
 
-def test_pupil_cannot_be_changed():
-    pupil = Pupil.circular(10)
-    with pytest.raises(ValueError, match="read-only"):
-        pupil.amplitude[0, 0] = 1
+@pytest.mark.parametrize("dtype", [bool, np.int16, np.float32, np.complex64])
+def test_gather_and_scatter_keep_the_dtype(dtype):
+    pupil = Pupil.circular(12, 0.3)
+    maps = np.arange(2 * 144).reshape(2, 12, 12).astype(dtype)
+    values = pupil.gather(maps.tolist() if dtype is bool else maps)
+    assert values.dtype == dtype
+    again = pupil.scatter(values, fill=0)
+    assert again.dtype == dtype
+    np.testing.assert_array_equal(again, np.where(pupil.mask, maps, 0))
+
+
+def test_points_on_the_edge_of_the_obscuration_are_inside():
+    pupil = Pupil.circular(25, 0.4)  # its radius is 5 pixels, a whole number, from the pixel in the middle
+    np.testing.assert_array_equal(pupil.mask[12, 12:19], [False] * 5 + [True] * 2)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e200])
+def test_the_unit_of_an_amplitude_does_not_matter(scale):
+    image = np.random.default_rng(0).uniform(0.5, 1, (9, 12))
+    expected = Pupil.from_amplitude(image).amplitude
+    np.testing.assert_allclose(Pupil.from_amplitude(scale * image).amplitude, expected, rtol=1e-14)
+
+
+def test_pupil_is_a_copy_of_its_arrays():
+    image, segments = np.ones((8, 8)), np.ones((8, 8), int)
+    pupils = Pupil(image, 8, segments, (3.5, 3.5)), Pupil.from_segments(segments), Pupil.from_amplitude(image)
+    image[0, 0] = segments[0, 0] = 0
+    for pupil in pupils:
+        assert pupil.n_points == 64
+        assert pupil.segments.all()
 
 
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: Pupil.circular(1), ValueError, "n_pixels = 1: expected at least 2"),
+        (lambda: Pupil.circular(1), ValueError, r"n_pixels = 1: expected an integer in \[2, "),
         (lambda: Pupil.circular(10.5), TypeError, r"n_pixels = 10\.5: expected an integer"),
         (lambda: Pupil.circular(10, 1.0), ValueError, r"central_obscuration = 1\.0: .*\[0, 1\)"),
         (lambda: Pupil.circular(10, spiders=[0.1]), TypeError, r"spiders\[0\] = 0\.1: expected a pair"),
@@ -151,7 +177,7 @@ def test_pupil_cannot_be_changed():
         (lambda: Pupil.hexagonal(50, n_rings=-1), ValueError, "n_rings = -1"),
         (lambda: Pupil.hexagonal(50, gap=1), ValueError, "gap = 1"),
         (lambda: Pupil.hexagonal(50, missing=[38]), ValueError, r"missing = \[38\]: .* from 1 to 37"),
-        (lambda: Pupil.hexagonal(50, stop=1.5), ValueError, r"stop = 1\.5: .*\(0, 1\]"),
+        (lambda: Pupil.hexagonal(50, stop=1.5), ValueError, r"stop = 1\.5: .*, 1\]"),
         (lambda: Pupil.hexagonal(50, n_rings=0, missing=[1]), ValueError, "pupil is empty"),
         (lambda: Pupil.from_amplitude(np.zeros((4, 4))), ValueError, "pupil is empty"),
         (lambda: Pupil.from_amplitude(np.zeros((0, 4))), ValueError, "image|empty"),
@@ -169,5 +195,61 @@ def test_pupil_cannot_be_changed():
     ],
 )
 def test_bad_input_is_named(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
+
+
+ONES, WHOLE = np.ones((4, 4)), np.ones((4, 4), int)
+MASKED = np.ma.masked_array(WHOLE, np.eye(4, dtype=bool))
+POINTS = np.ones(Pupil.circular(4).n_points)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: Pupil.circular(10**6), ValueError, "n_pixels = 1000000"),
+        (lambda: Pupil.circular(8, spiders=None), TypeError, "spiders = None: expected pairs"),
+        (lambda: Pupil.circular(8, spiders=np.array(1.0)), TypeError, "spiders = .*expected pairs"),
+        (lambda: Pupil.circular(8, spiders="ab"), TypeError, "spiders = 'ab': expected pairs"),
+        (lambda: Pupil.circular(8, spiders=[(90, 0.1)]), ValueError, r"spiders\[0\] angle = 90: .*degrees"),
+        (lambda: Pupil.circular(6, 0.99), ValueError, "central_obscuration"),
+        (lambda: Pupil.hexagonal(50, n_rings=26), ValueError, "n_rings = 26: .*n_pixels = 50"),
+        (lambda: Pupil.hexagonal(50, stop=1e-310), ValueError, "stop = 1e-310"),
+        (lambda: Pupil.hexagonal(50, n_rings=0, missing=[1]), ValueError, "missing"),
+        (lambda: Pupil.hexagonal(50, missing="12"), TypeError, "missing = '12'"),
+        (lambda: Pupil.from_amplitude(0 * ONES), ValueError, "image"),
+        (lambda: Pupil.from_amplitude(ONES, 0.5), ValueError, r"n_pixels = 0\.5"),
+        (lambda: Pupil.from_amplitude(ONES, 1e300), ValueError, r"n_pixels = 1e\+300"),
+        (lambda: Pupil.from_amplitude(ONES, center=(np.nan, 1)), ValueError, "center row = nan"),
+        (lambda: Pupil.from_amplitude(ONES, center=(1, 1e6)), ValueError, r"center = \(1, .*1000 D"),
+        (lambda: Pupil.from_amplitude(ONES, center=[[1, 2], [3]]), TypeError, "center"),
+        (lambda: Pupil.from_amplitude(ONES, center=3), TypeError, "center = 3: expected a pair"),
+        (lambda: Pupil.from_segments(MASKED), ValueError, "segments is a masked array, 4 values"),
+        (lambda: Pupil.from_segments([[1, 2], [3]]), TypeError, "segments is a list"),
+        (lambda: Pupil.from_segments(0 * WHOLE), ValueError, "segments"),
+        (lambda: Pupil.from_segments(np.full((4, 4), 2**63, np.uint64)), ValueError, "segments reaches"),
+        (lambda: Pupil(ONES, 4, WHOLE, np.nan), TypeError, "center = nan: expected a pair"),
+        (lambda: Pupil(ONES, 4, WHOLE, (0, np.inf)), ValueError, "center column = inf"),
+        (lambda: Pupil(ONES, np.nan, WHOLE, (1, 1)), ValueError, "n_pixels = nan"),
+        (lambda: Pupil(ONES * np.nan, 4, WHOLE, (1, 1)), ValueError, "amplitude holds 16 NaN"),
+        (lambda: Pupil(0 * ONES, 4, WHOLE, (1, 1)), ValueError, "amplitude"),
+        (lambda: Pupil(ONES, 4, WHOLE[:3], (1, 1)), ValueError, r"segments has shape \(3, 4\)"),
+        (lambda: Pupil(ONES, 4, 0 * WHOLE, (1, 1)), ValueError, "segments differs .* at 16 points"),
+        (lambda: Pupil(ONES, 4, ONES, (1, 1)), TypeError, "segments is 2-dimensional float64"),
+        (lambda: Pupil.circular(4).gather(np.ones((3, 4))), ValueError, r"maps has shape \(3, 4\)"),
+        (lambda: Pupil.circular(4).gather(None), TypeError, "maps has dtype object"),
+        (lambda: Pupil.circular(4).gather(MASKED), ValueError, "maps is a masked array"),
+        (lambda: Pupil.circular(4).scatter(POINTS[1:]), ValueError, "values has shape"),
+        (lambda: Pupil.circular(4).scatter("abc"), TypeError, "values has dtype"),
+        (lambda: Pupil.circular(4).scatter(POINTS, "x"), TypeError, "fill = 'x': expected a real number"),
+        (lambda: Pupil.circular(4).scatter(POINTS, 1j), TypeError, "fill = 1j: expected a real number"),
+        (lambda: Pupil.circular(4).scatter(POINTS.astype(int)), TypeError, "fill = nan: expected an integer"),
+        (lambda: Pupil.circular(4).scatter(POINTS.astype(np.uint8), 256), ValueError, "fill = 256"),
+        (lambda: Pupil.circular(4).scatter(POINTS.astype(np.float32), 1e300), ValueError, r"fill = 1e\+300"),
+        (lambda: Pupil.circular(4).rms(np.nan * ONES), ValueError, "phase holds .*inside the pupil"),
+        (lambda: Pupil.circular(4).rms(1e200 * ONES), ValueError, r"phase reaches a modulus of 1e\+200"),
+    ],
+)
+def test_hostile_input_is_named(make, error, message):
     with pytest.raises(error, match=message):
         make()

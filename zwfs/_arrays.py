@@ -50,7 +50,9 @@ class Kind(NamedTuple):
         return self.xp.asarray(values, dtype=self.dtype, device=self.device)
 
     def flags(self, values: NDArray[np.bool_]) -> Any:
-        """Truth values beside arrays of this kind."""
+        """Truth values for use with arrays of this kind; memory is shared with NumPy as by `array`."""
+        if self.xp is not np:
+            values = values.copy()
         return self.xp.asarray(values, dtype=self.xp.bool, device=self.device)
 
     def zeros(self, *shape: int) -> Any:
@@ -70,6 +72,14 @@ def any_array(value: Any) -> tuple[Any, Any]:
     if not array.dtype.isnative:  # as in FITS files
         array = array.astype(array.dtype.newbyteorder("="))
     return array, np
+
+
+def read_only(array: Any) -> Any:
+    """View of an array of NumPy that cannot be written to; anything else as it is."""
+    if isinstance(array, np.ndarray):
+        array = array.view()
+        array.flags.writeable = False
+    return array
 
 
 def product(real: Any, maps: Any, xp: Any) -> Any:

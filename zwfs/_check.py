@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -168,3 +168,38 @@ def non_negative(name: str, array: Any, hint: str = "") -> None:
     lowest = float(any_array(array)[1].min(array))
     if lowest < 0:
         raise ValueError(f"{name} reaches down to {lowest:.6g}: expected no negative values{hint}")
+
+
+def radian(name: str, value: Any) -> float:
+    """Return an angle as a float; more than a full turn is nearly surely in degrees."""
+    angle = number(name, value)
+    if abs(angle) > 6.3:  # 2 pi, rounded up
+        raise ValueError(f"{name} = {value!r}: expected radian, from -2 pi to 2 pi; is it in degrees?")
+    return angle
+
+
+def items(name: str, values: Any, expected: str) -> Iterable[Any]:
+    """Return `values`, which must be a list or something else to iterate over, but no string."""
+    if isinstance(values, str | bytes) or not isinstance(values, Iterable) or getattr(values, "ndim", 1) == 0:
+        raise TypeError(f"{name} = {values!r}: expected {expected}")
+    return values
+
+
+def any_numbers(name: str, value: Any) -> NDArray:
+    """Return `value` as an array of NumPy of bools, integers, real or complex numbers; the dtype is kept."""
+    array = _made(name, value, np.asarray)
+    if array.dtype.kind not in "biufc":
+        raise TypeError(f"{name} has dtype {array.dtype}: expected numbers")
+    return array
+
+
+def moderate(name: str, array: Any, where: str = "") -> None:
+    """Require numbers that are finite, and whose squares, which are intensities, add up to something finite."""
+    xp = any_array(array)[1]
+    flat = xp.reshape(array, (-1,))
+    with np.errstate(over="ignore", invalid="ignore"):
+        if xp.isfinite(xp.vecdot(flat, flat)):
+            return
+    finite(name, array, where)
+    largest = float(xp.max(xp.abs(array)))
+    raise ValueError(f"{name} reaches a modulus of {largest:.3g}{where}: expected values whose squares are finite")

@@ -47,3 +47,7 @@ def test_bad_input_is_named(pupil):
         focal_field(pupil, field, [[0.0]], [0.0])
     with pytest.raises(ValueError, match="v holds 1 NaN"):
         focal_field(pupil, field, [0.0], [np.nan])
+    with pytest.raises(ValueError, match=r"u reaches 20\.1 lambda/D: expected at most 20,"):
+        focal_field(pupil, field, [20.1], [0.0])
+    with pytest.raises(ValueError, match=r"field reaches a modulus of 1e\+308"):
+        focal_field(pupil, 1e308 * field, [0.0], [0.0])

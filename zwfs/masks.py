@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from zwfs import _check
 
+_MOST_SAMPLES = 2048  # a quarter of a minute for 100 pixels
+
 
 class Mask(Protocol):
     """What a sensor needs to know of a mask: its transmission is 1 outside a disc around the axis."""
@@ -31,14 +33,15 @@ class Dimple:
     ----------
     diameter : float, lambda/D
     phase : float, radian
-        Phase shift theta of the light that goes through the dimple.
+        Phase shift theta of the light that goes through the dimple, from -2 pi to 2 pi.
     amplitude : float
         Amplitude transmission of the dimple, in [0, 1].
 
     Raises
     ------
-    ValueError
-        If the diameter is not above 0 or the amplitude is outside [0, 1].
+    TypeError, ValueError
+        If the diameter is not above 0, the phase is more than a full turn, as a phase in degrees is, or the
+        amplitude is outside [0, 1].
 
     References
     ----------
@@ -52,13 +55,18 @@ class Dimple:
     n_samples: int = field(default=0, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        _check.number("diameter", self.diameter, 0, open_low=True)
-        _check.number("phase", self.phase)
-        _check.number("amplitude", self.amplitude, 0, 1)
+        values = {
+            "diameter": _check.number("diameter", self.diameter, 0, open_low=True),
+            "phase": _check.radian("phase", self.phase),
+            "amplitude": _check.number("amplitude", self.amplitude, 0, 1),
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
     def transmission(self, u: NDArray, v: NDArray) -> NDArray[np.complex128]:
         """Complex transmission, the same everywhere in the dimple."""
-        return np.full(np.shape(u), self.amplitude * np.exp(1j * self.phase))
+        u, _ = _coordinates(u, v)
+        return np.full(u.shape, self.amplitude * np.exp(1j * self.phase))
 
 
 @dataclass(frozen=True)
@@ -67,7 +75,9 @@ class Patch:
 
     The transmission is integrated by Gauss-Legendre nodes along the radius and equispaced ones around the axis.
     It should be smooth, except at circles, which are to be named in `breaks`; a function with structure finer than
-    that of the diffraction pattern of the pupil needs a larger `n_samples`.
+    that of the diffraction pattern of the pupil needs a larger `n_samples`. A sensor estimates the error of this
+    quadrature and warns where it exceeds the tolerance. The error falls only slowly with `n_samples` where the
+    transmission jumps across the angle, as at the edges of a square.
 
     Parameters
     ----------
@@ -79,13 +89,13 @@ class Patch:
     breaks : sequence of float, lambda/D
         Diameters of circles at which the transmission jumps.
     n_samples : int
-        Smallest number of nodes around the axis; half as many are taken along each radius. Raise it for a
-        transmission with fine structure or jumps across the angle.
+        Smallest number of nodes around the axis, at most 2048; half as many are taken along each radius. Raise it
+        for a transmission with fine structure or jumps across the angle.
 
     Raises
     ------
-    ValueError
-        If the diameter is not above 0, or a break is not inside the patch.
+    TypeError, ValueError
+        If the diameter is not above 0, the function cannot be called, or a break is not inside the patch.
 
     References
     ----------
@@ -101,19 +111,36 @@ class Patch:
         diameter = _check.number("diameter", self.diameter, 0, open_low=True)
         if not callable(self.function):
             raise TypeError(f"function = {self.function!r}: expected a callable of (u, v)")
-        breaks = tuple(
+        breaks = sorted(
             _check.number(f"breaks[{i}]", value, 0, diameter, open_low=True, open_high=True)
-            for i, value in enumerate(self.breaks)
+            for i, value in enumerate(_check.items("breaks", self.breaks, "diameters, such as (1.0,)"))
         )
-        _check.integer("n_samples", self.n_samples, 0)
-        object.__setattr__(self, "breaks", tuple(sorted(breaks)))
+        n_samples = _check.integer("n_samples", self.n_samples, 0, _MOST_SAMPLES)
+        for name, value in {"diameter": diameter, "breaks": tuple(breaks), "n_samples": n_samples}.items():
+            object.__setattr__(self, name, value)
 
     def transmission(self, u: NDArray, v: NDArray) -> NDArray[np.complex128]:
         """Complex transmission at (u, v), checked."""
-        values = _check.complex_array("transmission", self.function(u, v))
-        values = np.broadcast_to(values, np.shape(u)).astype(np.complex128)
+        u, v = _coordinates(u, v)
+        # Copies: a function that works in place must not move the nodes of a sensor.
+        values = _check.complex_array("transmission", self.function(u.copy(), v.copy()))
+        try:
+            values = np.broadcast_to(values, u.shape).astype(np.complex128)
+        except ValueError:
+            raise ValueError(f"transmission has shape {values.shape}: expected {u.shape}, as u and v") from None
         _check.finite("transmission", values)
         largest = np.abs(values).max(initial=0.0)
         if largest > 1 + 1e-12:
             raise ValueError(f"transmission reaches a modulus of {largest:.6g}: expected at most 1")
         return values
+
+
+def _coordinates(u: NDArray, v: NDArray) -> tuple[NDArray, NDArray]:
+    """Checked coordinates, of the shape that they have in common."""
+    u, v = _check.real_array("u", u), _check.real_array("v", v)
+    _check.finite("u", u)
+    _check.finite("v", v)
+    try:
+        return tuple(np.broadcast_arrays(u, v))
+    except ValueError:
+        raise ValueError(f"u and v have shapes {u.shape} and {v.shape}: expected ones that broadcast") from None

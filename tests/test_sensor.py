@@ -1,10 +1,15 @@
+import copy
+import inspect
+import pickle
+import re
 import warnings
 
 import numpy as np
 import pytest
 
 import zwfs
-from zwfs import Dimple, Patch, Pupil, ZernikeSensor, lowrank, zernike_basis
+from zwfs import Detector, Dimple, Patch, Pupil, ZernikeSensor, lowrank, zernike_basis
+from zwfs._arrays import Kind
 
 from .reference import exact_reference
 
@@ -106,6 +111,187 @@ def test_annular_patch_is_the_difference_of_two_dimples(pupil, complex_field):
         complex_field(pupil)
     )
     np.testing.assert_allclose(waves[0], waves[1] - waves[2], rtol=0, atol=1e-12)
+
+
+def test_patch_of_several_rings_is_a_sum_of_airy_kernels(complex_field):
+    pupil, margin = Pupil.circular(32), 8
+    edges, inside = (0.8, 1.5, 2.1, 3.0), (0.9j, 0.2, -0.7, np.exp(0.4j))
+    field = complex_field(pupil)
+
+    def rings(u, v):
+        return np.array(inside)[np.searchsorted(np.divide(edges[:3], 2), np.hypot(u, v))]
+
+    steps = -np.diff([*inside, 1])  # of the transmission, outwards
+    discs = (exact_reference(pupil, Dimple(d, 0.0, 0.0), field, margin) for d in edges)  # opaque: minus the kernel
+    exact = -sum(step * disc for step, disc in zip(steps, discs, strict=True))
+    sensor = ZernikeSensor(pupil, Patch(3.0, rings, breaks=edges[:3]), extent=1.5, tolerance=1e-14)
+    np.testing.assert_allclose(sensor.reference_wave(field)[0], exact, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("diameter", [0.5, 1.5, 5.0])
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
+def test_quadrature_is_exact_to_far_below_the_tolerance(diameter, tolerance):
+    pupil = Pupil.circular(12)
+    points = pupil.scatter(np.eye(pupil.n_points), fill=0)
+    function = {"function": lambda u, v: 0.7 * ramp(u, v)}
+    found, exact = (
+        ZernikeSensor(pupil, Patch(diameter, **function, n_samples=n), tolerance=tolerance)
+        .reference_wave(points)
+        .reshape(len(points), -1)
+        for n in (0, 128)
+    )
+    assert np.linalg.norm(found - exact, 2) < 1e-4 * tolerance * np.linalg.norm(exact, 2)
+
+
+SIDE = 1.0  # of the square, lambda/D
+
+
+def square(u, v):
+    return np.where(np.maximum(np.abs(u), np.abs(v)) < SIDE / 2, 1j, 1)
+
+
+@pytest.mark.parametrize("n_samples", [0, 100, 200])
+def test_error_of_a_square_patch_is_estimated(n_samples):
+    pupil = Pupil.circular(12)
+    points = pupil.scatter(np.eye(pupil.n_points), fill=0)
+    with pytest.warns(UserWarning, match=r"masks\[1\]: .* error of about .*`breaks`.*`n_samples`") as warned:
+        sensor = ZernikeSensor(
+            pupil, Dimple(1.06, 1.0), Patch(np.sqrt(2) * SIDE, square, n_samples=n_samples), extent=2
+        )
+    assert [one.filename for one in warned] == [__file__]
+    stated = float(re.search(r"error of about (\S+),", str(warned[0].message))[1])
+    y, x = (np.arange(-6, 18) - 5.5) / 12, pupil.x
+    along = SIDE / 12 * np.sinc(SIDE * (y[:, np.newaxis] - x))  # the kernel of a square is a product
+    exact = (1j - 1) * (along @ points @ along.T).reshape(len(points), -1)
+    found = sensor.reference_wave(points)[:, 1].reshape(len(points), -1)
+    error = np.linalg.norm(found - exact, 2) / np.linalg.norm(exact, 2)
+    assert stated / 4 < error < 4 * stated
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-10, 1e-14])
+def test_no_patch_that_is_exact_draws_a_warning(tolerance):
+    def rings(u, v):
+        return np.where(np.hypot(u, v) < 0.5, 1j, np.where(np.hypot(u, v) < 0.8, 0, np.exp(0.1j * u)))
+
+    masks = (
+        Patch(1.5, ramp), Patch(0.1, ramp), Patch(2, tilted), Patch(2.0, rings, breaks=[1.0, 1.6]),
+        Patch(1, lambda u, v: 1), Patch(1, lambda u, v: 1 - 1e-9 * u**2),
+    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for mask in masks:
+            ZernikeSensor(Pupil.circular(16), mask, extent=1.5, tolerance=tolerance)
+
+
+def test_masks_as_wide_as_the_sampling_carries(complex_field):
+    # Up to n_pixels lambda/D the sum over the pixels stands for the integral over the pupil.
+    pupil = Pupil.circular(8)
+    field = complex_field(pupil)
+    sensor = ZernikeSensor(pupil, Dimple(8, 1.0), tolerance=1e-14)
+    exact = exact_reference(pupil, Dimple(8, 1.0), field)
+    np.testing.assert_allclose(sensor.reference_wave(field)[0], exact, rtol=0, atol=1e-12)
+    with pytest.raises(
+        ValueError, match=r"masks\[1\] is 8\.1 lambda/D wide: expected at most 8, the number of pix"
+    ):
+        ZernikeSensor(pupil, Dimple(1, 1.0), Dimple(8.1, 1.0))
+
+
+@pytest.mark.parametrize("options", [{}, {"extent": 150.0}])
+def test_masks_that_would_take_for_ever_are_refused(options):
+    pupil = Pupil.circular(100)
+    with pytest.raises(ValueError, match=r"masks\[0\] is .* lambda/D wide.*extent"):
+        ZernikeSensor(pupil, Dimple(1.06 if options else 60.0, 1.0), **options)
+
+
+class Ring:
+    """Mask of a user: opaque between two circles."""
+
+    diameter, breaks, n_samples = 2.0, (1.0,), 0
+
+    def transmission(self, u, v):
+        return np.where(np.hypot(u, v) < 0.5, 1, 0)
+
+
+def test_any_mask_of_the_protocol(pupil, complex_field):
+    waves = ZernikeSensor(pupil, Ring(), Dimple(2.0, 0.0, 0.0), Dimple(1.0, 0.0, 0.0)).reference_wave(
+        complex_field(pupil)
+    )
+    np.testing.assert_allclose(waves[0], waves[1] - waves[2], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "error", "message"),
+    [
+        ({"breaks": 1.0}, TypeError, r"masks\[0\]\.breaks = 1\.0"),
+        ({"breaks": (3.0,)}, ValueError, r"masks\[0\]\.breaks = 3\.0"),
+        ({"diameter": np.nan}, ValueError, r"masks\[0\]\.diameter = nan"),
+        ({"n_samples": 1.5}, TypeError, r"masks\[0\]\.n_samples = 1\.5"),
+        ({"transmission": lambda u, v: np.nan * u}, ValueError, r"transmission of masks\[0\] holds"),
+        ({"transmission": lambda u, v: 1}, ValueError, r"transmission of masks\[0\] has shape \(\)"),
+    ],
+)
+def test_bad_masks_of_the_protocol_are_named(pupil, attributes, error, message):
+    mask = Ring()
+    vars(mask).update(attributes)
+    with pytest.raises(error, match=message):
+        ZernikeSensor(pupil, mask)
+
+
+def attributes(thing):
+    """Public attributes that are no methods."""
+    names = (name for name in dir(thing) if not name.startswith("_"))
+    values = ((name, getattr(thing, name)) for name in names)
+    return {name: value for name, value in values if not inspect.ismethod(value)}
+
+
+def assert_frozen(thing, path):
+    """No attribute can be assigned or deleted, no array written to, here and in what the attributes hold."""
+    if isinstance(thing, np.ndarray):
+        assert not thing.flags.writeable, path
+        with pytest.raises(ValueError, match="read-only"):
+            thing[...] = 0
+        return
+    if isinstance(thing, tuple):
+        for index, value in enumerate(thing):
+            assert_frozen(value, f"{path}[{index}]")
+    if not type(thing).__module__.startswith("zwfs"):
+        return
+    for name, value in attributes(thing).items():
+        with pytest.raises(AttributeError):
+            setattr(thing, name, value)
+        with pytest.raises(AttributeError):
+            delattr(thing, name)
+        assert_frozen(value, f"{path}.{name}")
+
+
+@pytest.mark.parametrize(
+    "again", [lambda thing: thing, lambda thing: pickle.loads(pickle.dumps(thing)), copy.deepcopy]
+)
+def test_no_public_object_can_be_changed(rough_pupil, again):
+    sensor = again(ZernikeSensor(rough_pupil, Dimple(1.06, np.pi / 2), Patch(2.0, ramp, breaks=[1.0]), extent=1.5))
+    detector = again(Detector(sensor.pupil, 1e6))
+    phase = rough_pupil.x * np.ones(rough_pupil.shape)
+    before = sensor.measure(phase), detector.expose(sensor.measure(phase), seed=1)
+    for thing in (sensor.pupil, sensor, *sensor.masks, sensor.factors, sensor.maps(Kind.numpy()), detector):
+        assert_frozen(thing, type(thing).__name__)
+    after = sensor.measure(phase), detector.expose(sensor.measure(phase), seed=1)
+    np.testing.assert_array_equal(after[0], before[0])
+    np.testing.assert_array_equal(after[1], before[1])
+
+
+def test_objects_that_hold_arrays_compare_by_identity(shifted, pupil):
+    other = ZernikeSensor(pupil, *shifted.masks)
+    kind = Kind.numpy()
+    pairs = (
+        (shifted.factors, other.factors),
+        (shifted.factors.pupil, other.factors.pupil),
+        (shifted.maps(kind), other.maps(kind)),
+        (shifted, other),
+    )
+    for mine, others in pairs:
+        assert mine == mine
+        assert mine != others
+        assert len({mine, others}) == 2
 
 
 def test_pieces_of_the_quadrature_add_up(pupil, complex_field, monkeypatch):
@@ -371,6 +557,18 @@ def test_phase_in_degrees_draws_a_warning(shifted, screens):
         (lambda s: s.propagate(np.full((40, 40), np.nan)), ValueError, "field holds"),
         (lambda s: s.adjoint(np.ones((1, 40, 40))), ValueError, r"field has shape \(1, 40, 40\): .* 2, 40"),
         (lambda s: s.adjoint(np.full((2, 40, 40), np.inf)), ValueError, "field holds 3200"),
+        (lambda s: s.measure(np.full((40, 40), 1e200)), ValueError, r"phase reaches a modulus of 1e\+200"),
+        (lambda s: s.measure(np.zeros((40, 40)), np.full((40, 40), 1e200)), ValueError, "amplitude reaches"),
+        (
+            lambda s: s.measure(np.zeros((40, 40), np.float32), np.full((40, 40), 1e30)),
+            ValueError,
+            "amplitude reaches a modulus of 1e",
+        ),
+        (lambda s: s.propagate(np.full((40, 40), 1e308)), ValueError, "field reaches a modulus"),
+        (lambda s: s.adjoint(np.full((2, 40, 40), 1e308)), ValueError, "field reaches a modulus"),
+        (lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), extent=1e6), ValueError, r"extent = 1e\+06"),
+        (lambda s: s.operator("float64"), TypeError, "kind is a str: expected a Kind"),
+        (lambda s: s.maps([]), TypeError, "kind is a list: expected a Kind"),
     ],
 )  # fmt: skip
 def test_bad_input_is_named(shifted, call, error, message):

@@ -16,6 +16,7 @@ shape (..., 2, ny, nx), real part first.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,15 +24,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zwfs._arrays import Kind, any_array, product
-from zwfs.masks import Mask
+from zwfs import _check
+from zwfs._arrays import Kind, any_array, product, read_only
+from zwfs._pickle import read_only_state
+from zwfs.masks import Dimple, Mask
 
 _NODES = 2048  # of a quadrature handled together: wide detectors and large masks have many
+_ROUNDING = 1e-13  # error of a reference wave, relative to the incoming one, that rounding may cause
+_ATTRIBUTES = ("diameter", "breaks", "n_samples", "transmission")  # of a mask
+_MOST_WORK = 5e9  # quadrature nodes times coefficients: about 15 seconds
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plane:
     """Real functions on a grid: products of functions of y and of x, and combinations of these.
+
+    Arrays of NumPy are kept as read-only views.
 
     Attributes
     ----------
@@ -43,6 +51,12 @@ class Plane:
     along_y: NDArray
     along_x: NDArray
     combine: NDArray
+
+    __setstate__ = read_only_state
+
+    def __post_init__(self) -> None:
+        for name in ("along_y", "along_x", "combine"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @property
     def xp(self) -> Any:
@@ -96,7 +110,7 @@ class Plane:
         return self.combine.T @ pairs @ other.combine
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Factors:
     """Low-rank factors of the operator from the pupil to the reference waves (`eq-low-rank`).
 
@@ -105,11 +119,17 @@ class Factors:
     pupil, detector : Plane
         Functions on the two planes, of rank r and q.
     core : ndarray of complex, shape (n_masks, q, r)
+        Kept as a read-only view.
     """
 
     pupil: Plane
     detector: Plane
     core: NDArray[np.complex128]
+
+    __setstate__ = read_only_state
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "core", read_only(self.core))
 
 
 class Operator:
@@ -201,23 +221,97 @@ def factorise(
     Returns
     -------
     Factors
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a mask lacks an attribute of `Mask`, or transmits something that is not finite. If it is wider in
+        lambda/D than there are pixels across D: the focal field of a sampled pupil repeats beyond. If it is so
+        wide on so wide a detector that the factors are not small.
+
+    Warns
+    -----
+    UserWarning
+        If the quadrature of a transmission that varies over the mask misses the tolerance.
     """
-    radius = max(mask.diameter for mask in masks) / 2
-    pupil_y, pupil_x = (_axis_functions(axis, radius, tolerance) for axis in pupil_axes)
-    detector_y, detector_x = (_axis_functions(axis, radius, tolerance) for axis in detector_axes)
     reach = math.hypot(*(np.ptp(np.concatenate(pair)) for pair in zip(pupil_axes, detector_axes, strict=True)))
-    core = []
-    for mask in masks:
-        u, v, weights = _quadrature(mask, reach, tolerance)
-        change = pixel_area * weights * (mask.transmission(u, v) - 1)
+    for index, mask in enumerate(masks):
+        _check_mask(index, mask, pixel_area**-0.5, (*pupil_axes, *detector_axes), reach)
+    radius = max(mask.diameter for mask in masks) / 2
+    from_pupil, to_detector = (
+        tuple((_axis_functions(axis, radius, tolerance), axis) for axis in axes)
+        for axes in (pupil_axes, detector_axes)
+    )
+
+    def core_of(index: int, refinement: float = 1.0) -> NDArray[np.complex128]:
+        u, v, weights = _quadrature(masks[index], reach, tolerance, refinement)
+        change = pixel_area * weights * (_transmission(index, masks[index], u, v) - 1)
         total = 0
         for some in (slice(first, first + _NODES) for first in range(0, u.size, _NODES)):
-            from_pupil = _spectra(pupil_y, pupil_axes[0], v[some], pupil_x, pupil_axes[1], u[some])
-            to_detector = _spectra(detector_y, detector_axes[0], v[some], detector_x, detector_axes[1], u[some])
-            total = total + to_detector.conj() * change[some] @ from_pupil.T
-        core.append(total)
-    left, core, right = _compress(np.array(core), tolerance)
-    return Factors(Plane(pupil_y, pupil_x, right), Plane(detector_y, detector_x, left), core)
+            spectra = _spectra(from_pupil, u[some], v[some])
+            total = total + _spectra(to_detector, u[some], v[some]).conj() * change[some] @ spectra.T
+        return total
+
+    core = np.array([core_of(index) for index in range(len(masks))])
+    varied = [index for index, mask in enumerate(masks) if not isinstance(mask, Dimple)]
+    if varied:  # the nodes are enough for a uniform mask
+        strongest = max(np.linalg.norm(one, 2) for one in core)
+        for index in varied:
+            error = np.linalg.norm(core_of(index, 1.5) - core[index], 2)
+            if error > max(tolerance * strongest, _ROUNDING):
+                _warn_of_quadrature(index, masks[index], error / strongest, tolerance)
+    left, core, right = _compress(core, tolerance)
+    pupil, detector = (
+        Plane(along_y, along_x, combine)
+        for ((along_y, _), (along_x, _)), combine in ((from_pupil, right), (to_detector, left))
+    )
+    return Factors(pupil, detector, core)
+
+
+def _check_mask(index: int, mask: Mask, n_pixels: float, axes: Sequence[NDArray], reach: float) -> None:
+    """Require the attributes of a mask, and a width for which the factors are right and small."""
+    if isinstance(mask, type) or not all(hasattr(mask, name) for name in _ATTRIBUTES):
+        raise TypeError(f"masks[{index}] is {mask!r}, a {type(mask).__name__}: expected a Dimple or a Patch")
+    name = f"masks[{index}]"
+    diameter = _check.number(f"{name}.diameter", mask.diameter, 0, open_low=True)
+    breaks = [
+        _check.number(f"{name}.breaks", value, 0, diameter, open_low=True, open_high=True)
+        for value in _check.items(f"{name}.breaks", mask.breaks, "diameters")
+    ]
+    n_samples = _check.integer(f"{name}.n_samples", mask.n_samples, 0)
+    if diameter > n_pixels * (1 + 1e-12):
+        raise ValueError(
+            f"{name} is {diameter:g} lambda/D wide: expected at most {n_pixels:g}, the number of pixels across D; "
+            "the focal field of a sampled pupil repeats beyond"
+        )
+    coefficients = math.prod(min(diameter * np.ptp(axis) + 8, axis.size) for axis in axes)
+    n_nodes = (len(breaks) + 1) * max(np.pi * diameter * reach + 20, n_samples) ** 2 / 2
+    if coefficients * n_nodes > _MOST_WORK:
+        raise ValueError(
+            f"{name} is {diameter:g} lambda/D wide, with {len(breaks)} breaks and n_samples = {n_samples}, on a "
+            f"detector that is {np.ptp(axes[-1]):.3g} D wide: expected a smaller mask or a smaller extent, for "
+            "which the factors are small"
+        )
+
+
+def _transmission(index: int, mask: Mask, u: NDArray, v: NDArray) -> NDArray[np.complex128]:
+    name = f"transmission of masks[{index}]"
+    values = _check.complex_array(name, mask.transmission(u, v))
+    if values.shape != u.shape:
+        raise ValueError(f"{name} has shape {values.shape}: expected {u.shape}, as u and v")
+    _check.finite(name, values)
+    return values
+
+
+def _warn_of_quadrature(index: int, mask: Mask, error: float, tolerance: float) -> None:
+    warnings.warn(
+        f"masks[{index}]: the reference wave has an error of about {error:.1g}, relative to the strongest "
+        f"response, which exceeds the tolerance of {tolerance:g}; the transmission varies too fast for the nodes "
+        "of its quadrature: name circles at which it jumps in `breaks`, or raise `n_samples` (now "
+        f"{mask.n_samples})",
+        UserWarning,
+        stacklevel=4,  # the caller of the sensor
+    )
 
 
 def _axis_functions(axis: NDArray, radius: float, tolerance: float) -> NDArray:
@@ -230,10 +324,13 @@ def _axis_functions(axis: NDArray, radius: float, tolerance: float) -> NDArray:
     return functions[: _rank(strength, max(tolerance, 1e-16))]
 
 
-def _quadrature(mask: Mask, reach: float, tolerance: float) -> tuple[NDArray, NDArray, NDArray]:
+def _quadrature(
+    mask: Mask, reach: float, tolerance: float, refinement: float = 1.0
+) -> tuple[NDArray, NDArray, NDArray]:
     """Nodes u, v and weights on the patch: Gauss-Legendre along the radius, equispaced around the axis."""
     edges = np.array([0.0, *mask.breaks, mask.diameter]) / 2
     n_angles = max(_bandwidth(2 * np.pi * edges[-1] * reach, tolerance), mask.n_samples + mask.n_samples % 2)
+    n_angles = 2 * round(n_angles * refinement / 2)
     unit, unit_weights = np.polynomial.legendre.leggauss(n_angles // 2)
     low, high = edges[:-1, np.newaxis], edges[1:, np.newaxis]
     radius = (low + (high - low) * (unit + 1) / 2).ravel()
@@ -247,13 +344,14 @@ def _bandwidth(argument: float, tolerance: float) -> int:
     """Even order from which on the Bessel functions J_n(`argument`) stay far below the tolerance."""
     target = math.log(max(1e-3 * tolerance, 1e-18))
     n = 8
-    while argument and n * math.log(argument / 2) - math.lgamma(n + 1) > target:
+    while argument > 1e-300 and n * math.log(argument / 2) - math.lgamma(n + 1) > target:
         n += 2
     return n
 
 
-def _spectra(along_y: NDArray, y: NDArray, v: NDArray, along_x: NDArray, x: NDArray, u: NDArray) -> NDArray:
+def _spectra(functions: tuple[tuple[NDArray, NDArray], ...], u: NDArray, v: NDArray) -> NDArray:
     """Fourier sums of all products of two axis functions at the nodes (u, v): (a * b, n_nodes)."""
+    (along_y, y), (along_x, x) = functions
     spectrum_y = along_y @ np.exp(-2j * np.pi * np.outer(y, v))
     spectrum_x = along_x @ np.exp(-2j * np.pi * np.outer(x, u))
     return (spectrum_y[:, np.newaxis] * spectrum_x).reshape(-1, u.size)

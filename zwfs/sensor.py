@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from math import prod, sqrt
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind
+from zwfs._arrays import Kind, read_only
 from zwfs.lowrank import Factors, Operator, factorise
 from zwfs.masks import Mask
 from zwfs.pupil import Pupil
 
 _DEGREES = 20.0  # radian rms; no phase map reaches it, the same map in degrees soon does
+_MOST_PIXELS = 2**14  # across the detector: a frame of them takes 2 GiB
 
 
 class ZernikeSensor:
@@ -27,31 +29,30 @@ class ZernikeSensor:
     One mask makes the classic sensor, two make the phase-shifted one. Detector pixels are as large as pupil
     pixels and stand at the same places, so the detector of an extent of 1 D is the grid of the pupil.
 
+    A sensor cannot be changed: its attributes are properties, and its arrays are read-only.
+
     Parameters
     ----------
     pupil : Pupil
     *masks : Dimple, Patch or any Mask
     extent : float, D
-        Width of the detector plane, at least 1 (rounded to whole pixels on each side). Light leaves the
-        geometric pupil; a wider detector catches more of it.
+        Width of the detector plane, at least 1 (rounded to whole pixels on each side) and at most 16384 pixels.
+        Light leaves the geometric pupil; a wider detector catches more of it.
     tolerance : float
         Error of the reference wave, relative to the strongest response of the masks (spectral norm). It decides
         the rank; the speed hardly depends on it. At 1e-14 the kernel is exact to rounding.
 
-    Attributes
-    ----------
-    pupil, masks, extent, tolerance
-        As given; `extent` in D after rounding.
-    detector_shape : (int, int)
-    window : (slice, slice)
-        Where the grid of the pupil lies in a frame.
-    rank : int
-        Number of coefficients that the reference waves are made of.
-
     Raises
     ------
     TypeError, ValueError
-        If there is no mask, or an argument is of the wrong kind or out of range.
+        If there is no mask, or an argument is of the wrong kind or out of range: a mask may be at most as many
+        lambda/D wide as there are pixels across D, and less on a wide detector.
+
+    Warns
+    -----
+    UserWarning
+        If the transmission of a `Patch` varies so fast that the error of its reference wave exceeds the tolerance;
+        the warning states an estimate of the error.
 
     References
     ----------
@@ -70,24 +71,17 @@ class ZernikeSensor:
         _check.instance("pupil", pupil, Pupil)
         if not masks:
             raise ValueError("masks is empty: expected at least one mask, such as Dimple(1.06, np.pi / 2)")
-        for index, mask in enumerate(masks):
-            if isinstance(mask, type) or not hasattr(mask, "transmission"):
-                raise TypeError(
-                    f"masks[{index}] is {mask!r}, a {type(mask).__name__}: expected a Dimple or a Patch"
-                )
-        extent = _check.number("extent", extent, 1)
-        self.tolerance = _check.number("tolerance", tolerance, 1e-16, 0.1)
-        self.pupil = pupil
-        self.masks = masks
-        self._margin = round((extent - 1) * pupil.n_pixels / 2)
-        self.extent = 1 + 2 * self._margin / pupil.n_pixels
-        self.detector_shape = tuple(n + 2 * self._margin for n in pupil.shape)
+        self._tolerance = _check.number("tolerance", tolerance, 1e-16, 0.1)
+        self._margin = _margin(extent, pupil)
+        self._pupil = pupil
+        self._masks = masks
         m = self._margin
-        self.window = tuple(slice(m, m + n) for n in pupil.shape)
+        self._detector_shape = tuple(n + 2 * m for n in pupil.shape)
+        self._window = tuple(slice(m, m + n) for n in pupil.shape)
         detector_axes = tuple(
             axis[0] + (np.arange(axis.size + 2 * m) - m) / pupil.n_pixels for axis in (pupil.y, pupil.x)
         )
-        self._factors = factorise(masks, (pupil.y, pupil.x), detector_axes, pupil.n_pixels**-2.0, self.tolerance)
+        self._factors = factorise(masks, (pupil.y, pupil.x), detector_axes, pupil.n_pixels**-2.0, self._tolerance)
         self._operators: dict[Kind, Operator] = {}
         self._maps: dict[Kind, PupilMaps] = {}
 
@@ -97,6 +91,36 @@ class ZernikeSensor:
     def __repr__(self) -> str:
         masks = ", ".join(map(repr, self.masks))
         return f"ZernikeSensor({self.pupil.n_points} points, {masks}, extent={self.extent:g}, rank={self.rank})"
+
+    @property
+    def pupil(self) -> Pupil:
+        """Pupil of the sensor."""
+        return self._pupil
+
+    @property
+    def masks(self) -> tuple[Mask, ...]:
+        """Masks, in the order of the frames."""
+        return self._masks
+
+    @property
+    def extent(self) -> float:
+        """Width of the detector plane in D, after rounding to whole pixels."""
+        return 1 + 2 * self._margin / self._pupil.n_pixels
+
+    @property
+    def tolerance(self) -> float:
+        """Error of the reference wave, relative to the strongest response of the masks."""
+        return self._tolerance
+
+    @property
+    def detector_shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        return self._detector_shape
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of a frame in which the grid of the pupil lies."""
+        return self._window
 
     @property
     def n_masks(self) -> int:
@@ -115,12 +139,14 @@ class ZernikeSensor:
 
     def operator(self, kind: Kind) -> Operator:
         """Low-rank operator for arrays of one kind, for those who write reconstructors; made once, then kept."""
+        _check.instance("kind", kind, Kind)
         if kind not in self._operators:
-            self._operators[kind] = Operator(self._factors, self.window, kind)
+            self._operators[kind] = Operator(self._factors, self._window, kind)
         return self._operators[kind]
 
     def maps(self, kind: Kind) -> PupilMaps:
         """Maps of the pupil for arrays of one kind; made once, then kept."""
+        _check.instance("kind", kind, Kind)
         if kind not in self._maps:
             self._maps[kind] = PupilMaps.of(self.pupil.mask, self.pupil.amplitude, kind)
         return self._maps[kind]
@@ -260,7 +286,7 @@ class ZernikeSensor:
             raise ValueError(f"{name} has shape {tuple(maps.shape)}: expected at least one map")
         kind = Kind.of(maps)
         clean = kind.xp.where(self.maps(kind).mask, maps, kind.array(0.0))
-        _check.finite(name, clean, " inside the pupil")
+        _check.moderate(name, clean, " inside the pupil")
         return kind.xp.reshape(clean, (-1, *self.pupil.shape)), batch
 
     def amplitude_maps(
@@ -274,7 +300,10 @@ class ZernikeSensor:
         xp = Kind.of(maps).xp
         if not xp.all(xp.any(maps > 0, axis=(-2, -1))):
             raise ValueError("amplitude is 0 everywhere in the pupil: expected some light")
-        return _check.in_kind("amplitude", maps, kind), batch
+        with np.errstate(over="ignore"):
+            maps = _check.in_kind("amplitude", maps, kind)
+        _check.moderate("amplitude", maps)
+        return maps, batch
 
     def intensity(self, phase: NDArray, amplitude: NDArray) -> NDArray:
         """Frames of phases (k, ny, nx) and amplitudes (1 or k, ny, nx): (k, n_masks, ny', nx')."""
@@ -308,7 +337,7 @@ class ZernikeSensor:
         batch = tuple(field.shape[: -len(shape)])
         if not prod(batch):
             raise ValueError(f"field has shape {tuple(field.shape)}: expected at least one field")
-        _check.finite("field", field)
+        _check.moderate("field", field)
         kind = Kind.of(field).real
         if kind.xp is np:
             field = np.ascontiguousarray(field)  # numbers side by side can be viewed as pairs of real ones
@@ -327,8 +356,21 @@ class ZernikeSensor:
         return xp.reshape(maps, (-1, *shape))
 
 
-class PupilMaps(NamedTuple):
-    """Maps of a pupil as arrays of one kind, shape (ny, nx)."""
+def _margin(extent: float, pupil: Pupil) -> int:
+    """Pixels of the detector beyond the grid of the pupil, on each side."""
+    extent = _check.number("extent", extent, 1)
+    width = max(pupil.shape) + (extent - 1) * pupil.n_pixels
+    if width > _MOST_PIXELS and extent > 1:
+        raise ValueError(
+            f"extent = {extent:g}: expected less, as it makes a detector of {width:.3g} pixels across; at most "
+            f"{_MOST_PIXELS} are possible"
+        )
+    return round((extent - 1) * pupil.n_pixels / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class PupilMaps:
+    """Maps of a pupil as arrays of one kind, shape (ny, nx); those of NumPy are read-only."""
 
     mask: NDArray[np.bool_]
     inside: NDArray[np.floating]  # 1 inside, 0 outside
@@ -340,15 +382,15 @@ class PupilMaps(NamedTuple):
     @classmethod
     def of(cls, mask: NDArray[np.bool_], amplitude: NDArray[np.float64], kind: Kind) -> PupilMaps:
         """Convert those of NumPy."""
-        inside = kind.array(mask)
+        inside = read_only(kind.array(mask))
         uniform = np.array_equal(amplitude, mask)
         return cls(
-            kind.flags(mask),
+            read_only(kind.flags(mask)),
             inside,
-            inside + 0j,
-            kind.array(np.where(mask, 0, np.nan)),
-            inside if uniform else kind.array(amplitude),
-            kind.xp.stack((inside, 0 * inside))[np.newaxis, ...],
+            read_only(inside + 0j),
+            read_only(kind.array(np.where(mask, 0, np.nan))),
+            inside if uniform else read_only(kind.array(amplitude)),
+            read_only(kind.xp.stack((inside, 0 * inside))[np.newaxis, ...]),
         )
 
     def field(self, phasor: NDArray) -> NDArray:

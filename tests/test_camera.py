@@ -7,6 +7,7 @@ import os
 import tracemalloc
 from pathlib import Path
 
+import nbformat
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -399,6 +400,22 @@ def test_output_that_would_lose_a_file_or_cannot_be_written(folder, name, messag
     with pytest.raises(ValueError, match=f"output = .*{message}|{message}"):
         camera.check_output(name)
     assert (folder / "notes.md").read_text() == "precious"
+
+
+@pytest.mark.parametrize("name", ["frame.fits", "sub/../frame.fits", "notes.md"])
+def test_notebook_refuses_such_an_output_before_any_work(folder, monkeypatch, name):
+    def work(*_, **__):
+        pytest.fail("a file was read before the output was checked")
+
+    notebook = Path(__file__).parents[1] / "notebooks" / "own_frames.ipynb"
+    sources = [cell.source for cell in nbformat.read(notebook, 4).cells if cell.cell_type == "code"]
+    defaults = next(index for index, source in enumerate(sources) if source.startswith("frame_files ="))
+    given = f"frame_files, pupil_files, output = ['frame.fits'], ['frame.fits'], {name!r}"
+    monkeypatch.setattr(camera, "read", work)
+    kept = {path: path.read_bytes() for path in folder.glob("*.*")}
+    with pytest.raises(ValueError, match="output = "):
+        exec("\n".join([sources[defaults], given, *sources[defaults + 1 :]]), {})
+    assert {path: path.read_bytes() for path in folder.glob("*.*")} == kept
 
 
 def test_bench_files_replace_only_those_of_a_bench(tmp_path):

@@ -60,7 +60,8 @@ class PhaseShifted:
     accelerate : bool
         Same fixed point in fewer iterations: without a start, the first two reference waves are dimmed to the
         light that the frames miss, and from then on the coefficients of the waves are extrapolated by the secant
-        method. The paper does neither.
+        method. The paper does neither. The dimming needs frames in the right unit: with a dimple of 2 lambda/D
+        and one frame that is 30 % too bright, a tenth of the frames that converge without acceleration fail.
 
     Raises
     ------

@@ -1,4 +1,5 @@
 import inspect
+import pickle
 import warnings
 from dataclasses import replace
 
@@ -284,8 +285,11 @@ def test_weak_waves_of_different_size_are_solved(pupil, screens, dtype):
 
 
 @every
-def test_what_a_reconstructor_was_made_from_cannot_change(make, method):
+@pytest.mark.parametrize("pickled", [False, True])
+def test_what_a_reconstructor_was_made_from_cannot_change(make, method, pickled):
     reconstruct, sensor = make(method)
+    if pickled:
+        reconstruct = pickle.loads(pickle.dumps(reconstruct))
     public = [name for name in dir(reconstruct) if not name.startswith("_")]
     values = {name: getattr(reconstruct, name) for name in public if not callable(getattr(reconstruct, name))}
     assert "settings" in values
@@ -878,9 +882,9 @@ OPTIONS = [
     ),
     ({"n_iterations": 10**400}, ValueError, r"n_iterations = 10+: expected an integer in \[1, 2147483647\]"),
     (
-        {"amplitude": np.full((40, 40), 1e200)},
+        {"amplitude": np.full((40, 40), 1e100)},
         ValueError,
-        "amplitude: its squares add up to inf: expected",
+        r"amplitude: its squares add up to .*e\+203: expected",
     ),
     (
         {"amplitude": np.full((40, 40), 1e-200)},

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind
+from zwfs._arrays import Kind, read_only
+from zwfs._pickle import read_only_state
 from zwfs.sensor import PupilMaps, ZernikeSensor, split, square
 
 # Detector pixels handled together: on the processor few enough for its fast memory, enough to vectorise.
@@ -96,6 +97,8 @@ class Settings:
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_maps": {}}  # cheap to make again, and no part of what was asked for
 
+    __setstate__ = read_only_state
+
     def maps(self, kind: Kind) -> PupilMaps:
         """Maps of the pupil, with the amplitude of the settings, for arrays of one kind; made once, then kept."""
         if kind not in self._maps:
@@ -128,17 +131,10 @@ def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLik
     if batch:
         raise ValueError(f"amplitude has shape {np.shape(amplitude)}: expected {sensor.pupil.shape}")
     own = read_only(maps[0].copy())
-    with np.errstate(over="ignore"):
-        light = float(np.sum(own * own))
+    light = float(np.sum(own * own))
     if not 1 / _RANGE < light < _RANGE:
         raise ValueError(f"amplitude: its squares add up to {light:.3g}: expected {1 / _RANGE:g} to {_RANGE:g}")
     return Settings(sensor, n_iterations, tolerance, own, light)
-
-
-def read_only(array: NDArray) -> NDArray:
-    """The array itself, locked: what was computed from it would not follow a change."""
-    array.setflags(write=False)
-    return array
 
 
 class FixedPoint(Protocol):

@@ -8,6 +8,7 @@ from scipy.optimize import OptimizeResult, minimize
 
 from zwfs import _check
 from zwfs._arrays import Kind
+from zwfs._pickle import read_only_state
 from zwfs.reconstructors._common import (
     Found,
     Reconstruction,
@@ -53,6 +54,8 @@ class GradientDescent:
     ) -> None:
         self._settings = settings(sensor, n_iterations, tolerance, amplitude)
         self._modes = None if modes is None else check_modes(sensor, modes)
+
+    __setstate__ = read_only_state
 
     @property
     def settings(self) -> Settings:

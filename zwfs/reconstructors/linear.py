@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind
+from zwfs._arrays import Kind, read_only
+from zwfs._pickle import read_only_state
 from zwfs.reconstructors._common import (
     Found,
     Reconstruction,
     Settings,
     check_frames,
-    read_only,
     report,
     settings,
     start_phase,
@@ -91,6 +91,8 @@ class Linear:
         self._n_inverted = int(np.count_nonzero(strength > conditioning * strength[0]))
         kept = slice(0, self._n_inverted)
         self._inverse = (vt[kept].T / strength[kept]) @ u[:, kept].T
+
+    __setstate__ = read_only_state
 
     @property
     def settings(self) -> Settings:

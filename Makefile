@@ -56,9 +56,10 @@ figures: $(READY) ## replace the committed notebooks by freshly run ones
 rerun: $(READY) ## run one notebook with other parameters: make rerun FIGURE=3 ARGS="-p rms_max=2.0"
 	@$(BIN)/python book/rerun.py "--line=$$RERUN"
 
-lint: $(READY) ## check style and formatting
+lint: $(READY) ## check style, formatting and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 
 bench: $(READY) ## time the reconstructors, beside other packages too, for the performance page
 	@mkdir -p _build
@@ -73,7 +74,7 @@ lock: $(BIN)/uv ## pin the newest allowed version of every dependency
 # Everything else in _build belongs to the user, above all the results of make rerun.
 clean: ## remove what these commands made, but not the results of make rerun
 	rm -rf $(addprefix _build/,home html html.json measured.json notebooks source building-* running-* rerunning-*)
-	rm -rf build $(VENV) *.egg-info .benchmarks .hypothesis .pytest_cache .ruff_cache
+	rm -rf build $(VENV) *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name _build -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 	@if [ -d _build ] && ! rmdir _build 2>/dev/null; then echo "kept: $$(echo _build/*)"; fi
 

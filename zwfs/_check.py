@@ -26,7 +26,7 @@ def integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
     if isinstance(value, bool | np.bool_) or not isinstance(value, Integral):
         whole = isinstance(value, float) and value.is_integer()
         raise TypeError(f"{name} = {value!r}: expected an integer{f', as in {int(value)}' if whole else ''}")
-    if not low <= value <= high:
+    if not low <= int(value) <= high:
         expected = f"at least {low}" if high == math.inf else f"an integer in [{low}, {high}]"
         raise ValueError(f"{name} = {value}: expected {expected}")
     return int(value)
@@ -51,12 +51,13 @@ def number(
     """Return `value` as a finite float between `low` and `high`; an open end excludes the bound."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
         raise TypeError(f"{name} = {value!r}: expected a real number")
-    too_low = value <= low if open_low else value < low
-    too_high = value >= high if open_high else value > high
-    if not math.isfinite(value) or too_low or too_high:
+    plain = float(value)
+    too_low = plain <= low if open_low else plain < low
+    too_high = plain >= high if open_high else plain > high
+    if not math.isfinite(plain) or too_low or too_high:
         left, right = "(" if open_low else "[", ")" if open_high else "]"
         raise ValueError(f"{name} = {value!r}: expected a finite number in {left}{low:g}, {high:g}{right}")
-    return float(value)
+    return plain
 
 
 def real_array(name: str, value: Any) -> NDArray:
@@ -64,7 +65,7 @@ def real_array(name: str, value: Any) -> NDArray:
     return real_any(name, _made(name, value, np.asarray))
 
 
-def real_any(name: str, value: Any) -> Any:
+def real_any(name: str, value: Any) -> NDArray:
     """Return `value` as a float32 or float64 array; those of a library of the array API stay there."""
     array, xp = _made(name, value, any_array)
     if array.dtype in (xp.float32, xp.float64):
@@ -81,7 +82,7 @@ def complex_array(name: str, value: Any) -> NDArray:
     return complex_any(name, _made(name, value, np.asarray))
 
 
-def complex_any(name: str, value: Any) -> Any:
+def complex_any(name: str, value: Any) -> NDArray:
     """Return `value` as a complex64 or complex128 array; those of a library of the array API stay there."""
     array, xp = _made(name, value, any_array)
     if array.dtype in (xp.complex64, xp.complex128):
@@ -92,7 +93,7 @@ def complex_any(name: str, value: Any) -> Any:
     return xp.astype(array, xp.result_type(array.dtype, xp.complex64))
 
 
-def in_kind(name: str, array: Any, kind: Kind) -> Any:
+def in_kind(name: str, array: Any, kind: Kind) -> NDArray:
     """Return real numbers as an array of the kind that goes with it."""
     return _made(name, array, kind.array)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -140,9 +141,9 @@ class Bench:
         return tuple(names[names.index("leakage") : names.index("photons")])
 
     @classmethod
-    def ideal(cls, **changes: float) -> Bench:
+    def ideal(cls, **changes: Any) -> Bench:
         """A bench without any error or noise, but for the `changes`."""
-        perfect = dict.fromkeys((*cls.errors(), "photons", "read_noise", "background"), 0)
+        perfect: dict[str, Any] = dict.fromkeys((*cls.errors(), "photons", "read_noise", "background"), 0)
         return cls(**{**perfect, **changes})
 
     @cached_property
@@ -243,9 +244,10 @@ class Bench:
     @property
     def _camera_shape(self) -> tuple[int, int]:
         margin = self._margin - round((self.extent - 1) * self.n_pixels / 2)
-        return tuple(n - 2 * margin for n in self._sensor.detector_shape)
+        ny, nx = self._sensor.detector_shape
+        return ny - 2 * margin, nx - 2 * margin
 
-    def _image(self, waves: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def _image(self, waves: NDArray[np.complexfloating]) -> NDArray[np.float64]:
         """Intensity on the camera of the two polarisations, (2, ny, nx) to (2, ny', nx')."""
         images = np.empty(waves.shape)
         for arm, sign in enumerate((1, -1)):
@@ -257,7 +259,9 @@ class Bench:
         inner = slice(margin, waves.shape[-1] - margin)
         return images[:, inner, inner]
 
-    def _relay(self, waves: NDArray[np.complex128], distance: float, shift: float) -> NDArray[np.complex128]:
+    def _relay(
+        self, waves: NDArray[np.complexfloating], distance: float, shift: float
+    ) -> NDArray[np.complexfloating]:
         """Fresnel propagation by a distance in units of D^2 / lambda, and a shift along both axes in D."""
         if not distance and not shift:
             return waves

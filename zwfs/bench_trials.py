@@ -29,7 +29,7 @@ class BenchCurves:
         Found less commanded, wrapped and without piston, for each reconstructor.
     """
 
-    rms: NDArray[np.float64]
+    rms: NDArray[np.floating]
     commanded: NDArray[np.float64]
     residuals: dict[str, NDArray[np.float64]]
 
@@ -97,13 +97,17 @@ def bench_reconstructors(
     """
     rng = np.random.default_rng(seed)
     pokes = _check.number("poke", poke, 0, open_low=True) * np.eye(bench.n_segments)
-    calibration = tuple(
+    flat, pushed, pulled = (
         model.normalise(bench.frames(command, rng))[..., :1, :, :] for command in (None, pokes, -pokes)
     )
-    steps = {"n_iterations": n_iterations}
+    steps: dict[str, Any] = {"n_iterations": n_iterations}
     return {
         "Linear": Linear(
-            model.classic, model.modes, poke=poke, conditioning=conditioning, calibration=calibration
+            model.classic,
+            model.modes,
+            poke=poke,
+            conditioning=conditioning,
+            calibration=(flat, pushed, pulled),
         ),
         "Arcsine": Arcsine(model.classic, **steps),
         "GerchbergSaxton": GerchbergSaxton(model.shifted, **steps),

@@ -136,7 +136,7 @@ def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     if content.getbuffer()[: len(_NPY)] == _NPY:
         with _broken(f"{name}: a broken NPY file"):
-            data, header = _read_npy(content, name, max_bytes), {}
+            data, header = _read_npy(content, name, max_bytes), dict[str, Any]()
     else:
         fits = _fits()
         with _broken(f"{name}: a broken FITS file"):
@@ -398,12 +398,12 @@ def write_bench(
     rng = np.random.default_rng(seed)
     counts = {"frame": bench.frames(pistons, rng), "pupils": bench.pupil_images(rng), "dark": bench.dark(rng)}
     gain = _FULL / max(pair.max() for pair in counts.values())
-    shape = np.hstack(counts["frame"]).shape
+    shape = np.concatenate(counts["frame"], axis=-1).shape
     places = rng.choice(shape[0] * shape[1], n_bad, replace=False)
     dead = np.zeros(shape, np.uint8)
     dead.flat[places[: n_bad // 2]] = 1
     for name, pair in counts.items():
-        image = np.clip(np.rint(np.hstack(pair) * gain), 0, 65535).astype(np.uint16)
+        image = np.clip(np.rint(np.concatenate(pair, axis=-1) * gain), 0, 65535).astype(np.uint16)
         image[dead > 0] = 0
         image.flat[places[n_bad // 2 :]] = 65535
         hdu = fits.PrimaryHDU(image)
@@ -438,8 +438,8 @@ def bench_error(bench: Bench, commanded: ArrayLike, recording: Recording, found:
     row, column = recording.corner
     canvas[row : row + recording.n_pixels, column : column + recording.n_pixels] = found.phase
     # The pupil stands in the middle of the left half of the image.
-    (ny, nx), height = bench.segments.shape, canvas.shape[0]
-    top = (height - ny) // 2
+    ny, nx = bench.segments.shape
+    top = (len(canvas) - ny) // 2
     pistons = segment_pistons(canvas[top : top + ny, top : top + nx], bench.segments, bench.numbers)
     return float(segment_residual(pistons, commanded).std())
 

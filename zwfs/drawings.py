@@ -271,7 +271,8 @@ def _bench_pictures(scene: _Scene, bench: Bench, phase: NDArray, frames: NDArray
     scene.scale(shown, (right - 0.55, upper - 0.77, 1.1, 0.06))
 
     scene.callout((8.0, 1.45), (right + size / 2, lower - size / 2))
-    clean = replace(bench, **dict.fromkeys((*bench.errors(), "photons", "read_noise", "background"), 0))
+    none: dict[str, Any] = dict.fromkeys((*bench.errors(), "photons", "read_noise", "background"), 0)
+    clean = replace(bench, **none)
     quilted = replace(clean, quilting=bench.quilting).frames()[0]
     scene.picture(right, lower, size, quilted, INTENSITY_MAP, 0, quilted.max())
     scene.label(right, lower + 0.73, "quilting in a flat frame")
@@ -415,7 +416,11 @@ def _turned(profile: _Profile, origin: _Point, angle: float) -> tuple[list[_Poin
     """Lower and upper edge of a beam along a direction (radian)."""
     along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     start = np.asarray(origin)
-    return tuple([tuple(start + s * along + sign * half * across) for s, half in profile] for sign in (-1, 1))
+
+    def edge(sign: int) -> list[_Point]:
+        return [(x, y) for x, y in (start + s * along + sign * half * across for s, half in profile)]
+
+    return edge(-1), edge(1)
 
 
 def _plane(
@@ -453,7 +458,7 @@ def _symbol(scene: _Scene, x: float, y: float, kind: str, color: str) -> None:
     """Sign of a polarisation: "left" or "right" circular; linear, "along" the drawing's plane or "across" it."""
     axes = scene.axes
     if kind == "along":
-        style = {"arrowstyle": "<|-|>", "mutation_scale": 8, "shrinkA": 0, "shrinkB": 0, "lw": 1.4}
+        style: dict[str, Any] = {"arrowstyle": "<|-|>", "mutation_scale": 8, "shrinkA": 0, "shrinkB": 0, "lw": 1.4}
         axes.add_patch(FancyArrowPatch((x, y - 0.15), (x, y + 0.15), color=color, **style))
         return
     if kind == "across":
@@ -471,7 +476,8 @@ def _symbol(scene: _Scene, x: float, y: float, kind: str, color: str) -> None:
 
 def _shift(mask: Mask, *, plus: bool = False) -> str:
     """Phase shift at the centre of a mask, with a + if asked for."""
-    angle = float(np.angle(mask.transmission(0.0, 0.0)))
+    axis = np.zeros(1)
+    angle = np.angle(mask.transmission(axis, axis)).item()
     text = _in_pi(angle)
     return f"$+${text}" if plus and angle > 0 else text
 
@@ -509,7 +515,14 @@ def _focus_marks(scene: _Scene, x: float, y: float, half: float, apart: float) -
         center = y + sign * apart
         scene.axes.plot([where, where], [center - half, center + half], color=look.color, lw=2.4, ls=(0, (1, 0.7)))
         scene.axes.plot([where, where], [center - sign * half, y - sign * 0.05], color=look.color, lw=0.9)
-    style = {"arrowstyle": "-|>", "mutation_scale": 7, "shrinkA": 0, "shrinkB": 0, "lw": 1, "zorder": 4}
+    style: dict[str, Any] = {
+        "arrowstyle": "-|>",
+        "mutation_scale": 7,
+        "shrinkA": 0,
+        "shrinkB": 0,
+        "lw": 1,
+        "zorder": 4,
+    }
     for start, end in ((planes[0] - 0.2, planes[0]), (planes[1] + 0.2, planes[1])):
         scene.axes.add_patch(FancyArrowPatch((start, y), (end, y), color="black", **style))
     scene.label(planes[1] + 0.24, y, "focus shift", ha="left", va="center")

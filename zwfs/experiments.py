@@ -33,7 +33,7 @@ class LinearityCurves:
         Strehl ratio of each screen: what is left of the light that makes the reference wave.
     """
 
-    rms: NDArray[np.float64]
+    rms: NDArray[np.floating]
     errors: dict[str, NDArray[np.float64]]
     converged: dict[str, NDArray[np.bool_]]
     wrapped: NDArray[np.float64]
@@ -56,7 +56,7 @@ class LinearityCurves:
         """Fraction of the screens with an error of at most `threshold` times the input, shape (n_rms,)."""
         return np.mean(self.errors[name] <= threshold * self.rms[:, np.newaxis], axis=1)
 
-    def columns(self) -> dict[str, NDArray[np.float64]]:
+    def columns(self) -> dict[str, NDArray[np.floating]]:
         """Input, and mean and standard deviation of every reconstructor, as columns for `zwfs.results.publish`."""
         columns = {"input (rad rms)": self.rms}
         for name in self.errors:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -48,7 +49,7 @@ LOOKS = {
 }
 
 # Curves that stand for no method have colours of their own, of Tol's muted palette, and markers of their own.
-OTHER_STYLES = tuple(
+OTHER_STYLES: tuple[dict[str, Any], ...] = tuple(
     {"color": color, "marker": marker, "linestyle": line}
     for color, marker, line in (
         ("#332288", "P", "-"),
@@ -58,7 +59,7 @@ OTHER_STYLES = tuple(
     )
 )
 
-_RC = {
+_RC: dict[Any, Any] = {
     "figure.dpi": 100,
     "savefig.dpi": 200,
     "savefig.bbox": None,
@@ -370,7 +371,7 @@ def _diameters(axes: Axes, end: float, claimed: float) -> None:
     """Axis of the diameter, with the one of the paper and that of the dark ring."""
     axes.axvline(claimed, color="#555555", lw=1.2, ls="--", zorder=0.5)
     axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
-    above = {"transform": axes.get_xaxis_transform(), "va": "bottom", "fontsize": 9}
+    above: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "va": "bottom", "fontsize": 9}
     axes.text(claimed, 1.005, f"paper: {claimed:g} ", ha="right", color="#555555", **above)
     axes.text(DARK_RING, 1.005, " dark ring", ha="left", color="#555555", **above)
     axes.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=(0, end))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -48,7 +49,7 @@ def measured_and_modelled(measured: NDArray, modelled: NDArray, phase: NDArray) 
     for key, title in (("m0", "measured"), ("f0", "modelled"), ("d0", "difference"), ("phase", "phase found")):
         panels[key].set_title(title, fontsize=10)
     found = show_phase(panels["phase"], phase, np.nanmax(np.abs(phase)))
-    bars = {"location": "bottom", "aspect": 25, "shrink": 0.85}
+    bars: dict[str, Any] = {"location": "bottom", "aspect": 25, "shrink": 0.85}
     figure.colorbar(image, ax=[panels[key] for key in ("m0", "f0", "m1", "f1")], label="intensity", **bars)
     figure.colorbar(difference, ax=[panels["d0"], panels["d1"]], label="intensity", extend="both", **bars)
     figure.colorbar(found, ax=panels["phase"], label="phase (rad)", **bars)

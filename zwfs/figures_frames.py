@@ -52,8 +52,9 @@ def phase_map(found: Found, wavelength: float) -> Figure:
         axes.plot(*np.argwhere(masked)[:, ::-1].T, "s", color=_MASKED, ms=2, label=f"{masked.sum()} masked points")
         figure.legend(loc="outside lower center", fontsize=9)
     bar = figure.colorbar(shown, ax=axes, label="phase (rad)")
+    scale = wavelength / (2 * np.pi)
     nm = bar.ax.secondary_yaxis(
-        -0.9, functions=(lambda rad: rad * wavelength / (2 * np.pi), lambda nm: nm * 2 * np.pi / wavelength)
+        -0.9, functions=(lambda rad: np.multiply(rad, scale), lambda nm: np.divide(nm, scale))
     )
     nm.set_ylabel("wavefront (nm)")
     return figure

@@ -137,12 +137,13 @@ class Measurement:
     @property
     def n_masked(self) -> int:
         """Points of the pupil that are masked."""
-        return self.pupil.n_points - np.count_nonzero(self.good)
+        return self.pupil.n_points - int(np.count_nonzero(self.good))
 
     @property
     def window(self) -> tuple[slice, slice]:
         """Where the grid of the pupil lies in a frame."""
-        return tuple(slice(self.margin, self.margin + n) for n in self.pupil.shape)
+        ny, nx = self.pupil.shape
+        return slice(self.margin, self.margin + ny), slice(self.margin, self.margin + nx)
 
     @cached_property
     def beside(self) -> NDArray[np.bool_]:
@@ -207,7 +208,7 @@ class Found:
         """
         beside, inside = self.measurement.beside, np.zeros(self.measured.shape, bool)
         inside[(..., *self.measurement.window)] = self.measurement.good
-        weight = inside / np.count_nonzero(inside) + beside / max(1, np.count_nonzero(beside))
+        weight = inside / np.count_nonzero(inside) + beside / max(1, int(np.count_nonzero(beside)))
         return (self.measured - self.modelled) * np.sqrt(weight / np.mean(self.contrast**2))
 
     @property
@@ -268,8 +269,8 @@ def _measure(recording: Recording, optics: Optics, margin: int) -> Measurement:
     pupil, counts = measured_pupil(images, stop, recording.diameter, center)
     intensity = frames / (counts[:, None, None] * recording.exposure)
     bad = frames_bad.copy()
-    inner = tuple(slice(margin, margin + n) for _ in range(2))
-    bad[(..., *inner)] |= images_bad.any(axis=0) & pupil.mask
+    inner = slice(margin, margin + n)
+    bad[..., inner, inner] |= images_bad.any(axis=0) & pupil.mask
     result = Measurement(
         intensity, pupil, bad, margin, recording.diameter, counts, levels, (1.0, light[0] / light[1])
     )
@@ -278,7 +279,7 @@ def _measure(recording: Recording, optics: Optics, margin: int) -> Measurement:
             f"{result.n_masked} of the {pupil.n_points} points of the pupil are bad or saturated: "
             f"expected at most {_MOST_BAD:.0%}"
         )
-    flux = intensity[(..., *inner)][:, result.good].mean(axis=1)
+    flux = intensity[..., inner, inner][:, result.good].mean(axis=1)
     if np.any(flux <= 0):
         raise ValueError(f"the frames hold {flux} of the light of the mask-out images: expected more than 0")
     if recording.balance and optics.opposite:
@@ -447,7 +448,8 @@ def fit(
     low, high, scale = np.array([_RANGES[name] for name in scalars] + [(-3, 3, 0.3)] * (2 * len(moved))).T
 
     def trial(values: NDArray) -> tuple[Recording, Optics]:
-        found = replace(optics, **dict(zip(scalars, map(float, values), strict=False)))
+        changes: dict[str, Any] = dict(zip(scalars, map(float, values), strict=False))
+        found = replace(optics, **changes)
         origins = recording.origins.copy()
         origins[moved] += values[len(scalars) :].reshape(-1, 2)
         return replace(recording, origins=origins), found
@@ -488,15 +490,15 @@ def _backgrounds(recording: Recording) -> NDArray[np.float64]:
     """Counts beside the pupils of the mask-out images, for frames and mask-out images, (4,); 0 where cut."""
     levels = []
     for index, image in enumerate(recording.pupil_images):
-        circles = recording.pupils if recording.pupil_images[0] is recording.pupil_images[1] else None
-        circles = circles or recording.pupils[index : index + 1]
+        shared = recording.pupil_images[0] is recording.pupil_images[1]
+        circles = recording.pupils if shared else recording.pupils[index : index + 1]
         far = ~image.bad
         for circle in circles:
             far &= radius(far.shape, (circle.row, circle.column)) > 0.58 * circle.diameter
         enough = np.count_nonzero(far) >= 100 and not image.cut
         levels.append(float(np.median(image.counts[far])) if enough else 0.0)
-    levels = np.array(levels)
-    return np.concatenate([levels * recording.exposure, levels])
+    dark = np.array(levels)
+    return np.concatenate([dark * recording.exposure, dark])
 
 
 def _mix(frames: NDArray, measurement: Measurement, optics: Optics) -> NDArray[np.float64]:
@@ -569,7 +571,7 @@ def steps(
     """
     _check_fit("fitted", fitted, optics)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
-    switches = {"subpixel": False, "background": False, "balance": False}
+    switches: dict[str, Any] = {"subpixel": False, "background": False, "balance": False}
     work = []
 
     def add(name: str, recording: Recording, model: Optics) -> None:

@@ -47,7 +47,7 @@ def fourier_waves(pupil: Pupil, mask: Mask, field: NDArray, padding: int = 8) ->
     outgoing, incoming, reference : ndarray of complex, shape (n, n)
         On a square of `padding` pupil diameters.
     """
-    n = _check.integer("padding", padding, 2) * pupil.n_pixels
+    n = round(_check.integer("padding", padding, 2) * pupil.n_pixels)
     incoming = np.zeros((n, n), complex)
     incoming[: pupil.shape[0], : pupil.shape[1]] = np.where(pupil.mask, field, 0)
     u = np.fft.fftfreq(n, 1 / pupil.n_pixels)

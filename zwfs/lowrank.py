@@ -246,7 +246,7 @@ def factorise(
     def core_of(index: int, refinement: float = 1.0) -> NDArray[np.complex128]:
         u, v, weights = _quadrature(masks[index], reach, tolerance, refinement)
         change = pixel_area * weights * (_transmission(index, masks[index], u, v) - 1)
-        total = 0
+        total: Any = 0
         for some in (slice(first, first + _NODES) for first in range(0, u.size, _NODES)):
             spectra = _spectra(from_pupil, u[some], v[some])
             total = total + _spectra(to_detector, u[some], v[some]).conj() * change[some] @ spectra.T
@@ -255,9 +255,9 @@ def factorise(
     core = np.array([core_of(index) for index in range(len(masks))])
     varied = [index for index, mask in enumerate(masks) if not isinstance(mask, Dimple)]
     if varied:  # the nodes are enough for a uniform mask
-        strongest = max(np.linalg.norm(one, 2) for one in core)
+        strongest = max(float(np.linalg.norm(one, 2)) for one in core)
         for index in varied:
-            error = np.linalg.norm(core_of(index, 1.5) - core[index], 2)
+            error = float(np.linalg.norm(core_of(index, 1.5) - core[index], 2))
             if error > max(tolerance * strongest, _ROUNDING):
                 _warn_of_quadrature(index, masks[index], error / strongest, tolerance)
     left, core, right = _compress(core, tolerance)
@@ -369,4 +369,4 @@ def _compress(core: NDArray[np.complex128], tolerance: float) -> tuple[NDArray, 
 
 def _rank(strength: NDArray, tolerance: float) -> int:
     """Number of singular values above the tolerance; 1 at least, for masks that change nothing."""
-    return max(1, np.count_nonzero(strength > tolerance * strength[0]))
+    return max(1, int(np.count_nonzero(strength > tolerance * strength[0])))

@@ -17,9 +17,17 @@ _MOST_SAMPLES = 2048  # a quarter of a minute for 100 pixels
 class Mask(Protocol):
     """What a sensor needs to know of a mask: its transmission is 1 outside a disc around the axis."""
 
-    diameter: float
-    breaks: tuple[float, ...]
-    n_samples: int
+    @property
+    def diameter(self) -> float:
+        """Diameter of the disc, lambda/D."""
+
+    @property
+    def breaks(self) -> Sequence[float]:
+        """Diameters of circles at which the transmission jumps, lambda/D, in order."""
+
+    @property
+    def n_samples(self) -> int:
+        """Smallest number of nodes around the axis."""
 
     def transmission(self, u: NDArray, v: NDArray) -> NDArray[np.complex128]:
         """Complex transmission at the focal coordinates u (horizontal) and v (vertical), in lambda/D."""
@@ -141,6 +149,7 @@ def _coordinates(u: NDArray, v: NDArray) -> tuple[NDArray, NDArray]:
     _check.finite("u", u)
     _check.finite("v", v)
     try:
-        return tuple(np.broadcast_arrays(u, v))
+        u, v = np.broadcast_arrays(u, v)
     except ValueError:
         raise ValueError(f"u and v have shapes {u.shape} and {v.shape}: expected ones that broadcast") from None
+    return u, v

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -248,12 +249,12 @@ class Pupil:
         return self.indices.size
 
     @cached_property
-    def x(self) -> NDArray[np.float64]:
+    def x(self) -> NDArray[np.floating]:
         """Horizontal coordinate of each column, in D, shape (nx,)."""
         return read_only((np.arange(self.shape[1]) - self.center[1]) / self.n_pixels)
 
     @cached_property
-    def y(self) -> NDArray[np.float64]:
+    def y(self) -> NDArray[np.floating]:
         """Vertical coordinate of each row, in D, shape (ny,)."""
         return read_only((np.arange(self.shape[0]) - self.center[0]) / self.n_pixels)
 
@@ -370,7 +371,7 @@ def _fill(fill: Any, dtype: np.dtype) -> Any:
             stored = np.array(fill, dtype)
     except OverflowError:
         raise ValueError(expected) from None
-    if np.isinf(stored) and not np.isinf(fill):
+    if np.isinf(stored) and not cmath.isinf(fill):
         raise ValueError(expected)
     return stored
 
@@ -397,8 +398,8 @@ def _hexagon_centers(n_rings: int) -> NDArray:
     for ring in range(1, n_rings + 1):
         for corner, following in pairwise(corners):
             centers += [ring * corner + step * (following - corner) for step in range(ring)]
-    centers = np.array(centers)
-    return np.stack([centers.real, centers.imag], axis=-1)
+    plane = np.array(centers)
+    return np.stack([plane.real, plane.imag], axis=-1)
 
 
 def _inside_hexagon(x: NDArray, y: NDArray, apothem: float) -> NDArray:

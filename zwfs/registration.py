@@ -6,13 +6,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 from zwfs import _check
+
+_Item = TypeVar("_Item")
 
 _REACH = 6  # pixels by which an image may be off its neighbour before sub-pixel registration
 _SMALLEST = 8  # pixels across a pupil: with fewer there is no outline
@@ -462,16 +464,16 @@ def _not_cut(circle: Circle, image: Image) -> None:
         )
 
 
-def _pair(images: Sequence[Image]) -> tuple[Image, Image]:
-    """Two images: the same twice if there is only one."""
-    return tuple(images) * (3 - len(images))
+def _pair(some: Sequence[_Item]) -> tuple[_Item, _Item]:
+    """Two of them: the same twice if there is only one."""
+    return some[0], some[-1]
 
 
 def _locate(
     argument: str, images: Sequence[Image], places: NDArray | None, diameter: float | None
 ) -> tuple[tuple[Image, Image], tuple[Circle, Circle]]:
     """Two images and the pupil on each."""
-    if places is None or argument == "frames":
+    if places is None or diameter is None or argument == "frames":
         if len(images) == 1:
             circles = find_pupils(images[0], 2, diameter)
         else:
@@ -482,8 +484,8 @@ def _locate(
             _not_cut(circle, image)
     images = _pair(images)
     if images[0] is images[1]:
-        return _pair([_extend(images[0], circles)]), circles
-    return tuple(_extend(image, [circle]) for image, circle in zip(images, circles, strict=True)), circles
+        return _pair([_extend(images[0], circles)]), _pair(circles)
+    return _pair([_extend(image, [circle]) for image, circle in zip(images, circles, strict=True)]), _pair(circles)
 
 
 def _extend(image: Image, circles: Sequence[Circle]) -> Image:
@@ -499,9 +501,9 @@ def _register(recording: Recording, frames_too: bool) -> Recording:
     """Shift the second mask-out image to the first, and each frame to, or with, its mask-out image."""
     images, _ = resample(recording, recording.pupil_images, recording.origins[2:], 0)
     first = recording.pupils[0]
-    center = np.array([first.row, first.column]) - recording.corner
+    row, column = np.array([first.row, first.column]) - recording.corner
     # Off the edge, which the mask makes bright or dark.
-    inside = radius(images.shape[1:], center) <= 0.45 * recording.diameter
+    inside = radius(images.shape[1:], (row, column)) <= 0.45 * recording.diameter
     shifts = np.zeros((4, 2))
     shifts[[1, 3]] = register(images[1], images[0], inside)
     if frames_too:

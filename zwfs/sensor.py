@@ -76,8 +76,9 @@ class ZernikeSensor:
         self._pupil = pupil
         self._masks = masks
         m = self._margin
-        self._detector_shape = tuple(n + 2 * m for n in pupil.shape)
-        self._window = tuple(slice(m, m + n) for n in pupil.shape)
+        ny, nx = pupil.shape
+        self._detector_shape = ny + 2 * m, nx + 2 * m
+        self._window = slice(m, m + ny), slice(m, m + nx)
         detector_axes = tuple(
             axis[0] + (np.arange(axis.size + 2 * m) - m) / pupil.n_pixels for axis in (pupil.y, pupil.x)
         )

@@ -24,7 +24,7 @@ from contextvars import ContextVar
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import CodeType, ModuleType, SimpleNamespace
 from typing import Any
 from uuid import uuid4
 
@@ -168,7 +168,8 @@ class _Store:
 
     def load(self, value: Any) -> list[Any] | None:
         """The result for a value, in a list; None if it is missing or its file damaged."""
-        if self._folder is None or not (path := self._path(value)).exists():
+        path = self._path(value)
+        if path is None or not path.exists():
             return None
         content = path.read_bytes()
         check, content = content[:32], content[32:]
@@ -176,12 +177,12 @@ class _Store:
 
     def save(self, value: Any, result: list[Any]) -> None:
         """Keep the result for a value."""
-        if self._folder is not None:
+        if path := self._path(value):
             content = pickle.dumps(result)
-            write_file(self._path(value), hashlib.sha256(content).digest() + content)
+            write_file(path, hashlib.sha256(content).digest() + content)
 
-    def _path(self, value: Any) -> Path:
-        return self._folder / f"{_digest(value)}.pickle"
+    def _path(self, value: Any) -> Path | None:
+        return self._folder and self._folder / f"{_digest(value)}.pickle"
 
 
 def _digest(value: Any) -> str:
@@ -192,21 +193,19 @@ def _digest(value: Any) -> str:
     files = {str(file) for file in Path(__file__).parent.rglob("*.py")}
 
     class Digest(Pickler):
-        def write(self, data: bytes) -> None:
-            total.update(data)
-
         def reducer_override(self, part: Any) -> Any:
             if isinstance(part, CodeType):
                 # Without the name of the file and the lines, which differ from one kernel to the next.
                 return tuple, ([part.co_code, part.co_consts, part.co_names, part.co_varnames, part.co_freevars],)
             # What is pickled by its name stands for a file, which may change.
-            module = part if isinstance(part, ModuleType) else sys.modules.get(getattr(part, "__module__", None))
-            files.add(getattr(module, "__file__", None))
+            module = (
+                part if isinstance(part, ModuleType) else sys.modules.get(getattr(part, "__module__", None) or "")
+            )
+            if file := getattr(module, "__file__", None):
+                files.add(file)
             return super().reducer_override(part)
 
-    digest = Digest.__new__(Digest)
-    digest.__init__(digest)
-    digest.dump(value)
-    for file in sorted(files - {None}):
+    Digest(SimpleNamespace(write=total.update)).dump(value)
+    for file in sorted(files):
         total.update(hashlib.sha256(Path(file).read_bytes()).digest())
     return total.hexdigest()[:32]

@@ -140,7 +140,7 @@ def diameter_curve(make: Callable[[float], Any], diameters: ArrayLike, screens: 
     return DiameterCurve(diameters, np.array(rows))
 
 
-def _diameter_point(diameter: float, make: Callable[[float], Any], screens: NDArray) -> NDArray[np.float64]:
+def _diameter_point(diameter: float, make: Callable[[float], Any], screens: NDArray) -> NDArray[np.floating]:
     """One diameter of the curve: error on each screen, (n_screens,)."""
     reconstructor = make(diameter)
     sensor = reconstructor.settings.sensor

@@ -10,4 +10,12 @@ from zwfs.reconstructors.phase_shifted import PhaseShifted
 RECONSTRUCTORS = (Linear, Arcsine, PhaseShifted, GerchbergSaxton, GradientDescent)
 """All reconstructors, in the order in which the book lists them."""
 
-__all__ = ["RECONSTRUCTORS", "Reconstruction", *(method.__name__ for method in RECONSTRUCTORS)]
+__all__ = [
+    "RECONSTRUCTORS",
+    "Arcsine",
+    "GerchbergSaxton",
+    "GradientDescent",
+    "Linear",
+    "PhaseShifted",
+    "Reconstruction",
+]

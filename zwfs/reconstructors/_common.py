@@ -129,7 +129,7 @@ def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLik
     tolerance = _check.number("tolerance", tolerance, 0)
     maps, batch = sensor.amplitude_maps(amplitude, Kind.numpy())
     if batch:
-        raise ValueError(f"amplitude has shape {np.shape(amplitude)}: expected {sensor.pupil.shape}")
+        raise ValueError(f"amplitude has shape {(*batch, *sensor.pupil.shape)}: expected {sensor.pupil.shape}")
     own = read_only(maps[0].copy())
     light = float(np.sum(own * own))
     if not 1 / _RANGE < light < _RANGE:
@@ -143,7 +143,9 @@ class FixedPoint(Protocol):
     A phasor is exp(i phase), split, shape (k, 2, ny, nx), and 0 outside the pupil: all that is kept of a field.
     """
 
-    settings: Settings
+    @property
+    def settings(self) -> Settings:
+        """Checked arguments that every reconstructor takes."""
 
     def prepare(self, frames: NDArray, phasor: NDArray, flat: bool, kind: Kind) -> dict[str, NDArray]:
         """What the steps need and keep: arrays with the frames (k, n_masks, ny', nx') on the first axis.
@@ -197,17 +199,16 @@ class Found(NamedTuple):
 
     def room_for(self, n_frames: int, kind: Kind) -> Found:
         """Arrays of the same kind for more frames, yet to be filled."""
-        return Found(
-            *(
-                None if array is None
-                else kind.xp.empty((n_frames, *array.shape[1:]), dtype=array.dtype, device=kind.device)
-                for array in self
-            )
+        return Found._make(
+            None if array is None
+            else kind.xp.empty((n_frames, *array.shape[1:]), dtype=array.dtype, device=kind.device)
+            for array in self
         )  # fmt: skip
 
     def put(self, piece: slice, some: Found) -> None:
         """Put some of the frames in their places."""
-        for array, part in zip(self, some, strict=True):
+        pairs: zip[tuple[Any, Any]] = zip(self, some, strict=True)
+        for array, part in pairs:
             if array is not None:
                 array[piece, ...] = part
 

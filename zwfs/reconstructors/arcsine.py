@@ -101,7 +101,7 @@ class Arcsine:
         power = square(wave)
         along = data["excess"] - constants.gain * power
         across = power - along * along
-        n_unsolved = constants.n_dark
+        n_unsolved: NDArray[np.int64] | int = constants.n_dark
         if xp.min(across) < 0:
             beyond = across < 0
             n_unsolved = n_unsolved + count(beyond, kind)

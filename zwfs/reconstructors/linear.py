@@ -156,7 +156,8 @@ class Linear:
         difference = np.empty((len(self._modes), self.settings.sensor.n_masks * pupil.n_points))
         for row, mode in zip(difference, self._modes, strict=True):
             push = pupil.scatter(np.stack([poke * mode, -poke * mode]), fill=0)
-            np.subtract(*self._signal(self._model(self._reference + push)), out=row)
+            pushed, pulled = self._signal(self._model(self._reference + push))
+            np.subtract(pushed, pulled, out=row)
         return self._signal(self._model(self._reference))[0], difference
 
     def _recorded(

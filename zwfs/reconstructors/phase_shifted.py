@@ -189,7 +189,12 @@ class PhaseShifted:
             self._constants[kind] = _Constants(
                 sensor.operator(kind),
                 self.settings.maps(kind),
-                *(kind.array(array) for array in (core, weights, offset, flat, flat_waves, inside)),
+                kind.array(core),
+                kind.array(weights),
+                kind.array(offset),
+                kind.array(flat),
+                kind.array(flat_waves),
+                kind.array(inside),
                 sensor.n_masks * self.settings.light,
                 self._acceleration and self._acceleration.to(kind),
             )

@@ -1,7 +1,5 @@
 import inspect
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -32,11 +30,6 @@ def curves(classic, shifted, modes):
 
 def drawn(axes, look):
     return next(line for line in axes.lines if line.get_color() == look.color and len(line.get_xdata()) > 1)
-
-
-def test_the_package_does_without_matplotlib():
-    code = "import sys, zwfs; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 def test_every_method_has_a_look_of_its_own():

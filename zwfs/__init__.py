@@ -1,5 +1,10 @@
 """Sensor models and reconstructors for the phase-shifted Zernike wavefront sensor."""
 
+import importlib
+import pkgutil
+from types import ModuleType
+from typing import TYPE_CHECKING
+
 from zwfs.detector import Detector
 from zwfs.masks import Dimple, Patch
 from zwfs.metrics import dynamic_range, reconstruction_error, strehl, wrapped_residual
@@ -15,6 +20,36 @@ from zwfs.reconstructors import (
     Reconstruction,
 )
 from zwfs.sensor import ZernikeSensor
+
+# The modules, for type checkers and editors. At run time each one is imported at its first use, see `__getattr__`.
+if TYPE_CHECKING:
+    from zwfs import bench as bench
+    from zwfs import bench_trials as bench_trials
+    from zwfs import camera as camera
+    from zwfs import closed_loop as closed_loop
+    from zwfs import detector as detector
+    from zwfs import drawings as drawings
+    from zwfs import experiments as experiments
+    from zwfs import figures as figures
+    from zwfs import figures_bench as figures_bench
+    from zwfs import figures_frames as figures_frames
+    from zwfs import figures_loop as figures_loop
+    from zwfs import focal as focal
+    from zwfs import frames as frames
+    from zwfs import interference as interference
+    from zwfs import lowrank as lowrank
+    from zwfs import masks as masks
+    from zwfs import metrics as metrics
+    from zwfs import modes as modes
+    from zwfs import parameters as parameters
+    from zwfs import pupil as pupil
+    from zwfs import reconstructors as reconstructors
+    from zwfs import registration as registration
+    from zwfs import results as results
+    from zwfs import sensor as sensor
+    from zwfs import sweeps as sweeps
+    from zwfs import tables as tables
+    from zwfs import variations as variations
 
 __version__ = "0.1.0"
 
@@ -39,3 +74,19 @@ __all__ = [
     "wrapped_residual",
     "zernike_basis",
 ]
+
+
+def _modules() -> list[str]:
+    return [module.name for module in pkgutil.iter_modules(__path__) if not module.name.startswith("_")]
+
+
+if not TYPE_CHECKING:  # A type checker would take any misspelt name for a module.
+
+    def __getattr__(name: str) -> ModuleType:
+        if name in _modules():
+            return importlib.import_module(f"{__name__}.{name}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_modules()})

@@ -1,0 +1,127 @@
+"""The package as a whole: what `import zwfs` imports, which names it has, and what type checkers learn of them."""
+
+import importlib
+import inspect
+import pkgutil
+import shutil
+import subprocess
+import sys
+import zipfile
+from functools import cached_property
+from pathlib import Path
+
+import pytest
+
+import zwfs
+
+ROOT = Path(__file__).parent.parent
+PUBLIC = [
+    module.name
+    for module in pkgutil.walk_packages(zwfs.__path__, "zwfs.")
+    if not any(part.startswith("_") for part in module.name.split("."))
+]
+TOP = [name.removeprefix("zwfs.") for name in PUBLIC if name.count(".") == 1]
+
+
+def run(*command, folder=ROOT):
+    return subprocess.run([sys.executable, *command], cwd=folder, capture_output=True, text=True)
+
+
+def test_the_package_imports_no_optional_package():
+    heavy = {"astropy", "cloudpickle", "distributed", "joblib", "matplotlib", "threadpoolctl"}
+    done = run("-c", f"import sys, zwfs; print(sorted({heavy} & set(sys.modules)))")
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_modules_are_imported_at_their_first_use():
+    code = "import sys, zwfs; before = 'zwfs.camera' in sys.modules; print(before, zwfs.camera.read.__module__)"
+    done = run("-c", code)
+    assert done.stdout.split() == ["False", "zwfs.camera"], done.stderr
+
+
+@pytest.mark.parametrize("name", TOP)
+def test_every_module_is_an_attribute(name):
+    assert getattr(zwfs, name) is importlib.import_module(f"zwfs.{name}")
+
+
+def test_completion_offers_every_module_and_public_name():
+    assert {*TOP, *zwfs.__all__} <= set(dir(zwfs))
+    assert len(dir(zwfs)) == len(set(dir(zwfs)))
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'zwfs' has no attribute 'cameras'"):
+        _ = zwfs.cameras
+
+
+@pytest.mark.slow
+def test_type_checkers_know_modules_and_results(tmp_path):
+    file = tmp_path / "script.py"
+    code = "\n".join(
+        [
+            "import zwfs",
+            *(f"zwfs.{name}" for name in TOP),
+            "reveal_type(zwfs.Pupil.circular(10).n_points)",
+            "reveal_type(zwfs.camera.read)",
+            "zwfs.cameras",
+        ]
+    )
+    file.write_text(code)
+    count, read, unknown, errors = run("-m", "mypy", str(file)).stdout.splitlines()
+    assert 'Revealed type is "int"' in count
+    assert 'Revealed type is "def (path: ' in read
+    assert 'Module has no attribute "cameras"' in unknown
+    assert errors.startswith("Found 1 error")
+
+
+@pytest.mark.slow
+def test_the_wheel_says_that_the_package_has_types(tmp_path):
+    for name in ("pyproject.toml", "README.md", "LICENSE", "LICENSE-TEXT"):
+        shutil.copy(ROOT / name, tmp_path)
+    shutil.copytree(ROOT / "zwfs", tmp_path / "zwfs", ignore=shutil.ignore_patterns("__pycache__"))
+    build = "from setuptools.build_meta import build_wheel; build_wheel('wheels')"
+    done = run("-c", build, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (wheel,) = (tmp_path / "wheels").glob("*.whl")
+    held = {name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("zwfs/")}
+    sources = (file for file in (ROOT / "zwfs").rglob("*") if file.suffix in (".py", ".typed"))
+    assert held == {file.relative_to(ROOT).as_posix() for file in sources}
+    assert "zwfs/py.typed" in held
+
+
+def functions(thing):
+    """The function itself, or the public methods and properties of a class and what it does when it is called."""
+    if inspect.isfunction(thing):
+        yield thing
+        return
+    for name, member in vars(thing).items():
+        if name.startswith("_") and name not in ("__init__", "__call__"):
+            continue
+        member = getattr(member, "__func__", member)  # of a class method
+        member = member.fget if isinstance(member, property) else member
+        member = member.func if isinstance(member, cached_property) else member
+        if inspect.isfunction(member) and member.__module__.startswith("zwfs"):
+            yield member
+
+
+def unannotated(function):
+    signature = inspect.signature(function)
+    hints = {name: parameter.annotation for name, parameter in signature.parameters.items()}
+    hints["return"] = signature.return_annotation
+    missing = {name for name, hint in hints.items() if hint is inspect.Signature.empty}
+    return sorted(missing - {"self", "cls"})
+
+
+@pytest.mark.parametrize("name", ["zwfs", *PUBLIC])
+def test_public_functions_are_annotated(name):
+    module = importlib.import_module(name)
+    own = [
+        thing
+        for key, thing in vars(module).items()
+        if not key.startswith("_")
+        and (key in getattr(module, "__all__", ()) or getattr(thing, "__module__", None) == name)
+    ]
+    things = [thing for thing in own if inspect.isclass(thing) or inspect.isfunction(thing)]
+    assert things
+    missing = {f.__qualname__: unannotated(f) for thing in things for f in functions(thing)}
+    assert {name: names for name, names in missing.items() if names} == {}

@@ -185,8 +185,8 @@ def test_only_liquid_crystal_needs_a_quarter_wave_plate(vector, phase):
 
 def test_polarisations_differ_by_dashes_too(vector, phase):
     scene = drawings.vector_sensor(vector, phase).axes[0]
-    solid = [line for line in scene.lines if same_color(line.get_color(), "#D55E00")]
-    dashed = [line for line in scene.lines if same_color(line.get_color(), "#0072B2")]
+    solid = [line for line in scene.lines if same_color(line.get_color(), drawings._PLUS.color)]
+    dashed = [line for line in scene.lines if same_color(line.get_color(), drawings._MINUS.color)]
     rays = [
         sum(line.get_linestyle() == style for line in lines) for lines, style in ((solid, "-"), (dashed, "--"))
     ]

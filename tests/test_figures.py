@@ -1,16 +1,23 @@
 import inspect
 import json
+import pkgutil
+from dataclasses import replace
+from itertools import combinations, product
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex, to_rgb, to_rgba_array
 
 import zwfs
-from zwfs import figures, figures_bench
+from zwfs import drawings, figures, figures_bench, figures_frames
+from zwfs.bench import Bench
 from zwfs.bench_trials import BenchCurves
+from zwfs.closed_loop import LoopRun
 from zwfs.experiments import linearity_curves
-from zwfs.variations import DiameterCurve
+from zwfs.frames import Found, Measurement, Optics, Step
+from zwfs.variations import DiameterCurve, PairMaps
 
 
 @pytest.fixture(autouse=True)
@@ -38,18 +45,153 @@ def test_every_method_has_a_look_of_its_own():
         assert len({getattr(look, part) for look in figures.LOOKS.values()}) == len(figures.LOOKS)
 
 
-def test_colours_of_methods_stand_for_nothing_else():
-    """Whoever draws a method asks LOOKS for its colour; black is also the colour of ink."""
-    source = inspect.getsource(figures) + inspect.getsource(figures_bench)
+def figure_functions():
+    """Every function of the package that draws a figure."""
+    names = [module.name for module in pkgutil.iter_modules(zwfs.__path__)]
+    modules = [getattr(zwfs, name) for name in names if name.startswith(("figures", "drawings"))]
+    return {
+        f"{module.__name__.removeprefix('zwfs.')}.{name}": function
+        for module in modules
+        for name, function in vars(module).items()
+        if inspect.isfunction(function)
+        and function.__module__ == module.__name__
+        and not name.startswith("_")
+        and function.__annotations__["return"] == "Figure"
+    }
+
+
+@pytest.fixture(scope="module")
+def drawn_methods(curves, pupil, classic, shifted):
+    """Return the arguments of every figure function, and the methods that it then draws."""
+    two, three = ["Linear", "PhaseShifted"], np.linspace(0.5, 1.5, 3)
+    shifted_only = {"PhaseShifted"}
+    phase = np.where(pupil.mask, np.add.outer(pupil.y, pupil.x), np.nan)
+    frames = np.ones((2, *pupil.shape))
+    pistons = np.linspace(-1, 1, 24).reshape(2, 3, 4)
+    trial = DiameterCurve(three, np.full((3, 3), 0.1))
+    bench_curves = BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(two, 0.1 * pistons))
+    loop = LoopRun(three, *np.full((3, 2, 3), 0.1))
+    bad = np.zeros(frames.shape, bool)
+    bad[:, 10, 10] = True
+    measurement = Measurement(frames, pupil, bad, 0, pupil.n_pixels, np.ones(2), np.zeros(4), (1.0, 1.0))
+    found = Found(phase, frames, 0.9 * frames, measurement, Optics(1.06, (1.5, -1.5)), True, 0)
+    bench = Bench(n_pixels=60)
+    commands = np.linspace(-1, 1, bench.n_segments)
+    lines = {f"curve {i}": three for i in range(4)}
+    return {
+        "drawings.sensor_layout": ((classic, phase), ()),
+        "drawings.vector_sensor": ((shifted, phase), ()),
+        "drawings.bench_layout": ((bench, commands, bench.frames(commands, seed=1)), ()),
+        "figures.linearity": ((curves, 0.05, two, 0.4), two),
+        "figures.convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in figures.LOOKS},), figures.LOOKS),
+        "figures.estimates": ((pupil, phase, dict.fromkeys(two, phase), dict.fromkeys(two, phase)), ()),
+        "figures.approximation": ((three, lines, lines), ()),
+        "figures.diversity": ((three, three, three, {f"pair {i}": i for i in range(3)}), ()),
+        "figures.dimple_diameter": (({25: trial, 100: trial}, 0.5, 0.05, 2.2), shifted_only),
+        "figures.diameter_methods": ((dict.fromkeys(figures.LOOKS, trial), 0.5, 0.05, 2.2), figures.LOOKS),
+        "figures.diameter_reasons": (
+            (three, three, np.full((3, 2), 0.5), {1.0: 0.5}, lines, 2.2),
+            shifted_only,
+        ),
+        "figures.pair_maps": ((PairMaps(three, *np.full((5, 3, 3), 1.0)), [(1.0, -1.0)] * 2), ()),
+        "figures.pair_noise": ((three, lines, {"curve 0": [(1.0, 1.0, 0.1)]}), ()),
+        "figures_bench.reference_intensities": ((frames, frames), ()),
+        "figures_bench.measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
+        "figures_bench.segment_errors": ((np.arange(4), dict.fromkeys(two, pistons[0, 0]), {"map": phase}), two),
+        "figures_bench.bench_linearity": ((bench_curves, two), two),
+        "figures_bench.budget": ((["none", "blur"], *np.ones((3, 2))), shifted_only),
+        "figures_frames.explained": ((found,), ()),
+        "figures_frames.phase_map": ((found, 635.0), ()),
+        "figures_frames.gains": (
+            ([Step("outlines", None, None, found, np.ones(2))] * 2, [0.1, 0.2]),
+            (),
+        ),
+        "figures_loop.loop_runs": (({"bright star": dict.fromkeys(two, loop)},), two),
+        "figures_loop.capture": (
+            (three, dict.fromkeys(two, three), dict.fromkeys(two, np.full((3, 2), 0.1))),
+            two,
+        ),
+    }
+
+
+def colours(figure):
+    """Colours of lines, areas, marks and text; pictures and colour scales have those of a colour map."""
+    found = set()
+    for artist in figure.findobj(lambda artist: getattr(artist, "get_array", lambda: None)() is None):
+        for part in ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"):
+            if hasattr(artist, f"get_{part}"):
+                found |= {to_hex(color).upper() for color in to_rgba_array(getattr(artist, f"get_{part}")())}
+    return found
+
+
+def test_every_figure_is_tested_for_its_colours(drawn_methods):
+    assert set(drawn_methods) == set(figure_functions())
+
+
+@pytest.mark.parametrize("name", figure_functions())
+def test_colours_of_methods_stand_for_nothing_else(name, drawn_methods, monkeypatch):
+    """With methods in other colours, no artist has the colour of a method; black is also the colour of ink."""
+    arguments, methods = drawn_methods[name]
+    usual = {look.color: method for method, look in figures.LOOKS.items() if look.color != "#000000"}
+    other = {method: f"#0{index}0{index}0{index}" for index, method in enumerate(figures.LOOKS, start=1)}
+    for method, color in other.items():
+        monkeypatch.setitem(figures.LOOKS, method, replace(figures.LOOKS[method], color=color))
+    shown = colours(figure_functions()[name](*arguments))
+    assert {usual[color] for color in shown & set(usual)} == set()
+    assert {method for method, color in other.items() if color in shown} == set(methods)
+
+
+def test_notebooks_draw_no_colour_of_a_method():
     notebooks = (Path(__file__).parent.parent / "notebooks").glob("*.ipynb")
     cells = (cell for file in notebooks for cell in json.loads(file.read_bytes())["cells"])
-    source += "".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    methods = {look.color for look in figures.LOOKS.values()} - {"#000000"}
-    assert {color: source.upper().count(color) for color in methods} == dict.fromkeys(methods, 1)
-    others = {part: {style[part] for style in figures.OTHER_STYLES} for part in ("color", "marker")}
-    for part, values in others.items():
+    source = "".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code").upper()
+    assert not [look.color for look in figures.LOOKS.values() if look.color in source]
+
+
+def test_curves_of_no_method_have_other_colours_and_markers():
+    for part in ("color", "marker"):
+        values = {style[part] for style in figures.OTHER_STYLES}
         assert len(values) == len(figures.OTHER_STYLES)
         assert not values & {getattr(look, part) for look in figures.LOOKS.values()}
+
+
+# Linear RGB as it looks without one kind of cones (Machado, Oliveira and Fernandes 2009, severity 1).
+VISION = {
+    "normal": np.eye(3),
+    "without red": [[0.1523, 1.0526, -0.2049], [0.1145, 0.7863, 0.0992], [-0.0039, -0.0481, 1.0520]],
+    "without green": [[0.3673, 0.8606, -0.2280], [0.2801, 0.6725, 0.0474], [-0.0118, 0.0429, 0.9689]],
+    "without blue": [[1.2555, -0.0767, -0.1788], [-0.0784, 0.9308, 0.1476], [0.0047, 0.6914, 0.3039]],
+}  # fmt: skip
+
+
+def lab(color, vision):
+    """CIE L*a*b* coordinates; their distance is about 2 where a difference just shows."""
+    rgb = np.array(to_rgb(color))
+    light = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    light = np.clip(VISION[vision] @ light, 0, 1)
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    xyz = to_xyz @ light / to_xyz.sum(axis=1)
+    x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+@pytest.mark.parametrize("vision", VISION)
+def test_colours_that_share_a_figure_differ_for_every_reader(vision):
+    palettes = {
+        "methods": [look.color for look in figures.LOOKS.values()],
+        "other curves": [style["color"] for style in figures.OTHER_STYLES],
+        "polarisations": [drawings._PLUS.color, drawings._MINUS.color],
+    }
+    for colors in palettes.values():
+        points = [lab(color, vision) for color in colors]
+        assert min(np.linalg.norm(a - b) for a, b in combinations(points, 2)) > 15
+
+
+def test_polarisations_and_masked_pixels_do_not_look_like_a_method():
+    others = [drawings._PLUS.color, drawings._MINUS.color, figures_frames._MASKED]
+    methods = [look.color for look in figures.LOOKS.values()]
+    gaps = [np.linalg.norm(lab(a, "normal") - lab(b, "normal")) for a, b in product(others, methods)]
+    assert min(gaps) > 25
 
 
 def test_a_method_looks_the_same_in_every_figure(curves):

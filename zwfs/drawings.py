@@ -39,8 +39,9 @@ class _Polarisation:
     line: str | tuple[float, tuple[float, ...]]
 
 
-# Vermilion and blue of Okabe and Ito's palette, close to the ends of the phase map for +theta and -theta.
-_PLUS, _MINUS = _Polarisation("#D55E00", "-"), _Polarisation("#0072B2", (0, (4, 2)))
+# Red and indigo, close to the ends of the phase map for +theta and -theta. They are far from the colours of the
+# methods, and colour-blind readers can distinguish them.
+_PLUS, _MINUS = _Polarisation("#B2182B", "-"), _Polarisation("#313695", (0, (4, 2)))
 
 
 def sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from zwfs.figures import OTHER_STYLES, show_intensity, show_phase
 from zwfs.frames import Found, Step
 
-_MASKED = "#CC79A7"
+_MASKED = "#FF00FF"  # not in the colour maps, and far from the colours of the methods
 
 
 def explained(found: Found) -> Figure:

@@ -234,13 +234,13 @@ def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, 
     float
         Seconds that the notebook took.
     """
-    import standalone  # its imports are slow, and a result that is there needs none of them
-
     within = project.build if folder.is_relative_to(project.build) else folder.parent
     commit, changed_since = runner.commit(project.root)
     with runner.scratch_folder(within, "rerunning-") as scratch:
         if (free := shutil.disk_usage(scratch).free) < ROOM:
             raise ParameterError(f"{within}: {free / 1e6:.0f} MB are free: expected at least {ROOM / 1e6:.0f} MB")
+        import standalone  # its imports are slow: only a run needs them
+
         new = scratch / "new"
         with Progress(project, [name], name) as progress:
             done = runner.execute(project, name, changed, scratch, Children(os.cpu_count()), progress)

@@ -147,3 +147,23 @@ def test_a_bad_flow_is_refused(pupil, arguments, message):
     *values, options = (*arguments, {}) if len(arguments) == 2 else arguments
     with pytest.raises(ValueError, match=message):
         FrozenFlow(pupil, *values, **options)
+
+
+@pytest.mark.parametrize("exponent", [-4.0, -2.0, 0.0])
+def test_the_power_falls_with_the_exponent(exponent):
+    whole = Pupil.from_amplitude(np.ones((36, 36)), n_pixels=12)  # 3 D: the screens repeat after that
+    screens = FrozenFlow(whole, 1.0, 200, cutoff=4.0, exponent=exponent, seed=6)(0.0)
+    power = np.mean(np.abs(np.fft.fft2(screens)) ** 2, axis=0)
+    lines = np.fft.fftfreq(36, 1 / 12)
+    frequency = np.hypot(lines[:, np.newaxis], lines)
+    used = (frequency > 0) & (frequency <= 4.0)
+    slope = np.polyfit(np.log(frequency[used]), np.log(power[used]), 1)[0]
+    assert slope == pytest.approx(exponent, abs=0.1)
+    assert power[frequency > 4.01].max() < 1e-20 * power.max()
+
+
+def test_settled_looks_at_no_more_steps_than_there_were(pupil, modes, shifted):
+    run = close_loop(shifted, modes, FrozenFlow(pupil, 0.1, 1, cutoff=1.0, seed=1), 3)
+    assert run.settled(3).shape == (1,)
+    with pytest.raises(ValueError, match="n_steps = 4"):
+        run.settled(4)

@@ -114,3 +114,14 @@ def test_error_of_a_reconstruction_falls_with_the_root_of_the_photons(pupil, shi
 def test_bad_input_is_named(make, error, message):
     with pytest.raises(error, match=message):
         make(Pupil.circular(8))
+
+
+def test_a_single_pixel_may_be_exposed():
+    counts = Detector(Pupil.circular(8), 1e6).expose(1.0, seed=1)
+    assert counts.shape == ()
+    assert counts == Detector(Pupil.circular(8), 1e6).expose([1.0], seed=1)[0]
+
+
+def test_more_photons_than_can_be_counted_are_refused():
+    with pytest.raises(ValueError, match=r"frames reach .* electrons"):
+        Detector(Pupil.circular(8), 1e25).expose([1.0], seed=1)

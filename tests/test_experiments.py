@@ -80,3 +80,18 @@ def test_convergence_goes_from_the_input_to_the_result(methods, modes, pupil, sh
     found = methods["shifted"](shifted.measure(screens))
     np.testing.assert_allclose(error[:, -1], reconstruction_error(pupil, found.phase, screens), atol=1e-12)
     assert np.all(error[:, -1] < 1e-6)
+
+
+def test_wraps_on_both_sides_are_counted(methods, modes, pupil):
+    curve = linearity_curves({"linear": methods["linear"]}, modes, [2.0], 3, seed=7)
+    phase = pupil.gather(screens_at(modes, 2.0, 3, seed=7, task=0))
+    above, below = np.mean(phase > np.pi, axis=1), np.mean(phase <= -np.pi, axis=1)
+    assert np.all(above > 0.01)
+    assert np.all(below > 0.01)
+    np.testing.assert_allclose(curve.wrapped[0], above + below)
+
+
+def test_an_unknown_reconstructor_is_named(curves):
+    for method in (curves.mean, curves.std, curves.recovered, curves.dynamic_range):
+        with pytest.raises(ValueError, match=r"name = 'nobody': expected one of \['linear', 'shifted'\]"):
+            method("nobody")

@@ -97,6 +97,9 @@ def test_dynamic_range_without_a_crossing():
         (lambda p: dynamic_range([0.0], [0]), ValueError, "rms = .*above 0"),
         (lambda p: dynamic_range([-1, 1], [0, 0]), ValueError, "rms reaches down to -1"),
         (lambda p: dynamic_range([1, 2], [0, np.nan]), ValueError, "error holds 1 NaN"),
+        (lambda p: dynamic_range([1, 2], [-1, -2]), ValueError, "error reaches down to -2"),
+        (lambda p: strehl(p, np.zeros((0, *p.shape))), ValueError, r"phase has shape \(0, 40, 40\): .* one map"),
+        (lambda p: wrapped_residual(p, np.zeros((0, *p.shape)), p.mask * 1), ValueError, "estimate has shape"),
         (lambda p: dynamic_range([1, 2], [0, 0], 0), ValueError, "threshold = 0"),
     ],
 )

@@ -157,3 +157,31 @@ def test_bad_input_is_named(pupil, modes, make, error, message):
 
 def test_zero_rms_makes_flat_screens(modes):
     assert not zwfs.power_law_screens(modes, 0, 2, seed=0).any()
+
+
+def test_noll_is_exact_for_large_numbers():
+    for n in (10**8, 2**31):
+        first = n * (n + 1) // 2 + 1  # of radial order n
+        assert noll_to_nm(first)[0] == n
+        assert noll_to_nm(first - 1)[0] == n - 1
+
+
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e300, 0.0])
+def test_modes_without_a_finite_rms_are_refused(value):
+    modes = zernike_basis(Pupil.circular(16), 3)
+    with pytest.raises(ValueError, match="modes"):
+        power_law_screens(np.full_like(modes, value), 0.1, 1, seed=1)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.0, "1", [1, 2], True])
+def test_a_bad_seed_is_named(seed):
+    modes = zernike_basis(Pupil.circular(16), 3)
+    with pytest.raises((TypeError, ValueError), match="seed"):
+        power_law_screens(modes, 0.1, 1, seed=seed)
+
+
+def test_any_seed_of_numpy_will_do():
+    modes, sequence = zernike_basis(Pupil.circular(16), 3), np.random.SeedSequence(2**200)
+    expected = power_law_screens(modes, 0.1, 1, seed=2**200)
+    for seed in (sequence, np.random.default_rng(sequence)):
+        np.testing.assert_array_equal(power_law_screens(modes, 0.1, 1, seed=seed), expected)

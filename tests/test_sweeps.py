@@ -417,3 +417,13 @@ def test_the_script_on_the_page_runs(tmp_path):
     lines = ended.stdout.splitlines()
     assert lines[0] == "0.1 rad rms: 100% of the screens recovered"
     assert len(lines) == 10
+
+
+def test_one_process_needs_no_joblib(pupil, modes, monkeypatch):
+    methods = {"linear": Linear(ZernikeSensor(pupil, Dimple(1.06, np.pi / 2)), modes)}
+    with joblib.parallel_config(n_jobs=1):
+        with_it = linearity_curves(methods, modes, [0.1, 0.2], 2)
+    for package in ("joblib", "cloudpickle", "threadpoolctl", "distributed"):
+        monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
+    without = linearity_curves(methods, modes, [0.1, 0.2], 2)
+    np.testing.assert_allclose(without.errors["linear"], with_it.errors["linear"], rtol=1e-9)

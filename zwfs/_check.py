@@ -21,21 +21,70 @@ def instance(name: str, value: Any, kind: type) -> None:
         raise TypeError(f"{name} is a {type(value).__name__}: expected a {kind.__name__}")
 
 
-def integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
+def function(name: str, value: Any) -> None:
+    """Require that `value` can be called."""
+    if not callable(value):
+        raise TypeError(f"{name} = {shown(value)}: expected a function")
+
+
+def choice(name: str, value: Any, known: dict[str, Any] | list[str] | tuple[str, ...]) -> None:
+    """Require that `value` is one of the names in `known`."""
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{name} = {shown(value)}: expected one of {list(known)}")
+
+
+def sensor_of(name: str, reconstructor: Any) -> Any:
+    """Return the sensor of a reconstructor."""
+    sensor = getattr(getattr(reconstructor, "settings", None), "sensor", None)
+    if sensor is None or not callable(reconstructor):
+        kind = type(reconstructor).__name__
+        raise TypeError(f"{name} is a {kind}: expected a reconstructor, such as PhaseShifted(sensor)")
+    return sensor
+
+
+_INT64 = 2**63 - 1  # largest integer that an array holds
+_NO_NUMBERS = bool, np.bool_, np.timedelta64  # though Python counts them among the integers
+
+
+def shown(value: Any) -> str:
+    """Return the representation of `value` in one line of at most 80 characters."""
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # Python refuses to print integers of more than 4300 digits
+        return f"a {type(value).__name__} of too many digits"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def integer(name: str, value: Any, low: int, high: float = _INT64) -> int:
     """Return `value` as an int between `low` and `high`."""
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Integral):
+    if isinstance(value, _NO_NUMBERS) or not isinstance(value, Integral):
         whole = isinstance(value, float) and value.is_integer()
-        raise TypeError(f"{name} = {value!r}: expected an integer{f', as in {int(value)}' if whole else ''}")
+        raise TypeError(f"{name} = {shown(value)}: expected an integer{f', as in {int(value)}' if whole else ''}")
     if not low <= int(value) <= high:
-        expected = f"at least {low}" if high == math.inf else f"an integer in [{low}, {high}]"
-        raise ValueError(f"{name} = {value}: expected {expected}")
+        one_sided = int(value) < low and high in (_INT64, math.inf)
+        expected = f"at least {low}" if one_sided else f"an integer in [{low}, {high}]"
+        raise ValueError(f"{name} = {shown(int(value))}: expected {expected}")
     return int(value)
+
+
+def integer_seed(name: str, value: Any) -> int:
+    """Return a seed that must be an integer; it may be of any size."""
+    return integer(name, value, 0, math.inf)
+
+
+def generator(name: str, seed: Any) -> np.random.Generator:
+    """Return the generator of a seed: an integer of at least 0, a SeedSequence, a Generator, or None for any."""
+    if seed is None or isinstance(seed, np.random.Generator | np.random.SeedSequence):
+        return np.random.default_rng(seed)
+    if not isinstance(seed, Integral):
+        raise TypeError(f"{name} is a {type(seed).__name__}: expected an integer, a SeedSequence or a Generator")
+    return np.random.default_rng(integer_seed(name, seed))
 
 
 def flag(name: str, value: Any) -> bool:
     """Return `value` as a bool."""
     if not isinstance(value, bool | np.bool_):
-        raise TypeError(f"{name} = {value!r}: expected True or False")
+        raise TypeError(f"{name} = {shown(value)}: expected True or False")
     return bool(value)
 
 
@@ -49,20 +98,49 @@ def number(
     open_high: bool = False,
 ) -> float:
     """Return `value` as a finite float between `low` and `high`; an open end excludes the bound."""
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
-        raise TypeError(f"{name} = {value!r}: expected a real number")
-    plain = float(value)
+    if isinstance(value, _NO_NUMBERS) or not isinstance(value, Real):
+        raise TypeError(f"{name} = {shown(value)}: expected a real number")
+    try:
+        plain = float(value)
+    except OverflowError:  # an integer or a fraction beyond the range of a float
+        plain = math.inf
     too_low = plain <= low if open_low else plain < low
     too_high = plain >= high if open_high else plain > high
     if not math.isfinite(plain) or too_low or too_high:
         left, right = "(" if open_low else "[", ")" if open_high else "]"
-        raise ValueError(f"{name} = {value!r}: expected a finite number in {left}{low:g}, {high:g}{right}")
+        raise ValueError(f"{name} = {shown(value)}: expected a finite number in {left}{low:g}, {high:g}{right}")
     return plain
+
+
+def number_field(owner: Any, name: str, low: float = -math.inf, high: float = math.inf, **ends: bool) -> None:
+    """Check a number among the fields of a frozen dataclass, see `number`, and keep it as a float."""
+    object.__setattr__(owner, name, number(name, getattr(owner, name), low, high, **ends))
+
+
+def float_dtype(name: str, value: Any) -> np.dtype:
+    """Return `value` as the dtype float32 or float64."""
+    name_of = np.dtype(value).name if isinstance(value, type | np.dtype) else value
+    if not isinstance(name_of, str) or name_of not in ("float32", "float64"):
+        raise TypeError(f"{name} = {shown(value)}: expected float32 or float64")
+    return np.dtype(name_of)
+
+
+def plain_array(name: str, value: Any) -> NDArray:
+    """Return `value` as an array of NumPy of any dtype."""
+    return _made(name, value, np.asarray)
 
 
 def real_array(name: str, value: Any) -> NDArray:
     """Return `value` as a float32 or float64 array of NumPy; other real numbers become float64."""
-    return real_any(name, _made(name, value, np.asarray))
+    return real_any(name, plain_array(name, value))
+
+
+def integer_array(name: str, value: Any) -> NDArray[np.integer]:
+    """Return `value` as an array of integers of NumPy."""
+    array = plain_array(name, value)
+    if array.dtype.kind not in "iu":
+        raise TypeError(f"{name} has dtype {array.dtype}: expected integers")
+    return array
 
 
 def real_any(name: str, value: Any) -> NDArray:
@@ -79,7 +157,7 @@ def real_any(name: str, value: Any) -> NDArray:
 
 def complex_array(name: str, value: Any) -> NDArray:
     """Return `value` as a complex64 or complex128 array of NumPy."""
-    return complex_any(name, _made(name, value, np.asarray))
+    return complex_any(name, plain_array(name, value))
 
 
 def complex_any(name: str, value: Any) -> NDArray:
@@ -141,7 +219,7 @@ def _made(name: str, value: Any, make: Callable[[Any], Any]) -> Any:
         )
     try:
         return make(value)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise TypeError(f"{name} is a {type(value).__name__} that makes no array here ({error})") from error
 
 
@@ -150,6 +228,24 @@ def trailing_shape(name: str, array: Any, shape: tuple[int, ...], meaning: str) 
     if tuple(array.shape[-len(shape) :]) != shape or array.ndim < len(shape):
         expected = ", ".join(str(n) for n in shape)
         raise ValueError(f"{name} has shape {tuple(array.shape)}: expected (..., {expected}), {meaning}")
+
+
+def maps(name: str, array: Any, shape: tuple[int, int], meaning: str = "the shape of the pupil") -> None:
+    """Require at least one map of a shape."""
+    trailing_shape(name, array, shape, meaning)
+    if 0 in array.shape:
+        raise ValueError(f"{name} has shape {tuple(array.shape)}: expected at least one map")
+
+
+def broadcast(**arrays: Any) -> tuple[int, ...]:
+    """Return the shape to which all arrays broadcast."""
+    shapes = [np.shape(array) for array in arrays.values()]
+    try:
+        return np.broadcast_shapes(*shapes)
+    except ValueError:
+        *first, last = arrays
+        names, told = f"{', '.join(first)} and {last}", " and ".join(map(str, shapes))
+        raise ValueError(f"{names} have shapes {told}: expected ones that broadcast") from None
 
 
 def finite(name: str, array: Any, where: str = "") -> None:
@@ -166,7 +262,7 @@ def finite(name: str, array: Any, where: str = "") -> None:
 
 def non_negative(name: str, array: Any, hint: str = "") -> None:
     """Require that no number of `array` is below 0."""
-    lowest = float(any_array(array)[1].min(array))
+    lowest = float(any_array(array)[1].min(array)) if 0 not in array.shape else 0.0
     if lowest < 0:
         raise ValueError(f"{name} reaches down to {lowest:.6g}: expected no negative values{hint}")
 
@@ -175,14 +271,14 @@ def radian(name: str, value: Any) -> float:
     """Return an angle as a float; more than a full turn is nearly surely in degrees."""
     angle = number(name, value)
     if abs(angle) > 6.3:  # 2 pi, rounded up
-        raise ValueError(f"{name} = {value!r}: expected radian, from -2 pi to 2 pi; is it in degrees?")
+        raise ValueError(f"{name} = {shown(value)}: expected radian, from -2 pi to 2 pi; is it in degrees?")
     return angle
 
 
 def items(name: str, values: Any, expected: str) -> Iterable[Any]:
     """Return `values`, which must be a list or something else to iterate over, but no string."""
     if isinstance(values, str | bytes) or not isinstance(values, Iterable) or getattr(values, "ndim", 1) == 0:
-        raise TypeError(f"{name} = {values!r}: expected {expected}")
+        raise TypeError(f"{name} = {shown(values)}: expected {expected}")
     return values
 
 

@@ -7,8 +7,8 @@ experimenter would model from the images alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
@@ -25,7 +25,14 @@ from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
+_N_MODES = 200  # that random segment commands are made of
+
 Seed = int | np.random.Generator | np.random.SeedSequence | None
+
+
+def _error(size: float) -> Any:
+    """Field of `Bench` that is an error: 0 is ideal."""
+    return field(default=size, metadata={"error": True})
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +46,7 @@ class Bench:
     n_pixels : int, pixels
         Camera pixels across a pupil image: 136 on the real bench.
     extent : float, D
-        Width of what the camera records of each pupil image: 180 pixels of 136 on the real bench.
+        Width of what the camera records of each pupil image, at most 10: 180 pixels of 136 on the real bench.
     n_rings, gap, missing, stop
         Layout of the segmented mirror, see `Pupil.hexagonal`. The defaults look like the real one: 37 segments,
         5.5 across the stop, gaps of two pixels (those of the real mirror are narrower, and would be sampled
@@ -97,35 +104,39 @@ class Bench:
     n_rings: int = 3
     gap: float = 0.015
     missing: tuple[int, ...] = (21,)
-    stop: float = 0.78
+    stop: float | None = 0.78
     diameter: float = 1.06
     phase: float = np.pi / 2
     illumination: float = 0.5
-    leakage: float = 0.03
-    focus_difference: float = 3e-4
-    misregistration: float = 0.5
-    blur: float = 0.8
-    flux_imbalance: float = 0.05
-    dimple_error: float = 0.04
-    static: float = 0.05
-    quilting: float = 0.06
+    leakage: float = _error(0.03)
+    focus_difference: float = _error(3e-4)
+    misregistration: float = _error(0.5)
+    blur: float = _error(0.8)
+    flux_imbalance: float = _error(0.05)
+    dimple_error: float = _error(0.04)
+    static: float = _error(0.05)
+    quilting: float = _error(0.06)
     photons: float = 1e10
     read_noise: float = 30.0
     background: float = 60000.0
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _check.number("extent", self.extent, 1)
-        _check.number("diameter", self.diameter, 0, open_low=True)
-        _check.number("illumination", self.illumination, 0, 2, open_high=True)
-        _check.number("leakage", self.leakage, 0, 0.5)
-        _check.number("focus_difference", self.focus_difference, 0, 1e-2)
-        _check.number("misregistration", self.misregistration, 0, 10)
-        _check.number("flux_imbalance", self.flux_imbalance, -1, 1, open_low=True, open_high=True)
-        _check.number("dimple_error", self.dimple_error, -0.9, 10)
+        _check.integer("n_pixels", self.n_pixels, 2)
+        _check.number_field(self, "extent", 1, 10)
+        if isinstance(self.missing, str | bytes) or not isinstance(self.missing, Sequence):
+            raise TypeError(f"missing = {_check.shown(self.missing)}: expected segment numbers, such as (21,)")
+        _check.number_field(self, "dimple_error", -0.9, 10)
+        _check.number_field(self, "diameter", 0, self.n_pixels / (1 + self.dimple_error), open_low=True)
+        _check.number_field(self, "phase")
+        _check.number_field(self, "illumination", 0, 2, open_high=True)
+        _check.number_field(self, "leakage", 0, 0.5)
+        _check.number_field(self, "focus_difference", 0, 1e-2)
+        _check.number_field(self, "misregistration", 0, 10)
+        _check.number_field(self, "flux_imbalance", -1, 1, open_low=True, open_high=True)
         for name in ("blur", "static", "quilting", "photons", "read_noise", "background"):
-            _check.number(name, getattr(self, name), 0)
-        _check.integer("seed", self.seed, 0)
+            _check.number_field(self, name, 0)
+        _check.integer_seed("seed", self.seed)
         if not self.photons and (self.read_noise or self.background):
             raise ValueError(
                 f"photons = 0 with read_noise = {self.read_noise:g} and background = {self.background:g}: "
@@ -137,8 +148,7 @@ class Bench:
     @classmethod
     def errors(cls) -> tuple[str, ...]:
         """Names of the parameters that are errors: 0 is ideal for each."""
-        names = [field.name for field in fields(cls)]
-        return tuple(names[names.index("leakage") : names.index("photons")])
+        return tuple(field.name for field in fields(cls) if "error" in field.metadata)
 
     @classmethod
     def ideal(cls, **changes: Any) -> Bench:
@@ -199,20 +209,22 @@ class Bench:
         ndarray, shape (..., 2, ny', nx')
             Image of the polarisation that sees +`phase`, then of the other one.
         """
+        rng = _check.generator("seed", seed)
         phase = 0.0 if pistons is None else self.commanded_phase(pistons)
         field = self._field * np.exp(1j * phase)
         flat = field.reshape(-1, *field.shape[-2:])
         images = np.stack([self._image(self._sensor.propagate(one)) for one in flat])
-        return self._expose(images.reshape(*field.shape[:-2], *images.shape[1:]), seed)
+        return self._expose(images.reshape(*field.shape[:-2], *images.shape[1:]), rng)
 
     def pupil_images(self, seed: Seed = None) -> NDArray:
         """Counts of the camera with the mask taken out and a flat command, shape (2, ny', nx')."""
+        rng = _check.generator("seed", seed)
         field = np.pad(self._field, self._margin)
-        return self._expose(self._image(np.stack([field, field])), seed)
+        return self._expose(self._image(np.stack([field, field])), rng)
 
     def dark(self, seed: Seed = None) -> NDArray:
         """Counts of the camera without light, shape (2, ny', nx')."""
-        return self._expose(np.zeros((2, *self._camera_shape)), seed)
+        return self._expose(np.zeros((2, *self._camera_shape)), _check.generator("seed", seed))
 
     @cached_property
     def _pupil(self) -> Pupil:
@@ -270,12 +282,12 @@ class Bench:
         transfer = np.exp(-1j * np.pi * (distance * (u**2 + v**2) + 2 * shift * (u + v)))
         return fft.ifft2(fft.fft2(waves) * transfer)
 
-    def _expose(self, images: NDArray[np.float64], seed: Seed) -> NDArray[np.float64]:
+    def _expose(self, images: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         flux = np.array([1 + self.flux_imbalance, 1 - self.flux_imbalance])[:, np.newaxis, np.newaxis]
         if not self.photons:
             return images * flux
         camera = Detector(self._pupil, self.photons, read_noise=self.read_noise, background=self.background)
-        return camera.expose(images * flux, seed)
+        return camera.expose(images * flux, rng)
 
     def _commands(self, pistons: ArrayLike | Mapping[int, float]) -> NDArray[np.float64]:
         if isinstance(pistons, Mapping):
@@ -335,7 +347,8 @@ class BenchModel:
         seed : int, Generator or SeedSequence, optional
             Of the noise of the images.
         """
-        rng = np.random.default_rng(seed)
+        _check.instance("bench", bench, Bench)
+        rng = _check.generator("seed", seed)
         dark = bench.dark(rng)
         images = bench.pupil_images(rng) - dark
         ny, nx = bench.segments.shape
@@ -388,13 +401,21 @@ class BenchModel:
 def segment_pistons(phase: ArrayLike, segments: NDArray, numbers: NDArray) -> NDArray[np.float64]:
     """Piston of each segment in a phase, see `BenchModel.pistons`: on a map of segment numbers (ny, nx)."""
     phase = _check.real_array("phase", phase)
-    _check.trailing_shape("phase", phase, segments.shape, "the grid of the segments")
+    segments = _check.integer_array("segments", segments)
+    if segments.ndim != 2:
+        raise ValueError(f"segments has shape {segments.shape}: expected (ny, nx)")
+    numbers = _check.integer_array("numbers", numbers)
+    if numbers.ndim != 1 or not numbers.size:
+        raise ValueError(f"numbers has shape {numbers.shape}: expected (n_segments,), at least one")
+    _check.maps("phase", phase, segments.shape, "the grid of the segments")
     on_segment = segments.ravel() > 0
     flat = phase.reshape(*phase.shape[:-2], -1)[..., on_segment]
     members = (segments.ravel()[on_segment] == numbers[:, np.newaxis]).astype(float)
     sums = np.where(np.isfinite(flat), np.exp(1j * np.nan_to_num(flat)), 0) @ members.T
     if not np.all(np.abs(sums) > 0):
-        raise ValueError("phase is NaN all over a segment: expected finite values")
+        raise ValueError(
+            "phase is NaN all over a segment, or segments lacks one of numbers: expected finite values"
+        )
     return np.angle(sums)
 
 
@@ -413,15 +434,12 @@ def segment_residual(found: ArrayLike, commanded: ArrayLike) -> NDArray[np.float
     Raises
     ------
     ValueError
-        If a value is not finite.
+        If there is no piston, or a value is not finite.
     """
     found, commanded = _check.real_array("found", found), _check.real_array("commanded", commanded)
-    try:
-        np.broadcast_shapes(found.shape, commanded.shape)
-    except ValueError:
-        raise ValueError(
-            f"found and commanded have shapes {found.shape} and {commanded.shape}: expected ones that broadcast"
-        ) from None
+    shape = _check.broadcast(found=found, commanded=commanded)
+    if not shape or 0 in shape:
+        raise ValueError(f"found and commanded have shape {shape}: expected (..., n_segments), at least one")
     _check.finite("found", found)
     _check.finite("commanded", commanded)
     phasor = np.exp(1j * (found - commanded))
@@ -448,13 +466,23 @@ def segment_screens(
     -------
     ndarray, shape (n_screens, n_segments), radian
 
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of the wrong kind or out of range, or the bench has a single segment or too few points.
+
     References
     ----------
     Chambouleyron et al. 2024, section 5.2.
     """
+    _check.instance("bench", bench, Bench)
+    if bench.n_segments < 2:
+        raise ValueError(f"bench has {bench.n_segments} segment: expected two or more, which differ in piston")
     rms = _check.number("rms", rms, 0)
     layout = Pupil.circular(bench.n_pixels)
-    screens = power_law_screens(zernike_basis(layout, 200), 1.0, n_screens, exponent, seed)
+    if layout.n_points <= _N_MODES:
+        raise ValueError(f"bench has n_pixels = {bench.n_pixels}: expected enough points for {_N_MODES} modes")
+    screens = power_law_screens(zernike_basis(layout, _N_MODES), 1.0, n_screens, exponent, seed)
     flat = screens.reshape(len(screens), -1)
     members = bench.segments.ravel() == bench.numbers[:, np.newaxis]
     pistons = flat @ (members / members.sum(axis=1, keepdims=True)).T

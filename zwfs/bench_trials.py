@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check, sweeps
-from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
-from zwfs.experiments import check_rms
+from zwfs.bench import Bench, BenchModel, Seed, segment_residual, segment_screens
+from zwfs.experiments import check_reconstructors, check_rms
 from zwfs.metrics import dynamic_range
 from zwfs.reconstructors import RECONSTRUCTORS, Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
 
@@ -40,10 +40,12 @@ class BenchCurves:
 
     def mean(self, name: str) -> NDArray[np.float64]:
         """Mean error over the screens, shape (n_rms,), radian rms."""
+        _check.choice("name", name, self.residuals)
         return self.errors[name].mean(axis=1)
 
     def std(self, name: str) -> NDArray[np.float64]:
         """Standard deviation of the error over the screens, shape (n_rms,), radian rms."""
+        _check.choice("name", name, self.residuals)
         return self.errors[name].std(axis=1)
 
     def dynamic_range(self, name: str, threshold: float) -> float:
@@ -56,6 +58,7 @@ class BenchCurves:
         The offset of each segment, which is its residual at an input of 0 where there is one, is taken off first.
         NaN at an input of 0.
         """
+        _check.choice("name", name, self.residuals)
         residuals = self.residuals[name]
         if np.any(self.rms == 0):
             residuals = residuals - residuals[self.rms == 0].mean(axis=(0, 1))
@@ -71,7 +74,7 @@ def bench_reconstructors(
     n_iterations: int = 25,
     poke: float = 0.1,
     conditioning: float = 0.1,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> dict[str, Any]:
     """The paper's reconstructors for a bench, from its model; the linear one is calibrated on the bench itself.
 
@@ -87,7 +90,7 @@ def bench_reconstructors(
     conditioning : float
         Smallest singular value of that matrix that is inverted, relative to the largest. The piston of all
         segments together is seen by no sensor: in its place stands the noise of the calibration, to be left out.
-    seed : int
+    seed : int, Generator or SeedSequence, optional
         Of the noise of the calibration.
 
     Returns
@@ -95,7 +98,11 @@ def bench_reconstructors(
     dict of reconstructor
         One mask's image makes "Linear" and "Arcsine", both the others. Gradient descent seeks segment pistons.
     """
-    rng = np.random.default_rng(seed)
+    _check.instance("bench", bench, Bench)
+    _check.instance("model", model, BenchModel)
+    n_iterations = _check.integer("n_iterations", n_iterations, 1)
+    conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
+    rng = _check.generator("seed", seed)
     pokes = _check.number("poke", poke, 0, open_low=True) * np.eye(bench.n_segments)
     flat, pushed, pulled = (
         model.normalise(bench.frames(command, rng))[..., :1, :, :] for command in (None, pokes, -pokes)
@@ -118,8 +125,11 @@ def bench_reconstructors(
 
 def find_pistons(reconstructor: Any, model: BenchModel, frames: ArrayLike) -> NDArray[np.float64]:
     """Segment pistons that a reconstructor sees in normalised frames, (..., 2, ny', nx') to (..., n_segments)."""
-    n_images = reconstructor.settings.sensor.n_masks
-    return model.pistons(reconstructor(np.asarray(frames)[..., :n_images, :, :]).phase)
+    n_images = _check.sensor_of("reconstructor", reconstructor).n_masks
+    _check.instance("model", model, BenchModel)
+    frames = _check.real_array("frames", frames)
+    _check.trailing_shape("frames", frames, model.dark.shape, "the two images of the bench")
+    return model.pistons(reconstructor(frames[..., :n_images, :, :]).phase)
 
 
 def bench_curves(
@@ -158,8 +168,13 @@ def bench_curves(
     ----------
     Chambouleyron et al. 2024, section 5.2 and Figure 9.
     """
+    _check.instance("bench", bench, Bench)
+    _check.instance("model", model, BenchModel)
+    check_reconstructors(reconstructors)
     rms = check_rms(rms)
     n_screens = _check.integer("n_screens", n_screens, 1)
+    exponent = _check.number("exponent", exponent)
+    seed = _check.integer_seed("seed", seed)
     shared = bench, model, dict(reconstructors), n_screens, exponent, seed
     points = sweeps.run(_bench_point, enumerate(rms.tolist()), *shared, name="bench_curves")
     commanded, residuals = zip(*points, strict=True)
@@ -220,9 +235,16 @@ def error_budget(
     dict of BenchCurves
         By the name of the error, "none" first and "all" last.
     """
-    known = {method.__name__ for method in RECONSTRUCTORS}
-    if isinstance(names, str) or not set(names) <= known:
-        raise ValueError(f"names = {names!r}: expected some of {sorted(known)}")
+    _check.instance("bench", bench, Bench)
+    known = sorted(method.__name__ for method in RECONSTRUCTORS)
+    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
+        raise TypeError(f"names = {_check.shown(names)}: expected a list with some of {known}")
+    for name in names:
+        _check.choice("names", name, known)
+    rms = check_rms(rms)
+    n_screens = _check.integer("n_screens", n_screens, 1)
+    n_iterations = _check.integer("n_iterations", n_iterations, 1)
+    seed = _check.integer_seed("seed", seed)
     values = {field.name: getattr(bench, field.name) for field in fields(bench)}
     noise = {name: values[name] for name in ("photons", "read_noise", "background")}
     layout = {name: value for name, value in values.items() if name not in (*Bench.errors(), *noise)}

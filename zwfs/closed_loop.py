@@ -34,9 +34,9 @@ class FrozenFlow:
         Each has a wind direction of its own.
     speed : float, D / second
     cutoff : float, cycles / D
-        Highest spatial frequency, at least 1.
+        Highest spatial frequency, at least 1 and at most one cycle per pixel.
     exponent : float
-        Exponent of the power spectral density.
+        Exponent of the power spectral density, in [-20, 20].
     seed : int, Generator or SeedSequence, optional
 
     Attributes
@@ -65,10 +65,10 @@ class FrozenFlow:
         rms = _check.number("rms", rms, 0)
         self.n_screens = _check.integer("n_screens", n_screens, 1)
         speed = _check.number("speed", speed, 0)
-        cutoff = _check.number("cutoff", cutoff, 1)
-        exponent = _check.number("exponent", exponent)
+        cutoff = _check.number("cutoff", cutoff, 1, pupil.n_pixels)
+        exponent = _check.number("exponent", exponent, -20, 20)
         self.pupil = pupil
-        rng = np.random.default_rng(seed)
+        rng = _check.generator("seed", seed)
         n = int(cutoff * _BOX)
         axis = np.arange(-n, n + 1) / _BOX
         frequency = np.hypot(axis[:, np.newaxis], axis)
@@ -113,7 +113,7 @@ class LoopRun:
 
     def settled(self, n_steps: int) -> NDArray[np.float64]:
         """Rms of the residual over the last steps, shape (n_screens,), radian rms."""
-        n_steps = _check.integer("n_steps", n_steps, 1)
+        n_steps = _check.integer("n_steps", n_steps, 1, self.times.size)
         return np.sqrt(np.mean(self.residual[:, -n_steps:] ** 2, axis=1))
 
     def closed(self, n_steps: int) -> NDArray[np.bool_]:
@@ -169,7 +169,7 @@ def close_loop(
     TypeError, ValueError
         If an argument is of the wrong kind, shape or range.
     """
-    sensor = reconstructor.settings.sensor
+    sensor = _check.sensor_of("reconstructor", reconstructor)
     pupil = sensor.pupil
     _check.instance("flow", flow, FrozenFlow)
     if flow.pupil.shape != pupil.shape or np.any(flow.pupil.mask != pupil.mask):
@@ -184,7 +184,7 @@ def close_loop(
     if photons is not None:
         photons = _check.number("photons", photons, 0, open_low=True)
         camera = Detector(pupil, photons / sensor.n_masks)
-    rng = np.random.default_rng(seed)
+    rng = _check.generator("seed", seed)
     times = np.arange(n_steps) / rate
     open_loop, residual, ratio = np.empty((3, flow.n_screens, n_steps))
     fit = np.linalg.pinv(modes)
@@ -208,7 +208,11 @@ def close_loop(
     return LoopRun(times, open_loop, residual, ratio)
 
 
-def without_piston(phase: NDArray) -> NDArray:
+def without_piston(phase: ArrayLike) -> NDArray[np.floating]:
     """Phases on the circle around their mean phasor: (..., n_points) to the same, radian, in (-pi, pi]."""
+    phase = _check.real_array("phase", phase)
+    if 0 in (phase.ndim, phase.size):
+        raise ValueError(f"phase has shape {phase.shape}: expected (..., n_points), not empty")
+    _check.finite("phase", phase)
     phasor = np.exp(1j * phase)
     return np.angle(phasor * np.conj(phasor.mean(axis=-1, keepdims=True)))

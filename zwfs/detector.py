@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs.pupil import Pupil
 
+_BRIGHTEST = 9e18  # electrons in a pixel: 64 bits count no more
+
 
 @dataclass(frozen=True)
 class Detector:
@@ -49,12 +51,13 @@ class Detector:
 
     def __post_init__(self) -> None:
         _check.instance("pupil", self.pupil, Pupil)
-        _check.number("photons", self.photons, 0, open_low=True)
-        _check.number("read_noise", self.read_noise, 0)
-        _check.number("background", self.background, 0)
-        if self.full_well != np.inf:
-            _check.number("full_well", self.full_well, 0, open_low=True)
-        _check.number("gain", self.gain, 0)
+        _check.number_field(self, "photons", 0, open_low=True)
+        _check.flag("photon_noise", self.photon_noise)
+        _check.number_field(self, "read_noise", 0)
+        _check.number_field(self, "background", 0)
+        if not (isinstance(self.full_well, float) and self.full_well == np.inf):
+            _check.number_field(self, "full_well", 0, open_low=True)
+        _check.number_field(self, "gain", 0)
 
     @property
     def photons_per_pixel(self) -> float:
@@ -80,15 +83,20 @@ class Detector:
         Raises
         ------
         TypeError, ValueError
-            If the frames are complex, not finite or negative.
+            If the frames are complex, not finite, negative, or brighter than 9e18 electrons in a pixel.
         """
         frames = _check.real_array("frames", frames)
         _check.finite("frames", frames)
         _check.non_negative("frames", frames)
-        rng = np.random.default_rng(seed)
+        rng = _check.generator("seed", seed)
         electrons = frames.astype(np.float64) * self.photons_per_pixel + self.background
+        brightest = electrons.max(initial=0.0)
+        if not brightest < _BRIGHTEST:
+            raise ValueError(
+                f"frames reach {brightest:.3g} electrons in a pixel: expected less than {_BRIGHTEST:g}"
+            )
         if self.photon_noise:
-            electrons = rng.poisson(electrons).astype(np.float64)
+            electrons = np.asarray(rng.poisson(electrons), np.float64)
         if self.read_noise:
             electrons += rng.normal(0, self.read_noise, electrons.shape)
         electrons = np.minimum(electrons, self.full_well)
@@ -97,6 +105,7 @@ class Detector:
     def saturated(self, counts: ArrayLike) -> NDArray[np.bool_]:
         """Where the full well is reached, to half a count."""
         counts = _check.real_array("counts", counts)
+        _check.finite("counts", counts)
         return counts * (self.gain or 1.0) >= self.full_well - self.gain / 2
 
     def normalise(self, counts: ArrayLike, floor: float | None = None) -> NDArray[np.float64]:

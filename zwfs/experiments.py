@@ -42,10 +42,12 @@ class LinearityCurves:
 
     def mean(self, name: str) -> NDArray[np.float64]:
         """Mean error over the screens, shape (n_rms,)."""
+        _check.choice("name", name, self.errors)
         return self.errors[name].mean(axis=1)
 
     def std(self, name: str) -> NDArray[np.float64]:
         """Standard deviation of the error over the screens, shape (n_rms,)."""
+        _check.choice("name", name, self.errors)
         return self.errors[name].std(axis=1)
 
     def dynamic_range(self, name: str, threshold: float = 0.05) -> float:
@@ -54,6 +56,8 @@ class LinearityCurves:
 
     def recovered(self, name: str, threshold: float = 0.05) -> NDArray[np.float64]:
         """Fraction of the screens with an error of at most `threshold` times the input, shape (n_rms,)."""
+        _check.choice("name", name, self.errors)
+        threshold = _check.number("threshold", threshold, 0)
         return np.mean(self.errors[name] <= threshold * self.rms[:, np.newaxis], axis=1)
 
     def columns(self) -> dict[str, NDArray[np.floating]]:
@@ -69,6 +73,7 @@ def screens_at(
     modes: NDArray, rms: float, n_screens: int, seed: int, task: int, exponent: float = -2.0
 ) -> NDArray[np.floating]:
     """Screens of one task of an experiment: they depend on the seed and the task's number, not on the order."""
+    seed, task = _check.integer_seed("seed", seed), _check.integer("task", task, 0)
     return power_law_screens(modes, rms, n_screens, exponent, np.random.SeedSequence(seed, spawn_key=(task,)))
 
 
@@ -80,6 +85,15 @@ def check_rms(rms: ArrayLike) -> NDArray[np.floating]:
     for value in rms.tolist():
         _check.number("rms", value, 0)
     return rms
+
+
+def check_reconstructors(reconstructors: Mapping[str, Any]) -> None:
+    """Require a mapping of at least one reconstructor."""
+    _check.instance("reconstructors", reconstructors, Mapping)
+    if not reconstructors:
+        raise ValueError("reconstructors is empty: expected at least one")
+    for name, reconstructor in reconstructors.items():
+        _check.sensor_of(f"reconstructors[{name!r}]", reconstructor)
 
 
 def linearity_curves(
@@ -119,8 +133,9 @@ def linearity_curves(
     """
     rms = check_rms(rms)
     n_screens = _check.integer("n_screens", n_screens, 1)
-    if not reconstructors:
-        raise ValueError("reconstructors is empty: expected at least one")
+    exponent = _check.number("exponent", exponent)
+    seed = _check.integer_seed("seed", seed)
+    check_reconstructors(reconstructors)
     shared = dict(reconstructors), modes, n_screens, exponent, seed
     points = sweeps.run(_linearity_point, enumerate(rms.tolist()), *shared, name="linearity_curves")
     errors, converged, *light = zip(*points, strict=True)
@@ -175,8 +190,8 @@ def convergence(
     ndarray, shape (n_screens, n_iterations + 1), radian rms
         Before the first iteration (a flat wavefront) and after each one.
     """
+    sensor = _check.sensor_of("reconstructor", reconstructor)
     screens = screens_at(modes, rms, n_screens, seed, 0, exponent)
-    sensor = reconstructor.settings.sensor
     errors = np.empty((n_screens, reconstructor.settings.n_iterations + 1))
     # One screen at a time: the history of all of them would take much memory.
     for index, screen in enumerate(screens):

@@ -23,6 +23,7 @@ def two_waves(incoming: NDArray, reference: NDArray) -> NDArray[np.floating]:
     ----------
     incoming, reference : ndarray of complex, shapes that broadcast
     """
+    incoming, reference = _arrays(incoming=incoming, reference=reference)
     i_in, i_ref = np.abs(incoming) ** 2, np.abs(reference) ** 2
     return i_ref + i_in + 2 * np.sqrt(i_ref * i_in) * np.cos(np.angle(incoming) - np.angle(reference))
 
@@ -47,9 +48,10 @@ def fourier_waves(pupil: Pupil, mask: Mask, field: NDArray, padding: int = 8) ->
     outgoing, incoming, reference : ndarray of complex, shape (n, n)
         On a square of `padding` pupil diameters.
     """
+    light = _light(pupil, mask, field)
     n = round(_check.integer("padding", padding, 2) * pupil.n_pixels)
     incoming = np.zeros((n, n), complex)
-    incoming[: pupil.shape[0], : pupil.shape[1]] = np.where(pupil.mask, field, 0)
+    incoming[: pupil.shape[0], : pupil.shape[1]] = light
     u = np.fft.fftfreq(n, 1 / pupil.n_pixels)
     v = u[:, np.newaxis]
     patch = np.hypot(u, v) <= mask.diameter / 2
@@ -74,13 +76,13 @@ def direct_reference_wave(pupil: Pupil, mask: Mask, field: NDArray, n_samples: i
     ndarray of complex, shape (ny, nx)
         In the plane of the detector, on the grid of the pupil.
     """
+    light = _light(pupil, mask, field) / pupil.n_pixels**2
     nodes, weights = np.polynomial.legendre.leggauss(_check.integer("n_samples", n_samples, 2))
     radius = (nodes + 1) * mask.diameter / 4
     angles = np.arange(2 * n_samples) * np.pi / n_samples
     u, v = np.outer(radius, np.cos(angles)).ravel(), np.outer(radius, np.sin(angles)).ravel()
     area = np.outer(weights * radius * mask.diameter / 4, np.full(angles.size, np.pi / n_samples)).ravel()
     waves_x, waves_y = np.exp(2j * np.pi * np.outer(u, pupil.x)), np.exp(2j * np.pi * np.outer(v, pupil.y))
-    light = np.where(pupil.mask, field, 0) / pupil.n_pixels**2
     spectrum = np.einsum("ky,yx,kx->k", waves_y.conj(), light, waves_x.conj(), optimize=True)
     return (waves_y.T * (area * (mask.transmission(u, v) - 1) * spectrum)) @ waves_x
 
@@ -95,6 +97,9 @@ def quotient(frame: NDArray, incoming: NDArray, reference: NDArray) -> NDArray[n
     incoming, reference : ndarray
         Amplitude or field of each wave; only the modulus counts.
     """
+    frame = _check.real_array("frame", frame)
+    frame, incoming, reference = _arrays(frame=frame, incoming=incoming, reference=reference)
+    _lit(incoming=incoming, reference=reference)
     incoming, reference = np.abs(incoming), np.abs(reference)
     return (frame - reference**2 - incoming**2) / (2 * reference * incoming)
 
@@ -117,6 +122,10 @@ def arccosine_phase(
     ndarray, shape (..., n), radian
         Cosines beyond +-1 count as +-1.
     """
+    if _check.integer("sign", sign, -1, 1) == 0:
+        raise ValueError("sign = 0: expected 1 or -1")
+    frame, amplitude, reference = _arrays(frame=frame, amplitude=amplitude, reference=reference)
+    _lit(amplitude=amplitude, reference=reference)
     return np.angle(reference) + sign * np.arccos(np.clip(quotient(frame, amplitude, reference), -1, 1))
 
 
@@ -128,6 +137,7 @@ def matrix_determinant(first: NDArray, second: NDArray) -> NDArray[np.floating]:
     first, second : ndarray of complex, shapes that broadcast
         Reference waves of both masks.
     """
+    first, second = _arrays(first=first, second=second)
     a, b = np.angle(first), np.angle(second)
     return np.cos(a) * np.sin(b) - np.sin(a) * np.cos(b)
 
@@ -146,9 +156,17 @@ def pair_phase(frames: NDArray, amplitude: NDArray, references: NDArray) -> NDAr
     -------
     ndarray, shape (..., n), radian
     """
+    frames = _check.real_array("frames", frames)
+    frames, amplitude, references = _arrays(frames=frames, amplitude=amplitude, references=references)
+    _lit(amplitude=amplitude, references=references)
+    for name, values in (("frames", frames), ("references", references)):
+        if values.ndim < 2 or values.shape[-2] != 2:
+            raise ValueError(f"{name} has shape {values.shape}: expected (..., 2, n)")
     c = quotient(frames, amplitude, references)
     a, b = np.moveaxis(np.angle(references), -2, 0)
     determinant = matrix_determinant(references[..., 0, :], references[..., 1, :])
+    if not determinant.all():
+        raise ValueError("references have the same phase at some points: expected two different ones at each")
     cosine = (np.sin(b) * c[..., 0, :] - np.sin(a) * c[..., 1, :]) / determinant
     sine = (np.cos(a) * c[..., 1, :] - np.cos(b) * c[..., 0, :]) / determinant
     return np.arctan2(sine, cosine)
@@ -191,6 +209,11 @@ def approximation_errors(sensor: ZernikeSensor, screens: NDArray, power: float =
     ----------
     Chambouleyron et al. 2024, section 2.1.
     """
+    _check.instance("sensor", sensor, ZernikeSensor)
+    if sensor.n_masks != 2:
+        raise ValueError(f"sensor has {sensor.n_masks} masks: expected two")
+    screens, _ = sensor.pupil_maps("screens", screens)
+    power = _check.number("power", power, 0, 10)
     pupil = sensor.pupil
     amplitude = pupil.gather(pupil.amplitude)
     frames = pupil.gather(sensor.measure(screens))
@@ -214,3 +237,35 @@ def approximation_errors(sensor: ZernikeSensor, screens: NDArray, power: float =
         one_image=phase_error(arccosine_phase(frames[:, 0], amplitude, first_guess), screens),
         two_images=phase_error(pair_phase(frames, amplitude, guess), screens),
     )
+
+
+def _arrays(**values: NDArray) -> list[NDArray]:
+    """Arrays of finite numbers, real or complex, whose shapes broadcast."""
+    arrays = {}
+    for name, value in values.items():
+        array = _check.plain_array(name, value)
+        check = _check.complex_array if array.dtype.kind == "c" else _check.real_array
+        arrays[name] = check(name, array)
+        _check.finite(name, arrays[name])
+    _check.broadcast(**arrays)
+    return list(arrays.values())
+
+
+def _lit(**waves: NDArray) -> None:
+    """Require waves that vanish nowhere."""
+    for name, wave in waves.items():
+        if not wave.all():
+            raise ValueError(f"{name} is 0 at {np.count_nonzero(wave == 0)} points: expected light at every point")
+
+
+def _light(pupil: Pupil, mask: Mask, field: NDArray) -> NDArray[np.complexfloating]:
+    """Field in the pupil, 0 outside."""
+    _check.instance("pupil", pupil, Pupil)
+    if isinstance(mask, type) or not hasattr(mask, "transmission"):
+        raise TypeError(f"mask is a {type(mask).__name__}: expected a Dimple or a Patch")
+    field = _check.complex_array("field", field)
+    if field.shape != pupil.shape:
+        raise ValueError(f"field has shape {field.shape}: expected {pupil.shape}")
+    light = np.where(pupil.mask, field, 0)
+    _check.finite("field", light, " inside the pupil")
+    return light

@@ -25,13 +25,14 @@ def wrapped_residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDA
     Raises
     ------
     ValueError
-        If a shape is wrong or a value inside the pupil is not finite.
+        If a shape is wrong, there is no map, or a value inside the pupil is not finite.
 
     References
     ----------
     Chambouleyron et al. 2024, section 4.1; `eq-error` of the book.
     """
-    return pupil.scatter(_residual(pupil, estimate, truth))
+    residual = _residual(pupil, estimate, truth)
+    return pupil.scatter(residual)
 
 
 def reconstruction_error(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.floating]:
@@ -60,7 +61,7 @@ def strehl(pupil: Pupil, phase: ArrayLike) -> NDArray[np.floating]:
     Raises
     ------
     ValueError
-        If the shape is wrong or a value inside the pupil is not finite.
+        If the shape is wrong, there is no map, or a value inside the pupil is not finite.
     """
     values = _inside(pupil, "phase", phase)
     weight = pupil.gather(pupil.amplitude)
@@ -90,7 +91,8 @@ def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> 
     Raises
     ------
     ValueError
-        If the arrays differ in shape, hold no positive input, or are not finite, or if `rms` does not increase.
+        If the arrays differ in shape, hold no positive input or a negative error, or are not finite, or if `rms`
+        does not increase.
 
     References
     ----------
@@ -105,6 +107,7 @@ def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> 
     _check.finite("rms", rms)
     _check.finite("error", error)
     _check.non_negative("rms", rms)
+    _check.non_negative("error", error)
     if np.any(np.diff(rms) <= 0) or not np.any(rms > 0):
         raise ValueError(f"rms = {rms}: expected increasing values, some of them above 0")
     ratio = error[rms > 0] / rms[rms > 0]
@@ -122,7 +125,7 @@ def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> 
 def _inside(pupil: Pupil, name: str, maps: ArrayLike) -> NDArray[np.floating]:
     _check.instance("pupil", pupil, Pupil)
     maps = _check.real_array(name, maps)
-    _check.trailing_shape(name, maps, pupil.shape, "the shape of the pupil")
+    _check.maps(name, maps, pupil.shape)
     values = pupil.gather(maps)
     _check.finite(name, values, " inside the pupil")
     return values

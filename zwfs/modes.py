@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isqrt
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -24,7 +26,7 @@ def noll_to_nm(j: int) -> tuple[int, int]:
     Noll 1976, J. Opt. Soc. Am. 66, 207, table I.
     """
     j = _check.integer("j", j, 1)
-    n = int((np.sqrt(8 * j - 7) - 1) / 2)
+    n = (isqrt(8 * j - 7) - 1) // 2
     position = j - n * (n + 1) // 2
     m = 2 * (position // 2) if n % 2 == 0 else 2 * ((position - 1) // 2) + 1
     return n, m if j % 2 == 0 else -m
@@ -64,8 +66,8 @@ def zernike_basis(
     """
     _check.instance("pupil", pupil, Pupil)
     n_modes = _check.integer("n_modes", n_modes, 1)
-    if np.dtype(dtype) not in (np.float32, np.float64):
-        raise TypeError(f"dtype = {dtype!r}: expected float32 or float64")
+    orthonormal = _check.flag("orthonormal", orthonormal)
+    checked_dtype = _check.float_dtype("dtype", dtype)
     if n_modes >= pupil.n_points:
         raise ValueError(
             f"n_modes = {n_modes}: expected fewer modes than the {pupil.n_points} points of the pupil"
@@ -84,7 +86,7 @@ def zernike_basis(
     scale = values.std(axis=1, keepdims=True)
     if not scale.min() > 1e-12:
         raise ValueError(f"n_modes = {n_modes}: the {pupil.n_points} points of the pupil do not tell them apart")
-    return pupil.scatter((values / scale).astype(dtype), fill=0.0)
+    return pupil.scatter((values / scale).astype(checked_dtype), fill=0.0)
 
 
 def power_law_screens(
@@ -110,7 +112,7 @@ def power_law_screens(
         Every screen is scaled to exactly this rms over the pupil, piston removed.
     n_screens : int
     exponent : float
-        Exponent of the power spectral density.
+        Exponent of the power spectral density, in [-20, 20].
     seed : int, Generator or SeedSequence, optional
         Fewer screens from the same integer seed are the first of more.
 
@@ -122,7 +124,8 @@ def power_law_screens(
     Raises
     ------
     ValueError
-        If the modes are not three-dimensional, empty or of different rms, or a number is out of range.
+        If the modes are not three-dimensional, empty, not finite, 0 or of different rms, or a number is out of
+        range.
 
     References
     ----------
@@ -133,14 +136,16 @@ def power_law_screens(
         raise ValueError(f"modes has shape {modes.shape}: expected (n_modes, ny, nx)")
     rms = _check.number("rms", rms, 0)
     n_screens = _check.integer("n_screens", n_screens, 1)
-    exponent = _check.number("exponent", exponent)
+    exponent = _check.number("exponent", exponent, -20, 20)
+    rng = _check.generator("seed", seed)
+    _check.finite("modes", modes)
     flat = modes.reshape(len(modes), -1)
     # The sum of squares of a mode of unit rms is the number of points inside.
     n_points = np.einsum("ij,ij->i", flat, flat, dtype=np.float64)
-    if not np.allclose(n_points, n_points[0], rtol=1e-3):
+    if not (0 < n_points.min() < np.inf and np.allclose(n_points, n_points[0], rtol=1e-3)):
         raise ValueError("modes have different rms: expected unit rms each, as zernike_basis gives them")
     orders = np.array([noll_to_nm(j)[0] for j in range(2, len(modes) + 2)])
-    coefficients = np.random.default_rng(seed).standard_normal((n_screens, len(modes)))
+    coefficients = rng.standard_normal((n_screens, len(modes)))
     coefficients *= orders ** (exponent / 2)
     screens = coefficients.astype(modes.dtype) @ flat
     power = np.einsum("ij,ij->i", screens, screens, dtype=np.float64) / n_points[0]

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from zwfs import _check
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -46,13 +48,16 @@ def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike], *, dpi:
 
     Raises
     ------
-    TypeError
-        If a column is complex.
-    ValueError
-        If the name holds other characters, there is no column, or columns differ in length or have two axes.
+    TypeError, ValueError
+        If the figure cannot be saved, the name holds other characters, there is no column, a column is complex or
+        holds objects, columns differ in length or have two axes, or the resolution is not above 0.
     """
+    if not hasattr(figure, "savefig") or isinstance(figure, type):
+        raise TypeError(f"figure is a {type(figure).__name__}: expected a Figure of matplotlib")
+    _check.instance("name", name, str)
     if not re.fullmatch(r"[a-z0-9][a-z0-9_-]*", name):
-        raise ValueError(f"name = {name!r}: expected lower-case letters, digits, - and _")
+        raise ValueError(f"name = {_check.shown(name)}: expected lower-case letters, digits, - and _")
+    dpi = _check.number("dpi", dpi, 0, open_low=True)
     contents = {"csv": _csv(columns)} | _pictures(figure, dpi)
     if folder := os.environ.get(FOLDER):
         for kind, content in contents.items():
@@ -78,12 +83,18 @@ def _pictures(figure: Figure, dpi: float) -> dict[str, bytes]:
 
 def _csv(columns: Mapping[str, ArrayLike]) -> bytes:
     """Columns as the bytes of a CSV file."""
-    arrays = {header: np.asarray(column) for header, column in columns.items()}
-    for header, array in arrays.items():
+    _check.instance("columns", columns, Mapping)
+    arrays = {}
+    for header, column in columns.items():
+        name = f"columns[{header!r}]"
+        _check.instance(f"header of {name}", header, str)
+        array = arrays[header] = _check.plain_array(name, column)
         if array.dtype.kind == "c":
-            raise TypeError(f"column {header!r} is complex: expected its parts in columns of their own")
+            raise TypeError(f"{name} is complex: expected its parts in columns of their own")
+        if array.dtype.kind not in "biufU":
+            raise TypeError(f"{name} has dtype {array.dtype}: expected numbers or strings")
         if array.ndim > 1:
-            raise ValueError(f"column {header!r} has shape {array.shape}: expected (n,) or a scalar")
+            raise ValueError(f"{name} has shape {array.shape}: expected (n,) or a scalar")
     lengths = {header: array.size for header, array in arrays.items() if array.ndim}
     if len(set(lengths.values())) > 1:
         told = ", ".join(f"{header!r}: {length}" for header, length in lengths.items())
@@ -104,6 +115,8 @@ def _text(value: Any) -> str:
 
 def write_file(path: Path, content: bytes) -> None:
     """Write a file, and its folder if need be, in one step: whoever looks sees the old one or all of the new."""
+    _check.instance("path", path, Path)
+    _check.instance("content", content, bytes)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:

@@ -1,8 +1,9 @@
 """Sweeps: tasks that do not depend on each other, on one core, on several, or on a cluster.
 
-An experiment hands its tasks to `run`, which has them done by joblib: on all cores, unless a
-`joblib.parallel_config` around it says otherwise. Where and in which order they are done does not change a bit of
-the results: random numbers come from the number of the task, and BLAS works with one thread.
+An experiment hands its tasks to `run`. With joblib they run on all cores, unless a `joblib.parallel_config` around
+the sweep says otherwise. Without joblib they run in this process, and so does a single task. Where and in which
+order they run does not change a bit of the results: random numbers come from the number of the task, and BLAS
+works with one thread. Without threadpoolctl BLAS keeps its threads, and the last digits may differ.
 
 Two environment variables, read when a sweep begins, name
 
@@ -20,6 +21,7 @@ import os
 import pickle
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from contextvars import ContextVar
 from functools import cache
 from importlib.util import find_spec
@@ -31,6 +33,7 @@ from uuid import uuid4
 import numpy as np
 import scipy
 
+from zwfs import _check
 from zwfs.results import write_file
 
 STORE = "ZWFS_SWEEPS"
@@ -63,10 +66,10 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
 
     Raises
     ------
-    ValueError
-        If the name is not an identifier.
+    TypeError, ValueError
+        If the task is not a function, the inputs are not iterable, or the name is not an identifier.
     ImportError
-        If joblib, cloudpickle or threadpoolctl is missing.
+        If joblib or a folder for the results needs cloudpickle or threadpoolctl, and one of them is missing.
     Exception
         That of the first task that fails, with a note that names the sweep, the task and its input. What other
         tasks had finished stays in the folder of ``ZWFS_SWEEPS``.
@@ -77,12 +80,19 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
     >>> sweeps.run(pow, range(5), 2, name="squares")
     [0, 1, 4, 9, 16]
     """
+    _check.function("task", task)
+    try:
+        inputs = iter(inputs)
+    except TypeError:
+        raise TypeError(f"inputs is a {type(inputs).__name__}: expected a list of values") from None
+    _check.instance("name", name, str)
     if not name.isidentifier():
-        raise ValueError(f"name = {name!r}: expected an identifier, such as 'linearity_curves'")
+        raise ValueError(f"name = {_check.shown(name)}: expected an identifier, such as 'linearity_curves'")
     inputs = list(inputs)
     if _IN_TASK.get():
         return [task(value, *shared) for value in inputs]
-    if missing := [package for package in ("joblib", "cloudpickle", "threadpoolctl") if not find_spec(package)]:
+    needed = ("cloudpickle", "threadpoolctl") if find_spec("joblib") or os.environ.get(STORE) else ()
+    if missing := [package for package in needed if not find_spec(package)]:
         raise ImportError(f"sweeps need {', '.join(missing)}: pip install zwfs[sweeps]")
     store = _Store(name, (task, *shared))
     found = {index: kept for index, value in enumerate(inputs) if (kept := store.load(value)) is not None}
@@ -98,11 +108,21 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
 
 def _results(waiting: list[tuple[int, Any]], shared: tuple[Any, ...], name: str) -> Iterator[tuple[int, Any]]:
     """Number and result of each task, as they finish."""
+    with _one_thread():
+        if len(waiting) < 2 or not find_spec("joblib"):
+            yield from (_work(shared, index, (value,), name, _PROCESS) for index, value in waiting)
+        else:
+            yield from _parallel_results(waiting, shared, name)
+
+
+def _parallel_results(
+    waiting: list[tuple[int, Any]], shared: tuple[Any, ...], name: str
+) -> Iterator[tuple[int, Any]]:
+    """Number and result of each task, as joblib's workers finish them."""
     # Not at the top: the rest of the package does without these.
     from cloudpickle import dumps
     from joblib import Parallel, delayed
     from joblib.parallel import get_active_backend
-    from threadpoolctl import threadpool_limits
 
     backend, n_jobs = get_active_backend()
     client = getattr(backend, "client", None)  # of a Dask cluster
@@ -112,14 +132,17 @@ def _results(waiting: list[tuple[int, Any]], shared: tuple[Any, ...], name: str)
     # The value in a tuple: joblib would send a large one to a single Dask worker, with which it could be lost.
     calls = [delayed(_work)(shared, index, (value,), name, _PROCESS) for index, value in waiting]
     # All tasks are handed out at once, so that a cluster can grow as they wait, and each comes back by itself.
-    pool = Parallel(
-        n_jobs=1 if len(waiting) < 2 else n_jobs or -1,
-        return_as="generator_unordered",
-        batch_size=1,
-        pre_dispatch="all",
-    )
-    with threadpool_limits(1):
-        yield from pool(calls)
+    pool = Parallel(n_jobs=n_jobs or -1, return_as="generator_unordered", batch_size=1, pre_dispatch="all")
+    yield from pool(calls)
+
+
+def _one_thread() -> AbstractContextManager[Any]:
+    """Let BLAS work with one thread, if threadpoolctl is there to say so."""
+    if not find_spec("threadpoolctl"):
+        return nullcontext()
+    from threadpoolctl import threadpool_limits
+
+    return threadpool_limits(1)
 
 
 def _work(shared: Any, index: int, value: tuple[Any], name: str, caller: str) -> tuple[int, Any]:
@@ -142,9 +165,7 @@ def _work(shared: Any, index: int, value: tuple[Any], name: str, caller: str) ->
 @cache
 def _limit_threads() -> None:
     """Let BLAS work with one thread in this process, which is a worker, from now on."""
-    from threadpoolctl import threadpool_limits
-
-    threadpool_limits(1)
+    _one_thread()
 
 
 def _tell(name: str, done: int, total: int) -> None:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from zwfs import _check
+
 
 @dataclass(frozen=True)
 class Table:
@@ -28,9 +30,19 @@ class Table:
     digits: int = 3
 
     def __post_init__(self) -> None:
+        for name in ("header", "rows"):
+            if isinstance(getattr(self, name), str) or not isinstance(getattr(self, name), Sequence):
+                raise TypeError(f"{name} = {_check.shown(getattr(self, name))}: expected a list")
+        _check.integer("digits", self.digits, 1, 17)
+        for text in self.header:
+            _check.instance("header", text, str)
         for index, row in enumerate(self.rows):
+            if isinstance(row, str) or not isinstance(row, Sequence):
+                raise TypeError(f"rows[{index}] = {_check.shown(row)}: expected a list of cells")
             if len(row) != len(self.header):
-                raise ValueError(f"rows[{index}] has {len(row)} cells: expected {len(self.header)}")
+                raise ValueError(
+                    f"rows[{index}] has {len(row)} cells: expected {len(self.header)}, as the header has"
+                )
 
     def __repr__(self) -> str:
         return f"Table of {len(self.rows)} rows: {', '.join(self.header)}"

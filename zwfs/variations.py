@@ -59,11 +59,13 @@ class DiameterCurve:
 
     def at(self, diameter: float) -> float:
         """Mean error at the sampled diameter (lambda/D) next to `diameter`, radian rms."""
-        return float(self.mean[np.argmin(np.abs(self.diameters - diameter))])
+        return float(self.mean[np.argmin(np.abs(self.diameters - _check.number("diameter", diameter)))])
 
     def leaves(self, limit: float, start: float = 0.0) -> float:
         """Diameter, from `start` on, at which the mean error rises above `limit`; see `crossing`."""
-        used = self.diameters >= start - 1e-9
+        used = self.diameters >= _check.number("start", start) - 1e-9
+        if not used.any():
+            raise ValueError(f"start = {start:g}: expected at most the last diameter, {self.diameters[-1]:g}")
         return crossing(self.diameters[used], self.mean[used], limit)
 
 
@@ -87,12 +89,13 @@ def crossing(x: ArrayLike, y: ArrayLike, limit: float) -> float:
     Raises
     ------
     ValueError
-        If the shapes differ, `x` does not increase, or a value of `y` is not positive and finite.
+        If the shapes differ, `x` does not increase or is not finite, or a value of `y` is not positive and finite.
     """
     x, y = _check.real_array("x", x), _check.real_array("y", y)
     if x.ndim != 1 or x.shape != y.shape or not x.size:
         raise ValueError(f"x and y have shapes {x.shape} and {y.shape}: expected the same (n,)")
     limit = _check.number("limit", limit, 0, open_low=True)
+    _check.finite("x", x)
     _check.finite("y", y)
     if np.any(np.diff(x) <= 0) or np.any(y <= 0):
         raise ValueError("x, y: expected increasing x and positive y")
@@ -131,11 +134,12 @@ def diameter_curve(make: Callable[[float], Any], diameters: ArrayLike, screens: 
     ----------
     Chambouleyron et al. 2024, section 4.2 and Figure 4.
     """
+    _check.function("make", make)
     diameters = _check.real_array("diameters", diameters)
+    _check.finite("diameters", diameters)
     if diameters.ndim != 1 or not diameters.size or diameters[0] <= 0 or np.any(np.diff(diameters) <= 0):
-        raise ValueError(f"diameters = {diameters}: expected positive, increasing values")
-    if np.ndim(screens) != 3 or not len(screens):
-        raise ValueError(f"screens has shape {np.shape(screens)}: expected (n_screens, ny, nx)")
+        raise ValueError(f"diameters = {_check.shown(diameters)}: expected positive, increasing values")
+    screens = _check_screens(screens)
     rows = sweeps.run(_diameter_point, diameters.tolist(), make, screens, name="diameter_curve")
     return DiameterCurve(diameters, np.array(rows))
 
@@ -143,7 +147,8 @@ def diameter_curve(make: Callable[[float], Any], diameters: ArrayLike, screens: 
 def _diameter_point(diameter: float, make: Callable[[float], Any], screens: NDArray) -> NDArray[np.floating]:
     """One diameter of the curve: error on each screen, (n_screens,)."""
     reconstructor = make(diameter)
-    sensor = reconstructor.settings.sensor
+    sensor = _check.sensor_of("make", reconstructor)
+    screens, _ = sensor.pupil_maps("screens", screens)
     return reconstruction_error(sensor.pupil, reconstructor(sensor.measure(screens)).phase, screens)
 
 
@@ -161,6 +166,9 @@ class DimpleLight:
     """
 
     def __init__(self, pupil: Pupil, diameter: float) -> None:
+        _check.instance("pupil", pupil, Pupil)
+        # The focal field of a sampled pupil repeats after as many lambda/D as there are pixels across D.
+        self.diameter = diameter = _check.number("diameter", diameter, 0, pupil.n_pixels, open_low=True)
         self.pupil = pupil
         axes = (pupil.y, pupil.x)
         # For a phase shift of pi the reference wave is -2 beta.
@@ -179,11 +187,22 @@ class DimpleLight:
 
     def project(self, field: NDArray) -> NDArray[np.complex128]:
         """Coefficients of fields, (k, n_points) to (k, rank)."""
-        return self._factors.pupil.project(self.pupil.scatter(np.asarray(field, np.complex128), fill=0))
+        field = self._rows("field", field, self.pupil.n_points).astype(np.complex128)
+        return self._factors.pupil.project(self.pupil.scatter(field, fill=0))
 
     def expand(self, coefficients: NDArray) -> NDArray:
         """Fields of coefficients on the detector side, (k, rank) to (k, n_points)."""
+        coefficients = self._rows("coefficients", coefficients, self.rank)
         return self.pupil.gather(self._factors.detector.expand(coefficients))
+
+    def _rows(self, name: str, values: NDArray, n: int) -> NDArray:
+        """Checked numbers, real or complex, shape (k, n)."""
+        values = _check.plain_array(name, values)
+        values = (_check.complex_array if values.dtype.kind == "c" else _check.real_array)(name, values)
+        if values.ndim != 2 or values.shape[1] != n:
+            raise ValueError(f"{name} has shape {values.shape}: expected (k, {n})")
+        _check.finite(name, values)
+        return values
 
     def functions(self) -> NDArray[np.float64]:
         """Beta of a unit coefficient each, shape (rank, n_points)."""
@@ -220,11 +239,12 @@ def linearised_step(pupil: Pupil, diameter: float, phase: ArrayLike, error: Arra
     ----------
     Chambouleyron et al. 2024, section 3.1; `eq-linear-system` of the book.
     """
-    light = DimpleLight(pupil, diameter)
-    psi, beta = _field(light, phase)
+    phase = _check_map(pupil, "phase", phase)
+    light, psi, beta = _linearised(pupil, diameter, phase)
     error = _check.real_array("error", error)
-    _check.trailing_shape("error", error, pupil.shape, "the shape of the pupil")
+    _check.maps("error", error, pupil.shape)
     change = pupil.gather(error).reshape(-1, pupil.n_points)
+    _check.finite("error", change, " inside the pupil")
     after = _after(psi, beta, light(1j * psi * change))
     return pupil.scatter(after.reshape(*error.shape[:-2], -1))
 
@@ -253,8 +273,7 @@ def iteration_spectrum(pupil: Pupil, diameter: float, phase: ArrayLike | None = 
     ValueError
         If the shape of the phase is wrong.
     """
-    light = DimpleLight(pupil, diameter)
-    psi, beta = _field(light, np.zeros(pupil.shape) if phase is None else phase)
+    light, psi, beta = _linearised(pupil, diameter, phase)
     functions = light.functions()
     # Real and imaginary parts of the coefficients of the change of the field, before and after.
     after = np.concatenate([_after(psi, beta, functions), _after(psi, beta, 1j * functions)])
@@ -294,12 +313,14 @@ def measured_factor(
         If the error of the start is 0, or an argument is out of range.
     """
     n_iterations = _check.integer("n_iterations", n_iterations, 2)
+    phase, away = _check_map(pupil, "phase", phase), _check_map(pupil, "away", away)
+    diameter = _linearised(pupil, diameter, phase)[0].diameter  # checked
     size = float(pupil.rms(away))
     if size == 0:
         raise ValueError("away is the same everywhere: expected an error of some size")
     sensor = ZernikeSensor(pupil, *(Dimple(diameter, theta) for theta in (np.pi / 2, -np.pi / 2)), tolerance=1e-13)
     method = PhaseShifted(sensor, n_iterations=1)
-    frames, error, factors = sensor.measure(phase), np.asarray(away), []
+    frames, error, factors = sensor.measure(phase), away, []
     for _ in range(n_iterations):
         error = wrapped_residual(pupil, method(frames, start=phase + error).phase, phase)
         error = np.where(pupil.mask, error, 0)
@@ -344,14 +365,19 @@ def mode_sensitivity(
     ----------
     Chambouleyron et al. 2024, section 4.2.
     """
-    light = DimpleLight(pupil, diameter)
-    psi, beta = _field(light, np.zeros(pupil.shape) if phase is None else phase)
+    light, psi, beta = _linearised(pupil, diameter, phase)
     modes = _check.real_array("modes", modes)
-    _check.trailing_shape("modes", modes, pupil.shape, "the shape of the pupil")
-    direct = 1j * psi * pupil.gather(modes).reshape(-1, pupil.n_points)
+    _check.maps("modes", modes, pupil.shape)
+    modes = pupil.gather(modes).reshape(-1, pupil.n_points)
+    _check.finite("modes", modes, " inside the pupil")
+    shifts = _check.real_array("phase_shifts", phase_shifts)
+    if shifts.ndim != 1 or not shifts.size:
+        raise ValueError(f"phase_shifts has shape {shifts.shape}: expected (n_masks,)")
+    _check.finite("phase_shifts", shifts)
+    direct = 1j * psi * modes
     through = light(direct)
     power = np.zeros(len(direct))
-    for theta in phase_shifts:
+    for theta in shifts:
         strength = np.exp(1j * theta) - 1
         out = psi + strength * beta
         power += np.mean((2 * np.real(out.conj() * (direct + strength * through))) ** 2, axis=-1)
@@ -408,10 +434,10 @@ def phase_noise(sensor: ZernikeSensor, phase: ArrayLike) -> PhaseNoise:
     ----------
     Chambouleyron et al. 2024, sections 2.2 and 4.2; `eq-linear-system` of the book.
     """
+    _check.instance("sensor", sensor, ZernikeSensor)
     if sensor.n_masks != 2 or sensor.detector_shape != sensor.pupil.shape:
         raise ValueError(f"sensor = {sensor!r}: expected two masks and an extent of 1")
-    phase = _check.real_array("phase", phase)
-    _check.trailing_shape("phase", phase, sensor.pupil.shape, "the shape of the pupil")
+    phase = _check_map(sensor.pupil, "phase", phase)
     field = sensor.pupil.amplitude * np.exp(1j * np.where(sensor.pupil.mask, phase, 0))
     psi = sensor.pupil.gather(field)
     waves = sensor.pupil.gather(sensor.reference_wave(field))
@@ -429,7 +455,11 @@ def phase_noise(sensor: ZernikeSensor, phase: ArrayLike) -> PhaseNoise:
 
 
 def drawn_noise(
-    sensor: ZernikeSensor, phase: ArrayLike, photons: float, n_draws: int, seed: int = 0
+    sensor: ZernikeSensor,
+    phase: ArrayLike,
+    photons: float,
+    n_draws: int,
+    seed: int | np.random.Generator | np.random.SeedSequence | None = 0,
 ) -> tuple[float, float]:
     """Photon noise of the phase-shifted iteration, from frames with drawn noise, to compare with `phase_noise`.
 
@@ -440,10 +470,10 @@ def drawn_noise(
     phase : array_like, shape (ny, nx), radian
         True phase.
     photons : float, photons
-        Per point of the pupil and frame set; many, as the comparison is to first order.
+        Per point of the pupil and frame set, at least 1; many, as the comparison is to first order.
     n_draws : int
         At least 2.
-    seed : int
+    seed : int, Generator or SeedSequence, optional
 
     Returns
     -------
@@ -455,10 +485,14 @@ def drawn_noise(
     ValueError
         If an argument is out of range.
     """
+    _check.instance("sensor", sensor, ZernikeSensor)
+    phase = _check_map(sensor.pupil, "phase", phase)
+    photons = _check.number("photons", photons, 1)
     n_draws = _check.integer("n_draws", n_draws, 2)
-    camera = Detector(sensor.pupil, _check.number("photons", photons) * sensor.pupil.n_points / sensor.n_masks)
+    rng = _check.generator("seed", seed)
+    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points / sensor.n_masks)
     frames = np.repeat(sensor.measure(phase)[np.newaxis], n_draws, axis=0)
-    found = PhaseShifted(sensor)(camera.normalise(camera.expose(frames, seed)))
+    found = PhaseShifted(sensor)(camera.normalise(camera.expose(frames, rng)))
     power = photons * reconstruction_error(sensor.pupil, found.phase, phase) ** 2
     noise = float(np.sqrt(power.mean()))
     return noise, float(power.std(ddof=1) / np.sqrt(n_draws) / (2 * noise))
@@ -503,6 +537,7 @@ class PairMaps:
 
     def best(self, name: str) -> tuple[float, float, float]:
         """Pair (radian, the larger first) with the lowest value of the map `name`, and that value."""
+        _check.choice("name", name, ("error", "flat", "aberrated", "bound", "read"))
         values = getattr(self, name)
         row, column = np.unravel_index(np.nanargmin(values), values.shape)
         angles = sorted((float(self.angles[row]), float(self.angles[column])), reverse=True)
@@ -538,11 +573,16 @@ def pair_maps(
     ----------
     Chambouleyron et al. 2024, section 4.2.
     """
+    _check.instance("pupil", pupil, Pupil)
+    diameter = _check.number("diameter", diameter, 0, pupil.n_pixels, open_low=True)
     angles = _check.real_array("angles", angles)
     if angles.ndim != 1 or not angles.size:
         raise ValueError(f"angles has shape {angles.shape}: expected (n,)")
-    if np.ndim(screens) != 3 or not len(screens):
-        raise ValueError(f"screens has shape {np.shape(screens)}: expected (n_screens, ny, nx)")
+    _check.finite("angles", angles)
+    screens = _check_screens(screens)
+    _check.trailing_shape("screens", screens, pupil.shape, "the shape of the pupil")
+    _check.finite("screens", pupil.gather(screens), " inside the pupil")
+    n_iterations = _check.integer("n_iterations", n_iterations, 1)
     maps = np.full((5, angles.size, angles.size), np.nan)
     below = np.tril_indices(angles.size, -1)
     pairs = zip(*(angles[side].tolist() for side in below), strict=True)
@@ -566,20 +606,39 @@ def _pair(
     return error, _rms(flat.photon), _rms(aberrated), _rms(flat.bound), _rms(flat.read)
 
 
+def _check_map(pupil: Pupil, name: str, values: ArrayLike) -> NDArray[np.floating]:
+    """Return one map that is finite inside the pupil."""
+    _check.instance("pupil", pupil, Pupil)
+    values = _check.real_array(name, values)
+    if values.shape != pupil.shape:
+        raise ValueError(f"{name} has shape {values.shape}: expected {pupil.shape}")
+    _check.finite(name, pupil.gather(values), " inside the pupil")
+    return values
+
+
+def _check_screens(screens: ArrayLike) -> NDArray[np.floating]:
+    """Return screens as an array, shape (n_screens, ny, nx)."""
+    screens = _check.real_array("screens", screens)
+    if screens.ndim != 3 or 0 in screens.shape:
+        raise ValueError(f"screens has shape {screens.shape}: expected (n_screens, ny, nx)")
+    return screens
+
+
 def _rms(values: NDArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _field(light: DimpleLight, phase: ArrayLike) -> tuple[NDArray, NDArray]:
-    """Field and its beta at the points of the pupil, (n_points,) each."""
-    phase = _check.real_array("phase", phase)
-    _check.trailing_shape("phase", phase, light.pupil.shape, "the shape of the pupil")
-    if phase.ndim != 2:
-        raise ValueError(f"phase has shape {phase.shape}: expected {light.pupil.shape}")
-    values = light.pupil.gather(phase)
-    _check.finite("phase", values, " inside the pupil")
-    psi = light.pupil.gather(light.pupil.amplitude) * np.exp(1j * values)
-    return psi, light(psi[np.newaxis])[0]
+def _linearised(pupil: Pupil, diameter: float, phase: ArrayLike | None) -> tuple[DimpleLight, NDArray, NDArray]:
+    """Light in the dimple, and the field and its beta at the points of the pupil, (n_points,) each."""
+    _check.instance("pupil", pupil, Pupil)
+    phase = np.zeros(pupil.shape) if phase is None else _check_map(pupil, "phase", phase)
+    values = pupil.gather(phase)
+    psi = pupil.gather(pupil.amplitude) * np.exp(1j * values)
+    light = DimpleLight(pupil, diameter)
+    beta = light(psi[np.newaxis])[0]
+    if not beta.any():
+        raise ValueError(f"diameter = {diameter}: no light passes through the dimple: expected a larger one")
+    return light, psi, beta
 
 
 def _after(psi: NDArray, beta: NDArray, change: NDArray) -> NDArray[np.float64]:

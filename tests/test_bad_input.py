@@ -1,0 +1,554 @@
+"""Bad input to every public function, class and method: a clear error or a right answer, never a wrong number.
+
+Public names are collected from the modules, and their parameters from the signatures. Each parameter gets every
+bad value while the others keep the valid ones of `valid`. A new public name needs no entry here unless it has a
+required parameter of a new name; without one its tests fail.
+"""
+
+import importlib
+import inspect
+import re
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from decimal import Decimal
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from joblib import parallel_config
+from scipy.ndimage import gaussian_filter
+from threadpoolctl import threadpool_limits
+
+import zwfs
+
+MODULES = (
+    *("pupil", "modes", "masks", "sensor", "detector", "metrics", "reconstructors"),
+    *("bench", "bench_trials", "closed_loop", "experiments", "variations", "interference", "sweeps"),
+    *("camera", "registration", "frames", "results", "tables"),
+)
+
+# Results that may be infinite: the limit lies beyond what was sampled, or the noise diverges.
+INFINITE = {"dynamic_range", "LinearityCurves.dynamic_range", "BenchCurves.dynamic_range", "crossing"}
+INFINITE |= {"DiameterCurve.leaves", "phase_noise", "Detector.full_well", "Detector"}
+
+# What reconstructors are built from: their callers check the arguments.
+INTERNAL = {"PupilMaps", "split", "square", "prepare", "step", "operator", "maps", "pupil_maps", "amplitude_maps"}
+HANDED_ON = {"run.shared"}  # to the task, as it is
+PASSED = {"Pupil.gather", "Pupil.scatter", "nearest_good"}  # give back what they are given, NaN and infinity too
+# The image or file whose content does not fit is named in place of the argument.
+CONTENT = {
+    "find_pupils": "frame",
+    "record": "clear",
+    "register": "images",
+    "measured_pupil": "image",
+    "CameraFile.keyword": "header",
+}
+SLOW = {"error_budget", "steps", "fit"}  # their answers are not compared, only what they must refuse
+INTERNAL |= {"intensity", "propagate_split", "adjoint_split", "resample"}
+
+
+@cache
+def targets():
+    """Public callables by name: functions, classes with documented parameters, and the methods of all classes."""
+    found = {}
+    for module in (importlib.import_module(f"zwfs.{name}") for name in MODULES):
+        for name, thing in vars(module).items():
+            if (
+                name.startswith("_")
+                or name in INTERNAL
+                or not getattr(thing, "__module__", "").startswith(module.__name__)
+            ):
+                continue
+            if inspect.isfunction(thing):
+                found[name if name not in found else f"{module.__name__[5:]}.{name}"] = thing
+            elif inspect.isclass(thing) and not getattr(thing, "_is_protocol", False):
+                # A class that documents attributes only is a result: functions of the package make it.
+                if "Parameters\n" in (thing.__doc__ or "") or name in ("Pupil", "Table"):
+                    found[name] = thing
+                for key, member in vars(thing).items():
+                    shown = not key.startswith("_") or key == "__call__"
+                    if shown and key not in INTERNAL and callable(getattr(thing, key)):
+                        found[f"{name}.{key}"] = member
+    return found
+
+
+@cache
+def valid() -> dict:
+    """Valid arguments: by the name of the parameter, or of the callable and the parameter."""
+    scene = gaussian_filter(np.random.default_rng(0).normal(size=(40, 40)), 2)
+    pupil = zwfs.Pupil.circular(12)
+    modes = zwfs.zernike_basis(pupil, 5)
+    plus, minus = zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2)
+    classic, shifted = zwfs.ZernikeSensor(pupil, plus), zwfs.ZernikeSensor(pupil, plus, minus)
+    phase = zwfs.power_law_screens(modes, 0.2, 1, seed=1)[0]
+    field = pupil.amplitude * np.exp(1j * phase)
+    waves = pupil.gather(shifted.reference_wave(field))
+    method = zwfs.PhaseShifted(shifted, n_iterations=3)
+    points = pupil.gather(phase)
+    from zwfs import bench, bench_trials, camera, closed_loop, experiments, frames, registration, variations
+
+    small = bench.Bench(n_pixels=17, n_rings=1, missing=(), gap=0.0, static=0.0, photons=1e6, read_noise=1.0)
+    model = bench.BenchModel.from_images(small, 1)
+    on_bench = model.normalise(small.frames(None, 2))
+    flow = closed_loop.FrozenFlow(pupil, 0.2, 1, cutoff=1.0, seed=1)
+    images, optics, recording, measurement, found = _recorded(frames, registration)
+    file = camera.CameraFile(images[0].counts[np.newaxis], "frame", "0" * 64, {"GAIN": 2.0})
+    arguments = {
+        "pupil": pupil,
+        "modes": modes,
+        "phase": phase,
+        "field": field,
+        "estimate": phase,
+        "truth": phase,
+        "sensor": shifted,
+        "masks": plus,
+        "mask": plus,
+        "maps": phase,
+        "values": points,
+        "image": np.abs(field) + 0.1,
+        "amplitude": 1.0,
+        "segments": (pupil.mask * 1).astype(int),
+        "center": (5.5, 5.5),
+        "n_pixels": 12,
+        "n_modes": 4,
+        "n_rings": 1,
+        "missing": (2,),
+        "spiders": ((0.3, 0.1),),
+        "gap": 0.02,
+        "stop": 0.9,
+        "threshold": 0.1,
+        "rms": 0.2,
+        "n_screens": 1,
+        "exponent": -2.0,
+        "seed": 1,
+        "diameter": 1.06,
+        "function": lambda u, v: 0.9 * np.exp(1j * (u + v) / 9),
+        "breaks": (0.5,),
+        "u": np.linspace(0, 0.5, 4),
+        "v": np.linspace(0, 0.5, 4),
+        "j": 4,
+        "photons": 1e5,
+        "counts": np.abs(field),
+        "floor": 0.0,
+        "frames": shifted.measure(phase),
+        "start": 0.1 * phase,
+        "reference": 0.0 * phase,
+        "error": phase,
+        "away": 0.01 * phase,
+        "screens": phase[np.newaxis],
+        "reconstructor": method,
+        "reconstructors": {"shifted": method},
+        "name": "shifted",
+        "flow": flow,
+        "n_steps": 2,
+        "stroke": 1.0,
+        "time": 0.1,
+        "bench": small,
+        "model": model,
+        "pistons": np.linspace(0, 0.1, small.n_segments),
+        "found": np.linspace(0, 0.1, 7),
+        "commanded": np.linspace(0, 0.1, small.n_segments),
+        "numbers": small.numbers,
+        "n_iterations": 3,
+        "diameters": np.array([1.0, 1.2]),
+        "make": lambda diameter: method,
+        "angles": np.array([1.5, -1.5]),
+        "phase_shifts": (1.5, -1.5),
+        "n_draws": 2,
+        "limit": 0.05,
+        "x": np.array([1.0, 2.0]),
+        "y": np.array([0.01, 0.1]),
+        "coefficients": np.ones((1, variations.DimpleLight(pupil, 1.06).rank)),
+        "padding": 2,
+        "output": Path("new.fits"),
+        "check_output.inputs": [Path("file.npy")],
+        "incoming": pupil.gather(field),
+        "frame": np.abs(waves[0]) + 1,
+        "first": waves[0],
+        "second": waves[1],
+        "references": waves,
+        "power": 0.5,
+        "sign": -1,
+        "task": lambda value, shared: 0.0,
+        "inputs": [1, 2],
+        "shared": 2,
+        "n": 1,
+        "path": Path("file"),
+        "folder": Path(),
+        "content": b"bytes",
+        "columns": {"x": [1.0, 2.0]},
+        "figure": _Figure(),
+        "dpi": 100.0,
+        "header": ["a"],
+        "rows": [[1.0]],
+        "digits": 3,
+        "key": "GAIN",
+        "files": [file],
+        "wavelength": 635.0,
+        "sources": [file],
+        "recording": recording,
+        "optics": optics,
+        "measurement": measurement,
+        "inside": np.pad(np.ones((20, 20), bool), 10),
+        "pupil_images": images[1:],
+        "names": ["scale"],
+        "fitted": ["scale"],
+        "n_pupils": 1,
+        "circles": recording.pupils,
+        "shape": (6, 6),
+        "margin": 1,
+        "origins": recording.origins[:2],
+        "good": np.ones((6, 6), bool),
+        # of one callable
+        "Pupil.amplitude": pupil.amplitude,
+        "Pupil.segments": pupil.segments,
+        "Pupil.from_segments.amplitude": 1.0,
+        "Dimple.amplitude": 1.0,
+        "Dimple.phase": 1.5,
+        "Bench.phase": 1.5,
+        "Bench.n_pixels": 17,
+        "Bench.missing": (),
+        "FrozenFlow.cutoff": 1.0,
+        "Linear.amplitude": pupil.amplitude,
+        "Arcsine.sensor": classic,
+        "Arcsine.__call__.frames": classic.measure(phase),
+        "ZernikeSensor.adjoint.field": shifted.propagate(field),
+        "ZernikeSensor.measure.amplitude": pupil.amplitude,
+        "GradientDescent.cost.phase": points,
+        "dynamic_range.rms": np.array([0.1, 0.2]),
+        "dynamic_range.error": np.array([0.001, 0.1]),
+        "linearity_curves.rms": np.array([0.1]),
+        "bench_curves.rms": np.array([0.1]),
+        "bench_curves.reconstructors": {"shifted": zwfs.PhaseShifted(model.shifted, n_iterations=2)},
+        "error_budget.rms": np.array([0.1]),
+        "error_budget.names": ["PhaseShifted"],
+        "check_rms.rms": np.array([0.1]),
+        "find_pistons.reconstructor": zwfs.PhaseShifted(model.shifted, n_iterations=2),
+        "find_pistons.frames": on_bench,
+        "BenchModel.normalise.counts": small.frames(None, 2),
+        "BenchModel.pistons.phase": np.zeros(small.segments.shape),
+        "segment_pistons.phase": np.zeros(small.segments.shape),
+        "segment_pistons.segments": small.segments,
+        "drawn_noise.photons": 1e8,
+        "approximation_errors.sensor": shifted,
+        "direct_reference_wave.n_samples": 4,
+        "quotient.reference": waves[0],
+        "two_waves.reference": waves[0],
+        "arccosine_phase.reference": waves[0],
+        "arccosine_phase.amplitude": np.abs(pupil.gather(field)),
+        "pair_phase.frames": np.abs(waves) + 1,
+        "pair_phase.amplitude": np.abs(pupil.gather(field)),
+        "DimpleLight.__call__.field": pupil.gather(field)[np.newaxis],
+        "DimpleLight.project.field": pupil.gather(field)[np.newaxis],
+        "PairMaps.best.name": "flat",
+        "run.name": "squares",
+        "screens_at.task": 0,
+        "read.path": Path("file.npy"),
+        "correlations.first": np.array([[1.0, 2, 4]]),
+        "correlations.second": np.array([[1.0, 3, 2]]),
+        "steps.fitted": (),
+        "publish.name": "name",
+        "record.frames": images[:1],
+        "steps.frames": images[:1],
+        "find_pupils.image": images[0],
+        "find_pupils.n_pupils": 2,
+        "find_pupils.diameter": None,
+        "record.diameter": None,
+        "same_size.name": "image",
+        "nearest_good.image": np.ones((6, 6)),
+        "register.image": np.roll(scene, 1, axis=0),
+        "register.reference": scene,
+        "resample.images": recording.frames,
+        "radius.center": (2.5, 2.5),
+        "write_phase.found": found,
+        "bench_error.found": found,
+        "measured_pupil.images": np.ones((2, 12, 12)),
+        "measured_pupil.inside": np.ones((12, 12), bool),
+        "measured_pupil.center": (5.5, 5.5),
+    }
+    curve = experiments.linearity_curves({"shifted": method}, modes, [0.1], 1)
+    instances = {
+        "Pupil": pupil,
+        "Dimple": plus,
+        "Patch": zwfs.Patch(1.0, lambda u, v: 0.9 * np.exp(1j * u / 9)),
+        "ZernikeSensor": shifted,
+        "Detector": zwfs.Detector(pupil, 1e5, gain=1.0, full_well=1e4),
+        "Linear": zwfs.Linear(shifted, modes),
+        "Arcsine": zwfs.Arcsine(classic, n_iterations=3),
+        "PhaseShifted": method,
+        "GerchbergSaxton": zwfs.GerchbergSaxton(shifted, n_iterations=3),
+        "GradientDescent": zwfs.GradientDescent(shifted, n_iterations=3),
+        "Bench": small,
+        "BenchModel": model,
+        "BenchCurves": bench_trials.BenchCurves(
+            np.array([0.1]), np.ones((1, 1, 2)), {"shifted": np.zeros((1, 1, 2))}
+        ),
+        "LinearityCurves": curve,
+        "FrozenFlow": flow,
+        "LoopRun": closed_loop.close_loop(method, modes, flow, 2),
+        "DiameterCurve": variations.DiameterCurve(np.array([1.0, 2.0]), np.array([[0.01], [0.1]])),
+        "DimpleLight": variations.DimpleLight(pupil, 1.06),
+        "PairMaps": variations.pair_maps(pupil, 1.06, [1.5, -1.5], phase[np.newaxis], 2),
+        "CameraFile": file,
+    }
+    return {"arguments": arguments, "instances": instances}
+
+
+class _Figure:
+    """Figure that saves nothing."""
+
+    def savefig(self, *_, **__):
+        pass
+
+    def get_layout_engine(self):
+        return None
+
+
+def _recorded(frames, registration):
+    """Images of two pupils side by side with a vane each, and what the package makes of them."""
+    pupil = zwfs.Pupil.circular(24, spiders=((0.4, 0.12),))
+    bare = np.hstack([np.pad(pupil.amplitude**2, 8)] * 2)
+    masked = bare * (1 + 0.1 * np.sin(np.arange(bare.shape[1]) / 3))
+    images = [
+        registration.Image(1000.0 * counts + 20, np.zeros(counts.shape, bool), name)
+        for counts, name in ((masked, "frame"), (bare, "clear"))
+    ]
+    optics = frames.Optics()
+    recording = registration.record(images[:1], images[1:])
+    measurement = frames.measure(recording, optics)
+    return images, optics, recording, measurement, frames.reconstruct(measurement, optics, 3)
+
+
+RAGGED = [[1.0, 2.0], [3.0]]
+MASKED = np.ma.array(np.ones(3), mask=[0, 1, 0])
+
+
+class _Evil:
+    """Object that cannot be an array."""
+
+    def __array__(self, dtype=None, copy=None):
+        raise RuntimeError("no array")
+
+
+# What no parameter of a number, an array or an object takes.
+BAD = {
+    "nan": np.nan, "inf": np.inf, "-inf": -np.inf, "float32 nan": np.float32("nan"), "list of nan": [np.nan],
+    "10**400": 10**400, "-10**400": -(10**400), "10**5000": 10**5000, "Fraction(10**400)": Fraction(10**400),
+    "list of 10**400": [10**400, 1.0], "2**63": 2**63, "2**64": 2**64, "Decimal": Decimal("0.5"),
+    "str": "a", "digits": "1",
+    "long str": "a" * 5000, "empty str": "", "bytes": b"1", "complex": 1 + 2j,
+    "complex array": np.array([1 + 2j, 1j]), "object array": np.array([None, 1], object), "ragged": RAGGED,
+    "masked": MASKED, "masked scalar": np.ma.masked, "dict": {}, "dict of str": {"a": 1}, "set": {1}, "class": int,
+    "array class": np.ndarray, "lambda": lambda *_: None, "module": np, "object": object(), "evil": _Evil(),
+    "generator": (i for i in ()), "range": range(0), "Ellipsis": ..., "slice": slice(None),
+    "datetime": np.datetime64(0, "s"),
+    "timedelta array": np.zeros(3, "m8[s]"), "str array": np.array(["a", "b"]), "structured": np.zeros(3, "i4,f4"),
+    "None": None, "list of None": [None], "list of str": ["a"], "nested": [[[[1.0]]]],
+    "exception": ValueError("x"),
+}  # fmt: skip
+# What some take: they must then give a right answer, the one of the plain value where there is one.
+UNUSUAL = {
+    "0": 0, "-1": -1, "-0.5": -0.5, "0.0": 0.0, "1e-300": 1e-300, "True": True, "np.True_": np.True_,
+    "Fraction": Fraction(1, 2), "float32": np.float32(0.5), "float16": np.float16(0.5), "int8": np.int8(1),
+    "longdouble": np.longdouble(0.5), "0-d": np.array(0.5), "1-element": np.array([0.5]), "empty": np.array([]),
+    "empty list": [], "empty tuple": (), "empty 3-d": np.zeros((0, 12, 12)), "wrong shape": np.ones((3, 7)),
+    "5-d": np.ones((1, 1, 1, 1, 1)), "bool array": np.ones((12, 12), bool),
+    "int array": np.ones((12, 12), np.int8),
+}  # fmt: skip
+PLAIN = {
+    "Fraction": 0.5, "float32": 0.5, "float16": 0.5, "int8": 1, "longdouble": 0.5, "np.True_": True,
+}  # fmt: skip
+
+
+def variants(value):
+    """Bad and unusual forms of a valid value that is an array: (label, value, plain value or None)."""
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fc" or not value.ndim:
+        return
+    hole, pole = value.copy(), value.copy()
+    hole.flat[value.size // 2], pole.flat[value.size // 2] = np.nan, np.inf
+    yield "with nan", hole, None
+    yield "with inf", pole, None
+    yield "cut", value[..., :-1], None
+    yield "empty batch", np.broadcast_to(value, (2, *value.shape))[:0], None
+    yield "object", value.astype(object), None
+    yield "str", value.astype(str), None
+    yield "half masked", np.ma.array(value, mask=np.arange(value.size).reshape(value.shape) % 2), None
+    yield "as masked array", np.ma.array(value), value
+    yield "as list", value.tolist(), value
+    yield "big-endian", value.astype(value.dtype.newbyteorder(">")), value
+    yield "column-major", np.asfortranarray(value), value
+    if value.dtype.kind == "f":
+        yield "complex", value + 0.1j, None
+        yield "negative", -value - 1, None
+        yield "long double", value.astype(np.longdouble), value
+
+
+def accepts(annotation: str, value) -> bool:
+    """Whether the annotation of a parameter allows a value."""
+    if "Iterable[Any]" in annotation:
+        return isinstance(value, Iterable)
+    if isinstance(value, bool | np.bool_):
+        return bool(re.search("bool|complex|Any", annotation))
+    if value is None:
+        return "None" in annotation or "Seed" in annotation
+    if isinstance(value, str | bytes):
+        return bool(re.search("str|Path|Any" if isinstance(value, str) else "bytes|Any", annotation))
+    if isinstance(value, int | np.integer):
+        return bool(re.search(r"int|float|complex|Array|Any|Seed", annotation))
+    if isinstance(value, float | np.floating | Fraction):
+        return bool(re.search(r"float|complex|Array", annotation))
+    if isinstance(value, complex):
+        return bool(re.search("NDArray|complex", annotation))
+    if isinstance(value, Mapping | set):
+        return bool(re.search("Mapping|Sequence|Iterable", annotation))
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+        return False
+    if isinstance(value, np.ndarray) and value.dtype.kind not in "biufc":
+        return "Sequence" in annotation and value.dtype.names is not None
+    if isinstance(value, np.ndarray | list | tuple | range) or inspect.isgenerator(value):
+        return bool(re.search(r"Array|Sequence|Iterable|tuple|Mapping", annotation))
+    return "Any" in annotation
+
+
+def leaves(value, path="", depth=0) -> Iterator[tuple[str, np.ndarray]]:
+    """Arrays of numbers in a result, with their places."""
+    if isinstance(value, np.ndarray | np.number | float | complex):
+        yield path, np.asarray(value)
+    elif isinstance(value, tuple | list):
+        for index, item in enumerate(value):
+            yield from leaves(item, f"{path}[{index}]", depth)
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from leaves(item, f"{path}[{key!r}]", depth)
+    elif depth < 4 and hasattr(value, "__dict__") and type(value).__module__.startswith("zwfs"):
+        yield from leaves(vars(value), path, depth + 1)
+
+
+def is_number(array):
+    return array.dtype.kind in "fc"
+
+
+def parameters(name):
+    """Parameters of a public callable, without `self` and those of any name."""
+    function = targets()[name]
+    found = list(inspect.signature(getattr(function, "__func__", function)).parameters.values())
+    found = found[1:] if "." in name and not isinstance(function, staticmethod) else found
+    return {parameter.name: parameter for parameter in found if parameter.kind is not parameter.VAR_KEYWORD}
+
+
+class Call:
+    """A public callable with valid arguments."""
+
+    def __init__(self, name):
+        self.name, self.parameters = name, parameters(name)
+
+    @property
+    def function(self):
+        """The callable; a method is that of a valid instance."""
+        owner, _, method = self.name.partition(".")
+        if not method:
+            return targets()[self.name]
+        if owner not in valid()["instances"]:
+            raise AssertionError(f"{self.name}: no instance of {owner}: add one to `valid`")
+        return getattr(valid()["instances"][owner], method)
+
+    def argument(self, name):
+        """Valid value of a parameter."""
+        parameter, known = self.parameters[name], valid()["arguments"]
+        for key in (f"{self.name}.{name}", f"{self.name.partition('.')[0]}.{name}"):
+            if key in known:
+                return known[key]
+        if parameter.default is not parameter.empty and name != "seed":
+            return parameter.default
+        if name not in known:
+            raise AssertionError(f"{self.name}: no valid value for its parameter {name}: add one to `valid`")
+        return known[name]
+
+    def __call__(self, **changes):
+        positional, named = [], {}
+        for name, parameter in self.parameters.items():
+            value = changes.get(name, self.argument(name)) if name not in changes else changes[name]
+            if parameter.kind is parameter.VAR_POSITIONAL:
+                positional.append(value)
+            elif parameter.kind is parameter.KEYWORD_ONLY or (named and not positional):
+                named[name] = value
+            else:
+                positional.append(value)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            warnings.simplefilter("ignore", UserWarning)
+            return self.function(*positional, **named)
+
+
+@cache
+def right(name):
+    """Places of the numbers in the result of the valid call that are not finite."""
+    with np.errstate(all="ignore"):
+        results = [Call(name)(), Call(name)(history=True) if "history" in parameters(name) else None]
+        found = list(leaves(results))
+    return {path[3:] for path, array in found if is_number(array) and not np.isfinite(array).all()}
+
+
+def judge(call, parameter, label, value, plain):
+    """What is wrong with the answer to a value; None if it is right."""
+    if "Callable" in str(call.parameters[parameter].annotation) and callable(value):
+        return None  # what it raises is the caller's own
+    annotation = str(call.parameters[parameter].annotation)
+    if f"{call.name}.{parameter}" in HANDED_ON or (call.name in SLOW and accepts(annotation, value)):
+        return None
+    try:
+        result = call(**{parameter: value})
+    except (TypeError, ValueError) as error:
+        # Of two arguments that do not fit either may be named.
+        fit = "|".join(call.parameters) if "shape" in str(error) else parameter
+        if re.search(rf"(?<![A-Za-z])({fit}|{CONTENT.get(call.name, parameter)})(?![A-Za-z])", str(error)):
+            return None
+        return f"{type(error).__name__} does not name it: {str(error)[:150]}"
+    except OSError as error:
+        return None if "Path" in str(call.parameters[parameter].annotation) else f"{error!r:.150}"
+    except Exception as error:
+        return f"{error!r:.200}"
+    if plain is None and not accepts(annotation, value):
+        return f"accepted, as a {annotation}: {result!r:.80}"
+    whole = call.name not in INFINITE
+    for path, array in leaves(result):
+        finite = not is_number(array) or (np.isfinite(array) if whole else ~np.isnan(array)).all()
+        if not finite and call.name not in PASSED and path not in right(call.name):
+            return f"result{path} is not finite"
+    if plain is not None and annotation != "Any":
+        expected = dict(leaves(call(**{parameter: plain})))
+        for path, array in leaves(result):
+            if is_number(array) and not np.allclose(array, expected[path], rtol=1e-5, atol=1e-7, equal_nan=True):
+                return f"result{path} differs from that of the plain value"
+    return None
+
+
+CASES = [(name, parameter) for name in targets() for parameter in parameters(name)]
+
+
+@pytest.fixture(autouse=True)
+def _folder_and_process(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.save("file.npy", np.ones((4, 4)))
+    with parallel_config(n_jobs=1), threadpool_limits(1):
+        yield
+
+
+@pytest.mark.parametrize("name", targets())
+def test_a_valid_call_works(name):
+    Call(name)()
+
+
+@pytest.mark.parametrize(("name", "parameter"), CASES, ids=".".join)
+def test_a_bad_value_is_named(name, parameter):
+    call = Call(name)
+    values = [(label, value, PLAIN.get(label)) for label, value in (BAD | UNUSUAL).items()]
+    values += variants(call.argument(parameter))
+    wrong = {
+        label: found
+        for label, value, plain in values
+        if (found := judge(call, parameter, label, value, plain)) is not None
+    }
+    assert not wrong, "\n".join(f"{name}({parameter}={label}): {found}" for label, found in wrong.items())

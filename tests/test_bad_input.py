@@ -232,6 +232,7 @@ def valid() -> dict:
         "segment_pistons.phase": np.zeros(small.segments.shape),
         "segment_pistons.segments": small.segments,
         "drawn_noise.photons": 1e8,
+        "measured_factor.n_iterations": 4,
         "approximation_errors.sensor": shifted,
         "direct_reference_wave.n_samples": 4,
         "quotient.reference": waves[0],
@@ -541,7 +542,21 @@ def test_a_valid_call_works(name):
     Call(name)()
 
 
-@pytest.mark.parametrize(("name", "parameter"), CASES, ids=".".join)
+def test_a_new_name_without_a_valid_argument_fails(monkeypatch):
+    def brand_new(unheard_of):
+        pass
+
+    brand_new.__module__ = "zwfs.metrics"
+    with monkeypatch.context() as patch:
+        patch.setattr("zwfs.metrics.brand_new", brand_new, raising=False)
+        targets.cache_clear()
+        call = Call("brand_new")
+    targets.cache_clear()
+    with pytest.raises(AssertionError, match="unheard_of: add one"):
+        call.argument("unheard_of")
+
+
+@pytest.mark.parametrize(("name", "parameter"), CASES, ids=[f"{name}({parameter})" for name, parameter in CASES])
 def test_a_bad_value_is_named(name, parameter):
     call = Call(name)
     values = [(label, value, PLAIN.get(label)) for label, value in (BAD | UNUSUAL).items()]

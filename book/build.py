@@ -12,7 +12,7 @@ from pages import BookError, build_book, check_contents
 from printing import PrintError
 from runner import NotebookError, Project
 
-from zwfs.results import write_file
+from zwfs._files import write_file
 
 FRONT_FIGURE = "fig03_dynamic_range"  # stands in the README, as book/_static/front.png
 

@@ -10,7 +10,7 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 from runner import Project
 
-from zwfs.tables import plain
+from zwfs.companion.tables import plain
 
 # Makes a figure again, from the root of a clone.
 RERUN = "make rerun FIGURE={notebook}"

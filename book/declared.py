@@ -14,7 +14,7 @@ from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event
 
-from zwfs.parameters import check_parameters
+from zwfs.companion.parameters import check_parameters
 
 # What may stand behind the last comma of a parameter's comment; all else there belongs to the meaning.
 UNITS = ("rad", "rad rms", "lambda/D", "D", "D²/lambda", "nm", "m", "s", "Hz", "pixels", "electrons", "photons")
@@ -54,7 +54,7 @@ class Parameter:
     meaning, unit : str
         From the comment behind it, ``# meaning, unit``; the unit of a pure number is empty.
     limits : Any
-        See `zwfs.parameters.check_parameters`; None if the notebook gives none.
+        See `zwfs.companion.parameters.check_parameters`; None if the notebook gives none.
     """
 
     default: Any

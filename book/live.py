@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 import zwfs
 from zwfs._arrays import Kind
-from zwfs.figures import INTENSITY_MAP, PHASE_MAP
 from zwfs.lowrank import Factors, Plane
+from zwfs.plots.style import INTENSITY_MAP, PHASE_MAP
 
 PAGE = "book/live.md"
 DATA = "book/_static/live-data.js"

@@ -21,7 +21,7 @@ import printing
 import yaml
 from runner import Project, digest, digest_files, read, scratch_folder, swap, to_bytes
 
-from zwfs.results import write_file
+from zwfs._files import write_file
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 JUPYTER_BOOK = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()"]

@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from zwfs import figures
+from zwfs import plots
 
 PAGE = "book/performance.md"
 MEASURED = "book/performance.json"
@@ -34,7 +34,7 @@ def fragments(source: Path) -> dict[str, str | bytes]:
     for row in kept["peers"]:
         tasks.setdefault(row["task"], []).append(row)
     with plt.rc_context():
-        figures.use_style()
+        plots.use_style()
         pictures = {
             "book/_static/peers.png": picture(error_against_time(tasks["one frame"] + tasks["two frames"])),
             "book/_static/growth.png": picture(time_against_pixels(kept["speed"]["slope"])),

@@ -26,7 +26,7 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 from runner import Children, NotebookError, Progress, Project
 
-from zwfs.tables import plain
+from zwfs.companion.tables import plain
 
 RECORD = "record.json"
 MAKER = "zwfs rerun"  # by this a folder is known to be ours

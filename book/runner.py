@@ -26,8 +26,8 @@ import nbformat
 from nbformat import NotebookNode
 from tqdm import tqdm
 
-from zwfs import results, sweeps
-from zwfs.results import write_file
+from zwfs._files import write_file
+from zwfs.companion import results, sweeps
 
 HERE = Path(__file__).parent
 EXECUTE = HERE / "execute.py"
@@ -41,7 +41,7 @@ KERNEL_ENVIRONMENT = {
     "PYTHONHASHSEED": "0",
 }
 
-# Holds the number of cores that the sweeps of a notebook use, see `zwfs.sweeps`.
+# Holds the number of cores that the sweeps of a notebook use, see `zwfs.companion.sweeps`.
 CORES = "LOKY_MAX_CPU_COUNT"
 
 LOCK = ".zwfs-lock"  # in a scratch folder; the process that uses the folder holds a lock on it

@@ -13,10 +13,10 @@ PAGE = Path(__file__).parent.parent / "_build" / "html" / "book" / "api.html"
 
 
 def test_public_names_are_functions_classes_and_documented_constants():
-    names = api.public_names(importlib.import_module("zwfs.variations"))
+    names = api.public_names(importlib.import_module("zwfs.paper.dimple_diameter"))
     assert {"DARK_RING", "DiameterCurve", "crossing"} <= set(names)
     assert not [name for name in names if name.startswith("_") or name in ("np", "Pupil", "Any")]
-    assert api.constants(importlib.import_module("zwfs.variations"))["DARK_RING"].startswith(
+    assert api.constants(importlib.import_module("zwfs.paper.dimple_diameter"))["DARK_RING"].startswith(
         "Diameter of the first"
     )
 

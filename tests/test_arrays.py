@@ -7,7 +7,7 @@ from astropy import units
 
 from zwfs import Arcsine, Dimple, GerchbergSaxton, Linear, PhaseShifted, ZernikeSensor, reconstruction_error
 from zwfs._arrays import Kind
-from zwfs.reconstructors import _common
+from zwfs.reconstructors import base
 
 
 class Library:
@@ -152,8 +152,8 @@ def test_single_precision(library, pupil, screens):
 def test_pieces_are_put_together(library, pupil, screens, monkeypatch):
     method, frames = METHODS["plain"](pupil), METHODS["plain"](pupil).settings.sensor.measure(screens(0.4, 5))
     together = method(library.array(frames))
-    monkeypatch.setattr(_common, "_CHUNK", 2 * frames[0].size)
-    monkeypatch.setattr(_common, "_CHUNK_ELSEWHERE", 2 * frames[0].size)
+    monkeypatch.setattr(base, "_CHUNK", 2 * frames[0].size)
+    monkeypatch.setattr(base, "_CHUNK_ELSEWHERE", 2 * frames[0].size)
     found = method(library.array(frames))
     for attribute in ("phase", "n_iterations", "converged", "residual"):
         same(library, getattr(found, attribute), library.to_numpy(getattr(together, attribute)), 1e-9)

@@ -25,8 +25,11 @@ import zwfs
 
 MODULES = (
     *("pupil", "modes", "masks", "sensor", "detector", "metrics", "reconstructors"),
-    *("bench", "bench_trials", "closed_loop", "experiments", "variations", "interference", "sweeps"),
-    *("camera", "registration", "frames", "results", "tables"),
+    *("bench.model", "bench.segments", "bench.recording"),
+    *("frames.files", "frames.registration", "frames.pipeline"),
+    *("paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
+    *("paper.bench_linearity", "paper.closed_loop"),
+    *("companion.sweeps", "companion.results", "companion.tables"),
 )
 
 # Results that may be infinite: the limit lies beyond what was sampled, or the noise diverges.
@@ -87,13 +90,16 @@ def valid() -> dict:
     waves = pupil.gather(shifted.reference_wave(field))
     method = zwfs.PhaseShifted(shifted, n_iterations=3)
     points = pupil.gather(phase)
-    from zwfs import bench, bench_trials, camera, closed_loop, experiments, frames, registration, variations
+    from zwfs.bench import model
+    from zwfs.frames import files as camera
+    from zwfs.frames import pipeline, registration
+    from zwfs.paper import bench_linearity, closed_loop, dimple_diameter, linearity, phase_shifts
 
-    small = bench.Bench(n_pixels=17, n_rings=1, missing=(), gap=0.0, static=0.0, photons=1e6, read_noise=1.0)
-    model = bench.BenchModel.from_images(small, 1)
+    small = model.Bench(n_pixels=17, n_rings=1, missing=(), gap=0.0, static=0.0, photons=1e6, read_noise=1.0)
+    model = model.BenchModel.from_images(small, 1)
     on_bench = model.normalise(small.frames(None, 2))
     flow = closed_loop.FrozenFlow(pupil, 0.2, 1, cutoff=1.0, seed=1)
-    images, optics, recording, measurement, found = _recorded(frames, registration)
+    images, optics, recording, measurement, found = _recorded(pipeline, registration)
     file = camera.CameraFile(images[0].counts[np.newaxis], "frame", "0" * 64, {"GAIN": 2.0})
     arguments = {
         "pupil": pupil,
@@ -160,7 +166,7 @@ def valid() -> dict:
         "limit": 0.05,
         "x": np.array([1.0, 2.0]),
         "y": np.array([0.01, 0.1]),
-        "coefficients": np.ones((1, variations.DimpleLight(pupil, 1.06).rank)),
+        "coefficients": np.ones((1, dimple_diameter.DimpleLight(pupil, 1.06).rank)),
         "padding": 2,
         "output": Path("new.fits"),
         "check_output.inputs": [Path("file.npy")],
@@ -269,7 +275,7 @@ def valid() -> dict:
         "measured_pupil.inside": np.ones((12, 12), bool),
         "measured_pupil.center": (5.5, 5.5),
     }
-    curve = experiments.linearity_curves({"shifted": method}, modes, [0.1], 1)
+    curve = linearity.linearity_curves({"shifted": method}, modes, [0.1], 1)
     instances = {
         "Pupil": pupil,
         "Dimple": plus,
@@ -283,15 +289,15 @@ def valid() -> dict:
         "GradientDescent": zwfs.GradientDescent(shifted, n_iterations=3),
         "Bench": small,
         "BenchModel": model,
-        "BenchCurves": bench_trials.BenchCurves(
+        "BenchCurves": bench_linearity.BenchCurves(
             np.array([0.1]), np.ones((1, 1, 2)), {"shifted": np.zeros((1, 1, 2))}
         ),
         "LinearityCurves": curve,
         "FrozenFlow": flow,
         "LoopRun": closed_loop.close_loop(method, modes, flow, 2),
-        "DiameterCurve": variations.DiameterCurve(np.array([1.0, 2.0]), np.array([[0.01], [0.1]])),
-        "DimpleLight": variations.DimpleLight(pupil, 1.06),
-        "PairMaps": variations.pair_maps(pupil, 1.06, [1.5, -1.5], phase[np.newaxis], 2),
+        "DiameterCurve": dimple_diameter.DiameterCurve(np.array([1.0, 2.0]), np.array([[0.01], [0.1]])),
+        "DimpleLight": dimple_diameter.DimpleLight(pupil, 1.06),
+        "PairMaps": phase_shifts.pair_maps(pupil, 1.06, [1.5, -1.5], phase[np.newaxis], 2),
         "CameraFile": file,
     }
     return {"arguments": arguments, "instances": instances}
@@ -307,7 +313,7 @@ class _Figure:
         return None
 
 
-def _recorded(frames, registration):
+def _recorded(pipeline, registration):
     """Images of two pupils side by side with a vane each, and what the package makes of them."""
     pupil = zwfs.Pupil.circular(24, spiders=((0.4, 0.12),))
     bare = np.hstack([np.pad(pupil.amplitude**2, 8)] * 2)
@@ -316,10 +322,10 @@ def _recorded(frames, registration):
         registration.Image(1000.0 * counts + 20, np.zeros(counts.shape, bool), name)
         for counts, name in ((masked, "frame"), (bare, "clear"))
     ]
-    optics = frames.Optics()
+    optics = pipeline.Optics()
     recording = registration.record(images[:1], images[1:])
-    measurement = frames.measure(recording, optics)
-    return images, optics, recording, measurement, frames.reconstruct(measurement, optics, 3)
+    measurement = pipeline.measure(recording, optics)
+    return images, optics, recording, measurement, pipeline.reconstruct(measurement, optics, 3)
 
 
 RAGGED = [[1.0, 2.0], [3.0]]

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from zwfs import Linear, PhaseShifted, dynamic_range
-from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
-from zwfs.bench_trials import BenchCurves, bench_curves, bench_reconstructors, error_budget, find_pistons
+from zwfs.bench.model import Bench, BenchModel, segment_screens
+from zwfs.bench.segments import segment_residual
+from zwfs.paper.bench_linearity import BenchCurves, bench_curves, bench_reconstructors, error_budget, find_pistons
 
 N = 68
 SMALL = {"n_pixels": N, "gap": 0.02, "stop": 0.8}

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from zwfs import camera
-from zwfs.bench import Bench
+from zwfs.bench.model import Bench
+from zwfs.frames import files as camera
 
 # Reading
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
-from zwfs.closed_loop import FrozenFlow, close_loop
+from zwfs.paper.closed_loop import FrozenFlow, close_loop
 
 PLUS, MINUS = Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2)
 

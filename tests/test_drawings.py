@@ -11,14 +11,14 @@ import pytest
 from matplotlib.colors import same_color
 
 import zwfs
-from zwfs import drawings, figures
-from zwfs.bench import Bench, segment_screens
+from zwfs import plots
+from zwfs.bench.model import Bench, segment_screens
 
 
 @pytest.fixture(autouse=True)
 def style():
     with plt.rc_context():
-        figures.use_style(vector=True)
+        plots.use_style(vector=True)
         yield
     plt.close("all")
 
@@ -61,9 +61,9 @@ def frames(bench, pistons):
 @pytest.fixture(params=["sensor_layout", "vector_sensor", "bench_layout"])
 def draw(request, classic, vector, phase, bench, pistons, frames):
     calls = {
-        "sensor_layout": lambda: drawings.sensor_layout(classic, phase),
-        "vector_sensor": lambda: drawings.vector_sensor(vector, phase),
-        "bench_layout": lambda: drawings.bench_layout(bench, pistons, frames),
+        "sensor_layout": lambda: plots.sensor_layout(classic, phase),
+        "vector_sensor": lambda: plots.vector_sensor(vector, phase),
+        "bench_layout": lambda: plots.bench_layout(bench, pistons, frames),
     }
     return calls[request.param]
 
@@ -131,7 +131,7 @@ def test_pictures_are_upright_and_sharp(draw):
 
 
 def test_sensor_layout_shows_what_is_computed(classic, pupil, phase):
-    figure = drawings.sensor_layout(classic, phase)
+    figure = plots.sensor_layout(classic, phase)
     field = pupil.amplitude * np.exp(1j * phase)
     assert holds(figure, np.where(pupil.mask, phase, np.nan)) == 1
     assert holds(figure, np.abs(classic.propagate(field)[0]) ** 2) == 2
@@ -141,19 +141,19 @@ def test_sensor_layout_shows_what_is_computed(classic, pupil, phase):
 
 
 def test_terms_of_sensor_layout_add_up(classic, phase):
-    total, incoming, reference, interference = pictures(drawings.sensor_layout(classic, phase))[3:7]
+    total, incoming, reference, interference = pictures(plots.sensor_layout(classic, phase))[3:7]
     assert np.abs(total - incoming - reference - interference).max() < 1e-12
 
 
 def test_vector_sensor_shows_the_frames_in_both_rows(vector, pupil, phase):
-    figure = drawings.vector_sensor(vector, phase)
+    figure = plots.vector_sensor(vector, phase)
     for frame in vector.measure(phase):
         assert holds(figure, frame) == 2
     assert holds(figure, np.where(pupil.mask, phase, np.nan)) == 2
 
 
 def test_vector_sensor_shows_both_masks(vector, phase):
-    shown = pictures(drawings.vector_sensor(vector, phase))
+    shown = pictures(plots.vector_sensor(vector, phase))
     for mask in vector.masks:
         maps = [picture for picture in shown if np.nanmax(picture) == np.nanmin(picture) == mask.phase]
         assert len(maps) == 2
@@ -163,7 +163,7 @@ def test_vector_sensor_shows_both_masks(vector, phase):
 
 
 def test_vector_sensor_names_its_elements(vector, phase):
-    found = texts(drawings.vector_sensor(vector, phase))
+    found = texts(plots.vector_sensor(vector, phase))
     named = {
         "Liquid crystal",
         "Metasurface",
@@ -178,15 +178,15 @@ def test_vector_sensor_names_its_elements(vector, phase):
 
 
 def test_only_liquid_crystal_needs_a_quarter_wave_plate(vector, phase):
-    scene = drawings.vector_sensor(vector, phase).axes[0]
+    scene = plots.vector_sensor(vector, phase).axes[0]
     assert sum("quarter" in text.get_text() for text in scene.texts) == 1
     assert sum("Wollaston" in text.get_text() for text in scene.texts) == 2
 
 
 def test_polarisations_differ_by_dashes_too(vector, phase):
-    scene = drawings.vector_sensor(vector, phase).axes[0]
-    solid = [line for line in scene.lines if same_color(line.get_color(), drawings._PLUS.color)]
-    dashed = [line for line in scene.lines if same_color(line.get_color(), drawings._MINUS.color)]
+    scene = plots.vector_sensor(vector, phase).axes[0]
+    solid = [line for line in scene.lines if same_color(line.get_color(), plots.layouts._PLUS.color)]
+    dashed = [line for line in scene.lines if same_color(line.get_color(), plots.layouts._MINUS.color)]
     rays = [
         sum(line.get_linestyle() == style for line in lines) for lines, style in ((solid, "-"), (dashed, "--"))
     ]
@@ -195,11 +195,11 @@ def test_polarisations_differ_by_dashes_too(vector, phase):
 
 def test_vector_sensor_refuses_another_number_of_masks(classic, phase):
     with pytest.raises(ValueError, match="sensor has 1 masks: expected two"):
-        drawings.vector_sensor(classic, phase)
+        plots.vector_sensor(classic, phase)
 
 
 def test_bench_layout_shows_the_camera(bench, pistons, frames):
-    figure = drawings.bench_layout(bench, pistons, frames)
+    figure = plots.bench_layout(bench, pistons, frames)
     for frame in frames:
         assert holds(figure, frame) == 1
     flat = Bench.ideal(n_pixels=60, quilting=bench.quilting).frames()[0]
@@ -207,7 +207,7 @@ def test_bench_layout_shows_the_camera(bench, pistons, frames):
 
 
 def test_bench_layout_shows_the_segments(bench, pistons, frames):
-    figure = drawings.bench_layout(bench, pistons, frames)
+    figure = plots.bench_layout(bench, pistons, frames)
     commanded = np.where(bench.segments > 0, bench.commanded_phase(pistons), np.nan)
     assert holds(figure, commanded) == 1
     pupil = zwfs.Pupil.from_segments(bench.segments)
@@ -220,7 +220,7 @@ def test_bench_layout_shows_the_segments(bench, pistons, frames):
 
 
 def test_bench_layout_of_flat_segments(bench, frames):
-    figure = drawings.bench_layout(bench, np.zeros(bench.n_segments), frames)
+    figure = plots.bench_layout(bench, np.zeros(bench.n_segments), frames)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         saved(figure)
@@ -229,14 +229,14 @@ def test_bench_layout_of_flat_segments(bench, frames):
 def test_bench_layout_names_its_elements(bench, pistons, frames):
     named = {"source", "635 nm", "pupil stop", "IrisAO segmented mirror", "BMC deformable mirror", "camera"}
     named |= {"vector-Zernike\nmask", "quarter-\nwave plate", "Wollaston\nprism"}
-    assert named <= texts(drawings.bench_layout(bench, pistons, frames))
+    assert named <= texts(plots.bench_layout(bench, pistons, frames))
 
 
 def test_bench_layout_refuses_what_does_not_fit(bench, pistons, frames):
     with pytest.raises(ValueError, match="pistons"):
-        drawings.bench_layout(bench, pistons[:-1], frames)
+        plots.bench_layout(bench, pistons[:-1], frames)
     with pytest.raises(ValueError, match="frames has 1 images: expected two"):
-        drawings.bench_layout(bench, pistons, frames[:1])
+        plots.bench_layout(bench, pistons, frames[:1])
 
 
 @pytest.mark.parametrize(
@@ -253,4 +253,4 @@ def test_bench_layout_refuses_what_does_not_fit(bench, pistons, frames):
     ],
 )
 def test_angles_in_pi(angle, text):
-    assert drawings._in_pi(angle) == text
+    assert plots.layouts._in_pi(angle) == text

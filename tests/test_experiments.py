@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from zwfs import Linear, PhaseShifted, dynamic_range, reconstruction_error
-from zwfs.experiments import convergence, linearity_curves, screens_at
+from zwfs.paper.linearity import convergence, linearity_curves, screens_at
 
 RMS = (0.05, 0.3, 0.6)
 

@@ -1,6 +1,5 @@
 import inspect
 import json
-import pkgutil
 from dataclasses import replace
 from itertools import combinations, product
 from pathlib import Path
@@ -11,20 +10,21 @@ import pytest
 from matplotlib.colors import to_hex, to_rgb, to_rgba_array
 
 import zwfs
-from zwfs import drawings, figures, figures_bench, figures_frames
-from zwfs.bench import Bench
-from zwfs.bench_trials import BenchCurves
-from zwfs.closed_loop import LoopRun
-from zwfs.experiments import linearity_curves
-from zwfs.frames import Found, Measurement, Optics, Step
-from zwfs.variations import DiameterCurve, PairMaps
+from zwfs import plots
+from zwfs.bench.model import Bench
+from zwfs.frames.pipeline import Found, Measurement, Optics, Step
+from zwfs.paper.bench_linearity import BenchCurves
+from zwfs.paper.closed_loop import LoopRun
+from zwfs.paper.dimple_diameter import DiameterCurve
+from zwfs.paper.linearity import linearity_curves
+from zwfs.paper.phase_shifts import PairMaps
 
 
 @pytest.fixture(autouse=True)
 def style():
     plt.switch_backend("Agg")
     with plt.rc_context():
-        figures.use_style()
+        plots.use_style()
         yield
     plt.close("all")
 
@@ -40,23 +40,18 @@ def drawn(axes, look):
 
 
 def test_every_method_has_a_look_of_its_own():
-    assert {method.__name__ for method in zwfs.RECONSTRUCTORS} <= set(figures.LOOKS)
+    assert {method.__name__ for method in zwfs.RECONSTRUCTORS} <= set(plots.LOOKS)
     for part in ("color", "marker", "label"):
-        assert len({getattr(look, part) for look in figures.LOOKS.values()}) == len(figures.LOOKS)
+        assert len({getattr(look, part) for look in plots.LOOKS.values()}) == len(plots.LOOKS)
 
 
 def figure_functions():
     """Every function of the package that draws a figure."""
-    names = [module.name for module in pkgutil.iter_modules(zwfs.__path__)]
-    modules = [getattr(zwfs, name) for name in names if name.startswith(("figures", "drawings"))]
+    functions = {name: getattr(plots, name) for name in plots.__all__}
     return {
-        f"{module.__name__.removeprefix('zwfs.')}.{name}": function
-        for module in modules
-        for name, function in vars(module).items()
-        if inspect.isfunction(function)
-        and function.__module__ == module.__name__
-        and not name.startswith("_")
-        and function.__annotations__["return"] == "Figure"
+        name: function
+        for name, function in functions.items()
+        if inspect.isfunction(function) and function.__annotations__["return"] == "Figure"
     }
 
 
@@ -79,35 +74,35 @@ def drawn_methods(curves, pupil, classic, shifted):
     commands = np.linspace(-1, 1, bench.n_segments)
     lines = {f"curve {i}": three for i in range(4)}
     return {
-        "drawings.sensor_layout": ((classic, phase), ()),
-        "drawings.vector_sensor": ((shifted, phase), ()),
-        "drawings.bench_layout": ((bench, commands, bench.frames(commands, seed=1)), ()),
-        "figures.linearity": ((curves, 0.05, two, 0.4), two),
-        "figures.convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in figures.LOOKS},), figures.LOOKS),
-        "figures.estimates": ((pupil, phase, dict.fromkeys(two, phase), dict.fromkeys(two, phase)), ()),
-        "figures.approximation": ((three, lines, lines), ()),
-        "figures.diversity": ((three, three, three, {f"pair {i}": i for i in range(3)}), ()),
-        "figures.dimple_diameter": (({25: trial, 100: trial}, 0.5, 0.05, 2.2), shifted_only),
-        "figures.diameter_methods": ((dict.fromkeys(figures.LOOKS, trial), 0.5, 0.05, 2.2), figures.LOOKS),
-        "figures.diameter_reasons": (
+        "sensor_layout": ((classic, phase), ()),
+        "vector_sensor": ((shifted, phase), ()),
+        "bench_layout": ((bench, commands, bench.frames(commands, seed=1)), ()),
+        "linearity": ((curves, 0.05, two, 0.4), two),
+        "convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in plots.LOOKS},), plots.LOOKS),
+        "estimates": ((pupil, phase, dict.fromkeys(two, phase), dict.fromkeys(two, phase)), ()),
+        "approximation": ((three, lines, lines), ()),
+        "diversity": ((three, three, three, {f"pair {i}": i for i in range(3)}), ()),
+        "dimple_diameter": (({25: trial, 100: trial}, 0.5, 0.05, 2.2), shifted_only),
+        "diameter_methods": ((dict.fromkeys(plots.LOOKS, trial), 0.5, 0.05, 2.2), plots.LOOKS),
+        "diameter_reasons": (
             (three, three, np.full((3, 2), 0.5), {1.0: 0.5}, lines, 2.2),
             shifted_only,
         ),
-        "figures.pair_maps": ((PairMaps(three, *np.full((5, 3, 3), 1.0)), [(1.0, -1.0)] * 2), ()),
-        "figures.pair_noise": ((three, lines, {"curve 0": [(1.0, 1.0, 0.1)]}), ()),
-        "figures_bench.reference_intensities": ((frames, frames), ()),
-        "figures_bench.measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
-        "figures_bench.segment_errors": ((np.arange(4), dict.fromkeys(two, pistons[0, 0]), {"map": phase}), two),
-        "figures_bench.bench_linearity": ((bench_curves, two), two),
-        "figures_bench.budget": ((["none", "blur"], *np.ones((3, 2))), shifted_only),
-        "figures_frames.explained": ((found,), ()),
-        "figures_frames.phase_map": ((found, 635.0), ()),
-        "figures_frames.gains": (
+        "pair_maps": ((PairMaps(three, *np.full((5, 3, 3), 1.0)), [(1.0, -1.0)] * 2), ()),
+        "pair_noise": ((three, lines, {"curve 0": [(1.0, 1.0, 0.1)]}), ()),
+        "reference_intensities": ((frames, frames), ()),
+        "measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
+        "segment_errors": ((np.arange(4), dict.fromkeys(two, pistons[0, 0]), {"map": phase}), two),
+        "bench_linearity": ((bench_curves, two), two),
+        "budget": ((["none", "blur"], *np.ones((3, 2))), shifted_only),
+        "explained": ((found,), ()),
+        "phase_map": ((found, 635.0), ()),
+        "gains": (
             ([Step("outlines", None, None, found, np.ones(2))] * 2, [0.1, 0.2]),
             (),
         ),
-        "figures_loop.loop_runs": (({"bright star": dict.fromkeys(two, loop)},), two),
-        "figures_loop.capture": (
+        "loop_runs": (({"bright star": dict.fromkeys(two, loop)},), two),
+        "capture": (
             (three, dict.fromkeys(two, three), dict.fromkeys(two, np.full((3, 2), 0.1))),
             two,
         ),
@@ -132,10 +127,10 @@ def test_every_figure_is_tested_for_its_colours(drawn_methods):
 def test_colours_of_methods_stand_for_nothing_else(name, drawn_methods, monkeypatch):
     """With methods in other colours, no artist has the colour of a method; black is also the colour of ink."""
     arguments, methods = drawn_methods[name]
-    usual = {look.color: method for method, look in figures.LOOKS.items() if look.color != "#000000"}
-    other = {method: f"#0{index}0{index}0{index}" for index, method in enumerate(figures.LOOKS, start=1)}
+    usual = {look.color: method for method, look in plots.LOOKS.items() if look.color != "#000000"}
+    other = {method: f"#0{index}0{index}0{index}" for index, method in enumerate(plots.LOOKS, start=1)}
     for method, color in other.items():
-        monkeypatch.setitem(figures.LOOKS, method, replace(figures.LOOKS[method], color=color))
+        monkeypatch.setitem(plots.LOOKS, method, replace(plots.LOOKS[method], color=color))
     shown = colours(figure_functions()[name](*arguments))
     assert {usual[color] for color in shown & set(usual)} == set()
     assert {method for method, color in other.items() if color in shown} == set(methods)
@@ -145,14 +140,14 @@ def test_notebooks_draw_no_colour_of_a_method():
     notebooks = (Path(__file__).parent.parent / "notebooks").glob("*.ipynb")
     cells = (cell for file in notebooks for cell in json.loads(file.read_bytes())["cells"])
     source = "".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code").upper()
-    assert not [look.color for look in figures.LOOKS.values() if look.color in source]
+    assert not [look.color for look in plots.LOOKS.values() if look.color in source]
 
 
 def test_curves_of_no_method_have_other_colours_and_markers():
     for part in ("color", "marker"):
-        values = {style[part] for style in figures.OTHER_STYLES}
-        assert len(values) == len(figures.OTHER_STYLES)
-        assert not values & {getattr(look, part) for look in figures.LOOKS.values()}
+        values = {style[part] for style in plots.OTHER_STYLES}
+        assert len(values) == len(plots.OTHER_STYLES)
+        assert not values & {getattr(look, part) for look in plots.LOOKS.values()}
 
 
 # Linear RGB as it looks without one kind of cones (Machado, Oliveira and Fernandes 2009, severity 1).
@@ -178,9 +173,9 @@ def lab(color, vision):
 @pytest.mark.parametrize("vision", VISION)
 def test_colours_that_share_a_figure_differ_for_every_reader(vision):
     palettes = {
-        "methods": [look.color for look in figures.LOOKS.values()],
-        "other curves": [style["color"] for style in figures.OTHER_STYLES],
-        "polarisations": [drawings._PLUS.color, drawings._MINUS.color],
+        "methods": [look.color for look in plots.LOOKS.values()],
+        "other curves": [style["color"] for style in plots.OTHER_STYLES],
+        "polarisations": [plots.layouts._PLUS.color, plots.layouts._MINUS.color],
     }
     for colors in palettes.values():
         points = [lab(color, vision) for color in colors]
@@ -188,37 +183,37 @@ def test_colours_that_share_a_figure_differ_for_every_reader(vision):
 
 
 def test_polarisations_and_masked_pixels_do_not_look_like_a_method():
-    others = [drawings._PLUS.color, drawings._MINUS.color, figures_frames._MASKED]
-    methods = [look.color for look in figures.LOOKS.values()]
+    others = [plots.layouts._PLUS.color, plots.layouts._MINUS.color, plots.frames._MASKED]
+    methods = [look.color for look in plots.LOOKS.values()]
     gaps = [np.linalg.norm(lab(a, "normal") - lab(b, "normal")) for a, b in product(others, methods)]
     assert min(gaps) > 25
 
 
 def test_a_method_looks_the_same_in_every_figure(curves):
-    trials = {name: DiameterCurve(np.array([1.0, 2]), np.full((2, 3), 0.1)) for name in figures.LOOKS}
-    steps = {name: {0.2: np.geomspace(1, 1e-6, 8) * np.ones((3, 8))} for name in figures.LOOKS}
+    trials = {name: DiameterCurve(np.array([1.0, 2]), np.full((2, 3), 0.1)) for name in plots.LOOKS}
+    steps = {name: {0.2: np.geomspace(1, 1e-6, 8) * np.ones((3, 8))} for name in plots.LOOKS}
     two = ["Linear", "PhaseShifted"]
     pistons = np.linspace(-1, 1, 24).reshape(2, 3, 4)
     bench = BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(two, 0.1 * pistons))
-    segments = figures_bench.segment_errors(np.arange(4), dict.fromkeys(two, pistons[0, 0]), {"map": np.eye(4)})
+    segments = plots.segment_errors(np.arange(4), dict.fromkeys(two, pistons[0, 0]), {"map": np.eye(4)})
     shown = [
-        (figures.linearity(curves, 0.05, two, rms_max=0.4), two),
-        (figures.convergence(steps), list(figures.LOOKS)),
-        (figures.diameter_methods(trials, 0.5, 0.05, 2.2), list(figures.LOOKS)),
-        (figures_bench.bench_linearity(bench, two), two),
+        (plots.linearity(curves, 0.05, two, rms_max=0.4), two),
+        (plots.convergence(steps), list(plots.LOOKS)),
+        (plots.diameter_methods(trials, 0.5, 0.05, 2.2), list(plots.LOOKS)),
+        (plots.bench_linearity(bench, two), two),
         (segments, two),
     ]
     for figure, names in shown:
-        for look in map(figures.LOOKS.get, names):
+        for look in map(plots.LOOKS.get, names):
             lines = [line for axes in figure.axes for line in axes.lines]
             found = {(line.get_color(), line.get_marker()) for line in lines if look.label in line.get_label()}
             assert found == {(look.color, look.marker)}
 
 
 def test_linearity_draws_the_means_and_marks_where_they_leave(curves):
-    figure = figures.linearity(curves, 0.05, ["Linear", "PhaseShifted"], rms_max=0.2)
+    figure = plots.linearity(curves, 0.05, ["Linear", "PhaseShifted"], rms_max=0.2)
     plain, ratio = figure.axes
-    look = figures.LOOKS["Linear"]
+    look = plots.LOOKS["Linear"]
     np.testing.assert_allclose(drawn(plain, look).get_ydata(), curves.mean("Linear")[:3])
     np.testing.assert_allclose(drawn(ratio, look).get_ydata(), curves.mean("Linear")[1:3] / curves.rms[1:3])
     marks = [line.get_xdata()[0] for line in ratio.lines if len(line.get_xdata()) == 1]
@@ -228,18 +223,18 @@ def test_linearity_draws_the_means_and_marks_where_they_leave(curves):
 def test_estimates_show_what_they_were_given(pupil, screens):
     truth = screens(0.5, 1)[0]
     found = {"Linear": np.where(pupil.mask, truth / 2, np.nan)}
-    figure = figures.estimates(pupil, truth, found, found)
+    figure = plots.estimates(pupil, truth, found, found)
     shown = [np.ma.filled(axes.images[0].get_array(), np.nan) for axes in figure.axes if axes.images]
     np.testing.assert_array_equal(shown[1], found["Linear"])
 
 
 def test_convergence_has_a_panel_for_each_input():
     errors = {"Linear": {0.2: np.ones((3, 2))}, "PhaseShifted": {0.2: np.geomspace(1, 1e-6, 8) * np.ones((3, 8))}}
-    figure = figures.convergence(errors)
-    line = drawn(figure.axes[0], figures.LOOKS["PhaseShifted"])
+    figure = plots.convergence(errors)
+    line = drawn(figure.axes[0], plots.LOOKS["PhaseShifted"])
     np.testing.assert_allclose(line.get_ydata(), np.geomspace(1, 1e-6, 8))
 
 
 def test_an_unknown_method_is_named():
     with pytest.raises(ValueError, match=r"methods = \['Magic'\]: expected some of"):
-        figures.convergence({"Magic": {0.2: np.ones((3, 2))}})
+        plots.convergence({"Magic": {0.2: np.ones((3, 2))}})

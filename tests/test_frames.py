@@ -7,10 +7,13 @@ import pytest
 from astropy.io import fits
 from scipy import ndimage
 
-from zwfs import Dimple, Pupil, ZernikeSensor, camera, power_law_screens, zernike_basis
-from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
-from zwfs.frames import Optics, fit, measure, measured_pupil, predict_other, reconstruct, steps
-from zwfs.registration import (
+from zwfs import Dimple, Pupil, ZernikeSensor, power_law_screens, zernike_basis
+from zwfs.bench import bench_error, write_bench
+from zwfs.bench.model import Bench, BenchModel, segment_screens
+from zwfs.bench.segments import segment_residual
+from zwfs.frames import files as camera
+from zwfs.frames.pipeline import Optics, fit, measure, measured_pupil, predict_other, reconstruct, steps
+from zwfs.frames.registration import (
     Circle,
     Image,
     correlations,
@@ -459,7 +462,7 @@ SMALL = {"n_pixels": D, "gap": 0.02, "stop": 0.8}
 
 def bench_images(folder, bench, pistons, **settings):
     files = {name: camera.read(path) for name, path in
-             camera.write_bench(folder, bench, pistons, **settings).items()}  # fmt: skip
+             write_bench(folder, bench, pistons, **settings).items()}  # fmt: skip
     shared = [files["dark"]], [files["bad_pixels"]]
     return files, camera.images([files["frame"]], *shared), camera.images([files["pupils"]], *shared)
 
@@ -476,7 +479,7 @@ def test_bench_writes_what_the_pipeline_reads(tmp_path):
     # The bench sets the images half a pixel apart.
     np.testing.assert_allclose(recording.origins[3], [-0.5, 89.5], atol=0.1)
     found = reconstruct(measure(recording, Optics()), Optics())
-    error = camera.bench_error(bench, commanded, recording, found)
+    error = bench_error(bench, commanded, recording, found)
     known = reconstruct_with(BenchModel.from_images(bench, 1), bench, commanded)
     assert error < known + 0.03  # as good as one who knows where the pupils stand
     assert error < 0.15
@@ -494,7 +497,7 @@ def test_bench_files_are_the_same_byte_for_byte(tmp_path):
     contents = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        paths = camera.write_bench(tmp_path / name, bench, n_bad=10, seed=4)
+        paths = write_bench(tmp_path / name, bench, n_bad=10, seed=4)
         contents.append([path.read_bytes() for path in paths.values()])
     assert contents[0] == contents[1]
 

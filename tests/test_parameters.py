@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import runner
 
-from zwfs.parameters import check_parameters
+from zwfs.companion.parameters import check_parameters
 
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 

@@ -19,7 +19,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from PIL import Image
 from runner import NotebookError, Project
 
-from zwfs.results import write_file
+from zwfs._files import write_file
 
 BOOK = Path(runner.__file__).parent
 

@@ -30,7 +30,7 @@ ROOT = Path(__file__).parent.parent
 DEFAULTS = (
     "n = 2  # pixels across\nwidth = 1.5  # of the slit, rad\nsteps = [1, 2]  # tried, in turn\nseed = 7  # of it"
 )
-LIMITS = """from zwfs.parameters import check_parameters
+LIMITS = """from zwfs.companion.parameters import check_parameters
 check_parameters(globals(), n=(1, 9), width=(0.0, 4.0), steps=[(0, 9), ...], seed=(0, 99))"""
 # Each letter is a list of nine of the letter before: the last stands for 9 to the power of 11 strings.
 BOMB = "".join(
@@ -522,7 +522,7 @@ HOSTILE = {
     "code": "`` ` ` <b>bold</b> | $x$ {math}`y` *z* &lt;",
     "end": "</code></td></table></style><svg onload=document.title=666>",
 }
-SHOWN = """from zwfs.tables import Table
+SHOWN = """from zwfs.companion.tables import Table
 Table(["name", *names], [[name, *[""] * len(names)] for name in names])"""
 # As if a notebook escaped nothing.
 UNESCAPED = "from IPython.display import Markdown, display\nfor name in names:\n    display(Markdown(name))"
@@ -534,7 +534,9 @@ def hostile_page(tmp_path, source):
     secret = tmp_path / "secret.txt"
     secret.write_text("the password")
     names = [name.replace("../../../SECRET", "../" * 20 + str(secret)[1:]) for name in HOSTILE.values()]
-    limits = "from zwfs.parameters import check_parameters\ncheck_parameters(globals(), names=[str, ...])"
+    limits = (
+        "from zwfs.companion.parameters import check_parameters\ncheck_parameters(globals(), names=[str, ...])"
+    )
     write(project, "fig02_works", new_code_cell(source), defaults="names = []  # of files", limits=limits)
     rerun.rerun(project, ["2", "-p", f"names={json.dumps(names)}"])
     return result(project) / "fig02_works.html", names

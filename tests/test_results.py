@@ -7,7 +7,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from zwfs.results import FOLDER, publish, write_file
+from zwfs._files import write_file
+from zwfs.companion.results import FOLDER, publish
 
 matplotlib.use("agg")
 

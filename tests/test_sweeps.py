@@ -16,21 +16,13 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 
-from zwfs import (
-    Arcsine,
-    Dimple,
-    GradientDescent,
-    Linear,
-    PhaseShifted,
-    Pupil,
-    ZernikeSensor,
-    sweeps,
-    zernike_basis,
-)
-from zwfs.bench import Bench, BenchModel
-from zwfs.bench_trials import bench_curves, bench_reconstructors, error_budget
-from zwfs.experiments import linearity_curves
-from zwfs.variations import diameter_curve, pair_maps
+from zwfs import Arcsine, Dimple, GradientDescent, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
+from zwfs.bench.model import Bench, BenchModel
+from zwfs.companion import sweeps
+from zwfs.paper.bench_linearity import bench_curves, bench_reconstructors, error_budget
+from zwfs.paper.dimple_diameter import diameter_curve
+from zwfs.paper.linearity import linearity_curves
+from zwfs.paper.phase_shifts import pair_maps
 
 ROOT = Path(__file__).parent.parent
 
@@ -258,7 +250,7 @@ import sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background SIGINT is ignored
 import numpy as np
 from tests.test_sweeps import slow
-from zwfs import sweeps
+from zwfs.companion import sweeps
 
 factor = 2.0
 
@@ -404,7 +396,7 @@ def test_what_was_looked_at_does_not_change_a_pickle(modes):
 
 def test_the_package_does_without_joblib():
     unwanted = "{'joblib', 'cloudpickle', 'threadpoolctl', 'distributed'}"
-    script = f"import sys, zwfs, zwfs.experiments; assert not {unwanted} & set(sys.modules)"
+    script = f"import sys, zwfs, zwfs.paper.linearity; assert not {unwanted} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", script], check=True)
 
 

@@ -2,7 +2,7 @@ import pytest
 from bs4 import BeautifulSoup
 from markdown_it import MarkdownIt
 
-from zwfs.tables import Table
+from zwfs.companion.tables import Table
 
 
 def test_few_digits_are_shown_and_truths_in_words():

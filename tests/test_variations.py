@@ -3,20 +3,18 @@ import pytest
 from scipy.special import j1, jn_zeros
 
 import zwfs
-from zwfs.variations import (
+from zwfs.paper.dimple_diameter import (
     DARK_RING,
     DiameterCurve,
     DimpleLight,
     crossing,
     diameter_curve,
-    drawn_noise,
     iteration_spectrum,
     linearised_step,
     measured_factor,
     mode_sensitivity,
-    pair_maps,
-    phase_noise,
 )
+from zwfs.paper.phase_shifts import drawn_noise, pair_maps, phase_noise
 
 HALF = np.pi / 2
 

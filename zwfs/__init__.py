@@ -24,32 +24,19 @@ from zwfs.sensor import ZernikeSensor
 # The modules, for type checkers and editors. At run time each one is imported at its first use, see `__getattr__`.
 if TYPE_CHECKING:
     from zwfs import bench as bench
-    from zwfs import bench_trials as bench_trials
-    from zwfs import camera as camera
-    from zwfs import closed_loop as closed_loop
+    from zwfs import companion as companion
     from zwfs import detector as detector
-    from zwfs import drawings as drawings
-    from zwfs import experiments as experiments
-    from zwfs import figures as figures
-    from zwfs import figures_bench as figures_bench
-    from zwfs import figures_frames as figures_frames
-    from zwfs import figures_loop as figures_loop
     from zwfs import focal as focal
     from zwfs import frames as frames
-    from zwfs import interference as interference
     from zwfs import lowrank as lowrank
     from zwfs import masks as masks
     from zwfs import metrics as metrics
     from zwfs import modes as modes
-    from zwfs import parameters as parameters
+    from zwfs import paper as paper
+    from zwfs import plots as plots
     from zwfs import pupil as pupil
     from zwfs import reconstructors as reconstructors
-    from zwfs import registration as registration
-    from zwfs import results as results
     from zwfs import sensor as sensor
-    from zwfs import sweeps as sweeps
-    from zwfs import tables as tables
-    from zwfs import variations as variations
 
 __version__ = "0.1.0"
 

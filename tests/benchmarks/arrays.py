@@ -12,7 +12,7 @@ from time import perf_counter
 import numpy as np
 
 from zwfs import Dimple, PhaseShifted, Pupil, ZernikeSensor, reconstruction_error, zernike_basis
-from zwfs.experiments import screens_at
+from zwfs.paper.linearity import screens_at
 
 REPEATS = 3
 

@@ -25,10 +25,10 @@ from zwfs import (
     reconstruction_error,
     zernike_basis,
 )
-from zwfs import closed_loop as loops
 from zwfs._arrays import Kind
-from zwfs.experiments import screens_at
-from zwfs.reconstructors import _common
+from zwfs.paper import closed_loop as loops
+from zwfs.paper.linearity import screens_at
+from zwfs.reconstructors import base
 
 DIMPLES = (Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
 REAL_TIME = {"n_iterations": 2, "tolerance": 0.0, "accelerate": True}
@@ -108,7 +108,7 @@ def breakdown(n_pixels, seconds):
     kind = Kind.of(frames)
     maps, operator, core = method.settings.maps(kind), sensor.operator(kind), method._of(kind).core
     phasor = maps.flat
-    flat, batch = _common.check_frames(sensor, frames)
+    flat, batch = base.check_frames(sensor, frames)
     data = method.prepare(flat, phasor, True, kind)
     projected, acceleration = operator.split_project(phasor), method._of(kind).acceleration
     coefficients = projected @ core
@@ -117,16 +117,16 @@ def breakdown(n_pixels, seconds):
     found = method(frames)
     one = np.zeros(1, int)
     parts = {
-        "check of the frames": lambda: _common.check_frames(sensor, frames),
+        "check of the frames": lambda: base.check_frames(sensor, frames),
         "signal and dimming": lambda: method.prepare(flat, phasor, True, kind),
         "step: projection": lambda: operator.split_project(phasor) @ core,
         "step: extrapolation": lambda: acceleration.extrapolate(projected, dict(data), np),
         "step: expansion": lambda: operator.split_expand(coefficients, in_window=True),
         "step: linear system": lambda: method._shared.solve(wave, data["signal"], kind),
-        "step: modulus": lambda: _common.unit(field.copy(), maps.inside, np),
-        "angle": lambda: _common.angle(phasor, np),
-        "report": lambda: _common.report(
-            method.settings, flat, batch, _common.Found(found.phase[np.newaxis], one, one, one)
+        "step: modulus": lambda: base.unit(field.copy(), maps.inside, np),
+        "angle": lambda: base.angle(phasor, np),
+        "report": lambda: base.report(
+            method.settings, flat, batch, base.Found(found.phase[np.newaxis], one, one, one)
         ),
         "whole call": lambda: method(frames),
     }
@@ -159,7 +159,7 @@ def limit(n_pixels, seconds):
             for _ in range(steps - 1)
         ],
         "one pass over frames and, in each step, over signal and field": passes,
-        "the arctangent of the phase": lambda: _common.angle(phasor, np),
+        "the arctangent of the phase": lambda: base.angle(phasor, np),
     }
     times = best_of_each(parts, seconds)
     return times | {"these three together": sum(times.values()) - times["the whole call"]}

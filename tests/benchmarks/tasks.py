@@ -14,11 +14,12 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 import numpy as np
 
 import zwfs
-from zwfs import sweeps
-from zwfs.bench import Bench, BenchModel
-from zwfs.bench_trials import bench_curves, bench_reconstructors, error_budget
-from zwfs.experiments import linearity_curves, screens_at
-from zwfs.variations import diameter_curve, pair_maps
+from zwfs.bench.model import Bench, BenchModel
+from zwfs.companion import sweeps
+from zwfs.paper.bench_linearity import bench_curves, bench_reconstructors, error_budget
+from zwfs.paper.dimple_diameter import diameter_curve
+from zwfs.paper.linearity import linearity_curves, screens_at
+from zwfs.paper.phase_shifts import pair_maps
 
 
 def screens_on(n_pixels, rms, n_screens):

@@ -1,7 +1,7 @@
 """Reconstructors: built once for a sensor, then called on frames; all give a `Reconstruction`."""
 
-from zwfs.reconstructors._common import Reconstruction
 from zwfs.reconstructors.arcsine import Arcsine
+from zwfs.reconstructors.base import Reconstruction
 from zwfs.reconstructors.gerchberg_saxton import GerchbergSaxton
 from zwfs.reconstructors.gradient_descent import GradientDescent
 from zwfs.reconstructors.linear import Linear

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zwfs._arrays import Kind
 from zwfs.lowrank import split_core
-from zwfs.reconstructors._common import with_piston_of
+from zwfs.reconstructors.base import with_piston_of
 from zwfs.sensor import ZernikeSensor
 
 _DIMMEST = 0.01  # least light that frames are taken to miss, relative to those of a flat wavefront

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs._arrays import Kind
 from zwfs.lowrank import Operator, split_core
-from zwfs.reconstructors._common import (
+from zwfs.reconstructors.base import (
     Estimate,
     Reconstruction,
     Settings,

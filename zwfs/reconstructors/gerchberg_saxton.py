@@ -5,7 +5,7 @@ from __future__ import annotations
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs._arrays import Kind
-from zwfs.reconstructors._common import Estimate, Reconstruction, Settings, iterate, settings, unit
+from zwfs.reconstructors.base import Estimate, Reconstruction, Settings, iterate, settings, unit
 from zwfs.sensor import ZernikeSensor
 
 

@@ -9,15 +9,7 @@ from scipy.optimize import OptimizeResult, minimize
 from zwfs import _check
 from zwfs._arrays import Kind
 from zwfs._pickle import read_only_state
-from zwfs.reconstructors._common import (
-    Found,
-    Reconstruction,
-    Settings,
-    check_frames,
-    report,
-    settings,
-    start_phase,
-)
+from zwfs.reconstructors.base import Found, Reconstruction, Settings, check_frames, report, settings, start_phase
 from zwfs.reconstructors.linear import check_modes
 from zwfs.sensor import ZernikeSensor, split, square
 

@@ -8,15 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs._arrays import Kind, read_only
 from zwfs._pickle import read_only_state
-from zwfs.reconstructors._common import (
-    Found,
-    Reconstruction,
-    Settings,
-    check_frames,
-    report,
-    settings,
-    start_phase,
-)
+from zwfs.reconstructors.base import Found, Reconstruction, Settings, check_frames, report, settings, start_phase
 from zwfs.sensor import ZernikeSensor
 
 

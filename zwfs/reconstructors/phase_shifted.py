@@ -13,7 +13,7 @@ from zwfs import _check
 from zwfs._arrays import Kind
 from zwfs.lowrank import Operator, split_core
 from zwfs.reconstructors._acceleration import Acceleration, dimming
-from zwfs.reconstructors._common import (
+from zwfs.reconstructors.base import (
     Estimate,
     Reconstruction,
     Settings,

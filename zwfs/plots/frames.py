@@ -8,8 +8,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from zwfs.figures import OTHER_STYLES, show_intensity, show_phase
-from zwfs.frames import Found, Step
+from zwfs.frames.pipeline import Found, Step
+from zwfs.plots.style import OTHER_STYLES, show_intensity, show_phase
 
 _MASKED = "#FF00FF"  # not in the colour maps, and far from the colours of the methods
 

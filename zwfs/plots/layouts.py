@@ -15,10 +15,10 @@ from matplotlib.patches import Circle, Ellipse, FancyArrowPatch, Polygon, Rectan
 from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs.bench import Bench
-from zwfs.figures import INTENSITY_MAP, PHASE_MAP
+from zwfs.bench.model import Bench
 from zwfs.focal import focal_field
 from zwfs.masks import Dimple, Mask
+from zwfs.plots.style import INTENSITY_MAP, PHASE_MAP
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zwfs import _check, sweeps
-from zwfs.bench import Bench, BenchModel, Seed, segment_residual, segment_screens
-from zwfs.experiments import check_reconstructors, check_rms
+from zwfs import _check
+from zwfs.bench.model import Bench, BenchModel, Seed, segment_screens
+from zwfs.bench.segments import segment_residual
+from zwfs.companion import sweeps
 from zwfs.metrics import dynamic_range
+from zwfs.paper.linearity import check_reconstructors, check_rms
 from zwfs.reconstructors import RECONSTRUCTORS, Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
 
 
@@ -144,7 +146,7 @@ def bench_curves(
 ) -> BenchCurves:
     """Errors of reconstructors on random segment commands of growing rms: the experiment of section 5.2.
 
-    An input is a task of the sweep "bench_curves", see `zwfs.sweeps`.
+    An input is a task of the sweep "bench_curves", see `zwfs.companion.sweeps`.
 
     Parameters
     ----------
@@ -216,7 +218,7 @@ def error_budget(
 ) -> dict[str, BenchCurves]:
     """Each error of a bench alone, none, and all: what every one of them does to the reconstruction.
 
-    An error is a task of the sweep "error_budget", see `zwfs.sweeps`.
+    An error is a task of the sweep "error_budget", see `zwfs.companion.sweeps`.
 
     Parameters
     ----------

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from zwfs import _check
+from zwfs._files import write_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -111,16 +112,3 @@ def _csv(columns: Mapping[str, ArrayLike]) -> bytes:
 
 def _text(value: Any) -> str:
     return f"{value:.9g}" if isinstance(value, np.floating) else str(value)
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Write a file, and its folder if need be, in one step: whoever looks sees the old one or all of the new."""
-    _check.instance("path", path, Path)
-    _check.instance("content", content, bytes)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        partial.write_bytes(content)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)

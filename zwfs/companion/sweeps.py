@@ -34,7 +34,7 @@ import numpy as np
 import scipy
 
 from zwfs import _check
-from zwfs.results import write_file
+from zwfs._files import write_file
 
 STORE = "ZWFS_SWEEPS"
 PROGRESS = "ZWFS_PROGRESS"

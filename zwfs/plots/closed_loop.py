@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from zwfs.closed_loop import LoopRun
-from zwfs.figures import LOOKS
+from zwfs.paper.closed_loop import LoopRun
+from zwfs.plots.style import LOOKS
 
 
 def loop_runs(runs: Mapping[str, Mapping[str, LoopRun]]) -> Figure:

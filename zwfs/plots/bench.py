@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from zwfs.bench_trials import BenchCurves
-from zwfs.figures import LOOKS, show_intensity, show_phase
+from zwfs.paper.bench_linearity import BenchCurves
+from zwfs.plots.style import LOOKS, show_intensity, show_phase
 
 _ARMS = ("+θ", "−θ")
 

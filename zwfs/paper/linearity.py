@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zwfs import _check, sweeps
+from zwfs import _check
+from zwfs.companion import sweeps
 from zwfs.metrics import dynamic_range, reconstruction_error, strehl
 from zwfs.modes import power_law_screens
 
@@ -61,7 +62,7 @@ class LinearityCurves:
         return np.mean(self.errors[name] <= threshold * self.rms[:, np.newaxis], axis=1)
 
     def columns(self) -> dict[str, NDArray[np.floating]]:
-        """Input, and mean and standard deviation of every reconstructor, as columns for `zwfs.results.publish`."""
+        """Input, and mean and standard deviation of every reconstructor, as columns for `publish`."""
         columns = {"input (rad rms)": self.rms}
         for name in self.errors:
             columns[f"{name}: mean error (rad rms)"] = self.mean(name)
@@ -108,7 +109,7 @@ def linearity_curves(
     """Error of reconstructors on random screens of growing rms: the experiment of section 4.1.
 
     Each input rms has screens of its own; all reconstructors see the same ones, each through its own sensor. An
-    input is a task of the sweep "linearity_curves", see `zwfs.sweeps`.
+    input is a task of the sweep "linearity_curves", see `zwfs.companion.sweeps`.
 
     Parameters
     ----------

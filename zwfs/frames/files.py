@@ -1,4 +1,4 @@
-"""Camera files: read frames from FITS or NPY, write the phase as FITS, and let the simulated bench write frames.
+"""Camera files: read frames from FITS or NPY, write the phase as FITS.
 
 The only module that needs astropy, and only for FITS: `pip install zwfs[frames]`.
 """
@@ -19,16 +19,14 @@ from types import ModuleType
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs.bench import Bench, Seed, segment_pistons, segment_residual
-from zwfs.frames import Found
-from zwfs.registration import Image, Recording, nearest_good
-from zwfs.results import write_file
+from zwfs._files import write_file
+from zwfs.frames.pipeline import Found
+from zwfs.frames.registration import Image, Recording, nearest_good
 
 _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do that, saturation does
-_FULL = 50_000  # counts of the brightest pixel of a simulated 16-bit camera
 _GZIP, _NPY, _FITS = b"\x1f\x8b", b"\x93NUMPY", b"SIMPLE  ="  # first bytes of a file
 # Header cards that show who wrote a file: only such a file is replaced.
 _PHASE_CARD, _BENCH_CARD = b"CREATOR = 'zwfs ", b"ORIGIN  = 'zwfs"
@@ -138,7 +136,7 @@ def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
         with _broken(f"{name}: a broken NPY file"):
             data, header = _read_npy(content, name, max_bytes), dict[str, Any]()
     else:
-        fits = _fits()
+        fits = fits_module()
         with _broken(f"{name}: a broken FITS file"):
             data, header = _read_fits(fits, content, name, max_bytes)
     if data.dtype.kind not in "biuf":
@@ -294,7 +292,7 @@ def write_phase(
     """
     from zwfs import __version__
 
-    fits = _fits()
+    fits = fits_module()
     _check.instance("found", found, Found)
     _check.instance("recording", recording, Recording)
     _camera_files("sources", sources)
@@ -340,111 +338,11 @@ def write_phase(
     nanometres = fits.ImageHDU(found.phase * wavelength / (2 * np.pi), name="PHASE_NM")
     nanometres.header["BUNIT"] = "nm"
     masked = fits.ImageHDU((measurement.pupil.mask & ~measurement.good).astype(np.uint8), name="MASKED")
-    write_file(path, _fits_bytes(fits.HDUList([primary, nanometres, masked])))
+    write_file(path, fits_bytes(fits.HDUList([primary, nanometres, masked])))
 
 
-def write_bench(
-    folder: str | Path,
-    bench: Bench,
-    pistons: ArrayLike | Mapping[int, float] | None = None,
-    *,
-    wavelength: float = 635.0,
-    n_bad: int = 0,
-    seed: Seed = None,
-) -> dict[str, Path]:
-    """Let the simulated bench write what a camera would: 16-bit FITS files with both pupils on one image.
-
-    Parameters
-    ----------
-    folder : str or Path
-        It must exist. Files that `write_bench` wrote earlier are replaced.
-    bench : Bench
-        With photons.
-    pistons : as for `Bench.commanded_phase`, optional
-        Flat if left out.
-    wavelength : float, nm
-        For the headers.
-    n_bad : int
-        Bad pixels of the camera: half of them dark and named by the bad-pixel map, half of them saturated.
-    seed : int, Generator or SeedSequence, optional
-        Of the noise and of the bad pixels.
-
-    Returns
-    -------
-    dict of Path
-        "frame", "pupils", "dark" and "bad_pixels".
-
-    Raises
-    ------
-    ImportError
-        If astropy is missing.
-    TypeError, ValueError
-        If a value is of the wrong kind or out of range, or the folder holds another file of the same name.
-    """
-    fits = _fits()
-    _check.instance("bench", bench, Bench)
-    wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-    n_bad = _check.integer("n_bad", n_bad, 0, 2 * math.prod(bench.segments.shape))
-    folder = _path("folder", folder)
-    if not os.path.isdir(folder):
-        raise ValueError(f"folder = {str(folder)!r}: expected a folder that exists")
-    paths = {name: folder / f"{name}.fits" for name in ("frame", "pupils", "dark", "bad_pixels")}
-    for path in paths.values():
-        if _is_there(path) and not (path.is_file() and _has_card(path, _BENCH_CARD)):
-            raise ValueError(
-                f"folder = {str(folder)!r} holds a {path.name} that the simulated bench did not write: "
-                "expected another folder"
-            )
-    rng = np.random.default_rng(seed)
-    counts = {"frame": bench.frames(pistons, rng), "pupils": bench.pupil_images(rng), "dark": bench.dark(rng)}
-    gain = _FULL / max(pair.max() for pair in counts.values())
-    shape = np.concatenate(counts["frame"], axis=-1).shape
-    places = rng.choice(shape[0] * shape[1], n_bad, replace=False)
-    dead = np.zeros(shape, np.uint8)
-    dead.flat[places[: n_bad // 2]] = 1
-    for name, pair in counts.items():
-        image = np.clip(np.rint(np.concatenate(pair, axis=-1) * gain), 0, 65535).astype(np.uint16)
-        image[dead > 0] = 0
-        image.flat[places[n_bad // 2 :]] = 65535
-        hdu = fits.PrimaryHDU(image)
-        hdu.header["BUNIT"] = "adu"
-        hdu.header["WAVELEN"] = (wavelength, "[nm] wavelength")
-        hdu.header["DIMPLE"] = (bench.diameter, "[lambda/D] diameter of the dimple by design")
-        hdu.header["THETA1"] = (_card_value(bench.phase), "[rad] phase shift of the left image")
-        hdu.header["THETA2"] = (_card_value(-bench.phase), "[rad] phase shift of the right image")
-        hdu.header["SATURATE"] = (65535, "[adu] pixels that reach it are saturated")
-        hdu.header["ORIGIN"] = ("zwfs", "simulated bench")
-        write_file(paths[name], _fits_bytes(fits.HDUList([hdu])))
-    marked = fits.PrimaryHDU(dead)
-    marked.header["ORIGIN"] = ("zwfs", "simulated bench")
-    write_file(paths["bad_pixels"], _fits_bytes(fits.HDUList([marked])))
-    return paths
-
-
-def bench_error(bench: Bench, commanded: ArrayLike, recording: Recording, found: Found) -> float:
-    """Rms error of the segment pistons in a phase found from frames that `write_bench` wrote, radian.
-
-    Parameters
-    ----------
-    bench : Bench
-    commanded : array_like, shape (n_segments,), radian
-    recording : Recording
-    found : Found
-    """
-    _check.instance("bench", bench, Bench)
-    _check.instance("recording", recording, Recording)
-    _check.instance("found", found, Found)
-    canvas = np.full(recording.pupil_images[0].counts.shape, np.nan)
-    row, column = recording.corner
-    canvas[row : row + recording.n_pixels, column : column + recording.n_pixels] = found.phase
-    # The pupil stands in the middle of the left half of the image.
-    ny, nx = bench.segments.shape
-    top = (len(canvas) - ny) // 2
-    pistons = segment_pistons(canvas[top : top + ny, top : top + nx], bench.segments, bench.numbers)
-    return float(segment_residual(pistons, commanded).std())
-
-
-def _fits() -> ModuleType:
+def fits_module() -> ModuleType:
+    """Return `astropy.io.fits`, or say how to get it."""
     try:
         from astropy.io import fits
     except ImportError:
@@ -615,7 +513,8 @@ def _card_value(value: Any) -> Any:
     return bool(value) if isinstance(value, np.bool_) else value
 
 
-def _fits_bytes(units: Any) -> bytes:
+def fits_bytes(units: Any) -> bytes:
+    """Content of a FITS file with these units."""
     stream = io.BytesIO()
     units.writeto(stream)
     return stream.getvalue()

@@ -1,6 +1,6 @@
 """Camera frames to phase: normalise, model the sensor from its own pupil, reconstruct, and judge.
 
-The images come from `zwfs.camera`, which reads files, and their places from `zwfs.registration`. What an
+The images come from `zwfs.frames.files`, their places from `zwfs.frames.registration`. What an
 experimenter does not know for sure is a parameter of `Optics`. `fit` seeks values that explain the frames better,
 which need not make the phase better: with two images for one unknown at each point, the iteration explains much of
 any pair of frames. `predict_other` is the sterner test.
@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from zwfs import _check
+from zwfs.frames.registration import Image, Recording, correlations, nearest_good, radius, record, resample
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
-from zwfs.registration import Image, Recording, correlations, nearest_good, radius, record, resample
 from zwfs.sensor import ZernikeSensor
 
 _MOST_BAD = 0.2  # of the pupil's points: with more of them masked, the reference wave is guesswork
@@ -45,7 +45,7 @@ class Optics:
     scale : float
         Factor on the frames: flux of the mask-out images over that of the frames.
     leakage : float
-        Fraction of the light of each image that belongs to the other one, as in `zwfs.bench.Bench`.
+        Fraction of the light of each image that belongs to the other one, as in `zwfs.bench.model.Bench`.
     unmasked : float
         Fraction of the light that the mask leaves as it is: its retardance is not half a wave.
 

@@ -1,0 +1,122 @@
+"""Camera files of the simulated bench, and the error of a phase reconstructed from them."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from zwfs import _check
+from zwfs._files import write_file
+from zwfs.bench.model import Bench, Seed
+from zwfs.bench.segments import segment_pistons, segment_residual
+from zwfs.frames.files import _BENCH_CARD, _card_value, _has_card, _is_there, _path, fits_bytes, fits_module
+from zwfs.frames.pipeline import Found
+from zwfs.frames.registration import Recording
+
+_FULL = 50_000  # counts of the brightest pixel of a simulated 16-bit camera
+
+
+def write_bench(
+    folder: str | Path,
+    bench: Bench,
+    pistons: ArrayLike | Mapping[int, float] | None = None,
+    *,
+    wavelength: float = 635.0,
+    n_bad: int = 0,
+    seed: Seed = None,
+) -> dict[str, Path]:
+    """Let the simulated bench write what a camera would: 16-bit FITS files with both pupils on one image.
+
+    Parameters
+    ----------
+    folder : str or Path
+        It must exist. Files that `write_bench` wrote earlier are replaced.
+    bench : Bench
+        With photons.
+    pistons : as for `Bench.commanded_phase`, optional
+        Flat if left out.
+    wavelength : float, nm
+        For the headers.
+    n_bad : int
+        Bad pixels of the camera: half of them dark and named by the bad-pixel map, half of them saturated.
+    seed : int, Generator or SeedSequence, optional
+        Of the noise and of the bad pixels.
+
+    Returns
+    -------
+    dict of Path
+        "frame", "pupils", "dark" and "bad_pixels".
+
+    Raises
+    ------
+    ImportError
+        If astropy is missing.
+    TypeError, ValueError
+        If a value is of the wrong kind or out of range, or the folder holds another file of the same name.
+    """
+    fits = fits_module()
+    _check.instance("bench", bench, Bench)
+    wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
+    n_bad = _check.integer("n_bad", n_bad, 0, 2 * math.prod(bench.segments.shape))
+    folder = _path("folder", folder)
+    if not os.path.isdir(folder):
+        raise ValueError(f"folder = {str(folder)!r}: expected a folder that exists")
+    paths = {name: folder / f"{name}.fits" for name in ("frame", "pupils", "dark", "bad_pixels")}
+    for path in paths.values():
+        if _is_there(path) and not (path.is_file() and _has_card(path, _BENCH_CARD)):
+            raise ValueError(
+                f"folder = {str(folder)!r} holds a {path.name} that the simulated bench did not write: "
+                "expected another folder"
+            )
+    rng = np.random.default_rng(seed)
+    counts = {"frame": bench.frames(pistons, rng), "pupils": bench.pupil_images(rng), "dark": bench.dark(rng)}
+    gain = _FULL / max(pair.max() for pair in counts.values())
+    shape = np.concatenate(counts["frame"], axis=-1).shape
+    places = rng.choice(shape[0] * shape[1], n_bad, replace=False)
+    dead = np.zeros(shape, np.uint8)
+    dead.flat[places[: n_bad // 2]] = 1
+    for name, pair in counts.items():
+        image = np.clip(np.rint(np.concatenate(pair, axis=-1) * gain), 0, 65535).astype(np.uint16)
+        image[dead > 0] = 0
+        image.flat[places[n_bad // 2 :]] = 65535
+        hdu = fits.PrimaryHDU(image)
+        hdu.header["BUNIT"] = "adu"
+        hdu.header["WAVELEN"] = (wavelength, "[nm] wavelength")
+        hdu.header["DIMPLE"] = (bench.diameter, "[lambda/D] diameter of the dimple by design")
+        hdu.header["THETA1"] = (_card_value(bench.phase), "[rad] phase shift of the left image")
+        hdu.header["THETA2"] = (_card_value(-bench.phase), "[rad] phase shift of the right image")
+        hdu.header["SATURATE"] = (65535, "[adu] pixels that reach it are saturated")
+        hdu.header["ORIGIN"] = ("zwfs", "simulated bench")
+        write_file(paths[name], fits_bytes(fits.HDUList([hdu])))
+    marked = fits.PrimaryHDU(dead)
+    marked.header["ORIGIN"] = ("zwfs", "simulated bench")
+    write_file(paths["bad_pixels"], fits_bytes(fits.HDUList([marked])))
+    return paths
+
+
+def bench_error(bench: Bench, commanded: ArrayLike, recording: Recording, found: Found) -> float:
+    """Rms error of the segment pistons in a phase found from frames that `write_bench` wrote, radian.
+
+    Parameters
+    ----------
+    bench : Bench
+    commanded : array_like, shape (n_segments,), radian
+    recording : Recording
+    found : Found
+    """
+    _check.instance("bench", bench, Bench)
+    _check.instance("recording", recording, Recording)
+    _check.instance("found", found, Found)
+    canvas = np.full(recording.pupil_images[0].counts.shape, np.nan)
+    row, column = recording.corner
+    canvas[row : row + recording.n_pixels, column : column + recording.n_pixels] = found.phase
+    # The pupil stands in the middle of the left half of the image.
+    ny, nx = bench.segments.shape
+    top = (len(canvas) - ny) // 2
+    pistons = segment_pistons(canvas[top : top + ny, top : top + nx], bench.segments, bench.numbers)
+    return float(segment_residual(pistons, commanded).std())

@@ -1,0 +1,56 @@
+"""Pistons of the segments of a segmented mirror."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+
+
+def segment_pistons(phase: ArrayLike, segments: NDArray, numbers: NDArray) -> NDArray[np.float64]:
+    """Piston of each segment in a phase, see `BenchModel.pistons`: on a map of segment numbers (ny, nx)."""
+    phase = _check.real_array("phase", phase)
+    segments = _check.integer_array("segments", segments)
+    if segments.ndim != 2:
+        raise ValueError(f"segments has shape {segments.shape}: expected (ny, nx)")
+    numbers = _check.integer_array("numbers", numbers)
+    if numbers.ndim != 1 or not numbers.size:
+        raise ValueError(f"numbers has shape {numbers.shape}: expected (n_segments,), at least one")
+    _check.maps("phase", phase, segments.shape, "the grid of the segments")
+    on_segment = segments.ravel() > 0
+    flat = phase.reshape(*phase.shape[:-2], -1)[..., on_segment]
+    members = (segments.ravel()[on_segment] == numbers[:, np.newaxis]).astype(float)
+    sums = np.where(np.isfinite(flat), np.exp(1j * np.nan_to_num(flat)), 0) @ members.T
+    if not np.all(np.abs(sums) > 0):
+        raise ValueError(
+            "phase is NaN all over a segment, or segments lacks one of numbers: expected finite values"
+        )
+    return np.angle(sums)
+
+
+def segment_residual(found: ArrayLike, commanded: ArrayLike) -> NDArray[np.float64]:
+    """Difference of segment pistons on the circle, without their common piston.
+
+    Parameters
+    ----------
+    found, commanded : array_like, shapes (..., n_segments) that broadcast, radian
+
+    Returns
+    -------
+    ndarray, shape (..., n_segments), radian
+        In (-pi, pi].
+
+    Raises
+    ------
+    ValueError
+        If there is no piston, or a value is not finite.
+    """
+    found, commanded = _check.real_array("found", found), _check.real_array("commanded", commanded)
+    shape = _check.broadcast(found=found, commanded=commanded)
+    if not shape or 0 in shape:
+        raise ValueError(f"found and commanded have shape {shape}: expected (..., n_segments), at least one")
+    _check.finite("found", found)
+    _check.finite("commanded", commanded)
+    phasor = np.exp(1j * (found - commanded))
+    return np.angle(phasor * phasor.mean(axis=-1, keepdims=True).conj())

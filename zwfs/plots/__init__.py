@@ -1,0 +1,54 @@
+"""The figures: one function for each, and the style that they share. Only this subpackage needs matplotlib."""
+
+from zwfs.plots.bench import bench_linearity, budget, measured_and_modelled, reference_intensities, segment_errors
+from zwfs.plots.closed_loop import capture, loop_runs
+from zwfs.plots.dimple_diameter import diameter_methods, diameter_reasons, dimple_diameter
+from zwfs.plots.frames import explained, gains, phase_map
+from zwfs.plots.identities import approximation, diversity
+from zwfs.plots.layouts import bench_layout, sensor_layout, vector_sensor
+from zwfs.plots.linearity import convergence, estimates, linearity
+from zwfs.plots.phase_shifts import pair_maps, pair_noise
+from zwfs.plots.style import (
+    INTENSITY_MAP,
+    LOOKS,
+    OTHER_STYLES,
+    PHASE_MAP,
+    Look,
+    show_intensity,
+    show_phase,
+    use_style,
+)
+
+__all__ = [
+    "INTENSITY_MAP",
+    "LOOKS",
+    "OTHER_STYLES",
+    "PHASE_MAP",
+    "Look",
+    "approximation",
+    "bench_layout",
+    "bench_linearity",
+    "budget",
+    "capture",
+    "convergence",
+    "diameter_methods",
+    "diameter_reasons",
+    "dimple_diameter",
+    "diversity",
+    "estimates",
+    "explained",
+    "gains",
+    "linearity",
+    "loop_runs",
+    "measured_and_modelled",
+    "pair_maps",
+    "pair_noise",
+    "phase_map",
+    "reference_intensities",
+    "segment_errors",
+    "sensor_layout",
+    "show_intensity",
+    "show_phase",
+    "use_style",
+    "vector_sensor",
+]

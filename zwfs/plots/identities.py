@@ -1,0 +1,62 @@
+"""Figures of section 2: the common approximation and the diversity of two masks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from zwfs.plots.style import OTHER_STYLES
+
+
+def approximation(
+    rms: Sequence[float], wave: Mapping[str, Sequence[float]], steps: Mapping[str, Sequence[float]]
+) -> Figure:
+    """Error of approximate reference waves against the input, and of one step of reconstruction with each.
+
+    Parameters
+    ----------
+    rms : sequence of float, radian rms
+        Input.
+    wave : mapping of label to sequence
+        Errors of the reference wave.
+    steps : mapping of label to sequence
+        Error of the reconstructed phase over the input.
+    """
+    figure, panels = plt.subplots(1, 2, figsize=(9, 4.1))
+    for axes, curves in zip(panels, (wave, steps), strict=True):
+        for (label, values), style in zip(curves.items(), OTHER_STYLES, strict=False):
+            axes.plot(rms, values, markersize=4.5, label=label, **style)
+        axes.set(xlabel="input phase (rad rms)", xlim=(0, None), ylim=(0, None))
+        axes.legend(fontsize=8)
+    panels[0].set_ylabel("error of the reference wave")
+    panels[1].set_ylabel("error of the phase / input")
+    return figure
+
+
+def diversity(difference: NDArray, determinant: NDArray, strength: NDArray, named: Mapping[str, int]) -> Figure:
+    """Determinant of equation (10) and the one weighted with both reference waves, for many pairs of masks.
+
+    Parameters
+    ----------
+    difference : ndarray, shape (n_pairs,), radian
+        Of the phase shifts.
+    determinant, strength : ndarray, shape (n_pairs,)
+    named : mapping of label to index
+        Pairs to point out.
+    """
+    figure, panels = plt.subplots(1, 2, figsize=(9, 3.9), sharex=True)
+    for axes, values in zip(panels, (determinant, strength), strict=True):
+        axes.plot(difference, values, ".", color="#56B4E9", ms=4)
+        for (label, index), style in zip(named.items(), OTHER_STYLES, strict=False):
+            axes.plot(difference[index], values[index], label=label, markersize=8, **style | {"linestyle": "none"})
+        axes.set(xlabel=r"difference of the phase shifts, $\theta_b-\theta_a$ (rad)", ylim=(0, None))
+        axes.set_xticks(np.pi / 2 * np.arange(5), ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"])
+    panels[0].set_ylabel(r"$|\det M|$")
+    panels[1].set_ylabel("determinant with the waves' strength")
+    if named:
+        panels[0].legend(fontsize=9, loc="lower center")  # below the arch, where no pair is
+    return figure

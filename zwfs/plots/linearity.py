@@ -1,0 +1,109 @@
+"""Figures of section 4.1: error against input, convergence, and single estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from zwfs.paper.linearity import LinearityCurves
+from zwfs.plots.style import _looks, show_phase
+from zwfs.pupil import Pupil
+
+
+def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], rms_max: float) -> Figure:
+    """Figure 3: mean error and its standard deviation against the input, and their ratio on a logarithmic axis.
+
+    Parameters
+    ----------
+    curves : LinearityCurves
+    threshold : float
+        Ratio of error to input that is marked.
+    names : sequence of str
+        Curves to draw.
+    rms_max : float, radian rms
+        End of the axis.
+    """
+    figure, (plain, ratio) = plt.subplots(1, 2, figsize=(9, 4.4))
+    drawn = curves.rms <= rms_max
+    bright = drawn & (curves.rms > 0)
+    rms = curves.rms[drawn]
+    for name, look in _looks(names):
+        mean, std = curves.mean(name), curves.std(name)[drawn]
+        line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
+        plain.plot(rms, mean[drawn], label=look.label, **line)
+        low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
+        plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
+        ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], **line)
+        limit = curves.dynamic_range(name, threshold)
+        if 0 < limit <= rms_max:
+            ratio.plot(limit, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
+    gray = {"color": "#555555", "fontsize": 9, "ha": "center", "va": "bottom"}
+    plain.plot(rms, threshold * rms, color="#555555", lw=1)
+    plain.text(0.6 * rms_max, 0.6 * threshold * rms_max + 0.01, f"{threshold:.0%} of the input", **gray)
+    ratio.axhline(threshold, color="#555555", lw=1)
+    ratio.text(0.6 * rms_max, threshold * 1.1, f"{threshold:.0%} of the input", **gray)
+    plain.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
+    ratio.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
+    figure.legend(loc="outside lower center", ncols=3, fontsize=9)
+    return figure
+
+
+def convergence(errors: Mapping[str, Mapping[float, NDArray]]) -> Figure:
+    """Error against iteration, one panel for each input.
+
+    Parameters
+    ----------
+    errors : mapping of method to mapping of input rms to ndarray, shape (n_screens, n_iterations + 1), radian rms
+        A method without iterations has two columns: before and after.
+    """
+    inputs = list(next(iter(errors.values())))
+    figure, panels = plt.subplots(1, len(inputs), figsize=(9, 3.9), sharey=True, squeeze=False)
+    for axes, value in zip(panels[0], inputs, strict=True):
+        for name, look in _looks(errors):
+            middle, low, high = (np.quantile(errors[name][value], q, axis=0) for q in (0.5, 0.1, 0.9))
+            if middle.size == 2:
+                axes.axhline(middle[1], color=look.color, linestyle=look.line, label=look.label)
+                continue
+            steps = np.arange(middle.size)
+            axes.semilogy(
+                steps, middle, color=look.color, linestyle=look.line, marker=look.marker, ms=3.5, label=look.label
+            )
+            axes.fill_between(steps, low, high, color=look.color, alpha=0.15, lw=0)
+        axes.set(xlabel="iteration", title=f"input {value:g} rad rms")
+        axes.xaxis.get_major_locator().set_params(integer=True)
+    panels[0, 0].set_ylabel("error (rad rms)")
+    panels[0, 0].set_ylim(3e-8, 2)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)
+    return figure
+
+
+def estimates(
+    pupil: Pupil, truth: NDArray, found: Mapping[str, NDArray], residuals: Mapping[str, NDArray]
+) -> Figure:
+    """One screen, what each method makes of it, and what is left (radian), on a scale four times finer."""
+    truth = np.where(pupil.mask, truth, np.nan)
+    limit = np.nanmax(np.abs(truth))
+    figure, panels = plt.subplots(2, len(found) + 1, figsize=(9, 3.6))
+    image = show_phase(panels[0, 0], truth, limit)
+    panels[0, 0].set_title("input", fontsize=9)
+    panels[1, 0].set_axis_off()
+    panels[1, 0].text(0.5, 0.5, "residual", ha="center", va="center", transform=panels[1, 0].transAxes)
+    for column, (name, look) in enumerate(_looks(found), start=1):
+        show_phase(panels[0, column], found[name], limit)
+        left = show_phase(panels[1, column], residuals[name], limit / 4)
+        panels[0, column].set_title(f"{look.name}\n({look.sees})", fontsize=9)
+        rms = np.sqrt(np.nanmean(residuals[name] ** 2))
+        panels[1, column].set_xlabel(f"{_short(rms)} rad rms", fontsize=9)
+    figure.colorbar(image, ax=panels[0], label="phase (rad)", aspect=12)
+    figure.colorbar(left, ax=panels[1], label="residual (rad)", aspect=12, extend="both")
+    return figure
+
+
+def _short(value: float) -> str:
+    """Two digits, or a bound where the digits would be those of rounding errors."""
+    return f"{value:.2g}" if value >= 1e-6 else "below $10^{-6}$"

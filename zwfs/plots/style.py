@@ -1,0 +1,108 @@
+"""The style of all figures: colours and markers of the methods, colour maps, resolution."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.image import AxesImage
+from numpy.typing import NDArray
+
+PHASE_MAP, INTENSITY_MAP = "RdBu_r", "viridis"
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a method is drawn, the same in every figure."""
+
+    name: str
+    sees: str
+    color: str
+    marker: str
+    line: str | tuple[float, tuple[float, ...]]
+
+    @property
+    def label(self) -> str:
+        """Name for a legend."""
+        return f"{self.name} ({self.sees})"
+
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart; marker and dashes say it once more.
+LOOKS = {
+    "Linear": Look("linear", "one pupil", "#000000", "o", "-"),
+    "Arcsine": Look("arcsine", "one pupil", "#E69F00", "s", "--"),
+    "GerchbergSaxton": Look("Gerchberg-Saxton", "two pupils", "#009E73", "^", "-."),
+    "GradientDescent": Look("gradient descent", "two pupils", "#CC79A7", "D", (0, (3, 1, 1, 1, 1, 1))),
+    "GradientDescentPoints": Look("gradient descent on points", "two pupils", "#D55E00", "d", "--"),
+    "PhaseShifted": Look("phase-shifted", "two pupils", "#0072B2", "v", ":"),
+}
+
+# Curves that stand for no method have colours of their own, of Tol's muted palette, and markers of their own.
+OTHER_STYLES: tuple[dict[str, Any], ...] = tuple(
+    {"color": color, "marker": marker, "linestyle": line}
+    for color, marker, line in (
+        ("#332288", "P", "-"),
+        ("#AA4499", "X", "--"),
+        ("#44AA99", "p", "-."),
+        ("#999933", "h", ":"),
+    )
+)
+
+_RC: dict[Any, Any] = {
+    "figure.dpi": 100,
+    "savefig.dpi": 200,
+    "savefig.bbox": None,
+    "figure.constrained_layout.use": True,
+    "font.size": 10,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "image.cmap": INTENSITY_MAP,
+    "image.interpolation": "nearest",
+    "image.origin": "lower",
+    # Element ids of SVG files are random unless salted.
+    "svg.hashsalt": "zwfs",
+}
+
+
+def use_style(*, vector: bool = False) -> None:
+    """Draw figures of this session alike; in a notebook, as sharp PNG or, if `vector`, as SVG without a date."""
+    plt.rcParams.update(_RC)
+    try:
+        from matplotlib_inline.backend_inline import set_matplotlib_formats
+    except ImportError:
+        return
+    if vector:
+        set_matplotlib_formats("svg", bbox_inches=None, metadata={"Date": None})
+    else:
+        set_matplotlib_formats("png", bbox_inches=None, dpi=200)
+
+
+def show_phase(axes: Axes, phase: NDArray, limit: float) -> AxesImage:
+    """Phase map, diverging around 0 from -`limit` to `limit` (radian)."""
+    return _show(axes, phase, PHASE_MAP, -limit, limit)
+
+
+def show_intensity(axes: Axes, frame: NDArray, limit: float) -> AxesImage:
+    """Intensity from 0 to `limit`."""
+    return _show(axes, frame, INTENSITY_MAP, 0, limit)
+
+
+def _show(axes: Axes, image: NDArray, colors: str, low: float, high: float) -> AxesImage:
+    axes.set(xticks=[], yticks=[])
+    axes.grid(False)
+    axes.spines[:].set_visible(False)
+    return axes.imshow(image, cmap=colors, vmin=low, vmax=high)
+
+
+def _looks(methods: Mapping | Sequence) -> list[tuple[str, Look]]:
+    unknown = set(methods) - set(LOOKS)
+    if unknown:
+        raise ValueError(f"methods = {sorted(unknown)}: expected some of {sorted(LOOKS)}")
+    return [(name, look) for name, look in LOOKS.items() if name in methods]

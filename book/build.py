@@ -7,7 +7,6 @@ from pathlib import Path
 import compare
 import printing
 import runner
-from claims import ClaimError
 from pages import BookError, build_book, check_contents
 from printing import PrintError
 from runner import NotebookError, Project
@@ -119,7 +118,7 @@ def main() -> int:
     runner.end_cleanly_on_signals()
     try:
         return command(Project(Path(__file__).resolve().parent.parent))
-    except (NotebookError, BookError, ClaimError, PrintError) as failure:
+    except (NotebookError, BookError, PrintError) as failure:
         print(failure, file=sys.stderr)
     except KeyboardInterrupt:
         print("interrupted: the earlier results are untouched", file=sys.stderr)

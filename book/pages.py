@@ -1,59 +1,47 @@
-"""Put the pages and the executed notebooks together and build the book from them."""
+"""Build the book with Jupyter Book, from the notebooks as they were just run, and print it."""
 
-import importlib.util
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import api
-import cards
-import claims
-import finish
-import live
-import performance
 import printing
 import yaml
-from runner import Project, digest, digest_files, read, scratch_folder, swap, to_bytes
+from runner import Project, digest, digest_files, scratch_folder, swap
 
 from zwfs._files import write_file
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 JUPYTER_BOOK = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()"]
+# Read by the extensions `cards` and `finish` in book/_ext.
+EXECUTED, PDF = "ZWFS_EXECUTED", "ZWFS_PDF"
 
 
 class BookError(Exception):
-    """The book has warnings or errors; the message is what Sphinx said."""
+    """The book has warnings or errors; the message holds those of Sphinx."""
 
 
-def mathjax_files() -> dict[str, Path]:
-    """The part of MathJax that a page loads, so that mathematics needs no network."""
-    package = importlib.util.find_spec("sphinx-mathjax-offline")
-    folder = Path(package.origin).parent / "static" / "mathjax"
-    files = [folder / "tex-chtml-full.js", *(folder / "output" / "chtml" / "fonts").rglob("*.woff")]
-    return {f"book/_static/mathjax/{file.relative_to(folder).as_posix()}": file for file in files}
-
-
-def staged_files(project: Project) -> dict[str, Path]:
-    """Everything that Sphinx reads, by its place in the staged sources."""
-    files = {name: project.root / name for name in ("_config.yml", "_toc.yml")}
-    for file in (project.root / "book").rglob("*"):
-        if file.is_file() and file.suffix not in (".py", ".pyc"):
-            files[file.relative_to(project.root).as_posix()] = file
+def inputs(project: Project) -> dict[str, Path]:
+    """Return every file that the book depends on, by its place in the project."""
+    root = project.root
+    files = [root / name for name in ("_config.yml", "_toc.yml", "pyproject.toml")]
+    files += [file for file in (root / "book").rglob("*") if "__pycache__" not in file.parts]
+    files += [*project.sources(), *project.shared_inputs()]
     for notebook in project.sources():
-        executed = project.executed / notebook.name
-        files[f"notebooks/{notebook.name}"] = executed
-        for file in (executed, *project.files(notebook.stem)):
-            place = f"notebooks/downloads/{file.name}"
-            if place in files:
-                raise BookError(f"{files[place].parent.stem} and {notebook.stem} both publish {file.name}")
-            files[place] = file
-    return files | mathjax_files()
+        run = project.executed / notebook.name
+        files += [run, run.with_suffix(".json"), *project.files(notebook.stem)]
+    return {file.relative_to(root).as_posix(): file for file in files if file.is_file()}
+
+
+def state(root: Path) -> str:
+    """Return what the book says of the working tree: the commit, and whether there are changes."""
+    git = ["git", "-C", str(root)]
+    commands = ([*git, "rev-parse", "HEAD"], [*git, "status", "--porcelain"])
+    return str([subprocess.run(command, capture_output=True, text=True).stdout for command in commands])
 
 
 def check_contents(project: Project) -> None:
@@ -85,7 +73,7 @@ def _entries(contents: Any) -> Iterator[str]:
 
 
 def build_book(project: Project) -> bool:
-    """Build the book in _build/html, unless it is there and nothing that it is made from changed.
+    """Build the book in _build/html, unless it is there and nothing that it depends on has changed.
 
     Parameters
     ----------
@@ -103,44 +91,23 @@ def build_book(project: Project) -> bool:
         Sphinx gave a warning or an error. The earlier book stays.
     PrintError
         The PDF would not be whole. The earlier book stays.
-    ClaimError
-        A claim is judged by a number that no notebook gives.
     """
     check_contents(project)
     html, record = project.build / "html", project.build / "html.json"
-    files = staged_files(project)
-    chromium = printing.find_chromium() if printing.STYLE in files else None
-    modules = (sys.modules[__name__], api, cards, claims, finish, live, performance, printing)
-    code = [Path(module.__file__) for module in modules]
-    about = [file for file in (project.root / "pyproject.toml",) if file.exists()]
-    inputs = {f"{file.parent.name}/{file.name}": file for file in (*code, *about, *project.shared_inputs())}
-    origin = {notebook.stem: cards.versions_of(project, notebook.stem) for notebook in project.sources()}
-    commit = cards.state_of(project)
-    told = [sys.version_info[:2], bool(chromium), commit, origin]
-    made_from = digest([digest_files(files | inputs).encode(), json.dumps(told, sort_keys=True).encode()])
+    chromium = printing.find_chromium() if (project.root / printing.STYLE).exists() else None
+    about = json.dumps([sys.version_info[:2], bool(chromium), state(project.root)])
+    made_from = digest([digest_files(inputs(project)).encode(), about.encode()])
     try:
         if html.is_dir() and json.loads(record.read_bytes()) == made_from:
             return False
     except (OSError, ValueError):
-        pass  # never built, or not to the end
-    record.unlink(missing_ok=True)  # from here on the staged sources are not those of the book that is there
-    source = _stage(project, files)
-    for name, versions in origin.items():
-        page = source / "notebooks" / f"{name}.ipynb"
-        # The notebook to take away, among the downloads, stays as it was run.
-        page.write_bytes(to_bytes(cards.with_cards(read(page), name, versions, commit)))
-    made = {
-        claims.PAGE: lambda: claims.fragments(project.executed),
-        api.PAGE: api.fragments,
-        live.PAGE: lambda: {live.DATA: live.script()},
-        performance.PAGE: lambda: performance.fragments(source),
-        printing.STYLE: lambda: {printing.LINK: printing.link(chromium)},
-    }
-    for page, fragments in made.items():
-        if page in files:
-            _write(source, fragments())
+        pass  # the book was never built, or not to its end
+    record.unlink(missing_ok=True)  # a failure from here on must be followed by a build
     with scratch_folder(project.build, "building-") as scratch:
-        built = write_pages(source, scratch)
+        environment = {EXECUTED: str(project.executed.relative_to(project.root))}
+        if chromium:
+            environment[PDF] = printing.NAME
+        built = write_pages(project.root, scratch, environment)
         if chromium:
             (built / printing.NAME).write_bytes(printing.print_book(project.root, built, chromium))
         swap(built, html, scratch / "earlier")
@@ -148,36 +115,18 @@ def build_book(project: Project) -> bool:
     return True
 
 
-def _stage(project: Project, files: dict[str, Path]) -> Path:
-    """Copy the sources into one fresh folder; it is kept, for those who look for a warning's cause."""
-    source = project.build / "source"
-    shutil.rmtree(source, ignore_errors=True)
-    for name, file in files.items():
-        (source / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, source / name)
-    return source
-
-
-def _write(source: Path, fragments: dict[str, str | bytes]) -> None:
-    for name, content in fragments.items():
-        (source / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-
-
-def write_pages(source: Path, output: Path) -> Path:
-    """Run Jupyter Book with warnings as errors, finish its pages and return their folder, which is in `output`."""
+def write_pages(root: Path, output: Path, environment: dict[str, str]) -> Path:
+    """Run ``jupyter-book build`` with warnings as errors, and return the folder of the pages, in `output`."""
     options = ["-W", "-n", "--keep-going", "--path-output", str(output)]
     done = subprocess.run(
-        [*JUPYTER_BOOK, "build", *options, str(source)],
+        [*JUPYTER_BOOK, "build", *options, str(root)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        # One extension of Sphinx is ours: `api`.
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
+        env=os.environ | environment,
     )
     if done.returncode:
-        lines = COLOUR.sub("", done.stdout).replace(f"{source}{os.sep}", "").splitlines()
+        lines = COLOUR.sub("", done.stdout).replace(f"{root}{os.sep}", "").splitlines()
         marked = [line for line in lines if "WARNING:" in line or "ERROR:" in line]
         raise BookError("\n".join(["the book was not built:", *(marked or lines[-40:])]))
-    html = output / "_build" / "html"
-    finish.finish(source, html)
-    return html
+    return output / "_build" / "html"

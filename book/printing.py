@@ -22,7 +22,6 @@ from sphinx_external_toc.api import SiteMap, TocTree
 from sphinx_external_toc.parsing import parse_toc_yaml
 
 STYLE = "book/print.css"  # a book that has none is not printed
-LINK = "book/_pdf_link.md"  # the front page includes it
 NAME = "zwfs.pdf"
 
 CHROMIUM = "ZWFS_CHROMIUM"  # environment variable that names the browser to use
@@ -84,13 +83,6 @@ def find_chromium() -> str | None:
     return path if os.path.exists(path) else None
 
 
-def link(chromium: str | None) -> str:
-    """Return what the front page says of the PDF: nothing, where none can be made."""
-    if not chromium:
-        return ""
-    return f'<p class="d-print-none"><a href="../{NAME}">The whole book as one PDF</a>, to print or to keep.</p>\n'
-
-
 def print_book(root: Path, book: Path, chromium: str) -> bytes:
     """Print a book.
 
@@ -137,12 +129,12 @@ def _assemble(root: Path, book: Path) -> BeautifulSoup:
     config = yaml.safe_load((root / "_config.yml").read_text("utf-8"))
     version = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["project"]["version"]
     mathjax = _mathjax(_read(book, toc.root.docname), toc.root.docname)
-    chapters = {name: _chapter(_read(book, name), name, known) for name in toc}
+    chapters = {name: chapter(_read(book, name), name, known) for name in toc}
     chapters[toc.root.docname].select_one("h2").string = "Introduction"
     title, author = html.escape(config["title"]), html.escape(config["author"])
-    parts = _parts(toc)
+    listed = parts(toc)
     contents, body = "", ""
-    for caption, names in parts:
+    for caption, names in listed:
         if caption:
             contents += f'<p class="part">{html.escape(caption)}</p>'
             body += f'<h1 class="part">{html.escape(caption)}</h1>'
@@ -167,7 +159,7 @@ def _read(book: Path, name: str) -> BeautifulSoup:
     return BeautifulSoup((book / f"{name}.html").read_text("utf-8"), "html.parser")
 
 
-def _parts(toc: SiteMap) -> list[tuple[str | None, list[str]]]:
+def parts(toc: SiteMap) -> list[tuple[str | None, list[str]]]:
     """List the parts of the book, each with its caption and its pages; the front page has no caption."""
 
     def below(tree: TocTree) -> list[str]:
@@ -185,7 +177,7 @@ def _mathjax(page: BeautifulSoup, name: str) -> str:
     return "".join(map(str, scripts))
 
 
-def _chapter(page: BeautifulSoup, name: str, known: set[str]) -> Tag:
+def chapter(page: BeautifulSoup, name: str, known: set[str]) -> Tag:
     """Return the article of a page, with names and links that hold in one file for all pages."""
     article = page.select_one("article.bd-article")
     for element in article.select(", ".join(SCREEN_ONLY)):

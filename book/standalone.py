@@ -15,17 +15,18 @@ from typing import Any
 from urllib.parse import quote, unquote, urlsplit
 
 import bs4
-from cards import published
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 from runner import Project, to_bytes
+
+from zwfs.companion.results import published
 
 HERE = Path(__file__).parent
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 # What in the book serves its navigation; the page has none.
 LEFT_OUT = {
-    "api", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_book_theme", "sphinx_comments",
-    "sphinx_copybutton", "sphinx_togglebutton",
+    "api", "cards", "claims", "finish", "live", "performance", "sphinx.ext.autodoc", "sphinx.ext.napoleon",
+    "sphinx_book_theme", "sphinx_comments", "sphinx_copybutton", "sphinx_togglebutton",
 }  # fmt: skip
 FRAME = """<!DOCTYPE html>
 <html lang="en" data-theme="light">

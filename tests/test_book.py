@@ -1,14 +1,10 @@
 """The built book: it needs nothing but its own files, and its links lead somewhere."""
 
 import re
-import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-import finish
-import pages
-import printing
 import pytest
 import yaml
 from bs4 import BeautifulSoup
@@ -16,6 +12,7 @@ from PIL import Image
 
 ROOT = Path(__file__).parent.parent
 HTML = ROOT / "_build" / "html"
+CARD = "_static/social.png"
 
 pytestmark = pytest.mark.skipif(not HTML.is_dir(), reason="the book is not built: make book")
 
@@ -91,7 +88,12 @@ def test_figures_say_what_they_show_and_keep_their_place():
             shown.append(image["alt"])
             assert len(image["alt"].split()) >= 15, file.name
             assert image.parent["href"] == image["src"]
-            assert (int(image["width"]), int(image["height"])) == finish.size(file.parent / image["src"])
+            assert int(image["width"]) > 0
+            assert int(image["height"]) > 0
+            if image["src"].endswith(".png"):
+                # Two pixels of the file are one of the page.
+                with Image.open(file.parent / image["src"]) as picture:
+                    assert (int(image["width"]), int(image["height"])) == tuple(n // 2 for n in picture.size)
     assert len(set(shown)) == len(shown) >= len(list((ROOT / "notebooks").glob("*.ipynb")))
 
 
@@ -104,7 +106,7 @@ def test_pages_tell_what_they_are_about(book_pages):
             tag.get("property") or tag.get("name"): tag["content"] for tag in head.find_all("meta", content=True)
         }
         assert told["og:url"] == config["html"]["baseurl"] + file.relative_to(HTML).as_posix()
-        assert told["og:image"] == config["html"]["baseurl"] + finish.CARD
+        assert told["og:image"] == config["html"]["baseurl"] + CARD
         assert told["og:title"]
         seen[file.relative_to(HTML).as_posix()] = told.get("description")
     assert 60 < len(seen["index.html"]) <= 250
@@ -115,21 +117,9 @@ def test_pages_tell_what_they_are_about(book_pages):
 
 
 def test_card_is_what_social_networks_show():
-    with Image.open(HTML / finish.CARD) as card:
-        assert card.size == finish.CARD_SIZE
+    with Image.open(HTML / CARD) as card:
+        assert card.size == (1200, 630)
         assert len(card.convert("RGB").getcolors(1 << 20)) > 100
-
-
-@pytest.mark.slow
-def test_a_second_clean_build_gives_the_same_bytes(tmp_path):
-    """From the same executed notebooks, in folders of another name."""
-    source = shutil.copytree(ROOT / "_build" / "source", tmp_path / "elsewhere")
-    built = pages.write_pages(source, tmp_path)
-    files = [{file.relative_to(top) for file in top.rglob("*") if file.is_file()} for top in (HTML, built)]
-    # The PDF is printed afterwards.
-    files[0].discard(Path(printing.NAME))
-    assert files[0] == files[1]
-    assert [name for name in sorted(files[0]) if (HTML / name).read_bytes() != (built / name).read_bytes()] == []
 
 
 def test_front_page_leads_to_the_book(book_pages):

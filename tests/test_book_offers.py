@@ -65,6 +65,11 @@ def pdf_pages(pdf):
     return [plain(page.extract_text()) for page in pdf.pages]
 
 
+def test_front_page_links_the_pdf_only_if_there_is_one():
+    linked = read(HTML / "book" / "index.html").find("a", href="../zwfs.pdf")
+    assert (linked is not None) == (HTML / "zwfs.pdf").exists()
+
+
 def chapters(pdf):
     """The bookmarks of the chapters, as (title, number of the page from 0)."""
     nested = [entry for entry in pdf.outline if isinstance(entry, list)]

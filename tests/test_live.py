@@ -13,7 +13,7 @@ from zwfs.lowrank import Plane
 
 ROOT = Path(__file__).parent.parent
 STATIC = ROOT / "book" / "_static"
-MARKUP = re.search(r"```\{raw\} html\n(.*?)```", (ROOT / live.PAGE).read_text("utf-8"), re.DOTALL)[1]
+MARKUP = re.search(r"```\{raw\} html\n(.*?)```", (ROOT / "book" / "live.md").read_text("utf-8"), re.DOTALL)[1]
 # The simplest shifts, unequal ones, ones of one sign; wide and narrow dimples: rms, seed, diameter (lambda/D),
 # shifts (pi), iterations.
 SETTINGS = [

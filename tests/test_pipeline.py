@@ -287,29 +287,34 @@ def small_book(ran):
     )
     (ran.root / "_config.yml").write_text(
         "title: small\nonly_build_toc_files: true\nexecute:\n  execute_notebooks: 'off'\n"
+        f"sphinx:\n  local_extensions:\n    cards: {BOOK / '_ext'}\n"
     )
     return ran
 
 
-def test_files_of_notebooks_are_staged(small_book):
-    staged = pages.staged_files(small_book)
-    assert staged["notebooks/downloads/numbers.csv"] == small_book.executed / "third.files" / "numbers.csv"
-    assert staged["notebooks/downloads/third.ipynb"] == small_book.executed / "third.ipynb"
+def test_the_book_shows_the_run_and_not_what_the_sources_store(small_book):
+    assert not any(
+        "outputs" in cell and cell.outputs for cell in runner.read(small_book.notebooks / "first.ipynb").cells
+    )
+    assert pages.build_book(small_book)
+    page = (small_book.build / "html" / "notebooks" / "first.html").read_text("utf-8")
+    assert printed(small_book, "first").split("\n")[0] in page
 
 
-def test_two_notebooks_may_not_publish_the_same_file(small_book):
-    write(small_book, "second", leave("numbers.csv", "3"))
+def test_a_figure_offers_the_files_of_its_run(small_book):
+    publish = "def publish(*_): pass\npublish(None, 'numbers', {})\n" + leave("numbers.csv", "2")
+    write(small_book, "first", publish)
     run(small_book)
-    with pytest.raises(pages.BookError, match=r"second and third both publish numbers.csv"):
-        pages.staged_files(small_book)
+    assert pages.build_book(small_book)
+    assert [file.read_text() for file in (small_book.build / "html" / "_downloads").rglob("numbers.csv")] == ["2"]
 
 
 def test_link_to_a_file_that_is_not_published_fails(small_book):
     page = small_book.root / "book" / "index.md"
-    page.write_text("# A book\n\n{download}`data <../notebooks/downloads/numbers.csv>`\n")
+    page.write_text("# A book\n\n{download}`data <../_build/notebooks/third.files/numbers.csv>`\n")
     assert pages.build_book(small_book)
     assert list((small_book.build / "html" / "_downloads").rglob("numbers.csv"))
-    page.write_text("# A book\n\n{download}`data <../notebooks/downloads/missing.csv>`\n")
+    page.write_text("# A book\n\n{download}`data <../_build/notebooks/third.files/missing.csv>`\n")
     with pytest.raises(pages.BookError, match=r"not readable.*missing.csv"):
         pages.build_book(small_book)
 
@@ -323,12 +328,12 @@ def test_book_is_built_once_and_a_failure_leaves_it(small_book):
     with pytest.raises(pages.BookError, match=r"book/index.md:3: WARNING: unknown document"):
         pages.build_book(small_book)
     assert page.read_bytes() == before
-    assert sorted(os.listdir(small_book.build)) == ["html", "notebooks", "source"]
+    assert sorted(os.listdir(small_book.build)) == ["html", "notebooks"]
 
 
 def test_book_is_built_again_after_a_failure(small_book):
-    """Its staged sources are those of the failure, even if the change is taken back."""
-    index, staged = (folder / "book" / "index.md" for folder in (small_book.root, small_book.build / "source"))
+    """Even if the change is taken back: the book that is there may lack a part."""
+    index = small_book.root / "book" / "index.md"
     pages.build_book(small_book)
     before = index.read_text()
     index.write_text("# A book\n\n{doc}`nowhere`\n")
@@ -336,7 +341,6 @@ def test_book_is_built_again_after_a_failure(small_book):
         pages.build_book(small_book)
     index.write_text(before)
     assert pages.build_book(small_book)
-    assert staged.read_text() == before
 
 
 @pytest.mark.parametrize(
@@ -359,16 +363,13 @@ def test_contents_that_do_not_match_the_pages_are_refused(small_book, change, me
         pages.build_book(small_book)
 
 
-def test_pdf_is_made_and_linked_where_there_is_a_browser(small_book, monkeypatch):
+def test_pdf_is_made_where_there_is_a_browser(small_book, monkeypatch):
     (small_book.root / "book" / "print.css").write_text("")
-    (small_book.root / "book" / "index.md").write_text("# A book\n\n```{include} _pdf_link.md\n```\n")
-    pdf, page = (small_book.build / "html" / name for name in (pages.printing.NAME, "book/index.html"))
     monkeypatch.setattr(pages.printing, "print_book", lambda *_: b"%PDF")
     for browser in (None, "a browser"):
         monkeypatch.setattr(pages.printing, "find_chromium", lambda browser=browser: browser)
         assert pages.build_book(small_book)
-        assert pdf.exists() == bool(browser)
-        assert (f'href="../{pdf.name}"' in page.read_text("utf-8")) == bool(browser)
+        assert (small_book.build / "html" / pages.printing.NAME).exists() == bool(browser)
         assert not pages.build_book(small_book)
 
 

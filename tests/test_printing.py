@@ -55,7 +55,7 @@ def printed(book):
 
 def chapter(article, name="notebooks/one"):
     known = {f"{name}.html" for name in PAGES}
-    return str(printing._chapter(BeautifulSoup(page(article), "html.parser"), name, known))
+    return str(printing.chapter(BeautifulSoup(page(article), "html.parser"), name, known))
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_what_needs_a_screen_is_left_out(left_out):
 
 def test_parts_hold_their_pages_and_the_sections_below_them(book):
     toc = printing.parse_toc_yaml(book[0] / "_toc.yml")
-    assert printing._parts(toc) == [(None, ["book/index"]), ("The sensor", ["book/theory", "notebooks/one"])]
+    assert printing.parts(toc) == [(None, ["book/index"]), ("The sensor", ["book/theory", "notebooks/one"])]
 
 
 @needs_chromium
@@ -135,11 +135,6 @@ def test_what_cannot_be_made_to_fit_is_refused(book):
     with pytest.raises(printing.PrintError, match='too wide for a page:\n<table class="lost"'):
         printing.print_book(*book, CHROMIUM)
     assert not list(book[1].glob(".*"))
-
-
-def test_front_page_links_the_pdf_only_if_there_is_one():
-    assert printing.link(None) == ""
-    assert f'href="../{printing.NAME}"' in printing.link("/usr/bin/chromium")
 
 
 def test_without_a_browser_the_reason_is_told(monkeypatch, tmp_path):

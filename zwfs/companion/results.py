@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import csv
 import io
 import os
@@ -63,6 +64,21 @@ def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike], *, dpi:
     if folder := os.environ.get(FOLDER):
         for kind, content in contents.items():
             write_file(Path(folder) / f"{name}.{kind}", content)
+
+
+def published(source: str) -> list[str]:
+    """Return the names under which code publishes figures.
+
+    Parameters
+    ----------
+    source : str
+        The code of a cell. Only calls ``publish(figure, "name", ...)`` with a literal name count.
+    """
+    if "publish(" not in source:
+        return []
+    calls = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
+    named = (call for call in calls if isinstance(call.func, ast.Name) and call.func.id == "publish")
+    return [ast.literal_eval(call.args[1]) for call in named]
 
 
 def _pictures(figure: Figure, dpi: float) -> dict[str, bytes]:

@@ -1,4 +1,4 @@
-"""Tables and figures of the performance page, from what `make bench` measured."""
+"""Tables and figures of the performance page, from the measurements of `make bench`."""
 
 import io
 import json
@@ -8,11 +8,14 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
+from sphinx.application import Sphinx
+from sphinx.config import Config
 
 from zwfs import plots
+from zwfs._files import write_file
 
-PAGE = "book/performance.md"
 MEASURED = "book/performance.json"
+PICTURES = "_build/performance"
 ACCURATE = 1.05e-4  # largest error of the second comparison, 1e-4 when rounded
 # Tol's muted colours: those of the methods stand for methods only.
 PACKAGES = {
@@ -27,39 +30,49 @@ INTENSITY = "largest error of the intensity"
 ERRORS = {"one propagation": "largest error of the field", "one frame": INTENSITY, "two frames": INTENSITY}
 
 
-def fragments(source: Path) -> dict[str, str | bytes]:
-    """Pieces of the page by their place among the staged sources, where the measured numbers lie."""
-    kept = json.loads((source / MEASURED).read_text("utf-8"))
+def add_substitutions(app: Sphinx, config: Config) -> None:
+    """Define the tables of the page, as in ``{{ performance.rates }}``, and draw its figures."""
+    kept = json.loads(Path(app.srcdir, MEASURED).read_text("utf-8"))
     tasks: dict[str, list[dict[str, Any]]] = {}
     for row in kept["peers"]:
         tasks.setdefault(row["task"], []).append(row)
+    compared = {task: peers(task, rows) for task, rows in tasks.items()}
+    added = tables(kept["speed"]) | {"peers": compared, "machine": kept["machine"]}
+    config.myst_substitutions = config.myst_substitutions | {"performance": added}
     with plt.rc_context():
         plots.use_style()
-        pictures = {
-            "book/_static/peers.png": picture(error_against_time(tasks["one frame"] + tasks["two frames"])),
-            "book/_static/growth.png": picture(time_against_pixels(kept["speed"]["slope"])),
+        figures = {
+            "peers": error_against_time(tasks["one frame"] + tasks["two frames"]),
+            "growth": time_against_pixels(kept["speed"]["slope"]),
         }
-    return pictures | {
-        "book/_peers.md": "\n\n".join(f"### {task.capitalize()}\n\n{peers(task, tasks[task])}" for task in tasks),
-        "book/_rates.md": rates(kept["speed"]),
-        "book/_parts.md": parts(kept["speed"]["breakdown"]["100"]),
-        "book/_batches.md": batches(kept["speed"]["batches"]),
-        "book/_methods.md": methods(kept["speed"]["others"]),
-        "book/_loop.md": loop(kept["speed"]["loop step"]),
-        "book/_limit.md": limit(kept["speed"]["limit"]),
-        "book/_growth.md": growth(kept["speed"]),
-        "book/_machine.md": f"{kept['machine']}\n",
+        for name, figure in figures.items():
+            stream = io.BytesIO()
+            figure.savefig(stream, format="png", dpi=200, metadata={"Software": None})
+            plt.close(figure)
+            write_file(Path(app.srcdir, PICTURES, f"{name}.png"), stream.getvalue())
+
+
+def tables(speed: dict[str, Any]) -> dict[str, str]:
+    """Return the tables and sentences on speed, by name."""
+    return {
+        "rates": rates(speed),
+        "parts": parts(speed["breakdown"]["100"]),
+        "batches": batches(speed["batches"]),
+        "methods": methods(speed["others"]),
+        "loop": loop(speed["loop step"]),
+        "limit": limit(speed["limit"]),
+        "growth": growth(speed),
     }
 
 
 def table(header: list[str], rows: Iterable[Iterable[str]]) -> str:
-    """Markdown; all columns but the first are aligned to the right."""
+    """Return a table in Markdown; all columns but the first are aligned to the right."""
     lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
 def peers(task: str, rows: list[dict[str, Any]]) -> str:
-    """Each package with its own settings, and with the quickest one that is accurate enough."""
+    """Return a table of the packages at one task, see `chosen`."""
     return table(
         ["package and setting", "time (zwfs\u00a0=\u00a01)", ERRORS.get(task, PHASE)],
         (
@@ -74,7 +87,7 @@ def peers(task: str, rows: list[dict[str, Any]]) -> str:
 
 
 def chosen(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Of each package its own setting, and the quickest one that is accurate enough if that is another."""
+    """Select of each package its own setting, and its fastest setting that is accurate enough."""
     picked = []
     for package in dict.fromkeys(row["package"] for row in rows):
         mine = [row for row in rows if row["package"] == package]
@@ -85,7 +98,7 @@ def chosen(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def rates(speed: dict[str, Any]) -> str:
-    """Reconstructions a second of single frame pairs; of the plain iterations one case, to compare with."""
+    """Return a table of reconstructions per second, one frame pair at a time."""
     rows = [
         [
             f"{row['n_pixels']} pixels, {row['dtype']}, {row['n_iterations']} iterations"
@@ -110,12 +123,12 @@ def rates(speed: dict[str, Any]) -> str:
 
 
 def parts(times: dict[str, float]) -> str:
-    """What the time of a call is made of."""
+    """Return a table of the parts of a call and their times."""
     return table(["part", "time (μs)"], ([name, f"{1e6 * time:.0f}"] for name, time in times.items()))
 
 
 def batches(rows: list[dict[str, Any]]) -> str:
-    """Time and memory of batches."""
+    """Return a table of the time and memory of batches."""
     return table(
         ["frame pairs in a call", "time of each (ms)", "memory beside frames and results (MB)"],
         ([str(r["n_frames"]), f"{1e3 * r['time per frame']:.2f}", f"{r['memory'] / 1e6:.1f}"] for r in rows),
@@ -123,17 +136,17 @@ def batches(rows: list[dict[str, Any]]) -> str:
 
 
 def methods(times: dict[str, float]) -> str:
-    """Time of each method on one screen."""
+    """Return a table of the time of each method on one screen."""
     return table(["method", "time (ms)"], ([name, f"{1e3 * time:.2g}"] for name, time in times.items()))
 
 
 def loop(times: dict[str, float]) -> str:
-    """Time of a step of the closed loop."""
+    """Return a table of the time of a step of the closed loop."""
     return table(["reconstructor", "time of a step (ms)"], ([name, f"{1e3 * t:.2g}"] for name, t in times.items()))
 
 
 def limit(times: dict[str, float]) -> str:
-    """Time of a reconstruction beside that of the products and passes it needs."""
+    """Return a table of the time of a reconstruction and of the products and passes that it needs."""
     return table(
         ["what", "time (μs)", "share"],
         ([name, f"{1e6 * time:.0f}", f"{time / times['the whole call']:.0%}"] for name, time in times.items()),
@@ -141,7 +154,7 @@ def limit(times: dict[str, float]) -> str:
 
 
 def growth(speed: dict[str, Any]) -> str:
-    """Numbers of set-up and growth in a sentence each."""
+    """Return sentences on the set-up and on the growth of time with the number of pixels."""
     made, slope = speed["set-up"], speed["slope"]
     return (
         f"Time grows with the number of pixels to the power of {slope['slope from 128 on']:.2f} from 128 pixels "
@@ -153,13 +166,13 @@ def growth(speed: dict[str, Any]) -> str:
 
 
 def power(value: float) -> str:
-    """Number as a power of ten where it is small."""
+    """Write a number, a small one as a power of ten."""
     mantissa, exponent = f"{value:.1e}".split("e")
     return f"{value:.2g}" if value >= 1e-3 else f"${mantissa}\\times10^{{{int(exponent)}}}$"
 
 
 def error_against_time(rows: list[dict[str, Any]]) -> Figure:
-    """Error of one or two frames against the time they take, for every setting of every package."""
+    """Draw the error of one or two frames against time, for every setting of every package."""
     figure, axes = plt.subplots(figsize=(7, 4.2))
     for package, (color, marker) in PACKAGES.items():
         mine = [row for row in rows if row["package"] == package]
@@ -175,7 +188,7 @@ def error_against_time(rows: list[dict[str, Any]]) -> Figure:
 
 
 def time_against_pixels(slope: dict[str, Any]) -> Figure:
-    """Time of a reconstruction against the number of pixels across the pupil, beside a line of proportion."""
+    """Draw the time of a reconstruction against the number of pixels across the pupil."""
     figure, axes = plt.subplots(figsize=(7, 3.8))
     pixels, times = slope["n_pixels"], [1e3 * time for time in slope["times"]]
     axes.loglog(pixels, times, "v-", color=PACKAGES["zwfs"][0], label="measured")
@@ -188,9 +201,7 @@ def time_against_pixels(slope: dict[str, Any]) -> Figure:
     return figure
 
 
-def picture(figure: Figure) -> bytes:
-    """PNG without a date."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=200, metadata={"Software": None})
-    plt.close(figure)
-    return stream.getvalue()
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Add the substitutions."""
+    app.connect("config-inited", add_substitutions)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

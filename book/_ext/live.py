@@ -1,20 +1,21 @@
-"""What the script of the live sensor is told by zwfs: its dimples, its screens and the colours of the figures."""
+"""The data of the live sensor: its dimples, its screens and the colours of the figures."""
 
 import base64
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from numpy.typing import NDArray
+from sphinx.application import Sphinx
 
 import zwfs
 from zwfs._arrays import Kind
 from zwfs.lowrank import Factors, Plane
 from zwfs.plots.style import INTENSITY_MAP, PHASE_MAP
 
-PAGE = "book/live.md"
-DATA = "book/_static/live-data.js"
+DATA = "_static/live-data.js"
 
 N_PIXELS = 64
 N_MODES = 200
@@ -26,12 +27,12 @@ TOLERANCE = 1e-7  # of the reference waves; single precision, in which they are 
 
 
 def script() -> str:
-    """Script that declares the data, for pages that may not fetch a file."""
+    """Return a script that defines the data: a page from the file system cannot fetch a file."""
     return f"window.zwfsLiveData = {json.dumps(data())};\n"
 
 
 def data() -> dict[str, Any]:
-    """Everything that book/_static/live-model.js computes with, ready for JSON."""
+    """Return the input of book/_static/live-model.js, ready for JSON."""
     pupil = zwfs.Pupil.circular(N_PIXELS)
     diameters, factors = dimples(pupil)
     return {
@@ -49,7 +50,7 @@ def data() -> dict[str, Any]:
 
 
 def dimples(pupil: zwfs.Pupil) -> tuple[NDArray, Factors]:
-    """Chebyshev points in the range of diameters, and the factors of dark dimples of these diameters.
+    """Return Chebyshev points in the range of diameters, and the factors of dark dimples of these diameters.
 
     A dark dimple takes away the light that goes through it: its reference wave is minus that light, and its core
     minus the core of the kernel without the factor exp(i theta) - 1. It is real.
@@ -62,7 +63,7 @@ def dimples(pupil: zwfs.Pupil) -> tuple[NDArray, Factors]:
 
 
 def screens(pupil: zwfs.Pupil) -> Plane:
-    """The screens of unit rms of the seeds from 1 on, as combinations of products of Legendre polynomials.
+    """Return the screens of the seeds from 1 on, unit rms, as combinations of products of Legendre polynomials.
 
     Zernike modes are polynomials in x and y, whose degree is at most the radial order of the last mode. In the
     corners of the square, where there is no pupil, they are huge: the coefficients need double precision.
@@ -81,6 +82,18 @@ def _plane(plane: Plane) -> dict[str, Any]:
 
 
 def _encode(array: NDArray) -> dict[str, Any]:
-    """Shape, type, and the values in base64, little-endian."""
+    """Return shape, type, and the values in base64, little-endian."""
     values = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
     return {"shape": array.shape, "type": array.dtype.name, "values": base64.b64encode(values).decode()}
+
+
+def write_data(app: Sphinx, exception: Exception | None) -> None:
+    """Write the script next to the scripts of the live page."""
+    if exception is None and app.builder.format == "html":
+        Path(app.outdir, DATA).write_text(script(), "utf-8")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Write the data at the end of each build."""
+    app.connect("build-finished", write_data)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

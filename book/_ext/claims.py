@@ -1,4 +1,4 @@
-"""The paper's claims, each with the rule that judges it by what the notebooks measured."""
+"""The paper's claims, each with the rule that judges it by the numbers of a notebook, and their table."""
 
 import inspect
 import json
@@ -10,7 +10,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-PAGE = "book/claims.md"
+from sphinx.application import Sphinx
+from sphinx.config import Config
+from sphinx.errors import ExtensionError
 
 HOLDS, REMARK, FAILS, UNTESTED = "holds", "holds with a remark", "does not hold", "not to be tested here"
 # The signs differ in shape, for those who do not see the colours.
@@ -29,13 +31,13 @@ SECTIONS = {
 }
 
 
-class ClaimError(Exception):
-    """A claim cannot be judged, as a notebook does not give what its rule asks for."""
+class ClaimError(ExtensionError):
+    """A claim cannot be judged: its notebook does not glue the numbers that its rule needs."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What a rule says.
+    """Result of a rule.
 
     Parameters
     ----------
@@ -44,12 +46,15 @@ class Finding:
     measured : str
         The measured values in words.
     remark : str
-        What has to be added, or why the claim does not hold.
+        The condition under which the claim holds, or the reason why it does not.
     """
 
     verdict: str
     measured: str = ""
     remark: str = ""
+
+
+Rule = Callable[..., Finding]
 
 
 @dataclass(frozen=True)
@@ -60,33 +65,58 @@ class Claim:
     ----------
     number : int
     section : str
-        Where the paper says it.
+        The section of the paper.
     statement : str
-        What it says, in our words.
+        The statement, in our words.
+    source : str
+        The notebook that measures it, and the heading to link to: ``notebook#its-words``.
     rule : callable
-        Takes measured values by keyword, under the names that they were glued by, and gives a `Finding`.
-    notebooks : tuple of str
-        The notebooks that glue them; the page links to the first.
-    anchor : str
-        The heading in it to link to, as ``#its-words``.
+        Takes numbers by keyword, under the names that the notebook gave to `glue`, and returns a `Finding`.
     """
 
     number: int
     section: str
     statement: str
-    rule: Callable[..., Finding]
-    notebooks: tuple[str, ...] = ()
-    anchor: str = ""
+    source: str
+    rule: Rule
+
+    @property
+    def notebook(self) -> str:
+        """The name of the notebook; empty if the claim is not measured."""
+        return self.source.partition("#")[0]
 
 
+CLAIMS: list[Claim] = []
+
+
+def claim(number: int, section: str, statement: str, source: str = "") -> Callable[[Rule], Rule]:
+    """Decorate the rule of a claim: see `Claim`."""
+
+    def add(rule: Rule) -> Rule:
+        CLAIMS.append(Claim(number, section, statement, source, rule))
+        return rule
+
+    return add
+
+
+@claim(
+    1,
+    "2.1",
+    "The intensity on the detector is that of two interfering waves: the incoming one and the reference.",
+    "identities#two-waves-and-any-patch",
+)
 def two_waves(dimple_two_wave_error: float) -> Finding:
-    """Claim 1."""
     verdict = HOLDS if dimple_two_wave_error <= ROUNDING else FAILS
     return Finding(verdict, f"the two sides differ by {below(dimple_two_wave_error)} of the mean intensity")
 
 
+@claim(
+    2,
+    "2.1",
+    "A patch of any complex transmission fits the same description.",
+    "identities#two-waves-and-any-patch",
+)
 def any_patch(patch_two_wave_error: float, patch_model_error: float) -> Finding:
-    """Claim 2."""
     measured = (
         f"for a patch of uneven phase and amplitude the two sides differ by {below(patch_two_wave_error)}, "
         f"the low-rank model and a direct sum over the patch by {below(patch_model_error)}"
@@ -95,6 +125,13 @@ def any_patch(patch_two_wave_error: float, patch_model_error: float) -> Finding:
     return Finding(HOLDS if exact else FAILS, measured)
 
 
+@claim(
+    3,
+    "2.1",
+    "A common approximation: the phase of the reference wave is that for a flat wavefront, and its intensity "
+    "is scaled by the square root of the Strehl ratio.",
+    "identities#the-common-approximation",
+)
 def common_approximation(
     wave_error_01: float,
     wave_error_05: float,
@@ -103,7 +140,7 @@ def common_approximation(
     step_error_05: float,
     literal_amplitude_error_05: float,
 ) -> Finding:
-    """Claim 3: 5 % is what the paper calls satisfactory, of the wave and of a phase found with it."""
+    """5 % is what the paper calls satisfactory, of the wave and of a phase found with it."""
     steps = {0.1: step_error_01, 0.3: step_error_03, 0.5: step_error_05}
     measured = (
         f"with the amplitude scaled by the square root, the wave is off by {wave_error_01:.1%} at 0.1 rad rms "
@@ -122,8 +159,14 @@ def common_approximation(
     return Finding(REMARK, measured, f"{remark} {literal}")
 
 
+@claim(
+    4,
+    "2.2",
+    "The determinant of the system is the sine of the difference of the reference phases, which for two "
+    "dimples of one size is $(\\theta_b-\\theta_a)/2$ at every point.",
+    "identities#the-determinant",
+)
 def determinant(determinant_error: float, half_difference_error: float, pairs_off_by_pi: float) -> Finding:
-    """Claim 4."""
     measured = (
         f"the determinant differs from the sine by {below(determinant_error)}, and the difference of the "
         f"reference phases from half of that of the dimples, modulo $\\pi$, by {below(half_difference_error)} rad"
@@ -136,8 +179,14 @@ def determinant(determinant_error: float, half_difference_error: float, pairs_of
     return Finding(REMARK, measured, remark)
 
 
+@claim(
+    5,
+    "2.2",
+    "There is no diversity for phase shifts that differ by 0, and the most of it for a difference of $\\pi$, "
+    "modulo $2\\pi$.",
+    "identities#the-determinant",
+)
 def diversity(diversity_at_0: float, largest_diversity: float, best_difference: float) -> Finding:
-    """Claim 5."""
     measured = (
         f"$\\lvert\\det M\\rvert$ is {below(diversity_at_0)} at a difference of 0, and largest, "
         f"{largest_diversity:.3f}, at {best_difference / math.pi:.2f} $\\pi$"
@@ -146,8 +195,13 @@ def diversity(diversity_at_0: float, largest_diversity: float, best_difference: 
     return Finding(HOLDS if right else FAILS, measured)
 
 
+@claim(
+    6,
+    "2.2",
+    "With accurate reference waves the phase is found on the whole circle.",
+    "identities#the-whole-circle",
+)
 def whole_circle(largest_phase: float, true_wave_error: float, one_image_error: float) -> Finding:
-    """Claim 6."""
     measured = (
         f"phases up to {largest_phase:.1f} rad come back with an error of {below(true_wave_error)} rad; "
         f"from one image, with the true wave as well, the error is {one_image_error:.2f} rad rms"
@@ -155,8 +209,14 @@ def whole_circle(largest_phase: float, true_wave_error: float, one_image_error: 
     return Finding(HOLDS if true_wave_error <= ROUNDING else FAILS, measured)
 
 
+@claim(
+    7,
+    "4.1",
+    "The iterative arcsine does better than the linear reconstructor, but fails from about 0.3 rad rms on.",
+    "fig03_dynamic_range#one-pupil-image-linear-and-arcsine",
+)
 def arcsine(arcsine_over_linear: float, arcsine_limit: float, arcsine_ratio_at_05: float) -> Finding:
-    """Claim 7: 'about 0.3' is 0.2 to 0.4 rad rms."""
+    """'about 0.3' is 0.2 to 0.4 rad rms."""
     measured = (
         f"up to 0.3 rad rms its error is at most {arcsine_over_linear:.0%} of the linear one; it leaves 5 % of "
         f"the input at {arcsine_limit:.2f} rad rms and reaches {arcsine_ratio_at_05:.0%} at 0.5"
@@ -168,8 +228,15 @@ def arcsine(arcsine_over_linear: float, arcsine_limit: float, arcsine_ratio_at_0
     return Finding(REMARK, measured, "It fails at another input than the paper says.")
 
 
+@claim(
+    8,
+    "4.1",
+    "With 5 % of the input as the limit, the phase-shifted sensor with non-linear methods has more than ten "
+    "times the range of the classic one with linear reconstruction.",
+    "fig03_dynamic_range#where-each-curve-leaves-the-threshold",
+)
 def dynamic_range(linear_limit: float, shifted_limit: float, descent_limit: float, saxton_limit: float) -> Finding:
-    """Claim 8: every non-linear method with two images, or some of them."""
+    """Every non-linear method with two images, or some of them."""
     gains = {
         "phase-shifted": shifted_limit / linear_limit,
         "gradient descent": descent_limit / linear_limit,
@@ -186,6 +253,12 @@ def dynamic_range(linear_limit: float, shifted_limit: float, descent_limit: floa
     return Finding(REMARK, measured, f"Not with {' and '.join(short)}.")
 
 
+@claim(
+    9,
+    "4.1",
+    "Gerchberg-Saxton has a systematic offset, since some light falls beside the detector.",
+    "fig03_dynamic_range#the-offset-of-gerchberg-saxton",
+)
 def saxton_offset(
     saxton_error_2: float,
     saxton_error_4: float,
@@ -193,7 +266,7 @@ def saxton_offset(
     light_lost_4: float,
     saxton_error_at_05: float,
 ) -> Finding:
-    """Claim 9: an offset at 0.1 rad that falls as the light lost does."""
+    """An offset at 0.1 rad that falls as the light lost does."""
     measured = (
         f"at 0.1 rad rms {saxton_error_2:.3f} rad on a detector of 2 D, which loses {light_lost_2:.0%} of the "
         f"light, and {saxton_error_4:.3f} on one of 4 D, which loses {light_lost_4:.0%}"
@@ -210,6 +283,12 @@ def saxton_offset(
     return Finding(HOLDS, measured)
 
 
+@claim(
+    10,
+    "4.1",
+    "The phase-shifted iteration and gradient descent perform alike; gradient descent takes more time.",
+    "fig03_dynamic_range#two-pupil-images-the-range-and-where-it-ends",
+)
 def alike(
     alike_up_to: float,
     lost_screens_at_1: float,
@@ -217,7 +296,7 @@ def alike(
     shifted_passes: float,
     descent_passes: float,
 ) -> Finding:
-    """Claim 10: passes through the model stand for time, which depends on the machine."""
+    """Passes through the model stand for time, which depends on the machine."""
     measured = (
         f"both below $10^{{-6}}$ rad up to {alike_up_to:.1f} rad rms; {shifted_passes:.0f} passes through the "
         f"model against {descent_passes:.0f}, for one screen at 0.5 rad rms"
@@ -235,8 +314,14 @@ def alike(
     return Finding(REMARK, measured, remark)
 
 
+@claim(
+    11,
+    "4.1",
+    "Phase wraps occur around 1 rad rms.",
+    "fig03_dynamic_range#two-pupil-images-the-range-and-where-it-ends",
+)
 def wraps(wrapped_screens_at_05: float, wrapped_screens_at_1: float, wrap_onset: float) -> Finding:
-    """Claim 11: the input at which half of the screens have wraps is 'around 1' within 0.2."""
+    """The input at which half of the screens have wraps is 'around 1' within 0.2."""
     measured = (
         f"{wrapped_screens_at_05:.0%} of the screens reach beyond $\\pm\\pi$ at 0.5 rad rms, "
         f"{wrapped_screens_at_1:.0%} at 1, half of them from {wrap_onset:.1f} on"
@@ -248,8 +333,14 @@ def wraps(wrapped_screens_at_05: float, wrapped_screens_at_1: float, wrap_onset:
     return Finding(FAILS, measured)
 
 
+@claim(
+    12,
+    "4.1",
+    "The phase-shifted sensor can be pushed to about 1 rad rms; beyond, no useful reference beam is left.",
+    "fig03_dynamic_range#two-pupil-images-the-range-and-where-it-ends",
+)
 def reach(shifted_limit: float, recovered_at_1: float, strehl_at_1: float, strehl_at_limit: float) -> Finding:
-    """Claim 12: 'about 1' is 0.8 to 1.2 rad rms."""
+    """'about 1' is 0.8 to 1.2 rad rms."""
     measured = (
         f"{recovered_at_1:.0%} of the screens are recovered at 1 rad rms (Strehl ratio {strehl_at_1:.2f}); the "
         f"mean error leaves 5 % at {shifted_limit:.1f} rad rms (Strehl ratio {strehl_at_limit:.2f})"
@@ -262,8 +353,14 @@ def reach(shifted_limit: float, recovered_at_1: float, strehl_at_1: float, streh
     return Finding(REMARK, measured, remark)
 
 
+@claim(
+    13,
+    "4.1",
+    "The reconstructors do not suit real time, as they need several Fourier transforms.",
+    "fig03_dynamic_range#what-it-costs",
+)
 def real_time(fourier_functions: float, rank: float) -> Finding:
-    """Claim 13: the reason that the paper gives; speed depends on the machine, and a verdict must not."""
+    """The reason that the paper gives; speed depends on the machine, and a verdict must not."""
     measured = f"functions for Fourier transforms that any reconstructor calls: {fourier_functions:.0f}"
     if fourier_functions:
         return Finding(HOLDS, measured)
@@ -274,6 +371,12 @@ def real_time(fourier_functions: float, rank: float) -> Finding:
     return Finding(REMARK, measured, remark)
 
 
+@claim(
+    14,
+    "4.2",
+    "Any pair of phase shifts works, but for a difference of $2\\pi$ and for the pair $(0, \\pi)$.",
+    "phase_shift_pairs#claim-14-which-pairs-work",
+)
 def pairs(
     n_allowed: float,
     n_singular: float,
@@ -281,7 +384,7 @@ def pairs(
     zero_works: float,
     error_max_allowed_pairs: float,
 ) -> Finding:
-    """Claim 14: a pair works if the iteration leaves less than a thousandth of a radian."""
+    """A pair works if the iteration leaves less than a thousandth of a radian."""
     measured = (
         f"of {n_allowed + n_singular:.0f} pairs {n_singular:.0f} are refused, those with equal shifts or with a "
         f"shift of 0; all others leave at most {below(error_max_allowed_pairs)} rad at 0.5 rad rms"
@@ -293,6 +396,7 @@ def pairs(
     return Finding(REMARK, measured, "$(0, \\pi)$ is no special case: no pair with a shift of 0 works.")
 
 
+@claim(15, "4.2", "The pair $\\pm\\pi/2$ is the most sensitive.", "phase_shift_pairs#claim-15-the-best-pair")
 def best_pair(
     best_theta_a: float,
     best_noise: float,
@@ -302,7 +406,7 @@ def best_pair(
     best_noise_read: float,
     noise_at_half_pi_read: float,
 ) -> Finding:
-    """Claim 15: best means that no other pair has less noise by more than 2 %."""
+    """Best means that no other pair has less noise by more than 2 %."""
     gains = {
         "photon noise, flat wavefront": 1 - best_noise / noise_at_half_pi,
         "photon noise, 0.5 rad rms": 1 - best_noise_aberrated / noise_at_half_pi_aberrated,
@@ -323,6 +427,12 @@ def best_pair(
     return Finding(REMARK, measured, remark)
 
 
+@claim(
+    16,
+    "4.2",
+    "For dimples larger than about 2.2 $\\lambda/D$ the error of the iteration rises drastically.",
+    "fig04_dimple_diameter#where-it-leaves",
+)
 def diameter(
     error_at_20: float,
     error_at_26: float,
@@ -330,7 +440,7 @@ def diameter(
     diameter_5_percent_400: float,
     contraction_crosses_1: float,
 ) -> Finding:
-    """Claim 16: 'about 2.2' is 2.0 to 2.4, 'drastically' more than ten times."""
+    """'about 2.2' is 2.0 to 2.4, 'drastically' more than ten times."""
     measured = (
         f"the mean error passes 5 % of the input at {diameter_5_percent:.2f} $\\lambda/D$, and grows "
         f"{error_at_26 / error_at_20:.0f} times from 2.0 to 2.6"
@@ -346,6 +456,12 @@ def diameter(
     return Finding(REMARK, measured, remark)
 
 
+@claim(
+    17,
+    "4.2",
+    "All the other reconstructors behave in exactly the same way.",
+    "fig04_dimple_diameter#the-other-methods",
+)
 def others_alike(
     claim17_linear_ratio: float,
     claim17_arcsine_ratio: float,
@@ -353,7 +469,7 @@ def others_alike(
     claim17_descent_ratio: float,
     claim17_descent_points_ratio: float,
 ) -> Finding:
-    """Claim 17: the same behaviour is an error that grows more than ten times from 2.0 to 2.6."""
+    """The same behaviour is an error that grows more than ten times from 2.0 to 2.6."""
     ratios = {
         "linear": claim17_linear_ratio,
         "arcsine": claim17_arcsine_ratio,
@@ -369,8 +485,14 @@ def others_alike(
     return Finding(FAILS, measured, f"Not {', '.join(other)}: each has a reason of its own, see Figure 4.")
 
 
+@claim(
+    18,
+    "2.3",
+    "Both kinds of vector mask suffer from a small shift of focus between the two pupil images.",
+    "error_budget",
+)
 def focus_shift(gain_focus_difference: float, offset_focus_difference: float) -> Finding:
-    """Claim 18: a statement on prisms that are not here; what it does can be told."""
+    """A statement on prisms that are not here; what it does can be told."""
     measured = (
         f"on the simulated bench such a shift, alone, makes the gain {gain_focus_difference:.2f} and an offset of "
         f"{offset_focus_difference:.4f} rad rms"
@@ -378,8 +500,14 @@ def focus_shift(gain_focus_difference: float, offset_focus_difference: float) ->
     return Finding(UNTESTED, measured, "A fact of hardware, taken over as a parameter of the bench.")
 
 
+@claim(
+    19,
+    "5.2",
+    "Leakage of one pupil image into the other can make the phase underestimated.",
+    "error_budget#leakage-swept",
+)
 def leakage(gain_leakage: float, gain_leakage_10: float) -> Finding:
-    """Claim 19: a gain below 1 by more than 1 %, and the more so the more leakage."""
+    """A gain below 1 by more than 1 %, and the more so the more leakage."""
     measured = (
         f"leakage of 3 % alone makes a gain of {gain_leakage:.2f} at 0.3 rad rms, leakage of 10 % one of "
         f"{gain_leakage_10:.2f}"
@@ -387,6 +515,13 @@ def leakage(gain_leakage: float, gain_leakage_10: float) -> Finding:
     return Finding(HOLDS if gain_leakage_10 < gain_leakage < 0.99 else FAILS, measured)
 
 
+@claim(
+    20,
+    "5.2",
+    "On the bench, linear and arcsine are alike with one image; two images extend the range, with an offset "
+    "near zero aberration.",
+    "fig09_bench_linearity#the-claims-of-section-52",
+)
 def on_the_bench(
     arcsine_over_linear: float,
     offset_linear: float,
@@ -395,7 +530,7 @@ def on_the_bench(
     reach_shifted: float,
     reach_saxton: float,
 ) -> Finding:
-    """Claim 20: alike within a third; twice the reach; an offset ten times that of the linear method."""
+    """Alike within a third; twice the reach; an offset ten times that of the linear method."""
     measured = (
         f"from 0.3 rad rms on the arcsine has {arcsine_over_linear:.2f} times the error of the linear method; "
         f"errors stay below a quarter of the input up to {reach_linear:.1f} (linear) and {reach_shifted:.1f} rad "
@@ -411,187 +546,22 @@ def on_the_bench(
     )
 
 
+@claim(
+    21,
+    "6",
+    "Next: a better model of the bench, and reconstruction fast enough for kilohertz, for instance by machine "
+    "learning.",
+)
 def next_steps() -> Finding:
-    """Claim 21: an announcement, which nothing measured could contradict."""
+    """An announcement, which nothing measured could contradict."""
     remark = (
         "A plan, and no statement to be tested. Here no Fourier transform is left in the way of speed, see 13."
     )
     return Finding(UNTESTED, remark=remark)
 
 
-IDENTITIES, FIGURE_3, FIGURE_4 = ("identities",), ("fig03_dynamic_range",), ("fig04_dimple_diameter",)
-PAIRS, BUDGET, FIGURE_9 = ("phase_shift_pairs",), ("error_budget",), ("fig09_bench_linearity",)
-
-CLAIMS = (
-    Claim(
-        1,
-        "2.1",
-        "The intensity on the detector is that of two interfering waves: the incoming one and the reference.",
-        two_waves,
-        IDENTITIES,
-        "#two-waves-and-any-patch",
-    ),
-    Claim(
-        2,
-        "2.1",
-        "A patch of any complex transmission fits the same description.",
-        any_patch,
-        IDENTITIES,
-        "#two-waves-and-any-patch",
-    ),
-    Claim(
-        3,
-        "2.1",
-        "A common approximation: the phase of the reference wave is that for a flat wavefront, and its intensity "
-        "is scaled by the square root of the Strehl ratio.",
-        common_approximation,
-        IDENTITIES,
-        "#the-common-approximation",
-    ),
-    Claim(
-        4,
-        "2.2",
-        "The determinant of the system is the sine of the difference of the reference phases, which for two "
-        "dimples of one size is $(\\theta_b-\\theta_a)/2$ at every point.",
-        determinant,
-        IDENTITIES,
-        "#the-determinant",
-    ),
-    Claim(
-        5,
-        "2.2",
-        "There is no diversity for phase shifts that differ by 0, and the most of it for a difference of $\\pi$, "
-        "modulo $2\\pi$.",
-        diversity,
-        IDENTITIES,
-        "#the-determinant",
-    ),
-    Claim(
-        6,
-        "2.2",
-        "With accurate reference waves the phase is found on the whole circle.",
-        whole_circle,
-        IDENTITIES,
-        "#the-whole-circle",
-    ),
-    Claim(
-        7,
-        "4.1",
-        "The iterative arcsine does better than the linear reconstructor, but fails from about 0.3 rad rms on.",
-        arcsine,
-        FIGURE_3,
-        "#one-pupil-image-linear-and-arcsine",
-    ),
-    Claim(
-        8,
-        "4.1",
-        "With 5 % of the input as the limit, the phase-shifted sensor with non-linear methods has more than ten "
-        "times the range of the classic one with linear reconstruction.",
-        dynamic_range,
-        FIGURE_3,
-        "#where-each-curve-leaves-the-threshold",
-    ),
-    Claim(
-        9,
-        "4.1",
-        "Gerchberg-Saxton has a systematic offset, since some light falls beside the detector.",
-        saxton_offset,
-        FIGURE_3,
-        "#the-offset-of-gerchberg-saxton",
-    ),
-    Claim(
-        10,
-        "4.1",
-        "The phase-shifted iteration and gradient descent perform alike; gradient descent takes more time.",
-        alike,
-        FIGURE_3,
-        "#two-pupil-images-the-range-and-where-it-ends",
-    ),
-    Claim(
-        11,
-        "4.1",
-        "Phase wraps occur around 1 rad rms.",
-        wraps,
-        FIGURE_3,
-        "#two-pupil-images-the-range-and-where-it-ends",
-    ),
-    Claim(
-        12,
-        "4.1",
-        "The phase-shifted sensor can be pushed to about 1 rad rms; beyond, no useful reference beam is left.",
-        reach,
-        FIGURE_3,
-        "#two-pupil-images-the-range-and-where-it-ends",
-    ),
-    Claim(
-        13,
-        "4.1",
-        "The reconstructors do not suit real time, as they need several Fourier transforms.",
-        real_time,
-        FIGURE_3,
-        "#what-it-costs",
-    ),
-    Claim(
-        14,
-        "4.2",
-        "Any pair of phase shifts works, but for a difference of $2\\pi$ and for the pair $(0, \\pi)$.",
-        pairs,
-        PAIRS,
-        "#claim-14-which-pairs-work",
-    ),
-    Claim(15, "4.2", "The pair $\\pm\\pi/2$ is the most sensitive.", best_pair, PAIRS, "#claim-15-the-best-pair"),
-    Claim(
-        16,
-        "4.2",
-        "For dimples larger than about 2.2 $\\lambda/D$ the error of the iteration rises drastically.",
-        diameter,
-        FIGURE_4,
-        "#where-it-leaves",
-    ),
-    Claim(
-        17,
-        "4.2",
-        "All the other reconstructors behave in exactly the same way.",
-        others_alike,
-        FIGURE_4,
-        "#the-other-methods",
-    ),
-    Claim(
-        18,
-        "2.3",
-        "Both kinds of vector mask suffer from a small shift of focus between the two pupil images.",
-        focus_shift,
-        BUDGET,
-    ),
-    Claim(
-        19,
-        "5.2",
-        "Leakage of one pupil image into the other can make the phase underestimated.",
-        leakage,
-        BUDGET,
-        "#leakage-swept",
-    ),
-    Claim(
-        20,
-        "5.2",
-        "On the bench, linear and arcsine are alike with one image; two images extend the range, with an offset "
-        "near zero aberration.",
-        on_the_bench,
-        FIGURE_9,
-        "#the-claims-of-section-52",
-    ),
-    Claim(
-        21,
-        "6",
-        "Next: a better model of the bench, and reconstruction fast enough for kilohertz, for instance by machine "
-        "learning.",
-        next_steps,
-    ),
-)
-
-
 def below(error: float) -> str:
-    """Tell a small error by one digit, rounded up: the notebooks give none below `ROUNDING`."""
+    """Write a small error with one digit, rounded up: the notebooks give none below `ROUNDING`."""
     exponent = math.floor(math.log10(error))
     digit = math.ceil(error / 10**exponent - 1e-9)
     if digit == 10:
@@ -616,77 +586,68 @@ def glued(notebook: Path) -> dict[str, float]:
             name = output.get("metadata", {}).get("scrapbook", {}).get("name")
             if name:
                 texts = output["data"].values()
-                # What is no number is said on the notebook's own page, and judges nothing.
+                # Only numbers can judge; a glued string appears on the notebook's own page.
                 with suppress(ValueError):
                     numbers[name] = float("".join(next(iter(texts))))
     return numbers
 
 
-def judge(claim: Claim, folder: Path) -> Finding:
-    """Judge a claim by the executed notebooks in a folder.
+def judge(claim: Claim, numbers: dict[str, float]) -> Finding:
+    """Judge a claim.
+
+    Parameters
+    ----------
+    claim : Claim
+    numbers : dict of float
+        The numbers of its notebook, see `glued`.
 
     Raises
     ------
     ClaimError
-        A value that the rule asks for is missing, or two notebooks give it.
+        A number that the rule asks for is missing.
     """
-    found = [glued(folder / f"{name}.ipynb") for name in claim.notebooks]
-    values = {}
-    for key in inspect.signature(claim.rule).parameters:
-        given = [numbers[key] for numbers in found if key in numbers]
-        if len(given) != 1:
-            where = " and ".join(claim.notebooks) or "no notebook"
-            raise ClaimError(
-                f"claim {claim.number} needs one value {key!r}: {where} glued {len(given)} of that name"
-            )
-        values[key] = given[0]
-    return claim.rule(**values)
+    needed = inspect.signature(claim.rule).parameters
+    if missing := [name for name in needed if name not in numbers]:
+        raise ClaimError(f"claim {claim.number} needs {', '.join(missing)}: {claim.notebook} does not glue it")
+    return claim.rule(**{name: numbers[name] for name in needed})
 
 
-def fragments(folder: Path) -> dict[str, str]:
-    """Return the parts of pages that tell the verdicts, by file name.
-
-    Parameters
-    ----------
-    folder : Path
-        The executed notebooks.
-    """
-    findings = {claim: judge(claim, folder) for claim in CLAIMS}
-    return {"book/_claims_table.md": table(findings), "book/_claims_count.md": count(findings)}
+def findings(folder: Path) -> dict[Claim, Finding]:
+    """Judge every claim by the executed notebooks in a folder."""
+    numbers = {name: glued(folder / f"{name}.ipynb") for name in {claim.notebook for claim in CLAIMS} if name}
+    return {claim: judge(claim, numbers.get(claim.notebook, {})) for claim in CLAIMS}
 
 
-def count(findings: dict[Claim, Finding]) -> str:
-    """Say in a line how many claims have which verdict."""
-    numbers = Counter(finding.verdict for finding in findings.values())
+def count(judged: dict[Claim, Finding]) -> str:
+    """Return a line that says how many claims have which verdict."""
+    numbers = Counter(finding.verdict for finding in judged.values())
     listed = ", ".join(f"{numbers[verdict]} {_marked(verdict)}" for verdict in SIGNS if numbers[verdict])
-    return f"The {len(findings)} claims of the paper, {{doc}}`one by one <claims>`: {listed}.\n"
+    return f"The {len(judged)} claims of the paper, {{doc}}`one by one <claims>`: {listed}."
 
 
-def table(findings: dict[Claim, Finding]) -> str:
-    """Return the table of all claims."""
+def table(judged: dict[Claim, Finding]) -> str:
+    """Return the table of all claims as MyST text."""
     header = ["", "the paper says", "measured here", "verdict"]
-    rows = [header, ["---"] * len(header), *(_row(claim, finding) for claim, finding in findings.items())]
+    rows = [header, ["---"] * len(header), *(_row(claim, finding) for claim, finding in judged.items())]
     lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
-    return "\n".join([":::{table}", ":class: claims", "", *lines, ":::", ""])
+    return "\n".join([":::{table}", ":class: claims", "", *lines, ":::"])
 
 
 def _row(claim: Claim, finding: Finding) -> list[str]:
     section = f"section {claim.section}"
     if page := SECTIONS.get(claim.section):
         section = f"[{section}]({page})"
-    measured = [
-        f"{finding.measured[:1].upper()}{finding.measured[1:]}." if finding.measured else "",
-        finding.remark,
-    ]
-    if claim.notebooks:
-        name = claim.notebooks[0]
-        measured.append(f"*[{_title(name)}](../notebooks/{name}.ipynb{claim.anchor})*")
+    measured = [f"{finding.measured[:1].upper()}{finding.measured[1:]}."] if finding.measured else []
+    measured += [finding.remark] if finding.remark else []
+    if claim.notebook:
+        address = claim.source.replace(claim.notebook, f"../notebooks/{claim.notebook}.ipynb")
+        measured.append(f"*[{_title(claim.notebook)}]({address})*")
     said = f"{claim.statement} *{section}*"
-    return [str(claim.number), said, " ".join(filter(None, measured)), _marked(finding.verdict)]
+    return [str(claim.number), said, " ".join(measured), _marked(finding.verdict)]
 
 
 def _title(notebook: str) -> str:
-    """Return what a link to a notebook says: figures by their number in the paper, others by their name."""
+    """Return the text of a link to a notebook: the number of its figure in the paper, or its name."""
     figure = re.match(r"fig(\d+)_", notebook)
     return f"Figure {int(figure[1])}" if figure else notebook.replace("_", " ").capitalize()
 
@@ -694,3 +655,17 @@ def _title(notebook: str) -> str:
 def _marked(verdict: str) -> str:
     """Return a verdict with its sign and the class for its colour."""
     return f"[{SIGNS[verdict]} {verdict}]{{.verdict-{verdict.replace(' ', '-')}}}"
+
+
+def add_substitutions(app: Sphinx, config: Config) -> None:
+    """Define ``{{ claims_table }}`` and ``{{ claims_count }}`` from the notebooks that the book shows."""
+    judged = findings(Path(app.srcdir, config.executed_notebooks))
+    added = {"claims_table": table(judged), "claims_count": count(judged)}
+    config.myst_substitutions = config.myst_substitutions | added
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Add the substitutions."""
+    app.setup_extension("cards")
+    app.connect("config-inited", add_substitutions)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

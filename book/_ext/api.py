@@ -1,0 +1,156 @@
+"""The API page: a directive that documents the public names of modules, and links in docstrings."""
+
+import importlib
+import inspect
+import pkgutil
+import re
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from docutils import nodes
+from docutils.statemachine import StringList
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+from sphinx.pycode import ModuleAnalyzer
+from sphinx.util import logging
+from sphinx.util.docutils import SphinxDirective
+from sphinx.util.nodes import make_refnode
+
+PACKAGE = "zwfs"
+PAGE = "book/api"
+KINDS = ("class", "data", "exception", "function")
+# The pages that number their equations as the paper does, in its order.
+PAPER = ("sensor.md", "phase_shifted.md", "methods.md")
+
+NUMBERED = re.compile(r"(?<=Chambouleyron)[^;]*?equations?\s[^;.\n]*")
+
+logger = logging.getLogger(__name__)
+
+
+class Modules(SphinxDirective):
+    """Document the public names of modules; ``package.*`` stands for a package and all its public modules."""
+
+    required_arguments = 1
+    final_argument_whitespace = True
+
+    def run(self) -> list[nodes.Node]:
+        """Parse a section for each module; MyST appends it to the section around the directive."""
+        lines = []
+        for name in self.arguments[0].split():
+            package = name.removesuffix(".*")
+            below = [one for one in modules() if name != package and one.startswith(f"{package}.")]
+            for module in (package, *below):
+                lines += section(module)
+        self.state.nested_parse(StringList(lines, self.env.docname), 0, nodes.container(), match_titles=True)
+        return []
+
+
+def section(name: str) -> list[str]:
+    """Return the MyST text that documents one module."""
+    module = importlib.import_module(name)
+    directives = []
+    for own in own_names(module):
+        if inspect.isclass(vars(module)[own]):
+            directives += [f".. autoclass:: {path(module, own)}", "   :members:", ""]
+        else:
+            directives += [f".. autofunction:: {path(module, own)}", ""]
+    for own, text in constants(module).items():
+        directives += [f".. py:data:: {own}", f"   :module: {name}", "", f"   {text}", ""]
+    return [f"### `{name}`", "", "```{eval-rst}", f".. automodule:: {name}", "", *directives, "```", ""]
+
+
+@cache
+def modules() -> list[str]:
+    """Return the names of the public modules of the package, in order."""
+    package = importlib.import_module(PACKAGE)
+    found = (module.name for module in pkgutil.walk_packages(package.__path__, f"{PACKAGE}."))
+    return sorted(name for name in found if not any(part.startswith("_") for part in name.split(".")))
+
+
+def own_names(module: ModuleType) -> list[str]:
+    """Return the public functions and classes that a module defines, in the order of its source."""
+    return [
+        name
+        for name, thing in vars(module).items()
+        if (inspect.isclass(thing) or inspect.isfunction(thing))
+        and thing.__module__ == module.__name__
+        and not name.startswith("_")
+    ]
+
+
+def constants(module: ModuleType) -> dict[str, str]:
+    """Return the docstrings of the public constants of a module: the strings after the assignments."""
+    documented = ModuleAnalyzer.for_module(module.__name__).find_attr_docs()
+    return {
+        name: " ".join(lines).strip()
+        for (owner, name), lines in documented.items()
+        if not owner and not name.startswith("_")
+    }
+
+
+def path(module: ModuleType, name: str) -> str:
+    """Return the shortest path from which a name can be imported; a path can also be that of a module."""
+    parts, taken = module.__name__.split("."), modules()
+    for package in (".".join(parts[:depth]) for depth in range(1, len(parts))):
+        if name in getattr(importlib.import_module(package), "__all__", ()) and f"{package}.{name}" not in taken:
+            return f"{package}.{name}"
+    return f"{module.__name__}.{name}"
+
+
+@cache
+def paper_labels(folder: Path) -> list[str]:
+    """Return the labels of the paper's equations: the first is that of its equation (1)."""
+    texts = ((folder / page).read_text("utf-8") for page in PAPER)
+    return [label for text in texts for label in re.findall(r"^ *:label: (\S+)$", text, re.MULTILINE)]
+
+
+def link_equations(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Link the equations of the paper that a docstring cites by number, and escape the bars of moduli."""
+    labels = paper_labels(Path(app.srcdir, "book"))
+
+    def label(number: re.Match) -> str:
+        return f":eq:`{labels[int(number[1]) - 1]}`"
+
+    text = NUMBERED.sub(lambda cited: re.sub(r"\((\d+)\)", label, cited[0]), "\n".join(lines))
+    # A bar is a modulus and no substitution; code in double backticks stays as it is.
+    text = re.sub(r"``[^`]*``|\|", lambda found: "\\|" if found[0] == "|" else found[0], text)
+    lines[:] = text.splitlines()
+
+
+def link_name(
+    app: Sphinx, env: BuildEnvironment, node: pending_xref, contnode: nodes.TextElement
+) -> nodes.Node | None:
+    """Resolve a name in single backticks: a public name of the package, the label of an equation, or code."""
+    if (node["refdomain"], node["reftype"]) != ("py", "obj"):
+        return None
+    target, document = node["reftarget"], node["refdoc"]
+    if target.startswith("eq-"):
+        return env.domains["math"].resolve_xref(env, document, app.builder, "eq", target, node, contnode)
+    named = {
+        full: entry
+        for full, entry in env.domains["py"].objects.items()
+        if entry.objtype in KINDS and not entry.aliased and full.endswith(f".{target}")
+    }
+    if len(named) == 1:
+        [(full, entry)] = named.items()
+        return make_refnode(app.builder, document, entry.docname, entry.node_id, contnode, full)
+    # A full path that leads nowhere is an error, and Sphinx says so.
+    return None if target.startswith(f"{PACKAGE}.") else contnode
+
+
+def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
+    """Warn of public modules that the API page does not document."""
+    if PAGE in env.found_docs and (missing := set(modules()) - set(env.domains["py"].modules)):
+        logger.warning("no directive names %s", ", ".join(sorted(missing)), location=PAGE)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Add the directive and the links."""
+    app.add_directive("modules", Modules)
+    app.connect("autodoc-process-docstring", link_equations, priority=400)
+    app.connect("missing-reference", link_name)
+    app.connect("env-check-consistency", check_complete)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,174 @@
+"""Finishing touches: pictures that keep their place, scripts that keep quiet, and what a link to a page shows."""
+
+import importlib.util
+import os
+import re
+import struct
+import textwrap
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from bs4 import BeautifulSoup, Tag
+from docutils import nodes
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from sphinx.application import Sphinx
+from sphinx.config import Config
+from sphinx.util.fileutil import copy_asset_file
+
+# Names the PDF to link from the front page, if one will be printed.
+PDF = "ZWFS_PDF"
+CARD = "_static/social.png"
+CARD_SIZE = (1200, 630)  # pixels, the shape that social networks show
+CARD_ALT = "The logo and the title of the book above its Figure 3: error against input of five reconstructors."
+LENGTH = 200  # characters of a description
+MATH = {"lambda": "λ", "theta": "θ", "pi": "π", "pm": "±"}
+TEX = re.compile(r"\\(?:[()]|([a-z]+))")
+CONSOLE = re.compile(r"\bconsole\.(?:log|info|debug)\(")
+FORWARD = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"/><title>{title}</title>
+<meta http-equiv="refresh" content="0; url={address}"/>
+{tags}</head>
+<body><main><h1><a href="{address}">{title}</a></h1></main></body></html>
+"""
+# A page from the file system cannot fetch others, not even to show what a search found in them.
+SUMMARY = ("else if (showSearchSummary)", 'else if (showSearchSummary && location.protocol !== "file:")')
+
+
+def add_substitutions(app: Sphinx, config: Config) -> None:
+    """Define ``{{ pdf_link }}``: empty if no PDF will be printed."""
+    name = os.environ.get(PDF)
+    link = f'<p class="d-print-none"><a href="../{name}">The whole book as one PDF</a>, to print or to keep.</p>'
+    config.myst_substitutions = config.myst_substitutions | {"pdf_link": link if name else ""}
+
+
+def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: nodes.document) -> None:
+    """Finish the body of a page, and describe the page in its head.
+
+    Every picture gets its width and height, so that nothing moves when it arrives. A figure can be opened alone,
+    and scrolls where the page is narrower than its labels need.
+    """
+    body = BeautifulSoup(context.get("body", ""), "html.parser")
+    pictures = {name: Path(app.srcdir, source) for source, name in app.builder.images.items()}
+    for image in body.find_all("img"):
+        if picture := pictures.get(unquote(image["src"].rpartition("/")[2])):
+            image["width"], image["height"] = map(str, size(picture))
+    for image in body.select("figure > img"):
+        image.wrap(body.new_tag("a", href=image["src"], title="Open the figure alone"))
+        image.parent.wrap(body.new_tag("div", **{"class": "wide-figure"}))
+    for entry in body.select("[role=doc-biblioentry]"):
+        entry["role"] = "listitem"  # the role of Sphinx is deprecated: a list has items
+    context["body"] = str(body)
+    if app.config.html_baseurl:
+        context["metatags"] = context.get("metatags", "") + tags(
+            app.config, page, body, context.get("metatags", "")
+        )
+
+
+def tags(config: Config, page: str, body: BeautifulSoup, given: str) -> str:
+    """Return the tags that describe a page to search engines and to readers who get a link to it.
+
+    Parameters
+    ----------
+    config : Config
+    page : str
+        The name of the page.
+    body : BeautifulSoup
+    given : str
+        The tags that the page has; a description in them is kept.
+    """
+    own = BeautifulSoup(given, "html.parser").find("meta", attrs={"name": "description"})
+    first = body.select_one("section > p")
+    text = own["content"] if own else plain(first) if first else ""
+    described = {
+        "og:type": "website",
+        "og:site_name": config.html_title,
+        "og:title": plain(body.h1) if body.h1 else config.html_title,
+        "og:description": text,
+        "og:url": f"{config.html_baseurl}{page}.html",
+        "og:image": f"{config.html_baseurl}{CARD}",
+        "og:image:width": str(CARD_SIZE[0]),
+        "og:image:height": str(CARD_SIZE[1]),
+        "og:image:alt": CARD_ALT,
+        "twitter:card": "summary_large_image",
+    }
+    if not own:
+        described["description"] = text
+    made = (
+        body.new_tag("meta", attrs={"property" if name.startswith("og:") else "name": name, "content": content})
+        for name, content in described.items()
+        if content
+    )
+    return "".join(f"\n{tag}" for tag in made)
+
+
+def plain(tag: Tag) -> str:
+    """Return the text of a heading or paragraph without the link to itself, shortened."""
+    words = "".join(part for part in tag.strings if "headerlink" not in part.parent.get("class", ()))
+    words = TEX.sub(lambda found: MATH.get(found[1], found[1] or ""), words)
+    return textwrap.shorten(words, LENGTH, placeholder=" …")
+
+
+def size(picture: Path) -> tuple[int, int]:
+    """Return width and height of a PNG or SVG file in CSS pixels; PNG files hold two pixels for each."""
+    head = picture.read_bytes()
+    if picture.suffix == ".png":
+        return tuple(length // 2 for length in struct.unpack(">II", head[16:24]))
+    box = re.search(rb'viewBox="([^"]+)"', head)
+    if box is None:
+        raise ValueError(f"{picture.name}: expected PNG, or SVG with a viewBox")
+    return tuple(round(float(length)) for length in box[1].split()[2:])
+
+
+def finish_files(app: Sphinx, exception: Exception | None) -> None:
+    """Finish the folder of the pages: MathJax, the social card, quiet scripts, and the page that forwards."""
+    if exception is not None or app.builder.format != "html":
+        return
+    html, sources = Path(app.outdir), Path(app.srcdir, "book", "_static")
+    copy_mathjax(html / "_static" / "mathjax")
+    draw_card(html / CARD, sources / "logo.png", sources / "front.png", app.config.html_title)
+    for script in (html / "search.html", *sorted((html / "_static").rglob("*.js"))):
+        if "mathjax" not in script.parts:
+            script.write_text(CONSOLE.sub("void(", script.read_text("utf-8")).replace(*SUMMARY), "utf-8")
+    forward(html, f"{app.config.root_doc}.html")
+
+
+def forward(html: Path, front: str) -> None:
+    """Write the page that the address of the book shows: it describes the front page and forwards to it."""
+    head = BeautifulSoup((html / front).read_text("utf-8"), "html.parser").head
+    kept = head.select("meta[property^='og:'], meta[name='description'], meta[name^='twitter:']")
+    described = "".join(str(tag).replace(f"/{front}", "/index.html") for tag in kept)
+    (html / "index.html").write_text(
+        FORWARD.format(title=head.title.string, address=front, tags=described), "utf-8"
+    )
+
+
+def copy_mathjax(folder: Path) -> None:
+    """Copy the part of MathJax that a page loads, so that mathematics needs no network."""
+    package = Path(importlib.util.find_spec("sphinx-mathjax-offline").origin).parent / "static" / "mathjax"
+    for file in (package / "tex-chtml-full.js", *(package / "output" / "chtml" / "fonts").rglob("*.woff")):
+        target = folder / file.relative_to(package)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        copy_asset_file(file, target)
+
+
+def draw_card(card: Path, logo: Path, figure: Path, title: str) -> None:
+    """Draw the picture that goes with a link to the book: logo and title above a figure."""
+    width, height = CARD_SIZE
+    drawing = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor="white")
+    for picture, (left, bottom, wide, high) in ((logo, (40, 500, 100, 100)), (figure, (40, 20, 1120, 450))):
+        box = (left / width, bottom / height, wide / width, high / height)
+        drawing.add_axes(box, frameon=False, xticks=[], yticks=[]).imshow(imread(picture), interpolation="lanczos")
+    lines = "\n".join(textwrap.wrap(title, 44))
+    drawing.text(165 / width, 550 / height, lines, size=29, weight="bold", color="#1f2d3d", va="center")
+    drawing.savefig(card, format="png", metadata={"Software": None})
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Finish each page, and in the end their folder."""
+    app.connect("config-inited", add_substitutions)
+    app.connect("html-page-context", finish_page)
+    # Before the extension that would write another index.html.
+    app.connect("build-finished", finish_files, priority=400)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

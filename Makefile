@@ -73,7 +73,7 @@ lock: $(BIN)/uv ## pin the newest allowed version of every dependency
 
 # Everything else in _build belongs to the user, above all the results of make rerun.
 clean: ## remove what these commands made, but not the results of make rerun
-	rm -rf $(addprefix _build/,home html html.json measured.json notebooks source building-* running-* rerunning-*)
+	rm -rf $(addprefix _build/,home html html.json jupyter_execute measured.json notebooks performance building-* running-* rerunning-*)
 	rm -rf build $(VENV) *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name _build -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 	@if [ -d _build ] && ! rmdir _build 2>/dev/null; then echo "kept: $$(echo _build/*)"; fi

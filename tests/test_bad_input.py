@@ -169,6 +169,7 @@ def valid() -> dict:
         "coefficients": np.ones((1, dimple_diameter.DimpleLight(pupil, 1.06).rank)),
         "padding": 2,
         "output": Path("new.fits"),
+        "text": "a",
         "check_output.inputs": [Path("file.npy")],
         "incoming": pupil.gather(field),
         "frame": np.abs(waves[0]) + 1,

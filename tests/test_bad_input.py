@@ -50,6 +50,7 @@ CONTENT = {
 }
 SLOW = {"error_budget", "steps", "fit"}  # their answers are not compared, only what they must refuse
 INTERNAL |= {"intensity", "propagate_split", "adjoint_split", "resample"}
+INTERNAL |= {"fits_module", "fits_bytes", "published"}
 
 
 @cache

@@ -179,7 +179,7 @@ def in_kind(name: str, array: Any, kind: Kind) -> NDArray:
 def pair(name: str, value: Any, check: Callable[..., Any], *limits: float) -> tuple[Any, Any]:
     """Return a sequence of two numbers, each of which passes a check such as `number`."""
     if not isinstance(value, Sequence | np.ndarray) or getattr(value, "ndim", 1) == 0 or len(value) != 2:
-        raise ValueError(f"{name} = {value!r}: expected two numbers")
+        raise ValueError(f"{name} = {shown(value)}: expected two numbers")
     return tuple(check(f"{name}[{index}]", one, *limits) for index, one in enumerate(value))
 
 

@@ -271,7 +271,9 @@ def factorise(
 def _check_mask(index: int, mask: Mask, n_pixels: float, axes: Sequence[NDArray], reach: float) -> None:
     """Require the attributes of a mask, and a width for which the factors are right and small."""
     if isinstance(mask, type) or not all(hasattr(mask, name) for name in _ATTRIBUTES):
-        raise TypeError(f"masks[{index}] is {mask!r}, a {type(mask).__name__}: expected a Dimple or a Patch")
+        raise TypeError(
+            f"masks[{index}] is {_check.shown(mask)}, a {type(mask).__name__}: expected a Dimple or a Patch"
+        )
     name = f"masks[{index}]"
     diameter = _check.number(f"{name}.diameter", mask.diameter, 0, open_low=True)
     breaks = [

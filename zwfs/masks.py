@@ -118,7 +118,7 @@ class Patch:
     def __post_init__(self) -> None:
         diameter = _check.number("diameter", self.diameter, 0, open_low=True)
         if not callable(self.function):
-            raise TypeError(f"function = {self.function!r}: expected a callable of (u, v)")
+            raise TypeError(f"function = {_check.shown(self.function)}: expected a callable of (u, v)")
         breaks = sorted(
             _check.number(f"breaks[{i}]", value, 0, diameter, open_low=True, open_high=True)
             for i, value in enumerate(_check.items("breaks", self.breaks, "diameters, such as (1.0,)"))

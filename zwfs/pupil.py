@@ -345,7 +345,9 @@ def _checked_center(center: Any, shape: tuple[int, ...], n_pixels: float) -> tup
     row, column = _pair("center", center, "(row, column)")
     row, column = _check.number("center row", row), _check.number("center column", column)
     if math.dist((row, column), _middle(shape)) > _FARTHEST * n_pixels:
-        raise ValueError(f"center = {center!r}: expected at most {_FARTHEST:g} D from the middle of the image")
+        raise ValueError(
+            f"center = {_check.shown(center)}: expected at most {_FARTHEST:g} D from the middle of the image"
+        )
     return row, column
 
 
@@ -353,7 +355,7 @@ def _pair(name: str, value: Any, meaning: str) -> tuple[Any, Any]:
     try:
         first, second = value
     except (TypeError, ValueError):
-        raise TypeError(f"{name} = {value!r}: expected a pair {meaning}") from None
+        raise TypeError(f"{name} = {_check.shown(value)}: expected a pair {meaning}") from None
     return first, second
 
 
@@ -363,7 +365,7 @@ def _fill(fill: Any, dtype: np.dtype) -> Any:
     kind, meaning = {"c": (Complex, "a number"), "f": (Real, "a real number")}.get(
         dtype.kind, (Integral, "an integer")
     )
-    expected = f"fill = {fill!r}: expected {meaning} that fits among values of dtype {dtype}"
+    expected = f"fill = {_check.shown(fill)}: expected {meaning} that fits among values of dtype {dtype}"
     if not isinstance(fill, kind):
         raise TypeError(expected)
     try:

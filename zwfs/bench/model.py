@@ -297,7 +297,7 @@ class Bench:
                 known = self.numbers.tolist()
                 if isinstance(number, bool) or number not in known:
                     raise ValueError(
-                        f"pistons names segment {number!r}, which is missing: expected some of {known}"
+                        f"pistons names segment {_check.shown(number)}, which is missing: expected some of {known}"
                     )
                 values[np.searchsorted(self.numbers, number)] = _check.number(f"pistons[{number}]", piston)
             return values

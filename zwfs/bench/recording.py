@@ -63,6 +63,11 @@ def write_bench(
     _check.instance("bench", bench, Bench)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
     n_bad = _check.integer("n_bad", n_bad, 0, 2 * math.prod(bench.segments.shape))
+    rng = _check.generator("seed", seed)
+    if pistons is not None and not isinstance(pistons, Mapping):
+        pistons = _check.real_array("pistons", pistons)
+        if pistons.ndim != 1:
+            raise ValueError(f"pistons has shape {pistons.shape}: expected ({bench.n_segments},), one command")
     folder = _path("folder", folder)
     if not os.path.isdir(folder):
         raise ValueError(f"folder = {str(folder)!r}: expected a folder that exists")
@@ -73,7 +78,6 @@ def write_bench(
                 f"folder = {str(folder)!r} holds a {path.name} that the simulated bench did not write: "
                 "expected another folder"
             )
-    rng = np.random.default_rng(seed)
     counts = {"frame": bench.frames(pistons, rng), "pupils": bench.pupil_images(rng), "dark": bench.dark(rng)}
     gain = _FULL / max(pair.max() for pair in counts.values())
     shape = np.concatenate(counts["frame"], axis=-1).shape

@@ -60,5 +60,6 @@ class Table:
 
 def plain(text: str) -> str:
     """Return Markdown that shows a text as it is: one line, in which nothing is a link, a command or HTML."""
+    _check.instance("text", text, str)
     line = "".join(character if character.isprintable() else repr(character)[1:-1] for character in text)
     return re.sub(r"([\\`*_{}\[\]<>$|#&~])", r"\\\1", line)

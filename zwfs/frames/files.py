@@ -231,12 +231,12 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
         If `output` is one of the inputs, also under another name or as a hard link, is a file that `write_phase`
         did not write, is a folder, or cannot be written.
     """
-    named = f"output = {str(output)!r}"
     overwrite = _check.flag("overwrite", overwrite)
     if isinstance(inputs, str | Path) or not isinstance(inputs, Sequence):
-        raise TypeError(f"inputs = {inputs!r}: expected a sequence of paths")
+        raise TypeError(f"inputs = {_check.shown(inputs)}: expected a sequence of paths")
     sources = [_path(f"inputs[{index}]", one) for index, one in enumerate(inputs)]
     path = _path("output", output)
+    named = f"output = {str(output)!r}"
     try:
         path = path.resolve()
         there = _is_there(path)
@@ -357,10 +357,10 @@ def _path(name: str, value: Any) -> Path:
         if b"\0" not in os.fsencode(path):
             return path
     except TypeError:
-        raise TypeError(f"{name} = {value!r}: expected a str or a Path") from None
+        raise TypeError(f"{name} = {_check.shown(value)}: expected a str or a Path") from None
     except UnicodeEncodeError:
         pass
-    raise ValueError(f"{name} = {str(value)!r}: expected the name of a file")
+    raise ValueError(f"{name} = {_check.shown(str(value))}: expected the name of a file")
 
 
 def _is_there(path: Path) -> bool:
@@ -385,7 +385,11 @@ def _has_card(path: Path, card: bytes) -> bool:
 
 def _camera_files(argument: str, files: Any) -> None:
     """Require a sequence of CameraFiles."""
-    if not isinstance(files, Sequence) or not all(isinstance(file, CameraFile) for file in files):
+    if (
+        isinstance(files, str)
+        or not isinstance(files, Sequence)
+        or not all(isinstance(file, CameraFile) for file in files)
+    ):
         raise TypeError(f"{argument} is a {type(files).__name__}: expected a sequence of CameraFiles")
 
 

@@ -68,10 +68,8 @@ class Optics:
         _check.pair("phase_shifts", self.phase_shifts, _check.number)
         first, second = np.exp(1j * np.array(self.phase_shifts))
         if min(abs(first - second), abs(first - 1), abs(second - 1)) < 1e-9:
-            raise ValueError(
-                f"phase_shifts = {self.phase_shifts!r}: expected two that differ by other than 0 mod 2 pi, none "
-                "of them 0"
-            )
+            expected = "two that differ by other than 0 mod 2 pi, none of them 0"
+            raise ValueError(f"phase_shifts = {_check.shown(self.phase_shifts)}: expected {expected}")
         _check.number("background", self.background, -1, 1, open_high=True)
         _check.number("pupil_background", self.pupil_background, -1, 1, open_high=True)
         _check.number("scale", self.scale, 0, open_low=True)
@@ -474,9 +472,9 @@ def _check_fit(argument: str, names: Any, optics: Any) -> None:
     known = (*_RANGES, "registration")
     listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
     if not listed or not all(isinstance(name, str) and name in known for name in names):
-        raise ValueError(f"{argument} = {names!r}: expected a list with some of {list(known)}")
+        raise ValueError(f"{argument} = {_check.shown(names)}: expected a list with some of {list(known)}")
     if len(set(names)) < len(names):
-        raise ValueError(f"{argument} = {names!r}: expected each name once")
+        raise ValueError(f"{argument} = {_check.shown(names)}: expected each name once")
     for name in set(names) & set(_RANGES):
         low, high, _ = _RANGES[name]
         if not low <= getattr(optics, name) <= high:

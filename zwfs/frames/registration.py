@@ -270,7 +270,7 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
 def same_size(circles: Sequence[Circle], name: str) -> None:
     """Refuse two pupils of different size: both images must have the same magnification."""
     if not isinstance(circles, Sequence) or [type(circle) for circle in circles] != [Circle, Circle]:
-        raise TypeError(f"circles = {circles!r}: expected two Circles")
+        raise TypeError(f"circles = {_check.shown(circles)}: expected two Circles")
     _check.instance("name", name, str)
     small, large = sorted(circle.diameter for circle in circles)
     if large - small > max(2.0, 0.03 * large):
@@ -306,7 +306,7 @@ def register(image: NDArray, reference: NDArray, inside: NDArray, blur: float = 
     image, reference = _check.real_map("image", image, 2), _check.real_map("reference", reference, 2)
     _check.trailing_shape("reference", reference, image.shape, "the shape of image")
     inside = _check.flag_map("inside", inside, image.shape, some=True)
-    blur = _check.number("blur", blur, 0, open_low=True)
+    blur = _check.number("blur", blur, 0, max(image.shape), open_low=True)
     wide = 4 * blur
     detail = ndimage.gaussian_filter(image, blur) - ndimage.gaussian_filter(image, wide)
     target = (ndimage.gaussian_filter(reference, blur) - ndimage.gaussian_filter(reference, wide))[inside]

@@ -173,7 +173,9 @@ def close_loop(
     pupil = sensor.pupil
     _check.instance("flow", flow, FrozenFlow)
     if flow.pupil.shape != pupil.shape or np.any(flow.pupil.mask != pupil.mask):
-        raise ValueError(f"flow has {flow.pupil!r}: expected that of the reconstructor, {pupil!r}")
+        raise ValueError(
+            f"flow has {_check.shown(flow.pupil)}: expected that of the reconstructor, {_check.shown(pupil)}"
+        )
     modes = check_modes(sensor, modes)
     n_steps = _check.integer("n_steps", n_steps, 1)
     rate = _check.number("rate", rate, 0, open_low=True)

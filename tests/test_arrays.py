@@ -126,7 +126,7 @@ def test_reconstructors(library, pupil, screens, name, batch):
     phase = (screens(0.4, 4) * np.array([0.01, 1, 0.1, 0.7])[:, np.newaxis, np.newaxis])[
         : np.prod(batch, dtype=int)
     ]
-    frames = method.settings.sensor.measure(phase.reshape(*batch, *pupil.shape), method.settings.amplitude)
+    frames = method.sensor.measure(phase.reshape(*batch, *pupil.shape), method.settings.amplitude)
     expected, found = method(frames), method(library.array(frames))
     for attribute in ("phase", "residual", "n_iterations", "converged", "n_unsolved", "frames"):
         same(library, getattr(found, attribute), getattr(expected, attribute), 1e-9)
@@ -135,7 +135,7 @@ def test_reconstructors(library, pupil, screens, name, batch):
 def test_history_and_start(library, pupil, screens):
     method = METHODS["accelerated"](pupil)
     phase = screens(0.4, 3)
-    frames = method.settings.sensor.measure(phase)
+    frames = method.sensor.measure(phase)
     expected, found = method(frames, history=True), method(library.array(frames), history=True)
     same(library, found.history, expected.history, 1e-9)
     same(library, method(library.array(frames), library.array(phase)).phase, method(frames, phase).phase, 1e-9)
@@ -143,14 +143,14 @@ def test_history_and_start(library, pupil, screens):
 
 def test_single_precision(library, pupil, screens):
     method, phase = METHODS["real time"](pupil), screens(0.4, 2)
-    frames = method.settings.sensor.measure(phase).astype(np.float32)
+    frames = method.sensor.measure(phase).astype(np.float32)
     found = method(library.array(frames))
     same(library, found.phase, method(frames).phase, 1e-3)
     assert reconstruction_error(pupil, library.to_numpy(found.phase), phase).max() < 0.01
 
 
 def test_pieces_are_put_together(library, pupil, screens, monkeypatch):
-    method, frames = METHODS["plain"](pupil), METHODS["plain"](pupil).settings.sensor.measure(screens(0.4, 5))
+    method, frames = METHODS["plain"](pupil), METHODS["plain"](pupil).sensor.measure(screens(0.4, 5))
     together = method(library.array(frames))
     monkeypatch.setattr(base, "_CHUNK", 2 * frames[0].size)
     monkeypatch.setattr(base, "_CHUNK_ELSEWHERE", 2 * frames[0].size)
@@ -201,7 +201,7 @@ def test_constants_are_not_shared_with_other_libraries(library):
 
 def test_subclasses_become_plain_arrays(pupil, screens):
     method = METHODS["plain"](pupil)
-    frames = method.settings.sensor.measure(screens(0.4, 1)[0])
+    frames = method.sensor.measure(screens(0.4, 1)[0])
     found = method(np.ma.array(frames))
     assert type(found.phase) is np.ndarray
     np.testing.assert_array_equal(found.phase, method(frames).phase)
@@ -224,7 +224,7 @@ def test_what_would_be_lost_is_refused(pupil, classic, method):
 def test_others_take_arrays_of_numpy(pupil, modes, screens):
     """What is not written for other libraries answers in NumPy."""
     method = Linear(ZernikeSensor(pupil, PAIR[0]), modes)
-    frames = method.settings.sensor.measure(screens(0.1, 2))
+    frames = method.sensor.measure(screens(0.1, 2))
     found = method(array_api_strict.asarray(frames))
     assert isinstance(found.phase, np.ndarray)
     np.testing.assert_array_equal(found.phase, method(frames).phase)

@@ -112,12 +112,12 @@ def test_bad_calibration_is_named(perfect, model, spoil, error, message):
 
 def test_reconstructors_of_a_bench(perfect, model, known):
     assert tuple(known) == NAMES
-    assert [known[name].settings.sensor.n_masks for name in NAMES] == [1, 1, 2, 2, 2]
+    assert [known[name].sensor.n_masks for name in NAMES] == [1, 1, 2, 2, 2]
     assert known["Linear"].n_inverted == 35  # all but the common piston
     few = bench_reconstructors(perfect, model, n_iterations=3)
     frames = model.normalise(perfect.frames(segment_screens(perfect, 0.5, 1, seed=1)))
     for name in NAMES[1:]:
-        n_used = few[name](frames[:, : few[name].settings.sensor.n_masks]).n_iterations
+        n_used = few[name](frames[:, : few[name].sensor.n_masks]).n_iterations
         assert np.max(n_used) <= 3
 
 

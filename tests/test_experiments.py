@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -95,3 +97,25 @@ def test_an_unknown_reconstructor_is_named(curves):
     for method in (curves.mean, curves.std, curves.recovered, curves.dynamic_range):
         with pytest.raises(ValueError, match=r"name = 'nobody': expected one of \['linear', 'shifted'\]"):
             method("nobody")
+
+
+class FirstOrder:
+    """A reconstructor of a reader, for one mask: first order in the phase, with the reference wave of no phase."""
+
+    def __init__(self, sensor):
+        self.sensor, field = sensor, sensor.pupil.amplitude.astype(complex)
+        self.flat = sensor.measure(np.zeros(sensor.pupil.shape))[0]
+        slope = 2 * np.real(sensor.reference_wave(field)[0].conj() * 1j * field)
+        self.gain = np.where(sensor.pupil.mask, 1, 0) / np.where(sensor.pupil.mask, slope, 1)
+
+    def __call__(self, frames):
+        phase = (frames[..., 0, :, :] - self.flat) * self.gain
+        return SimpleNamespace(phase=phase, converged=np.ones(phase.shape[:-2], bool))
+
+
+def test_a_reconstructor_of_a_reader_stands_next_to_the_others(classic, modes):
+    """It has a sensor, and is called on frames; its result has a phase and says whether it converged."""
+    methods = {"FirstOrder": FirstOrder(classic), "Linear": Linear(classic, modes)}
+    curves = linearity_curves(methods, modes, np.array([0.0, 0.01]), 2)
+    assert curves.mean("FirstOrder")[0] < 1e-12
+    assert curves.mean("Linear")[1] < curves.mean("FirstOrder")[1] < 0.01

@@ -923,3 +923,11 @@ def test_bad_options_are_named(sensor_of, modes, method, options, error, message
 def test_sensor_is_checked(modes, pupil, method):
     with pytest.raises(TypeError, match="sensor is a Pupil: expected a ZernikeSensor"):
         build(method, pupil, modes)
+
+
+def test_reconstructors_and_results_print_as_one_line(shifted):
+    method = PhaseShifted(shifted, n_iterations=7)
+    assert method.sensor is shifted
+    assert repr(method) == f"PhaseShifted({shifted!r}, 7, tolerance=1e-06)"
+    result = method(shifted.measure(np.zeros((3, *shifted.pupil.shape))))
+    assert repr(result) == f"Reconstruction(phase {result.phase.shape}, 3 of 3 converged)"

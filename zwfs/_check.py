@@ -34,8 +34,8 @@ def choice(name: str, value: Any, known: dict[str, Any] | list[str] | tuple[str,
 
 
 def sensor_of(name: str, reconstructor: Any) -> Any:
-    """Return the sensor of a reconstructor."""
-    sensor = getattr(getattr(reconstructor, "settings", None), "sensor", None)
+    """Return the sensor of a reconstructor: anything with a `sensor` that can be called on frames."""
+    sensor = getattr(reconstructor, "sensor", None)
     if sensor is None or not callable(reconstructor):
         kind = type(reconstructor).__name__
         raise TypeError(f"{name} is a {kind}: expected a reconstructor, such as PhaseShifted(sensor)")

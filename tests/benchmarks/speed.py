@@ -179,7 +179,7 @@ def loop_step(n_pixels, seconds):
     flat, steps = pupil.gather(modes), {}
     fit = np.linalg.pinv(flat)
     for name, method in methods.items():
-        frames = method.settings.sensor.measure(screen).astype(np.float32)
+        frames = method.sensor.measure(screen).astype(np.float32)
 
         def step(method=method, frames=frames):
             found = loops.without_piston(pupil.gather(method(frames).phase))
@@ -246,10 +246,7 @@ def others(seconds):
     }
     screen = screens_at(modes, 0.3, 1, 2024, 2)[0]
     return best_of_each(
-        {
-            name: partial(_with_residual, method, method.settings.sensor.measure(screen))
-            for name, method in methods.items()
-        },
+        {name: partial(_with_residual, method, method.sensor.measure(screen)) for name, method in methods.items()},
         seconds,
     )
 

@@ -114,7 +114,8 @@ def linearity_curves(
     Parameters
     ----------
     reconstructors : mapping of str to reconstructor
-        For sensors on the same pupil.
+        For sensors on the same pupil. Anything with a `sensor` counts that takes the frames of that sensor and
+        returns an object with `phase`, (n_screens, ny, nx), and `converged`, (n_screens,).
     modes : ndarray, shape (n_modes, ny, nx)
         Modes that the screens are made of.
     rms : array_like, shape (n_rms,), radian rms
@@ -159,11 +160,11 @@ def _linearity_point(
     """One input of the linearity curves: errors, converged, wrapped, folded and Strehl, (n_screens,) each."""
     task, rms = point
     screens = screens_at(modes, rms, n_screens, seed, task, exponent)
-    pupil = next(iter(reconstructors.values())).settings.sensor.pupil
+    pupil = next(iter(reconstructors.values())).sensor.pupil
     phase = pupil.gather(screens)
     errors, converged = {}, {}
     for name, reconstructor in reconstructors.items():
-        found = reconstructor(reconstructor.settings.sensor.measure(screens))
+        found = reconstructor(reconstructor.sensor.measure(screens))
         errors[name] = reconstruction_error(pupil, found.phase, screens)
         converged[name] = found.converged
     wrapped, folded = np.mean(np.abs(phase) > np.pi, axis=-1), np.mean(phase < -np.pi / 4, axis=-1)

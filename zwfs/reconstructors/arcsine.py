@@ -12,7 +12,7 @@ from zwfs.lowrank import Operator, split_core
 from zwfs.reconstructors.base import (
     Estimate,
     Reconstruction,
-    Settings,
+    Reconstructor,
     count,
     for_each,
     iterate,
@@ -25,7 +25,7 @@ from zwfs.sensor import ZernikeSensor, square
 _IN_LINE = 1e-6  # sine of the angle between a field and its reference wave below which they count as in line
 
 
-class Arcsine:
+class Arcsine(Reconstructor):
     """Phase from one mask: the two-wave interference is inverted, with a reference wave that is updated.
 
     A cosine has two inverses, one on each side of the phase of the reference wave. Taken at every point, in all
@@ -60,15 +60,10 @@ class Arcsine:
         tolerance: float = 1e-6,
         amplitude: ArrayLike | None = None,
     ) -> None:
-        self._settings = settings(sensor, n_iterations, tolerance, amplitude)
+        super().__init__(settings(sensor, n_iterations, tolerance, amplitude))
         if sensor.n_masks != 1:
             raise ValueError(f"sensor has {sensor.n_masks} masks: expected one; PhaseShifted takes more")
         self._constants: dict[Kind, _Constants] = {}
-
-    @property
-    def settings(self) -> Settings:
-        """Checked arguments that every reconstructor takes."""
-        return self._settings
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_constants": {}}  # made again where they are needed
@@ -82,7 +77,7 @@ class Arcsine:
     def prepare(self, frames: NDArray, phasor: NDArray, flat: bool, kind: Kind) -> dict[str, NDArray]:
         """Interference term of the frames, and the side of the reference wave to look on."""
         maps, constants = self.settings.maps(kind), self._of(kind)
-        light = frames[:, 0, ...][(..., *self.settings.sensor.window)]
+        light = frames[:, 0, ...][(..., *self.sensor.window)]
         data = {"excess": (light - maps.amplitude**2) * constants.gain}
         if flat:
             start = constants.flat
@@ -117,7 +112,7 @@ class Arcsine:
     def _of(self, kind: Kind) -> _Constants:
         """Constants for arrays of one kind; made once, then kept."""
         if kind not in self._constants:
-            amplitude, sensor, exact = self.settings.amplitude, self.settings.sensor, Kind.numpy()
+            amplitude, sensor, exact = self.settings.amplitude, self.sensor, Kind.numpy()
             mask, core = sensor.pupil.mask, split_core(sensor.factors.core)
             lit = mask & (amplitude > 0)
             gain = np.where(lit, 1 / (2 * np.where(lit, amplitude, 1)), 0)

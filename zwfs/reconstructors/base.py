@@ -25,7 +25,7 @@ _MOST_ITERATIONS = 2**31 - 1
 _RANGE = 1e30  # of the light in the pupil, and of its inverse: its square is a number in single precision, too
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Reconstruction:
     """Result of a reconstruction; `...` is the batch of the frames.
 
@@ -57,8 +57,13 @@ class Reconstruction:
     converged: NDArray[np.bool_]
     n_unsolved: NDArray[np.int64]
     history: NDArray[np.floating] | None
-    settings: Settings = field(repr=False)
-    frames: NDArray[np.floating] = field(repr=False)
+    settings: Settings
+    frames: NDArray[np.floating]
+
+    def __repr__(self) -> str:
+        xp, n_frames = Kind.of(self.phase).xp, prod(self.converged.shape)
+        n_converged = int(xp.count_nonzero(self.converged))
+        return f"Reconstruction(phase {tuple(self.phase.shape)}, {n_converged} of {n_frames} converged)"
 
     @cached_property
     def residual(self) -> NDArray[np.floating]:
@@ -135,6 +140,33 @@ def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLik
     if not 1 / _RANGE < light < _RANGE:
         raise ValueError(f"amplitude: its squares add up to {light:.3g}: expected {1 / _RANGE:g} to {_RANGE:g}")
     return Settings(sensor, n_iterations, tolerance, own, light)
+
+
+class Reconstructor:
+    """Base of the reconstructors: the sensor that they model and the arguments that all of them take.
+
+    Parameters
+    ----------
+    settings : Settings
+        From `settings`, which checks them.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+
+    @property
+    def settings(self) -> Settings:
+        """Checked arguments that every reconstructor takes."""
+        return self._settings
+
+    @property
+    def sensor(self) -> ZernikeSensor:
+        """Sensor whose frames are reconstructed."""
+        return self._settings.sensor
+
+    def __repr__(self) -> str:
+        config = self._settings
+        return f"{type(self).__name__}({config.sensor!r}, {config.n_iterations}, tolerance={config.tolerance:g})"
 
 
 class FixedPoint(Protocol):

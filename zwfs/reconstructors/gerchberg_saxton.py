@@ -5,11 +5,11 @@ from __future__ import annotations
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs._arrays import Kind
-from zwfs.reconstructors.base import Estimate, Reconstruction, Settings, iterate, settings, unit
+from zwfs.reconstructors.base import Estimate, Reconstruction, Reconstructor, iterate, settings, unit
 from zwfs.sensor import ZernikeSensor
 
 
-class GerchbergSaxton:
+class GerchbergSaxton(Reconstructor):
     """Phase by going to and fro between the planes, with the measured amplitude put in at each.
 
     One iteration propagates the estimate through every mask, puts the square root of the measured frames in the
@@ -43,12 +43,7 @@ class GerchbergSaxton:
         tolerance: float = 1e-6,
         amplitude: ArrayLike | None = None,
     ) -> None:
-        self._settings = settings(sensor, n_iterations, tolerance, amplitude)
-
-    @property
-    def settings(self) -> Settings:
-        """Checked arguments that every reconstructor takes."""
-        return self._settings
+        super().__init__(settings(sensor, n_iterations, tolerance, amplitude))
 
     def __call__(
         self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
@@ -62,7 +57,7 @@ class GerchbergSaxton:
 
     def step(self, phasor: NDArray, data: dict[str, NDArray], kind: Kind) -> Estimate:
         """To the detector and back."""
-        sensor = self.settings.sensor
+        sensor = self.sensor
         maps = self.settings.maps(kind)
         waves = sensor.propagate_split(maps.field(phasor))
         # A modelled field of 0 has no phase: such a pixel adds nothing on the way back.

@@ -9,12 +9,20 @@ from scipy.optimize import OptimizeResult, minimize
 from zwfs import _check
 from zwfs._arrays import Kind
 from zwfs._pickle import read_only_state
-from zwfs.reconstructors.base import Found, Reconstruction, Settings, check_frames, report, settings, start_phase
+from zwfs.reconstructors.base import (
+    Found,
+    Reconstruction,
+    Reconstructor,
+    check_frames,
+    report,
+    settings,
+    start_phase,
+)
 from zwfs.reconstructors.linear import check_modes
 from zwfs.sensor import ZernikeSensor, split, square
 
 
-class GradientDescent:
+class GradientDescent(Reconstructor):
     """Phase whose modelled frames differ least from the measured ones.
 
     The cost is half the mean over the detector of the squared difference: its minimum is that of the 2-norm in
@@ -44,15 +52,10 @@ class GradientDescent:
         tolerance: float = 1e-6,
         amplitude: ArrayLike | None = None,
     ) -> None:
-        self._settings = settings(sensor, n_iterations, tolerance, amplitude)
+        super().__init__(settings(sensor, n_iterations, tolerance, amplitude))
         self._modes = None if modes is None else check_modes(sensor, modes)
 
     __setstate__ = read_only_state
-
-    @property
-    def settings(self) -> Settings:
-        """Checked arguments that every reconstructor takes."""
-        return self._settings
 
     @property
     def modes(self) -> NDArray[np.float64] | None:
@@ -99,17 +102,17 @@ class GradientDescent:
         TypeError, ValueError
             If phase or frames are of the wrong shape, complex, not finite, or the frames negative or dark.
         """
-        frames, batch = check_frames(self.settings.sensor, _check.real_array("frames", frames))
+        frames, batch = check_frames(self.sensor, _check.real_array("frames", frames))
         if batch not in ((), (1,)):
             raise ValueError(f"frames has a batch of {batch}: expected one set of frames")
-        phase, expected = _check.real_array("phase", phase), (self.settings.sensor.pupil.n_points,)
+        phase, expected = _check.real_array("phase", phase), (self.sensor.pupil.n_points,)
         if phase.shape != expected:
             raise ValueError(f"phase has shape {phase.shape}: expected {expected}, the points of the pupil")
         _check.finite("phase", phase)
         return self._cost(phase, frames)
 
     def _cost(self, phase: NDArray, frames: NDArray) -> tuple[float, NDArray]:
-        sensor = self.settings.sensor
+        sensor = self.sensor
         maps = sensor.pupil.scatter(phase.astype(frames.dtype), fill=0)[np.newaxis]
         psi = split(maps, self.settings.amplitude.astype(frames.dtype))
         waves = sensor.propagate_split(psi)

@@ -8,11 +8,19 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs._arrays import Kind, read_only
 from zwfs._pickle import read_only_state
-from zwfs.reconstructors.base import Found, Reconstruction, Settings, check_frames, report, settings, start_phase
+from zwfs.reconstructors.base import (
+    Found,
+    Reconstruction,
+    Reconstructor,
+    check_frames,
+    report,
+    settings,
+    start_phase,
+)
 from zwfs.sensor import ZernikeSensor
 
 
-class Linear:
+class Linear(Reconstructor):
     """Phase from the difference to the frames of a reference phase, by one matrix product.
 
     Each mode is pushed and pulled by a small amount around the reference phase, and half the difference of the
@@ -65,7 +73,7 @@ class Linear:
         amplitude: ArrayLike | None = None,
         calibration: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
     ) -> None:
-        self._settings = settings(sensor, 1, 0.0, amplitude)
+        super().__init__(settings(sensor, 1, 0.0, amplitude))
         self._modes = check_modes(sensor, modes)
         poke = _check.number("poke", poke, 1e-10, np.pi)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
@@ -85,11 +93,6 @@ class Linear:
         self._inverse = (vt[kept].T / strength[kept]) @ u[:, kept].T
 
     __setstate__ = read_only_state
-
-    @property
-    def settings(self) -> Settings:
-        """Checked arguments that every reconstructor takes."""
-        return self._settings
 
     @property
     def modes(self) -> NDArray[np.float64]:
@@ -144,8 +147,8 @@ class Linear:
 
     def _simulated(self, poke: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Signal of the reference phase, and push less pull of each mode, (n_modes, n_masks * n_points)."""
-        pupil = self.settings.sensor.pupil
-        difference = np.empty((len(self._modes), self.settings.sensor.n_masks * pupil.n_points))
+        pupil = self.sensor.pupil
+        difference = np.empty((len(self._modes), self.sensor.n_masks * pupil.n_points))
         for row, mode in zip(difference, self._modes, strict=True):
             push = pupil.scatter(np.stack([poke * mode, -poke * mode]), fill=0)
             pushed, pulled = self._signal(self._model(self._reference + push))
@@ -164,7 +167,7 @@ class Linear:
         signals = []
         for name, frames, n_frames in (("flat", flat, 1), ("pushed", pushed, None), ("pulled", pulled, None)):
             what = f"calibration {name}"
-            checked, batch = check_frames(self.settings.sensor, _check.real_array(what, frames), what)
+            checked, batch = check_frames(self.sensor, _check.real_array(what, frames), what)
             if len(checked) != (n_frames or len(self._modes)):
                 raise ValueError(
                     f"calibration {name} has a batch of {batch}: expected {n_frames or len(self._modes)}"
@@ -173,12 +176,12 @@ class Linear:
         return signals[0][0], signals[1] - signals[2]
 
     def _model(self, phase: NDArray) -> NDArray:
-        return self.settings.sensor.intensity(phase, self.settings.amplitude[np.newaxis])
+        return self.sensor.intensity(phase, self.settings.amplitude[np.newaxis])
 
     def _signal(self, frames: NDArray) -> NDArray:
         """Values at the points of the pupil, all masks in a row: (k, n_masks * n_points)."""
-        window = frames[(..., *self.settings.sensor.window)]
-        return self.settings.sensor.pupil.gather(window).reshape(len(frames), -1)
+        window = frames[(..., *self.sensor.window)]
+        return self.sensor.pupil.gather(window).reshape(len(frames), -1)
 
 
 def check_modes(sensor: ZernikeSensor, modes: ArrayLike) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from zwfs.reconstructors._acceleration import Acceleration, dimming
 from zwfs.reconstructors.base import (
     Estimate,
     Reconstruction,
-    Settings,
+    Reconstructor,
     count,
     for_each,
     iterate,
@@ -31,7 +31,7 @@ _DARK = 1e-9  # amplitude of a reference wave, in units of the mean of the pupil
 _SMALL_TILT = 1e-3  # radian per D, by which the speed of convergence is found
 
 
-class PhaseShifted:
+class PhaseShifted(Reconstructor):
     """Phase from two or more masks of different phase shifts.
 
     With the reference waves r_m of the estimate before, every point has one linear equation per mask for the real
@@ -84,7 +84,7 @@ class PhaseShifted:
         amplitude: ArrayLike | None = None,
         accelerate: bool = False,
     ) -> None:
-        self._settings = settings(sensor, n_iterations, tolerance, amplitude)
+        super().__init__(settings(sensor, n_iterations, tolerance, amplitude))
         if sensor.n_masks < 2:
             raise ValueError(f"sensor has {sensor.n_masks} mask: expected two or more with different phase shifts")
         self._pairs = tuple(combinations(range(sensor.n_masks), 2))
@@ -93,11 +93,6 @@ class PhaseShifted:
         self._shared = _SharedWave.of(sensor.factors.core)
         self._acceleration = self._accelerated() if accelerate else None
         self._constants: dict[Kind, _Constants] = {}
-
-    @property
-    def settings(self) -> Settings:
-        """Checked arguments that every reconstructor takes."""
-        return self._settings
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_constants": {}}  # made again where they are needed
@@ -136,7 +131,7 @@ class PhaseShifted:
         """What the frames give to the linear system, and the reference waves of a flat start."""
         xp, constants = kind.xp, self._of(kind)
         acceleration = constants.acceleration
-        light, n_frames = frames[(..., *self.settings.sensor.window)], frames.shape[0]
+        light, n_frames = frames[(..., *self.sensor.window)], frames.shape[0]
         if self._shared is None:
             data = {"excess": light - constants.offset}
         else:
@@ -177,7 +172,7 @@ class PhaseShifted:
     def _of(self, kind: Kind) -> _Constants:
         """Constants for arrays of one kind; made once, then kept."""
         if kind not in self._constants:
-            sensor, incoming, exact = self.settings.sensor, self.settings.amplitude**2, Kind.numpy()
+            sensor, incoming, exact = self.sensor, self.settings.amplitude**2, Kind.numpy()
             cores, weights, offset = sensor.factors.core, np.ones((1, 1)), incoming
             if self._shared is not None:
                 cores, weights = self._shared.core[np.newaxis], self._shared.weights
@@ -206,7 +201,7 @@ class PhaseShifted:
         return maps.field(maps.flat)
 
     def _accelerated(self) -> Acceleration:
-        sensor, amplitude = self.settings.sensor, self.settings.amplitude
+        sensor, amplitude = self.sensor, self.settings.amplitude
         x = sensor.pupil.gather(np.broadcast_to(sensor.pupil.x, sensor.pupil.shape))
         tilt = _SMALL_TILT * (x - x.mean())  # without the piston, which no frame shows
         frames = sensor.measure(sensor.pupil.scatter(tilt), amplitude)
@@ -242,7 +237,7 @@ class PhaseShifted:
         return solved, singular if xp.any(singular) else None
 
     def _refuse_equal_masks(self) -> None:
-        sensor, kind = self.settings.sensor, Kind.numpy()
+        sensor, kind = self.sensor, Kind.numpy()
         waves = sensor.operator(kind).split_reference(self._flat(), in_window=True)
         _, singular = self._solve(waves, np.zeros((1, sensor.n_masks, *sensor.pupil.shape)), kind)
         if singular is not None and singular[0][sensor.pupil.mask].all():

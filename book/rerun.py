@@ -79,7 +79,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     if asked.line is None:
         return asked
     if len(arguments) > 1:
-        raise ParameterError("--line stands for all other arguments: expected none but it")
+        raise ParameterError("--line replaces all other arguments: expected no other")
     try:
         return parse(shlex.split(asked.line))
     except ValueError as error:  # of a quotation without an end
@@ -341,7 +341,7 @@ def _text(file: Path) -> str:
     except OSError as error:
         raise ParameterError(f"-f {file}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise ParameterError(f"-f {file}: it is no text in UTF-8") from None
+        raise ParameterError(f"-f {file}: expected text in UTF-8") from None
 
 
 def interruptible() -> None:

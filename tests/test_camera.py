@@ -379,10 +379,10 @@ def test_output_is_never_an_input(folder, name, overwrite):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("frame.fits", "exists and is no phase map"),
-        ("notes.md", "exists and is no phase map"),
-        ("sub/../notes.md", "exists and is no phase map"),
-        ("link.md", "exists and is no phase map"),
+        ("frame.fits", "exists and is not a phase map"),
+        ("notes.md", "exists and is not a phase map"),
+        ("sub/../notes.md", "exists and is not a phase map"),
+        ("link.md", "exists and is not a phase map"),
         ("sub", "expected a file, not a folder"),
         ("/dev/null", "expected a file, not a folder"),
         ("", "expected a file, not a folder"),

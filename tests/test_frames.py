@@ -545,7 +545,7 @@ def test_phase_file_replaces_no_source_and_nothing_but_a_phase_map(tmp_path, rec
         with pytest.raises(ValueError, match=r"output = .* is the input"):
             camera.write_phase(name, found, recording, 635.0, [source], overwrite=True)
     target.write_text("precious")
-    with pytest.raises(ValueError, match=r"output = .*a\.fits' exists and is no phase map"):
+    with pytest.raises(ValueError, match=r"output = .*a\.fits' exists and is not a phase map"):
         camera.write_phase(target, found, recording, 635.0, [source])
     assert target.read_text() == "precious"
     assert (tmp_path / "größe.npy").read_bytes() == (tmp_path / "hard.npy").read_bytes() == raw

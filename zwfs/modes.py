@@ -100,8 +100,8 @@ def power_law_screens(
 
     How the sentence "an f^-2 power spectral density defined on the first 200 Zernike polynomials" is read here:
     the coefficients are independent normal numbers, and a mode of radial order n, which oscillates n/2 times
-    across the diameter, has a variance proportional to n^`exponent`. Modes are spread evenly over the plane of
-    spatial frequencies, so the variance of a mode follows the density at its frequency.
+    across the diameter, has a variance proportional to n to the power of `exponent`. Modes are spread evenly over
+    the plane of spatial frequencies, so the variance of a mode follows the density at its frequency.
 
     Parameters
     ----------

@@ -256,7 +256,7 @@ def dynamic_range(linear_limit: float, shifted_limit: float, descent_limit: floa
 @claim(
     9,
     "4.1",
-    "Gerchberg-Saxton has a systematic offset, since some light falls beside the detector.",
+    "Gerchberg-Saxton has a systematic offset, since some light falls outside the detector.",
     "fig03_dynamic_range#the-offset-of-gerchberg-saxton",
 )
 def saxton_offset(
@@ -492,7 +492,7 @@ def others_alike(
     "error_budget",
 )
 def focus_shift(gain_focus_difference: float, offset_focus_difference: float) -> Finding:
-    """A statement on prisms that are not here; what it does can be told."""
+    """Claim 18: the optics themselves are not simulated, only the shift of focus that they cause."""
     measured = (
         f"on the simulated bench such a shift, alone, makes the gain {gain_focus_difference:.2f} and an offset of "
         f"{offset_focus_difference:.4f} rad rms"

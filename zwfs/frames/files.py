@@ -218,7 +218,7 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     inputs : sequence of str or Path
         Files that are never replaced: camera frames, darks, and the like.
     overwrite : bool
-        Whether `output` may also be a file that is no phase map; it may never be an input.
+        Whether `output` may also be a file that is not a phase map; it may never be an input.
 
     Returns
     -------
@@ -248,7 +248,9 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     if there and not path.is_file():
         raise ValueError(f"{named}: expected a file, not a folder or a device")
     if there and not overwrite and not _has_card(path, _PHASE_CARD):
-        raise ValueError(f"{named} exists and is no phase map of zwfs: expected a new name, or overwrite = True")
+        raise ValueError(
+            f"{named} exists and is not a phase map of zwfs: expected a new name, or overwrite = True"
+        )
     folder = next(parent for parent in path.parents if parent.exists())
     if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
         raise ValueError(f"{named}: expected a file in a folder that can be written, not in {folder}")

@@ -138,6 +138,40 @@ def test_no_noisy_frame_is_worse_for_the_acceleration(photons):
     assert ratio.max() < 1.1
 
 
+@pytest.fixture(scope="module")
+def mismatched():
+    """Frames of a large dimple, the first 20 % too bright: a part of them never converges."""
+    pupil = zwfs.Pupil.circular(24)
+    modes = zwfs.zernike_basis(pupil, 60)
+    sensor, rng = pair(pupil, 2.0), np.random.default_rng(5)
+    phase = zwfs.power_law_screens(modes, 1.0, 60, seed=rng)
+    return sensor, phase, rng.poisson(1e3 * sensor.measure(phase) * [[[1.2]], [[1.0]]]) / 1e3
+
+
+def test_frames_that_do_not_converge_are_explained_as_well_as_without_acceleration(mismatched):
+    sensor, phase, frames = mismatched
+    plain, faster = (PhaseShifted(sensor, n_iterations=50, accelerate=a)(frames) for a in (False, True))
+    lost = ~faster.converged
+    assert lost.sum() > 3
+    assert (faster.residual[lost] <= plain.residual[lost] * (1 + 1e-9)).all()
+    errors = [reconstruction_error(sensor.pupil, result.phase, phase) for result in (plain, faster)]
+    usable = errors[0] < 0.3
+    assert (errors[1][usable] < 1.1 * errors[0][usable]).all()
+
+
+def test_frames_that_do_not_converge_do_not_depend_on_their_batch(mismatched):
+    sensor, phase, frames = mismatched
+    frames, start = frames[:12].reshape(3, 4, *frames.shape[1:]), 0.5 * phase[:12].reshape(3, 4, *phase.shape[1:])
+    method = PhaseShifted(sensor, n_iterations=20, accelerate=True)
+    whole = method(frames, start, history=True)
+    assert not whole.converged.all()
+    np.testing.assert_array_equal(whole.history[:, :, -1], whole.phase)
+    for index in np.ndindex(3, 4):
+        single = method(frames[index], start[index])
+        np.testing.assert_allclose(single.phase, whole.phase[index], atol=1e-9)
+        assert single.n_iterations == whole.n_iterations[index]
+
+
 @pytest.mark.parametrize("diameter", [1.06, 2.0])
 def test_acceleration_reaches_the_fixed_point_of_noisy_frames(pupil, screens, diameter):
     sensor, phase = pair(pupil, diameter), screens(0.5, 20)

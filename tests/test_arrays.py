@@ -141,6 +141,15 @@ def test_history_and_start(library, pupil, screens):
     same(library, method(library.array(frames), library.array(phase)).phase, method(frames, phase).phase, 1e-9)
 
 
+def test_frames_that_do_not_converge(library, pupil, screens):
+    sensor = ZernikeSensor(pupil, Dimple(2.0, np.pi / 2), Dimple(2.0, -np.pi / 2))
+    method = PhaseShifted(sensor, n_iterations=8, accelerate=True)
+    frames = sensor.measure(screens(1.2, 4)) * np.array([1.2, 1.0])[:, np.newaxis, np.newaxis]
+    expected = method(frames)
+    assert not expected.converged.any()
+    same(library, method(library.array(frames)).phase, expected.phase, 1e-8)
+
+
 def test_single_precision(library, pupil, screens):
     method, phase = METHODS["real time"](pupil), screens(0.4, 2)
     frames = method.sensor.measure(phase).astype(np.float32)

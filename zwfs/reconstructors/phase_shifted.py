@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -17,10 +18,12 @@ from zwfs.reconstructors.base import (
     Estimate,
     Reconstruction,
     Reconstructor,
+    check_frames,
     count,
     for_each,
     iterate,
     settings,
+    start_phase,
     steady,
     turn,
 )
@@ -60,8 +63,9 @@ class PhaseShifted(Reconstructor):
     accelerate : bool
         Same fixed point in fewer iterations: without a start, the first two reference waves are dimmed to the
         light that the frames miss, and from then on the coefficients of the waves are extrapolated by the secant
-        method. The paper does neither. The dimming needs frames in the right unit: with a dimple of 2 lambda/D
-        and one frame that is 30 % too bright, a tenth of the frames that converge without acceleration fail.
+        method. The paper does neither. Frames that have not converged at the end, as frames of a wrong unit may,
+        are iterated without acceleration, too; the result is the phase that explains them better. With a tolerance
+        of 0 they are not.
 
     Raises
     ------
@@ -125,7 +129,35 @@ class PhaseShifted(Reconstructor):
         UserWarning
             If a frame is more than 10 times as bright, inside the pupil, as with the mask out: raw counts?
         """
-        return iterate(self, frames, start, history)
+        result = iterate(self, frames, start, history)
+        if self._acceleration is None or not self.settings.tolerance:
+            return result
+        return result if Kind.of(result.phase).xp.all(result.converged) else self._secured(result, frames, start)
+
+    def _secured(self, result: Reconstruction, frames: ArrayLike, start: ArrayLike | None) -> Reconstruction:
+        """Replace the phases that did not converge where the plain iteration explains the frames better."""
+        checked, batch = check_frames(self.sensor, frames)
+        kind = Kind.of(checked)
+        xp, n_frames = kind.xp, checked.shape[0]
+        converged = xp.reshape(result.converged, (n_frames,))
+        lost = [index for index in range(n_frames) if not converged[index]]
+        which = kind.integers(lost)
+        first = None if start is None else xp.take(start_phase(self.sensor, start, batch, kind), which, axis=0)
+        plain = copy(self)
+        plain._acceleration, plain._constants = None, {}
+        other = iterate(plain, xp.take(checked, which, axis=0), first, result.history is not None)
+        better = other.residual < xp.take(xp.reshape(result.residual, (n_frames,)), which, axis=0)
+        parts = {}
+        for name in ("phase", "n_iterations", "converged", "n_unsolved", "history"):
+            values, news = getattr(result, name), getattr(other, name)
+            if values is None:
+                continue
+            flat = xp.reshape(values, (n_frames, *values.shape[len(batch) :]))
+            for place, index in enumerate(lost):
+                if better[place]:
+                    flat[index, ...] = news[place, ...]
+            parts[name] = xp.reshape(flat, values.shape)
+        return replace(result, **parts)
 
     def prepare(self, frames: NDArray, phasor: NDArray, flat: bool, kind: Kind) -> dict[str, NDArray]:
         """What the frames give to the linear system, and the reference waves of a flat start."""

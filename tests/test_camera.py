@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from zwfs.bench.model import Bench
+from zwfs.bench import Bench, write_bench
 from zwfs.frames import files as camera
 
 # Reading
@@ -420,14 +420,14 @@ def test_notebook_refuses_such_an_output_before_any_work(folder, monkeypatch, na
 
 def test_bench_files_replace_only_those_of_a_bench(tmp_path):
     bench = Bench(n_pixels=40, gap=0.02)
-    before = [path.read_bytes() for path in camera.write_bench(tmp_path, bench, seed=1).values()]
-    after = [path.read_bytes() for path in camera.write_bench(tmp_path, bench, seed=2).values()]
+    before = [path.read_bytes() for path in write_bench(tmp_path, bench, seed=1).values()]
+    after = [path.read_bytes() for path in write_bench(tmp_path, bench, seed=2).values()]
     assert before != after
     fits.PrimaryHDU(FRAME).writeto(tmp_path / "dark.fits", overwrite=True)
     raw = (tmp_path / "dark.fits").read_bytes()
     with pytest.raises(ValueError, match=r"folder = .* holds a dark\.fits that the simulated bench did not write"):
-        camera.write_bench(tmp_path, bench, seed=3)
+        write_bench(tmp_path, bench, seed=3)
     assert (tmp_path / "dark.fits").read_bytes() == raw
     assert (tmp_path / "frame.fits").read_bytes() == after[0]
     with pytest.raises(ValueError, match=r"folder = .*nowhere'"):
-        camera.write_bench(tmp_path / "nowhere", bench)
+        write_bench(tmp_path / "nowhere", bench)

@@ -167,7 +167,7 @@ def refused(project, *arguments):
         (["1", "-f", "a" * 300], "File name too long"),
         (["--line=1 -p n=10"], "n = 10: expected an integer in [1, 9]"),
         (["--line=1 -p 'n=10"], "No closing quotation"),
-        (["--line=1", "--list"], "--line stands for all other arguments"),
+        (["--line=1", "--list"], "--line replaces all other arguments"),
     ],
 )
 def test_bad_requests_are_refused_before_anything_runs(project, arguments, message):

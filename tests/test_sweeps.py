@@ -118,7 +118,7 @@ def threads_of_blas(value):
 def test_blas_has_one_thread_in_every_task(n_jobs):
     # A process of its own, which may use two: the variables are read when NumPy is loaded.
     script = (
-        "import joblib\nfrom zwfs import sweeps\nfrom tests.test_sweeps import threads_of_blas\n"
+        "import joblib\nfrom zwfs.companion import sweeps\nfrom tests.test_sweeps import threads_of_blas\n"
         f"with joblib.parallel_config(backend='loky', n_jobs={n_jobs}, inner_max_num_threads=2):\n"
         "    found = sweeps.run(threads_of_blas, range(4), name='threads')\n"
         "print(threads_of_blas(0)[1], *(threads for _, threads in found))"

@@ -76,7 +76,7 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
 
     Examples
     --------
-    >>> from zwfs import sweeps
+    >>> from zwfs.companion import sweeps
     >>> sweeps.run(pow, range(5), 2, name="squares")
     [0, 1, 4, 9, 16]
     """

@@ -211,7 +211,7 @@ def _digest(value: Any) -> str:
     from cloudpickle import Pickler
 
     total = hashlib.sha256(f"{sys.version_info[:2]} {np.__version__} {scipy.__version__}".encode())
-    files = {str(file) for file in Path(__file__).parent.rglob("*.py")}
+    files = {str(file) for file in Path(__file__).parents[1].rglob("*.py")}
 
     class Digest(Pickler):
         def reducer_override(self, part: Any) -> Any:

@@ -21,7 +21,7 @@ def exact_reference(pupil, dimple, field, margin=0, shift=(0.0, 0.0)):
     y, x = (np.arange(-(n + margin - 1), n + margin) / pupil.n_pixels for n in pupil.shape)
     kernel = airy(dimple.diameter, x + shift[0], y[:, np.newaxis] + shift[1])
     change = dimple.amplitude * np.exp(1j * dimple.phase) - 1
-    return change * fftconvolve(kernel, np.where(pupil.mask, field, 0), mode="valid") / pupil.n_pixels**2
+    return change * fftconvolve(kernel, np.where(pupil.inside, field, 0), mode="valid") / pupil.n_pixels**2
 
 
 def exact_frame(pupil, dimple, phase):

@@ -93,14 +93,14 @@ def test_coefficients_tell_the_light_that_is_lost(pupil, screens, second, extent
     sensor, phase = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), second, extent=extent), screens(0.8)
     method, kind = PhaseShifted(sensor, accelerate=True), Kind.numpy()
     light = sensor.measure(phase)[(..., *sensor.window)]
-    missing = (pupil.amplitude**2 - light * pupil.mask).sum(axis=(-3, -2, -1))
-    coefficients = sensor.operator(kind).split_project(split(np.where(pupil.mask, phase, 0), pupil.amplitude))
+    missing = (pupil.amplitude**2 - light * pupil.inside).sum(axis=(-3, -2, -1))
+    coefficients = sensor.operator(kind).split_project(split(np.where(pupil.inside, phase, 0), pupil.amplitude))
     np.testing.assert_allclose(method._acceleration.taken(coefficients, np), missing, rtol=1e-7)
 
 
 @pytest.mark.parametrize("diameter", [0.6, 1.06, 1.4])
 def test_relaxation_leaves_nothing_of_a_small_tilt(pupil, diameter):
-    sensor, tilt = pair(pupil, diameter), np.where(pupil.mask, 1e-2 * pupil.x, 0)
+    sensor, tilt = pair(pupil, diameter), np.where(pupil.inside, 1e-2 * pupil.x, 0)
     left = {}
     for accelerate in (False, True):
         found = PhaseShifted(sensor, n_iterations=2, tolerance=0, accelerate=accelerate)(sensor.measure(tilt))
@@ -186,7 +186,7 @@ def test_acceleration_reaches_the_fixed_point_of_noisy_frames(pupil, screens, di
 @pytest.mark.parametrize("flux", [0.01, 0.5, 2.0, 9.0])
 def test_a_wrong_flux_leaves_numbers(shifted, screens, pupil, flux):
     method = PhaseShifted(shifted, accelerate=True, tolerance=0)
-    assert np.all(np.isfinite(method(flux * shifted.measure(screens(0.5))).phase[:, pupil.mask]))
+    assert np.all(np.isfinite(method(flux * shifted.measure(screens(0.5))).phase[:, pupil.inside]))
 
 
 def test_coefficients_that_take_no_light_out_are_not_divided_by(shifted):
@@ -223,8 +223,8 @@ def test_shared_wave_solves_the_general_system(pupil, screens, phases):
     waves = operator.split_expand(operator.split_project(field) @ method._of(kind).core)
     special, _ = shared.solve(waves[:, 0], data["signal"], kind)
     ratio = (special[:, 0] + 1j * special[:, 1]) / (general[:, 0] + 1j * general[:, 1])
-    assert np.abs(ratio.imag)[:, pupil.mask].max() < 1e-8 * np.abs(ratio)[:, pupil.mask].max()
-    assert ratio.real[:, pupil.mask].min() > 0
+    assert np.abs(ratio.imag)[:, pupil.inside].max() < 1e-8 * np.abs(ratio)[:, pupil.inside].max()
+    assert ratio.real[:, pupil.inside].min() > 0
 
 
 def test_masks_of_different_size_share_no_wave(pupil):

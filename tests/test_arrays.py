@@ -86,7 +86,7 @@ def test_adjoint(library, wide):
 
 def test_measure(library, pupil, wide, screens):
     phase = screens(0.5, 6).reshape(2, 3, *pupil.shape)
-    phase[:, :, ~pupil.mask] = np.nan
+    phase[:, :, ~pupil.inside] = np.nan
     amplitude = np.linspace(0.5, 1.5, 3)[:, np.newaxis, np.newaxis] * pupil.amplitude
     same(library, wide.measure(library.array(phase)), wide.measure(phase))
     same(library, wide.measure(library.array(phase), library.array(amplitude)), wide.measure(phase, amplitude))

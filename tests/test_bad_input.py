@@ -116,7 +116,7 @@ def valid() -> dict:
         "values": points,
         "image": np.abs(field) + 0.1,
         "amplitude": 1.0,
-        "segments": (pupil.mask * 1).astype(int),
+        "segments": (pupil.inside * 1).astype(int),
         "center": (5.5, 5.5),
         "n_pixels": 12,
         "n_modes": 4,

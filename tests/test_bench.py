@@ -258,7 +258,7 @@ def test_focus_difference_turns_a_phase_grating_into_opposite_contrasts(distance
 @pytest.mark.parametrize("distance", [1e-4, 1e-2])
 def test_focus_difference_loses_no_light(distance):
     images = ideal(extent=4, focus_difference=distance).pupil_images()
-    np.testing.assert_allclose(images.sum(axis=(1, 2)), np.count_nonzero(LAYOUT.mask), rtol=1e-10)
+    np.testing.assert_allclose(images.sum(axis=(1, 2)), np.count_nonzero(LAYOUT.inside), rtol=1e-10)
     # Nor does it come back from the other side on the narrower plane.
     narrow = ideal(focus_difference=distance).pupil_images()
     cut = 3 * N // 2 - MARGIN
@@ -286,12 +286,12 @@ def test_static_aberration_is_smooth_and_has_its_rms(perfect):
     np.testing.assert_allclose(bench.pupil_images(), perfect.pupil_images(), rtol=0, atol=1e-14)
     phase = phase_of(bench)
     assert LAYOUT.rms(phase) == pytest.approx(0.3, abs=1e-6)
-    low = zernike_basis(LAYOUT, 27)[:, LAYOUT.mask]
-    values = phase[LAYOUT.mask] - phase[LAYOUT.mask].mean()
+    low = zernike_basis(LAYOUT, 27)[:, LAYOUT.inside]
+    values = phase[LAYOUT.inside] - phase[LAYOUT.inside].mean()
     rest = values - low.T @ np.linalg.lstsq(low.T, values)[0]
     assert rest.std() < 1e-5
     # It belongs to the bench: half of it has the same shape, another seed another one.
-    half, other = phase_of(ideal(static=0.15))[LAYOUT.mask], phase_of(ideal(static=0.3, seed=1))[LAYOUT.mask]
+    half, other = phase_of(ideal(static=0.15))[LAYOUT.inside], phase_of(ideal(static=0.3, seed=1))[LAYOUT.inside]
     np.testing.assert_allclose(2 * (half - half.mean()), values, atol=1e-5)
     assert abs(np.corrcoef(other, values)[0, 1]) < 0.9
 
@@ -299,7 +299,7 @@ def test_static_aberration_is_smooth_and_has_its_rms(perfect):
 def test_quilting_has_its_rms_and_22_periods(perfect):
     bench = ideal(quilting=0.06)
     np.testing.assert_allclose(bench.pupil_images(), perfect.pupil_images(), rtol=0, atol=1e-14)
-    values = phase_of(bench)[LAYOUT.mask]
+    values = phase_of(bench)[LAYOUT.inside]
     assert values.std() == pytest.approx(0.06, rel=0.03)
     x, y = LAYOUT.points.T
     grid = np.cos(2 * np.pi * 22 * x) + np.cos(2 * np.pi * 22 * y)
@@ -309,10 +309,10 @@ def test_quilting_has_its_rms_and_22_periods(perfect):
 def test_static_and_quilting_add_to_the_commands(commands):
     bench = ideal(static=0.2, quilting=0.06)
     flat, phase = (
-        PhaseShifted(design(bench), n_iterations=60, tolerance=1e-10)(bench.frames(pistons)).phase[LAYOUT.mask]
+        PhaseShifted(design(bench), n_iterations=60, tolerance=1e-10)(bench.frames(pistons)).phase[LAYOUT.inside]
         for pistons in (None, commands[0])
     )
-    excess = np.exp(1j * (phase - flat - bench.commanded_phase(commands[0])[LAYOUT.mask]))
+    excess = np.exp(1j * (phase - flat - bench.commanded_phase(commands[0])[LAYOUT.inside]))
     assert abs(excess.mean()) == pytest.approx(1, abs=1e-9)
 
 
@@ -320,7 +320,7 @@ def test_static_and_quilting_add_to_the_commands(commands):
 def test_illumination_shows_in_the_pupil_images(illumination):
     left, right = ideal(illumination=illumination).pupil_images()
     np.testing.assert_array_equal(left, right)
-    values = inner(left)[LAYOUT.mask]
+    values = inner(left)[LAYOUT.inside]
     slope, mean = np.polyfit(LAYOUT.points[:, 0], values, 1)
     assert slope / mean == pytest.approx(illumination)
     assert values.mean() == pytest.approx(1)
@@ -418,9 +418,9 @@ def test_model_has_the_layout_and_amplitude_of_an_ideal_bench(perfect, model):
     truth = design(perfect).pupil.amplitude
     np.testing.assert_allclose(model.shifted.pupil.amplitude, truth, atol=1e-12)
     np.testing.assert_array_equal(model.segments, LAYOUT.segments)
-    np.testing.assert_array_equal(model.modes.argmax(axis=0)[LAYOUT.mask], model.segments[LAYOUT.mask] - 1
-                                  - (model.segments[LAYOUT.mask] > 21))  # fmt: skip
-    np.testing.assert_array_equal(model.modes.sum(axis=0), LAYOUT.mask)
+    np.testing.assert_array_equal(model.modes.argmax(axis=0)[LAYOUT.inside], model.segments[LAYOUT.inside] - 1
+                                  - (model.segments[LAYOUT.inside] > 21))  # fmt: skip
+    np.testing.assert_array_equal(model.modes.sum(axis=0), LAYOUT.inside)
 
 
 def test_model_amplitude_is_close_to_the_truth_on_the_bench_as_it_is():
@@ -428,15 +428,15 @@ def test_model_amplitude_is_close_to_the_truth_on_the_bench_as_it_is():
     layout = Pupil.hexagonal(136, 3, 0.02, (21,), 0.8)
     truth = Pupil.from_segments(layout.segments, np.sqrt(1 + 0.5 * layout.x)).amplitude
     found = BenchModel.from_images(bench, seed=1).shifted.pupil
-    assert found.mask[layout.mask].mean() > 0.999
+    assert found.inside[layout.inside].mean() > 0.999
     missing = Pupil.hexagonal(136, 3, 0.02, (), 0.8).segments == 21
-    assert found.mask[missing].mean() < 0.35  # its edges catch some light
-    ratio = (found.amplitude / truth.clip(0.1))[layout.mask]
+    assert found.inside[missing].mean() < 0.35  # its edges catch some light
+    ratio = (found.amplitude / truth.clip(0.1))[layout.inside]
     assert ratio.std() / ratio.mean() < 0.1
     # Away from gaps and edges, where diffraction is at home, it is much closer.
-    deep = ndimage.binary_erosion(layout.mask, iterations=4)[layout.mask]
+    deep = ndimage.binary_erosion(layout.inside, iterations=4)[layout.inside]
     assert ratio[deep].std() / ratio[deep].mean() < 0.04
-    assert not found.mask[np.hypot(layout.x, layout.y[:, np.newaxis]) > 0.5].any()
+    assert not found.inside[np.hypot(layout.x, layout.y[:, np.newaxis]) > 0.5].any()
 
 
 def test_model_follows_the_seed():
@@ -451,7 +451,7 @@ def test_normalised_counts_are_1_on_average_in_the_pupil():
     bench = ideal(photons=1e9, read_noise=30, background=5000, flux_imbalance=0.2)
     found = BenchModel.from_images(bench, 1)
     off = found.normalise(bench.pupil_images(2))
-    np.testing.assert_allclose(inner(off)[:, LAYOUT.mask].mean(axis=1), 1, atol=1e-3)
+    np.testing.assert_allclose(inner(off)[:, LAYOUT.inside].mean(axis=1), 1, atol=1e-3)
     assert off.min() == 0  # noise around 0 is raised, not left negative
     np.testing.assert_array_equal(found.normalise(found.dark - 1), 0)
     frames = bench.frames(np.zeros((3, 36)), 2)
@@ -614,8 +614,8 @@ def test_pupil_from_segments():
     amplitude = np.array([[9, 1, 2], [3, 4, -9], [9, 5, 6.0]])
     pupil = Pupil.from_segments(segments, amplitude)
     np.testing.assert_array_equal(pupil.segments, segments)
-    np.testing.assert_array_equal(pupil.mask, segments > 0)
-    inside = pupil.amplitude[pupil.mask]
+    np.testing.assert_array_equal(pupil.inside, segments > 0)
+    inside = pupil.amplitude[pupil.inside]
     np.testing.assert_allclose(inside / inside[0], [1, 2, 3, 4, 5, 6])
     assert np.mean(inside**2) == pytest.approx(1)
     assert pupil.n_pixels == 3

@@ -26,7 +26,7 @@ def test_screens_have_the_rms_asked_for_at_the_start_and_no_piston(pupil):
     screens = FrozenFlow(pupil, 0.8, 5, seed=1)(0.0)
     np.testing.assert_allclose(pupil.rms(screens), 0.8)
     np.testing.assert_allclose(pupil.gather(screens).mean(axis=-1), 0, atol=1e-12)
-    assert not screens[:, ~pupil.mask].any()
+    assert not screens[:, ~pupil.inside].any()
 
 
 def test_screens_move_with_the_wind():
@@ -51,7 +51,7 @@ def test_no_frequency_lies_beyond_the_cutoff(pupil):
         for kx in range(-6, 7):
             if 0 < np.hypot(kx, ky) / 3 <= 2.0:
                 angle = 2 * np.pi * (kx * x + ky * y) / 3
-                waves += [np.cos(angle)[pupil.mask], np.sin(angle)[pupil.mask]]
+                waves += [np.cos(angle)[pupil.inside], np.sin(angle)[pupil.inside]]
     waves = np.array([np.ones(pupil.n_points), *waves]).T
     values = pupil.gather(flow(0.7)).T
     left = values - waves @ np.linalg.lstsq(waves, values, rcond=1e-13)[0]

@@ -9,7 +9,7 @@ N_FRAMES = 400
 @pytest.fixture(scope="module")
 def flat(pupil):
     """Frames of the pupil with the mask taken out."""
-    return np.broadcast_to(pupil.mask.astype(float), (N_FRAMES, *pupil.shape))
+    return np.broadcast_to(pupil.inside.astype(float), (N_FRAMES, *pupil.shape))
 
 
 def test_photons_are_those_of_the_pupil_without_a_mask(pupil, flat):
@@ -22,11 +22,11 @@ def test_photons_are_those_of_the_pupil_without_a_mask(pupil, flat):
 def test_photon_noise_is_poissonian(pupil, flat):
     detector = Detector(pupil, 7.0 * pupil.n_points)
     counts = detector.expose(flat, seed=1)
-    inside = counts[:, pupil.mask]
+    inside = counts[:, pupil.inside]
     assert inside.mean() == pytest.approx(7, rel=0.01)
     assert inside.var() == pytest.approx(7, rel=0.01)
     assert not np.any(inside % 1)
-    assert not counts[:, ~pupil.mask].any()
+    assert not counts[:, ~pupil.inside].any()
 
 
 def test_background_has_photon_noise_and_adds_to_read_noise(pupil, flat):

@@ -133,7 +133,7 @@ def test_pictures_are_upright_and_sharp(draw):
 def test_sensor_layout_shows_what_is_computed(classic, pupil, phase):
     figure = plots.sensor_layout(classic, phase)
     field = pupil.amplitude * np.exp(1j * phase)
-    assert holds(figure, np.where(pupil.mask, phase, np.nan)) == 1
+    assert holds(figure, np.where(pupil.inside, phase, np.nan)) == 1
     assert holds(figure, np.abs(classic.propagate(field)[0]) ** 2) == 2
     assert holds(figure, np.abs(classic.reference_wave(field)[0]) ** 2) == 1
     assert {"pupil plane", "focal plane", "detector plane", "lens"} <= texts(figure)
@@ -149,7 +149,7 @@ def test_vector_sensor_shows_the_frames_in_both_rows(vector, pupil, phase):
     figure = plots.vector_sensor(vector, phase)
     for frame in vector.measure(phase):
         assert holds(figure, frame) == 2
-    assert holds(figure, np.where(pupil.mask, phase, np.nan)) == 2
+    assert holds(figure, np.where(pupil.inside, phase, np.nan)) == 2
 
 
 def test_vector_sensor_shows_both_masks(vector, phase):
@@ -214,7 +214,7 @@ def test_bench_layout_shows_the_segments(bench, pistons, frames):
     assert holds(figure, pupil.amplitude**2) == 1
     # The missing segment is at the top right: up is the last row.
     full = zwfs.Pupil.hexagonal(60, bench.n_rings, bench.gap, (), bench.stop)
-    row, column = np.nonzero(full.mask & ~pupil.mask)
+    row, column = np.nonzero(full.inside & ~pupil.inside)
     assert row.mean() > 40
     assert column.mean() > 35
 

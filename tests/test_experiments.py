@@ -106,7 +106,7 @@ class FirstOrder:
         self.sensor, field = sensor, sensor.pupil.amplitude.astype(complex)
         self.flat = sensor.measure(np.zeros(sensor.pupil.shape))[0]
         slope = 2 * np.real(sensor.reference_wave(field)[0].conj() * 1j * field)
-        self.gain = np.where(sensor.pupil.mask, 1, 0) / np.where(sensor.pupil.mask, slope, 1)
+        self.gain = np.where(sensor.pupil.inside, 1, 0) / np.where(sensor.pupil.inside, slope, 1)
 
     def __call__(self, frames):
         phase = (frames[..., 0, :, :] - self.flat) * self.gain

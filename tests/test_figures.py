@@ -60,7 +60,7 @@ def drawn_methods(curves, pupil, classic, shifted):
     """Return the arguments of every figure function, and the methods that it then draws."""
     two, three = ["Linear", "PhaseShifted"], np.linspace(0.5, 1.5, 3)
     shifted_only = {"PhaseShifted"}
-    phase = np.where(pupil.mask, np.add.outer(pupil.y, pupil.x), np.nan)
+    phase = np.where(pupil.inside, np.add.outer(pupil.y, pupil.x), np.nan)
     frames = np.ones((2, *pupil.shape))
     pistons = np.linspace(-1, 1, 24).reshape(2, 3, 4)
     trial = DiameterCurve(three, np.full((3, 3), 0.1))
@@ -222,7 +222,7 @@ def test_linearity_draws_the_means_and_marks_where_they_leave(curves):
 
 def test_estimates_show_what_they_were_given(pupil, screens):
     truth = screens(0.5, 1)[0]
-    found = {"Linear": np.where(pupil.mask, truth / 2, np.nan)}
+    found = {"Linear": np.where(pupil.inside, truth / 2, np.nan)}
     figure = plots.estimates(pupil, truth, found, found)
     shown = [np.ma.filled(axes.images[0].get_array(), np.nan) for axes in figure.axes if axes.images]
     np.testing.assert_array_equal(shown[1], found["Linear"])

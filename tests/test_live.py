@@ -93,7 +93,7 @@ def sensor_of(pupil, diameter, shifts):
 def test_core_of_any_diameter_is_that_of_zwfs(pupil):
     diameters, factors = live.dimples(pupil)
     rng = np.random.default_rng(0)
-    field = (rng.normal(size=pupil.shape) + 1j * rng.normal(size=pupil.shape)) * pupil.mask
+    field = (rng.normal(size=pupil.shape) + 1j * rng.normal(size=pupil.shape)) * pupil.inside
     for diameter in (*live.DIAMETERS, 1.06, 2.2):
         weights = [
             np.prod([(diameter - other) / (own - other) for other in diameters if other != own])
@@ -112,7 +112,7 @@ def test_screens_are_those_of_zwfs(pupil, modes):
     assert plane.rank == live.N_SEEDS
     for seed in (1, live.N_SEEDS):
         wanted = zwfs.power_law_screens(modes, 1.0, 1, seed=seed)
-        found = plane.expand(np.eye(live.N_SEEDS)[[seed - 1]]) * pupil.mask
+        found = plane.expand(np.eye(live.N_SEEDS)[[seed - 1]]) * pupil.inside
         np.testing.assert_allclose(found, wanted, atol=1e-8)
 
 
@@ -132,7 +132,7 @@ def test_script_agrees_with_zwfs(compute, pupil, modes, rms, seed, diameter, shi
         found = reconstruct(frames, history=True)
         history = found.history
         assert made["unsolved"] == found.n_unsolved
-    inside = pupil.mask
+    inside = pupil.inside
     turn = np.angle(np.exp(1j * (made["estimate"] - history[-1])))
     np.testing.assert_allclose(turn[inside], 0, atol=1e-5)
     residual = zwfs.wrapped_residual(pupil, history[-1], phase)

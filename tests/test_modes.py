@@ -55,7 +55,7 @@ def test_zero_mean_and_unit_rms_on_the_sampled_pupil(pupil, orthonormal):
     values = pupil.gather(modes)
     np.testing.assert_allclose(values.mean(axis=1), 0, atol=1e-12)
     np.testing.assert_allclose(values.std(axis=1), 1, atol=1e-12)
-    assert not modes[:, ~pupil.mask].any()
+    assert not modes[:, ~pupil.inside].any()
 
 
 @pytest.mark.parametrize("pupil", [Pupil.circular(60), Pupil.circular(60, 0.3, [(1, 0.03)])])

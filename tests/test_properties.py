@@ -30,7 +30,7 @@ def pupils(draw):
     if draw(st.booleans()):
         return pupil
     rng = np.random.default_rng(draw(seeds))
-    image = rng.uniform(0.5, 1.5, pupil.shape) * pupil.mask
+    image = rng.uniform(0.5, 1.5, pupil.shape) * pupil.inside
     right, below = draw(st.integers(0, 4)), draw(st.integers(0, 4))
     return Pupil.from_amplitude(np.pad(image, ((0, below), (0, right))), pupil.n_pixels, pupil.center)
 
@@ -78,7 +78,7 @@ def test_propagation_is_linear(sensor, factor, seed):
 
 @given(sensors(), batches, seeds)
 def test_a_passive_mask_never_adds_light(sensor, batch, seed):
-    field = white((*batch, *sensor.pupil.shape), seed) * sensor.pupil.mask
+    field = white((*batch, *sensor.pupil.shape), seed) * sensor.pupil.inside
     flux = np.sum(np.abs(sensor.propagate(field)) ** 2, axis=(-2, -1))
     incoming = np.sum(np.abs(field) ** 2, axis=(-2, -1))
     assert np.all(flux <= incoming[..., np.newaxis] * (1 + 1e-12))
@@ -87,7 +87,7 @@ def test_a_passive_mask_never_adds_light(sensor, batch, seed):
 # The wave of a dimple is 1 / diameter wide: smaller ones would need a wider detector.
 @given(pupils(), st.builds(Dimple, st.floats(1, 3), st.floats(-3, 3)), seeds)
 def test_a_phase_mask_loses_no_light_on_a_wide_detector(pupil, dimple, seed):
-    field = white(pupil.shape, seed) * pupil.mask
+    field = white(pupil.shape, seed) * pupil.inside
     sensor = ZernikeSensor(pupil, dimple, extent=6.0, tolerance=1e-8)
     lost = 1 - np.sum(np.abs(sensor.propagate(field)) ** 2) / np.sum(np.abs(field) ** 2)
     # What is scattered, |psi_ref|^2, falls with the cube of the distance.

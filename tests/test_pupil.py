@@ -16,7 +16,7 @@ def test_coordinates_are_pixel_centres_in_diameters(n):
     centres = (np.arange(n) - (n - 1) / 2) / n
     np.testing.assert_allclose(pupil.x, centres, atol=1e-15)
     np.testing.assert_allclose(pupil.y, centres, atol=1e-15)
-    rows, columns = np.nonzero(pupil.mask)
+    rows, columns = np.nonzero(pupil.inside)
     np.testing.assert_array_equal(pupil.points, np.stack([pupil.x[columns], pupil.y[rows]], axis=-1))
 
 
@@ -24,8 +24,8 @@ def test_coordinates_are_pixel_centres_in_diameters(n):
 def test_disc_holds_the_centres_within_half_a_diameter(n):
     pupil = Pupil.circular(n)
     radius = np.hypot(pupil.x, pupil.y[:, np.newaxis])
-    np.testing.assert_array_equal(pupil.mask, radius <= 0.5)
-    np.testing.assert_array_equal(pupil.segments, pupil.mask)
+    np.testing.assert_array_equal(pupil.inside, radius <= 0.5)
+    np.testing.assert_array_equal(pupil.segments, pupil.inside)
 
 
 @pytest.mark.parametrize(
@@ -38,9 +38,9 @@ def test_disc_holds_the_centres_within_half_a_diameter(n):
     ],
 )
 def test_mean_square_amplitude_is_1_inside_and_0_outside(pupil):
-    assert np.mean(pupil.amplitude[pupil.mask] ** 2) == pytest.approx(1, abs=1e-12)
-    assert not pupil.amplitude[~pupil.mask].any()
-    assert pupil.n_points == np.count_nonzero(pupil.mask)
+    assert np.mean(pupil.amplitude[pupil.inside] ** 2) == pytest.approx(1, abs=1e-12)
+    assert not pupil.amplitude[~pupil.inside].any()
+    assert pupil.n_points == np.count_nonzero(pupil.inside)
 
 
 def test_obscuration_takes_its_share_of_the_area():
@@ -50,13 +50,13 @@ def test_obscuration_takes_its_share_of_the_area():
 def test_spider_is_dark_on_its_side_only():
     pupil = Pupil.circular(101, spiders=[(np.pi / 2, 0.05)])
     x, y = pupil.x, pupil.y[:, np.newaxis]
-    blocked = Pupil.circular(101).mask & ~pupil.mask
+    blocked = Pupil.circular(101).inside & ~pupil.inside
     np.testing.assert_array_equal(blocked, (np.hypot(x, y) <= 0.5) & (np.abs(x) < 0.025) & (y > -1e-12))
 
 
 def test_three_rings_are_37_segments_of_equal_area():
     pupil = Pupil.hexagonal(300, n_rings=3, gap=0.004)
-    numbers, areas = np.unique(pupil.segments[pupil.mask], return_counts=True)
+    numbers, areas = np.unique(pupil.segments[pupil.inside], return_counts=True)
     np.testing.assert_array_equal(numbers, np.arange(1, 38))
     pitch = 0.5 / np.sqrt(9 + 3 + 1 / 3)
     expected = CORNER * ((pitch - 0.004) / np.sqrt(3)) ** 2 * 300**2
@@ -66,7 +66,7 @@ def test_three_rings_are_37_segments_of_equal_area():
 
 def test_segments_are_numbered_counter_clockwise_from_30_degrees():
     pupil = Pupil.hexagonal(200, n_rings=2)
-    centre = {k: pupil.points[pupil.segments[pupil.mask] == k].mean(axis=0) @ (1, 1j) for k in range(1, 20)}
+    centre = {k: pupil.points[pupil.segments[pupil.inside] == k].mean(axis=0) @ (1, 1j) for k in range(1, 20)}
     pitch = 0.5 / np.sqrt(4 + 2 + 1 / 3)
     assert abs(centre[1]) < 0.01 * pitch
     for ring, first in ((1, 2), (2, 8)):
@@ -79,7 +79,7 @@ def test_segments_are_numbered_counter_clockwise_from_30_degrees():
 
 def test_a_gap_is_as_wide_as_asked():
     n, gap = 400, 0.03
-    column = Pupil.hexagonal(n, n_rings=1, gap=gap).mask[:, n // 2]
+    column = Pupil.hexagonal(n, n_rings=1, gap=gap).inside[:, n // 2]
     lit = np.flatnonzero(column)
     assert np.diff(lit).max() - 1 == pytest.approx(gap * n, abs=1)
 
@@ -98,15 +98,15 @@ def test_segments_reach_the_circle_of_diameter_D(n_rings):
 def test_stop_becomes_the_pupil():
     pupil = Pupil.hexagonal(200, stop=0.85)
     assert np.hypot(*pupil.points.T).max() <= 0.5
-    inner = Pupil.circular(200).mask
+    inner = Pupil.circular(200).inside
     assert pupil.n_points / np.count_nonzero(inner) > 0.97
 
 
 def test_amplitude_image_keeps_its_relative_values():
     image = np.array([[0.0, 1.0, 0.1], [2.0, 3.0, 0.0]])
     pupil = Pupil.from_amplitude(image, threshold=0.1)
-    np.testing.assert_array_equal(pupil.mask, image > 0.3)
-    inside = pupil.amplitude[pupil.mask]
+    np.testing.assert_array_equal(pupil.inside, image > 0.3)
+    inside = pupil.amplitude[pupil.inside]
     np.testing.assert_allclose(inside / inside[0], [1, 2, 3])
     assert pupil.n_pixels == 3
     assert pupil.center == (0.5, 1.0)
@@ -123,14 +123,24 @@ def test_scatter_undoes_gather():
     maps = np.random.default_rng(0).normal(size=(2, 3, *pupil.shape)).astype(np.float32)
     again = pupil.scatter(pupil.gather(maps))
     assert again.dtype == np.float32
-    np.testing.assert_array_equal(again[..., pupil.mask], maps[..., pupil.mask])
-    assert np.isnan(again[..., ~pupil.mask]).all()
+    np.testing.assert_array_equal(again[..., pupil.inside], maps[..., pupil.inside])
+    assert np.isnan(again[..., ~pupil.inside]).all()
+
+
+def test_field_has_the_amplitude_and_the_phase_and_is_dark_outside():
+    pupil = Pupil.from_amplitude(np.pad(np.arange(1.0, 10).reshape(3, 3), 2))
+    phase = np.linspace(-3, 3, 2 * 49).reshape(2, 7, 7)
+    field = pupil.field(np.where(pupil.inside, phase, np.nan))
+    np.testing.assert_allclose(np.abs(field), np.broadcast_to(pupil.amplitude, field.shape), rtol=1e-15)
+    np.testing.assert_allclose(np.angle(pupil.gather(field)), pupil.gather(phase), rtol=1e-14)
+    with pytest.raises(ValueError, match="phase"):
+        pupil.field(np.full(pupil.shape, np.nan))
 
 
 def test_rms_ignores_piston_and_what_lies_outside():
     pupil = Pupil.circular(20)
     phase = np.where(pupil.x > 0, 1.0, -1.0) * np.ones(pupil.shape) + 7
-    assert pupil.rms(np.where(pupil.mask, phase, np.nan)) == pytest.approx(1)
+    assert pupil.rms(np.where(pupil.inside, phase, np.nan)) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("dtype", [bool, np.int16, np.float32, np.complex64])
@@ -141,12 +151,12 @@ def test_gather_and_scatter_keep_the_dtype(dtype):
     assert values.dtype == dtype
     again = pupil.scatter(values, fill=0)
     assert again.dtype == dtype
-    np.testing.assert_array_equal(again, np.where(pupil.mask, maps, 0))
+    np.testing.assert_array_equal(again, np.where(pupil.inside, maps, 0))
 
 
 def test_points_on_the_edge_of_the_obscuration_are_inside():
     pupil = Pupil.circular(25, 0.4)  # its radius is 5 pixels, a whole number, from the pixel in the middle
-    np.testing.assert_array_equal(pupil.mask[12, 12:19], [False] * 5 + [True] * 2)
+    np.testing.assert_array_equal(pupil.inside[12, 12:19], [False] * 5 + [True] * 2)
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e200])

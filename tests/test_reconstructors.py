@@ -212,7 +212,7 @@ def test_arcsine_takes_a_start_in_line_with_its_wave_as_ahead_of_it(pupil, mask)
     sensor = ZernikeSensor(pupil, mask)
     peak = -0.4 * np.exp(-0.5 * (pupil.x**2 + pupil.y[:, np.newaxis] ** 2) / 0.05**2)
     for start in (None, np.zeros(pupil.shape)):
-        found = Arcsine(sensor, n_iterations=1)(sensor.measure(peak), start).phase[pupil.mask]
+        found = Arcsine(sensor, n_iterations=1)(sensor.measure(peak), start).phase[pupil.inside]
         assert np.all((found <= 1e-6) | (found > np.pi - 1e-6))
         assert found.min() < -0.35
 
@@ -260,16 +260,16 @@ def test_arcsine_knows_the_modulus_of_what_it_finds(classic, pupil, screens):
     method, kind = Arcsine(classic, amplitude=amplitude), Kind.numpy()
     phasor = split(screens(0.3), method.settings.maps(kind).inside)
     found = method.step(phasor, method.prepare(frames, phasor, True, kind), kind)
-    assert np.all(found.unsolved > (pupil.mask & (amplitude == 0)).sum() + 10)
+    assert np.all(found.unsolved > (pupil.inside & (amplitude == 0)).sum() + 10)
     modulus = np.hypot(found.field[:, 0], found.field[:, 1])
     known = np.broadcast_to(found.modulus, modulus.shape)
-    np.testing.assert_allclose(known[:, pupil.mask], modulus[:, pupil.mask], rtol=1e-12)
+    np.testing.assert_allclose(known[:, pupil.inside], modulus[:, pupil.inside], rtol=1e-12)
 
 
 def test_unsolved_points_are_counted_in_the_pupil(shifted, pupil):
     method = PhaseShifted(shifted)
     method._shared = replace(method._shared, darkest=np.inf)
-    start = np.where(pupil.mask, 0.3, np.nan)
+    start = np.where(pupil.inside, 0.3, np.nan)
     found = method(shifted.measure(np.zeros(pupil.shape)), start)
     assert found.n_unsolved == pupil.n_points
     np.testing.assert_allclose(found.phase, start)
@@ -380,7 +380,7 @@ def test_linear_is_exact_to_second_order_around_its_reference(pupil, modes, shif
 
 
 def test_conditioning_drops_what_the_sensor_does_not_see(pupil, modes, shifted, screens):
-    with_piston = np.concatenate([modes, pupil.mask[np.newaxis]])
+    with_piston = np.concatenate([modes, pupil.inside[np.newaxis]])
     assert Linear(shifted, modes).n_inverted == len(modes)
     assert Linear(shifted, with_piston).n_inverted == len(modes)
     few = Linear(shifted, modes, conditioning=0.9)
@@ -391,7 +391,7 @@ def test_conditioning_drops_what_the_sensor_does_not_see(pupil, modes, shifted, 
 
 def test_linear_refuses_modes_that_no_mask_shows(pupil, shifted):
     with pytest.raises(ValueError, match="modes"):
-        Linear(shifted, pupil.mask[np.newaxis].astype(float))
+        Linear(shifted, pupil.inside[np.newaxis].astype(float))
 
 
 def test_gerchberg_saxton_offset_falls_with_the_extent(pupil, screens):
@@ -451,7 +451,7 @@ def test_residual_is_the_mismatch_of_the_frames_in_the_pupil(make, method, scree
     reconstruct, sensor = make(method)
     frames = sensor.measure(screens(0.6))
     found = reconstruct(frames)
-    mismatch = (sensor.measure(found.phase) - frames)[..., pupil.mask]
+    mismatch = (sensor.measure(found.phase) - frames)[..., pupil.inside]
     np.testing.assert_allclose(found.residual, np.sqrt(np.mean(mismatch**2, axis=(-2, -1))), atol=1e-10)
 
 
@@ -459,7 +459,7 @@ def test_residual_of_a_wide_detector_is_that_of_the_pupil(pupil, screens):
     sensor = pair(pupil, np.pi / 2, -np.pi / 2, extent=1.5)
     frames = sensor.measure(screens(0.6))
     found = GerchbergSaxton(sensor)(frames)
-    mismatch = (sensor.measure(found.phase) - frames)[(..., *sensor.window)][..., pupil.mask]
+    mismatch = (sensor.measure(found.phase) - frames)[(..., *sensor.window)][..., pupil.inside]
     np.testing.assert_allclose(found.residual, np.sqrt(np.mean(mismatch**2, axis=(-2, -1))), atol=1e-10)
 
 
@@ -493,7 +493,7 @@ def test_phase_is_nan_outside_and_finite_inside(make, method, screens, pupil):
     reconstruct, sensor = make(method)
     found = reconstruct(sensor.measure(screens(0.3)), history=True)
     for maps in (found.phase, found.history):
-        np.testing.assert_array_equal(np.isfinite(maps), np.broadcast_to(pupil.mask, maps.shape))
+        np.testing.assert_array_equal(np.isfinite(maps), np.broadcast_to(pupil.inside, maps.shape))
 
 
 @every
@@ -560,7 +560,7 @@ def test_history_holds_the_results_of_shorter_runs(make, method, screens):
 @iterative
 def test_history_begins_with_the_start_as_it_was_given(make, method, pupil, screens):
     reconstruct, sensor = make(method, n_iterations=2)
-    start = np.where(pupil.mask, 4.0 + screens(0.1, 1)[0], np.nan)
+    start = np.where(pupil.inside, 4.0 + screens(0.1, 1)[0], np.nan)
     found = reconstruct(sensor.measure(screens(0.1, 2)), start, history=True)
     np.testing.assert_array_equal(found.history[0, 0], start)
 
@@ -594,10 +594,10 @@ def test_start_is_where_it_starts(make, method, screens, pupil):
     phase = screens(0.4)
     frames = sensor.measure(phase)
     each = reconstruct(frames, start=phase, history=True)
-    np.testing.assert_allclose(each.history[:, 0][:, pupil.mask], phase[:, pupil.mask])
+    np.testing.assert_allclose(each.history[:, 0][:, pupil.inside], phase[:, pupil.inside])
     same = reconstruct(frames, start=phase[0], history=True)
     np.testing.assert_allclose(same.history[0], each.history[0], atol=1e-9)
-    np.testing.assert_allclose(same.history[1, 0][pupil.mask], phase[0][pupil.mask])
+    np.testing.assert_allclose(same.history[1, 0][pupil.inside], phase[0][pupil.inside])
     # Its own result, NaN outside, can be handed back in.
     again = reconstruct(frames, start=reconstruct(frames).phase)
     longer = make(method, n_iterations=6, tolerance=0)[0](frames)
@@ -680,7 +680,7 @@ def test_any_piston_of_the_start_gives_the_same_phase(shifted, pupil, screens, o
     expected = method(frames, start).phase
     for piston in (0.3, 1.7, 3.1, -2.0):
         turned = np.angle(np.exp(1j * (method(frames, start + piston).phase - expected - piston)))
-        np.testing.assert_allclose(turned[:, pupil.mask], 0, atol=1e-8)
+        np.testing.assert_allclose(turned[:, pupil.inside], 0, atol=1e-8)
 
 
 @iterative
@@ -688,7 +688,7 @@ def test_piston_of_the_start_is_kept(make, method, screens, pupil):
     reconstruct, sensor = make(method)
     frames = sensor.measure(screens(0.1, 1)[0])
     plain, moved = reconstruct(frames).phase, reconstruct(frames, start=np.full(pupil.shape, 0.3)).phase
-    np.testing.assert_allclose(moved[pupil.mask], plain[pupil.mask] + 0.3, atol=1e-6)
+    np.testing.assert_allclose(moved[pupil.inside], plain[pupil.inside] + 0.3, atol=1e-6)
 
 
 # Points without an equation.
@@ -703,9 +703,9 @@ def test_singular_points_keep_their_value_and_are_counted():
     frames = sensor.measure(zwfs.zernike_basis(pupil, 1)[0] * 0.1)
     start = np.full(pupil.shape, 0.3)
     found = PhaseShifted(sensor, n_iterations=1)(frames, start=start)
-    assert found.n_unsolved == np.count_nonzero(pupil.mask[:, 15])
-    np.testing.assert_allclose(found.phase[pupil.mask[:, 15], 15], 0.3, atol=1e-12)
-    assert np.abs(found.phase - 0.3)[:, :15][pupil.mask[:, :15]].min() > 1e-4
+    assert found.n_unsolved == np.count_nonzero(pupil.inside[:, 15])
+    np.testing.assert_allclose(found.phase[pupil.inside[:, 15], 15], 0.3, atol=1e-12)
+    assert np.abs(found.phase - 0.3)[:, :15][pupil.inside[:, :15]].min() > 1e-4
 
 
 def test_points_of_no_amplitude_do_no_harm(pupil, shifted, screens):
@@ -713,8 +713,8 @@ def test_points_of_no_amplitude_do_no_harm(pupil, shifted, screens):
     amplitude[15:18, 10:30] = 0
     phase = screens(0.4)
     found = PhaseShifted(shifted, amplitude=amplitude)(shifted.measure(phase, amplitude))
-    assert np.isfinite(found.phase[:, pupil.mask]).all()
-    lit = (amplitude > 0) & pupil.mask
+    assert np.isfinite(found.phase[:, pupil.inside]).all()
+    lit = (amplitude > 0) & pupil.inside
     error = np.angle(np.exp(1j * (found.phase - phase)))[:, lit]
     np.testing.assert_allclose(error - error.mean(axis=1, keepdims=True), 0, atol=1e-5)
 
@@ -750,7 +750,7 @@ def test_raw_counts_are_warned_of(make, method, screens, scale):
     reconstruct, sensor = make(method)
     counts = sensor.measure(screens(0.3))
     counts[1] *= scale
-    mean = counts[1][:, sensor.pupil.mask].mean(axis=-1).max()
+    mean = counts[1][:, sensor.pupil.inside].mean(axis=-1).max()
     message = f"frames: the mean inside the pupil reaches {mean:.4g}: expected at most about 1, .*raw counts"
     with pytest.warns(UserWarning, match=message) as caught:
         reconstruct(counts)

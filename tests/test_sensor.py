@@ -98,7 +98,7 @@ def test_patch_equals_a_direct_fourier_sum_on_a_fine_grid(complex_field):
     patch = Patch(2.0, lambda u, v: 1 + change(u, v), n_samples=64)
     sensor = ZernikeSensor(pupil, patch, tolerance=1e-14)
     u = np.arange(-1, 1, 0.01)
-    field = complex_field(pupil) * pupil.mask
+    field = complex_field(pupil) * pupil.inside
     to_u, to_v = (np.exp(-2j * np.pi * np.outer(u, axis)) for axis in (pupil.x, pupil.y))
     focal = to_v @ field @ to_u.T / 16**2
     summed = to_v.conj().T @ (change(u, u[:, np.newaxis]) * focal) @ to_u.conj() * 0.01**2
@@ -315,7 +315,7 @@ def test_detector_sees_incoming_field_plus_reference_wave(pupil, complex_field, 
     sensor = ZernikeSensor(pupil, *MASKS["two dimples"], extent=extent)
     field = complex_field(pupil)
     rest = sensor.propagate(field) - sensor.reference_wave(field)
-    np.testing.assert_allclose(rest[(..., *sensor.window)], [field * pupil.mask] * 2, atol=1e-14)
+    np.testing.assert_allclose(rest[(..., *sensor.window)], [field * pupil.inside] * 2, atol=1e-14)
     rest[(..., *sensor.window)] = 0
     assert not rest.any()
 
@@ -338,12 +338,12 @@ def test_adjoint_passes_the_dot_product_test(rough_pupil, complex_field, masks, 
     wave = sensor.propagate(complex_field(rough_pupil, seed=1)).conj() + 1
     forward, back = np.vdot(wave, sensor.propagate(field)), np.vdot(sensor.adjoint(wave), field)
     assert abs(forward - back) < 1e-13 * np.linalg.norm(wave) * np.linalg.norm(field)
-    assert not sensor.adjoint(wave)[~rough_pupil.mask].any()
+    assert not sensor.adjoint(wave)[~rough_pupil.inside].any()
 
 
 def test_adjoint_is_nearly_the_inverse_on_a_wide_detector(complex_field):
     pupil = Pupil.circular(20)
-    field = zernike_basis(pupil, 5)[4] * pupil.mask + 0j
+    field = zernike_basis(pupil, 5)[4] * pupil.inside + 0j
     loss = [
         np.abs(sensor.adjoint(sensor.propagate(field)) - field).max()
         for sensor in (ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), extent=extent) for extent in (2, 16))
@@ -355,7 +355,7 @@ def test_adjoint_is_nearly_the_inverse_on_a_wide_detector(complex_field):
 def test_reference_phases_differ_by_half_the_phases_of_the_dimples(pupil, screens, phases):
     sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in phases))
     a, b = np.moveaxis(sensor.reference_wave(np.exp(1j * screens(0.8))), 1, 0)
-    excess = (np.angle(b / a) - (phases[1] - phases[0]) / 2)[:, pupil.mask]
+    excess = (np.angle(b / a) - (phases[1] - phases[0]) / 2)[:, pupil.inside]
     np.testing.assert_allclose(np.sin(excess), 0, atol=1e-10)
 
 
@@ -406,7 +406,7 @@ def test_half_of_the_light_leaves_the_pupil():
     pupil = Pupil.circular(100)
     sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), extent=2)
     frame = sensor.measure(np.zeros(pupil.shape))[0] / pupil.n_points
-    assert frame[sensor.window][pupil.mask].sum() == pytest.approx(0.505, abs=5e-4)
+    assert frame[sensor.window][pupil.inside].sum() == pytest.approx(0.505, abs=5e-4)
     assert frame.sum() == pytest.approx(0.890, abs=5e-4)
 
 
@@ -506,9 +506,9 @@ def test_fields_in_another_order_of_memory(shifted, complex_field, pupil):
 
 def test_what_lies_outside_the_pupil_does_not_matter(shifted, screens, pupil):
     phase = screens(0.5)
-    np.testing.assert_array_equal(shifted.measure(np.where(pupil.mask, phase, np.nan)), shifted.measure(phase))
-    field = np.exp(1j * phase) * pupil.mask
-    np.testing.assert_array_equal(shifted.propagate(np.where(pupil.mask, field, 5)), shifted.propagate(field))
+    np.testing.assert_array_equal(shifted.measure(np.where(pupil.inside, phase, np.nan)), shifted.measure(phase))
+    field = np.exp(1j * phase) * pupil.inside
+    np.testing.assert_array_equal(shifted.propagate(np.where(pupil.inside, field, 5)), shifted.propagate(field))
 
 
 def test_inputs_are_left_alone(shifted, screens, pupil):

@@ -62,7 +62,7 @@ def test_linearised_step_is_the_derivative_of_a_step(rough_pupil, rms):
     measured = rough_pupil.gather(np.angle(np.exp(1j * (plus - minus)))) / (2 * h)
     expected = linearised_step(rough_pupil, 1.8, phase, error)
     np.testing.assert_allclose(rough_pupil.gather(expected), measured, atol=2e-6)
-    assert np.isnan(expected[~rough_pupil.mask]).all()
+    assert np.isnan(expected[~rough_pupil.inside]).all()
 
 
 def test_flat_wavefront_gives_a_weighted_mean(pupil, modes):

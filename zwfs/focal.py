@@ -49,4 +49,4 @@ def focal_field(pupil: Pupil, field: ArrayLike, u: ArrayLike, v: ArrayLike) -> N
             )
     from_x = np.exp(-2j * np.pi * np.outer(pupil.x, u))
     from_y = np.exp(-2j * np.pi * np.outer(v, pupil.y))
-    return from_y @ (field * pupil.mask) @ from_x / pupil.n_points
+    return from_y @ (field * pupil.inside) @ from_x / pupil.n_points

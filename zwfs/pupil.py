@@ -234,14 +234,14 @@ class Pupil:
         return self.amplitude.shape
 
     @cached_property
-    def mask(self) -> NDArray[np.bool_]:
-        """True at the points inside, shape (ny, nx)."""
+    def inside(self) -> NDArray[np.bool_]:
+        """Whether a point lies inside the pupil, shape (ny, nx)."""
         return read_only(self.amplitude > 0)
 
     @cached_property
     def indices(self) -> NDArray[np.intp]:
         """Positions of the points inside in a flattened map, shape (n_points,)."""
-        return read_only(np.flatnonzero(self.mask))
+        return read_only(np.flatnonzero(self.inside))
 
     @property
     def n_points(self) -> int:
@@ -277,6 +277,23 @@ class Pupil:
         maps = np.full((*values.shape[:-1], self.amplitude.size), _fill(fill, values.dtype), values.dtype)
         maps[..., self.indices] = values
         return maps.reshape(*values.shape[:-1], *self.shape)
+
+    def field(self, phase: ArrayLike) -> NDArray[np.complex128]:
+        """Return the field amplitude * exp(i phase): (..., ny, nx), radian, to complex, 0 outside.
+
+        Only the points inside count; NaN or anything else is allowed outside.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the phase is complex, of the wrong shape, or not finite inside the pupil.
+        """
+        phase = _check.real_array("phase", phase)
+        _check.trailing_shape("phase", phase, self.shape, "the shape of the pupil")
+        phase = np.where(self.inside, phase, 0)
+        _check.moderate("phase", phase, " inside the pupil")
+        phasor: NDArray[np.complex128] = np.exp(1j * phase.astype(np.float64, copy=False))
+        return self.amplitude * phasor
 
     def rms(self, phase: ArrayLike) -> NDArray[np.float64]:
         """Rms over the points inside, piston removed: (..., ny, nx) to (...), in the unit of `phase`."""

@@ -149,7 +149,7 @@ class ZernikeSensor:
         """Maps of the pupil for arrays of one kind; made once, then kept."""
         _check.instance("kind", kind, Kind)
         if kind not in self._maps:
-            self._maps[kind] = PupilMaps.of(self.pupil.mask, self.pupil.amplitude, kind)
+            self._maps[kind] = PupilMaps.of(self.pupil.inside, self.pupil.amplitude, kind)
         return self._maps[kind]
 
     def propagate(self, field: ArrayLike) -> NDArray[np.complexfloating]:

@@ -36,7 +36,7 @@ def data() -> dict[str, Any]:
     pupil = zwfs.Pupil.circular(N_PIXELS)
     diameters, factors = dimples(pupil)
     return {
-        "inside": _encode(pupil.mask.astype(np.uint8)),
+        "inside": _encode(pupil.inside.astype(np.uint8)),
         "diameters": diameters.tolist(),
         "pupil": _plane(factors.pupil.to(Kind.numpy(np.float32))),
         "detector": _plane(factors.detector.to(Kind.numpy(np.float32))),

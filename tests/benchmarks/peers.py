@@ -139,7 +139,7 @@ class Field:
             yield Contestant(task, "HCIPy", f"{n} samples", n == 128, run, error)
 
     def _worst(self, difference):
-        return float(np.abs(difference)[..., self.pupil.mask].max())
+        return float(np.abs(difference)[..., self.pupil.inside].max())
 
     def _phase_error(self, phase, truth):
         return float(reconstruction_error(self.pupil, phase, truth))
@@ -217,7 +217,7 @@ class Field:
         return zelda.Sensor(
             "CLASSIC", mask_Fratio=65.0, mask_depth=depth, mask_diameter=DIAMETER * 65.0 * WAVELENGTH,
             pupil_diameter=self.pupil.n_pixels, silent=True,
-            pupil_telescope=True, pupil_function=lambda _: self.pupil.mask.astype(float),
+            pupil_telescope=True, pupil_function=lambda _: self.pupil.inside.astype(float),
         )  # fmt: skip
 
     @cached_property

@@ -252,7 +252,7 @@ class Bench:
         if self.quilting:
             x, y = np.meshgrid(self._pupil.x, self._pupil.y)
             phase += self.quilting * (np.cos(2 * np.pi * 22 * x) + np.cos(2 * np.pi * 22 * y))
-        return self._pupil.amplitude * np.exp(1j * phase)
+        return self._pupil.field(phase)
 
     @property
     def _camera_shape(self) -> tuple[int, int]:

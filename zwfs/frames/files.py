@@ -339,7 +339,7 @@ def write_phase(
         primary.header[key] = (_card_value(value), comment) if comment else _card_value(value)
     nanometres = fits.ImageHDU(found.phase * wavelength / (2 * np.pi), name="PHASE_NM")
     nanometres.header["BUNIT"] = "nm"
-    masked = fits.ImageHDU((measurement.pupil.mask & ~measurement.good).astype(np.uint8), name="MASKED")
+    masked = fits.ImageHDU((measurement.pupil.inside & ~measurement.good).astype(np.uint8), name="MASKED")
     write_file(path, fits_bytes(fits.HDUList([primary, nanometres, masked])))
 
 

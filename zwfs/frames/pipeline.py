@@ -130,7 +130,7 @@ class Measurement:
     @cached_property
     def good(self) -> NDArray[np.bool_]:
         """Points of the pupil at which both frames and both mask-out images are good, (ny, nx)."""
-        return self.pupil.mask & ~self.bad[(..., *self.window)].any(axis=0)
+        return self.pupil.inside & ~self.bad[(..., *self.window)].any(axis=0)
 
     @property
     def n_masked(self) -> int:
@@ -268,7 +268,7 @@ def _measure(recording: Recording, optics: Optics, margin: int) -> Measurement:
     intensity = frames / (counts[:, None, None] * recording.exposure)
     bad = frames_bad.copy()
     inner = slice(margin, margin + n)
-    bad[..., inner, inner] |= images_bad.any(axis=0) & pupil.mask
+    bad[..., inner, inner] |= images_bad.any(axis=0) & pupil.inside
     result = Measurement(
         intensity, pupil, bad, margin, recording.diameter, counts, levels, (1.0, light[0] / light[1])
     )
@@ -326,7 +326,7 @@ def measured_pupil(
     middle = center or tuple((n - 1) / 2 for n in amplitude.shape)
     stop = radius(amplitude.shape, middle) <= n_pixels / 2
     pupil = Pupil.from_amplitude(np.where(stop, amplitude, 0), n_pixels, center, threshold=0.1)
-    return pupil, scale * np.mean(amplitude[pupil.mask] ** 2)
+    return pupil, scale * np.mean(amplitude[pupil.inside] ** 2)
 
 
 def reconstruct(measurement: Measurement, optics: Optics, n_iterations: int = 25) -> Found:
@@ -356,7 +356,7 @@ def reconstruct(measurement: Measurement, optics: Optics, n_iterations: int = 25
     iterate = PhaseShifted(sensor, n_iterations=n_iterations, tolerance=1e-4)
     measured = measurement.intensity * optics.scale - optics.background
     frames = np.maximum(_unmix(measured, measurement, optics), 0)
-    masked = measurement.pupil.mask & ~measurement.good
+    masked = measurement.pupil.inside & ~measurement.good
     for _ in range(2 if masked.any() else 1):
         estimate = iterate(frames)
         phase = nearest_good(estimate.phase, measurement.good)

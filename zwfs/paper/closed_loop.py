@@ -172,7 +172,7 @@ def close_loop(
     sensor = _check.sensor_of("reconstructor", reconstructor)
     pupil = sensor.pupil
     _check.instance("flow", flow, FrozenFlow)
-    if flow.pupil.shape != pupil.shape or np.any(flow.pupil.mask != pupil.mask):
+    if flow.pupil.shape != pupil.shape or np.any(flow.pupil.inside != pupil.inside):
         raise ValueError(
             f"flow has {_check.shown(flow.pupil)}: expected that of the reconstructor, {_check.shown(pupil)}"
         )

@@ -323,7 +323,7 @@ def measured_factor(
     frames, error, factors = sensor.measure(phase), away, []
     for _ in range(n_iterations):
         error = wrapped_residual(pupil, method(frames, start=phase + error).phase, phase)
-        error = np.where(pupil.mask, error, 0)
+        error = np.where(pupil.inside, error, 0)
         factors.append(float(pupil.rms(error)) / size)
         error /= factors[-1]
     return float(np.exp(np.mean(np.log(factors[n_iterations // 2 :]))))
@@ -410,8 +410,7 @@ def _linearised(pupil: Pupil, diameter: float, phase: ArrayLike | None) -> tuple
     """Light in the dimple, and the field and its beta at the points of the pupil, (n_points,) each."""
     _check.instance("pupil", pupil, Pupil)
     phase = np.zeros(pupil.shape) if phase is None else _check_map(pupil, "phase", phase)
-    values = pupil.gather(phase)
-    psi = pupil.gather(pupil.amplitude) * np.exp(1j * values)
+    psi = pupil.gather(pupil.field(phase))
     light = DimpleLight(pupil, diameter)
     beta = light(psi[np.newaxis])[0]
     if not beta.any():

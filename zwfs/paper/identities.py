@@ -217,7 +217,7 @@ def approximation_errors(sensor: ZernikeSensor, screens: NDArray, power: float =
     pupil = sensor.pupil
     amplitude = pupil.gather(pupil.amplitude)
     frames = pupil.gather(sensor.measure(screens))
-    field = pupil.amplitude * np.exp(1j * np.where(pupil.mask, screens, 0))
+    field = pupil.field(screens)
     true = pupil.gather(sensor.reference_wave(field))
     flat = pupil.gather(sensor.reference_wave(pupil.amplitude))
     guess = strehl(pupil, screens)[:, np.newaxis, np.newaxis] ** power * flat
@@ -266,6 +266,6 @@ def _light(pupil: Pupil, mask: Mask, field: NDArray) -> NDArray[np.complexfloati
     field = _check.complex_array("field", field)
     if field.shape != pupil.shape:
         raise ValueError(f"field has shape {field.shape}: expected {pupil.shape}")
-    light = np.where(pupil.mask, field, 0)
+    light = np.where(pupil.inside, field, 0)
     _check.finite("field", light, " inside the pupil")
     return light

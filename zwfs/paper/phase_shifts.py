@@ -72,7 +72,7 @@ def phase_noise(sensor: ZernikeSensor, phase: ArrayLike) -> PhaseNoise:
     if sensor.n_masks != 2 or sensor.detector_shape != sensor.pupil.shape:
         raise ValueError(f"sensor = {_check.shown(sensor)}: expected two masks and an extent of 1")
     phase = _check_map(sensor.pupil, "phase", phase)
-    field = sensor.pupil.amplitude * np.exp(1j * np.where(sensor.pupil.mask, phase, 0))
+    field = sensor.pupil.field(phase)
     psi = sensor.pupil.gather(field)
     waves = sensor.pupil.gather(sensor.reference_wave(field))
     intensity = np.abs(psi + waves) ** 2

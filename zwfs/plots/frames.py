@@ -47,7 +47,7 @@ def phase_map(found: Found, wavelength: float) -> Figure:
     figure, axes = plt.subplots(figsize=(6.4, 5))
     limit = np.nanmax(np.abs(found.phase))
     shown = show_phase(axes, found.phase, limit)
-    masked = found.measurement.pupil.mask & ~found.measurement.good
+    masked = found.measurement.pupil.inside & ~found.measurement.good
     if masked.any():
         axes.plot(*np.argwhere(masked)[:, ::-1].T, "s", color=_MASKED, ms=2, label=f"{masked.sum()} masked points")
         figure.legend(loc="outside lower center", fontsize=9)

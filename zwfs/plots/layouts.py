@@ -47,10 +47,10 @@ _PLUS, _MINUS = _Polarisation("#B2182B", "-"), _Polarisation("#313695", (0, (4, 
 def sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:
     """Figure 1: the planes of a sensor with one mask, with the fields computed for `phase` (radian)."""
     pupil, mask = sensor.pupil, sensor.masks[0]
-    field = pupil.amplitude * np.exp(1j * np.where(pupil.mask, phase, 0))
+    field = pupil.field(phase)
     wave = sensor.reference_wave(field)[0]
     frame = np.abs(sensor.propagate(field)[0]) ** 2
-    inside = np.where(pupil.mask, 1, np.nan)
+    inside = np.where(pupil.inside, 1, np.nan)
 
     scene = _Scene(9, 4.7)
     y, half = 3.0, 0.8 * 0.98
@@ -138,14 +138,14 @@ def _vector_row(scene: _Scene, y: float, sensor: ZernikeSensor, phase: NDArray, 
         scene.label(x, y - 0.84, "lens")
 
     pupil = sensor.pupil
-    inside = np.where(pupil.mask, phase, np.nan)
+    inside = np.where(pupil.inside, phase, np.nan)
     limit = np.nanmax(np.abs(inside))
     shown = scene.picture(pupil_x, y, 1.05, inside, PHASE_MAP, -limit, limit)
     scene.label(pupil_x, y + 0.6, r"pupil: $\phi_{in}$ (rad)")
     scene.scale(shown, (pupil_x - 0.45, y - 0.66, 0.9, 0.06))
     scene.label(pupil_x, y - 1.1, "unpolarised light")
 
-    halo = _halo(pupil, pupil.amplitude * np.exp(1j * np.where(pupil.mask, phase, 0)), 2.2)
+    halo = _halo(pupil, pupil.field(phase), 2.2)
     frames = sensor.measure(phase)
     for index, (mask, look, sign) in enumerate(zip(sensor.masks, (_PLUS, _MINUS), (1, -1), strict=True)):
         linear, circular, swapped = ("along", "left", "right") if sign > 0 else ("across", "right", "left")
@@ -278,7 +278,7 @@ def _bench_pictures(scene: _Scene, bench: Bench, phase: NDArray, frames: NDArray
     scene.picture(right, lower, size, quilted, INTENSITY_MAP, 0, quilted.max())
     scene.label(right, lower + 0.73, "quilting in a flat frame")
     mask = Dimple(bench.diameter, bench.phase)
-    halo = _halo(pupil, pupil.amplitude * np.exp(1j * np.nan_to_num(phase)), 4)
+    halo = _halo(pupil, pupil.field(phase), 4)
     scene.callout((left, 1.2), (left, lower))
     _mask_picture(scene, left, lower, size, mask, halo, 4, _PLUS)
     scene.label(left, lower + 0.73, f"focus, dimple of {_shift(mask, plus=True)}")

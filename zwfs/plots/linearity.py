@@ -86,7 +86,7 @@ def estimates(
     pupil: Pupil, truth: NDArray, found: Mapping[str, NDArray], residuals: Mapping[str, NDArray]
 ) -> Figure:
     """One screen, what each method makes of it, and what is left (radian), on a scale four times finer."""
-    truth = np.where(pupil.mask, truth, np.nan)
+    truth = np.where(pupil.inside, truth, np.nan)
     limit = np.nanmax(np.abs(truth))
     figure, panels = plt.subplots(2, len(found) + 1, figsize=(9, 3.6))
     image = show_phase(panels[0, 0], truth, limit)

@@ -40,7 +40,7 @@ class Acceleration:
         """From the coefficients of a flat wavefront, (1, 2 r), and what an iteration leaves of a small tilt."""
         pupil, core = sensor.factors.pupil, sensor.factors.core
         window = sensor.factors.detector.cut(*sensor.window)
-        inside = sensor.pupil.mask.astype(float)
+        inside = sensor.pupil.inside.astype(float)
         # With r = K b the light changes by |r|^2 + 2 Re(conj(r) psi), summed over the pupil: a form of b.
         cross = window.products(pupil, np.ones_like(inside))
         power = window.products(window, inside)

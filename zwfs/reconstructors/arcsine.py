@@ -113,7 +113,7 @@ class Arcsine(Reconstructor):
         """Constants for arrays of one kind; made once, then kept."""
         if kind not in self._constants:
             amplitude, sensor, exact = self.settings.amplitude, self.sensor, Kind.numpy()
-            mask, core = sensor.pupil.mask, split_core(sensor.factors.core)
+            mask, core = sensor.pupil.inside, split_core(sensor.factors.core)
             lit = mask & (amplitude > 0)
             gain = np.where(lit, 1 / (2 * np.where(lit, amplitude, 1)), 0)
             dark = mask & ~lit

@@ -107,7 +107,7 @@ class Settings:
     def maps(self, kind: Kind) -> PupilMaps:
         """Maps of the pupil, with the amplitude of the settings, for arrays of one kind; made once, then kept."""
         if kind not in self._maps:
-            self._maps[kind] = PupilMaps.of(self.sensor.pupil.mask, self.amplitude, kind)
+            self._maps[kind] = PupilMaps.of(self.sensor.pupil.inside, self.amplitude, kind)
         return self._maps[kind]
 
 

@@ -272,7 +272,7 @@ class PhaseShifted(Reconstructor):
         sensor, kind = self.sensor, Kind.numpy()
         waves = sensor.operator(kind).split_reference(self._flat(), in_window=True)
         _, singular = self._solve(waves, np.zeros((1, sensor.n_masks, *sensor.pupil.shape)), kind)
-        if singular is not None and singular[0][sensor.pupil.mask].all():
+        if singular is not None and singular[0][sensor.pupil.inside].all():
             raise ValueError(
                 "sensor: the determinant sin(phi_ref_b - phi_ref_a) of equation (10) is 0 at every point for "
                 "its masks: expected phase shifts that differ by other than 0 mod 2 pi, none of them 0, and "

@@ -3,6 +3,8 @@
 import ast
 import difflib
 import io
+import math
+import operator
 import tokenize
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,6 +16,7 @@ from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event
 
+from zwfs.companion.limits import LIMITS
 from zwfs.companion.parameters import check_parameters
 
 # What may stand behind the last comma of a parameter's comment; all else there belongs to the meaning.
@@ -96,7 +99,7 @@ def parameters(notebook: NotebookNode) -> dict[str, Parameter]:
     Raises
     ------
     ParameterError
-        If a default or a limit is no literal.
+        If a default or a limit is not a literal.
     """
     limits = _limits(notebook)
     return {
@@ -134,8 +137,22 @@ def _limits(notebook: NotebookNode) -> dict[str, Any]:
         if cell.cell_type == "code" and f"{check_parameters.__name__}(" in cell.source:
             for node in ast.walk(ast.parse(cell.source)):
                 if isinstance(node, ast.Call) and getattr(node.func, "id", "") == check_parameters.__name__:
-                    return {keyword.arg: _limit(keyword.value) for keyword in node.keywords}
+                    limits = {}
+                    for keyword in node.keywords:
+                        # Without a name the keyword is a mapping: **LIMITS["fig03_dynamic_range"].
+                        limits |= {keyword.arg: _limit(keyword.value)} if keyword.arg else _listed(keyword.value)
+                    return limits
     return {}
+
+
+def _listed(node: ast.expr) -> dict[str, Any]:
+    """Return the limits that the package lists under a name: ``LIMITS["name"]``."""
+    match node:
+        case ast.Subscript(value=ast.Name(id="LIMITS"), slice=ast.Constant(value=name)) if name in LIMITS:
+            return LIMITS[name]
+    raise ParameterError(
+        f"{ast.unparse(node)}: expected limits of zwfs.companion.limits, one of {', '.join(LIMITS)}"
+    )
 
 
 def _limit(node: ast.expr) -> Any:
@@ -151,6 +168,18 @@ def _expression(value: str) -> ast.expr:
 
 
 def _literal(node: ast.expr) -> Any:
+    """Evaluate a literal, in which np.pi may stand: -np.pi / 2, 0.3 * np.pi."""
+    match node:
+        case ast.Attribute(value=ast.Name(id="np"), attr="pi"):
+            return math.pi
+        case ast.List(elts=items):
+            return [_literal(item) for item in items]
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return -_literal(operand)
+        case ast.BinOp(left=left, op=ast.Mult() | ast.Div() as operation, right=right):
+            return (operator.mul if isinstance(operation, ast.Mult) else operator.truediv)(
+                _literal(left), _literal(right)
+            )
     try:
         return ast.literal_eval(node)
     except ValueError:

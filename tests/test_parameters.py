@@ -1,6 +1,5 @@
 """Limits of parameters: what is let through, and what is said of the rest."""
 
-import ast
 import math
 from pathlib import Path
 
@@ -8,7 +7,9 @@ import declared
 import numpy as np
 import pytest
 import runner
+from nbformat.v4 import new_code_cell, new_notebook
 
+from zwfs.companion.limits import LIMITS
 from zwfs.companion.parameters import check_parameters
 
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
@@ -85,10 +86,7 @@ def test_every_parameter_of_a_notebook_has_a_meaning_and_limits(path):
     assert [name for name, one in known.items() if not one.meaning] == []
     assert [name for name, one in known.items() if one.limits is None] == []
     # No limits for what is no parameter, and defaults within them.
-    [tagged] = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", ())]
-    after = notebook.cells[notebook.cells.index(tagged) + 1]
-    [call] = [node for node in ast.walk(ast.parse(after.source)) if isinstance(node, ast.Call) and node.keywords]
-    assert {keyword.arg for keyword in call.keywords} == set(known)
+    assert set(LIMITS[path.stem]) == set(known)
     assert declared.accept({name: one.default for name, one in known.items()}, known) == {}
 
 
@@ -99,3 +97,27 @@ def test_notebook_refuses_bad_values_in_its_second_cell_of_code():
     exec(f"{tagged.source}\n{after.source}", {})
     with pytest.raises(ValueError, match="rms = 40"):
         exec(f"{tagged.source}\nrms = 40\n{after.source}", {})
+
+
+def with_default(written):
+    cell = new_code_cell(f"angle = {written}  # shift, rad", metadata={"tags": ["parameters"]})
+    return new_notebook(cells=[cell])
+
+
+@pytest.mark.parametrize(
+    ("written", "value"),
+    [
+        ("np.pi", np.pi),
+        ("-np.pi / 2", -np.pi / 2),
+        ("0.3 * np.pi", 0.3 * np.pi),
+        ("[np.pi / 2, 1]", [np.pi / 2, 1]),
+    ],
+)
+def test_defaults_may_be_fractions_of_pi(written, value):
+    assert declared.parameters(with_default(written))["angle"].default == value
+
+
+@pytest.mark.parametrize("written", ["np.e", "np.pi + 1", "math.pi", "open('file')"])
+def test_other_expressions_are_refused(written):
+    with pytest.raises(declared.ParameterError, match="literal"):
+        declared.parameters(with_default(written))

@@ -1,15 +1,15 @@
-"""Sweeps: tasks that do not depend on each other, on one core, on several, or on a cluster.
+"""Sweeps: independent tasks, on one core, on several, or on a cluster.
 
-An experiment hands its tasks to `run`. With joblib they run on all cores, unless a `joblib.parallel_config` around
-the sweep says otherwise. Without joblib they run in this process, and so does a single task. Where and in which
-order they run does not change a bit of the results: random numbers come from the number of the task, and BLAS
-works with one thread. Without threadpoolctl BLAS keeps its threads, and the last digits may differ.
+An experiment passes its tasks to `run`. With joblib the tasks run on all cores; a `joblib.parallel_config` around
+the sweep chooses other workers. Without joblib, or with a single task, they run in this process. The results are
+the same to the last bit wherever and in whatever order the tasks run: random numbers depend on the number of the
+task, and BLAS uses one thread. Without threadpoolctl BLAS keeps its threads, and the last digits may differ.
 
-Two environment variables, read when a sweep begins, name
+Two environment variables are read when a sweep begins:
 
-- ``ZWFS_SWEEPS``, a folder that keeps what each finished task gave. A sweep that was stopped, run again, does only
-  what is left. Its files are pickles: use no folder that others can write to.
-- ``ZWFS_PROGRESS``, a file that gets a line as each task finishes:
+- ``ZWFS_SWEEPS`` names a folder that keeps the result of each finished task. A sweep that was stopped and is run
+  again computes only the missing results. The files are pickles: use a folder that only you can write to.
+- ``ZWFS_PROGRESS`` names a file to which each finished task appends a line:
   ``{"name": "linearity_curves", "done": 3, "total": 22}``.
 """
 
@@ -39,26 +39,26 @@ from zwfs._files import write_file
 STORE = "ZWFS_SWEEPS"
 PROGRESS = "ZWFS_PROGRESS"
 
-_PROCESS = uuid4().hex  # a name for this process that no other one has, on any machine
+_PROCESS = uuid4().hex  # identifies this process among those of all machines
 _IN_TASK = ContextVar("_IN_TASK", default=False)
 
 
 def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str) -> list[Any]:
-    """Do a task for every input, and give the results in the order of the inputs.
+    """Run a task for every input, and return the results in the order of the inputs.
 
-    A sweep that is begun within a task is done there, as a part of it.
+    A sweep that begins within a task runs in the process of that task.
 
     Parameters
     ----------
     task : callable
-        ``task(value, *shared)`` for each `value` of the inputs. It may not depend on anything that changes from
-        task to task but on `value`, which therefore holds the seed, or the number that a seed is made of.
+        Called as ``task(value, *shared)`` for each `value` of the inputs. Its result may depend on these arguments
+        only, so `value` holds the seed of the task, or the number from which the seed is derived.
     inputs : iterable
-        Small ones: a number, a tuple of a few.
+        Small values, such as a number or a short tuple.
     *shared
-        What all tasks need, however large: it travels once to each process of a cluster.
+        Data that all tasks need, of any size; each process of a cluster receives them once.
     name : str
-        Of the sweep, for progress and messages.
+        Name of the sweep in progress reports and messages.
 
     Returns
     -------
@@ -71,8 +71,8 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
     ImportError
         If joblib or a folder for the results needs cloudpickle or threadpoolctl, and one of them is missing.
     Exception
-        That of the first task that fails, with a note that names the sweep, the task and its input. What other
-        tasks had finished stays in the folder of ``ZWFS_SWEEPS``.
+        The exception of the first task that fails, with a note that names the sweep, the task and its input. The
+        results of finished tasks stay in the folder of ``ZWFS_SWEEPS``.
 
     Examples
     --------
@@ -95,19 +95,19 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
     if missing := [package for package in needed if not find_spec(package)]:
         raise ImportError(f"sweeps need {', '.join(missing)}: pip install zwfs[sweeps]")
     store = _Store(name, (task, *shared))
-    found = {index: kept for index, value in enumerate(inputs) if (kept := store.load(value)) is not None}
-    if found:
-        _tell(name, len(found), len(inputs))
-    waiting = [(index, value) for index, value in enumerate(inputs) if index not in found]
+    finished = {index: kept for index, value in enumerate(inputs) if (kept := store.load(value)) is not None}
+    if finished:
+        _report_progress(name, len(finished), len(inputs))
+    waiting = [(index, value) for index, value in enumerate(inputs) if index not in finished]
     for index, *result in _results(waiting, (task, *shared), name):
         store.save(inputs[index], result)
-        found[index] = result
-        _tell(name, len(found), len(inputs))
-    return [found[index][0] for index in range(len(inputs))]
+        finished[index] = result
+        _report_progress(name, len(finished), len(inputs))
+    return [finished[index][0] for index in range(len(inputs))]
 
 
 def _results(waiting: list[tuple[int, Any]], shared: tuple[Any, ...], name: str) -> Iterator[tuple[int, Any]]:
-    """Number and result of each task, as they finish."""
+    """Yield number and result of each task as it finishes."""
     with _one_thread():
         if len(waiting) < 2 or not find_spec("joblib"):
             yield from (_work(shared, index, (value,), name, _PROCESS) for index, value in waiting)
@@ -118,8 +118,8 @@ def _results(waiting: list[tuple[int, Any]], shared: tuple[Any, ...], name: str)
 def _parallel_results(
     waiting: list[tuple[int, Any]], shared: tuple[Any, ...], name: str
 ) -> Iterator[tuple[int, Any]]:
-    """Number and result of each task, as joblib's workers finish them."""
-    # Not at the top: the rest of the package does without these.
+    """Yield number and result of each task as a worker of joblib finishes it."""
+    # Imported here because the rest of the package does not need them.
     from cloudpickle import dumps
     from joblib import Parallel, delayed
     from joblib.parallel import get_active_backend
@@ -127,17 +127,17 @@ def _parallel_results(
     backend, n_jobs = get_active_backend()
     client = getattr(backend, "client", None)  # of a Dask cluster
     if client is not None:
-        # The result of a task, unlike data that are sent, is made again if the worker that holds it is lost.
+        # Dask repeats a task if the worker that holds its result is lost; data that were sent would stay lost.
         shared = client.submit(pickle.loads, dumps(shared), pure=False)
-    # The value in a tuple: joblib would send a large one to a single Dask worker, with which it could be lost.
+    # The tuple keeps joblib from sending a large value to a single Dask worker, with which it could be lost.
     calls = [delayed(_work)(shared, index, (value,), name, _PROCESS) for index, value in waiting]
-    # All tasks are handed out at once, so that a cluster can grow as they wait, and each comes back by itself.
+    # All tasks are submitted at once, so that a cluster can grow while they wait; each result returns by itself.
     pool = Parallel(n_jobs=n_jobs or -1, return_as="generator_unordered", batch_size=1, pre_dispatch="all")
     yield from pool(calls)
 
 
 def _one_thread() -> AbstractContextManager[Any]:
-    """Let BLAS work with one thread, if threadpoolctl is there to say so."""
+    """Limit BLAS to one thread if threadpoolctl is installed."""
     if not find_spec("threadpoolctl"):
         return nullcontext()
     from threadpoolctl import threadpool_limits
@@ -146,11 +146,11 @@ def _one_thread() -> AbstractContextManager[Any]:
 
 
 def _work(shared: Any, index: int, value: tuple[Any], name: str, caller: str) -> tuple[int, Any]:
-    """Do one task, in the caller's process or in another one."""
+    """Run one task, in the caller's process or in a worker."""
     if caller != _PROCESS:
         _limit_threads()
     if not isinstance(shared, tuple):
-        shared = shared.result()  # on a cluster of one core joblib works in the caller's process
+        shared = shared.result()  # on a cluster of one core joblib runs tasks in the caller's process
     task, *rest = shared
     within = _IN_TASK.set(True)
     try:
@@ -164,21 +164,22 @@ def _work(shared: Any, index: int, value: tuple[Any], name: str, caller: str) ->
 
 @cache
 def _limit_threads() -> None:
-    """Let BLAS work with one thread in this process, which is a worker, from now on."""
+    """Limit BLAS to one thread in this worker process from now on."""
     _one_thread()
 
 
-def _tell(name: str, done: int, total: int) -> None:
-    """Append a line to the file of the progress, if there is one."""
+def _report_progress(name: str, done: int, total: int) -> None:
+    """Append a line to the progress file, if the environment names one."""
     if path := os.environ.get(PROGRESS):
         with open(path, "a") as file:
             file.write(json.dumps({"name": name, "done": done, "total": total}) + "\n")
 
 
 class _Store:
-    """What the tasks of a sweep gave, a file for each, if ``ZWFS_SWEEPS`` names a folder.
+    """Results of the tasks of a sweep, one file for each, if ``ZWFS_SWEEPS`` names a folder.
 
-    A file is known by what its result was made from: the value, the task, what the tasks share, and the code.
+    The name of a file is a digest of everything that its result depends on: the value, the task, the shared data,
+    and the code.
     """
 
     def __init__(self, name: str, shared: tuple[Any, ...]) -> None:
@@ -188,7 +189,7 @@ class _Store:
             self._folder.mkdir(parents=True, exist_ok=True)
 
     def load(self, value: Any) -> list[Any] | None:
-        """The result for a value, in a list; None if it is missing or its file damaged."""
+        """Return the result for a value, in a list; None if its file is missing or damaged."""
         path = self._path(value)
         if path is None or not path.exists():
             return None
@@ -197,7 +198,7 @@ class _Store:
         return pickle.loads(content) if hashlib.sha256(content).digest() == check else None
 
     def save(self, value: Any, result: list[Any]) -> None:
-        """Keep the result for a value."""
+        """Store the result for a value."""
         if path := self._path(value):
             content = pickle.dumps(result)
             write_file(path, hashlib.sha256(content).digest() + content)
@@ -207,7 +208,7 @@ class _Store:
 
 
 def _digest(value: Any) -> str:
-    """Digest of any value and of the code that it leads to."""
+    """Return a digest of any value, of the code of `zwfs`, and of the modules that the value comes from."""
     from cloudpickle import Pickler
 
     total = hashlib.sha256(f"{sys.version_info[:2]} {np.__version__} {scipy.__version__}".encode())
@@ -216,9 +217,9 @@ def _digest(value: Any) -> str:
     class Digest(Pickler):
         def reducer_override(self, part: Any) -> Any:
             if isinstance(part, CodeType):
-                # Without the name of the file and the lines, which differ from one kernel to the next.
+                # File name and line numbers are left out: they differ from one kernel to the next.
                 return tuple, ([part.co_code, part.co_consts, part.co_names, part.co_varnames, part.co_freevars],)
-            # What is pickled by its name stands for a file, which may change.
+            # An object that is pickled by name depends on its module, whose file may change.
             module = (
                 part if isinstance(part, ModuleType) else sys.modules.get(getattr(part, "__module__", None) or "")
             )

@@ -33,6 +33,11 @@ def test_the_package_imports_no_optional_package():
     assert done.stdout.strip() == "[]", done.stderr
 
 
+def test_only_gradient_descent_imports_the_optimisers_of_scipy():
+    done = run("-c", "import sys, zwfs; print('scipy.optimize' in sys.modules)")
+    assert done.stdout.strip() == "False", done.stderr
+
+
 def test_modules_are_imported_at_their_first_use():
     code = "import sys, zwfs; print('zwfs.frames' in sys.modules, zwfs.frames.files.read.__module__)"
     done = run("-c", code)

@@ -1,5 +1,6 @@
 """Sweeps give the same bits on one core, two, or a cluster that loses a worker; and they can be taken up again."""
 
+import inspect
 import json
 import os
 import pickle
@@ -108,20 +109,15 @@ def test_large_arrays_are_shared_and_change_no_bit():
     assert found[0].tobytes() == found[1].tobytes()
 
 
-def threads_of_blas(value):
-    from threadpoolctl import threadpool_info
-
-    return os.getpid(), max(library["num_threads"] for library in threadpool_info())
-
-
 @pytest.mark.parametrize("n_jobs", [1, 2])
 def test_blas_has_one_thread_in_every_task(n_jobs):
     # A process of its own, which may use two: the variables are read when NumPy is loaded.
     script = (
-        "import joblib\nfrom zwfs.companion import sweeps\nfrom tests.test_sweeps import threads_of_blas\n"
+        "import joblib\nfrom threadpoolctl import threadpool_info\nfrom zwfs.companion import sweeps\n"
+        "def n_threads(value):\n"
+        "    return max(library['num_threads'] for library in threadpool_info())\n"
         f"with joblib.parallel_config(backend='loky', n_jobs={n_jobs}, inner_max_num_threads=2):\n"
-        "    found = sweeps.run(threads_of_blas, range(4), name='threads')\n"
-        "print(threads_of_blas(0)[1], *(threads for _, threads in found))"
+        "    print(n_threads(0), *sweeps.run(n_threads, range(4), name='threads'))"
     )
     limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2")
     ended = subprocess.run(
@@ -243,14 +239,16 @@ def test_a_cluster_of_one_core_works_too():
         assert sweeps.run(pow, range(4), 2, name="squares") == [0, 1, 4, 9]
 
 
-SWEEP = """
-import signal
-import sys
+# The script defines the task itself, so that the workers need not import this module and what it imports.
+SWEEP = f"""
+import os, signal, sys, time
+from pathlib import Path
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background SIGINT is ignored
 import numpy as np
-from tests.test_sweeps import slow
 from zwfs.companion import sweeps
+
+{inspect.getsource(slow)}
 
 factor = 2.0
 

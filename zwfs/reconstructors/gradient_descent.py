@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import OptimizeResult, minimize
 
 from zwfs import _check
 from zwfs._arrays import Kind
@@ -20,6 +21,9 @@ from zwfs.reconstructors.base import (
 )
 from zwfs.reconstructors.linear import check_modes
 from zwfs.sensor import ZernikeSensor, split, square
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
 
 
 class GradientDescent(Reconstructor):
@@ -124,6 +128,8 @@ class GradientDescent(Reconstructor):
 
     def _descend(self, frames: NDArray, start: NDArray) -> tuple[list[NDArray], bool]:
         """Phases at the points of the pupil after each iteration, and whether the last change was small."""
+        from scipy.optimize import minimize  # takes three times as long to import as the rest of the package
+
         config = self.settings
         n_points = config.sensor.pupil.n_points
         path = [start]

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
 from math import prod
 from typing import Any, NamedTuple, Protocol
 
@@ -140,6 +141,34 @@ def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLik
     if not 1 / _RANGE < light < _RANGE:
         raise ValueError(f"amplitude: its squares add up to {light:.3g}: expected {1 / _RANGE:g} to {_RANGE:g}")
     return Settings(sensor, n_iterations, tolerance, own, light)
+
+
+def load(path: str) -> type:
+    """Return the class of a reconstructor from its path.
+
+    Parameters
+    ----------
+    path : str
+        "module:Class", such as "zwfs.reconstructors.linear:Linear". The module may be any that can be imported: a
+        file next to the notebook, or a part of an installed package.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the path is no such string, there is no such module or class, or objects of the class cannot be called.
+    """
+    if not isinstance(path, str):
+        raise TypeError(f"path = {_check.shown(path)}: expected a string 'module:Class'")
+    module, colon, name = path.partition(":")
+    if not (colon and name.isidentifier() and all(part.isidentifier() for part in module.split("."))):
+        raise ValueError(f"path = {path!r}: expected 'module:Class', such as 'my_method:MyMethod'")
+    try:
+        method = getattr(import_module(module), name, None)
+    except ModuleNotFoundError as error:
+        raise ValueError(f"path = {path!r}: expected a module that can be imported ({error})") from error
+    if not isinstance(method, type) or "__call__" not in dir(method):
+        raise ValueError(f"path = {path!r}: expected the class of a reconstructor, got {_check.shown(method)}")
+    return method
 
 
 class Reconstructor:

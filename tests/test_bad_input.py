@@ -22,9 +22,10 @@ from scipy.ndimage import gaussian_filter
 from threadpoolctl import threadpool_limits
 
 import zwfs
+from zwfs.reconstructors.base import Reconstructor
 
 MODULES = (
-    *("pupil", "modes", "masks", "sensor", "detector", "metrics", "reconstructors"),
+    *("pupil", "modes", "masks", "sensor", "detector", "metrics", "reconstructors", "reconstructors.base"),
     *("bench.model", "bench.segments", "bench.recording"),
     *("frames.files", "frames.registration", "frames.pipeline"),
     *("paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
@@ -36,8 +37,9 @@ MODULES = (
 INFINITE = {"dynamic_range", "LinearityCurves.dynamic_range", "BenchCurves.dynamic_range", "crossing"}
 INFINITE |= {"DiameterCurve.leaves", "phase_noise", "Detector.full_well", "Detector"}
 
-# What reconstructors are built from: their callers check the arguments.
-INTERNAL = {"PupilMaps", "split", "square", "prepare", "step", "operator", "maps", "pupil_maps", "amplitude_maps"}
+# Hooks of the base classes of reconstructors, and the checks of what they get.
+INTERNAL = {"Settings", "Solution", "State", "Estimate", "model", "solve", "invert", "begin", "step", "constants"}
+INTERNAL |= {"check_frames", "check_phase"}
 HANDED_ON = {"run.shared"}  # to the task, as it is
 PASSED = {"Pupil.gather", "Pupil.scatter", "nearest_good"}  # give back what they are given, NaN and infinity too
 # The image or file whose content does not fit is named in place of the argument.
@@ -49,8 +51,7 @@ CONTENT = {
     "CameraFile.keyword": "header",
 }
 SLOW = {"error_budget", "steps", "fit"}  # their answers are not compared, only what they must refuse
-INTERNAL |= {"intensity", "propagate_split", "adjoint_split", "resample"}
-INTERNAL |= {"fits_module", "fits_bytes", "published"}
+INTERNAL |= {"resample", "fits_module", "fits_bytes", "published"}
 
 
 @cache
@@ -69,9 +70,12 @@ def targets():
                 found[name if name not in found else f"{module.__name__[5:]}.{name}"] = thing
             elif inspect.isclass(thing) and not getattr(thing, "_is_protocol", False):
                 # A class that documents attributes only is a result: functions of the package make it.
+                if inspect.isabstract(thing):
+                    continue
                 if "Parameters\n" in (thing.__doc__ or "") or name in ("Pupil", "Table"):
                     found[name] = thing
-                for key, member in vars(thing).items():
+                inherited = {"__call__": thing.__call__} if issubclass(thing, Reconstructor) else {}
+                for key, member in (inherited | vars(thing)).items():
                     shown = not key.startswith("_") or key == "__call__"
                     if shown and key not in INTERNAL and callable(getattr(thing, key)):
                         found[f"{name}.{key}"] = member
@@ -89,7 +93,12 @@ def valid() -> dict:
     phase = zwfs.power_law_screens(modes, 0.2, 1, seed=1)[0]
     field = pupil.amplitude * np.exp(1j * phase)
     waves = pupil.gather(shifted.reference_wave(field))
-    method = zwfs.PhaseShifted(shifted, n_iterations=3)
+    methods = {}
+    for kind in zwfs.RECONSTRUCTORS:
+        options = {"n_iterations": 3} if kind.iterative else {}
+        options |= {"modes": modes} if kind is zwfs.Linear else {}
+        methods[kind.__name__] = kind(shifted if kind.n_masks[1] > 1 else classic, **options)
+    method = methods["PhaseShifted"]
     points = pupil.gather(phase)
     from zwfs.bench import model
     from zwfs.frames import files as camera
@@ -220,8 +229,10 @@ def valid() -> dict:
         "Bench.missing": (),
         "FrozenFlow.cutoff": 1.0,
         "Linear.amplitude": pupil.amplitude,
-        "Arcsine.sensor": classic,
-        "Arcsine.__call__.frames": classic.measure(phase),
+        **{f"{name}.sensor": one.sensor for name, one in methods.items()},
+        **{f"{name}.__call__.frames": one.sensor.measure(phase) for name, one in methods.items()},
+        **{f"{name}.__call__.start": None for name, one in methods.items() if not one.iterative},
+        "load.path": "zwfs.reconstructors.linear:Linear",
         "ZernikeSensor.adjoint.field": shifted.propagate(field),
         "ZernikeSensor.measure.amplitude": pupil.amplitude,
         "GradientDescent.cost.phase": points,
@@ -284,11 +295,7 @@ def valid() -> dict:
         "Patch": zwfs.Patch(1.0, lambda u, v: 0.9 * np.exp(1j * u / 9)),
         "ZernikeSensor": shifted,
         "Detector": zwfs.Detector(pupil, 1e5, gain=1.0, full_well=1e4),
-        "Linear": zwfs.Linear(shifted, modes),
-        "Arcsine": zwfs.Arcsine(classic, n_iterations=3),
-        "PhaseShifted": method,
-        "GerchbergSaxton": zwfs.GerchbergSaxton(shifted, n_iterations=3),
-        "GradientDescent": zwfs.GradientDescent(shifted, n_iterations=3),
+        **methods,
         "Bench": small,
         "BenchModel": model,
         "BenchCurves": bench_linearity.BenchCurves(

@@ -1,7 +1,6 @@
 import inspect
 import pickle
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import zwfs
 from zwfs import (
     RECONSTRUCTORS,
     Arcsine,
-    Detector,
     Dimple,
     GerchbergSaxton,
     GradientDescent,
@@ -20,13 +18,13 @@ from zwfs import (
     ZernikeSensor,
     reconstruction_error,
 )
-from zwfs._arrays import Kind
 from zwfs.reconstructors import gradient_descent
-from zwfs.sensor import split
+from zwfs.reconstructors.base import FixedPoint, load
 
 every = pytest.mark.parametrize("method", RECONSTRUCTORS)
-iterative = pytest.mark.parametrize("method", [method for method in RECONSTRUCTORS if method is not Linear])
-fixed_point = pytest.mark.parametrize("method", [Arcsine, PhaseShifted, GerchbergSaxton])
+iterative = pytest.mark.parametrize("method", [method for method in RECONSTRUCTORS if method.iterative])
+in_one_step = pytest.mark.parametrize("method", [method for method in RECONSTRUCTORS if not method.iterative])
+fixed_point = pytest.mark.parametrize("method", [one for one in RECONSTRUCTORS if issubclass(one, FixedPoint)])
 
 
 def takes(method, name):
@@ -37,10 +35,15 @@ def build(method, sensor, modes, **options):
     return method(sensor, modes, **options) if takes(method, "modes") else method(sensor, **options)
 
 
+def steps(method, **options):
+    """Return options of an iteration, and none for a method without one."""
+    return options if method.iterative else {}
+
+
 @pytest.fixture
 def sensor_of(classic, shifted):
-    """Sensor for a method: one mask for the arcsine, two for the others."""
-    return lambda method: classic if method is Arcsine else shifted
+    """Sensor for a method: two masks if it accepts them, else one."""
+    return lambda method: shifted if method.n_masks[0] <= 2 <= method.n_masks[1] else classic
 
 
 @pytest.fixture
@@ -81,8 +84,14 @@ def errors(reconstruct, sensor, phase):
 def test_small_phases_come_back(pupil, modes, screens, method, n_masks, extent, bound):
     dimples = [Dimple(1.06, phase) for phase in (np.pi / 2, -np.pi / 2, 2.0)[:n_masks]]
     sensor = ZernikeSensor(pupil, *dimples, extent=extent)
-    options = {} if method is Linear else {"n_iterations": 50, "tolerance": 1e-10}
-    assert errors(build(method, sensor, modes, **options), sensor, screens(0.01)).max() < bound * 0.01
+    reconstruct = build(method, sensor, modes, **steps(method, n_iterations=50, tolerance=1e-10))
+    assert errors(reconstruct, sensor, screens(0.01)).max() < bound * 0.01
+
+
+@every
+def test_most_of_a_small_phase_comes_back(sensor_of, pupil, modes, screens, method):
+    sensor = ZernikeSensor(pupil, *sensor_of(method).masks, extent=4)  # Gerchberg-Saxton needs a wide detector
+    assert errors(build(method, sensor, modes), sensor, screens(0.01)).max() < 0.5 * 0.01
 
 
 @pytest.mark.parametrize("phases", [(np.pi / 2, -np.pi / 2), (np.pi / 2, np.pi), (0.3, -2.0), (1.5, -1.5, 2.5)])
@@ -173,7 +182,7 @@ def test_masks_whose_shared_wave_cannot_be_scaled_are_solved_one_by_one(pupil, s
 
 @every
 def test_measured_amplitude_is_used(sensor_of, modes, method, screens, pupil):
-    sensor = ZernikeSensor(pupil, *sensor_of(method).masks, extent=4)  # Gerchberg-Saxton needs the light beside
+    sensor = ZernikeSensor(pupil, *sensor_of(method).masks, extent=4)  # Gerchberg-Saxton needs a wide detector
     amplitude = np.random.default_rng(0).uniform(0.7, 1.3, pupil.shape)
     frames = sensor.measure(screens(0.01), amplitude)
     right, wrong = build(method, sensor, modes, amplitude=amplitude), build(method, sensor, modes)
@@ -192,7 +201,7 @@ def test_arcsine_folds_what_lies_beyond_minus_pi_over_4(classic, pupil):
     phase[20, 20] = -1.1
     frames = classic.measure(phase)
     assert Arcsine(classic)(frames).phase[20, 20] == pytest.approx(-np.pi / 2 + 1.1, abs=0.02)
-    # Told on which side the phase lies, it finds it.
+    # A start on the right side leads to the phase.
     assert Arcsine(classic)(frames, start=phase).phase[20, 20] == pytest.approx(-1.1, abs=1e-5)
 
 
@@ -252,29 +261,6 @@ def test_unsolved_points_are_those_of_each_frame(classic, pupil, screens):
     assert found.n_unsolved[0] == 4
 
 
-def test_arcsine_knows_the_modulus_of_what_it_finds(classic, pupil, screens):
-    # Beside points with a solution there are dark ones, and too bright and too dark ones, in many frames.
-    amplitude = np.where(np.random.default_rng(0).uniform(size=pupil.shape) < 0.1, 0, 1.0)
-    detector = Detector(pupil, 3e3)
-    frames = detector.normalise(detector.expose(classic.measure(screens(0.5), amplitude), seed=1), floor=0)
-    method, kind = Arcsine(classic, amplitude=amplitude), Kind.numpy()
-    phasor = split(screens(0.3), method.settings.maps(kind).inside)
-    found = method.step(phasor, method.prepare(frames, phasor, True, kind), kind)
-    assert np.all(found.unsolved > (pupil.inside & (amplitude == 0)).sum() + 10)
-    modulus = np.hypot(found.field[:, 0], found.field[:, 1])
-    known = np.broadcast_to(found.modulus, modulus.shape)
-    np.testing.assert_allclose(known[:, pupil.inside], modulus[:, pupil.inside], rtol=1e-12)
-
-
-def test_unsolved_points_are_counted_in_the_pupil(shifted, pupil):
-    method = PhaseShifted(shifted)
-    method._shared = replace(method._shared, darkest=np.inf)
-    start = np.where(pupil.inside, 0.3, np.nan)
-    found = method(shifted.measure(np.zeros(pupil.shape)), start)
-    assert found.n_unsolved == pupil.n_points
-    np.testing.assert_allclose(found.phase, start)
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_weak_waves_of_different_size_are_solved(pupil, screens, dtype):
     sensor = ZernikeSensor(pupil, Dimple(0.01, np.pi / 2), Dimple(0.012, -np.pi / 2))
@@ -290,7 +276,7 @@ def test_what_a_reconstructor_was_made_from_cannot_change(make, method, pickled)
     reconstruct, sensor = make(method)
     if pickled:
         reconstruct = pickle.loads(pickle.dumps(reconstruct))
-    public = [name for name in dir(reconstruct) if not name.startswith("_")]
+    public = [name for name in dir(method) if isinstance(getattr(method, name), property)]
     values = {name: getattr(reconstruct, name) for name in public if not callable(getattr(reconstruct, name))}
     assert "settings" in values
     for name, value in values.items():
@@ -464,17 +450,20 @@ def test_residual_of_a_wide_detector_is_that_of_the_pupil(pupil, screens):
 
 
 @every
-def test_batch_equals_loop(make, method, screens, pupil):
+@pytest.mark.parametrize("history", [False, True])
+def test_batch_equals_loop(make, method, screens, pupil, history):
     reconstruct, sensor = make(method)
+    # Some converge early and leave the others.
     phase = np.concatenate([screens(0.05, 2), screens(0.4, 4)]).reshape(2, 3, *pupil.shape)
     frames = sensor.measure(phase)
-    together = reconstruct(frames, history=True)
+    together = reconstruct(frames, history=history)
     assert together.phase.shape == phase.shape
     for where in np.ndindex(2, 3):
-        alone = reconstruct(frames[where], history=True)
+        alone = reconstruct(frames[where], history=history)
         np.testing.assert_allclose(together.phase[where], alone.phase, atol=1e-9)
-        np.testing.assert_allclose(together.history[where], alone.history, atol=1e-9)
         np.testing.assert_allclose(together.residual[where], alone.residual, atol=1e-9)
+        if history:
+            np.testing.assert_allclose(together.history[where], alone.history, atol=1e-9)
         for name in ("n_iterations", "converged", "n_unsolved"):
             assert getattr(together, name)[where] == getattr(alone, name), name
             assert np.shape(getattr(alone, name)) == ()
@@ -483,7 +472,7 @@ def test_batch_equals_loop(make, method, screens, pupil):
 @every
 def test_many_frames_at_once_equal_few(make, method, screens):
     # More than are handled together.
-    reconstruct, sensor = make(method, **({} if method is Linear else {"n_iterations": 3}))
+    reconstruct, sensor = make(method, **steps(method, n_iterations=3))
     frames = sensor.measure(screens(0.3, 60))
     np.testing.assert_allclose(reconstruct(frames).phase[-3:], reconstruct(frames[-3:]).phase, atol=1e-9)
 
@@ -498,7 +487,7 @@ def test_phase_is_nan_outside_and_finite_inside(make, method, screens, pupil):
 
 @every
 def test_single_precision_in_single_precision_out(make, method, screens, pupil):
-    reconstruct, sensor = make(method, **({} if method is Linear else {"n_iterations": 8, "tolerance": 0}))
+    reconstruct, sensor = make(method, **steps(method, n_iterations=8, tolerance=0))
     frames = sensor.measure(screens(0.3))
     single = reconstruct(frames.astype(np.float32), history=True)
     assert single.phase.dtype == single.residual.dtype == single.history.dtype == np.float32
@@ -512,7 +501,7 @@ def test_inputs_are_left_alone(sensor_of, modes, method, screens, pupil):
     for array in (frames, modes, start, *options.values()):
         array.setflags(write=False)  # writing to one of them raises
     reconstruct = build(method, sensor, modes, **options)
-    reconstruct(frames, *([] if method is Linear else [start]), history=True)
+    reconstruct(frames, start if method.iterative else None, history=True)
 
 
 @every
@@ -526,7 +515,7 @@ def test_whole_numbers_are_good_frames(make, method, pupil):
 def test_one_wavefront_is_solved_by_the_truth(make, method, pupil):
     reconstruct, sensor = make(method)
     found = reconstruct(sensor.measure(np.zeros(pupil.shape)))
-    if method is not GerchbergSaxton:  # which needs the light beside the pupil
+    if method is not GerchbergSaxton:  # which needs a wide detector
         assert reconstruction_error(pupil, found.phase, np.zeros(pupil.shape)) < 1e-7
         assert found.residual < 1e-7
         assert found.converged
@@ -537,8 +526,7 @@ def test_history_leads_from_the_start_to_the_result(make, method, screens):
     reconstruct, sensor = make(method)
     frames = sensor.measure(screens(0.3))
     found = reconstruct(frames, history=True)
-    n_iterations = 1 if method is Linear else 25
-    assert found.history.shape == (3, n_iterations + 1, 40, 40)
+    assert found.history.shape == (3, reconstruct.settings.n_iterations + 1, 40, 40)
     assert np.nanmax(np.abs(found.history[:, 0])) == 0
     np.testing.assert_array_equal(found.history[:, -1], found.phase)
     assert reconstruct(frames).history is None
@@ -610,18 +598,6 @@ def test_phase_lies_on_the_circle(make, method, screens):
     reconstruct, sensor = make(method)
     phase = reconstruct(sensor.measure(screens(1.5))).phase
     assert np.nanmax(np.abs(phase)) <= np.pi
-
-
-@fixed_point
-@pytest.mark.parametrize("flat", [True, False])
-def test_what_the_steps_keep_is_that_of_each_frame(make, method, screens, flat):
-    reconstruct, sensor = make(method)
-    frames, kind = sensor.measure(screens(0.3, 5)), Kind.numpy()
-    phasor = split(screens(0.0 if flat else 0.3, 5), reconstruct.settings.maps(kind).inside)
-    data = reconstruct.prepare(frames, phasor, flat, kind)
-    for _ in range(3):
-        assert {name: array.shape[0] for name, array in data.items()} == dict.fromkeys(data, 5)
-        reconstruct.step(phasor, data, kind)
 
 
 def mean_phasor(pupil, phase):
@@ -697,7 +673,7 @@ def test_piston_of_the_start_is_kept(make, method, screens, pupil):
 def test_singular_points_keep_their_value_and_are_counted():
     # For a flat start the reference waves of these two masks mirror each other, so on the middle column they are
     # the same: the determinant vanishes there, and only there.
-    pupil = zwfs.Pupil.circular(31)
+    pupil = zwfs.Pupil.circular(31, 0.3)  # points of the obscuration do not count
     masks = [zwfs.Patch(1.06, lambda u, v, sign=sign: np.exp(1j * (np.pi / 2 + sign * u))) for sign in (1, -1)]
     sensor = ZernikeSensor(pupil, *masks)
     frames = sensor.measure(zwfs.zernike_basis(pupil, 1)[0] * 0.1)
@@ -761,8 +737,8 @@ def test_raw_counts_are_warned_of(make, method, screens, scale):
 @pytest.mark.parametrize("extent", [1.0, 2.0])
 @pytest.mark.parametrize("dimple", [Dimple(1.06, np.pi / 2), Dimple(1.06, np.pi), Dimple(2.5, 1.0, 0.3)])
 def test_no_frame_of_a_mask_is_taken_for_raw_counts(pupil, modes, screens, method, extent, dimple):
-    sensor = ZernikeSensor(pupil, dimple, *[Dimple(1.06, -2.0)] * (method is not Arcsine), extent=extent)
-    reconstruct = build(method, sensor, modes, **({} if method is Linear else {"n_iterations": 1}))
+    sensor = ZernikeSensor(pupil, dimple, *[Dimple(1.06, -2.0)] * (method.n_masks[1] > 1), extent=extent)
+    reconstruct = build(method, sensor, modes, **steps(method, n_iterations=1))
     phase = np.concatenate([screens(0.0, 1), screens(0.5), screens(3.0)])
     rng = np.random.default_rng(0)
     with warnings.catch_warnings():
@@ -772,7 +748,7 @@ def test_no_frame_of_a_mask_is_taken_for_raw_counts(pupil, modes, screens, metho
             if photons < np.inf:
                 frames = np.maximum(rng.poisson(frames * photons) + rng.normal(0, 3, frames.shape), 0) / photons
             reconstruct(frames)
-        if method is not Linear:
+        if method.iterative:
             bright = build(method, sensor, modes, n_iterations=1, amplitude=100 * pupil.amplitude)
             bright(1e4 * sensor.measure(phase))
 
@@ -803,11 +779,39 @@ def test_any_change_is_within_a_huge_tolerance(make, method, screens):
     assert np.all(found.n_iterations == 1)
 
 
-def test_number_of_masks_is_checked(classic, shifted):
-    with pytest.raises(ValueError, match="sensor has 2 masks: expected one"):
-        Arcsine(shifted)
-    with pytest.raises(ValueError, match="sensor has 1 mask: expected two or more"):
-        PhaseShifted(classic)
+@every
+def test_number_of_masks_is_checked(pupil, modes, method):
+    fewest, most = method.n_masks
+    for n in range(1, 5):
+        sensor = ZernikeSensor(pupil, *(Dimple(1.06, 1.0 + k) for k in range(n)))
+        if fewest <= n <= most:
+            build(method, sensor, modes)
+        else:
+            with pytest.raises(
+                ValueError, match=rf"sensor has {n} masks?: expected {fewest}.* for {method.__name__}"
+            ):
+                build(method, sensor, modes)
+
+
+@in_one_step
+def test_a_method_without_iteration_refuses_a_start(make, method, screens):
+    reconstruct, sensor = make(method)
+    frames = sensor.measure(screens(0.1))
+    assert reconstruct(frames, None).converged.all()
+    with pytest.raises(ValueError, match=rf"start = .*: expected None, since {method.__name__} does not iterate"):
+        reconstruct(frames, screens(0.1))
+
+
+def test_a_method_is_loaded_by_its_path(tmp_path, monkeypatch):
+    assert load("zwfs.reconstructors.linear:Linear") is Linear
+    (tmp_path / "mine.py").write_text("class Mine:\n    def __call__(self, frames): ...\n\nclass Other: ...\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert load("mine:Mine").__module__ == "mine"
+    for path in ("mine", "mine:", "mine:Mine()", "mine:Nobody", "mine:Other", "nowhere:Mine", "./mine:Mine"):
+        with pytest.raises(ValueError, match=r"path = .*: expected"):
+            load(path)
+    with pytest.raises(TypeError, match="path = 3: expected a string"):
+        load(3)
 
 
 @every
@@ -925,9 +929,10 @@ def test_sensor_is_checked(modes, pupil, method):
         build(method, pupil, modes)
 
 
-def test_reconstructors_and_results_print_as_one_line(shifted):
-    method = PhaseShifted(shifted, n_iterations=7)
-    assert method.sensor is shifted
-    assert repr(method) == f"PhaseShifted({shifted!r}, 7, tolerance=1e-06)"
-    result = method(shifted.measure(np.zeros((3, *shifted.pupil.shape))))
-    assert repr(result) == f"Reconstruction(phase {result.phase.shape}, 3 of 3 converged)"
+@every
+def test_reconstructors_and_results_print_as_one_line(make, method, screens):
+    reconstruct, sensor = make(method)
+    assert reconstruct.sensor is sensor
+    assert repr(reconstruct).startswith(f"{method.__name__}({sensor!r}, ")
+    result = reconstruct(sensor.measure(screens(0.0)))
+    assert repr(result) == f"Reconstruction(phase {result.phase.shape}, {result.converged.sum()} of 3 converged)"

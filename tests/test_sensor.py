@@ -9,7 +9,6 @@ import pytest
 
 import zwfs
 from zwfs import Detector, Dimple, Patch, Pupil, ZernikeSensor, lowrank, zernike_basis
-from zwfs._arrays import Kind
 
 from .reference import exact_reference
 
@@ -272,7 +271,7 @@ def test_no_public_object_can_be_changed(rough_pupil, again):
     detector = again(Detector(sensor.pupil, 1e6))
     phase = rough_pupil.x * np.ones(rough_pupil.shape)
     before = sensor.measure(phase), detector.expose(sensor.measure(phase), seed=1)
-    for thing in (sensor.pupil, sensor, *sensor.masks, sensor.factors, sensor.maps(Kind.numpy()), detector):
+    for thing in (sensor.pupil, sensor, *sensor.masks, sensor.factors, detector):
         assert_frozen(thing, type(thing).__name__)
     after = sensor.measure(phase), detector.expose(sensor.measure(phase), seed=1)
     np.testing.assert_array_equal(after[0], before[0])
@@ -281,11 +280,9 @@ def test_no_public_object_can_be_changed(rough_pupil, again):
 
 def test_objects_that_hold_arrays_compare_by_identity(shifted, pupil):
     other = ZernikeSensor(pupil, *shifted.masks)
-    kind = Kind.numpy()
     pairs = (
         (shifted.factors, other.factors),
         (shifted.factors.pupil, other.factors.pupil),
-        (shifted.maps(kind), other.maps(kind)),
         (shifted, other),
     )
     for mine, others in pairs:
@@ -567,8 +564,6 @@ def test_phase_in_degrees_draws_a_warning(shifted, screens):
         (lambda s: s.propagate(np.full((40, 40), 1e308)), ValueError, "field reaches a modulus"),
         (lambda s: s.adjoint(np.full((2, 40, 40), 1e308)), ValueError, "field reaches a modulus"),
         (lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), extent=1e6), ValueError, r"extent = 1e\+06"),
-        (lambda s: s.operator("float64"), TypeError, "kind is a str: expected a Kind"),
-        (lambda s: s.maps([]), TypeError, "kind is a list: expected a Kind"),
     ],
 )  # fmt: skip
 def test_bad_input_is_named(shifted, call, error, message):

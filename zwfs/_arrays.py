@@ -1,12 +1,14 @@
 """Arrays of NumPy, and of any other library that follows the Python array API standard.
 
-What runs on such arrays asks them for their `Kind`, calls the functions of its namespace `xp`, and keeps one copy
-of its constants for each kind that was met.
+Code for such arrays asks an array for its `Kind`, calls the functions of the namespace `xp`, and keeps one copy of
+its constants for each kind, see `per_kind`.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, NamedTuple, TypeVar
 
 import array_api_compat
 import numpy as np
@@ -60,12 +62,34 @@ class Kind(NamedTuple):
         return self.xp.zeros(shape, dtype=self.dtype, device=self.device)
 
     def integers(self, values: Any) -> Any:
-        """Integers beside arrays of this kind."""
+        """Integers for use with arrays of this kind."""
         return self.xp.asarray(values, dtype=self.xp.int64, device=self.device)
 
 
+Owner = TypeVar("Owner")
+Constants = TypeVar("Constants")
+KEPT = "_kept"  # attribute that holds the results of methods decorated with `per_kind`
+
+
+def per_kind(make: Callable[[Owner, Kind], Constants]) -> Callable[[Owner, Kind], Constants]:
+    """Decorate a method of a kind of arrays: its result is computed once for each kind, then kept in the object.
+
+    This is for constants as arrays of that kind. `zwfs._pickle.Immutable` keeps them out of pickles.
+    """
+
+    @wraps(make)
+    def kept(owner: Owner, kind: Kind) -> Constants:
+        results = owner.__dict__.setdefault(KEPT, {})
+        try:
+            return results[make, kind]
+        except KeyError:
+            return results.setdefault((make, kind), make(owner, kind))
+
+    return kept
+
+
 def any_array(value: Any) -> tuple[Any, Any]:
-    """An array, left in its library if that follows the standard, and made one of NumPy if not; its namespace."""
+    """Return an array and its namespace: of its own library if that follows the standard, else of NumPy."""
     if not isinstance(value, np.ndarray | np.generic) and array_api_compat.is_array_api_obj(value):
         return value, array_api_compat.array_namespace(value)
     array = np.asarray(value)  # subclasses become plain arrays
@@ -80,6 +104,11 @@ def read_only(array: Any) -> Any:
         array = array.view()
         array.flags.writeable = False
     return array
+
+
+def for_each(array: Any, k: int, xp: Any) -> Any:
+    """Return an array that all frame sets share, (1, ...), as a view of shape (k, ...)."""
+    return xp.broadcast_to(array, (k, *array.shape[1:]))
 
 
 def product(real: Any, maps: Any, xp: Any) -> Any:

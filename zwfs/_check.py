@@ -244,8 +244,17 @@ def broadcast(**arrays: Any) -> tuple[int, ...]:
         return np.broadcast_shapes(*shapes)
     except ValueError:
         *first, last = arrays
-        names, told = f"{', '.join(first)} and {last}", " and ".join(map(str, shapes))
-        raise ValueError(f"{names} have shapes {told}: expected ones that broadcast") from None
+        names, listed = f"{', '.join(first)} and {last}", " and ".join(map(str, shapes))
+        raise ValueError(f"{names} have shapes {listed}: expected ones that broadcast") from None
+
+
+def values_inside(name: str, array: Any, pupil: Any) -> NDArray:
+    """Return the values of real maps inside a pupil, (..., ny, nx) to (..., n_points), finite and at least one."""
+    array = real_array(name, array)
+    maps(name, array, pupil.shape)
+    values = pupil.gather(array)
+    moderate(name, values, " inside the pupil")
+    return values
 
 
 def finite(name: str, array: Any, where: str = "") -> None:

@@ -1,26 +1,27 @@
-"""What travels to another process, and what is made again there."""
+"""The base of objects that cannot be changed: caches stay out of their pickles, and arrays stay read-only."""
 
 from __future__ import annotations
 
 from functools import cached_property
 from typing import Any
 
-from zwfs._arrays import read_only
+from zwfs._arrays import KEPT, read_only
 
 
-def uncached_state(self: Any) -> dict[str, Any]:
-    """State without the values of cached properties, to stand as ``__getstate__`` in a class.
+class Immutable:
+    """Object whose arrays are read-only, here and after a pickle.
 
-    They are cheap to make again, and what was looked at before does not change the pickle.
+    A pickle holds neither cached properties nor constants per kind of arrays. They are cheap to compute again, and
+    the pickle of an object does not depend on its use.
     """
-    kind = type(self)
-    return {
-        name: value
-        for name, value in self.__dict__.items()
-        if not isinstance(getattr(kind, name, None), cached_property)
-    }
 
+    def __getstate__(self) -> dict[str, Any]:
+        kind = type(self)
+        return {
+            name: value
+            for name, value in self.__dict__.items()
+            if name != KEPT and not isinstance(getattr(kind, name, None), cached_property)
+        }
 
-def read_only_state(self: Any, state: dict[str, Any]) -> None:
-    """Restore a state with read-only arrays, as ``__setstate__`` of a class: a pickle forgets that they were."""
-    self.__dict__.update({name: read_only(value) for name, value in state.items()})
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({name: read_only(value) for name, value in state.items()})

@@ -19,6 +19,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind, any_array, product, read_only
-from zwfs._pickle import read_only_state
+from zwfs._pickle import Immutable
 from zwfs.masks import Dimple, Mask
 
 _NODES = 2048  # of a quadrature handled together: wide detectors and large masks have many
@@ -36,7 +37,7 @@ _MOST_WORK = 5e9  # quadrature nodes times coefficients: about 15 seconds
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class Plane(Immutable):
     """Real functions on a grid: products of functions of y and of x, and combinations of these.
 
     Arrays of NumPy are kept as read-only views.
@@ -52,13 +53,11 @@ class Plane:
     along_x: NDArray
     combine: NDArray
 
-    __setstate__ = read_only_state
-
     def __post_init__(self) -> None:
         for name in ("along_y", "along_x", "combine"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
-    @property
+    @cached_property
     def xp(self) -> Any:
         """Namespace of the library that the arrays belong to."""
         return any_array(self.combine)[1]
@@ -111,7 +110,7 @@ class Plane:
 
 
 @dataclass(frozen=True, eq=False)
-class Factors:
+class Factors(Immutable):
     """Low-rank factors of the operator from the pupil to the reference waves (`eq-low-rank`).
 
     Attributes
@@ -125,8 +124,6 @@ class Factors:
     pupil: Plane
     detector: Plane
     core: NDArray[np.complex128]
-
-    __setstate__ = read_only_state
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "core", read_only(self.core))

@@ -1,6 +1,8 @@
-"""How good a reconstruction is."""
+"""Metrics of a reconstruction: errors, Strehl ratio, dynamic range."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,18 +33,33 @@ def wrapped_residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDA
     ----------
     Chambouleyron et al. 2024, section 4.1; `eq-error` of the book.
     """
-    residual = _residual(pupil, estimate, truth)
-    return pupil.scatter(residual)
+    return pupil.scatter(_residual(pupil, estimate, truth))
 
 
 def reconstruction_error(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.floating]:
-    """Rms over the pupil of the `wrapped_residual`, whose parameters and errors it has.
+    """Rms over the pupil of the `wrapped_residual`; parameters and errors are the same.
 
     Returns
     -------
     ndarray, shape (...), radian rms
     """
     return np.sqrt(np.mean(_residual(pupil, estimate, truth) ** 2, axis=-1))
+
+
+def without_piston(phase: ArrayLike) -> NDArray[Any]:
+    """Phases on the circle around their mean phasor: (..., n_points) to the same, radian, in (-pi, pi].
+
+    Raises
+    ------
+    ValueError
+        If there is no phase, or a value is not finite.
+    """
+    phase = _check.real_array("phase", phase)
+    if 0 in (phase.ndim, phase.size):
+        raise ValueError(f"phase has shape {phase.shape}: expected (..., n_points), not empty")
+    _check.finite("phase", phase)
+    phasor = np.exp(1j * phase)
+    return np.angle(phasor * np.conj(phasor.mean(axis=-1, keepdims=True)))
 
 
 def strehl(pupil: Pupil, phase: ArrayLike) -> NDArray[np.floating]:
@@ -63,13 +80,14 @@ def strehl(pupil: Pupil, phase: ArrayLike) -> NDArray[np.floating]:
     ValueError
         If the shape is wrong, there is no map, or a value inside the pupil is not finite.
     """
-    values = _inside(pupil, "phase", phase)
+    _check.instance("pupil", pupil, Pupil)
+    values = _check.values_inside("phase", phase, pupil)
     weight = pupil.gather(pupil.amplitude)
     return np.abs(np.exp(1j * values) @ weight / weight.sum()) ** 2
 
 
 def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> float:
-    """Input rms at which the error of a reconstructor leaves a fraction of the input.
+    """Input rms at which the error of a reconstructor first exceeds a fraction of the input.
 
     The ratio of error to input is interpolated linearly between the samples around the place where it crosses the
     threshold for the first time. Samples at an input of 0 have no ratio and are left out.
@@ -122,22 +140,15 @@ def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> 
     return float(rms[last - 1] + step * (rms[last] - rms[last - 1]))
 
 
-def _inside(pupil: Pupil, name: str, maps: ArrayLike) -> NDArray[np.floating]:
-    _check.instance("pupil", pupil, Pupil)
-    maps = _check.real_array(name, maps)
-    _check.maps(name, maps, pupil.shape)
-    values = pupil.gather(maps)
-    _check.finite(name, values, " inside the pupil")
-    return values
-
-
 def _residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.floating]:
-    found, true = _inside(pupil, "estimate", estimate), _inside(pupil, "truth", truth)
+    _check.instance("pupil", pupil, Pupil)
+    estimate = _check.values_inside("estimate", estimate, pupil)
+    truth = _check.values_inside("truth", truth, pupil)
     try:
-        phasor = np.exp(1j * (found - true))
+        difference = estimate - truth
     except ValueError:
         raise ValueError(
-            f"estimate has a batch of {found.shape[:-1]}: expected one that broadcasts with that of the truth, "
-            f"{true.shape[:-1]}"
+            f"estimate has a batch of {estimate.shape[:-1]}: expected one that broadcasts with that of the truth, "
+            f"{truth.shape[:-1]}"
         ) from None
-    return np.angle(phasor * np.conj(phasor.mean(axis=-1, keepdims=True)))
+    return without_piston(difference)

@@ -16,14 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import read_only
-from zwfs._pickle import read_only_state, uncached_state
+from zwfs._pickle import Immutable
 
 _MOST_PIXELS = 2**14  # across the pupil: a map of them takes 2 GiB
 _FARTHEST = 1000.0  # distance of the optical axis, in D, at which coordinates are still exact to 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Pupil:
+class Pupil(Immutable):
     """Sampled pupil, made with `circular`, `hexagonal`, `from_amplitude` or `from_segments`.
 
     A pupil cannot be changed: its arrays are read-only copies.
@@ -50,9 +50,6 @@ class Pupil:
     n_pixels: float
     segments: NDArray[np.int64]
     center: tuple[float, float]
-
-    __getstate__ = uncached_state
-    __setstate__ = read_only_state
 
     def __post_init__(self) -> None:
         amplitude = _image("amplitude", self.amplitude)

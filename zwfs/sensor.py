@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from math import prod, sqrt
 from typing import Any
 
@@ -11,8 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind, read_only
-from zwfs.lowrank import Factors, Operator, factorise
+from zwfs._arrays import Kind, per_kind
+from zwfs._pickle import Immutable
+from zwfs._propagator import Propagator, split, square
+from zwfs.lowrank import Factors, factorise
 from zwfs.masks import Mask
 from zwfs.pupil import Pupil
 
@@ -20,7 +21,7 @@ _DEGREES = 20.0  # radian rms; no phase map reaches it, the same map in degrees 
 _MOST_PIXELS = 2**14  # across the detector: a frame of them takes 2 GiB
 
 
-class ZernikeSensor:
+class ZernikeSensor(Immutable):
     """A Zernike wavefront sensor with any number of masks.
 
     Fields and phases may be arrays of NumPy or of any library that follows the Python array API and lets arrays be
@@ -83,11 +84,6 @@ class ZernikeSensor:
             axis[0] + (np.arange(axis.size + 2 * m) - m) / pupil.n_pixels for axis in (pupil.y, pupil.x)
         )
         self._factors = factorise(masks, (pupil.y, pupil.x), detector_axes, pupil.n_pixels**-2.0, self._tolerance)
-        self._operators: dict[Kind, Operator] = {}
-        self._maps: dict[Kind, PupilMaps] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_operators": {}, "_maps": {}}
 
     def __repr__(self) -> str:
         masks = ", ".join(map(repr, self.masks))
@@ -138,20 +134,6 @@ class ZernikeSensor:
         """Matrices of `eq-low-rank`, common to all masks but for the cores: to compute with them elsewhere."""
         return self._factors
 
-    def operator(self, kind: Kind) -> Operator:
-        """Low-rank operator for arrays of one kind, for those who write reconstructors; made once, then kept."""
-        _check.instance("kind", kind, Kind)
-        if kind not in self._operators:
-            self._operators[kind] = Operator(self._factors, self._window, kind)
-        return self._operators[kind]
-
-    def maps(self, kind: Kind) -> PupilMaps:
-        """Maps of the pupil for arrays of one kind; made once, then kept."""
-        _check.instance("kind", kind, Kind)
-        if kind not in self._maps:
-            self._maps[kind] = PupilMaps.of(self.pupil.inside, self.pupil.amplitude, kind)
-        return self._maps[kind]
-
     def propagate(self, field: ArrayLike) -> NDArray[np.complexfloating]:
         """Field on the detector behind each mask.
 
@@ -174,7 +156,7 @@ class ZernikeSensor:
         Chambouleyron et al. 2024, equations (1) to (3).
         """
         psi, batch, kind = self._pupil_field(field)
-        waves = self.operator(kind).reference(psi)
+        waves = self._model(kind).operator.reference(psi)
         waves[(..., *self.window)] += psi[:, np.newaxis, ...]
         return kind.xp.reshape(waves, (*batch, *waves.shape[1:]))
 
@@ -188,7 +170,7 @@ class ZernikeSensor:
         Chambouleyron et al. 2024, equation (4).
         """
         psi, batch, kind = self._pupil_field(field)
-        waves = self.operator(kind).reference(psi)
+        waves = self._model(kind).operator.reference(psi)
         return kind.xp.reshape(waves, (*batch, *waves.shape[1:]))
 
     def adjoint(self, field: ArrayLike) -> NDArray[np.complexfloating]:
@@ -215,9 +197,9 @@ class ZernikeSensor:
         """
         shape = (self.n_masks, *self.detector_shape)
         field, batch, kind = self._field(field, shape, "masks and detector")
-        psi = self.operator(kind).adjoint(field)
+        psi = self._model(kind).operator.adjoint(field)
         psi += kind.xp.sum(field[(..., *self.window)], axis=1)
-        psi *= self.maps(kind).stop
+        psi *= self._model(kind).stop
         return kind.xp.reshape(psi, (*batch, *self.pupil.shape))
 
     def measure(self, phase: ArrayLike, amplitude: ArrayLike | None = None) -> NDArray[np.floating]:
@@ -250,7 +232,7 @@ class ZernikeSensor:
         ----------
         Chambouleyron et al. 2024, equation (5).
         """
-        phase, batch = self.pupil_maps("phase", phase)
+        phase, batch = self._pupil_maps("phase", phase)
         kind = Kind.of(phase)
         rms = self._largest_rms(phase, kind.xp)
         if rms > _DEGREES:
@@ -259,7 +241,7 @@ class ZernikeSensor:
                 UserWarning,
                 stacklevel=2,
             )
-        strength, strength_batch = self.amplitude_maps(amplitude, kind)
+        strength, strength_batch = self._amplitude_maps(amplitude, kind)
         if strength_batch:
             try:
                 full = np.broadcast_shapes(batch, strength_batch)
@@ -273,12 +255,15 @@ class ZernikeSensor:
                 for maps, shape in ((phase, batch), (strength, strength_batch))
             )
             batch = full
-        frames = self.intensity(phase, strength)
+        frames = square(self._model(kind).propagate(split(phase, strength)))
         return kind.xp.reshape(frames, (*batch, self.n_masks, *self.detector_shape))
 
-    # What follows is for reconstructors: one batch axis k, split fields, 0 outside the pupil, no further checks.
+    @per_kind
+    def _model(self, kind: Kind) -> Propagator:
+        """Model for arrays of one kind, the part of the sensor that reconstructors compute with."""
+        return Propagator.of(self._factors, self._window, self._pupil, kind)
 
-    def pupil_maps(self, name: str, maps: ArrayLike) -> tuple[NDArray[np.floating], tuple[int, ...]]:
+    def _pupil_maps(self, name: str, maps: ArrayLike) -> tuple[NDArray[np.floating], tuple[int, ...]]:
         """Checked real maps, (k, ny, nx) with 0 outside the pupil, and the shape of the batch."""
         maps = _check.real_any(name, maps)
         _check.trailing_shape(name, maps, self.pupil.shape, "the shape of the pupil")
@@ -286,17 +271,17 @@ class ZernikeSensor:
         if not prod(batch):
             raise ValueError(f"{name} has shape {tuple(maps.shape)}: expected at least one map")
         kind = Kind.of(maps)
-        clean = kind.xp.where(self.maps(kind).mask, maps, kind.array(0.0))
+        clean = kind.xp.where(self._model(kind).inside, maps, kind.array(0.0))
         _check.moderate(name, clean, " inside the pupil")
         return kind.xp.reshape(clean, (-1, *self.pupil.shape)), batch
 
-    def amplitude_maps(
+    def _amplitude_maps(
         self, amplitude: ArrayLike | None, kind: Kind
     ) -> tuple[NDArray[np.floating], tuple[int, ...]]:
         """Checked amplitude, (k, ny, nx) with 0 outside, and the shape of the batch; the pupil's for None."""
         if amplitude is None:
-            return self.maps(kind).amplitude[np.newaxis, ...], ()
-        maps, batch = self.pupil_maps("amplitude", amplitude)
+            return self._model(kind).amplitude[np.newaxis, ...], ()
+        maps, batch = self._pupil_maps("amplitude", amplitude)
         _check.non_negative("amplitude", maps)
         xp = Kind.of(maps).xp
         if not xp.all(xp.any(maps > 0, axis=(-2, -1))):
@@ -306,28 +291,10 @@ class ZernikeSensor:
         _check.moderate("amplitude", maps)
         return maps, batch
 
-    def intensity(self, phase: NDArray, amplitude: NDArray) -> NDArray:
-        """Frames of phases (k, ny, nx) and amplitudes (1 or k, ny, nx): (k, n_masks, ny', nx')."""
-        return square(self.propagate_split(split(phase, amplitude)))
-
-    def propagate_split(self, psi: NDArray) -> NDArray:
-        """Propagate split fields: (k, 2, ny, nx) to (k, n_masks, 2, ny', nx')."""
-        out = self.operator(Kind.of(psi)).split_reference(psi)
-        out[(..., *self.window)] += psi[:, np.newaxis, ...]
-        return out
-
-    def adjoint_split(self, waves: NDArray) -> NDArray:
-        """Adjoint of `propagate_split`: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
-        kind = Kind.of(waves)
-        psi = self.operator(kind).split_adjoint(waves)
-        psi += kind.xp.sum(waves[(..., *self.window)], axis=1)
-        psi *= self.maps(kind).inside
-        return psi
-
     def _pupil_field(self, field: ArrayLike) -> tuple[NDArray, tuple[int, ...], Kind]:
         """Checked complex maps, (k, ny, nx) with 0 outside the pupil, the batch, and the kind of their parts."""
         psi, batch, kind = self._field(field, self.pupil.shape, "the shape of the pupil")
-        return psi * self.maps(kind).stop, batch, kind
+        return psi * self._model(kind).stop, batch, kind
 
     def _field(
         self, field: ArrayLike, shape: tuple[int, ...], meaning: str
@@ -367,48 +334,3 @@ def _margin(extent: float, pupil: Pupil) -> int:
             f"{_MOST_PIXELS} are possible"
         )
     return round((extent - 1) * pupil.n_pixels / 2)
-
-
-@dataclass(frozen=True, eq=False)
-class PupilMaps:
-    """Maps of a pupil as arrays of one kind, shape (ny, nx); those of NumPy are read-only."""
-
-    mask: NDArray[np.bool_]
-    inside: NDArray[np.floating]  # 1 inside, 0 outside
-    stop: NDArray[np.complexfloating]  # the same for complex fields
-    outside: NDArray[np.floating]  # 0 inside, NaN outside
-    amplitude: NDArray[np.floating]
-    flat: NDArray[np.floating]  # (1, 2, ny, nx), phasor of a flat wavefront
-
-    @classmethod
-    def of(cls, mask: NDArray[np.bool_], amplitude: NDArray[np.float64], kind: Kind) -> PupilMaps:
-        """Convert those of NumPy."""
-        inside = read_only(kind.array(mask))
-        uniform = np.array_equal(amplitude, mask)
-        return cls(
-            read_only(kind.flags(mask)),
-            inside,
-            read_only(inside + 0j),
-            read_only(kind.array(np.where(mask, 0, np.nan))),
-            inside if uniform else read_only(kind.array(amplitude)),
-            read_only(kind.xp.stack((inside, 0 * inside))[np.newaxis, ...]),
-        )
-
-    def field(self, phasor: NDArray) -> NDArray:
-        """Split field of a phasor that is 0 outside."""
-        return phasor if self.amplitude is self.inside else phasor * self.amplitude
-
-
-def split(phase: NDArray, amplitude: NDArray) -> NDArray:
-    """Split field amplitude * exp(i phase): (k, ny, nx) to (k, 2, ny, nx)."""
-    kind = Kind.of(phase)
-    out = kind.xp.empty((phase.shape[0], 2, *phase.shape[1:]), dtype=kind.dtype, device=kind.device)
-    out[:, 0, ...] = kind.xp.cos(phase) * amplitude
-    out[:, 1, ...] = kind.xp.sin(phase) * amplitude
-    return out
-
-
-def square(waves: NDArray) -> NDArray:
-    """Squared modulus of split fields: (..., 2, ny, nx) to (..., ny, nx)."""
-    squares = waves * waves
-    return squares[..., 0, :, :] + squares[..., 1, :, :]

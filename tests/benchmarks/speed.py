@@ -8,6 +8,7 @@ import json
 import resource
 import sys
 import tracemalloc
+from dataclasses import replace
 from functools import partial
 from time import perf_counter, thread_time
 
@@ -26,7 +27,8 @@ from zwfs import (
     zernike_basis,
 )
 from zwfs._arrays import Kind
-from zwfs.paper import closed_loop as loops
+from zwfs._propagator import angle, unit
+from zwfs.metrics import without_piston
 from zwfs.paper.linearity import screens_at
 from zwfs.reconstructors import base
 
@@ -90,8 +92,8 @@ def closed_loop(n_pixels, seconds):
     one, other = screens_at(zernike_basis(pupil, 200), 0.8, 2, 2024, 7)
     method = PhaseShifted(sensor, n_iterations=1, tolerance=0.0)
     phase, errors = None, []
-    for angle in np.linspace(0, np.pi / 2, 101):
-        truth = np.cos(angle) * one + np.sin(angle) * other
+    for turn in np.linspace(0, np.pi / 2, 101):
+        truth = np.cos(turn) * one + np.sin(turn) * other
         frames = sensor.measure(truth).astype(np.float32)
         phase = method(frames, phase).phase
         errors.append(float(reconstruction_error(pupil, phase, truth)))
@@ -106,27 +108,28 @@ def breakdown(n_pixels, seconds):
     frames = sensor.measure(screen).astype(np.float32)
     method = PhaseShifted(sensor, **REAL_TIME)
     kind = Kind.of(frames)
-    maps, operator, core = method.settings.maps(kind), sensor.operator(kind), method._of(kind).core
-    phasor = maps.flat
+    constants = method.constants(kind)
+    model, core, acceleration = constants.model, constants.core, constants.acceleration
+    operator, phasor = model.operator, model.flat
     flat, batch = base.check_frames(sensor, frames)
-    data = method.prepare(flat, phasor, True, kind)
-    projected, acceleration = operator.split_project(phasor), method._of(kind).acceleration
+    state = method.begin(flat, None, constants)
+    projected = operator.split_project(phasor)
     coefficients = projected @ core
     wave = operator.split_expand(coefficients, in_window=True)[:, 0]
-    field, _ = method._shared.solve(wave, data["signal"], kind)
+    field, _ = method._shared.solve(wave, state.measured, kind)
     found = method(frames)
     one = np.zeros(1, int)
     parts = {
         "check of the frames": lambda: base.check_frames(sensor, frames),
-        "signal and dimming": lambda: method.prepare(flat, phasor, True, kind),
+        "signal and dimming": lambda: method.begin(flat, None, constants),
         "step: projection": lambda: operator.split_project(phasor) @ core,
-        "step: extrapolation": lambda: acceleration.extrapolate(projected, dict(data), np),
+        "step: extrapolation": lambda: acceleration.next(projected, replace(state), np),
         "step: expansion": lambda: operator.split_expand(coefficients, in_window=True),
-        "step: linear system": lambda: method._shared.solve(wave, data["signal"], kind),
-        "step: modulus": lambda: base.unit(field.copy(), maps.inside, np),
-        "angle": lambda: base.angle(phasor, np),
-        "report": lambda: base.report(
-            method.settings, flat, batch, base.Found(found.phase[np.newaxis], one, one, one)
+        "step: linear system": lambda: method._shared.solve(wave, state.measured, kind),
+        "step: modulus": lambda: unit(field.copy(), model.stop, np),
+        "angle": lambda: angle(phasor, np),
+        "report": lambda: base._report(
+            method.settings, flat, batch, base.Solution(found.phase[np.newaxis], one, one, one)
         ),
         "whole call": lambda: method(frames),
     }
@@ -140,9 +143,10 @@ def limit(n_pixels, seconds):
     frames = sensor.measure(screen).astype(np.float32)
     method = PhaseShifted(sensor, **REAL_TIME)
     kind = Kind.of(frames)
-    operator = sensor.operator(kind)
+    constants = method.constants(kind)
+    operator = constants.model.operator
     phasor = np.ones((1, 2, *frames.shape[1:]), frames.dtype)
-    coefficients = operator.split_project(phasor) @ method._of(kind).core
+    coefficients = operator.split_project(phasor) @ constants.core
     steps = REAL_TIME["n_iterations"]
     signal, target = np.ones_like(phasor), np.empty_like(phasor)
 
@@ -159,7 +163,7 @@ def limit(n_pixels, seconds):
             for _ in range(steps - 1)
         ],
         "one pass over frames and, in each step, over signal and field": passes,
-        "the arctangent of the phase": lambda: base.angle(phasor, np),
+        "the arctangent of the phase": lambda: angle(phasor, np),
     }
     times = best_of_each(parts, seconds)
     return times | {"these three together": sum(times.values()) - times["the whole call"]}
@@ -182,7 +186,7 @@ def loop_step(n_pixels, seconds):
         frames = method.sensor.measure(screen).astype(np.float32)
 
         def step(method=method, frames=frames):
-            found = loops.without_piston(pupil.gather(method(frames).phase))
+            found = without_piston(pupil.gather(method(frames).phase))
             return 0.4 * (found @ fit) @ flat
 
         steps[name] = step

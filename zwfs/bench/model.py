@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from zwfs import _check
-from zwfs._pickle import uncached_state
+from zwfs._pickle import Immutable
 from zwfs.bench.segments import segment_pistons
 from zwfs.detector import Detector
 from zwfs.frames.pipeline import measured_pupil
@@ -310,7 +310,7 @@ class Bench:
 
 
 @dataclass(frozen=True, eq=False)
-class BenchModel:
+class BenchModel(Immutable):
     """The sensor as an experimenter models it: off-mask images, the design of the mask, Fraunhofer diffraction.
 
     Make one with `from_images`.
@@ -332,8 +332,6 @@ class BenchModel:
     numbers: NDArray[np.int64]
     scale: NDArray[np.float64]
     dark: NDArray[np.float64]
-
-    __getstate__ = uncached_state
 
     @classmethod
     def from_images(cls, bench: Bench, seed: Seed = None) -> BenchModel:

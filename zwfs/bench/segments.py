@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
+from zwfs.metrics import without_piston
 
 
 def segment_pistons(phase: ArrayLike, segments: NDArray, numbers: NDArray) -> NDArray[np.float64]:
@@ -52,5 +53,4 @@ def segment_residual(found: ArrayLike, commanded: ArrayLike) -> NDArray[np.float
         raise ValueError(f"found and commanded have shape {shape}: expected (..., n_segments), at least one")
     _check.finite("found", found)
     _check.finite("commanded", commanded)
-    phasor = np.exp(1j * (found - commanded))
-    return np.angle(phasor * phasor.mean(axis=-1, keepdims=True).conj())
+    return without_piston(found - commanded)

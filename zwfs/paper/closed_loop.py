@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs.detector import Detector
-from zwfs.metrics import strehl
+from zwfs.metrics import strehl, without_piston
 from zwfs.pupil import Pupil
 from zwfs.reconstructors.linear import check_modes
 
@@ -208,13 +208,3 @@ def close_loop(
         mirror.append(figure / np.maximum(figure.std(axis=-1, keepdims=True) / stroke, 1))
         mirror.popleft()
     return LoopRun(times, open_loop, residual, ratio)
-
-
-def without_piston(phase: ArrayLike) -> NDArray[np.floating]:
-    """Phases on the circle around their mean phasor: (..., n_points) to the same, radian, in (-pi, pi]."""
-    phase = _check.real_array("phase", phase)
-    if 0 in (phase.ndim, phase.size):
-        raise ValueError(f"phase has shape {phase.shape}: expected (..., n_points), not empty")
-    _check.finite("phase", phase)
-    phasor = np.exp(1j * phase)
-    return np.angle(phasor * np.conj(phasor.mean(axis=-1, keepdims=True)))

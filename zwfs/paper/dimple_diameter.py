@@ -148,7 +148,7 @@ def _diameter_point(diameter: float, make: Callable[[float], Any], screens: NDAr
     """One diameter of the curve: error on each screen, (n_screens,)."""
     reconstructor = make(diameter)
     sensor = _check.sensor_of("make", reconstructor)
-    screens, _ = sensor.pupil_maps("screens", screens)
+    screens = sensor.pupil.scatter(_check.values_inside("screens", screens, sensor.pupil), fill=0)
     return reconstruction_error(sensor.pupil, reconstructor(sensor.measure(screens)).phase, screens)
 
 

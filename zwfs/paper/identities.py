@@ -212,9 +212,8 @@ def approximation_errors(sensor: ZernikeSensor, screens: NDArray, power: float =
     _check.instance("sensor", sensor, ZernikeSensor)
     if sensor.n_masks != 2:
         raise ValueError(f"sensor has {sensor.n_masks} masks: expected two")
-    screens, _ = sensor.pupil_maps("screens", screens)
-    power = _check.number("power", power, 0, 10)
-    pupil = sensor.pupil
+    pupil, power = sensor.pupil, _check.number("power", power, 0, 10)
+    screens = pupil.scatter(_check.values_inside("screens", screens, pupil).reshape(-1, pupil.n_points), fill=0)
     amplitude = pupil.gather(pupil.amplitude)
     frames = pupil.gather(sensor.measure(screens))
     field = pupil.field(screens)

@@ -9,17 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs._arrays import Kind
+from zwfs._propagator import with_piston_of
 from zwfs.lowrank import split_core
-from zwfs.reconstructors.base import with_piston_of
+from zwfs.reconstructors.base import State
 from zwfs.sensor import ZernikeSensor
 
 _DIMMEST = 0.01  # least light that frames are taken to miss, relative to those of a flat wavefront
-_MOST = 0.5  # of a small tilt that an iteration is taken to leave: a relaxation beyond 2 makes other errors grow
+_MOST = 0.5  # largest remainder of a small tilt: a relaxation beyond 2 makes other errors grow
+
+
+@dataclass(kw_only=True)
+class Path(State):
+    """Points that an iteration has passed: coefficients of the field, (k, 2 r)."""
+
+    tried: NDArray[np.floating] | None = None  # from which the last step started
+    before: NDArray[np.floating] | None = None  # from which the step before that started
+    change: NDArray[np.floating] | None = None  # by that step
+    lost: NDArray[np.floating] | None = None  # (k,), light that the frames miss, before the second step only
 
 
 @dataclass(frozen=True, eq=False)
 class Acceleration:
-    """What the coefficients of the reference waves are made of, from one iteration to the next.
+    """Extrapolation of the coefficients of the reference waves from one iteration to the next.
 
     Attributes
     ----------
@@ -28,7 +39,7 @@ class Acceleration:
     lost : float
         That light for a flat wavefront.
     relaxation : float
-        By which the change of an iteration is multiplied.
+        Factor by which the change of an iteration is multiplied.
     """
 
     form: NDArray[np.floating]
@@ -36,8 +47,11 @@ class Acceleration:
     relaxation: float
 
     @classmethod
-    def of(cls, sensor: ZernikeSensor, flat: NDArray[np.float64], left: float) -> Acceleration:
-        """From the coefficients of a flat wavefront, (1, 2 r), and what an iteration leaves of a small tilt."""
+    def of(cls, sensor: ZernikeSensor, flat: NDArray[np.float64], remainder: float) -> Acceleration:
+        """Compute it from the coefficients of a flat wavefront, (1, 2 r), and the remainder of a small tilt.
+
+        The remainder is the fraction of a small tilt that is still missing after one iteration.
+        """
         pupil, core = sensor.factors.pupil, sensor.factors.core
         window = sensor.factors.detector.cut(*sensor.window)
         inside = sensor.pupil.inside.astype(float)
@@ -47,8 +61,8 @@ class Acceleration:
         turned = core.conj().transpose(0, 2, 1)
         gained = turned @ cross + (turned @ cross).conj().transpose(0, 2, 1) + turned @ power @ core
         form = -split_core(gained.sum(axis=0, keepdims=True))
-        # An iteration multiplies a small tilt by `left`: with this relaxation none of it remains.
-        relaxation = 1 / (1 - min(max(left, 0.0), _MOST))
+        # An iteration multiplies a small tilt by the remainder: with this relaxation none of it remains.
+        relaxation = 1 / (1 - min(max(remainder, 0.0), _MOST))
         return cls(form, float(np.vecdot(flat @ form, flat)[0]), relaxation)
 
     def to(self, kind: Kind) -> Acceleration:
@@ -63,29 +77,37 @@ class Acceleration:
         """Light (k,) that the reference waves of coefficients (k, 2 r) take out of the pupil."""
         return xp.vecdot(coefficients @ self.form, coefficients)
 
-    def extrapolate(self, found: NDArray, data: dict[str, NDArray], xp: Any) -> NDArray:
-        """Next coefficients (k, 2 r) from those that an iteration found; what is remembered is kept in `data`."""
-        tried = data.get("tried")
-        if tried is None:
-            data["tried"] = found
-            return found
-        if "lost" in data:  # a new start, and no point on the line of the secant
-            lost = data.pop("lost")
-            new = tried + self.relaxation * (found - tried)
-            data["tried"] = new * dimming(lost, xp.maximum(self.taken(new, xp), _DIMMEST * lost), xp)
-            return data["tried"]
-        # A piston that turns in each iteration would be a change that never ends, which the secant magnifies.
-        change = with_piston_of(tried, found, xp) - tried
-        new = tried + self.relaxation * change
-        if "change" in data:
-            turn = change - data["change"]
+    def next(self, new: NDArray, path: Path, xp: Any) -> NDArray:
+        """Return the coefficients (k, 2 r) for the next step, from those of the last estimate; the path grows."""
+        tried = path.tried
+        if tried is None:  # the start of a caller, which is not changed
+            path.tried = new
+        elif path.lost is not None:  # the second step from a flat start, whose first one was dimmed
+            relaxed = tried + self.relaxation * (new - tried)
+            taken = xp.maximum(self.taken(relaxed, xp), _DIMMEST * path.lost)
+            path.tried, path.lost = relaxed * dimming(path.lost, taken, xp), None
+        else:
+            # A piston that turns in each iteration would be a change that never ends, which the secant magnifies.
+            path.tried = self._secant(tried, with_piston_of(tried, new, xp) - tried, path, xp)
+        return path.tried
+
+    def _secant(self, x: NDArray, f: NDArray, path: Path, xp: Any) -> NDArray:
+        """Return the next point of the path from the last one and from its change by an iteration.
+
+        This is Anderson's method of depth 1. An iteration changes the last point x by f, and changed the point x'
+        before it by f'. On the line x - s (x - x') the change is about f - s (f - f'). It is smallest for
+        s = <f - f', f> / |f - f'|^2. The next point is that point of the line, plus the relaxed change there.
+        """
+        new = x + self.relaxation * f
+        if path.before is not None and path.change is not None:
+            turn = f - path.change
             size = xp.vecdot(turn, turn)
-            share = xp.vecdot(turn, change) / xp.where(size > 0, size, 1.0)
-            new -= share[:, np.newaxis] * (tried - data["before"] + self.relaxation * turn)
-        data.update(tried=new, before=tried, change=change)
+            share = xp.vecdot(turn, f) / xp.where(size > 0, size, 1.0)
+            new -= share[:, np.newaxis] * (x - path.before + self.relaxation * turn)
+        path.before, path.change = x, f
         return new
 
 
 def dimming(lost: NDArray, taken: NDArray | float, xp: Any) -> NDArray:
-    """Factor (k, 1) by which reference waves that take out some light (k,) take out what is lost, (k,)."""
+    """Factor (k, 1) by which reference waves that take out some light (k,) take out the lost light (k,)."""
     return xp.sqrt(lost / taken)[:, np.newaxis]

@@ -1,26 +1,36 @@
-"""What all reconstructors share: their result, their checks, and the loop of the iterative ones."""
+"""The base of all reconstructors: what each of them accepts and returns, and the loop of the iterative ones.
+
+A reconstructor without iteration derives from `ClosedForm` and computes a phase from frames. One that improves a
+field step by step derives from `FixedPoint`. Anything else derives from `Reconstructor`. A module in
+`zwfs.reconstructors` with such a class is all that a new method needs; `load` finds a class anywhere else.
+
+Frames arrive checked, with one batch axis: shape (k, n_masks, ny', nx') on the detector. Phases have shape
+(k, ny, nx) and are 0 outside the pupil; the base class puts NaN there.
+"""
 
 from __future__ import annotations
 
+import math
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from math import prod
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind, read_only
-from zwfs._pickle import read_only_state
-from zwfs.sensor import PupilMaps, ZernikeSensor, split, square
+from zwfs._arrays import Kind, per_kind, read_only
+from zwfs._pickle import Immutable
+from zwfs._propagator import Propagator, angle, split, unit
+from zwfs.sensor import ZernikeSensor
 
 # Detector pixels handled together: on the processor few enough for its fast memory, enough to vectorise.
 _CHUNK, _CHUNK_ELSEWHERE = 80_000, 40_000_000
-_VANISHING = 1e-30  # modulus, or its square, of a field that counts as 0
 _BRIGHT = 10.0  # mean of a frame inside the pupil, relative to no mask: masks never exceed 1, raw counts soon do
 _MOST_ITERATIONS = 2**31 - 1
 _RANGE = 1e30  # of the light in the pupil, and of its inverse: its square is a number in single precision, too
@@ -38,10 +48,10 @@ class Reconstruction:
         NaN outside the pupil. Wrapped to (-pi, pi], except by `Linear` and `GradientDescent`. The frames do not
         depend on the piston, so its value has no meaning: remove it on the circle before you fit modes.
     n_iterations : ndarray of int, shape (...)
-        Iterations used.
+        Iterations used; 1 without iteration.
     converged : ndarray of bool, shape (...)
-        Whether the last iteration changed the phase by no more than the tolerance; with a tolerance of 0,
-        `Arcsine`, `PhaseShifted` and `GerchbergSaxton` do not look, and tell False. Always True for `Linear`.
+        Whether the last iteration changed the phase by no more than the tolerance. A `FixedPoint` with a tolerance
+        of 0 makes no such test and reports False. A `ClosedForm` always reports True.
     n_unsolved : ndarray of int, shape (...)
         Points whose equation had no (unique) solution in the last iteration: singular ones, which kept the value
         of the iteration before, or cosines beyond +-1.
@@ -50,7 +60,7 @@ class Reconstruction:
     settings : Settings
         Of the reconstructor.
     frames : ndarray, shape (..., n_masks, ny, nx)
-        Copy of what was reconstructed, on the grid of the pupil.
+        Copy of the reconstructed frames, cut to the grid of the pupil.
     """
 
     phase: NDArray[np.floating]
@@ -68,52 +78,124 @@ class Reconstruction:
 
     @cached_property
     def residual(self) -> NDArray[np.floating]:
-        """Mismatch of the frames, shape (...), computed when it is first asked for.
+        """Mismatch of the frames, shape (...), computed at its first use.
 
         Rms difference, over all masks and the points of the pupil, between the measured frames and those modelled
         from the phase; the unit is the mean intensity of the pupil.
         """
-        config, kind = self.settings, Kind.of(self.frames)
-        sensor, maps, xp = config.sensor, config.maps(kind), kind.xp
-        frames = xp.reshape(self.frames, (-1, *self.frames.shape[-3:]))
-        phase = xp.reshape(xp.where(maps.mask, self.phase, kind.array(0.0)), (-1, *sensor.pupil.shape))
-        found = []
-        for piece in pieces(frames, kind):
-            psi = split(phase[piece, ...], maps.amplitude)
-            waves = sensor.operator(kind).split_reference(psi, in_window=True) + psi[:, np.newaxis, ...]
-            mismatch = (square(waves) - frames[piece, ...]) * maps.inside
-            mismatch = xp.reshape(mismatch, (psi.shape[0], -1))
-            found.append(xp.vecdot(mismatch, mismatch))
-        mean = xp.concat(found) / (sensor.n_masks * sensor.pupil.n_points)
+        kind = Kind.of(self.frames)
+        model, xp = self.settings.model(kind), kind.xp
+        phase = xp.reshape(xp.where(model.inside, self.phase, kind.array(0.0)), (-1, *model.pupil.shape))
+        residual = self.settings.residual(phase, xp.reshape(self.frames, (-1, *self.frames.shape[-3:])))
         batch = self.phase.shape[:-2]
-        return xp.reshape(xp.sqrt(mean), batch) if batch else xp.sqrt(mean)[0]
+        return xp.reshape(residual, batch) if batch else residual[0]
 
 
 @dataclass(frozen=True, eq=False)
-class Settings:
-    """Checked arguments that every reconstructor takes; see `settings`."""
+class Settings(Immutable):
+    """Checked arguments that every reconstructor accepts.
+
+    Attributes
+    ----------
+    sensor : ZernikeSensor
+    n_iterations : int
+        Largest number of iterations.
+    tolerance : float, radian
+        An iteration that changes the phase by no more than this (rms over the pupil) is the last one.
+    amplitude : ndarray, shape (ny, nx)
+        Amplitude A_in of the incoming field, 0 outside the pupil.
+    light : float
+        Sum of the squared amplitude over the pupil: the light of a clear frame.
+    """
 
     sensor: ZernikeSensor
     n_iterations: int
     tolerance: float
     amplitude: NDArray[np.float64]
-    light: float  # sum of the squared amplitude over the pupil: a frame without mask
-    _maps: dict[Kind, PupilMaps] = field(default_factory=dict, init=False, repr=False)
+    light: float
 
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_maps": {}}  # cheap to make again, and no part of what was asked for
+    @classmethod
+    def checked(cls, sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLike | None) -> Settings:
+        """Check the arguments; an amplitude of None is that of the sensor's pupil.
 
-    __setstate__ = read_only_state
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is of the wrong kind, shape or range.
+        """
+        _check.instance("sensor", sensor, ZernikeSensor)
+        n_iterations = _check.integer("n_iterations", n_iterations, 1, _MOST_ITERATIONS)
+        tolerance = _check.number("tolerance", tolerance, 0)
+        maps, batch = sensor._amplitude_maps(amplitude, Kind.numpy())
+        if batch:
+            raise ValueError(f"amplitude has shape {(*batch, *sensor.pupil.shape)}: expected {sensor.pupil.shape}")
+        light = float(np.sum(maps[0] * maps[0]))
+        if not 1 / _RANGE < light < _RANGE:
+            raise ValueError(
+                f"amplitude: its squares add up to {light:.3g}: expected {1 / _RANGE:g} to {_RANGE:g}"
+            )
+        return cls(sensor, n_iterations, tolerance, read_only(maps[0].copy()), light)
 
-    def maps(self, kind: Kind) -> PupilMaps:
-        """Maps of the pupil, with the amplitude of the settings, for arrays of one kind; made once, then kept."""
-        if kind not in self._maps:
-            self._maps[kind] = PupilMaps.of(self.sensor.pupil.inside, self.amplitude, kind)
-        return self._maps[kind]
+    @per_kind
+    def model(self, kind: Kind) -> Propagator:
+        """Model of the sensor with this amplitude, for arrays of one kind."""
+        return self.sensor._model(kind).with_amplitude(self.amplitude)
+
+    def residual(self, phase: NDArray, light: NDArray) -> NDArray[np.floating]:
+        """Rms mismatch, (k,), of phases (k, ny, nx) and frames on the grid of the pupil, (k, n_masks, ny, nx)."""
+        kind = Kind.of(light)
+        model = self.model(kind)
+        squares = [model.mismatch(phase[piece, ...], light[piece, ...]) for piece in _pieces(light, kind)]
+        return kind.xp.sqrt(kind.xp.concat(squares) / (self.sensor.n_masks * model.pupil.n_points))
 
 
-def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLike | None) -> Settings:
-    """Check the common arguments.
+class Solution(NamedTuple):
+    """Result for a batch of k frame sets; the meaning is that of `Reconstruction`, 0 outside the pupil."""
+
+    phase: NDArray[np.floating]
+    n_iterations: NDArray[np.int64]
+    converged: NDArray[np.bool_]
+    n_unsolved: NDArray[np.int64]
+    history: NDArray[np.floating] | None = None
+
+    def empty(self, k: int, kind: Kind) -> Solution:
+        """Return arrays of the same shapes and types for k frame sets, yet to be filled."""
+        return self._each(
+            lambda array: kind.xp.empty((k, *array.shape[1:]), dtype=array.dtype, device=kind.device)
+        )
+
+    @classmethod
+    def joined(cls, parts: list[tuple[NDArray[np.int64], Solution]], kind: Kind) -> Solution:
+        """Join the results of parts of a batch; each comes with the places of its frame sets, integers (j,)."""
+        if len(parts) == 1:
+            return parts[0][1]
+        order = kind.xp.argsort(kind.xp.concat([places for places, _ in parts]))
+        columns = zip(*(solution[:4] for _, solution in parts), strict=True)  # a part with a history is alone
+        return cls(*(kind.xp.concat(column) for column in columns)).take(order, kind)
+
+    def take(self, which: NDArray[np.int64], kind: Kind) -> Solution:
+        """Return the results of some frame sets: integers, (j,)."""
+        return self._each(lambda array: kind.xp.take(array, which, axis=0))
+
+    def at(self, index: int) -> Solution:
+        """Return the result of one frame set, without the batch axis."""
+        return self._each(lambda array: array[index, ...])
+
+    def put(self, which: slice | int, part: Solution) -> None:
+        """Write the results of some frame sets to their places."""
+        pairs: zip[tuple[Any, Any]] = zip(self, part, strict=True)
+        for array, values in pairs:
+            if array is not None:
+                array[which, ...] = values
+
+    def _each(self, function: Any) -> Solution:
+        return Solution._make(None if array is None else function(array) for array in self)
+
+
+class Reconstructor(Immutable, ABC):
+    """Base class of the reconstructors: they are built with a sensor and called on frames.
+
+    A subclass implements `solve`. Its constructor hands the common arguments to this class and checks its own.
 
     Parameters
     ----------
@@ -123,24 +205,364 @@ def settings(sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLik
     tolerance : float, radian
         An iteration that changes the phase by no more than this (rms over the pupil) is the last one.
     amplitude : array_like, shape (ny, nx), optional
-        Measured amplitude A_in in the pupil; that of the sensor's pupil if None.
+        Measured amplitude A_in in the pupil; that of the sensor's pupil if left out.
+
+    Attributes
+    ----------
+    n_masks : (int, float)
+        Fewest and most masks of a sensor; class attribute.
+    iterative : bool
+        Whether the method iterates and accepts a starting phase; class attribute.
+    any_library : bool
+        Whether `solve` accepts arrays of any library. If not, frames become arrays of NumPy. Class attribute.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is of the wrong kind, shape or range.
+        If an argument is of the wrong kind, shape or range, or the sensor has too few or too many masks.
     """
-    _check.instance("sensor", sensor, ZernikeSensor)
-    n_iterations = _check.integer("n_iterations", n_iterations, 1, _MOST_ITERATIONS)
-    tolerance = _check.number("tolerance", tolerance, 0)
-    maps, batch = sensor.amplitude_maps(amplitude, Kind.numpy())
-    if batch:
-        raise ValueError(f"amplitude has shape {(*batch, *sensor.pupil.shape)}: expected {sensor.pupil.shape}")
-    own = read_only(maps[0].copy())
-    light = float(np.sum(own * own))
-    if not 1 / _RANGE < light < _RANGE:
-        raise ValueError(f"amplitude: its squares add up to {light:.3g}: expected {1 / _RANGE:g} to {_RANGE:g}")
-    return Settings(sensor, n_iterations, tolerance, own, light)
+
+    n_masks: ClassVar[tuple[int, float]] = (1, math.inf)
+    iterative: ClassVar[bool] = True
+    any_library: ClassVar[bool] = False
+
+    def __init__(
+        self, sensor: ZernikeSensor, *, n_iterations: int, tolerance: float, amplitude: ArrayLike | None = None
+    ) -> None:
+        self._settings = Settings.checked(sensor, n_iterations, tolerance, amplitude)
+        self._light = self._settings.light  # of a clear frame; infinite where frames may come in any unit
+        fewest, most = self.n_masks
+        if not fewest <= sensor.n_masks <= most:
+            expected = (
+                f"{fewest}" if fewest == most else f"{fewest} {'or more' if most == math.inf else f'to {most}'}"
+            )
+            raise ValueError(
+                f"sensor has {sensor.n_masks} mask{'s' * (sensor.n_masks > 1)}: expected {expected} for "
+                f"{type(self).__name__}"
+            )
+
+    @property
+    def settings(self) -> Settings:
+        """Checked arguments that every reconstructor accepts."""
+        return self._settings
+
+    @property
+    def sensor(self) -> ZernikeSensor:
+        """Sensor whose frames are reconstructed."""
+        return self._settings.sensor
+
+    def __repr__(self) -> str:
+        config = self._settings
+        return f"{type(self).__name__}({config.sensor!r}, {config.n_iterations}, tolerance={config.tolerance:g})"
+
+    def __call__(
+        self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
+    ) -> Reconstruction:
+        """Reconstruct the phase of each frame set.
+
+        Parameters
+        ----------
+        frames : array_like, shape (..., n_masks, ny', nx')
+            Intensity, 1 = mean of the pupil with the mask out.
+        start : array_like, shape (ny, nx) or (..., ny, nx), radian, optional
+            Phase at which the iteration starts; flat if left out. A method that does not iterate refuses it.
+        history : bool
+            Keep the phase after each iteration.
+
+        Returns
+        -------
+        Reconstruction
+
+        Raises
+        ------
+        TypeError, ValueError
+            If frames or start are of the wrong shape, complex, not finite, negative or dark.
+
+        Warns
+        -----
+        UserWarning
+            If a frame is more than 10 times as bright, inside the pupil, as with the mask out: raw counts?
+        """
+        config, history = self._settings, _check.flag("history", history)
+        if not self.any_library:
+            frames = _check.real_array("frames", frames)
+        frames, batch = check_frames(config.sensor, frames, light=self._light)
+        if start is not None:
+            if not self.iterative:
+                raise ValueError(
+                    f"start = {_check.shown(start)}: expected None, since {type(self).__name__} does not iterate"
+                )
+            start = check_phase("start", start, config.sensor, batch, Kind.of(frames))
+        return _report(config, frames, batch, self.solve(frames, start, history))
+
+    @abstractmethod
+    def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
+        """Reconstruct checked frames.
+
+        Parameters
+        ----------
+        frames : ndarray, shape (k, n_masks, ny', nx')
+        start : ndarray, shape (k, ny, nx), radian, or None for a flat phase
+        history : bool
+            Whether the solution needs a history.
+        """
+
+
+class ClosedForm(Reconstructor):
+    """Base class of the reconstructors without iteration: a subclass implements `invert`.
+
+    Parameters
+    ----------
+    sensor : ZernikeSensor
+    amplitude : array_like, shape (ny, nx), optional
+        Measured amplitude A_in in the pupil; that of the sensor's pupil if left out.
+    """
+
+    iterative = False
+
+    def __init__(self, sensor: ZernikeSensor, *, amplitude: ArrayLike | None = None) -> None:
+        super().__init__(sensor, n_iterations=1, tolerance=0.0, amplitude=amplitude)
+
+    @abstractmethod
+    def invert(self, frames: NDArray) -> tuple[NDArray, NDArray | int]:
+        """Return the phase, (k, ny, nx), and the number of points without a solution, (k,) or one for all.
+
+        The frames are an array of NumPy, shape (k, n_masks, ny', nx'). Values outside the pupil do not matter.
+        """
+
+    def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
+        """Return the phase of `invert` as the result of one iteration, which has always converged."""
+        k, inside = len(frames), self.sensor.pupil.inside
+        phase, n_unsolved = self.invert(frames)
+        phase = np.where(inside, phase, 0).astype(frames.dtype)
+        before = np.broadcast_to(self._before().astype(frames.dtype), phase.shape)
+        path = np.stack([before, phase], axis=1) if history else None
+        return Solution(phase, np.ones(k, int), np.ones(k, bool), np.zeros(k, int) + n_unsolved, path)
+
+    def _before(self) -> NDArray[np.floating]:
+        """Phase with which a history begins, (ny, nx)."""
+        return np.zeros(self.sensor.pupil.shape)
+
+
+@dataclass
+class State:
+    """State of an iteration: base of dataclasses of arrays with the frame sets on the first axis, or None."""
+
+    def keep(self, active: NDArray[np.bool_]) -> None:
+        """Drop the frame sets that have left the loop: only those where `active`, (k,), is True stay."""
+        for name, values in vars(self).items():
+            if values is not None:
+                setattr(self, name, values[active])
+
+
+class Estimate(NamedTuple):
+    """Result of a step: a field of any modulus, shape (k, 2, ny, nx)."""
+
+    field: NDArray[np.floating]
+    n_unsolved: NDArray[np.int64] | int = 0  # points without a solution, (k,) or the same for all
+    modulus: NDArray[np.floating] | None = None  # of the field, (k, ny, nx), if the step knows it
+
+
+class FixedPoint(Reconstructor):
+    """Base class of the iterations in which each step computes a better field from the phasor of the last one.
+
+    The phasor exp(i phase) is all that is kept of a field. It is split into its real and imaginary part: shape
+    (k, 2, ny, nx), 0 outside the pupil. A subclass implements `begin` and `step`, for arrays of any library. Both
+    receive the `constants` of the arrays' kind: those of `Propagator`, unless the subclass computes others.
+
+    Parameters are those of `Reconstructor`; with a tolerance of 0 all iterations are done.
+    """
+
+    any_library = True
+
+    def __init__(
+        self,
+        sensor: ZernikeSensor,
+        *,
+        n_iterations: int = 25,
+        tolerance: float = 1e-6,
+        amplitude: ArrayLike | None = None,
+    ) -> None:
+        super().__init__(sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=amplitude)
+
+    def constants(self, kind: Kind) -> Any:
+        """Arrays of one kind that all frames share; an override is decorated with `per_kind`."""
+        return self.settings.model(kind)
+
+    @abstractmethod
+    def begin(self, frames: NDArray, phasor: NDArray | None, constants: Any) -> State:
+        """Return the state before the first step; a phasor of None stands for a flat wavefront."""
+
+    @abstractmethod
+    def step(self, phasor: NDArray, state: Any, constants: Any) -> Estimate:
+        """Return the next field, as a new array; the state may change, the phasor may not."""
+
+    def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
+        """Iterate the steps on every frame set until it converges or the iterations are used up."""
+        kind = Kind.of(frames)
+
+        def iterate(piece: slice) -> Solution:
+            return self._iterate(frames[piece, ...], None if start is None else start[piece, ...], history)
+
+        # A frame set that is done early would leave a gap in a history: each then is a piece of its own.
+        first, *others = _pieces(frames, kind, 1 if history else None)
+        solution = iterate(first)
+        if not others:
+            return solution
+        whole = solution.empty(frames.shape[0], kind)
+        whole.put(first, solution)
+        for piece in others:
+            whole.put(piece, iterate(piece))
+        return whole
+
+    def _iterate(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
+        """Iterate a few frame sets together. Those that are done leave, so no result depends on the others."""
+        kind, k, config = Kind.of(frames), frames.shape[0], self.settings
+        xp, model, constants = kind.xp, config.model(kind), self.constants(kind)
+        limit = config.tolerance * config.tolerance * model.pupil.n_points  # of the squared norm of a change
+        phasor = model.flat + kind.zeros(k, 1, 1, 1) if start is None else split(start, model.stop)
+        path = [angle(phasor, xp) if start is None else start] if history else []
+        state = self.begin(frames, None if start is None else phasor, constants)
+        places, done = kind.integers(np.arange(k)), kind.flags(np.zeros(k, bool))
+        ended: list[tuple[NDArray[np.int64], Solution]] = []
+
+        def result(phasor: NDArray, done: NDArray, n_unsolved: NDArray | int) -> Solution:
+            zeros = kind.integers([0] * done.shape[0])
+            return Solution(angle(phasor, xp), zeros + iteration, done, zeros + n_unsolved)
+
+        for iteration in range(1, config.n_iterations + 1):
+            before, last, n_done = phasor, iteration == config.n_iterations, 0
+            phasor, n_unsolved, modulus = self.step(before, state, constants)
+            if limit or not last:  # the phase of the last field does not depend on its modulus
+                phasor = unit(phasor, model.stop, xp, modulus)
+            if limit:
+                before -= phasor  # in place: the array is not needed any more
+                done = _small(before, limit, xp)
+                n_done = int(xp.count_nonzero(done))
+            if history:
+                path.append(angle(phasor, xp))
+            if last or n_done == done.shape[0]:
+                break
+            if n_done:
+                n_unsolved = n_unsolved + 0 * places
+                ended.append((places[done], result(phasor[done], done[done], n_unsolved[done])))
+                places, phasor = places[~done], phasor[~done]
+                state.keep(~done)
+        ended.append((places, result(phasor, done, n_unsolved)))
+        solution = Solution.joined(ended, kind)
+        if not history:
+            return solution
+        path += path[-1:] * (config.n_iterations + 1 - len(path))
+        return solution._replace(history=xp.stack(path, axis=1))
+
+
+def _small(change: NDArray, limit: float, xp: Any) -> NDArray[np.bool_]:
+    """Whether the squared norm of a change of the phasors, nearly that of the phases, is within the limit."""
+    change = xp.reshape(change, (change.shape[0], -1))
+    return xp.vecdot(change, change) <= limit
+
+
+def _report(config: Settings, frames: NDArray, batch: tuple[int, ...], solution: Solution) -> Reconstruction:
+    """Result in the shape of the batch; the phases of the solution are written to."""
+    kind = Kind.of(frames)
+    no_data = config.model(kind).no_data
+    phase, n_iterations, converged, n_unsolved, history = solution
+    phase += no_data
+    if history is not None:
+        history += no_data
+    # A copy, since the residual is computed later: a camera may write the next frame to the same place.
+    window = kind.xp.asarray(frames[(..., *config.sensor.window)], copy=True)
+
+    def shaped(values: NDArray) -> NDArray:
+        # A single frame is the case of a control loop: no need to compute its shape.
+        return kind.xp.reshape(values, (*batch, *values.shape[1:])) if batch else values[0, ...]
+
+    return Reconstruction(
+        shaped(phase), shaped(n_iterations), shaped(converged), shaped(n_unsolved),
+        None if history is None else shaped(history), config, shaped(window),
+    )  # fmt: skip
+
+
+def _pieces(frames: NDArray, kind: Kind, size: int | None = None) -> Iterator[slice]:
+    """Slices of frames (n, ...) that are handled together."""
+    if size is None:
+        chunk = _CHUNK if kind.on_host else _CHUNK_ELSEWHERE
+        size = max(1, chunk // prod(frames.shape[1:]))
+    n = frames.shape[0]
+    return (slice(first, min(first + size, n)) for first in range(0, n, size))
+
+
+def check_frames(
+    sensor: ZernikeSensor, frames: ArrayLike, name: str = "frames", *, light: float = math.inf
+) -> tuple[NDArray[np.floating], tuple[int, ...]]:
+    """Check frames and return them with one batch axis, (k, n_masks, ny', nx'), and the shape of their batch.
+
+    Parameters
+    ----------
+    sensor : ZernikeSensor
+    frames : array_like, shape (..., n_masks, ny', nx')
+    name : str
+        Name of the frames in error messages.
+    light : float
+        Sum of a clear frame over the pupil. Frames that are more than 10 times as bright cause a warning.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the frames are of the wrong shape, complex, not finite, negative or dark.
+    """
+    frames = _check.real_any(name, frames)
+    shape = (sensor.n_masks, *sensor.detector_shape)
+    _check.trailing_shape(name, frames, shape, "masks and detector of the sensor")
+    batch, xp = tuple(frames.shape[:-3]), Kind.of(frames).xp
+    flat = xp.reshape(frames, (-1, *shape))
+    if not prod(batch):
+        raise ValueError(f"{name} has shape {tuple(frames.shape)}: expected at least one frame")
+    total = xp.sum(flat, axis=(-2, -1))
+    # A sum is finite only if all its terms are; one of nothing negative is 0 only if all of them are.
+    if not (xp.min(flat) >= 0 and xp.all((total > 0) & (total < _BRIGHT * light))):
+        _check.finite(name, flat)
+        _check.non_negative(name, flat, "; after subtracting a background, raise them to 0 explicitly")
+        if not xp.all(total > 0):
+            n_dark = int(xp.count_nonzero(total == 0))
+            raise ValueError(f"{name}: {n_dark} of {prod(total.shape)} hold no light: expected some flux in each")
+        _warn_of_counts(sensor, name, flat, light)
+    return flat, batch
+
+
+def _warn_of_counts(sensor: ZernikeSensor, name: str, frames: NDArray, light: float) -> None:
+    """Warn if frames (k, n_masks, ny', nx') are brighter inside the pupil than behind any mask."""
+    kind = Kind.of(frames)
+    inside = frames[(..., *sensor.window)] * sensor._model(kind).stop
+    brightest = float(kind.xp.max(kind.xp.sum(inside, axis=(-2, -1)))) / sensor.pupil.n_points
+    expected = light / sensor.pupil.n_points
+    if brightest > _BRIGHT * expected:
+        warnings.warn(
+            f"{name}: the mean inside the pupil reaches {brightest:.4g}: expected at most about {expected:.4g}, "
+            "the mean with the mask taken out; are these raw counts? Subtract the background, then divide by the "
+            "mean count in the pupil with the mask taken out",
+            UserWarning,
+            stacklevel=4,  # the call of the reconstructor
+        )
+
+
+def check_phase(
+    name: str, phase: ArrayLike, sensor: ZernikeSensor, batch: tuple[int, ...], kind: Kind
+) -> NDArray[np.floating]:
+    """Check one phase, or one for each frame set, and return one for each: (k, ny, nx), 0 outside the pupil.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the phase is complex, of the wrong shape, not finite inside the pupil, or on another device.
+    """
+    shape = sensor.pupil.shape
+    maps, own_batch = sensor._pupil_maps(name, phase)
+    if own_batch not in ((), batch):
+        expected = f"{shape} or {(*batch, *shape)}" if batch else f"{shape}"
+        raise ValueError(f"{name} has shape {(*own_batch, *shape)}: expected {expected}")
+    # As many copies as there are frame sets, of one map or of each.
+    return _check.in_kind(name, maps, kind) + kind.zeros(prod(batch), 1, 1)
 
 
 def load(path: str) -> type:
@@ -169,314 +591,3 @@ def load(path: str) -> type:
     if not isinstance(method, type) or "__call__" not in dir(method):
         raise ValueError(f"path = {path!r}: expected the class of a reconstructor, got {_check.shown(method)}")
     return method
-
-
-class Reconstructor:
-    """Base of the reconstructors: the sensor that they model and the arguments that all of them take.
-
-    Parameters
-    ----------
-    settings : Settings
-        From `settings`, which checks them.
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
-
-    @property
-    def settings(self) -> Settings:
-        """Checked arguments that every reconstructor takes."""
-        return self._settings
-
-    @property
-    def sensor(self) -> ZernikeSensor:
-        """Sensor whose frames are reconstructed."""
-        return self._settings.sensor
-
-    def __repr__(self) -> str:
-        config = self._settings
-        return f"{type(self).__name__}({config.sensor!r}, {config.n_iterations}, tolerance={config.tolerance:g})"
-
-
-class FixedPoint(Protocol):
-    """An iterative reconstructor: each step makes a better field out of the phasor before.
-
-    A phasor is exp(i phase), split, shape (k, 2, ny, nx), and 0 outside the pupil: all that is kept of a field.
-    """
-
-    @property
-    def settings(self) -> Settings:
-        """Checked arguments that every reconstructor takes."""
-
-    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool, kind: Kind) -> dict[str, NDArray]:
-        """What the steps need and keep: arrays with the frames (k, n_masks, ny', nx') on the first axis.
-
-        `flat` says that the starting phasor is flat, `kind` what all arrays are.
-        """
-
-    def step(self, phasor: NDArray, data: dict[str, NDArray], kind: Kind) -> Estimate:
-        """Next field."""
-
-
-class Estimate(NamedTuple):
-    """Field that a step found, (k, 2, ny, nx), of any modulus."""
-
-    field: NDArray[np.floating]
-    unsolved: NDArray[np.int64] | int = 0  # number of points, (k,) or the same for all
-    modulus: NDArray[np.floating] | None = None  # of the field, (k, ny, nx), where the step knows it
-
-
-def iterate(method: FixedPoint, frames: ArrayLike, start: ArrayLike | None, history: bool) -> Reconstruction:
-    """Run the steps of `method` on every frame until it converges or the iterations are used up."""
-    config = method.settings
-    history = _check.flag("history", history)
-    frames, batch = check_frames(config.sensor, frames, light=config.light, depth=4)
-    kind = Kind.of(frames)
-    first = None if start is None else start_phase(config.sensor, start, batch, kind)
-
-    def run(piece: slice) -> Found:
-        return _iterate_piece(method, frames[piece, ...], None if first is None else first[piece, ...], history)
-
-    # Frames that leave early would leave gaps in a history, so each then is a piece of its own.
-    slices = list(pieces(frames, kind, 1 if history else None))
-    found = run(slices[0])
-    if len(slices) > 1:
-        whole = found.room_for(frames.shape[0], kind)
-        whole.put(slices[0], found)
-        for piece in slices[1:]:
-            whole.put(piece, run(piece))
-        found = whole
-    return report(config, frames, batch, found)
-
-
-class Found(NamedTuple):
-    """What was found for k frames; the meaning is that of `Reconstruction`, 0 outside the pupil."""
-
-    phase: NDArray[np.floating]
-    n_iterations: NDArray[np.int64]
-    converged: NDArray[np.bool_]
-    n_unsolved: NDArray[np.int64]
-    history: NDArray[np.floating] | None = None
-
-    def room_for(self, n_frames: int, kind: Kind) -> Found:
-        """Arrays of the same kind for more frames, yet to be filled."""
-        return Found._make(
-            None if array is None
-            else kind.xp.empty((n_frames, *array.shape[1:]), dtype=array.dtype, device=kind.device)
-            for array in self
-        )  # fmt: skip
-
-    def put(self, piece: slice, some: Found) -> None:
-        """Put some of the frames in their places."""
-        pairs: zip[tuple[Any, Any]] = zip(self, some, strict=True)
-        for array, part in pairs:
-            if array is not None:
-                array[piece, ...] = part
-
-
-def _iterate_piece(method: FixedPoint, frames: NDArray, start: NDArray | None, history: bool) -> Found:
-    """Iterate a few frames."""
-    config, kind = method.settings, Kind.of(frames)
-    xp, maps, n_frames = kind.xp, config.maps(kind), frames.shape[0]
-    phasor = maps.flat + kind.zeros(n_frames, 1, 1, 1) if start is None else split(start, maps.inside)
-    path = [angle(phasor, xp) if start is None else start] if history else []
-    data = method.prepare(frames, phasor, start is None, kind)
-    limit = config.tolerance * config.tolerance * config.sensor.pupil.n_points
-    none = kind.integers([0] * n_frames)
-    active, finished, done = None, [], none > 0
-
-    def result(iteration: int, phasor: NDArray, done: NDArray, unsolved: NDArray) -> Found:
-        return Found(angle(phasor, xp), none[: done.shape[0]] + iteration, done, unsolved)
-
-    for iteration in range(1, config.n_iterations + 1):
-        field, unsolved, modulus = method.step(phasor, data, kind)
-        last = iteration == config.n_iterations
-        if last and not limit:
-            phasor = field  # the modulus does not matter any more
-        else:
-            before, phasor = phasor, unit(field, maps.inside, xp, modulus)
-            done = _small(phasor - before, limit, xp) if limit else done
-        if history:
-            path.append(angle(phasor, xp))
-        if last or (limit and xp.all(done)):
-            break
-        if limit and xp.any(done):
-            # Frames that are done leave the loop, so a frame's result does not depend on its neighbours.
-            active = kind.integers(np.arange(n_frames)) if active is None else active
-            finished.append((active[done], result(iteration, phasor[done], done[done], (unsolved + none)[done])))
-            active, phasor = active[~done], phasor[~done]
-            data = {name: values[~done] for name, values in data.items()}
-            none = none[: phasor.shape[0]]
-    found = result(iteration, phasor, done, unsolved + none)
-    if finished:
-        order = xp.argsort(xp.concat([*(which for which, _ in finished), active]))
-        parts = zip(*(part[:4] for _, part in finished), found[:4], strict=True)
-        found = Found(*(xp.take(xp.concat(arrays), order, axis=0) for arrays in parts))
-    if history:
-        path += path[-1:] * (config.n_iterations + 1 - len(path))
-        found = found._replace(history=xp.stack(path, axis=1))
-    return found
-
-
-def _small(change: NDArray, limit: float, xp: Any) -> NDArray[np.bool_]:
-    """Whether the squared norm of a change of the phasors, nearly that of the phases, is within the limit."""
-    change = xp.reshape(change, (change.shape[0], -1))
-    return xp.vecdot(change, change) <= limit
-
-
-def report(config: Settings, frames: NDArray, batch: tuple[int, ...], found: Found) -> Reconstruction:
-    """Result in the shape of the batch; the phases found are written to."""
-    kind = Kind.of(frames)
-    outside = config.maps(kind).outside
-    phase, n_iterations, converged, n_unsolved, history = found
-    phase += outside
-    if history is not None:
-        history += outside
-    # A copy, since the residual is computed later: a camera may write the next frame to the same place.
-    window = kind.xp.asarray(frames[(..., *config.sensor.window)], copy=True)
-
-    def shaped(values: NDArray) -> NDArray:
-        # A single frame is what a control loop hands in: no need to compute its shape.
-        return kind.xp.reshape(values, (*batch, *values.shape[1:])) if batch else values[0, ...]
-
-    return Reconstruction(
-        shaped(phase), shaped(n_iterations), shaped(converged), shaped(n_unsolved),
-        None if history is None else shaped(history), config, shaped(window),
-    )  # fmt: skip
-
-
-def pieces(frames: NDArray, kind: Kind, size: int | None = None) -> Iterator[slice]:
-    """Slices of frames (n, ...) that are handled together."""
-    if size is None:
-        chunk = _CHUNK if kind.on_host else _CHUNK_ELSEWHERE
-        size = max(1, chunk // prod(frames.shape[1:]))
-    n = frames.shape[0]
-    return (slice(first, min(first + size, n)) for first in range(0, n, size))
-
-
-def check_frames(
-    sensor: ZernikeSensor, frames: ArrayLike, name: str = "frames", *, light: float = np.inf, depth: int = 3
-) -> tuple[NDArray[np.floating], tuple[int, ...]]:
-    """Checked frames, (k, n_masks, ny', nx'), and the shape of the batch.
-
-    Parameters
-    ----------
-    sensor : ZernikeSensor
-    frames : array_like, shape (..., n_masks, ny', nx')
-    name : str
-        Of the frames, in messages.
-    light : float
-        Sum over the pupil with the mask out. Frames that are far brighter cause a warning; none do if left out.
-    depth : int
-        Calls between the warning and the line that it names.
-    """
-    frames = _check.real_any(name, frames)
-    shape = (sensor.n_masks, *sensor.detector_shape)
-    _check.trailing_shape(name, frames, shape, "masks and detector of the sensor")
-    batch, xp = tuple(frames.shape[:-3]), Kind.of(frames).xp
-    flat = xp.reshape(frames, (-1, *shape))
-    if not prod(batch):
-        raise ValueError(f"{name} has shape {tuple(frames.shape)}: expected at least one frame")
-    total = xp.sum(flat, axis=(-2, -1))
-    # A sum is finite only if all its terms are; one of nothing negative is 0 only if all of them are.
-    if not (xp.min(flat) >= 0 and xp.all((total > 0) & (total < _BRIGHT * light))):
-        _check.finite(name, flat)
-        _check.non_negative(name, flat, "; after subtracting a background, raise them to 0 explicitly")
-        if not xp.all(total > 0):
-            n_dark = int(xp.count_nonzero(total == 0))
-            raise ValueError(f"{name}: {n_dark} of {prod(total.shape)} hold no light: expected some flux in each")
-        _warn_of_counts(sensor, name, flat, light, depth + 1)
-    return flat, batch
-
-
-def _warn_of_counts(sensor: ZernikeSensor, name: str, frames: NDArray, light: float, depth: int) -> None:
-    """Warn if frames (k, n_masks, ny', nx') are brighter inside the pupil than behind any mask."""
-    kind = Kind.of(frames)
-    inside = frames[(..., *sensor.window)] * sensor.maps(kind).inside
-    brightest = float(kind.xp.max(kind.xp.sum(inside, axis=(-2, -1)))) / sensor.pupil.n_points
-    expected = light / sensor.pupil.n_points
-    if brightest > _BRIGHT * expected:
-        warnings.warn(
-            f"{name}: the mean inside the pupil reaches {brightest:.4g}: expected at most about {expected:.4g}, "
-            "the mean with the mask taken out; are these raw counts? Subtract the background, then divide by the "
-            "mean count in the pupil with the mask taken out",
-            UserWarning,
-            stacklevel=depth,
-        )
-
-
-def start_phase(
-    sensor: ZernikeSensor, start: ArrayLike | None, batch: tuple[int, ...], kind: Kind, name: str = "start"
-) -> NDArray[np.floating]:
-    """Checked starting phase of every frame, (k, ny, nx), 0 outside; flat for None."""
-    shape = sensor.pupil.shape
-    if start is None:
-        return kind.xp.zeros((prod(batch), *shape), dtype=kind.dtype, device=kind.device)
-    maps, start_batch = sensor.pupil_maps(name, start)
-    if start_batch not in ((), batch):
-        expected = f"{shape} or {(*batch, *shape)}" if batch else f"{shape}"
-        raise ValueError(f"{name} has shape {(*start_batch, *shape)}: expected {expected}")
-    # As many copies as there are frames, of one map or of each.
-    return _check.in_kind(name, maps, kind) + kind.xp.zeros(
-        (prod(batch), 1, 1), dtype=kind.dtype, device=kind.device
-    )
-
-
-def angle(phasor: NDArray, xp: Any) -> NDArray:
-    """Phase of a split phasor: (..., 2, ny, nx) to (..., ny, nx)."""
-    return xp.atan2(phasor[..., 1, :, :], phasor[..., 0, :, :])
-
-
-def count(points: NDArray[np.bool_], kind: Kind) -> NDArray[np.int64]:
-    """Number of points that are true in each map: (k, ny, nx) to (k,)."""
-    if kind.xp is np:  # along an axis NumPy turns all of them into integers first
-        return np.array([np.count_nonzero(one) for one in points])
-    return kind.xp.sum(kind.xp.astype(points, kind.xp.int64), axis=(-2, -1))
-
-
-def turn(wave: NDArray, along: NDArray, across: NDArray) -> NDArray:
-    """Split product (along + i across) wave, of two maps (k, ny, nx) and a split wave (k, 2, ny, nx)."""
-    turned = along[:, np.newaxis, ...] * wave
-    ahead = across[:, np.newaxis, ...] * wave
-    turned[:, 0, ...] -= ahead[:, 1, ...]
-    turned[:, 1, ...] += ahead[:, 0, ...]
-    return turned
-
-
-def for_each(array: NDArray, n_frames: int, xp: Any) -> NDArray:
-    """What all frames share, (1, ...), as a view of shape (n_frames, ...)."""
-    return xp.broadcast_to(array, (n_frames, *array.shape[1:]))
-
-
-def steady(found: NDArray, data: dict[str, NDArray], xp: Any) -> NDArray:
-    """Coefficients of an estimate, (k, 2 r), turned to the piston of those before; kept for the next ones."""
-    if "tried" in data:
-        found = with_piston_of(data["tried"], found, xp)
-    data["tried"] = found
-    return found
-
-
-def with_piston_of(before: NDArray, found: NDArray, xp: Any) -> NDArray:
-    """Coefficients (k, 2 r) turned by the constant phase that brings them nearest to those before.
-
-    The frames do not depend on a piston, and one iteration F obeys F(exp(i a) psi) = exp(i a) F(psi) for any a. It
-    therefore may settle at F(psi) = exp(i w) psi: if noise or a wrong model leaves no phase that explains the
-    frames, each iteration adds the piston w. The angle that makes <before, found> real and positive removes w and
-    changes nothing else. A fixed gauge, such as a real mean field, would fail where the mean field vanishes.
-    """
-    rank = found.shape[-1] // 2
-    real, imag = found[:, :rank], found[:, rank:]
-    across = xp.vecdot(before[:, :rank], imag) - xp.vecdot(before[:, rank:], real)
-    ahead = xp.atan2(across, xp.vecdot(before, found))[:, np.newaxis]
-    along, across = xp.cos(ahead), xp.sin(ahead)
-    return xp.concat([along * real + across * imag, along * imag - across * real], axis=-1)
-
-
-def unit(field: NDArray, modulus: NDArray, xp: Any, before: NDArray | None = None) -> NDArray:
-    """Split field with another modulus, (..., ny, nx); 0 where the field vanishes. `field` is reused.
-
-    `before` is the modulus that it has, if that is known.
-    """
-    before = xp.sqrt(square(field) + _VANISHING) if before is None else before + _VANISHING
-    field *= (modulus / before)[..., np.newaxis, :, :]
-    return field

@@ -9,18 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind
-from zwfs._pickle import read_only_state
-from zwfs.reconstructors.base import (
-    Found,
-    Reconstruction,
-    Reconstructor,
-    check_frames,
-    report,
-    settings,
-    start_phase,
-)
+from zwfs._propagator import split, square
+from zwfs.reconstructors.base import Reconstructor, Solution, check_frames
 from zwfs.reconstructors.linear import check_modes
-from zwfs.sensor import ZernikeSensor, split, square
+from zwfs.sensor import ZernikeSensor
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
@@ -38,7 +30,7 @@ class GradientDescent(Reconstructor):
     sensor : ZernikeSensor
         With any number of masks.
     modes : array_like, shape (n_modes, ny, nx), optional
-        Modes whose coefficients are sought; every point of the pupil on its own if left out.
+        Modes whose coefficients are sought; the phases of all points of the pupil if left out.
     n_iterations, tolerance, amplitude
         As for `PhaseShifted`.
 
@@ -56,36 +48,29 @@ class GradientDescent(Reconstructor):
         tolerance: float = 1e-6,
         amplitude: ArrayLike | None = None,
     ) -> None:
-        super().__init__(settings(sensor, n_iterations, tolerance, amplitude))
+        super().__init__(sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=amplitude)
         self._modes = None if modes is None else check_modes(sensor, modes)
-
-    __setstate__ = read_only_state
 
     @property
     def modes(self) -> NDArray[np.float64] | None:
         """Modes at the points of the pupil, shape (n_modes, n_points), if there are any."""
         return self._modes
 
-    def __call__(
-        self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
-    ) -> Reconstruction:
-        """Reconstruct the phase of each frame set; parameters, result and errors are those of `PhaseShifted`."""
-        config, history = self.settings, _check.flag("history", history)
-        pupil = config.sensor.pupil
-        frames, batch = check_frames(config.sensor, _check.real_array("frames", frames), light=config.light)
-        phase = start_phase(config.sensor, start, batch, Kind.of(frames))
-        n_used = np.zeros(len(frames), int)
-        converged = np.zeros(len(frames), bool)
-        record = np.empty((len(frames), config.n_iterations + 1, *pupil.shape), frames.dtype) if history else None
+    def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
+        """Descend from the start, frame set by frame set."""
+        pupil, n_iterations, k = self.sensor.pupil, self.settings.n_iterations, len(frames)
+        phase = np.zeros((k, *pupil.shape), frames.dtype) if start is None else start
+        n_used = np.zeros(k, int)
+        converged = np.zeros(k, bool)
+        record = np.empty((k, n_iterations + 1, *pupil.shape), frames.dtype) if history else None
         for index, frame in enumerate(frames):
             path, converged[index] = self._descend(frame[np.newaxis], pupil.gather(phase[index]))
             n_used[index] = len(path) - 1
             phase[index] = pupil.scatter(path[-1], fill=0)
             if record is not None:
-                path += [path[-1]] * (config.n_iterations + 1 - len(path))
+                path += [path[-1]] * (n_iterations + 1 - len(path))
                 record[index] = pupil.scatter(np.array(path), fill=0)
-        found = Found(phase, n_used, converged, np.zeros(len(frames), int), record)
-        return report(config, frames, batch, found)
+        return Solution(phase, n_used, converged, np.zeros(k, int), record)
 
     def cost(self, phase: NDArray, frames: NDArray) -> tuple[float, NDArray]:
         """Cost of a phase and its gradient.
@@ -116,15 +101,14 @@ class GradientDescent(Reconstructor):
         return self._cost(phase, frames)
 
     def _cost(self, phase: NDArray, frames: NDArray) -> tuple[float, NDArray]:
-        sensor = self.sensor
-        maps = sensor.pupil.scatter(phase.astype(frames.dtype), fill=0)[np.newaxis]
-        psi = split(maps, self.settings.amplitude.astype(frames.dtype))
-        waves = sensor.propagate_split(psi)
+        pupil, model = self.sensor.pupil, self.settings.model(Kind.of(frames))
+        psi = split(pupil.scatter(phase.astype(frames.dtype), fill=0)[np.newaxis], model.amplitude)
+        waves = model.propagate(psi)
         mismatch = square(waves) - frames
-        back = sensor.adjoint_split(waves * mismatch[:, :, np.newaxis])
+        back = model.adjoint(waves * mismatch[:, :, np.newaxis])
         # 2 Im(conj(psi) back)
         gradient = 2 * (psi[0, 0] * back[0, 1] - psi[0, 1] * back[0, 0]) / mismatch.size
-        return float(np.vdot(mismatch, mismatch)) / (2 * mismatch.size), sensor.pupil.gather(gradient)
+        return float(np.vdot(mismatch, mismatch)) / (2 * mismatch.size), pupil.gather(gradient)
 
     def _descend(self, frames: NDArray, start: NDArray) -> tuple[list[NDArray], bool]:
         """Phases at the points of the pupil after each iteration, and whether the last change was small."""
@@ -147,12 +131,12 @@ class GradientDescent(Reconstructor):
                 raise StopIteration
 
         n = n_points if self.modes is None else len(self.modes)
-        found = minimize(
+        result = minimize(
             value, np.zeros(n), jac=True, method="L-BFGS-B", callback=follow,
             options={"maxiter": config.n_iterations, "ftol": 0.0, "gtol": 0.0},
         )  # fmt: skip
         # Status 0: the gradient is exactly 0. No step at all: none leads down, as at a start that is the solution.
-        stuck = found.status == 0 or len(path) == 1
+        stuck = result.status == 0 or len(path) == 1
         return path, stuck or _rms(path[-1] - path[-2]) <= config.tolerance
 
 

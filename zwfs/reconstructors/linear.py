@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind, read_only
-from zwfs._pickle import read_only_state
-from zwfs.reconstructors.base import (
-    Found,
-    Reconstruction,
-    Reconstructor,
-    check_frames,
-    report,
-    settings,
-    start_phase,
-)
+from zwfs._propagator import split, square
+from zwfs.reconstructors.base import ClosedForm, check_frames, check_phase
 from zwfs.sensor import ZernikeSensor
 
 
-class Linear(Reconstructor):
+class Linear(ClosedForm):
     """Phase from the difference to the frames of a reference phase, by one matrix product.
 
     Each mode is pushed and pulled by a small amount around the reference phase, and half the difference of the
@@ -73,15 +67,16 @@ class Linear(Reconstructor):
         amplitude: ArrayLike | None = None,
         calibration: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
     ) -> None:
-        super().__init__(settings(sensor, 1, 0.0, amplitude))
+        super().__init__(sensor, amplitude=amplitude)
         self._modes = check_modes(sensor, modes)
         poke = _check.number("poke", poke, 1e-10, np.pi)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
-        self._reference = start_phase(sensor, reference, (), Kind.numpy(), "reference")
-        # Recorded frames may come in any unit, which is then that of the interaction matrix.
-        self._light = self._settings.light if calibration is None else np.inf
-        flat, difference = self._simulated(poke) if calibration is None else self._recorded(calibration)
-        self._reference_signal = flat
+        flat = np.zeros(sensor.pupil.shape) if reference is None else reference
+        self._reference = read_only(check_phase("reference", flat, sensor, (), Kind.numpy())[0])
+        if calibration is not None:  # the unit of the frames is then that of the interaction matrix
+            self._light = math.inf
+        signal, difference = self._simulated(poke) if calibration is None else self._recorded(calibration)
+        self._reference_signal = signal
         self._matrix = read_only(difference.T / (2 * poke))
         u, strength, vt = np.linalg.svd(self._matrix, full_matrices=False)
         # A frame of unit intensity is rounded at 1e-16, which the poke divides.
@@ -91,8 +86,6 @@ class Linear(Reconstructor):
         self._n_inverted = int(np.count_nonzero(strength > conditioning * strength[0]))
         kept = slice(0, self._n_inverted)
         self._inverse = (vt[kept].T / strength[kept]) @ u[:, kept].T
-
-    __setstate__ = read_only_state
 
     @property
     def modes(self) -> NDArray[np.float64]:
@@ -109,41 +102,14 @@ class Linear(Reconstructor):
         """Number of singular values above the conditioning."""
         return self._n_inverted
 
-    def __call__(self, frames: ArrayLike, *, history: bool = False) -> Reconstruction:
-        """Reconstruct the phase of each frame set.
-
-        Parameters
-        ----------
-        frames : array_like, shape (..., n_masks, ny', nx')
-            Intensity, 1 = mean of the pupil with the mask out.
-        history : bool
-            Keep the phase before, which is the reference phase, and after.
-
-        Returns
-        -------
-        Reconstruction
-            After one iteration; always converged.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the frames are of the wrong shape, complex, not finite, negative or dark.
-
-        Warns
-        -----
-        UserWarning
-            As for `PhaseShifted`, but with a `calibration`, whose unit is free.
-        """
-        config, history = self.settings, _check.flag("history", history)
-        frames, batch = check_frames(config.sensor, _check.real_array("frames", frames), light=self._light)
+    def invert(self, frames: NDArray) -> tuple[NDArray, int]:
+        """Return the phase of the modes that explain the difference to the frames of the reference best."""
         coefficients = (self._signal(frames) - self._reference_signal) @ self._inverse.T
-        phase = coefficients @ self._modes + config.sensor.pupil.gather(self._reference)
-        phase = config.sensor.pupil.scatter(phase, fill=0).astype(frames.dtype)
-        n_frames = len(frames)
-        before = np.broadcast_to(self._reference.astype(frames.dtype), phase.shape)
-        record = np.stack([before, phase], axis=1) if history else None
-        once, always, none = np.ones(n_frames, int), np.ones(n_frames, bool), np.zeros(n_frames, int)
-        return report(config, frames, batch, Found(phase, once, always, none, record))
+        pupil = self.sensor.pupil
+        return pupil.scatter(coefficients @ self._modes + pupil.gather(self._reference), fill=0), 0
+
+    def _before(self) -> NDArray[np.float64]:
+        return self._reference
 
     def _simulated(self, poke: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Signal of the reference phase, and push less pull of each mode, (n_modes, n_masks * n_points)."""
@@ -153,7 +119,7 @@ class Linear(Reconstructor):
             push = pupil.scatter(np.stack([poke * mode, -poke * mode]), fill=0)
             pushed, pulled = self._signal(self._model(self._reference + push))
             np.subtract(pushed, pulled, out=row)
-        return self._signal(self._model(self._reference))[0], difference
+        return self._signal(self._model(self._reference[np.newaxis]))[0], difference
 
     def _recorded(
         self, calibration: tuple[ArrayLike, ArrayLike, ArrayLike]
@@ -166,17 +132,16 @@ class Linear(Reconstructor):
         flat, pushed, pulled = calibration
         signals = []
         for name, frames, n_frames in (("flat", flat, 1), ("pushed", pushed, None), ("pulled", pulled, None)):
-            what = f"calibration {name}"
-            checked, batch = check_frames(self.sensor, _check.real_array(what, frames), what)
+            name = f"calibration {name}"
+            checked, batch = check_frames(self.sensor, _check.real_array(name, frames), name)
             if len(checked) != (n_frames or len(self._modes)):
-                raise ValueError(
-                    f"calibration {name} has a batch of {batch}: expected {n_frames or len(self._modes)}"
-                )
+                raise ValueError(f"{name} has a batch of {batch}: expected {n_frames or len(self._modes)}")
             signals.append(self._signal(checked.astype(np.float64)))
         return signals[0][0], signals[1] - signals[2]
 
     def _model(self, phase: NDArray) -> NDArray:
-        return self.sensor.intensity(phase, self.settings.amplitude[np.newaxis])
+        model = self.settings.model(Kind.numpy())
+        return square(model.propagate(split(phase, model.amplitude)))
 
     def _signal(self, frames: NDArray) -> NDArray:
         """Values at the points of the pupil, all masks in a row: (k, n_masks * n_points)."""
@@ -189,9 +154,7 @@ def check_modes(sensor: ZernikeSensor, modes: ArrayLike) -> NDArray[np.float64]:
     modes = _check.real_array("modes", modes)
     if modes.ndim != 3 or not len(modes):
         raise ValueError(f"modes has shape {modes.shape}: expected (n_modes, ny, nx)")
-    _check.trailing_shape("modes", modes, sensor.pupil.shape, "the shape of the pupil")
-    values = sensor.pupil.gather(modes).astype(np.float64)
-    _check.finite("modes", values, " inside the pupil")
+    values = _check.values_inside("modes", modes, sensor.pupil).astype(np.float64)
     if len(values) > values.shape[1]:
         raise ValueError(
             f"modes: {len(values)} of them, expected at most the {values.shape[1]} points of the pupil"

@@ -2,39 +2,28 @@
 
 from __future__ import annotations
 
-from copy import copy
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind
-from zwfs.lowrank import Operator, split_core
-from zwfs.reconstructors._acceleration import Acceleration, dimming
-from zwfs.reconstructors.base import (
-    Estimate,
-    Reconstruction,
-    Reconstructor,
-    check_frames,
-    count,
-    for_each,
-    iterate,
-    settings,
-    start_phase,
-    steady,
-    turn,
-)
-from zwfs.sensor import PupilMaps, ZernikeSensor, square
+from zwfs._arrays import Kind, for_each, per_kind
+from zwfs._propagator import Propagator, count, square, turn, with_piston_of
+from zwfs.lowrank import split_core
+from zwfs.reconstructors._acceleration import Acceleration, Path, dimming
+from zwfs.reconstructors.base import Estimate, FixedPoint, Solution
+from zwfs.sensor import ZernikeSensor
 
 _PARALLEL = 1e-6  # sine of the angle between two reference waves below which they count as parallel
 _DARK = 1e-9  # amplitude of a reference wave, in units of the mean of the pupil, below which it counts as absent
-_SMALL_TILT = 1e-3  # radian per D, by which the speed of convergence is found
+_SMALL_TILT = 1e-3  # radian per D, for measuring the speed of convergence
 
 
-class PhaseShifted(Reconstructor):
+class PhaseShifted(FixedPoint):
     """Phase from two or more masks of different phase shifts.
 
     With the reference waves r_m of the estimate before, every point has one linear equation per mask for the real
@@ -79,6 +68,8 @@ class PhaseShifted(Reconstructor):
     `eq-shared-wave` of the book, `eq-dimming` and `eq-secant` for the acceleration.
     """
 
+    n_masks = 2, math.inf
+
     def __init__(
         self,
         sensor: ZernikeSensor,
@@ -88,162 +79,119 @@ class PhaseShifted(Reconstructor):
         amplitude: ArrayLike | None = None,
         accelerate: bool = False,
     ) -> None:
-        super().__init__(settings(sensor, n_iterations, tolerance, amplitude))
-        if sensor.n_masks < 2:
-            raise ValueError(f"sensor has {sensor.n_masks} mask: expected two or more with different phase shifts")
-        self._pairs = tuple(combinations(range(sensor.n_masks), 2))
+        super().__init__(sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=amplitude)
         accelerate = _check.flag("accelerate", accelerate)
+        self._pairs = tuple(combinations(range(sensor.n_masks), 2))
         self._refuse_equal_masks()
         self._shared = _SharedWave.of(sensor.factors.core)
-        self._acceleration = self._accelerated() if accelerate else None
-        self._constants: dict[Kind, _Constants] = {}
+        self._plain: PhaseShifted | None = None
+        self._acceleration: Acceleration | None = None
+        if accelerate:
+            self._plain = PhaseShifted(
+                sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=self.settings.amplitude
+            )
+            self._acceleration = self._accelerated()
 
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_constants": {}}  # made again where they are needed
+    def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
+        """Iterate; where the accelerated iteration did not converge, try the plain one, too."""
+        solution = super().solve(frames, start, history)
+        if self._plain is None or not self.settings.tolerance:
+            return solution
+        kind = Kind.of(frames)
+        failed = [index for index in range(frames.shape[0]) if not solution.converged[index]]
+        if failed:
+            some = kind.integers(failed)
+            frames = kind.xp.take(frames, some, axis=0)
+            start = None if start is None else kind.xp.take(start, some, axis=0)
+            other = self._plain.solve(frames, start, history)
+            light = frames[(..., *self.sensor.window)]
+            accelerated = self.settings.residual(kind.xp.take(solution.phase, some, axis=0), light)
+            better = self.settings.residual(other.phase, light) < accelerated
+            for index, place in enumerate(failed):
+                if better[index]:
+                    solution.put(place, other.at(index))
+        return solution
 
-    def __call__(
-        self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
-    ) -> Reconstruction:
-        """Reconstruct the phase of each frame set.
-
-        Parameters
-        ----------
-        frames : array_like, shape (..., n_masks, ny', nx')
-            Intensity, 1 = mean of the pupil with the mask out.
-        start : array_like, shape (ny, nx) or (..., ny, nx), radian, optional
-            Starting phase; flat if left out.
-        history : bool
-            Keep the phase after each iteration.
-
-        Returns
-        -------
-        Reconstruction
-
-        Raises
-        ------
-        TypeError, ValueError
-            If frames or start are of the wrong shape, complex, not finite, negative or dark.
-
-        Warns
-        -----
-        UserWarning
-            If a frame is more than 10 times as bright, inside the pupil, as with the mask out: raw counts?
-        """
-        result = iterate(self, frames, start, history)
-        if self._acceleration is None or not self.settings.tolerance:
-            return result
-        return result if Kind.of(result.phase).xp.all(result.converged) else self._secured(result, frames, start)
-
-    def _secured(self, result: Reconstruction, frames: ArrayLike, start: ArrayLike | None) -> Reconstruction:
-        """Replace the phases that did not converge where the plain iteration explains the frames better."""
-        checked, batch = check_frames(self.sensor, frames)
-        kind = Kind.of(checked)
-        xp, n_frames = kind.xp, checked.shape[0]
-        converged = xp.reshape(result.converged, (n_frames,))
-        lost = [index for index in range(n_frames) if not converged[index]]
-        which = kind.integers(lost)
-        first = None if start is None else xp.take(start_phase(self.sensor, start, batch, kind), which, axis=0)
-        plain = copy(self)
-        plain._acceleration, plain._constants = None, {}
-        other = iterate(plain, xp.take(checked, which, axis=0), first, result.history is not None)
-        better = other.residual < xp.take(xp.reshape(result.residual, (n_frames,)), which, axis=0)
-        parts = {}
-        for name in ("phase", "n_iterations", "converged", "n_unsolved", "history"):
-            values, news = getattr(result, name), getattr(other, name)
-            if values is None:
-                continue
-            flat = xp.reshape(values, (n_frames, *values.shape[len(batch) :]))
-            for place, index in enumerate(lost):
-                if better[place]:
-                    flat[index, ...] = news[place, ...]
-            parts[name] = xp.reshape(flat, values.shape)
-        return replace(result, **parts)
-
-    def prepare(self, frames: NDArray, phasor: NDArray, flat: bool, kind: Kind) -> dict[str, NDArray]:
-        """What the frames give to the linear system, and the reference waves of a flat start."""
-        xp, constants = kind.xp, self._of(kind)
-        acceleration = constants.acceleration
-        light, n_frames = frames[(..., *self.sensor.window)], frames.shape[0]
+    def begin(self, frames: NDArray, phasor: NDArray | None, constants: _Constants) -> _State:
+        """Return the part of the linear system that only depends on the frames, and the waves of a flat start."""
+        model, acceleration = constants.model, constants.acceleration
+        xp, light, k = model.kind.xp, frames[(..., *model.window)], frames.shape[0]
         if self._shared is None:
-            data = {"excess": light - constants.offset}
+            measured = light - constants.offset
         else:
             mixed = constants.weights @ xp.reshape(light, (*light.shape[:2], -1))
-            data = {"signal": xp.reshape(mixed, (n_frames, *constants.offset.shape)) - constants.offset}
-        if not flat:
-            return data
+            measured = xp.reshape(mixed, (k, *constants.offset.shape)) - constants.offset
+        if phasor is not None:
+            return _State(measured)
         if acceleration is None or not acceleration.lost > 0:
-            start = {"waves": constants.flat_waves, "tried": constants.flat}
-            return data | {name: for_each(array, n_frames, xp) for name, array in start.items()}
-        lost = constants.incoming - xp.reshape(light, (n_frames, -1)) @ constants.inside
+            return _State(measured, for_each(constants.flat_waves, k, xp), tried=for_each(constants.flat, k, xp))
+        lost = constants.incoming - xp.reshape(light, (k, -1)) @ constants.inside
         lost = acceleration.missing(lost, xp)
         factor = dimming(lost, acceleration.lost, xp)
         waves = constants.flat_waves * factor[..., np.newaxis, np.newaxis, np.newaxis]
-        return data | {"waves": waves, "tried": constants.flat * factor, "lost": lost}
+        return _State(measured, waves, tried=constants.flat * factor, lost=lost)
 
-    def step(self, phasor: NDArray, data: dict[str, NDArray], kind: Kind) -> Estimate:
-        """Reference waves of the estimate, then the linear system of every point."""
-        constants = self._of(kind)
-        waves = data.pop("waves", None)
+    def step(self, phasor: NDArray, state: _State, constants: _Constants) -> Estimate:
+        """Compute the reference waves of the estimate, then solve the linear system of every point."""
+        model = constants.model
+        kind, operator = model.kind, model.operator
+        waves, state.waves = state.waves, None  # those of a flat start are known
         if waves is None:
-            operator = constants.operator
-            coefficients = operator.split_project(constants.maps.field(phasor))
+            coefficients = operator.split_project(model.field(phasor))
             if constants.acceleration is not None:
-                coefficients = constants.acceleration.extrapolate(coefficients, data, kind.xp)
+                coefficients = constants.acceleration.next(coefficients, state, kind.xp)
             elif self.settings.tolerance:
-                coefficients = steady(coefficients, data, kind.xp)
+                if state.tried is not None:
+                    coefficients = with_piston_of(state.tried, coefficients, kind.xp)
+                state.tried = coefficients
             waves = operator.split_expand(coefficients @ constants.core, in_window=True)
         if self._shared is None:
-            solved, singular = self._solve(waves, data["excess"], kind)
+            solved, singular = self._solve(waves, state.measured, kind)
         else:
-            solved, singular = self._shared.solve(waves[:, 0, ...], data["signal"], kind)
+            solved, singular = self._shared.solve(waves[:, 0, ...], state.measured, kind)
         if singular is None:
             return Estimate(solved)
         solved = kind.xp.where(singular[:, np.newaxis, ...], phasor, solved)
-        return Estimate(solved, count(singular & constants.maps.mask, kind))
+        return Estimate(solved, count(singular & model.inside, kind))
 
-    def _of(self, kind: Kind) -> _Constants:
-        """Constants for arrays of one kind; made once, then kept."""
-        if kind not in self._constants:
-            sensor, incoming, exact = self.sensor, self.settings.amplitude**2, Kind.numpy()
-            cores, weights, offset = sensor.factors.core, np.ones((1, 1)), incoming
-            if self._shared is not None:
-                cores, weights = self._shared.core[np.newaxis], self._shared.weights
-                offset = weights.sum(axis=1)[:, np.newaxis, np.newaxis] * offset
-            operator, core = sensor.operator(exact), split_core(cores)
-            flat = operator.split_project(self._flat())
-            flat_waves = operator.split_expand(flat @ core, in_window=True)
-            inside = np.tile(self.settings.maps(exact).inside.ravel(), sensor.n_masks)
-            self._constants[kind] = _Constants(
-                sensor.operator(kind),
-                self.settings.maps(kind),
-                kind.array(core),
-                kind.array(weights),
-                kind.array(offset),
-                kind.array(flat),
-                kind.array(flat_waves),
-                kind.array(inside),
-                sensor.n_masks * self.settings.light,
-                self._acceleration and self._acceleration.to(kind),
-            )
-        return self._constants[kind]
-
-    def _flat(self) -> NDArray[np.float64]:
-        """Split field of a flat wavefront, (1, 2, ny, nx)."""
-        maps = self.settings.maps(Kind.numpy())
-        return maps.field(maps.flat)
+    @per_kind
+    def constants(self, kind: Kind) -> _Constants:
+        """Arrays of one kind that all frames share."""
+        exact = self.settings.model(Kind.numpy())
+        if self._shared is None:
+            cores, weights, offset = self.sensor.factors.core, np.ones((1, 1)), exact.amplitude**2
+        else:
+            cores, weights = self._shared.core[np.newaxis], self._shared.weights
+            offset = weights.sum(axis=1)[:, np.newaxis, np.newaxis] * exact.amplitude**2
+        core = split_core(cores)
+        flat = exact.operator.split_project(exact.field(exact.flat))
+        flat_waves = exact.operator.split_expand(flat @ core, in_window=True)
+        inside = np.tile(exact.stop.ravel(), self.sensor.n_masks)
+        return _Constants(
+            self.settings.model(kind),
+            kind.array(core),
+            kind.array(weights),
+            kind.array(offset),
+            kind.array(flat),
+            kind.array(flat_waves),
+            kind.array(inside),
+            self.sensor.n_masks * self.settings.light,
+            self._acceleration and self._acceleration.to(kind),
+        )
 
     def _accelerated(self) -> Acceleration:
-        sensor, amplitude = self.sensor, self.settings.amplitude
+        """Measure how much of a small tilt is missing after one plain step."""
+        sensor, amplitude, exact = self.sensor, self.settings.amplitude, self.settings.model(Kind.numpy())
         x = sensor.pupil.gather(np.broadcast_to(sensor.pupil.x, sensor.pupil.shape))
         tilt = _SMALL_TILT * (x - x.mean())  # without the piston, which no frame shows
         frames = sensor.measure(sensor.pupil.scatter(tilt), amplitude)
-        plain = PhaseShifted(sensor, n_iterations=1, tolerance=0.0, amplitude=amplitude)
-        found = sensor.pupil.gather(plain(frames).phase)
-        flat = sensor.operator(Kind.numpy()).split_project(self._flat())
-        return Acceleration.of(sensor, flat, 1 - float(found @ tilt / (tilt @ tilt)))
+        one_step = PhaseShifted(sensor, n_iterations=1, tolerance=0.0, amplitude=amplitude)
+        estimate = sensor.pupil.gather(one_step(frames).phase)
+        flat = exact.operator.split_project(exact.field(exact.flat))
+        return Acceleration.of(sensor, flat, 1 - float(estimate @ tilt / (tilt @ tilt)))
 
     def _solve(self, waves: NDArray, excess: NDArray, kind: Kind) -> tuple[NDArray, NDArray | None]:
-        """The field at every point, and where the determinant vanishes, if anywhere.
+        """Return the field at every point, and where the determinant vanishes, if anywhere.
 
         The equations are 2 Re(conj(r) psi) = I - A^2 - |r|^2. Each pair of masks gives Cramer's numerators and
         its determinant; weighting the pairs with their determinants makes the sum the least-squares solution.
@@ -264,14 +212,14 @@ class PhaseShifted(Reconstructor):
             strength += determinant * determinant
             scale += power[:, a, ...] * power[:, b, ...]
         singular = (strength <= _DARK**2) | (strength <= _PARALLEL**2 * scale)
-        # Weak waves would make a solution too small to be told from none.
+        # Weak waves would give a solution so small that it would count as 0.
         solved /= xp.where(singular, kind.array(1.0), strength)[:, np.newaxis, ...]
         return solved, singular if xp.any(singular) else None
 
     def _refuse_equal_masks(self) -> None:
-        sensor, kind = self.sensor, Kind.numpy()
-        waves = sensor.operator(kind).split_reference(self._flat(), in_window=True)
-        _, singular = self._solve(waves, np.zeros((1, sensor.n_masks, *sensor.pupil.shape)), kind)
+        sensor, exact = self.sensor, self.settings.model(Kind.numpy())
+        waves = exact.reference(exact.field(exact.flat))
+        _, singular = self._solve(waves, np.zeros((1, sensor.n_masks, *sensor.pupil.shape)), exact.kind)
         if singular is not None and singular[0][sensor.pupil.inside].all():
             raise ValueError(
                 "sensor: the determinant sin(phi_ref_b - phi_ref_a) of equation (10) is 0 at every point for "
@@ -280,11 +228,14 @@ class PhaseShifted(Reconstructor):
             )
 
 
-class _Constants(NamedTuple):
-    """What all frames share, as arrays of one kind."""
+@dataclass
+class _State(Path):
+    measured: NDArray[np.floating]  # (k, 2, ny, nx), signal; (k, n_masks, ny, nx), I - A^2, without shared wave
+    waves: NDArray[np.floating] | None = None  # (k, n, 2, ny, nx), reference waves of the first step
 
-    operator: Operator
-    maps: PupilMaps
+
+class _Constants(NamedTuple):
+    model: Propagator
     core: NDArray[np.floating]  # coefficients of the field (k, 2 r) to those of the waves
     weights: NDArray[np.floating]  # (2, n_masks), of the intensities in the signal
     offset: NDArray[np.floating]  # (2, ny, nx), the signal of the incoming light; (ny, nx) without shared wave
@@ -297,7 +248,7 @@ class _Constants(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _SharedWave:
-    """What dimples of one size have in common: one wave B, of which all reference waves are multiples.
+    """Wave B of which the reference waves of all dimples of one size are multiples.
 
     The linear system of every point then is the same, and its solution is psi conj(B) = |B|^2 + signal, with a
     signal that the frames give once and for all (`eq-shared-wave`).
@@ -305,7 +256,7 @@ class _SharedWave:
     Attributes
     ----------
     core : ndarray of complex, shape (q, r)
-        Makes the coefficients of B out of those of the field.
+        Turns coefficients of the field into those of B.
     weights : ndarray, shape (2, n_masks)
         Of the intensities in the real and imaginary part of the signal.
     darkest : float
@@ -318,27 +269,31 @@ class _SharedWave:
 
     @classmethod
     def of(cls, cores: NDArray[np.complex128]) -> _SharedWave | None:
-        """The wave that masks of these cores share; None if they do not."""
+        """Return the wave that masks of these cores share, (n_masks, q, r); None if they share none.
+
+        Let R be the strongest reference wave, and r_k = t_k R that of mask k. With u = psi conj(R) its equation
+        2 Re(conj(r_k) psi) = I_k - A^2 - |r_k|^2 becomes 2 Re(conj(t_k) u) = I_k - A^2 - |t_k|^2 |R|^2. This is
+        linear in the real and imaginary part of u, with the same matrix M = 2 (Re t, Im t) at every point. With
+        its pseudo-inverse as a complex row, p = (1, i) pinv(M), the least-squares solution is
+        u = sum_k p_k (I_k - A^2) - c |R|^2, where c = sum_k p_k |t_k|^2. Multiplied by -conj(c), with B = -c R, it
+        is psi conj(B) = |B|^2 + sum_k w_k (I_k - A^2), where w_k = -conj(c) p_k.
+        """
         base = cores[np.argmax(np.linalg.norm(cores, axis=(-2, -1)))]
-        factors = np.sum(base.conj() * cores, axis=(-2, -1)) / np.linalg.norm(base) ** 2
-        rest = cores - factors[:, np.newaxis, np.newaxis] * base
+        t = np.sum(base.conj() * cores, axis=(-2, -1)) / np.linalg.norm(base) ** 2
+        rest = cores - t[:, np.newaxis, np.newaxis] * base
         if np.linalg.norm(rest) > 1e-12 * np.linalg.norm(base):
             return None
-        # Least squares for r_k = factor_k R: psi conj(R) = inverse @ (I - A^2) - bend |R|^2.
-        inverse = np.array([1, 1j]) @ np.linalg.pinv(2 * np.stack([factors.real, factors.imag], axis=1))
-        bend = inverse @ np.abs(factors) ** 2
-        if abs(bend) < _PARALLEL:
+        p = np.array([1, 1j]) @ np.linalg.pinv(2 * np.stack([t.real, t.imag], axis=1))
+        c = p @ np.abs(t) ** 2
+        if abs(c) < _PARALLEL:
             return None
-        # With B = -bend R the factor of |B|^2 is 1.
-        weights = -bend.conj() * inverse
-        factors = -factors / bend
-        determinants = [(a.conj() * b).imag for a, b in combinations(factors, 2)]
-        return cls(
-            -bend * base, np.stack([weights.real, weights.imag]), _DARK / float(np.linalg.norm(determinants))
-        )
+        w = -c.conj() * p
+        in_units_of_b = -t / c  # r_k / B, so a determinant of two masks is |B|^2 times that of these factors
+        determinants = [(a.conj() * b).imag for a, b in combinations(in_units_of_b, 2)]
+        return cls(-c * base, np.stack([w.real, w.imag]), _DARK / float(np.linalg.norm(determinants)))
 
     def solve(self, wave: NDArray, signal: NDArray, kind: Kind) -> tuple[NDArray, NDArray | None]:
-        """A multiple of the field at every point, (k, 2, ny, nx), and where the system is singular, if it is."""
+        """Return a multiple of the field at every point, (k, 2, ny, nx), and where the system is singular."""
         power = square(wave)
         solved = turn(wave, power + signal[:, 0, ...], signal[:, 1, ...])
         return solved, None if kind.xp.min(power) > self.darkest else power <= self.darkest

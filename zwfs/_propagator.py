@@ -1,0 +1,177 @@
+"""The model of a sensor that reconstructors compute with: split fields of one kind of arrays, without checks.
+
+A split field has shape (..., 2, ny, nx): the real part, then the imaginary part. It is 0 outside the pupil. A
+phasor is exp(i phase) as a split field. `k` is the number of frame sets in a batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zwfs._arrays import Kind, read_only
+from zwfs.lowrank import Factors, Operator
+from zwfs.pupil import Pupil
+
+_VANISHING = 1e-30  # modulus, or its square, of a field that counts as 0
+
+
+@dataclass(frozen=True, eq=False)
+class Propagator:
+    """Propagation through a sensor, and the maps of its pupil, for arrays of one kind.
+
+    Maps have shape (ny, nx); those of NumPy are read-only.
+
+    Attributes
+    ----------
+    kind : Kind
+        Of real arrays.
+    pupil : Pupil
+    operator : Operator
+        Low-rank operator from the pupil to the reference waves.
+    window : (slice, slice)
+        Rows and columns of the detector in which the grid of the pupil lies.
+    inside : array of bool
+        Whether a point lies inside the pupil.
+    stop : array
+        Transmission of the pupil stop: 1 inside, 0 outside.
+    no_data : array
+        0 inside, NaN outside: added to a map that people look at.
+    amplitude : array
+        Amplitude of the incoming field, 0 outside.
+    flat : array, shape (1, 2, ny, nx)
+        Phasor of a flat wavefront.
+    """
+
+    kind: Kind
+    pupil: Pupil
+    operator: Operator
+    window: tuple[slice, slice]
+    inside: NDArray[np.bool_]
+    stop: NDArray[np.floating]
+    no_data: NDArray[np.floating]
+    amplitude: NDArray[np.floating]
+    flat: NDArray[np.floating]
+
+    @classmethod
+    def of(cls, factors: Factors, window: tuple[slice, slice], pupil: Pupil, kind: Kind) -> Propagator:
+        """Convert the factors of a sensor and the maps of its pupil."""
+        stop = read_only(kind.array(pupil.inside))
+        model = cls(
+            kind,
+            pupil,
+            Operator(factors, window, kind),
+            window,
+            inside=read_only(kind.flags(pupil.inside)),
+            stop=stop,
+            no_data=read_only(kind.array(np.where(pupil.inside, 0, np.nan))),
+            amplitude=stop,
+            flat=read_only(kind.xp.stack((stop, 0 * stop))[np.newaxis, ...]),
+        )
+        return model.with_amplitude(pupil.amplitude)
+
+    def with_amplitude(self, amplitude: NDArray[np.float64]) -> Propagator:
+        """Return the same model for another amplitude of the incoming field, an array of NumPy, (ny, nx)."""
+        uniform = np.array_equal(amplitude, self.pupil.inside)
+        return replace(self, amplitude=self.stop if uniform else read_only(self.kind.array(amplitude)))
+
+    def field(self, phasor: NDArray) -> NDArray:
+        """Field of a phasor, (k, 2, ny, nx); for a uniform amplitude the phasor itself."""
+        return phasor if self.amplitude is self.stop else phasor * self.amplitude
+
+    def reference(self, psi: NDArray) -> NDArray:
+        """Reference waves on the grid of the pupil: (k, 2, ny, nx) to (k, n_masks, 2, ny, nx)."""
+        return self.operator.split_reference(psi, in_window=True)
+
+    def propagate(self, psi: NDArray) -> NDArray:
+        """Fields on the detector: (k, 2, ny, nx) to (k, n_masks, 2, ny', nx')."""
+        out = self.operator.split_reference(psi)
+        out[(..., *self.window)] += psi[:, np.newaxis, ...]
+        return out
+
+    def adjoint(self, waves: NDArray) -> NDArray:
+        """Adjoint of `propagate`: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
+        psi = self.operator.split_adjoint(waves)
+        psi += self.kind.xp.sum(waves[(..., *self.window)], axis=1)
+        psi *= self.stop
+        return psi
+
+    def mismatch(self, phase: NDArray, light: NDArray) -> NDArray:
+        """Squared difference between modelled and measured frames, summed over masks and points of the pupil.
+
+        The phase is 0 outside the pupil, (k, ny, nx). The frames are cut to the grid of the pupil,
+        (k, n_masks, ny, nx). The result has shape (k,).
+        """
+        psi = split(phase, self.amplitude)
+        difference = (square(self.reference(psi) + psi[:, np.newaxis, ...]) - light) * self.stop
+        difference = self.kind.xp.reshape(difference, (psi.shape[0], -1))
+        return self.kind.xp.vecdot(difference, difference)
+
+
+def split(phase: NDArray, amplitude: NDArray) -> NDArray:
+    """Field amplitude * exp(i phase): (k, ny, nx) to (k, 2, ny, nx)."""
+    kind = Kind.of(phase)
+    out = kind.xp.empty((phase.shape[0], 2, *phase.shape[1:]), dtype=kind.dtype, device=kind.device)
+    out[:, 0, ...] = kind.xp.cos(phase) * amplitude
+    out[:, 1, ...] = kind.xp.sin(phase) * amplitude
+    return out
+
+
+def square(waves: NDArray) -> NDArray:
+    """Squared modulus: (..., 2, ny, nx) to (..., ny, nx)."""
+    squares = waves * waves
+    return squares[..., 0, :, :] + squares[..., 1, :, :]
+
+
+def angle(field: NDArray, xp: Any) -> NDArray:
+    """Phase: (..., 2, ny, nx) to (..., ny, nx)."""
+    return xp.atan2(field[..., 1, :, :], field[..., 0, :, :])
+
+
+def turn(wave: NDArray, along: NDArray, across: NDArray) -> NDArray:
+    """Product (along + i across) wave, of two maps (k, ny, nx) and a wave (k, 2, ny, nx)."""
+    turned = along[:, np.newaxis, ...] * wave
+    ahead = across[:, np.newaxis, ...] * wave
+    turned[:, 0, ...] -= ahead[:, 1, ...]
+    turned[:, 1, ...] += ahead[:, 0, ...]
+    return turned
+
+
+def unit(field: NDArray, modulus: NDArray, xp: Any, before: NDArray | None = None) -> NDArray:
+    """Field with another modulus, (..., ny, nx); 0 where the field vanishes. The array of `field` is reused.
+
+    `before` is the modulus of `field`, if that is known.
+    """
+    if before is None:
+        power = square(field)
+        power += _VANISHING
+        before = xp.sqrt(power)
+    else:
+        before = before + _VANISHING
+    field *= (modulus / before)[..., np.newaxis, :, :]
+    return field
+
+
+def count(points: NDArray[np.bool_], kind: Kind) -> NDArray[np.int64]:
+    """Number of points that are true in each map: (k, ny, nx) to (k,)."""
+    if kind.xp is np:  # along an axis NumPy turns all of them into integers first
+        return np.array([np.count_nonzero(one) for one in points])
+    return kind.xp.sum(kind.xp.astype(points, kind.xp.int64), axis=(-2, -1))
+
+
+def with_piston_of(before: NDArray, new: NDArray, xp: Any) -> NDArray:
+    """Coefficients (k, 2 r) turned by the constant phase that brings them nearest to those before.
+
+    The frames do not depend on a piston, and one iteration F obeys F(exp(i a) psi) = exp(i a) F(psi) for any a. It
+    therefore may settle at F(psi) = exp(i w) psi: where no phase explains the frames, because of noise or a wrong
+    model, each iteration adds the piston w. The angle that makes <before, new> real and positive removes w and
+    changes nothing else. A fixed gauge, such as a real mean field, would fail where the mean field vanishes.
+    """
+    rank = new.shape[-1] // 2
+    real, imag = new[:, :rank], new[:, rank:]
+    across = xp.vecdot(before[:, :rank], imag) - xp.vecdot(before[:, rank:], real)
+    ahead = xp.atan2(across, xp.vecdot(before, new))[:, np.newaxis]
+    return xp.cos(ahead) * new + xp.sin(ahead) * xp.concat([imag, -real], axis=-1)

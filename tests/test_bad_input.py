@@ -439,7 +439,7 @@ def leaves(value, path="", depth=0) -> Iterator[tuple[str, np.ndarray]]:
         for key, item in value.items():
             yield from leaves(item, f"{path}[{key!r}]", depth)
     elif depth < 4 and hasattr(value, "__dict__") and type(value).__module__.startswith("zwfs"):
-        yield from leaves(vars(value), path, depth + 1)
+        yield from leaves(value.__getstate__(), path, depth + 1)
 
 
 def is_number(array):

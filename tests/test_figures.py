@@ -235,6 +235,16 @@ def test_convergence_has_a_panel_for_each_input():
     np.testing.assert_allclose(line.get_ydata(), np.geomspace(1, 1e-6, 8))
 
 
-def test_an_unknown_method_is_named():
-    with pytest.raises(ValueError, match=r"methods = \['Magic'\]: expected some of"):
-        plots.convergence({"Magic": {0.2: np.ones((3, 2))}})
+def test_methods_of_a_reader_get_looks_of_their_own(monkeypatch):
+    names = ["WhiteMagic", "Luck"]
+    for name in names:
+        monkeypatch.setitem(plots.LOOKS, name, None)  # taken out again at the end
+        del plots.LOOKS[name]
+    assert [plots.LOOKS[name].label for name in names] == ["white magic", "luck"]
+    for part in ("color", "marker"):
+        assert len({getattr(look, part) for look in plots.LOOKS.values()}) == len(plots.LOOKS)
+    for vision in VISION:
+        points = [lab(look.color, vision) for look in plots.LOOKS.values()]
+        assert min(np.linalg.norm(a - b) for a, b in combinations(points, 2)) > 15
+    figure = plots.convergence({name: {0.2: np.ones((3, 2))} for name in names})
+    assert {line.get_color() for line in figure.axes[0].lines} >= {plots.LOOKS[name].color for name in names}

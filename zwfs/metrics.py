@@ -33,7 +33,8 @@ def wrapped_residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDA
     ----------
     Chambouleyron et al. 2024, section 4.1; `eq-error` of the book.
     """
-    return pupil.scatter(_residual(pupil, estimate, truth))
+    residual = _residual(pupil, estimate, truth)
+    return pupil.scatter(residual)
 
 
 def reconstruction_error(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.floating]:

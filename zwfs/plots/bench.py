@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from zwfs.paper.bench_linearity import BenchCurves
-from zwfs.plots.style import LOOKS, show_intensity, show_phase
+from zwfs.plots.style import LOOKS, _looks, show_intensity, show_phase
 
 _ARMS = ("+θ", "−θ")
 
@@ -95,9 +95,7 @@ def segment_errors(numbers: NDArray, residuals: Mapping[str, NDArray], maps: Map
 def bench_linearity(curves: BenchCurves, names: Sequence[str]) -> Figure:
     """Figure 9: error of the segments against the input, and the gain, the slope of found against commanded."""
     figure, (plain, gain) = plt.subplots(1, 2, figsize=(9, 4.2))
-    for name, look in LOOKS.items():
-        if name not in names:
-            continue
+    for name, look in _looks(names):
         mean, std = curves.mean(name), curves.std(name)
         line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
         plain.plot(curves.rms, mean, label=look.label, **line)

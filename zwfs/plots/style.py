@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,12 +12,14 @@ from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
+from zwfs.reconstructors import RECONSTRUCTORS
+
 PHASE_MAP, INTENSITY_MAP = "RdBu_r", "viridis"
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a method is drawn, the same in every figure."""
+    """Name, colour, marker and dashes of a method, the same in every figure."""
 
     name: str
     sees: str
@@ -27,11 +30,26 @@ class Look:
     @property
     def label(self) -> str:
         """Name for a legend."""
-        return f"{self.name} ({self.sees})"
+        return f"{self.name} ({self.sees})" if self.sees else self.name
 
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart; marker and dashes say it once more.
-LOOKS = {
+# Colours that differ from those of the methods for every reader, for methods that are not listed.
+_SPARE = (("#882255", "<", "-"), ("#56B4E9", ">", "--"), ("#661100", "*", "-."))
+
+
+class _Looks(dict[str, Look]):
+    """Looks by the name of a method; a name that is not listed gets the next spare look."""
+
+    def __missing__(self, name: str) -> Look:
+        words = re.sub("(?<!^)(?=[A-Z])", " ", name).lower()  # of the name of a class
+        self[name] = look = Look(words, "", *_SPARE[len(self) % len(_SPARE)])
+        return look
+
+
+# Okabe and Ito's palette, which colour-blind readers can distinguish; marker and dashes repeat the difference.
+LOOKS = _Looks()
+"""Look of each method, by the name of its class; a name that is not listed gets a spare look at its first use."""
+LOOKS |= {
     "Linear": Look("linear", "one pupil", "#000000", "o", "-"),
     "Arcsine": Look("arcsine", "one pupil", "#E69F00", "s", "--"),
     "GerchbergSaxton": Look("Gerchberg-Saxton", "two pupils", "#009E73", "^", "-."),
@@ -39,6 +57,8 @@ LOOKS = {
     "GradientDescentPoints": Look("gradient descent on points", "two pupils", "#D55E00", "d", "--"),
     "PhaseShifted": Look("phase-shifted", "two pupils", "#0072B2", "v", ":"),
 }
+for _method in RECONSTRUCTORS:
+    LOOKS[_method.__name__]
 
 # Curves that stand for no method have colours of their own, of Tol's muted palette, and markers of their own.
 OTHER_STYLES: tuple[dict[str, Any], ...] = tuple(
@@ -102,7 +122,6 @@ def _show(axes: Axes, image: NDArray, colors: str, low: float, high: float) -> A
 
 
 def _looks(methods: Mapping | Sequence) -> list[tuple[str, Look]]:
-    unknown = set(methods) - set(LOOKS)
-    if unknown:
-        raise ValueError(f"methods = {sorted(unknown)}: expected some of {sorted(LOOKS)}")
-    return [(name, look) for name, look in LOOKS.items() if name in methods]
+    """Names and looks of methods, in the order of `LOOKS`."""
+    looks = {name: LOOKS[name] for name in methods}
+    return [(name, looks[name]) for name in LOOKS if name in looks]

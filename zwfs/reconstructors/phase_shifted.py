@@ -52,9 +52,9 @@ class PhaseShifted(FixedPoint):
     accelerate : bool
         Same fixed point in fewer iterations: without a start, the first two reference waves are dimmed to the
         light that the frames miss, and from then on the coefficients of the waves are extrapolated by the secant
-        method. The paper does neither. Frames that have not converged at the end, as frames of a wrong unit may,
-        are iterated without acceleration, too; the result is the phase that explains them better. With a tolerance
-        of 0 they are not.
+        method. The paper does neither. Frames that do not converge, such as frames of a wrong unit, are iterated
+        without acceleration, too; the result is the phase that explains them better. With a tolerance of 0 they are
+        not.
 
     Raises
     ------

@@ -195,7 +195,7 @@ def test_arrays_on_the_wrong_device_are_named(pupil, classic, modes):
         (lambda: Arcsine(classic)(frames, there), "start"),
         (lambda: Linear(classic, modes)(there[np.newaxis, ...]), "frames"),
     ):
-        with pytest.raises(TypeError, match=f"{name} is a Array that makes no array here"):
+        with pytest.raises(TypeError, match=f"{name} is a Array that cannot become an array here"):
             call()
 
 

@@ -1,4 +1,4 @@
-"""Checks of what a caller hands in: each names the argument, its value and what was expected."""
+"""Checks of arguments: each error names the argument, its value and what was expected."""
 
 from __future__ import annotations
 
@@ -220,7 +220,9 @@ def _made(name: str, value: Any, make: Callable[[Any], Any]) -> Any:
     try:
         return make(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise TypeError(f"{name} is a {type(value).__name__} that makes no array here ({error})") from error
+        raise TypeError(
+            f"{name} is a {type(value).__name__} that cannot become an array here ({error})"
+        ) from error
 
 
 def trailing_shape(name: str, array: Any, shape: tuple[int, ...], meaning: str) -> None:

@@ -17,7 +17,7 @@ _BRIGHTEST = 9e18  # electrons in a pixel: 64 bits count no more
 class Detector:
     """Camera that turns frames into counts, and counts back into frames.
 
-    Every default is that of a camera without the effect. Light is detected first (photon noise), then the
+    By default a camera adds photon noise only. Light is detected first (photon noise), then the
     electronics add read noise, then the converter saturates and rounds.
 
     Parameters
@@ -78,7 +78,7 @@ class Detector:
         Returns
         -------
         ndarray, the shape of `frames`
-            Counts, or electrons where `gain` is 0. Pixels at the full well are told by `saturated`.
+            Counts, or electrons where `gain` is 0. `saturated` marks pixels at the full well.
 
         Raises
         ------
@@ -116,7 +116,7 @@ class Detector:
         counts : array_like, any shape
         floor : float, optional
             Raise intensities below this value to it. Noise makes some negative, which reconstructors refuse;
-            they are left as they are unless you ask.
+            they stay as they are by default.
 
         Returns
         -------

@@ -1,12 +1,13 @@
 """The reference wave as a product of small real matrices, without a Fourier transform.
 
-A mask differs from 1 on a patch of a few lambda/D only. The operator from the incoming field to the reference wave is
-therefore smooth and numerically of very low rank: 12 coefficients describe the wave of a dimple of 1.06 lambda/D to a
-relative error of 1e-6. `factorise` computes the factors to a tolerance; `Operator` applies them and their adjoint.
+A mask differs from 1 on a patch of a few lambda/D only. The operator from the incoming field to the reference wave
+is therefore smooth and numerically of very low rank: 28 coefficients describe the wave of a dimple of 1.06 lambda/D
+to a relative error of 1e-10. `factorise` computes the factors to a tolerance; `Operator` applies them and their
+adjoint.
 
 The functions of the factors are products of one-dimensional ones along y and x (Slepian's prolate functions of the
-two axes). Projecting a map of N x N pixels costs two thin matrix products, and nothing larger than N times the number
-of these functions is stored.
+two axes). Projecting a map of N x N pixels costs two thin matrix products, and nothing larger than N times the
+number of these functions is stored.
 
 The functions are real. A complex map is therefore two real ones, and the large products act on both at once. For
 arithmetic on every pixel, as in the reconstructors, the two maps stay apart: "split" fields have shape

@@ -15,7 +15,7 @@ _MOST_SAMPLES = 2048  # a quarter of a minute for 100 pixels
 
 
 class Mask(Protocol):
-    """What a sensor needs to know of a mask: its transmission is 1 outside a disc around the axis."""
+    """Interface of a mask, whose transmission is 1 outside a disc around the axis."""
 
     @property
     def diameter(self) -> float:

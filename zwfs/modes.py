@@ -58,7 +58,7 @@ def zernike_basis(
     Raises
     ------
     ValueError
-        If there are more modes than the points can tell apart, or points farther than D/2 from the axis.
+        If the modes are not independent on the points, or there are points farther than D/2 from the axis.
 
     References
     ----------
@@ -85,7 +85,9 @@ def zernike_basis(
         values = _orthonormalise(values)
     scale = values.std(axis=1, keepdims=True)
     if not scale.min() > 1e-12:
-        raise ValueError(f"n_modes = {n_modes}: the {pupil.n_points} points of the pupil do not tell them apart")
+        raise ValueError(
+            f"n_modes = {n_modes}: they are not independent on the {pupil.n_points} points of the pupil"
+        )
     return pupil.scatter((values / scale).astype(checked_dtype), fill=0.0)
 
 
@@ -98,7 +100,7 @@ def power_law_screens(
 ) -> NDArray[np.floating]:
     """Random phase screens whose power spectral density falls as a power of the spatial frequency.
 
-    How the sentence "an f^-2 power spectral density defined on the first 200 Zernike polynomials" is read here:
+    The paper defines "an f^-2 power spectral density defined on the first 200 Zernike polynomials". We read it so:
     the coefficients are independent normal numbers, and a mode of radial order n, which oscillates n/2 times
     across the diameter, has a variance proportional to n to the power of `exponent`. Modes are spread evenly over
     the plane of spatial frequencies, so the variance of a mode follows the density at its frequency.

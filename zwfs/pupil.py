@@ -1,4 +1,4 @@
-"""The pupil: what part of the plane the light comes through, and how much of it."""
+"""The pupil: the part of the plane through which light comes, and its amplitude."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class ZernikeSensor(Immutable):
     """A Zernike wavefront sensor with any number of masks.
 
     Fields and phases may be arrays of NumPy or of any library that follows the Python array API and lets arrays be
-    changed in place, such as PyTorch and CuPy; what comes out is of the same library and on the same device.
+    changed in place, such as PyTorch and CuPy; results are of the same library and on the same device.
 
     One mask makes the classic sensor, two make the phase-shifted one. Detector pixels are as large as pupil
     pixels and stand at the same places, so the detector of an extent of 1 D is the grid of the pupil.

@@ -53,8 +53,10 @@ class PhaseShifted(FixedPoint):
         Same fixed point in fewer iterations: without a start, the first two reference waves are dimmed to the
         light that the frames miss, and from then on the coefficients of the waves are extrapolated by the secant
         method. The paper does neither. Frames that do not converge, such as frames of a wrong unit, are iterated
-        without acceleration, too; the result is the phase that explains them better. With a tolerance of 0 they are
-        not.
+        without acceleration, too; the result is the phase that explains them better. With a tolerance of 0 they
+        are not. Where the frames contradict each other, the two iterations may converge to different phases: with
+        one image 20 % too bright, a dimple of 1.06 lambda/D and up to 1.2 rad rms, the accelerated phase was more
+        than 10 % worse in 3 of 3600 simulated cases, and more than 10 % better in 22, all above 0.9 rad rms.
 
     Raises
     ------

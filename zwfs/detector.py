@@ -17,8 +17,8 @@ _BRIGHTEST = 9e18  # electrons in a pixel: 64 bits count no more
 class Detector:
     """Camera that turns frames into counts, and counts back into frames.
 
-    By default a camera adds photon noise only. Light is detected first (photon noise), then the
-    electronics add read noise, then the converter saturates and rounds.
+    By default a camera adds photon noise only. Light is detected first (photon noise), then the electronics add
+    read noise, then the converter saturates and rounds.
 
     Parameters
     ----------

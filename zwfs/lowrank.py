@@ -1,9 +1,9 @@
 """The reference wave as a product of small real matrices, without a Fourier transform.
 
 A mask differs from 1 on a patch of a few lambda/D only. The operator from the incoming field to the reference wave
-is therefore smooth and numerically of very low rank: 28 coefficients describe the wave of a dimple of 1.06 lambda/D
-to a relative error of 1e-10. `factorise` computes the factors to a tolerance; `Operator` applies them and their
-adjoint.
+is therefore smooth and numerically of very low rank: 28 coefficients describe the wave of a dimple of 1.06
+lambda/D to a relative error of 1e-10. `factorise` computes the factors to a tolerance; `Operator` applies them and
+their adjoint.
 
 The functions of the factors are products of one-dimensional ones along y and x (Slepian's prolate functions of the
 two axes). Projecting a map of N x N pixels costs two thin matrix products, and nothing larger than N times the

@@ -139,7 +139,7 @@ def test_coefficients_are_independent(pupil):
             ValueError,
             "n_modes = 12: expected fewer .* 12 points",
         ),
-        (lambda p, m: zernike_basis(Pupil.circular(2), 3), ValueError, "n_modes = 3: the 4 points"),
+        (lambda p, m: zernike_basis(Pupil.circular(2), 3), ValueError, "n_modes = 3: .* the 4 points"),
         (lambda p, m: zernike_basis(Pupil.from_amplitude(np.ones((9, 9))), 3), ValueError, r"reaches 0\.6.* D"),
         (lambda p, m: power_law_screens(m[0], 1, 1), ValueError, r"modes has shape \(40, 40\): expected"),
         (lambda p, m: power_law_screens(m * 1j, 1, 1), TypeError, "modes is complex"),

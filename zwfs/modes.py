@@ -86,7 +86,7 @@ def zernike_basis(
     scale = values.std(axis=1, keepdims=True)
     if not scale.min() > 1e-12:
         raise ValueError(
-            f"n_modes = {n_modes}: they are not independent on the {pupil.n_points} points of the pupil"
+            f"n_modes = {n_modes}: the modes are not independent on the {pupil.n_points} points of the pupil"
         )
     return pupil.scatter((values / scale).astype(checked_dtype), fill=0.0)
 

@@ -26,7 +26,7 @@ export OPENBLAS_NUM_THREADS = 1
 export MKL_NUM_THREADS = 1
 export VECLIB_MAXIMUM_THREADS = 1
 
-# Make expands no $ in these, and the shell sees no more than the name of a variable: only rerun.py reads them.
+# Make expands no $ in these, and the shell sees no more than the name of a variable: only the command rerun reads them.
 export RERUN := $(value FIGURE) $(value ARGS)
 unexport FIGURE ARGS
 
@@ -47,14 +47,13 @@ lab: $(READY) ## open the notebooks in JupyterLab
 
 test: $(READY) ## test the package, the pipeline and the committed notebooks
 	$(BIN)/python -m pytest tests --benchmark-disable
-	$(BIN)/python -m pytest --nbval --nbval-current-env --nbval-cell-timeout 600 \
-		--nbval-sanitize-with tests/nbval.cfg notebooks
+	$(BIN)/python -m pytest --nbval --nbval-current-env --nbval-cell-timeout 600 --numprocesses auto --dist loadfile notebooks
 
 figures: $(READY) ## replace the committed notebooks by freshly run ones
 	@$(BIN)/python book/build.py figures
 
 rerun: $(READY) ## run one notebook with other parameters: make rerun FIGURE=3 ARGS="-p rms_max=2.0"
-	@$(BIN)/python book/rerun.py "--line=$$RERUN"
+	@$(BIN)/python -m book._tools rerun "--line=$$RERUN"
 
 lint: $(READY) ## check style, formatting and types
 	$(BIN)/ruff check .

@@ -70,7 +70,8 @@ def complex_field():
 def browser():
     """A Chromium, driven by Playwright; it is closed with the module, whose event loop others could not share."""
     from playwright.sync_api import sync_playwright
-    from printing import find_chromium
+
+    from book._tools.pdf import find_chromium
 
     program = find_chromium()
     if program is None:

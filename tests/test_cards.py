@@ -4,10 +4,10 @@ import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
-import cards
 import nbformat
 import pytest
 
+from book._ext import cards
 from zwfs.companion.results import published
 
 ROOT = Path(__file__).parent.parent
@@ -16,7 +16,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 @pytest.fixture
-def carded(tmp_path):
+def carded():
     """Writes a notebook of code cells, the first with the parameters, and returns its cells with cards."""
 
     def make(name, *sources, links=(), versions="not recorded", commit="not known"):
@@ -24,9 +24,7 @@ def carded(tmp_path):
         cells[0].metadata["tags"] = ["parameters"]
         kernel = {"name": "python3", "language": "python", "display_name": "Python 3"}
         made = nbformat.v4.new_notebook(cells=cells, metadata={"kernelspec": kernel})
-        source = tmp_path / f"{name}.ipynb"
-        nbformat.write(made, source)
-        cards.with_cards(made, source, dict(links), versions, commit)
+        cards.add_cards(made, name, dict(links), versions, commit)
         return made.cells
 
     return make

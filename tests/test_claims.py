@@ -3,10 +3,11 @@
 import json
 from pathlib import Path
 
-import claims
 import pytest
-from claims import FAILS, HOLDS, REMARK, UNTESTED, Claim, ClaimError, Finding
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output, writes
+
+from book._ext import claims
+from book._ext.claims import FAILS, HOLDS, REMARK, UNTESTED, Claim, ClaimError, Finding
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 VERDICTS = json.loads((Path(__file__).parent / "claims.json").read_text())

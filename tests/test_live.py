@@ -4,11 +4,11 @@ import re
 import shutil
 from pathlib import Path
 
-import live
 import numpy as np
 import pytest
 
 import zwfs
+from book._ext import live
 from zwfs.lowrank import Plane
 
 ROOT = Path(__file__).parent.parent

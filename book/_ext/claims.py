@@ -666,6 +666,6 @@ def add_substitutions(app: Sphinx, config: Config) -> None:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Add the substitutions."""
-    app.setup_extension("cards")
+    app.setup_extension("book._ext.cards")
     app.connect("config-inited", add_substitutions)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,4 +1,4 @@
-"""Print the built book into one PDF: its pages, put one after the other, as Chromium prints them."""
+"""The book as one PDF: Chromium prints its pages, joined in one file."""
 
 import functools
 import html
@@ -21,21 +21,20 @@ from pypdf.generic import DictionaryObject, NameObject, TextStringObject
 from sphinx_external_toc.api import SiteMap, TocTree
 from sphinx_external_toc.parsing import parse_toc_yaml
 
-STYLE = "book/print.css"  # a book that has none is not printed
+from .project import ToolError
+
+STYLE = Path(__file__).with_name("print.css")
 NAME = "zwfs.pdf"
 
 CHROMIUM = "ZWFS_CHROMIUM"  # environment variable that names the browser to use
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-MISSING = (
-    f"a PDF needs Chromium: install one, run .venv/bin/playwright install chromium, or name one in {CHROMIUM}"
-)
 
-# What makes sense on a screen only.
+# Elements that make sense on a screen only.
 SCREEN_ONLY = [".run-card", "script", "style", "button", ".headerlink", ".d-print-none", "details.above-input"]
 HEADINGS = [f"h{level}" for level in range(1, 7)]
 STYLES = ["pygments.css", "sphinx-design.min.css", "custom.css"]
 
-# Nothing is cut off: what is wider than the page is made smaller. Returns what is too wide even so.
+# Shrinks elements that are wider than the page, so that nothing is cut off; returns those that stay too wide.
 FIT = """() => {
   const edge = document.body.getBoundingClientRect().right + 1;
   const wide = () => [...document.querySelectorAll("table, img, svg, pre, mjx-container")]
@@ -47,7 +46,7 @@ FIT = """() => {
   return wide().map(element => element.outerHTML.slice(0, 200));
 }"""
 
-# Writes into the table of contents on which page each chapter begins.
+# Writes the first page of each chapter into the table of contents.
 NUMBER = """places => {
   for (const entry of document.querySelectorAll("nav .page")) entry.textContent = places[entry.dataset.name];
 }"""
@@ -63,11 +62,11 @@ PRINT = {
     "tagged": True,
 }
 
-logging.getLogger("pypdf").setLevel(logging.ERROR)  # it counts the objects of Chromium's files in another way
+logging.getLogger("pypdf").setLevel(logging.ERROR)  # it warns of the count of objects in Chromium's files
 
 
-class PrintError(Exception):
-    """The book cannot be printed; the message says why."""
+class PrintError(ToolError):
+    """Failure of the PDF; the message lists what does not fit on a page."""
 
 
 @functools.cache
@@ -89,21 +88,21 @@ def print_book(root: Path, book: Path, chromium: str) -> bytes:
     Parameters
     ----------
     root : Path
-        The folder with _toc.yml, _config.yml, pyproject.toml and the style.
+        The folder with _toc.yml, _config.yml and pyproject.toml.
     book : Path
-        The folder with the built pages; a page is written there for a moment.
+        The folder with the built pages; a temporary page is written there.
     chromium : str
         The path of the browser.
 
     Returns
     -------
     bytes
-        The PDF: the same for the same pages and the same browser.
+        The PDF; it depends on the pages and the browser only.
 
     Raises
     ------
     PrintError
-        Something is wider than a page.
+        If an element is wider than a page.
     """
     pages = _assemble(root, book)
     paper = book / ".print.html"
@@ -113,7 +112,7 @@ def print_book(root: Path, book: Path, chromium: str) -> bytes:
             browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
             page = browser.new_page(viewport={"width": 642, "height": 970})  # the text of a page, see the style
             _open(page, paper)
-            # Only the printed book tells on which page a chapter begins; its table of contents is as long then.
+            # The numbers of pages come from a first print, with a table of contents of the same length.
             page.evaluate(NUMBER, _places(page.pdf(**PRINT)))
             printed = page.pdf(**PRINT)
             browser.close()
@@ -123,7 +122,7 @@ def print_book(root: Path, book: Path, chromium: str) -> bytes:
 
 
 def _assemble(root: Path, book: Path) -> BeautifulSoup:
-    """Put all pages into one, behind a title and a table of contents."""
+    """Join all pages, behind a title and a table of contents."""
     toc = parse_toc_yaml(root / "_toc.yml")
     known = {f"{name}.html" for name in toc}
     config = yaml.safe_load((root / "_config.yml").read_text("utf-8"))
@@ -132,9 +131,8 @@ def _assemble(root: Path, book: Path) -> BeautifulSoup:
     chapters = {name: chapter(_read(book, name), name, known) for name in toc}
     chapters[toc.root.docname].select_one("h2").string = "Introduction"
     title, author = html.escape(config["title"]), html.escape(config["author"])
-    listed = parts(toc)
     contents, body = "", ""
-    for caption, names in listed:
+    for caption, names in parts(toc):
         if caption:
             contents += f'<p class="part">{html.escape(caption)}</p>'
             body += f'<h1 class="part">{html.escape(caption)}</h1>'
@@ -142,12 +140,11 @@ def _assemble(root: Path, book: Path) -> BeautifulSoup:
             heading = html.escape(chapters[name].select_one("h2").get_text())
             contents += f'<p><a href="#{name}">{heading}</a><span class="page" data-name="{name}">000</span></p>'
             body += str(chapters[name])
-    style = (root / STYLE).read_text("utf-8")
     sheets = "".join(f'<link rel="stylesheet" href="_static/{sheet}">' for sheet in STYLES)
     return BeautifulSoup(
         f"""<!DOCTYPE html>
 <html lang="en" data-theme="light"><head><meta charset="utf-8"><title>{title}</title>
-{sheets}<style>{style}</style>{mathjax}</head>
+{sheets}<style>{STYLE.read_text("utf-8")}</style>{mathjax}</head>
 <body><header><p class="title">{title}</p><p id="authors">{author}</p><p>zwfs {version}</p>
 <p>{config["repository"]["url"]}</p><p>Text and figures: CC-BY-4.0. Code: MIT.</p></header>
 <nav><p class="contents">Contents</p>{contents}</nav>{body}</body></html>""",
@@ -169,7 +166,7 @@ def parts(toc: SiteMap) -> list[tuple[str | None, list[str]]]:
 
 
 def _mathjax(page: BeautifulSoup, name: str) -> str:
-    """Return the scripts that set mathematics, as a page of the book has them."""
+    """Return the scripts of a page that set mathematics."""
     scripts = [script for script in page.find_all("script") if "mathjax" in str(script).lower()]
     for script in scripts:
         if script.get("src"):
@@ -178,7 +175,7 @@ def _mathjax(page: BeautifulSoup, name: str) -> str:
 
 
 def chapter(page: BeautifulSoup, name: str, known: set[str]) -> Tag:
-    """Return the article of a page, with names and links that hold in one file for all pages."""
+    """Return the article of a page, with names and links that are unique in one file for all pages."""
     article = page.select_one("article.bd-article")
     for element in article.select(", ".join(SCREEN_ONLY)):
         element.decompose()
@@ -201,7 +198,7 @@ def chapter(page: BeautifulSoup, name: str, known: set[str]) -> Tag:
 
 
 def _target(name: str, address: str) -> tuple[str, str]:
-    """Return the file and the fragment of an address on a page; the file from the book's folder."""
+    """Return the file, relative to the folder of the book, and the fragment of an address on a page."""
     parts = urlsplit(address)
     if parts.scheme or parts.netloc:
         return address, ""
@@ -210,17 +207,17 @@ def _target(name: str, address: str) -> tuple[str, str]:
 
 
 def _redirect(element: Tag, name: str, known: set[str]) -> None:
-    """Let a link to another page lead to that page in the same file."""
+    """Point a link to another page to that page in the same file."""
     path, fragment = _target(name, element["href"])
     if path in known:
         page = path.removesuffix(".html")
         element["href"] = f"#{page}--{fragment}" if fragment else f"#{page}"
     elif not urlsplit(path).scheme:
-        element.unwrap()  # a file beside the book: not beside the PDF
+        element.unwrap()  # a file of the book, which does not come with the PDF
 
 
 def _open(page: Page, file: Path) -> None:
-    """Open a file as it is printed, and wait for its mathematics."""
+    """Open a file for print, and wait for its mathematics."""
     page.emulate_media(media="print")
     page.goto(file.resolve().as_uri())
     page.evaluate("async () => { await window.MathJax?.startup?.promise; await document.fonts.ready }")
@@ -229,19 +226,19 @@ def _open(page: Page, file: Path) -> None:
 
 
 def _places(printed: bytes) -> dict[str, int]:
-    """Return the page on which each name that is linked to stands, from 1."""
+    """Return the page, from 1, of each target of a link."""
     reader = PdfReader(io.BytesIO(printed))
     places = reader.named_destinations.items()
     return {name.lstrip("/"): reader.get_destination_page_number(place) + 1 for name, place in places}
 
 
 def _finish(printed: bytes, pages: BeautifulSoup) -> bytes:
-    """Leave out what differs from one print to the next, dates and versions, and mend the bookmarks."""
+    """Remove dates and versions, so that two prints are equal, and repair the bookmarks."""
     writer = PdfWriter(clone_from=io.BytesIO(printed))
     writer.metadata = {"/Title": pages.title.string, "/Author": pages.select_one("#authors").string}
     headings = [" ".join(heading.get_text().split()) for heading in pages.find_all(HEADINGS)]
     whole = {"".join(heading.split()): heading for heading in headings}
-    # Chromium loses the blank where a heading goes on in the next line.
+    # Chromium loses the blank at a line break in a heading.
     for entry in _entries(writer.get_outline_root()):
         title = entry["/Title"]
         entry[NameObject("/Title")] = TextStringObject(whole.get("".join(title.split()), title))
@@ -251,7 +248,7 @@ def _finish(printed: bytes, pages: BeautifulSoup) -> bytes:
 
 
 def _entries(parent: DictionaryObject) -> Iterator[DictionaryObject]:
-    """Go through the bookmarks below a bookmark."""
+    """Return the bookmarks below a bookmark."""
     entry = parent.get("/First")
     while entry:
         yield entry.get_object()

@@ -1,4 +1,4 @@
-"""One executed notebook as one HTML file that opens by itself: pictures and mathematics are in it."""
+"""An executed notebook as one HTML file, with its pictures and the program for mathematics in it."""
 
 import base64
 import copy
@@ -17,17 +17,17 @@ from urllib.parse import quote, unquote, urlsplit
 import bs4
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
-from runner import Project, to_bytes
 
 from zwfs.companion.results import published
 
-HERE = Path(__file__).parent
+from .notebook import to_bytes
+from .project import Project
+
+STYLE = Path(__file__).with_name("standalone.css")
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-# What in the book serves its navigation; the page has none.
-LEFT_OUT = {
-    "api", "cards", "claims", "finish", "live", "performance", "sphinx.ext.autodoc", "sphinx.ext.napoleon",
-    "sphinx_book_theme", "sphinx_comments", "sphinx_copybutton", "sphinx_togglebutton",
-}  # fmt: skip
+# Extensions for the other pages of the book and for its navigation.
+OMITTED = ("book._ext.", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_book_theme", "sphinx_comments",
+           "sphinx_copybutton", "sphinx_togglebutton")  # fmt: skip
 FRAME = """<!DOCTYPE html>
 <html lang="en" data-theme="light">
 <head>
@@ -51,15 +51,15 @@ window.MathJax = {
   options: {enableMenu: false, ignoreHtmlClass: "tex2jax_ignore|document", processHtmlClass: "math"}
 };
 """
-# Neither of the page's own; Markdown can hold any HTML.
+# Elements that the page does not need; Markdown can hold any HTML.
 ACTIVE = ["script", "iframe", "object", "embed", "base", "meta", "link", "form"]
 
 
 def page(project: Project, name: str, notebook: NotebookNode, files: list[Path], scratch: Path) -> tuple[str, str]:
     """Build the page of a notebook.
 
-    The book's own Sphinx settings are used, and its other pages are read beside this one: equations have the
-    numbers that they have there. Links to other pages become plain text.
+    Sphinx reads the whole book with its settings and writes this page: equations have the same numbers as in the
+    book. Links to other pages become plain text.
 
     Parameters
     ----------
@@ -69,15 +69,15 @@ def page(project: Project, name: str, notebook: NotebookNode, files: list[Path],
     notebook : NotebookNode
         Executed.
     files : list of Path
-        What it published: the page links to them by their name, as files beside it.
+        Published by the notebook. The page links to them as files in its folder.
     scratch : Path
-        A folder to work in.
+        A folder for temporary files.
 
     Returns
     -------
     html : str
     warnings : str
-        What Sphinx says of this page, a line each.
+        Warnings of Sphinx about this page, a line each.
     """
     source, output = scratch / "source", scratch / "html"
     _stage(project, name, notebook, files, source)
@@ -88,12 +88,11 @@ def page(project: Project, name: str, notebook: NotebookNode, files: list[Path],
 
 
 def _stage(project: Project, name: str, notebook: NotebookNode, files: list[Path], source: Path) -> None:
-    """Lay out what Sphinx reads: the book as it is committed, with this notebook in its place."""
-    for file in (project.root / "_config.yml", project.root / "_toc.yml", *(project.root / "book").rglob("*")):
-        if file.is_file() and file.suffix in (".yml", ".md", ".bib"):
-            place = source / file.relative_to(project.root)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, place)
+    """Lay out the sources for Sphinx: the committed book, with this notebook in its place."""
+    root = project.root
+    (source / "book").mkdir(parents=True)
+    for file in (root / "_config.yml", root / "_toc.yml", *root.glob("book/*.md"), *root.glob("book/*.bib")):
+        shutil.copyfile(file, source / file.relative_to(root))
     downloads = source / "notebooks" / "downloads"
     downloads.mkdir(parents=True)
     for other in project.sources():
@@ -116,7 +115,7 @@ def _with_downloads(notebook: NotebookNode, files: list[Path]) -> NotebookNode:
 
 
 def _sphinx(source: Path, output: Path, document: str) -> str:
-    """Let Sphinx write one document, and return its warnings."""
+    """Write one document with Sphinx, and return its warnings."""
     from jupyter_book.config import get_final_config
     from sphinx.application import Sphinx
     from sphinx.util.docutils import docutils_namespace, patch_docutils
@@ -127,7 +126,7 @@ def _sphinx(source: Path, output: Path, document: str) -> str:
         sourcedir=source,
     )
     config |= {
-        "extensions": [name for name in config["extensions"] if name not in LEFT_OUT],
+        "extensions": [name for name in config["extensions"] if not name.startswith(OMITTED)],
         "html_theme": "basic",
         "html_theme_options": {},
         "html_static_path": [],
@@ -141,25 +140,25 @@ def _sphinx(source: Path, output: Path, document: str) -> str:
         app = Sphinx(
             source, None, output, output.with_name("doctrees"), "html", config, status=None, warning=warnings
         )
-        app.connect("env-updated", _forget_foreign)
+        app.connect("env-updated", _drop_foreign)
         app.build(filenames=[str(source / document)])
     return COLOUR.sub("", warnings.getvalue())
 
 
-def _forget_foreign(app: Any, env: Any) -> None:
-    """Drop pictures that lie neither among the sources nor among the results: Sphinx would copy any file."""
+def _drop_foreign(app: Any, env: Any) -> None:
+    """Drop pictures outside the scratch folder: Sphinx would copy any file of the computer."""
     for picture in list(env.images):
         if not _is_within(Path(app.srcdir).parent, Path(app.srcdir) / picture):
             del env.images[picture]
 
 
 def _is_within(folder: Path, file: Path) -> bool:
-    """Say whether a file lies in a folder, also after every symbolic link is followed."""
+    """Return whether a file lies in a folder once all symbolic links are resolved."""
     return Path(os.path.realpath(file)).is_relative_to(os.path.realpath(folder))
 
 
-def _embed(output: Path, document: str, beside: set[str]) -> str:
-    """Return the content of a page that Sphinx wrote, with the pictures and styles that it loads in it."""
+def _embed(output: Path, document: str, published: set[str]) -> str:
+    """Return a page that Sphinx wrote, with its pictures and styles in it, and without active elements."""
     file = output / document
     soup = bs4.BeautifulSoup(file.read_text("utf-8"), "html.parser")
     body = soup.find("div", class_="body")
@@ -174,7 +173,7 @@ def _embed(output: Path, document: str, beside: set[str]) -> str:
     for link in body.find_all("a"):
         target = urlsplit(link.get("href", ""))
         filename = unquote(target.path).rpartition("/")[2]
-        if "download" in link.get("class", ()) and filename in beside:
+        if "download" in link.get("class", ()) and filename in published:
             link["href"] = quote(filename)
         elif target.scheme not in ("http", "https", "mailto") and (target.scheme or target.netloc or target.path):
             link.unwrap()
@@ -184,14 +183,14 @@ def _embed(output: Path, document: str, beside: set[str]) -> str:
     return FRAME.format(
         policy=_policy(scripts),
         title=html.escape(body.find("h1").get_text()),
-        style="\n".join([*style, (HERE / "standalone.css").read_text("utf-8")]),
+        style="\n".join([*style, STYLE.read_text("utf-8")]),
         scripts="\n".join(f"<script>{script}</script>" for script in scripts),
         body="".join(map(str, body.contents)),
     )
 
 
 def _policy(scripts: list[str]) -> str:
-    """Return what a browser may load and run: what is in the page, and of scripts only these."""
+    """Return the content security policy: nothing from outside the page, and of scripts only these."""
     digests = (base64.b64encode(sha256(script.encode()).digest()).decode() for script in scripts)
     allowed = " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
     return (
@@ -201,13 +200,13 @@ def _policy(scripts: list[str]) -> str:
 
 
 def _data(file: Path) -> str:
-    """Return a file as an address that holds it."""
+    """Return a data URL that holds a file."""
     kind = mimetypes.guess_type(file.name)[0]
     return f"data:{kind};base64,{base64.b64encode(file.read_bytes()).decode()}"
 
 
 def _mathjax() -> str:
-    """MathJax in one piece: the letters are drawn, so it loads no fonts."""
+    """Return MathJax as one script; it draws the letters, so it loads no fonts."""
     package = importlib.util.find_spec("sphinx-mathjax-offline")
     code = Path(package.origin).parent / "static" / "mathjax" / "tex-svg-full.js"
     return code.read_text("utf-8").replace("</script", "<\\/script")

@@ -1,4 +1,4 @@
-"""What a notebook declares of its parameters, read without running it, and values for them from outside."""
+"""Parameters of a notebook, read without running it, and values for them from the command line and from files."""
 
 import ast
 import difflib
@@ -19,31 +19,28 @@ from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEv
 from zwfs.companion.limits import LIMITS
 from zwfs.companion.parameters import check_parameters
 
-# What may stand behind the last comma of a parameter's comment; all else there belongs to the meaning.
-UNITS = ("rad", "rad rms", "lambda/D", "D", "D²/lambda", "nm", "m", "s", "Hz", "pixels", "electrons", "photons")
+from .project import ToolError, one_line
 
+# A unit is one of these behind the last comma of a parameter's comment; other words there belong to the meaning.
+UNITS = ("rad", "rad rms", "lambda/D", "D", "D²/lambda", "nm", "m", "s", "Hz", "pixels", "electrons", "photons")
 
 # Limits that are types.
 TYPES = {"str": str, "bool": bool}
 
 
-# Of the YAML of parameters: a list of 1000 numbers is half as long, and no parameter is a list of lists of lists.
-LONGEST = 16384  # characters, which take a second to read
+# Limits of the YAML of parameters: a list of 1000 numbers is half as long, and no list is nested more than twice.
+LONGEST = 16384  # characters, read in a second
 DEEPEST = 8
 NOT_PLAIN = "tags (!), anchors (&), aliases (*), merges (<<) and directives (%) are not allowed; quote strings"
 
 
-class ParameterError(Exception):
-    """A value for a parameter that the notebook does not take; the message is one line."""
+class ParameterError(ToolError):
+    """Refusal of a command line or of a value for a parameter; the message is one line."""
+
+    status = 2
 
     def __init__(self, message: str) -> None:
         super().__init__(one_line(message))
-
-
-def one_line(text: str) -> str:
-    """Return a text for the terminal: on one line, without control characters, cut in the middle if it is long."""
-    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-    return line if len(line) <= 400 else f"{line[:250]} ... {line[-140:]}"
 
 
 @dataclass(frozen=True)
@@ -67,14 +64,14 @@ class Parameter:
 
     @property
     def kind(self) -> str:
-        """Its type, as a reader calls it."""
+        """Name of the type for a reader."""
         if isinstance(self.default, list):
             return f"list of {type(_scalar(self.limits)).__name__}"
         return type(self.default).__name__
 
     @property
     def allowed(self) -> str:
-        """Its limits, as a reader calls them."""
+        """Limits in words for a reader."""
         limits = self.limits
         while isinstance(limits, list):
             limits = limits[0]
@@ -109,7 +106,7 @@ def parameters(notebook: NotebookNode) -> dict[str, Parameter]:
 
 
 def assigned(notebook: NotebookNode) -> dict[str, tuple[str, str]]:
-    """Return, by name, what the cell tagged ``parameters`` assigns: value and comment, as they are written."""
+    """Return value and comment of each parameter, as they are written in the cell tagged ``parameters``."""
     source = next((c.source for c in notebook.cells if "parameters" in c.metadata.get("tags", ())), "")
     tokens = tokenize.generate_tokens(io.StringIO(source).readline)
     comments = {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
@@ -123,8 +120,8 @@ def assigned(notebook: NotebookNode) -> dict[str, tuple[str, str]]:
 
 def _meaning_and_unit(comment: str) -> tuple[str, str]:
     """Split a comment; a remark behind a semicolon belongs to the meaning."""
-    told, semicolon, remark = comment.partition(";")
-    meaning, _, unit = told.rpartition(",")
+    main, semicolon, remark = comment.partition(";")
+    meaning, _, unit = main.rpartition(",")
     if unit.strip() not in UNITS:
         return (comment, "") if comment not in UNITS else ("", comment)
     return meaning + semicolon + remark, unit.strip()
@@ -199,7 +196,7 @@ def accept(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]
     Raises
     ------
     ParameterError
-        If a name is unknown, or a value is not of the type or within the limits that the notebook asks for.
+        If a name is unknown, or a value has another type or is out of the limits.
     """
     for name in given:
         if name not in known:
@@ -210,26 +207,26 @@ def accept(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]
         check_parameters(given, **{name: known[name].limits for name in given})
     except (TypeError, ValueError) as error:
         raise ParameterError(str(error)) from None
-    # In the notebook's order: what came first on the command line makes no difference.
+    # In the order of the notebook: the order on the command line makes no difference.
     typed = {name: _typed(given[name], one.limits) for name, one in known.items() if name in given}
     return {name: value for name, value in typed.items() if value != known[name].default}
 
 
 def nearest(name: str, known: Any) -> str:
-    """Ask for the known name that is most like a given one, or tell them all."""
-    found = difflib.get_close_matches(str(name), known, n=1)
-    return f"did you mean {found[0]!r}?" if found else f"expected one of {', '.join(known) or '(none)'}"
+    """Suggest the known name that is most like a given one, or list all known names."""
+    similar = difflib.get_close_matches(str(name), known, n=1)
+    return f"did you mean {similar[0]!r}?" if similar else f"expected one of {', '.join(known) or '(none)'}"
 
 
 def _typed(value: Any, limits: Any) -> Any:
-    """Return a value that was checked, with integers turned to floats where numbers are asked for."""
+    """Return a checked value, with floats in place of integers where the limits are floats."""
     if isinstance(value, list):
         return [_typed(item, limits[0]) for item in value]
     return float(value) if isinstance(_scalar(limits), float) else value
 
 
 class _Constructor(SafeConstructor):
-    """One that leaves dates, which no parameter is, as strings."""
+    """Constructor that reads dates as strings: no parameter is a date."""
 
 
 _Constructor.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
@@ -242,12 +239,12 @@ def load(text: str, origin: str) -> Any:
     ----------
     text : str
     origin : str
-        Where the text comes from, for the error message.
+        The source of the text, for the error message.
 
     Raises
     ------
     ParameterError
-        If the text is no such YAML, is longer than `LONGEST`, or is nested deeper than `DEEPEST`.
+        If the text is not plain YAML, is longer than `LONGEST`, or is nested deeper than `DEEPEST`.
     """
     if len(text) > LONGEST:
         raise ParameterError(f"{origin}: {len(text)} characters: expected at most {LONGEST}")
@@ -260,12 +257,12 @@ def load(text: str, origin: str) -> Any:
         where = f", line {error.problem_mark.line + 1}" if "\n" in text else ""
         context = f" ({error.context})" if error.context else ""
         raise ParameterError(f"{origin}{where}: {error.problem}{context}") from None
-    except (YAMLError, ValueError) as error:  # a character that is none, or a number with too many digits
+    except (YAMLError, ValueError) as error:  # an invalid character, or a number with too many digits
         raise ParameterError(f"{origin}: {error}") from None
 
 
 def _check_plain(events: Iterator[Event]) -> None:
-    """Refuse all that is not plain while it is still a stream: a few characters can stand for gigabytes."""
+    """Refuse all other YAML while it is still a stream: a few characters can stand for gigabytes."""
     depth = 0
     for event in events:
         depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
@@ -280,20 +277,20 @@ def _check_plain(events: Iterator[Event]) -> None:
 
 def mapping(text: str, origin: str) -> dict[str, Any]:
     """Return the parameters that a file in YAML gives, by name."""
-    found = load(text, origin)
-    if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
+    given = load(text, origin)
+    if not isinstance(given, dict) or not all(isinstance(name, str) for name in given):
         raise ParameterError(f"{origin}: expected a mapping of names to values, as in 'n_screens: 50'")
-    return found
+    return given
 
 
 def assignments(texts: list[str]) -> dict[str, Any]:
     """Return the parameters that texts of the form ``name=value`` give, the value in YAML."""
-    found: dict[str, Any] = {}
+    given: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals or not name:
             raise ParameterError(f"-p {text}: expected name=value, as in n_screens=50")
-        if name in found:
+        if name in given:
             raise ParameterError(f"-p {text}: {name!r} is given twice")
-        found[name] = load(value, f"-p {text}")
-    return found
+        given[name] = load(value, f"-p {text}")
+    return given

@@ -1,0 +1,1 @@
+"""Command line of the book: ``python -m book._tools``. The Makefile calls it."""

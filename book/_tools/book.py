@@ -1,0 +1,155 @@
+"""The book: run what changed, build it with Jupyter Book, and print it."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from zwfs._files import write_file
+
+from . import pdf as printing
+from .project import EXECUTED, PDF, Project, ToolError
+from .record import commit, digest, digest_files
+from .run import refresh, run
+from .scratch import scratch_folder, swap
+
+COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+JUPYTER_BOOK = Path(sys.executable).with_name("jupyter-book")
+OPTIONS = ["-W", "-n", "--keep-going"]  # warnings are errors, and all of them are listed
+NO_PDF = (
+    "the PDF needs Chromium: install one, run .venv/bin/playwright install chromium, or name one in ZWFS_CHROMIUM"
+)
+
+
+class BookError(ToolError):
+    """Failure of the book; the message holds the warnings of Sphinx."""
+
+
+def book(project: Project) -> None:
+    """Run the notebooks that changed and build the book, with its PDF where there is a browser."""
+    chromium = printing.find_chromium()
+    check_contents(project)
+    run(project)
+    print(f"book: {'built' if build(project, chromium) else 'unchanged'}")
+    print(f"open {(project.build / 'html' / 'index.html').relative_to(project.root)}")
+    if not chromium:
+        print(NO_PDF)
+
+
+def pdf(project: Project) -> None:
+    """Build the book with its PDF."""
+    if not printing.find_chromium():
+        raise BookError(NO_PDF)
+    book(project)
+    print(f"open {(project.build / 'html' / printing.NAME).relative_to(project.root)}")
+
+
+def figures(project: Project) -> None:
+    """Replace the committed notebooks and the front figure by freshly run ones."""
+    run(project)
+    for name in refresh(project):
+        print(f"{name} is new")
+
+
+def check_contents(project: Project) -> None:
+    """Check that _toc.yml lists every page and every notebook, and nothing else.
+
+    Raises
+    ------
+    BookError
+        If not: Sphinx would omit a page without a warning.
+    """
+    contents = yaml.safe_load((project.root / "_toc.yml").read_text("utf-8"))
+    listed = {name.removesuffix(".md").removesuffix(".ipynb") for name in _entries(contents)}
+    pages = [*sorted((project.root / "book").glob("[!_]*.md")), *project.sources()]
+    known = {page.relative_to(project.root).with_suffix("").as_posix(): page.suffix for page in pages}
+    wrong = [f"{name}{known[name]} is not listed in _toc.yml" for name in known if name not in listed]
+    wrong += [f"_toc.yml lists {name}, which does not exist" for name in sorted(listed - known.keys())]
+    if wrong:
+        raise BookError("\n".join(["the book was not built:", *wrong]))
+
+
+def _entries(contents: dict[str, Any]) -> Iterator[str]:
+    """Return the pages that a table of contents names, at any depth."""
+    for key, value in contents.items():
+        if key in ("root", "file"):
+            yield value
+        elif isinstance(value, list):
+            for entry in value:
+                yield from _entries(entry)
+
+
+def build(project: Project, chromium: str | None = None) -> bool:
+    """Build the book in _build/html, unless nothing that it depends on has changed.
+
+    Parameters
+    ----------
+    project : Project
+        Its notebooks have been run.
+    chromium : str, optional
+        The browser that prints the PDF; without one there is no PDF.
+
+    Returns
+    -------
+    bool
+        Whether the book was built now.
+
+    Raises
+    ------
+    BookError
+        If Sphinx gives a warning or an error. The earlier book stays.
+    PrintError
+        If the PDF would not be whole. The earlier book stays.
+    """
+    html, record = project.build / "html", project.build / "html.json"
+    made_from = _digest(project, bool(chromium))
+    with suppress(OSError, ValueError):  # the book was never built, or not to its end
+        if html.is_dir() and json.loads(record.read_bytes()) == made_from:
+            return False
+    record.unlink(missing_ok=True)  # a failure from here on must be followed by a build
+    with scratch_folder(project.build, "building-") as scratch:
+        pages = _write_pages(project, scratch, {PDF: printing.NAME} if chromium else {})
+        if chromium:
+            (pages / printing.NAME).write_bytes(printing.print_book(project.root, pages, chromium))
+        swap(pages, html, scratch / "earlier")
+    write_file(record, json.dumps(made_from).encode())
+    return True
+
+
+def _digest(project: Project, printed: bool) -> str:
+    """Return a digest of everything that the book depends on."""
+    root = project.root
+    files = [root / name for name in ("_config.yml", "_toc.yml", "pyproject.toml")]
+    files += [file for file in (root / "book").rglob("*") if "__pycache__" not in file.parts]
+    files += [*project.sources(), *project.shared_inputs()]
+    for notebook in project.sources():
+        executed = project.executed / notebook.name
+        files += [executed, executed.with_suffix(".json"), *project.published(notebook.stem)]
+    named = {file.relative_to(root).as_posix(): file for file in files if file.is_file()}
+    about = json.dumps([sys.version_info[:2], printed, commit(root)])  # the pages name the commit
+    return digest([digest_files(named).encode(), about.encode()])
+
+
+def _write_pages(project: Project, output: Path, environment: dict[str, str]) -> Path:
+    """Run ``jupyter-book build .`` with the executed notebooks, and return the folder of the pages."""
+    executed = {EXECUTED: str(project.executed.relative_to(project.root))}
+    done = subprocess.run(
+        [JUPYTER_BOOK, "build", *OPTIONS, "--path-output", output, "."],
+        cwd=project.root,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | executed | environment,
+    )
+    if done.returncode:
+        lines = COLOUR.sub("", done.stdout).replace(f"{project.root}{os.sep}", "").splitlines()
+        marked = [line for line in lines if "WARNING:" in line or "ERROR:" in line]
+        raise BookError("\n".join(["the book was not built:", *(marked or lines[-40:])]))
+    return output / "_build" / "html"

@@ -1,0 +1,248 @@
+"""Execution of notebooks with papermill: in parallel, with a progress bar, stopped cleanly by an interruption."""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import papermill
+from nbformat import NotebookNode
+from papermill.clientwrap import PapermillNotebookClient
+from papermill.engines import NBClientEngine, papermill_engines
+from papermill.exceptions import PapermillExecutionError, strip_color
+from tqdm import tqdm
+
+from zwfs.companion import results, sweeps
+
+from . import declared
+from .notebook import read, to_bytes
+from .project import Project, ToolError
+from .record import key
+
+# One thread for each kernel: the numbers do not depend on how many notebooks run at the same time.
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "VECLIB_MAXIMUM_THREADS": "1",
+    "PYTHONHASHSEED": "0",
+}
+CORES = "LOKY_MAX_CPU_COUNT"  # the number of cores for the sweeps of a notebook, see `zwfs.companion.sweeps`
+
+PERIOD = 0.2  # of the progress bar, second
+TRACEBACK_LINES = 12
+LOG_CHARACTERS = 2000
+
+
+class NotebookError(ToolError):
+    """Failure of notebooks; the message says in which cell, with which parameters and why."""
+
+
+class Run:
+    """One execution of a notebook.
+
+    Parameters
+    ----------
+    project : Project
+    name : str
+        The stem of the notebook's file.
+    scratch : Path
+        A folder for everything that the run writes.
+    parameters : dict, optional
+        Values that replace defaults in the cell tagged ``parameters``.
+
+    Attributes
+    ----------
+    cells : list of NotebookNode
+    cell : int
+        The number of the cell that runs, from 1; 0 before the first one.
+    error : NotebookError or None
+    key : str or None
+        Digest of what the result was made from, see `record.key`; None if that changed during the run.
+    seconds : float
+    """
+
+    error: NotebookError | None = None
+    key: str | None = None
+    seconds = 0.0
+    cell = 0
+    _client: PapermillNotebookClient | None = None
+    _stopped = False
+
+    def __init__(
+        self, project: Project, name: str, scratch: Path, parameters: dict[str, Any] | None = None
+    ) -> None:
+        self.project, self.name, self.parameters = project, name, parameters or {}
+        self.folder = scratch / f"{name}.files"
+        self._target, self._log, self._progress = (
+            scratch / f"{name}{end}" for end in (".ipynb", ".log", ".progress")
+        )
+        self._source = read(project.source(name))
+        self.cells = self._source.cells
+
+    @property
+    def notebook(self) -> NotebookNode:
+        """The executed notebook, in its normal form."""
+        return read(self._target)
+
+    @property
+    def files(self) -> list[Path]:
+        """The figures and tables that it published."""
+        return sorted(self.folder.glob("[!.]*"))
+
+    def execute(self, cores: int) -> None:
+        """Run the notebook to its end, or set `error`."""
+        begin = time.perf_counter()
+        try:
+            made_from = key(self.project, self.name, self.parameters)
+            self.folder.mkdir()
+            source = self._target.with_suffix(".source.ipynb")
+            source.write_bytes(to_bytes(self._source))
+            try:
+                self._papermill(source, cores)
+            except RuntimeError:
+                # Another program may take the port of a kernel that starts: the kernel never answers.
+                if self.cell or self._stopped:
+                    raise
+                self._papermill(source, cores)
+            # The result of a notebook that is edited during the run is not current.
+            self.key = made_from if key(self.project, self.name, self.parameters) == made_from else None
+        except Exception as error:
+            self.error = NotebookError(self._describe(error))
+        self.cell = len(self.cells)
+        self.seconds = round(time.perf_counter() - begin, 1)
+
+    def _papermill(self, source: Path, cores: int) -> None:
+        own = {results.FOLDER: str(self.folder), sweeps.PROGRESS: str(self._progress), CORES: str(cores)}
+        papermill.execute_notebook(
+            source,
+            self._target,
+            parameters=self.parameters,
+            engine_name="zwfs",
+            kernel_name="python3",
+            progress_bar=False,
+            request_save_on_cell_execute=False,
+            run=self,
+            environment=os.environ | ENVIRONMENT | own,
+        )
+
+    def start_kernel(self, client: PapermillNotebookClient, environment: dict[str, str]) -> None:
+        """Run the cells in a kernel with this environment; its messages go to a log."""
+        self._client = client
+        with self._log.open("w") as log:
+            client.execute(env=environment, cwd=str(self.project.notebooks), stdout=log, stderr=log)
+
+    def begin_cell(self, number: int) -> None:
+        """Note that a cell begins; refuse if the run was stopped."""
+        if self._stopped:
+            raise InterruptedError
+        self._progress.unlink(missing_ok=True)
+        self.cell = number
+
+    def stop(self) -> None:
+        """End the kernel and all processes that it started, at once."""
+        self._stopped = True
+        with suppress(AttributeError, OSError):  # there is no kernel yet, or no longer
+            os.killpg(self._client.km.provisioner.pid, signal.SIGKILL)
+
+    def progress(self) -> str:
+        """Return the number of the cell that runs, and the progress of a sweep in it."""
+        said = f"cell {self.cell}/{len(self.cells)}"
+        with suppress(OSError, ValueError, KeyError, TypeError):  # there is no sweep, or its line is not complete
+            sweep = json.loads(self._progress.read_bytes().rpartition(b"\n")[0].rpartition(b"\n")[2])
+            said += f", {sweep['name']} {sweep['done']:d}/{sweep['total']:d}"
+        return said
+
+    def _describe(self, error: Exception) -> str:
+        """Return where the notebook failed, with which parameters, and why."""
+        lines = [f"notebooks/{self.name}.ipynb failed before its first cell"]
+        if self.cell:
+            lines = [f"notebooks/{self.name}.ipynb failed in cell {self.cell} of {len(self.cells)}"]
+            code = [line for line in self.cells[self.cell - 1].source.splitlines() if line.strip()]
+            lines += [f"  the cell begins: {line}" for line in code[:1]]
+        defaults = {name: value for name, (value, _) in declared.assigned(self._source).items()}
+        values = ", ".join(f"{name} = {value}" for name, value in (defaults | self.parameters).items())
+        lines += [f"  parameters in force: {values or '(none)'}", ""]
+        if isinstance(error, PapermillExecutionError):
+            traceback = strip_color("\n".join(error.traceback)).splitlines()[-TRACEBACK_LINES:]
+            return "\n".join([*lines, *(traceback or [f"{error.ename}: {error.evalue}"])])
+        log = self._log.read_text(errors="replace")[-LOG_CHARACTERS:] if self._log.exists() else ""
+        return "\n".join([*lines, *log.splitlines(), f"{type(error).__name__}: {error}"])
+
+
+class Engine(NBClientEngine):
+    """Papermill's engine, with an environment for each kernel; it reports each cell to the `Run`."""
+
+    @classmethod
+    def execute_managed_notebook(
+        cls, nb_man: Any, kernel_name: str, *, run: Run, environment: dict[str, str], **_: Any
+    ) -> None:
+        """Run the cells of a notebook."""
+        begin, run.cells = nb_man.cell_start, list(nb_man.nb.cells)
+
+        def cell_start(cell: NotebookNode, cell_index: int, **options: Any) -> None:
+            run.begin_cell(cell_index + 1)
+            begin(cell, cell_index, **options)
+
+        nb_man.cell_start = cell_start
+        client = PapermillNotebookClient(
+            nb_man, kernel_name=kernel_name, timeout=None, shutdown_kernel="immediate"
+        )
+        run.start_kernel(client, environment)
+
+
+papermill_engines.register("zwfs", Engine)
+
+
+def execute(runs: list[Run], finished: Callable[[Run], None], n_processes: int | None = None) -> None:
+    """Execute notebooks in parallel.
+
+    Parameters
+    ----------
+    runs : list of Run
+        In the order in which they start.
+    finished : callable
+        Takes each run when it ends, whether it failed or not.
+    n_processes : int, optional
+        The number of notebooks that run at the same time; by default the number of cores.
+
+    Raises
+    ------
+    NotebookError
+        After the end of all notebooks, if some failed.
+    """
+    n_processes = min(n_processes or os.cpu_count(), len(runs))
+    cores = max(1, os.cpu_count() // n_processes)
+    with (
+        tqdm(unit="cell", total=1, disable=None, leave=False, dynamic_ncols=True) as bar,
+        ThreadPoolExecutor(n_processes) as pool,
+    ):
+        waiting = {pool.submit(run.execute, cores): run for run in runs}
+        try:
+            while waiting:
+                for future in wait(waiting, PERIOD, FIRST_COMPLETED).done:
+                    future.result()
+                    finished(waiting.pop(future))
+                _show(bar, runs, list(waiting.values()))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for run in runs:
+                run.stop()
+            raise
+    if failures := [str(run.error) for run in runs if run.error]:
+        raise NotebookError("\n\n".join(failures))
+
+
+def _show(bar: tqdm, runs: list[Run], waiting: list[Run]) -> None:
+    """Draw the progress of all notebooks."""
+    several = len(runs) > 1
+    title = f"{len(runs) - len(waiting)}/{len(runs)} notebooks" if several else runs[0].name
+    now = ((run.name.split("_")[0] + ", " if several else "") + run.progress() for run in waiting if run.cell)
+    bar.total, bar.n = sum(len(run.cells) for run in runs), sum(run.cell for run in runs)
+    bar.set_description_str(title, refresh=False)
+    bar.set_postfix_str("; ".join(now))

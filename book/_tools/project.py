@@ -1,0 +1,65 @@
+"""Places of the files of a project."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+# Environment variables for the extensions of the book: the folder of the executed notebooks from the root, and the
+# name of the PDF.
+EXECUTED, PDF = "ZWFS_EXECUTED", "ZWFS_PDF"
+
+
+class ToolError(Exception):
+    """Reason why a command stopped, in words for the terminal."""
+
+    status = 1
+
+
+def one_line(text: str) -> str:
+    """Return a text for the terminal: on one line, without control characters, cut in the middle if it is long."""
+    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return line if len(line) <= 400 else f"{line[:250]} ... {line[-140:]}"
+
+
+@dataclass(frozen=True)
+class Project:
+    """Places of the files of a project.
+
+    Parameters
+    ----------
+    root : Path
+        The folder with notebooks/, zwfs/, book/ and the lock. Results go to its _build/.
+    """
+
+    root: Path
+
+    @property
+    def notebooks(self) -> Path:
+        """Folder of the committed notebooks."""
+        return self.root / "notebooks"
+
+    @property
+    def build(self) -> Path:
+        """Folder of all results."""
+        return self.root / "_build"
+
+    @property
+    def executed(self) -> Path:
+        """Folder of the executed notebooks, each with its published files and its record."""
+        return self.build / "notebooks"
+
+    def source(self, name: str) -> Path:
+        """Return the file of a committed notebook."""
+        return self.notebooks / f"{name}.ipynb"
+
+    def sources(self) -> list[Path]:
+        """Return the files of the committed notebooks, in order."""
+        return sorted(self.notebooks.glob("*.ipynb"))
+
+    def published(self, name: str) -> list[Path]:
+        """Return the figures and tables that the last run of a notebook published, in order."""
+        return sorted((self.executed / f"{name}.files").glob("[!.]*"))
+
+    def shared_inputs(self) -> list[Path]:
+        """Return the files that the result of every notebook depends on."""
+        lock = self.root / "environment" / "requirements.lock"
+        return [file for file in (*sorted((self.root / "zwfs").rglob("*.py")), lock) if file.exists()]

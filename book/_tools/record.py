@@ -1,0 +1,90 @@
+"""Records of results: what a result was made from, and whether it is current."""
+
+import hashlib
+import json
+import platform
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from . import notebook
+from .project import Project
+
+# The modules that the content of an executed notebook depends on.
+RUNNER = [Path(__file__).with_name(name) for name in ("execute.py", "notebook.py")]
+
+
+def digest(parts: Iterable[bytes]) -> str:
+    """Return the sha256 of several byte strings; the place of their boundaries counts."""
+    total = hashlib.sha256()
+    for part in parts:
+        total.update(hashlib.sha256(part).digest())
+    return total.hexdigest()
+
+
+def digest_files(files: dict[str, Path]) -> str:
+    """Return the sha256 of the names and the contents of files."""
+    return digest(part for name in sorted(files) for part in (name.encode(), files[name].read_bytes()))
+
+
+def key(project: Project, name: str, parameters: dict[str, Any]) -> str:
+    """Return a digest of everything that the result of a notebook depends on."""
+    files = {str(file.relative_to(project.root)): file for file in project.shared_inputs()}
+    files |= {f"runner {file.name}": file for file in RUNNER}
+    files |= {f"parameter {file}": file for file in _named_files(project.notebooks, parameters)}
+    cells = [[cell.cell_type, cell.source, cell.metadata] for cell in notebook.read(project.source(name)).cells]
+    own = [list(sys.version_info[:2]), parameters, cells]
+    return digest([json.dumps(own, sort_keys=True).encode(), digest_files(files).encode()])
+
+
+def _named_files(folder: Path, value: Any) -> Iterator[Path]:
+    """Return the files that parameters name: their contents count as much as their names."""
+    if isinstance(value, dict | list | tuple):
+        for one in value.values() if isinstance(value, dict) else value:
+            yield from _named_files(folder, one)
+    elif isinstance(value, str):
+        with suppress(OSError, ValueError):  # not the name of a file
+            if (folder / value).is_file():
+                yield folder / value
+
+
+def digest_result(executed: bytes, files: list[Path]) -> str:
+    """Return a digest of an executed notebook and of the files that it published."""
+    return digest([executed, digest_files({file.name: file for file in files}).encode()])
+
+
+def read_record(project: Project, name: str) -> dict[str, Any]:
+    """Return the record of the last result of a notebook; empty if the result is missing or was changed."""
+    result = project.executed / f"{name}.ipynb"
+    try:
+        record = json.loads(result.with_suffix(".json").read_bytes())
+        return record if record["result"] == digest_result(result.read_bytes(), project.published(name)) else {}
+    except (OSError, ValueError, KeyError):
+        return {}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide what a notebook shows."""
+    packages = {"NumPy": "numpy", "SciPy": "scipy", "Matplotlib": "matplotlib", "zwfs": "zwfs"}
+    return {"Python": platform.python_version()} | {name: metadata.version(p) for name, p in packages.items()}
+
+
+def commit(root: Path) -> tuple[str | None, bool | None]:
+    """Return the commit of a working tree, and whether the tree has changes; None where there is no history.
+
+    An untracked file is a change, too: it may be a notebook, or a module that a notebook imports.
+    """
+
+    def git(*command: str) -> str:
+        done = subprocess.run(["git", "-C", str(root), *command], capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    with suppress(OSError, subprocess.CalledProcessError):
+        # A copy without a history may lie within another repository.
+        if Path(git("rev-parse", "--show-toplevel")) == root.resolve():
+            return git("rev-parse", "HEAD"), bool(git("status", "--porcelain"))
+    return None, None

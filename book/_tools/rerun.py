@@ -1,0 +1,335 @@
+"""Run of one notebook with other parameters: its results go to a separate folder."""
+
+import argparse
+import json
+import os
+import re
+import shlex
+import shutil
+import stat
+import sys
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NoReturn
+
+from nbformat import NotebookNode
+from nbformat.v4 import new_markdown_cell
+
+from zwfs.companion.tables import plain
+
+from . import declared, record
+from .declared import Parameter, ParameterError
+from .notebook import normalise, read, to_bytes
+from .project import Project
+from .scratch import scratch_folder, swap
+
+RECORD = "record.json"
+MAKER = "zwfs rerun"  # marks the record of a folder with results
+COMMAND = ".venv/bin/python -m book._tools rerun"
+READABLE = 60  # characters of a folder's name for the parameters
+ROOM = 50_000_000  # bytes on the disk for the scratch files of a run
+EXAMPLES = """examples:
+  rerun                                     list the notebooks
+  rerun 3 --list                            list the parameters of Figure 3
+  rerun 3 -p rms_max=2.0 -p n_screens=50    run it
+  rerun phase_shift_pairs -f mine.yaml      with parameters from a file
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """Parser that raises its errors."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise an error of the command line."""
+        raise ParameterError(message)
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """Read the command line."""
+    for argument in arguments:
+        if re.search("[\ud800-\udfff]", argument):  # bytes that are not UTF-8
+            raise ParameterError(f"{argument}: expected UTF-8")
+    options = {"description": __doc__, "epilog": EXAMPLES, "formatter_class": argparse.RawDescriptionHelpFormatter}
+    parser = Parser("rerun", **options)
+    parser.add_argument("figure", nargs="?", help="number of a figure, or name of a notebook")
+    parser.add_argument("-p", metavar="NAME=VALUE", action="append", default=[], help="a parameter, in YAML")
+    file_help = "YAML file of parameters; -p overrides it"
+    parser.add_argument("-f", metavar="FILE", type=Path, action="append", default=[], help=file_help)
+    parser.add_argument("--list", action="store_true", help="list parameters, and run nothing")
+    parser.add_argument("--force", action="store_true", help="run even if the result exists")
+    parser.add_argument("--output", metavar="DIR", type=Path, help="folder for the results")
+    parser.add_argument("--line", metavar="TEXT", help="all arguments in one string, quoted as for a shell")
+    asked = parser.parse_args(arguments)
+    if asked.line is None:
+        return asked
+    if len(arguments) > 1:
+        raise ParameterError("--line replaces all other arguments: expected no other")
+    try:
+        return parse(shlex.split(asked.line))
+    except ValueError as error:  # a quotation without an end
+        raise ParameterError(f"{asked.line}: {error}") from None
+
+
+def rerun(project: Project, arguments: list[str]) -> None:
+    """Serve a command line.
+
+    Raises
+    ------
+    ParameterError
+        If it asks for something impossible; no notebook has been started.
+    NotebookError
+        If the notebook fails; nothing has been written.
+    """
+    asked = parse(arguments)
+    if asked.figure in (None, "list"):
+        if asked.p or asked.f or asked.output or asked.force:
+            raise ParameterError("name a figure, as in: rerun 3 -p n_screens=50")
+        print(titles(project))
+        if asked.list:
+            print(*(f"\n{description(project, path.stem)}" for path in project.sources()), sep="\n")
+        return
+    name = resolve(project, asked.figure)
+    if asked.list:
+        print(description(project, name))
+        return
+    known = declared.parameters(read(project.source(name)))
+    changed = declared.accept(_given(asked), known)
+    folder = _folder(project, asked.output or project.build / "rerun" / folder_name(name, changed))
+    earlier = read_result(folder, name)
+    if not asked.force and is_current(earlier, folder, record.key(project, name, changed)):
+        print(f"{name}: unchanged, from {earlier['made']}")
+    else:
+        print(f"{name}: {make(project, name, changed, known, folder):.1f} s")
+    page = folder / f"{name}.html"
+    print(f"open {page.relative_to(Path.cwd()) if page.is_relative_to(Path.cwd()) else page}")
+
+
+def resolve(project: Project, figure: str) -> str:
+    """Return the name of the notebook for a number of a figure or a name.
+
+    Raises
+    ------
+    ParameterError
+        If there is no such notebook.
+    """
+    names = [path.stem for path in project.sources()]
+    wanted = Path(figure).name.removesuffix(".ipynb")
+    if wanted in names:
+        return wanted
+    if number := re.fullmatch(r"(?:fig(?:ure)?)?[ _]?0*(\d+)", wanted, re.IGNORECASE):
+        numbers = {_number(name): name for name in names if _number(name)}
+        if number[1] in numbers:
+            return numbers[number[1]]
+        known = ", ".join(numbers) or "none"
+        raise ParameterError(f"no notebook makes Figure {number[1]}: expected one of {known}")
+    raise ParameterError(f"unknown notebook {wanted!r}: {declared.nearest(wanted, names)}")
+
+
+def _number(name: str) -> str:
+    """Return the number of the figure of a notebook; empty if its name has none."""
+    number = re.match(r"fig0*(\d+)_", name)
+    return number[1] if number else ""
+
+
+def _given(asked: argparse.Namespace) -> dict[str, Any]:
+    """Return the parameters of the file and of the command line."""
+    if len(asked.f) > 1:
+        raise ParameterError(f"-f {' -f '.join(map(str, asked.f))}: expected one file")
+    from_file = declared.mapping(_text(asked.f[0]), str(asked.f[0])) if asked.f else {}
+    return from_file | declared.assignments(asked.p)
+
+
+def _text(file: Path) -> str:
+    """Return the content of a file of parameters."""
+    try:
+        if not stat.S_ISREG(file.stat().st_mode):
+            raise ParameterError(f"-f {file}: expected a regular file")
+        with file.open("rb") as stream:
+            content = stream.read(declared.LONGEST + 1)
+        if len(content) > declared.LONGEST:
+            raise ParameterError(f"-f {file}: expected at most {declared.LONGEST} bytes")
+        return content.decode()
+    except OSError as error:
+        raise ParameterError(f"-f {file}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ParameterError(f"-f {file}: expected text in UTF-8") from None
+
+
+def _folder(project: Project, asked: Path) -> Path:
+    """Return the folder for the results without symbolic links; its parent exists or is within _build."""
+    folder = Path(os.path.realpath(asked))  # Path.resolve fails in a circle of links
+    if not folder.is_relative_to(project.build.resolve()) and not folder.parent.is_dir():
+        raise ParameterError(f"--output {asked}: {folder.parent} is not a folder")
+    return folder
+
+
+def titles(project: Project) -> str:
+    """List the notebooks: number, name, title."""
+    lines = []
+    for path in project.sources():
+        notebook = read(path)
+        title = notebook.cells[_title_cell(notebook)].source.splitlines()[0].lstrip("# ")
+        lines.append([_number(path.stem), path.stem, title])
+    return table(["figure", "notebook", "title"], sorted(lines, key=lambda line: (not line[0], line[1])))
+
+
+def _title_cell(notebook: NotebookNode) -> int:
+    """Return the index of the cell that begins with the title."""
+    cells = enumerate(notebook.cells)
+    return next((i for i, cell in cells if cell.cell_type == "markdown" and cell.source.startswith("# ")), 0)
+
+
+def description(project: Project, name: str) -> str:
+    """List the parameters of a notebook."""
+    known = declared.parameters(read(project.source(name)))
+    rows = [
+        [key, one.kind, json.dumps(one.default), one.allowed, one.unit, one.meaning] for key, one in known.items()
+    ]
+    return f"{name}\n\n{table(['parameter', 'type', 'default', 'allowed', 'unit', 'meaning'], rows)}"
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    """Set rows in columns."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    lines = [header, ["-" * width for width in widths], *rows]
+    return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)
+
+
+def folder_name(name: str, changed: dict[str, Any]) -> str:
+    """Return a readable name for the results that is different for other parameters."""
+    if not changed:
+        return f"{name}-defaults"
+    values = "-".join(f"{key}={json.dumps(value)}" for key, value in changed.items())
+    readable = re.sub(r"[^\w.=,+-]+", "", values.replace(" ", ""), flags=re.ASCII)[:READABLE]
+    return f"{name}-{readable}-{sha256(json.dumps(changed, sort_keys=True).encode()).hexdigest()[:8]}"
+
+
+def read_result(folder: Path, name: str) -> dict[str, Any]:
+    """Return the record of an earlier result; empty if the folder does not exist or is empty.
+
+    Raises
+    ------
+    ParameterError
+        If the folder holds anything else: a run replaces the whole folder.
+    """
+    if not folder.exists():
+        return {}
+    if not folder.is_dir():
+        raise ParameterError(f"{folder} is not a folder")
+    files = {file.name for file in folder.glob("[!.]*")}
+    try:
+        earlier = json.loads((folder / RECORD).read_bytes()) if files else {}
+        if files and (earlier["made_by"], earlier["notebook"]) != (MAKER, name):
+            raise KeyError
+        foreign = files - {RECORD, *earlier.get("files", ())}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ParameterError(f"{folder} holds no result of {name}: name another folder") from None
+    if foreign:
+        raise ParameterError(f"{folder} holds other files, such as {min(foreign)}: move them first")
+    return earlier
+
+
+def is_current(earlier: dict[str, Any], folder: Path, key: str) -> bool:
+    """Return whether an earlier result has the same inputs, and is unchanged."""
+    try:
+        return earlier.get("key") == key and earlier["files"] == digests(folder, earlier["files"])
+    except (OSError, KeyError):
+        return False
+
+
+def digests(folder: Path, names: Any) -> dict[str, str]:
+    """Return the sha256 of files by name."""
+    return {name: sha256((folder / name).read_bytes()).hexdigest() for name in sorted(names)}
+
+
+def notice(changed: dict[str, Any], known: dict[str, Parameter]) -> NotebookNode:
+    """Return a cell that lists the parameters that are not the defaults."""
+    rows = [
+        f"| `{name}` | {_code(value)} | {_code(known[name].default)} "
+        f"| {plain(known[name].unit)} | {plain(known[name].meaning)} |"
+        for name, value in changed.items()
+    ]
+    text = [
+        "> **The parameters of this page are not those of the book.**",
+        "> Pictures, tables and numbers show this run. The text was written for the defaults:",
+        "> its statements about the results may not hold here.",
+        "",
+        "| parameter | here | default | unit | meaning |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    return new_markdown_cell("\n".join([*text, *rows]))
+
+
+def _code(value: Any) -> str:
+    """Return a value as code in a table, without the characters that end the code or the cell."""
+    return "`" + json.dumps(value).replace("`", r"\u0060").replace("|", r"\u007c") + "`"
+
+
+def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, Parameter], folder: Path) -> float:
+    """Run a notebook, and move all its results into a folder in one step.
+
+    Parameters
+    ----------
+    project : Project
+    name : str
+        The notebook.
+    changed : dict
+        Checked values that are not the defaults.
+    known : dict of Parameter
+        The parameters of the notebook.
+    folder : Path
+        Absent, or an earlier result, which is replaced.
+
+    Returns
+    -------
+    float
+        The time of the notebook in seconds.
+    """
+    within = project.build if folder.is_relative_to(project.build) else folder.parent
+    commit, changed_since = record.commit(project.root)
+    with scratch_folder(within, "rerunning-") as scratch:
+        if (free := shutil.disk_usage(scratch).free) < ROOM:
+            raise ParameterError(f"{within}: {free / 1e6:.0f} MB are free: expected at least {ROOM / 1e6:.0f} MB")
+        # Not at the top: these imports take seconds, and only a run needs them.
+        from . import page
+        from .execute import Run, execute
+
+        run, new = Run(project, name, scratch, changed), scratch / "new"
+        execute([run], lambda _: None)
+        notebook = run.notebook
+        if changed:
+            notebook.cells.insert(_title_cell(notebook) + 1, notice(changed, known))
+        notebook = normalise(notebook)
+        shutil.copytree(run.folder, new)
+        (new / f"{name}.ipynb").write_bytes(to_bytes(notebook))
+        html, warnings = page.page(project, name, notebook, run.files, scratch / "page")
+        (new / f"{name}.html").write_text(html, "utf-8")
+        parameters = {key: one.default for key, one in known.items()} | changed
+        about = {
+            "made_by": MAKER,
+            "made": datetime.now(UTC).isoformat(timespec="seconds"),
+            "notebook": name,
+            "command": command(name, changed),
+            "parameters": parameters,
+            "changed": changed,
+            "seed": parameters.get("seed"),
+            "versions": record.versions(),
+            "commit": commit,
+            "changed_since": changed_since,
+            "key": run.key,
+            "seconds": run.seconds,
+            "files": digests(new, [file.name for file in new.iterdir()]),
+        }
+        (new / RECORD).write_text(json.dumps(about, indent=2) + "\n", "utf-8")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        swap(new, folder, scratch / "earlier")
+    if warnings:
+        print(f"the page has gaps:\n{warnings}", file=sys.stderr)
+    return run.seconds
+
+
+def command(name: str, changed: dict[str, Any]) -> str:
+    """Return the command that repeats a run, from the root of a clone."""
+    values = [shlex.quote(f"{key}={json.dumps(value)}") for key, value in changed.items()]
+    return " ".join([COMMAND, name, *(f"-p {value}" for value in values)])

@@ -1,0 +1,102 @@
+"""Comparison of notebooks with a fresh run beyond that of nbval.
+
+``pytest --nbval notebooks`` executes all cells and compares text exactly. This file
+adds what nbval skips: pictures, metadata, and cells that were never run.
+"""
+
+import base64
+import io
+import os
+import re
+
+import numpy as np
+import pytest
+from matplotlib.testing.compare import calculate_rms
+from PIL import Image
+
+# Levels of 0 to 255. One changed digit of a label exceeds the rms of all pixels.
+# Processors with and without AVX-512 differ by up to 5 levels in a pixel.
+RMS, PIXEL = 0.5, 10
+PATH = 0.05  # of each number in a vector picture, SVG units
+
+NUMBER = re.compile(r"(?<![\w.#])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+EMBEDDED = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=\s]+)")
+NAME = re.compile(r'(?<=\bid=")[^"]+|(?<=href="#)[^"]+|(?<=url\(#)[^)]+')
+
+# Notebooks that run at the same time share the cores.
+workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+os.environ["LOKY_MAX_CPU_COUNT"] = str(max(1, os.cpu_count() // workers))
+for name in ("OMP", "OPENBLAS", "MKL"):
+    os.environ[f"{name}_NUM_THREADS"] = "1"
+
+
+def pytest_collectstart(collector):
+    """Exempt vector pictures from the exact comparison of nbval."""
+    if hasattr(collector, "skip_compare"):
+        collector.skip_compare = (*collector.skip_compare, "image/svg+xml")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """Compare the rest after nbval has executed a cell and compared its text."""
+    cell = getattr(item, "cell", None)
+    if cell is not None and cell.source.strip() and cell.execution_count is None:
+        pytest.fail("the cell was never run: it has no execution count")
+    yield
+    if cell is not None:
+        stored, fresh = (
+            [output for output in outputs if "data" in output]
+            for outputs in (cell.outputs, item.test_outputs)
+        )
+        if len(stored) != len(fresh):
+            pytest.fail(
+                f"{len(stored)} outputs stored, {len(fresh)} in the fresh run"
+            )
+        for old, new in zip(stored, fresh, strict=True):
+            if difference := compare(old, new):
+                pytest.fail(difference)
+
+
+def compare(old, new):
+    """Return how two outputs differ; None if they agree."""
+    if old.metadata != new.metadata:  # it holds the names of glued values
+        return f"{dict(old.metadata)} stored, {dict(new.metadata)} in the fresh run"
+    if old.data.keys() != new.data.keys():
+        return f"{list(old.data)} stored, {list(new.data)} in the fresh run"
+    if "image/svg+xml" in old.data:
+        return compare_svg(old.data["image/svg+xml"], new.data["image/svg+xml"])
+    if "image/png" in old.data:
+        return compare_png(old.data["image/png"], new.data["image/png"])
+    return None
+
+
+def compare_png(old, new):
+    """Return how two PNG files in base64 differ; None if they agree."""
+    files = (io.BytesIO(base64.b64decode(data)) for data in (old, new))
+    a, b = (np.asarray(Image.open(file).convert("RGBA"), float) for file in files)
+    if a.shape != b.shape:
+        return f"a picture of shape {a.shape} stored, {b.shape} in the fresh run"
+    rms, pixel = calculate_rms(a, b), abs(a - b).max()
+    if rms > RMS or pixel > PIXEL:
+        return f"pictures differ by {rms:.2f} rms, {pixel:.0f} in one pixel, of 255"
+    return None
+
+
+def compare_svg(old, new):
+    """Return how two SVG files differ; None if they agree within the tolerance."""
+    rasters = [EMBEDDED.findall(svg) for svg in (old, new)]
+    texts = [numbered(EMBEDDED.sub("", svg)) for svg in (old, new)]
+    if NUMBER.sub("", texts[0]) != NUMBER.sub("", texts[1]):
+        return "vector pictures differ by more than numbers"
+    for a, b in zip(*map(NUMBER.findall, texts), strict=True):
+        if abs(float(a) - float(b)) > PATH:
+            return f"{a} stored, {b} in the fresh run, in a vector picture"
+    return next(filter(None, map(compare_png, *rasters)), None)
+
+
+def numbered(svg):
+    """Return an SVG with numbers for names, which matplotlib derives from paths."""
+    names = {}
+    return NAME.sub(
+        lambda match: names.setdefault(match[0], f"name{len(names)}"), svg
+    )

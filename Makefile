@@ -37,10 +37,10 @@ help: ## list these commands
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
 
 book: $(READY) ## run the notebooks that changed and build the book in _build/html
-	@$(BIN)/python book/build.py book
+	@$(BIN)/python -m book._tools book
 
 pdf: $(READY) ## build the book and its PDF, _build/html/zwfs.pdf: needs Chromium
-	@$(BIN)/python book/build.py pdf
+	@$(BIN)/python -m book._tools pdf
 
 lab: $(READY) ## open the notebooks in JupyterLab
 	$(BIN)/jupyter lab notebooks
@@ -50,7 +50,7 @@ test: $(READY) ## test the package, the pipeline and the committed notebooks
 	$(BIN)/python -m pytest --nbval --nbval-current-env --nbval-cell-timeout 600 --numprocesses auto --dist loadfile notebooks
 
 figures: $(READY) ## replace the committed notebooks by freshly run ones
-	@$(BIN)/python book/build.py figures
+	@$(BIN)/python -m book._tools figures
 
 rerun: $(READY) ## run one notebook with other parameters: make rerun FIGURE=3 ARGS="-p rms_max=2.0"
 	@$(BIN)/python -m book._tools rerun "--line=$$RERUN"

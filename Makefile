@@ -1,4 +1,4 @@
-# Everything runs in .venv, which is set up from the lock when it is needed.
+# Every command runs in .venv, which is set up from the lock when needed.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,8 +7,8 @@ READY := $(VENV)/.ready
 UV := $(BIN)/uv --quiet
 UV_REQUIREMENT := uv==0.13.8
 
-# What the environment was set up for. In a folder that was moved, with another Python, or after a set-up that was
-# interrupted, this is not what $(READY) holds, and the environment is set up again.
+# The folder and the Python of the environment. The set-up writes them to $(READY) at its end. After an interruption,
+# a move of the folder or a change of Python they differ, and the set-up is repeated.
 IDENTITY := $(BIN)/python -I -c 'import sys; print(sys.prefix, *sys.version_info[:2])'
 ifneq ($(shell $(IDENTITY) 2>/dev/null | cmp -s - $(READY) && echo same),same)
 .PHONY: $(BIN)/uv
@@ -26,7 +26,7 @@ export OPENBLAS_NUM_THREADS = 1
 export MKL_NUM_THREADS = 1
 export VECLIB_MAXIMUM_THREADS = 1
 
-# Make expands no $ in these, and the shell sees no more than the name of a variable: only the command rerun reads them.
+# Neither make nor the shell expands these: only the command rerun reads them, from an environment variable.
 export RERUN := $(value FIGURE) $(value ARGS)
 unexport FIGURE ARGS
 
@@ -45,7 +45,7 @@ pdf: $(READY) ## build the book and its PDF, _build/html/zwfs.pdf: needs Chromiu
 lab: $(READY) ## open the notebooks in JupyterLab
 	$(BIN)/jupyter lab notebooks
 
-test: $(READY) ## test the package, the pipeline and the committed notebooks
+test: $(READY) ## test the package and the tools, and compare each notebook with a fresh run
 	$(BIN)/python -m pytest tests --benchmark-disable
 	$(BIN)/python -m pytest --nbval --nbval-current-env --nbval-cell-timeout 600 --numprocesses auto --dist loadfile notebooks
 
@@ -60,7 +60,7 @@ lint: $(READY) ## check style, formatting and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(READY) ## time the reconstructors, beside other packages too, for the performance page
+bench: $(READY) ## time the reconstructors, next to other packages, for the performance page
 	@mkdir -p _build
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only --benchmark-json=_build/measured.json
 	$(BIN)/python -m tests.benchmarks.report _build/measured.json
@@ -70,8 +70,8 @@ lock: $(BIN)/uv ## pin the newest allowed version of every dependency
 		--universal --python-version 3.11 --fork-strategy fewest --generate-hashes --no-emit-index-url \
 		--custom-compile-command "make lock" --output-file $(LOCK)
 
-# Everything else in _build belongs to the user, above all the results of make rerun.
-clean: ## remove what these commands made, but not the results of make rerun
+# Other files in _build belong to the user, above all the results of make rerun.
+clean: ## remove the results of these commands, except those of make rerun
 	rm -rf $(addprefix _build/,home html html.json jupyter_execute measured.json notebooks performance building-* running-* rerunning-*)
 	rm -rf build $(VENV) *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name _build -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -79,8 +79,8 @@ clean: ## remove what these commands made, but not the results of make rerun
 
 $(BIN)/uv:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-		{ echo "zwfs needs Python 3.11 or newer, and $(PYTHON) is not: $$($(PYTHON) --version 2>&1)." \
-		"Name another: make PYTHON=python3.12" >&2; exit 1; }
+		{ echo "zwfs needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) --version 2>&1)." \
+		"Choose another: make PYTHON=python3.12" >&2; exit 1; }
 	@echo "setting up $(VENV)"
 	@$(PYTHON) -m venv --clear $(VENV)
 	@$(BIN)/python -m pip --quiet --disable-pip-version-check install $(UV_REQUIREMENT)

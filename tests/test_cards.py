@@ -1,11 +1,11 @@
 """The cards under the figures, and their links."""
 
 import subprocess
-from html.parser import HTMLParser
 from pathlib import Path
 
 import nbformat
 import pytest
+from bs4 import BeautifulSoup
 
 from book._ext import cards
 from zwfs.companion.results import published
@@ -80,38 +80,6 @@ def test_the_commit_is_that_of_this_folder_alone(tmp_path):
     assert cards.commit(tmp_path / "within") == "not known"
 
 
-class Cards(HTMLParser):
-    """The cards of a page: the links in each, and what the folded part is called."""
-
-    def __init__(self, file):
-        super().__init__()
-        self.links, self.titles, self.depth, self.in_title = [], [], 0, False
-        self.feed(file.read_text("utf-8"))
-
-    def handle_starttag(self, tag, attrs):
-        attributes = dict(attrs)
-        if tag == "div":
-            if "run-card" in (attributes.get("class") or "").split():
-                self.links.append([])
-                self.depth = 1
-            elif self.depth:
-                self.depth += 1
-        if self.depth and tag == "a":
-            self.links[-1].append(attributes["href"])
-        if self.depth and tag == "summary":
-            self.titles.append("")
-            self.in_title = True
-
-    def handle_endtag(self, tag):
-        if tag == "div" and self.depth:
-            self.depth -= 1
-        self.in_title = self.in_title and tag != "summary"
-
-    def handle_data(self, data):
-        if self.in_title:
-            self.titles[-1] += data
-
-
 @pytest.mark.skipif(not HTML.is_dir(), reason="the book is not built: make book")
 def test_every_figure_has_a_card_whose_links_work():
     titles = []
@@ -119,11 +87,10 @@ def test_every_figure_has_a_card_whose_links_work():
         code = [cell.source for cell in nbformat.read(path, 4).cells if cell.cell_type == "code"]
         names = [name for source in code for name in published(source)]
         page = HTML / "notebooks" / f"{path.stem}.html"
-        found = Cards(page)
-        assert len(found.titles) == len(names), path.stem
-        titles += [title.strip() for title in found.titles]
-        for name, links in zip(names, found.links, strict=True):
-            files = [(page.parent / link).resolve() for link in links]
+        found = BeautifulSoup(page.read_text("utf-8"), "html.parser").select(".run-card")
+        for name, card in zip(names, found, strict=True):
+            titles.append(card.summary.get_text().strip())
+            files = [(page.parent / link["href"]).resolve() for link in card.select("a")]
             assert all(file.is_file() for file in files), name
             others = [f"{name}.{ending}" for ending in ("png", "pdf", "csv")]
             # A plain build has the notebooks as they are stored; only a run has the other files.

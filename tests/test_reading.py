@@ -119,19 +119,6 @@ def test_the_book_has_the_order_of_the_paper():
     assert committed <= set(pages)
 
 
-def test_every_page_says_what_comes_next():
-    parts = documents(yaml.safe_load((ROOT / "_toc.yml").read_text()))
-    pages = [page for chapters in parts.values() for page in chapters][:-1]
-    last = {}
-    for page in pages:
-        if page.startswith("book/"):
-            last[page] = (ROOT / f"{page}.md").read_text("utf-8").rstrip().rsplit("\n\n", 1)[-1]
-        else:
-            cells = nbformat.read(ROOT / f"{page}.ipynb", 4).cells
-            last[page] = cells[-1].source.rsplit("\n\n", 1)[-1] if cells[-1].cell_type == "markdown" else ""
-    assert not [page for page, text in last.items() if not re.match(r"Next: .*(\]\(|\{doc\})", text, re.DOTALL)]
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_cells_that_set_up_or_draw_are_folded_and_one_that_computes_is_not(path):
     cells = [cell for cell in nbformat.read(path, 4).cells if cell.cell_type == "code"]

@@ -1,4 +1,4 @@
-"""The API page: a directive that documents the public names of modules, and links in docstrings."""
+"""The API page: a directive for the public names of modules, and links in docstrings."""
 
 import importlib
 import inspect
@@ -22,7 +22,7 @@ from sphinx.util.nodes import make_refnode
 PACKAGE = "zwfs"
 PAGE = "book/api"
 KINDS = ("class", "data", "exception", "function")
-# The pages that number their equations as the paper does, in its order.
+# The pages with the equations of the paper, in its order.
 PAPER = ("sensor.md", "phase_shifted.md", "methods.md")
 
 NUMBERED = re.compile(r"(?<=Chambouleyron)[^;]*?equations?\s[^;.\n]*")
@@ -102,7 +102,7 @@ def path(module: ModuleType, name: str) -> str:
 
 @cache
 def paper_labels(folder: Path) -> list[str]:
-    """Return the labels of the paper's equations: the first is that of its equation (1)."""
+    """Return the labels of the paper's equations, from equation (1) on."""
     texts = ((folder / page).read_text("utf-8") for page in PAPER)
     return [label for text in texts for label in re.findall(r"^ *:label: (\S+)$", text, re.MULTILINE)]
 
@@ -137,12 +137,12 @@ def link_name(
     if len(named) == 1:
         [(full, entry)] = named.items()
         return make_refnode(app.builder, document, entry.docname, entry.node_id, contnode, full)
-    # A full path that leads nowhere is an error, and Sphinx says so.
+    # Sphinx reports a full path that leads nowhere.
     return None if target.startswith(f"{PACKAGE}.") else contnode
 
 
 def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
-    """Warn of public modules that the API page does not document."""
+    """Warn of public modules that are missing on the API page."""
     if PAGE in env.found_docs and (missing := set(modules()) - set(env.domains["py"].modules)):
         logger.warning("no directive names %s", ", ".join(sorted(missing)), location=PAGE)
 

@@ -1,4 +1,4 @@
-"""Finishing touches: pictures that keep their place, scripts that keep quiet, and what a link to a page shows."""
+"""Finish of the pages: sizes of pictures, descriptions for links, MathJax without the network, quiet scripts."""
 
 import importlib.util
 import os
@@ -17,10 +17,10 @@ from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.util.fileutil import copy_asset_file
 
-# Names the PDF to link from the front page, if one will be printed.
-PDF = "ZWFS_PDF"
+from book._tools.project import PDF
+
 CARD = "_static/social.png"
-CARD_SIZE = (1200, 630)  # pixels, the shape that social networks show
+CARD_SIZE = (1200, 630)  # pixels, as social networks expect
 CARD_ALT = "The logo and the title of the book above its Figure 3: error against input of five reconstructors."
 LENGTH = 200  # characters of a description
 MATH = {"lambda": "λ", "theta": "θ", "pi": "π", "pm": "±"}
@@ -32,12 +32,12 @@ FORWARD = """<!DOCTYPE html>
 {tags}</head>
 <body><main><h1><a href="{address}">{title}</a></h1></main></body></html>
 """
-# A page from the file system cannot fetch others, not even to show what a search found in them.
+# Browsers block pages from the file system from reading other files, so a search cannot show summaries there.
 SUMMARY = ("else if (showSearchSummary)", 'else if (showSearchSummary && location.protocol !== "file:")')
 
 
 def add_substitutions(app: Sphinx, config: Config) -> None:
-    """Define ``{{ pdf_link }}``: empty if no PDF will be printed."""
+    """Define ``{{ pdf_link }}``: empty if the book gets no PDF."""
     name = os.environ.get(PDF)
     link = f'<p class="d-print-none"><a href="../{name}">The whole book as one PDF</a>, to print or to keep.</p>'
     config.myst_substitutions = config.myst_substitutions | {"pdf_link": link if name else ""}
@@ -46,8 +46,8 @@ def add_substitutions(app: Sphinx, config: Config) -> None:
 def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: nodes.document) -> None:
     """Finish the body of a page, and describe the page in its head.
 
-    Every picture gets its width and height, so that nothing moves when it arrives. A figure can be opened alone,
-    and scrolls where the page is narrower than its labels need.
+    Each picture gets its size, so that the text does not move when the picture arrives. Each figure links to its
+    file, and scrolls on narrow screens.
     """
     body = BeautifulSoup(context.get("body", ""), "html.parser")
     pictures = {name: Path(app.srcdir, source) for source, name in app.builder.images.items()}
@@ -61,23 +61,12 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
         entry["role"] = "listitem"  # the role of Sphinx is deprecated: a list has items
     context["body"] = str(body)
     if app.config.html_baseurl:
-        context["metatags"] = context.get("metatags", "") + tags(
-            app.config, page, body, context.get("metatags", "")
-        )
+        given = context.get("metatags", "")
+        context["metatags"] = given + tags(app.config, page, body, given)
 
 
 def tags(config: Config, page: str, body: BeautifulSoup, given: str) -> str:
-    """Return the tags that describe a page to search engines and to readers who get a link to it.
-
-    Parameters
-    ----------
-    config : Config
-    page : str
-        The name of the page.
-    body : BeautifulSoup
-    given : str
-        The tags that the page has; a description in them is kept.
-    """
+    """Return the tags for search engines and social networks; a description in the `given` tags is kept."""
     own = BeautifulSoup(given, "html.parser").find("meta", attrs={"name": "description"})
     first = body.select_one("section > p")
     text = own["content"] if own else plain(first) if first else ""
@@ -104,7 +93,7 @@ def tags(config: Config, page: str, body: BeautifulSoup, given: str) -> str:
 
 
 def plain(tag: Tag) -> str:
-    """Return the text of a heading or paragraph without the link to itself, shortened."""
+    """Return the text of a heading or paragraph, shortened, without its permalink."""
     words = "".join(part for part in tag.strings if "headerlink" not in part.parent.get("class", ()))
     words = TEX.sub(lambda found: MATH.get(found[1], found[1] or ""), words)
     return textwrap.shorten(words, LENGTH, placeholder=" …")
@@ -122,7 +111,7 @@ def size(picture: Path) -> tuple[int, int]:
 
 
 def finish_files(app: Sphinx, exception: Exception | None) -> None:
-    """Finish the folder of the pages: MathJax, the social card, quiet scripts, and the page that forwards."""
+    """Add MathJax, the social card and the index page, and silence the scripts."""
     if exception is not None or app.builder.format != "html":
         return
     html, sources = Path(app.outdir), Path(app.srcdir, "book", "_static")
@@ -135,7 +124,7 @@ def finish_files(app: Sphinx, exception: Exception | None) -> None:
 
 
 def forward(html: Path, front: str) -> None:
-    """Write the page that the address of the book shows: it describes the front page and forwards to it."""
+    """Write index.html, which describes the front page and forwards to it."""
     head = BeautifulSoup((html / front).read_text("utf-8"), "html.parser").head
     kept = head.select("meta[property^='og:'], meta[name='description'], meta[name^='twitter:']")
     described = "".join(str(tag).replace(f"/{front}", "/index.html") for tag in kept)
@@ -145,7 +134,7 @@ def forward(html: Path, front: str) -> None:
 
 
 def copy_mathjax(folder: Path) -> None:
-    """Copy the part of MathJax that a page loads, so that mathematics needs no network."""
+    """Copy the part of MathJax that pages load: mathematics needs no network."""
     package = Path(importlib.util.find_spec("sphinx-mathjax-offline").origin).parent / "static" / "mathjax"
     for file in (package / "tex-chtml-full.js", *(package / "output" / "chtml" / "fonts").rglob("*.woff")):
         target = folder / file.relative_to(package)
@@ -154,7 +143,7 @@ def copy_mathjax(folder: Path) -> None:
 
 
 def draw_card(card: Path, logo: Path, figure: Path, title: str) -> None:
-    """Draw the picture that goes with a link to the book: logo and title above a figure."""
+    """Draw the social card: logo and title above a figure."""
     width, height = CARD_SIZE
     drawing = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor="white")
     for picture, (left, bottom, wide, high) in ((logo, (40, 500, 100, 100)), (figure, (40, 20, 1120, 450))):
@@ -166,7 +155,7 @@ def draw_card(card: Path, logo: Path, figure: Path, title: str) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Finish each page, and in the end their folder."""
+    """Finish each page, and their folder at the end."""
     app.connect("config-inited", add_substitutions)
     app.connect("html-page-context", finish_page)
     # Before the extension that would write another index.html.

@@ -21,13 +21,13 @@ N_PIXELS = 64
 N_MODES = 200
 N_SEEDS = 50
 DIAMETERS = (0.5, 3.0)  # lambda/D
-# The dimple's core is an entire function of its diameter: 14 samples of it give all others to 1e-7.
+# The core of a dimple is an entire function of the diameter: 14 samples interpolate it to 1e-7.
 N_DIAMETERS = 14
-TOLERANCE = 1e-7  # of the reference waves; single precision, in which they are handed over, is not much finer
+TOLERANCE = 1e-7  # of the reference waves, which are stored in single precision
 
 
 def script() -> str:
-    """Return a script that defines the data: a page from the file system cannot fetch a file."""
+    """Return a script that defines the data: browsers block pages from the file system from reading data files."""
     return f"window.zwfsLiveData = {json.dumps(data())};\n"
 
 
@@ -52,8 +52,8 @@ def data() -> dict[str, Any]:
 def dimples(pupil: zwfs.Pupil) -> tuple[NDArray, Factors]:
     """Return Chebyshev points in the range of diameters, and the factors of dark dimples of these diameters.
 
-    A dark dimple takes away the light that goes through it: its reference wave is minus that light, and its core
-    minus the core of the kernel without the factor exp(i theta) - 1. It is real.
+    A dark dimple blocks its light: its reference wave is minus that light. Its core is real: minus the core of the
+    kernel without the factor exp(i theta) - 1.
     """
     low, high = DIAMETERS
     angles = np.pi * (np.arange(N_DIAMETERS) + 0.5) / N_DIAMETERS
@@ -65,8 +65,8 @@ def dimples(pupil: zwfs.Pupil) -> tuple[NDArray, Factors]:
 def screens(pupil: zwfs.Pupil) -> Plane:
     """Return the screens of the seeds from 1 on, unit rms, as combinations of products of Legendre polynomials.
 
-    Zernike modes are polynomials in x and y, whose degree is at most the radial order of the last mode. In the
-    corners of the square, where there is no pupil, they are huge: the coefficients need double precision.
+    Zernike modes are polynomials in x and y of a degree up to the radial order of the last mode. They are huge in
+    the corners of the square outside the pupil: the coefficients need double precision.
     """
     degree = zwfs.noll_to_nm(N_MODES + 1)[0]
     modes = zwfs.zernike_basis(pupil, N_MODES)

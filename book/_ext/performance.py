@@ -14,10 +14,10 @@ from sphinx.config import Config
 from zwfs import plots
 from zwfs._files import write_file
 
-MEASURED = "book/performance.json"
+MEASURED = "book/_ext/performance.json"
 PICTURES = "_build/performance"
 ACCURATE = 1.05e-4  # largest error of the second comparison, 1e-4 when rounded
-# Tol's muted colours: those of the methods stand for methods only.
+# Tol's muted colours; the colours of the figures stand for methods only.
 PACKAGES = {
     "zwfs": ("#332288", "v"),
     "HCIPy": ("#CC6677", "o"),
@@ -52,19 +52,6 @@ def add_substitutions(app: Sphinx, config: Config) -> None:
             write_file(Path(app.srcdir, PICTURES, f"{name}.png"), stream.getvalue())
 
 
-def tables(speed: dict[str, Any]) -> dict[str, str]:
-    """Return the tables and sentences on speed, by name."""
-    return {
-        "rates": rates(speed),
-        "parts": parts(speed["breakdown"]["100"]),
-        "batches": batches(speed["batches"]),
-        "methods": methods(speed["others"]),
-        "loop": loop(speed["loop step"]),
-        "limit": limit(speed["limit"]),
-        "growth": growth(speed),
-    }
-
-
 def table(header: list[str], rows: Iterable[Iterable[str]]) -> str:
     """Return a table in Markdown; all columns but the first are aligned to the right."""
     lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
@@ -72,29 +59,48 @@ def table(header: list[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def peers(task: str, rows: list[dict[str, Any]]) -> str:
-    """Return a table of the packages at one task, see `chosen`."""
-    return table(
-        ["package and setting", "time (zwfs\u00a0=\u00a01)", ERRORS.get(task, PHASE)],
-        (
-            [
-                f"{row['package']}, {row['setting']}{' (its own)' if row['default'] else ''}",
-                f"{row['ratio']:.3g}",
-                power(row["error"]),
-            ]
-            for row in chosen(rows)
-        ),
-    )
-
-
-def chosen(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Select of each package its own setting, and its fastest setting that is accurate enough."""
-    picked = []
+    """Return a table of each package with its own setting, and with its fastest accurate setting."""
+    lines = []
     for package in dict.fromkeys(row["package"] for row in rows):
         mine = [row for row in rows if row["package"] == package]
         accurate = [row for row in mine if row["error"] <= ACCURATE]
         quickest = min(accurate, key=lambda row: row["ratio"], default=None)
-        picked += [row for row in mine if row["default"] or row is quickest]
-    return picked
+        for row in mine:
+            if row["default"] or row is quickest:
+                setting = f"{package}, {row['setting']}{' (its own)' if row['default'] else ''}"
+                lines.append([setting, f"{row['ratio']:.3g}", power(row["error"])])
+    return table(["package and setting", "time (zwfs\u00a0=\u00a01)", ERRORS.get(task, PHASE)], lines)
+
+
+def tables(speed: dict[str, Any]) -> dict[str, str]:
+    """Return the tables and sentences on speed, by name."""
+    limit, batches = speed["limit"], speed["batches"]
+    return {
+        "rates": rates(speed),
+        "parts": table(
+            ["part", "time (μs)"],
+            ([name, f"{1e6 * time:.0f}"] for name, time in speed["breakdown"]["100"].items()),
+        ),
+        "batches": table(
+            ["frame pairs in a call", "time of each (ms)", "memory without frames and results (MB)"],
+            (
+                [str(row["n_frames"]), f"{1e3 * row['time per frame']:.2f}", f"{row['memory'] / 1e6:.1f}"]
+                for row in batches
+            ),
+        ),
+        "methods": table(
+            ["method", "time (ms)"], ([name, f"{1e3 * time:.2g}"] for name, time in speed["others"].items())
+        ),
+        "loop": table(
+            ["reconstructor", "time of a step (ms)"],
+            ([name, f"{1e3 * time:.2g}"] for name, time in speed["loop step"].items()),
+        ),
+        "limit": table(
+            ["part", "time (μs)", "share"],
+            ([name, f"{1e6 * t:.0f}", f"{t / limit['the whole call']:.0%}"] for name, t in limit.items()),
+        ),
+        "growth": growth(speed),
+    }
 
 
 def rates(speed: dict[str, Any]) -> str:
@@ -110,58 +116,22 @@ def rates(speed: dict[str, Any]) -> str:
         for row in speed["real time"]
         if row["accelerate"] or (row["n_pixels"], row["dtype"]) == (100, "float32")
     ]
-    rows += [
-        [
-            f"{row['n_pixels']} pixels, float32, 1 iteration from the phase before",
-            f"{row['rate']:.0f}",
-            power(row["median error"]),
-            "",
-        ]
-        for row in speed["closed loop"]
-    ]
+    for row in speed["closed loop"]:
+        setting = f"{row['n_pixels']} pixels, float32, 1 iteration from the phase before"
+        rows.append([setting, f"{row['rate']:.0f}", power(row["median error"]), ""])
     return table(["setting", "rate (1/s)", "median error (rad)", "largest error (rad)"], rows)
-
-
-def parts(times: dict[str, float]) -> str:
-    """Return a table of the parts of a call and their times."""
-    return table(["part", "time (μs)"], ([name, f"{1e6 * time:.0f}"] for name, time in times.items()))
-
-
-def batches(rows: list[dict[str, Any]]) -> str:
-    """Return a table of the time and memory of batches."""
-    return table(
-        ["frame pairs in a call", "time of each (ms)", "memory beside frames and results (MB)"],
-        ([str(r["n_frames"]), f"{1e3 * r['time per frame']:.2f}", f"{r['memory'] / 1e6:.1f}"] for r in rows),
-    )
-
-
-def methods(times: dict[str, float]) -> str:
-    """Return a table of the time of each method on one screen."""
-    return table(["method", "time (ms)"], ([name, f"{1e3 * time:.2g}"] for name, time in times.items()))
-
-
-def loop(times: dict[str, float]) -> str:
-    """Return a table of the time of a step of the closed loop."""
-    return table(["reconstructor", "time of a step (ms)"], ([name, f"{1e3 * t:.2g}"] for name, t in times.items()))
-
-
-def limit(times: dict[str, float]) -> str:
-    """Return a table of the time of a reconstruction and of the products and passes that it needs."""
-    return table(
-        ["what", "time (μs)", "share"],
-        ([name, f"{1e6 * time:.0f}", f"{time / times['the whole call']:.0%}"] for name, time in times.items()),
-    )
 
 
 def growth(speed: dict[str, Any]) -> str:
     """Return sentences on the set-up and on the growth of time with the number of pixels."""
     made, slope = speed["set-up"], speed["slope"]
     return (
-        f"Time grows with the number of pixels to the power of {slope['slope from 128 on']:.2f} from 128 pixels "
-        f"across on ({slope['slope']:.2f} over all sizes, as in small ones the cost of a call shows). To set up a "
-        f"sensor takes {1e3 * made['100 pixels']:.0f} ms at 100 pixels across and {made['1000 pixels']:.2f} s at "
-        f"1000, or {made['1000 pixels, pupil and reconstructor included']:.1f} s with its pupil and a "
-        f"reconstructor; the process then has taken {made['peak memory'] / 1e6:.0f} MB.\n"
+        f"From 128 pixels across on, the time grows with the number of pixels to the power of "
+        f"{slope['slope from 128 on']:.2f}. Over all sizes the power is {slope['slope']:.2f}: the fixed cost of a "
+        f"call dominates at few pixels. The set-up of a sensor takes {1e3 * made['100 pixels']:.0f} ms at 100 "
+        f"pixels across and {made['1000 pixels']:.2f} s at 1000. With its pupil and a reconstructor, the set-up at 1000 "
+        f"pixels takes {made['1000 pixels, pupil and reconstructor included']:.1f} s and "
+        f"{made['peak memory'] / 1e6:.0f} MB of memory.\n"
     )
 
 
@@ -193,7 +163,7 @@ def time_against_pixels(slope: dict[str, Any]) -> Figure:
     pixels, times = slope["n_pixels"], [1e3 * time for time in slope["times"]]
     axes.loglog(pixels, times, "v-", color=PACKAGES["zwfs"][0], label="measured")
     proportion = [times[-1] * (n / pixels[-1]) ** 2 for n in pixels]
-    axes.loglog(pixels, proportion, "--", color="#777777", label="in proportion to the number of pixels")
+    axes.loglog(pixels, proportion, "--", color="#777777", label="proportional to the number of pixels")
     axes.set(xlabel="pixels across the pupil", ylabel="time (ms)")
     axes.set_xticks(pixels, map(str, pixels))
     axes.minorticks_off()

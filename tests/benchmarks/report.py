@@ -1,6 +1,6 @@
 """Numbers of the book from what pytest-benchmark measured: python -m tests.benchmarks.report MEASURED.json.
 
-It also runs `tests.benchmarks.speed`, and writes both to book/performance.json, from which the page is made.
+It also runs `tests.benchmarks.speed`, and writes both to book/_ext/performance.json, from which the page is made.
 
 The shortest time of each contestant is divided by that of zwfs with its own settings at the same task, so that
 what is kept depends little on the machine.
@@ -15,7 +15,7 @@ from zwfs._files import write_file
 
 from . import speed
 
-KEPT = Path(__file__).parents[2] / "book" / "performance.json"
+KEPT = Path(__file__).parents[2] / "book" / "_ext" / "performance.json"
 
 
 def digits(value, n):

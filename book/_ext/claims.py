@@ -301,7 +301,8 @@ def pairs(n: Numbers) -> Finding:
     """A pair works if the error of the iteration is below a thousandth of a radian."""
     measured = (
         f"of {n.n_allowed + n.n_singular:.0f} pairs {n.n_singular:.0f} are refused, those with equal shifts or "
-        f"with a shift of 0; the error of all others is at most {below(n.error_max_allowed_pairs)} rad at 0.5 rad rms"
+        f"with a shift of 0; the error of all others is at most {below(n.error_max_allowed_pairs)} rad at 0.5 "
+        "rad rms"
     )
     return first(
         measured,

@@ -125,13 +125,13 @@ def rates(speed: dict[str, Any]) -> str:
 def growth(speed: dict[str, Any]) -> str:
     """Return sentences on the set-up and on the growth of time with the number of pixels."""
     made, slope = speed["set-up"], speed["slope"]
+    complete = made["1000 pixels, pupil and reconstructor included"]
     return (
         f"From 128 pixels across on, the time grows with the number of pixels to the power of "
         f"{slope['slope from 128 on']:.2f}. Over all sizes the power is {slope['slope']:.2f}: the fixed cost of a "
         f"call dominates at few pixels. The set-up of a sensor takes {1e3 * made['100 pixels']:.0f} ms at 100 "
-        f"pixels across and {made['1000 pixels']:.2f} s at 1000. With its pupil and a reconstructor, the set-up at 1000 "
-        f"pixels takes {made['1000 pixels, pupil and reconstructor included']:.1f} s and "
-        f"{made['peak memory'] / 1e6:.0f} MB of memory.\n"
+        f"pixels across and {made['1000 pixels']:.2f} s at 1000. With its pupil and a reconstructor, the set-up "
+        f"at 1000 pixels takes {complete:.1f} s and {made['peak memory'] / 1e6:.0f} MB of memory.\n"
     )
 
 

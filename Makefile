@@ -46,8 +46,9 @@ lab: $(READY) ## open the notebooks in JupyterLab
 	$(BIN)/jupyter lab notebooks
 
 test: $(READY) ## test the package and the tools, and compare each notebook with a fresh run
-	$(BIN)/python -m pytest tests --benchmark-disable
-	$(BIN)/python -m pytest --nbval --nbval-current-env --nbval-cell-timeout 600 --numprocesses auto --dist loadfile notebooks
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --benchmark-disable tests
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --nbval --nbval-current-env \
+		--nbval-cell-timeout 600 notebooks
 
 figures: $(READY) ## replace the committed notebooks by freshly run ones
 	@$(BIN)/python -m book._tools figures

@@ -215,7 +215,7 @@ def test_a_cluster_that_loses_workers_gives_the_full_result(cluster, all_of_them
         lost.update(pids if all_of_them else {int(began(tmp_path)[-1][1])})
         for pid in lost:
             os.kill(pid, signal.SIGKILL)
-        # New workers join, as on a cluster with a queue: on a busy machine a nanny may fail to start a worker again.
+        # New workers join: on a busy machine a nanny may fail to start its worker again.
         cluster.cluster.scale(2 + len(lost))
         done_by_now.append(len(began(tmp_path)))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from zwfs._files import write_file
-from zwfs.companion.results import FOLDER, publish
+from zwfs.companion.results import FOLDER, glue_numbers, publish
 
 matplotlib.use("agg")
 
@@ -113,3 +113,11 @@ def test_bad_arguments_are_refused(figure, monkeypatch, name, columns, error, me
     monkeypatch.delenv(FOLDER, raising=False)
     with pytest.raises(error, match=message):
         publish(figure, name, columns)
+
+
+def test_numbers_are_glued_rounded_and_strings_as_they_are(monkeypatch):
+    glued = {}
+    monkeypatch.setattr("myst_nb.glue", lambda name, value, display: glued.update({name: value}))
+    glue_numbers({"error": np.float64(0.123456), "limit": np.inf, "where": "never"})
+    glue_numbers({"ratio": 3210.123}, ".2g")
+    assert glued == {"error": 0.1235, "limit": np.inf, "where": "never", "ratio": 3200}

@@ -2,7 +2,7 @@ import pytest
 from bs4 import BeautifulSoup
 from markdown_it import MarkdownIt
 
-from zwfs.companion.tables import Table
+from zwfs.companion.tables import Table, small
 
 
 def test_few_digits_are_shown_and_truths_in_words():
@@ -48,3 +48,10 @@ def test_strings_are_shown_as_they_are():
 
 def test_string_of_several_lines_stays_in_its_cell():
     assert Table(["a"], [["b\n\n# c\x1b"]])._repr_markdown_().splitlines()[2:] == ["| b\\\\n\\\\n\\# c\\\\x1b |"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.12345, "0.12"), (1e-6, "1e-06"), (9.9e-7, "<10⁻⁶"), (0.0, "<10⁻⁶")]
+)
+def test_rounding_errors_are_shown_as_a_bound(value, text):
+    assert small(value) == text

@@ -66,6 +66,22 @@ def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike], *, dpi:
             write_file(Path(folder) / f"{name}.{kind}", content)
 
 
+def glue_numbers(numbers: Mapping[str, float | str], form: str = ".4f") -> None:
+    """Store numbers in the output of a notebook's cell, under names by which pages of the book show them.
+
+    Parameters
+    ----------
+    numbers : mapping of str to float or str
+        A string is stored as it is.
+    form : str
+        Format that rounds the numbers, so that they are the same on every machine.
+    """
+    from myst_nb import glue
+
+    for name, value in numbers.items():
+        glue(name, value if isinstance(value, str) else float(f"{float(value):{form}}"), display=False)
+
+
 def published(source: str) -> list[str]:
     """Return the names under which code publishes figures.
 

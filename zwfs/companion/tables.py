@@ -58,6 +58,11 @@ class Table:
         return f"{cell:.{self.digits}g}" if isinstance(cell, float) else plain(str(cell))
 
 
+def small(value: float) -> str:
+    """Return a number with two significant digits, or a bound below which digits are rounding errors."""
+    return "<10⁻⁶" if value < 1e-6 else f"{value:.2g}"
+
+
 def plain(text: str) -> str:
     """Return Markdown that shows a text as it is: one line, in which nothing is a link, a command or HTML."""
     _check.instance("text", text, str)

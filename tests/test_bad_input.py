@@ -28,14 +28,21 @@ MODULES = (
     *("pupil", "modes", "masks", "sensor", "detector", "metrics", "reconstructors", "reconstructors.base"),
     *("bench.model", "bench.segments", "bench.recording"),
     *("frames.files", "frames.registration", "frames.pipeline"),
-    *("paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
+    *("paper.curves", "paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
     *("paper.bench_linearity", "paper.closed_loop"),
     *("companion.sweeps", "companion.results", "companion.tables"),
 )
 
 # Results that may be infinite: the limit lies beyond what was sampled, or the noise diverges.
 INFINITE = {"dynamic_range", "LinearityCurves.dynamic_range", "BenchCurves.dynamic_range", "crossing"}
-INFINITE |= {"DiameterCurve.leaves", "phase_noise", "Detector.full_well", "Detector"}
+INFINITE |= {
+    "ErrorCurves.dynamic_range",
+    "DiameterCurves.dynamic_range",
+    "DiameterCurves.exceeds",
+    "phase_noise",
+    "Detector.full_well",
+    "Detector",
+}
 
 # Hooks of the base classes of reconstructors, and the checks of what they get.
 INTERNAL = {"Settings", "Solution", "State", "Estimate", "model", "solve", "invert", "begin", "step", "constants"}
@@ -52,6 +59,7 @@ CONTENT = {
 }
 SLOW = {"error_budget", "steps", "fit"}  # their answers are not compared, only what they must refuse
 INTERNAL |= {"resample", "fits_module", "fits_bytes", "published"}
+INTERNAL |= {"small", "glue_numbers"}  # for the notebooks of the book
 
 
 @cache
@@ -304,7 +312,13 @@ def valid() -> dict:
         "LinearityCurves": curve,
         "FrozenFlow": flow,
         "LoopRun": closed_loop.close_loop(method, modes, flow, 2),
-        "DiameterCurve": dimple_diameter.DiameterCurve(np.array([1.0, 2.0]), np.array([[0.01], [0.1]])),
+        "ErrorCurves": curve,
+        "DiameterCurves": dimple_diameter.DiameterCurves(
+            np.array([0.5, 0.6]), {"shifted": np.array([[0.01], [0.1]])}, np.array([1.0, 2.0])
+        ),
+        "Contraction": dimple_diameter.contraction(
+            pupil, zwfs.zernike_basis(pupil, 149), [1.0], phase[np.newaxis], 0.01 * phase
+        ),
         "DimpleLight": dimple_diameter.DimpleLight(pupil, 1.06),
         "PairMaps": phase_shifts.pair_maps(pupil, 1.06, [1.5, -1.5], phase[np.newaxis], 2),
         "CameraFile": file,

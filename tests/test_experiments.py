@@ -2,9 +2,27 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from joblib import parallel_config
 
-from zwfs import Linear, PhaseShifted, dynamic_range, reconstruction_error
-from zwfs.paper.linearity import convergence, linearity_curves, screens_at
+from zwfs import (
+    Dimple,
+    GerchbergSaxton,
+    Linear,
+    PhaseShifted,
+    ZernikeSensor,
+    dynamic_range,
+    reconstruction_error,
+)
+from zwfs.paper.linearity import (
+    count_work,
+    iteration_errors,
+    linearity_curves,
+    model_accuracy,
+    offset_by_width,
+    own_reconstructor,
+    paper_reconstructors,
+    screens_at,
+)
 
 RMS = (0.05, 0.3, 0.6)
 
@@ -74,8 +92,8 @@ def test_recovered_is_the_share_of_good_screens(curves):
     assert curves.recovered("linear", middle)[0] == 0.5
 
 
-def test_convergence_goes_from_the_input_to_the_result(methods, modes, pupil, shifted):
-    error = convergence(methods["shifted"], modes, 0.3, 2, seed=7)
+def test_errors_of_iterations_go_from_the_input_to_the_result(methods, modes, pupil, shifted):
+    error = iteration_errors(methods["shifted"], modes, 0.3, 2, seed=7)
     assert error.shape == (2, 26)
     np.testing.assert_allclose(error[:, 0], 0.3, rtol=1e-3)
     screens = screens_at(modes, 0.3, 2, seed=7, task=0)
@@ -119,3 +137,95 @@ def test_a_reconstructor_of_a_reader_stands_next_to_the_others(classic, modes):
     curves = linearity_curves(methods, modes, np.array([0.0, 0.01]), 2)
     assert curves.mean("FirstOrder")[0] < 1e-12
     assert curves.mean("Linear")[1] < curves.mean("FirstOrder")[1] < 0.01
+
+
+OWN = """
+import numpy as np
+from types import SimpleNamespace
+
+
+class Nothing:
+    n_masks = 1
+
+    def __init__(self, sensor):
+        self.sensor = sensor
+
+    def __call__(self, frames):
+        phase = np.zeros((*frames.shape[:-3], *self.sensor.pupil.shape))
+        return SimpleNamespace(phase=phase, converged=np.ones(phase.shape[:-2], bool))
+
+
+class NothingOfTwo(Nothing):
+    n_masks = 2
+
+
+class Linear(Nothing):
+    pass
+"""
+
+
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
+    (tmp_path / "own_methods.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    return "own_methods"
+
+
+def test_an_own_reconstructor_gets_the_sensor_with_its_number_of_masks(own_module, pupil, modes):
+    methods = paper_reconstructors(pupil, modes, 1.06, np.pi / 2)
+    [(name, own)] = own_reconstructor(f"{own_module}:Nothing", methods).items()
+    assert (name, own.sensor.n_masks) == ("Nothing", 1)
+    assert own_reconstructor(f"{own_module}:NothingOfTwo", methods)["NothingOfTwo"].sensor.n_masks == 2
+    assert own_reconstructor("", methods) == {}
+    with parallel_config(n_jobs=1):  # other workers may have started before the module was there
+        curves = linearity_curves({name: own}, modes, [0.1, 0.2], 2)
+    np.testing.assert_allclose(curves.mean(name), [0.1, 0.2], rtol=1e-3)
+    with pytest.raises(ValueError, match="path = 'own_methods:Linear': expected a name other than Linear"):
+        own_reconstructor(f"{own_module}:Linear", methods)
+
+
+def test_paper_reconstructors_take_masks_and_settings(pupil, modes):
+    methods = paper_reconstructors(pupil, modes, 1.06, np.pi / 2, extent=1.5, n_iterations=7)
+    assert {name: method.sensor.n_masks for name, method in methods.items()} == {
+        "Linear": 1,
+        "Arcsine": 1,
+        "GerchbergSaxton": 2,
+        "GradientDescent": 2,
+        "GradientDescentPoints": 2,
+        "PhaseShifted": 2,
+    }
+    assert methods["GerchbergSaxton"].sensor.extent == pytest.approx(1.5, abs=0.1)
+    assert methods["Arcsine"].settings.n_iterations == 7
+
+
+def test_a_wider_detector_loses_less_light_and_has_a_smaller_offset(pupil, modes, shifted):
+    wide = GerchbergSaxton(ZernikeSensor(pupil, *shifted.masks, extent=2))
+    extents, lost, offset = offset_by_width(wide, modes, [2.0, 4.0], 2).T
+    np.testing.assert_allclose(extents, [2, 4])
+    assert 0 < lost[1] < lost[0] < 0.2
+    assert 0 < offset[1] < offset[0] < 0.1
+
+
+def test_work_is_counted(methods, modes, shifted):
+    screen = screens_at(modes, 0.3, 1, seed=7, task=0)[0]
+    passes, fourier = count_work({**methods, "endless": PhaseShifted(shifted, tolerance=0.0)}, screen)
+    assert passes["linear"] == 0
+    assert 0 < passes["shifted"] < passes["endless"]
+    assert not fourier
+    assert count_work({"fft": Transforming(shifted)}, screen)[1]
+
+
+class Transforming(PhaseShifted):
+    """Reconstructor that calls a function for Fourier transforms."""
+
+    def __call__(self, frames):
+        np.fft.fft(np.ones(4))
+        return super().__call__(frames)
+
+
+def test_model_is_as_accurate_as_its_tolerance(pupil, screens):
+    rows = model_accuracy(pupil, Dimple(1.06, np.pi / 2), screens(0.5, 1)[0], [1e-2, 1e-6, 1e-10])
+    for tolerance, _, error in rows:
+        assert error < tolerance
+    ranks = [rank for _, rank, _ in rows]
+    assert ranks == sorted(set(ranks))

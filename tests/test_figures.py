@@ -15,7 +15,7 @@ from zwfs.bench.model import Bench
 from zwfs.frames.pipeline import Found, Measurement, Optics, Step
 from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.paper.closed_loop import LoopRun
-from zwfs.paper.dimple_diameter import DiameterCurve
+from zwfs.paper.dimple_diameter import Contraction, DiameterCurves
 from zwfs.paper.linearity import linearity_curves
 from zwfs.paper.phase_shifts import PairMaps
 
@@ -63,7 +63,9 @@ def drawn_methods(curves, pupil, classic, shifted):
     phase = np.where(pupil.inside, np.add.outer(pupil.y, pupil.x), np.nan)
     frames = np.ones((2, *pupil.shape))
     pistons = np.linspace(-1, 1, 24).reshape(2, 3, 4)
-    trial = DiameterCurve(three, np.full((3, 3), 0.1))
+    trial = DiameterCurves(np.full(3, 0.5), dict.fromkeys(plots.LOOKS, np.full((3, 3), 0.1)), three)
+    lines = {f"curve {i}": three for i in range(4)}
+    reasons = Contraction(three, three, np.full((3, 2), 0.5), {1.0: 0.5}, lines)
     bench_curves = BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(two, 0.1 * pistons))
     loop = LoopRun(three, *np.full((3, 2, 3), 0.1))
     bad = np.zeros(frames.shape, bool)
@@ -72,22 +74,18 @@ def drawn_methods(curves, pupil, classic, shifted):
     found = Found(phase, frames, 0.9 * frames, measurement, Optics(1.06, (1.5, -1.5)), True, 0)
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
-    lines = {f"curve {i}": three for i in range(4)}
     return {
         "sensor_layout": ((classic, phase), ()),
         "vector_sensor": ((shifted, phase), ()),
         "bench_layout": ((bench, commands, bench.frames(commands, seed=1)), ()),
         "linearity": ((curves, 0.05, two, 0.4), two),
         "convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in plots.LOOKS},), plots.LOOKS),
-        "estimates": ((pupil, phase, dict.fromkeys(two, phase), dict.fromkeys(two, phase)), ()),
+        "estimates": ((pupil, phase, dict.fromkeys(two, phase)), ()),
         "approximation": ((three, lines, lines), ()),
         "diversity": ((three, three, three, {f"pair {i}": i for i in range(3)}), ()),
-        "dimple_diameter": (({25: trial, 100: trial}, 0.5, 0.05, 2.2), shifted_only),
-        "diameter_methods": ((dict.fromkeys(plots.LOOKS, trial), 0.5, 0.05, 2.2), plots.LOOKS),
-        "diameter_reasons": (
-            (three, three, np.full((3, 2), 0.5), {1.0: 0.5}, lines, 2.2),
-            shifted_only,
-        ),
+        "dimple_diameter": (({25: trial, 100: trial}, 0.05, 2.2), shifted_only),
+        "diameter_methods": ((dict.fromkeys(plots.LOOKS, trial), 0.05, 2.2), plots.LOOKS),
+        "diameter_reasons": ((reasons, 2.2), shifted_only),
         "pair_maps": ((PairMaps(three, *np.full((5, 3, 3), 1.0)), [(1.0, -1.0)] * 2), ()),
         "pair_noise": ((three, lines, {"curve 0": [(1.0, 1.0, 0.1)]}), ()),
         "reference_intensities": ((frames, frames), ()),
@@ -190,7 +188,8 @@ def test_polarisations_and_masked_pixels_do_not_look_like_a_method():
 
 
 def test_a_method_looks_the_same_in_every_figure(curves):
-    trials = {name: DiameterCurve(np.array([1.0, 2]), np.full((2, 3), 0.1)) for name in plots.LOOKS}
+    errors = dict.fromkeys(plots.LOOKS, np.full((2, 3), 0.1))
+    trials = dict.fromkeys(plots.LOOKS, DiameterCurves(np.full(2, 0.5), errors, np.array([1.0, 2])))
     steps = {name: {0.2: np.geomspace(1, 1e-6, 8) * np.ones((3, 8))} for name in plots.LOOKS}
     two = ["Linear", "PhaseShifted"]
     pistons = np.linspace(-1, 1, 24).reshape(2, 3, 4)
@@ -199,7 +198,7 @@ def test_a_method_looks_the_same_in_every_figure(curves):
     shown = [
         (plots.linearity(curves, 0.05, two, rms_max=0.4), two),
         (plots.convergence(steps), list(plots.LOOKS)),
-        (plots.diameter_methods(trials, 0.5, 0.05, 2.2), list(plots.LOOKS)),
+        (plots.diameter_methods(trials, 0.05, 2.2), list(plots.LOOKS)),
         (plots.bench_linearity(bench, two), two),
         (segments, two),
     ]
@@ -223,7 +222,7 @@ def test_linearity_draws_the_means_and_marks_where_they_leave(curves):
 def test_estimates_show_what_they_were_given(pupil, screens):
     truth = screens(0.5, 1)[0]
     found = {"Linear": np.where(pupil.inside, truth / 2, np.nan)}
-    figure = plots.estimates(pupil, truth, found, found)
+    figure = plots.estimates(pupil, truth, found)
     shown = [np.ma.filled(axes.images[0].get_array(), np.nan) for axes in figure.axes if axes.images]
     np.testing.assert_array_equal(shown[1], found["Linear"])
 

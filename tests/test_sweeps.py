@@ -21,7 +21,7 @@ from zwfs import Arcsine, Dimple, GradientDescent, Linear, PhaseShifted, Pupil, 
 from zwfs.bench.model import Bench, BenchModel
 from zwfs.companion import sweeps
 from zwfs.paper.bench_linearity import bench_curves, bench_reconstructors, error_budget
-from zwfs.paper.dimple_diameter import diameter_curve
+from zwfs.paper.dimple_diameter import iteration_curves
 from zwfs.paper.linearity import linearity_curves
 from zwfs.paper.phase_shifts import pair_maps
 
@@ -63,10 +63,7 @@ def figure_3(pupil, modes):
 
 
 def figure_4(pupil, modes):
-    def make(diameter):
-        return PhaseShifted(ZernikeSensor(pupil, *(Dimple(diameter, sign * np.pi / 2) for sign in (1, -1))))
-
-    return [diameter_curve(make, [0.8, 1.06, 2.3], modes[:3]).errors]
+    return list(iteration_curves(pupil, np.pi / 2, 25, [0.8, 1.06, 2.3], modes[:3]).errors.values())
 
 
 def figure_9(pupil, modes):

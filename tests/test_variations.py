@@ -3,16 +3,21 @@ import pytest
 from scipy.special import j1, jn_zeros
 
 import zwfs
+from zwfs import plots
+from zwfs.paper.curves import crossing
 from zwfs.paper.dimple_diameter import (
     DARK_RING,
-    DiameterCurve,
+    TABLED,
     DimpleLight,
-    crossing,
-    diameter_curve,
+    contraction,
+    diameter_curves,
+    iteration_curves,
     iteration_spectrum,
     linearised_step,
     measured_factor,
     mode_sensitivity,
+    other_curves,
+    sampled_diameters,
 )
 from zwfs.paper.phase_shifts import drawn_noise, pair_maps, phase_noise
 
@@ -200,22 +205,46 @@ def test_pair_maps(small):
     assert maps.best("flat")[:2] == pytest.approx((0.75 * np.pi, -0.75 * np.pi))
 
 
-def test_diameter_curve(pupil, screens):
-    phases = screens(0.5)
-    curve = diameter_curve(lambda d: zwfs.PhaseShifted(pair(pupil, d)), [1.0, 2.0, 2.5], phases)
-    assert curve.errors.shape == (3, 3)
-    assert np.all(np.diff(curve.mean) > 0)
-    assert curve.at(1.95) == curve.mean[1]
-    assert 2.0 < curve.leaves(0.025) < 2.5
-    assert curve.leaves(0.025, start=2.2) == 2.5
-    np.testing.assert_allclose(curve.std, curve.errors.std(axis=1))
+def test_diameter_curves(pupil, screens):
+    curves = diameter_curves(lambda d: {"it": zwfs.PhaseShifted(pair(pupil, d))}, [1.0, 2.0, 2.5], screens(0.5))
+    assert curves.errors["it"].shape == (3, 3)
+    np.testing.assert_allclose(curves.rms, 0.5)
+    assert np.all(np.diff(curves.mean("it")) > 0)
+    assert curves.at("it", 1.95) == curves.mean("it")[1]
+    assert 2.0 < curves.exceeds("it", 0.025) < 2.5
+    assert curves.exceeds("it", 0.025, start=2.2) == 2.5
+
+
+def test_iteration_does_not_stop_early_and_the_other_methods_are_the_papers(small):
+    modes = zwfs.zernike_basis(small, 10)
+    screens = zwfs.power_law_screens(modes, 0.3, 1, seed=1)
+    curves = [iteration_curves(small, HALF, n, [1.0, 2.0], screens) for n in (5, 10)]
+    assert curves[1].at("PhaseShifted", 2.0) < curves[0].at("PhaseShifted", 2.0)
+    others = other_curves(small, modes, HALF, screens, n_iterations=3)
+    assert set(others.errors) == {*plots.LOOKS} - {"PhaseShifted"}
+
+
+def test_diameters_are_finer_near_the_dark_ring():
+    diameters = sampled_diameters(0.5, 3.0, 0.1)
+    assert {*TABLED, 0.5, 3.0, 2.3} <= set(diameters)
+    assert np.diff(diameters[(diameters >= 2) & (diameters <= 2.6)]).max() == pytest.approx(0.1)
+
+
+def test_contraction_is_that_of_the_spectrum_and_the_iteration(small):
+    modes = zwfs.zernike_basis(small, 149)
+    screens = zwfs.power_law_screens(modes[:20], 0.4, 1, seed=1)
+    reasons = contraction(small, modes, [1.06, 2.2], screens, 1e-4 * modes[1])
+    np.testing.assert_array_equal(reasons.diameters, [1.06, 2.2, DARK_RING])
+    assert reasons.index(2.3) == 1
+    assert reasons.flat[1] == abs(iteration_spectrum(small, 2.2)[0])
+    assert reasons.observed[2.2] == pytest.approx(reasons.aberrated[1, 0], rel=0.01)
+    assert reasons.sensitivity["tilt"][2] < 0.1 * reasons.sensitivity["tilt"][0]
 
 
 def test_crossing_is_interpolated_on_the_logarithm():
     assert crossing([1, 2, 3], [1e-4, 1e-2, 1e-4], 1e-3) == pytest.approx(1.5)
     assert crossing([1, 2], [1.0, 2.0], 0.5) == 1
     assert crossing([1, 2], [1.0, 2.0], 5) == np.inf
-    assert DiameterCurve(np.array([1.0]), np.array([[1.0, 3.0]])).mean == 2
 
 
 @pytest.mark.parametrize(
@@ -224,8 +253,8 @@ def test_crossing_is_interpolated_on_the_logarithm():
         (lambda p, z: crossing([1, 2], [1.0], 1), "shapes"),
         (lambda p, z: crossing([2, 1], [1.0, 1.0], 1), "increasing"),
         (lambda p, z: crossing([1, 2], [0.0, 1.0], 1), "positive"),
-        (lambda p, z: diameter_curve(len, [2.0, 1.0], z[np.newaxis]), "diameters"),
-        (lambda p, z: diameter_curve(len, [1.0], z), "screens"),
+        (lambda p, z: diameter_curves(len, [2.0, 1.0], z[np.newaxis]), "diameters"),
+        (lambda p, z: diameter_curves(len, [1.0], z), "screens"),
         (lambda p, z: pair_maps(p, 1.0, 0.0, z[np.newaxis]), "angles"),
         (lambda p, z: pair_maps(p, 1.0, [0.0], z), "screens"),
         (lambda p, z: iteration_spectrum(p, 1.0, z[np.newaxis]), "phase has shape"),

@@ -17,8 +17,8 @@ import zwfs
 from zwfs.bench.model import Bench, BenchModel
 from zwfs.companion import sweeps
 from zwfs.paper.bench_linearity import bench_curves, bench_reconstructors, error_budget
-from zwfs.paper.dimple_diameter import diameter_curve
-from zwfs.paper.linearity import linearity_curves, screens_at
+from zwfs.paper.dimple_diameter import iteration_curves
+from zwfs.paper.linearity import linearity_curves, paper_reconstructors, screens_at
 from zwfs.paper.phase_shifts import pair_maps
 
 
@@ -27,24 +27,11 @@ def screens_on(n_pixels, rms, n_screens):
     return pupil, screens_at(zwfs.zernike_basis(pupil, 200), rms, n_screens, 2024, 0)
 
 
-def sensor(pupil, *phases, diameter=1.06, extent=1.0):
-    return zwfs.ZernikeSensor(pupil, *(zwfs.Dimple(diameter, phase) for phase in phases), extent=extent)
-
-
 def figure_3(n_pixels=100):
     """Figure 3: an input, 20 screens, 6 reconstructors"""
     pupil = zwfs.Pupil.circular(n_pixels)
     modes = zwfs.zernike_basis(pupil, 200)
-    pair = np.pi / 2, -np.pi / 2
-    classic, shifted, wide = sensor(pupil, pair[0]), sensor(pupil, *pair), sensor(pupil, *pair, extent=2.0)
-    methods = {
-        "Linear": zwfs.Linear(classic, modes),
-        "Arcsine": zwfs.Arcsine(classic),
-        "GerchbergSaxton": zwfs.GerchbergSaxton(wide),
-        "GradientDescent": zwfs.GradientDescent(shifted, modes),
-        "GradientDescentPoints": zwfs.GradientDescent(shifted),
-        "PhaseShifted": zwfs.PhaseShifted(shifted),
-    }
+    methods = paper_reconstructors(pupil, modes, 1.06, np.pi / 2)
     linearity_curves(methods, modes, [0.1, 0.5, 1.0], 20, seed=2024)
 
 
@@ -61,12 +48,7 @@ def figure_3_double():
 def figure_4(n_iterations=25, n_screens=20):
     """Figure 4: a diameter, 20 screens, 25 iterations"""
     pupil, screens = screens_on(100, 0.5, n_screens)
-
-    def make(diameter):
-        pair = sensor(pupil, np.pi / 2, -np.pi / 2, diameter=diameter)
-        return zwfs.PhaseShifted(pair, n_iterations=n_iterations, tolerance=0.0)
-
-    diameter_curve(make, [1.06, 2.0, 3.0], screens)
+    iteration_curves(pupil, np.pi / 2, n_iterations, [1.06, 2.0, 3.0], screens)
 
 
 def figure_4_long():

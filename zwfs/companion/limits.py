@@ -63,6 +63,7 @@ LIMITS: dict[str, dict[str, Any]] = {
         "n_iterations": (1, 10000),
         "extent": (1.0, 8.0),
         "extents": [(1.0, 8.0)],
+        "own_reconstructor": str,
         "threshold": (0.001, 1.0),
         "seed": (0, 4294967295),
     },

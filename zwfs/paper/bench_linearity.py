@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -13,46 +13,31 @@ from zwfs import _check
 from zwfs.bench.model import Bench, BenchModel, Seed, segment_screens
 from zwfs.bench.segments import segment_residual
 from zwfs.companion import sweeps
-from zwfs.metrics import dynamic_range
+from zwfs.paper.curves import ErrorCurves
 from zwfs.paper.linearity import check_reconstructors, check_rms
 from zwfs.reconstructors import RECONSTRUCTORS, Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
 
 
 @dataclass(frozen=True)
-class BenchCurves:
-    """Segment pistons commanded on a bench, and what several reconstructors found.
+class BenchCurves(ErrorCurves):
+    """Errors of several reconstructors of the segment pistons that are commanded on a bench.
 
     Attributes
     ----------
-    rms : ndarray, shape (n_rms,), radian rms
-        Input.
+    errors : dict of ndarray, shape (n_rms, n_screens), radian rms
+        Rms of the residuals over the segments.
     commanded : ndarray, shape (n_rms, n_screens, n_segments), radian
     residuals : dict of ndarray, shape (n_rms, n_screens, n_segments), radian
-        Found less commanded, wrapped and without piston, for each reconstructor.
+        Reconstructed less commanded pistons, wrapped and without piston, for each reconstructor.
     """
 
-    rms: NDArray[np.floating]
+    errors: dict[str, NDArray[np.float64]] = field(init=False)
     commanded: NDArray[np.float64]
     residuals: dict[str, NDArray[np.float64]]
 
-    @property
-    def errors(self) -> dict[str, NDArray[np.float64]]:
-        """Rms error over the segments, shape (n_rms, n_screens), radian rms."""
-        return {name: np.sqrt(np.mean(values**2, axis=-1)) for name, values in self.residuals.items()}
-
-    def mean(self, name: str) -> NDArray[np.float64]:
-        """Mean error over the screens, shape (n_rms,), radian rms."""
-        _check.choice("name", name, self.residuals)
-        return self.errors[name].mean(axis=1)
-
-    def std(self, name: str) -> NDArray[np.float64]:
-        """Standard deviation of the error over the screens, shape (n_rms,), radian rms."""
-        _check.choice("name", name, self.residuals)
-        return self.errors[name].std(axis=1)
-
-    def dynamic_range(self, name: str, threshold: float) -> float:
-        """Input at which the mean error leaves `threshold` times the input; see `zwfs.dynamic_range`."""
-        return dynamic_range(self.rms, self.mean(name), threshold)
+    def __post_init__(self) -> None:
+        errors = {name: np.sqrt(np.mean(values**2, axis=-1)) for name, values in self.residuals.items()}
+        object.__setattr__(self, "errors", errors)
 
     def gain(self, name: str) -> NDArray[np.float64]:
         """Slope of the found pistons against the commanded ones, (n_rms,); below 1 they are underestimated.

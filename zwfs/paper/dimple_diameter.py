@@ -1,4 +1,4 @@
-"""Variations of the phase-shifted sensor, section 4.2 of the paper: diameter of the dimple, pair of phase shifts.
+"""Diameter of the dimple, section 4.2 of the paper: errors of the reconstructors, and why the iteration diverges.
 
 Everything rests on one identity. With beta the part of the field psi that passes through the dimple and
 c_k = exp(i theta_k) - 1, the frame of mask k is |psi|^2 + 2 Re(conj(c_k) W) with
@@ -12,7 +12,7 @@ estimate before, and keeps its phase: the phase shifts drop out.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,8 @@ from zwfs.companion import sweeps
 from zwfs.lowrank import factorise
 from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error, wrapped_residual
+from zwfs.paper.curves import ErrorCurves, crossing
+from zwfs.paper.linearity import check_reconstructors, paper_reconstructors
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
@@ -31,99 +33,56 @@ from zwfs.sensor import ZernikeSensor
 DARK_RING = 2 * 1.2196698912665045
 """Diameter of the first dark ring of the Airy pattern, lambda/D: twice the first zero of J1(pi r)."""
 
+TABLED = (1.06, 1.5, 2.0, 2.2, 2.4, 2.6, 3.0, 3.5)
+"""Diameters of the table on the causes of Figure 4, lambda/D."""
+
+FEW = (0.5, 1.0, 1.06, 1.5, 1.6, 1.75, 2.0, 2.2, 2.4, 2.6, 3.0, 3.5, 4.0)
+"""Diameters at which the costly methods are compared, lambda/D."""
+
+_MODES = {"tilt": 0, "defocus": 2, "high order (Noll 150)": 148}  # by their place among the modes
 _TOLERANCE = 1e-12  # of the low-rank factors, as the spectrum is to be exact where the iteration is
 
 
 @dataclass(frozen=True)
-class DiameterCurve:
-    """Error of a reconstructor against the diameter of the dimple.
+class DiameterCurves(ErrorCurves):
+    """Errors of several reconstructors against the diameter of the dimple, on screens of one rms.
 
     Attributes
     ----------
     diameters : ndarray, shape (n_diameters,), lambda/D
-    errors : ndarray, shape (n_diameters, n_screens), radian rms
     """
 
     diameters: NDArray[np.float64]
-    errors: NDArray[np.float64]
 
-    @property
-    def mean(self) -> NDArray[np.float64]:
-        """Mean error over the screens, shape (n_diameters,), radian rms."""
-        return self.errors.mean(axis=1)
+    def at(self, name: str, diameter: float) -> float:
+        """Mean error at the sampled diameter (lambda/D) that is nearest to `diameter`, radian rms."""
+        return float(self.mean(name)[np.argmin(np.abs(self.diameters - _check.number("diameter", diameter)))])
 
-    @property
-    def std(self) -> NDArray[np.float64]:
-        """Standard deviation of the error over the screens, shape (n_diameters,), radian rms."""
-        return self.errors.std(axis=1)
-
-    def at(self, diameter: float) -> float:
-        """Mean error at the sampled diameter (lambda/D) next to `diameter`, radian rms."""
-        return float(self.mean[np.argmin(np.abs(self.diameters - _check.number("diameter", diameter)))])
-
-    def leaves(self, limit: float, start: float = 0.0) -> float:
-        """Diameter, from `start` on, at which the mean error rises above `limit`; see `crossing`."""
+    def exceeds(self, name: str, limit: float, start: float = 0.0) -> float:
+        """Diameter, from `start` on, at which the mean error exceeds `limit` (radian rms); see `crossing`."""
         used = self.diameters >= _check.number("start", start) - 1e-9
         if not used.any():
             raise ValueError(f"start = {start:g}: expected at most the last diameter, {self.diameters[-1]:g}")
-        return crossing(self.diameters[used], self.mean[used], limit)
+        return crossing(self.diameters[used], self.mean(name)[used], limit)
 
 
-def crossing(x: ArrayLike, y: ArrayLike, limit: float) -> float:
-    """Where a sampled positive curve rises above a limit for the first time.
+def diameter_curves(
+    make: Callable[[float], Mapping[str, Any]], diameters: ArrayLike, screens: NDArray
+) -> DiameterCurves:
+    """Errors of reconstructors on the same screens for dimples of several diameters: the experiment of Figure 4.
 
-    Parameters
-    ----------
-    x : array_like, shape (n,)
-        Increasing.
-    y : array_like, shape (n,)
-        Positive; its logarithm is interpolated linearly.
-    limit : float
-        In the unit of `y`.
-
-    Returns
-    -------
-    float
-        In the unit of `x`; `x[0]` if the curve starts above the limit, infinity if it never gets there.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ, `x` does not increase or is not finite, or a value of `y` is not positive and finite.
-    """
-    x, y = _check.real_array("x", x), _check.real_array("y", y)
-    if x.ndim != 1 or x.shape != y.shape or not x.size:
-        raise ValueError(f"x and y have shapes {x.shape} and {y.shape}: expected the same (n,)")
-    limit = _check.number("limit", limit, 0, open_low=True)
-    _check.finite("x", x)
-    _check.finite("y", y)
-    if np.any(np.diff(x) <= 0) or np.any(y <= 0):
-        raise ValueError("x, y: expected increasing x and positive y")
-    above = np.flatnonzero(y > limit)
-    if not above.size:
-        return np.inf
-    last = above[0]
-    if last == 0:
-        return float(x[0])
-    low, high = np.log(y[last - 1 : last + 1])
-    return float(x[last - 1] + (np.log(limit) - low) / (high - low) * (x[last] - x[last - 1]))
-
-
-def diameter_curve(make: Callable[[float], Any], diameters: ArrayLike, screens: NDArray) -> DiameterCurve:
-    """Error of a reconstructor on the same screens for dimples of several diameters: the experiment of Figure 4.
-
-    A diameter is a task of the sweep "diameter_curve", see `zwfs.companion.sweeps`.
+    A diameter is a task of the sweep "diameter_curves", see `zwfs.companion.sweeps`.
 
     Parameters
     ----------
     make : callable
-        `make(diameter)` gives a reconstructor for a sensor with dimples of that diameter (lambda/D).
+        `make(diameter)` returns reconstructors by name, for sensors with dimples of that diameter (lambda/D).
     diameters : array_like, shape (n_diameters,), lambda/D
     screens : ndarray, shape (n_screens, ny, nx), radian
 
     Returns
     -------
-    DiameterCurve
+    DiameterCurves
 
     Raises
     ------
@@ -140,16 +99,60 @@ def diameter_curve(make: Callable[[float], Any], diameters: ArrayLike, screens: 
     if diameters.ndim != 1 or not diameters.size or diameters[0] <= 0 or np.any(np.diff(diameters) <= 0):
         raise ValueError(f"diameters = {_check.shown(diameters)}: expected positive, increasing values")
     screens = _check_screens(screens)
-    rows = sweeps.run(_diameter_point, diameters.tolist(), make, screens, name="diameter_curve")
-    return DiameterCurve(diameters, np.array(rows))
+    points = sweeps.run(_diameter_point, diameters.tolist(), make, screens, name="diameter_curves")
+    rms, errors = zip(*points, strict=True)
+    return DiameterCurves(
+        np.array(rms), {name: np.array([point[name] for point in errors]) for name in errors[0]}, diameters
+    )
 
 
-def _diameter_point(diameter: float, make: Callable[[float], Any], screens: NDArray) -> NDArray[np.floating]:
-    """One diameter of the curve: error on each screen, (n_screens,)."""
-    reconstructor = make(diameter)
-    sensor = _check.sensor_of("make", reconstructor)
-    screens = sensor.pupil.scatter(_check.values_inside("screens", screens, sensor.pupil), fill=0)
-    return reconstruction_error(sensor.pupil, reconstructor(sensor.measure(screens)).phase, screens)
+def _diameter_point(
+    diameter: float, make: Callable[[float], Mapping[str, Any]], screens: NDArray
+) -> tuple[float, dict[str, NDArray[np.floating]]]:
+    """One diameter of the curves: rms of the screens, and errors on each of them, (n_screens,)."""
+    reconstructors = make(diameter)
+    check_reconstructors(reconstructors)
+    errors = {}
+    for name, reconstructor in reconstructors.items():
+        sensor = reconstructor.sensor
+        screens, _ = sensor.pupil_maps("screens", screens)
+        found = reconstructor(sensor.measure(screens))
+        errors[name] = reconstruction_error(sensor.pupil, found.phase, screens)
+    return float(np.mean(sensor.pupil.rms(screens))), errors
+
+
+def sampled_diameters(step: float, diameter_max: float, step_fine: float) -> NDArray[np.float64]:
+    """Diameters of Figure 4 (lambda/D): every `step`, every `step_fine` from 2 to 2.6, and those of the table."""
+    step, step_fine = _check.number("step", step, 0.01), _check.number("step_fine", step_fine, 0.001)
+    diameter_max = _check.number("diameter_max", diameter_max, 0.01, 100)
+    coarse = np.arange(step, diameter_max + step / 2, step)
+    fine = np.arange(2.0, 2.6 + step_fine / 2, step_fine)
+    return np.unique(np.round([*coarse, *fine, *TABLED], 9))
+
+
+def iteration_curves(
+    pupil: Pupil, phase_shift: float, n_iterations: int, diameters: ArrayLike, screens: NDArray
+) -> DiameterCurves:
+    """Errors of the phase-shifted iteration, without an early stop; see `diameter_curves`."""
+
+    def make(diameter: float) -> dict[str, Any]:
+        sensor = ZernikeSensor(pupil, Dimple(diameter, phase_shift), Dimple(diameter, -phase_shift))
+        return {"PhaseShifted": PhaseShifted(sensor, n_iterations=n_iterations, tolerance=0.0)}
+
+    return diameter_curves(make, diameters, screens)
+
+
+def other_curves(
+    pupil: Pupil, modes: NDArray, phase_shift: float, screens: NDArray, **settings: Any
+) -> DiameterCurves:
+    """Errors of the other methods, at few diameters; settings are those of `paper_reconstructors`."""
+
+    def make(diameter: float) -> dict[str, Any]:
+        methods = paper_reconstructors(pupil, modes, diameter, phase_shift, **settings)
+        del methods["PhaseShifted"]
+        return methods
+
+    return diameter_curves(make, FEW, screens)
 
 
 class DimpleLight:
@@ -210,7 +213,7 @@ class DimpleLight:
 
 
 def linearised_step(pupil: Pupil, diameter: float, phase: ArrayLike, error: ArrayLike) -> NDArray[np.float64]:
-    """What one phase-shifted step makes of a small error of its estimate, whatever the pair of phase shifts.
+    """Return the error after one phase-shifted step from a small error before it, for any pair of phase shifts.
 
     With delta = i K[psi error], the change of beta (K being the dimple), the error after the step is
     Im(delta / beta) - 2 Re(delta / beta) Im(conj(beta) psi) / |psi|^2. Around a flat wavefront and a real
@@ -245,16 +248,15 @@ def linearised_step(pupil: Pupil, diameter: float, phase: ArrayLike, error: Arra
     _check.maps("error", error, pupil.shape)
     change = pupil.gather(error).reshape(-1, pupil.n_points)
     _check.finite("error", change, " inside the pupil")
-    after = _after(psi, beta, light(1j * psi * change))
+    after = _error_after(psi, beta, light(1j * psi * change))
     return pupil.scatter(after.reshape(*error.shape[:-2], -1))
 
 
 def iteration_spectrum(pupil: Pupil, diameter: float, phase: ArrayLike | None = None) -> NDArray[np.complex128]:
     """Eigenvalues of the linearised phase-shifted step, piston left out.
 
-    The step only sees the few coefficients of beta, so all eigenvalues but zeros are those of a matrix of twice
-    their number. The iteration converges to the true phase from nearby if the first one is inside the unit
-    circle, and its modulus is the factor by which an iteration then multiplies the error.
+    The iteration converges to the true phase from nearby if the first eigenvalue is inside the unit circle. Its
+    modulus is the factor by which an iteration then multiplies the error.
 
     Parameters
     ----------
@@ -266,7 +268,7 @@ def iteration_spectrum(pupil: Pupil, diameter: float, phase: ArrayLike | None = 
     Returns
     -------
     ndarray of complex, shape (2 rank - 1,)
-        Largest modulus first.
+        Largest modulus first; all others are 0.
 
     Raises
     ------
@@ -274,12 +276,14 @@ def iteration_spectrum(pupil: Pupil, diameter: float, phase: ArrayLike | None = 
         If the shape of the phase is wrong.
     """
     light, psi, beta = _linearised(pupil, diameter, phase)
-    functions = light.functions()
-    # Real and imaginary parts of the coefficients of the change of the field, before and after.
-    after = np.concatenate([_after(psi, beta, functions), _after(psi, beta, 1j * functions)])
-    coefficients = light.project(1j * psi * after)
+    # A step maps an error to the few coefficients of the change of beta, and these to the next error. Its
+    # eigenvalues other than 0 are those of the two maps in the opposite order: a small matrix.
+    unit = light.functions()
+    # The map is linear over the real numbers only: real and imaginary parts of the coefficients count separately.
+    errors = _error_after(psi, beta, np.concatenate([unit, 1j * unit]))
+    coefficients = light.project(1j * psi * errors)
     values = np.linalg.eigvals(np.concatenate([coefficients.real, coefficients.imag], axis=1))
-    # A piston comes back unchanged: its eigenvalue is exactly 1, and no frame shows a piston.
+    # A piston returns unchanged: its eigenvalue is exactly 1, and no frame shows a piston.
     values = np.delete(values, np.argmin(np.abs(values - 1)))
     return values[np.argsort(-np.abs(values), kind="stable")]
 
@@ -336,7 +340,7 @@ def mode_sensitivity(
     phase_shifts: tuple[float, ...] = (np.pi / 2, -np.pi / 2),
     phase: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
-    """How strongly the frames answer to each mode, the change of the reference wave included.
+    """Sensitivity of the frames to each mode, the change of the reference wave included.
 
     Parameters
     ----------
@@ -384,6 +388,67 @@ def mode_sensitivity(
     return np.sqrt(power)
 
 
+@dataclass(frozen=True)
+class Contraction:
+    """Factor by which an iteration multiplies a small error, and sensitivity to modes, against the diameter.
+
+    Attributes
+    ----------
+    diameters : ndarray, shape (n_diameters,), lambda/D
+    flat : ndarray, shape (n_diameters,)
+        Factor around a flat wavefront.
+    aberrated : ndarray, shape (n_diameters, n_screens)
+        Factor around each screen.
+    observed : dict of float
+        Factor that `PhaseShifted` shows on the first screen, by diameter.
+    sensitivity : dict of ndarray, shape (n_diameters,), 1 / radian
+        See `mode_sensitivity`, by the name of the mode.
+    """
+
+    diameters: NDArray[np.float64]
+    flat: NDArray[np.float64]
+    aberrated: NDArray[np.float64]
+    observed: dict[float, float]
+    sensitivity: dict[str, NDArray[np.float64]]
+
+    def index(self, diameter: float) -> int:
+        """Index of the sampled diameter that is nearest to `diameter` (lambda/D)."""
+        return int(np.argmin(np.abs(self.diameters - _check.number("diameter", diameter))))
+
+
+def contraction(
+    pupil: Pupil, modes: NDArray, diameters: ArrayLike, screens: NDArray, away: NDArray
+) -> Contraction:
+    """Return the causes of Figure 4: the linearised iteration and the sensitivity, at each diameter.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    modes : ndarray, shape (n_modes, ny, nx)
+        At least 149, from Noll 2 on.
+    diameters : array_like, shape (n_diameters,), lambda/D
+        The first dark ring is added.
+    screens : ndarray, shape (n_screens, ny, nx), radian
+    away : ndarray, shape (ny, nx), radian
+        Small error from which the observed iteration starts, see `measured_factor`.
+    """
+    diameters = np.unique(np.append(_check.real_array("diameters", diameters), DARK_RING))
+    screens = _check_screens(screens)
+    chosen = _check.real_array("modes", modes)[list(_MODES.values())]
+
+    def factor(diameter: float, phase: NDArray | None = None) -> float:
+        return float(np.abs(iteration_spectrum(pupil, diameter, phase)[0]))
+
+    sensitivity = np.array([mode_sensitivity(pupil, diameter, chosen) for diameter in diameters]).T
+    return Contraction(
+        diameters,
+        np.array([factor(diameter) for diameter in diameters]),
+        np.array([[factor(diameter, screen) for screen in screens] for diameter in diameters]),
+        {diameter: measured_factor(pupil, diameter, screens[0], away) for diameter in TABLED},
+        dict(zip(_MODES, sensitivity, strict=True)),
+    )
+
+
 def _check_map(pupil: Pupil, name: str, values: ArrayLike) -> NDArray[np.floating]:
     """Return one map that is finite inside the pupil."""
     _check.instance("pupil", pupil, Pupil)
@@ -418,7 +483,7 @@ def _linearised(pupil: Pupil, diameter: float, phase: ArrayLike | None) -> tuple
     return light, psi, beta
 
 
-def _after(psi: NDArray, beta: NDArray, change: NDArray) -> NDArray[np.float64]:
-    """Error of the phase after a step that was made with beta + change in the place of beta."""
+def _error_after(psi: NDArray, beta: NDArray, change: NDArray) -> NDArray[np.float64]:
+    """Error of the phase after a step that uses beta + change in place of beta."""
     relative = change / beta
     return relative.imag - 2 * relative.real * np.imag(beta.conj() * psi) / np.abs(psi) ** 2

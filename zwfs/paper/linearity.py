@@ -1,8 +1,10 @@
-"""The numerical experiments behind the figures: reconstructors go in, tables of errors come out."""
+"""Experiments of section 4.1: errors of reconstructors on random screens, and their causes and cost."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import cProfile
+import pstats
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,63 +13,37 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs.companion import sweeps
-from zwfs.metrics import dynamic_range, reconstruction_error, strehl
+from zwfs.masks import Dimple, Mask
+from zwfs.metrics import reconstruction_error, strehl
 from zwfs.modes import power_law_screens
+from zwfs.paper.curves import ErrorCurves
+from zwfs.pupil import Pupil
+from zwfs.reconstructors import Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
+from zwfs.reconstructors.base import load
+from zwfs.sensor import ZernikeSensor
+
+_PASSES = ("split_expand", "split_adjoint")  # functions that pass through the low-rank model of the sensor
 
 
 @dataclass(frozen=True)
-class LinearityCurves:
-    """Error of several reconstructors against the input.
+class LinearityCurves(ErrorCurves):
+    """Errors of several reconstructors against the input, and properties of the screens.
 
     Attributes
     ----------
-    rms : ndarray, shape (n_rms,), radian rms
-        Input.
-    errors : dict of ndarray, shape (n_rms, n_screens), radian rms
-        Error of each reconstructor on each screen.
     converged : dict of ndarray of bool, shape (n_rms, n_screens)
     wrapped : ndarray, shape (n_rms, n_screens)
         Fraction of the points of each screen whose phase, piston removed, is outside (-pi, pi].
     folded : ndarray, shape (n_rms, n_screens)
         Fraction of the points of each screen below -pi/4, which an arcsine at +pi/2 folds back.
     strehl : ndarray, shape (n_rms, n_screens)
-        Strehl ratio of each screen: what is left of the light that makes the reference wave.
+        Strehl ratio of each screen: the share of the light in the core, which makes the reference wave.
     """
 
-    rms: NDArray[np.floating]
-    errors: dict[str, NDArray[np.float64]]
     converged: dict[str, NDArray[np.bool_]]
     wrapped: NDArray[np.float64]
     folded: NDArray[np.float64]
     strehl: NDArray[np.float64]
-
-    def mean(self, name: str) -> NDArray[np.float64]:
-        """Mean error over the screens, shape (n_rms,)."""
-        _check.choice("name", name, self.errors)
-        return self.errors[name].mean(axis=1)
-
-    def std(self, name: str) -> NDArray[np.float64]:
-        """Standard deviation of the error over the screens, shape (n_rms,)."""
-        _check.choice("name", name, self.errors)
-        return self.errors[name].std(axis=1)
-
-    def dynamic_range(self, name: str, threshold: float = 0.05) -> float:
-        """Input at which the mean error leaves `threshold` times the input; see `zwfs.dynamic_range`."""
-        return dynamic_range(self.rms, self.mean(name), threshold)
-
-    def recovered(self, name: str, threshold: float = 0.05) -> NDArray[np.float64]:
-        """Fraction of the screens with an error of at most `threshold` times the input, shape (n_rms,)."""
-        _check.choice("name", name, self.errors)
-        threshold = _check.number("threshold", threshold, 0)
-        return np.mean(self.errors[name] <= threshold * self.rms[:, np.newaxis], axis=1)
-
-    def columns(self) -> dict[str, NDArray[np.floating]]:
-        """Input, and mean and standard deviation of every reconstructor, as columns for `publish`."""
-        columns = {"input (rad rms)": self.rms}
-        for name in self.errors:
-            columns[f"{name}: mean error (rad rms)"] = self.mean(name)
-            columns[f"{name}: standard deviation (rad rms)"] = self.std(name)
-        return columns
 
 
 def screens_at(
@@ -95,6 +71,82 @@ def check_reconstructors(reconstructors: Mapping[str, Any]) -> None:
         raise ValueError("reconstructors is empty: expected at least one")
     for name, reconstructor in reconstructors.items():
         _check.sensor_of(f"reconstructors[{name!r}]", reconstructor)
+
+
+def paper_reconstructors(
+    pupil: Pupil,
+    modes: NDArray,
+    diameter: float,
+    phase_shift: float,
+    *,
+    extent: float = 2.0,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Return the paper's reconstructors by name, each for the sensor that it needs.
+
+    "Linear" and "Arcsine" use one dimple, the others two of opposite phase shifts. "GradientDescentPoints", which
+    is not in the paper, is gradient descent on the points of the pupil in place of modes.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    modes : ndarray, shape (n_modes, ny, nx)
+        Modes of the linear reconstructor and of gradient descent.
+    diameter : float, lambda/D
+        Diameter of the dimples.
+    phase_shift : float, radian
+        Phase shift of the first dimple; that of the second one is opposite.
+    extent : float, pupil diameters
+        Width of the detector for Gerchberg-Saxton.
+    **settings
+        For the iterative reconstructors, such as `n_iterations`.
+
+    Returns
+    -------
+    dict of reconstructor
+    """
+    plus, minus = Dimple(diameter, phase_shift), Dimple(diameter, -phase_shift)
+    classic, shifted = ZernikeSensor(pupil, plus), ZernikeSensor(pupil, plus, minus)
+    wide = ZernikeSensor(pupil, plus, minus, extent=extent)
+    return {
+        "Linear": Linear(classic, modes),
+        "Arcsine": Arcsine(classic, **settings),
+        "GerchbergSaxton": GerchbergSaxton(wide, **settings),
+        "GradientDescent": GradientDescent(shifted, modes, **settings),
+        "GradientDescentPoints": GradientDescent(shifted, **settings),
+        "PhaseShifted": PhaseShifted(shifted, **settings),
+    }
+
+
+def own_reconstructor(path: str, reconstructors: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a reader's reconstructor by the name of its class, for a sensor of the paper's reconstructors.
+
+    Parameters
+    ----------
+    path : str
+        "module:Class", see `zwfs.reconstructors.base.load`; empty for none. The class is called with a sensor:
+        that of one dimple if its `n_masks` is 1, else that of two.
+    reconstructors : mapping of str to reconstructor
+        See `paper_reconstructors`.
+
+    Returns
+    -------
+    dict of reconstructor
+        Empty if the path is.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the path leads to no class of a reconstructor, or its name is one of `reconstructors`.
+    """
+    check_reconstructors(reconstructors)
+    if path == "":
+        return {}
+    method = load(path)
+    if method.__name__ in reconstructors:
+        raise ValueError(f"path = {path!r}: expected a name other than {', '.join(reconstructors)}")
+    like = "Arcsine" if getattr(method, "n_masks", 2) == 1 else "PhaseShifted"
+    return {method.__name__: method(reconstructors[like].sensor)}
 
 
 def linearity_curves(
@@ -171,7 +223,7 @@ def _linearity_point(
     return errors, converged, wrapped, folded, strehl(pupil, screens)
 
 
-def convergence(
+def iteration_errors(
     reconstructor: Any, modes: NDArray, rms: float, n_screens: int, *, exponent: float = -2.0, seed: int = 0
 ) -> NDArray[np.float64]:
     """Error of a reconstructor on random screens, iteration by iteration.
@@ -200,3 +252,102 @@ def convergence(
         history = reconstructor(sensor.measure(screen), history=True).history
         errors[index] = reconstruction_error(sensor.pupil, history, screen)
     return errors
+
+
+def offset_by_width(
+    reconstructor: GerchbergSaxton,
+    modes: NDArray,
+    extents: Sequence[float],
+    n_screens: int,
+    *,
+    exponent: float = -2.0,
+    seed: int = 0,
+) -> NDArray[np.float64]:
+    """Error of Gerchberg-Saxton at 0.1 rad rms on detectors of several widths, and the light that they lose.
+
+    Parameters
+    ----------
+    reconstructor : GerchbergSaxton
+        Its masks and settings are used on every detector.
+    modes : ndarray, shape (n_modes, ny, nx)
+        Modes that the screens are made of.
+    extents : sequence of float, pupil diameters
+        Widths of the detector.
+    n_screens : int
+    exponent : float
+        Exponent of the power spectral density of the screens.
+    seed : int
+
+    Returns
+    -------
+    ndarray, shape (n_extents, 3)
+        Width (D), fraction of the light of a flat wavefront that misses the detector, and mean error (radian rms).
+    """
+    _check.instance("reconstructor", reconstructor, GerchbergSaxton)
+    pupil, masks = reconstructor.sensor.pupil, reconstructor.sensor.masks
+    rows = []
+    for extent in extents:
+        sensor = ZernikeSensor(pupil, *masks, extent=extent)
+        method = GerchbergSaxton(sensor, n_iterations=reconstructor.settings.n_iterations)
+        curves = linearity_curves({"it": method}, modes, [0.1], n_screens, exponent=exponent, seed=seed)
+        caught = sensor.measure(np.zeros(pupil.shape))[0].sum() / pupil.n_points
+        rows.append((sensor.extent, 1 - caught, curves.mean("it")[0]))
+    return np.array(rows)
+
+
+def count_work(reconstructors: Mapping[str, Any], screen: NDArray) -> tuple[dict[str, int], set[str]]:
+    """Count how often reconstructors pass through the model of the sensor, for one screen (radian).
+
+    Parameters
+    ----------
+    reconstructors : mapping of str to reconstructor
+    screen : ndarray, shape (ny, nx), radian
+
+    Returns
+    -------
+    passes : dict of int
+        Passes of each reconstructor, forward or back.
+    fourier : set of str
+        Functions for Fourier transforms that any reconstructor calls.
+    """
+    check_reconstructors(reconstructors)
+    passes, fourier = {}, set()
+    for name, reconstructor in reconstructors.items():
+        frames = reconstructor.sensor.measure(screen)
+        reconstructor(frames)  # the first call also builds what later calls use again
+        profile = cProfile.Profile()
+        profile.runcall(reconstructor, frames)
+        calls = pstats.Stats(profile).stats  # type: ignore[attr-defined]
+        places = {place: f"{place[0]}:{place[2]}" for place in calls}
+        fourier |= {text for text in places.values() if "fft" in text}
+        passes[name] = sum(calls[place][1] for place in places if place[2] in _PASSES)
+    return passes, fourier
+
+
+def model_accuracy(
+    pupil: Pupil, mask: Mask, phase: NDArray, tolerances: Sequence[float]
+) -> list[tuple[float, int, float]]:
+    """Rank of the low-rank model for several tolerances, and error of the reference wave.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    mask : Mask
+    phase : ndarray, shape (ny, nx), radian
+    tolerances : sequence of float
+        Of the model, see `zwfs.ZernikeSensor`.
+
+    Returns
+    -------
+    list of (tolerance, rank, error)
+        The error is the largest over the detector, relative to the largest modulus of the wave, with respect to a
+        tolerance of 1e-14.
+    """
+    field = pupil.field(phase)
+    exact = ZernikeSensor(pupil, mask, tolerance=1e-14).reference_wave(field)
+    rows = []
+    for tolerance in tolerances:
+        sensor = ZernikeSensor(pupil, mask, tolerance=tolerance)
+        error = np.abs(sensor.reference_wave(field) - exact).max() / np.abs(exact).max()
+        rows.append((tolerance, sensor.rank, float(error)))
+    return rows

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from zwfs.metrics import wrapped_residual
 from zwfs.paper.linearity import LinearityCurves
 from zwfs.plots.style import _looks, show_phase
 from zwfs.pupil import Pupil
@@ -82,25 +83,24 @@ def convergence(errors: Mapping[str, Mapping[float, NDArray]]) -> Figure:
     return figure
 
 
-def estimates(
-    pupil: Pupil, truth: NDArray, found: Mapping[str, NDArray], residuals: Mapping[str, NDArray]
-) -> Figure:
-    """One screen, what each method makes of it, and what is left (radian), on a scale four times finer."""
+def estimates(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) -> Figure:
+    """One screen, the phase (radian) that each method estimates, and the residual, on a scale four times finer."""
     truth = np.where(pupil.inside, truth, np.nan)
     limit = np.nanmax(np.abs(truth))
-    figure, panels = plt.subplots(2, len(found) + 1, figsize=(9, 3.6))
+    figure, panels = plt.subplots(2, len(phases) + 1, figsize=(9, 3.6))
     image = show_phase(panels[0, 0], truth, limit)
     panels[0, 0].set_title("input", fontsize=9)
     panels[1, 0].set_axis_off()
     panels[1, 0].text(0.5, 0.5, "residual", ha="center", va="center", transform=panels[1, 0].transAxes)
-    for column, (name, look) in enumerate(_looks(found), start=1):
-        show_phase(panels[0, column], found[name], limit)
-        left = show_phase(panels[1, column], residuals[name], limit / 4)
+    for column, (name, look) in enumerate(_looks(phases), start=1):
+        residual = wrapped_residual(pupil, phases[name], truth)
+        show_phase(panels[0, column], phases[name], limit)
+        shown = show_phase(panels[1, column], residual, limit / 4)
         panels[0, column].set_title(f"{look.name}\n({look.sees})", fontsize=9)
-        rms = np.sqrt(np.nanmean(residuals[name] ** 2))
+        rms = np.sqrt(np.nanmean(residual**2))
         panels[1, column].set_xlabel(f"{_short(rms)} rad rms", fontsize=9)
     figure.colorbar(image, ax=panels[0], label="phase (rad)", aspect=12)
-    figure.colorbar(left, ax=panels[1], label="residual (rad)", aspect=12, extend="both")
+    figure.colorbar(shown, ax=panels[1], label="residual (rad)", aspect=12, extend="both")
     return figure
 
 

@@ -52,7 +52,7 @@ class DiameterCurves(ErrorCurves):
     diameters : ndarray, shape (n_diameters,), lambda/D
     """
 
-    diameters: NDArray[np.float64]
+    diameters: NDArray[np.floating]
 
     def at(self, name: str, diameter: float) -> float:
         """Mean error at the sampled diameter (lambda/D) that is nearest to `diameter`, radian rms."""
@@ -94,10 +94,7 @@ def diameter_curves(
     Chambouleyron et al. 2024, section 4.2 and Figure 4.
     """
     _check.function("make", make)
-    diameters = _check.real_array("diameters", diameters)
-    _check.finite("diameters", diameters)
-    if diameters.ndim != 1 or not diameters.size or diameters[0] <= 0 or np.any(np.diff(diameters) <= 0):
-        raise ValueError(f"diameters = {_check.shown(diameters)}: expected positive, increasing values")
+    diameters = _check_diameters(diameters)
     screens = _check_screens(screens)
     points = sweeps.run(_diameter_point, diameters.tolist(), make, screens, name="diameter_curves")
     rms, errors = zip(*points, strict=True)
@@ -115,7 +112,7 @@ def _diameter_point(
     errors = {}
     for name, reconstructor in reconstructors.items():
         sensor = reconstructor.sensor
-        screens, _ = sensor.pupil_maps("screens", screens)
+        screens = _check_screens(screens, sensor.pupil)
         found = reconstructor(sensor.measure(screens))
         errors[name] = reconstruction_error(sensor.pupil, found.phase, screens)
     return float(np.mean(sensor.pupil.rms(screens))), errors
@@ -134,6 +131,7 @@ def iteration_curves(
     pupil: Pupil, phase_shift: float, n_iterations: int, diameters: ArrayLike, screens: NDArray
 ) -> DiameterCurves:
     """Errors of the phase-shifted iteration, without an early stop; see `diameter_curves`."""
+    phase_shift = _check.number("phase_shift", phase_shift, 0.01, 3.13)
 
     def make(diameter: float) -> dict[str, Any]:
         sensor = ZernikeSensor(pupil, Dimple(diameter, phase_shift), Dimple(diameter, -phase_shift))
@@ -405,7 +403,7 @@ class Contraction:
         See `mode_sensitivity`, by the name of the mode.
     """
 
-    diameters: NDArray[np.float64]
+    diameters: NDArray[np.floating]
     flat: NDArray[np.float64]
     aberrated: NDArray[np.float64]
     observed: dict[float, float]
@@ -432,9 +430,15 @@ def contraction(
     away : ndarray, shape (ny, nx), radian
         Small error from which the observed iteration starts, see `measured_factor`.
     """
-    diameters = np.unique(np.append(_check.real_array("diameters", diameters), DARK_RING))
-    screens = _check_screens(screens)
-    chosen = _check.real_array("modes", modes)[list(_MODES.values())]
+    _check.instance("pupil", pupil, Pupil)
+    diameters = np.unique(np.append(_check_diameters(diameters), DARK_RING))
+    screens = _check_screens(screens, pupil)
+    modes = _check.real_array("modes", modes)
+    _check.maps("modes", modes, pupil.shape)
+    if modes.ndim != 3 or len(modes) <= max(_MODES.values()):
+        raise ValueError(f"modes has shape {modes.shape}: expected at least {max(_MODES.values()) + 1} modes")
+    chosen = modes[list(_MODES.values())]
+    observed = {diameter: measured_factor(pupil, diameter, screens[0], away) for diameter in TABLED}
 
     def factor(diameter: float, phase: NDArray | None = None) -> float:
         return float(np.abs(iteration_spectrum(pupil, diameter, phase)[0]))
@@ -444,7 +448,7 @@ def contraction(
         diameters,
         np.array([factor(diameter) for diameter in diameters]),
         np.array([[factor(diameter, screen) for screen in screens] for diameter in diameters]),
-        {diameter: measured_factor(pupil, diameter, screens[0], away) for diameter in TABLED},
+        observed,
         dict(zip(_MODES, sensitivity, strict=True)),
     )
 
@@ -459,11 +463,23 @@ def _check_map(pupil: Pupil, name: str, values: ArrayLike) -> NDArray[np.floatin
     return values
 
 
-def _check_screens(screens: ArrayLike) -> NDArray[np.floating]:
-    """Return screens as an array, shape (n_screens, ny, nx)."""
+def _check_diameters(diameters: ArrayLike) -> NDArray[np.floating]:
+    """Return diameters as an array, shape (n_diameters,), positive and increasing."""
+    diameters = _check.real_array("diameters", diameters)
+    _check.finite("diameters", diameters)
+    if diameters.ndim != 1 or not diameters.size or diameters[0] <= 0 or np.any(np.diff(diameters) <= 0):
+        raise ValueError(f"diameters = {_check.shown(diameters)}: expected positive, increasing values")
+    return diameters
+
+
+def _check_screens(screens: ArrayLike, pupil: Pupil | None = None) -> NDArray[np.floating]:
+    """Return screens as an array, shape (n_screens, ny, nx), finite inside the pupil if it is given."""
     screens = _check.real_array("screens", screens)
     if screens.ndim != 3 or 0 in screens.shape:
         raise ValueError(f"screens has shape {screens.shape}: expected (n_screens, ny, nx)")
+    if pupil is not None:
+        _check.trailing_shape("screens", screens, pupil.shape, "the shape of the pupil")
+        _check.finite("screens", pupil.gather(screens), " inside the pupil")
     return screens
 
 

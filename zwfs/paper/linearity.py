@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cProfile
 import pstats
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs.companion import sweeps
-from zwfs.masks import Dimple, Mask
+from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error, strehl
 from zwfs.modes import power_law_screens
 from zwfs.paper.curves import ErrorCurves
@@ -105,6 +105,9 @@ def paper_reconstructors(
     -------
     dict of reconstructor
     """
+    _check.instance("pupil", pupil, Pupil)
+    diameter = _check.number("diameter", diameter, 0.01, pupil.n_pixels)
+    phase_shift = _check.number("phase_shift", phase_shift, 0.01, 3.13)  # the pair is singular at 0 and pi
     plus, minus = Dimple(diameter, phase_shift), Dimple(diameter, -phase_shift)
     classic, shifted = ZernikeSensor(pupil, plus), ZernikeSensor(pupil, plus, minus)
     wide = ZernikeSensor(pupil, plus, minus, extent=extent)
@@ -140,7 +143,7 @@ def own_reconstructor(path: str, reconstructors: Mapping[str, Any]) -> dict[str,
         If the path leads to no class of a reconstructor, or its name is one of `reconstructors`.
     """
     check_reconstructors(reconstructors)
-    if path == "":
+    if isinstance(path, str) and not path:
         return {}
     method = load(path)
     if method.__name__ in reconstructors:
@@ -257,7 +260,7 @@ def iteration_errors(
 def offset_by_width(
     reconstructor: GerchbergSaxton,
     modes: NDArray,
-    extents: Sequence[float],
+    extents: ArrayLike,
     n_screens: int,
     *,
     exponent: float = -2.0,
@@ -271,7 +274,7 @@ def offset_by_width(
         Its masks and settings are used on every detector.
     modes : ndarray, shape (n_modes, ny, nx)
         Modes that the screens are made of.
-    extents : sequence of float, pupil diameters
+    extents : array_like, shape (n_extents,), pupil diameters
         Widths of the detector.
     n_screens : int
     exponent : float
@@ -285,8 +288,11 @@ def offset_by_width(
     """
     _check.instance("reconstructor", reconstructor, GerchbergSaxton)
     pupil, masks = reconstructor.sensor.pupil, reconstructor.sensor.masks
+    extents = _check.real_array("extents", extents)
+    if extents.ndim != 1 or not extents.size or not np.all((extents >= 1) & (extents <= 100)):
+        raise ValueError(f"extents = {_check.shown(extents)}: expected a list of values between 1 and 100")
     rows = []
-    for extent in extents:
+    for extent in extents.tolist():
         sensor = ZernikeSensor(pupil, *masks, extent=extent)
         method = GerchbergSaxton(sensor, n_iterations=reconstructor.settings.n_iterations)
         curves = linearity_curves({"it": method}, modes, [0.1], n_screens, exponent=exponent, seed=seed)
@@ -295,13 +301,13 @@ def offset_by_width(
     return np.array(rows)
 
 
-def count_work(reconstructors: Mapping[str, Any], screen: NDArray) -> tuple[dict[str, int], set[str]]:
-    """Count how often reconstructors pass through the model of the sensor, for one screen (radian).
+def count_work(reconstructors: Mapping[str, Any], phase: NDArray) -> tuple[dict[str, int], set[str]]:
+    """Count how often reconstructors pass through the model of the sensor, for one wavefront.
 
     Parameters
     ----------
     reconstructors : mapping of str to reconstructor
-    screen : ndarray, shape (ny, nx), radian
+    phase : ndarray, shape (ny, nx), radian
 
     Returns
     -------
@@ -313,7 +319,7 @@ def count_work(reconstructors: Mapping[str, Any], screen: NDArray) -> tuple[dict
     check_reconstructors(reconstructors)
     passes, fourier = {}, set()
     for name, reconstructor in reconstructors.items():
-        frames = reconstructor.sensor.measure(screen)
+        frames = reconstructor.sensor.measure(phase)
         reconstructor(frames)  # the first call also builds what later calls use again
         profile = cProfile.Profile()
         profile.runcall(reconstructor, frames)
@@ -324,30 +330,35 @@ def count_work(reconstructors: Mapping[str, Any], screen: NDArray) -> tuple[dict
     return passes, fourier
 
 
-def model_accuracy(
-    pupil: Pupil, mask: Mask, phase: NDArray, tolerances: Sequence[float]
-) -> list[tuple[float, int, float]]:
-    """Rank of the low-rank model for several tolerances, and error of the reference wave.
+def model_accuracy(sensor: ZernikeSensor, phase: NDArray, tolerances: ArrayLike) -> NDArray[np.float64]:
+    """Rank of the low-rank model and error of the reference wave, for several tolerances of the model.
 
     Parameters
     ----------
-    pupil : Pupil
-    mask : Mask
+    sensor : ZernikeSensor
+        Its pupil and its masks are used.
     phase : ndarray, shape (ny, nx), radian
-    tolerances : sequence of float
-        Of the model, see `zwfs.ZernikeSensor`.
+    tolerances : array_like, shape (n,)
 
     Returns
     -------
-    list of (tolerance, rank, error)
-        The error is the largest over the detector, relative to the largest modulus of the wave, with respect to a
-        tolerance of 1e-14.
+    ndarray, shape (n, 3)
+        Tolerance, rank, and largest error of the reference wave on the detector, relative to its largest modulus.
+        The model with a tolerance of 1e-14 is the truth.
     """
-    field = pupil.field(phase)
-    exact = ZernikeSensor(pupil, mask, tolerance=1e-14).reference_wave(field)
+    _check.instance("sensor", sensor, ZernikeSensor)
+    tolerances = _check.real_array("tolerances", tolerances)
+    if tolerances.ndim != 1 or not tolerances.size or not np.all((tolerances >= 1e-14) & (tolerances <= 0.1)):
+        raise ValueError(
+            f"tolerances = {_check.shown(tolerances)}: expected a list of values between 1e-14 and 0.1"
+        )
+    phase = _check.real_array("phase", phase)
+    _check.maps("phase", phase, sensor.pupil.shape)
+    field = sensor.pupil.field(phase)
+    exact = ZernikeSensor(sensor.pupil, *sensor.masks, tolerance=1e-14).reference_wave(field)
     rows = []
-    for tolerance in tolerances:
-        sensor = ZernikeSensor(pupil, mask, tolerance=tolerance)
-        error = np.abs(sensor.reference_wave(field) - exact).max() / np.abs(exact).max()
-        rows.append((tolerance, sensor.rank, float(error)))
-    return rows
+    for tolerance in tolerances.tolist():
+        model = ZernikeSensor(sensor.pupil, *sensor.masks, tolerance=tolerance)
+        error = np.abs(model.reference_wave(field) - exact).max() / np.abs(exact).max()
+        rows.append((tolerance, model.rank, error))
+    return np.array(rows)

@@ -1,8 +1,10 @@
-"""Pairs of phase shifts, section 4.2 of the paper: which pair gives the least noise."""
+"""Pairs of phase shifts, section 4.2 of the paper: their errors without noise, and their noise."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +18,14 @@ from zwfs.paper.dimple_diameter import _check_map, _check_screens, _rms
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
+
+DRAWN = (
+    *((theta * np.pi, -theta * np.pi) for theta in (0.5, 0.8)),
+    (np.pi / 2, -1.0),
+    (np.pi, np.pi / 2),
+    *((theta * np.pi, -theta * np.pi) for theta in (0.25, 0.65)),
+)
+"""Pairs for which the predicted noise is compared with drawn noise, radian."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +96,147 @@ def phase_noise(sensor: ZernikeSensor, phase: ArrayLike) -> PhaseNoise:
         read = np.sqrt(np.sum(answer**2, axis=0))
         bound = 1 / np.sqrt(np.sum(slope**2 / intensity, axis=0) / 2)
     return PhaseNoise(*(np.where(np.isnan(values), np.inf, values) for values in (photon, bound, read)))
+
+
+def noise_of_pairs(
+    pupil: Pupil, diameter: float, angles: ArrayLike, wavefronts: Mapping[str, ArrayLike]
+) -> dict[str, NDArray[np.float64]]:
+    """Predicted noise of the pairs (theta, -theta): photon noise for each wavefront, and read noise for the first.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    diameter : float, lambda/D
+    angles : array_like, shape (n,), radian
+        Theta of each pair.
+    wavefronts : mapping of str to array_like, shape (n_screens, ny, nx), radian
+
+    Returns
+    -------
+    dict of ndarray, shape (n,), radian sqrt(photon), and radian for read noise
+        Rms over pupil and screens; see `PhaseNoise`.
+    """
+    angles = _check.real_array("angles", angles)
+    if angles.ndim != 1 or not angles.size:
+        raise ValueError(f"angles has shape {angles.shape}: expected (n,)")
+    _check.finite("angles", angles)
+    screens = _check_wavefronts(pupil, wavefronts)
+    first, noise = next(iter(screens)), {name: np.empty(angles.size) for name in _noises(screens)}
+    for index, theta in enumerate(angles.tolist()):
+        sensor = _sensor(pupil, diameter, theta, -theta)
+        for name, phases in screens.items():
+            found = [phase_noise(sensor, phase) for phase in phases]
+            noise[f"photon noise, {name}"][index] = _rms(np.array([one.photon for one in found]))
+            if name == first:
+                noise[f"read noise, {name}"][index] = _rms(np.array([one.read for one in found]))
+    return noise
+
+
+def _noises(wavefronts: Mapping[str, Any]) -> list[str]:
+    """Names of the noises, in order."""
+    return [*(f"photon noise, {name}" for name in wavefronts), f"read noise, {next(iter(wavefronts))}"]
+
+
+class DrawnNoise(NamedTuple):
+    """Photon noise of a pair of phase shifts (radian), predicted and drawn.
+
+    Attributes
+    ----------
+    theta_a, theta_b : float, radian
+    name : str
+        As in `noise_of_pairs`.
+    expected, drawn, error : float, radian sqrt(photon)
+        Predicted noise, that of the draws, and its standard error.
+    """
+
+    theta_a: float
+    theta_b: float
+    name: str
+    expected: float
+    drawn: float
+    error: float
+
+
+def compare_noise(
+    pupil: Pupil,
+    diameter: float,
+    wavefronts: Mapping[str, ArrayLike],
+    photons: float,
+    n_draws: int,
+    *,
+    seed: int = 0,
+) -> list[DrawnNoise]:
+    """Photon noise of the pairs of `DRAWN`, predicted and drawn; see `drawn_noise`.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    diameter : float, lambda/D
+    wavefronts : mapping of str to array_like, shape (n_screens, ny, nx), radian
+    photons : float, photons
+    n_draws : int
+    seed : int
+        Of the first screen; the next ones have the next seeds.
+    """
+    screens, seed = _check_wavefronts(pupil, wavefronts), _check.integer_seed("seed", seed)
+    rows = []
+    for theta_a, theta_b in DRAWN:
+        sensor = _sensor(pupil, diameter, theta_a, theta_b)
+        for name, phases in screens.items():
+            draws = np.array(
+                [drawn_noise(sensor, phase, photons, n_draws, seed + i) for i, phase in enumerate(phases)]
+            )
+            expected = _rms(np.array([phase_noise(sensor, phase).photon for phase in phases]))
+            error = float(np.linalg.norm(draws[:, 1]) / len(phases))
+            rows.append(DrawnNoise(theta_a, theta_b, f"photon noise, {name}", expected, _rms(draws[:, 0]), error))
+    return rows
+
+
+def close_pairs(
+    pupil: Pupil, diameter: float, gaps: ArrayLike, screens: NDArray, n_iterations: int = 25
+) -> NDArray[np.float64]:
+    """Error and photon noise of pairs that are nearly equal: pi/2, and pi/2 less a gap.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    diameter : float, lambda/D
+    gaps : array_like, shape (n,), radian
+    screens : ndarray, shape (n_screens, ny, nx), radian
+    n_iterations : int
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Gap, mean error on the screens without noise (radian rms), and photon noise for a flat wavefront.
+    """
+    _check.instance("pupil", pupil, Pupil)
+    gaps = _check.real_array("gaps", gaps)
+    if gaps.ndim != 1 or not gaps.size or not np.all((gaps >= 1e-6) & (gaps <= 1)):
+        raise ValueError(f"gaps = {_check.shown(gaps)}: expected a list of values between 1e-6 and 1 radian")
+    screens = _check_screens(screens, pupil)
+    rows = []
+    for gap in gaps.tolist():
+        sensor = _sensor(pupil, diameter, np.pi / 2, np.pi / 2 - gap)
+        phase = PhaseShifted(sensor, n_iterations=n_iterations)(sensor.measure(screens)).phase
+        noise = _rms(phase_noise(sensor, np.zeros(pupil.shape)).photon)
+        rows.append((gap, reconstruction_error(pupil, phase, screens).mean(), noise))
+    return np.array(rows)
+
+
+def _sensor(pupil: Pupil, diameter: float, theta_a: float, theta_b: float) -> ZernikeSensor:
+    """Sensor with two dimples of one diameter."""
+    diameter = _check.number("diameter", diameter, 0, pupil.n_pixels, open_low=True)
+    return ZernikeSensor(pupil, Dimple(diameter, theta_a), Dimple(diameter, theta_b))
+
+
+def _check_wavefronts(pupil: Pupil, wavefronts: Mapping[str, ArrayLike]) -> dict[str, NDArray[np.floating]]:
+    """Return screens by name, (n_screens, ny, nx) each."""
+    _check.instance("pupil", pupil, Pupil)
+    _check.instance("wavefronts", wavefronts, Mapping)
+    if not wavefronts:
+        raise ValueError("wavefronts is empty: expected at least one")
+    return {name: _check_screens(screens, pupil) for name, screens in wavefronts.items()}
 
 
 def drawn_noise(
@@ -213,9 +364,7 @@ def pair_maps(
     if angles.ndim != 1 or not angles.size:
         raise ValueError(f"angles has shape {angles.shape}: expected (n,)")
     _check.finite("angles", angles)
-    screens = _check_screens(screens)
-    _check.trailing_shape("screens", screens, pupil.shape, "the shape of the pupil")
-    _check.finite("screens", pupil.gather(screens), " inside the pupil")
+    screens = _check_screens(screens, pupil)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     maps = np.full((5, angles.size, angles.size), np.nan)
     below = np.tril_indices(angles.size, -1)
@@ -229,7 +378,7 @@ def _pair(
     pair: tuple[float, float], pupil: Pupil, diameter: float, screens: NDArray, n_iterations: int
 ) -> tuple[float, ...]:
     """Error and the four noises of one pair, NaN if it is refused."""
-    sensor = ZernikeSensor(pupil, *(Dimple(diameter, theta) for theta in pair))
+    sensor = _sensor(pupil, diameter, *pair)
     try:
         method = PhaseShifted(sensor, n_iterations=n_iterations)
     except ValueError:

@@ -7,7 +7,7 @@ from zwfs.plots.frames import explained, gains, phase_map
 from zwfs.plots.identities import approximation, diversity
 from zwfs.plots.layouts import bench_layout, sensor_layout, vector_sensor
 from zwfs.plots.linearity import convergence, estimates, linearity
-from zwfs.plots.phase_shifts import pair_maps, pair_noise
+from zwfs.plots.phase_shifts import all_pairs, pair_noise
 from zwfs.plots.style import (
     INTENSITY_MAP,
     LOOKS,
@@ -25,6 +25,7 @@ __all__ = [
     "OTHER_STYLES",
     "PHASE_MAP",
     "Look",
+    "all_pairs",
     "approximation",
     "bench_layout",
     "bench_linearity",
@@ -41,7 +42,6 @@ __all__ = [
     "linearity",
     "loop_runs",
     "measured_and_modelled",
-    "pair_maps",
     "pair_noise",
     "phase_map",
     "reference_intensities",

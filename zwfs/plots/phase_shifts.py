@@ -11,19 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from zwfs.paper.phase_shifts import PairMaps
+from zwfs.paper.phase_shifts import DrawnNoise, PairMaps
 from zwfs.plots.style import OTHER_STYLES
 
 
-def pair_maps(maps: PairMaps, best: Sequence[tuple[float, float]]) -> Figure:
+def all_pairs(maps: PairMaps) -> Figure:
     """Error, and photon noise for a flat and for an aberrated wavefront, for all pairs of phase shifts.
 
-    Parameters
-    ----------
-    maps : PairMaps
-        For evenly spaced angles.
-    best : sequence of (theta_a, theta_b), radian
-        Pair that is marked by a star on each of the two maps of noise.
+    Stars mark the best pairs. The angles of the maps must be evenly spaced.
     """
     figure, panels = plt.subplots(1, 3, figsize=(9, 4.1), sharey=True)
     half = (maps.angles[1] - maps.angles[0]) / 2 / np.pi
@@ -48,35 +43,37 @@ def pair_maps(maps: PairMaps, best: Sequence[tuple[float, float]]) -> Figure:
         scale = r"rad rms" if axes is panels[0] else r"rad $\sqrt{\mathrm{photon}}$"
         more = "neither" if axes is panels[0] else "max"
         figure.colorbar(shown, ax=axes, location="bottom", label=scale, extend=more, aspect=16)
-    for axes, (theta_a, theta_b) in zip(panels[1:], best, strict=True):
+    for axes, name in zip(panels[1:], ("flat", "aberrated"), strict=True):
+        theta_a, theta_b, _ = maps.best(name)
         pairs = np.array([[theta_a, theta_b], [theta_b, theta_a]]) / np.pi
         axes.plot(*pairs.T, "*", mfc="#ffffff", mec="#000000", ms=12, zorder=4)
     panels[0].set_ylabel(r"$\theta_b$ (rad)")
     return figure
 
 
-def pair_noise(
-    angles: NDArray, curves: Mapping[str, NDArray], drawn: Mapping[str, Sequence[tuple[float, float, float]]]
-) -> Figure:
+def pair_noise(angles: NDArray, noise: Mapping[str, NDArray], rows: Sequence[DrawnNoise]) -> Figure:
     """Noise of the pairs (theta, -theta) against theta, relative to its value at pi/2.
 
     Parameters
     ----------
     angles : ndarray, shape (n,), radian
-    curves : mapping of name to ndarray, shape (n,)
-        Noise over that of the pair of +-pi/2.
-    drawn : mapping of name to sequence of (theta, noise, error)
-        The same from draws of noise, with its standard error; drawn in the colour of the curve.
+    noise : mapping of name to ndarray, shape (n,)
+        See `zwfs.paper.phase_shifts.noise_of_pairs`.
+    rows : sequence of DrawnNoise
+        Those of such pairs are drawn with their standard errors.
     """
     figure, axes = plt.subplots(figsize=(9, 4.2))
-    for (name, values), style in zip(curves.items(), OTHER_STYLES, strict=False):
-        shade = style["color"]
-        axes.plot(angles / np.pi, values, lw=1.8, label=name, **style | {"marker": "none"})
+    middle = int(np.argmin(np.abs(angles - np.pi / 2)))
+    for (name, values), style in zip(noise.items(), OTHER_STYLES, strict=False):
+        shade, scale = style["color"], values[middle]
+        axes.plot(angles / np.pi, values / scale, lw=1.8, label=name, **style | {"marker": "none"})
         least = int(np.argmin(values))
-        axes.plot(angles[least] / np.pi, values[least], "*", color=shade, ms=12)
-        if name in drawn:
-            theta, noise, error = np.array(drawn[name]).T
-            axes.errorbar(theta / np.pi, noise, error, fmt="o", mfc="none", color=shade, ms=6, capsize=3)
+        axes.plot(angles[least] / np.pi, values[least] / scale, "*", color=shade, ms=12)
+        if drawn := [row for row in rows if row.name == name and row.theta_a == -row.theta_b]:
+            theta, value, error = np.array([(row.theta_a, row.drawn, row.error) for row in drawn]).T
+            axes.errorbar(
+                theta / np.pi, value / scale, error / scale, fmt="o", mfc="none", color=shade, ms=6, capsize=3
+            )
     axes.axhline(1, color="#555555", lw=1)
     axes.axvline(0.5, color="#555555", lw=1)
     axes.set_xticks((0, 0.25, 0.5, 0.75, 1), ("0", "π/4", "π/2", "3π/4", "π"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,9 +65,12 @@ def results(pupil: Pupil, screen: NDArray, found: Mapping[str, Reconstruction]) 
     )
 
 
-def accuracy(rows: Sequence[tuple[float, int, float]]) -> Table:
+def accuracy(rows: NDArray) -> Table:
     """Rank and error of the low-rank model, see `zwfs.paper.linearity.model_accuracy`."""
     return Table(
         ["tolerance", "rank", "error of the reference wave, below"],
-        [[f"{tolerance:.0e}", rank, f"{10.0 ** np.ceil(np.log10(error)):.0e}"] for tolerance, rank, error in rows],
+        [
+            [f"{tolerance:.0e}", int(rank), f"{10.0 ** np.ceil(np.log10(error)):.0e}"]
+            for tolerance, rank, error in rows
+        ],
     )

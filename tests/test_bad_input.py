@@ -182,6 +182,8 @@ def valid() -> dict:
         "phase_shifts": (1.5, -1.5),
         "n_draws": 2,
         "phase_shift": 1.5,
+        "gaps": np.array([0.1, 0.2]),
+        "wavefronts": {"flat": np.zeros((1, 12, 12))},
         "step": 0.5,
         "diameter_max": 3.0,
         "step_fine": 0.1,

@@ -17,7 +17,7 @@ from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.paper.closed_loop import LoopRun
 from zwfs.paper.dimple_diameter import Contraction, DiameterCurves
 from zwfs.paper.linearity import linearity_curves
-from zwfs.paper.phase_shifts import PairMaps
+from zwfs.paper.phase_shifts import DrawnNoise, PairMaps
 
 
 @pytest.fixture(autouse=True)
@@ -86,8 +86,8 @@ def drawn_methods(curves, pupil, classic, shifted):
         "dimple_diameter": (({25: trial, 100: trial}, 0.05, 2.2), shifted_only),
         "diameter_methods": ((dict.fromkeys(plots.LOOKS, trial), 0.05, 2.2), plots.LOOKS),
         "diameter_reasons": ((reasons, 2.2), shifted_only),
-        "pair_maps": ((PairMaps(three, *np.full((5, 3, 3), 1.0)), [(1.0, -1.0)] * 2), ()),
-        "pair_noise": ((three, lines, {"curve 0": [(1.0, 1.0, 0.1)]}), ()),
+        "all_pairs": ((PairMaps(three, *np.full((5, 3, 3), 1.0)),), ()),
+        "pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
         "reference_intensities": ((frames, frames), ()),
         "measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
         "segment_errors": ((np.arange(4), dict.fromkeys(two, pistons[0, 0]), {"map": phase}), two),

@@ -19,7 +19,15 @@ from zwfs.paper.dimple_diameter import (
     other_curves,
     sampled_diameters,
 )
-from zwfs.paper.phase_shifts import drawn_noise, pair_maps, phase_noise
+from zwfs.paper.phase_shifts import (
+    DRAWN,
+    close_pairs,
+    compare_noise,
+    drawn_noise,
+    noise_of_pairs,
+    pair_maps,
+    phase_noise,
+)
 
 HALF = np.pi / 2
 
@@ -177,6 +185,34 @@ def test_noise_is_that_of_noisy_frames(pupil, screens, shifts):
     # The reference waves, held fixed in the expectation, take part in the noise of a few modes.
     assert noise == pytest.approx(expected, abs=3 * error + 0.01 * expected)
     assert error < 0.01 * noise
+
+
+def test_noise_of_pairs_is_that_of_each_sensor(small):
+    screens = zwfs.power_law_screens(zwfs.zernike_basis(small, 10), 0.3, 2, seed=1)
+    noise = noise_of_pairs(small, 1.06, [1.0, HALF], {"flat": np.zeros((1, 16, 16)), "screens": screens})
+    assert list(noise) == ["photon noise, flat", "photon noise, screens", "read noise, flat"]
+    sensor = pair(small, 1.06)
+    expected = [phase_noise(sensor, screen).photon for screen in screens]
+    np.testing.assert_allclose(noise["photon noise, screens"][1], np.sqrt(np.mean(np.square(expected))))
+    np.testing.assert_allclose(
+        noise["read noise, flat"][1], np.sqrt(np.mean(phase_noise(sensor, np.zeros((16, 16))).read ** 2))
+    )
+
+
+def test_drawn_noise_is_compared_with_the_prediction(small):
+    rows = compare_noise(small, 1.06, {"flat": np.zeros((1, 16, 16))}, 1e6, 30, seed=2)
+    assert [(row.theta_a, row.theta_b) for row in rows] == list(DRAWN)
+    assert {row.name for row in rows} == {"photon noise, flat"}
+    for row in rows:
+        assert row.drawn == pytest.approx(row.expected, abs=5 * row.error + 0.1 * row.expected)
+
+
+def test_noise_grows_as_the_inverse_of_the_gap(small):
+    screens = zwfs.power_law_screens(zwfs.zernike_basis(small, 10), 0.3, 1, seed=1)
+    gaps, errors, noise = close_pairs(small, 1.06, [1e-2, 1e-3], screens).T
+    np.testing.assert_array_equal(gaps, [1e-2, 1e-3])
+    assert errors.max() < 1e-6
+    assert noise[1] / noise[0] == pytest.approx(10, rel=0.01)
 
 
 def test_noise_needs_two_masks_on_the_pupil(pupil, classic):

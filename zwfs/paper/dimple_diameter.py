@@ -472,14 +472,14 @@ def _check_diameters(diameters: ArrayLike) -> NDArray[np.floating]:
     return diameters
 
 
-def _check_screens(screens: ArrayLike, pupil: Pupil | None = None) -> NDArray[np.floating]:
+def _check_screens(screens: ArrayLike, pupil: Pupil | None = None, name: str = "screens") -> NDArray[np.floating]:
     """Return screens as an array, shape (n_screens, ny, nx), finite inside the pupil if it is given."""
-    screens = _check.real_array("screens", screens)
+    screens = _check.real_array(name, screens)
     if screens.ndim != 3 or 0 in screens.shape:
-        raise ValueError(f"screens has shape {screens.shape}: expected (n_screens, ny, nx)")
+        raise ValueError(f"{name} has shape {screens.shape}: expected (n_screens, ny, nx)")
     if pupil is not None:
-        _check.trailing_shape("screens", screens, pupil.shape, "the shape of the pupil")
-        _check.finite("screens", pupil.gather(screens), " inside the pupil")
+        _check.trailing_shape(name, screens, pupil.shape, "the shape of the pupil")
+        _check.finite(name, pupil.gather(screens), " inside the pupil")
     return screens
 
 

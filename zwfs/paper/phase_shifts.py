@@ -226,7 +226,7 @@ def close_pairs(
 
 def _sensor(pupil: Pupil, diameter: float, theta_a: float, theta_b: float) -> ZernikeSensor:
     """Sensor with two dimples of one diameter."""
-    diameter = _check.number("diameter", diameter, 0, pupil.n_pixels, open_low=True)
+    diameter = _check.number("diameter", diameter, 0.01, pupil.n_pixels)
     return ZernikeSensor(pupil, Dimple(diameter, theta_a), Dimple(diameter, theta_b))
 
 
@@ -236,7 +236,7 @@ def _check_wavefronts(pupil: Pupil, wavefronts: Mapping[str, ArrayLike]) -> dict
     _check.instance("wavefronts", wavefronts, Mapping)
     if not wavefronts:
         raise ValueError("wavefronts is empty: expected at least one")
-    return {name: _check_screens(screens, pupil) for name, screens in wavefronts.items()}
+    return {name: _check_screens(screens, pupil, f"wavefronts[{name!r}]") for name, screens in wavefronts.items()}
 
 
 def drawn_noise(

@@ -59,7 +59,7 @@ CONTENT = {
 }
 # Only what they must refuse is tested, not their answers.
 SLOW = {"error_budget", "contraction", "steps", "fit"}
-INTERNAL |= {"resample", "fits_module", "fits_bytes", "published"}
+INTERNAL |= {"frames_on_grid", "clear_on_grid", "fits_module", "fits_bytes", "published"}
 INTERNAL |= {"small", "glue_numbers"}  # for the notebooks of the book
 
 
@@ -119,7 +119,12 @@ def valid() -> dict:
     on_bench = model.normalise(small.frames(None, 2))
     flow = closed_loop.FrozenFlow(pupil, 0.2, 1, cutoff=1.0, seed=1)
     images, optics, recording, measurement, found = _recorded(pipeline, registration)
-    file = camera.CameraFile(images[0].counts[np.newaxis], "frame", "0" * 64, {"GAIN": 2.0})
+    file = camera.CameraFile(
+        images[0].counts[np.newaxis],
+        "frame",
+        "0" * 64,
+        {"GAIN": 2.0, "DIMPLE": 1.06, "THETA1": 1.5, "THETA2": -1.5},
+    )
     arguments = {
         "pupil": pupil,
         "modes": modes,
@@ -139,6 +144,7 @@ def valid() -> dict:
         "n_pixels": 12,
         "n_modes": 4,
         "n_rings": 1,
+        "n_shifts": 4,
         "missing": (2,),
         "spiders": ((0.3, 0.1),),
         "gap": 0.02,
@@ -171,6 +177,7 @@ def valid() -> dict:
         "stroke": 1.0,
         "time": 0.1,
         "bench": small,
+        "benches": {"small": small},
         "model": model,
         "pistons": np.linspace(0, 0.1, small.n_segments),
         "found": np.linspace(0, 0.1, 7),
@@ -207,7 +214,6 @@ def valid() -> dict:
         "second": waves[1],
         "references": waves,
         "power": 0.5,
-        "sign": -1,
         "task": lambda value, shared: 0.0,
         "inputs": [1, 2],
         "shared": 2,
@@ -229,14 +235,12 @@ def valid() -> dict:
         "optics": optics,
         "measurement": measurement,
         "inside": np.pad(np.ones((20, 20), bool), 10),
-        "pupil_images": images[1:],
+        "clear_frames": images[1:],
         "names": ["scale"],
         "fitted": ["scale"],
         "n_pupils": 1,
-        "circles": recording.pupils,
         "shape": (6, 6),
         "margin": 1,
-        "origins": recording.origins[:2],
         "good": np.ones((6, 6), bool),
         # of one callable
         "Pupil.amplitude": pupil.amplitude,
@@ -274,7 +278,6 @@ def valid() -> dict:
         "measured_factor.n_iterations": 4,
         "approximation_errors.sensor": shifted,
         "direct_reference_wave.n_samples": 4,
-        "quotient.reference": waves[0],
         "two_waves.reference": waves[0],
         "arccosine_phase.reference": waves[0],
         "arccosine_phase.amplitude": np.abs(pupil.gather(field)),
@@ -286,6 +289,8 @@ def valid() -> dict:
         "run.name": "squares",
         "screens_at.task": 0,
         "read.path": Path("file.npy"),
+        "frame_files": [Path("file.npy")],
+        "pupil_files": [Path("file.npy")],
         "correlations.first": np.array([[1.0, 2, 4]]),
         "correlations.second": np.array([[1.0, 3, 2]]),
         "steps.fitted": (),
@@ -296,14 +301,12 @@ def valid() -> dict:
         "find_pupils.n_pupils": 2,
         "find_pupils.diameter": None,
         "record.diameter": None,
-        "same_size.name": "image",
         "nearest_good.image": np.ones((6, 6)),
         "register.image": np.roll(scene, 1, axis=0),
         "register.reference": scene,
-        "resample.images": recording.frames,
         "radius.center": (2.5, 2.5),
-        "write_phase.found": found,
-        "bench_error.found": found,
+        "write_phase.phase": found,
+        "bench_error.phase": found,
         "measured_pupil.images": np.ones((2, 12, 12)),
         "measured_pupil.inside": np.ones((12, 12), bool),
         "measured_pupil.center": (5.5, 5.5),
@@ -359,8 +362,8 @@ def _recorded(pipeline, registration):
     ]
     optics = pipeline.Optics()
     recording = registration.record(images[:1], images[1:])
-    measurement = pipeline.measure(recording, optics)
-    return images, optics, recording, measurement, pipeline.reconstruct(measurement, optics, 3)
+    measurement = pipeline.reduce_frames(recording, optics)
+    return images, optics, recording, measurement, pipeline.reconstruct(measurement, 3)
 
 
 RAGGED = [[1.0, 2.0], [3.0]]

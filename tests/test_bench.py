@@ -77,7 +77,7 @@ def test_layout_is_36_segments_six_across_with_one_missing_at_the_top_right():
 
 def test_camera_sees_a_margin_around_the_pupil(perfect):
     assert Bench.ideal().frames().shape == (2, 180, 180)
-    for images in (perfect.frames(), perfect.pupil_images(), perfect.dark()):
+    for images in (perfect.frames(), perfect.clear_frames(), perfect.dark()):
         assert images.shape == (2, N + 2 * MARGIN, N + 2 * MARGIN)
     assert perfect.segments.shape == (N, N)
 
@@ -87,7 +87,7 @@ def test_blur_widens_the_images_and_loses_no_light(perfect):
         axes = np.indices(image.shape).reshape(2, -1)
         return image.sum(), np.cov(axes, aweights=image.ravel(), ddof=0).diagonal()
 
-    for sharp, blurred in zip(perfect.pupil_images(), ideal(blur=1.5).pupil_images(), strict=True):
+    for sharp, blurred in zip(perfect.clear_frames(), ideal(blur=1.5).clear_frames(), strict=True):
         (light, width), (same, wider) = moments(sharp), moments(blurred)
         assert same == pytest.approx(light)
         np.testing.assert_allclose(wider - width, 1.5**2, rtol=0.01)
@@ -126,7 +126,7 @@ def test_ideal_bench_is_the_sensor(illumination, commands):
     flat = sensor.measure(np.zeros(LAYOUT.shape))
     np.testing.assert_allclose(bench.frames(), flat, rtol=0, atol=1e-10)
     lit = np.pad(sensor.pupil.amplitude**2, MARGIN)
-    np.testing.assert_allclose(bench.pupil_images(), [lit, lit], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(bench.clear_frames(), [lit, lit], rtol=0, atol=1e-14)
     assert not bench.dark().any()
 
 
@@ -159,7 +159,7 @@ def test_leakage_mixes_the_images_by_that_fraction(perfect, commands, leakage):
     plus, minus = np.moveaxis(perfect.frames(commands), 1, 0)
     mixed = np.stack([(1 - leakage) * plus + leakage * minus, (1 - leakage) * minus + leakage * plus], axis=1)
     np.testing.assert_allclose(bench.frames(commands), mixed, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(bench.pupil_images(), perfect.pupil_images(), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(bench.clear_frames(), perfect.clear_frames(), rtol=0, atol=1e-13)
     assert np.abs(plus - minus).max() > 0.5
 
 
@@ -176,7 +176,7 @@ def test_leakage_makes_the_phase_too_small(perfect, model, commands, leakage):
 def test_flux_imbalance_shows_in_the_pupil_images_and_drops_out(perfect, commands, imbalance):
     bench = ideal(flux_imbalance=imbalance)
     share = np.array([1 + imbalance, 1 - imbalance])[:, np.newaxis, np.newaxis]
-    np.testing.assert_allclose(bench.pupil_images(), share * perfect.pupil_images(), rtol=1e-13)
+    np.testing.assert_allclose(bench.clear_frames(), share * perfect.clear_frames(), rtol=1e-13)
     np.testing.assert_allclose(bench.frames(commands), share * perfect.frames(commands), rtol=1e-13)
     scaled = BenchModel.from_images(bench).normalise(bench.frames(commands))
     np.testing.assert_allclose(scaled, perfect.frames(commands), rtol=1e-12)
@@ -188,10 +188,10 @@ def test_misregistration_moves_the_images_apart(perfect, distance):
         rows, columns = np.mgrid[: images.shape[-2], : images.shape[-1]]
         return np.stack([(images * grid).sum(axis=(1, 2)) / images.sum(axis=(1, 2)) for grid in (rows, columns)])
 
-    images = ideal(misregistration=distance).pupil_images()
-    moved = centroids(images) - centroids(perfect.pupil_images())
+    images = ideal(misregistration=distance).clear_frames()
+    moved = centroids(images) - centroids(perfect.clear_frames())
     np.testing.assert_allclose(moved, np.array([[0.5, -0.5]] * 2) * distance, atol=0.02)
-    np.testing.assert_allclose(images.sum(axis=(1, 2)), perfect.pupil_images().sum(axis=(1, 2)), rtol=2e-3)
+    np.testing.assert_allclose(images.sum(axis=(1, 2)), perfect.clear_frames().sum(axis=(1, 2)), rtol=2e-3)
 
 
 def test_misregistration_moves_frames_as_it_moves_pupil_images(perfect, commands):
@@ -245,7 +245,7 @@ def test_focus_difference_turns_a_phase_grating_into_opposite_contrasts(distance
     # Talbot: exp(i q cos(2 pi f x)) becomes 1 + 2 q sin(pi z f^2) cos(2 pi f x) in intensity, for a small q.
     q, f = 0.01, 22
     open_pupil = {"n_rings": 0, "missing": (), "illumination": 0, "focus_difference": distance}
-    graved, plain = (ideal(**open_pupil, quilting=value).pupil_images() for value in (q, 0))
+    graved, plain = (ideal(**open_pupil, quilting=value).clear_frames() for value in (q, 0))
     x, y = np.meshgrid(LAYOUT.x, LAYOUT.x)
     centre = np.hypot(x, y) < 0.25
     waves = np.stack([np.cos(2 * np.pi * f * x), np.cos(2 * np.pi * f * y), np.ones_like(x)])[:, centre]
@@ -257,10 +257,10 @@ def test_focus_difference_turns_a_phase_grating_into_opposite_contrasts(distance
 
 @pytest.mark.parametrize("distance", [1e-4, 1e-2])
 def test_focus_difference_loses_no_light(distance):
-    images = ideal(extent=4, focus_difference=distance).pupil_images()
+    images = ideal(extent=4, focus_difference=distance).clear_frames()
     np.testing.assert_allclose(images.sum(axis=(1, 2)), np.count_nonzero(LAYOUT.inside), rtol=1e-10)
     # Nor does it come back from the other side on the narrower plane.
-    narrow = ideal(focus_difference=distance).pupil_images()
+    narrow = ideal(focus_difference=distance).clear_frames()
     cut = 3 * N // 2 - MARGIN
     np.testing.assert_allclose(
         narrow, images[:, cut:-cut, cut:-cut], rtol=0, atol=2e-2 if distance > 1e-3 else 1e-3
@@ -268,14 +268,14 @@ def test_focus_difference_loses_no_light(distance):
 
 
 def test_a_flat_wavefront_looks_the_same_on_either_side_of_focus(perfect):
-    one, other = ideal(focus_difference=1e-3).pupil_images()
+    one, other = ideal(focus_difference=1e-3).clear_frames()
     np.testing.assert_allclose(one, other, rtol=0, atol=1e-13)
-    assert np.abs(one - perfect.pupil_images()[0]).max() > 0.1
+    assert np.abs(one - perfect.clear_frames()[0]).max() > 0.1
 
 
 def test_dimple_error_changes_the_dimple_only(perfect, commands):
     bench = ideal(dimple_error=0.25)
-    np.testing.assert_array_equal(bench.pupil_images(), perfect.pupil_images())
+    np.testing.assert_array_equal(bench.clear_frames(), perfect.clear_frames())
     expected = design(bench, 1.06 * 1.25).measure(bench.commanded_phase(commands))
     np.testing.assert_allclose(bench.frames(commands), expected, rtol=0, atol=1e-10)
     assert np.abs(expected - perfect.frames(commands)).max() > 0.05
@@ -283,7 +283,7 @@ def test_dimple_error_changes_the_dimple_only(perfect, commands):
 
 def test_static_aberration_is_smooth_and_has_its_rms(perfect):
     bench = ideal(static=0.3)
-    np.testing.assert_allclose(bench.pupil_images(), perfect.pupil_images(), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(bench.clear_frames(), perfect.clear_frames(), rtol=0, atol=1e-14)
     phase = phase_of(bench)
     assert LAYOUT.rms(phase) == pytest.approx(0.3, abs=1e-6)
     low = zernike_basis(LAYOUT, 27)[:, LAYOUT.inside]
@@ -298,7 +298,7 @@ def test_static_aberration_is_smooth_and_has_its_rms(perfect):
 
 def test_quilting_has_its_rms_and_22_periods(perfect):
     bench = ideal(quilting=0.06)
-    np.testing.assert_allclose(bench.pupil_images(), perfect.pupil_images(), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(bench.clear_frames(), perfect.clear_frames(), rtol=0, atol=1e-14)
     values = phase_of(bench)[LAYOUT.inside]
     assert values.std() == pytest.approx(0.06, rel=0.03)
     x, y = LAYOUT.points.T
@@ -318,7 +318,7 @@ def test_static_and_quilting_add_to_the_commands(commands):
 
 @pytest.mark.parametrize("illumination", [0.5, 1.5])
 def test_illumination_shows_in_the_pupil_images(illumination):
-    left, right = ideal(illumination=illumination).pupil_images()
+    left, right = ideal(illumination=illumination).clear_frames()
     np.testing.assert_array_equal(left, right)
     values = inner(left)[LAYOUT.inside]
     slope, mean = np.polyfit(LAYOUT.points[:, 0], values, 1)
@@ -346,10 +346,10 @@ def test_counts_scatter_as_those_of_a_camera(perfect):
 
 def test_a_frame_holds_the_photons_that_it_should():
     bench = ideal(photons=1e9, flux_imbalance=0.1)
-    np.testing.assert_allclose(bench.pupil_images(1).sum(axis=(1, 2)), [1.1e9, 0.9e9], rtol=3e-4)
+    np.testing.assert_allclose(bench.clear_frames(1).sum(axis=(1, 2)), [1.1e9, 0.9e9], rtol=3e-4)
 
 
-@pytest.mark.parametrize("shoot", [Bench.frames, Bench.pupil_images, Bench.dark])
+@pytest.mark.parametrize("shoot", [Bench.frames, Bench.clear_frames, Bench.dark])
 def test_noise_follows_the_seed(shoot):
     bench = Bench(**SMALL)
     before = np.random.get_state()[1].copy()
@@ -367,15 +367,13 @@ def test_noise_follows_the_seed(shoot):
 # Commands
 
 
-def test_commands_by_array_and_by_number(perfect):
+def test_commands_are_in_the_order_of_the_numbers(perfect):
     pistons = np.zeros(36)
     pistons[[4, 20]] = 0.3, -0.2  # numbers 5 and 22: 21 is missing
     phase = perfect.commanded_phase(pistons)
     expected = 0.3 * (LAYOUT.segments == 5) - 0.2 * (LAYOUT.segments == 22)
     np.testing.assert_array_equal(phase, expected)
-    np.testing.assert_array_equal(perfect.commanded_phase({22: -0.2, 5: 0.3}), expected)
-    np.testing.assert_array_equal(perfect.frames({5: 0.3, 22: -0.2}), perfect.frames(pistons))
-    np.testing.assert_array_equal(perfect.frames({}), perfect.frames())
+    np.testing.assert_array_equal(perfect.frames(0 * pistons), perfect.frames())
 
 
 def test_commands_in_batches_of_any_depth(perfect):
@@ -400,7 +398,8 @@ def test_bench_keeps_its_aberrations_to_itself():
     shown = [name for name in names if not callable(getattr(one, name))]
     for name in shown:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), name)
-    np.testing.assert_array_equal(one.commanded_phase({3: 1.0}), other.commanded_phase({3: 1.0}))
+    pistons = np.linspace(-1, 1, one.n_segments)
+    np.testing.assert_array_equal(one.commanded_phase(pistons), other.commanded_phase(pistons))
 
 
 def test_model_knows_no_more_than_the_images_show(perfect, model):
@@ -450,7 +449,7 @@ def test_model_follows_the_seed():
 def test_normalised_counts_are_1_on_average_in_the_pupil():
     bench = ideal(photons=1e9, read_noise=30, background=5000, flux_imbalance=0.2)
     found = BenchModel.from_images(bench, 1)
-    off = found.normalise(bench.pupil_images(2))
+    off = found.normalise(bench.clear_frames(2))
     np.testing.assert_allclose(inner(off)[:, LAYOUT.inside].mean(axis=1), 1, atol=1e-3)
     assert off.min() == 0  # noise around 0 is raised, not left negative
     np.testing.assert_array_equal(found.normalise(found.dark - 1), 0)
@@ -572,12 +571,6 @@ def test_bad_parameters_are_named(changes, error, message):
         (np.zeros(36, complex), TypeError, "pistons is complex"),
         (["a"] * 36, TypeError, "pistons has dtype"),
         (np.zeros((0, 36)), ValueError, r"pistons has shape \(0, 36\): expected at least one"),
-        ({21: 0.1}, ValueError, r"pistons names segment 21, which is missing: expected some of \[1, 2, .* 37\]"),
-        ({38: 0.1}, ValueError, "pistons names segment 38"),
-        ({"a": 0.1}, ValueError, "pistons names segment 'a'"),
-        ({(1, 2): 0.1}, ValueError, r"pistons names segment \(1, 2\)"),
-        ({5: np.nan}, ValueError, r"pistons\[5\] = nan: expected a finite number"),
-        ({5: "x"}, TypeError, r"pistons\[5\] = 'x': expected a real number"),
     ],
 )  # fmt: skip
 def test_bad_commands_are_named(perfect, pistons, error, message):

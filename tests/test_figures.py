@@ -12,7 +12,8 @@ from matplotlib.colors import to_hex, to_rgb, to_rgba_array
 import zwfs
 from zwfs import plots
 from zwfs.bench.model import Bench
-from zwfs.frames.pipeline import Found, Measurement, Optics, Step
+from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics, Step
+from zwfs.paper import identities
 from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.paper.closed_loop import LoopRun
 from zwfs.paper.dimple_diameter import Contraction, DiameterCurves
@@ -70,8 +71,8 @@ def drawn_methods(curves, pupil, classic, shifted):
     loop = LoopRun(three, *np.full((3, 2, 3), 0.1))
     bad = np.zeros(frames.shape, bool)
     bad[:, 10, 10] = True
-    measurement = Measurement(frames, pupil, bad, 0, pupil.n_pixels, np.ones(2), np.zeros(4), (1.0, 1.0))
-    found = Found(phase, frames, 0.9 * frames, measurement, Optics(1.06, (1.5, -1.5)), True, 0)
+    measurement = Measurement(None, Optics(), frames, pupil, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0))
+    found = MeasuredPhase(phase, frames, 0.9 * frames, measurement, True, 0)
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
     return {
@@ -82,7 +83,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in plots.LOOKS},), plots.LOOKS),
         "estimates": ((pupil, phase, dict.fromkeys(two, phase)), ()),
         "approximation": ((three, lines, lines), ()),
-        "diversity": ((three, three, three, {f"pair {i}": i for i in range(3)}), ()),
+        "diversity": ((identities.dimple_pairs(pupil, 1.06, 24, pupil.field(0 * phase)),), ()),
         "dimple_diameter": (({25: trial, 100: trial}, 0.05, 2.2), shifted_only),
         "diameter_methods": ((dict.fromkeys(plots.LOOKS, trial), 0.05, 2.2), plots.LOOKS),
         "diameter_reasons": ((reasons, 2.2), shifted_only),
@@ -90,18 +91,18 @@ def drawn_methods(curves, pupil, classic, shifted):
         "pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
         "reference_intensities": ((frames, frames), ()),
         "measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
-        "segment_errors": ((np.arange(4), dict.fromkeys(two, pistons[0, 0]), {"map": phase}), two),
-        "bench_linearity": ((bench_curves, two), two),
-        "budget": ((["none", "blur"], *np.ones((3, 2))), shifted_only),
+        "segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),
+        "bench_linearity": ((bench_curves,), two),
+        "budget": ((dict.fromkeys(["none", "blur"], bench_curves), "PhaseShifted"), shifted_only),
         "explained": ((found,), ()),
         "phase_map": ((found, 635.0), ()),
         "gains": (
-            ([Step("outlines", None, None, found, np.ones(2))] * 2, [0.1, 0.2]),
+            ([Step("outlines", found, np.ones(2))] * 2, [0.1, 0.2]),
             (),
         ),
-        "loop_runs": (({"bright star": dict.fromkeys(two, loop)},), two),
+        "loop_runs": (({4.0: dict.fromkeys(two, loop)},), two),
         "capture": (
-            (three, dict.fromkeys(two, three), dict.fromkeys(two, np.full((3, 2), 0.1))),
+            (three, [dict.fromkeys(two, loop)] * 3),
             two,
         ),
     }
@@ -181,7 +182,7 @@ def test_colours_that_share_a_figure_differ_for_every_reader(vision):
 
 
 def test_polarisations_and_masked_pixels_do_not_look_like_a_method():
-    others = [plots.layouts._PLUS.color, plots.layouts._MINUS.color, plots.frames._MASKED]
+    others = [plots.layouts._PLUS.color, plots.layouts._MINUS.color, plots.frames._BAD]
     methods = [look.color for look in plots.LOOKS.values()]
     gaps = [np.linalg.norm(lab(a, "normal") - lab(b, "normal")) for a, b in product(others, methods)]
     assert min(gaps) > 25
@@ -194,12 +195,14 @@ def test_a_method_looks_the_same_in_every_figure(curves):
     two = ["Linear", "PhaseShifted"]
     pistons = np.linspace(-1, 1, 24).reshape(2, 3, 4)
     bench = BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(two, 0.1 * pistons))
-    segments = plots.segment_errors(np.arange(4), dict.fromkeys(two, pistons[0, 0]), {"map": np.eye(4)})
+    mirror = Bench(n_pixels=60)
+    commands = np.linspace(-1, 1, mirror.n_segments)
+    segments = plots.segment_errors(mirror, commands, dict.fromkeys(two, commands))
     shown = [
         (plots.linearity(curves, 0.05, two, rms_max=0.4), two),
         (plots.convergence(steps), list(plots.LOOKS)),
         (plots.diameter_methods(trials, 0.05, 2.2), list(plots.LOOKS)),
-        (plots.bench_linearity(bench, two), two),
+        (plots.bench_linearity(bench), two),
         (segments, two),
     ]
     for figure, names in shown:

@@ -75,7 +75,9 @@ def figure_9(pupil, modes):
 
 
 def budget(pupil, modes):
-    found = error_budget(Bench(n_pixels=40), ["PhaseShifted"], [0.0, 0.3], 1, n_iterations=2, seed=1)
+    found = error_budget(
+        Bench(n_pixels=40).single_errors(), ["PhaseShifted"], [0.0, 0.3], 1, n_iterations=2, seed=1
+    )
     return [curves.residuals["PhaseShifted"] for curves in found.values()]
 
 

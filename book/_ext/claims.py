@@ -18,7 +18,7 @@ HOLDS, REMARK, FAILS, UNTESTED = "holds", "holds with a remark", "does not hold"
 # The signs differ in shape, for readers who do not see the colours.
 SIGNS = {HOLDS: "✔", REMARK: "◐", FAILS: "✘", UNTESTED: "○"}
 
-ROUNDING = 1e-12  # an identity must hold to this; the notebooks give no smaller errors, see their `at_least`
+ROUNDING = 1e-12  # an identity must hold to this; the notebooks give no smaller errors
 
 # The page that treats a section of the paper.
 SECTIONS = {

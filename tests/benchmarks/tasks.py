@@ -65,7 +65,7 @@ def figure_9():
 
 def budget():
     """Error budget: an error, 3 inputs, 5 screens"""
-    error_budget(Bench(), ["PhaseShifted"], [0.0, 0.3, 0.8], 5, seed=1)
+    error_budget(Bench().single_errors(), ["PhaseShifted"], [0.0, 0.3, 0.8], 5, seed=1)
 
 
 def maps():

@@ -1,13 +1,13 @@
 """A simulated bench: a vector-Zernike sensor behind a segmented mirror, with the errors of a real one.
 
-The bench stands for the one of section 5 of the paper. It hands out what a camera would: frames, off-mask pupil
+The bench stands for the one of section 5 of the paper. It hands out what a camera would: frames, clear frames
 images and darks, in counts. What it knows of its own errors stays inside; `BenchModel` is the sensor that an
 experimenter would model from the images alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -58,7 +58,7 @@ class Bench:
         Phase shift of the mask, of opposite sign for the two polarisations.
     illumination : float
         Change of the intensity from the left edge of the pupil to the right one, as a fraction of the mean. The
-        off-mask image shows it, so it is no error.
+        clear frame shows it, so it is no error.
     leakage : float
         Fraction of the light of each polarisation that ends in the image of the other. 3 % is what a quarter-wave
         plate makes that is turned by 10 degrees (sin^2), or 20 degrees short of a quarter wave.
@@ -72,7 +72,7 @@ class Bench:
     blur : float, pixels rms
         Gaussian blur of the relay optics and the camera. The power spectrum of the real frames asks for 0.8.
     flux_imbalance : float
-        The two images hold 1 + and 1 - this of the mean flux. The off-mask images show it.
+        The two images hold 1 + and 1 - this of the mean flux. The clear frames show it.
     dimple_error : float
         Relative error of the dimple's diameter. The real frames are explained best by 1.1 lambda/D, 4 % above the
         design.
@@ -157,6 +157,14 @@ class Bench:
         perfect: dict[str, Any] = dict.fromkeys((*cls.errors(), "photons", "read_noise", "background"), 0)
         return cls(**{**perfect, **changes})
 
+    def single_errors(self) -> dict[str, Bench]:
+        """Benches with each error of this one alone, "none" of them (first), the "noise", and "all" (last)."""
+        layout = {field.name: getattr(self, field.name) for field in fields(self)}
+        cases: dict[str, dict[str, float]] = {"none": {}}
+        cases |= {name: {name: layout.pop(name)} for name in self.errors()}
+        cases["noise"] = {name: layout.pop(name) for name in ("photons", "read_noise", "background")}
+        return {name: Bench.ideal(**layout, **case) for name, case in cases.items()} | {"all": self}
+
     @cached_property
     def segments(self) -> NDArray[np.int64]:
         """Number of the segment seen by each point of the pupil's grid, 0 in gaps and outside, (ny, nx)."""
@@ -173,13 +181,13 @@ class Bench:
         """Number of segments that can be commanded."""
         return len(self.numbers)
 
-    def commanded_phase(self, pistons: ArrayLike | Mapping[int, float]) -> NDArray[np.float64]:
+    def commanded_phase(self, pistons: ArrayLike) -> NDArray[np.float64]:
         """Phase that segment commands ask for.
 
         Parameters
         ----------
-        pistons : array_like, shape (..., n_segments), or mapping of segment number to float, radian
-            Wavefront piston of each segment in the order of `numbers`; a mapping leaves the others at 0.
+        pistons : array_like, shape (..., n_segments), radian
+            Wavefront piston of each segment in the order of `numbers`.
 
         Returns
         -------
@@ -189,13 +197,17 @@ class Bench:
         Raises
         ------
         TypeError, ValueError
-            If the number of commands is wrong, a command is not finite, or a segment is missing.
+            If the number of commands is wrong, or a command is not finite.
         """
-        values = self._commands(pistons)
+        values = _check.real_array("pistons", pistons).astype(np.float64)
+        _check.trailing_shape("pistons", values, (self.n_segments,), "a command for each usable segment")
+        if not values.size:
+            raise ValueError(f"pistons has shape {values.shape}: expected at least one command")
+        _check.finite("pistons", values)
         index = np.searchsorted(self.numbers, self.segments)
         return np.where(self.segments > 0, values[..., np.minimum(index, self.n_segments - 1)], 0.0)
 
-    def frames(self, pistons: ArrayLike | Mapping[int, float] | None = None, seed: Seed = None) -> NDArray:
+    def frames(self, pistons: ArrayLike | None = None, seed: Seed = None) -> NDArray:
         """Counts of the camera with the mask in.
 
         Parameters
@@ -217,7 +229,7 @@ class Bench:
         images = np.stack([self._image(self._sensor.propagate(one)) for one in flat])
         return self._expose(images.reshape(*field.shape[:-2], *images.shape[1:]), rng)
 
-    def pupil_images(self, seed: Seed = None) -> NDArray:
+    def clear_frames(self, seed: Seed = None) -> NDArray:
         """Counts of the camera with the mask taken out and a flat command, shape (2, ny', nx')."""
         rng = _check.generator("seed", seed)
         field = np.pad(self._field, self._margin)
@@ -290,28 +302,10 @@ class Bench:
         camera = Detector(self._pupil, self.photons, read_noise=self.read_noise, background=self.background)
         return camera.expose(images * flux, rng)
 
-    def _commands(self, pistons: ArrayLike | Mapping[int, float]) -> NDArray[np.float64]:
-        if isinstance(pistons, Mapping):
-            values = np.zeros(self.n_segments)
-            for number, piston in pistons.items():
-                known = self.numbers.tolist()
-                if isinstance(number, bool) or number not in known:
-                    raise ValueError(
-                        f"pistons names segment {_check.shown(number)}, which is missing: expected some of {known}"
-                    )
-                values[np.searchsorted(self.numbers, number)] = _check.number(f"pistons[{number}]", piston)
-            return values
-        values = _check.real_array("pistons", pistons).astype(np.float64)
-        _check.trailing_shape("pistons", values, (self.n_segments,), "a command for each usable segment")
-        if not values.size:
-            raise ValueError(f"pistons has shape {values.shape}: expected at least one command")
-        _check.finite("pistons", values)
-        return values
-
 
 @dataclass(frozen=True, eq=False)
 class BenchModel(Immutable):
-    """The sensor as an experimenter models it: off-mask images, the design of the mask, Fraunhofer diffraction.
+    """The sensor as an experimenter models it: clear frames, the design of the mask, Fraunhofer diffraction.
 
     Make one with `from_images`.
 
@@ -335,7 +329,7 @@ class BenchModel(Immutable):
 
     @classmethod
     def from_images(cls, bench: Bench, seed: Seed = None) -> BenchModel:
-        """Record off-mask images and a dark on a bench, and model the sensor from them.
+        """Record clear frames and a dark on a bench, and model the sensor from them.
 
         The amplitude is the square root of the mean of the two images, each scaled to the same flux. The layout of
         the segments, the dimple's design and its phase shifts are taken as known.
@@ -349,7 +343,7 @@ class BenchModel(Immutable):
         _check.instance("bench", bench, Bench)
         rng = _check.generator("seed", seed)
         dark = bench.dark(rng)
-        images = bench.pupil_images(rng) - dark
+        images = bench.clear_frames(rng) - dark
         ny, nx = bench.segments.shape
         top, left = (images.shape[-2] - ny) // 2, (images.shape[-1] - nx) // 2
         inner = images[:, top : top + ny, left : left + nx]

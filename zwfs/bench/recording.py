@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,7 @@ from zwfs._files import write_file
 from zwfs.bench.model import Bench, Seed
 from zwfs.bench.segments import segment_pistons, segment_residual
 from zwfs.frames.files import _BENCH_CARD, _card_value, _has_card, _is_there, _path, fits_bytes, fits_module
-from zwfs.frames.pipeline import Found
-from zwfs.frames.registration import Recording
+from zwfs.frames.pipeline import MeasuredPhase
 
 _FULL = 50_000  # counts of the brightest pixel of a simulated 16-bit camera
 
@@ -24,7 +22,7 @@ _FULL = 50_000  # counts of the brightest pixel of a simulated 16-bit camera
 def write_bench(
     folder: str | Path,
     bench: Bench,
-    pistons: ArrayLike | Mapping[int, float] | None = None,
+    pistons: ArrayLike | None = None,
     *,
     wavelength: float = 635.0,
     n_bad: int = 0,
@@ -64,7 +62,7 @@ def write_bench(
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
     n_bad = _check.integer("n_bad", n_bad, 0, 2 * math.prod(bench.segments.shape))
     rng = _check.generator("seed", seed)
-    if pistons is not None and not isinstance(pistons, Mapping):
+    if pistons is not None:
         pistons = _check.real_array("pistons", pistons)
         if pistons.ndim != 1:
             raise ValueError(f"pistons has shape {pistons.shape}: expected ({bench.n_segments},), one command")
@@ -78,7 +76,7 @@ def write_bench(
                 f"folder = {str(folder)!r} holds a {path.name} that the simulated bench did not write: "
                 "expected another folder"
             )
-    counts = {"frame": bench.frames(pistons, rng), "pupils": bench.pupil_images(rng), "dark": bench.dark(rng)}
+    counts = {"frame": bench.frames(pistons, rng), "pupils": bench.clear_frames(rng), "dark": bench.dark(rng)}
     gain = _FULL / max(pair.max() for pair in counts.values())
     shape = np.concatenate(counts["frame"], axis=-1).shape
     places = rng.choice(shape[0] * shape[1], n_bad, replace=False)
@@ -103,22 +101,21 @@ def write_bench(
     return paths
 
 
-def bench_error(bench: Bench, commanded: ArrayLike, recording: Recording, found: Found) -> float:
-    """Rms error of the segment pistons in a phase found from frames that `write_bench` wrote, radian.
+def bench_error(bench: Bench, commanded: ArrayLike, phase: MeasuredPhase) -> float:
+    """Rms error of the segment pistons in the phase of frames that `write_bench` wrote, radian.
 
     Parameters
     ----------
     bench : Bench
     commanded : array_like, shape (n_segments,), radian
-    recording : Recording
-    found : Found
+    phase : MeasuredPhase
     """
     _check.instance("bench", bench, Bench)
-    _check.instance("recording", recording, Recording)
-    _check.instance("found", found, Found)
-    canvas = np.full(recording.pupil_images[0].counts.shape, np.nan)
+    _check.instance("phase", phase, MeasuredPhase)
+    recording = phase.measurement.recording
+    canvas = np.full(recording.clear_frames[0].counts.shape, np.nan)
     row, column = recording.corner
-    canvas[row : row + recording.n_pixels, column : column + recording.n_pixels] = found.phase
+    canvas[row : row + recording.n_pixels, column : column + recording.n_pixels] = phase.phase
     # The pupil stands in the middle of the left half of the image.
     ny, nx = bench.segments.shape
     top = (len(canvas) - ny) // 2

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs._files import write_file
-from zwfs.frames.pipeline import Found
-from zwfs.frames.registration import Image, Recording, nearest_good
+from zwfs.frames.pipeline import MeasuredPhase, Optics
+from zwfs.frames.registration import Image, nearest_good
 
 _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do that, saturation does
 _GZIP, _NPY, _FITS = b"\x1f\x8b", b"\x93NUMPY", b"SIMPLE  ="  # first bytes of a file
@@ -39,7 +39,7 @@ class FileError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class CameraFile:
-    """What one file holds.
+    """Images and header of a file.
 
     Attributes
     ----------
@@ -92,6 +92,14 @@ class CameraFile:
         if key not in self.header:
             raise ValueError(f"{self.name}: its header has no {key}: give the value as a parameter")
         return _check.number(f"{self.name}: {key}", self.header[key])
+
+    def optics(self, diameter: float = 0.0, phase_shifts: Sequence[float] = ()) -> Optics:
+        """Optics with these values, see `Optics`; by default those of the header, DIMPLE, THETA1 and THETA2."""
+        diameter = _check.number("diameter", diameter, 0)
+        if isinstance(phase_shifts, str) or not isinstance(phase_shifts, Sequence):
+            raise TypeError(f"phase_shifts = {_check.shown(phase_shifts)}: expected a list of two numbers")
+        shifts: Any = phase_shifts or [self.keyword(key) for key in ("THETA1", "THETA2")]
+        return Optics(diameter or self.keyword("DIMPLE"), tuple(shifts))
 
 
 def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
@@ -147,6 +155,37 @@ def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
     return CameraFile(images, name, sha256, header, full_scale, path.resolve())
 
 
+def load(
+    frame_files: Sequence[str | Path],
+    pupil_files: Sequence[str | Path],
+    dark_files: Sequence[str | Path] = (),
+    bad_pixel_files: Sequence[str | Path] = (),
+    saturation: float | None = None,
+) -> tuple[tuple[Image, ...], tuple[Image, ...], list[CameraFile]]:
+    """Read all files of a measurement: one or two for each kind, darks and bad-pixel maps also none.
+
+    Parameters, as for `read` and `images`.
+
+    Returns
+    -------
+    frames, clear_frames : tuple of Image
+    sources : list of CameraFile
+        All the files, that of the first frame first.
+    """
+    kinds = {
+        "frame_files": _paths("frame_files", frame_files),
+        "pupil_files": _paths("pupil_files", pupil_files),
+        "dark_files": _paths("dark_files", dark_files),
+        "bad_pixel_files": _paths("bad_pixel_files", bad_pixel_files),
+    }
+    for name in ("frame_files", "pupil_files"):
+        if not kinds[name]:
+            raise ValueError(f"{name} is empty: expected one file or two")
+    frames, clear, darks, maps = ([read(path) for path in paths] for paths in kinds.values())
+    shared = darks, maps, saturation
+    return images(frames, *shared), images(clear, *shared), [*frames, *clear, *darks, *maps]
+
+
 def images(
     files: Sequence[CameraFile],
     darks: Sequence[CameraFile] = (),
@@ -180,28 +219,28 @@ def images(
         _camera_files(argument, given)
     if saturation is not None:
         saturation = _check.number("saturation", saturation, 0, open_low=True)
-    found = [(file, counts) for file in files for counts in file.images]
-    if len(found) not in (1, 2):
+    recorded = [(file, counts) for file in files for counts in file.images]
+    if len(recorded) not in (1, 2):
         names = ", ".join(file.name for file in files) or "files"
-        raise ValueError(f"{names}: {len(found)} images: expected one or two")
-    result = []
-    for index, (file, counts) in enumerate(found):
-        dark = _companion("darks", _usable, darks, index, len(found), counts, file.name)
-        marked = _companion("bad_pixels", np.logical_not, bad_pixels, index, len(found), counts, file.name)
+        raise ValueError(f"{names}: {len(recorded)} images: expected one or two")
+    result: list[Image] = []
+    for (file, counts), dark, marked in zip(
+        recorded,
+        _companions("darks", darks, recorded, _usable),
+        _companions("bad_pixels", bad_pixels, recorded, np.logical_not),
+        strict=True,
+    ):
         bad = ~_usable(counts)
         level = saturation or _saturation(file, counts[~bad])
         bad |= np.where(bad, 0, counts) >= level
-        if dark is not None:
-            with np.errstate(over="ignore", invalid="ignore"):
-                counts = counts - dark
-            bad |= ~_usable(counts)
-        if marked is not None:
-            bad |= marked != 0
+        with np.errstate(over="ignore", invalid="ignore"):
+            counts = counts - dark
+        bad |= ~_usable(counts) | (marked != 0)
         if bad.all():
             raise ValueError(
                 f"{file.name}: all pixels are bad or saturated (saturation = {level:g}): expected an image"
             )
-        name = file.name if len(file.images) == 1 else f"{file.name}[{index}]"
+        name = file.name if len(file.images) == 1 else f"{file.name}[{len(result)}]"
         result.append(Image(nearest_good(counts, ~bad), bad, name))
     return tuple(result)
 
@@ -232,9 +271,7 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
         did not write, is a folder, or cannot be written.
     """
     overwrite = _check.flag("overwrite", overwrite)
-    if isinstance(inputs, str | Path) or not isinstance(inputs, Sequence):
-        raise TypeError(f"inputs = {_check.shown(inputs)}: expected a sequence of paths")
-    sources = [_path(f"inputs[{index}]", one) for index, one in enumerate(inputs)]
+    sources = _paths("inputs", inputs)
     path = _path("output", output)
     named = f"output = {str(output)!r}"
     try:
@@ -261,24 +298,22 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
 
 def write_phase(
     output: str | Path,
-    found: Found,
-    recording: Recording,
+    phase: MeasuredPhase,
     wavelength: float,
     sources: Sequence[CameraFile] = (),
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write a phase map as FITS: in radian, in nm as an extension, and the masked points as another.
+    """Write a phase map as FITS: in radian, in nm as an extension, and the bad points as another.
 
-    The header says what the map was made from and how well the frames are explained. It holds no date but DATE-OBS
+    The header names the sources and holds the optics and the agreement of the frames. It has no date but DATE-OBS
     of the first source, so that the same input gives the same bytes.
 
     Parameters
     ----------
     output : str or Path
         See `check_output`. An earlier phase map is replaced.
-    found : Found
-    recording : Recording
+    phase : MeasuredPhase
     wavelength : float, nm
     sources : sequence of CameraFiles
         Their names and checksums go into the header. None of these files is replaced.
@@ -295,38 +330,37 @@ def write_phase(
     from zwfs import __version__
 
     fits = fits_module()
-    _check.instance("found", found, Found)
-    _check.instance("recording", recording, Recording)
+    _check.instance("phase", phase, MeasuredPhase)
     _camera_files("sources", sources)
     path = check_output(output, [source.path for source in sources if source.path], overwrite=overwrite)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-    measurement, optics = found.measurement, found.optics
+    measurement, recording, optics = phase.measurement, phase.measurement.recording, phase.measurement.optics
     cards = [
-        ("BUNIT", "rad", "in (-pi, pi]; NaN outside and where masked"),
+        ("BUNIT", "rad", "in (-pi, pi]; NaN outside and at bad points"),
         ("WAVELEN", wavelength, "[nm] wavelength"),
-        ("PUPDIAM", measurement.diameter, "[pixel] diameter D of the pupil"),
-        ("PIXSCALE", 1 / measurement.diameter, "[D] width of a pixel"),
+        ("PUPDIAM", recording.diameter, "[pixel] diameter D of the pupil"),
+        ("PIXSCALE", 1 / recording.diameter, "[D] width of a pixel"),
         ("CENTROW", measurement.pupil.center[0], "[pixel] centre of the pupil, from 0"),
         ("CENTCOL", measurement.pupil.center[1], "[pixel] centre of the pupil, from 0"),
         ("DIMPLE", optics.diameter, "[lambda/D] diameter of the dimple"),
         *((f"THETA{i}", value, f"[rad] phase shift, image {i}") for i, value in enumerate(optics.phase_shifts, 1)),
         ("BACKGRND", optics.background, "background of the frames, 1 = mean of pupil"),
-        ("PUPBACK", optics.pupil_background, "the same of the mask-out images"),
+        ("PUPBACK", optics.pupil_background, "the same of the clear frames"),
         ("SCALE", optics.scale, "factor on the frames"),
         ("LEAKAGE", optics.leakage, "fraction of the other image's light"),
         ("UNMASKED", optics.unmasked, "fraction of light the mask leaves as it is"),
         ("FLUXMASK", measurement.flux_ratio[0], "light of image 1 over image 2, mask in"),
         ("FLUXOUT", measurement.flux_ratio[1], "the same, mask out"),
-        *((f"CORR{i}", value, "measured with modelled frame") for i, value in enumerate(found.correlation, 1)),
-        *((f"RESID{i}", value, "rms difference of them") for i, value in enumerate(found.residual, 1)),
+        *((f"CORR{i}", value, "measured with modelled frame") for i, value in enumerate(phase.correlation, 1)),
+        *((f"RESID{i}", value, "rms difference of them") for i, value in enumerate(phase.residual, 1)),
         ("NPOINTS", measurement.pupil.n_points, "points of the pupil"),
-        ("NMASKED", measurement.n_masked, "of these, points that are masked"),
-        ("CONVERGE", found.converged, "the iteration converged"),
+        ("NMASKED", measurement.n_bad, "of these, bad points"),
+        ("CONVERGE", phase.converged, "the iteration converged"),
     ]
     for index, (image, origin) in enumerate(zip(recording.images, recording.origins, strict=True), 1):
         cards += [
-            (f"IMAGE{index}", image.name, "frames, then mask-out images"),
-            (f"ROW{index}", origin[0], "[pixel] place of mask-out image 1 on it"),
+            (f"IMAGE{index}", image.name, "frames, then clear frames"),
+            (f"ROW{index}", origin[0], "[pixel] place of clear frame 1 on it"),
             (f"COL{index}", origin[1], "[pixel]"),
         ]
     for index, source in enumerate(sources, 1):
@@ -334,13 +368,13 @@ def write_phase(
     if sources and "DATE-OBS" in sources[0].header:
         cards.append(("DATE-OBS", str(sources[0].header["DATE-OBS"]), f"of {sources[0].name}"))
     cards.append(("CREATOR", f"zwfs {__version__}", ""))
-    primary = fits.PrimaryHDU(found.phase)
+    primary = fits.PrimaryHDU(phase.phase)
     for key, value, comment in cards:
         primary.header[key] = (_card_value(value), comment) if comment else _card_value(value)
-    nanometres = fits.ImageHDU(found.phase * wavelength / (2 * np.pi), name="PHASE_NM")
+    nanometres = fits.ImageHDU(phase.phase * wavelength / (2 * np.pi), name="PHASE_NM")
     nanometres.header["BUNIT"] = "nm"
-    masked = fits.ImageHDU((measurement.pupil.inside & ~measurement.good).astype(np.uint8), name="MASKED")
-    write_file(path, fits_bytes(fits.HDUList([primary, nanometres, masked])))
+    bad = fits.ImageHDU((measurement.pupil.inside & ~measurement.good).astype(np.uint8), name="MASKED")
+    write_file(path, fits_bytes(fits.HDUList([primary, nanometres, bad])))
 
 
 def fits_module() -> ModuleType:
@@ -353,7 +387,7 @@ def fits_module() -> ModuleType:
 
 
 def _path(name: str, value: Any) -> Path:
-    """A path that the operating system can have."""
+    """Path that the operating system accepts."""
     try:
         path = Path(value)
         if b"\0" not in os.fsencode(path):
@@ -363,6 +397,13 @@ def _path(name: str, value: Any) -> Path:
     except UnicodeEncodeError:
         pass
     raise ValueError(f"{name} = {_check.shown(str(value))}: expected the name of a file")
+
+
+def _paths(name: str, values: Any) -> list[Path]:
+    """Paths that the operating system accepts, from a sequence of them."""
+    if isinstance(values, str | bytes | Path) or not isinstance(values, Sequence):
+        raise TypeError(f"{name} = {_check.shown(values)}: expected a sequence of paths")
+    return [_path(f"{name}[{index}]", one) for index, one in enumerate(values)]
 
 
 def _is_there(path: Path) -> bool:
@@ -478,27 +519,30 @@ def _usable(counts: NDArray) -> NDArray[np.bool_]:
     return np.abs(counts) <= _check.LARGEST
 
 
-def _companion(
-    what: str,
-    good: Callable[[NDArray], NDArray],
+def _companions(
+    argument: str,
     files: Sequence[CameraFile],
-    index: int,
-    n_images: int,
-    counts: NDArray,
-    name: str,
-) -> NDArray | None:
-    """Dark or bad-pixel map of image number `index`, with at least one good pixel; None if there is none."""
+    recorded: list[tuple[CameraFile, NDArray]],
+    good: Callable[[NDArray], NDArray],
+) -> list[NDArray]:
+    """Dark or bad-pixel map of each recorded image, with at least one good pixel; 0 everywhere without files."""
     maps = [(file.name, image) for file in files for image in file.images]
     if not maps:
-        return None
-    if len(maps) not in (1, n_images):
-        raise ValueError(f"{what}: {len(maps)} images for the {n_images} of {name}: expected one, or one for each")
-    source, chosen = maps[0] if len(maps) == 1 else maps[index]
-    if chosen.shape != counts.shape:
-        raise ValueError(f"{what}: {source} has shape {chosen.shape}: expected {counts.shape}, that of {name}")
-    if not good(chosen).any():
-        raise ValueError(f"{what}: {source} has no good pixel: expected some")
-    return chosen
+        return [np.zeros(())] * len(recorded)
+    n = len(recorded)
+    if len(maps) not in (1, n):
+        raise ValueError(
+            f"{argument}: {len(maps)} images for the {n} of {recorded[0][0].name}: expected one, or one for each"
+        )
+    maps = maps * n if len(maps) == 1 else maps
+    for (name, image), (file, counts) in zip(maps, recorded, strict=True):
+        if image.shape != counts.shape:
+            raise ValueError(
+                f"{argument}: {name} has shape {image.shape}: expected {counts.shape}, that of {file.name}"
+            )
+        if not good(image).any():
+            raise ValueError(f"{argument}: {name} has no good pixel: expected some")
+    return [image for _, image in maps]
 
 
 def _saturation(file: CameraFile, counts: NDArray) -> float:

@@ -1,9 +1,9 @@
 """Camera frames to phase: normalise, model the sensor from its own pupil, reconstruct, and judge.
 
-The images come from `zwfs.frames.files`, their places from `zwfs.frames.registration`. What an
-experimenter does not know for sure is a parameter of `Optics`. `fit` seeks values that explain the frames better,
-which need not make the phase better: with two images for one unknown at each point, the iteration explains much of
-any pair of frames. `predict_other` is the sterner test.
+The images come from `zwfs.frames.files`, their places from `zwfs.frames.registration`. Uncertain properties of the
+sensor are parameters of `Optics`. `fit` seeks values that explain the frames better. They need not make the phase
+better: with two images for one unknown at each point, the iteration explains much of any pair of frames.
+`predict_other` is the stricter test.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from zwfs import _check
-from zwfs.frames.registration import Image, Recording, correlations, nearest_good, radius, record, resample
+from zwfs.frames.registration import Image, Recording, correlations, nearest_good, radius, record
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
-_MOST_BAD = 0.2  # of the pupil's points: with more of them masked, the reference wave is guesswork
+_MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
 
 
 @dataclass(frozen=True)
 class Optics:
-    """What a model of the sensor needs to know beside the pupil; all but the first two may be fitted.
+    """Properties of the sensor other than its pupil; all but the phase shifts may be fitted.
 
     Parameters
     ----------
     diameter : float, lambda/D
         Diameter of the dimple.
     phase_shifts : (float, float), radian
-        Of the two images. Exchanging them changes the sign of the phase found, and nothing else: the frames
-        cannot tell which image is which.
+        Of the two images. Exchanging them changes the sign of the phase, and nothing else: the frames do not show
+        which image is which.
     background : float
-        Stray light in the frames that is left after the dark, in units of the mean intensity of the pupil.
+        Stray light in the frames that remains after the dark, in units of the mean intensity of the pupil.
     pupil_background : float
-        The same for the mask-out images. Below 0, it lowers the contrast of the amplitude.
+        The same for the clear frames. Below 0, it lowers the contrast of the amplitude.
     scale : float
-        Factor on the frames: flux of the mask-out images over that of the frames.
+        Factor on the frames: flux of the clear frames over that of the frames.
     leakage : float
         Fraction of the light of each image that belongs to the other one, as in `zwfs.bench.model.Bench`.
     unmasked : float
-        Fraction of the light that the mask leaves as it is: its retardance is not half a wave.
+        Fraction of the light that the mask does not shift, because its retardance is not half a wave.
 
     Raises
     ------
@@ -82,7 +82,8 @@ class Optics:
         return abs(np.exp(1j * sum(self.phase_shifts)) - 1) < 1e-9
 
 
-# Lowest and highest value, and a typical change, of each parameter that `fit` knows.
+# Lowest and highest value, and a typical change, of each parameter of `fit`, and of a shift in pixels.
+_SHIFT_RANGE = (-3.0, 3.0, 0.3)
 _RANGES = {
     "background": (-0.5, 0.9, 0.05),
     "pupil_background": (-0.9, 0.9, 0.1),
@@ -99,42 +100,43 @@ class Measurement:
 
     Attributes
     ----------
+    recording : Recording
+    optics : Optics
     intensity : ndarray, shape (2, ny', nx')
         Frames; 1 is the mean intensity of the pupil with the mask out. May be negative where there is noise.
     pupil : Pupil
-        Of the mean of the two mask-out images, each scaled to the same flux.
+        Of the mean of the two clear frames, each scaled to the same flux.
     bad : ndarray of bool, shape (2, ny', nx')
-        Where a frame, or in the pupil a mask-out image, has a bad pixel.
+        Where a frame, or in the pupil a clear frame, has a bad pixel.
     margin : int, pixels
         Of the frames around the grid of the pupil.
-    diameter : float, pixels
-        Of the pupil.
     counts : ndarray, shape (2,)
-        Counts of the mask-out images that make an intensity of 1.
+        Counts of the clear frames that make an intensity of 1.
     background : ndarray, shape (4,)
-        Counts subtracted, of frames first, then of mask-out images.
+        Counts subtracted, of frames first, then of clear frames.
     flux_ratio : (float, float)
         Light of the first image in the pupil over that of the second: with the mask in, before the balance, and
         with the mask out.
     """
 
+    recording: Recording
+    optics: Optics
     intensity: NDArray[np.float64]
     pupil: Pupil
     bad: NDArray[np.bool_]
     margin: int
-    diameter: float
     counts: NDArray[np.float64]
     background: NDArray[np.float64]
     flux_ratio: tuple[float, float]
 
     @cached_property
     def good(self) -> NDArray[np.bool_]:
-        """Points of the pupil at which both frames and both mask-out images are good, (ny, nx)."""
+        """Points of the pupil at which both frames and both clear frames are good, (ny, nx)."""
         return self.pupil.inside & ~self.bad[(..., *self.window)].any(axis=0)
 
     @property
-    def n_masked(self) -> int:
-        """Points of the pupil that are masked."""
+    def n_bad(self) -> int:
+        """Points of the pupil that are bad."""
         return self.pupil.n_points - int(np.count_nonzero(self.good))
 
     @property
@@ -144,25 +146,23 @@ class Measurement:
         return slice(self.margin, self.margin + ny), slice(self.margin, self.margin + nx)
 
     @cached_property
-    def beside(self) -> NDArray[np.bool_]:
-        """Good points of the frames beside the pupil, clear of its edge, (2, ny', nx')."""
-        axes = (np.arange(n) - self.margin - c for n, c in zip(self.bad.shape[1:], self.pupil.center, strict=True))
-        radius = np.hypot(*np.meshgrid(*axes, indexing="ij"))
-        return ~self.bad & (radius > 0.53 * self.diameter)
+    def surroundings(self) -> NDArray[np.bool_]:
+        """Good points of the frames next to the pupil, clear of its edge, (2, ny', nx')."""
+        center = self.margin + self.pupil.center[0], self.margin + self.pupil.center[1]
+        return ~self.bad & (radius(self.bad.shape[1:], center) > 0.53 * self.recording.diameter)
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """A phase, and how well the frames that it makes agree with the measured ones.
+class MeasuredPhase:
+    """Phase of a pair of frames, and the agreement of its modelled frames with the measured ones.
 
     Attributes
     ----------
     phase : ndarray, shape (ny, nx), radian
-        Wrapped to (-pi, pi], NaN outside the pupil and where a pixel is masked.
+        Wrapped to (-pi, pi], NaN outside the pupil and at bad pixels.
     measured, modelled : ndarray, shape (2, ny', nx')
-        Frames: the measured ones as normalised for these `optics`.
+        Frames: the measured ones as normalised for the optics of the measurement.
     measurement : Measurement
-    optics : Optics
     converged : bool
     n_unsolved : int
         Points whose equations had no unique solution.
@@ -172,7 +172,6 @@ class Found:
     measured: NDArray[np.float64]
     modelled: NDArray[np.float64]
     measurement: Measurement
-    optics: Optics
     converged: bool
     n_unsolved: int
 
@@ -192,10 +191,10 @@ class Found:
         return self._inside(self.measured).std(axis=1)
 
     @cached_property
-    def offset_beside(self) -> float:
-        """Mean of measured less modelled light beside the pupil, where no phase was fitted."""
-        beside = self.measurement.beside
-        return float(np.mean((self.measured - self.modelled)[beside])) if beside.any() else float("nan")
+    def excess_light(self) -> float:
+        """Mean of measured less modelled light next to the pupil, where no phase was fitted."""
+        around = self.measurement.surroundings
+        return float(np.mean((self.measured - self.modelled)[around])) if around.any() else float("nan")
 
     @cached_property
     def mismatch(self) -> NDArray[np.float64]:
@@ -204,35 +203,35 @@ class Found:
         Its squares sum up to that of `misfit`. Pupil and surroundings weigh the same, however many pixels they
         have; what belongs to neither is 0.
         """
-        beside, inside = self.measurement.beside, np.zeros(self.measured.shape, bool)
+        around, inside = self.measurement.surroundings, np.zeros(self.measured.shape, bool)
         inside[(..., *self.measurement.window)] = self.measurement.good
-        weight = inside / np.count_nonzero(inside) + beside / max(1, int(np.count_nonzero(beside)))
+        weight = inside / np.count_nonzero(inside) + around / max(1, int(np.count_nonzero(around)))
         return (self.measured - self.modelled) * np.sqrt(weight / np.mean(self.contrast**2))
 
     @property
     def misfit(self) -> float:
-        """What `fit` makes small: rms difference in the pupil and beside it, over the contrast of the frames."""
+        """Rms difference of the frames in the pupil and around it, over their contrast; `fit` minimises it."""
         return float(np.sqrt(np.sum(self.mismatch**2)))
 
     def _inside(self, frames: NDArray) -> NDArray:
         return frames[(..., *self.measurement.window)][:, self.measurement.good]
 
 
-def measure(recording: Recording, optics: Optics, margin: int | None = None) -> Measurement:
+def reduce_frames(recording: Recording, optics: Optics, margin: int | None = None) -> Measurement:
     """Bring a recording on one grid and normalise it.
 
-    The amplitude is common to both images: the mean of the mask-out images, each scaled to the same flux. The
-    light of the two frames is balanced where their phase shifts are opposite: what two such masks send into the
-    pupil differs by 4 sin(theta) Im <psi, b>, and that is 0 for any field psi, because b is its projection on the
-    dimple.
+    The amplitude is common to both images: the mean of the clear frames, each scaled to the same flux. The light
+    of the two frames is balanced where their phase shifts are opposite: the light that two such masks send into
+    the pupil differs by 4 sin(theta) Im <psi, b>, and that is 0 for any field psi, because b is its projection on
+    the dimple.
 
     Parameters
     ----------
     recording : Recording
     optics : Optics
-        Its `pupil_background` and whether the phase shifts are opposite count here.
+        Of the model; here `pupil_background` is subtracted, and the balance depends on the phase shifts.
     margin : int, pixels, optional
-        Of the frames around the grid of the pupil; all that both frames hold if left out, which is the most.
+        Of the frames around the grid of the pupil; by default the largest that both frames hold.
 
     Returns
     -------
@@ -241,56 +240,52 @@ def measure(recording: Recording, optics: Optics, margin: int | None = None) -> 
     Raises
     ------
     TypeError, ValueError
-        If a value is of the wrong kind or out of range, too much of the pupil is masked, or the mask-out images
-        are dark.
+        If a value is of the wrong kind or out of range, too much of the pupil is bad, or a clear frame is dark.
     """
     _check.instance("recording", recording, Recording)
     _check.instance("optics", optics, Optics)
     margin = recording.margin if margin is None else _check.integer("margin", margin, 0, recording.margin)
-    return _measure(recording, optics, margin)
+    return _reduce(recording, optics, margin)
 
 
-def _measure(recording: Recording, optics: Optics, margin: int) -> Measurement:
-    """Measure as `measure` does; the frames may end a little before the margin does."""
+def _reduce(recording: Recording, optics: Optics, margin: int) -> Measurement:
+    """Reduce as `reduce_frames` does, without a check: the frames may end a little before the margin does."""
     n = recording.n_pixels
-    frames, frames_bad = resample(recording, recording.frames, recording.origins[:2], margin)
-    images, images_bad = resample(recording, recording.pupil_images, recording.origins[2:], 0)
-    levels = _backgrounds(recording) if recording.background else np.zeros(4)
-    frames, images = frames - levels[:2, None, None], images - levels[2:, None, None]
-    center = tuple(np.array([recording.pupils[0].row, recording.pupils[0].column]) - recording.corner)
+    (frames, bad), (clear, clear_bad) = recording.frames_on_grid(margin), recording.clear_on_grid()
+    background = _backgrounds(recording) if recording.background else np.zeros(4)
+    frames, clear = frames - background[:2, None, None], clear - background[2:, None, None]
+    center = recording.pupils[0].row - recording.corner[0], recording.pupils[0].column - recording.corner[1]
     stop = radius((n, n), center) <= recording.diameter / 2
-    light = images[:, stop].mean(axis=1)
+    light = clear[:, stop].mean(axis=1)
     if np.any(light <= 0):
-        names = " and ".join(dict.fromkeys(image.name for image in recording.pupil_images))
+        names = " and ".join(dict.fromkeys(image.name for image in recording.clear_frames))
         raise ValueError(f"{names}: the pupils hold {light} counts on average: expected light")
-    images = images - optics.pupil_background * light[:, None, None]
-    pupil, counts = measured_pupil(images, stop, recording.diameter, center)
-    intensity = frames / (counts[:, None, None] * recording.exposure)
-    bad = frames_bad.copy()
-    inner = slice(margin, margin + n)
-    bad[..., inner, inner] |= images_bad.any(axis=0) & pupil.inside
-    result = Measurement(
-        intensity, pupil, bad, margin, recording.diameter, counts, levels, (1.0, light[0] / light[1])
-    )
-    if result.n_masked > _MOST_BAD * pupil.n_points:
+    clear = clear - optics.pupil_background * light[:, None, None]
+    pupil, counts = measured_pupil(clear, stop, recording.diameter, center)
+    inner = (..., slice(margin, margin + n), slice(margin, margin + n))
+    bad[inner] |= clear_bad.any(axis=0) & pupil.inside
+    good = pupil.inside & ~bad[inner].any(axis=0)
+    n_bad = pupil.n_points - np.count_nonzero(good)
+    if n_bad > _MOST_BAD * pupil.n_points:
         raise ValueError(
-            f"{result.n_masked} of the {pupil.n_points} points of the pupil are bad or saturated: "
+            f"{n_bad} of the {pupil.n_points} points of the pupil are bad or saturated: "
             f"expected at most {_MOST_BAD:.0%}"
         )
-    flux = intensity[..., inner, inner][:, result.good].mean(axis=1)
+    intensity = frames / (counts[:, None, None] * recording.exposure)
+    flux = intensity[inner][:, good].mean(axis=1)
     if np.any(flux <= 0):
-        raise ValueError(f"the frames hold {flux} of the light of the mask-out images: expected more than 0")
+        raise ValueError(f"the frames hold {flux} of the light of the clear frames: expected more than 0")
     if recording.balance and optics.opposite:
         intensity = intensity * (flux.mean() / flux)[:, None, None]
-    return replace(
-        result, intensity=intensity, flux_ratio=((flux * counts)[0] / (flux * counts)[1], light[0] / light[1])
-    )
+    flux = flux * counts
+    ratio = flux[0] / flux[1], light[0] / light[1]
+    return Measurement(recording, optics, intensity, pupil, bad, margin, counts, background, ratio)
 
 
 def measured_pupil(
     images: NDArray, inside: NDArray, n_pixels: float, center: tuple[float, float] | None = None
 ) -> tuple[Pupil, NDArray[np.float64]]:
-    """Pupil of two mask-out images, and their counts that make an intensity of 1.
+    """Pupil of two clear frames, and their counts that make an intensity of 1.
 
     Parameters
     ----------
@@ -299,10 +294,10 @@ def measured_pupil(
     inside : ndarray of bool, shape (ny, nx)
         Where the flux of the two is compared.
     n_pixels : float, pixels
-        Diameter. What is outside that circle is stopped, and what has less than a tenth of the largest amplitude
-        within it counts as dark.
+        Diameter. The light outside that circle is stopped. An amplitude of less than a tenth of the largest one
+        counts as dark.
     center : (float, float), pixels, optional
-        The middle of the images if left out.
+        The middle of the images by default.
 
     Returns
     -------
@@ -329,22 +324,21 @@ def measured_pupil(
     return pupil, scale * np.mean(amplitude[pupil.inside] ** 2)
 
 
-def reconstruct(measurement: Measurement, optics: Optics, n_iterations: int = 25) -> Found:
-    """Phase of a measurement by the phase-shifted iteration, and the frames that it makes in the model.
+def reconstruct(measurement: Measurement, n_iterations: int = 25) -> MeasuredPhase:
+    """Phase of a measurement by the phase-shifted iteration, and its modelled frames.
 
-    Masked pixels take no part: their intensity is that of the model, with the phase of the nearest good point, so
+    Bad pixels take no part: their intensity is that of the model, with the phase of the nearest good point, so
     that the reference wave has no hole. They are NaN in the result.
 
     Parameters
     ----------
     measurement : Measurement
-    optics : Optics
     n_iterations : int
         Largest number of iterations.
 
     Returns
     -------
-    Found
+    MeasuredPhase
 
     Raises
     ------
@@ -352,45 +346,45 @@ def reconstruct(measurement: Measurement, optics: Optics, n_iterations: int = 25
         If a value is of the wrong kind or out of range.
     """
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
-    sensor = model(measurement, optics)
+    sensor = model(measurement)
     iterate = PhaseShifted(sensor, n_iterations=n_iterations, tolerance=1e-4)
-    measured = measurement.intensity * optics.scale - optics.background
-    frames = np.maximum(_unmix(measured, measurement, optics), 0)
-    masked = measurement.pupil.inside & ~measurement.good
-    for _ in range(2 if masked.any() else 1):
+    measured = _scaled(measurement)
+    frames = np.maximum(_unmix(measured, measurement), 0)
+    inner = (..., *sensor.window)
+    bad = measurement.pupil.inside & ~measurement.good
+    for _ in range(2 if bad.any() else 1):
         estimate = iterate(frames)
-        phase = nearest_good(estimate.phase, measurement.good)
-        clean = sensor.measure(phase)
-        frames[(..., *sensor.window)] = np.where(
-            masked, clean[(..., *sensor.window)], frames[(..., *sensor.window)]
-        )
-    phase = np.where(measurement.good, estimate.phase, np.nan)
-    return Found(
-        phase, measured, _mix(clean, measurement, optics), measurement, optics,
-        bool(estimate.converged), int(estimate.n_unsolved),
-    )  # fmt: skip
+        clean = sensor.measure(nearest_good(estimate.phase, measurement.good))
+        frames[inner] = np.where(bad, clean[inner], frames[inner])
+    return MeasuredPhase(
+        phase=np.where(measurement.good, estimate.phase, np.nan),
+        measured=measured,
+        modelled=_mix(clean, measurement),
+        measurement=measurement,
+        converged=bool(estimate.converged),
+        n_unsolved=int(estimate.n_unsolved),
+    )
 
 
-def model(measurement: Measurement, optics: Optics) -> ZernikeSensor:
+def model(measurement: Measurement) -> ZernikeSensor:
     """Sensor with the measured pupil, on the detector of the frames."""
     _check.instance("measurement", measurement, Measurement)
-    _check.instance("optics", optics, Optics)
-    masks = tuple(Dimple(optics.diameter, shift) for shift in optics.phase_shifts)
-    extent = 1 + 2 * measurement.margin / measurement.diameter
+    masks = (Dimple(measurement.optics.diameter, shift) for shift in measurement.optics.phase_shifts)
+    extent = 1 + 2 * measurement.margin / measurement.recording.diameter
     return ZernikeSensor(measurement.pupil, *masks, extent=extent, tolerance=1e-6)
 
 
-def predict_other(measurement: Measurement, optics: Optics, n_iterations: int = 25) -> NDArray[np.float64]:
+def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[np.float64]:
     """Correlation of each frame with the one that the other frame alone predicts, (2,).
 
     The phase-shifted iteration sees both frames, and could explain part of their noise. Here the arcsine
-    reconstruction sees one frame, and its phase is asked for the other, which it has never seen.
+    reconstruction sees one frame, and the model predicts the other one from its phase.
 
     Parameters, as for `reconstruct`.
     """
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
-    both = model(measurement, optics)
-    frames = np.maximum(_unmix(measurement.intensity * optics.scale - optics.background, measurement, optics), 0)
+    both = model(measurement)
+    frames = np.maximum(_unmix(_scaled(measurement), measurement), 0)
     good, window = measurement.good, measurement.window
     predicted = np.empty((2, np.count_nonzero(good)))
     for seen in (0, 1):
@@ -409,17 +403,17 @@ def fit(
 ) -> tuple[Recording, Optics]:
     """Seek parameters of the model, and the registration, for which the modelled frames agree best.
 
-    A handful of numbers against some ten thousand pixels: what is made small is `Found.misfit`, which counts the
-    light beside the pupil as much as that in it, because there no phase can hide an error of the model.
+    A least-squares search makes `MeasuredPhase.misfit` small. The light next to the pupil counts as much as that
+    in it: there no phase can hide an error of the model.
 
     Parameters
     ----------
     recording : Recording
     optics : Optics
-        Where to start.
+        Start of the search.
     names : sequence of str
         Parameters of `Optics` other than the phase shifts; "registration" stands for the shifts of all images
-        but the first mask-out image, six numbers.
+        but the first clear frame, six numbers.
     n_iterations : int
         As for `reconstruct`.
     n_steps : int
@@ -441,27 +435,25 @@ def fit(
     n_steps = _check.integer("n_steps", n_steps, 1)
     if not names:
         return recording, optics
-    scalars = [name for name in names if name in _RANGES]
-    moved = [0, 1, 3] if "registration" in names else []
-    low, high, scale = np.array([_RANGES[name] for name in scalars] + [(-3, 3, 0.3)] * (2 * len(moved))).T
+    # The unknowns are values of the optics, then a shift (rows, columns) of each of these images.
+    values = [name for name in names if name in _RANGES]
+    images = [0, 1, 3] if "registration" in names else []
+    n_shifts = 2 * len(images)
+    start = [*(getattr(optics, name) for name in values), *[0.0] * n_shifts]
+    low, high, step = np.transpose([*(_RANGES[name] for name in values), *[_SHIFT_RANGE] * n_shifts])
+    margin = recording.margin  # the same in each trial, so that the number of residuals stays
 
-    def trial(values: NDArray) -> tuple[Recording, Optics]:
-        changes: dict[str, Any] = dict(zip(scalars, map(float, values), strict=False))
-        found = replace(optics, **changes)
+    def trial(unknowns: NDArray) -> tuple[Recording, Optics]:
         origins = recording.origins.copy()
-        origins[moved] += values[len(scalars) :].reshape(-1, 2)
-        return replace(recording, origins=origins), found
+        origins[images] += unknowns[len(values) :].reshape(-1, 2)
+        changes: dict[str, Any] = dict(zip(values, unknowns.tolist(), strict=False))
+        return replace(recording, origins=origins), replace(optics, **changes)
 
-    # The window must stay the same, and with it the number of residuals.
-    fixed = recording.margin
+    def residuals(unknowns: NDArray) -> NDArray:
+        return reconstruct(_reduce(*trial(unknowns), margin), n_iterations).mismatch.ravel()
 
-    def mismatch(values: NDArray) -> NDArray:
-        images, found = trial(values)
-        return reconstruct(_measure(images, found, fixed), found, n_iterations).mismatch.ravel()
-
-    start = np.array([getattr(optics, name) for name in scalars] + [0.0] * (2 * len(moved)))
     best = optimize.least_squares(
-        mismatch, start, bounds=(low, high), x_scale=scale, diff_step=1e-4, max_nfev=n_steps
+        residuals, start, bounds=(low, high), x_scale=step, diff_step=1e-4, max_nfev=n_steps
     )
     return trial(best.x)
 
@@ -485,10 +477,10 @@ def _check_fit(argument: str, names: Any, optics: Any) -> None:
 
 
 def _backgrounds(recording: Recording) -> NDArray[np.float64]:
-    """Counts beside the pupils of the mask-out images, for frames and mask-out images, (4,); 0 where cut."""
+    """Counts around the pupils of the clear frames, for frames and clear frames, (4,); 0 where cut."""
     levels = []
-    for index, image in enumerate(recording.pupil_images):
-        shared = recording.pupil_images[0] is recording.pupil_images[1]
+    for index, image in enumerate(recording.clear_frames):
+        shared = recording.clear_frames[0] is recording.clear_frames[1]
         circles = recording.pupils if shared else recording.pupils[index : index + 1]
         far = ~image.bad
         for circle in circles:
@@ -499,16 +491,23 @@ def _backgrounds(recording: Recording) -> NDArray[np.float64]:
     return np.concatenate([dark * recording.exposure, dark])
 
 
-def _mix(frames: NDArray, measurement: Measurement, optics: Optics) -> NDArray[np.float64]:
-    """What leakage and the unmasked light make of ideal frames."""
+def _scaled(measurement: Measurement) -> NDArray[np.float64]:
+    """Frames with the scale and the background of the optics."""
+    return measurement.intensity * measurement.optics.scale - measurement.optics.background
+
+
+def _mix(frames: NDArray, measurement: Measurement) -> NDArray[np.float64]:
+    """Add leakage and unmasked light to ideal frames."""
+    optics = measurement.optics
     mixed = (1 - optics.leakage) * frames + optics.leakage * frames[::-1]
     mixed *= 1 - optics.unmasked
     mixed[(..., *measurement.window)] += optics.unmasked * measurement.pupil.amplitude**2
     return mixed
 
 
-def _unmix(frames: NDArray, measurement: Measurement, optics: Optics) -> NDArray[np.float64]:
+def _unmix(frames: NDArray, measurement: Measurement) -> NDArray[np.float64]:
     """Inverse of `_mix`."""
+    optics = measurement.optics
     pure = frames.copy()
     pure[(..., *measurement.window)] -= optics.unmasked * measurement.pupil.amplitude**2
     pure /= 1 - optics.unmasked
@@ -517,28 +516,24 @@ def _unmix(frames: NDArray, measurement: Measurement, optics: Optics) -> NDArray
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One more step of the work, and what it gains.
+    """Result of one more step of the work.
 
     Attributes
     ----------
     name : str
-    recording : Recording
-    optics : Optics
-    found : Found
+    result : MeasuredPhase
     predicted : ndarray, shape (2,)
-        Correlation of each frame with what the other one alone predicts, see `predict_other`.
+        Correlation of each frame with the prediction from the other one alone, see `predict_other`.
     """
 
     name: str
-    recording: Recording
-    optics: Optics
-    found: Found
+    result: MeasuredPhase
     predicted: NDArray[np.float64]
 
 
 def steps(
     frames: Sequence[Image],
-    pupil_images: Sequence[Image],
+    clear_frames: Sequence[Image],
     optics: Optics,
     fitted: Sequence[str] = ("registration", "background", "scale"),
     n_iterations: int = 25,
@@ -548,10 +543,10 @@ def steps(
 
     Parameters
     ----------
-    frames, pupil_images : sequence of one or two Images
+    frames, clear_frames : sequence of one or two Images
     optics : Optics
     fitted : sequence of str
-        What is fitted, see `fit`: with each step one more, and all before it again.
+        Parameters to fit, see `fit`: with each step one more, and all earlier ones again.
     n_iterations : int
         As for `reconstruct`.
     **settings
@@ -565,28 +560,26 @@ def steps(
     Raises
     ------
     TypeError, ValueError
-        As `record`, `measure` and `fit` do.
+        As `record`, `reduce_frames` and `fit` do.
     """
     _check_fit("fitted", fitted, optics)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
-    switches: dict[str, Any] = {"subpixel": False, "background": False, "balance": False}
     work = []
 
-    def add(name: str, recording: Recording, model: Optics) -> None:
-        measurement = measure(recording, model)
-        found = reconstruct(measurement, model, n_iterations)
-        work.append(Step(name, recording, model, found, predict_other(measurement, model, n_iterations)))
+    def add(name: str, recording: Recording, optics: Optics) -> None:
+        measurement = reduce_frames(recording, optics)
+        work.append(Step(name, reconstruct(measurement, n_iterations), predict_other(measurement, n_iterations)))
 
-    add("outlines of the pupils", record(frames, pupil_images, **settings, **switches), optics)
-    for name, switch in (
-        ("registration by content", "subpixel"),
-        ("background beside the pupils", "background"),
-        ("balance of the flux", "balance"),
+    switches: dict[str, Any] = dict.fromkeys(("subpixel", "background", "balance"), False)
+    add("outlines of the pupils", record(frames, clear_frames, **settings, **switches), optics)
+    for switch, name in (
+        ("subpixel", "registration by content"),
+        ("background", "background beside the pupils"),
+        ("balance", "balance of the flux"),
     ):
         switches[switch] = True
-        add(name, record(frames, pupil_images, **settings, **switches), optics)
-    for number in range(1, len(fitted) + 1):
-        last = work[-1]
-        found = fit(last.recording, last.optics, fitted[:number], n_iterations)
-        add(f"fit of {fitted[number - 1].replace('_', ' ')}", *found)
+        add(name, record(frames, clear_frames, **settings, **switches), optics)
+    for number, name in enumerate(fitted, 1):
+        last = work[-1].result.measurement
+        add(f"fit of {name.replace('_', ' ')}", *fit(last.recording, last.optics, fitted[:number], n_iterations))
     return work

@@ -18,7 +18,7 @@ _Item = TypeVar("_Item")
 
 _REACH = 6  # pixels by which an image may be off its neighbour before sub-pixel registration
 _SMALLEST = 8  # pixels across a pupil: with fewer there is no outline
-_MARGIN = 0.25  # of the diameter: more of the dark surroundings tells nothing
+_MARGIN = 0.25  # of the diameter: more of the dark surroundings adds nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Image:
     name : str
         For messages.
     cut : bool
-        Whether the surroundings of the pupil were set to 0 by software: they tell nothing of the background.
+        Whether the surroundings of the pupil were set to 0 by software, so that they do not show the background.
 
     Raises
     ------
@@ -77,27 +77,27 @@ class Circle:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Two frames and two mask-out images on the camera, and where the pupils stand on them.
+    """Two frames and two clear frames on the camera, and where the pupils stand on them.
 
     Make one with `record`.
 
     Attributes
     ----------
-    frames, pupil_images : (Image, Image)
+    frames, clear_frames : (Image, Image)
         Counts, less the dark. One camera image with two pupils stands here twice.
     pupils : (Circle, Circle)
-        On the mask-out images.
+        On the clear frames.
     origins : ndarray, shape (4, 2), pixels
-        Place of the first mask-out image's pixel (0, 0) on each image: frames first, then mask-out images. What
-        registration finds.
+        Place of the first clear frame's pixel (0, 0) on each image, by registration: frames first, then clear
+        frames.
     background, balance : bool
-        Whether to subtract what is seen beside the pupils of the mask-out images, and whether to balance.
+        Whether to subtract the light around the pupils of the clear frames, and whether to balance.
     exposure : float
-        Exposure of the frames over that of the mask-out images.
+        Exposure of the frames over that of the clear frames.
     """
 
     frames: tuple[Image, Image]
-    pupil_images: tuple[Image, Image]
+    clear_frames: tuple[Image, Image]
     pupils: tuple[Circle, Circle]
     origins: NDArray[np.float64]
     background: bool = True
@@ -106,8 +106,8 @@ class Recording:
 
     @property
     def images(self) -> tuple[Image, ...]:
-        """Frames, then mask-out images."""
-        return self.frames + self.pupil_images
+        """Frames, then clear frames."""
+        return self.frames + self.clear_frames
 
     @cached_property
     def diameter(self) -> float:
@@ -121,7 +121,7 @@ class Recording:
 
     @cached_property
     def corner(self) -> NDArray[np.int64]:
-        """First row and column of the grid of the pupil on the first mask-out image."""
+        """First row and column of the grid of the pupil on the first clear frame."""
         first = self.pupils[0]
         return np.round(np.array([first.row, first.column]) - (self.n_pixels - 1) / 2).astype(int)
 
@@ -137,15 +137,31 @@ class Recording:
             room.append((np.abs(self.origins[1] - self.origins[0]).max() - self.n_pixels) / 2)
         return max(0, math.floor(min(room)))
 
-    @property
-    def shifts(self) -> NDArray[np.float64]:
-        """Fractions of a pixel by which each image is moved, (4, 2)."""
-        return self.origins - np.round(self.origins)
+    def frames_on_grid(self, margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Frames and their bad pixels, (2, ny', nx') each, on the grid of the pupil with a margin around it."""
+        return self._on_grid(self.frames, self.origins[:2], margin)
+
+    def clear_on_grid(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Clear frames and their bad pixels, (2, ny, nx) each, on the grid of the pupil."""
+        return self._on_grid(self.clear_frames, self.origins[2:], 0)
+
+    def _on_grid(
+        self, images: tuple[Image, Image], origins: NDArray, margin: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        size = (self.n_pixels + 2 * margin,) * 2
+        counts, bad = np.empty((2, *size)), np.empty((2, *size), bool)
+        for index, (image, origin) in enumerate(zip(images, origins, strict=True)):
+            # Beyond an image its edge is repeated.
+            grid = {"offset": self.corner - margin + origin, "output_shape": size, "mode": "nearest"}
+            counts[index] = ndimage.affine_transform(image.counts, (1, 1), order=3, **grid)
+            # A bad pixel spoils the points on all its sides.
+            bad[index] = ndimage.affine_transform(image.bad.astype(float), (1, 1), order=1, **grid) > 0.01
+        return counts, bad
 
 
 def record(
     frames: Sequence[Image],
-    pupil_images: Sequence[Image],
+    clear_frames: Sequence[Image],
     *,
     pupil_centers: Sequence[Sequence[float]] | None = None,
     pupil_diameter: float | None = None,
@@ -156,23 +172,23 @@ def record(
 ) -> Recording:
     """Find the pupils on the images and register these to each other.
 
-    The second mask-out image is registered to the first. Frames of the same format as the mask-out images are
-    taken to stand where these do: the camera has not moved. If they are of another format, the pupils are found on
-    them, too, and each is registered to its mask-out image. That is less sure, because the phase changes what gaps
-    and edges look like.
+    The second clear frame is registered to the first. Frames of the same format as the clear frames are taken to
+    stand at the same place: the camera has not moved. If they are of another format, the pupils are located on
+    them, too, and each is registered to its clear frame. That is less reliable, because the phase changes the look
+    of gaps and edges.
 
     Parameters
     ----------
     frames : sequence of one or two Images
         With the mask in: one that holds both pupils, side by side or one above the other, or one for each.
-    pupil_images : sequence of one or two Images
+    clear_frames : sequence of one or two Images
         The same with the mask taken out. May be cropped closer than the frames.
     pupil_centers : sequence of two (row, column), pixels, optional
-        Centres of the pupils on the mask-out images; found if left out.
+        Centres of the pupils on the clear frames; by default those of their outlines.
     pupil_diameter : float, pixels, optional
-        Diameter of the pupils; found if left out.
+        Diameter of the pupils; by default that of the outlines.
     exposure : float
-        Exposure of the frames over that of the mask-out images.
+        Exposure of the frames over that of the clear frames.
     subpixel : bool
         Register to a fraction of a pixel. If not, pupils are put on each other by their outlines, to whole pixels.
     background, balance : bool
@@ -192,15 +208,15 @@ def record(
     subpixel = _check.flag("subpixel", subpixel)
     background, balance = _check.flag("background", background), _check.flag("balance", balance)
     _check_images("frames", frames)
-    _check_images("pupil_images", pupil_images)
+    _check_images("clear_frames", clear_frames)
     places = None if pupil_centers is None else _check.real_map("pupil_centers", pupil_centers, 2)
     if places is not None and places.shape != (2, 2):
         raise ValueError(f"pupil_centers has shape {places.shape}: expected (row, column) of each of two pupils")
     if places is not None and diameter is None:
         raise ValueError("pupil_centers without a pupil_diameter: expected both, or neither")
-    pupil_images, pupils = _locate("pupil_images", pupil_images, places, diameter)
-    same_size(pupils, " and ".join(dict.fromkeys(image.name for image in pupil_images)))
-    pairs = _pair(frames), pupil_images
+    clear_frames, pupils = _locate("clear_frames", clear_frames, places, diameter)
+    _require_same_size(pupils, clear_frames)
+    pairs = _pair(frames), clear_frames
     formats = [(pair[0] is pair[1], *(image.counts.shape for image in pair)) for pair in pairs]
     moved = formats[0] != formats[1]
     if moved:
@@ -212,7 +228,7 @@ def record(
                 raise ValueError(f"{image.name}: every pixel is {image.counts.flat[0]:.6g}: expected light")
     first = np.array([pupils[0].row, pupils[0].column])
     origins = np.array([[circle.row, circle.column] for circle in (*seen, *pupils)]) - first
-    rough = Recording(frames, pupil_images, pupils, np.round(origins), background, balance, exposure)
+    rough = Recording(frames, clear_frames, pupils, np.round(origins), background, balance, exposure)
     return _register(rough, frames_too=moved) if subpixel else rough
 
 
@@ -228,7 +244,7 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
     n_pupils : int
         Discs that the image holds. They come back from left to right, or from top to bottom if they stand so.
     diameter : float, pixels, optional
-        Put in the place of the one found; at least 8.
+        Replaces that of the outline; at least 8.
 
     Returns
     -------
@@ -265,18 +281,6 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
         _not_cut(circle, image)
     places = np.array([(circle.row, circle.column) for circle in circles])
     return tuple(circles[index] for index in np.argsort(places[:, np.argmax(np.ptp(places, axis=0))]))
-
-
-def same_size(circles: Sequence[Circle], name: str) -> None:
-    """Refuse two pupils of different size: both images must have the same magnification."""
-    if not isinstance(circles, Sequence) or [type(circle) for circle in circles] != [Circle, Circle]:
-        raise TypeError(f"circles = {_check.shown(circles)}: expected two Circles")
-    _check.instance("name", name, str)
-    small, large = sorted(circle.diameter for circle in circles)
-    if large - small > max(2.0, 0.03 * large):
-        raise ValueError(
-            f"{name}: the two pupils are {small:.1f} and {large:.1f} pixels wide: expected the same size, to 3 %"
-        )
 
 
 def register(image: NDArray, reference: NDArray, inside: NDArray, blur: float = 2.0) -> NDArray[np.float64]:
@@ -330,46 +334,6 @@ def register(image: NDArray, reference: NDArray, inside: NDArray, blur: float = 
     return optimize.minimize(mismatch, start, method="Nelder-Mead", options=options).x
 
 
-def resample(
-    recording: Recording, images: Sequence[Image], origins: NDArray, margin: int
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Images, and their bad pixels, on the grid of the pupil with a margin around.
-
-    Parameters
-    ----------
-    recording : Recording
-    images : sequence of two Images
-    origins : ndarray, shape (2, 2), pixels
-        Place of the first mask-out image's pixel (0, 0) on each image.
-    margin : int, pixels
-        Around the grid of the pupil, at most the size of an image. What lies beyond an image repeats its edge.
-
-    Returns
-    -------
-    ndarray, shape (2, ny', nx')
-    ndarray of bool, shape (2, ny', nx')
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is of the wrong kind or shape.
-    """
-    _check.instance("recording", recording, Recording)
-    _check_images("images", images, (2,))
-    origins = _check.real_map("origins", origins)
-    _check.trailing_shape("origins", origins, (2, 2), "row and column on each of two images")
-    margin = _check.integer("margin", margin, 0, max(max(image.counts.shape) for image in images))
-    size = (recording.n_pixels + 2 * margin,) * 2
-    maps, bad = np.empty((2, *size)), np.empty((2, *size), bool)
-    for index, (image, origin) in enumerate(zip(images, origins, strict=True)):
-        start = recording.corner - margin + origin
-        grid = {"offset": start, "output_shape": size, "mode": "nearest"}
-        maps[index] = ndimage.affine_transform(image.counts, (1, 1), order=3, **grid)
-        # A bad pixel spoils the points on all its sides.
-        bad[index] = ndimage.affine_transform(image.bad.astype(float), (1, 1), order=1, **grid) > 0.01
-    return maps, bad
-
-
 def nearest_good(image: NDArray, good: NDArray) -> NDArray:
     """An image with every pixel that is not good replaced by the nearest good one, of which there must be one."""
     image = _check.real_array("image", image)
@@ -396,12 +360,12 @@ def correlations(first: NDArray, second: NDArray) -> NDArray[np.float64]:
     return np.divide(np.sum(first * second, axis=1), scale, out=np.zeros(len(scale)), where=scale > 0)
 
 
-def _check_images(name: str, images: Any, allowed: tuple[int, ...] = (1, 2)) -> None:
-    """Require a sequence of so many Images."""
+def _check_images(name: str, images: Any) -> None:
+    """Require a sequence of one or two Images."""
     if not isinstance(images, Sequence) or not all(isinstance(image, Image) for image in images):
         raise TypeError(f"{name} is a {type(images).__name__}: expected a sequence of Images")
-    if len(images) not in allowed:
-        raise ValueError(f"{name} holds {len(images)} images: expected {' or '.join(map(str, allowed))}")
+    if len(images) not in (1, 2):
+        raise ValueError(f"{name} holds {len(images)} images: expected 1 or 2")
 
 
 def _threshold(image: NDArray) -> float:
@@ -415,28 +379,33 @@ def _threshold(image: NDArray) -> float:
 
 
 def _outline(image: NDArray, region: NDArray, level: float) -> Circle:
-    """Circle through the points where rays from the middle of a region leave it."""
+    """Circle through the edge of a pupil, to a fraction of a pixel.
+
+    The edge lies where rays from the centre cross half of their bright level for the last time. A region of bright
+    pixels gives the first centre and radius. Each pass then takes both from the circle through the edge points.
+    """
     region = ndimage.binary_fill_holes(region)
     row, column = ndimage.center_of_mass(region)
     radius = np.sqrt(np.count_nonzero(region) / np.pi)
     dark = np.median(image[image <= level])
     angles = np.arange(720) * np.pi / 360
+    sine, cosine = np.sin(angles), np.cos(angles)
     for _ in range(4):
-        # Nothing of a neighbour: the space between two pupils may be narrow.
+        # Not beyond 1.08 radii: the next pupil may begin close to this one.
         reach = np.arange(0.7 * radius, 1.08 * radius, 0.05)
-        lines = np.array([row + np.outer(np.sin(angles), reach), column + np.outer(np.cos(angles), reach)])
-        light = ndimage.map_coordinates(image, lines, order=1, mode="constant", cval=dark)
-        # Half of what is bright on the same ray: the pupil may be lit unevenly.
+        rays = np.array([row + np.outer(sine, reach), column + np.outer(cosine, reach)])
+        light = ndimage.map_coordinates(image, rays, order=1, mode="constant", cval=dark)
+        # The bright level belongs to the ray, because the pupil may be lit unevenly.
         bright = np.median(light[:, reach < 0.93 * radius], axis=1, keepdims=True)
-        above = light > (dark + bright) / 2
-        last = reach[above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)]
-        points = np.stack([row + last * np.sin(angles), column + last * np.cos(angles)], axis=1)
-        row, column, radius = _circle_through(points[above.any(axis=1)])
+        inside = light > (dark + bright) / 2
+        last = reach[inside.shape[1] - 1 - np.argmax(inside[:, ::-1], axis=1)]
+        edge = np.stack([row + last * sine, column + last * cosine], axis=1)
+        row, column, radius = _circle_through(edge[inside.any(axis=1)])
     return Circle(float(row), float(column), float(2 * radius))
 
 
 def _circle_through(points: NDArray) -> tuple[float, float, float]:
-    """Least-squares circle (row, column, radius) through most of the points: outliers are left out in turn."""
+    """Least-squares circle (row, column, radius) through the points, without outliers."""
     keep = np.ones(len(points), bool)
     for _ in range(10):
         some = points[keep]
@@ -461,6 +430,16 @@ def _not_cut(circle: Circle, image: Image) -> None:
         raise ValueError(
             f"{image.name}: the pupil at row {circle.row:.1f}, column {circle.column:.1f}, {circle.diameter:.1f} "
             f"pixels wide, is cut off at the {side} (row 0 is the top): expected all of it on the image"
+        )
+
+
+def _require_same_size(circles: tuple[Circle, Circle], images: tuple[Image, Image]) -> None:
+    """Refuse two pupils of different size: both images must have the same magnification."""
+    small, large = sorted(circle.diameter for circle in circles)
+    if large - small > max(2.0, 0.03 * large):
+        names = " and ".join(dict.fromkeys(image.name for image in images))
+        raise ValueError(
+            f"{names}: the two pupils are {small:.1f} and {large:.1f} pixels wide: expected the same size, to 3 %"
         )
 
 
@@ -498,8 +477,8 @@ def _extend(image: Image, circles: Sequence[Circle]) -> Image:
 
 
 def _register(recording: Recording, frames_too: bool) -> Recording:
-    """Shift the second mask-out image to the first, and each frame to, or with, its mask-out image."""
-    images, _ = resample(recording, recording.pupil_images, recording.origins[2:], 0)
+    """Shift the second clear frame to the first, and each frame to, or with, its clear frame."""
+    images, _ = recording.clear_on_grid()
     first = recording.pupils[0]
     row, column = np.array([first.row, first.column]) - recording.corner
     # Off the edge, which the mask makes bright or dark.
@@ -507,6 +486,6 @@ def _register(recording: Recording, frames_too: bool) -> Recording:
     shifts = np.zeros((4, 2))
     shifts[[1, 3]] = register(images[1], images[0], inside)
     if frames_too:
-        frames, _ = resample(recording, recording.frames, recording.origins[:2], 0)
+        frames, _ = recording.frames_on_grid()
         shifts[:2] += [register(frame, image, inside) for frame, image in zip(frames, images, strict=True)]
     return replace(recording, origins=recording.origins + shifts)

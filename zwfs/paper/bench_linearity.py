@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,10 @@ from zwfs.companion import sweeps
 from zwfs.paper.curves import ErrorCurves
 from zwfs.paper.linearity import check_reconstructors, check_rms
 from zwfs.reconstructors import RECONSTRUCTORS, Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
+
+# Smallest singular value of the interaction matrix that is inverted, over the largest. No sensor sees the piston
+# of all segments together: its singular value is the noise of the calibration, and is left out.
+_CONDITIONING = 0.1
 
 
 @dataclass(frozen=True)
@@ -60,10 +64,9 @@ def bench_reconstructors(
     *,
     n_iterations: int = 25,
     poke: float = 0.1,
-    conditioning: float = 0.1,
     seed: Seed = 0,
 ) -> dict[str, Any]:
-    """The paper's reconstructors for a bench, from its model; the linear one is calibrated on the bench itself.
+    """Return the paper's reconstructors for the model of a bench; the linear one is calibrated on the bench.
 
     Parameters
     ----------
@@ -74,21 +77,17 @@ def bench_reconstructors(
         Of the iterative reconstructors.
     poke : float, radian
         Piston by which each segment is pushed and pulled for the interaction matrix.
-    conditioning : float
-        Smallest singular value of that matrix that is inverted, relative to the largest. The piston of all
-        segments together is seen by no sensor: in its place stands the noise of the calibration, to be left out.
     seed : int, Generator or SeedSequence, optional
         Of the noise of the calibration.
 
     Returns
     -------
     dict of reconstructor
-        One mask's image makes "Linear" and "Arcsine", both the others. Gradient descent seeks segment pistons.
+        "Linear" and "Arcsine" use the image of one mask, the others both. Gradient descent seeks segment pistons.
     """
     _check.instance("bench", bench, Bench)
     _check.instance("model", model, BenchModel)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
-    conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
     rng = _check.generator("seed", seed)
     pokes = _check.number("poke", poke, 0, open_low=True) * np.eye(bench.n_segments)
     flat, pushed, pulled = (
@@ -100,7 +99,7 @@ def bench_reconstructors(
             model.classic,
             model.modes,
             poke=poke,
-            conditioning=conditioning,
+            conditioning=_CONDITIONING,
             calibration=(flat, pushed, pulled),
         ),
         "Arcsine": Arcsine(model.classic, **steps),
@@ -137,7 +136,7 @@ def bench_curves(
     ----------
     bench : Bench
     model : BenchModel
-        Model of that bench, or of another one, to see what that does.
+        Of that bench, or of another one, to see the effect of a wrong model.
     reconstructors : mapping of str to reconstructor
     rms : array_like, shape (n_rms,), radian rms
     n_screens : int
@@ -193,7 +192,7 @@ def _bench_point(
 
 
 def error_budget(
-    bench: Bench,
+    benches: Mapping[Any, Bench],
     names: Sequence[str],
     rms: ArrayLike,
     n_screens: int,
@@ -201,28 +200,30 @@ def error_budget(
     n_iterations: int = 25,
     seed: int = 0,
 ) -> dict[str, BenchCurves]:
-    """Each error of a bench alone, none, and all: what every one of them does to the reconstruction.
+    """Curves of benches that differ in their errors, each with its model and reconstructors.
 
-    An error is a task of the sweep "error_budget", see `zwfs.companion.sweeps`.
+    A bench is a task of the sweep "error_budget", see `zwfs.companion.sweeps`.
 
     Parameters
     ----------
-    bench : Bench
-        Holds the sizes of the errors.
+    benches : mapping to Bench
+        Such as `Bench.single_errors` returns.
     names : sequence of str
         Reconstructors to run.
     rms : array_like, shape (n_rms,), radian rms
     n_screens : int
     n_iterations : int
     seed : int
-        The same screens are commanded every time.
+        The same screens are commanded on every bench.
 
     Returns
     -------
     dict of BenchCurves
-        By the name of the error, "none" first and "all" last.
+        Under the keys of `benches`.
     """
-    _check.instance("bench", bench, Bench)
+    _check.instance("benches", benches, Mapping)
+    for key, bench in benches.items():
+        _check.instance(f"benches[{key!r}]", bench, Bench)
     known = sorted(method.__name__ for method in RECONSTRUCTORS)
     if isinstance(names, str) or not isinstance(names, Sequence) or not names:
         raise TypeError(f"names = {_check.shown(names)}: expected a list with some of {known}")
@@ -232,21 +233,15 @@ def error_budget(
     n_screens = _check.integer("n_screens", n_screens, 1)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     seed = _check.integer_seed("seed", seed)
-    values = {field.name: getattr(bench, field.name) for field in fields(bench)}
-    noise = {name: values[name] for name in ("photons", "read_noise", "background")}
-    layout = {name: value for name, value in values.items() if name not in (*Bench.errors(), *noise)}
-    cases = {"none": Bench.ideal(**layout)}
-    cases |= {name: Bench.ideal(**layout, **{name: values[name]}) for name in Bench.errors()}
-    cases |= {"noise": Bench.ideal(**layout, **noise), "all": bench}
     shared = list(names), rms, n_screens, n_iterations, seed
-    curves = sweeps.run(_budget_case, cases.values(), *shared, name="error_budget")
-    return dict(zip(cases, curves, strict=True))
+    curves = sweeps.run(_bench_case, benches.values(), *shared, name="error_budget")
+    return dict(zip(benches, curves, strict=True))
 
 
-def _budget_case(
+def _bench_case(
     bench: Bench, names: Sequence[str], rms: ArrayLike, n_screens: int, n_iterations: int, seed: int
 ) -> BenchCurves:
-    """Curves of one bench, with a model and reconstructors of its own."""
+    """Model one bench, build its reconstructors, and return their curves."""
     model = BenchModel.from_images(bench, seed)
     methods = bench_reconstructors(bench, model, n_iterations=n_iterations, seed=seed)
     return bench_curves(bench, model, {name: methods[name] for name in names}, rms, n_screens, seed=seed)

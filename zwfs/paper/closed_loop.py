@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs.detector import Detector
 from zwfs.metrics import strehl, without_piston
+from zwfs.paper.linearity import check_reconstructors
 from zwfs.pupil import Pupil
 from zwfs.reconstructors.linear import check_modes
 
@@ -31,7 +33,7 @@ class FrozenFlow:
     rms : float, radian
         Of every screen over the pupil at the start, piston removed.
     n_screens : int
-        Each has a wind direction of its own.
+        Each has another direction of the wind.
     speed : float, D / second
     cutoff : float, cycles / D
         Highest spatial frequency, at least 1 and at most one cycle per pixel.
@@ -70,30 +72,39 @@ class FrozenFlow:
         self.pupil = pupil
         rng = _check.generator("seed", seed)
         n = int(cutoff * _BOX)
-        axis = np.arange(-n, n + 1) / _BOX
-        frequency = np.hypot(axis[:, np.newaxis], axis)
-        used = (frequency > 0) & (frequency <= cutoff)
-        weight = np.where(used, np.where(used, frequency, 1) ** (exponent / 2), 0)
-        waves = rng.standard_normal((2, self.n_screens, *weight.shape))
-        self._waves = weight * (waves[0] + 1j * waves[1])
+        u = np.arange(-n, n + 1) / _BOX  # frequencies along x, cycles / D
+        v = u[:, np.newaxis]  # the same along y
+        self._amplitudes = _random_amplitudes(np.hypot(u, v), cutoff, exponent, self.n_screens, rng)
+        # A screen is the sum of a(v, u) exp(2 pi i (v y + u x)): two matrix products.
+        self._waves_y = np.exp(2j * np.pi * np.outer(pupil.y, u))
+        self._waves_x = np.exp(2j * np.pi * np.outer(u, pupil.x))
+        # A wind (wy, wx) moves it to y - wy t, x - wx t: each amplitude turns by -2 pi (wy v + wx u) t.
         direction = rng.uniform(0, 2 * np.pi, self.n_screens)
         self.velocity = speed * np.stack([np.sin(direction), np.cos(direction)], axis=-1)
-        along_y, along_x = self.velocity.T[..., np.newaxis, np.newaxis]
-        self._turn = -2j * np.pi * (along_y * axis[:, np.newaxis] + along_x * axis)
-        self._along_y = np.exp(2j * np.pi * np.outer(pupil.y, axis))
-        self._along_x = np.exp(2j * np.pi * np.outer(axis, pupil.x))
-        self._waves *= (rms / pupil.rms(self(0.0)))[:, np.newaxis, np.newaxis]
+        wy, wx = self.velocity.T[..., np.newaxis, np.newaxis]
+        self._turn = -2j * np.pi * (wy * v + wx * u)
+        self._amplitudes *= (rms / pupil.rms(self(0.0)))[:, np.newaxis, np.newaxis]
 
     def __call__(self, time: float) -> NDArray[np.float64]:
         """Screens at a time in seconds, (n_screens, ny, nx), radian: without piston, 0 outside the pupil."""
-        waves = self._waves * np.exp(self._turn * _check.number("time", time))
-        inside = self.pupil.gather((self._along_y @ waves @ self._along_x).real)
+        amplitudes = self._amplitudes * np.exp(self._turn * _check.number("time", time))
+        inside = self.pupil.gather((self._waves_y @ amplitudes @ self._waves_x).real)
         return self.pupil.scatter(inside - inside.mean(axis=-1, keepdims=True), fill=0)
+
+
+def _random_amplitudes(
+    frequency: NDArray, cutoff: float, exponent: float, n_screens: int, rng: np.random.Generator
+) -> NDArray[np.complex128]:
+    """Gaussian amplitudes whose power falls as a power of the frequency; 0 for piston and beyond the cutoff."""
+    used = (frequency > 0) & (frequency <= cutoff)
+    scale = np.where(used, np.where(used, frequency, 1) ** (exponent / 2), 0)
+    real, imaginary = rng.standard_normal((2, n_screens, *frequency.shape))
+    return scale * (real + 1j * imaginary)
 
 
 @dataclass(frozen=True)
 class LoopRun:
-    """What a closed loop left, step by step.
+    """Residual of a closed loop, step by step.
 
     Attributes
     ----------
@@ -111,14 +122,18 @@ class LoopRun:
     residual: NDArray[np.float64]
     strehl: NDArray[np.float64]
 
-    def settled(self, n_steps: int) -> NDArray[np.float64]:
-        """Rms of the residual over the last steps, shape (n_screens,), radian rms."""
-        n_steps = _check.integer("n_steps", n_steps, 1, self.times.size)
-        return np.sqrt(np.mean(self.residual[:, -n_steps:] ** 2, axis=1))
+    @property
+    def last_third(self) -> slice:
+        """Last third of the steps, in which a loop counts as settled."""
+        return slice(self.times.size - max(1, self.times.size // 3), None)
 
-    def closed(self, n_steps: int) -> NDArray[np.bool_]:
-        """Whether each loop settled below half of what it started from, shape (n_screens,)."""
-        return self.settled(n_steps) < self.open_loop[:, 0] / 2
+    def settled(self) -> NDArray[np.float64]:
+        """Rms of the residual over the last third of the steps, shape (n_screens,), radian rms."""
+        return np.sqrt(np.mean(self.residual[:, self.last_third] ** 2, axis=1))
+
+    def closed(self) -> NDArray[np.bool_]:
+        """Whether each loop settled below half of the error at its start, shape (n_screens,)."""
+        return self.settled() < self.open_loop[:, 0] / 2
 
 
 def close_loop(
@@ -208,3 +223,11 @@ def close_loop(
         mirror.append(figure / np.maximum(figure.std(axis=-1, keepdims=True) / stroke, 1))
         mirror.popleft()
     return LoopRun(times, open_loop, residual, ratio)
+
+
+def close_loops(
+    reconstructors: Mapping[str, Any], modes: ArrayLike, flow: FrozenFlow, n_steps: int, **settings: Any
+) -> dict[str, LoopRun]:
+    """Close the loop with each of several reconstructors, on the same screens; see `close_loop`."""
+    check_reconstructors(reconstructors)
+    return {name: close_loop(one, modes, flow, n_steps, **settings) for name, one in reconstructors.items()}

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs.masks import Mask
+from zwfs.masks import Dimple, Mask
 from zwfs.metrics import reconstruction_error, strehl
 from zwfs.pupil import Pupil
+from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
 # Fields have the phases of the equations as their arguments: psi = sqrt(I) exp(i phi).
+
+# Of the Strehl ratio, with which the common approximation scales the amplitude of the reference wave.
+POWERS = {"amplitude × √S": 0.5, "intensity × √S": 0.25, "not scaled": 0.0}
 
 
 def two_waves(incoming: NDArray, reference: NDArray) -> NDArray[np.floating]:
@@ -87,26 +93,23 @@ def direct_reference_wave(pupil: Pupil, mask: Mask, field: NDArray, n_samples: i
     return (waves_y.T * (area * (mask.transmission(u, v) - 1) * spectrum)) @ waves_x
 
 
-def quotient(frame: NDArray, incoming: NDArray, reference: NDArray) -> NDArray[np.floating]:
-    """Cosine of the phase between two waves, as equations (6) and (9) take it from the intensity.
+def two_wave_errors(pupil: Pupil, mask: Mask, field: NDArray) -> tuple[float, float]:
+    """Largest error of equation (5), and largest difference of the low-rank model from `direct_reference_wave`.
 
     Parameters
     ----------
-    frame : ndarray
-        Intensity.
-    incoming, reference : ndarray
-        Amplitude or field of each wave; only the modulus counts.
+    pupil : Pupil
+    mask : Dimple, Patch or any Mask
+    field : ndarray of complex, shape (ny, nx)
     """
-    frame = _check.real_array("frame", frame)
-    frame, incoming, reference = _arrays(frame=frame, incoming=incoming, reference=reference)
-    _lit(incoming=incoming, reference=reference)
-    incoming, reference = np.abs(incoming), np.abs(reference)
-    return (frame - reference**2 - incoming**2) / (2 * reference * incoming)
+    outgoing, incoming, reference = fourier_waves(pupil, mask, field)
+    intensity_error = np.abs(outgoing) ** 2 - two_waves(incoming, reference)
+    low_rank = ZernikeSensor(pupil, mask, tolerance=1e-14).reference_wave(field)[0]
+    model_error = low_rank - direct_reference_wave(pupil, mask, field)
+    return float(np.abs(intensity_error).max()), float(np.abs(model_error).max())
 
 
-def arccosine_phase(
-    frame: NDArray, amplitude: NDArray, reference: NDArray, sign: int = -1
-) -> NDArray[np.floating]:
+def arccosine_phase(frame: NDArray, amplitude: NDArray, reference: NDArray) -> NDArray[np.floating]:
     """Equation (6): phase from one frame and its reference wave.
 
     Parameters
@@ -114,19 +117,17 @@ def arccosine_phase(
     frame, amplitude : ndarray, shape (..., n)
         Intensity, and the amplitude of the incoming field, at points of the pupil.
     reference : ndarray of complex, shape (..., n)
-    sign : int
-        Of the arccosine: -1 for a dimple of positive phase, see `eq-branch` of the book.
+        Of a dimple of positive phase, which decides the sign of the arccosine, see `eq-branch` of the book.
 
     Returns
     -------
     ndarray, shape (..., n), radian
         Cosines beyond +-1 count as +-1.
     """
-    if _check.integer("sign", sign, -1, 1) == 0:
-        raise ValueError("sign = 0: expected 1 or -1")
+    frame = _check.real_array("frame", frame)
     frame, amplitude, reference = _arrays(frame=frame, amplitude=amplitude, reference=reference)
     _lit(amplitude=amplitude, reference=reference)
-    return np.angle(reference) + sign * np.arccos(np.clip(quotient(frame, amplitude, reference), -1, 1))
+    return np.angle(reference) - np.arccos(np.clip(_cosine(frame, amplitude, reference), -1, 1))
 
 
 def matrix_determinant(first: NDArray, second: NDArray) -> NDArray[np.floating]:
@@ -162,7 +163,7 @@ def pair_phase(frames: NDArray, amplitude: NDArray, references: NDArray) -> NDAr
     for name, values in (("frames", frames), ("references", references)):
         if values.ndim < 2 or values.shape[-2] != 2:
             raise ValueError(f"{name} has shape {values.shape}: expected (..., 2, n)")
-    c = quotient(frames, amplitude, references)
+    c = _cosine(frames, amplitude, references)
     a, b = np.moveaxis(np.angle(references), -2, 0)
     determinant = matrix_determinant(references[..., 0, :], references[..., 1, :])
     if not determinant.all():
@@ -209,11 +210,9 @@ def approximation_errors(sensor: ZernikeSensor, screens: NDArray, power: float =
     ----------
     Chambouleyron et al. 2024, section 2.1.
     """
-    _check.instance("sensor", sensor, ZernikeSensor)
-    if sensor.n_masks != 2:
-        raise ValueError(f"sensor has {sensor.n_masks} masks: expected two")
-    pupil, power = sensor.pupil, _check.number("power", power, 0, 10)
-    screens = pupil.scatter(_check.values_inside("screens", screens, pupil).reshape(-1, pupil.n_points), fill=0)
+    screens = _screens(sensor, screens)
+    power = _check.number("power", power, 0, 10)
+    pupil = sensor.pupil
     amplitude = pupil.gather(pupil.amplitude)
     frames = pupil.gather(sensor.measure(screens))
     field = pupil.field(screens)
@@ -236,6 +235,129 @@ def approximation_errors(sensor: ZernikeSensor, screens: NDArray, power: float =
         one_image=phase_error(arccosine_phase(frames[:, 0], amplitude, first_guess), screens),
         two_images=phase_error(pair_phase(frames, amplitude, guess), screens),
     )
+
+
+def approximation_curves(
+    sensor: ZernikeSensor, screens: NDArray, inputs: Sequence[float]
+) -> dict[str, list[ApproximationErrors]]:
+    """Errors of the common approximation with each of `POWERS`, for screens of 1 rad rms scaled to each input."""
+    inputs = _check.real_map("inputs", inputs, 1).tolist()
+    screens = _check.real_array("screens", screens)
+    return {
+        name: [approximation_errors(sensor, value * screens, power) for value in inputs]
+        for name, power in POWERS.items()
+    }
+
+
+@dataclass(frozen=True)
+class DimplePairs:
+    """Determinants of all pairs of phase shifts on a grid round the circle; means over the pupil.
+
+    Attributes
+    ----------
+    shifts : ndarray, shape (n_pairs, 2), radian
+        Phase shifts a and b of each pair.
+    difference : ndarray, shape (n_pairs,), radian
+        Of the phase shifts, b less a, in [0, 2 pi).
+    determinant : ndarray, shape (n_pairs,)
+        Modulus of that of equation (9).
+    strength : ndarray, shape (n_pairs,)
+        Modulus of the determinant with the strength of both waves, over 4 |beta|^2.
+    off_by_pi : float
+        Fraction of points and pairs at which the phases of the waves differ by pi more or less than half the
+        difference.
+    sine_error, half_error : float
+        Largest errors of the two forms of the determinant: the sine of the difference of the waves' phases, and
+        this difference as half the one of the phase shifts, modulo pi.
+    """
+
+    shifts: NDArray[np.float64]
+    difference: NDArray[np.float64]
+    determinant: NDArray[np.float64]
+    strength: NDArray[np.float64]
+    off_by_pi: float
+    sine_error: float
+    half_error: float
+
+
+def dimple_pairs(pupil: Pupil, diameter: float, n_shifts: int, field: NDArray) -> DimplePairs:
+    """Take the determinant of every pair of dimples of `n_shifts` phase shifts, at every point of the pupil.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    diameter : float, lambda/D
+    n_shifts : int
+        Phase shifts on the circle; that of 0 is left out, because it has no reference wave.
+    field : ndarray of complex, shape (ny, nx)
+    """
+    _check.instance("pupil", pupil, Pupil)
+    diameter = _check.number("diameter", diameter, 0.01, pupil.n_pixels)
+    n_shifts = _check.integer("n_shifts", n_shifts, 2)
+    shifts = 2 * np.pi * np.arange(n_shifts) / n_shifts - np.pi
+    shifts = shifts[np.abs(shifts) > 1e-9]
+    sensor = ZernikeSensor(pupil, *(Dimple(diameter, theta) for theta in shifts))
+    waves = pupil.gather(sensor.reference_wave(field))
+    beta = waves[0] / (np.exp(1j * shifts[0]) - 1)
+    pairs = list(product(range(len(shifts)), repeat=2))
+    size, strength, off_by_pi, sine_error, half_error = np.empty((5, len(pairs)))
+    for index, (a, b) in enumerate(pairs):
+        determinant = matrix_determinant(waves[a], waves[b])
+        between = np.angle(waves[b]) - np.angle(waves[a])
+        beyond_half = between - (shifts[b] - shifts[a]) / 2
+        size[index] = np.abs(determinant).mean()
+        strength[index] = np.abs((waves[a].conj() * waves[b]).imag / np.abs(beta) ** 2).mean()
+        off_by_pi[index] = np.mean(np.cos(beyond_half) < 0)
+        sine_error[index] = np.abs(determinant - np.sin(between)).max()
+        half_error[index] = np.abs(np.sin(beyond_half)).max()
+    both = shifts[pairs]
+    difference = (both[:, 1] - both[:, 0]) % (2 * np.pi)
+    return DimplePairs(
+        both, difference, size, strength, float(off_by_pi.mean()), float(sine_error.max()), float(half_error.max())
+    )
+
+
+def true_wave_errors(sensor: ZernikeSensor, screens: NDArray) -> dict[str, NDArray[np.float64]]:
+    """Absolute errors of the phase at each point, from two frames and from one, with the true reference waves.
+
+    Parameters
+    ----------
+    sensor : ZernikeSensor
+        With two masks, the phase of the first one in (0, pi].
+    screens : ndarray, shape (n_screens, ny, nx), radian
+
+    Returns
+    -------
+    dict of ndarray, shape (n_screens, n_points), radian
+        By equation (9), by one iteration that starts at the truth, and by equation (6).
+    """
+    screens = _screens(sensor, screens)
+    pupil = sensor.pupil
+    amplitude, truth = pupil.gather(pupil.amplitude), pupil.gather(screens)
+    frames = sensor.measure(screens)
+    inside, waves = pupil.gather(frames), pupil.gather(sensor.reference_wave(pupil.field(screens)))
+    one_step = PhaseShifted(sensor, n_iterations=1)(frames, start=screens)
+    phases = {
+        "two images, equation (9)": pair_phase(inside, amplitude, waves),
+        "two images, one iteration": pupil.gather(one_step.phase),
+        "one image, equation (6)": arccosine_phase(inside[:, 0], amplitude, waves[:, 0]),
+    }
+    return {name: np.abs(np.angle(np.exp(1j * (phase - truth)))) for name, phase in phases.items()}
+
+
+def _screens(sensor: ZernikeSensor, screens: NDArray) -> NDArray:
+    """Check a sensor with two masks, and screens on its pupil."""
+    _check.instance("sensor", sensor, ZernikeSensor)
+    if sensor.n_masks != 2:
+        raise ValueError(f"sensor has {sensor.n_masks} masks: expected two")
+    pupil = sensor.pupil
+    return pupil.scatter(_check.values_inside("screens", screens, pupil).reshape(-1, pupil.n_points), fill=0)
+
+
+def _cosine(frame: NDArray, amplitude: NDArray, reference: NDArray) -> NDArray[np.floating]:
+    """Cosine of the phase between two waves, as equations (6) and (9) take it from the intensity."""
+    amplitude, reference = np.abs(amplitude), np.abs(reference)
+    return (frame - reference**2 - amplitude**2) / (2 * reference * amplitude)
 
 
 def _arrays(**values: NDArray) -> list[NDArray]:

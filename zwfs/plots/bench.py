@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -10,16 +10,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from zwfs.bench.model import Bench
 from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.plots.style import LOOKS, _looks, show_intensity, show_phase
 
 _ARMS = ("+θ", "−θ")
 
 
-def reference_intensities(frames: NDArray, pupil_images: NDArray) -> Figure:
-    """Figure 6: the two images of a flat command, mask in, and the off-mask images, (2, ny, nx) each."""
+def reference_intensities(frames: NDArray, clear_frames: NDArray) -> Figure:
+    """Figure 6: the two images of a flat command, mask in, and the clear frames, (2, ny, nx) each."""
     figure, panels = plt.subplots(1, 4, figsize=(9, 3.4))
-    for pair, images, label in ((panels[:2], frames, "mask in"), (panels[2:], pupil_images, "mask out")):
+    for pair, images, label in ((panels[:2], frames, "mask in"), (panels[2:], clear_frames, "mask out")):
         top = np.quantile(images, 0.9995)
         for axes, image, arm in zip(pair, images, _ARMS, strict=True):
             shown = show_intensity(axes, image, top)
@@ -56,24 +57,29 @@ def measured_and_modelled(measured: NDArray, modelled: NDArray, phase: NDArray) 
     return figure
 
 
-def segment_errors(numbers: NDArray, residuals: Mapping[str, NDArray], maps: Mapping[str, NDArray]) -> Figure:
-    """Figure 8: residual piston of each segment, as points and as maps (radian).
+def segment_errors(bench: Bench, commanded: NDArray, errors: Mapping[str, NDArray]) -> Figure:
+    """Figure 8: error of the piston of each segment, as points and as maps, and the commands.
 
     Parameters
     ----------
-    numbers : ndarray, shape (n_segments,)
-    residuals : mapping of method to ndarray, shape (n_segments,)
-    maps : mapping of title to ndarray, shape (ny, nx)
+    bench : Bench
+    commanded : ndarray, shape (n_segments,), radian
+    errors : mapping of method to ndarray, shape (n_segments,), radian
     """
+    pistons = {"commanded": commanded} | {f"error, {LOOKS[name].name}": values for name, values in errors.items()}
+    maps = {
+        title: np.where(bench.segments > 0, bench.commanded_phase(values), np.nan)
+        for title, values in pistons.items()
+    }
     figure, panels = plt.subplot_mosaic(
         [["points"] * len(maps), list(maps)], figsize=(9, 5.2), height_ratios=[1, 1.1]
     )
     points = panels["points"]
-    for name, values in residuals.items():
+    for name, values in errors.items():
         look = LOOKS[name]
         rms = np.sqrt(np.mean(values**2))
         points.plot(
-            numbers,
+            bench.numbers,
             values,
             look.marker,
             color=look.color,
@@ -92,10 +98,10 @@ def segment_errors(numbers: NDArray, residuals: Mapping[str, NDArray], maps: Map
     return figure
 
 
-def bench_linearity(curves: BenchCurves, names: Sequence[str]) -> Figure:
+def bench_linearity(curves: BenchCurves) -> Figure:
     """Figure 9: error of the segments against the input, and the gain, the slope of found against commanded."""
     figure, (plain, gain) = plt.subplots(1, 2, figsize=(9, 4.2))
-    for name, look in _looks(names):
+    for name, look in _looks(curves.residuals):
         mean, std = curves.mean(name), curves.std(name)
         line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
         plain.plot(curves.rms, mean, label=look.label, **line)
@@ -110,27 +116,26 @@ def bench_linearity(curves: BenchCurves, names: Sequence[str]) -> Figure:
     return figure
 
 
-def budget(labels: Sequence[str], offsets: NDArray, gains: NDArray, errors: NDArray) -> Figure:
-    """What each error of the bench does alone: offset at a flat command, loss of gain, error at two inputs.
+def budget(curves: Mapping[str, BenchCurves], name: str) -> Figure:
+    """Effect of each error of the bench alone: offset at a flat command, and gain and error at the second input.
 
     Parameters
     ----------
-    labels : sequence of str, length n
-    offsets : ndarray, shape (n,), radian rms
-    gains : ndarray, shape (n,)
-    errors : ndarray, shape (n,), radian rms
+    curves : mapping of the name of an error to BenchCurves
+    name : str
+        Reconstructor.
     """
     figure, panels = plt.subplots(1, 3, figsize=(9, 3.4), sharey=True)
-    rows = np.arange(len(labels))[::-1]
+    rows = np.arange(len(curves))[::-1]
     quantities = (
-        ("offset at a flat command\n(rad rms)", offsets),
-        ("change of the gain\n(%)", 100 * (gains - 1)),
-        ("error\n(rad rms)", errors),
+        ("offset at a flat command\n(rad rms)", [one.mean(name)[0] for one in curves.values()]),
+        ("change of the gain\n(%)", [100 * (one.gain(name)[1] - 1) for one in curves.values()]),
+        ("error\n(rad rms)", [one.mean(name)[1] for one in curves.values()]),
     )
     for axes, (title, values) in zip(panels, quantities, strict=True):
-        axes.barh(rows, values, color=LOOKS["PhaseShifted"].color, height=0.65)
+        axes.barh(rows, values, color=LOOKS[name].color, height=0.65)
         axes.axvline(0, color="#555555", lw=1)
         axes.set(xlabel=title)
         axes.grid(axis="y", visible=False)
-    panels[0].set_yticks(rows, labels)
+    panels[0].set_yticks(rows, [error.replace("_", " ") for error in curves])
     return figure

@@ -2,53 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from zwfs.paper.closed_loop import LoopRun
 from zwfs.plots.style import LOOKS
 
 
-def loop_runs(runs: Mapping[str, Mapping[str, LoopRun]]) -> Figure:
+def loop_runs(runs: Mapping[float, Mapping[str, LoopRun]]) -> Figure:
     """Residual against time, one panel for each star and one line for each screen.
 
     Parameters
     ----------
-    runs : mapping of title to mapping of method to LoopRun
+    runs : mapping of magnitude to mapping of method to LoopRun
     """
     figure, panels = plt.subplots(1, len(runs), figsize=(9, 3.9), sharey=True, squeeze=False)
-    for axes, (title, methods) in zip(panels[0], runs.items(), strict=True):
+    for axes, (magnitude, methods) in zip(panels[0], runs.items(), strict=True):
         for name, run in methods.items():
             look, time = LOOKS[name], 1e3 * run.times
             labels = [look.label, *[None] * (len(run.residual) - 1)]
             axes.semilogy(time, run.residual.T, lw=1, color=look.color, linestyle=look.line, label=labels)
         axes.semilogy(time, np.median(run.open_loop, axis=0), color="#777777", lw=1, label="without correction")
-        axes.set(xlabel="time (ms)", title=title, xlim=(0, time[-1]))
+        axes.set(xlabel="time (ms)", title=f"magnitude {magnitude:g}", xlim=(0, time[-1]))
     panels[0, 0].set_ylabel("residual (rad rms)")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
     return figure
 
 
-def capture(inputs: NDArray, closed: Mapping[str, NDArray], settled: Mapping[str, NDArray]) -> Figure:
+def capture(inputs: Sequence[float], runs: Sequence[Mapping[str, LoopRun]]) -> Figure:
     """Fraction of the loops that close, and the residual they settle at, against the wavefront error at the start.
 
     Parameters
     ----------
-    inputs : ndarray, shape (n_rms,), radian rms
-    closed : mapping of method to ndarray, shape (n_rms,)
-    settled : mapping of method to ndarray, shape (n_rms, n_screens), radian rms
+    inputs : sequence of float, radian rms
+    runs : sequence of mapping of method to LoopRun
+        One for each input.
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.9))
-    for name, fraction in closed.items():
+    for name in runs[0]:
         look = LOOKS[name]
+        settled = np.array([methods[name].settled() for methods in runs])
+        closed = [100 * np.mean(methods[name].closed()) for methods in runs]
         line = {"color": look.color, "linestyle": look.line, "marker": look.marker, "label": look.label}
-        left.plot(inputs, 100 * fraction, **line)
-        right.semilogy(inputs, np.median(settled[name], axis=1), **line)
-        right.fill_between(inputs, settled[name].min(1), settled[name].max(1), color=look.color, alpha=0.15, lw=0)
+        left.plot(inputs, closed, **line)
+        right.semilogy(inputs, np.median(settled, axis=1), **line)
+        right.fill_between(inputs, settled.min(1), settled.max(1), color=look.color, alpha=0.15, lw=0)
     right.plot(inputs, inputs, color="#777777", lw=1, label="as at the start")
     left.set(xlabel="error at the start (rad rms)", ylabel="loops that close (%)", ylim=(-3, 103))
     right.set(xlabel="error at the start (rad rms)", ylabel="settled residual (rad rms)")

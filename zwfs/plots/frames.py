@@ -8,25 +8,25 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from zwfs.frames.pipeline import Found, Step
+from zwfs.frames.pipeline import MeasuredPhase, Step
 from zwfs.plots.style import OTHER_STYLES, show_intensity, show_phase
 
-_MASKED = "#FF00FF"  # not in the colour maps, and far from the colours of the methods
+_BAD = "#FF00FF"  # not in the colour maps, and far from the colours of the methods
 
 
-def explained(found: Found) -> Figure:
-    """Measured frames, modelled frames and their difference, all on one scale; masked pixels are marked."""
+def explained(result: MeasuredPhase) -> Figure:
+    """Measured frames, modelled frames and their difference, all on one scale; bad pixels are marked."""
     figure, panels = plt.subplots(2, 3, figsize=(9, 5.6))
-    top = np.quantile(found.measured[..., *found.measurement.window][:, found.measurement.good], 0.999)
+    top = np.quantile(result.measured[..., *result.measurement.window][:, result.measurement.good], 0.999)
     for row, (measured, modelled, bad) in enumerate(
-        zip(found.measured, found.modelled, found.measurement.bad, strict=True)
+        zip(result.measured, result.modelled, result.measurement.bad, strict=True)
     ):
         shown = show_intensity(panels[row, 0], measured, top)
         show_intensity(panels[row, 1], modelled, top)
         difference = show_phase(panels[row, 2], np.where(bad, np.nan, measured - modelled), top / 2)
         for axes in panels[row, ::2]:
-            axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_MASKED, ms=1.2)
-        panels[row, 0].set_ylabel(f"image {row + 1}: correlation {found.correlation[row]:.3f}")
+            axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=1.2)
+        panels[row, 0].set_ylabel(f"image {row + 1}: correlation {result.correlation[row]:.3f}")
     for axes, title in zip(panels[0], ("measured", "modelled", "measured − modelled"), strict=True):
         axes.set_title(title, fontsize=10)
     figure.colorbar(shown, ax=panels[:, :2], label="intensity", location="bottom", shrink=0.6, aspect=40)
@@ -36,20 +36,20 @@ def explained(found: Found) -> Figure:
     return figure
 
 
-def phase_map(found: Found, wavelength: float) -> Figure:
-    """Phase in radian, with a second scale in nm; masked points are marked.
+def phase_map(result: MeasuredPhase, wavelength: float) -> Figure:
+    """Phase in radian, with a second scale in nm; bad points are marked.
 
     Parameters
     ----------
-    found : Found
+    result : MeasuredPhase
     wavelength : float, nm
     """
     figure, axes = plt.subplots(figsize=(6.4, 5))
-    limit = np.nanmax(np.abs(found.phase))
-    shown = show_phase(axes, found.phase, limit)
-    masked = found.measurement.pupil.inside & ~found.measurement.good
-    if masked.any():
-        axes.plot(*np.argwhere(masked)[:, ::-1].T, "s", color=_MASKED, ms=2, label=f"{masked.sum()} masked points")
+    limit = np.nanmax(np.abs(result.phase))
+    shown = show_phase(axes, result.phase, limit)
+    bad = result.measurement.pupil.inside & ~result.measurement.good
+    if bad.any():
+        axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=2, label=f"{bad.sum()} masked points")
         figure.legend(loc="outside lower center", fontsize=9)
     bar = figure.colorbar(shown, ax=axes, label="phase (rad)")
     scale = wavelength / (2 * np.pi)
@@ -72,7 +72,7 @@ def gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> Figure
     figure, panels = plt.subplots(1, 2 + (errors is not None), figsize=(9, 3.6), sharey=True)
     rows = np.arange(len(work))[::-1]
     for axes, title, values in (
-        (panels[0], "correlation of measured\nand modelled frames", [step.found.correlation for step in work]),
+        (panels[0], "correlation of measured\nand modelled frames", [step.result.correlation for step in work]),
         (panels[1], "correlation with the prediction\nfrom the other frame", [step.predicted for step in work]),
     ):
         for index, (points, style) in enumerate(zip(np.transpose(values), OTHER_STYLES, strict=False), start=1):

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from zwfs.paper.identities import DimplePairs
 from zwfs.plots.style import OTHER_STYLES
 
 
@@ -37,22 +37,24 @@ def approximation(
     return figure
 
 
-def diversity(difference: NDArray, determinant: NDArray, strength: NDArray, named: Mapping[str, int]) -> Figure:
-    """Determinant of equation (10) and the one weighted with both reference waves, for many pairs of masks.
+# Pairs of phase shifts to point out, where the grid has them, rad.
+_NAMED = {
+    "±π/2": (-np.pi / 2, np.pi / 2),
+    "±2π/3": (-2 * np.pi / 3, 2 * np.pi / 3),
+    "π/12 and −11π/12": (np.pi / 12, -11 * np.pi / 12),
+}
 
-    Parameters
-    ----------
-    difference : ndarray, shape (n_pairs,), radian
-        Of the phase shifts.
-    determinant, strength : ndarray, shape (n_pairs,)
-    named : mapping of label to index
-        Pairs to point out.
-    """
+
+def diversity(pairs: DimplePairs) -> Figure:
+    """Determinant of equation (10) and the one weighted with both reference waves, for many pairs of masks."""
+    matches = {label: np.isclose(pairs.shifts, pair).all(axis=1) for label, pair in _NAMED.items()}
+    named = {label: int(match.argmax()) for label, match in matches.items() if match.any()}
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.9), sharex=True)
-    for axes, values in zip(panels, (determinant, strength), strict=True):
-        axes.plot(difference, values, ".", color="#56B4E9", ms=4)
+    for axes, values in zip(panels, (pairs.determinant, pairs.strength), strict=True):
+        axes.plot(pairs.difference, values, ".", color="#56B4E9", ms=4)
         for (label, index), style in zip(named.items(), OTHER_STYLES, strict=False):
-            axes.plot(difference[index], values[index], label=label, markersize=8, **style | {"linestyle": "none"})
+            point = pairs.difference[index], values[index]
+            axes.plot(*point, label=label, markersize=8, **style | {"linestyle": "none"})
         axes.set(xlabel=r"difference of the phase shifts, $\theta_b-\theta_a$ (rad)", ylim=(0, None))
         axes.set_xticks(np.pi / 2 * np.arange(5), ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"])
     panels[0].set_ylabel(r"$|\det M|$")

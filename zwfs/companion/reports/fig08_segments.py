@@ -1,0 +1,22 @@
+"""Figure 8: the errors of the segments of one screen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zwfs.companion.results import glue_numbers
+from zwfs.companion.tables import Table
+from zwfs.plots import LOOKS
+
+
+def claims(numbers: NDArray, errors: Mapping[str, NDArray]) -> Table:
+    """Glue and show the error of each reconstructor, (n_segments,) in radian, over the segments' `numbers`."""
+    glue_numbers({"linear_at_08": errors["Linear"].std(), "shifted_at_08": errors["PhaseShifted"].std()})
+    rows = []
+    for name, values in errors.items():
+        worst = np.abs(values).argmax()
+        rows.append([LOOKS[name].name, float(values.std()), float(np.abs(values[worst])), int(numbers[worst])])
+    return Table(["reconstructor", "error (rad rms)", "largest error (rad)", "segment"], rows)

@@ -419,16 +419,8 @@ def contraction(
 ) -> Contraction:
     """Return the causes of Figure 4: the linearised iteration and the sensitivity, at each diameter.
 
-    Parameters
-    ----------
-    pupil : Pupil
-    modes : ndarray, shape (n_modes, ny, nx)
-        At least 149, from Noll 2 on.
-    diameters : array_like, shape (n_diameters,), lambda/D
-        The first dark ring is added.
-    screens : ndarray, shape (n_screens, ny, nx), radian
-    away : ndarray, shape (ny, nx), radian
-        Small error from which the observed iteration starts, see `measured_factor`.
+    The first dark ring is added to the diameters. At least 149 modes are needed, from Noll 2 on. `away` is the
+    small error (radian) from which the observed iteration starts, see `measured_factor`.
     """
     _check.instance("pupil", pupil, Pupil)
     diameters = np.unique(np.append(_check_diameters(diameters), DARK_RING))

@@ -124,18 +124,8 @@ def paper_reconstructors(
 def own_reconstructor(path: str, reconstructors: Mapping[str, Any]) -> dict[str, Any]:
     """Return a reader's reconstructor by the name of its class, for a sensor of the paper's reconstructors.
 
-    Parameters
-    ----------
-    path : str
-        "module:Class", see `zwfs.reconstructors.base.load`; empty for none. The class is called with a sensor:
-        that of one dimple if its `n_masks` is 1, else that of two.
-    reconstructors : mapping of str to reconstructor
-        See `paper_reconstructors`.
-
-    Returns
-    -------
-    dict of reconstructor
-        Empty if the path is.
+    The class is that of `path`, "module:Class", see `zwfs.reconstructors.base.load`; there is none if `path` is
+    empty. It is called with the sensor of one dimple if its `n_masks` is 1, else with that of two.
 
     Raises
     ------
@@ -268,23 +258,8 @@ def offset_by_width(
 ) -> NDArray[np.float64]:
     """Error of Gerchberg-Saxton at 0.1 rad rms on detectors of several widths, and the light that they lose.
 
-    Parameters
-    ----------
-    reconstructor : GerchbergSaxton
-        Its masks and settings are used on every detector.
-    modes : ndarray, shape (n_modes, ny, nx)
-        Modes that the screens are made of.
-    extents : array_like, shape (n_extents,), pupil diameters
-        Widths of the detector.
-    n_screens : int
-    exponent : float
-        Exponent of the power spectral density of the screens.
-    seed : int
-
-    Returns
-    -------
-    ndarray, shape (n_extents, 3)
-        Width (D), fraction of the light of a flat wavefront that misses the detector, and mean error (radian rms).
+    The masks and the settings are those of `reconstructor`. Returns rows (n_extents, 3): width (D), fraction of
+    the light of a flat wavefront that misses the detector, and mean error on the screens (radian rms).
     """
     _check.instance("reconstructor", reconstructor, GerchbergSaxton)
     pupil, masks = reconstructor.sensor.pupil, reconstructor.sensor.masks
@@ -302,19 +277,10 @@ def offset_by_width(
 
 
 def count_work(reconstructors: Mapping[str, Any], phase: NDArray) -> tuple[dict[str, int], set[str]]:
-    """Count how often reconstructors pass through the model of the sensor, for one wavefront.
+    """Count how often reconstructors pass through the model of the sensor, for one wavefront (ny, nx) in radian.
 
-    Parameters
-    ----------
-    reconstructors : mapping of str to reconstructor
-    phase : ndarray, shape (ny, nx), radian
-
-    Returns
-    -------
-    passes : dict of int
-        Passes of each reconstructor, forward or back.
-    fourier : set of str
-        Functions for Fourier transforms that any reconstructor calls.
+    Returns the passes of each reconstructor, forward or back, and all functions for Fourier transforms that any of
+    them calls.
     """
     check_reconstructors(reconstructors)
     passes, fourier = {}, set()
@@ -331,20 +297,10 @@ def count_work(reconstructors: Mapping[str, Any], phase: NDArray) -> tuple[dict[
 
 
 def model_accuracy(sensor: ZernikeSensor, phase: NDArray, tolerances: ArrayLike) -> NDArray[np.float64]:
-    """Rank of the low-rank model and error of the reference wave, for several tolerances of the model.
+    """Rank of the low-rank model of a sensor and error of the reference wave, for several tolerances.
 
-    Parameters
-    ----------
-    sensor : ZernikeSensor
-        Its pupil and its masks are used.
-    phase : ndarray, shape (ny, nx), radian
-    tolerances : array_like, shape (n,)
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Tolerance, rank, and largest error of the reference wave on the detector, relative to its largest modulus.
-        The model with a tolerance of 1e-14 is the truth.
+    Returns rows (n, 3): tolerance, rank, and largest error on the detector for a phase (radian), relative to the
+    largest modulus of the wave. The model with a tolerance of 1e-14 is the truth.
     """
     _check.instance("sensor", sensor, ZernikeSensor)
     tolerances = _check.real_array("tolerances", tolerances)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -101,27 +101,19 @@ def phase_noise(sensor: ZernikeSensor, phase: ArrayLike) -> PhaseNoise:
 def noise_of_pairs(
     pupil: Pupil, diameter: float, angles: ArrayLike, wavefronts: Mapping[str, ArrayLike]
 ) -> dict[str, NDArray[np.float64]]:
-    """Predicted noise of the pairs (theta, -theta): photon noise for each wavefront, and read noise for the first.
+    """Predicted noise of pairs (theta, -theta): photon noise for each wavefront, and read noise for the first.
 
-    Parameters
-    ----------
-    pupil : Pupil
-    diameter : float, lambda/D
-    angles : array_like, shape (n,), radian
-        Theta of each pair.
-    wavefronts : mapping of str to array_like, shape (n_screens, ny, nx), radian
-
-    Returns
-    -------
-    dict of ndarray, shape (n,), radian sqrt(photon), and radian for read noise
-        Rms over pupil and screens; see `PhaseNoise`.
+    The wavefronts are screens (n_screens, ny, nx) in radian, by name. Returns the rms over pupil and screens of
+    `PhaseNoise`, by the name of the noise, for each theta.
     """
     angles = _check.real_array("angles", angles)
     if angles.ndim != 1 or not angles.size:
         raise ValueError(f"angles has shape {angles.shape}: expected (n,)")
     _check.finite("angles", angles)
     screens = _check_wavefronts(pupil, wavefronts)
-    first, noise = next(iter(screens)), {name: np.empty(angles.size) for name in _noises(screens)}
+    first = next(iter(screens))
+    names = [*(f"photon noise, {name}" for name in screens), f"read noise, {first}"]
+    noise = {name: np.empty(angles.size) for name in names}
     for index, theta in enumerate(angles.tolist()):
         sensor = _sensor(pupil, diameter, theta, -theta)
         for name, phases in screens.items():
@@ -132,22 +124,8 @@ def noise_of_pairs(
     return noise
 
 
-def _noises(wavefronts: Mapping[str, Any]) -> list[str]:
-    """Names of the noises, in order."""
-    return [*(f"photon noise, {name}" for name in wavefronts), f"read noise, {next(iter(wavefronts))}"]
-
-
 class DrawnNoise(NamedTuple):
-    """Photon noise of a pair of phase shifts (radian), predicted and drawn.
-
-    Attributes
-    ----------
-    theta_a, theta_b : float, radian
-    name : str
-        As in `noise_of_pairs`.
-    expected, drawn, error : float, radian sqrt(photon)
-        Predicted noise, that of the draws, and its standard error.
-    """
+    """Photon noise of a pair of phase shifts, radian sqrt(photon): predicted, drawn, and standard error."""
 
     theta_a: float
     theta_b: float
@@ -166,18 +144,7 @@ def compare_noise(
     *,
     seed: int = 0,
 ) -> list[DrawnNoise]:
-    """Photon noise of the pairs of `DRAWN`, predicted and drawn; see `drawn_noise`.
-
-    Parameters
-    ----------
-    pupil : Pupil
-    diameter : float, lambda/D
-    wavefronts : mapping of str to array_like, shape (n_screens, ny, nx), radian
-    photons : float, photons
-    n_draws : int
-    seed : int
-        Of the first screen; the next ones have the next seeds.
-    """
+    """Photon noise of the pairs of `DRAWN`, predicted and drawn; see `noise_of_pairs` and `drawn_noise`."""
     screens, seed = _check_wavefronts(pupil, wavefronts), _check.integer_seed("seed", seed)
     rows = []
     for theta_a, theta_b in DRAWN:
@@ -195,20 +162,10 @@ def compare_noise(
 def close_pairs(
     pupil: Pupil, diameter: float, gaps: ArrayLike, screens: NDArray, n_iterations: int = 25
 ) -> NDArray[np.float64]:
-    """Error and photon noise of pairs that are nearly equal: pi/2, and pi/2 less a gap.
+    """Error and photon noise of pairs that are nearly equal: pi/2, and pi/2 less a gap (radian).
 
-    Parameters
-    ----------
-    pupil : Pupil
-    diameter : float, lambda/D
-    gaps : array_like, shape (n,), radian
-    screens : ndarray, shape (n_screens, ny, nx), radian
-    n_iterations : int
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Gap, mean error on the screens without noise (radian rms), and photon noise for a flat wavefront.
+    Returns rows (n, 3): gap, mean error on the screens without noise (radian rms), and photon noise for a flat
+    wavefront (radian sqrt(photon)).
     """
     _check.instance("pupil", pupil, Pupil)
     gaps = _check.real_array("gaps", gaps)

@@ -15,7 +15,7 @@ from urllib.parse import unquote, urlsplit
 
 import yaml
 from bs4 import BeautifulSoup, Tag
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, sync_playwright
 from pypdf import PdfReader, PdfWriter
 from pypdf.generic import DictionaryObject, NameObject, TextStringObject
 from sphinx_external_toc.api import SiteMap, TocTree
@@ -48,7 +48,9 @@ FIT = """() => {
 
 # Writes the first page of each chapter into the table of contents.
 NUMBER = """places => {
-  for (const entry of document.querySelectorAll("nav .page")) entry.textContent = places[entry.dataset.name];
+  for (const entry of document.querySelectorAll("nav .page")) {
+    entry.textContent = places[entry.dataset.name] ?? "000";
+  }
 }"""
 
 PRINT = {
@@ -110,11 +112,9 @@ def print_book(root: Path, book: Path, chromium: str) -> bytes:
         paper.write_text(str(pages), "utf-8")
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-            page = browser.new_page(viewport={"width": 642, "height": 970})  # the text of a page, see the style
-            _open(page, paper)
             # The numbers of pages come from a first print, with a table of contents of the same length.
-            page.evaluate(NUMBER, _places(page.pdf(**PRINT)))
-            printed = page.pdf(**PRINT)
+            places = _places(_print(browser, paper, {}))
+            printed = _print(browser, paper, places)
             browser.close()
     finally:
         paper.unlink(missing_ok=True)
@@ -216,13 +216,21 @@ def _redirect(element: Tag, name: str, known: set[str]) -> None:
         element.unwrap()  # a file of the book, which does not come with the PDF
 
 
-def _open(page: Page, file: Path) -> None:
-    """Open a file for print, and wait for its mathematics."""
+def _print(browser: Browser, file: Path, places: dict[str, int]) -> bytes:
+    """Print a file with these numbers of pages in its table of contents.
+
+    Each print needs a new page: Chromium may break the second print of a page at other lines.
+    """
+    page = browser.new_page(viewport={"width": 642, "height": 970})  # the text of a page, see the style
     page.emulate_media(media="print")
     page.goto(file.resolve().as_uri())
     page.evaluate("async () => { await window.MathJax?.startup?.promise; await document.fonts.ready }")
     if wide := page.evaluate(FIT):
         raise PrintError("\n".join(["the book was not printed: too wide for a page:", *wide]))
+    page.evaluate(NUMBER, places)
+    printed = page.pdf(**PRINT)
+    page.close()
+    return printed
 
 
 def _places(printed: bytes) -> dict[str, int]:

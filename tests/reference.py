@@ -45,7 +45,7 @@ class HcipySensor:
         ]
 
     def wavefront(self, field):
-        """What HCIPy's optics take."""
+        """Field in the form that the optics of HCIPy accept."""
         return self._hcipy.Wavefront(self._hcipy.Field(field.ravel(), self.grid))
 
     def propagate(self, field):

@@ -231,7 +231,7 @@ def test_what_would_be_lost_is_refused(pupil, classic, method):
 
 
 def test_others_take_arrays_of_numpy(pupil, modes, screens):
-    """What is not written for other libraries answers in NumPy."""
+    """Methods that are written for NumPy only answer in NumPy."""
     method = Linear(ZernikeSensor(pupil, PAIR[0]), modes)
     frames = method.sensor.measure(screens(0.1, 2))
     found = method(array_api_strict.asarray(frames))

@@ -537,7 +537,7 @@ def right(name):
 
 
 def judge(call, parameter, label, value, plain):
-    """What is wrong with the answer to a value; None if it is right."""
+    """Return the fault of the answer to a value; None if the answer is right."""
     if "Callable" in str(call.parameters[parameter].annotation) and callable(value):
         return None  # what it raises is the caller's own
     annotation = str(call.parameters[parameter].annotation)

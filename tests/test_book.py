@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(not HTML.is_dir(), reason="the book is not built
 
 
 class Page(HTMLParser):
-    """What a page loads, what it links to, and what can be linked to in it."""
+    """Files that a page loads, its links, and the anchors in it."""
 
     def __init__(self, file):
         super().__init__()

@@ -1,4 +1,4 @@
-"""What the built book offers beside its pages: launch buttons, and the PDF, which is as whole as the pages are."""
+"""Launch buttons of the built book, and its PDF, which is as complete as the pages."""
 
 import re
 import unicodedata

@@ -1,4 +1,4 @@
-"""What ``jupyter-book build .`` makes of the tracked files alone: the whole book, without a warning."""
+"""``jupyter-book build .`` builds the whole book from the tracked files alone, without a warning."""
 
 import pytest
 from bs4 import BeautifulSoup

@@ -175,12 +175,14 @@ def _unnormalised(disc: NDArray[np.complex128], n_modes: int) -> NDArray[np.floa
 
 def _jacobi(t: NDArray, m: int, k_max: int) -> list[NDArray]:
     """Jacobi polynomials P_k^(0,m)(t) for k = 0 to `k_max`, by their recurrence in k."""
-    found = [np.ones_like(t), (m + 2) / 2 * t - m / 2]
+    polynomials = [np.ones_like(t), (m + 2) / 2 * t - m / 2]
     for k in range(2, k_max + 1):
         c = 2 * k + m
-        rise = (c - 1) * (c * (c - 2) * t - m * m) * found[-1] - 2 * (k - 1) * (k + m - 1) * c * found[-2]
-        found.append(rise / (2 * k * (k + m) * (c - 2)))
-    return found[: k_max + 1]
+        rise = (c - 1) * (c * (c - 2) * t - m * m) * polynomials[-1] - 2 * (k - 1) * (k + m - 1) * c * polynomials[
+            -2
+        ]
+        polynomials.append(rise / (2 * k * (k + m) * (c - 2)))
+    return polynomials[: k_max + 1]
 
 
 def _orthonormalise(values: NDArray) -> NDArray:

@@ -180,7 +180,9 @@ def _literal(node: ast.expr) -> Any:
     try:
         return ast.literal_eval(node)
     except ValueError:
-        raise ParameterError(f"{ast.unparse(node)} is no literal: it cannot be read without running it") from None
+        raise ParameterError(
+            f"{ast.unparse(node)} is not a literal: it cannot be read without running it"
+        ) from None
 
 
 def accept(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]:

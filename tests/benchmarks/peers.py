@@ -62,7 +62,7 @@ class Contestant:
 
 
 def prepared(make):
-    """What `make` gives, set up when it is called for the first time."""
+    """Result of `make`, set up at the first call."""
     once = cache(make)
     return lambda: once()()
 

@@ -1,4 +1,4 @@
-"""What a task of each sweep costs at the figures' parameters, a Markdown table: python -m tests.benchmarks.tasks.
+"""Cost of a task of each sweep at the figures' parameters, as a Markdown table: python -m tests.benchmarks.tasks.
 
 Processor time does not grow when a machine is busy. The memory is that of a worker which does only such tasks.
 """

@@ -1,4 +1,4 @@
-"""What the speed is measured of: right answers, at any speed."""
+"""The calls that the benchmarks time give right answers."""
 
 import json
 

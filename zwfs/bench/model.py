@@ -1,7 +1,7 @@
 """A simulated bench: a vector-Zernike sensor behind a segmented mirror, with the errors of a real one.
 
 The bench stands for the one of section 5 of the paper. It hands out what a camera would: frames, clear frames
-images and darks, in counts. What it knows of its own errors stays inside; `BenchModel` is the sensor that an
+images and darks, in counts. The errors of the bench stay inside; `BenchModel` is the sensor that an
 experimenter would model from the images alone.
 """
 
@@ -58,7 +58,7 @@ class Bench:
         Phase shift of the mask, of opposite sign for the two polarisations.
     illumination : float
         Change of the intensity from the left edge of the pupil to the right one, as a fraction of the mean. The
-        clear frame shows it, so it is no error.
+        clear frame shows it, so it does not count as an error.
     leakage : float
         Fraction of the light of each polarisation that ends in the image of the other. 3 % is what a quarter-wave
         plate makes that is turned by 10 degrees (sin^2), or 20 degrees short of a quarter wave.
@@ -77,7 +77,7 @@ class Bench:
         Relative error of the dimple's diameter. The real frames are explained best by 1.1 lambda/D, 4 % above the
         design.
     static : float, radian rms
-        Low-order aberration of the bench that the flat command leaves.
+        Low-order aberration of the bench at the flat command.
     quilting : float, radian rms
         Grid that the actuators print on the surface of the deformable mirror; 22 of them across the pupil, as seen
         in the real frames. 6 nm at 635 nm is 0.06 rad.

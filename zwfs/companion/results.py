@@ -123,15 +123,15 @@ def _csv(columns: Mapping[str, ArrayLike]) -> bytes:
         _check.instance(f"header of {name}", header, str)
         array = arrays[header] = _check.plain_array(name, column)
         if array.dtype.kind == "c":
-            raise TypeError(f"{name} is complex: expected its parts in columns of their own")
+            raise TypeError(f"{name} is complex: expected its real and imaginary parts as separate columns")
         if array.dtype.kind not in "biufU":
             raise TypeError(f"{name} has dtype {array.dtype}: expected numbers or strings")
         if array.ndim > 1:
             raise ValueError(f"{name} has shape {array.shape}: expected (n,) or a scalar")
     lengths = {header: array.size for header, array in arrays.items() if array.ndim}
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{header!r}: {length}" for header, length in lengths.items())
-        raise ValueError(f"columns differ in length: {told}")
+        sizes = ", ".join(f"{header!r}: {length}" for header, length in lengths.items())
+        raise ValueError(f"columns differ in length: {sizes}")
     if not arrays:
         raise ValueError("columns is empty: expected at least one")
     stream = io.StringIO()

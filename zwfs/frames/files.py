@@ -86,7 +86,7 @@ class CameraFile:
         Raises
         ------
         ValueError
-            If the header lacks the keyword, or it is no number.
+            If the header lacks the keyword, or its value is not a number.
         """
         _check.instance("key", key, str)
         if key not in self.header:
@@ -546,7 +546,7 @@ def _companions(
 
 
 def _saturation(file: CameraFile, counts: NDArray) -> float:
-    """Level at which pixels are saturated, as far as a file tells."""
+    """Level at which pixels are saturated, if a file states it."""
     if "SATURATE" in file.header:
         return file.keyword("SATURATE")
     top = counts.max(initial=-np.inf)
@@ -555,7 +555,7 @@ def _saturation(file: CameraFile, counts: NDArray) -> float:
 
 
 def _card_value(value: Any) -> Any:
-    """What a header can hold: floats of nine digits, which hide rounding errors, no NaN, and strings in ASCII."""
+    """Value for a FITS header: floats with nine digits, which hide rounding errors, no NaN, and ASCII strings."""
     if isinstance(value, str):
         return value if value.isascii() and value.isprintable() else ascii(value)[1:-1]
     if isinstance(value, float | np.floating):

@@ -62,7 +62,7 @@ class Circle:
     Raises
     ------
     TypeError, ValueError
-        If one is no finite number, or the diameter is not above 0.
+        If a number is not finite, or the diameter is not above 0.
     """
 
     row: float

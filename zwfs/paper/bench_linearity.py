@@ -44,7 +44,7 @@ class BenchCurves(ErrorCurves):
         object.__setattr__(self, "errors", errors)
 
     def gain(self, name: str) -> NDArray[np.float64]:
-        """Slope of the found pistons against the commanded ones, (n_rms,); below 1 they are underestimated.
+        """Slope of the measured pistons against the commanded ones, (n_rms,); below 1 they are underestimated.
 
         The offset of each segment, which is its residual at an input of 0 where there is one, is taken off first.
         NaN at an input of 0.

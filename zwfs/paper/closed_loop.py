@@ -151,7 +151,7 @@ def close_loop(
 ) -> LoopRun:
     """Correct drifting screens with an integrator that a Zernike sensor feeds.
 
-    In each step the sensor measures what the mirror leaves; the reconstructed phase, its piston removed on the
+    In each step the sensor measures the residual of the mirror; the reconstructed phase, its piston removed on the
     circle, is fitted by the modes, and the mirror gets `gain` times that more, `delay` steps later. Frames without
     a photon change nothing.
 
@@ -215,7 +215,7 @@ def close_loop(
         if camera is not None:
             frames = camera.normalise(camera.expose(frames, rng), floor=0.0)
         found = np.zeros((flow.n_screens, pupil.n_points))
-        # A frame without a photon tells nothing: the mirror stays as it is.
+        # A frame without a photon holds no information: the mirror keeps its figure.
         seen = frames.any(axis=(-2, -1)).all(axis=-1)
         if seen.any():
             found[seen] = without_piston(pupil.gather(reconstructor(frames[seen]).phase))

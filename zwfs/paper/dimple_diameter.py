@@ -113,8 +113,8 @@ def _diameter_point(
     for name, reconstructor in reconstructors.items():
         sensor = reconstructor.sensor
         screens = _check_screens(screens, sensor.pupil)
-        found = reconstructor(sensor.measure(screens))
-        errors[name] = reconstruction_error(sensor.pupil, found.phase, screens)
+        estimate = reconstructor(sensor.measure(screens))
+        errors[name] = reconstruction_error(sensor.pupil, estimate.phase, screens)
     return float(np.mean(sensor.pupil.rms(screens))), errors
 
 

@@ -221,8 +221,8 @@ def approximation_errors(sensor: ZernikeSensor, screens: NDArray, power: float =
     guess = strehl(pupil, screens)[:, np.newaxis, np.newaxis] ** power * flat
     first, first_guess = true[:, 0], guess[:, 0]
 
-    def phase_error(found: NDArray, truth: NDArray) -> float:
-        return float(reconstruction_error(pupil, pupil.scatter(found), truth).mean())
+    def phase_error(phase: NDArray, truth: NDArray) -> float:
+        return float(reconstruction_error(pupil, pupil.scatter(phase), truth).mean())
 
     def relative(gap: NDArray) -> float:
         return float(np.mean(np.linalg.norm(gap, axis=-1) / np.linalg.norm(first, axis=-1)))

@@ -153,7 +153,7 @@ def linearity_curves(
 ) -> LinearityCurves:
     """Error of reconstructors on random screens of growing rms: the experiment of section 4.1.
 
-    Each input rms has screens of its own; all reconstructors see the same ones, each through its own sensor. An
+    Each input rms has different screens. All reconstructors see the same screens, each through its own sensor. An
     input is a task of the sweep "linearity_curves", see `zwfs.companion.sweeps`.
 
     Parameters
@@ -209,9 +209,9 @@ def _linearity_point(
     phase = pupil.gather(screens)
     errors, converged = {}, {}
     for name, reconstructor in reconstructors.items():
-        found = reconstructor(reconstructor.sensor.measure(screens))
-        errors[name] = reconstruction_error(pupil, found.phase, screens)
-        converged[name] = found.converged
+        estimate = reconstructor(reconstructor.sensor.measure(screens))
+        errors[name] = reconstruction_error(pupil, estimate.phase, screens)
+        converged[name] = estimate.converged
     wrapped, folded = np.mean(np.abs(phase) > np.pi, axis=-1), np.mean(phase < -np.pi / 4, axis=-1)
     return errors, converged, wrapped, folded, strehl(pupil, screens)
 

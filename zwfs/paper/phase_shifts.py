@@ -117,10 +117,10 @@ def noise_of_pairs(
     for index, theta in enumerate(angles.tolist()):
         sensor = _sensor(pupil, diameter, theta, -theta)
         for name, phases in screens.items():
-            found = [phase_noise(sensor, phase) for phase in phases]
-            noise[f"photon noise, {name}"][index] = _rms(np.array([one.photon for one in found]))
+            noises = [phase_noise(sensor, phase) for phase in phases]
+            noise[f"photon noise, {name}"][index] = _rms(np.array([one.photon for one in noises]))
             if name == first:
-                noise[f"read noise, {name}"][index] = _rms(np.array([one.read for one in found]))
+                noise[f"read noise, {name}"][index] = _rms(np.array([one.read for one in noises]))
     return noise
 
 
@@ -234,8 +234,8 @@ def drawn_noise(
     rng = _check.generator("seed", seed)
     camera = Detector(sensor.pupil, photons * sensor.pupil.n_points / sensor.n_masks)
     frames = np.repeat(sensor.measure(phase)[np.newaxis], n_draws, axis=0)
-    found = PhaseShifted(sensor)(camera.normalise(camera.expose(frames, rng)))
-    power = photons * reconstruction_error(sensor.pupil, found.phase, phase) ** 2
+    estimate = PhaseShifted(sensor)(camera.normalise(camera.expose(frames, rng)))
+    power = photons * reconstruction_error(sensor.pupil, estimate.phase, phase) ** 2
     noise = float(np.sqrt(power.mean()))
     return noise, float(power.std(ddof=1) / np.sqrt(n_draws) / (2 * noise))
 

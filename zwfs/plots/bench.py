@@ -99,7 +99,7 @@ def segment_errors(bench: Bench, commanded: NDArray, errors: Mapping[str, NDArra
 
 
 def bench_linearity(curves: BenchCurves) -> Figure:
-    """Figure 9: error of the segments against the input, and the gain, the slope of found against commanded."""
+    """Figure 9: error of the segments against the input, and the gain, measured over commanded pistons."""
     figure, (plain, gain) = plt.subplots(1, 2, figsize=(9, 4.2))
     for name, look in _looks(curves.residuals):
         mean, std = curves.mean(name), curves.std(name)

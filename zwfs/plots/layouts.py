@@ -154,8 +154,8 @@ def _vector_row(scene: _Scene, y: float, sensor: ZernikeSensor, phase: NDArray, 
         scene.axes.plot([focus, focus], [y, center - sign * 0.475], color=look.color, lw=1, ls=look.line)
         _symbol(scene, focus - 0.38, center + sign * 0.64, circular if liquid else linear, look.color)
         name = f"{circular} circular" if liquid else "linear"
-        told = f"{name}: {_shift(mask, plus=True)}"
-        scene.label(focus - 0.2, center + sign * 0.64, told, ha="left", va="center", color=look.color)
+        label = f"{name}: {_shift(mask, plus=True)}"
+        scene.label(focus - 0.2, center + sign * 0.64, label, ha="left", va="center", color=look.color)
         if liquid:
             # Geometric phase comes with a half-wave retarder, which swaps the handedness.
             _symbol(scene, focus + 0.68, y + sign * 0.52, swapped, look.color)
@@ -260,7 +260,7 @@ def bench_layout(bench: Bench, pistons: NDArray, frames: NDArray) -> Figure:
 
 
 def _bench_pictures(scene: _Scene, bench: Bench, phase: NDArray, frames: NDArray) -> None:
-    """Computed pictures of Figure 5, beside the elements that they belong to."""
+    """Computed pictures of Figure 5, next to their elements."""
     pupil = Pupil.from_segments(bench.segments)
     limit = np.nanmax(np.abs(phase))
     left, right, upper, lower, size = 4.75, 6.7, 4.8, 2.87, 1.35
@@ -495,7 +495,7 @@ def _in_pi(angle: float) -> str:
 
 
 def _legend(scene: _Scene, y: float) -> None:
-    """What lines and signs mean."""
+    """Key to the lines and signs."""
     for x, look, text in ((0.25, _PLUS, r"sees phase $+\theta$"), (1.95, _MINUS, r"sees phase $-\theta$")):
         scene.key(x, y, look, text)
     gray = "#444444"

@@ -60,7 +60,7 @@ LOOKS |= {
 for _method in RECONSTRUCTORS:
     LOOKS[_method.__name__]
 
-# Curves that stand for no method have colours of their own, of Tol's muted palette, and markers of their own.
+# Curves that stand for no method have other colours, from Tol's muted palette, and other markers.
 OTHER_STYLES: tuple[dict[str, Any], ...] = tuple(
     {"color": color, "marker": marker, "linestyle": line}
     for color, marker, line in (

@@ -404,7 +404,7 @@ class FixedPoint(Reconstructor):
         def iterate(piece: slice) -> Solution:
             return self._iterate(frames[piece, ...], None if start is None else start[piece, ...], history)
 
-        # A frame set that is done early would leave a gap in a history: each then is a piece of its own.
+        # With a history each frame set is a piece by itself: one that converges early would leave a gap.
         first, *others = _pieces(frames, kind, 1 if history else None)
         solution = iterate(first)
         if not others:
@@ -577,7 +577,7 @@ def load(path: str) -> type:
     Raises
     ------
     TypeError, ValueError
-        If the path is no such string, there is no such module or class, or objects of the class cannot be called.
+        If the path has another form, the module or class is missing, or objects of the class cannot be called.
     """
     if not isinstance(path, str):
         raise TypeError(f"path = {_check.shown(path)}: expected a string 'module:Class'")

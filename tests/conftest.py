@@ -1,5 +1,6 @@
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,12 @@ ROOT = Path(__file__).parent.parent
 
 settings.register_profile("zwfs", derandomize=True, deadline=None, max_examples=25)
 settings.load_profile("zwfs")
+
+
+def heed_signals():
+    """Restore in a child the signals that a shell in the background (SIGINT) and nohup (SIGHUP) ignore."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session")

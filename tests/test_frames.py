@@ -595,5 +595,5 @@ def test_seal_frames_that_do_not_belong_together_are_explained_worse(seal):
     true, false = (
         steps(one, clear_frames, Optics(), names, pupil_diameter=136.0)[-1] for one in ([frame], [nonsense])
     )
-    assert np.all(true.found.correlation > false.found.correlation + 0.03)
+    assert np.all(true.result.correlation > false.result.correlation + 0.03)
     assert np.all(true.predicted > false.predicted + 0.15)

@@ -16,6 +16,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from book._tools import book, notebook, record, run, scratch
 from book._tools.execute import NotebookError
 from book._tools.project import Project
+from tests.conftest import heed_signals
 from zwfs._files import write_file
 
 ROOT = Path(__file__).parent.parent
@@ -162,11 +163,6 @@ def test_dead_kernel_is_named(project):
     assert results(project) == {}
 
 
-def interruptible():
-    """Undo the setting of a shell for processes in the background, which ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 def start_sleeping_run(project):
     """Start a run in a process, wait until the notebook sleeps, and return the process and the kernel's id."""
     pid = project.notebooks / "pid"
@@ -181,7 +177,7 @@ def start_sleeping_run(project):
         f"sys.exit(main(['figures'], Project(pathlib.Path({str(project.root)!r}))))"
     )
     process = subprocess.Popen(
-        [sys.executable, "-c", code], cwd=ROOT, stderr=subprocess.DEVNULL, preexec_fn=interruptible
+        [sys.executable, "-c", code], cwd=ROOT, stderr=subprocess.DEVNULL, preexec_fn=heed_signals
     )
     wait_until(lambda: pid.exists() and pid.read_text(), seconds=60)
     return process, int(pid.read_text())

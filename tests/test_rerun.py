@@ -25,6 +25,7 @@ from book._tools.declared import ParameterError
 from book._tools.execute import NotebookError
 from book._tools.notebook import read
 from book._tools.project import Project
+from tests.conftest import heed_signals
 
 ROOT = Path(__file__).parent.parent
 
@@ -368,14 +369,9 @@ def run_command(project, *arguments):
     ours, theirs = pty.openpty()
     termios.tcsetwinsize(ours, (24, 120))
     command = [sys.executable, "-c", code, *arguments]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=theirs, stderr=theirs, preexec_fn=restore_interruption)
+    process = subprocess.Popen(command, cwd=ROOT, stdout=theirs, stderr=theirs, preexec_fn=heed_signals)
     os.close(theirs)
     return process, ours
-
-
-def restore_interruption():
-    """Undo what a shell does to processes in the background: they ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def heard(terminal):
@@ -425,7 +421,7 @@ def test_interruption_while_the_program_is_loaded_needs_no_traceback():
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=restore_interruption,
+        preexec_fn=heed_signals,
     )
     while "argparse" not in process.stderr.readline():  # one of the first, and NumPy is still to come
         assert process.poll() is None

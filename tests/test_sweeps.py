@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 
+from tests.conftest import heed_signals
 from zwfs import Arcsine, Dimple, GradientDescent, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
 from zwfs.bench.model import Bench, BenchModel
 from zwfs.companion import sweeps
@@ -264,7 +265,7 @@ def start_sweep(folder, store, script=SWEEP):
     return subprocess.Popen(
         [sys.executable, "-c", script, str(folder)], cwd=ROOT, env=os.environ | {sweeps.STORE: str(store)},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # in the background it is ignored
+        preexec_fn=heed_signals,
     )  # fmt: skip
 
 

@@ -155,22 +155,22 @@ def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
     return CameraFile(images, name, sha256, header, full_scale, path.resolve())
 
 
-def load(
+def read_all(
     frame_files: Sequence[str | Path],
     pupil_files: Sequence[str | Path],
     dark_files: Sequence[str | Path] = (),
     bad_pixel_files: Sequence[str | Path] = (),
     saturation: float | None = None,
 ) -> tuple[tuple[Image, ...], tuple[Image, ...], list[CameraFile]]:
-    """Read all files of a measurement: one or two for each kind, darks and bad-pixel maps also none.
+    """Read all files of a measurement: one or two each of frames and clear frames, and optional darks and maps.
 
-    Parameters, as for `read` and `images`.
+    The parameters are those of `read` and `images`.
 
     Returns
     -------
     frames, clear_frames : tuple of Image
     sources : list of CameraFile
-        All the files, that of the first frame first.
+        All files; the first is that of the first frame.
     """
     kinds = {
         "frame_files": _paths("frame_files", frame_files),

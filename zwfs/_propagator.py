@@ -1,4 +1,6 @@
-"""The model of a sensor that reconstructors compute with: split fields of one kind of arrays, without checks.
+"""The model that sensors and reconstructors compute with: split fields of one kind of arrays.
+
+`propagator` returns the model of a sensor. `pupil_maps` and `amplitude_maps` check input; nothing else here does.
 
 A split field has shape (..., 2, ny, nx): the real part, then the imaginary part. It is 0 outside the pupil. A
 phasor is exp(i phase) as a split field. `k` is the number of frame sets in a batch.
@@ -7,14 +9,19 @@ phasor is exp(i phase) as a split field. `k` is the number of frame sets in a ba
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from math import prod
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from zwfs._arrays import Kind, read_only
+from zwfs import _check
+from zwfs._arrays import Kind, per_kind, read_only
 from zwfs.lowrank import Factors, Operator
 from zwfs.pupil import Pupil
+
+if TYPE_CHECKING:
+    from zwfs.sensor import ZernikeSensor
 
 _VANISHING = 1e-30  # modulus, or its square, of a field that counts as 0
 
@@ -109,6 +116,43 @@ class Propagator:
         difference = (square(self.reference(psi) + psi[:, np.newaxis, ...]) - light) * self.stop
         difference = self.kind.xp.reshape(difference, (psi.shape[0], -1))
         return self.kind.xp.vecdot(difference, difference)
+
+
+@per_kind
+def propagator(sensor: ZernikeSensor, kind: Kind) -> Propagator:
+    """Return the model of a sensor for arrays of one kind."""
+    return Propagator.of(sensor.factors, sensor.window, sensor.pupil, kind)
+
+
+def pupil_maps(name: str, maps: ArrayLike, sensor: ZernikeSensor) -> tuple[NDArray[np.floating], tuple[int, ...]]:
+    """Return checked real maps, (k, ny, nx) with 0 outside the pupil, and the shape of their batch."""
+    shape = sensor.pupil.shape
+    maps = _check.real_any(name, maps)
+    _check.trailing_shape(name, maps, shape, "the shape of the pupil")
+    batch = tuple(maps.shape[:-2])
+    if not prod(batch):
+        raise ValueError(f"{name} has shape {tuple(maps.shape)}: expected at least one map")
+    kind = Kind.of(maps)
+    clean = kind.xp.where(propagator(sensor, kind).inside, maps, kind.array(0.0))
+    _check.moderate(name, clean, " inside the pupil")
+    return kind.xp.reshape(clean, (-1, *shape)), batch
+
+
+def amplitude_maps(
+    amplitude: ArrayLike | None, sensor: ZernikeSensor, kind: Kind
+) -> tuple[NDArray[np.floating], tuple[int, ...]]:
+    """Return checked amplitudes, (k, ny, nx) with 0 outside, and the shape of their batch; None: the pupil's."""
+    if amplitude is None:
+        return propagator(sensor, kind).amplitude[np.newaxis, ...], ()
+    maps, batch = pupil_maps("amplitude", amplitude, sensor)
+    _check.non_negative("amplitude", maps)
+    xp = Kind.of(maps).xp
+    if not xp.all(xp.any(maps > 0, axis=(-2, -1))):
+        raise ValueError("amplitude is 0 everywhere in the pupil: expected some light")
+    with np.errstate(over="ignore"):
+        maps = _check.in_kind("amplitude", maps, kind)
+    _check.moderate("amplitude", maps)
+    return maps, batch
 
 
 def split(phase: NDArray, amplitude: NDArray) -> NDArray:

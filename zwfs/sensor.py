@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind, per_kind
+from zwfs._arrays import Kind
 from zwfs._pickle import Immutable
-from zwfs._propagator import Propagator, split, square
+from zwfs._propagator import amplitude_maps, propagator, pupil_maps, split, square
 from zwfs.lowrank import Factors, factorise
 from zwfs.masks import Mask
 from zwfs.pupil import Pupil
@@ -156,7 +156,7 @@ class ZernikeSensor(Immutable):
         Chambouleyron et al. 2024, equations (1) to (3).
         """
         psi, batch, kind = self._pupil_field(field)
-        waves = self._model(kind).operator.reference(psi)
+        waves = propagator(self, kind).operator.reference(psi)
         waves[(..., *self.window)] += psi[:, np.newaxis, ...]
         return kind.xp.reshape(waves, (*batch, *waves.shape[1:]))
 
@@ -170,7 +170,7 @@ class ZernikeSensor(Immutable):
         Chambouleyron et al. 2024, equation (4).
         """
         psi, batch, kind = self._pupil_field(field)
-        waves = self._model(kind).operator.reference(psi)
+        waves = propagator(self, kind).operator.reference(psi)
         return kind.xp.reshape(waves, (*batch, *waves.shape[1:]))
 
     def adjoint(self, field: ArrayLike) -> NDArray[np.complexfloating]:
@@ -197,9 +197,10 @@ class ZernikeSensor(Immutable):
         """
         shape = (self.n_masks, *self.detector_shape)
         field, batch, kind = self._field(field, shape, "masks and detector")
-        psi = self._model(kind).operator.adjoint(field)
+        model = propagator(self, kind)
+        psi = model.operator.adjoint(field)
         psi += kind.xp.sum(field[(..., *self.window)], axis=1)
-        psi *= self._model(kind).stop
+        psi *= model.stop
         return kind.xp.reshape(psi, (*batch, *self.pupil.shape))
 
     def measure(self, phase: ArrayLike, amplitude: ArrayLike | None = None) -> NDArray[np.floating]:
@@ -232,7 +233,7 @@ class ZernikeSensor(Immutable):
         ----------
         Chambouleyron et al. 2024, equation (5).
         """
-        phase, batch = self._pupil_maps("phase", phase)
+        phase, batch = pupil_maps("phase", phase, self)
         kind = Kind.of(phase)
         rms = self._largest_rms(phase, kind.xp)
         if rms > _DEGREES:
@@ -241,7 +242,7 @@ class ZernikeSensor(Immutable):
                 UserWarning,
                 stacklevel=2,
             )
-        strength, strength_batch = self._amplitude_maps(amplitude, kind)
+        strength, strength_batch = amplitude_maps(amplitude, self, kind)
         if strength_batch:
             try:
                 full = np.broadcast_shapes(batch, strength_batch)
@@ -255,46 +256,13 @@ class ZernikeSensor(Immutable):
                 for maps, shape in ((phase, batch), (strength, strength_batch))
             )
             batch = full
-        frames = square(self._model(kind).propagate(split(phase, strength)))
+        frames = square(propagator(self, kind).propagate(split(phase, strength)))
         return kind.xp.reshape(frames, (*batch, self.n_masks, *self.detector_shape))
-
-    @per_kind
-    def _model(self, kind: Kind) -> Propagator:
-        """Model for arrays of one kind, the part of the sensor that reconstructors compute with."""
-        return Propagator.of(self._factors, self._window, self._pupil, kind)
-
-    def _pupil_maps(self, name: str, maps: ArrayLike) -> tuple[NDArray[np.floating], tuple[int, ...]]:
-        """Checked real maps, (k, ny, nx) with 0 outside the pupil, and the shape of the batch."""
-        maps = _check.real_any(name, maps)
-        _check.trailing_shape(name, maps, self.pupil.shape, "the shape of the pupil")
-        batch = tuple(maps.shape[:-2])
-        if not prod(batch):
-            raise ValueError(f"{name} has shape {tuple(maps.shape)}: expected at least one map")
-        kind = Kind.of(maps)
-        clean = kind.xp.where(self._model(kind).inside, maps, kind.array(0.0))
-        _check.moderate(name, clean, " inside the pupil")
-        return kind.xp.reshape(clean, (-1, *self.pupil.shape)), batch
-
-    def _amplitude_maps(
-        self, amplitude: ArrayLike | None, kind: Kind
-    ) -> tuple[NDArray[np.floating], tuple[int, ...]]:
-        """Checked amplitude, (k, ny, nx) with 0 outside, and the shape of the batch; the pupil's for None."""
-        if amplitude is None:
-            return self._model(kind).amplitude[np.newaxis, ...], ()
-        maps, batch = self._pupil_maps("amplitude", amplitude)
-        _check.non_negative("amplitude", maps)
-        xp = Kind.of(maps).xp
-        if not xp.all(xp.any(maps > 0, axis=(-2, -1))):
-            raise ValueError("amplitude is 0 everywhere in the pupil: expected some light")
-        with np.errstate(over="ignore"):
-            maps = _check.in_kind("amplitude", maps, kind)
-        _check.moderate("amplitude", maps)
-        return maps, batch
 
     def _pupil_field(self, field: ArrayLike) -> tuple[NDArray, tuple[int, ...], Kind]:
         """Checked complex maps, (k, ny, nx) with 0 outside the pupil, the batch, and the kind of their parts."""
         psi, batch, kind = self._field(field, self.pupil.shape, "the shape of the pupil")
-        return psi * self._model(kind).stop, batch, kind
+        return psi * propagator(self, kind).stop, batch, kind
 
     def _field(
         self, field: ArrayLike, shape: tuple[int, ...], meaning: str

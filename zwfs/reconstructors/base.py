@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs._arrays import Kind, per_kind, read_only
 from zwfs._pickle import Immutable
-from zwfs._propagator import Propagator, angle, split, unit
+from zwfs._propagator import Propagator, amplitude_maps, angle, propagator, pupil_maps, split, unit
 from zwfs.sensor import ZernikeSensor
 
 # Detector pixels handled together: on the processor few enough for its fast memory, enough to vectorise.
@@ -126,7 +126,7 @@ class Settings(Immutable):
         _check.instance("sensor", sensor, ZernikeSensor)
         n_iterations = _check.integer("n_iterations", n_iterations, 1, _MOST_ITERATIONS)
         tolerance = _check.number("tolerance", tolerance, 0)
-        maps, batch = sensor._amplitude_maps(amplitude, Kind.numpy())
+        maps, batch = amplitude_maps(amplitude, sensor, Kind.numpy())
         if batch:
             raise ValueError(f"amplitude has shape {(*batch, *sensor.pupil.shape)}: expected {sensor.pupil.shape}")
         light = float(np.sum(maps[0] * maps[0]))
@@ -139,7 +139,7 @@ class Settings(Immutable):
     @per_kind
     def model(self, kind: Kind) -> Propagator:
         """Model of the sensor with this amplitude, for arrays of one kind."""
-        return self.sensor._model(kind).with_amplitude(self.amplitude)
+        return propagator(self.sensor, kind).with_amplitude(self.amplitude)
 
     def residual(self, phase: NDArray, light: NDArray) -> NDArray[np.floating]:
         """Rms mismatch, (k,), of phases (k, ny, nx) and frames on the grid of the pupil, (k, n_masks, ny, nx)."""
@@ -533,7 +533,7 @@ def check_frames(
 def _warn_of_counts(sensor: ZernikeSensor, name: str, frames: NDArray, light: float) -> None:
     """Warn if frames (k, n_masks, ny', nx') are brighter inside the pupil than behind any mask."""
     kind = Kind.of(frames)
-    inside = frames[(..., *sensor.window)] * sensor._model(kind).stop
+    inside = frames[(..., *sensor.window)] * propagator(sensor, kind).stop
     brightest = float(kind.xp.max(kind.xp.sum(inside, axis=(-2, -1)))) / sensor.pupil.n_points
     expected = light / sensor.pupil.n_points
     if brightest > _BRIGHT * expected:
@@ -557,7 +557,7 @@ def check_phase(
         If the phase is complex, of the wrong shape, not finite inside the pupil, or on another device.
     """
     shape = sensor.pupil.shape
-    maps, own_batch = sensor._pupil_maps(name, phase)
+    maps, own_batch = pupil_maps(name, phase, sensor)
     if own_batch not in ((), batch):
         expected = f"{shape} or {(*batch, *shape)}" if batch else f"{shape}"
         raise ValueError(f"{name} has shape {(*own_batch, *shape)}: expected {expected}")

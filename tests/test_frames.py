@@ -518,7 +518,7 @@ def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
         header = units[0].header
         np.testing.assert_array_equal(units[0].data, found.phase)
         np.testing.assert_allclose(units["PHASE_NM"].data, found.phase * 635 / (2 * np.pi))
-        assert units["MASKED"].data.sum() == found.measurement.n_bad == header["NMASKED"] > 0
+        assert units["BAD"].data.sum() == found.measurement.n_bad == header["NBAD"] > 0
         assert (header["BUNIT"], units["PHASE_NM"].header["BUNIT"]) == ("rad", "nm")
         assert (header["WAVELEN"], header["DIMPLE"]) == (635, 1.1)
         assert header["CORR1"] == pytest.approx(found.correlation[0])

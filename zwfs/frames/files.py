@@ -348,13 +348,13 @@ def write_phase(
         ("PUPBACK", optics.pupil_background, "the same of the clear frames"),
         ("SCALE", optics.scale, "factor on the frames"),
         ("LEAKAGE", optics.leakage, "fraction of the other image's light"),
-        ("UNMASKED", optics.unmasked, "fraction of light the mask leaves as it is"),
-        ("FLUXMASK", measurement.flux_ratio[0], "light of image 1 over image 2, mask in"),
-        ("FLUXOUT", measurement.flux_ratio[1], "the same, mask out"),
+        ("UNMASKED", optics.unmasked, "fraction of light the mask does not shift"),
+        ("FLUXMASK", measurement.flux_ratio[0], "light of image 1 over image 2, frames"),
+        ("FLUXOUT", measurement.flux_ratio[1], "the same, clear frames"),
         *((f"CORR{i}", value, "measured with modelled frame") for i, value in enumerate(phase.correlation, 1)),
         *((f"RESID{i}", value, "rms difference of them") for i, value in enumerate(phase.residual, 1)),
         ("NPOINTS", measurement.pupil.n_points, "points of the pupil"),
-        ("NMASKED", measurement.n_bad, "of these, bad points"),
+        ("NBAD", measurement.n_bad, "of these, bad"),
         ("CONVERGE", phase.converged, "the iteration converged"),
     ]
     for index, (image, origin) in enumerate(zip(recording.images, recording.origins, strict=True), 1):
@@ -373,7 +373,7 @@ def write_phase(
         primary.header[key] = (_card_value(value), comment) if comment else _card_value(value)
     nanometres = fits.ImageHDU(phase.phase * wavelength / (2 * np.pi), name="PHASE_NM")
     nanometres.header["BUNIT"] = "nm"
-    bad = fits.ImageHDU((measurement.pupil.inside & ~measurement.good).astype(np.uint8), name="MASKED")
+    bad = fits.ImageHDU((measurement.pupil.inside & ~measurement.good).astype(np.uint8), name="BAD")
     write_file(path, fits_bytes(fits.HDUList([primary, nanometres, bad])))
 
 

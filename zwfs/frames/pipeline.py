@@ -182,7 +182,7 @@ class MeasuredPhase:
 
     @cached_property
     def residual(self) -> NDArray[np.float64]:
-        """Rms difference of the frames over the good points of the pupil, (2,), 1 = mean intensity mask out."""
+        """Rms difference of the frames over the good points of the pupil, (2,); 1 = mean of a clear frame."""
         return np.sqrt(np.mean((self._inside(self.measured) - self._inside(self.modelled)) ** 2, axis=1))
 
     @cached_property
@@ -574,7 +574,7 @@ def steps(
     add("outlines of the pupils", record(frames, clear_frames, **settings, **switches), optics)
     for switch, name in (
         ("subpixel", "registration by content"),
-        ("background", "background beside the pupils"),
+        ("background", "background around the pupils"),
         ("balance", "balance of the flux"),
     ):
         switches[switch] = True

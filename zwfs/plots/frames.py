@@ -49,7 +49,7 @@ def phase_map(result: MeasuredPhase, wavelength: float) -> Figure:
     shown = show_phase(axes, result.phase, limit)
     bad = result.measurement.pupil.inside & ~result.measurement.good
     if bad.any():
-        axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=2, label=f"{bad.sum()} masked points")
+        axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=2, label=f"{bad.sum()} bad points")
         figure.legend(loc="outside lower center", fontsize=9)
     bar = figure.colorbar(shown, ax=axes, label="phase (rad)")
     scale = wavelength / (2 * np.pi)

@@ -15,7 +15,7 @@ from zwfs.frames.files import read
 from zwfs.frames.pipeline import MeasuredPhase, Step
 from zwfs.frames.registration import Image
 
-SHOWN = ("BUNIT", "WAVELEN", "PUPDIAM", "DIMPLE", "CORR1", "CORR2", "NMASKED")  # keywords of the phase map
+SHOWN = ("BUNIT", "WAVELEN", "PUPDIAM", "DIMPLE", "CORR1", "CORR2", "NBAD")  # keywords of the phase map
 
 
 def images(frames: Sequence[Image], clear_frames: Sequence[Image]) -> Table:
@@ -52,16 +52,16 @@ def result(result: MeasuredPhase) -> Table:
             ["first pupil: row, column, diameter (pixels)", pupils[0]],
             ["second pupil: row, column, diameter (pixels)", pupils[1]],
             ["second image from the first (rows, columns)", _pair(recording.origins[3] - recording.origins[2], 2)],
-            ["background of the mask-out images (counts)", _pair(measurement.background[2:], 1)],
+            ["background of the clear frames (counts)", _pair(measurement.background[2:], 1)],
             ["counts that make an intensity of 1", _pair(measurement.counts, 0)],
-            ["light of image 1 over 2, mask in", f"{measurement.flux_ratio[0]:.3f}"],
-            ["the same, mask out", f"{measurement.flux_ratio[1]:.3f}"],
+            ["light of image 1 over 2, frames", f"{measurement.flux_ratio[0]:.3f}"],
+            ["the same, clear frames", f"{measurement.flux_ratio[1]:.3f}"],
             ["points of the pupil", measurement.pupil.n_points],
-            ["of these, masked", measurement.n_bad],
+            ["of these, bad", measurement.n_bad],
             ["points without a unique solution", result.n_unsolved],
             ["correlation of the frames", _pair(result.correlation, 3)],
             ["rms difference of the frames (mean = 1)", _pair(result.residual, 3)],
-            ["excess of light beside the pupil (mean = 1)", f"{result.excess_light:.3f}"],
+            ["excess light around the pupil (mean = 1)", f"{result.excess_light:.3f}"],
         ],
     )
 

@@ -13,7 +13,6 @@ from zwfs.paper.dimple_diameter import (
     diameter_curves,
     iteration_curves,
     iteration_spectrum,
-    linearised_step,
     measured_factor,
     mode_sensitivity,
     other_curves,
@@ -63,19 +62,13 @@ def test_the_iteration_is_the_same_for_every_pair(pupil, screens):
         np.testing.assert_allclose(history, wanted, atol=1e-10)
 
 
-@pytest.mark.parametrize("rms", [0.0, 0.6])
-def test_linearised_step_is_the_derivative_of_a_step(rough_pupil, rms):
-    modes = zwfs.zernike_basis(rough_pupil, 20)
-    phase = zwfs.power_law_screens(modes, rms, 1, seed=3)[0]
-    error = zwfs.power_law_screens(modes, 1.0, 1, seed=4)[0] + 0.5
-    sensor = pair(rough_pupil, 1.8, 1.9, -1.0)
+def derivative_of_a_step(pupil, diameter, phase, errors):
+    """Errors after one step, (k, n_points), over small errors before it."""
+    sensor, h = pair(pupil, diameter, 1.9, -1.0), 1e-4
     method = zwfs.PhaseShifted(sensor, n_iterations=1)
-    frames, h = sensor.measure(phase), 1e-4
-    plus, minus = (method(frames, start=phase + s * h * error).phase for s in (1, -1))
-    measured = rough_pupil.gather(np.angle(np.exp(1j * (plus - minus)))) / (2 * h)
-    expected = linearised_step(rough_pupil, 1.8, phase, error)
-    np.testing.assert_allclose(rough_pupil.gather(expected), measured, atol=2e-6)
-    assert np.isnan(expected[~rough_pupil.inside]).all()
+    frames = np.broadcast_to(sensor.measure(phase), (len(errors), *sensor.measure(phase).shape))
+    plus, minus = (method(frames, start=phase + s * h * errors).phase for s in (1, -1))
+    return pupil.gather(np.angle(np.exp(1j * (plus - minus)))) / (2 * h)
 
 
 def test_flat_wavefront_gives_a_weighted_mean(pupil, modes):
@@ -85,10 +78,8 @@ def test_flat_wavefront_gives_a_weighted_mean(pupil, modes):
     assert b.real.min() > 0
     np.testing.assert_allclose(b.imag, 0, atol=1e-12)
     expected = light(pupil.gather(modes[:3])) / b
-    after = pupil.gather(linearised_step(pupil, 1.06, np.zeros(pupil.shape), modes[:3]))
-    np.testing.assert_allclose(after, expected.real, atol=1e-10)
-    piston = linearised_step(pupil, 1.06, modes[4], np.ones(pupil.shape))
-    np.testing.assert_allclose(pupil.gather(piston), 1, atol=1e-9)
+    after = derivative_of_a_step(pupil, 1.06, np.zeros(pupil.shape), modes[:3])
+    np.testing.assert_allclose(after, expected.real, atol=2e-6)
 
 
 def test_a_mean_contracts():
@@ -104,11 +95,11 @@ def test_a_mean_contracts():
 def test_spectrum_is_that_of_the_whole_matrix(small, rms):
     phase = zwfs.power_law_screens(zwfs.zernike_basis(small, 20), rms, 1, seed=2)[0]
     points = small.scatter(np.eye(small.n_points), fill=0)
-    matrix = small.gather(linearised_step(small, 2.2, phase, points)).T
+    matrix = derivative_of_a_step(small, 2.2, phase, points).T
     whole = np.sort(np.abs(np.linalg.eigvals(matrix)))[::-1]
     found = iteration_spectrum(small, 2.2, phase)
     everything = np.sort(np.append(np.abs(found), 1))[::-1]
-    np.testing.assert_allclose(everything[:8], whole[:8], rtol=1e-6)
+    np.testing.assert_allclose(everything[:8], whole[:8], rtol=1e-5)
 
 
 @pytest.mark.parametrize("diameter", [1.06, 2.2, 2.8])
@@ -133,8 +124,8 @@ def test_tilt_is_lost_where_the_dimple_ends_on_the_dark_ring():
         pupil = zwfs.Pupil.circular(n_pixels)
         tilt = zwfs.zernike_basis(pupil, 1)
         left.append(mode_sensitivity(pupil, DARK_RING, tilt)[0] / mode_sensitivity(pupil, 1.06, tilt)[0])
-        step = linearised_step(pupil, DARK_RING, np.zeros(pupil.shape), tilt)[0]
-        np.testing.assert_allclose(pupil.gather(step), pupil.gather(tilt[0]), atol=0.6 / n_pixels)
+        step = derivative_of_a_step(pupil, DARK_RING, np.zeros(pupil.shape), tilt)
+        np.testing.assert_allclose(step, pupil.gather(tilt), atol=0.6 / n_pixels)
         assert iteration_spectrum(pupil, DARK_RING)[0] == pytest.approx(1, abs=0.2 / n_pixels)
     # What is left is the staircase of the pupil's edge.
     assert left[1] < left[0] < 0.02
@@ -153,9 +144,9 @@ def test_sensitivity_is_the_derivative_of_the_frames(pupil, modes, screens, rms)
 
 def test_signal_and_iteration_are_one_operator(pupil, modes):
     b = DimpleLight(pupil, 2.0)(np.ones((1, pupil.n_points)))[0].real
-    step = linearised_step(pupil, 2.0, np.zeros(pupil.shape), modes[:5])
-    expected = np.sqrt(8 * np.mean((b * pupil.gather(modes[:5] - step)) ** 2, axis=-1))
-    np.testing.assert_allclose(mode_sensitivity(pupil, 2.0, modes[:5]), expected, rtol=1e-8)
+    step = derivative_of_a_step(pupil, 2.0, np.zeros(pupil.shape), modes[:5])
+    expected = np.sqrt(8 * np.mean((b * (pupil.gather(modes[:5]) - step)) ** 2, axis=-1))
+    np.testing.assert_allclose(mode_sensitivity(pupil, 2.0, modes[:5]), expected, rtol=1e-5)
 
 
 def test_noise_of_the_symmetric_pair_on_a_flat_wavefront(pupil):
@@ -295,7 +286,6 @@ def test_crossing_is_interpolated_on_the_logarithm():
         (lambda p, z: pair_maps(p, 1.0, [0.0], z), "screens"),
         (lambda p, z: iteration_spectrum(p, 1.0, z[np.newaxis]), "phase has shape"),
         (lambda p, z: iteration_spectrum(p, 1.0, z + np.nan), "NaN"),
-        (lambda p, z: linearised_step(p, 1.0, z, z[:3]), "error has shape"),
         (lambda p, z: mode_sensitivity(p, 1.0, z[:3]), "modes has shape"),
         (lambda p, z: phase_noise(pair(p, 1.0), z[:3]), "phase has shape"),
         (lambda p, z: drawn_noise(pair(p, 1.0), z, 1e4, 1), "n_draws"),

@@ -89,7 +89,7 @@ def per_kind(make: Callable[[Owner, Kind], Constants]) -> Callable[[Owner, Kind]
 
 
 def any_array(value: Any) -> tuple[Any, Any]:
-    """Return an array and its namespace: of its own library if that follows the standard, else of NumPy."""
+    """Return an array and its namespace. What does not follow the standard becomes an array of NumPy."""
     if not isinstance(value, np.ndarray | np.generic) and array_api_compat.is_array_api_obj(value):
         return value, array_api_compat.array_namespace(value)
     array = np.asarray(value)  # subclasses become plain arrays

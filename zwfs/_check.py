@@ -187,7 +187,8 @@ def real_map(name: str, value: Any, n_axes: int = 2) -> NDArray:
     """Return `value` as float64 with so many axes, none of them empty, and numbers of at most `LARGEST`."""
     array = real_array(name, value).astype(np.float64, copy=False)
     if array.ndim != n_axes or not array.size:
-        raise ValueError(f"{name} has shape {array.shape}: expected {n_axes} axes, none of them empty")
+        expected = "a list of at least one number" if n_axes == 1 else f"{n_axes} axes, none of them empty"
+        raise ValueError(f"{name} has shape {array.shape}: expected {expected}")
     finite(name, array)
     if np.abs(array).max() > LARGEST:
         raise ValueError(f"{name} reaches {np.abs(array).max():.3g}: expected at most {LARGEST:g}")

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from zwfs import _check
-
-if TYPE_CHECKING:
-    pass
 
 
 def write_file(path: Path, content: bytes) -> None:

@@ -148,8 +148,5 @@ def _coordinates(u: NDArray, v: NDArray) -> tuple[NDArray, NDArray]:
     u, v = _check.real_array("u", u), _check.real_array("v", v)
     _check.finite("u", u)
     _check.finite("v", v)
-    try:
-        u, v = np.broadcast_arrays(u, v)
-    except ValueError:
-        raise ValueError(f"u and v have shapes {u.shape} and {v.shape}: expected ones that broadcast") from None
-    return u, v
+    shape = _check.broadcast(u=u, v=v)
+    return np.broadcast_to(u, shape), np.broadcast_to(v, shape)

@@ -33,8 +33,7 @@ def wrapped_residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDA
     ----------
     Chambouleyron et al. 2024, section 4.1; `eq-error` of the book.
     """
-    residual = _residual(pupil, estimate, truth)
-    return pupil.scatter(residual)
+    return pupil.scatter(_residual(pupil, estimate, truth))
 
 
 def reconstruction_error(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.floating]:
@@ -53,7 +52,7 @@ def without_piston(phase: ArrayLike) -> NDArray[Any]:
     Raises
     ------
     ValueError
-        If there is no phase, or a value is not finite.
+        If the array is empty, or a value is not finite.
     """
     phase = _check.real_array("phase", phase)
     if 0 in (phase.ndim, phase.size):

@@ -210,46 +210,6 @@ class DimpleLight:
         return self.expand(np.ascontiguousarray(self._core))
 
 
-def linearised_step(pupil: Pupil, diameter: float, phase: ArrayLike, error: ArrayLike) -> NDArray[np.float64]:
-    """Return the error after one phase-shifted step from a small error before it, for any pair of phase shifts.
-
-    With delta = i K[psi error], the change of beta (K being the dimple), the error after the step is
-    Im(delta / beta) - 2 Re(delta / beta) Im(conj(beta) psi) / |psi|^2. Around a flat wavefront and a real
-    positive beta = b this is K[A error] / b, a weighted mean of the error where the kernel is positive.
-
-    Parameters
-    ----------
-    pupil : Pupil
-    diameter : float, lambda/D
-    phase : array_like, shape (ny, nx), radian
-        True phase, at which the iteration is linearised.
-    error : array_like, shape (..., ny, nx), radian
-        Error of the estimate before the step.
-
-    Returns
-    -------
-    ndarray, shape (..., ny, nx), radian
-        Error after it, NaN outside the pupil. A piston comes back unchanged.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong.
-
-    References
-    ----------
-    Chambouleyron et al. 2024, section 3.1; `eq-linear-system` of the book.
-    """
-    phase = _check_map(pupil, "phase", phase)
-    light, psi, beta = _linearised(pupil, diameter, phase)
-    error = _check.real_array("error", error)
-    _check.maps("error", error, pupil.shape)
-    change = pupil.gather(error).reshape(-1, pupil.n_points)
-    _check.finite("error", change, " inside the pupil")
-    after = _error_after(psi, beta, light(1j * psi * change))
-    return pupil.scatter(after.reshape(*error.shape[:-2], -1))
-
-
 def iteration_spectrum(pupil: Pupil, diameter: float, phase: ArrayLike | None = None) -> NDArray[np.complex128]:
     """Eigenvalues of the linearised phase-shifted step, piston left out.
 
@@ -368,18 +328,10 @@ def mode_sensitivity(
     Chambouleyron et al. 2024, section 4.2.
     """
     light, psi, beta = _linearised(pupil, diameter, phase)
-    modes = _check.real_array("modes", modes)
-    _check.maps("modes", modes, pupil.shape)
-    modes = pupil.gather(modes).reshape(-1, pupil.n_points)
-    _check.finite("modes", modes, " inside the pupil")
-    shifts = _check.real_array("phase_shifts", phase_shifts)
-    if shifts.ndim != 1 or not shifts.size:
-        raise ValueError(f"phase_shifts has shape {shifts.shape}: expected (n_masks,)")
-    _check.finite("phase_shifts", shifts)
-    direct = 1j * psi * modes
+    direct = 1j * psi * _check.values_inside("modes", modes, pupil).reshape(-1, pupil.n_points)
     through = light(direct)
     power = np.zeros(len(direct))
-    for theta in shifts:
+    for theta in _check.real_map("phase_shifts", phase_shifts, 1):
         strength = np.exp(1j * theta) - 1
         out = psi + strength * beta
         power += np.mean((2 * np.real(out.conj() * (direct + strength * through))) ** 2, axis=-1)
@@ -457,9 +409,8 @@ def _check_map(pupil: Pupil, name: str, values: ArrayLike) -> NDArray[np.floatin
 
 def _check_diameters(diameters: ArrayLike) -> NDArray[np.floating]:
     """Return diameters as an array, shape (n_diameters,), positive and increasing."""
-    diameters = _check.real_array("diameters", diameters)
-    _check.finite("diameters", diameters)
-    if diameters.ndim != 1 or not diameters.size or diameters[0] <= 0 or np.any(np.diff(diameters) <= 0):
+    diameters = _check.real_map("diameters", diameters, 1)
+    if diameters[0] <= 0 or np.any(np.diff(diameters) <= 0):
         raise ValueError(f"diameters = {_check.shown(diameters)}: expected positive, increasing values")
     return diameters
 
@@ -492,6 +443,10 @@ def _linearised(pupil: Pupil, diameter: float, phase: ArrayLike | None) -> tuple
 
 
 def _error_after(psi: NDArray, beta: NDArray, change: NDArray) -> NDArray[np.float64]:
-    """Error of the phase after a step that uses beta + change in place of beta."""
+    """Error of the phase after a step that uses beta + change in place of beta.
+
+    An error before the step changes beta by K[i psi error], with K the dimple. Around a flat wavefront and a real
+    positive beta = b the error after the step is K[A error] / b: a weighted mean where the kernel is positive.
+    """
     relative = change / beta
     return relative.imag - 2 * relative.real * np.imag(beta.conj() * psi) / np.abs(psi) ** 2

@@ -106,10 +106,7 @@ def noise_of_pairs(
     The wavefronts are screens (n_screens, ny, nx) in radian, by name. Returns the rms over pupil and screens of
     `PhaseNoise`, by the name of the noise, for each theta.
     """
-    angles = _check.real_array("angles", angles)
-    if angles.ndim != 1 or not angles.size:
-        raise ValueError(f"angles has shape {angles.shape}: expected (n,)")
-    _check.finite("angles", angles)
+    angles = _check.real_map("angles", angles, 1)
     screens = _check_wavefronts(pupil, wavefronts)
     first = next(iter(screens))
     names = [*(f"photon noise, {name}" for name in screens), f"read noise, {first}"]
@@ -168,8 +165,8 @@ def close_pairs(
     wavefront (radian sqrt(photon)).
     """
     _check.instance("pupil", pupil, Pupil)
-    gaps = _check.real_array("gaps", gaps)
-    if gaps.ndim != 1 or not gaps.size or not np.all((gaps >= 1e-6) & (gaps <= 1)):
+    gaps = _check.real_map("gaps", gaps, 1)
+    if not np.all((gaps >= 1e-6) & (gaps <= 1)):
         raise ValueError(f"gaps = {_check.shown(gaps)}: expected a list of values between 1e-6 and 1 radian")
     screens = _check_screens(screens, pupil)
     rows = []
@@ -317,10 +314,7 @@ def pair_maps(
     """
     _check.instance("pupil", pupil, Pupil)
     diameter = _check.number("diameter", diameter, 0, pupil.n_pixels, open_low=True)
-    angles = _check.real_array("angles", angles)
-    if angles.ndim != 1 or not angles.size:
-        raise ValueError(f"angles has shape {angles.shape}: expected (n,)")
-    _check.finite("angles", angles)
+    angles = _check.real_map("angles", angles, 1)
     screens = _check_screens(screens, pupil)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     maps = np.full((5, angles.size, angles.size), np.nan)

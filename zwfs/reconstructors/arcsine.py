@@ -19,11 +19,11 @@ _IN_LINE = 1e-6  # sine of the angle between a field and its reference wave belo
 class Arcsine(FixedPoint):
     """Phase from one mask: the two-wave interference is inverted, with a reference wave that is updated.
 
-    A cosine has two inverses, one on each side of the phase of the reference wave. In all iterations, each point
-    keeps the side on which the starting phase lies of its own reference wave. For a dimple of +pi/2 and a flat
-    start that covers about -pi/4 to 3 pi/4, counted from the piston of the wavefront. A true phase beyond is
-    folded back, which limits this method. A starting phase in line with its reference wave counts as ahead of it.
-    The piston is held as by `PhaseShifted`. Cosines beyond +-1 are taken as +-1 and counted.
+    A cosine has two inverses, one on each side of the phase of the reference wave. At each
+    point the starting phase decides the side, and all iterations keep it. For a dimple of +pi/2 and a flat start
+    this side covers about -pi/4 to 3 pi/4, counted from the piston of the wavefront. A true phase outside this
+    range is folded back into it, which limits this method. A starting phase in line with its reference wave counts
+    as ahead of it. The piston is held as by `PhaseShifted`. Cosines beyond +-1 are taken as +-1 and counted.
 
     Parameters
     ----------

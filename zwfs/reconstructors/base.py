@@ -227,7 +227,12 @@ class Reconstructor(Immutable, ABC):
     any_library: ClassVar[bool] = False
 
     def __init__(
-        self, sensor: ZernikeSensor, *, n_iterations: int, tolerance: float, amplitude: ArrayLike | None = None
+        self,
+        sensor: ZernikeSensor,
+        *,
+        n_iterations: int = 25,
+        tolerance: float = 1e-6,
+        amplitude: ArrayLike | None = None,
     ) -> None:
         self._settings = Settings.checked(sensor, n_iterations, tolerance, amplitude)
         self._light = self._settings.light  # of a clear frame; infinite where frames may come in any unit
@@ -374,16 +379,6 @@ class FixedPoint(Reconstructor):
     """
 
     any_library = True
-
-    def __init__(
-        self,
-        sensor: ZernikeSensor,
-        *,
-        n_iterations: int = 25,
-        tolerance: float = 1e-6,
-        amplitude: ArrayLike | None = None,
-    ) -> None:
-        super().__init__(sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=amplitude)
 
     def constants(self, kind: Kind) -> Any:
         """Arrays of one kind that all frames share; an override is decorated with `per_kind`."""

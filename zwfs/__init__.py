@@ -5,6 +5,7 @@ import pkgutil
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from zwfs.bounds import cramer_rao
 from zwfs.detector import Detector
 from zwfs.masks import Dimple, Patch
 from zwfs.metrics import dynamic_range, reconstruction_error, strehl, wrapped_residual
@@ -15,7 +16,9 @@ from zwfs.reconstructors import (
     Arcsine,
     GerchbergSaxton,
     GradientDescent,
+    LikelihoodReconstruction,
     Linear,
+    MaximumLikelihood,
     PhaseShifted,
     Reconstruction,
 )
@@ -24,6 +27,7 @@ from zwfs.sensor import ZernikeSensor
 # The modules, for type checkers and editors. At run time each one is imported at its first use, see `__getattr__`.
 if TYPE_CHECKING:
     from zwfs import bench as bench
+    from zwfs import bounds as bounds
     from zwfs import companion as companion
     from zwfs import detector as detector
     from zwfs import focal as focal
@@ -47,12 +51,15 @@ __all__ = [
     "Dimple",
     "GerchbergSaxton",
     "GradientDescent",
+    "LikelihoodReconstruction",
     "Linear",
+    "MaximumLikelihood",
     "Patch",
     "PhaseShifted",
     "Pupil",
     "Reconstruction",
     "ZernikeSensor",
+    "cramer_rao",
     "dynamic_range",
     "noll_to_nm",
     "power_law_screens",

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
+from zwfs._arrays import read_only
 from zwfs.pupil import Pupil
 
 
@@ -153,6 +154,25 @@ def power_law_screens(
     power = np.einsum("ij,ij->i", screens, screens, dtype=np.float64) / n_points[0]
     screens *= (rms / np.sqrt(power)).astype(modes.dtype)[:, np.newaxis]
     return screens.reshape(n_screens, *modes.shape[1:])
+
+
+def check_modes(pupil: Pupil, modes: ArrayLike) -> NDArray[np.float64]:
+    """Checked modes at the points of the pupil, shape (n_modes, n_points).
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the modes have no shape (n_modes, ny, nx), are not finite, or are more than the points of the pupil.
+    """
+    modes = _check.real_array("modes", modes)
+    if modes.ndim != 3 or not len(modes):
+        raise ValueError(f"modes has shape {modes.shape}: expected (n_modes, ny, nx)")
+    values = _check.values_inside("modes", modes, pupil).astype(np.float64)
+    if len(values) > values.shape[1]:
+        raise ValueError(
+            f"modes: {len(values)} of them, expected at most the {values.shape[1]} points of the pupil"
+        )
+    return read_only(values)
 
 
 def _unnormalised(disc: NDArray[np.complex128], n_modes: int) -> NDArray[np.float64]:

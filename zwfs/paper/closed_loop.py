@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs.detector import Detector
 from zwfs.metrics import strehl, without_piston
+from zwfs.modes import check_modes
 from zwfs.paper.linearity import check_reconstructors
 from zwfs.pupil import Pupil
-from zwfs.reconstructors.linear import check_modes
 
 _BOX = 3.0  # D; the screens repeat after this length
 
@@ -191,7 +191,7 @@ def close_loop(
         raise ValueError(
             f"flow has {_check.shown(flow.pupil)}: expected that of the reconstructor, {_check.shown(pupil)}"
         )
-    modes = check_modes(sensor, modes)
+    modes = check_modes(sensor.pupil, modes)
     n_steps = _check.integer("n_steps", n_steps, 1)
     rate = _check.number("rate", rate, 0, open_low=True)
     gain = _check.number("gain", gain, 0, 2, open_low=True, open_high=True)

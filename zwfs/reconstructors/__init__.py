@@ -13,6 +13,7 @@ from zwfs.reconstructors.base import Reconstruction, Reconstructor
 from zwfs.reconstructors.gerchberg_saxton import GerchbergSaxton
 from zwfs.reconstructors.gradient_descent import GradientDescent
 from zwfs.reconstructors.linear import Linear
+from zwfs.reconstructors.maximum_likelihood import LikelihoodReconstruction, MaximumLikelihood
 from zwfs.reconstructors.phase_shifted import PhaseShifted
 
 
@@ -38,7 +39,9 @@ __all__ = [
     "Arcsine",
     "GerchbergSaxton",
     "GradientDescent",
+    "LikelihoodReconstruction",
     "Linear",
+    "MaximumLikelihood",
     "PhaseShifted",
     "Reconstruction",
 ]

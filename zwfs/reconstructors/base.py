@@ -145,7 +145,7 @@ class Settings(Immutable):
         """Rms mismatch, (k,), of phases (k, ny, nx) and frames on the grid of the pupil, (k, n_masks, ny, nx)."""
         kind = Kind.of(light)
         model = self.model(kind)
-        squares = [model.mismatch(phase[piece, ...], light[piece, ...]) for piece in _pieces(light, kind)]
+        squares = [model.mismatch(phase[piece, ...], light[piece, ...]) for piece in pieces(light, kind)]
         return kind.xp.sqrt(kind.xp.concat(squares) / (self.sensor.n_masks * model.pupil.n_points))
 
 
@@ -288,17 +288,43 @@ class Reconstructor(Immutable, ABC):
         UserWarning
             If a frame is more than 10 times as bright, inside the pupil, as with the mask out: raw counts?
         """
-        config, history = self._settings, _check.flag("history", history)
+        frames, batch, start = self.accept(frames, start)
+        return self.report(frames, batch, self.solve(frames, start, _check.flag("history", history)))
+
+    def accept(
+        self, frames: ArrayLike, start: ArrayLike | None
+    ) -> tuple[NDArray[np.floating], tuple[int, ...], NDArray[np.floating] | None]:
+        """Check the arguments of a call and return them as `solve` expects them, with the batch of the frames."""
         if not self.any_library:
             frames = _check.real_array("frames", frames)
-        frames, batch = check_frames(config.sensor, frames, light=self._light)
-        if start is not None:
-            if not self.iterative:
-                raise ValueError(
-                    f"start = {_check.shown(start)}: expected None, since {type(self).__name__} does not iterate"
-                )
-            start = check_phase("start", start, config.sensor, batch, Kind.of(frames))
-        return _report(config, frames, batch, self.solve(frames, start, history))
+        frames, batch = check_frames(self.sensor, frames, light=self._light)
+        if start is None:
+            return frames, batch, None
+        if not self.iterative:
+            raise ValueError(
+                f"start = {_check.shown(start)}: expected None, since {type(self).__name__} does not iterate"
+            )
+        return frames, batch, check_phase("start", start, self.sensor, batch, Kind.of(frames))
+
+    def report(self, frames: NDArray, batch: tuple[int, ...], solution: Solution) -> Reconstruction:
+        """Return the result of a solution in the shape of the batch; its phases are written to."""
+        kind = Kind.of(frames)
+        no_data = self._settings.model(kind).no_data
+        phase, n_iterations, converged, n_unsolved, history = solution
+        phase += no_data
+        if history is not None:
+            history += no_data
+        # A copy, since the residual is computed later: a camera may write the next frame to the same place.
+        window = kind.xp.asarray(frames[(..., *self.sensor.window)], copy=True)
+
+        def shaped(values: NDArray) -> NDArray:
+            # A single frame is the case of a control loop: no need to compute its shape.
+            return kind.xp.reshape(values, (*batch, *values.shape[1:])) if batch else values[0, ...]
+
+        return Reconstruction(
+            shaped(phase), shaped(n_iterations), shaped(converged), shaped(n_unsolved),
+            None if history is None else shaped(history), self._settings, shaped(window),
+        )  # fmt: skip
 
     @abstractmethod
     def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
@@ -400,7 +426,7 @@ class FixedPoint(Reconstructor):
             return self._iterate(frames[piece, ...], None if start is None else start[piece, ...], history)
 
         # With a history each frame set is a piece by itself: one that converges early would leave a gap.
-        first, *others = _pieces(frames, kind, 1 if history else None)
+        first, *others = pieces(frames, kind, 1 if history else None)
         solution = iterate(first)
         if not others:
             return solution
@@ -457,28 +483,7 @@ def _small(change: NDArray, limit: float, xp: Any) -> NDArray[np.bool_]:
     return xp.vecdot(change, change) <= limit
 
 
-def _report(config: Settings, frames: NDArray, batch: tuple[int, ...], solution: Solution) -> Reconstruction:
-    """Result in the shape of the batch; the phases of the solution are written to."""
-    kind = Kind.of(frames)
-    no_data = config.model(kind).no_data
-    phase, n_iterations, converged, n_unsolved, history = solution
-    phase += no_data
-    if history is not None:
-        history += no_data
-    # A copy, since the residual is computed later: a camera may write the next frame to the same place.
-    window = kind.xp.asarray(frames[(..., *config.sensor.window)], copy=True)
-
-    def shaped(values: NDArray) -> NDArray:
-        # A single frame is the case of a control loop: no need to compute its shape.
-        return kind.xp.reshape(values, (*batch, *values.shape[1:])) if batch else values[0, ...]
-
-    return Reconstruction(
-        shaped(phase), shaped(n_iterations), shaped(converged), shaped(n_unsolved),
-        None if history is None else shaped(history), config, shaped(window),
-    )  # fmt: skip
-
-
-def _pieces(frames: NDArray, kind: Kind, size: int | None = None) -> Iterator[slice]:
+def pieces(frames: NDArray, kind: Kind, size: int | None = None) -> Iterator[slice]:
     """Slices of frames (n, ...) that are handled together."""
     if size is None:
         chunk = _CHUNK if kind.on_host else _CHUNK_ELSEWHERE
@@ -537,7 +542,7 @@ def _warn_of_counts(sensor: ZernikeSensor, name: str, frames: NDArray, light: fl
             "the mean with the mask taken out; are these raw counts? Subtract the background, then divide by the "
             "mean count in the pupil with the mask taken out",
             UserWarning,
-            stacklevel=4,  # the call of the reconstructor
+            stacklevel=5,  # the call of the reconstructor
         )
 
 

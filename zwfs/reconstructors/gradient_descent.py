@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs._arrays import Kind
 from zwfs._propagator import split, square
+from zwfs.modes import check_modes
 from zwfs.reconstructors.base import Reconstructor, Solution, check_frames
-from zwfs.reconstructors.linear import check_modes
 from zwfs.sensor import ZernikeSensor
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class GradientDescent(Reconstructor):
         amplitude: ArrayLike | None = None,
     ) -> None:
         super().__init__(sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=amplitude)
-        self._modes = None if modes is None else check_modes(sensor, modes)
+        self._modes = None if modes is None else check_modes(sensor.pupil, modes)
 
     @property
     def modes(self) -> NDArray[np.float64] | None:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs._arrays import Kind, read_only
 from zwfs._propagator import split, square
+from zwfs.modes import check_modes
 from zwfs.reconstructors.base import ClosedForm, check_frames, check_phase
 from zwfs.sensor import ZernikeSensor
 
@@ -68,7 +69,7 @@ class Linear(ClosedForm):
         calibration: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
     ) -> None:
         super().__init__(sensor, amplitude=amplitude)
-        self._modes = check_modes(sensor, modes)
+        self._modes = check_modes(sensor.pupil, modes)
         poke = _check.number("poke", poke, 1e-10, np.pi)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
         flat = np.zeros(sensor.pupil.shape) if reference is None else reference
@@ -147,16 +148,3 @@ class Linear(ClosedForm):
         """Values at the points of the pupil, all masks in a row: (k, n_masks * n_points)."""
         window = frames[(..., *self.sensor.window)]
         return self.sensor.pupil.gather(window).reshape(len(frames), -1)
-
-
-def check_modes(sensor: ZernikeSensor, modes: ArrayLike) -> NDArray[np.float64]:
-    """Checked modes at the points of the pupil, shape (n_modes, n_points)."""
-    modes = _check.real_array("modes", modes)
-    if modes.ndim != 3 or not len(modes):
-        raise ValueError(f"modes has shape {modes.shape}: expected (n_modes, ny, nx)")
-    values = _check.values_inside("modes", modes, sensor.pupil).astype(np.float64)
-    if len(values) > values.shape[1]:
-        raise ValueError(
-            f"modes: {len(values)} of them, expected at most the {values.shape[1]} points of the pupil"
-        )
-    return read_only(values)

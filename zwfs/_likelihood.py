@@ -1,0 +1,179 @@
+"""Likelihood of frames with photon noise and read noise, and what the frames determine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zwfs import _check
+from zwfs._arrays import Kind
+from zwfs._information import Information, Response
+from zwfs._propagator import square
+from zwfs.sensor import ZernikeSensor
+
+_DARK = 1e-12  # electrons: a modelled pixel that is darker counts as this bright
+_DISTINCT = 1e-6  # difference of two masks, relative to the strongest response, from which on they are different
+_SINGULAR = 1e-14  # eigenvalue of the information about modes, relative to the largest, that counts as 0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of a frame: photon noise and read noise.
+
+    The electrons of a pixel plus the variance of the read noise are taken to follow the Poisson distribution (Snyder
+    et al. 1995). Mean and variance are right. The likelihood is exact without read noise.
+
+    Attributes
+    ----------
+    photons : float or None
+        Photons that an intensity of 1 puts into a pixel of each frame. None stands for an unknown variance that is
+        the same in all pixels: ordinary least squares.
+    read_noise : float, electrons rms / pixel
+    """
+
+    photons: float | None
+    read_noise: float
+
+    @classmethod
+    def checked(cls, photons: Any, read_noise: Any) -> Noise:
+        """Check the arguments.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a number is out of range, or there is read noise without a number of photons.
+        """
+        read_noise = _check.number("read_noise", read_noise, 0, 1e6)
+        if photons is not None:
+            return cls(_check.number("photons", photons, 0, 1e12, open_low=True), read_noise)
+        if read_noise:
+            raise ValueError(f"read_noise = {read_noise:g}: expected 0, since there is no number of photons")
+        return cls(None, 0.0)
+
+    def electrons(self, light: NDArray) -> NDArray:
+        """Mean of the Poisson distribution in each pixel, above 0."""
+        return self.photons * light + (self.read_noise**2 + _DARK)
+
+    def weights(self, light: NDArray) -> NDArray | None:
+        """Inverse variance of frames whose mean is `light`; None without a number of photons."""
+        return None if self.photons is None else self.photons**2 / self.electrons(light)
+
+    def deviance(self, light: NDArray, frames: NDArray) -> NDArray:
+        """Twice the logarithm of the best possible likelihood over that of a mean `light`: (k, ...) to (k,).
+
+        Without a number of photons it is the sum of squares.
+        """
+        xp, axes = Kind.of(light).xp, tuple(range(1, light.ndim))
+        if self.photons is None:
+            difference = light - frames
+            return xp.sum(difference * difference, axis=axes)
+        expected, seen = self.electrons(light), self.electrons(frames)
+        return 2 * xp.sum(expected - seen + seen * xp.log(seen / expected), axis=axes)
+
+    def misfit(self, light: NDArray, frames: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Squared differences in units of the variance, their expected sum, and the variance of the sum: (k,) each.
+
+        The variance m of a pixel counts as 1 electron at least: far darker pixels hold no photon nearly always, and
+        one in a million of them a thousand times too many. A Poisson distribution has a fourth moment of 3 m^2 + m.
+        """
+        xp, axes = Kind.of(light).xp, tuple(range(1, light.ndim))
+        expected = self.electrons(light)
+        difference, scale = self.electrons(frames) - expected, 1 / xp.clip(expected, 1, None)
+        terms = difference * difference * scale, expected * scale, (2 * expected + 1) * expected * scale * scale
+        return tuple(xp.sum(term, axis=axes) for term in terms)
+
+
+def tangents(psi: NDArray, stop: NDArray, unknown_amplitude: bool, xp: Any) -> NDArray:
+    """Change of the field per radian of phase, and per unit of amplitude: (k, 2, ny, nx) to (k, c, 2, ny, nx)."""
+    along_phase = xp.stack([-psi[:, 1, ...], psi[:, 0, ...]], axis=1)
+    if not unknown_amplitude:
+        return along_phase[:, np.newaxis, ...]
+    modulus = xp.sqrt(square(psi))[:, np.newaxis, ...]
+    dark = modulus == 0
+    # The phase of a dark point is undefined: any direction will do.
+    flat = xp.stack([stop, 0 * stop])[np.newaxis, ...]
+    return xp.stack([along_phase, xp.where(dark, flat, psi / xp.where(dark, modulus + 1, modulus))], axis=1)
+
+
+def require_information(sensor: ZernikeSensor, unknown_amplitude: bool) -> None:
+    """Require masks that determine the phase, or the phase and the amplitude.
+
+    With a reference wave t_k R behind mask k, each point of the frame gives |psi|^2 + 2 Re(conj(t_k R) psi). Three
+    different t_k determine psi. Two allow another field at every point.
+
+    Raises
+    ------
+    ValueError
+        If no mask changes the light, or the amplitude is unknown and fewer than three masks are different.
+    """
+    cores = sensor.factors.core.reshape(sensor.n_masks, -1)
+    strongest = float(np.linalg.norm(cores, axis=1).max())
+    if not strongest > 1e-12:
+        raise ValueError("sensor: none of its masks changes the light: expected at least one that does")
+    different: list[NDArray] = []
+    for core in cores:
+        if all(np.linalg.norm(core - other) > _DISTINCT * strongest for other in different):
+            different.append(core)
+    if unknown_amplitude and len(different) < 3:
+        raise ValueError(
+            f"amplitude is unknown and the sensor has {len(different)} different "
+            f"mask{'s' * (len(different) > 1)}: expected at least 3, since two frames allow two fields at every "
+            "point; a clear frame is that of a mask that changes nothing, such as Dimple(1, 0)"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Estimator:
+    """Unknowns of a fit and the noise of the frames: the information and its inverse at any field.
+
+    Attributes
+    ----------
+    response : Response
+        Of the sensor.
+    noise : Noise
+    unknown_amplitude : bool
+        Whether the amplitude of every point is unknown, too.
+    modes : array, shape (m, ny, nx), or None
+        Modes whose coefficients are the unknowns.
+    precision : array, shape (m, m), or None
+        Inverse of the covariance of the coefficients before the measurement.
+    """
+
+    response: Response
+    noise: Noise
+    unknown_amplitude: bool = False
+    modes: NDArray | None = None
+    precision: NDArray | None = None
+
+    def information(self, psi: NDArray, waves: NDArray) -> Information:
+        """Information at fields (k, 2, ny, nx) in the pupil and (k, n_masks, 2, ny', nx') on the detector."""
+        kind = Kind.of(psi)
+        constants = self.response.constants(kind)
+        change = tangents(psi, constants.stop, self.unknown_amplitude, kind.xp)
+        return self.response.information(change, waves, self.noise.weights(square(waves)))
+
+    def of_modes(self, information: Information) -> NDArray:
+        """Information about the coefficients, that of the prior included: (k, m, m)."""
+        kind = information.constants.kind
+        result = information.onto(kind.array(self.modes))
+        return result if self.precision is None else result + kind.array(self.precision)
+
+    def variance(self, psi: NDArray, waves: NDArray) -> tuple[NDArray, NDArray | None]:
+        """Variance of every point, (k, c, ny, nx), and of the coefficients, (k, m), if there are modes.
+
+        Directions that the frames do not show have a large variance.
+        """
+        information = self.information(psi, waves)
+        if self.modes is None:
+            return information.inverse().variance(), None
+        xp, kind = information.constants.kind.xp, information.constants.kind
+        modes = kind.array(self.modes)
+        values, vectors = xp.linalg.eigh(self.of_modes(information))
+        values = xp.maximum(values, _SINGULAR * values[:, -1:])
+        vectors = vectors / xp.sqrt(values)[:, np.newaxis, :]
+        flat = xp.reshape(modes, (modes.shape[0], -1))
+        points = xp.sum((xp.matrix_transpose(vectors) @ flat) ** 2, axis=1)
+        return xp.reshape(points, (-1, 1, *modes.shape[1:])), xp.sum(vectors**2, axis=2)

@@ -1,0 +1,101 @@
+"""Bounds of the error that no unbiased reconstructor can beat."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs._arrays import Kind
+from zwfs._information import Response
+from zwfs._likelihood import Estimator, Noise, require_information
+from zwfs._propagator import amplitude_maps, propagator, pupil_maps, split
+from zwfs.modes import check_modes
+from zwfs.sensor import ZernikeSensor
+
+
+def cramer_rao(
+    sensor: ZernikeSensor,
+    phase: ArrayLike,
+    *,
+    photons: float,
+    read_noise: float = 0.0,
+    modes: ArrayLike | None = None,
+    amplitude: ArrayLike | None = None,
+    amplitude_known: bool = True,
+) -> NDArray[np.float64]:
+    """Cramer-Rao bound: smallest standard deviation of an unbiased estimate of a phase.
+
+    The frames do not show the piston. The bound of a point is therefore that of the phase without its piston.
+    Other directions that the frames hardly show, such as tilt for a dimple near 2.44 lambda/D, raise the bound of
+    every point. With modes the phase is known to be a sum of them, which lowers the bound.
+
+    Parameters
+    ----------
+    sensor : ZernikeSensor
+        With any number of masks.
+    phase : array_like, shape (..., ny, nx), radian
+        True phase; only the points of the pupil count.
+    photons : float
+        Photons that an intensity of 1 puts into a pixel of each frame: `Detector.photons_per_pixel`.
+    read_noise : float, electrons rms / pixel
+    modes : array_like, shape (n_modes, ny, nx), optional
+        Modes whose coefficients are estimated; the phases of all points if left out.
+    amplitude : array_like, shape (ny, nx), optional
+        True amplitude A_in in the pupil; that of the sensor's pupil if left out.
+    amplitude_known : bool
+        Whether the amplitude is known. If not, it is estimated at every point, too. This takes three masks or
+        more; a clear frame is that of a mask that changes nothing.
+
+    Returns
+    -------
+    ndarray, shape (..., ny, nx) or (..., n_modes), radian
+        Standard deviation of every point, NaN outside the pupil, or of every coefficient.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of the wrong kind, shape or range, no mask changes the light, or the masks do not
+        determine an unknown amplitude.
+
+    References
+    ----------
+    Kay 1993, section 3.9; `eq-information` and `eq-woodbury` of the book.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> masks = [zwfs.Dimple(1.06, phase) for phase in (np.pi / 2, -np.pi / 2)]
+    >>> sensor = zwfs.ZernikeSensor(pupil, *masks)
+    >>> bound = zwfs.cramer_rao(sensor, np.zeros(pupil.shape), photons=1000)
+    >>> round(float(np.nanmean(bound)), 4)  # radian
+    0.016
+    """
+    _check.instance("sensor", sensor, ZernikeSensor)
+    if photons is None:
+        raise TypeError("photons = None: expected a number, since the bound is that of photon noise")
+    noise = Noise.checked(photons, read_noise)
+    unknown = not _check.flag("amplitude_known", amplitude_known)
+    if unknown and modes is not None:
+        raise ValueError("amplitude_known = False: expected True with modes, which describe the phase only")
+    require_information(sensor, unknown)
+    pupil = sensor.pupil
+    basis = None if modes is None else pupil.scatter(check_modes(pupil, modes), fill=0)
+    maps, batch = pupil_maps("phase", _check.real_array("phase", phase), sensor)
+    estimator = Estimator(Response(sensor.factors, sensor.window, pupil), noise, unknown, basis)
+    model = propagator(sensor, Kind.numpy())
+    if amplitude is not None:
+        strength, amplitude_batch = amplitude_maps(amplitude, sensor, Kind.numpy())
+        if amplitude_batch:
+            raise ValueError(f"amplitude has shape {(*amplitude_batch, *pupil.shape)}: expected {pupil.shape}")
+        model = model.with_amplitude(strength[0])
+    sigma = []
+    for one in maps.astype(np.float64):  # one at a time: the memory does not grow with the batch
+        psi = split(one[np.newaxis], model.amplitude)
+        points, coefficients = estimator.variance(psi, model.propagate(psi))
+        sigma.append(np.sqrt(points[0, 0] if coefficients is None else coefficients[0]))
+    result = np.array(sigma)
+    if modes is None:
+        result = np.where(pupil.inside, result, np.nan)
+    return result.reshape(*batch, *result.shape[1:])

@@ -1,0 +1,576 @@
+"""Maximum-likelihood reconstruction with error bars. It is not in the paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import prod
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs._arrays import Kind, read_only
+from zwfs._information import Information, Response
+from zwfs._likelihood import Estimator, Noise, require_information, tangents
+from zwfs._propagator import Propagator, angle, split, square
+from zwfs.modes import check_modes, power_law_screens, zernike_basis
+from zwfs.reconstructors.arcsine import Arcsine
+from zwfs.reconstructors.base import FixedPoint, Reconstruction, Reconstructor, Solution, pieces
+from zwfs.reconstructors.phase_shifted import PhaseShifted
+from zwfs.sensor import ZernikeSensor
+
+_COARSE = 1e-2  # error of the responses in the Hessian; gradient and cost are those of the sensor
+_FIRST_ITERATIONS = 2  # of the first start; more of them help small dimples and harm large ones
+_DAMPING = 1e-3  # of the first step, relative to the mean of the information's diagonal
+_LEAST_CUT = 0.1  # of the damping after a good step
+_KICK, _SHIFT = 1.0, 0.5  # radian rms, random phases of the other starts
+_KICK_MODES = 20
+_RESIDUAL = 1e-3  # rms, in units of the mean intensity, up to which frames without a noise model are explained
+_NOTHING = 1e-300
+_SIGMAS = 5.0  # excess of the misfit, in its standard deviations, up to which noise explains it
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LikelihoodReconstruction(Reconstruction):
+    """Result of `MaximumLikelihood`: a `Reconstruction` with error bars; `...` is the batch of the frames.
+
+    Attributes
+    ----------
+    amplitude : ndarray, shape (..., ny, nx), or None
+        Estimated amplitude, NaN outside the pupil; None if it was known.
+    coefficients : ndarray, shape (..., n_modes), radian, or None
+        Estimated coefficients of the modes, if there are any.
+    chi2 : ndarray, shape (...)
+        Reduced chi-square: about 1 where the model explains the frames. NaN without a number of photons, and where
+        the frames have no more information than there are unknowns, as for one mask.
+    consistent : ndarray of bool, shape (...)
+        Whether the phase explains the frames to within the noise: their misfit exceeds its expectation by less than
+        5 standard deviations. Without a number of photons: whether the rms residual of the frames, over the
+        detector, is at most 1e-3 of the mean intensity. For one mask many phases explain a frame.
+    n_starts : ndarray of int, shape (...)
+        Number of starts that were tried.
+    estimator : Estimator
+        Unknowns and noise, from which `sigma` is computed.
+    """
+
+    amplitude: NDArray[np.floating] | None
+    coefficients: NDArray[np.floating] | None
+    chi2: NDArray[np.floating]
+    consistent: NDArray[np.bool_]
+    n_starts: NDArray[np.int64]
+    noise_variance: NDArray[np.floating]
+    estimator: Estimator
+
+    @property
+    def sigma(self) -> NDArray[np.floating]:
+        """Standard error of the phase, shape (..., ny, nx), radian, NaN outside the pupil.
+
+        From the Fisher information at the estimate, computed at the first use. It is that of the phase without its
+        piston. Directions that the frames hardly show make it large.
+        """
+        return self._errors[0][..., 0, :, :]
+
+    @property
+    def sigma_amplitude(self) -> NDArray[np.floating] | None:
+        """Standard error of the amplitude, shape (..., ny, nx); None if the amplitude was known."""
+        return None if self.amplitude is None else self._errors[0][..., 1, :, :]
+
+    @property
+    def sigma_coefficients(self) -> NDArray[np.floating] | None:
+        """Standard error of the coefficients, shape (..., n_modes), radian; None without modes."""
+        return self._errors[1]
+
+    @cached_property
+    def residual(self) -> NDArray[np.floating]:
+        """Mismatch of the frames, see `Reconstruction`."""
+        kind = Kind.of(self.frames)
+        model, xp = self.settings.model(kind), kind.xp
+        light = xp.reshape(self.frames, (-1, *self.frames.shape[-3:]))
+        waves = model.propagate(self._field(model))[(..., *model.window)]
+        difference = (square(waves) - light) * model.stop
+        squares = xp.sum(difference * difference, axis=(1, 2, 3))
+        residual = xp.sqrt(squares / (light.shape[1] * model.pupil.n_points))
+        return xp.reshape(residual, self.converged.shape)
+
+    @cached_property
+    def _errors(self) -> tuple[NDArray[np.floating], NDArray[np.floating] | None]:
+        kind = Kind.of(self.phase)
+        double = kind._replace(dtype=kind.xp.float64)
+        model, xp = self.settings.model(double), kind.xp
+        field = xp.astype(self._field(self.settings.model(kind)), xp.float64)
+        batch = tuple(self.converged.shape)
+        points, coefficients = [], []
+        for index in range(field.shape[0]):  # one at a time: the memory does not grow with the batch
+            psi = field[index : index + 1, ...]
+            of_points, of_modes = self.estimator.variance(psi, model.propagate(psi))
+            points.append(of_points)
+            coefficients.append(of_modes)
+        scale = xp.reshape(self.noise_variance, (-1, 1))
+        sigma = xp.sqrt(xp.concat(points) * scale[..., np.newaxis, np.newaxis]) + model.no_data
+        sigma = xp.reshape(xp.astype(sigma, kind.dtype), (*batch, *sigma.shape[1:]))
+        if self.coefficients is None:
+            return sigma, None
+        of_modes = xp.astype(xp.sqrt(xp.concat(coefficients) * scale), kind.dtype)
+        return sigma, xp.reshape(of_modes, (*batch, of_modes.shape[1]))
+
+    def _field(self, model: Propagator) -> NDArray[np.floating]:
+        """Estimated field, split, one batch axis."""
+        xp, shape = model.kind.xp, (-1, *model.pupil.shape)
+        phase = xp.reshape(xp.where(model.inside, self.phase, model.kind.array(0.0)), shape)
+        if self.amplitude is None:
+            return split(phase, model.amplitude)
+        return split(phase, xp.reshape(xp.where(model.inside, self.amplitude, model.kind.array(0.0)), shape))
+
+
+class MaximumLikelihood(Reconstructor):
+    """Phase that makes the measured frames most likely, with its standard error at every point.
+
+    Levenberg-Marquardt steps on the phase of every point of the pupil. The Hessian is the Fisher information: a
+    diagonal plus a matrix of low rank, which Woodbury's identity inverts (`eq-woodbury`). The first start is two
+    accelerated iterations of `PhaseShifted`, or of `Arcsine` for one mask. Where a solution does not explain the
+    frames, other starts follow: in turn, the best solution so far plus a random phase of 1 rad rms, made of the 20
+    lowest Zernike modes, and two iterations that begin at half such a phase. The most likely solution counts.
+
+    Some directions are hard to see or invisible. No frame shows the piston: each step keeps it, and `sigma` is that
+    of the phase without piston. A dimple near 2.44 lambda/D hardly shows small tilts, and a single mask hardly
+    shows phases at which its cosine turns. The damping holds such directions, and `sigma` reports them as large.
+
+    Parameters
+    ----------
+    sensor : ZernikeSensor
+        With any number of masks.
+    photons : float, optional
+        Photons that an intensity of 1 puts into a pixel of each frame, `Detector.photons_per_pixel`. If left out,
+        all pixels have the same weight, and `sigma` follows from the residual of the frames.
+    read_noise : float, electrons rms / pixel
+    modes : array_like, shape (n_modes, ny, nx), optional
+        Modes whose coefficients are estimated; the phases of all points if left out.
+    prior : array_like, shape (n_modes, n_modes), radian^2, optional
+        Covariance of the coefficients before the measurement, of mean 0. The estimate then is the most probable
+        one, not the most likely (maximum a posteriori).
+    amplitude : array_like, shape (ny, nx), or "unknown", optional
+        Measured amplitude A_in in the pupil; that of the sensor's pupil if left out. If unknown, the amplitude of
+        every point is estimated, too. This takes three different masks or more; a clear frame is that of a mask that
+        changes nothing, such as `Dimple(1, 0)`.
+    n_iterations : int
+        Largest number of steps from one start.
+    tolerance : float, radian
+        A step that changes the phase by no more than this (rms over the pupil) is the last one.
+    n_starts : int
+        Largest number of starts. Frames that no phase explains, such as noisy ones without a number of photons, use
+        all of them: set 1 for those.
+    seed : int
+        Of the random phases of the other starts.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of the wrong kind, shape or range; if there is read noise or a prior without a number of
+        photons, or a prior without modes; if the prior is not positive definite; or if the masks do not determine
+        the unknowns.
+
+    References
+    ----------
+    Levenberg 1944; Marquardt 1963; Paxman, Schulz & Fienup 1992; `eq-information`, `eq-woodbury` of the book.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> masks = [zwfs.Dimple(2.4, phase * np.pi) for phase in (0.30, -0.68)]
+    >>> sensor = zwfs.ZernikeSensor(pupil, *masks)
+    >>> phase = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 50), rms=0.5, n_screens=1, exponent=-2, seed=1)[0]
+    >>> result = zwfs.MaximumLikelihood(sensor)(sensor.measure(phase))
+    >>> bool(result.consistent), bool(zwfs.reconstruction_error(pupil, result.phase, phase) < 1e-6)
+    (True, True)
+    """
+
+    any_library = True
+
+    def __init__(
+        self,
+        sensor: ZernikeSensor,
+        *,
+        photons: float | None = None,
+        read_noise: float = 0.0,
+        modes: ArrayLike | None = None,
+        prior: ArrayLike | None = None,
+        amplitude: ArrayLike | str | None = None,
+        n_iterations: int = 50,
+        tolerance: float = 1e-6,
+        n_starts: int = 8,
+        seed: int = 0,
+    ) -> None:
+        if isinstance(amplitude, str) and amplitude != "unknown":
+            raise ValueError(f"amplitude = {amplitude!r}: expected an array or 'unknown'")
+        unknown = isinstance(amplitude, str)
+        known = None if isinstance(amplitude, str) else amplitude
+        super().__init__(sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=known)
+        noise = Noise.checked(photons, read_noise)
+        n_starts = _check.integer("n_starts", n_starts, 1, 1000)
+        seed = _check.integer("seed", seed, 0)
+        if unknown and modes is not None:
+            raise ValueError("amplitude = 'unknown': expected a known one with modes, which describe the phase only")
+        require_information(sensor, unknown)
+        pupil = sensor.pupil
+        values = None if modes is None else check_modes(pupil, modes)
+        basis = None if values is None else read_only(pupil.scatter(values, fill=0))
+        precision = _precision(prior, values, noise)
+        rough = ZernikeSensor(pupil, *sensor.masks, extent=sensor.extent, tolerance=max(_COARSE, sensor.tolerance))
+        self._exact, self._rough = (
+            Estimator(Response(one.factors, one.window, pupil), noise, unknown, basis, precision)
+            for one in (sensor, rough)
+        )
+        self._first = self._first_method()
+        self._slopes = None if basis is None else _Slopes.of(pupil.inside, basis)
+        n_low = min(_KICK_MODES, pupil.n_points - 1)
+        self._kicks: NDArray[np.float64] | None = None
+        if n_starts > 1 and n_low:
+            low = zernike_basis(pupil, n_low)
+            kicks = power_law_screens(low, rms=_KICK, n_screens=n_starts - 1, exponent=-2, seed=seed)
+            self._kicks = read_only(np.where(pupil.inside, kicks, 0))
+
+    @property
+    def n_starts(self) -> int:
+        """Largest number of starts."""
+        return 1 if self._kicks is None else 1 + len(self._kicks)
+
+    def __call__(
+        self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
+    ) -> LikelihoodReconstruction:
+        """Reconstruct the phase of each frame set: parameters and errors are those of `Reconstructor`."""
+        frames, batch, start = self.accept(frames, start)
+        fit = self._fit(frames, start, _check.flag("history", history))
+        kind, result = Kind.of(frames), vars(self.report(frames, batch, self._solution(fit, Kind.of(frames))))
+
+        def shaped(values: NDArray) -> NDArray:
+            return kind.xp.reshape(values, (*batch, *values.shape[1:]))
+
+        amplitude, coefficients = None, fit.coefficients
+        if self._exact.unknown_amplitude:
+            amplitude = shaped(kind.xp.astype(kind.xp.sqrt(square(fit.psi)), kind.dtype))
+            amplitude += self.settings.model(kind).no_data
+        if coefficients is not None:
+            coefficients = shaped(kind.xp.astype(coefficients, kind.dtype))
+        return LikelihoodReconstruction(
+            **result,
+            amplitude=amplitude,
+            coefficients=coefficients,
+            chi2=shaped(self._chi2(fit)),
+            consistent=shaped(self._consistent(fit)),
+            n_starts=shaped(fit.n_starts),
+            noise_variance=shaped(self._noise_variance(fit)),
+            estimator=self._exact,
+        )
+
+    def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
+        """Return the phase that makes the frames most likely."""
+        return self._solution(self._fit(frames, start, history), Kind.of(frames))
+
+    def _solution(self, fit: _Fit, kind: Kind) -> Solution:
+        xp = kind.xp
+        phase = angle(fit.psi, xp) if fit.coefficients is None else self._phase(fit.coefficients)
+        history = None if fit.history is None else xp.astype(fit.history, kind.dtype)
+        return Solution(
+            xp.astype(phase, kind.dtype), fit.n_iterations, fit.converged, 0 * fit.n_iterations, history
+        )
+
+    def _fit(self, frames: NDArray, start: NDArray | None, history: bool) -> _Fit:
+        """Fit all frame sets, in double precision."""
+        kind = Kind.of(frames)
+        frames, start = (
+            None if array is None else kind.xp.astype(array, kind.xp.float64) for array in (frames, start)
+        )
+        fits = [
+            self._search(frames[piece, ...], None if start is None else start[piece, ...], history)
+            for piece in pieces(frames, kind, 1 if history else None)
+        ]
+        return _Fit.joined(fits, kind.xp)
+
+    def _search(self, frames: NDArray, start: NDArray | None, history: bool) -> _Fit:
+        """Fit from start after start, until every frame set is explained or the starts are used up."""
+        if start is None:
+            start = self._rough_phase(frames, None)
+        fit = self._descend(frames, start, history)
+        for attempt in range(1, self.n_starts):
+            poor = ~self._consistent(fit)
+            if not Kind.of(frames).xp.any(poor):
+                break
+            best = fit.at(poor)
+            other = self._descend(best.frames, self._other_start(attempt, best), history)
+            other.n_starts = best.n_starts + 1
+            fit.improve(poor, best, other)
+        return fit
+
+    def _rough_phase(self, frames: NDArray, start: NDArray | None) -> NDArray:
+        """Phase after the first iterations, (k, ny, nx)."""
+        if self._first is None:
+            return 0 * frames[(..., *self.sensor.window)][:, 0, ...] if start is None else start
+        return self._first.solve(frames, start, False).phase
+
+    def _other_start(self, attempt: int, fit: _Fit) -> NDArray:
+        """Phase from which the next attempt begins, (k, ny, nx); it depends on no other frame set."""
+        kind, some = Kind.of(fit.psi), 0 * fit.psi[:, 0, ...]
+        kick = kind.array(self._kicks[attempt - 1])
+        if attempt % 2:
+            return angle(fit.psi, kind.xp) + kick
+        return self._rough_phase(fit.frames, some + _SHIFT * kick)
+
+    def _descend(self, frames: NDArray, start: NDArray, history: bool) -> _Fit:
+        """Take steps from one start. Frame sets that are done leave, so no result depends on the others."""
+        kind, n_iterations = Kind.of(frames), self.settings.n_iterations
+        xp = kind.xp
+        fit = self._begin(frames, start)
+        places, ended, path = kind.integers(np.arange(frames.shape[0])), [], [angle(fit.psi, xp)]
+        for iteration in range(1, n_iterations + 1):
+            self._step(fit)
+            fit.n_iterations = fit.n_iterations + 1
+            if history:
+                path.append(angle(fit.psi, xp))
+            n_done = int(xp.count_nonzero(fit.converged))
+            if iteration == n_iterations or n_done == places.shape[0]:
+                break
+            if n_done:
+                ended.append((places[fit.converged], fit.at(fit.converged)))
+                places, fit = places[~fit.converged], fit.at(~fit.converged)
+        if history:
+            fit.history = xp.stack(path + path[-1:] * (n_iterations + 1 - len(path)), axis=1)
+        ended.append((places, fit))
+        order = xp.argsort(xp.concat([some for some, _ in ended]))
+        return _Fit.joined([part for _, part in ended], xp).at(order)
+
+    def _begin(self, frames: NDArray, start: NDArray) -> _Fit:
+        kind = Kind.of(frames)
+        model, coefficients = self.settings.model(kind), None
+        if self._slopes is not None:
+            coefficients = self._slopes.fit(start, kind)
+            start = self._phase(coefficients)
+        psi = split(start, model.amplitude)
+        waves = model.propagate(psi)
+        light = square(waves)
+        zeros = kind.integers([0] * frames.shape[0])
+        fit = _Fit(
+            frames, psi, waves, light, coefficients, self._exact.noise.deviance(light, frames),
+            _DAMPING + kind.zeros(frames.shape[0]), 2 + kind.zeros(frames.shape[0]), zeros, zeros > 0, zeros + 1,
+        )  # fmt: skip
+        fit.cost = fit.cost + self._penalty(fit)
+        return fit
+
+    def _step(self, fit: _Fit) -> None:
+        """Try one step of Levenberg and Marquardt on every frame set; take it where the cost falls.
+
+        The damping follows Nielsen 1999: it falls the more, the better the quadratic model predicted the cost.
+        """
+        kind = Kind.of(fit.psi)
+        xp, model = kind.xp, self.settings.model(kind)
+        weights, difference = self._exact.noise.weights(fit.light), fit.light - fit.frames
+        weighted = difference if weights is None else weights * difference
+        back = model.adjoint(fit.waves * weighted[:, :, np.newaxis, ...])
+        change = tangents(fit.psi, model.stop, self._exact.unknown_amplitude, xp)
+        gradient = 2 * xp.sum(change * back[:, np.newaxis, ...], axis=2)
+        information = self._rough.information(fit.psi, fit.waves)
+        if fit.coefficients is None:
+            step, predicted = _points_step(information, gradient, fit.damping)
+            coefficients = None
+        else:
+            jump, predicted = self._modes_step(information, gradient, fit)
+            coefficients = fit.coefficients + jump
+            step = self._phase(jump)[:, np.newaxis, ...]
+        if self._exact.unknown_amplitude:
+            psi = fit.psi + xp.sum(change * step[:, :, np.newaxis, ...], axis=1)
+        else:
+            psi = _turned(fit.psi, step[:, 0, ...], xp)
+        waves = model.propagate(psi)
+        light = square(waves)
+        trial = replace(fit, psi=psi, waves=waves, light=light, coefficients=coefficients)
+        trial.cost = self._exact.noise.deviance(light, fit.frames) + self._penalty(trial)
+        ratio = (fit.cost - trial.cost) / (predicted + _NOTHING)
+        better = trial.cost < fit.cost
+        cut = xp.clip(1 - (2 * ratio - 1) ** 3, _LEAST_CUT, None)
+        damping = fit.damping * xp.where(better, cut, fit.growth)
+        growth = xp.where(better, 2 + 0 * fit.growth, 2 * fit.growth)
+        fit.take(better, trial, xp)
+        fit.damping, fit.growth = damping, growth
+        size = xp.sum(step * step, axis=(1, 2, 3))
+        fit.converged = size <= self.settings.tolerance**2 * model.pupil.n_points
+
+    def _modes_step(self, information: Information, gradient: NDArray, fit: _Fit) -> tuple[NDArray, NDArray]:
+        """Step of the coefficients, (k, m), and the fall of the cost that it promises, (k,)."""
+        kind = information.constants.kind
+        xp = kind.xp
+        modes = kind.array(self._exact.modes)
+        hessian = self._rough.of_modes(information)
+        slope = xp.reshape(gradient, (gradient.shape[0], -1)) @ xp.reshape(modes, (modes.shape[0], -1)).T
+        if self._exact.precision is not None:
+            slope = slope + fit.coefficients @ kind.array(self._exact.precision)
+        eye = kind.array(np.eye(modes.shape[0]))
+        damping = fit.damping * xp.sum(hessian * eye, axis=(1, 2)) / modes.shape[0]
+        damped = hessian + damping[:, np.newaxis, np.newaxis] * eye
+        step = -xp.linalg.solve(damped, slope[..., np.newaxis])[..., 0]
+        return step, xp.vecdot(step, damping[:, np.newaxis] * step - slope)
+
+    def _phase(self, coefficients: NDArray) -> NDArray:
+        """Phase of coefficients: (k, m) to (k, ny, nx)."""
+        kind = Kind.of(coefficients)
+        modes = kind.array(self._exact.modes)
+        flat = coefficients @ kind.xp.reshape(modes, (modes.shape[0], -1))
+        return kind.xp.reshape(flat, (-1, *modes.shape[1:]))
+
+    def _penalty(self, fit: _Fit) -> NDArray | float:
+        """Twice the negative logarithm of the prior, (k,)."""
+        if self._exact.precision is None:
+            return 0.0
+        kind = Kind.of(fit.coefficients)
+        return kind.xp.vecdot(fit.coefficients @ kind.array(self._exact.precision), fit.coefficients)
+
+    def _n_unknowns(self) -> int:
+        if self._exact.modes is not None:
+            return len(self._exact.modes)
+        return (1 + self._exact.unknown_amplitude) * self.sensor.pupil.n_points - 1  # no frame shows the piston
+
+    def _chi2(self, fit: _Fit) -> NDArray:
+        """Reduced chi-square, (k,)."""
+        xp = Kind.of(fit.light).xp
+        if self._exact.noise.photons is None:
+            return fit.cost * np.nan
+        misfit, expected, _ = self._exact.noise.misfit(fit.light, fit.frames)
+        freedom = expected - self._n_unknowns()
+        return xp.where(freedom > 0, misfit, np.nan) / freedom
+
+    def _consistent(self, fit: _Fit) -> NDArray[np.bool_]:
+        """Whether the noise explains the misfit, (k,)."""
+        xp = Kind.of(fit.light).xp
+        if self._exact.noise.photons is None:
+            return fit.cost <= _RESIDUAL**2 * prod(fit.frames.shape[1:])
+        misfit, expected, variance = self._exact.noise.misfit(fit.light, fit.frames)
+        freedom = xp.clip(expected - self._n_unknowns(), 0, None)
+        return misfit <= freedom + _SIGMAS * xp.sqrt(variance)
+
+    def _noise_variance(self, fit: _Fit) -> NDArray:
+        """Variance by which the inverse of the information is multiplied, (k,): 1 with a number of photons."""
+        if self._exact.noise.photons is not None:
+            return 1 + 0 * fit.cost
+        return fit.cost / max(prod(fit.frames.shape[1:]) - self._n_unknowns(), 1)
+
+    def _first_method(self) -> FixedPoint | None:
+        """Method of the first iterations; None for masks that no iteration of this package handles."""
+        method, options = (PhaseShifted, {"accelerate": True}) if self.sensor.n_masks > 1 else (Arcsine, {})
+        try:
+            return method(
+                self.sensor, n_iterations=_FIRST_ITERATIONS, tolerance=0, amplitude=self.settings.amplitude, **options
+            )
+        except ValueError:  # such as the same mask twice, which still determines a phase as one mask does
+            return None
+
+
+@dataclass
+class _Fit:
+    """State of the fits of k frame sets."""
+
+    frames: NDArray[np.floating]  # (k, n_masks, ny', nx'), measured
+    psi: NDArray[np.floating]  # (k, 2, ny, nx), field in the pupil
+    waves: NDArray[np.floating]  # (k, n_masks, 2, ny', nx'), its fields on the detector
+    light: NDArray[np.floating]  # (k, n_masks, ny', nx'), their intensity
+    coefficients: NDArray[np.floating] | None  # (k, m), of the modes
+    cost: NDArray[np.floating]  # (k,), twice the negative logarithm of the likelihood and of the prior
+    damping: NDArray[np.floating]  # (k,), relative to the mean of the diagonal of the information
+    growth: NDArray[np.floating]  # (k,), of the damping after a step that raises the cost
+    n_iterations: NDArray[np.int64]  # (k,)
+    converged: NDArray[np.bool_]  # (k,)
+    n_starts: NDArray[np.int64]  # (k,)
+    history: NDArray[np.floating] | None = None  # (k, n_iterations + 1, ny, nx)
+
+    def at(self, which: NDArray) -> _Fit:
+        """Return the fits of some frame sets, by their places or by flags."""
+        return _Fit(*(None if array is None else array[which] for array in vars(self).values()))
+
+    def take(self, where: NDArray[np.bool_], other: _Fit, xp: Any) -> None:
+        """Replace the arrays by those of other fits of the same frame sets where flags (k,) are True."""
+        if xp.all(where):
+            vars(self).update(vars(other))
+            return
+        for name, array in vars(self).items():
+            if array is not None:
+                flags = xp.reshape(where, (-1, *(1,) * (array.ndim - 1)))
+                setattr(self, name, xp.where(flags, getattr(other, name), array))
+
+    def improve(self, which: NDArray[np.bool_], best: _Fit, other: _Fit) -> None:
+        """Replace the fits of some frame sets by the better one of two; the number of starts is that of `other`."""
+        xp = Kind.of(self.psi).xp
+        n_starts = other.n_starts
+        best.take(other.cost < best.cost, other, xp)
+        best.n_starts = n_starts
+        for name, array in vars(self).items():
+            if array is not None:
+                array[which] = getattr(best, name)
+
+    @classmethod
+    def joined(cls, fits: list[_Fit], xp: Any) -> _Fit:
+        """Return the fits of several batches as those of one."""
+        columns = zip(*(vars(fit).values() for fit in fits), strict=True)
+        return cls(*(None if column[0] is None else xp.concat(column) for column in columns))
+
+
+class _Slopes(NamedTuple):
+    """Fit of modes to a phase that is known up to multiples of 2 pi: their differences between neighbours fit."""
+
+    pairs_y: NDArray[np.bool_]  # (ny - 1, nx), whether a point and the next one along y are both inside
+    pairs_x: NDArray[np.bool_]  # (ny, nx - 1)
+    inverse: NDArray[np.float64]  # (m, n_pairs), from differences to coefficients
+
+    @classmethod
+    def of(cls, inside: NDArray[np.bool_], modes: NDArray[np.float64]) -> _Slopes:
+        pairs_y, pairs_x = inside[1:] & inside[:-1], inside[:, 1:] & inside[:, :-1]
+        slopes = np.concatenate(
+            [np.diff(modes, axis=1)[:, pairs_y], np.diff(modes, axis=2)[:, pairs_x]], axis=1
+        )
+        return cls(pairs_y, pairs_x, np.linalg.pinv(slopes.T, rcond=1e-10))
+
+    def fit(self, phase: NDArray, kind: Kind) -> NDArray:
+        """Coefficients of phases: (k, ny, nx) to (k, m)."""
+        xp, k = kind.xp, phase.shape[0]
+        along_y, along_x = phase[:, 1:, :] - phase[:, :-1, :], phase[:, :, 1:] - phase[:, :, :-1]
+        slopes = xp.concat([
+            xp.reshape(slope, (k, -1))[:, kind.flags(pairs.ravel())]
+            for slope, pairs in ((along_y, self.pairs_y), (along_x, self.pairs_x))
+        ], axis=1)  # fmt: skip
+        return xp.atan2(xp.sin(slopes), xp.cos(slopes)) @ kind.array(self.inverse).T
+
+
+def _points_step(information: Information, gradient: NDArray, damping: NDArray) -> tuple[NDArray, NDArray]:
+    """Step at every point, (k, c, ny, nx), and the fall of the cost that it promises, (k,)."""
+    xp, scale = information.constants.kind.xp, information.scale
+    absolute = damping[:, np.newaxis, np.newaxis] * scale
+    step = -(information.inverse(absolute) @ gradient)
+    promised = absolute[..., np.newaxis] * step - gradient
+    return step, xp.sum(step * promised, axis=(1, 2, 3))
+
+
+def _turned(psi: NDArray, by: NDArray, xp: Any) -> NDArray:
+    """Field (k, 2, ny, nx) with a phase (k, ny, nx) added."""
+    cos, sin = xp.cos(by), xp.sin(by)
+    real, imag = psi[:, 0, ...], psi[:, 1, ...]
+    return xp.stack([cos * real - sin * imag, sin * real + cos * imag], axis=1)
+
+
+def _precision(prior: ArrayLike | None, modes: NDArray | None, noise: Noise) -> NDArray[np.float64] | None:
+    """Inverse of the checked covariance of the coefficients."""
+    if prior is None:
+        return None
+    if modes is None:
+        raise ValueError("prior: expected None without modes, whose covariance it is")
+    if noise.photons is None:
+        raise ValueError("prior: expected a number of photons, which weighs the frames against the prior")
+    covariance = _check.real_map("prior", prior)
+    if covariance.shape != 2 * (len(modes),):
+        raise ValueError(f"prior has shape {covariance.shape}: expected {2 * (len(modes),)}, one row for each mode")
+    if not np.allclose(covariance, covariance.T, rtol=1e-9, atol=0):
+        raise ValueError("prior is not symmetric: expected a covariance")
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    if not values[0] > 1e-14 * values[-1]:
+        raise ValueError(
+            f"prior has eigenvalues from {values[0]:.3g} to {values[-1]:.3g}: expected a positive definite matrix"
+        )
+    return read_only((vectors / values) @ vectors.T)

@@ -30,6 +30,7 @@ from zwfs._pickle import Immutable
 from zwfs.lowrank import Factors
 from zwfs.pupil import Pupil
 
+_ZERO: Any = 0
 _SMALLEST = 1e-12  # of the diagonal, relative to its mean: a point that no frame shows has no information
 
 
@@ -59,11 +60,11 @@ class _Pairs:
         return cls(*map(kind.array, (along_y, along_x, pairs_y, pairs_x, unfold_y, unfold_x)))
 
     def project(self, maps: NDArray, xp: Any) -> NDArray:
-        """Inner products of maps with all functions: (k, s, ny, nx) to (k, s, a * b)."""
+        """Inner products of maps with all functions: (..., ny, nx) to (..., a * b)."""
         return xp.reshape(self.along_y @ maps @ self.along_x.T, (*maps.shape[:-2], -1))
 
     def expand(self, coefficients: NDArray, xp: Any) -> NDArray:
-        """Sums of all functions: (k, s, a * b) to (k, s, ny, nx)."""
+        """Sums of all functions: (..., a * b) to (..., ny, nx)."""
         a, b = self.along_y.shape[0], self.along_x.shape[0]
         return self.along_y.T @ xp.reshape(coefficients, (*coefficients.shape[:-1], a, b)) @ self.along_x
 
@@ -126,10 +127,9 @@ class Response(Immutable):
         columns[2:, :, 2 * r :] = left @ split.reshape(2 * n, q, 2 * r)
         detector = outer.combine @ split.reshape(2 * n, q, 2 * r)
         return _Constants(
-            kind, self._pupil, self._window,
+            kind, self._pupil.n_points, self._window, kind.array(self._pupil.inside),
             _Pairs.of(inner.along_y, inner.along_x, kind), _Pairs.of(outer.along_y, outer.along_x, kind),
-            kind.array(columns.reshape(-1, 4 * r)), kind.array(detector.reshape(-1, 2 * r)),
-            kind.array(turns.real), kind.array(turns.imag), kind.array(self._pupil.inside),
+            kind.array(columns), kind.array(detector), turns,
         )  # fmt: skip
 
     def information(self, tangents: NDArray, waves: NDArray, weights: NDArray | None) -> Information:
@@ -150,138 +150,125 @@ class Response(Immutable):
 @dataclass(frozen=True, eq=False)
 class _Constants:
     kind: Kind
-    pupil: Pupil
+    n_points: int
     window: tuple[slice, slice]
+    stop: NDArray  # (ny, nx), 1 in the pupil
     inner: _Pairs
     outer: _Pairs
-    columns: NDArray  # (s * a * b, 4 r), functions times maps to columns of K and B
-    detector: NDArray  # (2 n * a' * b', 2 r), the same for H
-    turn_real: NDArray  # (n_masks, n), parts of the factors of a mask's core
-    turn_imag: NDArray
-    stop: NDArray
+    columns: NDArray  # (s, a * b, 4 r), functions times maps to columns of K and B
+    detector: NDArray  # (2 n, a' * b', 2 r), the same for H
+    turns: NDArray[np.complex128]  # (n_masks, n), factors of which the core of a mask is made
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
     """Fisher information F at a field, for k frame sets: see the head of this module.
 
+    Maps have shape (k, ny, nx). Lists of maps have one entry for each unknown of a point.
+
     Attributes
     ----------
     constants : _Constants
-    local : array, shape (k, c, c, ny, nx)
-        Diagonal blocks sum_k D_k^T W D_k; outside the pupil the identity.
-    sets : array, shape (k, s, c, ny, nx)
-        Maps of the columns of K, then of B: real and imaginary part each.
+    local : list of lists of maps
+        Diagonal blocks sum_k D_k^T W D_k; outside the pupil a multiple of the identity.
+    sets : list of lists of maps
+        Factors of the columns of K, then of B: real and imaginary part of each.
     gram : array, shape (k, 2 r, 2 r)
         M.
     scale : array, shape (k, 1, 1)
-        Mean of the diagonal of the phase in the pupil.
+        Mean over the pupil of the diagonal for the phase.
     """
 
     constants: _Constants
-    local: NDArray
-    sets: NDArray
+    local: list[list[NDArray]]
+    sets: list[list[NDArray]]
     gram: NDArray
     scale: NDArray
 
     @classmethod
     def of(cls, constants: _Constants, tangents: NDArray, waves: NDArray, weights: NDArray | None) -> Information:
-        """Compute the parts of the information."""
-        kind, window, stop = constants.kind, constants.window, constants.stop
-        xp = kind.xp
-        real, imag = waves[:, :, 0, ...], waves[:, :, 1, ...]
-        n = constants.turn_real.shape[1]
-        along: list[NDArray] = []  # of dI_k per unit of the coefficients of each combination of cores
-        for index in range(n):
-            a, b = (t[:, index][:, np.newaxis, np.newaxis] for t in (constants.turn_real, constants.turn_imag))
-            along += [2 * (a * real + b * imag), 2 * (a * imag - b * real)]
-        weighted = along if weights is None else [weights * one for one in along]
-        pairs = [xp.sum(s * t, axis=1) for i, s in enumerate(along) for t in weighted[i:]]
-        gram = _congruent(constants.outer.gram(xp.stack(pairs, axis=1), xp), constants.detector, 2 * n, xp)
-        real, imag = (part[(..., *window)][:, :, np.newaxis, ...] for part in (real, imag))
-        local_change = 2 * (real * tangents[:, np.newaxis, :, 0, ...] + imag * tangents[:, np.newaxis, :, 1, ...])
-        weighted_change = (
-            local_change if weights is None
-            else local_change * weights[(..., *window)][:, :, np.newaxis, ...]
-        )  # fmt: skip
-        c = tangents.shape[1]
-        local = xp.empty((tangents.shape[0], c, c, *stop.shape), dtype=kind.dtype, device=kind.device)
-        for i in range(c):
-            for j in range(i, c):
-                block = xp.sum(local_change[:, :, i, ...] * weighted_change[:, :, j, ...], axis=1)
-                local[:, i, j, ...] = local[:, j, i, ...] = block
-        mixed = [
-            xp.sum(weighted_change * one[(..., *window)][:, :, np.newaxis, ...], axis=1) for one in along
-        ]
-        sets = xp.stack([tangents[:, :, 0, ...], tangents[:, :, 1, ...], *mixed], axis=1)
-        scale = xp.sum(local[:, 0, 0, ...], axis=(-2, -1)) / constants.pupil.n_points
-        scale = scale[:, np.newaxis, np.newaxis]
-        for i in range(c):
-            local[:, i, i, ...] += _SMALLEST * scale + (1 - stop) * scale
-        return cls(constants, local, sets, gram, scale)
+        """Sum the contributions of all masks."""
+        xp, window, n_unknowns = constants.kind.xp, constants.window, tangents.shape[1]
+        unknowns = range(n_unknowns)
+        real, imag = ([tangents[:, c, part, ...] for c in unknowns] for part in (0, 1))
+        n_sets = 2 * constants.turns.shape[1]
+        local = [[_ZERO for _ in unknowns] for _ in unknowns]
+        mixed = [[_ZERO for _ in unknowns] for _ in range(n_sets)]
+        pairs = [_ZERO for _ in _pairs_of(n_sets)]
+        for mask, turns in enumerate(constants.turns):
+            wave = waves[:, mask, ...]
+            weight = 1 if weights is None else weights[:, mask, ...]
+            # dI per unit of the real and imaginary part of a coefficient: 2 Re and -2 Im of conj(o) times the turn
+            along = [
+                2 * (t.real * wave[:, 0, ...] + t.imag * wave[:, 1, ...])
+                for turn in turns
+                for t in (turn, turn * 1j)
+            ]
+            weighted = along if weights is None else [weight * one for one in along]
+            pairs = [
+                total + along[i] * weighted[j] for total, (i, j) in zip(pairs, _pairs_of(n_sets), strict=True)
+            ]
+            inside = wave[(..., *window)]
+            change = [2 * (inside[:, 0, ...] * real[c] + inside[:, 1, ...] * imag[c]) for c in unknowns]
+            along, weighted = ([one[(..., *window)] for one in maps] for maps in (along, weighted))
+            seen = change if weights is None else [weight[(..., *window)] * one for one in change]
+            local = [[local[i][j] + change[i] * seen[j] for j in unknowns] for i in unknowns]
+            mixed = [[mixed[s][c] + change[c] * weighted[s] for c in unknowns] for s in range(n_sets)]
+        gram = _congruent(constants.outer.gram(xp.stack(pairs, axis=1), xp), constants.detector, xp)
+        scale = xp.sum(local[0][0], axis=(-2, -1))[:, np.newaxis, np.newaxis] / constants.n_points
+        for c in unknowns:
+            local[c][c] = local[c][c] + scale * (_SMALLEST + 1 - constants.stop)
+        return cls(constants, local, [real, imag, *mixed], gram, scale)
 
     def inverse(self, damping: NDArray | float = 0.0) -> Inverse:
         """Inverse of F with `damping`, (k, 1, 1), added to its diagonal, and the piston fixed.
 
-        No frame shows the piston of the phase, F 1 = 0. A gauge of unit strength, 1 1^T scale / n_points, is added
-        to F. It changes nothing else.
+        No frame shows the piston of the phase, F 1 = 0. A gauge, 1 1^T scale / n_points, is added to F. It gives
+        the piston as much information as a point has on average, and changes nothing else.
         """
-        constants, kind, xp = self.constants, self.constants.kind, self.constants.kind.xp
-        c = self.local.shape[1]
-        if c == 1:
-            local = 1 / (self.local[:, 0, 0, ...] + damping)
-            local = local[:, np.newaxis, np.newaxis, ...]
-        else:
-            first, cross, second = self.local[:, 0, 0, ...] + damping, self.local[:, 0, 1, ...], self.local[:, 1, 1, ...]
-            second = second + damping
-            determinant = first * second - cross * cross
-            rows = [[second, -cross], [-cross, first]]
-            local = xp.stack([xp.stack([e / determinant for e in row], axis=1) for row in rows], axis=1)
-        scaled = _apply(local, self.sets, xp)
-        pairs = [
-            xp.sum(self.sets[:, i, ...] * scaled[:, j, ...], axis=1)
-            for i in range(self.sets.shape[1]) for j in range(i, self.sets.shape[1])
-        ]  # fmt: skip
+        constants, xp = self.constants, self.constants.kind.xp
+        local = _inverse_blocks(self.local, damping)
+        scaled = [_times(local, one) for one in self.sets]
+        pairs = [_dot(self.sets[i], scaled[j]) for i, j in _pairs_of(len(self.sets))]
+        capacitance = _congruent(constants.inner.gram(xp.stack(pairs, axis=1), xp), constants.columns, xp)
         rank = self.gram.shape[-1]
-        capacitance = xp.empty((local.shape[0], 2 * rank + 1, 2 * rank + 1), dtype=kind.dtype, device=kind.device)
-        capacitance[:, :-1, :-1] = _congruent(
-            constants.inner.gram(xp.stack(pairs, axis=1), xp), constants.columns, self.sets.shape[1], xp
+        eye = constants.kind.array(np.eye(rank))
+        capacitance[:, :rank, rank:] += eye
+        capacitance[:, rank:, :rank] += eye
+        capacitance[:, rank:, rank:] -= self.gram
+        gauge = xp.sqrt(self.scale / constants.n_points) * constants.stop
+        piston = [block * gauge for block in local[0]]
+        cross = self._project(piston)[..., np.newaxis]
+        corner = 1 + xp.sum(gauge * piston[0], axis=(-2, -1))[:, np.newaxis, np.newaxis]
+        capacitance = xp.concat(
+            [xp.concat([capacitance, cross], axis=2), xp.concat([xp.matrix_transpose(cross), corner], axis=2)],
+            axis=1,
         )
-        eye = kind.array(np.eye(rank))
-        capacitance[:, :rank, rank:-1] += eye
-        capacitance[:, rank:-1, :rank] += eye
-        capacitance[:, rank:-1, rank:-1] -= self.gram
-        gauge = xp.sqrt(self.scale / constants.pupil.n_points) * constants.stop
-        piston = local[:, 0, ...] * gauge[:, np.newaxis, ...]
-        cross = self._project(piston)
-        capacitance[:, :-1, -1] = capacitance[:, -1, :-1] = cross
-        capacitance[:, -1, -1] = 1 + xp.sum(gauge * piston[:, 0, ...], axis=(-2, -1))
         return Inverse(self, local, scaled, gauge, piston, capacitance)
 
     def onto(self, modes: NDArray) -> NDArray:
-        """Information about the coefficients of modes, maps (m, ny, nx) of the phase: (k, m, m).
+        """Information about the coefficients of modes of the phase, maps (m, ny, nx): (k, m, m).
 
         There is no gauge: a mode that is a piston has no information.
         """
         constants, xp = self.constants, self.constants.kind.xp
         flat = xp.reshape(modes, (modes.shape[0], -1))
-        local = xp.reshape(self.local[:, 0, 0, ...], (self.local.shape[0], 1, -1))
-        n_sets, n = self.sets.shape[1], constants.columns.shape[0] // self.sets.shape[1]
+        local = xp.reshape(self.local[0][0], (self.gram.shape[0], 1, -1))
         columns: Any = 0  # (k, m, 4 r), products of the columns of K and B with the modes
-        for index in range(n_sets):
-            products = constants.inner.project(modes * self.sets[:, index, 0, np.newaxis, ...], xp)
-            columns = columns + products @ constants.columns[index * n : (index + 1) * n, :]
+        for one, matrix in zip(self.sets, constants.columns, strict=True):
+            columns = columns + constants.inner.project(modes * one[0][:, np.newaxis, ...], xp) @ matrix
         rank = self.gram.shape[-1]
         inputs, mixed = columns[..., :rank], columns[..., rank:]
         cross = mixed @ xp.matrix_transpose(inputs)
         inputs = inputs @ self.gram @ xp.matrix_transpose(inputs)
         return (flat * local) @ flat.T + cross + xp.matrix_transpose(cross) + inputs
 
-    def _project(self, scaled: NDArray) -> NDArray:
-        """Products of the columns of K and B with unknowns: (k, c, ny, nx) to (k, 4 r)."""
-        constants, xp = self.constants, self.constants.kind.xp
-        maps = xp.sum(self.sets * scaled[:, np.newaxis, ...], axis=2)
-        return xp.reshape(constants.inner.project(maps, xp), (maps.shape[0], -1)) @ constants.columns
+    def _project(self, unknowns: list[NDArray]) -> NDArray:
+        """Products of the columns of K and B with maps of the unknowns: (k, 4 r)."""
+        total: Any = 0
+        for one, matrix in zip(self.sets, self.constants.columns, strict=True):
+            total = total + self.constants.inner.project(_dot(one, unknowns), self.constants.kind.xp) @ matrix
+        return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,65 +276,82 @@ class Inverse:
     """Inverse of a Fisher information, by Woodbury's identity (`eq-woodbury`)."""
 
     information: Information
-    local: NDArray  # (k, c, c, ny, nx), inverse of the diagonal blocks
-    scaled: NDArray  # (k, s, c, ny, nx), local times the maps of the columns
+    local: list[list[NDArray]]  # inverse of the diagonal blocks
+    scaled: list[list[NDArray]]  # that times the maps of the columns
     gauge: NDArray  # (k, ny, nx), column of the gauge
-    piston: NDArray  # (k, c, ny, nx), local times that
+    piston: list[NDArray]  # local times that
     capacitance: NDArray  # (k, 4 r + 1, 4 r + 1)
 
-    def __matmul__(self, right: NDArray) -> NDArray:
-        """Solve F x = right: both (k, c, ny, nx)."""
+    def __matmul__(self, right: list[NDArray]) -> list[NDArray]:
+        """Solve F x = right: lists of maps."""
         info, xp = self.information, self.information.constants.kind.xp
-        first = _apply(self.local, right[:, np.newaxis, ...], xp)[:, 0, ...]
-        sides = xp.concat(
-            [info._project(first), xp.sum(self.gauge * first[:, 0, ...], axis=(-2, -1))[:, np.newaxis]], axis=1
-        )
+        first = _times(self.local, right)
+        piston = xp.sum(self.gauge * first[0], axis=(-2, -1))[:, np.newaxis]
+        sides = xp.concat([info._project(first), piston], axis=1)
         weights = xp.linalg.solve(self.capacitance, sides[..., np.newaxis])[..., 0]
-        return first - self._expand(weights)
+        return [one - other for one, other in zip(first, self._expand(weights), strict=True)]
 
-    def variance(self) -> NDArray:
-        """Diagonal of F^-1 without the piston: (k, c, ny, nx); NaN-free, without meaning outside the pupil."""
+    def variance(self) -> list[NDArray]:
+        """Diagonal of F^-1 without the piston: a list of maps, without meaning outside the pupil."""
         info, constants = self.information, self.information.constants
-        xp, n_sets = constants.kind.xp, self.scaled.shape[1]
+        xp, columns = constants.kind.xp, constants.columns
         inverse = xp.linalg.inv(self.capacitance)
-        inner = constants.columns @ inverse[:, :-1, :-1] @ constants.columns.T
-        n = constants.columns.shape[0] // n_sets
-        inner = xp.permute_dims(xp.reshape(inner, (-1, n_sets, n, n_sets, n)), (0, 1, 3, 2, 4))
-        pairs = [(i, j) for i in range(n_sets) for j in range(i, n_sets)]
-        blocks = [inner[:, i, j, ...] * (1 if i == j else 2) for i, j in pairs]
-        forms = constants.inner.forms(xp.stack([(b + xp.matrix_transpose(b)) / 2 for b in blocks], axis=1), xp)
-        c = self.local.shape[1]
-        variance = xp.stack([self.local[:, i, i, ...] for i in range(c)], axis=1)
-        for index, (i, j) in enumerate(pairs):
-            variance -= self.scaled[:, i, ...] * self.scaled[:, j, ...] * forms[:, index, ...][:, np.newaxis, ...]
+        forms = []
+        for i, j in _pairs_of(len(columns)):
+            block = columns[i, ...] @ inverse[:, :-1, :-1] @ columns[j, ...].T
+            forms.append(block if i == j else block + xp.matrix_transpose(block))  # a form of a symmetric matrix
+        maps = constants.inner.forms(xp.stack(forms, axis=1), xp)
         cross = self._expand(xp.concat([inverse[:, :-1, -1], 0 * inverse[:, :1, -1]], axis=1))
-        variance -= (2 * cross + self.piston * inverse[:, -1:, -1:][..., np.newaxis]) * self.piston
-        variance[:, 0, ...] -= 1 / (info.scale * constants.pupil.n_points)
+        variance = []
+        for c, (own, one) in enumerate(zip(self.piston, cross, strict=True)):
+            total = self.local[c][c] - own * (2 * one + inverse[:, -1:, -1:] * own)
+            for index, (i, j) in enumerate(_pairs_of(len(columns))):
+                total = total - self.scaled[i][c] * self.scaled[j][c] * maps[:, index, ...]
+            variance.append(total)
+        variance[0] = variance[0] - 1 / (info.scale * constants.n_points)
         return variance
 
-    def _expand(self, weights: NDArray) -> NDArray:
-        """Sum of the columns, each times the inverse of the diagonal: (k, 4 r + 1) to (k, c, ny, nx)."""
-        constants, n_sets = self.information.constants, self.scaled.shape[1]
-        xp = constants.kind.xp
-        coefficients = xp.reshape(weights[:, :-1] @ constants.columns.T, (weights.shape[0], n_sets, -1))
-        maps = constants.inner.expand(coefficients, xp)
-        total = xp.sum(self.scaled * maps[:, :, np.newaxis, ...], axis=1)
-        return total + weights[:, -1][:, np.newaxis, np.newaxis, np.newaxis] * self.piston
+    def _expand(self, weights: NDArray) -> list[NDArray]:
+        """Sum of the columns times the inverse of the diagonal: (k, 4 r + 1) to a list of maps."""
+        constants = self.information.constants
+        total = [weights[:, -1:, np.newaxis] * one for one in self.piston]
+        for one, matrix in zip(self.scaled, constants.columns, strict=True):
+            wave = constants.inner.expand(weights[:, :-1] @ matrix.T, constants.kind.xp)
+            total = [before + new * wave for before, new in zip(total, one, strict=True)]
+        return total
 
 
-def _apply(blocks: NDArray, maps: NDArray, xp: Any) -> NDArray:
-    """Blocks of every point times unknowns: (k, c, c, ny, nx) and (k, s, c, ny, nx) to (k, s, c, ny, nx)."""
-    if blocks.shape[1] == 1:
-        return blocks * maps
-    return xp.sum(blocks[:, np.newaxis, ...] * maps[:, :, np.newaxis, ...], axis=3)
+def _pairs_of(n: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(n) for j in range(i, n)]
 
 
-def _congruent(pairs: NDArray, columns: NDArray, n_sets: int, xp: Any) -> NDArray:
-    """Return columns^T Q columns for the unordered pairs of sets: (k, pairs, n, n) to (k, m, m)."""
-    n, total = pairs.shape[-1], None
-    for index, (i, j) in enumerate((i, j) for i in range(n_sets) for j in range(i, n_sets)):
-        left, right = columns[i * n : (i + 1) * n, :], columns[j * n : (j + 1) * n, :]
-        part = left.T @ pairs[:, index, ...] @ right
-        part = part if i == j else part + xp.matrix_transpose(part)
-        total = part if total is None else total + part
+def _dot(left: list[NDArray], right: list[NDArray]) -> NDArray:
+    """Sum over the unknowns of a point."""
+    total: Any = 0
+    for one, other in zip(left, right, strict=True):
+        total = total + one * other
+    return total
+
+
+def _times(blocks: list[list[NDArray]], maps: list[NDArray]) -> list[NDArray]:
+    """Blocks of every point times the unknowns."""
+    return [_dot(row, maps) for row in blocks]
+
+
+def _inverse_blocks(blocks: list[list[NDArray]], damping: NDArray | float) -> list[list[NDArray]]:
+    """Inverse of the symmetric blocks of every point, of one or two unknowns, with `damping` on the diagonal."""
+    first = blocks[0][0] + damping
+    if len(blocks) == 1:
+        return [[1 / first]]
+    second, cross = blocks[1][1] + damping, blocks[0][1]
+    determinant = first * second - cross * cross
+    return [[second / determinant, -cross / determinant], [-cross / determinant, first / determinant]]
+
+
+def _congruent(pairs: NDArray, columns: NDArray, xp: Any) -> NDArray:
+    """Return X^T Q X of columns X, (s, n, m), for all pairs of sets: Q of (k, pairs, n, n) to (k, m, m)."""
+    total: Any = 0
+    for index, (i, j) in enumerate(_pairs_of(columns.shape[0])):
+        part = columns[i, ...].T @ pairs[:, index, ...] @ columns[j, ...]
+        total = total + (part if i == j else part + xp.matrix_transpose(part))
     return total

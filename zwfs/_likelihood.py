@@ -23,8 +23,8 @@ _SINGULAR = 1e-14  # eigenvalue of the information about modes, relative to the 
 class Noise:
     """Noise of a frame: photon noise and read noise.
 
-    The electrons of a pixel plus the variance of the read noise are taken to follow the Poisson distribution (Snyder
-    et al. 1995). Mean and variance are right. The likelihood is exact without read noise.
+    The electrons of a pixel plus the variance of the read noise are taken to follow the Poisson distribution
+    (Snyder et al. 1995). Mean and variance are right. The likelihood is exact without read noise.
 
     Attributes
     ----------
@@ -66,12 +66,17 @@ class Noise:
 
         Without a number of photons it is the sum of squares.
         """
-        xp, axes = Kind.of(light).xp, tuple(range(1, light.ndim))
+        terms = self.terms(light, frames)
+        return Kind.of(terms).xp.sum(terms, axis=(-2, -1))
+
+    def terms(self, light: NDArray, frames: NDArray) -> NDArray:
+        """Sum over the masks of the terms of `deviance`: (k, n_masks, ny, nx) to (k, ny, nx)."""
+        xp = Kind.of(light).xp
         if self.photons is None:
             difference = light - frames
-            return xp.sum(difference * difference, axis=axes)
+            return xp.sum(difference * difference, axis=1)
         expected, seen = self.electrons(light), self.electrons(frames)
-        return 2 * xp.sum(expected - seen + seen * xp.log(seen / expected), axis=axes)
+        return 2 * xp.sum(expected - seen + seen * xp.log(seen / expected), axis=1)
 
     def misfit(self, light: NDArray, frames: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Squared differences in units of the variance, their expected sum, and the variance of the sum: (k,) each.
@@ -82,8 +87,10 @@ class Noise:
         xp, axes = Kind.of(light).xp, tuple(range(1, light.ndim))
         expected = self.electrons(light)
         difference, scale = self.electrons(frames) - expected, 1 / xp.clip(expected, 1, None)
-        terms = difference * difference * scale, expected * scale, (2 * expected + 1) * expected * scale * scale
-        return tuple(xp.sum(term, axis=axes) for term in terms)
+        expected = expected * scale
+        terms = difference * difference * scale, expected, (2 * expected + scale) * expected
+        misfit, mean, variance = (xp.sum(term, axis=axes) for term in terms)
+        return misfit, mean, variance
 
 
 def tangents(psi: NDArray, stop: NDArray, unknown_amplitude: bool, xp: Any) -> NDArray:
@@ -168,7 +175,7 @@ class Estimator:
         """
         information = self.information(psi, waves)
         if self.modes is None:
-            return information.inverse().variance(), None
+            return information.constants.kind.xp.stack(information.inverse().variance(), axis=1), None
         xp, kind = information.constants.kind.xp, information.constants.kind
         modes = kind.array(self.modes)
         values, vectors = xp.linalg.eigh(self.of_modes(information))

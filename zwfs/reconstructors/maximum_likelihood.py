@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from math import prod
 from typing import Any, NamedTuple
@@ -28,7 +28,12 @@ _LEAST_CUT = 0.1  # of the damping after a good step
 _KICK, _SHIFT = 1.0, 0.5  # radian rms, random phases of the other starts
 _KICK_MODES = 20
 _RESIDUAL = 1e-3  # rms, in units of the mean intensity, up to which frames without a noise model are explained
-_NOTHING = 1e-300
+_GROWTH = 2.0  # of the damping after a first step that raises the cost
+_NOTHING = 1e-300  # keeps quotients finite
+_NEGLIGIBLE = 1e-3  # of the mean standard error: a smaller step is the last one
+_REFLECTIONS = 3  # largest number of times that points of one start are reflected
+_GAIN = 0.01  # of twice the logarithm of the likelihood, from which on a reflection counts
+_RIDGE = 1e-6  # of the normal equations at points whose reference waves vanish
 _SIGMAS = 5.0  # excess of the misfit, in its standard deviations, up to which noise explains it
 
 
@@ -141,12 +146,12 @@ class MaximumLikelihood(Reconstructor):
     ----------
     sensor : ZernikeSensor
         With any number of masks.
+    modes : array_like, shape (n_modes, ny, nx), optional
+        Modes whose coefficients are estimated; the phases of all points if left out.
     photons : float, optional
         Photons that an intensity of 1 puts into a pixel of each frame, `Detector.photons_per_pixel`. If left out,
         all pixels have the same weight, and `sigma` follows from the residual of the frames.
     read_noise : float, electrons rms / pixel
-    modes : array_like, shape (n_modes, ny, nx), optional
-        Modes whose coefficients are estimated; the phases of all points if left out.
     prior : array_like, shape (n_modes, n_modes), radian^2, optional
         Covariance of the coefficients before the measurement, of mean 0. The estimate then is the most probable
         one, not the most likely (maximum a posteriori).
@@ -173,7 +178,7 @@ class MaximumLikelihood(Reconstructor):
 
     References
     ----------
-    Levenberg 1944; Marquardt 1963; Paxman, Schulz & Fienup 1992; `eq-information`, `eq-woodbury` of the book.
+    Levenberg 1944; Marquardt 1963; Paxman, Schulz & Fienup 1992; Nielsen 1999; `eq-information`, `eq-woodbury` of the book.
 
     Examples
     --------
@@ -192,10 +197,10 @@ class MaximumLikelihood(Reconstructor):
     def __init__(
         self,
         sensor: ZernikeSensor,
+        modes: ArrayLike | None = None,
         *,
         photons: float | None = None,
         read_noise: float = 0.0,
-        modes: ArrayLike | None = None,
         prior: ArrayLike | None = None,
         amplitude: ArrayLike | str | None = None,
         n_iterations: int = 50,
@@ -212,7 +217,9 @@ class MaximumLikelihood(Reconstructor):
         n_starts = _check.integer("n_starts", n_starts, 1, 1000)
         seed = _check.integer("seed", seed, 0)
         if unknown and modes is not None:
-            raise ValueError("amplitude = 'unknown': expected a known one with modes, which describe the phase only")
+            raise ValueError(
+                "amplitude = 'unknown': expected a known one with modes, which describe the phase only"
+            )
         require_information(sensor, unknown)
         pupil = sensor.pupil
         values = None if modes is None else check_modes(pupil, modes)
@@ -293,15 +300,17 @@ class MaximumLikelihood(Reconstructor):
         """Fit from start after start, until every frame set is explained or the starts are used up."""
         if start is None:
             start = self._rough_phase(frames, None)
-        fit = self._descend(frames, start, history)
+        xp, fit = Kind.of(frames).xp, self._descend(frames, start, history)
         for attempt in range(1, self.n_starts):
             poor = ~self._consistent(fit)
-            if not Kind.of(frames).xp.any(poor):
+            if not xp.any(poor):
                 break
             best = fit.at(poor)
             other = self._descend(best.frames, self._other_start(attempt, best), history)
-            other.n_starts = best.n_starts + 1
-            fit.improve(poor, best, other)
+            n_starts = best.n_starts + 1
+            best.take(other.cost < best.cost, other, xp)
+            best.n_starts = n_starts
+            fit.put(poor, best)
         return fit
 
     def _rough_phase(self, frames: NDArray, start: NDArray | None) -> NDArray:
@@ -326,7 +335,8 @@ class MaximumLikelihood(Reconstructor):
         places, ended, path = kind.integers(np.arange(frames.shape[0])), [], [angle(fit.psi, xp)]
         for iteration in range(1, n_iterations + 1):
             self._step(fit)
-            fit.n_iterations = fit.n_iterations + 1
+            if iteration < n_iterations and xp.any(fit.converged):
+                self._reflect(fit)
             if history:
                 path.append(angle(fit.psi, xp))
             n_done = int(xp.count_nonzero(fit.converged))
@@ -342,61 +352,110 @@ class MaximumLikelihood(Reconstructor):
         return _Fit.joined([part for _, part in ended], xp).at(order)
 
     def _begin(self, frames: NDArray, start: NDArray) -> _Fit:
-        kind = Kind.of(frames)
+        """Return the fit at a starting phase, (k, ny, nx)."""
+        kind, k = Kind.of(frames), frames.shape[0]
         model, coefficients = self.settings.model(kind), None
         if self._slopes is not None:
             coefficients = self._slopes.fit(start, kind)
             start = self._phase(coefficients)
         psi = split(start, model.amplitude)
-        waves = model.propagate(psi)
-        light = square(waves)
-        zeros = kind.integers([0] * frames.shape[0])
-        fit = _Fit(
-            frames, psi, waves, light, coefficients, self._exact.noise.deviance(light, frames),
-            _DAMPING + kind.zeros(frames.shape[0]), 2 + kind.zeros(frames.shape[0]), zeros, zeros > 0, zeros + 1,
-        )  # fmt: skip
-        fit.cost = fit.cost + self._penalty(fit)
+        if self._exact.unknown_amplitude:
+            psi = psi * _amplitude_ratio(frames, psi, model)[:, np.newaxis, ...]
+        fit = self._at(psi, coefficients, frames)
+        zeros = kind.integers([0] * k)
+        fit.damping, fit.growth = _DAMPING + kind.zeros(k), _GROWTH + kind.zeros(k)
+        fit.n_iterations, fit.converged, fit.n_starts, fit.n_reflections = zeros, zeros > 0, zeros + 1, zeros
         return fit
+
+    def _at(self, psi: NDArray, coefficients: NDArray | None, frames: NDArray) -> _Fit:
+        """Return the model of the frames at a field, and its cost."""
+        waves = self.settings.model(Kind.of(psi)).propagate(psi)
+        light = square(waves)
+        cost = self._exact.noise.deviance(light, frames)
+        if coefficients is not None and self._exact.precision is not None:
+            precision = Kind.of(cost).array(self._exact.precision)
+            cost = cost + Kind.of(cost).xp.vecdot(coefficients @ precision, coefficients)
+        return _Fit(frames, psi, waves, light, cost, coefficients)
 
     def _step(self, fit: _Fit) -> None:
         """Try one step of Levenberg and Marquardt on every frame set; take it where the cost falls.
 
         The damping follows Nielsen 1999: it falls the more, the better the quadratic model predicted the cost.
         """
-        kind = Kind.of(fit.psi)
+        kind, estimator = Kind.of(fit.psi), self._exact
         xp, model = kind.xp, self.settings.model(kind)
-        weights, difference = self._exact.noise.weights(fit.light), fit.light - fit.frames
+        change = tangents(fit.psi, model.stop, estimator.unknown_amplitude, xp)
+        weights, difference = estimator.noise.weights(fit.light), fit.light - fit.frames
         weighted = difference if weights is None else weights * difference
         back = model.adjoint(fit.waves * weighted[:, :, np.newaxis, ...])
-        change = tangents(fit.psi, model.stop, self._exact.unknown_amplitude, xp)
-        gradient = 2 * xp.sum(change * back[:, np.newaxis, ...], axis=2)
-        information = self._rough.information(fit.psi, fit.waves)
-        if fit.coefficients is None:
-            step, predicted = _points_step(information, gradient, fit.damping)
-            coefficients = None
+        products = change * back[:, np.newaxis, ...]
+        gradient = 2 * (products[:, :, 0, ...] + products[:, :, 1, ...])
+        information = self._rough.response.information(change, fit.waves, weights)
+        coefficients = fit.coefficients
+        if coefficients is None:
+            step, promised = _points_step(information, gradient, fit.damping)
         else:
-            jump, predicted = self._modes_step(information, gradient, fit)
-            coefficients = fit.coefficients + jump
+            jump, promised = self._modes_step(information, gradient, coefficients, fit.damping)
+            coefficients = coefficients + jump
             step = self._phase(jump)[:, np.newaxis, ...]
-        if self._exact.unknown_amplitude:
+        if estimator.unknown_amplitude:
             psi = fit.psi + xp.sum(change * step[:, :, np.newaxis, ...], axis=1)
         else:
             psi = _turned(fit.psi, step[:, 0, ...], xp)
-        waves = model.propagate(psi)
-        light = square(waves)
-        trial = replace(fit, psi=psi, waves=waves, light=light, coefficients=coefficients)
-        trial.cost = self._exact.noise.deviance(light, fit.frames) + self._penalty(trial)
-        ratio = (fit.cost - trial.cost) / (predicted + _NOTHING)
+        trial = self._at(psi, coefficients, fit.frames)
+        ratio = (fit.cost - trial.cost) / (promised + _NOTHING)
         better = trial.cost < fit.cost
         cut = xp.clip(1 - (2 * ratio - 1) ** 3, _LEAST_CUT, None)
-        damping = fit.damping * xp.where(better, cut, fit.growth)
-        growth = xp.where(better, 2 + 0 * fit.growth, 2 * fit.growth)
+        fit.damping = fit.damping * xp.where(better, cut, fit.growth)
+        fit.growth = xp.where(better, _GROWTH + 0 * fit.growth, 2 * fit.growth)
         fit.take(better, trial, xp)
-        fit.damping, fit.growth = damping, growth
-        size = xp.sum(step * step, axis=(1, 2, 3))
-        fit.converged = size <= self.settings.tolerance**2 * model.pupil.n_points
+        size = xp.sum(step * step, axis=(1, 2, 3)) / model.pupil.n_points
+        limit = self.settings.tolerance**2
+        if weights is not None:
+            limit = xp.clip(_NEGLIGIBLE**2 / information.scale[:, 0, 0], limit, None)
+        fit.converged = size <= limit
+        fit.n_iterations = fit.n_iterations + 1
 
-    def _modes_step(self, information: Information, gradient: NDArray, fit: _Fit) -> tuple[NDArray, NDArray]:
+    def _reflect(self, fit: _Fit) -> None:
+        """Try to leave local minima of single points, where frame sets have converged.
+
+        A frame depends on the cosine of the angle between psi and its reference wave r. With the reflection of psi
+        at r it is the same. The point may have converged to the wrong one of the two, mostly where a frame is
+        dark. With the reference waves held, each point takes the reflection that makes its frames most likely. Frame
+        sets whose cost falls by this continue.
+        """
+        estimator = self._exact
+        if estimator.unknown_amplitude or estimator.modes is not None:
+            return
+        xp = Kind.of(fit.psi).xp
+        model = self.settings.model(Kind.of(fit.psi))
+        some = fit.converged & (fit.n_reflections < _REFLECTIONS)
+        if estimator.noise.photons is None:
+            some = some & ~self._consistent(fit)
+        if not xp.any(some):
+            return
+        part = fit.at(some)
+        own, frames = part.psi, part.frames[(..., *model.window)]
+        references = part.waves[(..., *model.window)] - own[:, np.newaxis, ...]
+        least = estimator.noise.terms(part.light[(..., *model.window)], frames)
+        psi, gain = own, _GAIN * self._noise_variance(part)[:, np.newaxis, np.newaxis]
+        for mask in range(self.sensor.n_masks):
+            other = _reflected(own, references[:, mask, ...])
+            terms = estimator.noise.terms(square(other[:, np.newaxis, ...] + references), frames)
+            better = terms < least - gain
+            psi = xp.where(better[:, np.newaxis, ...], other, psi)
+            least = xp.where(better, terms, least)
+        trial = self._at(psi, None, part.frames)
+        better = trial.cost < part.cost - gain[:, 0, 0]
+        part.take(better, trial, xp)
+        part.converged = ~better
+        part.damping = xp.where(better, _DAMPING + 0 * part.damping, part.damping)
+        part.n_reflections = part.n_reflections + 1
+        fit.put(some, part)
+
+    def _modes_step(
+        self, information: Information, gradient: NDArray, coefficients: NDArray, damping: NDArray
+    ) -> tuple[NDArray, NDArray]:
         """Step of the coefficients, (k, m), and the fall of the cost that it promises, (k,)."""
         kind = information.constants.kind
         xp = kind.xp
@@ -404,9 +463,9 @@ class MaximumLikelihood(Reconstructor):
         hessian = self._rough.of_modes(information)
         slope = xp.reshape(gradient, (gradient.shape[0], -1)) @ xp.reshape(modes, (modes.shape[0], -1)).T
         if self._exact.precision is not None:
-            slope = slope + fit.coefficients @ kind.array(self._exact.precision)
+            slope = slope + coefficients @ kind.array(self._exact.precision)
         eye = kind.array(np.eye(modes.shape[0]))
-        damping = fit.damping * xp.sum(hessian * eye, axis=(1, 2)) / modes.shape[0]
+        damping = damping * xp.sum(hessian * eye, axis=(1, 2)) / modes.shape[0]
         damped = hessian + damping[:, np.newaxis, np.newaxis] * eye
         step = -xp.linalg.solve(damped, slope[..., np.newaxis])[..., 0]
         return step, xp.vecdot(step, damping[:, np.newaxis] * step - slope)
@@ -417,13 +476,6 @@ class MaximumLikelihood(Reconstructor):
         modes = kind.array(self._exact.modes)
         flat = coefficients @ kind.xp.reshape(modes, (modes.shape[0], -1))
         return kind.xp.reshape(flat, (-1, *modes.shape[1:]))
-
-    def _penalty(self, fit: _Fit) -> NDArray | float:
-        """Twice the negative logarithm of the prior, (k,)."""
-        if self._exact.precision is None:
-            return 0.0
-        kind = Kind.of(fit.coefficients)
-        return kind.xp.vecdot(fit.coefficients @ kind.array(self._exact.precision), fit.coefficients)
 
     def _n_unknowns(self) -> int:
         if self._exact.modes is not None:
@@ -459,7 +511,11 @@ class MaximumLikelihood(Reconstructor):
         method, options = (PhaseShifted, {"accelerate": True}) if self.sensor.n_masks > 1 else (Arcsine, {})
         try:
             return method(
-                self.sensor, n_iterations=_FIRST_ITERATIONS, tolerance=0, amplitude=self.settings.amplitude, **options
+                self.sensor,
+                n_iterations=_FIRST_ITERATIONS,
+                tolerance=0,
+                amplitude=self.settings.amplitude,
+                **options,
             )
         except ValueError:  # such as the same mask twice, which still determines a phase as one mask does
             return None
@@ -473,44 +529,45 @@ class _Fit:
     psi: NDArray[np.floating]  # (k, 2, ny, nx), field in the pupil
     waves: NDArray[np.floating]  # (k, n_masks, 2, ny', nx'), its fields on the detector
     light: NDArray[np.floating]  # (k, n_masks, ny', nx'), their intensity
-    coefficients: NDArray[np.floating] | None  # (k, m), of the modes
     cost: NDArray[np.floating]  # (k,), twice the negative logarithm of the likelihood and of the prior
-    damping: NDArray[np.floating]  # (k,), relative to the mean of the diagonal of the information
-    growth: NDArray[np.floating]  # (k,), of the damping after a step that raises the cost
-    n_iterations: NDArray[np.int64]  # (k,)
-    converged: NDArray[np.bool_]  # (k,)
-    n_starts: NDArray[np.int64]  # (k,)
+    coefficients: NDArray[np.floating] | None = None  # (k, m), of the modes
+    damping: Any = None  # (k,), relative to the mean of the diagonal of the information
+    growth: Any = None  # (k,), of the damping after a step that raises the cost
+    n_iterations: Any = None  # (k,)
+    converged: Any = None  # (k,)
+    n_starts: Any = None  # (k,)
+    n_reflections: Any = None  # (k,)
     history: NDArray[np.floating] | None = None  # (k, n_iterations + 1, ny, nx)
 
     def at(self, which: NDArray) -> _Fit:
         """Return the fits of some frame sets, by their places or by flags."""
-        return _Fit(*(None if array is None else array[which] for array in vars(self).values()))
+        return _Fit(**{name: array[which] for name, array in self._arrays()})
 
     def take(self, where: NDArray[np.bool_], other: _Fit, xp: Any) -> None:
-        """Replace the arrays by those of other fits of the same frame sets where flags (k,) are True."""
-        if xp.all(where):
-            vars(self).update(vars(other))
-            return
-        for name, array in vars(self).items():
-            if array is not None:
+        """Replace the arrays by those that other fits of the same frame sets have, where flags (k,) are True."""
+        for name, array in other._arrays():
+            if not xp.all(where):
                 flags = xp.reshape(where, (-1, *(1,) * (array.ndim - 1)))
-                setattr(self, name, xp.where(flags, getattr(other, name), array))
+                array = xp.where(flags, array, getattr(self, name))
+            setattr(self, name, array)
 
-    def improve(self, which: NDArray[np.bool_], best: _Fit, other: _Fit) -> None:
-        """Replace the fits of some frame sets by the better one of two; the number of starts is that of `other`."""
-        xp = Kind.of(self.psi).xp
-        n_starts = other.n_starts
-        best.take(other.cost < best.cost, other, xp)
-        best.n_starts = n_starts
-        for name, array in vars(self).items():
-            if array is not None:
-                array[which] = getattr(best, name)
+    def put(self, which: NDArray[np.bool_], part: _Fit) -> None:
+        """Write the fits of some frame sets to their places."""
+        for name, array in part._arrays():
+            whole = getattr(self, name)
+            whole = Kind.of(whole).xp.asarray(whole, copy=True)
+            whole[which] = array
+            setattr(self, name, whole)
 
     @classmethod
     def joined(cls, fits: list[_Fit], xp: Any) -> _Fit:
         """Return the fits of several batches as those of one."""
-        columns = zip(*(vars(fit).values() for fit in fits), strict=True)
-        return cls(*(None if column[0] is None else xp.concat(column) for column in columns))
+        if len(fits) == 1:
+            return fits[0]
+        return cls(**{name: xp.concat([getattr(fit, name) for fit in fits]) for name, _ in fits[0]._arrays()})
+
+    def _arrays(self) -> list[tuple[str, Any]]:
+        return [(name, array) for name, array in vars(self).items() if array is not None]
 
 
 class _Slopes(NamedTuple):
@@ -523,9 +580,7 @@ class _Slopes(NamedTuple):
     @classmethod
     def of(cls, inside: NDArray[np.bool_], modes: NDArray[np.float64]) -> _Slopes:
         pairs_y, pairs_x = inside[1:] & inside[:-1], inside[:, 1:] & inside[:, :-1]
-        slopes = np.concatenate(
-            [np.diff(modes, axis=1)[:, pairs_y], np.diff(modes, axis=2)[:, pairs_x]], axis=1
-        )
+        slopes = np.concatenate([np.diff(modes, axis=1)[:, pairs_y], np.diff(modes, axis=2)[:, pairs_x]], axis=1)
         return cls(pairs_y, pairs_x, np.linalg.pinv(slopes.T, rcond=1e-10))
 
     def fit(self, phase: NDArray, kind: Kind) -> NDArray:
@@ -541,11 +596,42 @@ class _Slopes(NamedTuple):
 
 def _points_step(information: Information, gradient: NDArray, damping: NDArray) -> tuple[NDArray, NDArray]:
     """Step at every point, (k, c, ny, nx), and the fall of the cost that it promises, (k,)."""
-    xp, scale = information.constants.kind.xp, information.scale
-    absolute = damping[:, np.newaxis, np.newaxis] * scale
-    step = -(information.inverse(absolute) @ gradient)
+    xp = information.constants.kind.xp
+    absolute = damping[:, np.newaxis, np.newaxis] * information.scale
+    slopes = [gradient[:, c, ...] for c in range(gradient.shape[1])]
+    step = -xp.stack(information.inverse(absolute) @ slopes, axis=1)
     promised = absolute[..., np.newaxis] * step - gradient
     return step, xp.sum(step * promised, axis=(1, 2, 3))
+
+
+def _amplitude_ratio(frames: NDArray, psi: NDArray, model: Propagator) -> NDArray:
+    """Modulus of the field over that of a model psi, (k, ny, nx), with the reference waves of the model.
+
+    The frames I_k = P + 2 Re(conj(r_k) psi) + |r_k|^2 are linear in P = |psi|^2 and psi. With three frames or more
+    their least-squares solution gives P.
+    """
+    kind = model.kind
+    xp, light = kind.xp, frames[(..., *model.window)]
+    waves = model.reference(psi)
+    real, imag = waves[:, :, 0, ...], waves[:, :, 1, ...]
+    columns = xp.stack([1 + 0 * real, 2 * real, 2 * imag], axis=-1)  # (k, n_masks, ny, nx, 3)
+    columns = xp.permute_dims(columns, (0, 2, 3, 1, 4))
+    right = xp.permute_dims(light - square(waves), (0, 2, 3, 1))
+    normal = xp.matrix_transpose(columns) @ columns + _RIDGE * kind.array(np.eye(3))
+    sides = xp.matrix_transpose(columns) @ right[..., np.newaxis]
+    power = xp.linalg.solve(normal, sides)[..., 0, 0]
+    return xp.sqrt(xp.clip(power, 0, None) / xp.where(model.inside, square(psi) + _NOTHING, kind.array(1.0)))
+
+
+def _reflected(psi: NDArray, reference: NDArray) -> NDArray:
+    """Field (k, 2, ny, nx) reflected at the direction of another, r^2 conj(psi) / |r|^2."""
+    xp = Kind.of(psi).xp
+    real, imag = reference[:, 0, ...], reference[:, 1, ...]
+    power = real * real + imag * imag + _NOTHING
+    cos, sin = (real * real - imag * imag) / power, 2 * real * imag / power
+    return xp.stack(
+        [cos * psi[:, 0, ...] + sin * psi[:, 1, ...], sin * psi[:, 0, ...] - cos * psi[:, 1, ...]], axis=1
+    )
 
 
 def _turned(psi: NDArray, by: NDArray, xp: Any) -> NDArray:
@@ -565,7 +651,7 @@ def _precision(prior: ArrayLike | None, modes: NDArray | None, noise: Noise) -> 
         raise ValueError("prior: expected a number of photons, which weighs the frames against the prior")
     covariance = _check.real_map("prior", prior)
     if covariance.shape != 2 * (len(modes),):
-        raise ValueError(f"prior has shape {covariance.shape}: expected {2 * (len(modes),)}, one row for each mode")
+        raise ValueError(f"prior has shape {covariance.shape}: expected {2 * (len(modes),)}, that of the modes")
     if not np.allclose(covariance, covariance.T, rtol=1e-9, atol=0):
         raise ValueError("prior is not symmetric: expected a covariance")
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)

@@ -96,8 +96,7 @@ class CameraFile:
     def optics(self, diameter: float = 0.0, phase_shifts: Sequence[float] = ()) -> Optics:
         """Optics with these values, see `Optics`; by default those of the header, DIMPLE, THETA1 and THETA2."""
         diameter = _check.number("diameter", diameter, 0)
-        if isinstance(phase_shifts, str) or not isinstance(phase_shifts, Sequence):
-            raise TypeError(f"phase_shifts = {_check.shown(phase_shifts)}: expected a list of two numbers")
+        _check.sequence("phase_shifts", phase_shifts, expected="a list of two numbers")
         shifts: Any = phase_shifts or [self.keyword(key) for key in ("THETA1", "THETA2")]
         return Optics(diameter or self.keyword("DIMPLE"), tuple(shifts))
 
@@ -172,16 +171,13 @@ def read_all(
     sources : list of CameraFile
         All files; the first is that of the first frame.
     """
-    kinds = {
-        "frame_files": _paths("frame_files", frame_files),
-        "pupil_files": _paths("pupil_files", pupil_files),
-        "dark_files": _paths("dark_files", dark_files),
-        "bad_pixel_files": _paths("bad_pixel_files", bad_pixel_files),
-    }
-    for name in ("frame_files", "pupil_files"):
-        if not kinds[name]:
+    names = "frame_files", "pupil_files", "dark_files", "bad_pixel_files"
+    given = frame_files, pupil_files, dark_files, bad_pixel_files
+    kinds = [_paths(name, paths) for name, paths in zip(names, given, strict=True)]
+    for name, paths in zip(names[:2], kinds, strict=False):
+        if not paths:
             raise ValueError(f"{name} is empty: expected one file or two")
-    frames, clear, darks, maps = ([read(path) for path in paths] for paths in kinds.values())
+    frames, clear, darks, maps = ([read(path) for path in paths] for paths in kinds)
     shared = darks, maps, saturation
     return images(frames, *shared), images(clear, *shared), [*frames, *clear, *darks, *maps]
 
@@ -216,7 +212,7 @@ def images(
         bad-pixel map marks all of them.
     """
     for argument, given in (("files", files), ("darks", darks), ("bad_pixels", bad_pixels)):
-        _camera_files(argument, given)
+        _check.sequence(argument, given, CameraFile)
     if saturation is not None:
         saturation = _check.number("saturation", saturation, 0, open_low=True)
     recorded = [(file, counts) for file in files for counts in file.images]
@@ -331,7 +327,7 @@ def write_phase(
 
     fits = fits_module()
     _check.instance("phase", phase, MeasuredPhase)
-    _camera_files("sources", sources)
+    _check.sequence("sources", sources, CameraFile)
     path = check_output(output, [source.path for source in sources if source.path], overwrite=overwrite)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
     measurement, recording, optics = phase.measurement, phase.measurement.recording, phase.measurement.optics
@@ -401,8 +397,7 @@ def _path(name: str, value: Any) -> Path:
 
 def _paths(name: str, values: Any) -> list[Path]:
     """Paths that the operating system accepts, from a sequence of them."""
-    if isinstance(values, str | bytes | Path) or not isinstance(values, Sequence):
-        raise TypeError(f"{name} = {_check.shown(values)}: expected a sequence of paths")
+    _check.sequence(name, values, expected="a sequence of paths")
     return [_path(f"{name}[{index}]", one) for index, one in enumerate(values)]
 
 
@@ -424,16 +419,6 @@ def _has_card(path: Path, card: bytes) -> bool:
         return False
     cards = (header[place : place + 80] for place in range(0, len(header), 80))
     return header.startswith(_FITS) and any(one.startswith(card) for one in cards)
-
-
-def _camera_files(argument: str, files: Any) -> None:
-    """Require a sequence of CameraFiles."""
-    if (
-        isinstance(files, str)
-        or not isinstance(files, Sequence)
-        or not all(isinstance(file, CameraFile) for file in files)
-    ):
-        raise TypeError(f"{argument} is a {type(files).__name__}: expected a sequence of CameraFiles")
 
 
 @contextmanager

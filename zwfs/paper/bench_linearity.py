@@ -225,8 +225,9 @@ def error_budget(
     for key, bench in benches.items():
         _check.instance(f"benches[{key!r}]", bench, Bench)
     known = sorted(method.__name__ for method in RECONSTRUCTORS)
-    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
-        raise TypeError(f"names = {_check.shown(names)}: expected a list with some of {known}")
+    _check.sequence("names", names, str, f"a list with some of {known}")
+    if not names:
+        raise ValueError(f"names is empty: expected a list with some of {known}")
     for name in names:
         _check.choice("names", name, known)
     rms = check_rms(rms)

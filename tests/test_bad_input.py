@@ -59,7 +59,7 @@ CONTENT = {
 }
 # Only what they must refuse is tested, not their answers.
 SLOW = {"error_budget", "contraction", "steps", "fit"}
-INTERNAL |= {"frames_on_grid", "clear_on_grid", "fits_module", "fits_bytes", "published"}
+INTERNAL |= {"frames_on_grid", "clear_on_grid", "published"}
 INTERNAL |= {"small", "glue_numbers"}  # for the notebooks of the book
 
 

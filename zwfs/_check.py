@@ -27,6 +27,13 @@ def function(name: str, value: Any) -> None:
         raise TypeError(f"{name} = {shown(value)}: expected a function")
 
 
+def sequence(name: str, values: Any, kind: type = object, expected: str = "") -> None:
+    """Require a sequence of objects of a class; a string is none."""
+    listed = isinstance(values, Sequence) and not isinstance(values, str | bytes)
+    if not listed or not all(isinstance(one, kind) for one in values):
+        raise TypeError(f"{name} = {shown(values)}: expected {expected or f'a sequence of {kind.__name__}s'}")
+
+
 def choice(name: str, value: Any, known: dict[str, Any] | list[str] | tuple[str, ...]) -> None:
     """Require that `value` is one of the names in `known`."""
     if not isinstance(value, str) or value not in known:
@@ -258,6 +265,26 @@ def values_inside(name: str, array: Any, pupil: Any) -> NDArray:
     values = pupil.gather(array)
     moderate(name, values, " inside the pupil")
     return values
+
+
+def map_inside(name: str, array: Any, pupil: Any) -> NDArray:
+    """Return one real map, (ny, nx), that is finite inside a pupil."""
+    array = real_array(name, array)
+    if array.shape != pupil.shape:
+        raise ValueError(f"{name} has shape {array.shape}: expected {pupil.shape}")
+    finite(name, pupil.gather(array), " inside the pupil")
+    return array
+
+
+def screens(name: str, array: Any, pupil: Any = None) -> NDArray:
+    """Return real screens, (n_screens, ny, nx), at least one, finite inside the pupil if it is given."""
+    array = real_array(name, array)
+    if array.ndim != 3 or 0 in array.shape:
+        raise ValueError(f"{name} has shape {array.shape}: expected (n_screens, ny, nx)")
+    if pupil is not None:
+        trailing_shape(name, array, pupil.shape, "the shape of the pupil")
+        finite(name, pupil.gather(array), " inside the pupil")
+    return array
 
 
 def finite(name: str, array: Any, where: str = "") -> None:

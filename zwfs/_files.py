@@ -1,9 +1,10 @@
-"""Files that are written whole or not at all."""
+"""Names of files, and files that are written whole or not at all."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from zwfs import _check
 
@@ -19,3 +20,31 @@ def write_file(path: Path, content: bytes) -> None:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def path_of(name: str, value: Any) -> Path:
+    """Path that the operating system accepts."""
+    try:
+        path = Path(value)
+        if b"\0" not in os.fsencode(path):
+            return path
+    except TypeError:
+        raise TypeError(f"{name} = {_check.shown(value)}: expected a str or a Path") from None
+    except UnicodeEncodeError:
+        pass
+    raise ValueError(f"{name} = {_check.shown(str(value))}: expected the name of a file")
+
+
+def paths_of(name: str, values: Any) -> list[Path]:
+    """Paths that the operating system accepts, from a sequence of them."""
+    _check.sequence(name, values, expected="a sequence of paths")
+    return [path_of(f"{name}[{index}]", one) for index, one in enumerate(values)]
+
+
+def is_there(path: Path) -> bool:
+    """Whether there is anything under a path, a link that leads nowhere included."""
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True

@@ -33,7 +33,8 @@ def wrapped_residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDA
     ----------
     Chambouleyron et al. 2024, section 4.1; `eq-error` of the book.
     """
-    return pupil.scatter(_residual(pupil, estimate, truth))
+    residual = _residual(pupil, estimate, truth)  # the pupil is checked
+    return pupil.scatter(residual)
 
 
 def reconstruction_error(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.floating]:
@@ -144,11 +145,5 @@ def _residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np
     _check.instance("pupil", pupil, Pupil)
     estimate = _check.values_inside("estimate", estimate, pupil)
     truth = _check.values_inside("truth", truth, pupil)
-    try:
-        difference = estimate - truth
-    except ValueError:
-        raise ValueError(
-            f"estimate has a batch of {estimate.shape[:-1]}: expected one that broadcasts with that of the truth, "
-            f"{truth.shape[:-1]}"
-        ) from None
-    return without_piston(difference)
+    _check.broadcast(estimate=estimate, truth=truth)
+    return without_piston(estimate - truth)

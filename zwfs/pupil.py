@@ -70,10 +70,7 @@ class Pupil(Immutable):
 
     @classmethod
     def circular(
-        cls,
-        n_pixels: int,
-        central_obscuration: float = 0.0,
-        spiders: Sequence[tuple[float, float]] = (),
+        cls, n_pixels: int, central_obscuration: float = 0.0, spiders: Sequence[tuple[float, float]] = ()
     ) -> Pupil:
         """Disc of diameter D, with an obscuration and spider vanes if asked for.
 

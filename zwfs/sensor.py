@@ -233,9 +233,9 @@ class ZernikeSensor(Immutable):
         ----------
         Chambouleyron et al. 2024, equation (5).
         """
-        phase, batch = pupil_maps("phase", phase, self)
-        kind = Kind.of(phase)
-        rms = self._largest_rms(phase, kind.xp)
+        maps, batch = pupil_maps("phase", phase, self)
+        kind = Kind.of(maps)
+        rms = self._largest_rms(maps, kind.xp)
         if rms > _DEGREES:
             warnings.warn(
                 f"phase has an rms of {rms:.4g}: expected radian, less than {_DEGREES:g} rms; is it in degrees?",
@@ -244,19 +244,12 @@ class ZernikeSensor(Immutable):
             )
         strength, strength_batch = amplitude_maps(amplitude, self, kind)
         if strength_batch:
-            try:
-                full = np.broadcast_shapes(batch, strength_batch)
-            except ValueError:
-                raise ValueError(
-                    f"amplitude has a batch of {strength_batch}: expected one that broadcasts with {batch}, the "
-                    "batch of the phase"
-                ) from None
-            phase, strength = (
-                self._spread(maps, shape, full, kind.xp)
-                for maps, shape in ((phase, batch), (strength, strength_batch))
-            )
-            batch = full
-        frames = square(propagator(self, kind).propagate(split(phase, strength)))
+            xp, shape = kind.xp, self.pupil.shape
+            maps, strength = xp.reshape(maps, (*batch, *shape)), xp.reshape(strength, (*strength_batch, *shape))
+            full = _check.broadcast(phase=maps, amplitude=strength)
+            maps, strength = (xp.reshape(xp.broadcast_to(one, full), (-1, *shape)) for one in (maps, strength))
+            batch = full[:-2]
+        frames = square(propagator(self, kind).propagate(split(maps, strength)))
         return kind.xp.reshape(frames, (*batch, self.n_masks, *self.detector_shape))
 
     def _pupil_field(self, field: ArrayLike) -> tuple[NDArray, tuple[int, ...], Kind]:
@@ -284,12 +277,6 @@ class ZernikeSensor(Immutable):
         axes, n_points = (-2, -1), self.pupil.n_points
         mean = xp.sum(phase, axis=axes) / n_points
         return sqrt(max(float(xp.max(xp.sum(phase * phase, axis=axes) / n_points - mean * mean)), 0.0))
-
-    def _spread(self, maps: NDArray, batch: tuple[int, ...], full: tuple[int, ...], xp: Any) -> NDArray:
-        """Maps of a batch, (k, ny, nx), repeated for a larger batch."""
-        shape = self.pupil.shape
-        maps = xp.broadcast_to(xp.reshape(maps, (*batch, *shape)), (*full, *shape))
-        return xp.reshape(maps, (-1, *shape))
 
 
 def _margin(extent: float, pupil: Pupil) -> int:

@@ -1,13 +1,12 @@
 """A simulated bench: a vector-Zernike sensor behind a segmented mirror, with the errors of a real one.
 
-The bench stands for the one of section 5 of the paper. It hands out what a camera would: frames, clear frames
-images and darks, in counts. The errors of the bench stay inside; `BenchModel` is the sensor that an
-experimenter would model from the images alone.
+The bench stands for the one of section 5 of the paper. It returns the images of a camera in counts: frames,
+clear frames and darks. The errors of the bench stay inside. `BenchModel` is the sensor that an experimenter would
+model from the images alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -125,8 +124,7 @@ class Bench:
     def __post_init__(self) -> None:
         _check.integer("n_pixels", self.n_pixels, 2)
         _check.number_field(self, "extent", 1, 10)
-        if isinstance(self.missing, str | bytes) or not isinstance(self.missing, Sequence):
-            raise TypeError(f"missing = {_check.shown(self.missing)}: expected segment numbers, such as (21,)")
+        _check.sequence("missing", self.missing, expected="segment numbers, such as (21,)")
         _check.number_field(self, "dimple_error", -0.9, 10)
         _check.number_field(self, "diameter", 0, self.n_pixels / (1 + self.dimple_error), open_low=True)
         _check.number_field(self, "phase")

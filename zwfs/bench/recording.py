@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from zwfs import _check
-from zwfs._files import write_file
+from zwfs._files import is_there, path_of, write_file
 from zwfs.bench.model import Bench, Seed
 from zwfs.bench.segments import segment_pistons, segment_residual
-from zwfs.frames.files import _BENCH_CARD, _card_value, _has_card, _is_there, _path, fits_bytes, fits_module
+from zwfs.frames._fits import fits_content, fits_module, has_card
 from zwfs.frames.pipeline import MeasuredPhase
 
+_BENCH_CARD = b"ORIGIN  = 'zwfs"  # header card of the files: no others are replaced
 _FULL = 50_000  # counts of the brightest pixel of a simulated 16-bit camera
 
 
@@ -57,7 +58,7 @@ def write_bench(
     TypeError, ValueError
         If a value is of the wrong kind or out of range, or the folder holds another file of the same name.
     """
-    fits = fits_module()
+    fits_module()
     _check.instance("bench", bench, Bench)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
     n_bad = _check.integer("n_bad", n_bad, 0, 2 * math.prod(bench.segments.shape))
@@ -66,12 +67,12 @@ def write_bench(
         pistons = _check.real_array("pistons", pistons)
         if pistons.ndim != 1:
             raise ValueError(f"pistons has shape {pistons.shape}: expected ({bench.n_segments},), one command")
-    folder = _path("folder", folder)
+    folder = path_of("folder", folder)
     if not os.path.isdir(folder):
         raise ValueError(f"folder = {str(folder)!r}: expected a folder that exists")
     paths = {name: folder / f"{name}.fits" for name in ("frame", "pupils", "dark", "bad_pixels")}
     for path in paths.values():
-        if _is_there(path) and not (path.is_file() and _has_card(path, _BENCH_CARD)):
+        if is_there(path) and not (path.is_file() and has_card(path, _BENCH_CARD)):
             raise ValueError(
                 f"folder = {str(folder)!r} holds a {path.name} that the simulated bench did not write: "
                 "expected another folder"
@@ -82,22 +83,22 @@ def write_bench(
     places = rng.choice(shape[0] * shape[1], n_bad, replace=False)
     dead = np.zeros(shape, np.uint8)
     dead.flat[places[: n_bad // 2]] = 1
+    origin = ("ORIGIN", "zwfs", "simulated bench")
+    cards = [
+        ("BUNIT", "adu", ""),
+        ("WAVELEN", wavelength, "[nm] wavelength"),
+        ("DIMPLE", bench.diameter, "[lambda/D] diameter of the dimple by design"),
+        ("THETA1", bench.phase, "[rad] phase shift of the left image"),
+        ("THETA2", -bench.phase, "[rad] phase shift of the right image"),
+        ("SATURATE", 65535, "[adu] pixels that reach it are saturated"),
+        origin,
+    ]
     for name, pair in counts.items():
         image = np.clip(np.rint(np.concatenate(pair, axis=-1) * gain), 0, 65535).astype(np.uint16)
         image[dead > 0] = 0
         image.flat[places[n_bad // 2 :]] = 65535
-        hdu = fits.PrimaryHDU(image)
-        hdu.header["BUNIT"] = "adu"
-        hdu.header["WAVELEN"] = (wavelength, "[nm] wavelength")
-        hdu.header["DIMPLE"] = (bench.diameter, "[lambda/D] diameter of the dimple by design")
-        hdu.header["THETA1"] = (_card_value(bench.phase), "[rad] phase shift of the left image")
-        hdu.header["THETA2"] = (_card_value(-bench.phase), "[rad] phase shift of the right image")
-        hdu.header["SATURATE"] = (65535, "[adu] pixels that reach it are saturated")
-        hdu.header["ORIGIN"] = ("zwfs", "simulated bench")
-        write_file(paths[name], fits_bytes(fits.HDUList([hdu])))
-    marked = fits.PrimaryHDU(dead)
-    marked.header["ORIGIN"] = ("zwfs", "simulated bench")
-    write_file(paths["bad_pixels"], fits_bytes(fits.HDUList([marked])))
+        write_file(paths[name], fits_content((image, "", cards)))
+    write_file(paths["bad_pixels"], fits_content((dead, "", [origin])))
     return paths
 
 

@@ -23,10 +23,7 @@ if TYPE_CHECKING:
 FOLDER = "ZWFS_RESULTS"  # environment variable that names the folder
 
 # Without dates and versions the same figure is the same file.
-_METADATA = {
-    "png": {"Software": None},
-    "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
-}
+_METADATA = {"png": {"Software": None}, "pdf": {"Creator": None, "Producer": None, "CreationDate": None}}
 
 
 def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike], *, dpi: float = 200) -> None:

@@ -30,15 +30,11 @@ class Table:
     digits: int = 3
 
     def __post_init__(self) -> None:
-        for name in ("header", "rows"):
-            if isinstance(getattr(self, name), str) or not isinstance(getattr(self, name), Sequence):
-                raise TypeError(f"{name} = {_check.shown(getattr(self, name))}: expected a list")
+        _check.sequence("header", self.header, str)
+        _check.sequence("rows", self.rows, expected="a list")
         _check.integer("digits", self.digits, 1, 17)
-        for text in self.header:
-            _check.instance("header", text, str)
         for index, row in enumerate(self.rows):
-            if isinstance(row, str) or not isinstance(row, Sequence):
-                raise TypeError(f"rows[{index}] = {_check.shown(row)}: expected a list of cells")
+            _check.sequence(f"rows[{index}]", row, expected="a list of cells")
             if len(row) != len(self.header):
                 raise ValueError(
                     f"rows[{index}] has {len(row)} cells: expected {len(self.header)}, as the header has"

@@ -1,6 +1,6 @@
 """Camera files: read frames from FITS or NPY, write the phase as FITS.
 
-The only module that needs astropy, and only for FITS: `pip install zwfs[frames]`.
+FITS files need astropy: `pip install zwfs[frames]`.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs._files import write_file
+from zwfs._files import is_there, path_of, paths_of, write_file
+from zwfs.frames._fits import FIRST_BYTES, fits_content, fits_module, has_card
 from zwfs.frames.pipeline import MeasuredPhase, Optics
 from zwfs.frames.registration import Image, nearest_good
 
 _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do that, saturation does
-_GZIP, _NPY, _FITS = b"\x1f\x8b", b"\x93NUMPY", b"SIMPLE  ="  # first bytes of a file
-# Header cards that show who wrote a file: only such a file is replaced.
-_PHASE_CARD, _BENCH_CARD = b"CREATOR = 'zwfs ", b"ORIGIN  = 'zwfs"
+_GZIP, _NPY = b"\x1f\x8b", b"\x93NUMPY"  # first bytes of a file
+# Header card of a phase map: no other file is replaced.
+_PHASE_CARD = b"CREATOR = 'zwfs "
 _LONGEST = 240  # bytes of a file name; a partial file has a few more, and most file systems allow 255
 
 
@@ -96,8 +97,7 @@ class CameraFile:
     def optics(self, diameter: float = 0.0, phase_shifts: Sequence[float] = ()) -> Optics:
         """Optics with these values, see `Optics`; by default those of the header, DIMPLE, THETA1 and THETA2."""
         diameter = _check.number("diameter", diameter, 0)
-        if isinstance(phase_shifts, str) or not isinstance(phase_shifts, Sequence):
-            raise TypeError(f"phase_shifts = {_check.shown(phase_shifts)}: expected a list of two numbers")
+        _check.sequence("phase_shifts", phase_shifts, expected="a list of two numbers")
         shifts: Any = phase_shifts or [self.keyword(key) for key in ("THETA1", "THETA2")]
         return Optics(diameter or self.keyword("DIMPLE"), tuple(shifts))
 
@@ -130,7 +130,7 @@ def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
     TypeError
         If an argument is of the wrong type, or the numbers of the file are not real.
     """
-    path = _path("path", path)
+    path = path_of("path", path)
     max_bytes = _check.integer("max_bytes", max_bytes, 1)
     if not os.path.isfile(path):
         where = "" if path.is_absolute() else f" in {Path.cwd()}"
@@ -172,16 +172,13 @@ def read_all(
     sources : list of CameraFile
         All files; the first is that of the first frame.
     """
-    kinds = {
-        "frame_files": _paths("frame_files", frame_files),
-        "pupil_files": _paths("pupil_files", pupil_files),
-        "dark_files": _paths("dark_files", dark_files),
-        "bad_pixel_files": _paths("bad_pixel_files", bad_pixel_files),
-    }
-    for name in ("frame_files", "pupil_files"):
-        if not kinds[name]:
+    names = "frame_files", "pupil_files", "dark_files", "bad_pixel_files"
+    given = frame_files, pupil_files, dark_files, bad_pixel_files
+    kinds = [paths_of(name, paths) for name, paths in zip(names, given, strict=True)]
+    for name, paths in zip(names[:2], kinds, strict=False):
+        if not paths:
             raise ValueError(f"{name} is empty: expected one file or two")
-    frames, clear, darks, maps = ([read(path) for path in paths] for paths in kinds.values())
+    frames, clear, darks, maps = ([read(path) for path in paths] for paths in kinds)
     shared = darks, maps, saturation
     return images(frames, *shared), images(clear, *shared), [*frames, *clear, *darks, *maps]
 
@@ -216,7 +213,7 @@ def images(
         bad-pixel map marks all of them.
     """
     for argument, given in (("files", files), ("darks", darks), ("bad_pixels", bad_pixels)):
-        _camera_files(argument, given)
+        _check.sequence(argument, given, CameraFile)
     if saturation is not None:
         saturation = _check.number("saturation", saturation, 0, open_low=True)
     recorded = [(file, counts) for file in files for counts in file.images]
@@ -271,12 +268,12 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
         did not write, is a folder, or cannot be written.
     """
     overwrite = _check.flag("overwrite", overwrite)
-    sources = _paths("inputs", inputs)
-    path = _path("output", output)
+    sources = paths_of("inputs", inputs)
+    path = path_of("output", output)
     named = f"output = {str(output)!r}"
     try:
         path = path.resolve()
-        there = _is_there(path)
+        there = is_there(path)
     except (OSError, RuntimeError) as error:  # a name that is too long, or links in a circle
         raise ValueError(f"{named}: {error}") from None
     for source in sources:
@@ -284,7 +281,7 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
             raise ValueError(f"{named} is the input {str(source)!r}: expected another file")
     if there and not path.is_file():
         raise ValueError(f"{named}: expected a file, not a folder or a device")
-    if there and not overwrite and not _has_card(path, _PHASE_CARD):
+    if there and not overwrite and not has_card(path, _PHASE_CARD):
         raise ValueError(
             f"{named} exists and is not a phase map of zwfs: expected a new name, or overwrite = True"
         )
@@ -329,9 +326,9 @@ def write_phase(
     """
     from zwfs import __version__
 
-    fits = fits_module()
+    fits_module()
     _check.instance("phase", phase, MeasuredPhase)
-    _camera_files("sources", sources)
+    _check.sequence("sources", sources, CameraFile)
     path = check_output(output, [source.path for source in sources if source.path], overwrite=overwrite)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
     measurement, recording, optics = phase.measurement, phase.measurement.recording, phase.measurement.optics
@@ -368,72 +365,10 @@ def write_phase(
     if sources and "DATE-OBS" in sources[0].header:
         cards.append(("DATE-OBS", str(sources[0].header["DATE-OBS"]), f"of {sources[0].name}"))
     cards.append(("CREATOR", f"zwfs {__version__}", ""))
-    primary = fits.PrimaryHDU(phase.phase)
-    for key, value, comment in cards:
-        primary.header[key] = (_card_value(value), comment) if comment else _card_value(value)
-    nanometres = fits.ImageHDU(phase.phase * wavelength / (2 * np.pi), name="PHASE_NM")
-    nanometres.header["BUNIT"] = "nm"
-    bad = fits.ImageHDU((measurement.pupil.inside & ~measurement.good).astype(np.uint8), name="BAD")
-    write_file(path, fits_bytes(fits.HDUList([primary, nanometres, bad])))
-
-
-def fits_module() -> ModuleType:
-    """Return `astropy.io.fits`, or say how to get it."""
-    try:
-        from astropy.io import fits
-    except ImportError:
-        raise ImportError("FITS files need astropy: pip install zwfs[frames]; NPY files do not") from None
-    return fits
-
-
-def _path(name: str, value: Any) -> Path:
-    """Path that the operating system accepts."""
-    try:
-        path = Path(value)
-        if b"\0" not in os.fsencode(path):
-            return path
-    except TypeError:
-        raise TypeError(f"{name} = {_check.shown(value)}: expected a str or a Path") from None
-    except UnicodeEncodeError:
-        pass
-    raise ValueError(f"{name} = {_check.shown(str(value))}: expected the name of a file")
-
-
-def _paths(name: str, values: Any) -> list[Path]:
-    """Paths that the operating system accepts, from a sequence of them."""
-    if isinstance(values, str | bytes | Path) or not isinstance(values, Sequence):
-        raise TypeError(f"{name} = {_check.shown(values)}: expected a sequence of paths")
-    return [_path(f"{name}[{index}]", one) for index, one in enumerate(values)]
-
-
-def _is_there(path: Path) -> bool:
-    """Whether there is anything under a path, a link that leads nowhere included."""
-    try:
-        path.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    return True
-
-
-def _has_card(path: Path, card: bytes) -> bool:
-    """Whether a file is FITS and the header of its first unit has a card that begins like this."""
-    try:
-        with path.open("rb") as file:
-            header = file.read(2880 * 32)
-    except OSError:
-        return False
-    cards = (header[place : place + 80] for place in range(0, len(header), 80))
-    return header.startswith(_FITS) and any(one.startswith(card) for one in cards)
-
-
-def _camera_files(argument: str, files: Any) -> None:
-    """Require a sequence of CameraFiles."""
-    if (
-        isinstance(files, str)
-        or not isinstance(files, Sequence)
-        or not all(isinstance(file, CameraFile) for file in files)
-    ):
-        raise TypeError(f"{argument} is a {type(files).__name__}: expected a sequence of CameraFiles")
+    bad = (measurement.pupil.inside & ~measurement.good).astype(np.uint8)
+    nanometres = phase.phase * wavelength / (2 * np.pi)
+    units = (nanometres, "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
+    write_file(path, fits_content((phase.phase, "", cards), *units))
 
 
 @contextmanager
@@ -459,7 +394,7 @@ def _content(file: BinaryIO, name: str, max_bytes: int) -> io.BytesIO:
     with _broken(f"{name}: a broken gzip file" if packed else f"{name}: it cannot be read"):
         stream = gzip.GzipFile(fileobj=file) if packed else file
         while size <= max_bytes and (chunk := stream.read(2**20)):
-            if not content.tell() and not chunk.startswith((_NPY, _FITS)):
+            if not content.tell() and not chunk.startswith((_NPY, FIRST_BYTES)):
                 break
             size = max(size, content.tell() + len(chunk))
             content.write(chunk)
@@ -552,19 +487,3 @@ def _saturation(file: CameraFile, counts: NDArray) -> float:
     top = counts.max(initial=-np.inf)
     plateau = np.count_nonzero(counts == top) >= _PLATEAU and top > counts.min(initial=np.inf)
     return min(file.full_scale, top if plateau else np.inf)
-
-
-def _card_value(value: Any) -> Any:
-    """Value for a FITS header: floats with nine digits, which hide rounding errors, no NaN, and ASCII strings."""
-    if isinstance(value, str):
-        return value if value.isascii() and value.isprintable() else ascii(value)[1:-1]
-    if isinstance(value, float | np.floating):
-        return float(f"{value:.9g}") if np.isfinite(value) else "NaN"
-    return bool(value) if isinstance(value, np.bool_) else value
-
-
-def fits_bytes(units: Any) -> bytes:
-    """Content of a FITS file with these units."""
-    stream = io.BytesIO()
-    units.writeto(stream)
-    return stream.getvalue()

@@ -395,11 +395,7 @@ def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[n
 
 
 def fit(
-    recording: Recording,
-    optics: Optics,
-    names: Sequence[str],
-    n_iterations: int = 25,
-    n_steps: int = 8,
+    recording: Recording, optics: Optics, names: Sequence[str], n_iterations: int = 25, n_steps: int = 8
 ) -> tuple[Recording, Optics]:
     """Seek parameters of the model, and the registration, for which the modelled frames agree best.
 
@@ -516,7 +512,7 @@ def _unmix(frames: NDArray, measurement: Measurement) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Result of one more step of the work.
+    """Result of one of the `steps`.
 
     Attributes
     ----------
@@ -539,7 +535,7 @@ def steps(
     n_iterations: int = 25,
     **settings: Any,
 ) -> list[Step]:
-    """All the work on a pair of frames, one step after the other, each judged.
+    """Reconstruct a pair of frames step by step, and judge each step.
 
     Parameters
     ----------

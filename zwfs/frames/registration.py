@@ -362,8 +362,7 @@ def correlations(first: NDArray, second: NDArray) -> NDArray[np.float64]:
 
 def _check_images(name: str, images: Any) -> None:
     """Require a sequence of one or two Images."""
-    if not isinstance(images, Sequence) or not all(isinstance(image, Image) for image in images):
-        raise TypeError(f"{name} is a {type(images).__name__}: expected a sequence of Images")
+    _check.sequence(name, images, Image)
     if len(images) not in (1, 2):
         raise ValueError(f"{name} holds {len(images)} images: expected 1 or 2")
 

@@ -59,12 +59,7 @@ class BenchCurves(ErrorCurves):
 
 
 def bench_reconstructors(
-    bench: Bench,
-    model: BenchModel,
-    *,
-    n_iterations: int = 25,
-    poke: float = 0.1,
-    seed: Seed = 0,
+    bench: Bench, model: BenchModel, *, n_iterations: int = 25, poke: float = 0.1, seed: Seed = 0
 ) -> dict[str, Any]:
     """Return the paper's reconstructors for the model of a bench; the linear one is calibrated on the bench.
 
@@ -96,11 +91,7 @@ def bench_reconstructors(
     steps: dict[str, Any] = {"n_iterations": n_iterations}
     return {
         "Linear": Linear(
-            model.classic,
-            model.modes,
-            poke=poke,
-            conditioning=_CONDITIONING,
-            calibration=(flat, pushed, pulled),
+            model.classic, model.modes, poke=poke, conditioning=_CONDITIONING, calibration=(flat, pushed, pulled)
         ),
         "Arcsine": Arcsine(model.classic, **steps),
         "GerchbergSaxton": GerchbergSaxton(model.shifted, **steps),
@@ -165,9 +156,7 @@ def bench_curves(
     points = sweeps.run(_bench_point, enumerate(rms.tolist()), *shared, name="bench_curves")
     commanded, residuals = zip(*points, strict=True)
     return BenchCurves(
-        rms,
-        np.array(commanded),
-        {name: np.array([point[name] for point in residuals]) for name in reconstructors},
+        rms, np.array(commanded), {name: np.array([point[name] for point in residuals]) for name in reconstructors}
     )
 
 
@@ -225,8 +214,9 @@ def error_budget(
     for key, bench in benches.items():
         _check.instance(f"benches[{key!r}]", bench, Bench)
     known = sorted(method.__name__ for method in RECONSTRUCTORS)
-    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
-        raise TypeError(f"names = {_check.shown(names)}: expected a list with some of {known}")
+    _check.sequence("names", names, str, f"a list with some of {known}")
+    if not names:
+        raise ValueError(f"names is empty: expected a list with some of {known}")
     for name in names:
         _check.choice("names", name, known)
     rms = check_rms(rms)

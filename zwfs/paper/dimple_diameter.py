@@ -95,7 +95,7 @@ def diameter_curves(
     """
     _check.function("make", make)
     diameters = _check_diameters(diameters)
-    screens = _check_screens(screens)
+    screens = _check.screens("screens", screens)
     points = sweeps.run(_diameter_point, diameters.tolist(), make, screens, name="diameter_curves")
     rms, errors = zip(*points, strict=True)
     return DiameterCurves(
@@ -112,7 +112,7 @@ def _diameter_point(
     errors = {}
     for name, reconstructor in reconstructors.items():
         sensor = reconstructor.sensor
-        screens = _check_screens(screens, sensor.pupil)
+        screens = _check.screens("screens", screens, sensor.pupil)
         estimate = reconstructor(sensor.measure(screens))
         errors[name] = reconstruction_error(sensor.pupil, estimate.phase, screens)
     return float(np.mean(sensor.pupil.rms(screens))), errors
@@ -275,8 +275,8 @@ def measured_factor(
         If the error of the start is 0, or an argument is out of range.
     """
     n_iterations = _check.integer("n_iterations", n_iterations, 2)
-    phase, away = _check_map(pupil, "phase", phase), _check_map(pupil, "away", away)
     diameter = _linearised(pupil, diameter, phase)[0].diameter  # checked
+    phase, away = _check.map_inside("phase", phase, pupil), _check.map_inside("away", away, pupil)
     size = float(pupil.rms(away))
     if size == 0:
         raise ValueError("away is the same everywhere: expected an error of some size")
@@ -376,7 +376,7 @@ def contraction(
     """
     _check.instance("pupil", pupil, Pupil)
     diameters = np.unique(np.append(_check_diameters(diameters), DARK_RING))
-    screens = _check_screens(screens, pupil)
+    screens = _check.screens("screens", screens, pupil)
     modes = _check.real_array("modes", modes)
     _check.maps("modes", modes, pupil.shape)
     if modes.ndim != 3 or len(modes) <= max(_MODES.values()):
@@ -397,16 +397,6 @@ def contraction(
     )
 
 
-def _check_map(pupil: Pupil, name: str, values: ArrayLike) -> NDArray[np.floating]:
-    """Return one map that is finite inside the pupil."""
-    _check.instance("pupil", pupil, Pupil)
-    values = _check.real_array(name, values)
-    if values.shape != pupil.shape:
-        raise ValueError(f"{name} has shape {values.shape}: expected {pupil.shape}")
-    _check.finite(name, pupil.gather(values), " inside the pupil")
-    return values
-
-
 def _check_diameters(diameters: ArrayLike) -> NDArray[np.floating]:
     """Return diameters as an array, shape (n_diameters,), positive and increasing."""
     diameters = _check.real_map("diameters", diameters, 1)
@@ -415,25 +405,10 @@ def _check_diameters(diameters: ArrayLike) -> NDArray[np.floating]:
     return diameters
 
 
-def _check_screens(screens: ArrayLike, pupil: Pupil | None = None, name: str = "screens") -> NDArray[np.floating]:
-    """Return screens as an array, shape (n_screens, ny, nx), finite inside the pupil if it is given."""
-    screens = _check.real_array(name, screens)
-    if screens.ndim != 3 or 0 in screens.shape:
-        raise ValueError(f"{name} has shape {screens.shape}: expected (n_screens, ny, nx)")
-    if pupil is not None:
-        _check.trailing_shape(name, screens, pupil.shape, "the shape of the pupil")
-        _check.finite(name, pupil.gather(screens), " inside the pupil")
-    return screens
-
-
-def _rms(values: NDArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def _linearised(pupil: Pupil, diameter: float, phase: ArrayLike | None) -> tuple[DimpleLight, NDArray, NDArray]:
     """Light in the dimple, and the field and its beta at the points of the pupil, (n_points,) each."""
     _check.instance("pupil", pupil, Pupil)
-    phase = np.zeros(pupil.shape) if phase is None else _check_map(pupil, "phase", phase)
+    phase = np.zeros(pupil.shape) if phase is None else _check.map_inside("phase", phase, pupil)
     psi = pupil.gather(pupil.field(phase))
     light = DimpleLight(pupil, diameter)
     beta = light(psi[np.newaxis])[0]

@@ -175,16 +175,16 @@ def pair_phase(frames: NDArray, amplitude: NDArray, references: NDArray) -> NDAr
 
 @dataclass(frozen=True)
 class ApproximationErrors:
-    """How wrong an approximate reference wave is; means over the screens.
+    """Errors of an approximate reference wave; means over the screens.
 
     Attributes
     ----------
     phase : float, radian rms
         Of the first mask's wave, without piston, which no frame depends on.
     amplitude, wave : float
-        Of its amplitude, and of the wave as a whole but for a piston, relative (rms).
+        Relative rms error of its amplitude, and of the whole wave without its piston.
     one_image, two_images : float, radian rms
-        Of the phase that one step finds with it, by equation (6) and by equation (9).
+        Of the phase after one step with it, by equation (6) and by equation (9).
     """
 
     phase: float

@@ -14,7 +14,6 @@ from zwfs.companion import sweeps
 from zwfs.detector import Detector
 from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error
-from zwfs.paper.dimple_diameter import _check_map, _check_screens, _rms
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
@@ -81,7 +80,7 @@ def phase_noise(sensor: ZernikeSensor, phase: ArrayLike) -> PhaseNoise:
     _check.instance("sensor", sensor, ZernikeSensor)
     if sensor.n_masks != 2 or sensor.detector_shape != sensor.pupil.shape:
         raise ValueError(f"sensor = {_check.shown(sensor)}: expected two masks and an extent of 1")
-    phase = _check_map(sensor.pupil, "phase", phase)
+    phase = _check.map_inside("phase", phase, sensor.pupil)
     field = sensor.pupil.field(phase)
     psi = sensor.pupil.gather(field)
     waves = sensor.pupil.gather(sensor.reference_wave(field))
@@ -168,7 +167,7 @@ def close_pairs(
     gaps = _check.real_map("gaps", gaps, 1)
     if not np.all((gaps >= 1e-6) & (gaps <= 1)):
         raise ValueError(f"gaps = {_check.shown(gaps)}: expected a list of values between 1e-6 and 1 radian")
-    screens = _check_screens(screens, pupil)
+    screens = _check.screens("screens", screens, pupil)
     rows = []
     for gap in gaps.tolist():
         sensor = _sensor(pupil, diameter, np.pi / 2, np.pi / 2 - gap)
@@ -190,7 +189,7 @@ def _check_wavefronts(pupil: Pupil, wavefronts: Mapping[str, ArrayLike]) -> dict
     _check.instance("wavefronts", wavefronts, Mapping)
     if not wavefronts:
         raise ValueError("wavefronts is empty: expected at least one")
-    return {name: _check_screens(screens, pupil, f"wavefronts[{name!r}]") for name, screens in wavefronts.items()}
+    return {name: _check.screens(f"wavefronts[{name!r}]", screens, pupil) for name, screens in wavefronts.items()}
 
 
 def drawn_noise(
@@ -225,7 +224,7 @@ def drawn_noise(
         If an argument is out of range.
     """
     _check.instance("sensor", sensor, ZernikeSensor)
-    phase = _check_map(sensor.pupil, "phase", phase)
+    phase = _check.map_inside("phase", phase, sensor.pupil)
     photons = _check.number("photons", photons, 1)
     n_draws = _check.integer("n_draws", n_draws, 2)
     rng = _check.generator("seed", seed)
@@ -315,7 +314,7 @@ def pair_maps(
     _check.instance("pupil", pupil, Pupil)
     diameter = _check.number("diameter", diameter, 0, pupil.n_pixels, open_low=True)
     angles = _check.real_map("angles", angles, 1)
-    screens = _check_screens(screens, pupil)
+    screens = _check.screens("screens", screens, pupil)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     maps = np.full((5, angles.size, angles.size), np.nan)
     below = np.tril_indices(angles.size, -1)
@@ -338,3 +337,7 @@ def _pair(
     flat = phase_noise(sensor, np.zeros(sensor.pupil.shape))
     aberrated = np.array([phase_noise(sensor, screen).photon for screen in screens])
     return error, _rms(flat.photon), _rms(aberrated), _rms(flat.bound), _rms(flat.read)
+
+
+def _rms(values: NDArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

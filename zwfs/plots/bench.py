@@ -78,15 +78,8 @@ def segment_errors(bench: Bench, commanded: NDArray, errors: Mapping[str, NDArra
     for name, values in errors.items():
         look = LOOKS[name]
         rms = np.sqrt(np.mean(values**2))
-        points.plot(
-            bench.numbers,
-            values,
-            look.marker,
-            color=look.color,
-            ms=5,
-            label=f"{look.label}: {rms:.2f} rad rms",
-            alpha=0.9,
-        )
+        label = f"{look.label}: {rms:.2f} rad rms"
+        points.plot(bench.numbers, values, look.marker, color=look.color, ms=5, label=label, alpha=0.9)
     points.axhline(0, color="#555555", lw=1)
     points.set(xlabel="segment number", ylabel="error of the piston (rad)")
     points.legend(loc="upper center", bbox_to_anchor=(0.5, 1.2), ncols=2, fontsize=9)
@@ -103,11 +96,10 @@ def bench_linearity(curves: BenchCurves) -> Figure:
     figure, (plain, gain) = plt.subplots(1, 2, figsize=(9, 4.2))
     for name, look in _looks(curves.residuals):
         mean, std = curves.mean(name), curves.std(name)
-        line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
-        plain.plot(curves.rms, mean, label=look.label, **line)
+        plain.plot(curves.rms, mean, markersize=4, label=look.label, **look.style)
         low, high = np.maximum(mean - std, 0), mean + std
         plain.fill_between(curves.rms, low, high, color=look.color, alpha=0.15, lw=0)
-        gain.plot(curves.rms, curves.gain(name), **line)
+        gain.plot(curves.rms, curves.gain(name), markersize=4, **look.style)
     gain.axhline(1, color="#555555", lw=1)
     plain.set(xlabel="input (rad rms over the segments)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
     gain.set(xlabel="input (rad rms over the segments)", ylabel="gain: found / commanded", xlim=(0, None))

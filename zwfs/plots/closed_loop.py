@@ -46,9 +46,8 @@ def capture(inputs: Sequence[float], runs: Sequence[Mapping[str, LoopRun]]) -> F
         look = LOOKS[name]
         settled = np.array([methods[name].settled() for methods in runs])
         closed = [100 * np.mean(methods[name].closed()) for methods in runs]
-        line = {"color": look.color, "linestyle": look.line, "marker": look.marker, "label": look.label}
-        left.plot(inputs, closed, **line)
-        right.semilogy(inputs, np.median(settled, axis=1), **line)
+        left.plot(inputs, closed, label=look.label, **look.style)
+        right.semilogy(inputs, np.median(settled, axis=1), label=look.label, **look.style)
         right.fill_between(inputs, settled.min(1), settled.max(1), color=look.color, alpha=0.15, lw=0)
     right.plot(inputs, inputs, color="#777777", lw=1, label="as at the start")
     left.set(xlabel="error at the start (rad rms)", ylabel="loops that close (%)", ylim=(-3, 103))

@@ -63,10 +63,8 @@ def diameter_methods(curves: Mapping[str, DiameterCurves], threshold: float, cla
     floor = 1e-7
     for name, look in _looks(curves):
         curve = curves[name]
-        axes.semilogy(
-            curve.diameters, np.maximum(curve.mean(name), floor), color=look.color, marker=look.marker,
-            linestyle=look.line, ms=4.5, label=look.label,
-        )  # fmt: skip
+        mean = np.maximum(curve.mean(name), floor)
+        axes.semilogy(curve.diameters, mean, markersize=4.5, label=look.label, **look.style)
     limit = threshold * curve.rms[0]
     axes.axhline(limit, color="#555555", lw=1)
     axes.text(0.05, limit * 1.2, f"{threshold:.0%} of the input", color="#555555", fontsize=9)

@@ -14,7 +14,6 @@ from matplotlib.layout_engine import PlaceHolderLayoutEngine
 from matplotlib.patches import Circle, Ellipse, FancyArrowPatch, Polygon, Rectangle
 from numpy.typing import NDArray
 
-from zwfs import _check
 from zwfs.bench.model import Bench
 from zwfs.focal import focal_field
 from zwfs.masks import Dimple, Mask
@@ -68,14 +67,8 @@ def sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:
     )
     # The axis runs from -4 to 4 lambda/D over 161 samples.
     focal.add_patch(Circle((80, 80), mask.diameter / 2 * 20, fill=False, ec="white", ls="--", lw=1.3))
-    focal.text(
-        80,
-        146,
-        f"mask: {mask.diameter:g} $\\lambda/D$, {_shift(mask)} rad",
-        color="white",
-        ha="center",
-        fontsize=8,
-    )
+    label = f"mask: {mask.diameter:g} $\\lambda/D$, {_shift(mask)} rad"
+    focal.text(80, 146, label, color="white", ha="center", fontsize=8)
     focal.plot([80, 80], [80 + mask.diameter * 10, 142], color="white", lw=0.8)
     focal.plot([20, 60], [12, 12], color="white", lw=1.5)
     focal.text(40, 17, r"2 $\lambda/D$", color="white", ha="center", fontsize=8)
@@ -341,10 +334,10 @@ class _Scene:
         """Text, centred on x unless said otherwise."""
         self.axes.text(x, y, text, ha=ha, fontsize=size, **style)
 
-    def beam(self, profile: _Profile, origin: _Point, angle: float = 0.0, color: str = _BEAM) -> None:
+    def beam(self, profile: _Profile, origin: _Point, angle: float = 0.0) -> None:
         """Beam of light: (distance along the axis, half of the width) at its corners."""
         low, high = _turned(profile, origin, angle)
-        self.axes.add_patch(Polygon([*low, *high[::-1]], closed=True, fc=color, ec="none"))
+        self.axes.add_patch(Polygon([*low, *high[::-1]], closed=True, fc=_BEAM, ec="none"))
 
     def edges(self, profile: _Profile, origin: _Point) -> None:
         """Edges of a beam that holds both polarisations, in both of their colours."""
@@ -447,9 +440,9 @@ def _mask_picture(
     axes.imshow(phase, cmap=PHASE_MAP, vmin=-np.pi, vmax=np.pi, origin="lower", interpolation="none")
 
 
-def _halo(pupil: Pupil, field: NDArray, reach: float, samples: int = _MASK_SAMPLES) -> NDArray:
+def _halo(pupil: Pupil, field: NDArray, reach: float) -> NDArray:
     """Decadic logarithm of the intensity in the focal plane, relative to its peak, to `reach` (lambda/D)."""
-    axis = np.linspace(-reach, reach, samples)
+    axis = np.linspace(-reach, reach, _MASK_SAMPLES)
     focus = np.abs(focal_field(pupil, field, axis, axis)) ** 2
     with np.errstate(divide="ignore"):
         return np.log10(focus / focus.max())
@@ -485,7 +478,6 @@ def _shift(mask: Mask, *, plus: bool = False) -> str:
 
 def _in_pi(angle: float) -> str:
     """Angle as a multiple of pi where it is a simple one."""
-    angle = _check.number("angle", float(angle))
     for parts in (1, 2, 3, 4, 6):
         times = angle / np.pi * parts
         if abs(times - round(times)) < 1e-9 and round(times):

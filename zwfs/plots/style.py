@@ -32,6 +32,11 @@ class Look:
         """Name for a legend."""
         return f"{self.name} ({self.sees})" if self.sees else self.name
 
+    @property
+    def style(self) -> dict[str, Any]:
+        """Keywords of a curve for `plot`."""
+        return {"color": self.color, "marker": self.marker, "linestyle": self.line}
+
 
 # Colours that differ from those of the methods for every reader, for methods that are not listed.
 _SPARE = (("#882255", "<", "-"), ("#56B4E9", ">", "--"), ("#661100", "*", "-."))

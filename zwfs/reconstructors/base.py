@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -160,9 +160,7 @@ class Solution(NamedTuple):
 
     def empty(self, k: int, kind: Kind) -> Solution:
         """Return arrays of the same shapes and types for k frame sets, yet to be filled."""
-        return self._each(
-            lambda array: kind.xp.empty((k, *array.shape[1:]), dtype=array.dtype, device=kind.device)
-        )
+        return self.each(lambda array: kind.xp.empty((k, *array.shape[1:]), dtype=array.dtype, device=kind.device))
 
     @classmethod
     def joined(cls, parts: list[tuple[NDArray[np.int64], Solution]], kind: Kind) -> Solution:
@@ -175,11 +173,11 @@ class Solution(NamedTuple):
 
     def take(self, which: NDArray[np.int64], kind: Kind) -> Solution:
         """Return the results of some frame sets: integers, (j,)."""
-        return self._each(lambda array: kind.xp.take(array, which, axis=0))
+        return self.each(lambda array: kind.xp.take(array, which, axis=0))
 
     def at(self, index: int) -> Solution:
         """Return the result of one frame set, without the batch axis."""
-        return self._each(lambda array: array[index, ...])
+        return self.each(lambda array: array[index, ...])
 
     def put(self, which: slice | int, part: Solution) -> None:
         """Write the results of some frame sets to their places."""
@@ -188,7 +186,8 @@ class Solution(NamedTuple):
             if array is not None:
                 array[which, ...] = values
 
-    def _each(self, function: Any) -> Solution:
+    def each(self, function: Callable[[NDArray], NDArray]) -> Solution:
+        """Apply a function to each array."""
         return Solution._make(None if array is None else function(array) for array in self)
 
 
@@ -309,11 +308,9 @@ class Reconstructor(Immutable, ABC):
     def report(self, frames: NDArray, batch: tuple[int, ...], solution: Solution) -> Reconstruction:
         """Return the result of a solution in the shape of the batch; its phases are written to."""
         kind = Kind.of(frames)
-        no_data = self._settings.model(kind).no_data
-        phase, n_iterations, converged, n_unsolved, history = solution
-        phase += no_data
-        if history is not None:
-            history += no_data
+        for phase in (solution.phase, solution.history):
+            if phase is not None:
+                phase += self._settings.model(kind).no_data
         # A copy, since the residual is computed later: a camera may write the next frame to the same place.
         window = kind.xp.asarray(frames[(..., *self.sensor.window)], copy=True)
 
@@ -321,10 +318,7 @@ class Reconstructor(Immutable, ABC):
             # A single frame is the case of a control loop: no need to compute its shape.
             return kind.xp.reshape(values, (*batch, *values.shape[1:])) if batch else values[0, ...]
 
-        return Reconstruction(
-            shaped(phase), shaped(n_iterations), shaped(converged), shaped(n_unsolved),
-            None if history is None else shaped(history), self._settings, shaped(window),
-        )  # fmt: skip
+        return Reconstruction(*solution.each(shaped), settings=self._settings, frames=shaped(window))
 
     @abstractmethod
     def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:

@@ -51,8 +51,8 @@ class LikelihoodReconstruction(Reconstruction):
         Reduced chi-square: about 1 where the model explains the frames. NaN without a number of photons, and where
         the frames have no more information than there are unknowns, as for one mask.
     consistent : ndarray of bool, shape (...)
-        Whether the phase explains the frames to within the noise: their misfit exceeds its expectation by less than
-        5 standard deviations. Without a number of photons: whether the rms residual of the frames, over the
+        Whether the phase explains the frames to within the noise: their misfit exceeds its expectation by less
+        than 5 standard deviations. Without a number of photons: whether the rms residual of the frames, over the
         detector, is at most 1e-3 of the mean intensity. For one mask many phases explain a frame.
     n_starts : ndarray of int, shape (...)
         Number of starts that were tried.
@@ -138,9 +138,9 @@ class MaximumLikelihood(Reconstructor):
     frames, other starts follow: in turn, the best solution so far plus a random phase of 1 rad rms, made of the 20
     lowest Zernike modes, and two iterations that begin at half such a phase. The most likely solution counts.
 
-    Some directions are hard to see or invisible. No frame shows the piston: each step keeps it, and `sigma` is that
-    of the phase without piston. A dimple near 2.44 lambda/D hardly shows small tilts, and a single mask hardly
-    shows phases at which its cosine turns. The damping holds such directions, and `sigma` reports them as large.
+    Some directions are invisible or nearly so. No frame shows the piston: each step keeps it, and `sigma` is that
+    of the phase without piston. A dimple near 2.44 lambda/D hardly shows small tilts. A single mask hardly shows
+    phases at which its intensity is extreme. The damping holds such directions, and `sigma` reports a large error.
 
     Parameters
     ----------
@@ -157,15 +157,15 @@ class MaximumLikelihood(Reconstructor):
         one, not the most likely (maximum a posteriori).
     amplitude : array_like, shape (ny, nx), or "unknown", optional
         Measured amplitude A_in in the pupil; that of the sensor's pupil if left out. If unknown, the amplitude of
-        every point is estimated, too. This takes three different masks or more; a clear frame is that of a mask that
-        changes nothing, such as `Dimple(1, 0)`.
+        every point is estimated, too. This takes three different masks or more; a clear frame is that of a mask
+        that changes nothing, such as `Dimple(1, 0)`.
     n_iterations : int
         Largest number of steps from one start.
     tolerance : float, radian
         A step that changes the phase by no more than this (rms over the pupil) is the last one.
     n_starts : int
-        Largest number of starts. Frames that no phase explains, such as noisy ones without a number of photons, use
-        all of them: set 1 for those.
+        Largest number of starts. Frames that no phase explains, such as noisy ones without a number of photons,
+        use all of them: set 1 for those.
     seed : int
         Of the random phases of the other starts.
 
@@ -178,7 +178,8 @@ class MaximumLikelihood(Reconstructor):
 
     References
     ----------
-    Levenberg 1944; Marquardt 1963; Paxman, Schulz & Fienup 1992; Nielsen 1999; `eq-information`, `eq-woodbury` of the book.
+    Levenberg 1944; Marquardt 1963; Paxman, Schulz & Fienup 1992; Nielsen 1999; `eq-information` and
+    `eq-woodbury` of the book.
 
     Examples
     --------
@@ -419,10 +420,10 @@ class MaximumLikelihood(Reconstructor):
     def _reflect(self, fit: _Fit) -> None:
         """Try to leave local minima of single points, where frame sets have converged.
 
-        A frame depends on the cosine of the angle between psi and its reference wave r. With the reflection of psi
-        at r it is the same. The point may have converged to the wrong one of the two, mostly where a frame is
-        dark. With the reference waves held, each point takes the reflection that makes its frames most likely. Frame
-        sets whose cost falls by this continue.
+        The intensity of a point depends on the angle between its field psi and the reference wave r of a mask. Its
+        reflection at r gives the same intensity behind this mask. A point may have converged to the wrong one of
+        the two, mostly where a frame is dark. With the reference waves held, each point takes the reflection that
+        makes its frames most likely. Frame sets whose cost falls by this continue.
         """
         estimator = self._exact
         if estimator.unknown_amplitude or estimator.modes is not None:

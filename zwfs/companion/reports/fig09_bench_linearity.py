@@ -61,12 +61,7 @@ def claims(curves: BenchCurves) -> Table:
     glue_numbers(numbers)
     smallest = np.flatnonzero(curves.rms > 0)[0]
     return Table(
-        [
-            "reconstructor",
-            "offset (rad rms)",
-            "error below 25 % up to (rad rms)",
-            "gain at the smallest input",
-        ],
+        ["reconstructor", "offset (rad rms)", "error below 25 % up to (rad rms)", "gain at the smallest input"],
         [
             [
                 LOOKS[name].name,

@@ -1,0 +1,56 @@
+"""FITS files. The only module that imports astropy: `pip install zwfs[frames]`."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FIRST_BYTES = b"SIMPLE  ="
+
+
+def fits_module() -> ModuleType:
+    """Return `astropy.io.fits`, or say how to get it."""
+    try:
+        from astropy.io import fits
+    except ImportError:
+        raise ImportError("FITS files need astropy: pip install zwfs[frames]; NPY files do not") from None
+    return fits
+
+
+def fits_content(*units: tuple[NDArray, str, Sequence[tuple[str, Any, str]]]) -> bytes:
+    """Return the content of a file: image, name and header cards (keyword, value, comment) of each unit."""
+    fits = fits_module()
+    made = fits.HDUList()
+    for image, name, cards in units:
+        made.append(fits.ImageHDU(image, name=name) if made else fits.PrimaryHDU(image))
+        for key, value, comment in cards:
+            made[-1].header[key] = (_card_value(value), comment) if comment else _card_value(value)
+    stream = io.BytesIO()
+    made.writeto(stream)
+    return stream.getvalue()
+
+
+def has_card(path: Path, card: bytes) -> bool:
+    """Whether a file is FITS and the header of its first unit has a card that begins like this."""
+    try:
+        with path.open("rb") as file:
+            header = file.read(2880 * 32)
+    except OSError:
+        return False
+    cards = (header[place : place + 80] for place in range(0, len(header), 80))
+    return header.startswith(FIRST_BYTES) and any(one.startswith(card) for one in cards)
+
+
+def _card_value(value: Any) -> Any:
+    """Value for a FITS header: floats with nine digits, which hide rounding errors, no NaN, and ASCII strings."""
+    if isinstance(value, str):
+        return value if value.isascii() and value.isprintable() else ascii(value)[1:-1]
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.9g}") if np.isfinite(value) else "NaN"
+    return bool(value) if isinstance(value, np.bool_) else value

@@ -197,7 +197,7 @@ class Information:
         pairs = [_ZERO for _ in _pairs_of(n_sets)]
         for mask, turns in enumerate(constants.turns):
             wave = waves[:, mask, ...]
-            weight = 1 if weights is None else weights[:, mask, ...]
+            weight: Any = 1 if weights is None else weights[:, mask, ...]
             # dI per unit of the real and imaginary part of a coefficient: 2 Re and -2 Im of conj(o) times the turn
             along = [
                 2 * (t.real * wave[:, 0, ...] + t.imag * wave[:, 1, ...])

@@ -79,10 +79,11 @@ class Noise:
         return 2 * xp.sum(expected - seen + seen * xp.log(seen / expected), axis=1)
 
     def misfit(self, light: NDArray, frames: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Squared differences in units of the variance, their expected sum, and the variance of the sum: (k,) each.
+        """Sum of squared differences over the variance, its expectation, and the variance of the sum: (k,) each.
 
-        The variance m of a pixel counts as 1 electron at least: far darker pixels hold no photon nearly always, and
-        one in a million of them a thousand times too many. A Poisson distribution has a fourth moment of 3 m^2 + m.
+        The variance m of a pixel counts as 1 electron at least. A far darker pixel would rarely hold a photon, and
+        one photon would then count as much as all bright pixels. The fourth moment of a Poisson distribution is
+        3 m^2 + m.
         """
         xp, axes = Kind.of(light).xp, tuple(range(1, light.ndim))
         expected = self.electrons(light)

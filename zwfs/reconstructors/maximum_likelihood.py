@@ -33,6 +33,7 @@ _NOTHING = 1e-300  # keeps quotients finite
 _NEGLIGIBLE = 1e-3  # of the mean standard error: a smaller step is the last one
 _REFLECTIONS = 3  # largest number of times that points of one start are reflected
 _GAIN = 0.01  # of twice the logarithm of the likelihood, from which on a reflection counts
+_LINEAR_ITERATIONS = 5  # of the start of an unknown amplitude
 _RIDGE = 1e-6  # of the normal equations at points whose reference waves vanish
 _SIGMAS = 5.0  # excess of the misfit, in its standard deviations, up to which noise explains it
 
@@ -234,7 +235,7 @@ class MaximumLikelihood(Reconstructor):
         self._first = self._first_method()
         self._slopes = None if basis is None else _Slopes.of(pupil.inside, basis)
         n_low = min(_KICK_MODES, pupil.n_points - 1)
-        self._kicks: NDArray[np.float64] | None = None
+        self._kicks: NDArray[np.float64] = np.zeros((0, *pupil.shape))
         if n_starts > 1 and n_low:
             low = zernike_basis(pupil, n_low)
             kicks = power_law_screens(low, rms=_KICK, n_screens=n_starts - 1, exponent=-2, seed=seed)
@@ -243,7 +244,7 @@ class MaximumLikelihood(Reconstructor):
     @property
     def n_starts(self) -> int:
         """Largest number of starts."""
-        return 1 if self._kicks is None else 1 + len(self._kicks)
+        return 1 + len(self._kicks)
 
     def __call__(
         self, frames: ArrayLike, start: ArrayLike | None = None, *, history: bool = False
@@ -288,9 +289,8 @@ class MaximumLikelihood(Reconstructor):
     def _fit(self, frames: NDArray, start: NDArray | None, history: bool) -> _Fit:
         """Fit all frame sets, in double precision."""
         kind = Kind.of(frames)
-        frames, start = (
-            None if array is None else kind.xp.astype(array, kind.xp.float64) for array in (frames, start)
-        )
+        frames = kind.xp.astype(frames, kind.xp.float64)
+        start = None if start is None else kind.xp.astype(start, kind.xp.float64)
         fits = [
             self._search(frames[piece, ...], None if start is None else start[piece, ...], history)
             for piece in pieces(frames, kind, 1 if history else None)
@@ -317,7 +317,8 @@ class MaximumLikelihood(Reconstructor):
     def _rough_phase(self, frames: NDArray, start: NDArray | None) -> NDArray:
         """Phase after the first iterations, (k, ny, nx)."""
         if self._first is None:
-            return 0 * frames[(..., *self.sensor.window)][:, 0, ...] if start is None else start
+            flat = 0 * frames[(..., *self.sensor.window)][:, 0, ...]
+            return flat if start is None else start
         return self._first.solve(frames, start, False).phase
 
     def _other_start(self, attempt: int, fit: _Fit) -> NDArray:
@@ -360,8 +361,8 @@ class MaximumLikelihood(Reconstructor):
             coefficients = self._slopes.fit(start, kind)
             start = self._phase(coefficients)
         psi = split(start, model.amplitude)
-        if self._exact.unknown_amplitude:
-            psi = psi * _amplitude_ratio(frames, psi, model)[:, np.newaxis, ...]
+        for _ in range(_LINEAR_ITERATIONS if self._exact.unknown_amplitude else 0):
+            psi = _linear_field(frames, psi, model)
         fit = self._at(psi, coefficients, frames)
         zeros = kind.integers([0] * k)
         fit.damping, fit.growth = _DAMPING + kind.zeros(k), _GROWTH + kind.zeros(k)
@@ -605,23 +606,21 @@ def _points_step(information: Information, gradient: NDArray, damping: NDArray) 
     return step, xp.sum(step * promised, axis=(1, 2, 3))
 
 
-def _amplitude_ratio(frames: NDArray, psi: NDArray, model: Propagator) -> NDArray:
-    """Modulus of the field over that of a model psi, (k, ny, nx), with the reference waves of the model.
+def _linear_field(frames: NDArray, psi: NDArray, model: Propagator) -> NDArray:
+    """Field that explains the frames best if the reference waves are those of another field, (k, 2, ny, nx).
 
-    The frames I_k = P + 2 Re(conj(r_k) psi) + |r_k|^2 are linear in P = |psi|^2 and psi. With three frames or more
-    their least-squares solution gives P.
+    With reference waves r_k the frames I_k = P + 2 Re(conj(r_k) psi) + |r_k|^2 are linear in P = |psi|^2 and psi.
+    Three different masks or more determine both.
     """
-    kind = model.kind
-    xp, light = kind.xp, frames[(..., *model.window)]
+    xp, light = model.kind.xp, frames[(..., *model.window)]
     waves = model.reference(psi)
-    real, imag = waves[:, :, 0, ...], waves[:, :, 1, ...]
-    columns = xp.stack([1 + 0 * real, 2 * real, 2 * imag], axis=-1)  # (k, n_masks, ny, nx, 3)
-    columns = xp.permute_dims(columns, (0, 2, 3, 1, 4))
-    right = xp.permute_dims(light - square(waves), (0, 2, 3, 1))
-    normal = xp.matrix_transpose(columns) @ columns + _RIDGE * kind.array(np.eye(3))
-    sides = xp.matrix_transpose(columns) @ right[..., np.newaxis]
-    power = xp.linalg.solve(normal, sides)[..., 0, 0]
-    return xp.sqrt(xp.clip(power, 0, None) / xp.where(model.inside, square(psi) + _NOTHING, kind.array(1.0)))
+    rows = xp.stack([1 + 0 * light, 2 * waves[:, :, 0, ...], 2 * waves[:, :, 1, ...]], axis=1)
+    rows = xp.permute_dims(rows, (0, 3, 4, 1, 2))  # (k, ny, nx, 3, n_masks)
+    right = xp.permute_dims(light - square(waves), (0, 2, 3, 1))[..., np.newaxis]
+    normal = rows @ xp.matrix_transpose(rows) + _RIDGE * model.kind.array(np.eye(3))
+    solved = xp.linalg.solve(normal, rows @ right)[..., 0]
+    modulus = xp.sqrt(xp.clip(solved[..., 0], 0, None))
+    return split(xp.atan2(solved[..., 2], solved[..., 1]), modulus) * model.stop
 
 
 def _reflected(psi: NDArray, reference: NDArray) -> NDArray:

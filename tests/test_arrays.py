@@ -115,6 +115,9 @@ METHODS = {
         ZernikeSensor(pupil, PAIR[0]), amplitude=pupil.amplitude * (np.arange(pupil.shape[1]) > 12)
     ),
     "Gerchberg-Saxton": lambda pupil: GerchbergSaxton(ZernikeSensor(pupil, *PAIR, extent=1.5), n_iterations=4),
+    "Gerchberg-Saxton, model kept": lambda pupil: GerchbergSaxton(
+        ZernikeSensor(pupil, *PAIR), n_iterations=4, unmeasured="model"
+    ),
 }
 
 

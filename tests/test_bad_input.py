@@ -114,6 +114,7 @@ def valid() -> dict:
     from zwfs.frames import pipeline, registration
     from zwfs.paper import bench_linearity, closed_loop, dimple_diameter, linearity, phase_shifts
 
+    paper = linearity.paper_reconstructors(pupil, modes, 1.06, 1.5, extent=1.0, n_iterations=2)
     small = model.Bench(n_pixels=17, n_rings=1, missing=(), gap=0.0, static=0.0, photons=1e6, read_noise=1.0)
     model = model.BenchModel.from_images(small, 1)
     on_bench = model.normalise(small.frames(None, 2))
@@ -145,6 +146,7 @@ def valid() -> dict:
         "n_modes": 4,
         "n_rings": 1,
         "n_shifts": 4,
+        "unmeasured": "model",
         "missing": (2,),
         "spiders": ((0.3, 0.1),),
         "gap": 0.02,
@@ -198,7 +200,7 @@ def valid() -> dict:
         "tolerances": np.array([1e-2, 1e-6]),
         "diameter_curves.make": lambda diameter: {"shifted": method},
         "own_reconstructor.path": "",
-        "offset_by_width.reconstructor": zwfs.GerchbergSaxton(shifted, n_iterations=2),
+        **dict.fromkeys(("saxton_by_width.reconstructors", "repaired_reconstructors.reconstructors"), paper),
         "contraction.modes": np.tile(modes, (30, 1, 1)),
         "limit": 0.05,
         "x": np.array([1.0, 2.0]),

@@ -5,21 +5,21 @@ import pytest
 from joblib import parallel_config
 
 from zwfs import (
-    GerchbergSaxton,
     Linear,
     PhaseShifted,
-    ZernikeSensor,
     dynamic_range,
     reconstruction_error,
 )
 from zwfs.paper.linearity import (
     count_work,
     iteration_errors,
+    light_lost,
     linearity_curves,
     model_accuracy,
-    offset_by_width,
     own_reconstructor,
     paper_reconstructors,
+    repaired_reconstructors,
+    saxton_by_width,
     screens_at,
 )
 
@@ -197,12 +197,27 @@ def test_paper_reconstructors_take_masks_and_settings(pupil, modes):
     assert methods["Arcsine"].settings.n_iterations == 7
 
 
-def test_a_wider_detector_loses_less_light_and_has_a_smaller_offset(pupil, modes, shifted):
-    wide = GerchbergSaxton(ZernikeSensor(pupil, *shifted.masks, extent=2))
-    extents, lost, offset = offset_by_width(wide, modes, [2.0, 4.0], 2).T
-    np.testing.assert_allclose(extents, [2, 4])
-    assert 0 < lost[1] < lost[0] < 0.2
-    assert 0 < offset[1] < offset[0] < 0.1
+def test_a_wider_detector_or_the_modelled_field_reduces_the_offset_of_gerchberg_saxton(pupil, modes):
+    methods = paper_reconstructors(pupil, modes, 1.06, np.pi / 2)
+    variants, curves = saxton_by_width(methods, modes, [2.0, 3.0], 1)
+    assert [method.sensor.extent for method in variants.values()] == pytest.approx([2, 3, 2, 2])
+    assert [method.unmeasured for method in variants.values()] == ["zero", "zero", "model", "model"]
+    near, wide, kept, longer = (curves.mean(name)[0] for name in variants)
+    assert 0.01 * near > kept > longer
+    assert 0.1 > near > wide > 0
+    sensors = [method.sensor for method in variants.values()][:2]
+    assert 0.2 > light_lost(sensors[0]) > light_lost(sensors[1]) > 0
+
+
+def test_repaired_reconstructors_find_what_the_originals_miss(pupil, modes):
+    methods = paper_reconstructors(pupil, modes, 1.06, np.pi / 2, n_iterations=40)
+    methods |= repaired_reconstructors(methods)
+    curves = linearity_curves(methods, modes, [0.3], 4)
+    assert curves.mean("GerchbergSaxtonModel") < 0.05 * curves.mean("GerchbergSaxton")
+    started = methods["GradientDescentStarted"]
+    frames = started.sensor.measure(screens_at(modes, 0.3, 2, seed=1, task=0))
+    start = PhaseShifted(started.sensor, n_iterations=5)(frames).phase
+    np.testing.assert_array_equal(started(frames).phase, methods["GradientDescent"](frames, start=start).phase)
 
 
 def test_work_is_counted(methods, modes, shifted):

@@ -397,6 +397,69 @@ def test_gerchberg_saxton_offset_falls_with_the_extent(pupil, screens):
     assert np.all(np.divide(offset[1:], offset[:-1]) < 0.8)
 
 
+def core(u, v):
+    """Gaussian that nearly vanishes at the edge of a patch of 3 lambda/D, as its transform does 2.5 D away."""
+    return np.exp(-(u**2 + v**2) / (2 * 0.31**2))
+
+
+SMOOTH = zwfs.Patch(3.0, lambda u, v: np.exp(1.5j * core(u, v) * (1 + 0.3 * u)))
+DARK = zwfs.Patch(3.0, lambda u, v: np.sqrt(1 - 0.5 * core(u, v) ** 2) * np.exp(-1.2j * core(u, v)))
+# 1 - t, if t^2 is the share of the light that DARK absorbs
+ABSORBED = zwfs.Patch(3.0, lambda u, v: 1 - np.sqrt(0.5) * core(u, v))
+
+
+def test_modelled_field_is_kept_beyond_the_detector_and_in_the_mask(pupil, screens):
+    """Compare with a detector that catches all light, and a second one behind the light that a mask absorbs."""
+    truth, guess = screens(0.8, 2)
+    wide, absorbing = (
+        ZernikeSensor(pupil, *masks, extent=6, tolerance=1e-8) for masks in ((SMOOTH, DARK), (ABSORBED,))
+    )
+    near = ZernikeSensor(pupil, SMOOTH, DARK, extent=1.5)
+    frames, field = near.measure(truth), pupil.field(guess)
+    waves, absorbed = wide.propagate(field), absorbing.reference_wave(field)
+    n = near.detector_shape[0]
+    middle = slice((wide.detector_shape[0] - n) // 2, (wide.detector_shape[0] + n) // 2)
+    some = waves[..., middle, middle]
+    waves[..., middle, middle] = np.sqrt(frames) * some / np.abs(some)
+    expected = np.angle(wide.adjoint(waves) + absorbing.adjoint(absorbed) - absorbed[0][absorbing.window])
+    once = GerchbergSaxton(near, n_iterations=1, tolerance=0, unmeasured="model")
+    for dtype, accuracy in ((np.float64, 1e-6), (np.float32, 1e-5)):
+        found = once(frames.astype(dtype), start=guess).phase
+        assert found.dtype == dtype
+        np.testing.assert_allclose(pupil.gather(found), pupil.gather(expected), atol=accuracy)
+
+
+@pytest.mark.parametrize(
+    "masks",
+    [
+        [Dimple(1.06, np.pi / 2)],
+        [Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), Dimple(2.0, 1.0)],
+        [Dimple(1.06, 1.0, amplitude=0.3), SMOOTH, DARK],
+    ],
+)
+def test_true_phase_is_a_fixed_point_if_the_modelled_field_is_kept(pupil, screens, masks):
+    sensor, phase = ZernikeSensor(pupil, *masks), screens(1.5)
+    kept = GerchbergSaxton(sensor, n_iterations=5, tolerance=0, unmeasured="model")
+    found = kept(sensor.measure(phase), start=phase).phase
+    assert reconstruction_error(pupil, found, phase).max() < 1e-13
+
+
+@pytest.mark.parametrize(("rms", "n_iterations", "bound"), [(0.1, 100, 1e-13), (0.4, 200, 1e-7)])
+def test_kept_model_is_exact_on_a_detector_as_wide_as_the_pupil(pupil, shifted, screens, rms, n_iterations, bound):
+    kept, zero = (
+        GerchbergSaxton(shifted, n_iterations=n_iterations, tolerance=0, unmeasured=unmeasured)
+        for unmeasured in ("model", "zero")
+    )
+    assert errors(kept, shifted, screens(rms)).max() < bound
+    assert errors(zero, shifted, screens(rms)).min() > rms  # it diverges
+
+
+@pytest.mark.parametrize("unmeasured", ["zeros", None, 0])
+def test_gerchberg_saxton_refuses_another_field_where_nothing_is_measured(shifted, unmeasured):
+    with pytest.raises(ValueError, match=r"unmeasured = .*: expected one of \['zero', 'model'\]"):
+        GerchbergSaxton(shifted, unmeasured=unmeasured)
+
+
 @pytest.mark.parametrize("on_modes", [False, True])
 @pytest.mark.parametrize("n_masks", [1, 2])
 def test_gradient_agrees_with_finite_differences(pupil, modes, screens, n_masks, on_modes):

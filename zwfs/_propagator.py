@@ -170,6 +170,13 @@ def square(waves: NDArray) -> NDArray:
     return squares[..., 0, :, :] + squares[..., 1, :, :]
 
 
+def modulus_of(field: NDArray, xp: Any) -> NDArray:
+    """Modulus: (..., 2, ny, nx) to (..., ny, nx); a number above 0 where the field vanishes."""
+    power = square(field)
+    power += _VANISHING
+    return xp.sqrt(power)
+
+
 def angle(field: NDArray, xp: Any) -> NDArray:
     """Phase: (..., 2, ny, nx) to (..., ny, nx)."""
     return xp.atan2(field[..., 1, :, :], field[..., 0, :, :])
@@ -189,12 +196,7 @@ def unit(field: NDArray, modulus: NDArray, xp: Any, before: NDArray | None = Non
 
     `before` is the modulus of `field`, if that is known.
     """
-    if before is None:
-        power = square(field)
-        power += _VANISHING
-        before = xp.sqrt(power)
-    else:
-        before = before + _VANISHING
+    before = modulus_of(field, xp) if before is None else before + _VANISHING
     field *= (modulus / before)[..., np.newaxis, :, :]
     return field
 

@@ -18,7 +18,14 @@ from zwfs.metrics import reconstruction_error, strehl
 from zwfs.modes import power_law_screens
 from zwfs.paper.curves import ErrorCurves
 from zwfs.pupil import Pupil
-from zwfs.reconstructors import Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
+from zwfs.reconstructors import (
+    Arcsine,
+    GerchbergSaxton,
+    GradientDescent,
+    Linear,
+    PhaseShifted,
+    Reconstruction,
+)
 from zwfs.reconstructors.base import load
 from zwfs.sensor import ZernikeSensor
 
@@ -118,6 +125,46 @@ def paper_reconstructors(
         "GradientDescent": GradientDescent(shifted, modes, **settings),
         "GradientDescentPoints": GradientDescent(shifted, **settings),
         "PhaseShifted": PhaseShifted(shifted, **settings),
+    }
+
+
+@dataclass(frozen=True)
+class _Started:
+    """Reconstructor that starts from the phase of another one for the same frames.
+
+    Attributes
+    ----------
+    first, then : reconstructor
+    """
+
+    first: Any
+    then: Any
+
+    @property
+    def sensor(self) -> ZernikeSensor:
+        """Sensor of both reconstructors."""
+        return _check.sensor_of("then", self.then)
+
+    def __call__(self, frames: ArrayLike) -> Reconstruction:
+        """Reconstruct the phase of each frame set."""
+        return self.then(frames, start=self.first(frames).phase)
+
+
+def repaired_reconstructors(reconstructors: Mapping[str, Any]) -> dict[str, Any]:
+    """Return variants of `paper_reconstructors`, with their settings, that avoid a failure of the originals.
+
+    "GerchbergSaxtonModel" keeps the modelled field where nothing is measured, on a detector as wide as the pupil.
+    "GradientDescentStarted" starts from the phase of five phase-shifted iterations.
+    """
+    check_reconstructors(reconstructors)
+    for name in ("GerchbergSaxton", "GradientDescent", "PhaseShifted"):
+        _check.choice("reconstructors", name, dict(reconstructors))
+    shifted, original = reconstructors["PhaseShifted"].sensor, reconstructors["GerchbergSaxton"].settings
+    steps = {"n_iterations": original.n_iterations, "tolerance": original.tolerance}
+    start = PhaseShifted(shifted, n_iterations=5)
+    return {
+        "GerchbergSaxtonModel": GerchbergSaxton(shifted, **steps, unmeasured="model"),
+        "GradientDescentStarted": _Started(start, reconstructors["GradientDescent"]),
     }
 
 
@@ -247,33 +294,58 @@ def iteration_errors(
     return errors
 
 
-def offset_by_width(
-    reconstructor: GerchbergSaxton,
+def saxton_by_width(
+    reconstructors: Mapping[str, Any],
     modes: NDArray,
     extents: ArrayLike,
     n_screens: int,
     *,
     exponent: float = -2.0,
     seed: int = 0,
-) -> NDArray[np.float64]:
-    """Error of Gerchberg-Saxton at 0.1 rad rms on detectors of several widths, and the light that they lose.
+) -> tuple[dict[str, GerchbergSaxton], LinearityCurves]:
+    """Error of variants of Gerchberg-Saxton on detectors of several widths, and of the linear method.
 
-    The masks and the settings are those of `reconstructor`. Returns rows (n_extents, 3): width (D), fraction of
-    the light of a flat wavefront that misses the detector, and mean error on the screens (radian rms).
+    The first variants take the unmeasured field as "zero", one for each of `extents` (D). The last two keep the
+    "model" on the narrowest of these detectors, with the usual number of iterations and with eight times as many.
+
+    Parameters
+    ----------
+    reconstructors : mapping of str to reconstructor
+        With "Linear" and "GerchbergSaxton", whose masks and settings the variants have.
+    modes, n_screens, exponent, seed
+        As for `linearity_curves`.
+    extents : array_like, shape (n_extents,), pupil diameters
+
+    Returns
+    -------
+    variants : dict of GerchbergSaxton
+    curves : LinearityCurves
+        Of the variants and "Linear", at inputs from 0.1 to 0.8 rad rms.
     """
-    _check.instance("reconstructor", reconstructor, GerchbergSaxton)
-    pupil, masks = reconstructor.sensor.pupil, reconstructor.sensor.masks
+    check_reconstructors(reconstructors)
+    _check.choice("reconstructors", "Linear", dict(reconstructors))
+    original: Any = reconstructors.get("GerchbergSaxton")
+    _check.instance("reconstructors['GerchbergSaxton']", original, GerchbergSaxton)
     extents = _check.real_array("extents", extents)
     if extents.ndim != 1 or not extents.size or not np.all((extents >= 1) & (extents <= 100)):
         raise ValueError(f"extents = {_check.shown(extents)}: expected a list of values between 1 and 100")
-    rows = []
-    for extent in extents.tolist():
-        sensor = ZernikeSensor(pupil, *masks, extent=extent)
-        method = GerchbergSaxton(sensor, n_iterations=reconstructor.settings.n_iterations)
-        curves = linearity_curves({"it": method}, modes, [0.1], n_screens, exponent=exponent, seed=seed)
-        caught = sensor.measure(np.zeros(pupil.shape))[0].sum() / pupil.n_points
-        rows.append((sensor.extent, 1 - caught, curves.mean("it")[0]))
-    return np.array(rows)
+    sensor, n_iterations = original.sensor, original.settings.n_iterations
+    chosen = [(extent, "zero", n_iterations) for extent in extents.tolist()]
+    chosen += [(float(extents.min()), "model", n) for n in (n_iterations, 8 * n_iterations)]
+    variants = {
+        f"{extent:g} D, {unmeasured}, {n}": GerchbergSaxton(
+            ZernikeSensor(sensor.pupil, *sensor.masks, extent=extent), n_iterations=n, unmeasured=unmeasured
+        )
+        for extent, unmeasured, n in chosen
+    }
+    methods, inputs = {"Linear": reconstructors["Linear"], **variants}, [0.1, 0.2, 0.3, 0.5, 0.8]
+    return variants, linearity_curves(methods, modes, inputs, n_screens, exponent=exponent, seed=seed)
+
+
+def light_lost(sensor: ZernikeSensor) -> float:
+    """Fraction of the light of a flat wavefront that misses the detector behind the first mask."""
+    _check.instance("sensor", sensor, ZernikeSensor)
+    return 1 - float(sensor.measure(np.zeros(sensor.pupil.shape))[0].sum()) / sensor.pupil.n_points
 
 
 def count_work(reconstructors: Mapping[str, Any], phase: NDArray) -> tuple[dict[str, int], set[str]]:

@@ -42,10 +42,9 @@ def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], r
         limit = curves.dynamic_range(name, threshold)
         if 0 < limit <= rms_max:
             ratio.plot(limit, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
-    gray = {"color": "#555555", "fontsize": 9, "ha": "center", "va": "bottom"}
     plain.plot(rms, threshold * rms, color="#555555", lw=1)
-    plain.text(0.6 * rms_max, 0.6 * threshold * rms_max + 0.01, f"{threshold:.0%} of the input", **gray)
     ratio.axhline(threshold, color="#555555", lw=1)
+    gray = {"color": "#555555", "fontsize": 9, "ha": "center", "va": "bottom"}
     ratio.text(0.6 * rms_max, threshold * 1.1, f"{threshold:.0%} of the input", **gray)
     plain.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
     ratio.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))

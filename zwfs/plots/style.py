@@ -58,8 +58,10 @@ LOOKS |= {
     "Linear": Look("linear", "one pupil", "#000000", "o", "-"),
     "Arcsine": Look("arcsine", "one pupil", "#E69F00", "s", "--"),
     "GerchbergSaxton": Look("Gerchberg-Saxton", "two pupils", "#009E73", "^", "-."),
+    "GerchbergSaxtonModel": Look("Gerchberg-Saxton, model kept", "two pupils", "#608040", "x", "-"),
     "GradientDescent": Look("gradient descent", "two pupils", "#CC79A7", "D", (0, (3, 1, 1, 1, 1, 1))),
     "GradientDescentPoints": Look("gradient descent on points", "two pupils", "#D55E00", "d", "--"),
+    "GradientDescentStarted": Look("gradient descent, phase-shifted start", "two pupils", "#7010E0", "+", "-."),
     "PhaseShifted": Look("phase-shifted", "two pupils", "#0072B2", "v", ":"),
 }
 for _method in RECONSTRUCTORS:

@@ -5,25 +5,31 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from zwfs._propagator import Propagator, unit
+from zwfs import _check
+from zwfs._propagator import Propagator, modulus_of, unit
 from zwfs.reconstructors.base import Estimate, FixedPoint, State
+from zwfs.sensor import ZernikeSensor
 
 
 class GerchbergSaxton(FixedPoint):
-    """Phase by going to and fro between the planes, with the measured amplitude put in at each.
+    """Phase from alternating propagation between the pupil and the detector, with the measured amplitude in each.
 
-    One iteration propagates the estimate through every mask, replaces the modelled amplitude by the square root of
-    the measured frames, back-propagates, adds the fields of all masks, and replaces the amplitude in the pupil by
-    A_in.
+    One iteration propagates the estimate psi through every mask, o = A psi, replaces the modelled amplitude |o| by
+    the square root a of the measured frames, back-propagates, adds the fields of all masks, and replaces the
+    amplitude in the pupil by A_in. Two variants differ in the field where nothing is measured, which is beyond the
+    detector and in the light that a mask absorbs.
 
-    The detector plane is that of the sensor. Light beyond it is taken as 0 on the way back, which biases the
-    phase: give the sensor an `extent` of 2 D or more. On a detector as wide as the pupil the phase improves in the
-    first iterations and then diverges.
+    With "zero", the paper's way, this field counts as 0: next = A^H (a o / |o|). The true phase is no fixed point.
+    The phase has a bias that grows with the light that misses the detector. Give the sensor an `extent` of 2 D or
+    more: on a detector as wide as the pupil the iteration diverges.
 
-    The piston stays near that of the start: with the estimate psi, the measured amplitude a and the modelled field
-    o = A psi of each mask, <psi, next> = sum a |o|, which is real and positive.
+    With "model", this field is the modelled one: next = n psi + A^H (a o / |o| - o), with n masks. The true phase
+    is a fixed point on a detector of any width, with masks of any transmission. No iteration increases the sum of
+    (a - |o|)^2 over the detector. The cost is that of "zero".
+
+    The piston stays near that of the start, since <psi, next> is real and positive.
 
     Parameters
     ----------
@@ -31,11 +37,37 @@ class GerchbergSaxton(FixedPoint):
         With any number of masks.
     n_iterations, tolerance, amplitude
         As for `PhaseShifted`.
+    unmeasured : {"zero", "model"}
+        Field where nothing is measured.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of the wrong kind, shape or range.
 
     References
     ----------
-    Chambouleyron et al. 2024, section 3.2, equations (14) and (15); Gerchberg & Saxton 1972.
+    Chambouleyron et al. 2024, section 3.2, equations (14) and (15); Gerchberg & Saxton 1972;
+    `eq-unmeasured` of the book for "model".
     """
+
+    def __init__(
+        self,
+        sensor: ZernikeSensor,
+        *,
+        n_iterations: int = 25,
+        tolerance: float = 1e-6,
+        amplitude: ArrayLike | None = None,
+        unmeasured: str = "zero",
+    ) -> None:
+        super().__init__(sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=amplitude)
+        _check.choice("unmeasured", unmeasured, ["zero", "model"])
+        self._unmeasured = unmeasured
+
+    @property
+    def unmeasured(self) -> str:
+        """The field where nothing is measured, "zero" or "model"."""
+        return self._unmeasured
 
     def begin(self, frames: NDArray, phasor: NDArray | None, constants: Propagator) -> _State:
         """Return the measured amplitude on the detector."""
@@ -43,9 +75,15 @@ class GerchbergSaxton(FixedPoint):
 
     def step(self, phasor: NDArray, state: _State, constants: Propagator) -> Estimate:
         """Propagate to the detector and back."""
-        waves = constants.propagate(constants.field(phasor))
+        xp, psi = constants.kind.xp, constants.field(phasor)
+        waves = constants.propagate(psi)
         # A modelled field of 0 has no phase: such a pixel adds nothing on the way back.
-        return Estimate(constants.adjoint(unit(waves, state.amplitude, constants.kind.xp)))
+        if self.unmeasured == "zero":
+            return Estimate(constants.adjoint(unit(waves, state.amplitude, xp)))
+        modelled = modulus_of(waves, xp)
+        back = constants.adjoint(unit(waves, state.amplitude - modelled, xp, modelled))
+        back += self.sensor.n_masks * psi
+        return Estimate(back)
 
 
 @dataclass

@@ -25,6 +25,11 @@ class GradientDescent(Reconstructor):
     the paper, but it is smooth there, where a norm has a kink that spoils the steps of the optimiser. The gradient
     comes from back-propagation through the sensor; `scipy.optimize.minimize` takes the steps (L-BFGS-B).
 
+    From a flat start, descent on modes ends in local minima from about 0.8 rad rms on: a patch at the rim lands a
+    whole 2 pi off. The phase of a few phase-shifted iterations is a safer start: call
+    `descent(frames, start=PhaseShifted(sensor, n_iterations=5)(frames).phase)`. The modes are added to the start,
+    which need not be a sum of modes; descent keeps the part of its error that no mode represents.
+
     Parameters
     ----------
     sensor : ZernikeSensor

@@ -1,8 +1,5 @@
 import os
-import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -88,31 +85,3 @@ def browser():
         chromium = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
         yield chromium
         chromium.close()
-
-
-@pytest.fixture(scope="session")
-def build_plain_book():
-    """Runs Jupyter Book on a copy of the tracked files, warnings as errors; returns the folder of pages."""
-
-    def build(root):
-        listed = subprocess.run(["git", "-C", ROOT, "ls-files"], capture_output=True, text=True, check=True).stdout
-        for name in filter(lambda name: (ROOT / name).is_file(), listed.splitlines()):
-            (root / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(ROOT / name, root / name)
-        jupyter_book = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()"]
-        done = subprocess.run(
-            [*jupyter_book, "build", "-W", "-n", "--keep-going", "."],
-            cwd=root,
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stderr[-4000:]
-        return root / "_build" / "html"
-
-    return build
-
-
-@pytest.fixture(scope="session")
-def plain_book(build_plain_book, tmp_path_factory):
-    """The pages of a plain build."""
-    return build_plain_book(tmp_path_factory.mktemp("plain"))

@@ -770,14 +770,6 @@ def test_frames_may_come_in_the_unit_of_their_calibration(shifted, modes, screen
     np.testing.assert_allclose(found.phase, Linear(shifted, modes)(frames / 1e4).phase, atol=1e-9)
 
 
-@every
-@pytest.mark.parametrize("history", [1, 0, None, "no"])
-def test_history_is_a_flag(make, method, screens, history):
-    reconstruct, sensor = make(method)
-    with pytest.raises(TypeError, match=f"history = {history!r}: expected True or False"):
-        reconstruct(sensor.measure(screens(0.1)), history=history)
-
-
 @iterative
 def test_any_change_is_within_a_huge_tolerance(make, method, screens):
     reconstruct, sensor = make(method, tolerance=1e200)
@@ -825,24 +817,11 @@ def test_a_method_is_loaded_by_its_path(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
-        (lambda f: f[0], ValueError, r"frames has shape .*: expected \(\.\.\., [12], 40, 40\)"),
         (lambda f: np.concatenate([f, f]), ValueError, r"frames has shape .*: expected \(\.\.\., [12], 40, 40\)"),
         (lambda f: f[:, 1:], ValueError, "frames has shape"),
         (lambda f: f[np.newaxis][:0], ValueError, r"frames has shape .*: expected at least one frame"),
-        (
-            lambda f: np.where(f == f.max(), np.nan, f),
-            ValueError,
-            "frames holds .* NaN or inf.*expected finite",
-        ),
-        (
-            lambda f: np.where(f == f.max(), np.inf, f),
-            ValueError,
-            "frames holds .* NaN or inf.*expected finite",
-        ),
         (lambda f: f - 0.5, ValueError, "frames reaches down to -.*: expected no negative"),
         (lambda f: 0 * f, ValueError, "frames: .* hold no light: expected some flux"),
-        (lambda f: f + 0j, TypeError, r"frames is complex \(complex128\): expected real"),
-        (lambda f: f.astype(str), TypeError, "frames has dtype"),
     ],
 )
 def test_bad_frames_are_named(make, method, pupil, spoil, error, message):
@@ -862,8 +841,6 @@ def test_bad_frames_are_named(make, method, pupil, spoil, error, message):
             ValueError,
             r"start has shape \(2, 40, 40\): expected \(40, 40\) or \(3, 40, 40\)",
         ),
-        (np.full((40, 40), np.nan), ValueError, "start holds .* inside the pupil"),
-        (np.zeros((40, 40), complex), TypeError, "start is complex"),
     ],
 )
 def test_bad_start_is_named(make, method, screens, start, error, message):
@@ -874,16 +851,10 @@ def test_bad_start_is_named(make, method, screens, start, error, message):
 
 OPTIONS = [
     ({"n_iterations": 0}, ValueError, r"n_iterations = 0: expected an integer in \[1, "),
-    ({"n_iterations": 2.5}, TypeError, r"n_iterations = 2\.5: expected an integer"),
-    ({"n_iterations": True}, TypeError, "n_iterations = True: expected an integer"),
     ({"tolerance": -1e-6}, ValueError, r"tolerance = -1e-06: .*\[0, inf"),
-    ({"tolerance": np.nan}, ValueError, "tolerance = nan"),
-    ({"amplitude": np.ones((3, 3))}, ValueError, r"amplitude has shape \(3, 3\)"),
     ({"amplitude": np.ones((2, 40, 40))}, ValueError, r"amplitude has shape \(2, 40, 40\): expected \(40, 40\)"),
     ({"amplitude": -np.ones((40, 40))}, ValueError, "amplitude reaches down to -1"),
     ({"amplitude": np.zeros((40, 40))}, ValueError, "amplitude is 0 everywhere in the pupil"),
-    ({"amplitude": np.full((40, 40), np.nan)}, ValueError, "amplitude holds"),
-    ({"amplitude": np.ones((40, 40)) * 1j}, TypeError, "amplitude is complex"),
     ({"poke": 0}, ValueError, r"poke = 0: .*\[1e-10, 3\.14"),
     ({"poke": 1e308}, ValueError, r"poke = 1e\+308: .*\[1e-10, 3\.14"),
     (
@@ -891,7 +862,6 @@ OPTIONS = [
         ValueError,
         "modes: .* none of them around the reference",
     ),
-    ({"n_iterations": 10**400}, ValueError, r"n_iterations = 10+.*: expected an integer in \[1, 2147483647\]"),
     (
         {"amplitude": np.full((40, 40), 1e100)},
         ValueError,
@@ -903,13 +873,7 @@ OPTIONS = [
         "amplitude: its squares add up to 0: expected",
     ),
     ({"conditioning": 1.0}, ValueError, r"conditioning = 1\.0: .*\[0, 1\)"),
-    ({"reference": np.zeros((3, 3))}, ValueError, r"reference has shape \(3, 3\): expected \(\.\.\., 40, 40\)"),
     ({"reference": np.zeros((2, 40, 40))}, ValueError, r"reference has shape \(2, 40, 40\): expected \(40, 40\)$"),
-    ({"modes": np.ones((40, 40))}, ValueError, r"modes has shape \(40, 40\): expected \(n_modes, ny, nx\)"),
-    ({"modes": np.ones((2, 40, 41))}, ValueError, r"modes has shape \(2, 40, 41\): expected \(\.\.\., 40, 40\)"),
-    ({"modes": np.full((2, 40, 40), np.nan)}, ValueError, "modes holds .* inside the pupil"),
-    ({"modes": np.ones((2, 40, 40), complex)}, TypeError, "modes is complex"),
-    ({"modes": np.empty((0, 40, 40))}, ValueError, r"modes has shape \(0, 40, 40\)"),
     ({"modes": np.ones((1265, 40, 40))}, ValueError, "modes: 1265 of them, expected at most the 1264 points"),
 ]
 
@@ -928,12 +892,6 @@ def test_bad_options_are_named(sensor_of, modes, method, options, error, message
         options = {"modes": modes} | options
     with pytest.raises(error, match=message):
         method(sensor_of(method), **options)
-
-
-@every
-def test_sensor_is_checked(modes, pupil, method):
-    with pytest.raises(TypeError, match="sensor is a Pupil: expected a ZernikeSensor"):
-        build(method, pupil, modes)
 
 
 @every

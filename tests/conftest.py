@@ -1,4 +1,5 @@
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -9,6 +10,13 @@ from hypothesis import settings
 import zwfs
 
 ROOT = Path(__file__).parent.parent
+
+
+def new_reconstructor():
+    """Return the path and the code of the reconstructor in CONTRIBUTING."""
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    return re.search(r"^`(zwfs/reconstructors/\w+\.py)`.*?^```python\n(.*?)^```", text, re.M | re.S).groups()
+
 
 settings.register_profile("zwfs", derandomize=True, deadline=None, max_examples=25)
 settings.load_profile("zwfs")

@@ -206,20 +206,3 @@ def test_page_answers_the_keyboard_and_keeps_its_height(page):
 def test_page_says_nothing_and_asks_for_nothing_else(page):
     assert page.said == []
     assert {address.split(":")[0] for address in page.asked} == {"file"}
-
-
-def test_how_fast(page):
-    """Prints the time of one update; nothing depends on it."""
-    times = page.evaluate(
-        """() => [10, 25].map((iterations) => {
-            const settings = { seed: 7, diameter: 1.06, shifts: [1.5, -1.5], photons: Infinity, iterations };
-            const times = Array.from({ length: 60 }, (_, k) => {
-                const start = performance.now();
-                window.zwfsLive.compute({ ...settings, rms: 0.4 + 0.01 * k });
-                return performance.now() - start;
-            });
-            return times.sort((a, b) => a - b)[30];
-        })"""
-    )
-    print(f"one update takes {times[0]:.1f} ms with 10 iterations, {times[1]:.1f} ms with 25")
-    assert all(np.isfinite(times))

@@ -183,7 +183,7 @@ def start_sleeping_run(project):
     return process, int(pid.read_text())
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_interruption_leaves_no_kernel_and_no_pieces(project, number):
     process, kernel = start_sleeping_run(project)
     process.send_signal(number)

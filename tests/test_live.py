@@ -9,7 +9,6 @@ import pytest
 
 import zwfs
 from book._ext import live
-from zwfs.lowrank import Plane
 
 ROOT = Path(__file__).parent.parent
 STATIC = ROOT / "book" / "_static"
@@ -88,32 +87,6 @@ def compute(page, pupil):
 
 def sensor_of(pupil, diameter, shifts):
     return zwfs.ZernikeSensor(pupil, *(zwfs.Dimple(diameter, shift * np.pi) for shift in shifts))
-
-
-def test_core_of_any_diameter_is_that_of_zwfs(pupil):
-    diameters, factors = live.dimples(pupil)
-    rng = np.random.default_rng(0)
-    field = (rng.normal(size=pupil.shape) + 1j * rng.normal(size=pupil.shape)) * pupil.inside
-    for diameter in (*live.DIAMETERS, 1.06, 2.2):
-        weights = [
-            np.prod([(diameter - other) / (own - other) for other in diameters if other != own])
-            for own in diameters
-        ]
-        core = np.tensordot(weights, factors.core, 1)
-        wave = factors.detector.expand(factors.pupil.project(field[np.newaxis]) @ core.T)[0]
-        dark = zwfs.ZernikeSensor(pupil, zwfs.Dimple(diameter, 0.0, 0.0), tolerance=1e-14)
-        np.testing.assert_allclose(wave, dark.reference_wave(field)[0], atol=1e-6)
-    assert np.abs(factors.core.imag).max() < 1e-12
-
-
-def test_screens_are_those_of_zwfs(pupil, modes):
-    plane = live.screens(pupil)
-    assert isinstance(plane, Plane)
-    assert plane.rank == live.N_SEEDS
-    for seed in (1, live.N_SEEDS):
-        wanted = zwfs.power_law_screens(modes, 1.0, 1, seed=seed)
-        found = plane.expand(np.eye(live.N_SEEDS)[[seed - 1]]) * pupil.inside
-        np.testing.assert_allclose(found, wanted, atol=1e-8)
 
 
 @pytest.mark.parametrize(("rms", "seed", "diameter", "shifts", "iterations"), SETTINGS)

@@ -11,6 +11,7 @@ import pytest
 from bs4 import BeautifulSoup
 
 import zwfs
+from book._ext import api
 
 from .conftest import ROOT
 
@@ -68,6 +69,16 @@ def test_every_figure_of_the_paper_has_a_card_with_its_notebook(plain_book):
 def test_pages_have_mathematics_and_the_address_leads_to_the_front_page(plain_book):
     assert (plain_book / "_static" / "mathjax" / "tex-chtml-full.js").is_file()
     assert 'url=book/index.html"' in (plain_book / "index.html").read_text("utf-8")
+
+
+def test_equations_are_numbered_through_the_book_and_those_of_the_paper_as_there(plain_book):
+    labels = api.paper_labels(ROOT / "book")
+    assert len(labels) == 16
+    named = {1: "eq-propagation", 6: "eq-arccos", 9: "eq-phase-shifted", 16: "eq-cost"}
+    assert {number: labels[number - 1] for number in named} == named
+    pages = [plain_book / "book" / page.replace(".md", ".html") for page in (*api.PAPER, "theory.md")]
+    found = [int(number.get_text().strip("()#\uf0c1")) for page in pages for number in read(page).select(".eqno")]
+    assert found == list(range(1, len(found) + 1))
 
 
 def test_no_pdf_is_linked(plain_book):

@@ -24,7 +24,7 @@ from book._tools.declared import ParameterError
 from book._tools.execute import NotebookError
 from book._tools.notebook import read
 from book._tools.project import Project
-from tests.conftest import heed_signals
+from tests.conftest import heed_signals, wait_until
 
 ROOT = Path(__file__).parent.parent
 
@@ -131,14 +131,8 @@ def refused(project, *arguments):
         (["1", "-p", "wdth=2"], "unknown parameter 'wdth': did you mean 'width'?"),
         (["1", "-p", "zzz=2"], "unknown parameter 'zzz': expected one of n, width, steps, seed"),
         (["1", "-p", "n=1e0"], "n = 1.0: expected an integer, as in 1"),
-        (["1", "-p", "n=2.0"], "n = 2.0: expected an integer, as in 2"),
-        (["1", "-p", "n=true"], "n = True: expected an integer"),
-        (["1", "-p", 'n="2"'], "n = '2': expected an integer"),
         (["1", "-p", "n="], "n = None: expected an integer"),
-        (["1", "-p", "n=10"], "n = 10: expected an integer in [1, 9]"),
-        (["1", "-p", "width=false"], "width = False: expected a real number"),
         (["1", "-p", "width=.nan"], "width = nan: expected a finite number in [0, 4]"),
-        (["1", "-p", "width=-.inf"], "width = -inf: expected a finite number in [0, 4]"),
         (["1", "-p", "steps=[1, 10]"], "steps[1] = 10: expected an integer in [0, 9]"),
         (["1", "-p", "steps=1"], "steps = 1: expected a list"),
         (["1", "-p", "steps=[1,"], "-p steps=[1,: expected the node content"),
@@ -390,10 +384,7 @@ def start_sleeping_run(project):
     """Start the command, and return it and its terminal when its notebook sleeps."""
     write(project, "fig02_works", new_code_cell("import time\nopen('begun', 'w').close()\ntime.sleep(99)"))
     process, terminal = run_command(project, "2")
-    end = time.monotonic() + 240
-    while not (project.notebooks / "begun").exists():
-        assert time.monotonic() < end, "it did not begin"
-        time.sleep(0.1)
+    wait_until((project.notebooks / "begun").exists, seconds=240)
     return process, terminal
 
 

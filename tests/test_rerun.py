@@ -558,7 +558,7 @@ FEW = ["n_pixels=16", "n_screens=1"]
         # Neither the inputs that the text quotes, nor the pairs of phase shifts that the figure points out.
         ("identities", ["inputs=[4.0]", "n_modes=1", "n_shifts=5"]),
         # Every method fails at every diameter.
-        ("4", ["n_screens_few=1", "rms=4", "n_iterations=1", "more_iterations=[1]", "step=2"]),
+        ("4", ["n_screens_few=1", "rms=4", "n_iterations=1", "more_iterations=[1]", "step=2", "step_fine=0.3"]),
     ],
 )
 def test_pages_of_unusual_parameters_have_no_gaps(tmp_path, capsys, figure, parameters):

@@ -1,8 +1,7 @@
 import os
-import shutil
+import re
 import signal
-import subprocess
-import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,13 @@ import zwfs
 
 ROOT = Path(__file__).parent.parent
 
+
+def new_reconstructor():
+    """Return the path and the code of the reconstructor in CONTRIBUTING."""
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    return re.search(r"^`(zwfs/reconstructors/\w+\.py)`.*?^```python\n(.*?)^```", text, re.M | re.S).groups()
+
+
 settings.register_profile("zwfs", derandomize=True, deadline=None, max_examples=25)
 settings.load_profile("zwfs")
 
@@ -21,6 +27,13 @@ def heed_signals():
     """Restore in a child the signals that a shell in the background (SIGINT) and nohup (SIGHUP) ignore."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
+
+
+def wait_until(condition, seconds):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.1)
 
 
 @pytest.fixture(scope="session")
@@ -88,31 +101,3 @@ def browser():
         chromium = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
         yield chromium
         chromium.close()
-
-
-@pytest.fixture(scope="session")
-def build_plain_book():
-    """Runs Jupyter Book on a copy of the tracked files, warnings as errors; returns the folder of pages."""
-
-    def build(root):
-        listed = subprocess.run(["git", "-C", ROOT, "ls-files"], capture_output=True, text=True, check=True).stdout
-        for name in filter(lambda name: (ROOT / name).is_file(), listed.splitlines()):
-            (root / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(ROOT / name, root / name)
-        jupyter_book = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()"]
-        done = subprocess.run(
-            [*jupyter_book, "build", "-W", "-n", "--keep-going", "."],
-            cwd=root,
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stderr[-4000:]
-        return root / "_build" / "html"
-
-    return build
-
-
-@pytest.fixture(scope="session")
-def plain_book(build_plain_book, tmp_path_factory):
-    """The pages of a plain build."""
-    return build_plain_book(tmp_path_factory.mktemp("plain"))

@@ -201,8 +201,3 @@ def test_residual_is_that_of_the_frames_given(pupil, screens):
     found = PhaseShifted(sensor, n_iterations=2)(frames)
     frames[:] = 0  # as a camera does that writes the next frame to the same place
     np.testing.assert_array_equal(found.residual, expected)
-
-
-def test_accelerate_is_checked(shifted):
-    with pytest.raises(TypeError, match="accelerate = 1: expected True or False"):
-        PhaseShifted(shifted, accelerate=1)

@@ -519,8 +519,6 @@ def test_segment_screens_are_averaged_power_law_screens(perfect):
     [
         ({"leakage": -0.1}, ValueError, r"leakage = -0\.1: expected .*\[0, 0\.5\]"),
         ({"leakage": 0.6}, ValueError, r"leakage = 0\.6: expected .*\[0, 0\.5\]"),
-        ({"leakage": np.nan}, ValueError, "leakage = nan: expected a finite number"),
-        ({"leakage": "3 %"}, TypeError, "leakage = '3 %': expected a real number"),
         ({"flux_imbalance": -1.5}, ValueError, r"flux_imbalance = -1\.5: expected .*\(-1, 1\)"),
         ({"flux_imbalance": 1}, ValueError, r"flux_imbalance = 1: expected .*\(-1, 1\)"),
         ({"photons": -1}, ValueError, r"photons = -1: expected .*\[0, inf"),
@@ -529,30 +527,21 @@ def test_segment_screens_are_averaged_power_law_screens(perfect):
             ValueError,
             "photons = 0 with read_noise = 30 and background = 60000: expected 0 for both",
         ),
-        ({"photons": np.inf}, ValueError, "photons = inf: expected a finite number"),
         ({"read_noise": -1}, ValueError, "read_noise = -1"),
         ({"background": -1}, ValueError, "background = -1"),
         ({"static": -0.1}, ValueError, r"static = -0\.1"),
-        ({"quilting": "a"}, TypeError, "quilting = 'a': expected a real number"),
         ({"focus_difference": -1e-4}, ValueError, r"focus_difference = -0\.0001: expected .*\[0, 0\.01\]"),
         ({"focus_difference": 1}, ValueError, "focus_difference = 1"),
         ({"misregistration": -1}, ValueError, r"misregistration = -1: expected .*\[0, 10\]"),
         ({"dimple_error": -1}, ValueError, r"dimple_error = -1: expected .*\[-0\.9, 10\]"),
         ({"illumination": 2}, ValueError, r"illumination = 2: expected .*\[0, 2\)"),
-        ({"n_pixels": 10.5}, TypeError, r"n_pixels = 10\.5: expected an integer"),
         ({"n_rings": -1}, ValueError, "n_rings = -1"),
         ({"gap": 0.5}, ValueError, r"gap = 0\.5"),
         ({"stop": 0}, ValueError, r"stop = 0: expected .*, 1\]"),
         ({"missing": (38,)}, ValueError, r"missing = \[38\]: .* from 1 to 37"),
-        ({"missing": 21}, TypeError, r"missing = 21: expected segment numbers, such as \(21,\)"),
-        ({"phase": np.nan}, ValueError, "phase = nan"),
         ({"seed": -1}, ValueError, "seed = -1: expected at least 0"),
-        ({"seed": 1.5}, TypeError, r"seed = 1\.5: expected an integer"),
         ({"diameter": -1}, ValueError, r"diameter = -1: expected"),
-        ({"diameter": "a"}, TypeError, "diameter = 'a': expected a real number"),
         ({"extent": 0.5}, ValueError, r"extent = 0\.5: expected .*\[1, 10"),
-        ({"extent": np.nan}, ValueError, "extent = nan: expected a finite number"),
-        ({"extent": "a"}, TypeError, "extent = 'a': expected a real number"),
     ],
 )
 def test_bad_parameters_are_named(changes, error, message):
@@ -561,37 +550,12 @@ def test_bad_parameters_are_named(changes, error, message):
 
 
 @pytest.mark.parametrize(
-    ("pistons", "error", "message"),
-    [
-        (np.zeros(37), ValueError, r"pistons has shape \(37,\): expected \(\.\.\., 36\), a command for each"),
-        (np.zeros((2, 35)), ValueError, r"pistons has shape \(2, 35\): expected \(\.\.\., 36\)"),
-        (0.0, ValueError, r"pistons has shape \(\): expected \(\.\.\., 36\)"),
-        (np.full(36, np.nan), ValueError, "pistons holds 36 NaN or infinite values: expected finite numbers"),
-        (np.full(36, np.inf), ValueError, "pistons holds 36"),
-        (np.zeros(36, complex), TypeError, "pistons is complex"),
-        (["a"] * 36, TypeError, "pistons has dtype"),
-        (np.zeros((0, 36)), ValueError, r"pistons has shape \(0, 36\): expected at least one"),
-    ],
-)  # fmt: skip
-def test_bad_commands_are_named(perfect, pistons, error, message):
-    with pytest.raises(error, match=message):
-        perfect.frames(pistons)
-
-
-@pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda m, b: m.normalise(np.zeros((2, N, N))), ValueError, r"counts has shape \(2, 68, 68\): .*, 90, 90"),
-        (lambda m, b: m.normalise(np.full((2, 90, 90), np.nan)), ValueError, "counts holds 16200 NaN"),
-        (lambda m, b: m.pistons(np.zeros((5, 5))), ValueError, r"phase has shape \(5, 5\): expected .*68, 68"),
         (lambda m, b: m.pistons(np.full((N, N), np.nan)), ValueError, "phase is NaN all over a segment"),
-        (lambda m, b: m.pistons(np.zeros((N, N), complex)), TypeError, "phase is complex"),
-        (lambda m, b: segment_residual([np.nan], [0.0]), ValueError, "found holds 1 NaN"),
-        (lambda m, b: segment_residual([0.0], [np.inf]), ValueError, "commanded holds 1 NaN"),
         (lambda m, b: segment_residual([0.0, 1], [0.0, 1, 2]), ValueError, "found and commanded have shapes"),
         (lambda m, b: segment_screens(b, -1, 2), ValueError, r"rms = -1: expected .*\[0, inf"),
         (lambda m, b: segment_screens(b, 1, 0), ValueError, "n_screens = 0: expected at least 1"),
-        (lambda m, b: segment_screens(b, 1, 1, np.nan), ValueError, "exponent = nan"),
     ],
 )  # fmt: skip
 def test_bad_input_is_named(perfect, model, call, error, message):
@@ -626,13 +590,8 @@ def test_pupil_from_the_segments_of_another_is_that_pupil():
     ("make", "error", "message"),
     [
         (lambda: Pupil.from_segments(np.ones((3, 3))), TypeError, "segments is .*float64: expected a map of int"),
-        (lambda: Pupil.from_segments(np.ones(3, int)), (TypeError, ValueError), "segments is 1-dimensional"),
-        (lambda: Pupil.from_segments(np.zeros((3, 3), int)), ValueError, "pupil is empty"),
         (lambda: Pupil.from_segments(np.eye(3, dtype=int), 0.0), ValueError, "amplitude reaches down to 0"),
         (lambda: Pupil.from_segments(np.eye(3, dtype=int), -np.ones((3, 3))), ValueError, "reaches down to -1"),
-        (lambda: Pupil.from_segments(np.eye(3, dtype=int), np.nan), ValueError, "amplitude holds"),
-        (lambda: Pupil.from_segments(np.eye(3, dtype=int), 1j), TypeError, "amplitude is complex"),
-        (lambda: Pupil.from_segments(np.eye(3, dtype=int), np.ones(2)), ValueError, r"amplitude has shape \(2,\)"),
         (lambda: Pupil.from_segments(-np.eye(3, dtype=int)), ValueError, "segments reaches down to -1"),
     ],
 )  # fmt: skip

@@ -89,17 +89,14 @@ def test_calibration_is_divided_by_the_poke(perfect, model):
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
-        (lambda f, p, q: (f[:, :5], p, q), ValueError, r"calibration flat has shape \(1, 5, 90\)"),
         (lambda f, p, q: (np.stack([f, f]), p, q), ValueError, r"calibration flat has a batch of \(2,\): exp"),
         (lambda f, p, q: (f, p[:-1], q), ValueError, r"calibration pushed has a batch of \(35,\): expected 36"),
         (lambda f, p, q: (f, p, f), ValueError, r"calibration pulled has a batch of \(\): expected 36"),
         (lambda f, p, q: (f, p, np.concatenate([q, q], 1)), ValueError, r"calibration pulled has shape \(36, 2, "),
         (lambda f, p, q: (f, p, -q), ValueError, "calibration pulled reaches down to -"),
-        (lambda f, p, q: (f, p * np.nan, q), ValueError, "calibration pushed holds"),
         (lambda f, p, q: (0 * f, p, q), ValueError, "calibration flat: 1 of 1 hold no light"),
         (lambda f, p, q: (f, p, p), ValueError, "sensor sees none of them"),
         (lambda f, p, q: (f, p), ValueError, r"calibration (is|has) .*expected .*flat, pushed, pulled"),
-        (lambda f, p, q: 3, (TypeError, ValueError), r"calibration (is|has|=) .*expected .*flat, pushed, pulled"),
     ],
 )  # fmt: skip
 def test_bad_calibration_is_named(perfect, model, spoil, error, message):
@@ -209,11 +206,7 @@ def test_ideal_bench_holds_no_error_for_the_exact_methods(curves):
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda b, m, k: bench_curves(b, m, k, 0.1, 1), ValueError, r"rms has shape \(\): expected \(n_rms,\)"),
-        (lambda b, m, k: bench_curves(b, m, k, [[0.1]], 1), ValueError, r"rms has shape \(1, 1\): expected"),
-        (lambda b, m, k: bench_curves(b, m, k, [], 1), ValueError, r"rms has shape \(0,\): expected"),
         (lambda b, m, k: bench_curves(b, m, k, [-0.1], 1), ValueError, r"rms .*-0\.1"),
-        (lambda b, m, k: bench_curves(b, m, k, [np.nan], 1), ValueError, "rms .*nan"),
         (lambda b, m, k: bench_curves(b, m, k, [0.1], 0), ValueError, "n_screens = 0: expected at least 1"),
         (lambda b, m, k: bench_reconstructors(b, m, poke=0), ValueError, r"poke = 0: expected .*\(0, inf"),
         (lambda b, m, k: bench_reconstructors(b, m, n_iterations=0), ValueError, "n_iterations = 0"),

@@ -113,7 +113,7 @@ def test_numbers_come_from_the_outputs_of_a_notebook(tmp_path):
 
 
 def test_missing_notebook_is_named(tmp_path):
-    with pytest.raises(ClaimError, match=r"there is no nowhere.ipynb"):
+    with pytest.raises(ClaimError, match=r"nowhere.ipynb does not exist"):
         claims.glued(tmp_path / "nowhere.ipynb")
 
 

@@ -1,5 +1,6 @@
 import io
 import warnings
+from collections import Counter
 
 import matplotlib
 
@@ -8,7 +9,6 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.colors import same_color
 
 import zwfs
 from zwfs import plots
@@ -24,23 +24,8 @@ def style():
 
 
 @pytest.fixture(scope="module")
-def pupil():
-    return zwfs.Pupil.circular(40)
-
-
-@pytest.fixture(scope="module")
-def phase(pupil):
-    return zwfs.power_law_screens(zwfs.zernike_basis(pupil, 30), 0.5, 1, seed=3)[0]
-
-
-@pytest.fixture(scope="module")
-def classic(pupil):
-    return zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
-
-
-@pytest.fixture(scope="module")
-def vector(pupil):
-    return zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
+def phase(screens):
+    return screens(0.5, 1, seed=3)[0]
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +44,10 @@ def frames(bench, pistons):
 
 
 @pytest.fixture(params=["sensor_layout", "vector_sensor", "bench_layout"])
-def draw(request, classic, vector, phase, bench, pistons, frames):
+def draw(request, classic, shifted, phase, bench, pistons, frames):
     calls = {
         "sensor_layout": lambda: plots.sensor_layout(classic, phase),
-        "vector_sensor": lambda: plots.vector_sensor(vector, phase),
+        "vector_sensor": lambda: plots.vector_sensor(shifted, phase),
         "bench_layout": lambda: plots.bench_layout(bench, pistons, frames),
     }
     return calls[request.param]
@@ -90,16 +75,11 @@ def saved(figure):
     return stream.getvalue()
 
 
-def test_drawn_twice_gives_the_same_bytes(draw):
-    assert saved(draw()) == saved(draw())
-
-
 def test_saving_is_silent_and_repeatable(draw):
     figure = draw()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        first = saved(figure)
-        assert saved(figure) == first
+        assert saved(figure) == saved(figure) == saved(draw())
 
 
 def test_is_wide_enough_and_in_type_that_can_be_read(draw):
@@ -145,16 +125,16 @@ def test_terms_of_sensor_layout_add_up(classic, phase):
     assert np.abs(total - incoming - reference - interference).max() < 1e-12
 
 
-def test_vector_sensor_shows_the_frames_in_both_rows(vector, pupil, phase):
-    figure = plots.vector_sensor(vector, phase)
-    for frame in vector.measure(phase):
+def test_vector_sensor_shows_the_frames_in_both_rows(shifted, pupil, phase):
+    figure = plots.vector_sensor(shifted, phase)
+    for frame in shifted.measure(phase):
         assert holds(figure, frame) == 2
     assert holds(figure, np.where(pupil.inside, phase, np.nan)) == 2
 
 
-def test_vector_sensor_shows_both_masks(vector, phase):
-    shown = pictures(plots.vector_sensor(vector, phase))
-    for mask in vector.masks:
+def test_vector_sensor_shows_both_masks(shifted, phase):
+    shown = pictures(plots.vector_sensor(shifted, phase))
+    for mask in shifted.masks:
         maps = [picture for picture in shown if np.nanmax(picture) == np.nanmin(picture) == mask.phase]
         assert len(maps) == 2
         # The field of view is 4.4 lambda/D wide.
@@ -162,35 +142,10 @@ def test_vector_sensor_shows_both_masks(vector, phase):
         assert area == pytest.approx(np.pi / 4 * mask.diameter**2, rel=0.03)
 
 
-def test_vector_sensor_names_its_elements(vector, phase):
-    found = texts(plots.vector_sensor(vector, phase))
-    named = {
-        "Liquid crystal",
-        "Metasurface",
-        "quarter-\nwave plate",
-        "Wollaston\nprism",
-        "detector",
-        "focus shift",
-    }
-    assert named <= found
-    assert {r"left circular: $+$$\pi/2$", r"right circular: $-\pi/2$"} <= found
-    assert {r"linear: $+$$\pi/2$", r"linear: $-\pi/2$"} <= found
-
-
-def test_only_liquid_crystal_needs_a_quarter_wave_plate(vector, phase):
-    scene = plots.vector_sensor(vector, phase).axes[0]
-    assert sum("quarter" in text.get_text() for text in scene.texts) == 1
-    assert sum("Wollaston" in text.get_text() for text in scene.texts) == 2
-
-
-def test_polarisations_differ_by_dashes_too(vector, phase):
-    scene = plots.vector_sensor(vector, phase).axes[0]
-    solid = [line for line in scene.lines if same_color(line.get_color(), plots.layouts._PLUS.color)]
-    dashed = [line for line in scene.lines if same_color(line.get_color(), plots.layouts._MINUS.color)]
-    rays = [
-        sum(line.get_linestyle() == style for line in lines) for lines, style in ((solid, "-"), (dashed, "--"))
-    ]
-    assert min(rays) >= 8
+def test_polarisations_differ_by_dashes_too(shifted, phase):
+    scene = plots.vector_sensor(shifted, phase).axes[0]
+    styles = Counter(line.get_linestyle() for line in scene.lines)
+    assert min(styles["-"], styles["--"]) >= 8
 
 
 def test_vector_sensor_refuses_another_number_of_masks(classic, phase):
@@ -226,31 +181,8 @@ def test_bench_layout_of_flat_segments(bench, frames):
         saved(figure)
 
 
-def test_bench_layout_names_its_elements(bench, pistons, frames):
-    named = {"source", "635 nm", "pupil stop", "IrisAO segmented mirror", "BMC deformable mirror", "camera"}
-    named |= {"vector-Zernike\nmask", "quarter-\nwave plate", "Wollaston\nprism"}
-    assert named <= texts(plots.bench_layout(bench, pistons, frames))
-
-
 def test_bench_layout_refuses_what_does_not_fit(bench, pistons, frames):
     with pytest.raises(ValueError, match="pistons"):
         plots.bench_layout(bench, pistons[:-1], frames)
     with pytest.raises(ValueError, match="frames has 1 images: expected two"):
         plots.bench_layout(bench, pistons, frames[:1])
-
-
-@pytest.mark.parametrize(
-    ("angle", "text"),
-    [
-        (np.pi, r"$\pi$"),
-        (-np.pi, r"$-\pi$"),
-        (np.pi / 2, r"$\pi/2$"),
-        (-np.pi / 2, r"$-\pi/2$"),
-        (3 * np.pi / 4, r"$3\pi/4$"),
-        (-2 * np.pi / 3, r"$-2\pi/3$"),
-        (1.0, "1"),
-        (0.0, "0"),
-    ],
-)
-def test_angles_in_pi(angle, text):
-    assert plots.layouts._in_pi(angle) == text

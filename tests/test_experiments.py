@@ -66,8 +66,6 @@ def test_a_point_depends_on_the_seed_and_its_place_only(curves, methods, modes):
         ({"reconstructors": {}}, "reconstructors is empty"),
         ({"n_screens": 0}, "n_screens = 0"),
         ({"rms": [0.1, -0.1]}, "rms"),
-        ({"rms": 0.1}, "rms"),
-        ({"rms": []}, r"rms has shape \(0,\): expected \(n_rms,\), at least one"),
     ],
 )
 def test_bad_input_is_named(methods, modes, change, message):

@@ -1,7 +1,7 @@
 import inspect
 import json
 from dataclasses import replace
-from itertools import combinations, product
+from itertools import combinations
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -174,18 +174,10 @@ def test_colours_that_share_a_figure_differ_for_every_reader(vision):
     palettes = {
         "methods": [look.color for look in plots.LOOKS.values()],
         "other curves": [style["color"] for style in plots.OTHER_STYLES],
-        "polarisations": [plots.layouts._PLUS.color, plots.layouts._MINUS.color],
     }
     for colors in palettes.values():
         points = [lab(color, vision) for color in colors]
         assert min(np.linalg.norm(a - b) for a, b in combinations(points, 2)) > 15
-
-
-def test_polarisations_and_masked_pixels_do_not_look_like_a_method():
-    others = [plots.layouts._PLUS.color, plots.layouts._MINUS.color, plots.frames._BAD]
-    methods = [look.color for look in plots.LOOKS.values()]
-    gaps = [np.linalg.norm(lab(a, "normal") - lab(b, "normal")) for a, b in product(others, methods)]
-    assert min(gaps) > 25
 
 
 def test_a_method_looks_the_same_in_every_figure(curves):

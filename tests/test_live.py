@@ -9,7 +9,6 @@ import pytest
 
 import zwfs
 from book._ext import live
-from zwfs.lowrank import Plane
 
 ROOT = Path(__file__).parent.parent
 STATIC = ROOT / "book" / "_static"
@@ -88,32 +87,6 @@ def compute(page, pupil):
 
 def sensor_of(pupil, diameter, shifts):
     return zwfs.ZernikeSensor(pupil, *(zwfs.Dimple(diameter, shift * np.pi) for shift in shifts))
-
-
-def test_core_of_any_diameter_is_that_of_zwfs(pupil):
-    diameters, factors = live.dimples(pupil)
-    rng = np.random.default_rng(0)
-    field = (rng.normal(size=pupil.shape) + 1j * rng.normal(size=pupil.shape)) * pupil.inside
-    for diameter in (*live.DIAMETERS, 1.06, 2.2):
-        weights = [
-            np.prod([(diameter - other) / (own - other) for other in diameters if other != own])
-            for own in diameters
-        ]
-        core = np.tensordot(weights, factors.core, 1)
-        wave = factors.detector.expand(factors.pupil.project(field[np.newaxis]) @ core.T)[0]
-        dark = zwfs.ZernikeSensor(pupil, zwfs.Dimple(diameter, 0.0, 0.0), tolerance=1e-14)
-        np.testing.assert_allclose(wave, dark.reference_wave(field)[0], atol=1e-6)
-    assert np.abs(factors.core.imag).max() < 1e-12
-
-
-def test_screens_are_those_of_zwfs(pupil, modes):
-    plane = live.screens(pupil)
-    assert isinstance(plane, Plane)
-    assert plane.rank == live.N_SEEDS
-    for seed in (1, live.N_SEEDS):
-        wanted = zwfs.power_law_screens(modes, 1.0, 1, seed=seed)
-        found = plane.expand(np.eye(live.N_SEEDS)[[seed - 1]]) * pupil.inside
-        np.testing.assert_allclose(found, wanted, atol=1e-8)
 
 
 @pytest.mark.parametrize(("rms", "seed", "diameter", "shifts", "iterations"), SETTINGS)
@@ -206,20 +179,3 @@ def test_page_answers_the_keyboard_and_keeps_its_height(page):
 def test_page_says_nothing_and_asks_for_nothing_else(page):
     assert page.said == []
     assert {address.split(":")[0] for address in page.asked} == {"file"}
-
-
-def test_how_fast(page):
-    """Prints the time of one update; nothing depends on it."""
-    times = page.evaluate(
-        """() => [10, 25].map((iterations) => {
-            const settings = { seed: 7, diameter: 1.06, shifts: [1.5, -1.5], photons: Infinity, iterations };
-            const times = Array.from({ length: 60 }, (_, k) => {
-                const start = performance.now();
-                window.zwfsLive.compute({ ...settings, rms: 0.4 + 0.01 * k });
-                return performance.now() - start;
-            });
-            return times.sort((a, b) => a - b)[30];
-        })"""
-    )
-    print(f"one update takes {times[0]:.1f} ms with 10 iterations, {times[1]:.1f} ms with 25")
-    assert all(np.isfinite(times))

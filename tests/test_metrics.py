@@ -72,21 +72,7 @@ def test_dynamic_range_without_a_crossing():
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (
-            lambda p: strehl(p, np.zeros((3, 3))),
-            ValueError,
-            r"phase has shape \(3, 3\): expected \(\.\.\., 40, 40\)",
-        ),
-        (lambda p: strehl(p, np.full(p.shape, np.nan)), ValueError, "phase holds .* inside the pupil"),
-        (lambda p: reconstruction_error(p, np.zeros(p.shape, complex), 0), TypeError, "estimate is complex"),
-        (lambda p: reconstruction_error(p, np.zeros(p.shape), 0.0), ValueError, r"truth has shape \(\)"),
-        (lambda p: wrapped_residual(p, np.zeros(p.shape), np.full(p.shape, np.inf)), ValueError, "truth holds"),
         (lambda p: dynamic_range([1, 2], [0]), ValueError, r"rms and error have shapes \(2,\) and \(1,\)"),
-        (
-            lambda p: reconstruction_error(p.inside, p.inside, p.inside),
-            TypeError,
-            "pupil is a ndarray: expected a Pupil",
-        ),
         (
             lambda p: reconstruction_error(p, np.zeros((2, *p.shape)), np.zeros((3, *p.shape))),
             ValueError,
@@ -96,10 +82,7 @@ def test_dynamic_range_without_a_crossing():
         (lambda p: dynamic_range([2, 1], [0, 0]), ValueError, "rms = .*expected increasing"),
         (lambda p: dynamic_range([0.0], [0]), ValueError, "rms = .*above 0"),
         (lambda p: dynamic_range([-1, 1], [0, 0]), ValueError, "rms reaches down to -1"),
-        (lambda p: dynamic_range([1, 2], [0, np.nan]), ValueError, "error holds 1 NaN"),
         (lambda p: dynamic_range([1, 2], [-1, -2]), ValueError, "error reaches down to -2"),
-        (lambda p: strehl(p, np.zeros((0, *p.shape))), ValueError, r"phase has shape \(0, 40, 40\): .* one map"),
-        (lambda p: wrapped_residual(p, np.zeros((0, *p.shape)), p.inside * 1), ValueError, "estimate has shape"),
         (lambda p: dynamic_range([1, 2], [0, 0], 0), ValueError, "threshold = 0"),
     ],
 )

@@ -133,7 +133,6 @@ def test_coefficients_are_independent(pupil):
     [
         (lambda p, m: noll_to_nm(0), ValueError, "j = 0"),
         (lambda p, m: zernike_basis(p, 0), ValueError, "n_modes = 0"),
-        (lambda p, m: zernike_basis(p, 2.0), TypeError, r"n_modes = 2\.0: expected an integer"),
         (
             lambda p, m: zernike_basis(Pupil.circular(4), 12),
             ValueError,
@@ -141,13 +140,9 @@ def test_coefficients_are_independent(pupil):
         ),
         (lambda p, m: zernike_basis(Pupil.circular(2), 3), ValueError, "n_modes = 3: .* the 4 points"),
         (lambda p, m: zernike_basis(Pupil.from_amplitude(np.ones((9, 9))), 3), ValueError, r"reaches 0\.6.* D"),
-        (lambda p, m: power_law_screens(m[0], 1, 1), ValueError, r"modes has shape \(40, 40\): expected"),
-        (lambda p, m: power_law_screens(m * 1j, 1, 1), TypeError, "modes is complex"),
         (lambda p, m: power_law_screens(m * np.arange(1, 31)[:, None, None], 1, 1), ValueError, "different rms"),
         (lambda p, m: power_law_screens(m, -1, 1), ValueError, "rms = -1"),
         (lambda p, m: power_law_screens(m, 1, 0), ValueError, "n_screens = 0"),
-        (lambda p, m: power_law_screens(m, 1, 1, np.nan), ValueError, "exponent = nan"),
-        (lambda p, m: power_law_screens(m * np.nan, 1, 1), ValueError, "modes"),
     ],
 )
 def test_bad_input_is_named(pupil, modes, make, error, message):
@@ -171,13 +166,6 @@ def test_modes_without_a_finite_rms_are_refused(value):
     modes = zernike_basis(Pupil.circular(16), 3)
     with pytest.raises(ValueError, match="modes"):
         power_law_screens(np.full_like(modes, value), 0.1, 1, seed=1)
-
-
-@pytest.mark.parametrize("seed", [-1, 1.0, "1", [1, 2], True])
-def test_a_bad_seed_is_named(seed):
-    modes = zernike_basis(Pupil.circular(16), 3)
-    with pytest.raises((TypeError, ValueError), match="seed"):
-        power_law_screens(modes, 0.1, 1, seed=seed)
 
 
 def test_any_seed_of_numpy_will_do():

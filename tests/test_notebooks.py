@@ -16,6 +16,7 @@ from nbformat.v4 import new_code_cell, new_notebook, new_output
 from PIL import Image
 
 from book._tools.run import FRONT_FIGURE
+from zwfs.companion.results import published
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 
@@ -104,6 +105,21 @@ def test_stored_notebook_has_outputs_of_every_cell(path):
     code = [cell for cell in nbformat.read(path, 4).cells if cell.cell_type == "code"]
     assert all(cell.execution_count for cell in code)
     assert any(cell.outputs for cell in code)
+
+
+@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
+def test_cells_that_set_up_or_draw_are_folded_and_one_that_computes_is_not(path):
+    cells = [cell for cell in nbformat.read(path, 4).cells if cell.cell_type == "code"]
+    folded = [
+        bool({"hide-input", "hide-cell", "remove-cell"} & set(cell.metadata.get("tags", ()))) for cell in cells
+    ]
+    for cell, hidden in zip(cells, folded, strict=True):
+        shown = "parameters" in cell.metadata.get("tags", ())
+        assert hidden or shown or not re.match(r"import |from |glue\(", cell.source), cell.source
+        assert hidden or not published(cell.source), cell.source
+    assert not all(
+        hidden or "parameters" in cell.metadata.get("tags", ()) for cell, hidden in zip(cells, folded, strict=True)
+    )
 
 
 def test_front_figure_is_the_stored_figure_of_its_notebook():

@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import nbformat
@@ -16,7 +15,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from book._tools import book, notebook, record, run, scratch
 from book._tools.execute import NotebookError
 from book._tools.project import Project
-from tests.conftest import heed_signals
+from tests.conftest import heed_signals, wait_until
 from zwfs._files import write_file
 
 ROOT = Path(__file__).parent.parent
@@ -183,7 +182,7 @@ def start_sleeping_run(project):
     return process, int(pid.read_text())
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_interruption_leaves_no_kernel_and_no_pieces(project, number):
     process, kernel = start_sleeping_run(project)
     process.send_signal(number)
@@ -208,13 +207,6 @@ def test_scratch_folder_of_a_living_process_and_foreign_folders_stay(tmp_path):
     with scratch.scratch_folder(tmp_path, "running-") as first, scratch.scratch_folder(tmp_path, "running-"):
         assert first.is_dir()
     assert [folder.name for folder in tmp_path.iterdir()] == ["running-of-somebody-else"]
-
-
-def wait_until(condition, seconds):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.1)
 
 
 def alive(pid):

@@ -1,13 +1,43 @@
 """``jupyter-book build .`` builds the whole book from the tracked files alone, without a warning."""
 
+import inspect
+import pkgutil
+import shutil
+import subprocess
+import sys
+from importlib import import_module
+
 import pytest
 from bs4 import BeautifulSoup
+
+import zwfs
+from book._ext import api
+
+from .conftest import ROOT
 
 pytestmark = pytest.mark.slow
 
 
 def read(file):
     return BeautifulSoup(file.read_text("utf-8"), "html.parser")
+
+
+def build(root):
+    """Run Jupyter Book on a copy of the tracked files, warnings as errors, and return the folder of pages."""
+    listed = subprocess.run(["git", "-C", ROOT, "ls-files"], capture_output=True, text=True, check=True).stdout
+    for name in filter(lambda name: (ROOT / name).is_file(), listed.splitlines()):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / name, root / name)
+    jupyter_book = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()"]
+    command = [*jupyter_book, "build", "-W", "-n", "--keep-going", "."]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-4000:]
+    return root / "_build" / "html"
+
+
+@pytest.fixture(scope="module")
+def plain_book(tmp_path_factory):
+    return build(tmp_path_factory.mktemp("plain"))
 
 
 def test_claims_have_their_verdicts(plain_book):
@@ -41,14 +71,70 @@ def test_pages_have_mathematics_and_the_address_leads_to_the_front_page(plain_bo
     assert 'url=book/index.html"' in (plain_book / "index.html").read_text("utf-8")
 
 
+def test_equations_are_numbered_through_the_book_and_those_of_the_paper_as_there(plain_book):
+    labels = api.paper_labels(ROOT / "book")
+    assert len(labels) == 16
+    named = {1: "eq-propagation", 6: "eq-arccos", 9: "eq-phase-shifted", 16: "eq-cost"}
+    assert {number: labels[number - 1] for number in named} == named
+    pages = [plain_book / "book" / page.replace(".md", ".html") for page in (*api.PAPER, "theory.md")]
+    found = [int(number.get_text().strip("()#\uf0c1")) for page in pages for number in read(page).select(".eqno")]
+    assert found == list(range(1, len(found) + 1))
+
+
 def test_no_pdf_is_linked(plain_book):
     assert "zwfs.pdf" not in (plain_book / "book" / "index.html").read_text("utf-8")
 
 
-def test_a_build_in_another_folder_gives_the_same_bytes(plain_book, build_plain_book, tmp_path):
-    again = build_plain_book(tmp_path / "another folder")
+def test_a_build_in_another_folder_gives_the_same_bytes(plain_book, tmp_path):
+    again = build(tmp_path / "another folder")
     files = [{file.relative_to(top) for file in top.rglob("*") if file.is_file()} for top in (plain_book, again)]
     assert files[0] == files[1]
     assert [
         name for name in sorted(files[0]) if (plain_book / name).read_bytes() != (again / name).read_bytes()
     ] == []
+
+
+# The API page
+
+
+@pytest.fixture(scope="module")
+def api_page(plain_book):
+    return read(plain_book / "book" / "api.html")
+
+
+def public_modules():
+    names = (module.name for module in pkgutil.walk_packages(zwfs.__path__, "zwfs."))
+    return [import_module(name) for name in names if "._" not in name]
+
+
+def test_every_public_function_and_class_is_on_the_page_once(api_page):
+    listed = [name["id"] for name in api_page.select("dt[id^='zwfs.']")]
+    assert {f"zwfs.{name}" for name in zwfs.__all__ if callable(getattr(zwfs, name))} <= set(listed)
+    for module in public_modules():
+        for name, thing in vars(module).items():
+            if not (inspect.isclass(thing) or inspect.isfunction(thing)) or name.startswith("_"):
+                continue
+            if thing.__module__ == module.__name__:
+                package = module.__name__.split(".")[:-1]
+                places = [f"{'.'.join(package[:depth])}.{name}" for depth in range(1, len(package) + 1)]
+                assert sum(listed.count(place) for place in {*places, f"{module.__name__}.{name}"}) == 1, name
+
+
+def test_the_page_lists_constants_with_their_docstrings(api_page):
+    ring = api_page.find(id="zwfs.paper.dimple_diameter.DARK_RING")
+    assert "dark ring" in ring.parent.dd.get_text()
+
+
+def test_modules_are_sections_of_their_group(api_page):
+    group = api_page.find("section", id="reconstructors")
+    modules = [heading.get_text().rstrip("#") for heading in group.select("h3")]
+    assert "zwfs.reconstructors.phase_shifted" in modules
+    assert not [name for name in modules if "._" in name or not name.startswith("zwfs.reconstructors")]
+
+
+def test_docstrings_link_names_and_equations(api_page):
+    phase_shifted = api_page.find(id="zwfs.PhaseShifted").parent
+    links = {link["href"] for link in phase_shifted.find_all("a", href=True)}
+    # The paper numbers its equations, ours have labels.
+    assert {"phase_shifted.html#equation-eq-phase-shifted", "theory.html#equation-eq-shared-wave"} <= links
+    assert api_page.find(id="module-zwfs.reconstructors").find("a", href="#zwfs.Reconstruction") is not None

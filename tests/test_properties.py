@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 
 from zwfs import (
     Dimple,
-    GerchbergSaxton,
     GradientDescent,
     Linear,
+    Patch,
     PhaseShifted,
     Pupil,
     ZernikeSensor,
@@ -20,6 +20,8 @@ from zwfs import (
 seeds = st.integers(0, 2**16)
 batches = st.lists(st.integers(1, 3), max_size=2).map(tuple)
 dimples = st.builds(Dimple, st.floats(0.3, 4), st.floats(-3, 3), st.floats(0, 1))
+# A transmission without any symmetry.
+patches = st.builds(Patch, st.floats(0.3, 3), st.just(lambda u, v: (0.8 + 0.1 * u) * np.exp(1j * (u - v + u * v))))
 extents = st.sampled_from([1.0, 1.3, 2.0])
 
 
@@ -37,7 +39,7 @@ def pupils(draw):
 
 @st.composite
 def sensors(draw):
-    masks = draw(st.lists(dimples, min_size=1, max_size=3))
+    masks = draw(st.lists(dimples | patches, min_size=1, max_size=3))
     return ZernikeSensor(draw(pupils()), *masks, extent=draw(extents))
 
 
@@ -67,6 +69,7 @@ def test_adjoint(sensor, batch, seed):
     wave = white((*batch, sensor.n_masks, *sensor.detector_shape), seed + 1)
     difference = np.vdot(wave, sensor.propagate(field)) - np.vdot(sensor.adjoint(wave), field)
     assert abs(difference) < 1e-13 * np.linalg.norm(wave) * np.linalg.norm(field)
+    assert not sensor.adjoint(wave)[..., ~sensor.pupil.inside].any()
 
 
 @given(sensors(), st.complex_numbers(max_magnitude=10), seeds)
@@ -104,19 +107,12 @@ def test_batch_equals_loop(sensor, batch, seed):
         np.testing.assert_allclose(frames[where], sensor.measure(phase[where]), atol=1e-12)
 
 
-@given(sensors(), batches, seeds)
-def test_single_precision_is_close_to_double(sensor, batch, seed):
-    phase = smooth(sensor.pupil, 0.5, batch, seed)
-    single = sensor.measure(phase.astype(np.float32))
-    assert single.dtype == np.float32
-    np.testing.assert_allclose(single, sensor.measure(phase), atol=3e-5)
-
-
 @given(sensors(), seeds)
 def test_gradient(sensor, seed):
     pupil = sensor.pupil
     truth, guess, direction = smooth(pupil, 0.5, (3,), seed)
-    cost = GradientDescent(sensor).cost
+    amplitude = np.random.default_rng(seed).uniform(0.5, 1.5, pupil.shape)
+    cost = GradientDescent(sensor, amplitude=amplitude).cost
     frames = sensor.measure(truth)[np.newaxis]
     step = 1e-3
     a, b, c, d = (cost(pupil.gather(guess + k * step * direction), frames)[0] for k in (-2, -1, 1, 2))
@@ -131,14 +127,6 @@ def test_phase_shifted_inverts_small_phases(pupil, masks, batch, seed):
     found = PhaseShifted(sensor, n_iterations=50, tolerance=1e-9)(sensor.measure(phase))
     assert found.phase.shape == phase.shape
     assert np.all(reconstruction_error(pupil, found.phase, phase) < 1e-6)
-
-
-@given(pupils(), useful_pairs(), seeds)
-def test_truth_is_a_fixed_point(pupil, masks, seed):
-    sensor = ZernikeSensor(pupil, *masks)
-    phase = smooth(pupil, 0.6, (), seed)
-    found = PhaseShifted(sensor, n_iterations=1)(sensor.measure(phase), start=phase)
-    assert reconstruction_error(pupil, found.phase, phase) < 1e-9
 
 
 @given(pupils(), useful_pairs(), seeds)
@@ -159,14 +147,3 @@ def test_gerchberg_saxton_with_the_modelled_field_never_moves_away_from_the_fram
     history = kept(amplitude**2, history=True).history
     mismatch = np.sum((amplitude - np.sqrt(sensor.measure(history))) ** 2, axis=(-3, -2, -1))
     assert np.all(np.diff(mismatch) <= 1e-9 * mismatch[0])
-
-
-@given(sensors(), batches, seeds, st.sampled_from(["zero", "model"]))
-def test_an_iteration_does_not_mix_frames(sensor, batch, seed, unmeasured):
-    frames = sensor.measure(smooth(sensor.pupil, 0.3, batch, seed))
-    reconstruct = GerchbergSaxton(sensor, n_iterations=3, unmeasured=unmeasured)
-    together = reconstruct(frames)
-    for where in np.ndindex(*batch):
-        alone = reconstruct(frames[where])
-        np.testing.assert_allclose(together.phase[where], alone.phase, atol=1e-8)
-        np.testing.assert_allclose(together.residual[where], alone.residual, atol=1e-8)

@@ -1,7 +1,6 @@
 import inspect
 import os
 import pickle
-import re
 import shutil
 import subprocess
 import sys
@@ -25,7 +24,7 @@ from zwfs import (
 )
 from zwfs.reconstructors.base import FixedPoint, load
 
-from .conftest import ROOT
+from .conftest import ROOT, new_reconstructor
 
 every = pytest.mark.parametrize("method", RECONSTRUCTORS)
 iterative = pytest.mark.parametrize("method", [method for method in RECONSTRUCTORS if method.iterative])
@@ -460,22 +459,6 @@ def test_gerchberg_saxton_refuses_another_field_where_nothing_is_measured(shifte
         GerchbergSaxton(shifted, unmeasured=unmeasured)
 
 
-@pytest.mark.parametrize("on_modes", [False, True])
-@pytest.mark.parametrize("n_masks", [1, 2])
-def test_gradient_agrees_with_finite_differences(pupil, modes, screens, n_masks, on_modes):
-    sensor = ZernikeSensor(pupil, *[Dimple(1.06, phase) for phase in (np.pi / 2, -2.0)[:n_masks]], extent=1.4)
-    amplitude = np.random.default_rng(3).uniform(0.5, 1.5, pupil.shape)
-    descent = GradientDescent(sensor, amplitude=amplitude)
-    frames = sensor.measure(screens(0.5, 1))
-    phase = pupil.gather(screens(0.7, 1, seed=9)[0])
-    directions = pupil.gather(modes)[:6] if on_modes else np.eye(pupil.n_points)[::200]
-    _, gradient = descent.cost(phase, frames)
-    step = 1e-3 if on_modes else 1e-2
-    for direction in directions:
-        a, b, c, d = (descent.cost(phase + k * step * direction, frames)[0] for k in (-2, -1, 1, 2))
-        assert (a - 8 * b + 8 * c - d) / (12 * step) == pytest.approx(direction @ gradient, rel=1e-6, abs=1e-10)
-
-
 def test_cost_is_half_the_mean_square_of_the_mismatch(pupil, shifted, screens):
     truth, guess = screens(0.4, 2)
     expected = np.mean((shifted.measure(truth) - shifted.measure(guess)) ** 2) / 2
@@ -503,18 +486,11 @@ def test_descent_on_modes_stays_within_them(pupil, modes, shifted, screens):
 
 
 @every
-def test_residual_is_the_mismatch_of_the_frames_in_the_pupil(make, method, screens, pupil):
-    reconstruct, sensor = make(method)
+@pytest.mark.parametrize("extent", [1, 1.5])
+def test_residual_is_the_mismatch_of_the_frames_in_the_pupil(sensor_of, modes, method, extent, screens, pupil):
+    sensor = ZernikeSensor(pupil, *sensor_of(method).masks, extent=extent)
     frames = sensor.measure(screens(0.6))
-    found = reconstruct(frames)
-    mismatch = (sensor.measure(found.phase) - frames)[..., pupil.inside]
-    np.testing.assert_allclose(found.residual, np.sqrt(np.mean(mismatch**2, axis=(-2, -1))), atol=1e-10)
-
-
-def test_residual_of_a_wide_detector_is_that_of_the_pupil(pupil, screens):
-    sensor = pair(pupil, np.pi / 2, -np.pi / 2, extent=1.5)
-    frames = sensor.measure(screens(0.6))
-    found = GerchbergSaxton(sensor)(frames)
+    found = build(method, sensor, modes)(frames)
     mismatch = (sensor.measure(found.phase) - frames)[(..., *sensor.window)][..., pupil.inside]
     np.testing.assert_allclose(found.residual, np.sqrt(np.mean(mismatch**2, axis=(-2, -1))), atol=1e-10)
 
@@ -833,14 +809,6 @@ def test_frames_may_come_in_the_unit_of_their_calibration(shifted, modes, screen
     np.testing.assert_allclose(found.phase, Linear(shifted, modes)(frames / 1e4).phase, atol=1e-9)
 
 
-@every
-@pytest.mark.parametrize("history", [1, 0, None, "no"])
-def test_history_is_a_flag(make, method, screens, history):
-    reconstruct, sensor = make(method)
-    with pytest.raises(TypeError, match=f"history = {history!r}: expected True or False"):
-        reconstruct(sensor.measure(screens(0.1)), history=history)
-
-
 @iterative
 def test_any_change_is_within_a_huge_tolerance(make, method, screens):
     reconstruct, sensor = make(method, tolerance=1e200)
@@ -888,24 +856,11 @@ def test_a_method_is_loaded_by_its_path(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
-        (lambda f: f[0], ValueError, r"frames has shape .*: expected \(\.\.\., [12], 40, 40\)"),
         (lambda f: np.concatenate([f, f]), ValueError, r"frames has shape .*: expected \(\.\.\., [12], 40, 40\)"),
         (lambda f: f[:, 1:], ValueError, "frames has shape"),
         (lambda f: f[np.newaxis][:0], ValueError, r"frames has shape .*: expected at least one frame"),
-        (
-            lambda f: np.where(f == f.max(), np.nan, f),
-            ValueError,
-            "frames holds .* NaN or inf.*expected finite",
-        ),
-        (
-            lambda f: np.where(f == f.max(), np.inf, f),
-            ValueError,
-            "frames holds .* NaN or inf.*expected finite",
-        ),
         (lambda f: f - 0.5, ValueError, "frames reaches down to -.*: expected no negative"),
         (lambda f: 0 * f, ValueError, "frames: .* hold no light: expected some flux"),
-        (lambda f: f + 0j, TypeError, r"frames is complex \(complex128\): expected real"),
-        (lambda f: f.astype(str), TypeError, "frames has dtype"),
     ],
 )
 def test_bad_frames_are_named(make, method, pupil, spoil, error, message):
@@ -925,8 +880,6 @@ def test_bad_frames_are_named(make, method, pupil, spoil, error, message):
             ValueError,
             r"start has shape \(2, 40, 40\): expected \(40, 40\) or \(3, 40, 40\)",
         ),
-        (np.full((40, 40), np.nan), ValueError, "start holds .* inside the pupil"),
-        (np.zeros((40, 40), complex), TypeError, "start is complex"),
     ],
 )
 def test_bad_start_is_named(make, method, screens, start, error, message):
@@ -937,16 +890,10 @@ def test_bad_start_is_named(make, method, screens, start, error, message):
 
 OPTIONS = [
     ({"n_iterations": 0}, ValueError, r"n_iterations = 0: expected an integer in \[1, "),
-    ({"n_iterations": 2.5}, TypeError, r"n_iterations = 2\.5: expected an integer"),
-    ({"n_iterations": True}, TypeError, "n_iterations = True: expected an integer"),
     ({"tolerance": -1e-6}, ValueError, r"tolerance = -1e-06: .*\[0, inf"),
-    ({"tolerance": np.nan}, ValueError, "tolerance = nan"),
-    ({"amplitude": np.ones((3, 3))}, ValueError, r"amplitude has shape \(3, 3\)"),
     ({"amplitude": np.ones((2, 40, 40))}, ValueError, r"amplitude has shape \(2, 40, 40\): expected \(40, 40\)"),
     ({"amplitude": -np.ones((40, 40))}, ValueError, "amplitude reaches down to -1"),
     ({"amplitude": np.zeros((40, 40))}, ValueError, "amplitude is 0 everywhere in the pupil"),
-    ({"amplitude": np.full((40, 40), np.nan)}, ValueError, "amplitude holds"),
-    ({"amplitude": np.ones((40, 40)) * 1j}, TypeError, "amplitude is complex"),
     ({"poke": 0}, ValueError, r"poke = 0: .*\[1e-10, 3\.14"),
     ({"poke": 1e308}, ValueError, r"poke = 1e\+308: .*\[1e-10, 3\.14"),
     (
@@ -954,7 +901,6 @@ OPTIONS = [
         ValueError,
         "modes: .* none of them around the reference",
     ),
-    ({"n_iterations": 10**400}, ValueError, r"n_iterations = 10+.*: expected an integer in \[1, 2147483647\]"),
     (
         {"amplitude": np.full((40, 40), 1e100)},
         ValueError,
@@ -966,13 +912,7 @@ OPTIONS = [
         "amplitude: its squares add up to 0: expected",
     ),
     ({"conditioning": 1.0}, ValueError, r"conditioning = 1\.0: .*\[0, 1\)"),
-    ({"reference": np.zeros((3, 3))}, ValueError, r"reference has shape \(3, 3\): expected \(\.\.\., 40, 40\)"),
     ({"reference": np.zeros((2, 40, 40))}, ValueError, r"reference has shape \(2, 40, 40\): expected \(40, 40\)$"),
-    ({"modes": np.ones((40, 40))}, ValueError, r"modes has shape \(40, 40\): expected \(n_modes, ny, nx\)"),
-    ({"modes": np.ones((2, 40, 41))}, ValueError, r"modes has shape \(2, 40, 41\): expected \(\.\.\., 40, 40\)"),
-    ({"modes": np.full((2, 40, 40), np.nan)}, ValueError, "modes holds .* inside the pupil"),
-    ({"modes": np.ones((2, 40, 40), complex)}, TypeError, "modes is complex"),
-    ({"modes": np.empty((0, 40, 40))}, ValueError, r"modes has shape \(0, 40, 40\)"),
     ({"modes": np.ones((1265, 40, 40))}, ValueError, "modes: 1265 of them, expected at most the 1264 points"),
 ]
 
@@ -994,12 +934,6 @@ def test_bad_options_are_named(sensor_of, modes, method, options, error, message
 
 
 @every
-def test_sensor_is_checked(modes, pupil, method):
-    with pytest.raises(TypeError, match="sensor is a Pupil: expected a ZernikeSensor"):
-        build(method, pupil, modes)
-
-
-@every
 def test_reconstructors_and_results_print_as_one_line(make, method, screens):
     reconstruct, sensor = make(method)
     assert reconstruct.sensor is sensor
@@ -1014,8 +948,7 @@ def test_a_new_reconstructor_is_one_file(tmp_path):
     for name in ("zwfs", "tests", "book/_ext"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
-    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
-    path, code = re.search(r"^`(zwfs/reconstructors/\w+\.py)`.*?^```python\n(.*?)^```", text, re.M | re.S).groups()
+    path, code = new_reconstructor()
     (tmp_path / path).write_text(code)
     use = """
 import api, zwfs
@@ -1034,10 +967,9 @@ assert plots.LOOKS["SecondOrder"].label == "second order"
     tested = [f"tests/test_{name}.py" for name in ("reconstructors", "bad_input", "figures")]
     for command in (
         ["-c", use],
-        ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", "SecondOrder or own or readers", *tested],
+        ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", "SecondOrder or look", *tested],
         ["-m", "ruff", "check", path],
         ["-m", "ruff", "format", "--check", path],
-        ["-m", "mypy", path],
     ):
         environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{tmp_path / 'book' / '_ext'}"}
         done = subprocess.run(

@@ -105,8 +105,6 @@ def test_columns_are_written_in_order_with_nine_digits(figure, tmp_path, monkeyp
         ("../plot", {"x": [1]}, ValueError, "name = '../plot'"),
         ("plot", {}, ValueError, "columns is empty"),
         ("plot", {"x": [1, 2], "y": [1]}, ValueError, "differ in length: 'x': 2, 'y': 1"),
-        ("plot", {"x": [[1]]}, ValueError, r"columns\['x'\] has shape \(1, 1\)"),
-        ("plot", {"x": [1j]}, TypeError, r"columns\['x'\] is complex"),
     ],
 )
 def test_bad_arguments_are_refused(figure, monkeypatch, name, columns, error, message):

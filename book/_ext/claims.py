@@ -251,7 +251,7 @@ def saxton_offset(n: Numbers) -> Finding:
     )
     return first(
         measured,
-        (n.saxton_error <= 0.05 * 0.1, FAILS, "There is no offset."),
+        (n.saxton_error <= 0.05 * 0.1, FAILS, "The error at 0.1 rad rms is below 5 % of the input."),
         (not explained, FAILS, "The lost light does not explain the offset."),
         (n.saxton_error_at_05 > 2 * n.saxton_error, REMARK, grows),
     )
@@ -456,10 +456,10 @@ def glued(notebook: Path) -> Numbers:
     Raises
     ------
     ClaimError
-        If there is no such notebook.
+        If the notebook does not exist.
     """
     if not notebook.exists():
-        raise ClaimError(f"there is no {notebook.name} in {notebook.parent.name}")
+        raise ClaimError(f"{notebook.parent.name}/{notebook.name} does not exist")
     numbers = Numbers()
     for cell in json.loads(notebook.read_text("utf-8"))["cells"]:
         for output in cell.get("outputs", []):

@@ -74,31 +74,24 @@ def peers(task: str, rows: list[dict[str, Any]]) -> str:
 
 def tables(speed: dict[str, Any]) -> dict[str, str]:
     """Return the tables and sentences on speed, by name."""
-    limit, batches = speed["limit"], speed["batches"]
+    whole = speed["limit"]["the whole call"]
+    limit = [[name, f"{1e6 * t:.0f}", f"{t / whole:.0%}"] for name, t in speed["limit"].items()]
+    parts = [[name, f"{1e6 * t:.0f}"] for name, t in speed["breakdown"]["100"].items()]
+    methods, loop = (
+        [[name, f"{1e3 * t:.2g}"] for name, t in speed[key].items()] for key in ("others", "loop step")
+    )
+    batches = [
+        [str(row["n_frames"]), f"{1e3 * row['time per frame']:.2f}", f"{row['memory'] / 1e6:.1f}"]
+        for row in speed["batches"]
+    ]
+    memory = "memory without frames and results (MB)"
     return {
         "rates": rates(speed),
-        "parts": table(
-            ["part", "time (μs)"],
-            ([name, f"{1e6 * time:.0f}"] for name, time in speed["breakdown"]["100"].items()),
-        ),
-        "batches": table(
-            ["frame pairs in a call", "time of each (ms)", "memory without frames and results (MB)"],
-            (
-                [str(row["n_frames"]), f"{1e3 * row['time per frame']:.2f}", f"{row['memory'] / 1e6:.1f}"]
-                for row in batches
-            ),
-        ),
-        "methods": table(
-            ["method", "time (ms)"], ([name, f"{1e3 * time:.2g}"] for name, time in speed["others"].items())
-        ),
-        "loop": table(
-            ["reconstructor", "time of a step (ms)"],
-            ([name, f"{1e3 * time:.2g}"] for name, time in speed["loop step"].items()),
-        ),
-        "limit": table(
-            ["part", "time (μs)", "share"],
-            ([name, f"{1e6 * t:.0f}", f"{t / limit['the whole call']:.0%}"] for name, t in limit.items()),
-        ),
+        "parts": table(["part", "time (μs)"], parts),
+        "batches": table(["frame pairs in a call", "time of each (ms)", memory], batches),
+        "methods": table(["method", "time (ms)"], methods),
+        "loop": table(["reconstructor", "time of a step (ms)"], loop),
+        "limit": table(["part", "time (μs)", "share"], limit),
         "growth": growth(speed),
     }
 

@@ -94,7 +94,7 @@ def build(project: Project, chromium: str | None = None) -> bool:
     project : Project
         Its notebooks have been run.
     chromium : str, optional
-        The browser that prints the PDF; without one there is no PDF.
+        The browser that prints the PDF; None builds the book without a PDF.
 
     Returns
     -------

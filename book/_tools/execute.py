@@ -147,13 +147,13 @@ class Run:
     def stop(self) -> None:
         """End the kernel and all processes that it started, at once."""
         self._stopped = True
-        with suppress(AttributeError, OSError):  # there is no kernel yet, or no longer
+        with suppress(AttributeError, OSError):  # the kernel has not started, or has ended
             os.killpg(self._client.km.provisioner.pid, signal.SIGKILL)
 
     def progress(self) -> str:
         """Return the number of the cell that runs, and the progress of a sweep in it."""
         said = f"cell {self.cell}/{len(self.cells)}"
-        with suppress(OSError, ValueError, KeyError, TypeError):  # there is no sweep, or its line is not complete
+        with suppress(OSError, ValueError, KeyError, TypeError):  # no sweep runs, or its last line is incomplete
             sweep = json.loads(self._progress.read_bytes().rpartition(b"\n")[0].rpartition(b"\n")[2])
             said += f", {sweep['name']} {sweep['done']:d}/{sweep['total']:d}"
         return said

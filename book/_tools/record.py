@@ -74,7 +74,7 @@ def versions() -> dict[str, str]:
 
 
 def commit(root: Path) -> tuple[str | None, bool | None]:
-    """Return the commit of a working tree, and whether the tree has changes; None where there is no history.
+    """Return the commit of a working tree, and whether the tree has changes; None without a history.
 
     An untracked file is a change, too: it may be a notebook, or a module that a notebook imports.
     """

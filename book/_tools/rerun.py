@@ -111,7 +111,7 @@ def resolve(project: Project, figure: str) -> str:
     Raises
     ------
     ParameterError
-        If there is no such notebook.
+        If no notebook has this number or name.
     """
     names = [path.stem for path in project.sources()]
     wanted = Path(figure).name.removesuffix(".ipynb")

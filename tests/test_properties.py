@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from zwfs import (
     Dimple,
+    GerchbergSaxton,
     GradientDescent,
     Linear,
     Patch,

@@ -18,6 +18,7 @@ from zwfs import (
     GerchbergSaxton,
     GradientDescent,
     Linear,
+    MaximumLikelihood,
     PhaseShifted,
     ZernikeSensor,
     reconstruction_error,
@@ -573,7 +574,8 @@ def test_history_leads_from_the_start_to_the_result(make, method, screens):
     frames = sensor.measure(screens(0.3))
     found = reconstruct(frames, history=True)
     assert found.history.shape == (3, reconstruct.settings.n_iterations + 1, 40, 40)
-    assert np.nanmax(np.abs(found.history[:, 0])) == 0
+    if method is not MaximumLikelihood:  # its start is a few phase-shifted iterations
+        assert np.nanmax(np.abs(found.history[:, 0])) == 0
     np.testing.assert_array_equal(found.history[:, -1], found.phase)
     assert reconstruct(frames).history is None
 
@@ -706,10 +708,11 @@ def test_any_piston_of_the_start_gives_the_same_phase(shifted, pupil, screens, o
 
 
 @iterative
-def test_piston_of_the_start_is_kept(make, method, screens, pupil):
-    reconstruct, sensor = make(method)
+def test_piston_of_the_start_is_kept(sensor_of, method, screens, pupil):
+    sensor = sensor_of(method)
+    reconstruct = method(sensor)  # of all points: no sum of modes is a piston
     frames = sensor.measure(screens(0.1, 1)[0])
-    plain, moved = reconstruct(frames).phase, reconstruct(frames, start=np.full(pupil.shape, 0.3)).phase
+    plain, moved = (reconstruct(frames, start=np.full(pupil.shape, piston)).phase for piston in (0.0, 0.3))
     np.testing.assert_allclose(moved[pupil.inside], plain[pupil.inside] + 0.3, atol=1e-6)
 
 

@@ -279,12 +279,10 @@ class MaximumLikelihood(Reconstructor):
         return self._solution(self._fit(frames, start, history), Kind.of(frames))
 
     def _solution(self, fit: _Fit, kind: Kind) -> Solution:
-        xp = kind.xp
-        phase = angle(fit.psi, xp) if fit.coefficients is None else self._phase(fit.coefficients)
-        history = None if fit.history is None else xp.astype(fit.history, kind.dtype)
-        return Solution(
-            xp.astype(phase, kind.dtype), fit.n_iterations, fit.converged, 0 * fit.n_iterations, history
-        )
+        xp, history = kind.xp, fit.history
+        phase = xp.astype(self._phase(fit) if history is None else history[:, -1, ...], kind.dtype)
+        history = None if history is None else xp.astype(history, kind.dtype)
+        return Solution(phase, fit.n_iterations, fit.converged, 0 * fit.n_iterations, history)
 
     def _fit(self, frames: NDArray, start: NDArray | None, history: bool) -> _Fit:
         """Fit all frame sets, in double precision."""
@@ -299,9 +297,10 @@ class MaximumLikelihood(Reconstructor):
 
     def _search(self, frames: NDArray, start: NDArray | None, history: bool) -> _Fit:
         """Fit from start after start, until every frame set is explained or the starts are used up."""
-        if start is None:
-            start = self._rough_phase(frames, None)
-        xp, fit = Kind.of(frames).xp, self._descend(frames, start, history)
+        xp = Kind.of(frames).xp
+        fit = self._descend(frames, self._rough_phase(frames, None) if start is None else start, history)
+        if fit.history is not None and start is not None:
+            fit.history[:, 0, ...] = start  # as it was given: modes may not represent it
         for attempt in range(1, self.n_starts):
             poor = ~self._consistent(fit)
             if not xp.any(poor):
@@ -334,13 +333,13 @@ class MaximumLikelihood(Reconstructor):
         kind, n_iterations = Kind.of(frames), self.settings.n_iterations
         xp = kind.xp
         fit = self._begin(frames, start)
-        places, ended, path = kind.integers(np.arange(frames.shape[0])), [], [angle(fit.psi, xp)]
+        places, ended, path = kind.integers(np.arange(frames.shape[0])), [], [self._phase(fit)]
         for iteration in range(1, n_iterations + 1):
             self._step(fit)
             if iteration < n_iterations and xp.any(fit.converged):
                 self._reflect(fit)
             if history:
-                path.append(angle(fit.psi, xp))
+                path.append(self._phase(fit))
             n_done = int(xp.count_nonzero(fit.converged))
             if iteration == n_iterations or n_done == places.shape[0]:
                 break
@@ -359,7 +358,7 @@ class MaximumLikelihood(Reconstructor):
         model, coefficients = self.settings.model(kind), None
         if self._slopes is not None:
             coefficients = self._slopes.fit(start, kind)
-            start = self._phase(coefficients)
+            start = self._of_modes(coefficients)
         psi = split(start, model.amplitude)
         for _ in range(_LINEAR_ITERATIONS if self._exact.unknown_amplitude else 0):
             psi = _linear_field(frames, psi, model)
@@ -399,7 +398,7 @@ class MaximumLikelihood(Reconstructor):
         else:
             jump, promised = self._modes_step(information, gradient, coefficients, fit.damping)
             coefficients = coefficients + jump
-            step = self._phase(jump)[:, np.newaxis, ...]
+            step = self._of_modes(jump)[:, np.newaxis, ...]
         if estimator.unknown_amplitude:
             psi = fit.psi + xp.sum(change * step[:, :, np.newaxis, ...], axis=1)
         else:
@@ -411,11 +410,10 @@ class MaximumLikelihood(Reconstructor):
         fit.damping = fit.damping * xp.where(better, cut, fit.growth)
         fit.growth = xp.where(better, _GROWTH + 0 * fit.growth, 2 * fit.growth)
         fit.take(better, trial, xp)
-        size = xp.sum(step * step, axis=(1, 2, 3)) / model.pupil.n_points
-        limit = self.settings.tolerance**2
+        size = xp.sqrt(xp.sum(step * step, axis=(1, 2, 3)) / model.pupil.n_points)
+        fit.converged = size <= self.settings.tolerance
         if weights is not None:
-            limit = xp.clip(_NEGLIGIBLE**2 / information.scale[:, 0, 0], limit, None)
-        fit.converged = size <= limit
+            fit.converged = fit.converged | (size <= _NEGLIGIBLE / xp.sqrt(information.scale[:, 0, 0]))
         fit.n_iterations = fit.n_iterations + 1
 
     def _reflect(self, fit: _Fit) -> None:
@@ -472,7 +470,13 @@ class MaximumLikelihood(Reconstructor):
         step = -xp.linalg.solve(damped, slope[..., np.newaxis])[..., 0]
         return step, xp.vecdot(step, damping[:, np.newaxis] * step - slope)
 
-    def _phase(self, coefficients: NDArray) -> NDArray:
+    def _phase(self, fit: _Fit) -> NDArray:
+        """Phase of fits, (k, ny, nx)."""
+        return (
+            angle(fit.psi, Kind.of(fit.psi).xp) if fit.coefficients is None else self._of_modes(fit.coefficients)
+        )
+
+    def _of_modes(self, coefficients: NDArray) -> NDArray:
         """Phase of coefficients: (k, m) to (k, ny, nx)."""
         kind = Kind.of(coefficients)
         modes = kind.array(self._exact.modes)

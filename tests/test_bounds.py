@@ -1,0 +1,151 @@
+"""Fisher information and Cramer-Rao bound, compared with dense matrices."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+import zwfs
+from zwfs import Dimple, Patch, Pupil, ZernikeSensor, cramer_rao, zernike_basis
+
+from .test_properties import seeds, sensors
+
+
+def jacobian(sensor, phase, amplitude=None, *, of_amplitude=False):
+    """Derivative of the frames with respect to every point, (n_points, n_pixels), by propagating each of them."""
+    pupil = sensor.pupil
+    field = np.exp(1j * phase) * (pupil.amplitude if amplitude is None else amplitude)
+    change = np.exp(1j * phase) if of_amplitude else 1j * field
+    field = np.where(pupil.inside, field, 0)
+    waves = sensor.propagate(field)
+    each = sensor.propagate(pupil.scatter(np.diag(pupil.gather(change)), fill=0))
+    return 2 * np.real(np.conj(waves) * each).reshape(pupil.n_points, -1)
+
+
+def dense_bound(sensor, phase, photons, read_noise=0.0, modes=None, amplitude=None, amplitude_known=True):
+    """Square roots of the diagonal of the pseudo-inverse of the information."""
+    frames = sensor.measure(phase, amplitude)
+    weights = photons**2 / (photons * frames.ravel() + read_noise**2 + 1e-12)
+    parts = [jacobian(sensor, phase, amplitude)]
+    if not amplitude_known:
+        parts.append(jacobian(sensor, phase, amplitude, of_amplitude=True))
+    derivative = np.concatenate(parts)
+    if modes is not None:
+        derivative = sensor.pupil.gather(modes) @ derivative
+    information = (derivative * weights) @ derivative.T
+    n = len(parts[0])
+    if modes is None:  # the piston
+        gauge = np.zeros(len(information))
+        gauge[:n] = 1
+        scale = information[:n, :n].trace() / n
+        inverse = np.linalg.inv(information + scale / n * np.outer(gauge, gauge))
+        return np.sqrt(np.diag(inverse)[:n] - 1 / (scale * n)), np.linalg.cond(
+            information + scale / n * np.outer(gauge, gauge)
+        )
+    return np.sqrt(np.diag(np.linalg.inv(information))), np.linalg.cond(information)
+
+
+@given(sensors(), seeds, st.floats(0, 1.5), st.floats(1, 1e5), st.sampled_from([0.0, 0.5, 20.0]))
+def test_bound_is_that_of_a_dense_matrix(sensor, seed, rms, photons, read_noise):
+    phase = rms * np.random.default_rng(seed).normal(size=sensor.pupil.shape)
+    expected, condition = dense_bound(sensor, phase, photons, read_noise)
+    assume(condition < 1e5)  # else rounding decides
+    bound = sensor.pupil.gather(cramer_rao(sensor, phase, photons=photons, read_noise=read_noise))
+    np.testing.assert_allclose(bound, expected, rtol=1e-8 + 1e-9 * condition)
+
+
+@pytest.fixture
+def small():
+    return Pupil.circular(20)
+
+
+THREE = Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), Dimple(1, 0)
+MIXED = Dimple(1.06, np.pi / 2), Dimple(2.2, -1.0), Patch(2.0, lambda u, v: np.exp(1j * (1 + u) - u**2 - v**2))
+
+
+@pytest.mark.parametrize("masks", [THREE, MIXED])
+@pytest.mark.parametrize("extent", [1.0, 1.5])
+def test_bound_with_an_unknown_amplitude_is_that_of_a_dense_matrix(small, masks, extent):
+    sensor = ZernikeSensor(small, *masks, extent=extent)
+    rng = np.random.default_rng(1)
+    phase, amplitude = rng.normal(0, 0.5, small.shape), rng.uniform(0.5, 1.5, small.shape)
+    options = {"photons": 100.0, "read_noise": 1.0, "amplitude": amplitude}
+    expected, _ = dense_bound(sensor, phase, amplitude_known=False, **options)
+    known = cramer_rao(sensor, phase, **options)
+    unknown = cramer_rao(sensor, phase, amplitude_known=False, **options)
+    np.testing.assert_allclose(small.gather(unknown), expected, rtol=1e-8)
+    assert np.all(small.gather(unknown) > small.gather(known))  # more unknowns, less information
+
+
+@pytest.mark.parametrize("masks", [THREE[:1], THREE[:2], MIXED])
+def test_bound_of_modes_is_that_of_a_dense_matrix(small, masks):
+    sensor, modes = ZernikeSensor(small, *masks, extent=1.2), zernike_basis(small, 30)
+    phase = np.random.default_rng(2).normal(0, 0.4, small.shape)
+    expected, _ = dense_bound(sensor, phase, 50.0, modes=modes)
+    np.testing.assert_allclose(cramer_rao(sensor, phase, photons=50.0, modes=modes), expected, rtol=1e-8)
+
+
+def test_ideal_bound_of_a_flat_wavefront(small):
+    """A point of field 1 and a reference wave b of two dimples of +-pi/2 has 8 b^2 / (1 - 2 b + 2 b^2) photons."""
+    sensor = ZernikeSensor(small, *THREE[:2])
+    wave = np.abs(sensor.reference_wave(np.where(small.inside, 1 + 0j, 0))[0]) / np.sqrt(2)
+    local = 8 * wave**2 / (1 - 2 * wave + 2 * wave**2)
+    bound = cramer_rao(sensor, np.zeros(small.shape), photons=1e4) * 100
+    ratio = small.gather(bound * np.sqrt(local))
+    # The wave depends on all points: that adds the error of its own measurement, which is shared by all of them.
+    assert np.all(ratio > 0.98)
+    assert ratio.mean() < 1.02
+
+
+def test_bound_falls_as_the_root_of_the_photons(small):
+    sensor, phase = ZernikeSensor(small, *MIXED), np.random.default_rng(3).normal(0, 0.4, small.shape)
+    few, many = (small.gather(cramer_rao(sensor, phase, photons=photons)) for photons in (10.0, 1000.0))
+    np.testing.assert_allclose(few, 10 * many, rtol=1e-9)
+    noisy = small.gather(cramer_rao(sensor, phase, photons=10.0, read_noise=3.0))
+    assert np.all(noisy > few)
+
+
+def test_bound_does_not_depend_on_the_piston_or_the_batch(small):
+    sensor, rng = ZernikeSensor(small, *THREE[:2]), np.random.default_rng(4)
+    phases = rng.normal(0, 0.4, (2, 3, *small.shape))
+    together = cramer_rao(sensor, phases, photons=10.0)
+    assert together.shape == phases.shape
+    assert np.array_equal(np.isnan(together[0, 0]), ~small.inside)
+    for where in np.ndindex(2, 3):
+        alone = cramer_rao(sensor, phases[where] + 1.3, photons=10.0)
+        np.testing.assert_allclose(together[where], alone, rtol=1e-9)
+    modes = zernike_basis(small, 5)
+    assert cramer_rao(sensor, phases, photons=10.0, modes=modes).shape == (2, 3, 5)
+
+
+def test_a_mode_that_no_frame_shows_has_a_large_bound(small):
+    sensor = ZernikeSensor(small, *THREE[:2])
+    modes = np.concatenate([np.ones((1, *small.shape)), zernike_basis(small, 4)])
+    bound = cramer_rao(sensor, np.zeros(small.shape), photons=100.0, modes=modes)
+    assert bound[0] > 1e4 * bound[1:].max()  # piston
+    near, far = (
+        cramer_rao(
+            ZernikeSensor(small, *(Dimple(d, a) for a in (1.5, -1.5))), np.zeros(small.shape), photons=100.0
+        )
+        for d in (2.44, 2.0)
+    )
+    assert np.nanmax(near) > 10 * np.nanmax(far)  # tilt at the dark ring
+
+
+def test_what_a_bound_refuses(small):
+    pair, phase = ZernikeSensor(small, *THREE[:2]), np.zeros(small.shape)
+    for options, message in (
+        ({"photons": 0}, "photons = 0"),
+        ({"photons": None}, "photons = None"),
+        ({"photons": 10, "read_noise": -1}, "read_noise = -1"),
+        ({"photons": 10, "amplitude_known": False}, "2 different masks"),
+        ({"photons": 10, "amplitude_known": False, "modes": zernike_basis(small, 3)}, "amplitude_known"),
+        ({"photons": 10, "modes": np.ones((small.n_points + 1, *small.shape))}, "modes"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            cramer_rao(pair, phase, **options)
+    with pytest.raises(ValueError, match="none of its masks changes the light"):
+        cramer_rao(ZernikeSensor(small, Dimple(1, 0)), phase, photons=10)
+    with pytest.raises(TypeError, match="sensor"):
+        cramer_rao(small, phase, photons=10)
+    assert zwfs.bounds.cramer_rao is cramer_rao

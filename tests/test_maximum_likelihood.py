@@ -1,0 +1,248 @@
+"""Maximum likelihood: on masks and inputs beyond the paper, with noise, and in its own unknowns."""
+
+import numpy as np
+import pytest
+
+import zwfs
+from zwfs import (
+    Detector,
+    Dimple,
+    MaximumLikelihood,
+    Patch,
+    PhaseShifted,
+    ZernikeSensor,
+    cramer_rao,
+    reconstruction_error,
+    wrapped_residual,
+    zernike_basis,
+)
+
+PI = np.pi
+CLEAR = Dimple(1, 0)
+
+
+def pair(pupil, diameter, *shifts, **options):
+    return ZernikeSensor(pupil, *(Dimple(diameter, shift * PI) for shift in shifts), **options)
+
+
+def exposed(pupil, frames, photons, n_draws, seed=5):
+    """Noisy frames, n_draws of each."""
+    camera = Detector(pupil, photons * pupil.n_points)
+    return camera.normalise(camera.expose(np.broadcast_to(frames, (n_draws, *frames.shape)), seed))
+
+
+# The paper's iteration diverges on most of these masks.
+@pytest.mark.parametrize("diameter", [1.06, 2.0, 2.4, 3.0])
+@pytest.mark.parametrize("shifts", [(0.5, -0.5), (0.75, -0.75), (0.33, -0.74), (0.30, -0.68)])
+def test_all_screens_come_back_and_are_known_to_be_right(pupil, screens, diameter, shifts):
+    sensor = pair(pupil, diameter, *shifts)
+    truth = np.concatenate([screens(rms, 2, seed=8) for rms in (0.2, 0.6, 1.0)])
+    result = MaximumLikelihood(sensor)(sensor.measure(truth))
+    assert result.consistent.all()
+    assert result.converged.all()
+    assert reconstruction_error(pupil, result.phase, truth).max() < 1e-6
+
+
+def test_the_iteration_of_the_paper_fails_where_maximum_likelihood_does_not(pupil, screens):
+    sensor, truth = pair(pupil, 3.0, 0.5, -0.5), screens(0.5, 4)
+    iterated = PhaseShifted(sensor)(sensor.measure(truth))
+    assert reconstruction_error(pupil, iterated.phase, truth).min() > 0.05 * 0.5
+
+
+def test_a_large_range_needs_several_starts(pupil, screens):
+    sensor, truth = pair(pupil, 2.0, 0.5, -0.5), screens(2.0, 12, seed=3)
+    frames = sensor.measure(truth)
+    one, many = (MaximumLikelihood(sensor, n_starts=n)(frames) for n in (1, 8))
+    right = reconstruction_error(pupil, many.phase, truth) < 0.05 * 2.0
+    assert one.consistent.sum() < many.consistent.sum()
+    assert right.sum() >= 10
+    np.testing.assert_array_equal(right, many.consistent)  # a wrong solution is not called consistent
+    np.testing.assert_array_equal(many.n_starts == 1, one.consistent)
+    assert many.n_starts.max() <= 8
+
+
+@pytest.mark.parametrize(
+    ("diameter", "rms", "photons"), [(1.06, 0.5, 100), (1.06, 1.0, 1000), (2.0, 0.05, 100), (2.0, 1.0, 10000)]
+)
+def test_error_is_the_bound_and_sigma_says_so(pupil, screens, diameter, rms, photons):
+    sensor, truth = pair(pupil, diameter, 0.5, -0.5), screens(rms, 1)[0]
+    frames = exposed(pupil, sensor.measure(truth), photons, 20)
+    result = MaximumLikelihood(sensor, photons=photons)(frames)
+    residual = wrapped_residual(pupil, result.phase, truth)
+    bound = cramer_rao(sensor, truth, photons=photons)
+    assert np.nanmean(residual**2) == pytest.approx(np.nanmean(bound**2), rel=0.1)
+    assert np.nanmean(result.chi2) == pytest.approx(1, abs=0.03)
+    assert result.consistent.all()
+    within = np.mean(pupil.gather(np.abs(residual) < result.sigma))
+    assert within == pytest.approx(0.683, abs=0.02)
+    # A control: with the wrong number of photons the error bars are too small, and the frames unexplained.
+    wrong = MaximumLikelihood(sensor, photons=10 * photons, n_starts=1)(frames)
+    assert np.mean(pupil.gather(np.abs(wrapped_residual(pupil, wrong.phase, truth)) < wrong.sigma)) < 0.4
+    assert not wrong.consistent.any()
+
+
+def test_read_noise_is_weighed(pupil, screens):
+    sensor, truth = pair(pupil, 1.06, 0.5, -0.5), screens(0.5, 1)[0]
+    camera = Detector(pupil, 300 * pupil.n_points, read_noise=10.0)
+    frames = np.broadcast_to(sensor.measure(truth), (20, *sensor.measure(truth).shape))
+    noisy = camera.normalise(camera.expose(frames, 1), floor=0.0)
+    result = MaximumLikelihood(sensor, photons=300, read_noise=10.0)(noisy)
+    bound = cramer_rao(sensor, truth, photons=300, read_noise=10.0)
+    error = np.sqrt(np.nanmean(wrapped_residual(pupil, result.phase, truth) ** 2))
+    # Frames raised to 0 lose a little light information; an estimator that ignores the noise loses more.
+    assert error == pytest.approx(np.sqrt(np.nanmean(bound**2)), rel=0.08)
+
+
+def test_without_a_number_of_photons_sigma_follows_from_the_residual(pupil, screens):
+    sensor, truth = pair(pupil, 1.06, 0.5, -0.5), screens(0.3, 1)[0]
+    rng = np.random.default_rng(2)
+    frames = sensor.measure(truth)
+    frames = np.maximum(frames + rng.normal(0, 1e-3, (10, *frames.shape)), 0)
+    result = MaximumLikelihood(sensor, n_starts=1)(frames)
+    residual = wrapped_residual(pupil, result.phase, truth)
+    assert np.mean(pupil.gather(np.abs(residual) < result.sigma)) == pytest.approx(0.683, abs=0.05)
+    assert np.isnan(result.chi2).all()
+
+
+def test_modes_and_their_errors(pupil, modes):
+    sensor, basis = pair(pupil, 2.4, 0.3, -0.68), modes[:30]
+    true = np.random.default_rng(3).normal(0, 0.12, (20, 30))
+    truth = np.tensordot(true, np.where(pupil.inside, basis, 0), 1)
+    exact = MaximumLikelihood(sensor, basis)(sensor.measure(truth))
+    np.testing.assert_allclose(exact.coefficients, true, atol=1e-6)
+    np.testing.assert_allclose(pupil.gather(exact.phase), pupil.gather(truth), atol=1e-6)  # it is not wrapped
+    camera = Detector(pupil, 30 * pupil.n_points)
+    noisy = MaximumLikelihood(sensor, basis, photons=30)(camera.normalise(camera.expose(sensor.measure(truth), 4)))
+    pull = (noisy.coefficients - true) / noisy.sigma_coefficients
+    assert np.std(pull) == pytest.approx(1, abs=0.1)
+    points = wrapped_residual(pupil, noisy.phase, truth)
+    assert np.sqrt(np.nanmean(points**2)) == pytest.approx(np.sqrt(np.nanmean(noisy.sigma**2)), rel=0.15)
+
+
+def test_a_prior_helps_faint_frames_and_does_not_bias_bright_ones(pupil):
+    sensor, basis = pair(pupil, 1.06, 0.5, -0.5), zernike_basis(pupil, 60)
+    variance = np.arange(2.0, 62) ** -2
+    variance *= 0.25 / variance.sum()
+    true = np.random.default_rng(6).normal(0, np.sqrt(variance), (20, 60))
+    frames = sensor.measure(np.tensordot(true, np.where(pupil.inside, basis, 0), 1))
+    for photons, gain in ((1, 0.8), (3000, 1.01)):
+        camera = Detector(pupil, photons * pupil.n_points)
+        noisy = camera.normalise(camera.expose(frames, 7))
+        plain, prior = (
+            MaximumLikelihood(sensor, basis, photons=photons, prior=covariance, n_starts=1)(noisy)
+            for covariance in (None, np.diag(variance))
+        )
+        errors = [np.sqrt(np.mean((one.coefficients - true) ** 2)) for one in (plain, prior)]
+        assert errors[1] < gain * errors[0]
+        assert np.std((prior.coefficients - true) / prior.sigma_coefficients) == pytest.approx(1, abs=0.1)
+
+
+def test_phase_and_amplitude_together(pupil, screens):
+    sensor = ZernikeSensor(pupil, Dimple(1.06, PI / 2), Dimple(1.06, -PI / 2), CLEAR)
+    truth = screens(0.7, 6)
+    amplitude = np.exp(0.2 * np.where(pupil.inside, screens(1.0, 6, seed=9), 0))
+    frames = sensor.measure(truth, amplitude)
+    exact = MaximumLikelihood(sensor, amplitude="unknown")(frames)
+    assert exact.consistent.all()
+    np.testing.assert_allclose(pupil.gather(exact.amplitude), pupil.gather(amplitude), atol=1e-6)
+    assert reconstruction_error(pupil, exact.phase, truth).max() < 1e-6
+    assert exact.residual.max() < 1e-6
+    ignorant = MaximumLikelihood(sensor, n_starts=1)(frames)
+    assert not ignorant.consistent.any()
+    camera = Detector(pupil, 1000 * pupil.n_points)
+    noisy = MaximumLikelihood(sensor, photons=1000, amplitude="unknown")(
+        camera.normalise(camera.expose(frames, 3))
+    )
+    for error, sigma in (
+        (wrapped_residual(pupil, noisy.phase, truth), noisy.sigma),
+        (noisy.amplitude - amplitude, noisy.sigma_amplitude),
+    ):
+        assert np.mean(pupil.gather(np.abs(error) < sigma)) == pytest.approx(0.683, abs=0.03)
+    expected = cramer_rao(sensor, truth[0], photons=1000, amplitude=amplitude[0], amplitude_known=False)
+    assert np.nanmean(noisy.sigma[0]) == pytest.approx(np.nanmean(expected), rel=0.03)
+
+
+def test_a_frame_of_one_mask_has_many_explanations(pupil, screens):
+    sensor, truth = ZernikeSensor(pupil, Dimple(1.06, PI / 2)), screens(0.3, 2)
+    result = MaximumLikelihood(sensor)(sensor.measure(truth))
+    assert result.consistent.all()
+    # A point whose intensity is extreme shows its phase to second order only.
+    assert reconstruction_error(pupil, result.phase, truth).max() < 0.1 * 0.3
+    far = MaximumLikelihood(sensor, n_starts=1)(sensor.measure(screens(1.5, 2)), screens(1.5, 2, seed=4))
+    assert np.all(far.residual < 0.3)
+
+
+@pytest.mark.parametrize(
+    "masks",
+    [
+        [Dimple(1.06, PI / 2), Dimple(2.2, -1.0)],
+        [Patch(2.0, lambda u, v: (0.8 + 0.1 * u) * np.exp(1j * (1.5 + u - v))), Dimple(1.5, -1.2, amplitude=0.6)],
+        [Dimple(1.06, PI / 2), Dimple(1.06, -PI / 2), Dimple(1.06, PI)],
+    ],
+)
+@pytest.mark.parametrize("extent", [1.0, 1.6])
+def test_any_masks_and_any_detector(pupil, screens, masks, extent):
+    sensor, truth = ZernikeSensor(pupil, *masks, extent=extent), screens(0.6, 2)
+    result = MaximumLikelihood(sensor)(sensor.measure(truth))
+    assert result.consistent.all()
+    assert reconstruction_error(pupil, result.phase, truth).max() < 1e-5
+
+
+def test_masks_that_no_iteration_takes(pupil, screens):
+    """The same mask twice and the pair (0, pi) have a determinant of 0: they hold as much as one mask."""
+    truth = screens(0.2, 2)
+    for shifts in ((0.5, 0.5), (0.5, 0.0)):
+        sensor = pair(pupil, 1.06, *shifts)
+        result = MaximumLikelihood(sensor)(sensor.measure(truth))
+        assert reconstruction_error(pupil, result.phase, truth).max() < 1e-4
+
+
+def test_sigma_is_large_where_nothing_is_seen(pupil):
+    """Tilt at the dark ring raises the error of every point, most at the rim."""
+    flat = np.zeros(pupil.shape)
+    near, far = (
+        MaximumLikelihood(sensor, photons=1e4)(sensor.measure(flat)).sigma
+        for sensor in (pair(pupil, 2.44, 0.5, -0.5), pair(pupil, 2.0, 0.5, -0.5))
+    )
+    assert np.nanmax(near) > 10 * np.nanmax(far)
+
+
+def test_a_result_in_single_precision_and_in_words(pupil, screens):
+    sensor, truth = pair(pupil, 2.0, 0.5, -0.5), screens(0.5, 2)
+    frames = sensor.measure(truth).astype(np.float32)
+    result = MaximumLikelihood(sensor, photons=1e4)(frames)
+    assert {result.phase.dtype, result.sigma.dtype} == {np.dtype(np.float32)}
+    assert reconstruction_error(pupil, result.phase, truth).max() < 1e-4
+    assert isinstance(result, zwfs.LikelihoodReconstruction)
+    assert isinstance(result, zwfs.Reconstruction)
+    single = MaximumLikelihood(sensor, photons=1e4)(frames[0])
+    assert single.phase.shape == single.sigma.shape == pupil.shape
+    assert single.chi2.shape == single.consistent.shape == single.n_starts.shape == ()
+    np.testing.assert_allclose(pupil.gather(single.sigma), pupil.gather(result.sigma[0]), rtol=1e-5)
+
+
+def test_what_it_refuses(pupil, modes):
+    sensor, few = pair(pupil, 1.06, 0.5, -0.5), modes[:3]
+    one = np.eye(3)
+    for options, message in (
+        ({"photons": 0}, "photons = 0"),
+        ({"photons": -3.0}, "photons = -3"),
+        ({"photons": 10, "read_noise": -1}, "read_noise = -1"),
+        ({"read_noise": 1}, "read_noise = 1: expected 0"),
+        ({"amplitude": "unknown"}, "2 different masks: expected at least 3"),
+        ({"amplitude": "measured"}, "amplitude = 'measured'"),
+        ({"amplitude": "unknown", "modes": few}, "amplitude = 'unknown'"),
+        ({"prior": one, "photons": 10}, "prior: expected None without modes"),
+        ({"prior": one, "modes": few}, "prior: expected a number of photons"),
+        ({"prior": np.eye(4), "modes": few, "photons": 10}, r"prior has shape \(4, 4\)"),
+        ({"prior": -one, "modes": few, "photons": 10}, "positive definite"),
+        ({"prior": one + np.eye(3, k=1), "modes": few, "photons": 10}, "not symmetric"),
+        ({"modes": np.ones((pupil.n_points + 1, *pupil.shape))}, "at most the"),
+        ({"n_starts": 0}, "n_starts = 0"),
+        ({"seed": -1}, "seed = -1"),
+        ({"n_iterations": 0}, "n_iterations = 0"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            MaximumLikelihood(sensor, **options)
+    with pytest.raises(ValueError, match="none of its masks changes the light"):
+        MaximumLikelihood(ZernikeSensor(pupil, CLEAR))

@@ -20,6 +20,8 @@ Shapes: k frame sets, c unknowns per point (1: phase; 2: phase and amplitude), m
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
+from operator import add, mul
 from typing import Any
 
 import numpy as np
@@ -30,7 +32,6 @@ from zwfs._pickle import Immutable
 from zwfs.lowrank import Factors
 from zwfs.pupil import Pupil
 
-_ZERO: Any = 0
 _SMALLEST = 1e-12  # of the diagonal, relative to its mean: a point that no frame shows has no information
 
 
@@ -127,7 +128,8 @@ class Response(Immutable):
         columns[2:, :, 2 * r :] = left @ split.reshape(2 * n, q, 2 * r)
         detector = outer.combine @ split.reshape(2 * n, q, 2 * r)
         return _Constants(
-            kind, self._pupil.n_points, self._window, kind.array(self._pupil.inside),
+            kind, self._pupil.n_points, self._window,
+            kind.array(self._pupil.inside), kind.array(np.where(self._pupil.inside, _SMALLEST, 1.0)),
             _Pairs.of(inner.along_y, inner.along_x, kind), _Pairs.of(outer.along_y, outer.along_x, kind),
             kind.array(columns), kind.array(detector), turns,
         )  # fmt: skip
@@ -153,6 +155,7 @@ class _Constants:
     n_points: int
     window: tuple[slice, slice]
     stop: NDArray  # (ny, nx), 1 in the pupil
+    outside: NDArray  # (ny, nx), 1 outside, and the smallest share of information inside
     inner: _Pairs
     outer: _Pairs
     columns: NDArray  # (s, a * b, 4 r), functions times maps to columns of K and B
@@ -192,33 +195,31 @@ class Information:
         unknowns = range(n_unknowns)
         real, imag = ([tangents[:, c, part, ...] for c in unknowns] for part in (0, 1))
         n_sets = 2 * constants.turns.shape[1]
-        local = [[_ZERO for _ in unknowns] for _ in unknowns]
-        mixed = [[_ZERO for _ in unknowns] for _ in range(n_sets)]
-        pairs = [_ZERO for _ in _pairs_of(n_sets)]
+        pairs: list[Any] = []
+        local: list[Any] = []
+        mixed: list[Any] = []
         for mask, turns in enumerate(constants.turns):
             wave = waves[:, mask, ...]
-            weight: Any = 1 if weights is None else weights[:, mask, ...]
             # dI per unit of the real and imaginary part of a coefficient: 2 Re and -2 Im of conj(o) times the turn
             along = [
-                2 * (t.real * wave[:, 0, ...] + t.imag * wave[:, 1, ...])
-                for turn in turns
-                for t in (turn, turn * 1j)
-            ]
-            weighted = along if weights is None else [weight * one for one in along]
-            pairs = [
-                total + along[i] * weighted[j] for total, (i, j) in zip(pairs, _pairs_of(n_sets), strict=True)
-            ]
-            inside = wave[(..., *window)]
-            change = [2 * (inside[:, 0, ...] * real[c] + inside[:, 1, ...] * imag[c]) for c in unknowns]
-            along, weighted = ([one[(..., *window)] for one in maps] for maps in (along, weighted))
-            seen = change if weights is None else [weight[(..., *window)] * one for one in change]
-            local = [[local[i][j] + change[i] * seen[j] for j in unknowns] for i in unknowns]
-            mixed = [[mixed[s][c] + change[c] * weighted[s] for c in unknowns] for s in range(n_sets)]
+                (2 * t.real) * wave[:, 0, ...] + (2 * t.imag) * wave[:, 1, ...]
+                for turn in turns for t in (turn, turn * 1j)
+            ]  # fmt: skip
+            weight: Any = None if weights is None else weights[:, mask, ...]
+            weighted = along if weight is None else [weight * one for one in along]
+            inside = 2 * wave[(..., *window)]
+            change = [inside[:, 0, ...] * real[c] + inside[:, 1, ...] * imag[c] for c in unknowns]
+            seen = change if weight is None else [weight[(..., *window)] * one for one in change]
+            _accumulate(pairs, [along[i] * weighted[j] for i, j in _pairs_of(n_sets)])
+            _accumulate(local, [change[i] * seen[j] for i in unknowns for j in unknowns])
+            _accumulate(mixed, [along[s][(..., *window)] * seen[c] for s in range(n_sets) for c in unknowns])
         gram = _congruent(constants.outer.gram(xp.stack(pairs, axis=1), xp), constants.detector, xp)
-        scale = xp.sum(local[0][0], axis=(-2, -1))[:, np.newaxis, np.newaxis] / constants.n_points
+        scale = xp.sum(local[0], axis=(-2, -1))[:, np.newaxis, np.newaxis] / constants.n_points
+        blocks = [local[c * n_unknowns : (c + 1) * n_unknowns] for c in unknowns]
         for c in unknowns:
-            local[c][c] = local[c][c] + scale * (_SMALLEST + 1 - constants.stop)
-        return cls(constants, local, [real, imag, *mixed], gram, scale)
+            blocks[c][c] += scale * constants.outside
+        sets = [real, imag, *(mixed[s * n_unknowns : (s + 1) * n_unknowns] for s in range(n_sets))]
+        return cls(constants, blocks, sets, gram, scale)
 
     def inverse(self, damping: NDArray | float = 0.0) -> Inverse:
         """Inverse of F with `damping`, (k, 1, 1), added to its diagonal, and the piston fixed.
@@ -265,10 +266,14 @@ class Information:
 
     def _project(self, unknowns: list[NDArray]) -> NDArray:
         """Products of the columns of K and B with maps of the unknowns: (k, 4 r)."""
-        total: Any = 0
-        for one, matrix in zip(self.sets, self.constants.columns, strict=True):
-            total = total + self.constants.inner.project(_dot(one, unknowns), self.constants.kind.xp) @ matrix
-        return total
+        inner, xp = self.constants.inner, self.constants.kind.xp
+        return reduce(
+            add,
+            (
+                inner.project(_dot(one, unknowns), xp) @ x
+                for one, x in zip(self.sets, self.constants.columns, strict=True)
+            ),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,7 +322,7 @@ class Inverse:
         total = [weights[:, -1:, np.newaxis] * one for one in self.piston]
         for one, matrix in zip(self.scaled, constants.columns, strict=True):
             wave = constants.inner.expand(weights[:, :-1] @ matrix.T, constants.kind.xp)
-            total = [before + new * wave for before, new in zip(total, one, strict=True)]
+            _accumulate(total, [new * wave for new in one])
         return total
 
 
@@ -327,10 +332,16 @@ def _pairs_of(n: int) -> list[tuple[int, int]]:
 
 def _dot(left: list[NDArray], right: list[NDArray]) -> NDArray:
     """Sum over the unknowns of a point."""
-    total: Any = 0
-    for one, other in zip(left, right, strict=True):
-        total = total + one * other
-    return total
+    return reduce(add, map(mul, left, right))
+
+
+def _accumulate(totals: list[Any], terms: list[Any]) -> None:
+    """Add terms to totals in place; the first terms become the totals."""
+    if not totals:
+        totals += terms
+        return
+    for total, term in zip(totals, terms, strict=True):
+        total += term
 
 
 def _times(blocks: list[list[NDArray]], maps: list[NDArray]) -> list[NDArray]:

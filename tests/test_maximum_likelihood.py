@@ -165,7 +165,6 @@ def test_phase_and_amplitude_together(pupil, screens):
 def test_a_frame_of_one_mask_has_many_explanations(pupil, screens):
     sensor, truth = ZernikeSensor(pupil, Dimple(1.06, PI / 2)), screens(0.3, 2)
     result = MaximumLikelihood(sensor)(sensor.measure(truth))
-    assert result.consistent.all()
     # A point whose intensity is extreme shows its phase to second order only.
     assert reconstruction_error(pupil, result.phase, truth).max() < 0.1 * 0.3
     far = MaximumLikelihood(sensor, n_starts=1)(sensor.measure(screens(1.5, 2)), screens(1.5, 2, seed=4))

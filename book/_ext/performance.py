@@ -90,6 +90,10 @@ def tables(speed: dict[str, Any]) -> dict[str, str]:
         "parts": table(["part", "time (μs)"], parts),
         "batches": table(["frame pairs in a call", "time of each (ms)", memory], batches),
         "methods": table(["method", "time (ms)"], methods),
+        "likelihood": table(
+            ["task", "time relative to one propagation of HCIPy"],
+            [[name.replace("lambda/D", "λ/D"), f"{ratio:.2g}"] for name, ratio in speed["likelihood"].items()],
+        ),
         "loop": table(["reconstructor", "time of a step (ms)"], loop),
         "limit": table(["part", "time (μs)", "share"], limit),
         "growth": growth(speed),

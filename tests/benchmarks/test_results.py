@@ -49,6 +49,12 @@ def test_every_reconstructor_of_the_loop_makes_a_step():
     assert len(speed.loop_step(32, seconds=0)) == 3
 
 
+def test_maximum_likelihood_is_compared_with_one_propagation():
+    ratios = speed.likelihood(0, n_pixels=32)
+    assert ratios["one propagation"] == 1
+    assert len(ratios) == 5
+
+
 def test_every_library_at_hand_finds_the_same():
     found = list(arrays.rates(21, 40))
     assert found[0][0] == "NumPy"

@@ -261,7 +261,7 @@ def _with_residual(method, frames):
 
 
 def likelihood(seconds, n_pixels=100):
-    """Time of maximum likelihood at 0.8 rad rms, and of its error bars, in propagations of HCIPy in the same run."""
+    """Time of maximum likelihood and its error bars at 0.8 rad rms, in propagations of HCIPy in the same run."""
     pupil = Pupil.circular(n_pixels)
     screen = screens_at(zernike_basis(pupil, 200), 0.8, 1, 2024, 7)[0]
     peer = HcipySensor(pupil, DIMPLES[0])

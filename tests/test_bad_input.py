@@ -29,7 +29,7 @@ MODULES = (
     *("bench.model", "bench.segments", "bench.recording"),
     *("frames.files", "frames.registration", "frames.pipeline"),
     *("paper.curves", "paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
-    *("paper.bench_linearity", "paper.closed_loop"),
+    *("paper.bench_linearity", "paper.closed_loop", "paper.photon_noise", "paper.design"),
     *("companion.sweeps", "companion.results", "companion.tables"),
 )
 
@@ -114,7 +114,15 @@ def valid() -> dict:
     from zwfs.bench import model
     from zwfs.frames import files as camera
     from zwfs.frames import pipeline, registration
-    from zwfs.paper import bench_linearity, closed_loop, dimple_diameter, linearity, phase_shifts
+    from zwfs.paper import (
+        bench_linearity,
+        closed_loop,
+        design,
+        dimple_diameter,
+        linearity,
+        phase_shifts,
+        photon_noise,
+    )
 
     paper = linearity.paper_reconstructors(pupil, modes, 1.06, 1.5, extent=1.0, n_iterations=2)
     small = model.Bench(n_pixels=17, n_rings=1, missing=(), gap=0.0, static=0.0, photons=1e6, read_noise=1.0)
@@ -290,6 +298,15 @@ def valid() -> dict:
         "DimpleLight.__call__.field": pupil.gather(field)[np.newaxis],
         "DimpleLight.project.field": pupil.gather(field)[np.newaxis],
         "PairMaps.best.name": "flat",
+        "photon_curves.rms": np.array([0.1]),
+        "photon_curves.photons": np.array([1e4]),
+        "error_bars.rms": np.array([0.1]),
+        "assumed": np.array([1.0]),
+        "design": design.PUBLISHED[0],
+        "shift": 0.1,
+        "designs": design.PUBLISHED[:1],
+        "design_map.angles": np.array([1.5, 1.6]),
+        "DesignMap.best.name": "flat",
         "run.name": "squares",
         "screens_at.task": 0,
         "read.path": Path("file.npy"),
@@ -340,6 +357,8 @@ def valid() -> dict:
         ),
         "DimpleLight": dimple_diameter.DimpleLight(pupil, 1.06),
         "PairMaps": phase_shifts.pair_maps(pupil, 1.06, [1.5, -1.5], phase[np.newaxis], 2),
+        "PhotonCurves": photon_noise.photon_curves(shifted, {"shifted": method}, modes, [0.1], [1e4], 1),
+        "DesignMap": design.DesignMap(np.array([1.0]), np.array([1.5]), {"flat": np.array([[2.0]])}),
         "CameraFile": file,
     }
     return {"arguments": arguments, "instances": instances}

@@ -16,9 +16,11 @@ from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics, Step
 from zwfs.paper import identities
 from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.paper.closed_loop import LoopRun
+from zwfs.paper.design import PUBLISHED, DesignMap
 from zwfs.paper.dimple_diameter import Contraction, DiameterCurves
 from zwfs.paper.linearity import linearity_curves
 from zwfs.paper.phase_shifts import DrawnNoise, PairMaps
+from zwfs.paper.photon_noise import EXPECTED, ErrorBars, PhotonCurves
 
 
 @pytest.fixture(autouse=True)
@@ -89,6 +91,16 @@ def drawn_methods(curves, pupil, classic, shifted):
         "diameter_reasons": ((reasons, 2.2), shifted_only),
         "all_pairs": ((PairMaps(three, *np.full((5, 3, 3), 1.0)),), ()),
         "pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
+        "photon_noise": (
+            (
+                PhotonCurves(
+                    three, three, dict.fromkeys(plots.LOOKS, np.ones((3, 3, 2))), np.eye(3) + 1, np.eye(3)
+                ),
+            ),
+            plots.LOOKS,
+        ),
+        "error_bars": (([ErrorBars(k, EXPECTED, k, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
+        "design_maps": ((DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5}), PUBLISHED), ()),
         "reference_intensities": ((frames, frames), ()),
         "measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
         "segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),

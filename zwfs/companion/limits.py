@@ -45,6 +45,14 @@ LIMITS: dict[str, dict[str, Any]] = {
         inputs=[(0.01, 4.0)],
         n_steps_capture=(3, 100000),
     ),
+    "design": _limits(
+        "n_modes inputs n_screens exponent",
+        n_pixels=(16, 200),
+        step=(0.05, 1.0),
+        diameter_max=(2.0, 8.0),
+        n_angles=(2, 100),
+        added=(-1.0, 1.0),
+    ),
     "error_budget": _limits("inputs n_screens n_iterations", n_pixels=(32, 1024), leakages=[(0.0, 0.49), ...]),
     "fig01_sensor_layout": _limits("n_pixels diameter rms", phase_shift=(-6.2832, 6.2832)),
     "fig02_vector_sensor": _limits("n_pixels diameter phase_shift rms"),
@@ -108,6 +116,14 @@ LIMITS: dict[str, dict[str, Any]] = {
         n_iterations=(2, 10000),
         photons=(1.0, 1e12),
         n_draws=(2, 10000),
+    ),
+    "photon_noise": _limits(
+        "n_modes diameter phase_shift inputs n_screens exponent n_iterations extent",
+        n_pixels=(16, 200),
+        diameter_wide=(0.1, 8.0),
+        photons=[(1.0, 1e9)],
+        photons_bars=(10.0, 1e9),
+        wrong=[(0.01, 100.0)],
     ),
     "reconstructors": _limits(
         "n_pixels n_modes diameter phase_shift inputs n_screens exponent n_iterations extent"

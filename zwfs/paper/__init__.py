@@ -1,5 +1,23 @@
-"""The experiments of the paper: one module for each section or group of figures."""
+"""The experiments of the paper, and those beyond it: one module for each section or group of figures."""
 
-from zwfs.paper import bench_linearity, closed_loop, dimple_diameter, identities, linearity, phase_shifts
+from zwfs.paper import (
+    bench_linearity,
+    closed_loop,
+    design,
+    dimple_diameter,
+    identities,
+    linearity,
+    phase_shifts,
+    photon_noise,
+)
 
-__all__ = ["bench_linearity", "closed_loop", "dimple_diameter", "identities", "linearity", "phase_shifts"]
+__all__ = [
+    "bench_linearity",
+    "closed_loop",
+    "design",
+    "dimple_diameter",
+    "identities",
+    "linearity",
+    "phase_shifts",
+    "photon_noise",
+]

@@ -8,6 +8,7 @@ from zwfs.plots.identities import approximation, diversity
 from zwfs.plots.layouts import bench_layout, sensor_layout, vector_sensor
 from zwfs.plots.linearity import convergence, estimates, linearity
 from zwfs.plots.phase_shifts import all_pairs, pair_noise
+from zwfs.plots.photon_noise import design_maps, error_bars, photon_noise
 from zwfs.plots.style import (
     INTENSITY_MAP,
     LOOKS,
@@ -32,10 +33,12 @@ __all__ = [
     "budget",
     "capture",
     "convergence",
+    "design_maps",
     "diameter_methods",
     "diameter_reasons",
     "dimple_diameter",
     "diversity",
+    "error_bars",
     "estimates",
     "explained",
     "gains",
@@ -44,6 +47,7 @@ __all__ = [
     "measured_and_modelled",
     "pair_noise",
     "phase_map",
+    "photon_noise",
     "reference_intensities",
     "segment_errors",
     "sensor_layout",

@@ -1,0 +1,128 @@
+import numpy as np
+import pytest
+
+import zwfs
+from zwfs.paper.design import CLASSIC, PUBLISHED, Design, DesignMap, design_map, photon_costs, uneven
+from zwfs.paper.linearity import paper_reconstructors, screens_at
+from zwfs.paper.photon_noise import EXPECTED, SIGMAS, error_bars, photon_curves
+
+PHOTONS = [100.0, 1e4]
+ONE = int(np.flatnonzero(SIGMAS == 1)[0])
+
+
+@pytest.fixture(scope="module")
+def methods(pupil, modes):
+    return paper_reconstructors(pupil, modes, 1.06, np.pi / 2)
+
+
+@pytest.fixture(scope="module")
+def curves(shifted, methods, modes):
+    others = {name: methods[name] for name in ("Arcsine", "PhaseShifted")}
+    return photon_curves(shifted, others, modes, [0.05, 0.5], PHOTONS, 3, seed=4)
+
+
+def test_maximum_likelihood_reaches_the_bound(curves):
+    np.testing.assert_allclose(curves.ratio("MaximumLikelihood"), 1, atol=0.06)
+
+
+def test_equal_weights_cost_photons_on_an_aberrated_wavefront(curves):
+    shifted, likely = curves.ratio("PhaseShifted"), curves.ratio("MaximumLikelihood")
+    assert np.all(shifted[1] > likely[1] + 0.02)
+    assert np.all(shifted < 1.3)
+
+
+def test_photons_do_not_reduce_a_systematic_error(curves):
+    arcsine = curves.error("Arcsine")[1]
+    assert arcsine[1] > 5 * curves.bound[1, 1]
+    assert curves.error("MaximumLikelihood")[1, 1] < 0.2 * arcsine[1]
+
+
+def test_the_bound_falls_with_the_root_of_the_photons(curves):
+    np.testing.assert_allclose(curves.bound[:, 0] / curves.bound[:, 1], 10, rtol=1e-9)
+
+
+def test_68_percent_are_within_one_sigma(curves):
+    np.testing.assert_allclose(curves.within, EXPECTED[ONE], atol=0.03)
+
+
+def test_a_cell_depends_on_the_seed_and_its_place_only(curves, shifted, modes):
+    alone = photon_curves(shifted, {}, modes, [0.05], PHOTONS[:1], 3, seed=4)
+    np.testing.assert_allclose(
+        alone.errors["MaximumLikelihood"][0, 0], curves.errors["MaximumLikelihood"][0, 0], rtol=1e-9
+    )
+    other = photon_curves(shifted, {}, modes, [0.05], PHOTONS[:1], 3, seed=5)
+    assert not np.allclose(alone.errors["MaximumLikelihood"], other.errors["MaximumLikelihood"])
+
+
+def test_error_bars_are_right_and_wrong_photons_are_noticed(shifted, modes):
+    right, short, long = error_bars(shifted, modes, [0.05, 0.5], 1000, [1, 2, 0.5], 3, seed=1)
+    np.testing.assert_allclose(right.within, EXPECTED, atol=0.02)
+    assert right.consistent == 1
+    assert right.chi2 == pytest.approx(1, abs=0.05)
+    # With k times the photons assumed, one standard error is 1 / sqrt(k) of the true one: a factor of 2 shifts the
+    # curve by sqrt(2).
+    assert short.within[ONE] == pytest.approx(np.interp(np.sqrt(0.5), SIGMAS, EXPECTED), abs=0.03)
+    assert long.within[ONE] == pytest.approx(np.interp(np.sqrt(2), SIGMAS, EXPECTED), abs=0.03)
+    assert (short.chi2, long.chi2) == (pytest.approx(2, rel=0.05), pytest.approx(0.5, rel=0.05))
+    assert short.consistent == 0
+
+
+@pytest.fixture(scope="module")
+def wavefronts(pupil, modes):
+    flat = np.zeros((1, *pupil.shape))
+    return {"flat": flat, "1 rad rms": screens_at(modes, 1.0, 2, 3, 0)}
+
+
+@pytest.fixture(scope="module")
+def maps(pupil, wavefronts):
+    return design_map(pupil, [1.06, 1.4, 2.4], np.array([0.3, 0.5, 0.7]) * np.pi, wavefronts)
+
+
+def test_no_sensor_is_better_than_the_ideal_one(maps, pupil):
+    # The bound leaves out the piston, one of as many directions as there are points.
+    assert min(cost.min() for cost in maps.costs.values()) > 1 - 2 / pupil.n_points
+
+
+def test_the_cost_is_the_mean_square_of_the_bound(pupil, shifted, wavefronts):
+    paper = photon_costs(pupil, PUBLISHED[:1], wavefronts)
+    for name, phases in wavefronts.items():
+        # 250 photons per point in each of two frames.
+        bound = pupil.gather(zwfs.cramer_rao(shifted, phases, photons=250))
+        assert paper[name][0] == pytest.approx(np.mean(bound**2) * 4 * 500, rel=1e-3)
+
+
+def test_one_dimple_sees_a_flat_wavefront_as_well_as_a_pair_of_them(pupil, wavefronts, classic):
+    [cost] = photon_costs(pupil, [CLASSIC], {"flat": wavefronts["flat"]})["flat"]
+    bound = pupil.gather(zwfs.cramer_rao(classic, wavefronts["flat"], photons=500))
+    assert cost == pytest.approx(np.mean(bound**2) * 4 * 500, rel=1e-3)
+    [pair] = photon_costs(pupil, PUBLISHED[:1], {"flat": wavefronts["flat"]})["flat"]
+    assert cost == pytest.approx(pair, rel=1e-3)
+
+
+def test_turned_signs_cost_the_same_for_turned_wavefronts(pupil, wavefronts):
+    design = Design("", 1.3, 0.9, -2.0)
+    phases = wavefronts["1 rad rms"]
+    turned = photon_costs(pupil, [Design("", 1.3, -0.9, 2.0)], {"": -phases[:, ::-1, ::-1]})
+    assert photon_costs(pupil, [design], {"": phases})[""] == pytest.approx(turned[""], rel=1e-3)
+
+
+def test_wider_dimples_with_larger_shifts_need_fewer_photons(maps):
+    for costs in maps.costs.values():
+        assert costs[1, 2] < 0.6 * costs[0, 1]
+    assert maps.costs["flat"][2].min() > 3, "a small tilt is hardly seen near the dark ring"
+    assert maps.costs["1 rad rms"][2, 1] < 0.6 * maps.costs["1 rad rms"][0, 1]
+
+
+def test_equal_sizes_of_the_shifts_are_best(pupil, wavefronts):
+    even = Design("", 1.6, 0.7 * np.pi, -0.7 * np.pi)
+    costs = photon_costs(pupil, [even, uneven(even, 0.4), uneven(even, -0.4)], wavefronts)
+    assert all(cost[0] < cost[1:].min() for cost in costs.values())
+    assert costs["flat"][1] == pytest.approx(costs["flat"][2], rel=1e-3)
+
+
+def test_best_designs_of_a_map():
+    costs = {"a": np.array([[2.0, 1.0], [1.5, 4.0]]), "b": np.array([[9.0, 8.0], [3.0, 2.0]])}
+    maps = DesignMap(np.array([1.0, 2.0]), np.array([0.5, 0.6]), costs)
+    assert maps.best("a") == Design("best, a", 1.0, 0.6, -0.6)
+    assert maps.best("b") == Design("best, b", 2.0, 0.6, -0.6)
+    assert maps.all_round == Design("all-round", 2.0, 0.5, -0.5)

@@ -1,0 +1,99 @@
+"""Figures of photon noise: errors next to the bound, error bars, and designs of sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
+
+from zwfs.paper.design import Design, DesignMap
+from zwfs.paper.photon_noise import EXPECTED, SIGMAS, ErrorBars, PhotonCurves
+from zwfs.plots.style import LOOKS, OTHER_STYLES, _looks
+
+# Photon costs at which a line is drawn, and its colour, which differs from that of the map.
+_LINES = dict.fromkeys((1.25, 1.5, 2), "#222222") | dict.fromkeys((3, 5, 10), "#ffffff")
+_MARKS = ("o", "s", "D", "*", "P", "X")
+
+
+def photon_noise(curves: PhotonCurves) -> Figure:
+    """Error of each method and the bound against the number of photons, and their ratio; one column per input."""
+    size = curves.rms.size
+    figure, panels = plt.subplots(2, size, figsize=(8, 6.6), sharex=True, sharey="row", squeeze=False)
+    for column, (errors, ratios) in enumerate(panels.T):
+        bound = curves.bound[column]
+        errors.loglog(
+            curves.photons, bound, color="#999999", lw=5, solid_capstyle="round", label="bound", zorder=0
+        )
+        ratios.axhline(1, color="#999999", lw=5, zorder=0)
+        for name, look in _looks(curves.errors):
+            errors.plot(curves.photons, curves.error(name)[column], ms=5, label=look.label, **look.style)
+            ratios.plot(curves.photons, curves.ratio(name)[column], ms=5, **look.style)
+        errors.set_title(f"input {curves.rms[column]:g} rad rms", fontsize=10)
+        ratios.set(xlabel="photons per point", xscale="log", ylim=(0.9, 1.6))
+    panels[0, 0].set_ylabel("error (rad rms)")
+    panels[1, 0].set_ylabel("error / bound")
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    return figure
+
+
+def error_bars(rows: Sequence[ErrorBars]) -> Figure:
+    """Share of the points within a number of standard errors, next to that of Gaussian errors."""
+    figure, axes = plt.subplots(figsize=(6.5, 4))
+    axes.plot(SIGMAS, EXPECTED, color="#999999", lw=5, label="Gaussian errors", zorder=0)
+    wrong = iter(OTHER_STYLES)
+    for row in rows:
+        right = row.assumed == 1
+        style = LOOKS["MaximumLikelihood"].style if right else next(wrong)
+        label = "right number of photons" if right else f"{row.assumed:g} times the photons assumed"
+        axes.plot(SIGMAS, row.within, ms=6, label=label, **style)
+    axes.axvline(1, color="#555555", lw=1, zorder=0.5)
+    axes.set(xlabel="width of the error bar (standard errors)", ylabel="share of the points", ylim=(0, 1.02))
+    axes.set_xlim(0, SIGMAS[-1] + 0.1)
+    axes.legend(loc="lower right")
+    return figure
+
+
+def design_maps(maps: DesignMap, designs: Sequence[Design]) -> Figure:
+    """Photon cost against diameter and phase shift, one panel for each kind of wavefront.
+
+    A design is a mark at its diameter and half the difference of its phase shifts. A bar joins shifts of different
+    size. The diameters and angles of the maps must be evenly spaced.
+    """
+    figure, panels = plt.subplots(1, len(maps.costs), figsize=(8, 4.6), sharey=True, squeeze=False)
+    x, y = maps.diameters, maps.angles / np.pi
+    half = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
+    extent = x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1]
+    for axes, (name, costs) in zip(panels[0], maps.costs.items(), strict=True):
+        axes.grid(False)
+        shown = axes.imshow(
+            costs.T, cmap="cividis_r", norm=LogNorm(1, 10), extent=extent, aspect="auto", interpolation="bilinear"
+        )
+        lines = axes.contour(x, y, costs.T, list(_LINES), colors=list(_LINES.values()), linewidths=0.8)
+        axes.clabel(lines, fmt="%g", fontsize=9)
+        for design, mark in zip((*designs, maps.best(name)), _MARKS, strict=False):
+            low, high = sorted(abs(theta) / np.pi for theta in design[2:])
+            if high > low + 1e-9:
+                axes.plot([design.diameter] * 2, [low, high], color="#ffffff", lw=4)
+                axes.plot([design.diameter] * 2, [low, high], color="#000000", lw=1.5)
+            label = "best of each map" if design.name.startswith("best") else design.name
+            size = {"*": 15}.get(mark, 8)
+            axes.plot(
+                design.diameter, (low + high) / 2, mark, mfc="#ffffff", mec="#000000", mew=1.2, ms=size,
+                label=label, ls="none",
+            )  # fmt: skip
+        axes.set(xlim=extent[:2], ylim=extent[2:], xlabel="diameter (λ/D)")
+        axes.set_title(name, fontsize=10)
+        axes.yaxis.set_major_formatter(FormatStrFormatter("±%gπ"))
+    panels[0, 0].set_ylabel("phase shifts (rad)")
+    bar = figure.colorbar(shown, ax=list(panels[0]), label="photons, ideal sensor: 1", extend="max", aspect=25)
+    bar.ax.yaxis.set_major_locator(FixedLocator([1, 2, 3, 5, 10]))
+    bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    bar.ax.yaxis.set_minor_formatter(NullFormatter())
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5)
+    return figure

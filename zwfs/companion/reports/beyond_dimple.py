@@ -71,25 +71,6 @@ def limits_columns(limits: DimpleLimits) -> dict[str, NDArray]:
     return columns
 
 
-def bounds(limits: DimpleLimits, rms: float) -> Table:
-    """Factor and bounds at the paper's diameter, at the dark ring and beyond."""
-    rows = []
-    for diameter in (USUAL, 2.0, DARK_RING, LARGE, 4.0):
-        at = _index(limits, diameter)
-        values = [_screens(part)[at] for part in (limits.tilt, limits.others, limits.total)]
-        rows.append([f"{diameter:.3g}", float(limits.factor[at, 1:].mean()), *map(float, values)])
-    return Table(
-        [
-            f"diameter (λ/D), input {rms:g} rad rms",
-            "factor of an iteration",
-            "bound of tilt / ideal",
-            "of the other modes",
-            "of all modes",
-        ],
-        rows,
-    )
-
-
 def instruments(curves: Mapping[str, RecoveryCurves], threshold: float) -> Table:
     """Number of screens that each method recovers on the masks of instruments."""
     names = list(next(iter(curves.values())).errors)

@@ -64,24 +64,6 @@ def verdicts(curves: Mapping[float, RecoveryCurves], threshold: float) -> Table:
     )
 
 
-def starts(curves: Mapping[float, RecoveryCurves], threshold: float) -> Table:
-    """Numbers of starts of maximum likelihood on the screens that it recovers, and on the others."""
-    rows = []
-    for diameter, curve in curves.items():
-        right, used = curve.right(threshold), curve.n_starts
-        more = used[right & (used > 1)]
-        rows.append([
-            f"{diameter:g}",
-            int(np.count_nonzero(right & (used == 1))),
-            more.size,
-            int(more.max()) if more.size else "–",
-            int(np.count_nonzero(~right)),
-        ])  # fmt: skip
-    return Table(
-        ["diameter (λ/D)", "recovered at the first start", "later", "starts then, at most", "not recovered"], rows
-    )
-
-
 def claims(curves: Mapping[float, RecoveryCurves], threshold: float, settings: Mapping[str, float]) -> None:
     """Glue the settings and the numbers of the text, with the limits of the first, second and third dimple."""
     total = _total(curves, threshold)

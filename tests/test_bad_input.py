@@ -29,7 +29,7 @@ MODULES = (
     *("bench.model", "bench.segments", "bench.recording"),
     *("frames.files", "frames.registration", "frames.pipeline"),
     *("paper.curves", "paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
-    *("paper.bench_linearity", "paper.closed_loop", "paper.photon_noise", "paper.design"),
+    *("paper.bench_linearity", "paper.closed_loop", "paper.photon_noise", "paper.design", "paper.recovery"),
     *("companion.sweeps", "companion.results", "companion.tables"),
 )
 
@@ -122,6 +122,7 @@ def valid() -> dict:
         linearity,
         phase_shifts,
         photon_noise,
+        recovery,
     )
 
     paper = linearity.paper_reconstructors(pupil, modes, 1.06, 1.5, extent=1.0, n_iterations=2)
@@ -211,6 +212,8 @@ def valid() -> dict:
         "diameter_curves.make": lambda diameter: {"shifted": method},
         "own_reconstructor.path": "",
         **dict.fromkeys(("saxton_by_width.reconstructors", "repaired_reconstructors.reconstructors"), paper),
+        "sensors": {"shifted": shifted},
+        "recovery_curves.rms": np.array([0.1]),
         "contraction.modes": np.tile(modes, (30, 1, 1)),
         "limit": 0.05,
         "x": np.array([1.0, 2.0]),
@@ -352,6 +355,7 @@ def valid() -> dict:
         "DiameterCurves": dimple_diameter.DiameterCurves(
             np.array([0.5, 0.6]), {"shifted": np.array([[0.01], [0.1]])}, np.array([1.0, 2.0])
         ),
+        "RecoveryCurves": recovery.recovery_curves({"shifted": shifted}, modes, [0.1], 1)["shifted"],
         "Contraction": dimple_diameter.Contraction(
             np.array([1.0, 2.0]), np.array([0.1, 0.8]), np.array([[0.1], [0.8]]), {1.06: 0.1}, {}
         ),

@@ -9,6 +9,7 @@ from zwfs.paper import (
     linearity,
     phase_shifts,
     photon_noise,
+    recovery,
 )
 
 __all__ = [
@@ -20,4 +21,5 @@ __all__ = [
     "linearity",
     "phase_shifts",
     "photon_noise",
+    "recovery",
 ]

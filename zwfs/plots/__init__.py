@@ -9,6 +9,7 @@ from zwfs.plots.layouts import bench_layout, sensor_layout, vector_sensor
 from zwfs.plots.linearity import convergence, estimates, linearity
 from zwfs.plots.phase_shifts import all_pairs, pair_noise
 from zwfs.plots.photon_noise import design_maps, error_bars, photon_noise
+from zwfs.plots.recovery import dimple_limits, dimple_recovery, range_recovery, range_starts
 from zwfs.plots.style import (
     INTENSITY_MAP,
     LOOKS,
@@ -37,6 +38,8 @@ __all__ = [
     "diameter_methods",
     "diameter_reasons",
     "dimple_diameter",
+    "dimple_limits",
+    "dimple_recovery",
     "diversity",
     "error_bars",
     "estimates",
@@ -48,6 +51,8 @@ __all__ = [
     "pair_noise",
     "phase_map",
     "photon_noise",
+    "range_recovery",
+    "range_starts",
     "reference_intensities",
     "segment_errors",
     "sensor_layout",

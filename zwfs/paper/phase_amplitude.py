@@ -208,9 +208,11 @@ def amplitude_curves(
     points = dict(zip(cells, sweeps.run(_point, cells, *shared, name="amplitude_curves"), strict=True))
     curves = {}
     for kind in KINDS:
-        errors, consistent, bound = zip(*(point for (of, _), point in points.items() if of == kind), strict=True)
-        by_way = ({way: np.array([one[way] for one in part]) for way in part[0]} for part in (errors, consistent))
-        curves[kind] = AmplitudeCurves(variations, *by_way, np.array(bound))
+        some = [point for (of, _), point in points.items() if of == kind]
+        errors, consistent = (
+            {way: np.array([one[part][way] for one in some]) for way in some[0][part]} for part in (0, 1)
+        )
+        curves[kind] = AmplitudeCurves(variations, errors, consistent, np.array([bound for _, _, bound in some]))
     return curves
 
 
@@ -263,17 +265,19 @@ def reconstruct(way: str, sensor: ZernikeSensor, frames: NDArray, photons: float
     _check.choice("way", way, WAYS)
     _check_sensor(sensor)
     method, source = WAYS[way]
-    noise = {"photons": photons / sensor.n_masks}
+    per_frame = photons / sensor.n_masks
     if source == "estimated":
-        return [MaximumLikelihood(sensor, amplitude="unknown", **noise)(frames)]
+        return [MaximumLikelihood(sensor, photons=per_frame, amplitude="unknown")(frames)]
     pair = ZernikeSensor(sensor.pupil, *sensor.masks[:-1], extent=sensor.extent, tolerance=sensor.tolerance)
     batches: list[tuple[NDArray | None, NDArray]] = [(None, frames)]
     if source == "measured":
         batches = [(np.sqrt(one[-1][sensor.window]), one[np.newaxis]) for one in frames]
     if method == "PhaseShifted":
         return [PhaseShifted(pair, amplitude=amplitude)(some[:, :-1]) for amplitude, some in batches]
-    options = noise | {"n_starts": 1}
-    return [MaximumLikelihood(pair, amplitude=amplitude, **options)(some[:, :-1]) for amplitude, some in batches]
+    return [
+        MaximumLikelihood(pair, photons=per_frame, amplitude=amplitude, n_starts=1)(some[:, :-1])
+        for amplitude, some in batches
+    ]
 
 
 def _check_sensor(sensor: ZernikeSensor) -> None:

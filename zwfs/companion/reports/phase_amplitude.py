@@ -35,16 +35,23 @@ def map_columns(
     pupil: Pupil, phase: NDArray, amplitude: NDArray, estimate: LikelihoodReconstruction
 ) -> dict[str, NDArray]:
     """Columns of the maps, one row for each point of the pupil."""
-    maps = {
-        "phase (rad)": phase,
-        "error of the phase (rad)": wrapped_residual(pupil, estimate.phase, phase),
-        "standard error of the phase (rad)": estimate.sigma,
-        "amplitude": amplitude,
-        "error of the amplitude": estimate.amplitude - amplitude,
-        "standard error of the amplitude": estimate.sigma_amplitude,
-    }
     places = {"x (D)": pupil.points[:, 0], "y (D)": pupil.points[:, 1]}
-    return places | {name: pupil.gather(one) for name, one in maps.items()}
+    truth = {"phase (rad)": pupil.gather(phase), "amplitude": pupil.gather(amplitude)}
+    columns = places | truth
+    for name, (error, sigma) in _example(pupil, phase, amplitude, estimate).items():
+        columns |= {f"error of the {name}": error, f"standard error of the {name}": sigma}
+    return columns
+
+
+def _example(
+    pupil: Pupil, phase: NDArray, amplitude: NDArray, estimate: LikelihoodReconstruction
+) -> dict[str, tuple[NDArray, NDArray]]:
+    """Error and standard error of each point, by quantity."""
+    maps = {
+        "phase": (wrapped_residual(pupil, estimate.phase, phase), estimate.sigma),
+        "amplitude": (np.asarray(estimate.amplitude) - amplitude, np.asarray(estimate.sigma_amplitude)),
+    }
+    return {name: (pupil.gather(error), pupil.gather(sigma)) for name, (error, sigma) in maps.items()}
 
 
 def costs(curves: Mapping[str, AmplitudeCurves]) -> Table:
@@ -83,13 +90,7 @@ def numbers(
         }
         word = f"consistent_{WAYS[name].amplitude}"
         found |= {f"{word}_0": shares.pop(0), word: np.mean(list(shares.values()))}
-    error = pupil.gather(wrapped_residual(pupil, estimate.phase, phase))
-    difference = pupil.gather(estimate.amplitude - amplitude)
-    found |= {
-        "example_phase": np.sqrt(np.mean(error**2)),
-        "example_amplitude": np.sqrt(np.mean(difference**2)),
-        "example_chi2": float(estimate.chi2),
-        "within_phase": np.mean(np.abs(error) < pupil.gather(estimate.sigma)),
-        "within_amplitude": np.mean(np.abs(difference) < pupil.gather(estimate.sigma_amplitude)),
-    }
+    for name, (error, sigma) in _example(pupil, phase, amplitude, estimate).items():
+        found |= {f"example_{name}": np.sqrt(np.mean(error**2)), f"within_{name}": np.mean(np.abs(error) < sigma)}
+    found["example_chi2"] = float(estimate.chi2)
     glue_numbers(found, ".4g")

@@ -18,6 +18,7 @@ from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.paper.closed_loop import LoopRun
 from zwfs.paper.dimple_diameter import Contraction, DiameterCurves
 from zwfs.paper.linearity import linearity_curves
+from zwfs.paper.phase_amplitude import WAYS, AmplitudeCurves
 from zwfs.paper.phase_shifts import DrawnNoise, PairMaps
 
 
@@ -73,6 +74,11 @@ def drawn_methods(curves, pupil, classic, shifted):
     bad[:, 10, 10] = True
     measurement = Measurement(None, Optics(), frames, pupil, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0))
     found = MeasuredPhase(phase, frames, 0.9 * frames, measurement, True, 0)
+    varied = AmplitudeCurves(three, dict.fromkeys(WAYS, np.full((3, 2), 0.1)), {}, three)
+    triple = zwfs.ZernikeSensor(pupil, *shifted.masks, zwfs.Dimple(1, 0))
+    both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(
+        triple.measure(pupil.scatter(pupil.gather(phase), 0))
+    )
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
     return {
@@ -89,6 +95,8 @@ def drawn_methods(curves, pupil, classic, shifted):
         "diameter_reasons": ((reasons, 2.2), shifted_only),
         "all_pairs": ((PairMaps(three, *np.full((5, 3, 3), 1.0)),), ()),
         "pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
+        "amplitude_errors": (({"dips": varied},), [*shifted_only, "MaximumLikelihood"]),
+        "phase_and_amplitude": ((pupil, 0 * pupil.amplitude, pupil.amplitude, both), ()),
         "reference_intensities": ((frames, frames), ()),
         "measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
         "segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),

@@ -130,6 +130,8 @@ def test_a_mode_that_no_frame_shows_has_a_large_bound(small):
         for d in (2.44, 2.0)
     )
     assert np.nanmax(near) > 10 * np.nanmax(far)  # tilt at the dark ring
+    blind = ZernikeSensor(small, Dimple(1.06, np.pi), Dimple(1.06, -np.pi))  # to first order in a flat phase
+    assert np.nanmin(cramer_rao(blind, np.zeros(small.shape), photons=100.0)) > 1e4 * np.nanmax(far)
 
 
 def test_what_a_bound_refuses(small):

@@ -314,7 +314,8 @@ class Inverse:
                 total = total - self.scaled[i][c] * self.scaled[j][c] * maps[:, index, ...]
             variance.append(total)
         variance[0] = variance[0] - 1 / (info.scale * constants.n_points)
-        return variance
+        # Where the frames show nothing, rounding decides even the sign.
+        return [xp.where(one >= 0, one, constants.kind.array(np.inf)) for one in variance]
 
     def _expand(self, weights: NDArray) -> list[NDArray]:
         """Sum of the columns times the inverse of the diagonal: (k, 4 r + 1) to a list of maps."""

@@ -19,6 +19,7 @@ from zwfs.paper.closed_loop import LoopRun
 from zwfs.paper.design import PUBLISHED, DesignMap
 from zwfs.paper.dimple_diameter import Contraction, DiameterCurves
 from zwfs.paper.linearity import linearity_curves
+from zwfs.paper.phase_amplitude import WAYS, AmplitudeCurves
 from zwfs.paper.phase_shifts import DrawnNoise, PairMaps
 from zwfs.paper.photon_noise import EXPECTED, ErrorBars, PhotonCurves
 from zwfs.paper.recovery import DimpleLimits, RecoveryCurves
@@ -80,6 +81,11 @@ def drawn_methods(curves, pupil, classic, shifted):
     bad[:, 10, 10] = True
     measurement = Measurement(None, Optics(), frames, pupil, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0))
     found = MeasuredPhase(phase, frames, 0.9 * frames, measurement, True, 0)
+    varied = AmplitudeCurves(three, dict.fromkeys(WAYS, np.full((3, 2), 0.1)), {}, three)
+    triple = zwfs.ZernikeSensor(pupil, *shifted.masks, zwfs.Dimple(1, 0))
+    both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(
+        triple.measure(pupil.scatter(pupil.gather(phase), 0))
+    )
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
     return {
@@ -110,6 +116,8 @@ def drawn_methods(curves, pupil, classic, shifted):
         ),
         "error_bars": (([ErrorBars(k, EXPECTED, k, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
         "design_maps": ((DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5}), PUBLISHED), ()),
+        "amplitude_errors": (({"dips": varied},), [*shifted_only, "MaximumLikelihood"]),
+        "phase_and_amplitude": ((pupil, 0 * pupil.amplitude, pupil.amplitude, both), ()),
         "reference_intensities": ((frames, frames), ()),
         "measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
         "segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),

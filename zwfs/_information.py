@@ -1,7 +1,7 @@
 """Fisher information of frames about the field in the pupil, as a diagonal plus a matrix of low rank.
 
 A change of the field psi by sum_c t_c x_c, with real unknowns x_c at every point of the pupil and tangents t_c,
-changes the frame o_k = psi + V C_k U^T psi of mask k by
+changes the frame |o_k|^2, o_k = psi + V C_k U^T psi, of mask k by (`eq-jacobian`)
 
     dI_k = sum_c D_kc x_c + H_k y,    D_kc = 2 Re(conj(o_k) t_c),    y = K^T x,
 
@@ -224,8 +224,8 @@ class Information:
     def inverse(self, damping: NDArray | float = 0.0) -> Inverse:
         """Inverse of F with `damping`, (k, 1, 1), added to its diagonal, and the piston fixed.
 
-        No frame shows the piston of the phase, F 1 = 0. A gauge, 1 1^T scale / n_points, is added to F. It gives
-        the piston as much information as a point has on average, and changes nothing else.
+        No frame shows the piston of the phase, F 1 = 0 (`eq-gauge`). A gauge, 1 1^T scale / n_points, is added to
+        F. It gives the piston as much information as a point has on average, and changes nothing else.
         """
         constants, xp = self.constants, self.constants.kind.xp
         local = _inverse_blocks(self.local, damping)

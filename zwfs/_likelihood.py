@@ -24,7 +24,7 @@ class Noise:
     """Noise of a frame: photon noise and read noise.
 
     The electrons of a pixel plus the variance of the read noise are taken to follow the Poisson distribution
-    (Snyder et al. 1995). Mean and variance are right. The likelihood is exact without read noise.
+    (Snyder et al. 1995; `eq-likelihood`). Mean and variance are right. The likelihood is exact without read noise.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ def require_information(sensor: ZernikeSensor, unknown_amplitude: bool) -> None:
     """Require masks that determine the phase, or the phase and the amplitude.
 
     With a reference wave t_k R behind mask k, each point of the frame gives |psi|^2 + 2 Re(conj(t_k R) psi). Three
-    different t_k determine psi. Two allow another field at every point.
+    different t_k determine psi. Two allow another field at every point (`eq-circles`).
 
     Raises
     ------

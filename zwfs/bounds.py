@@ -60,7 +60,7 @@ def cramer_rao(
 
     References
     ----------
-    Kay 1993, section 3.9; `eq-information` and `eq-woodbury` of the book.
+    Kay 1993, section 3.7; `eq-bound` and `eq-information` of the book.
 
     Examples
     --------

@@ -121,6 +121,13 @@ LIMITS: dict[str, dict[str, Any]] = {
         overwrite=bool,
         n_bad=(0, 2000),
     ),
+    "phase_amplitude": _limits(
+        "n_modes diameter phase_shift rms n_screens exponent",
+        n_pixels=(16, 200),
+        variations=[(0.0, 0.4)],
+        shown=(0.0, 0.4),
+        photons=(1.0, 1e9),
+    ),
     "phase_shift_pairs": _limits(
         "n_pixels n_modes diameter rms n_screens exponent",
         n_quarter=(1, 50),

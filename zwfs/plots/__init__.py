@@ -7,6 +7,7 @@ from zwfs.plots.frames import explained, gains, phase_map
 from zwfs.plots.identities import approximation, diversity
 from zwfs.plots.layouts import bench_layout, sensor_layout, vector_sensor
 from zwfs.plots.linearity import convergence, estimates, linearity
+from zwfs.plots.phase_amplitude import amplitude_errors, phase_and_amplitude
 from zwfs.plots.phase_shifts import all_pairs, pair_noise
 from zwfs.plots.photon_noise import design_maps, error_bars, photon_noise
 from zwfs.plots.recovery import dimple_limits, dimple_recovery, range_recovery, range_starts
@@ -28,6 +29,7 @@ __all__ = [
     "PHASE_MAP",
     "Look",
     "all_pairs",
+    "amplitude_errors",
     "approximation",
     "bench_layout",
     "bench_linearity",
@@ -49,6 +51,7 @@ __all__ = [
     "loop_runs",
     "measured_and_modelled",
     "pair_noise",
+    "phase_and_amplitude",
     "phase_map",
     "photon_noise",
     "range_recovery",

@@ -181,8 +181,8 @@ class MaximumLikelihood(Reconstructor):
 
     References
     ----------
-    Levenberg 1944; Marquardt 1963; Paxman, Schulz & Fienup 1992; Nielsen 1999; `eq-information` and
-    `eq-woodbury` of the book.
+    Levenberg 1944; Marquardt 1963; Paxman, Schulz & Fienup 1992; Nielsen 1999; `eq-likelihood` to
+    `eq-linear-field` of the book.
 
     Examples
     --------
@@ -381,7 +381,7 @@ class MaximumLikelihood(Reconstructor):
         return _Fit(frames, psi, waves, light, cost, coefficients)
 
     def _step(self, fit: _Fit) -> None:
-        """Try one step of Levenberg and Marquardt on every frame set; take it where the cost falls.
+        """Try one step (`eq-step`) on every frame set; take it where the cost falls.
 
         The damping follows Nielsen 1999: it falls the more, the better the quadratic model predicted the cost.
         """
@@ -424,9 +424,9 @@ class MaximumLikelihood(Reconstructor):
         """Try to leave local minima of single points, where frame sets have converged.
 
         The intensity of a point depends on the angle between its field psi and the reference wave r of a mask. Its
-        reflection at r gives the same intensity behind this mask. A point may have converged to the wrong one of
-        the two, mostly where a frame is dark. With the reference waves held, each point takes the reflection that
-        makes its frames most likely. Frame sets whose cost falls by this continue.
+        reflection at r gives the same intensity behind this mask (`eq-reflection`). A point may have converged to
+        the wrong one of the two, mostly where a frame is dark. With the reference waves held, each point takes the
+        reflection that makes its frames most likely. Frame sets whose cost falls by this continue.
         """
         estimator = self._exact
         if estimator.unknown_amplitude or estimator.modes is not None:
@@ -617,8 +617,8 @@ def _points_step(information: Information, gradient: NDArray, damping: NDArray) 
 def _linear_field(frames: NDArray, psi: NDArray, model: Propagator) -> NDArray:
     """Field that explains the frames best if the reference waves are those of another field, (k, 2, ny, nx).
 
-    With reference waves r_k the frames I_k = P + 2 Re(conj(r_k) psi) + |r_k|^2 are linear in P = |psi|^2 and psi.
-    Three different masks or more determine both.
+    With reference waves r_k the frames I_k = P + 2 Re(conj(r_k) psi) + |r_k|^2 are linear in P = |psi|^2 and psi
+    (`eq-linear-field`). Three different masks or more determine both.
     """
     xp, light = model.kind.xp, frames[(..., *model.window)]
     waves = model.reference(psi)

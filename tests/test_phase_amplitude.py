@@ -1,0 +1,140 @@
+"""Phase and amplitude from two masks and a clear frame."""
+
+import numpy as np
+import pytest
+
+import zwfs
+from zwfs.paper.phase_amplitude import KINDS, WAYS, amplitude_curves, amplitude_maps, noisy_frames, reconstruct
+
+PUPIL = zwfs.Pupil.circular(24)
+MODES = zwfs.zernike_basis(PUPIL, 30)
+PAIR = [zwfs.Dimple(1.06, sign * np.pi / 2) for sign in (1, -1)]
+SENSOR = zwfs.ZernikeSensor(PUPIL, *PAIR, zwfs.Dimple(1, 0))
+IGNORED, MEASURED, ESTIMATED = (f"MaximumLikelihood, {word}" for word in ("ignored", "measured", "estimated"))
+PHOTONS = 3000.0
+
+
+@pytest.fixture(scope="module")
+def curves():
+    return amplitude_curves(SENSOR, MODES, [0.0, 0.05, 0.2], 0.5, 4, PHOTONS, seed=1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("variation", [0.0, 0.05, 0.4])
+def test_amplitudes_have_the_stated_variation_and_a_mean_square_of_one(kind, variation):
+    amplitudes = PUPIL.gather(amplitude_maps(PUPIL, MODES, kind, variation, 3, seed=2))
+    assert amplitudes.std(axis=1) / amplitudes.mean(axis=1) == pytest.approx(variation, abs=1e-9)
+    assert np.mean(amplitudes**2, axis=1) == pytest.approx(1)
+    assert np.all(amplitudes > 0)
+
+
+def test_dips_are_dark_spots_and_scintillation_is_bright_and_dark():
+    skewness = {}
+    for kind in KINDS:
+        amplitudes = PUPIL.gather(amplitude_maps(PUPIL, MODES, kind, 0.2, 8, seed=3))
+        centred = amplitudes - amplitudes.mean(axis=1, keepdims=True)
+        skewness[kind] = np.mean(centred**3) / np.mean(centred**2) ** 1.5
+    assert skewness["dips"] < -0.5 < 0 < skewness["scintillation"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_joint_estimate_reaches_the_bound_and_is_consistent(curves, kind):
+    one = curves[kind]
+    assert one.error(ESTIMATED) / one.bound == pytest.approx(1, abs=0.08)
+    assert np.all(one.consistent[ESTIMATED])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_ignored_amplitude_is_wrong_and_called_inconsistent(curves, kind):
+    one = curves[kind]
+    for way in (IGNORED, "PhaseShifted, ignored"):
+        assert np.all(np.diff(one.error(way)) > 0)
+        assert one.error(way)[-1] > 4 * one.bound[-1]
+    assert np.all(one.consistent[IGNORED][0])  # the amplitude is uniform indeed
+    assert not np.any(one.consistent[IGNORED][1:])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_measured_amplitude_costs_little_but_spoils_the_verdict(curves, kind):
+    one = curves[kind]
+    assert np.all(one.error(MEASURED) < 1.2 * one.bound)
+    assert np.all(one.error(MEASURED) > one.error(ESTIMATED))
+    assert not np.any(one.consistent[MEASURED])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_without_noise_phase_and_amplitude_are_exact(kind):
+    phases = zwfs.power_law_screens(MODES, 0.5, 3, seed=4)
+    amplitudes = amplitude_maps(PUPIL, MODES, kind, 0.2, 3, seed=4)
+    frames = SENSOR.measure(phases, amplitudes)
+    result = zwfs.MaximumLikelihood(SENSOR, amplitude="unknown")(frames)
+    assert np.all(zwfs.reconstruction_error(PUPIL, result.phase, phases) < 1e-6)
+    assert PUPIL.gather(result.amplitude) == pytest.approx(PUPIL.gather(amplitudes), abs=1e-6)
+    ignored = zwfs.MaximumLikelihood(zwfs.ZernikeSensor(PUPIL, *PAIR), n_starts=1)(frames[:, :2])
+    assert not np.any(ignored.consistent)
+
+
+def test_the_error_of_an_ignored_amplitude_is_a_fixed_share_of_a_small_phase():
+    # To first order an amplitude error d changes the phase by d sin(phi) / |beta|.
+    amplitude = amplitude_maps(PUPIL, MODES, "dips", 0.02, 1, seed=5)[0]
+    screen = zwfs.power_law_screens(MODES, 1.0, 1, seed=5)[0]
+    shares = []
+    for rms in (0.05, 0.1):
+        frames = SENSOR.measure(rms * screen, amplitude)[np.newaxis]
+        [result] = reconstruct("PhaseShifted, ignored", SENSOR, frames, PHOTONS)
+        shares.append(zwfs.reconstruction_error(PUPIL, result.phase[0], rms * screen) / rms)
+    assert shares[0] == pytest.approx(shares[1], rel=0.05)
+    assert 0.5 < shares[0] / (2 * 0.02) < 2
+
+
+def test_two_frames_alone_do_not_determine_phase_and_amplitude():
+    with pytest.raises(ValueError, match="two frames allow two fields"):
+        zwfs.MaximumLikelihood(zwfs.ZernikeSensor(PUPIL, *PAIR), photons=1000, amplitude="unknown")
+
+
+def test_standard_errors_hold_for_phase_and_amplitude():
+    phases = zwfs.power_law_screens(MODES, 0.5, 6, seed=6)
+    amplitudes = amplitude_maps(PUPIL, MODES, "scintillation", 0.1, 6, seed=6)
+    frames = noisy_frames(SENSOR, phases, amplitudes, PHOTONS, 6)
+    [result] = reconstruct(ESTIMATED, SENSOR, frames, PHOTONS)
+    error = zwfs.metrics.wrapped_residual(PUPIL, result.phase, phases)
+    within = np.abs(PUPIL.gather(error / result.sigma)) < 1
+    within_amplitude = np.abs(PUPIL.gather((result.amplitude - amplitudes) / result.sigma_amplitude)) < 1
+    assert within.mean() == pytest.approx(0.683, abs=0.03)
+    assert within_amplitude.mean() == pytest.approx(0.683, abs=0.03)
+
+
+def test_curves_do_not_depend_on_the_other_variations(curves):
+    alone = amplitude_curves(SENSOR, MODES, [0.0, 0.05], 0.5, 4, PHOTONS, seed=1)
+    for kind in KINDS:
+        for way in WAYS:
+            assert np.array_equal(alone[kind].errors[way], curves[kind].errors[way][:2])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"variations": [0.1, 0.5]}, "variations = 0.5"),
+        ({"photons": 0.5}, "photons = 0.5"),
+        ({"sensor": zwfs.ZernikeSensor(PUPIL, *PAIR)}, "a last one that changes nothing"),
+        (
+            {"sensor": zwfs.ZernikeSensor(PUPIL, zwfs.Dimple(1, 0), *PAIR)},
+            "a last one that changes nothing",
+        ),
+    ],
+)
+def test_bad_input_is_refused(change, message):
+    known = {
+        "sensor": SENSOR,
+        "modes": MODES,
+        "variations": [0.1],
+        "rms": 0.5,
+        "n_screens": 1,
+        "photons": 100.0,
+    }
+    with pytest.raises(ValueError, match=message):
+        amplitude_curves(**known | change)
+    with pytest.raises(ValueError, match="kind = 'clouds'"):
+        amplitude_maps(PUPIL, MODES, "clouds", 0.1, 1)
+    with pytest.raises(ValueError, match="way = 'guessed'"):
+        reconstruct("guessed", SENSOR, np.zeros((1, 3, *PUPIL.shape)), 100)

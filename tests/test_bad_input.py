@@ -29,7 +29,7 @@ MODULES = (
     *("bench.model", "bench.segments", "bench.recording"),
     *("frames.files", "frames.registration", "frames.pipeline"),
     *("paper.curves", "paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
-    *("paper.bench_linearity", "paper.closed_loop"),
+    *("paper.bench_linearity", "paper.closed_loop", "paper.recovery"),
     *("companion.sweeps", "companion.results", "companion.tables"),
 )
 
@@ -114,7 +114,7 @@ def valid() -> dict:
     from zwfs.bench import model
     from zwfs.frames import files as camera
     from zwfs.frames import pipeline, registration
-    from zwfs.paper import bench_linearity, closed_loop, dimple_diameter, linearity, phase_shifts
+    from zwfs.paper import bench_linearity, closed_loop, dimple_diameter, linearity, phase_shifts, recovery
 
     paper = linearity.paper_reconstructors(pupil, modes, 1.06, 1.5, extent=1.0, n_iterations=2)
     small = model.Bench(n_pixels=17, n_rings=1, missing=(), gap=0.0, static=0.0, photons=1e6, read_noise=1.0)
@@ -203,6 +203,8 @@ def valid() -> dict:
         "diameter_curves.make": lambda diameter: {"shifted": method},
         "own_reconstructor.path": "",
         **dict.fromkeys(("saxton_by_width.reconstructors", "repaired_reconstructors.reconstructors"), paper),
+        "sensors": {"shifted": shifted},
+        "recovery_curves.rms": np.array([0.1]),
         "contraction.modes": np.tile(modes, (30, 1, 1)),
         "limit": 0.05,
         "x": np.array([1.0, 2.0]),
@@ -335,6 +337,7 @@ def valid() -> dict:
         "DiameterCurves": dimple_diameter.DiameterCurves(
             np.array([0.5, 0.6]), {"shifted": np.array([[0.01], [0.1]])}, np.array([1.0, 2.0])
         ),
+        "RecoveryCurves": recovery.recovery_curves({"shifted": shifted}, modes, [0.1], 1)["shifted"],
         "Contraction": dimple_diameter.Contraction(
             np.array([1.0, 2.0]), np.array([0.1, 0.8]), np.array([[0.1], [0.8]]), {1.06: 0.1}, {}
         ),

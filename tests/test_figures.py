@@ -19,6 +19,7 @@ from zwfs.paper.closed_loop import LoopRun
 from zwfs.paper.dimple_diameter import Contraction, DiameterCurves
 from zwfs.paper.linearity import linearity_curves
 from zwfs.paper.phase_shifts import DrawnNoise, PairMaps
+from zwfs.paper.recovery import DimpleLimits, RecoveryCurves
 
 
 @pytest.fixture(autouse=True)
@@ -68,6 +69,10 @@ def drawn_methods(curves, pupil, classic, shifted):
     lines = {f"curve {i}": three for i in range(4)}
     reasons = Contraction(three, three, np.full((3, 2), 0.5), {1.0: 0.5}, lines)
     bench_curves = BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(two, 0.1 * pistons))
+    compared = ["PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood"]
+    trials = DiameterCurves(np.full(3, 0.5), dict.fromkeys(compared, np.full((3, 3), 0.1)), three)
+    limits = DimpleLimits(three, np.full((3, 2), 0.5), np.full((3, 2, 4), 2.0))
+    recovered = RecoveryCurves(three, trials.errors, np.ones((3, 3), bool), np.ones((3, 3), int))
     loop = LoopRun(three, *np.full((3, 2, 3), 0.1))
     bad = np.zeros(frames.shape, bool)
     bad[:, 10, 10] = True
@@ -87,6 +92,10 @@ def drawn_methods(curves, pupil, classic, shifted):
         "dimple_diameter": (({25: trial, 100: trial}, 0.05, 2.2), shifted_only),
         "diameter_methods": ((dict.fromkeys(plots.LOOKS, trial), 0.05, 2.2), plots.LOOKS),
         "diameter_reasons": ((reasons, 2.2), shifted_only),
+        "dimple_recovery": (({0.5: trials, 1.0: trials}, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
+        "dimple_limits": ((limits, 0.5), shifted_only),
+        "range_recovery": (({1.06: recovered}, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
+        "range_starts": (({1.06: recovered, 2.0: recovered},), ()),
         "all_pairs": ((PairMaps(three, *np.full((5, 3, 3), 1.0)),), ()),
         "pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
         "reference_intensities": ((frames, frames), ()),

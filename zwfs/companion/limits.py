@@ -29,6 +29,17 @@ def _limits(usual: str = "", **own: Any) -> dict[str, Any]:
 
 
 LIMITS: dict[str, dict[str, Any]] = {
+    "beyond_dimple": _limits(
+        "n_pixels n_modes phase_shift inputs n_screens exponent n_iterations threshold",
+        step=(0.05, 2.0),
+        diameter_min=(0.1, 1.0),
+        diameter_max=(3.5, 8.0),
+        step_fine=(0.01, 0.3),
+        n_screens_few=(1, 100),
+    ),
+    "beyond_range": _limits(
+        "n_pixels n_modes phase_shift inputs n_screens exponent n_iterations threshold", diameters=[(0.1, 8.0)]
+    ),
     "closed_loop": _limits(
         "n_modes diameter phase_shift n_screens exponent n_iterations",
         n_pixels=(16, 200),

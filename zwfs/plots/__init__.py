@@ -8,6 +8,7 @@ from zwfs.plots.identities import approximation, diversity
 from zwfs.plots.layouts import bench_layout, sensor_layout, vector_sensor
 from zwfs.plots.linearity import convergence, estimates, linearity
 from zwfs.plots.phase_shifts import all_pairs, pair_noise
+from zwfs.plots.recovery import dimple_limits, dimple_recovery, range_recovery, range_starts
 from zwfs.plots.style import (
     INTENSITY_MAP,
     LOOKS,
@@ -35,6 +36,8 @@ __all__ = [
     "diameter_methods",
     "diameter_reasons",
     "dimple_diameter",
+    "dimple_limits",
+    "dimple_recovery",
     "diversity",
     "estimates",
     "explained",
@@ -44,6 +47,8 @@ __all__ = [
     "measured_and_modelled",
     "pair_noise",
     "phase_map",
+    "range_recovery",
+    "range_starts",
     "reference_intensities",
     "segment_errors",
     "sensor_layout",

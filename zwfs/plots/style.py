@@ -39,7 +39,7 @@ class Look:
 
 
 # Colours that differ from those of the methods for every reader, for methods that are not listed.
-_SPARE = (("#882255", "<", "-"), ("#56B4E9", ">", "--"), ("#661100", "*", "-."))
+_SPARE = (("#882255", "<", "-"), ("#56B4E9", ">", "--"))
 
 
 class _Looks(dict[str, Look]):
@@ -63,6 +63,7 @@ LOOKS |= {
     "GradientDescentPoints": Look("gradient descent on points", "two pupils", "#D55E00", "d", "--"),
     "GradientDescentStarted": Look("gradient descent, phase-shifted start", "two pupils", "#7010E0", "+", "-."),
     "PhaseShifted": Look("phase-shifted", "two pupils", "#0072B2", "v", ":"),
+    "MaximumLikelihood": Look("maximum likelihood", "", "#661100", "*", "-"),
 }
 for _method in RECONSTRUCTORS:
     LOOKS[_method.__name__]

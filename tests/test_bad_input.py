@@ -46,7 +46,7 @@ INFINITE |= {
 
 # Hooks of the base classes of reconstructors, and the checks of what they get.
 INTERNAL = {"Settings", "Solution", "State", "Estimate", "model", "solve", "invert", "begin", "step", "constants"}
-INTERNAL |= {"check_frames", "check_phase"}
+INTERNAL |= {"check_frames", "check_phase", "check_modes", "pieces"}
 HANDED_ON = {"run.shared"}  # to the task, as it is
 PASSED = {"Pupil.gather", "Pupil.scatter", "nearest_good"}  # give back what they are given, NaN and infinity too
 # Take complex numbers where the valid ones are real.

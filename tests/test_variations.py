@@ -248,7 +248,8 @@ def test_iteration_does_not_stop_early_and_the_other_methods_are_the_papers(smal
     curves = [iteration_curves(small, HALF, n, [1.0, 2.0], screens) for n in (5, 10)]
     assert curves[1].at("PhaseShifted", 2.0) < curves[0].at("PhaseShifted", 2.0)
     others = other_curves(small, modes, HALF, screens, n_iterations=3)
-    assert set(others.errors) == {*plots.LOOKS} - {"PhaseShifted"}
+    assert "PhaseShifted" not in others.errors
+    assert {"Linear", "Arcsine", "GerchbergSaxton", "GradientDescent"} <= set(others.errors) <= {*plots.LOOKS}
 
 
 def test_diameters_are_finer_near_the_dark_ring():

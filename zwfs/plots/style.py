@@ -39,7 +39,7 @@ class Look:
 
 
 # Colours that differ from those of the methods for every reader, for methods that are not listed.
-_SPARE = (("#882255", "<", "-"), ("#56B4E9", ">", "--"))
+_SPARE = (("#882255", "<", "-"), ("#56B4E9", ">", "--"), ("#A080FF", "H", "-."))
 
 
 class _Looks(dict[str, Look]):

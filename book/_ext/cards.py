@@ -11,11 +11,11 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 from sphinx.application import Sphinx
 
+from book._ext.reading import CARD, put_in_order
 from book._tools import record
 from book._tools.declared import assigned
 from book._tools.project import EXECUTED
 from zwfs.companion.results import published
-from zwfs.companion.tables import plain
 
 
 def read_notebook(app: Sphinx, document: str, text: list[str]) -> None:
@@ -31,11 +31,12 @@ def read_notebook(app: Sphinx, document: str, text: list[str]) -> None:
     files = sorted(run.with_suffix(".files").glob("[!.]*"))
     links = {file.name: Path(os.path.relpath(file, source.parent)).as_posix() for file in (run, *files)}
     add_cards(notebook, source.stem, links, versions(run), commit(Path(app.srcdir)))
+    put_in_order(notebook)
     text[0] = nbformat.writes(notebook)
 
 
 def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions: str, commit: str) -> None:
-    """Add a card under each figure of an executed notebook, in place.
+    """Add a card under each figure of an executed notebook, in place: its files, its parameters, how to re-run it.
 
     Parameters
     ----------
@@ -49,24 +50,29 @@ def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions
         See `versions` and `commit`.
     """
     cells = []
-    parameters = assigned(notebook)
+    parameters = next((c.source for c in notebook.cells if "parameters" in c.metadata.get("tags", ())), "")
+    numbers = (f"{key}={value}" for key, (value, _) in assigned(notebook).items() if value.isnumeric())
+    changed = next(numbers, "NAME=VALUE")
     for cell in notebook.cells:
         cells.append(cell)
         for figure in published(cell.source) if cell.cell_type == "code" else []:
-            text = card(name, figure, parameters, links, f"Commit: {commit}. Versions: {versions}.")
-            cells.append(new_markdown_cell(text, id=f"card-{figure}"[:64]))
+            text = card(name, figure, parameters, changed, links, f"Commit: {commit}. Versions: {versions}.")
+            cells.append(new_markdown_cell(text, id=f"{CARD}{figure}"[:64]))
     notebook.cells = cells
 
 
-def card(name: str, figure: str, parameters: dict[str, tuple[str, str]], links: dict[str, str], about: str) -> str:
-    """Return the card of one figure as MyST text; see `add_cards`."""
+def card(name: str, figure: str, parameters: str, changed: str, links: dict[str, str], about: str) -> str:
+    """Return the card of one figure as MyST text; see `add_cards`.
+
+    `parameters` is the code of their cell, `changed` an example of an assignment.
+    """
     number = re.match(r"fig(\d+)_", name)
-    of_paper = f"Figure {int(number[1])}" if number else ""
-    origin, title = "Not in the paper", f"`{figure}`"
+    of_paper = f"Figure {int(number[1])} of the paper" if number else ""
+    origin = "Not in the paper"
     if number and figure == name:
-        origin, title = f"{of_paper} of the paper", of_paper
+        origin = of_paper
     elif number:
-        origin += f", goes with {of_paper} of the paper"
+        origin += f", goes with {of_paper}"
     files = {
         "notebook": name + ".ipynb",
         "PNG": figure + ".png",
@@ -74,23 +80,23 @@ def card(name: str, figure: str, parameters: dict[str, tuple[str, str]], links: 
         "data (CSV)": figure + ".csv",
     }
     offered = [f"{{download}}`{text} <{links[file]}>`" for text, file in files.items() if file in links]
-    seed = parameters.get("seed", ("",))[0]
-    listed = (f"- `{key} = {value}`: {plain(text)}" for key, (value, text) in parameters.items() if key != "seed")
     return "\n".join(
         [
             "::::{div} run-card",
             " · ".join([origin, *offered]),
             "",
-            f":::{{dropdown}} How {title} was made",
-            "To make it again, from the root of a clone:",
-            "",
-            "```sh",
-            f"make rerun FIGURE={name}",
+            ":::{dropdown} Parameters (click to change and re-run)",
+            "```python",
+            parameters,
             "```",
             "",
-            f"Seed: {f'`{seed}`' if seed else 'none, nothing is random'}. {about}",
+            "To re-run the notebook from the root of a clone, with one parameter or more changed:",
             "",
-            *listed,
+            "```sh",
+            f'make rerun FIGURE={name} ARGS="-p {changed}"',
+            "```",
+            "",
+            about,
             ":::",
             "::::",
         ]

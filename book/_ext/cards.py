@@ -36,7 +36,7 @@ def read_notebook(app: Sphinx, document: str, text: list[str]) -> None:
 
 
 def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions: str, commit: str) -> None:
-    """Add a card under each figure of an executed notebook, in place: its files, its parameters, how to re-run it.
+    """Add a card under each figure of an executed notebook, in place; the first one shows the parameters.
 
     Parameters
     ----------
@@ -45,27 +45,23 @@ def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions
     name : str
         The stem of its file.
     links : dict of str
-        Addresses, from the page, of the files that the card offers, by name.
+        Addresses, from the page, of the files that the cards offer, by name.
     versions, commit : str
         See `versions` and `commit`.
     """
     cells = []
-    parameters = next((c.source for c in notebook.cells if "parameters" in c.metadata.get("tags", ())), "")
-    numbers = (f"{key}={value}" for key, (value, _) in assigned(notebook).items() if value.isnumeric())
-    changed = next(numbers, "NAME=VALUE")
+    fold = ["", *parameters(notebook, name), "", f"Commit: {commit}. Versions: {versions}.", ":::"]
     for cell in notebook.cells:
         cells.append(cell)
         for figure in published(cell.source) if cell.cell_type == "code" else []:
-            text = card(name, figure, parameters, changed, links, f"Commit: {commit}. Versions: {versions}.")
+            text = "\n".join(["::::{div} run-card", files(name, figure, links), *fold, "::::"])
             cells.append(new_markdown_cell(text, id=f"{CARD}{figure}"[:64]))
+            fold = []
     notebook.cells = cells
 
 
-def card(name: str, figure: str, parameters: str, changed: str, links: dict[str, str], about: str) -> str:
-    """Return the card of one figure as MyST text; see `add_cards`.
-
-    `parameters` is the code of their cell, `changed` an example of an assignment.
-    """
+def files(name: str, figure: str, links: dict[str, str]) -> str:
+    """Return the line of a card that names the origin of a figure and links its files."""
     number = re.match(r"fig(\d+)_", name)
     of_paper = f"Figure {int(number[1])} of the paper" if number else ""
     origin = "Not in the paper"
@@ -73,34 +69,32 @@ def card(name: str, figure: str, parameters: str, changed: str, links: dict[str,
         origin = of_paper
     elif number:
         origin += f", goes with {of_paper}"
-    files = {
+    offered = {
         "notebook": name + ".ipynb",
         "PNG": figure + ".png",
         "PDF": figure + ".pdf",
         "data (CSV)": figure + ".csv",
     }
-    offered = [f"{{download}}`{text} <{links[file]}>`" for text, file in files.items() if file in links]
-    return "\n".join(
-        [
-            "::::{div} run-card",
-            " · ".join([origin, *offered]),
-            "",
-            ":::{dropdown} Parameters (click to change and re-run)",
-            "```python",
-            parameters,
-            "```",
-            "",
-            "To re-run the notebook from the root of a clone, with one parameter or more changed:",
-            "",
-            "```sh",
-            f'make rerun FIGURE={name} ARGS="-p {changed}"',
-            "```",
-            "",
-            about,
-            ":::",
-            "::::",
-        ]
-    )
+    shown = [f"{{download}}`{text} <{links[file]}>`" for text, file in offered.items() if file in links]
+    return " · ".join([origin, *shown])
+
+
+def parameters(notebook: NotebookNode, name: str) -> list[str]:
+    """Return the lines of the fold that shows the parameters of a notebook, and the command that changes one."""
+    code = next((c.source for c in notebook.cells if "parameters" in c.metadata.get("tags", ())), "")
+    numbers = (f"{key}={value}" for key, (value, _) in assigned(notebook).items() if value.isnumeric())
+    return [
+        ":::{dropdown} Parameters (click to change and re-run)",
+        "```python",
+        code,
+        "```",
+        "",
+        "To re-run the notebook from the root of a clone, with one parameter or more changed:",
+        "",
+        "```sh",
+        f'make rerun FIGURE={name} ARGS="-p {next(numbers, "NAME=VALUE")}"',
+        "```",
+    ]
 
 
 def versions(run: Path) -> str:

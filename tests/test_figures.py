@@ -92,6 +92,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "sensor_layout": ((classic, phase), ()),
         "vector_sensor": ((shifted, phase), ()),
         "bench_layout": ((bench, commands, bench.frames(commands, seed=1)), ()),
+        "at_a_glance": ((pupil, phase, frames, dict.fromkeys(two, phase)), ()),
         "linearity": ((curves, 0.05, two, 0.4), two),
         "convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in plots.LOOKS},), plots.LOOKS),
         "estimates": ((pupil, phase, dict.fromkeys(two, phase)), ()),

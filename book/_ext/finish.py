@@ -21,7 +21,7 @@ from book._tools.project import PDF
 
 CARD = "_static/social.png"
 CARD_SIZE = (1200, 630)  # pixels, as social networks expect
-CARD_ALT = "The logo and the title of the book above its Figure 3: error against input of five reconstructors."
+CARD_ALT = "The logo and the title of the book above a wavefront, its two images, and three reconstructions."
 LENGTH = 200  # characters of a description
 MATH = {"lambda": "λ", "theta": "θ", "pi": "π", "pm": "±"}
 TEX = re.compile(r"\\(?:[()]|([a-z]+))")

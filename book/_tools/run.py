@@ -14,7 +14,7 @@ from .project import Project
 from .record import digest_result, key, read_record, versions
 from .scratch import scratch_folder
 
-FRONT_FIGURE = "fig03_dynamic_range"  # shown in the README, as book/_static/front.png
+FRONT_FIGURE = "at_a_glance"  # shown in the README and on the front page, as book/_static/front.png
 
 
 def run(project: Project, say: Callable[[str], None] = tqdm.write) -> list[str]:

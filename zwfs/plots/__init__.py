@@ -1,5 +1,6 @@
 """The figures: one function for each, and the style that they share. Only this subpackage needs matplotlib."""
 
+from zwfs.plots.at_a_glance import at_a_glance
 from zwfs.plots.bench import bench_linearity, budget, measured_and_modelled, reference_intensities, segment_errors
 from zwfs.plots.closed_loop import capture, loop_runs
 from zwfs.plots.dimple_diameter import diameter_methods, diameter_reasons, dimple_diameter
@@ -31,6 +32,7 @@ __all__ = [
     "all_pairs",
     "amplitude_errors",
     "approximation",
+    "at_a_glance",
     "bench_layout",
     "bench_linearity",
     "budget",

@@ -354,10 +354,17 @@ def write_phase(
         ("NBAD", measurement.n_bad, "of these, bad"),
         ("CONVERGE", phase.converged, "the iteration converged"),
     ]
+    placement = recording.placement
+    cards += [
+        ("ROTATE", placement.rotation, "[deg] image 2 from image 1, x to y"),
+        ("ROTERR", placement.sigma[2], "[deg] standard error; NaN: not determined"),
+        ("MAGNIF", placement.magnification, "size of image 2 over that of image 1"),
+        ("MAGERR", placement.sigma[3], "standard error; NaN: not determined"),
+    ]
     for index, (image, origin) in enumerate(zip(recording.images, recording.origins, strict=True), 1):
         cards += [
             (f"IMAGE{index}", image.name, "frames, then clear frames"),
-            (f"ROW{index}", origin[0], "[pixel] place of clear frame 1 on it"),
+            (f"ROW{index}", origin[0], "[pixel] pupil from its place on clear frame 1"),
             (f"COL{index}", origin[1], "[pixel]"),
         ]
     for index, source in enumerate(sources, 1):

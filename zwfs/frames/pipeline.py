@@ -483,7 +483,7 @@ def _backgrounds(recording: Recording) -> NDArray[np.float64]:
             far &= radius(far.shape, (circle.row, circle.column)) > 0.58 * circle.diameter
         enough = np.count_nonzero(far) >= 100 and not image.cut
         levels.append(float(np.median(image.counts[far])) if enough else 0.0)
-    dark = np.array(levels)
+    dark = np.array(levels) * np.linalg.det(recording.matrices)  # counts of a pixel of the first image
     return np.concatenate([dark * recording.exposure, dark])
 
 

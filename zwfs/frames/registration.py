@@ -1,10 +1,14 @@
-"""Where the pupils stand on a camera: find them, and register them to a fraction of a pixel."""
+"""Where the pupils stand on a camera: find them, and register them to a fraction of a pixel.
+
+The second image may be shifted, rotated and magnified with respect to the first. `record` measures all of it, and
+each image is interpolated once.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -19,6 +23,12 @@ _Item = TypeVar("_Item")
 _REACH = 6  # pixels by which an image may be off its neighbour before sub-pixel registration
 _SMALLEST = 8  # pixels across a pupil: with fewer there is no outline
 _MARGIN = 0.25  # of the diameter: more of the dark surroundings adds nothing
+_ORDER = 3  # of the splines that interpolate an image
+# A rotation or magnification is fitted if its standard error is below so many pixels at the edge of the pupil, or
+# below this part of its value.
+_SURE, _SIGNIFICANT = 0.05, 0.1
+_EDGE = 3  # pixels around the outline that take part where the surroundings are there
+_LARGEST_TURN, _LARGEST_STRETCH = 6.0, 0.06  # degrees, and relative, of the second image
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +86,37 @@ class Circle:
 
 
 @dataclass(frozen=True, eq=False)
+class Placement:
+    """Shift, rotation and magnification of an image with respect to a reference.
+
+    A point that stands at p on the reference, counted from the centre of the pupil, stands at shift + matrix p on
+    the image, counted from the same pixel.
+
+    Attributes
+    ----------
+    shift : ndarray, shape (2,), pixels
+        Of the centre of the pupil: rows, columns.
+    rotation : float, degrees
+        Positive from the axis of the columns (x) to that of the rows (y).
+    magnification : float
+        Size of the image over that of the reference.
+    sigma : ndarray, shape (4,)
+        Standard errors of row, column, rotation and magnification. NaN for a value that the images do not
+        determine and that was not fitted, such as the rotation of a plain disc.
+    """
+
+    shift: NDArray[np.float64]
+    rotation: float = 0.0
+    magnification: float = 1.0
+    sigma: NDArray[np.float64] = field(default_factory=lambda: np.full(4, np.nan))
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """Rotation and magnification, for (row, column), shape (2, 2)."""
+        return _turned(self.rotation, self.magnification)
+
+
+@dataclass(frozen=True, eq=False)
 class Recording:
     """Two frames and two clear frames on the camera, and where the pupils stand on them.
 
@@ -88,12 +129,15 @@ class Recording:
     pupils : (Circle, Circle)
         On the clear frames.
     origins : ndarray, shape (4, 2), pixels
-        Place of the first clear frame's pixel (0, 0) on each image, by registration: frames first, then clear
-        frames.
+        How far the centre of the pupil stands on each image from its place on the first clear frame, by
+        registration: frames first, then clear frames.
     background, balance : bool
         Whether to subtract the light around the pupils of the clear frames, and whether to balance.
     exposure : float
         Exposure of the frames over that of the clear frames.
+    placement : Placement
+        Of the second clear frame with respect to the first. Its rotation and magnification are also those of the
+        second frame.
     """
 
     frames: tuple[Image, Image]
@@ -103,6 +147,7 @@ class Recording:
     background: bool = True
     balance: bool = True
     exposure: float = 1.0
+    placement: Placement = Placement(np.zeros(2))
 
     @property
     def images(self) -> tuple[Image, ...]:
@@ -111,8 +156,14 @@ class Recording:
 
     @cached_property
     def diameter(self) -> float:
-        """Mean diameter of the two pupils, in pixels."""
-        return sum(pupil.diameter for pupil in self.pupils) / 2
+        """Diameter of the pupil in pixels of the first image: the mean of both, less the magnification."""
+        first, second = self.pupils
+        return (first.diameter + second.diameter / self.placement.magnification) / 2
+
+    @property
+    def matrices(self) -> NDArray[np.float64]:
+        """Rotation and magnification of the first and second image, (2, 2, 2), in the sense of `Placement`."""
+        return np.stack([np.eye(2), self.placement.matrix])
 
     @cached_property
     def n_pixels(self) -> int:
@@ -128,10 +179,12 @@ class Recording:
     @cached_property
     def margin(self) -> int:
         """Pixels around the grid of the pupil that both frames hold."""
+        half = (self.n_pixels - 1) / 2
         room = [_MARGIN * self.diameter]
-        for image, origin in zip(self.frames, self.origins[:2], strict=True):
-            first = origin + self.corner
-            room += [*first, *(np.array(image.counts.shape) - first - self.n_pixels)]
+        for image, offset, matrix in zip(self.frames, self._offsets(self.origins[:2]), self.matrices, strict=True):
+            middle = offset + matrix @ (self.corner + half)
+            ends = np.minimum(middle, np.array(image.counts.shape) - 1 - middle)
+            room += list(ends / np.abs(matrix).sum(axis=1) - half)
         if self.frames[0] is self.frames[1]:
             # Light of the neighbour begins half-way.
             room.append((np.abs(self.origins[1] - self.origins[0]).max() - self.n_pixels) / 2)
@@ -148,15 +201,25 @@ class Recording:
     def _on_grid(
         self, images: tuple[Image, Image], origins: NDArray, margin: int
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Images on the grid, interpolated once; counts are those of a pixel of the first image."""
         size = (self.n_pixels + 2 * margin,) * 2
         counts, bad = np.empty((2, *size)), np.empty((2, *size), bool)
-        for index, (image, origin) in enumerate(zip(images, origins, strict=True)):
-            # Beyond an image its edge is repeated.
-            grid = {"offset": self.corner - margin + origin, "output_shape": size, "mode": "nearest"}
-            counts[index] = ndimage.affine_transform(image.counts, (1, 1), order=3, **grid)
+        for index, (image, offset, matrix) in enumerate(
+            zip(images, self._offsets(origins), self.matrices, strict=True)
+        ):
+            # A matrix without off-diagonal terms is faster as a vector. Beyond an image its edge is repeated.
+            step = matrix if np.any(matrix[[0, 1], [1, 0]]) else np.diag(matrix)
+            grid = {"offset": offset + matrix @ (self.corner - margin), "output_shape": size, "mode": "nearest"}
+            counts[index] = ndimage.affine_transform(image.counts, step, order=_ORDER, **grid)
+            counts[index] *= np.linalg.det(matrix)
             # A bad pixel spoils the points on all its sides.
-            bad[index] = ndimage.affine_transform(image.bad.astype(float), (1, 1), order=1, **grid) > 0.01
+            bad[index] = ndimage.affine_transform(image.bad.astype(float), step, order=1, **grid) > 0.01
         return counts, bad
+
+    def _offsets(self, origins: NDArray) -> NDArray[np.float64]:
+        """Place of the first clear frame's pixel (0, 0) on two images, (2, 2)."""
+        center = np.array([self.pupils[0].row, self.pupils[0].column])
+        return origins + center - self.matrices @ center
 
 
 def record(
@@ -283,8 +346,16 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
     return tuple(circles[index] for index in np.argsort(places[:, np.argmax(np.ptp(places, axis=0))]))
 
 
-def register(image: NDArray, reference: NDArray, inside: NDArray, blur: float = 2.0) -> NDArray[np.float64]:
-    """Shift between two images of one pupil, to a fraction of a pixel.
+def register(
+    image: NDArray,
+    reference: NDArray,
+    inside: NDArray,
+    blur: float = 2.0,
+    *,
+    turn: bool = False,
+    magnification: float = 1.0,
+) -> Placement:
+    """Shift between two images of one pupil, to a fraction of a pixel; on request with rotation and magnification.
 
     Maximises the correlation of the two, after a band-pass that keeps gaps, vanes and edges but takes away noise,
     the illumination, and the grid of a deformable mirror, whose contrast depends on the focus of the camera.
@@ -292,15 +363,21 @@ def register(image: NDArray, reference: NDArray, inside: NDArray, blur: float = 
     Parameters
     ----------
     image, reference : ndarray, shape (ny, nx)
+        The pupil stands in the middle of the reference.
     inside : ndarray of bool, shape (ny, nx)
-        Points of the pupil on the reference, clear of its edge.
+        Points of the reference that are compared.
     blur : float, pixels rms
         Finest detail that counts.
+    turn : bool
+        Whether to measure rotation and magnification, too.
+    magnification : float
+        Start of the search, with `turn`.
 
     Returns
     -------
-    ndarray, shape (2,), pixels
-        How far (rows, columns) the image stands from the reference.
+    Placement
+        Of the image with respect to the reference. A rotation or magnification stays out if the images do not
+        determine it: if its standard error exceeds 0.05 pixels at the edge of `inside` and a tenth of its value.
 
     Raises
     ------
@@ -311,27 +388,102 @@ def register(image: NDArray, reference: NDArray, inside: NDArray, blur: float = 
     _check.trailing_shape("reference", reference, image.shape, "the shape of image")
     inside = _check.flag_map("inside", inside, image.shape, some=True)
     blur = _check.number("blur", blur, 0, max(image.shape), open_low=True)
-    wide = 4 * blur
-    detail = ndimage.gaussian_filter(image, blur) - ndimage.gaussian_filter(image, wide)
-    target = (ndimage.gaussian_filter(reference, blur) - ndimage.gaussian_filter(reference, wide))[inside]
-    spline = ndimage.spline_filter(detail, order=3, mode="nearest")
-    points = np.argwhere(inside).T.astype(float)
-
-    def mismatch(shift: NDArray) -> float:
-        moved = ndimage.map_coordinates(
-            spline, points + np.reshape(shift, (2, 1)), order=3, mode="nearest", prefilter=False
-        )
-        return -correlations(moved[np.newaxis], target[np.newaxis])[0]
-
+    turn = _check.flag("turn", turn)
+    magnification = _check.number("magnification", magnification, 0, open_low=True)
+    # Details of three times the width, at every third point, draw the search from farther away.
+    thin = np.zeros_like(inside)
+    thin[::3, ::3] = True
+    coarse = _Details.of(image, reference, inside & thin if np.any(inside & thin) else inside, 3 * blur)
+    details = _Details.of(image, reference, inside, blur)
+    stretch = (magnification - 1) * details.reach if turn else 0.0
     steps = range(-_REACH, _REACH + 1)
-    start = min(((y, x) for y in steps for x in steps), key=lambda shift: mismatch(np.array(shift, float)))
-    if max(map(abs, start)) == _REACH:
-        raise ValueError(
-            f"the best shift of the images is {start} pixels, the end of the search: expected less than {_REACH}"
+    moves = [(y, x, 0.0, stretch) for y in steps for x in steps]
+    start = min(moves, key=lambda move: float(np.sum(coarse.difference(move) ** 2)))
+    if max(map(abs, start[:2])) == _REACH:
+        found = f"the best shift of the images is {start[:2]} pixels, the end of the search"
+        raise ValueError(f"{found}: expected less than {_REACH}")
+    turns = np.array([False, False, True, True])
+    free = turn | ~turns
+    best, _ = coarse.search(np.array(start), free)
+    best, sigma = details.search(best, free)
+    while (unsure := turns & free & ~(sigma < np.maximum(_SURE, _SIGNIFICANT * np.abs(best)))).any():
+        worst = np.argmax(np.where(unsure, np.nan_to_num(sigma, nan=np.inf), -1))
+        free[worst], best[worst] = False, 0
+        best, sigma = details.search(best, free)
+    scale = np.array([1, 1, np.degrees(1 / details.reach), 1 / details.reach])
+    rows, columns, rotation, stretch = best * scale
+    return Placement(np.array([rows, columns]), float(rotation), float(1 + stretch), sigma * scale)
+
+
+@dataclass(frozen=True, eq=False)
+class _Details:
+    """Band-passed image and reference, and their difference after a move.
+
+    A move is (rows, columns, rotation, stretch), all in pixels; the last two at the edge of the points.
+    """
+
+    image: NDArray[np.float64]  # coefficients of splines
+    reference: NDArray[np.float64]
+    points: NDArray[np.float64]  # (2, n), from the middle
+    middle: NDArray[np.float64]
+    reach: float  # pixels from the middle to the farthest point
+    block: NDArray[np.int64]  # number of the block of pixels that a point belongs to
+
+    @classmethod
+    def of(cls, image: NDArray, reference: NDArray, inside: NDArray, blur: float) -> _Details:
+        bands = (
+            ndimage.gaussian_filter(one, blur) - ndimage.gaussian_filter(one, 4 * blur)
+            for one in (image, reference)
         )
-    simplex = np.array(start) + np.array([[0, 0], [0.5, 0], [0, 0.5]])
-    options = {"xatol": 1e-3, "fatol": 1e-9, "initial_simplex": simplex}
-    return optimize.minimize(mismatch, start, method="Nelder-Mead", options=options).x
+        splines = [ndimage.spline_filter(band, order=3, mode="nearest") for band in bands]
+        places = np.argwhere(inside).T
+        middle = (np.array(inside.shape)[:, np.newaxis] - 1) / 2
+        points = places - middle
+        # Errors of neighbours go together: those of different blocks hardly do.
+        size = max(1, round(8 * blur))
+        block = np.unique(places[0] // size * inside.shape[1] + places[1] // size, return_inverse=True)[1]
+        return cls(splines[0], splines[1], points, middle, float(np.hypot(*points).max()), block)
+
+    def search(self, start: NDArray, free: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Best move and its standard errors, pixels; what is not free keeps its start."""
+
+        def move(values: NDArray) -> NDArray[np.float64]:
+            full = start.copy()
+            full[free] = values
+            return full
+
+        best = optimize.least_squares(
+            lambda values: self.difference(move(values)), start[free], x_scale=0.1, xtol=1e-5, ftol=1e-9, gtol=1e-9
+        )
+        sigma = np.full(4, np.nan)
+        sigma[free] = self._errors(best.jac, best.fun, free)
+        return move(best.x), sigma
+
+    def difference(self, move: Any) -> NDArray[np.float64]:
+        """Moved image less the reference, each of mean 0 and norm 1."""
+        return self._at(self.image, move) - self._at(self.reference, np.zeros(4))
+
+    def _at(self, spline: NDArray, move: Any) -> NDArray[np.float64]:
+        turned = _turned(np.degrees(move[2] / self.reach), 1 + move[3] / self.reach) @ self.points
+        places = self.middle + np.reshape(move[:2], (2, 1)) + turned
+        values = ndimage.map_coordinates(spline, places, order=3, mode="nearest", prefilter=False)
+        values -= values.mean()
+        return values / max(float(np.linalg.norm(values)), 1e-300)
+
+    def _errors(self, slopes: NDArray, difference: NDArray, free: NDArray) -> NDArray[np.float64]:
+        """Standard errors of the free values: the curvature, and the scatter of the gradient between blocks.
+
+        The curvature is the product of the slopes of image and reference. Their noise is independent, so that
+        noise alone makes no curvature.
+        """
+        moves = 0.1 * np.eye(4)[free]
+        other = [(self._at(self.reference, one) - self._at(self.reference, -one)) / 0.2 for one in moves]
+        curvature = slopes.T @ np.transpose(other)
+        curvature += 1e-9 * np.trace(slopes.T @ slopes) * np.eye(len(moves))
+        gradient = np.zeros((self.block.max() + 1, len(moves)))
+        np.add.at(gradient, self.block, slopes * difference[:, np.newaxis])
+        weight = np.linalg.pinv(curvature)
+        return np.sqrt(np.diag(weight @ (gradient.T @ gradient) @ weight.T))
 
 
 def nearest_good(image: NDArray, good: NDArray) -> NDArray:
@@ -358,6 +510,12 @@ def correlations(first: NDArray, second: NDArray) -> NDArray[np.float64]:
     first, second = (rows - rows.mean(axis=1, keepdims=True) for rows in (first, second))
     scale = np.sqrt(np.sum(first**2, axis=1) * np.sum(second**2, axis=1))
     return np.divide(np.sum(first * second, axis=1), scale, out=np.zeros(len(scale)), where=scale > 0)
+
+
+def _turned(rotation: float, magnification: float) -> NDArray[np.float64]:
+    """Matrix of a rotation (degrees) and a magnification, for (row, column)."""
+    sine, cosine = np.sin(np.radians(rotation)), np.cos(np.radians(rotation))
+    return magnification * np.array([[cosine, sine], [-sine, cosine]])
 
 
 def _check_images(name: str, images: Any) -> None:
@@ -433,12 +591,13 @@ def _not_cut(circle: Circle, image: Image) -> None:
 
 
 def _require_same_size(circles: tuple[Circle, Circle], images: tuple[Image, Image]) -> None:
-    """Refuse two pupils of different size: both images must have the same magnification."""
+    """Refuse two pupils whose sizes differ by more than registration can measure."""
     small, large = sorted(circle.diameter for circle in circles)
-    if large - small > max(2.0, 0.03 * large):
+    if large - small > max(2.0, _LARGEST_STRETCH * large):
         names = " and ".join(dict.fromkeys(image.name for image in images))
         raise ValueError(
-            f"{names}: the two pupils are {small:.1f} and {large:.1f} pixels wide: expected the same size, to 3 %"
+            f"{names}: the two pupils are {small:.1f} and {large:.1f} pixels wide: "
+            f"expected the same size, to {_LARGEST_STRETCH:.0%}"
         )
 
 
@@ -476,15 +635,42 @@ def _extend(image: Image, circles: Sequence[Circle]) -> Image:
 
 
 def _register(recording: Recording, frames_too: bool) -> Recording:
-    """Shift the second clear frame to the first, and each frame to, or with, its clear frame."""
-    images, _ = recording.clear_on_grid()
-    first = recording.pupils[0]
-    row, column = np.array([first.row, first.column]) - recording.corner
-    # Off the edge, which the mask makes bright or dark.
-    inside = radius(images.shape[1:], (row, column)) <= 0.45 * recording.diameter
+    """Register the second clear frame to the first, and each frame to, or with, its clear frame."""
+    first, second = recording.pupils
+    center = np.array([first.row, first.column])
+    cut = any(image.cut for image in recording.clear_frames)
+    # The outline takes part, unless software cut it out of its surroundings.
+    reach = 0.45 * recording.diameter if cut else recording.diameter / 2 + _EDGE
+    size = 2 * math.ceil(recording.diameter / 2) + 17
+    reference, image = (
+        ndimage.affine_transform(
+            one.counts, (1, 1), center + np.round(origin) - (size - 1) / 2, (size, size), order=3, mode="nearest"
+        )
+        for one, origin in zip(recording.clear_frames, recording.origins[2:], strict=True)
+    )
+    placement = register(
+        image,
+        reference,
+        radius(reference.shape, ((size - 1) / 2,) * 2) <= reach,
+        turn=True,
+        magnification=second.diameter / first.diameter,
+    )
+    if abs(placement.rotation) > _LARGEST_TURN or abs(placement.magnification - 1) > _LARGEST_STRETCH:
+        raise ValueError(
+            f"the second image is rotated by {placement.rotation:.1f} degrees and magnified by "
+            f"{placement.magnification:.3f}: expected at most {_LARGEST_TURN:g} degrees and {_LARGEST_STRETCH:.0%}"
+        )
     shifts = np.zeros((4, 2))
-    shifts[[1, 3]] = register(images[1], images[0], inside)
-    if frames_too:
-        frames, _ = recording.frames_on_grid()
-        shifts[:2] += [register(frame, image, inside) for frame, image in zip(frames, images, strict=True)]
-    return replace(recording, origins=recording.origins + shifts)
+    shifts[[1, 3]] = placement.shift
+    placement = replace(placement, shift=recording.origins[3] + placement.shift)
+    placed = replace(recording, origins=recording.origins + shifts, placement=placement)
+    if not frames_too:
+        return placed
+    (frames, _), (images, _) = placed.frames_on_grid(), placed.clear_on_grid()
+    # Off the edge, which the mask makes bright or dark.
+    middle = first.row - placed.corner[0], first.column - placed.corner[1]
+    inside = radius(images.shape[1:], middle) <= 0.45 * recording.diameter
+    apart = [register(frame, image, inside).shift for frame, image in zip(frames, images, strict=True)]
+    apart[1] = placement.matrix @ apart[1]
+    shifts[:2] += apart
+    return replace(placed, origins=recording.origins + shifts)

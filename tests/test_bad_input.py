@@ -10,6 +10,7 @@ import inspect
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache
@@ -27,7 +28,7 @@ from zwfs.reconstructors.base import Reconstructor
 MODULES = (
     *("pupil", "modes", "masks", "sensor", "detector", "metrics", "reconstructors", "reconstructors.base"),
     *("bench.model", "bench.segments", "bench.recording"),
-    *("frames.files", "frames.registration", "frames.pipeline"),
+    *("units", "frames.files", "frames.registration", "frames.pipeline", "frames.order"),
     *("paper.curves", "paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
     *("paper.bench_linearity", "paper.closed_loop", "paper.photon_noise", "paper.design", "paper.recovery"),
     *("companion.sweeps", "companion.results", "companion.tables"),
@@ -48,7 +49,13 @@ INFINITE |= {
 INTERNAL = {"Settings", "Solution", "State", "Estimate", "model", "solve", "invert", "begin", "step", "constants"}
 INTERNAL |= {"check_frames", "check_phase", "check_modes", "pieces"}
 HANDED_ON = {"run.shared"}  # to the task, as it is
-PASSED = {"Pupil.gather", "Pupil.scatter", "nearest_good"}  # give back what they are given, NaN and infinity too
+PASSED = {
+    "Pupil.gather",
+    "Pupil.scatter",
+    "nearest_good",
+    "phase_to_opd",
+    "opd_to_phase",
+}  # give back what they are given, NaN and infinity too
 # Take complex numbers where the valid ones are real.
 COMPLEX = PASSED | {"DimpleLight.expand", "arccosine_phase", "pair_phase"}
 # The image or file whose content does not fit is named in place of the argument.
@@ -131,6 +138,8 @@ def valid() -> dict:
     on_bench = model.normalise(small.frames(None, 2))
     flow = closed_loop.FrozenFlow(pupil, 0.2, 1, cutoff=1.0, seed=1)
     images, optics, recording, measurement, found = _recorded(pipeline, registration)
+    poked = replace(measurement, intensity=measurement.intensity.copy())
+    poked.intensity[:, 10:14, 10:14] += np.reshape([0.4, -0.3], (2, 1, 1))
     file = camera.CameraFile(
         images[0].counts[np.newaxis],
         "frame",
@@ -329,6 +338,9 @@ def valid() -> dict:
         "register.image": np.roll(scene, 1, axis=0),
         "register.reference": scene,
         "radius.center": (2.5, 2.5),
+        "opd": points,
+        "flat": measurement,
+        "poked": poked,
         "write_phase.phase": found,
         "bench_error.phase": found,
         "measured_pupil.images": np.ones((2, 12, 12)),
@@ -364,6 +376,7 @@ def valid() -> dict:
         "PhotonCurves": photon_noise.photon_curves(shifted, {"shifted": method}, modes, [0.1], [1e4], 1),
         "DesignMap": design.DesignMap(np.array([1.0]), np.array([1.5]), {"flat": np.array([[2.0]])}),
         "CameraFile": file,
+        "MeasuredPhase": found,
     }
     return {"arguments": arguments, "instances": instances}
 

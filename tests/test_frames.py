@@ -12,6 +12,7 @@ from zwfs.bench import bench_error, write_bench
 from zwfs.bench.model import Bench, BenchModel, segment_screens
 from zwfs.bench.segments import segment_residual
 from zwfs.frames import files as camera
+from zwfs.frames.order import order_of_images
 from zwfs.frames.pipeline import Optics, fit, measured_pupil, predict_other, reconstruct, reduce_frames, steps
 from zwfs.frames.registration import (
     Circle,
@@ -290,6 +291,41 @@ def test_steps_name_what_they_do(recorded):
     assert [step.name for step in work][0::4] == ["outlines of the pupils", "fit of scale"]
     assert work[-1].result.misfit <= work[-2].result.misfit
     assert work[1].result.correlation.mean() > work[0].result.correlation.mean()
+
+
+# Order of the images
+
+
+def poked_pair(screen, height):
+    """Measurements before and after a poke, with the images in the given order of the phase shifts."""
+    y, x = (np.mgrid[:D, :D] - (D - 1) / 2) / D
+    poke = height * np.exp(-((x + 0.15) ** 2 + (y - 0.1) ** 2) / 0.06**2)
+    rng, both = np.random.default_rng(4), []
+    for phase in (screen, screen + poke):
+        _, masked, bare = pair(phase)
+        both.append(reduce_frames(record([image(rng.poisson(masked) * 1.0)], [image(bare)]), Optics()))
+    return both
+
+
+@pytest.mark.parametrize("height", [0.4, -0.4])
+def test_order_of_the_images_follows_from_a_poke(screen, height):
+    right = poked_pair(screen, height)
+    wrong = [replace(one, optics=Optics(phase_shifts=(-np.pi / 2, np.pi / 2))) for one in right]
+    for measured, exchanged in ((right, False), (wrong, True)):
+        order = order_of_images(*measured, sign=int(np.sign(height)))
+        assert order.exchanged == exchanged
+        assert order.optics.phase_shifts == (np.pi / 2, -np.pi / 2)
+        assert order.score > 0.8
+
+
+def test_order_without_a_poke_is_refused(screen):
+    flat, poked = poked_pair(screen, 0.0)
+    with pytest.raises(ValueError, match="flat and poked: the change of phase scores"):
+        order_of_images(flat, poked)
+    with pytest.raises(ValueError, match="sign = 0"):
+        order_of_images(flat, poked, sign=0)
+    with pytest.raises(ValueError, match="flat and poked differ in optics"):
+        order_of_images(flat, replace(poked, optics=Optics(1.1)))
 
 
 # Bad frames

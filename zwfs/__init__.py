@@ -23,6 +23,7 @@ from zwfs.reconstructors import (
     Reconstruction,
 )
 from zwfs.sensor import ZernikeSensor
+from zwfs.units import opd_to_phase, phase_to_opd
 
 # The modules, for type checkers and editors. At run time each one is imported at its first use, see `__getattr__`.
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from zwfs import pupil as pupil
     from zwfs import reconstructors as reconstructors
     from zwfs import sensor as sensor
+    from zwfs import units as units
 
 __version__ = "0.1.0"
 
@@ -62,6 +64,8 @@ __all__ = [
     "cramer_rao",
     "dynamic_range",
     "noll_to_nm",
+    "opd_to_phase",
+    "phase_to_opd",
     "power_law_screens",
     "reconstruction_error",
     "strehl",

@@ -1,5 +1,10 @@
-"""Camera files to phase: `files` reads and writes, `registration` locates the pupils, `pipeline` reconstructs."""
+"""Camera files to phase.
 
-from zwfs.frames import files, pipeline, registration
+`files` reads and writes, `registration` locates the pupils, `pipeline` reconstructs, `verdict` judges the result,
+and `order` finds which image has which phase shift.
+"""
 
-__all__ = ["files", "pipeline", "registration"]
+from zwfs.frames import files, order, pipeline, registration
+from zwfs.frames.order import order_of_images
+
+__all__ = ["files", "order", "order_of_images", "pipeline", "registration"]

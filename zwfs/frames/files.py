@@ -373,8 +373,7 @@ def write_phase(
         cards.append(("DATE-OBS", str(sources[0].header["DATE-OBS"]), f"of {sources[0].name}"))
     cards.append(("CREATOR", f"zwfs {__version__}", ""))
     bad = (measurement.pupil.inside & ~measurement.good).astype(np.uint8)
-    nanometres = phase.phase * wavelength / (2 * np.pi)
-    units = (nanometres, "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
+    units = (phase.opd(wavelength), "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
     write_file(path, fits_content((phase.phase, "", cards), *units))
 
 

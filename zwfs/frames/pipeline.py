@@ -23,6 +23,7 @@ from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
 from zwfs.sensor import ZernikeSensor
+from zwfs.units import phase_to_opd
 
 _MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
 
@@ -174,6 +175,10 @@ class MeasuredPhase:
     measurement: Measurement
     converged: bool
     n_unsolved: int
+
+    def opd(self, wavelength: float) -> NDArray[np.float64]:
+        """Optical path difference, shape (ny, nx), nm, at a wavelength in nm; see `zwfs.phase_to_opd`."""
+        return phase_to_opd(self.phase, wavelength)
 
     @cached_property
     def correlation(self) -> NDArray[np.float64]:

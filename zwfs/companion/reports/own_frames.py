@@ -14,6 +14,7 @@ from zwfs.companion.tables import Table
 from zwfs.frames.files import read
 from zwfs.frames.pipeline import MeasuredPhase, Step
 from zwfs.frames.registration import Image
+from zwfs.units import phase_to_opd
 
 SHOWN = ("BUNIT", "WAVELEN", "PUPDIAM", "DIMPLE", "CORR1", "CORR2", "NBAD")  # keywords of the phase map
 
@@ -38,7 +39,7 @@ def phase_columns(result: MeasuredPhase, wavelength: float) -> dict[str, NDArray
     return {
         "column (pixel)": np.arange(row.size),
         "phase on the middle row (rad)": row,
-        "the same (nm)": row * wavelength / (2 * np.pi),
+        "the same (nm)": phase_to_opd(row, wavelength),
     }
 
 

@@ -1,4 +1,4 @@
-"""The same physics by other means: the exact kernel of the dimple, and HCIPy."""
+"""The same physics by other means: the exact kernel of the dimple, HCIPy and prysm."""
 
 import numpy as np
 from scipy.signal import fftconvolve
@@ -68,3 +68,29 @@ class HcipySensor:
             phasor = 1j * (right_b * a - right_a * b) * np.sign((np.conj(a) * b).imag)
             field = amplitude * np.exp(1j * np.angle(phasor))
         return np.angle(field)
+
+
+def prysm_propagation(n_pixels, mask, n_samples):
+    """Function from a field, shape (n, n), to the field behind the mask, by the matrix transforms of prysm.
+
+    This is Soummer's semi-analytical propagation, as prysm does it for a coronagraph. Both its transforms are
+    inverse ones, so they turn the pupil upside down. Its `babinet` subtracts the turned wave from the field as it
+    was, which is right for even fields only. The wave is turned back here. A grid with an even number of samples
+    gets one more row and column: about its middle sample it then turns into itself.
+    """
+    import prysm.propagation
+
+    # With D = 1 mm, this focal length (mm) and this wavelength (micrometre) one lambda/D is a micrometre.
+    length, wavelength, spacing = 1000.0, 1e-3, mask.diameter / n_samples
+    u = (np.arange(n_samples + 2) - (n_samples + 2) // 2) * spacing
+    u, v = -u, -u[:, np.newaxis]
+    change = np.where(np.hypot(u, v) <= mask.diameter / 2, mask.transmission(u + 0 * v, v + 0 * u) - 1, 0)
+
+    def run(field):
+        n = len(field)
+        odd = np.pad(field, (0, 1 - n % 2))
+        wavefront = prysm.propagation.Wavefront(odd, wavelength, 1 / n_pixels)
+        wave = wavefront.to_fpm_and_back(length, change, spacing).data[::-1, ::-1]
+        return field + wave[:n, :n]
+
+    return run

@@ -10,7 +10,6 @@ from functools import cache, cached_property, partial
 
 import hcipy
 import numpy as np
-import prysm.propagation
 from pyzelda import zelda, ztools
 
 from zwfs import (
@@ -25,7 +24,7 @@ from zwfs import (
     zernike_basis,
 )
 
-from ..reference import HcipySensor, exact_frame, exact_reference
+from ..reference import HcipySensor, exact_frame, exact_reference, prysm_propagation
 
 DIAMETER, N_ITERATIONS = 1.06, 25
 PLUS, MINUS = Dimple(DIAMETER, np.pi / 2), Dimple(DIAMETER, -np.pi / 2)
@@ -191,24 +190,8 @@ class Field:
         return run
 
     def _prysm(self, n_samples):
-        """Soummer's semi-analytical propagation, as prysm does it for a coronagraph.
-
-        Both its transforms are inverse ones, which turns the pupil upside down; its `babinet` subtracts that from
-        the field as it was, which is right for fields without odd parts only. So the subtraction is done here, and
-        the grid gets one more row and column: about its middle sample it then turns into itself.
-        """
-        spacing = DIAMETER / n_samples  # micrometre, which the numbers below make lambda/D
-        length, wavelength, pixel = 1000.0, 1e-3, 1 / self.pupil.n_pixels  # mm, micrometre, mm: D = 1 mm
-        x = (np.arange(n_samples + 2) - (n_samples + 2) // 2) * spacing
-        change = np.where(np.hypot(x, x[:, np.newaxis]) <= DIAMETER / 2, np.exp(1j * np.pi / 2) - 1, 0)
-
-        def run():
-            field = self.pupil.amplitude * np.exp(1j * self.screen)
-            wavefront = prysm.propagation.Wavefront(np.pad(field, ((0, 1), (0, 1))), wavelength, pixel)
-            wave = wavefront.to_fpm_and_back(length, change, spacing).data[::-1, ::-1]
-            return np.abs(field + wave[:-1, :-1]) ** 2
-
-        return run
+        propagate = prysm_propagation(self.pupil.n_pixels, PLUS, n_samples)
+        return lambda: np.abs(propagate(self.pupil.amplitude * np.exp(1j * self.screen))) ** 2
 
     @cached_property
     def _pyzelda(self):

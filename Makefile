@@ -47,6 +47,7 @@ lab: $(READY) ## open the notebooks in JupyterLab
 
 test: $(READY) ## test the package and the tools, and compare each notebook with a fresh run
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --benchmark-disable tests
+	$(BIN)/python -m pytest --numprocesses auto --doctest-modules zwfs
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --nbval --nbval-current-env \
 		--nbval-cell-timeout 600 notebooks
 

@@ -70,7 +70,7 @@ def cramer_rao(
     >>> sensor = zwfs.ZernikeSensor(pupil, *masks)
     >>> bound = zwfs.cramer_rao(sensor, np.zeros(pupil.shape), photons=1000)
     >>> round(float(np.nanmean(bound)), 4)  # radian
-    0.016
+    0.0161
     """
     _check.instance("sensor", sensor, ZernikeSensor)
     if photons is None:

@@ -39,6 +39,18 @@ class Detector:
     ------
     TypeError, ValueError
         If an argument is of the wrong kind or out of range.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
+    >>> camera = zwfs.Detector(pupil, photons=1e6, read_noise=1.0)
+    >>> counts = camera.expose(sensor.measure(np.zeros(pupil.shape)), seed=1)
+    >>> camera.normalise(counts).shape
+    (1, 32, 32)
+    >>> round(camera.photons_per_pixel)
+    1232
     """
 
     pupil: Pupil

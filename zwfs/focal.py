@@ -31,6 +31,14 @@ def focal_field(pupil: Pupil, field: ArrayLike, u: ArrayLike, v: ArrayLike) -> N
     ------
     TypeError, ValueError
         If a shape is wrong, or a value is not finite or too large.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> u = np.array([0.0, 1.22])
+    >>> np.abs(zwfs.focal.focal_field(pupil, pupil.amplitude, u, [0.0])).round(2)
+    array([[1., 0.]])
     """
     _check.instance("pupil", pupil, Pupil)
     field = _check.complex_array("field", field)

@@ -48,6 +48,15 @@ class Plane(Immutable):
     along_y : array, shape (a, ny)
     along_x : array, shape (b, nx)
     combine : array, shape (a * b, r)
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
+    >>> plane = sensor.factors.pupil
+    >>> plane.project(np.ones(pupil.shape)).shape == (plane.rank,)
+    True
     """
 
     along_y: NDArray
@@ -120,6 +129,14 @@ class Factors(Immutable):
         Functions on the two planes, of rank r and q.
     core : ndarray of complex, shape (n_masks, q, r)
         Kept as a read-only view.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
+    >>> sensor.factors.core.shape == (1, sensor.rank, sensor.rank)
+    True
     """
 
     pupil: Plane
@@ -191,7 +208,14 @@ class Operator:
 
 
 def split_core(core: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Cores (n, q, r) as a real matrix that acts from the right: coefficients (k, 2 r) to (k, n 2 q)."""
+    """Cores (n, q, r) as a real matrix that acts from the right: coefficients (k, 2 r) to (k, n 2 q).
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> zwfs.lowrank.split_core(np.array([[[1 + 2j]]])).shape
+    (2, 2)
+    """
     block = np.block([[core.real, -core.imag], [core.imag, core.real]])
     return np.ascontiguousarray(block.reshape(-1, block.shape[-1]).T)
 
@@ -231,6 +255,16 @@ def factorise(
     -----
     UserWarning
         If the quadrature of a transmission that varies over the mask misses the tolerance.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> dimple = zwfs.Dimple(1.06, np.pi / 2)
+    >>> axes = pupil.y, pupil.x
+    >>> factors = zwfs.lowrank.factorise([dimple], axes, axes, pupil.n_pixels**-2, tolerance=1e-6)
+    >>> factors.core.shape
+    (1, 17, 17)
     """
     reach = math.hypot(*(np.ptp(np.concatenate(pair)) for pair in zip(pupil_axes, detector_axes, strict=True)))
     for index, mask in enumerate(masks):

@@ -15,7 +15,15 @@ _MOST_SAMPLES = 2048  # a quarter of a minute for 100 pixels
 
 
 class Mask(Protocol):
-    """Interface of a mask, whose transmission is 1 outside a disc around the axis."""
+    """Interface of a mask, whose transmission is 1 outside a disc around the axis.
+
+    Examples
+    --------
+    >>> import zwfs
+    >>> mask: zwfs.masks.Mask = zwfs.Dimple(1.06, 0.5)
+    >>> mask.diameter
+    1.06
+    """
 
     @property
     def diameter(self) -> float:
@@ -54,6 +62,14 @@ class Dimple:
     References
     ----------
     Chambouleyron et al. 2024, section 2.2.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> zwfs.Dimple(diameter=2.0, phase=0.5)
+    Dimple(diameter=2.0, phase=0.5, amplitude=1.0)
+    >>> complex(zwfs.Dimple(1.06, np.pi / 2, amplitude=0.8).transmission(0.0, 0.0).round(3))
+    0.8j
     """
 
     diameter: float
@@ -108,6 +124,16 @@ class Patch:
     References
     ----------
     Chambouleyron et al. 2024, section 2.1.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> def two_steps(u, v):
+    ...     return np.where(np.hypot(u, v) < 0.5, 1j, -1j)
+    ...
+    >>> ring = zwfs.Patch(2.0, two_steps, breaks=[1.0])
+    >>> zwfs.ZernikeSensor(zwfs.Pupil.circular(32), ring).n_masks
+    1
     """
 
     diameter: float

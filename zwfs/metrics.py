@@ -32,6 +32,14 @@ def wrapped_residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDA
     References
     ----------
     Chambouleyron et al. 2024, section 4.1; `eq-error` of the book.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> residual = zwfs.wrapped_residual(pupil, np.full(pupil.shape, 0.3), np.zeros(pupil.shape))
+    >>> float(np.nanmax(np.abs(residual))) < 1e-12  # a piston is no error
+    True
     """
     residual = _residual(pupil, estimate, truth)  # the pupil is checked
     return pupil.scatter(residual)
@@ -43,6 +51,14 @@ def reconstruction_error(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) ->
     Returns
     -------
     ndarray, shape (...), radian rms
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> tilt = 0.1 * zwfs.zernike_basis(pupil, 1)[0]
+    >>> round(float(zwfs.reconstruction_error(pupil, tilt, np.zeros(pupil.shape))), 3)
+    0.1
     """
     return np.sqrt(np.mean(_residual(pupil, estimate, truth) ** 2, axis=-1))
 
@@ -54,6 +70,12 @@ def without_piston(phase: ArrayLike) -> NDArray[Any]:
     ------
     ValueError
         If the array is empty, or a value is not finite.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> zwfs.metrics.without_piston(np.array([1.0, 1.2, 1.7])).round(3)
+    array([-0.298, -0.098,  0.402])
     """
     phase = _check.real_array("phase", phase)
     if 0 in (phase.ndim, phase.size):
@@ -80,6 +102,14 @@ def strehl(pupil: Pupil, phase: ArrayLike) -> NDArray[np.floating]:
     ------
     ValueError
         If the shape is wrong, there is no map, or a value inside the pupil is not finite.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> tilt = 0.1 * zwfs.zernike_basis(pupil, 1)[0]
+    >>> round(float(zwfs.strehl(pupil, tilt)), 3)  # close to exp(-0.1**2)
+    0.99
     """
     _check.instance("pupil", pupil, Pupil)
     values = _check.values_inside("phase", phase, pupil)
@@ -116,6 +146,12 @@ def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> 
     References
     ----------
     Chambouleyron et al. 2024, section 4.1.
+
+    Examples
+    --------
+    >>> import zwfs
+    >>> round(zwfs.dynamic_range([0.1, 0.2, 0.3], [0.001, 0.004, 0.03]), 3)
+    0.237
     """
     rms, error = _check.real_array("rms", rms), _check.real_array("error", error)
     if rms.ndim != 1 or rms.shape != error.shape or not rms.size:

@@ -25,6 +25,12 @@ def noll_to_nm(j: int) -> tuple[int, int]:
     References
     ----------
     Noll 1976, J. Opt. Soc. Am. 66, 207, table I.
+
+    Examples
+    --------
+    >>> import zwfs
+    >>> zwfs.noll_to_nm(4)  # focus
+    (2, 0)
     """
     j = _check.integer("j", j, 1)
     n = (isqrt(8 * j - 7) - 1) // 2
@@ -64,6 +70,14 @@ def zernike_basis(
     References
     ----------
     Noll 1976, J. Opt. Soc. Am. 66, 207.
+
+    Examples
+    --------
+    >>> import zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> modes = zwfs.zernike_basis(pupil, 10)
+    >>> modes.shape, float(pupil.rms(modes[0]).round(6))
+    ((10, 32, 32), 1.0)
     """
     _check.instance("pupil", pupil, Pupil)
     n_modes = _check.integer("n_modes", n_modes, 1)
@@ -133,6 +147,14 @@ def power_law_screens(
     References
     ----------
     Chambouleyron et al. 2024, section 4.1; `eq-screens` of the book.
+
+    Examples
+    --------
+    >>> import zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> screens = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 50), rms=0.5, n_screens=3, seed=1)
+    >>> pupil.rms(screens).round(6)
+    array([0.5, 0.5, 0.5])
     """
     modes = _check.real_array("modes", modes)
     if modes.ndim != 3 or 0 in modes.shape:
@@ -163,6 +185,13 @@ def check_modes(pupil: Pupil, modes: ArrayLike) -> NDArray[np.float64]:
     ------
     TypeError, ValueError
         If the modes have no shape (n_modes, ny, nx), are not finite, or are more than the points of the pupil.
+
+    Examples
+    --------
+    >>> import zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> zwfs.modes.check_modes(pupil, zwfs.zernike_basis(pupil, 5)).shape
+    (5, 812)
     """
     modes = _check.real_array("modes", modes)
     if modes.ndim != 3 or not len(modes):

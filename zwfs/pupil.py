@@ -44,6 +44,15 @@ class Pupil(Immutable):
     ------
     TypeError, ValueError
         If an attribute is of the wrong kind, shape or range, or if the segments do not cover the points inside.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(100, central_obscuration=0.3)
+    >>> pupil.shape, round(float(np.mean(pupil.amplitude[pupil.inside] ** 2)), 6)
+    ((100, 100), 1.0)
+    >>> int(zwfs.Pupil.hexagonal(100, n_rings=3, gap=0.02, missing=[21]).segments.max())
+    37
     """
 
     amplitude: NDArray[np.float64]

@@ -97,6 +97,15 @@ class Bench:
     References
     ----------
     Chambouleyron et al. 2024, sections 2.3 and 5.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> bench = Bench(n_pixels=40)
+    >>> frames = bench.frames(np.zeros(bench.n_segments), seed=1)
+    >>> frames.shape, bench.n_segments
+    ((2, 52, 52), 36)
     """
 
     n_pixels: int = 136
@@ -316,6 +325,19 @@ class BenchModel(Immutable):
     scale : ndarray, shape (2, 1, 1)
         Counts of each image that make an intensity of 1.
     dark : ndarray, shape (2, ny', nx')
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs import PhaseShifted
+    >>> from zwfs.bench.model import Bench, BenchModel
+    >>> bench = Bench.ideal(n_pixels=40)
+    >>> model = BenchModel.from_images(bench, seed=1)
+    >>> pistons = np.linspace(-0.5, 0.5, bench.n_segments)
+    >>> frames = model.normalise(bench.frames(pistons, seed=2))
+    >>> found = model.pistons(PhaseShifted(model.shifted)(frames).phase)
+    >>> float(np.std(found - pistons)) < 0.05
+    True
     """
 
     shifted: ZernikeSensor
@@ -417,6 +439,12 @@ def segment_screens(
     References
     ----------
     Chambouleyron et al. 2024, section 5.2.
+
+    Examples
+    --------
+    >>> from zwfs.bench.model import Bench, segment_screens
+    >>> segment_screens(Bench(n_pixels=40), rms=0.5, n_screens=3, seed=1).shape
+    (3, 36)
     """
     _check.instance("bench", bench, Bench)
     if bench.n_segments < 2:

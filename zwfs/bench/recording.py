@@ -57,6 +57,17 @@ def write_bench(
         If astropy is missing.
     TypeError, ValueError
         If a value is of the wrong kind or out of range, or the folder holds another file of the same name.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     paths = write_bench(folder, Bench(n_pixels=40), seed=1)
+    ...
+    >>> sorted(paths)
+    ['bad_pixels', 'dark', 'frame', 'pupils']
     """
     fits_module()
     _check.instance("bench", bench, Bench)
@@ -110,6 +121,26 @@ def bench_error(bench: Bench, commanded: ArrayLike, phase: MeasuredPhase) -> flo
     bench : Bench
     commanded : array_like, shape (n_segments,), radian
     phase : MeasuredPhase
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import bench_error, write_bench
+    >>> from zwfs.frames.files import read_all
+    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.registration import record
+    >>> bench = Bench(n_pixels=40)
+    >>> pistons = np.linspace(-0.5, 0.5, bench.n_segments)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, bench, pistons, seed=1)
+    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
+    >>> phase = reconstruct(reduce_frames(record(frames, clear_frames), optics))
+    >>> bench_error(bench, pistons, phase) < 0.2
+    True
     """
     _check.instance("bench", bench, Bench)
     _check.instance("phase", phase, MeasuredPhase)

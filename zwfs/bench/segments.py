@@ -10,7 +10,16 @@ from zwfs.metrics import without_piston
 
 
 def segment_pistons(phase: ArrayLike, segments: NDArray, numbers: NDArray) -> NDArray[np.float64]:
-    """Piston of each segment in a phase, see `BenchModel.pistons`: on a map of segment numbers (ny, nx)."""
+    """Piston of each segment in a phase, see `BenchModel.pistons`: on a map of segment numbers (ny, nx).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.segments import segment_pistons
+    >>> segments = np.array([[1, 1, 2, 2]])
+    >>> segment_pistons(0.1 * segments, segments, np.array([1, 2])).round(3)
+    array([0.1, 0.2])
+    """
     phase = _check.real_array("phase", phase)
     segments = _check.integer_array("segments", segments)
     if segments.ndim != 2:
@@ -46,6 +55,12 @@ def segment_residual(found: ArrayLike, commanded: ArrayLike) -> NDArray[np.float
     ------
     ValueError
         If there is no piston, or a value is not finite.
+
+    Examples
+    --------
+    >>> from zwfs.bench.segments import segment_residual
+    >>> segment_residual([0.1, 0.2, 0.3], [0.0, 0.1, 0.2]).round(6) + 0.0  # a common piston
+    array([0., 0., 0.])
     """
     found, commanded = _check.real_array("found", found), _check.real_array("commanded", commanded)
     shape = _check.broadcast(found=found, commanded=commanded)

@@ -34,6 +34,11 @@ def check_parameters(values: Mapping[str, Any], /, **limits: Any) -> None:
         If a value is of another type, or limits have none of these forms.
     ValueError
         If a value is out of range, or there is no value for a name.
+
+    Examples
+    --------
+    >>> from zwfs.companion.parameters import check_parameters
+    >>> check_parameters({"n_screens": 20, "rms": 0.5}, n_screens=(1, 1000), rms=(0.0, 4.0))
     """
     for name, limit in limits.items():
         if name not in values:

@@ -35,7 +35,14 @@ _LONGEST = 240  # bytes of a file name; a partial file has a few more, and most 
 
 
 class FileError(ValueError):
-    """A camera file is broken, too large, or holds no image; the message names the file."""
+    """A camera file is broken, too large, or holds no image; the message names the file.
+
+    Examples
+    --------
+    >>> from zwfs.frames.files import FileError
+    >>> issubclass(FileError, ValueError)
+    True
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +67,14 @@ class CameraFile:
     ------
     TypeError, ValueError
         If a value is of the wrong kind.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.frames.files import CameraFile
+    >>> file = CameraFile(np.ones((1, 8, 8)), "dark.fits", "", header={"EXPTIME": 0.5})
+    >>> file.keyword("EXPTIME")
+    0.5
     """
 
     images: NDArray[np.float64]
@@ -129,6 +144,18 @@ def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
         (ny, nx), (1, ny, nx) or (2, ny, nx).
     TypeError
         If an argument is of the wrong type, or the numbers of the file are not real.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.frames.files import read
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     np.save(f"{folder}/frame.npy", np.eye(16))
+    ...     file = read(f"{folder}/frame.npy")
+    ...
+    >>> file.name, file.images.shape
+    ('frame.npy', (1, 16, 16))
     """
     path = path_of("path", path)
     max_bytes = _check.integer("max_bytes", max_bytes, 1)
@@ -171,6 +198,23 @@ def read_all(
     frames, clear_frames : tuple of Image
     sources : list of CameraFile
         All files; the first is that of the first frame.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames.files import read_all
+    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.registration import record
+    >>> bench = Bench(n_pixels=40)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, bench, seed=1)
+    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> len(frames), len(clear_frames), frames[0].counts.shape
+    (1, 1, (52, 104))
     """
     names = "frame_files", "pupil_files", "dark_files", "bad_pixel_files"
     given = frame_files, pupil_files, dark_files, bad_pixel_files
@@ -211,6 +255,19 @@ def images(
     ValueError
         If the number of images or a shape is wrong, every pixel of an image or of its dark is bad, or the
         bad-pixel map marks all of them.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.frames.files import images, read
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     np.save(f"{folder}/frame.npy", np.eye(16))
+    ...     file = read(f"{folder}/frame.npy")
+    ...
+    >>> (image,) = images([file], saturation=2.0)
+    >>> image.counts.shape
+    (16, 16)
     """
     for argument, given in (("files", files), ("darks", darks), ("bad_pixels", bad_pixels)):
         _check.sequence(argument, given, CameraFile)
@@ -266,6 +323,16 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     TypeError, ValueError
         If `output` is one of the inputs, also under another name or as a hard link, is a file that `write_phase`
         did not write, is a folder, or cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from zwfs.frames.files import check_output
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = check_output(f"{folder}/phase.fits")
+    ...
+    >>> path.name
+    'phase.fits'
     """
     overwrite = _check.flag("overwrite", overwrite)
     sources = paths_of("inputs", inputs)
@@ -323,6 +390,27 @@ def write_phase(
         If astropy is missing.
     TypeError, ValueError
         If the wavelength is not above 0, or `check_output` refuses the file.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames.files import read_all, write_phase
+    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.registration import record
+    >>> bench = Bench(n_pixels=40)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, bench, seed=1)
+    ...     frames, clear_frames, sources = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
+    >>> measurement = reduce_frames(record(frames, clear_frames), optics)
+    >>> phase = reconstruct(measurement)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_phase(f"{folder}/phase.fits", phase, 635.0, sources)
+    ...
     """
     from zwfs import __version__
 

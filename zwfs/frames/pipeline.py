@@ -54,6 +54,13 @@ class Optics:
     ------
     TypeError, ValueError
         If a value is of the wrong kind or out of range, or the phase shifts are the same or one of them is 0.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.frames.pipeline import Optics
+    >>> bool(Optics(diameter=1.06, phase_shifts=(np.pi / 2, -np.pi / 2)).opposite)
+    True
     """
 
     diameter: float = 1.06
@@ -246,6 +253,25 @@ def reduce_frames(recording: Recording, optics: Optics, margin: int | None = Non
     ------
     TypeError, ValueError
         If a value is of the wrong kind or out of range, too much of the pupil is bad, or a clear frame is dark.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames.files import read_all
+    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.registration import record
+    >>> bench = Bench(n_pixels=40)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, bench, seed=1)
+    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
+    >>> measurement = reduce_frames(record(frames, clear_frames), optics)
+    >>> measurement.pupil.shape == measurement.good.shape
+    True
     """
     _check.instance("recording", recording, Recording)
     _check.instance("optics", optics, Optics)
@@ -313,6 +339,16 @@ def measured_pupil(
     ------
     TypeError, ValueError
         If a value is of the wrong kind or shape, or an image is dark.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.frames.pipeline import measured_pupil
+    >>> y, x = np.mgrid[:32, :32]
+    >>> disc = np.hypot(x - 15.5, y - 15.5) <= 16
+    >>> pupil, scale = measured_pupil(np.stack([900 * disc, 1100 * disc]), disc, n_pixels=32)
+    >>> pupil.shape, scale.round(6)
+    ((32, 32), array([ 900., 1100.]))
     """
     images = _check.real_map("images", images, 3)
     if len(images) != 2:
@@ -349,6 +385,26 @@ def reconstruct(measurement: Measurement, n_iterations: int = 25) -> MeasuredPha
     ------
     TypeError, ValueError
         If a value is of the wrong kind or out of range.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames.files import read_all
+    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.registration import record
+    >>> bench = Bench(n_pixels=40)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, bench, seed=1)
+    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
+    >>> measurement = reduce_frames(record(frames, clear_frames), optics)
+    >>> phase = reconstruct(measurement)
+    >>> phase.converged, phase.phase.shape == measurement.pupil.shape
+    (True, True)
     """
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     sensor = model(measurement)
@@ -372,7 +428,27 @@ def reconstruct(measurement: Measurement, n_iterations: int = 25) -> MeasuredPha
 
 
 def model(measurement: Measurement) -> ZernikeSensor:
-    """Sensor with the measured pupil, on the detector of the frames."""
+    """Sensor with the measured pupil, on the detector of the frames.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames.files import read_all
+    >>> from zwfs.frames.pipeline import Optics, model, reduce_frames
+    >>> from zwfs.frames.registration import record
+    >>> bench = Bench(n_pixels=40)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, bench, seed=1)
+    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
+    >>> measurement = reduce_frames(record(frames, clear_frames), optics)
+    >>> model(measurement).n_masks
+    2
+    """
     _check.instance("measurement", measurement, Measurement)
     masks = (Dimple(measurement.optics.diameter, shift) for shift in measurement.optics.phase_shifts)
     extent = 1 + 2 * measurement.margin / measurement.recording.diameter
@@ -386,6 +462,25 @@ def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[n
     reconstruction sees one frame, and the model predicts the other one from its phase.
 
     Parameters, as for `reconstruct`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames.files import read_all
+    >>> from zwfs.frames.pipeline import Optics, predict_other, reduce_frames
+    >>> from zwfs.frames.registration import record
+    >>> bench = Bench(n_pixels=40)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, bench, seed=1)
+    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
+    >>> measurement = reduce_frames(record(frames, clear_frames), optics)
+    >>> predict_other(measurement).shape
+    (2,)
     """
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     both = model(measurement)
@@ -429,6 +524,25 @@ def fit(
     TypeError, ValueError
         If a value is of the wrong kind, a name is unknown or there twice, or `optics` begins out of the range of a
         fit.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames.files import read_all
+    >>> from zwfs.frames.pipeline import Optics, fit
+    >>> from zwfs.frames.registration import record
+    >>> bench = Bench(n_pixels=40)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, bench, seed=1)
+    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
+    >>> recording, fitted = fit(record(frames, clear_frames), optics, ["scale"], n_steps=2)
+    >>> bool(0.8 < fitted.scale < 1.2)
+    True
     """
     _check.instance("recording", recording, Recording)
     _check_fit("names", names, optics)
@@ -562,6 +676,23 @@ def steps(
     ------
     TypeError, ValueError
         As `record`, `reduce_frames` and `fit` do.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames.files import read_all
+    >>> from zwfs.frames.pipeline import Optics, steps
+    >>> bench = Bench(n_pixels=40)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, bench, seed=1)
+    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
+    >>> [step.name for step in steps(frames, clear_frames, optics, fitted=())][-1]
+    'balance of the flux'
     """
     _check_fit("fitted", fitted, optics)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)

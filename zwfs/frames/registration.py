@@ -50,6 +50,13 @@ class Image:
     ------
     TypeError, ValueError
         If a value is of the wrong kind or shape, or a count is not finite or beyond 1e38.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.frames.registration import Image
+    >>> Image(np.ones((8, 8)), bad=np.zeros((8, 8), bool)).name
+    'image'
     """
 
     counts: NDArray[np.float64]
@@ -73,6 +80,12 @@ class Circle:
     ------
     TypeError, ValueError
         If a number is not finite, or the diameter is not above 0.
+
+    Examples
+    --------
+    >>> from zwfs.frames.registration import Circle
+    >>> Circle(row=20.0, column=20.5, diameter=31.0)
+    Circle(row=20.0, column=20.5, diameter=31.0)
     """
 
     row: float
@@ -138,6 +151,24 @@ class Recording:
     placement : Placement
         Of the second clear frame with respect to the first. Its rotation and magnification are also those of the
         second frame.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames.files import read_all
+    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.registration import record
+    >>> bench = Bench(n_pixels=40)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, bench, seed=1)
+    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> recording = record(frames, clear_frames)
+    >>> recording.frames_on_grid()[0].shape == (2, recording.n_pixels, recording.n_pixels)
+    True
     """
 
     frames: tuple[Image, Image]
@@ -265,6 +296,24 @@ def record(
     ------
     TypeError, ValueError
         If the number of images is wrong, the pupils are not found, cut, or of different size.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames.files import read_all
+    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.registration import record
+    >>> bench = Bench(n_pixels=40)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, bench, seed=1)
+    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> recording = record(frames, clear_frames)
+    >>> round(recording.diameter)
+    40
     """
     diameter = None if pupil_diameter is None else _check.number("pupil_diameter", pupil_diameter, _SMALLEST)
     exposure = _check.number("exposure", exposure, 0, open_low=True)
@@ -317,6 +366,16 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
     ------
     TypeError, ValueError
         If there is no light, another number of discs, or one that is cut by the edge.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.frames.registration import Image, find_pupils
+    >>> y, x = np.mgrid[:48, :48]
+    >>> disc = (np.hypot(x - 23, y - 24) <= 16).astype(float)
+    >>> (circle,) = find_pupils(Image(disc, bad=disc < 0), n_pupils=1)
+    >>> round(circle.row), round(circle.column), round(circle.diameter)
+    (24, 23, 32)
     """
     _check.instance("image", image, Image)
     n_pupils = _check.integer("n_pupils", n_pupils, 1)
@@ -383,6 +442,15 @@ def register(
     ------
     TypeError, ValueError
         If a value is of the wrong kind or shape, or no shift of up to 6 pixels makes a maximum.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.frames.registration import register
+    >>> y, x = np.mgrid[:48, :48]
+    >>> spot, moved = (np.exp(-np.hypot(x - 20 - d, y - 25) ** 2 / 50) for d in (0.0, 1.5))
+    >>> register(moved, spot, np.hypot(x - 24, y - 24) < 18).round(2) + 0.0
+    array([0. , 1.5])
     """
     image, reference = _check.real_map("image", image, 2), _check.real_map("reference", reference, 2)
     _check.trailing_shape("reference", reference, image.shape, "the shape of image")
@@ -487,7 +555,15 @@ class _Details:
 
 
 def nearest_good(image: NDArray, good: NDArray) -> NDArray:
-    """An image with every pixel that is not good replaced by the nearest good one, of which there must be one."""
+    """An image with every pixel that is not good replaced by the nearest good one, of which there must be one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.frames.registration import nearest_good
+    >>> nearest_good(np.array([[1.0, np.nan, 3.0, 3.0]]), np.array([[True, False, False, True]]))
+    array([[1., 1., 3., 3.]])
+    """
     image = _check.real_array("image", image)
     good = _check.flag_map("good", good, image.shape, some=True)
     if good.all():
@@ -497,14 +573,30 @@ def nearest_good(image: NDArray, good: NDArray) -> NDArray:
 
 
 def radius(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[np.float64]:
-    """Distance of every pixel from the centre (row, column), in pixels."""
+    """Distance of every pixel from the centre (row, column), in pixels.
+
+    Examples
+    --------
+    >>> from zwfs.frames.registration import radius
+    >>> radius((1, 3), center=(0, 1))
+    array([[1., 0., 1.]])
+    """
     shape, center = _check.pair("shape", shape, _check.integer, 1), _check.pair("center", center, _check.number)
     rows, columns = (np.arange(n) - middle for n, middle in zip(shape, center, strict=True))
     return np.hypot(rows[:, np.newaxis], columns)
 
 
 def correlations(first: NDArray, second: NDArray) -> NDArray[np.float64]:
-    """Correlation coefficient of each row, (k, n) and (k, n) to (k,); 0 where one is constant."""
+    """Correlation coefficient of each row, (k, n) and (k, n) to (k,); 0 where one is constant.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.frames.registration import correlations
+    >>> a = np.array([[1.0, 2.0, 4.0]])
+    >>> correlations(a, 2 * a + 1).round(6)
+    array([1.])
+    """
     first, second = _check.real_map("first", first), _check.real_map("second", second)
     _check.trailing_shape("second", second, first.shape, "the shape of first")
     first, second = (rows - rows.mean(axis=1, keepdims=True) for rows in (first, second))

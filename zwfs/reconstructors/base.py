@@ -61,6 +61,18 @@ class Reconstruction:
         Of the reconstructor.
     frames : ndarray, shape (..., n_masks, ny, nx)
         Copy of the reconstructed frames, cut to the grid of the pupil.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
+    >>> truth = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 20), 0.05, 1, seed=1)[0]
+    >>> estimate = zwfs.PhaseShifted(sensor)(sensor.measure(truth))
+    >>> estimate
+    Reconstruction(phase (32, 32), 1 of 1 converged)
+    >>> estimate.n_iterations.shape, float(estimate.residual) < 1e-5
+    ((), True)
     """
 
     phase: NDArray[np.floating]
@@ -106,6 +118,14 @@ class Settings(Immutable):
         Amplitude A_in of the incoming field, 0 outside the pupil.
     light : float
         Sum of the squared amplitude over the pupil: the light of a clear frame.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
+    >>> zwfs.PhaseShifted(sensor, n_iterations=3).settings.n_iterations
+    3
     """
 
     sensor: ZernikeSensor
@@ -219,6 +239,12 @@ class Reconstructor(Immutable, ABC):
     ------
     TypeError, ValueError
         If an argument is of the wrong kind, shape or range, or the sensor has too few or too many masks.
+
+    Examples
+    --------
+    >>> import zwfs
+    >>> issubclass(zwfs.PhaseShifted, zwfs.reconstructors.base.Reconstructor)
+    True
     """
 
     n_masks: ClassVar[tuple[int, float]] = (1, math.inf)
@@ -341,6 +367,19 @@ class ClosedForm(Reconstructor):
     sensor : ZernikeSensor
     amplitude : array_like, shape (ny, nx), optional
         Measured amplitude A_in in the pupil; that of the sensor's pupil if left out.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
+    >>> class Mean(zwfs.reconstructors.base.ClosedForm):
+    ...     def invert(self, frames):
+    ...         excess = frames[:, 0] - frames[:, 0].mean(axis=(-2, -1), keepdims=True)
+    ...         return excess / 2 * self.sensor.pupil.inside, 0
+    ...
+    >>> Mean(sensor)(sensor.measure(np.zeros(pupil.shape))).phase.shape
+    (32, 32)
     """
 
     iterative = False
@@ -396,6 +435,12 @@ class FixedPoint(Reconstructor):
     receive the `constants` of the arrays' kind: those of `Propagator`, unless the subclass computes others.
 
     Parameters are those of `Reconstructor`; with a tolerance of 0 all iterations are done.
+
+    Examples
+    --------
+    >>> import zwfs
+    >>> issubclass(zwfs.Arcsine, zwfs.reconstructors.base.FixedPoint)
+    True
     """
 
     any_library = True
@@ -478,7 +523,16 @@ def _small(change: NDArray, limit: float, xp: Any) -> NDArray[np.bool_]:
 
 
 def pieces(frames: NDArray, kind: Kind, size: int | None = None) -> Iterator[slice]:
-    """Slices of frames (n, ...) that are handled together."""
+    """Slices of frames (n, ...) that are handled together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs._arrays import Kind
+    >>> from zwfs.reconstructors.base import pieces
+    >>> list(pieces(np.ones((5, 1, 8, 8)), Kind.numpy(), size=2))
+    [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
+    """
     if size is None:
         chunk = _CHUNK if kind.on_host else _CHUNK_ELSEWHERE
         size = max(1, chunk // prod(frames.shape[1:]))
@@ -504,6 +558,15 @@ def check_frames(
     ------
     TypeError, ValueError
         If the frames are of the wrong shape, complex, not finite, negative or dark.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
+    >>> frames, batch = zwfs.reconstructors.base.check_frames(sensor, np.ones((5, 1, 32, 32)))
+    >>> frames.shape, batch
+    ((5, 1, 32, 32), (5,))
     """
     frames = _check.real_any(name, frames)
     shape = (sensor.n_masks, *sensor.detector_shape)
@@ -549,6 +612,15 @@ def check_phase(
     ------
     TypeError, ValueError
         If the phase is complex, of the wrong shape, not finite inside the pupil, or on another device.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> from zwfs._arrays import Kind
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
+    >>> zwfs.reconstructors.base.check_phase("start", 0 * pupil.amplitude, sensor, (2,), Kind.numpy()).shape
+    (2, 32, 32)
     """
     shape = sensor.pupil.shape
     maps, own_batch = pupil_maps(name, phase, sensor)
@@ -572,6 +644,12 @@ def load(path: str) -> type:
     ------
     TypeError, ValueError
         If the path has another form, the module or class is missing, or objects of the class cannot be called.
+
+    Examples
+    --------
+    >>> from zwfs.reconstructors.base import load
+    >>> load("zwfs.reconstructors.linear:Linear").__name__
+    'Linear'
     """
     if not isinstance(path, str):
         raise TypeError(f"path = {_check.shown(path)}: expected a string 'module:Class'")

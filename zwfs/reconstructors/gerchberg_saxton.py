@@ -49,6 +49,16 @@ class GerchbergSaxton(FixedPoint):
     ----------
     Chambouleyron et al. 2024, section 3.2, equations (14) and (15); Gerchberg & Saxton 1972;
     `eq-unmeasured` of the book for "model".
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
+    >>> truth = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 20), 0.05, 1, seed=1)[0]
+    >>> estimate = zwfs.GerchbergSaxton(sensor, unmeasured="model", n_iterations=100)(sensor.measure(truth))
+    >>> float(zwfs.reconstruction_error(pupil, estimate.phase, truth)) < 0.01
+    True
     """
 
     def __init__(

@@ -42,6 +42,16 @@ class GradientDescent(Reconstructor):
     References
     ----------
     Chambouleyron et al. 2024, section 3.3, equation (16); `eq-gradient` of the book.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
+    >>> truth = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 20), 0.05, 1, seed=1)[0]
+    >>> estimate = zwfs.GradientDescent(sensor)(sensor.measure(truth))
+    >>> float(zwfs.reconstruction_error(pupil, estimate.phase, truth)) < 1e-3
+    True
     """
 
     def __init__(

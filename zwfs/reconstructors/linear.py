@@ -55,6 +55,16 @@ class Linear(ClosedForm):
     References
     ----------
     Chambouleyron et al. 2024, section 4.1 ("interaction matrix approach").
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
+    >>> truth = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 20), 0.05, 1, seed=1)[0]
+    >>> estimate = zwfs.Linear(sensor, zwfs.zernike_basis(pupil, 20))(sensor.measure(truth))
+    >>> float(zwfs.reconstruction_error(pupil, estimate.phase, truth)) < 0.01
+    True
     """
 
     def __init__(

@@ -59,6 +59,16 @@ class LikelihoodReconstruction(Reconstruction):
         Number of starts that were tried.
     estimator : Estimator
         Unknowns and noise, from which `sigma` is computed.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
+    >>> truth = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 20), 0.05, 1, seed=1)[0]
+    >>> estimate = zwfs.MaximumLikelihood(sensor)(sensor.measure(truth))
+    >>> bool(estimate.consistent), estimate.sigma.shape
+    (True, (32, 32))
     """
 
     amplitude: NDArray[np.floating] | None

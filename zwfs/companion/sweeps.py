@@ -21,7 +21,6 @@ import os
 import pickle
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, nullcontext
 from contextvars import ContextVar
 from functools import cache
 from importlib.util import find_spec
@@ -35,6 +34,7 @@ import scipy
 
 from zwfs import _check
 from zwfs._files import write_file
+from zwfs._threads import one_thread
 
 STORE = "ZWFS_SWEEPS"
 PROGRESS = "ZWFS_PROGRESS"
@@ -108,7 +108,7 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
 
 def _results(waiting: list[tuple[int, Any]], shared: tuple[Any, ...], name: str) -> Iterator[tuple[int, Any]]:
     """Yield number and result of each task as it finishes."""
-    with _one_thread():
+    with one_thread():
         if len(waiting) < 2 or not find_spec("joblib"):
             yield from (_work(shared, index, (value,), name, _PROCESS) for index, value in waiting)
         else:
@@ -136,15 +136,6 @@ def _parallel_results(
     yield from pool(calls)
 
 
-def _one_thread() -> AbstractContextManager[Any]:
-    """Limit BLAS to one thread if threadpoolctl is installed."""
-    if not find_spec("threadpoolctl"):
-        return nullcontext()
-    from threadpoolctl import threadpool_limits
-
-    return threadpool_limits(1)
-
-
 def _work(shared: Any, index: int, value: tuple[Any], name: str, caller: str) -> tuple[int, Any]:
     """Run one task, in the caller's process or in a worker."""
     if caller != _PROCESS:
@@ -165,7 +156,7 @@ def _work(shared: Any, index: int, value: tuple[Any], name: str, caller: str) ->
 @cache
 def _limit_threads() -> None:
     """Limit BLAS to one thread in this worker process from now on."""
-    _one_thread()
+    one_thread()
 
 
 def _report_progress(name: str, done: int, total: int) -> None:

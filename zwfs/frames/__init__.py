@@ -1,10 +1,24 @@
 """Camera files to phase.
 
-`files` reads and writes, `registration` locates the pupils, `pipeline` reconstructs, `verdict` judges the result,
-and `order` finds which image has which phase shift.
+`files` reads and writes, `registration` locates the pupils, `pipeline` reconstructs a pair of frames, and `order`
+finds which image has which phase shift. `calibration` keeps the constants of a bench, and `telemetry` reconstructs
+files of any length with them. The command is `python -m zwfs.frames`.
 """
 
-from zwfs.frames import files, order, pipeline, registration
+from zwfs.frames import calibration, files, order, pipeline, registration, telemetry
+from zwfs.frames.calibration import Calibration, calibrate
 from zwfs.frames.order import order_of_images
+from zwfs.frames.telemetry import reconstruct
 
-__all__ = ["files", "order", "order_of_images", "pipeline", "registration"]
+__all__ = [
+    "Calibration",
+    "calibrate",
+    "calibration",
+    "files",
+    "order",
+    "order_of_images",
+    "pipeline",
+    "reconstruct",
+    "registration",
+    "telemetry",
+]

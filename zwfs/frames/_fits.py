@@ -30,7 +30,7 @@ def fits_content(*units: tuple[NDArray, str, Sequence[tuple[str, Any, str]]]) ->
     for image, name, cards in units:
         made.append(fits.ImageHDU(image, name=name) if made else fits.PrimaryHDU(image))
         for key, value, comment in cards:
-            made[-1].header[key] = (_card_value(value), comment) if comment else _card_value(value)
+            made[-1].header[key] = (card_value(value), comment) if comment else card_value(value)
     stream = io.BytesIO()
     made.writeto(stream)
     return stream.getvalue()
@@ -47,7 +47,7 @@ def has_card(path: Path, card: bytes) -> bool:
     return header.startswith(FIRST_BYTES) and any(one.startswith(card) for one in cards)
 
 
-def _card_value(value: Any) -> Any:
+def card_value(value: Any) -> Any:
     """Value for a FITS header: floats with nine digits, which hide rounding errors, no NaN, and ASCII strings."""
     if isinstance(value, str):
         return value if value.isascii() and value.isprintable() else ascii(value)[1:-1]

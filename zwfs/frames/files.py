@@ -120,8 +120,8 @@ class CameraFile:
 def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
     """Read a FITS or NPY file, plain or packed with gzip; the first bytes decide which.
 
-    Integers, big-endian numbers, BZERO and BSCALE all become float64. Of a FITS file the first image is taken.
-    Header cards that do not follow the standard are left out.
+    Integers, big-endian numbers, BZERO and BSCALE all become float64. Two images in two extensions of a FITS file
+    are read as an array of two images. Header cards that do not follow the standard are left out.
 
     Parameters
     ----------
@@ -512,7 +512,8 @@ def _accept(name: str, shape: tuple[int, ...], max_bytes: int) -> None:
         )
 
 
-def _read_npy(content: io.BytesIO, name: str, max_bytes: int) -> NDArray:
+def _npy_header(content: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether columns come first, and type of the numbers of an NPY file; its data follow."""
     version = np.lib.format.read_magic(content)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:
@@ -520,27 +521,38 @@ def _read_npy(content: io.BytesIO, name: str, max_bytes: int) -> NDArray:
     shape, columns_first, dtype = readers[version](content)
     if dtype.hasobject:
         raise ValueError("it holds objects of Python: expected numbers")
+    return shape, columns_first, dtype
+
+
+def _read_npy(content: io.BytesIO, name: str, max_bytes: int) -> NDArray:
+    shape, columns_first, dtype = _npy_header(content)
     _accept(name, shape, max_bytes)
     data = np.frombuffer(content.read(math.prod(shape) * dtype.itemsize), dtype)
     return data.reshape(shape, order="F" if columns_first else "C")
 
 
 def _read_fits(fits: ModuleType, content: io.BytesIO, name: str, max_bytes: int) -> tuple[NDArray, dict[str, Any]]:
-    def cards(header: Any) -> dict[str, Any]:
-        values: dict[str, Any] = {}
-        for card in header.cards:
-            with suppress(fits.VerifyError):
-                values.setdefault(card.keyword, card.value)
-        return values
-
     # Odd header cards are no reason to refuse a file; missing pixels are.
     warnings.filterwarnings("error", message=".*truncated.*")
     with fits.open(content, memmap=False) as units:
-        for unit in units:
-            if unit.is_image and unit.shape:
-                _accept(name, unit.shape, max_bytes)
-                return unit.data, cards(units[0].header) | cards(unit.header)
-    raise FileError(f"{name}: a FITS file without an image")
+        images = [unit for unit in units if unit.is_image and unit.shape]
+        if not images:
+            raise FileError(f"{name}: a FITS file without an image")
+        shapes = [unit.shape for unit in images]
+        if len(images) > 2 or shapes[0] != shapes[-1] or (len(images) == 2 and len(shapes[0]) != 2):
+            raise FileError(f"{name}: images of shapes {shapes}: expected one, or two of the same (ny, nx)")
+        _accept(name, shapes[0] if len(images) == 1 else (2, *shapes[0]), max_bytes)
+        data = images[0].data if len(images) == 1 else np.stack([unit.data for unit in images])
+        return data, _header_cards(units[0].header) | _header_cards(images[0].header)
+
+
+def _header_cards(header: Any) -> dict[str, Any]:
+    """Values of a FITS header by keyword; cards that do not follow the standard are left out."""
+    values: dict[str, Any] = {}
+    for card in header.cards:
+        with suppress(fits_module().VerifyError):
+            values.setdefault(card.keyword, card.value)
+    return values
 
 
 def _usable(counts: NDArray) -> NDArray[np.bool_]:

@@ -410,7 +410,7 @@ def reconstruct(measurement: Measurement, n_iterations: int = 25) -> MeasuredPha
     sensor = model(measurement)
     iterate = PhaseShifted(sensor, n_iterations=n_iterations, tolerance=1e-4)
     measured = _scaled(measurement)
-    frames = np.maximum(_unmix(measured, measurement), 0)
+    frames = np.maximum(ideal_frames(measurement), 0)
     inner = (..., *sensor.window)
     bad = measurement.pupil.inside & ~measurement.good
     for _ in range(2 if bad.any() else 1):
@@ -455,6 +455,12 @@ def model(measurement: Measurement) -> ZernikeSensor:
     return ZernikeSensor(measurement.pupil, *masks, extent=extent, tolerance=1e-6)
 
 
+def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:
+    """Frames of a measurement as those of an ideal sensor: its optics are undone. They may be negative."""
+    _check.instance("measurement", measurement, Measurement)
+    return _unmix(_scaled(measurement), measurement)
+
+
 def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[np.float64]:
     """Correlation of each frame with the one that the other frame alone predicts, (2,).
 
@@ -484,7 +490,7 @@ def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[n
     """
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     both = model(measurement)
-    frames = np.maximum(_unmix(_scaled(measurement), measurement), 0)
+    frames = np.maximum(ideal_frames(measurement), 0)
     good, window = measurement.good, measurement.window
     predicted = np.empty((2, np.count_nonzero(good)))
     for seen in (0, 1):

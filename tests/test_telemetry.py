@@ -1,0 +1,709 @@
+"""A calibrated bench and its telemetry: phases, flags, what is refused, and that no frame is lost."""
+
+import gzip
+import io
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zwfs import Dimple, Pupil, ZernikeSensor, power_law_screens, zernike_basis
+from zwfs.frames import Calibration, calibrate, pipeline, reconstruct
+from zwfs.frames.__main__ import main
+from zwfs.frames._stack import Stack
+from zwfs.frames.calibration import Flag
+from zwfs.frames.files import FileError
+from zwfs.frames.pipeline import Optics, reduce_frames
+from zwfs.frames.registration import Image, nearest_good, record
+
+D, MARGIN, PHOTONS, DARK = 40, 8, 1e4, 500
+OPTICS = {"DIMPLE": 1.06, "THETA1": np.pi / 2, "THETA2": -np.pi / 2, "BUNIT": "adu"}
+
+
+class Bench:
+    """Camera images of a simulated bench: both pupils on one image, 16 bit, photon noise."""
+
+    pupil = Pupil.hexagonal(D, 2, 0.03, (9,), 0.8)
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1 + 2 * MARGIN / D)
+    screens = power_law_screens(zernike_basis(Pupil.circular(D), 60), 0.4, 12, seed=3)
+
+    def __init__(self):
+        self.rng = np.random.default_rng(1)
+        self.flat = self.expose(self.sensor.measure(np.zeros(self.pupil.shape)))
+        self.clear = self.expose(np.stack([np.pad(self.pupil.amplitude**2, MARGIN)] * 2))
+        self.frames = self.expose(self.sensor.measure(self.screens))
+
+    def expose(self, frames):
+        image = np.concatenate(list(np.moveaxis(frames, -3, 0)), axis=-1)
+        return np.rint(self.rng.poisson(image * PHOTONS) + DARK).astype(np.uint16)
+
+    def image(self, counts, bad=None):
+        bad = np.zeros(counts.shape, bool) if bad is None else bad
+        return Image(nearest_good(counts - float(DARK), ~bad), bad, "camera.fits")
+
+    def recording(self, bad=None):
+        return record([self.image(self.flat, bad)], [self.image(self.clear)])
+
+    @property
+    def dark(self):
+        return np.full(self.flat.shape, float(DARK))
+
+    def calibration(self, optics=Optics(), bad=None, **settings):  # noqa: B008
+        measurement = reduce_frames(self.recording(bad), optics)
+        return Calibration.of(measurement, self.dark, saturation=65535, **settings)
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Bench()
+
+
+@pytest.fixture(scope="module")
+def calibration(bench):
+    return bench.calibration(bunit="adu")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch, bench, calibration):
+    """A folder with a cube, its calibration, and the files from which a calibration is made."""
+    monkeypatch.chdir(tmp_path)
+    header = fits.Header(OPTICS)
+    fits.PrimaryHDU(bench.frames, fits.Header(OPTICS | {"EXPTIME": 0.01})).writeto("cube.fits")
+    for name, image in (("frame", bench.flat), ("pupils", bench.clear), ("dark", bench.dark.astype(np.uint16))):
+        fits.PrimaryHDU(image, header).writeto(f"{name}.fits")
+    calibration.save("bench.npz")
+    return tmp_path
+
+
+def rms(difference):
+    difference = difference[np.isfinite(difference)]
+    return np.sqrt(np.mean((difference - difference.mean()) ** 2))
+
+
+# The calibrated object
+
+
+@pytest.mark.parametrize("optics", [Optics(), Optics(leakage=0.05, unmasked=0.1, background=0.02, scale=1.03)])
+@pytest.mark.parametrize("n_bad", [0, 30])
+def test_phase_is_that_of_the_pipeline(bench, optics, n_bad):
+    bad = np.zeros(bench.flat.shape, bool)
+    bad.flat[np.random.default_rng(2).choice(bad.size, n_bad, replace=False)] = True
+    calibration = bench.calibration(optics, bad, tolerance=1e-5, n_iterations=50)
+    found = calibration(np.where(bad, 0, bench.frames[:3]))
+    recording = bench.recording(bad)
+    for phase, counts in zip(found.phase, bench.frames, strict=False):
+        one = replace(recording, frames=(bench.image(counts, bad),) * 2)
+        expected = pipeline.reconstruct(reduce_frames(one, optics), n_iterations=60).phase
+        assert rms(phase - expected) < 5e-4
+        np.testing.assert_array_equal(np.isnan(phase), np.isnan(expected))
+    assert not found.flags.any()
+
+
+def test_phase_is_that_which_was_put_in(bench, calibration):
+    corner = calibration.places[0, :, 0, 0] - MARGIN
+    grid = np.rint(corner).astype(int)
+    window = slice(-grid[0], D - grid[0]), slice(-grid[1], D - grid[1])
+    for phase, screen in zip(calibration(bench.frames).phase, bench.screens, strict=True):
+        assert rms(phase[window] - screen) < 0.05
+
+
+def test_two_images_of_an_exposure_are_the_halves_of_one(bench, calibration):
+    half = bench.flat.shape[1] // 2
+    parts = [bench.image(image[:, side]) for image in (bench.flat, bench.clear)
+             for side in (slice(None, half), slice(half, None))]  # fmt: skip
+    two = Calibration.of(reduce_frames(record(parts[:2], parts[2:]), Optics()), bench.dark[:, :half])
+    frames = np.stack([bench.frames[..., :half], bench.frames[..., half:]], axis=1)
+    assert two.n_images == 2
+    assert rms(two(frames).phase - calibration(bench.frames).phase) < 0.01
+
+
+def test_calibration_is_kept_in_a_file_and_in_a_pickle(tmp_path, bench, calibration):
+    calibration.save(tmp_path / "a.npz")
+    loaded = Calibration.load(tmp_path / "a.npz")
+    loaded.save(tmp_path / "b.npz")
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    expected = calibration(bench.frames[:2]).phase
+    for other in (loaded, pickle.loads(pickle.dumps(calibration))):
+        np.testing.assert_array_equal(other(bench.frames[:2]).phase, expected)
+        assert other.sha256 == calibration.sha256
+        with pytest.raises(ValueError, match="read-only"):
+            other.amplitude[0, 0] = 1
+        with pytest.raises(AttributeError):
+            other.n_images = 2
+
+
+def rewritten(path, **changes):
+    """The same file with other values."""
+    import json
+
+    with np.load(path) as file:
+        arrays = dict(file)
+    values = json.loads(str(arrays["values"])) | changes
+    np.savez(path, **(arrays | {"values": np.array(json.dumps(values))}))
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda path: path.write_bytes(b""), "bench.npz: expected a calibration"),
+        (lambda path: path.write_bytes(pickle.dumps([1, 2])), "bench.npz: expected a calibration"),
+        (lambda path: path.write_bytes(path.read_bytes()[:5000]), "bench.npz: expected a calibration"),
+        (lambda path: np.savez(path, x=np.ones(3)), "bench.npz: expected a calibration"),
+        (lambda path: rewritten(path, format=99), "bench.npz: a calibration of format 99: expected format 1"),
+        (lambda path: rewritten(path, n_iterations="many"), "bench.npz: a broken calibration: n_iterations"),
+        (lambda path: rewritten(path, surplus=1), "bench.npz: a broken calibration"),
+        (lambda path: np.savez(path, values=np.array([{}]), places=0), "bench.npz: a broken calibration: Object"),
+    ],
+)
+def test_file_that_is_no_calibration_is_named(folder, break_it, message):
+    break_it(folder / "bench.npz")
+    with pytest.raises(FileError, match=message):
+        reconstruct("cube.fits", "bench.npz", "phase.fits")
+    assert not list(folder.glob("*phase*"))
+
+
+def test_calibration_replaces_no_other_file(folder, calibration):
+    with pytest.raises(ValueError, match="exists and is not a calibration"):
+        calibration.save("cube.fits")
+    calibration.save("bench.npz")
+
+
+@pytest.mark.parametrize(
+    ("counts", "error", "message"),
+    [
+        (np.zeros((3, 10, 10)), ValueError, r"counts has shape \(3, 10, 10\): expected \(\.\.\., 56, 112\)"),
+        (np.zeros((56, 112), complex), TypeError, "counts has dtype complex128"),
+        (np.zeros((56, 112), object), TypeError, "counts has dtype object"),
+    ],
+)
+def test_wrong_counts_are_named(calibration, counts, error, message):
+    with pytest.raises(error, match=message):
+        calibration(counts)
+
+
+# Flags
+
+
+def pixel(calibration, point, image=0):
+    """Row and column on the camera of a point of the grid."""
+    return tuple(np.rint(calibration.places[image, :, *point]).astype(int))
+
+
+def test_frames_with_faults_are_flagged_and_the_others_stay(bench, calibration):
+    frames = np.stack([bench.frames[0].astype(float)] * 8)
+    inside = np.argwhere(calibration.good)[200]
+    frames[1] = DARK  # the shutter is closed
+    frames[2] = np.nan
+    frames[3][pixel(calibration, inside)] = 65535
+    frames[4][pixel(calibration, inside, 1)] = np.nan
+    frames[5, 0, 0] = np.inf  # outside the pupil
+    frames[6, :, : frames.shape[2] // 2] = DARK  # an image is lost
+    frames[7, 20:40] = -np.inf
+    found = calibration(frames)
+    bad, saturated = Flag.BAD_PIXELS, Flag.BAD_PIXELS | Flag.SATURATED
+    assert found.flags.tolist() == [0, 1, 3, saturated, bad, 0, 1, 3]
+    lost = found.flags & Flag.LOST > 0
+    assert np.isnan(found.phase[lost]).all()
+    good = found.phase[0]
+    for index, image in ((3, 0), (4, 1)):
+        assert found.n_bad[index] == 1
+        touched = np.argwhere(np.isnan(found.phase[index]) & np.isfinite(good))
+        assert 1 <= len(touched) <= 4
+        assert np.abs(touched - inside).max() <= 1, image
+        assert rms(found.phase[index] - good) < 0.02
+    assert found.n_saturated.tolist() == [0, 0, 0, 1, 0, 0, 0, 0]
+    np.testing.assert_array_equal(found.phase[5], good)
+
+
+def test_pixels_bad_in_the_calibration_raise_no_flag(bench):
+    bad = np.zeros(bench.flat.shape, bool)
+    bad[25, 30] = True
+    calibration = bench.calibration(bad=bad)
+    frames = np.where(bad, np.nan, bench.frames[:2])
+    found = calibration(frames)
+    assert not found.flags.any()
+    assert rms(found.phase - bench.calibration()(bench.frames[:2]).phase) < 0.02
+
+
+def test_iteration_that_does_not_end_is_flagged(bench, calibration):
+    assert (replace(calibration, n_iterations=1)(bench.frames).flags == Flag.NOT_CONVERGED).all()
+    assert not replace(calibration, n_iterations=3, tolerance=0.0)(bench.frames).flags.any()
+
+
+def test_pair_that_does_not_belong_together_is_inconsistent(folder, bench, calibration):
+    cube, half = bench.frames.copy(), bench.frames.shape[2] // 2
+    cube[5, :, half:] = cube[6, :, half:]
+    np.save("wrong.npy", cube)
+    found = reconstruct("wrong.npy", calibration, "phase.fits")
+    assert found.counts["INCONSISTENT"] == found.n_flagged == 1
+    table = fits.getdata("phase.fits", "FRAMES")
+    assert np.flatnonzero(table["FLAGS"]).tolist() == [5]
+    assert table["RESIDUAL"][5] > found.largest_residual > np.delete(table["RESIDUAL"], 5).max()
+    strict = reconstruct("wrong.npy", calibration, "phase.fits", largest_residual=0.0)
+    assert strict.counts["INCONSISTENT"] == 12
+
+
+# Modes and errors
+
+
+def test_coefficients_are_those_that_were_put_in(bench, calibration):
+    modes = zernike_basis(calibration.sensor.pupil, 9)
+    matrix = calibration.modal_matrix(modes)
+    put = np.random.default_rng(5).normal(0, 0.15, (4, 9)).astype(np.float32)
+    filled = np.tensordot(put, np.nan_to_num(modes), 1)
+    found = calibration(bench.frames[:4])
+    np.testing.assert_allclose(calibration.coefficients(replace(found, filled=filled), matrix), put, atol=1e-4)
+
+
+def test_sigma_is_the_scatter_of_many_exposures(bench, calibration):
+    frames = np.stack([bench.expose(bench.sensor.measure(bench.screens[0])) for _ in range(60)])
+    modes = zernike_basis(calibration.sensor.pupil, 9)
+    found = calibration(frames)
+    photons = float(calibration.unit.mean())
+    one = replace(found, **{name: value[:1] for name, value in vars(found).items()})
+    scatter = calibration.coefficients(found, calibration.modal_matrix(modes)).std(axis=0)
+    sigma = calibration.sigma(one, photons, modes=modes)[0]
+    assert 0.8 < np.median(scatter / sigma) < 1.4
+    points = calibration.sigma(one, photons)[0]
+    np.testing.assert_array_equal(np.isnan(points), np.isnan(found.phase[0]))
+    phase = found.phase - np.nanmean(found.phase, axis=(1, 2), keepdims=True)
+    assert 0.7 < np.nanmedian(phase.std(axis=0) / points) < 1.2  # resampling smooths the noise a little
+    noisy = calibration.sigma(one, photons, read_noise=100.0)
+    assert (noisy[0] > points)[np.isfinite(points)].all()
+
+
+# Telemetry
+
+
+def test_file_holds_phases_table_and_keywords(folder, bench, calibration):
+    found = reconstruct("cube.fits", "bench.npz", "out/phase.fits", keywords=["exptime", "BUNIT"], photons=1e4)
+    assert (found.n_frames, found.n_flagged, found.n_resumed) == (12, 0, 0)
+    expected = calibration(bench.frames)
+    with fits.open("out/phase.fits") as units:
+        units.verify("exception")
+        assert [unit.name for unit in units] == ["PRIMARY", "SIGMA", "FRAMES", "FILES"]
+        np.testing.assert_array_equal(units[0].data, expected.phase)
+        header, table = units[0].header, units["FRAMES"].data
+        assert (header["BUNIT"], header["NFRAMES"], header["NFLAGGED"], header["EXPTIME"]) == ("rad", 12, 0, 0.01)
+        assert header["CALIBSHA"] == calibration.sha256
+        assert header["RESLIMIT"] == pytest.approx(found.largest_residual, rel=1e-6)
+        np.testing.assert_array_equal(table["INDEX"], np.arange(12))
+        np.testing.assert_array_equal(table["RESIDUAL"], expected.residual)
+        assert set(table["BUNIT"]) == {"adu"}
+        assert (table["EXPTIME"] == 0.01).all()
+        sigma = units["SIGMA"].data
+        np.testing.assert_allclose(table["SIGMA"], np.sqrt(np.nanmean(sigma**2, axis=(1, 2))), rtol=1e-5)
+        assert units["FILES"].data["NAME"].tolist() == ["cube.fits"]
+    assert os.listdir("out") == ["phase.fits"]
+
+
+def test_coefficients_go_to_the_table(folder, bench, calibration):
+    reconstruct("cube.fits", calibration, "modes.fits", modes=6, photons=1e4, read_noise=2)
+    matrix = calibration.modal_matrix(zernike_basis(calibration.sensor.pupil, 6))
+    expected = calibration.coefficients(calibration(bench.frames), matrix)
+    with fits.open("modes.fits") as units:
+        units.verify("exception")
+        assert units[0].data is None
+        np.testing.assert_allclose(units["FRAMES"].data["COEFFS"], expected, rtol=1e-6)
+        assert (units["FRAMES"].data["SIGCOEFF"] > 0).all()
+    reconstruct("cube.fits", calibration, "both.fits", modes=6, phases=True)
+    assert fits.getdata("both.fits").shape[0] == 12
+
+
+def test_frames_between_bad_ones_stay_and_none_is_left_out(folder, bench, calibration):
+    cube = bench.frames.astype(np.float32)
+    cube[[3, 7]] = np.nan
+    np.save("cube.npy", cube)
+    found = reconstruct("cube.npy", calibration, "phase.fits", modes=3, phases=True, saturation=65535)
+    assert found.counts["LOST"] == 2
+    with fits.open("phase.fits") as units:
+        phase, table = units[0].data, units["FRAMES"].data
+        assert np.flatnonzero(table["FLAGS"]).tolist() == [3, 7]
+        assert np.isnan(phase[[3, 7]]).all()
+        assert np.isnan(table["COEFFS"][[3, 7]]).all()
+        others = np.delete(np.arange(12), [3, 7])
+        np.testing.assert_array_equal(phase[others], calibration(bench.frames).phase[others])
+
+
+def small_chunks(monkeypatch, exposures=5):
+    """Chunks of a few exposures, as those of large cameras."""
+    from zwfs.frames import telemetry
+
+    monkeypatch.setattr(telemetry, "_CHUNK", 56 * 112 * 2 * exposures)
+
+
+class Stopped(Exception):  # noqa: N818
+    pass
+
+
+def stop_after(n):
+    def progress(done, total):
+        if n <= done < total:
+            raise Stopped
+
+    return progress
+
+
+@pytest.mark.parametrize("spoil", [False, True])
+def test_interrupted_run_goes_on_to_the_same_bytes(folder, monkeypatch, spoil):
+    small_chunks(monkeypatch)
+    reconstruct("cube.fits", "bench.npz", "whole.fits", n_workers=3)
+    with pytest.raises(Stopped):
+        reconstruct("cube.fits", "bench.npz", "phase.fits", n_workers=1, progress=stop_after(5))
+    assert not Path("phase.fits").exists()
+    part = Path(".phase.fits.part")
+    if spoil:  # as a crash of the machine may
+        content = bytearray(part.read_bytes())
+        content[2880 * 2 : 2880 * 4] = bytes(2 * 2880)
+        part.write_bytes(content)
+        with Path(".phase.fits.journal").open("a") as file:
+            file.write("10 1")
+    found = reconstruct("cube.fits", "bench.npz", "phase.fits", n_workers=2)
+    assert (found.n_resumed > 0) != spoil
+    assert Path("phase.fits").read_bytes() == Path("whole.fits").read_bytes()
+    assert not list(folder.glob(".*"))
+
+
+def test_part_of_another_run_is_not_taken_over(folder, monkeypatch, bench):
+    small_chunks(monkeypatch)
+    with pytest.raises(Stopped):
+        reconstruct("cube.fits", "bench.npz", "phase.fits", progress=stop_after(5))
+    with pytest.raises(ValueError, match=r"\.phase\.fits\.part is part of a run with other frames"):
+        reconstruct("cube.fits", "bench.npz", "phase.fits", photons=100)
+    fits.PrimaryHDU(bench.frames[::-1], fits.Header(OPTICS)).writeto("cube.fits", overwrite=True)
+    with pytest.raises(ValueError, match="part of a run with other frames"):
+        reconstruct("cube.fits", "bench.npz", "phase.fits")
+    assert reconstruct("cube.fits", "bench.npz", "phase.fits", restart=True).n_resumed == 0
+    assert not list(folder.glob(".*"))
+
+
+def test_failure_before_the_first_chunk_keeps_nothing(folder, monkeypatch):
+    def fail(*_, **__):
+        raise Stopped
+
+    monkeypatch.setattr(Calibration, "__call__", fail)
+    with pytest.raises(Stopped):
+        reconstruct("cube.fits", Calibration.load("bench.npz"), "phase.fits")
+    assert not list(folder.glob("*phase.fits*"))
+    assert not list(folder.glob(".*"))
+
+
+def test_memory_does_not_grow_with_the_cube(folder, monkeypatch, bench, calibration):
+    small_chunks(monkeypatch, 12)
+
+    def peak(n):
+        np.save("long.npy", np.concatenate([bench.frames] * n))
+        tracemalloc.start()
+        reconstruct("long.npy", calibration, "long.fits", n_workers=1)
+        used = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return used
+
+    peak(2)
+    assert peak(16) < 1.2 * peak(4)
+
+
+# Kinds of files
+
+
+def kinds_of_files(bench):
+    """Names and writers of the same 12 exposures."""
+    frames = bench.frames
+    header = fits.Header(OPTICS)
+    scaled = fits.PrimaryHDU(((frames.astype(int) - 1000) // 1).astype(np.int32))
+    scaled.header["BSCALE"], scaled.header["BZERO"] = 1.0, 1000.0
+
+    def by_hand(path):  # astropy would scale the numbers
+        content = io.BytesIO()
+        plain = fits.PrimaryHDU((frames.astype(np.int32) - 1000) * 2)
+        plain.header["BLANK"] = -(2**31)
+        plain.writeto(content)
+        text = content.getvalue()
+        end = text.index(b"END" + b" " * 77)
+        cards = b"".join(
+            card.ljust(80) for card in (b"BSCALE  =                  0.5", b"BZERO   =               1000.0")
+        )
+        path.write_bytes(text[:end] + cards + text[end : 2880 - len(cards)] + text[2880:])
+
+    return {
+        "cube.fits": lambda path: fits.PrimaryHDU(frames, header).writeto(path),
+        "cube.npy": lambda path: np.save(path, frames),
+        "single.npy": lambda path: np.save(path, frames[:, np.newaxis]),
+        "float.npy": lambda path: np.save(path, frames.astype(">f8")),
+        "packed.fits": lambda path: path.write_bytes(gzip.compress(_bytes(fits.PrimaryHDU(frames, header)))),
+        "scaled.fits": by_hand,
+        "extensions.fits": lambda path: fits.HDUList(
+            [fits.PrimaryHDU(), fits.ImageHDU(frames[:7]), fits.ImageHDU(frames[7]), fits.ImageHDU(frames[8:])]
+        ).writeto(path),
+    }
+
+
+def _bytes(unit):
+    stream = io.BytesIO()
+    unit.writeto(stream)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "name", ["cube.npy", "single.npy", "float.npy", "packed.fits", "scaled.fits", "extensions.fits"]
+)
+def test_every_kind_of_file_holds_the_same_frames(folder, bench, calibration, name):
+    kinds_of_files(bench)[name](folder / name)
+    stack = Stack([folder / name], [], 1, calibration.shape)
+    assert stack.n == 12
+    np.testing.assert_array_equal(stack.read(0, 12)[:, 0], bench.frames)
+    assert reconstruct(name, calibration, "phase.fits").n_flagged == 0
+    np.testing.assert_array_equal(fits.getdata("phase.fits"), calibration(bench.frames).phase)
+
+
+def test_list_of_files_is_one_cube(folder, bench, calibration):
+    names = [f"frame{index:02}.fits" for index in range(12)]
+    for index, name in enumerate(names):
+        fits.PrimaryHDU(bench.frames[index], fits.Header({"DATE-OBS": f"2026-11-22T10:00:{index:02}"})).writeto(
+            name
+        )
+    reconstruct(names, calibration, "phase.fits", keywords=["DATE-OBS"])
+    table = fits.getdata("phase.fits", "FRAMES")
+    assert table["FILE"].tolist() == list(range(12))
+    assert table["DATE-OBS"][11] == "2026-11-22T10:00:11"
+    assert fits.getdata("phase.fits", "FILES")["NAME"][3] == "frame03.fits"
+    np.testing.assert_array_equal(fits.getdata("phase.fits"), calibration(bench.frames).phase)
+    one = reconstruct(names[0], calibration, "one.fits")
+    assert (one.n_frames, one.counts["INCONSISTENT"]) == (1, 0)
+
+
+@pytest.mark.parametrize("kind", ["pairs", "extensions", "second files", "single pair", "single extensions"])
+def test_second_image_is_read_wherever_it_is(tmp_path, kind):
+    pairs = np.arange(5 * 2 * 6 * 7, dtype=np.int16).reshape(5, 2, 6, 7)
+    path, other = tmp_path / "a.fits", tmp_path / "b.npy"
+    images, second, expected = [fits.PrimaryHDU(pairs)], [], pairs
+    if kind.startswith("single"):
+        pairs = expected = pairs[:1]
+    if kind == "extensions":
+        images = [fits.PrimaryHDU(), fits.ImageHDU(pairs[:, 0]), fits.ImageHDU(pairs[:, 1])]
+    elif kind == "second files":
+        images = [fits.PrimaryHDU(pairs[:, 0])]
+        np.save(other, pairs[:, 1].astype(">i2"))
+        second = [other]
+    elif kind == "single pair":
+        images = [fits.PrimaryHDU(pairs[0])]
+    elif kind == "single extensions":
+        images = [fits.PrimaryHDU(pairs[0, 0]), fits.ImageHDU(pairs[0, 1])]
+    fits.HDUList(images).writeto(path)
+    stack = Stack([path], second, 2, (6, 7))
+    np.testing.assert_array_equal(stack.read(0, stack.n), expected)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(1, 6), min_size=1, max_size=5), st.data())
+def test_any_range_of_any_files_is_read(tmp_path_factory, lengths, data):
+    folder = tmp_path_factory.mktemp("stack")
+    whole = np.arange(sum(lengths) * 6, dtype=np.int32).reshape(-1, 2, 3)
+    ends = np.cumsum(lengths)
+    paths = [folder / f"{index}.npy" for index in range(len(lengths))]
+    for path, stop, n in zip(paths, ends, lengths, strict=True):
+        np.save(path, whole[stop - n : stop])
+    stack = Stack(paths, [], 1, (2, 3))
+    first = data.draw(st.integers(0, stack.n - 1))
+    stop = data.draw(st.integers(first + 1, stack.n))
+    np.testing.assert_array_equal(stack.read(first, stop)[:, 0], whole[first:stop])
+    assert sum(end - start for _, start, end in stack.places(first, stop)) == stop - first
+
+
+# Bad input
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data(), st.sampled_from(["a.fits", "a.npy", "a.fits.gz"]))
+def test_file_that_is_cut_or_spoiled_is_refused_by_name(tmp_path_factory, data, name):
+    path = tmp_path_factory.mktemp("cut") / name
+    content = _bytes(fits.PrimaryHDU(np.arange(60, dtype=np.int16).reshape(5, 3, 4)))[: 2880 + 120]
+    if name.endswith("npy"):
+        stream = io.BytesIO()
+        np.save(stream, np.arange(60.0).reshape(5, 3, 4))
+        content = stream.getvalue()
+    elif name.endswith("gz"):
+        content = gzip.compress(content, mtime=0)
+    if data.draw(st.booleans()):
+        content = content[: data.draw(st.integers(0, len(content) - 1))]
+    else:
+        place = data.draw(st.integers(0, min(len(content), 900) - 1))
+        content = content[:place] + data.draw(st.binary(min_size=1, max_size=9)) + content[place:]
+    path.write_bytes(content)
+    try:
+        stack = Stack([path], [], 1, (3, 4))
+        assert stack.read(0, stack.n).shape == (stack.n, 1, 3, 4)
+    except FileError as error:
+        assert name in str(error)  # noqa: PT017
+
+
+BAD = {
+    "empty": (lambda path, f: path.write_bytes(b""), "bad.fits: the file is empty"),
+    "text": (lambda path, f: path.write_text("not a picture"), "bad.fits: its first bytes are those of neither"),
+    "pickle": (
+        lambda path, f: path.write_bytes(pickle.dumps(f)),
+        "bad.fits: its first bytes are those of neither",
+    ),
+    "objects": (
+        lambda path, f: _save(path, np.array([{}, None])),
+        "bad.fits: a broken NPY file: it holds objects",
+    ),
+    "complex": (lambda path, f: _save(path, f.astype(complex)), "bad.fits: its numbers are complex128"),
+    "columns first": (lambda path, f: _save(path, np.asfortranarray(f)), "bad.fits: its columns come first"),
+    "shape": (
+        lambda path, f: _save(path, f[:, 1:]),
+        r"bad.fits: its shape is \(12, 55, 112\): expected images of",
+    ),
+    "no frame": (lambda path, f: _save(path, f[:0]), r"bad.fits: its shape is \(0, 56, 112\)"),
+    "five axes": (lambda path, f: _save(path, f[None, None]), r"bad.fits: its shape is \(1, 1, 12, 56, 112\)"),
+    "truncated NPY": (lambda path, f: _cut(path, f, "npy"), r"bad.fits: truncated: it ends in exposure 6 of 12"),
+    "truncated FITS": (lambda path, f: _cut(path, f, "fits"), r"bad.fits: truncated: it ends in exposure 6 of 12"),
+    "no image": (lambda path, f: fits.PrimaryHDU().writeto(path), "bad.fits: a FITS file without an image"),
+    "unit": (
+        lambda path, f: fits.PrimaryHDU(f, fits.Header({"BUNIT": "electron"})).writeto(path),
+        "bad.fits: BUNIT = 'electron': expected 'adu', that of the calibration",
+    ),
+    "compressed": (
+        lambda path, f: fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(f)]).writeto(path),
+        "bad.fits: extension 1 is compressed: expected plain images; use funpack",
+    ),
+}
+
+
+def _save(path, array):
+    with path.open("wb") as file:
+        np.save(file, array)
+
+
+def _cut(path, frames, kind):
+    if kind == "npy":
+        _save(path, frames)
+    else:
+        fits.PrimaryHDU(frames).writeto(path)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) - frames.nbytes // 2 + (100 if kind == "npy" else 0)])
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_file_is_refused_by_name_before_any_work(folder, bench, kind):
+    write, message = BAD[kind]
+    write(folder / "bad.fits", bench.frames)
+    with pytest.raises(FileError, match=message):
+        reconstruct(["cube.fits", "bad.fits"], "bench.npz", "phase.fits")
+    assert not Path("phase.fits").exists()
+    assert not list(folder.glob(".*"))
+
+
+def test_missing_keyword_is_named_with_its_file(folder, bench):
+    with pytest.raises(FileError, match=r"cube.fits: its header has no DATE-OBS"):
+        reconstruct("cube.fits", "bench.npz", "phase.fits", keywords=["DATE-OBS"])
+    np.save("bare.npy", bench.flat)
+    with pytest.raises(ValueError, match=r"bare.npy: its header has no THETA1"):
+        calibrate(["bare.npy"], ["pupils.fits"])
+
+
+@pytest.mark.parametrize(
+    ("names", "settings", "error", "message"),
+    [
+        ([], {}, ValueError, "frames is empty"),
+        (["none.fits"], {}, FileNotFoundError, "none.fits: no such file"),
+        (["cube.fits"], {"second_frames": "cube.fits"}, ValueError, "second_files holds 1 files: expected none"),
+        (["cube.fits"], {"phases": False}, ValueError, "phases = False: expected True, or modes"),
+        (["cube.fits"], {"read_noise": 3.0}, ValueError, "read_noise = 3: expected a number of photons"),
+        (["cube.fits"], {"photons": -1}, ValueError, "photons = -1"),
+        (["cube.fits"], {"n_workers": 0}, ValueError, "n_workers = 0"),
+        (["cube.fits"], {"keywords": ["FLAGS"]}, FileError, "cube.fits: its header has no FLAGS"),
+        (["cube.fits"], {"modes": np.ones((2, 5, 5))}, ValueError, "modes has shape"),
+        (["cube.fits"], {"modes": 0}, ValueError, "= 0: expected"),
+        (["cube.fits"], {"saturation": "high"}, TypeError, "saturation = 'high'"),
+    ],
+)
+def test_wrong_argument_is_named(folder, names, settings, error, message):
+    with pytest.raises(error, match=message):
+        reconstruct(names, "bench.npz", "phase.fits", **settings)
+    assert not list(folder.glob("*phase.fits*"))
+
+
+def test_output_is_no_input(folder):
+    before = Path("cube.fits").read_bytes()
+    with pytest.raises(ValueError, match=r"output = 'cube.fits' is the input"):
+        reconstruct("cube.fits", "bench.npz", "cube.fits", overwrite=True)
+    assert Path("cube.fits").read_bytes() == before
+
+
+def test_files_of_two_kinds_are_refused(folder, bench):
+    np.save("other.npy", bench.frames.astype(float))
+    with pytest.raises(FileError, match=r"other.npy: its type, BSCALE, BZERO and BLANK are \('<f8'"):
+        reconstruct(["cube.fits", "other.npy"], "bench.npz", "phase.fits")
+
+
+# The command
+
+
+def command(*arguments, cwd, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "zwfs.frames", *arguments], cwd=cwd, capture_output=True, text=True, **options
+    )
+
+
+def test_command_calibrates_and_reconstructs(folder, capsys):
+    files = ["--frames", "frame.fits", "--pupils", "pupils.fits", "--dark", "dark.fits"]
+    assert main(["calibrate", "new.npz", *files]) == 0
+    assert main(["reconstruct", "cube.fits", "--calibration", "new.npz", "-o", "phase.fits", "--strict"]) == 0
+    assert "12 frames, 0 flagged" in capsys.readouterr().out
+    assert main(["reconstruct", "none.fits", "--calibration", "new.npz", "-o", "phase.fits"]) == 1
+    assert "error: none.fits: no such file" in capsys.readouterr().err
+    arguments = ["--calibration", "new.npz", "-o", "strict.fits", "--strict", "--largest-residual", "0"]
+    assert main(["reconstruct", "cube.fits", *arguments]) == 3
+    assert "12 flagged: 12 inconsistent" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stopped:
+        main(["reconstruct"])
+    assert stopped.value.code == 2
+
+
+def test_command_explains_itself(tmp_path):
+    for arguments in ((), ("calibrate",), ("reconstruct",)):
+        shown = command(*arguments, "--help", cwd=tmp_path)
+        assert shown.returncode == 0
+        assert "exit codes:" in shown.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_command_that_is_stopped_goes_on_to_the_same_bytes(folder, bench, calibration, number):
+    np.save("long.npy", np.concatenate([bench.frames] * 100))
+    arguments = ["reconstruct", "long.npy", "--calibration", "bench.npz", "-o"]
+    reconstruct("long.npy", calibration, "whole.fits", saturation=65535)
+    process = subprocess.Popen([sys.executable, "-m", "zwfs.frames", *arguments, "phase.fits"], cwd=folder)
+    journal = Path(".phase.fits.journal")
+    while process.poll() is None and not (journal.exists() and len(journal.read_text().splitlines()) > 2):
+        pass
+    process.send_signal(number)
+    expected = -signal.SIGKILL if number == signal.SIGKILL else 130
+    assert process.wait() == expected
+    assert not Path("phase.fits").exists()
+    assert command(*arguments, "phase.fits", cwd=folder).returncode == 0
+    assert Path("phase.fits").read_bytes() == Path("whole.fits").read_bytes()
+
+
+def test_full_disk_is_one_message_and_keeps_nothing(folder):
+    shown = subprocess.run(
+        ["bash", "-c", f"ulimit -f 40; exec '{sys.executable}' -m zwfs.frames reconstruct cube.fits "
+         "--calibration bench.npz -o phase.fits"],
+        cwd=folder, capture_output=True, text=True,
+    )  # fmt: skip
+    assert shown.returncode == 1
+    assert "phase.fits' cannot be written (File too large): expected" in shown.stderr
+    assert "Traceback" not in shown.stderr
+    assert not list(folder.glob("*phase.fits*"))
+    assert not list(folder.glob(".*"))

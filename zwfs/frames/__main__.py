@@ -1,0 +1,150 @@
+"""The command `python -m zwfs.frames`: calibrate a bench, and reconstruct camera files of any length."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from zwfs.frames.calibration import calibrate
+from zwfs.frames.telemetry import reconstruct
+
+_EXIT_CODES = """exit codes:
+  0    complete
+  1    a file or a value was refused, or there is no space; the message says which
+  2    the command line is wrong
+  3    complete, but frames are flagged (only with --strict)
+  130  interrupted; the same command goes on from there"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Those of the command line if left out.
+    """
+    options = vars(_parser().parse_args(arguments))
+    run = options.pop("run")
+    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return run(**options)
+    except KeyboardInterrupt:
+        print("\ninterrupted: the same command goes on from there", file=sys.stderr)
+        return 130
+    except (OSError, ValueError, TypeError, ImportError) as error:
+        message = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        name = f"{error.filename}: " if isinstance(error, OSError) and error.filename else ""
+        print(f"error: {name}{message}", file=sys.stderr)
+        return 1
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m zwfs.frames",
+        description="Camera files of a phase-shifted Zernike wavefront sensor to phases.",
+        epilog=_EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(required=True, metavar="command")
+    shared: dict[str, Any] = {
+        "epilog": _EXIT_CODES,
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+    }
+    one = commands.add_parser("calibrate", help="make a calibration from frames and clear frames", **shared)
+    one.set_defaults(run=_calibrate)
+    one.add_argument("output", help="calibration to write, NPZ")
+    one.add_argument(
+        "--frames", nargs="+", required=True, metavar="FILE", help="a frame, or one file for each image"
+    )
+    one.add_argument("--pupils", nargs="+", required=True, metavar="FILE", help="clear frames, likewise")
+    one.add_argument("--dark", nargs="+", default=(), metavar="FILE", help="counts without light")
+    one.add_argument("--bad-pixels", nargs="+", default=(), metavar="FILE", help="maps, other than 0 where bad")
+    one.add_argument("--diameter", type=float, default=0.0, help="of the dimple in lambda/D; default: DIMPLE")
+    one.add_argument(
+        "--phase-shifts", type=float, nargs=2, default=(), metavar="RAD", help="default: THETA1, THETA2"
+    )
+    one.add_argument("--pupil-centers", type=float, nargs=4, metavar="PIXEL", help="row, column of both pupils")
+    one.add_argument("--pupil-diameter", type=float, metavar="PIXEL", help="default: from the clear frames")
+    one.add_argument("--no-registration", dest="subpixel", action="store_false", help="trust the outlines")
+    one.add_argument("--exposure", type=float, default=1.0, help="of the frames over that of the clear frames")
+    one.add_argument("--saturation", type=float, metavar="COUNTS", help="default: SATURATE, or the type's largest")
+    one.add_argument(
+        "--fit", nargs="+", default=(), metavar="NAME", help="parameters to fit, such as registration"
+    )
+    one.add_argument("--iterations", type=int, default=25, metavar="N", help="at most; default: 25")
+    one.add_argument("--tolerance", type=float, default=1e-3, metavar="RAD", help="that ends them; default: 1e-3")
+    two = commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared)
+    two.set_defaults(run=_reconstruct)
+    two.add_argument("frames", nargs="+", help="FITS or NPY files with frames")
+    two.add_argument("--calibration", required=True, metavar="FILE", help="that `calibrate` wrote")
+    two.add_argument("--output", "-o", required=True, metavar="FILE", help="FITS file to write")
+    two.add_argument("--second", nargs="+", default=(), metavar="FILE", help="files with the second images")
+    two.add_argument("--modes", type=int, metavar="N", help="write coefficients of N Zernike modes, not phases")
+    two.add_argument("--phases", action="store_true", default=None, help="write phases, too")
+    two.add_argument("--photons", type=float, help="per pixel at an intensity of 1: write standard errors")
+    two.add_argument("--read-noise", type=float, default=0.0, metavar="ELECTRONS", help="rms per pixel")
+    two.add_argument("--keywords", nargs="+", default=(), metavar="KEY", help="of the headers, for the table")
+    two.add_argument("--saturation", type=float, metavar="COUNTS", help="default: that of the calibration")
+    two.add_argument("--largest-residual", type=float, metavar="RMS", help="of a consistent frame")
+    two.add_argument("--workers", type=int, metavar="N", help="threads; default: one for each core")
+    two.add_argument("--restart", action="store_true", help="drop the part of an interrupted run")
+    two.add_argument("--overwrite", action="store_true", help="replace any file")
+    two.add_argument("--strict", action="store_true", help="exit with 3 if frames are flagged")
+    two.add_argument("--quiet", action="store_true", help="no progress bar and no summary")
+    return parser
+
+
+def _calibrate(
+    output: str, frames: Sequence[str], pupils: Sequence[str], dark: Sequence[str], bad_pixels: Sequence[str],
+    diameter: float, phase_shifts: Sequence[float], pupil_centers: Sequence[float] | None,
+    pupil_diameter: float | None, subpixel: bool, exposure: float, saturation: float | None, fit: Sequence[str],
+    iterations: int, tolerance: float,
+) -> int:  # fmt: skip
+    centers = None if pupil_centers is None else [pupil_centers[:2], pupil_centers[2:]]
+    found = calibrate(
+        frames, pupils, dark, bad_pixels, diameter=diameter, phase_shifts=phase_shifts, saturation=saturation,
+        fitted=fit, n_iterations=iterations, tolerance=tolerance, pupil_centers=centers,
+        pupil_diameter=pupil_diameter, subpixel=subpixel, exposure=exposure,
+    )  # fmt: skip
+    found.save(output)
+    print(
+        f"{output}: pupil {found.diameter:.2f} pixels wide, residual of the frames {found.residual:.3f}, "
+        f"counts at an intensity of 1: {found.unit[0]:.6g} and {found.unit[1]:.6g}"
+    )
+    return 0
+
+
+def _reconstruct(
+    frames: Sequence[str], calibration: str, output: str, second: Sequence[str], workers: int | None, strict: bool,
+    quiet: bool, **settings: Any,
+) -> int:  # fmt: skip
+    bar = _bar() if sys.stderr.isatty() and not quiet else None
+    found = reconstruct(
+        frames, calibration, output, second_frames=second, n_workers=workers, progress=bar, **settings
+    )
+    if not quiet:
+        flags = ", ".join(f"{n} {name.lower().replace('_', ' ')}" for name, n in found.counts.items() if n)
+        print(f"{Path(output)}: {found.n_frames} frames, {found.n_flagged} flagged{f': {flags}' if flags else ''}")
+    return 3 if strict and found.n_flagged else 0
+
+
+def _bar() -> Callable[[int, int], None]:
+    def show(done: int, total: int) -> None:
+        width = 40 * done // total
+        end = "\n" if done == total else ""
+        print(
+            f"\r[{'#' * width}{'.' * (40 - width)}] {done} of {total} frames", end=end, file=sys.stderr, flush=True
+        )
+
+    return show
+
+
+if __name__ == "__main__":
+    sys.exit(main())

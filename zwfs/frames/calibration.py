@@ -1,0 +1,779 @@
+"""A calibrated bench: what is computed once, so that camera images become phases in one call.
+
+`Calibration.of` takes it from a measurement with clear frames, `save` and `load` keep it in a file, and a call
+turns camera images into phases. It does the same as `reduce_frames` and `reconstruct` of `zwfs.frames.pipeline` in
+single precision, without making the model anew for each pair of frames.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from enum import IntFlag
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage, sparse
+
+from zwfs import _check
+from zwfs._arrays import Kind, read_only
+from zwfs._files import path_of, write_file
+from zwfs._information import Response
+from zwfs._likelihood import Estimator, Noise
+from zwfs._pickle import Immutable
+from zwfs._propagator import propagator, split
+from zwfs.frames.files import FileError, read_all
+from zwfs.frames.pipeline import Measurement, Optics, fit, ideal_frames, reduce_frames
+from zwfs.frames.registration import Recording, nearest_good, record
+from zwfs.masks import Dimple
+from zwfs.metrics import without_piston
+from zwfs.modes import check_modes
+from zwfs.pupil import Pupil
+from zwfs.reconstructors import PhaseShifted
+from zwfs.sensor import ZernikeSensor
+
+FORMAT = 1  # of the file; another number is refused
+_NAME = "zwfs calibration"
+_REACH = 12  # pixels around the pupil that its splines need: farther ones weigh less than 2e-7
+_NEGLIGIBLE = 1e-10  # in a spline filter: smaller numbers only slow the product down
+_TOUCHED = 0.01  # weight of a bad pixel from which on a point is bad, as in `Recording`
+_MOST_BAD = 0.2  # of the points of the pupil, as in `reduce_frames`: a frame with more is lost
+_DIM = 0.1  # of the light of the calibration: a frame with less is lost
+_PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
+
+
+class Flag(IntFlag):
+    """What is wrong with a frame; flags add up.
+
+    Attributes
+    ----------
+    LOST
+        The frame has less than a tenth of the light of the calibration, or more than a fifth of the pupil is bad.
+        Its phase is NaN.
+    BAD_PIXELS
+        Pixels are NaN, infinite or saturated that are good in the calibration.
+    SATURATED
+        Some of these are saturated.
+    INCONSISTENT
+        No phase explains the frame: its residual exceeds the limit of the call.
+    NOT_CONVERGED
+        The iteration used all its steps.
+    """
+
+    LOST = 1
+    BAD_PIXELS = 2
+    SATURATED = 4
+    INCONSISTENT = 8
+    NOT_CONVERGED = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Phases:
+    """Phases of camera images; `...` is the batch of the exposures.
+
+    Attributes
+    ----------
+    phase : ndarray of float32, shape (..., ny, nx), radian
+        In (-pi, pi], NaN outside the pupil, at bad points, and everywhere if the frame is lost.
+    filled : ndarray of float32, shape (..., ny, nx), radian
+        The same with bad points filled with the phase of the nearest good one, and 0 outside the pupil.
+    flux : ndarray of float32, shape (...)
+        Light of the pupil relative to the calibration, mean of the two images.
+    n_bad, n_saturated : ndarray of int, shape (...)
+        Pixels of both images that are bad here and good in the calibration, and those of them that are saturated.
+    residual : ndarray of float32, shape (...)
+        Rms difference of measured and modelled frames in the pupil; 1 = mean of a clear frame.
+    n_iterations : ndarray of int, shape (...)
+    flags : ndarray of int, shape (...)
+        Sum of `Flag`; 0 is a good frame.
+    """
+
+    phase: NDArray[np.float32]
+    filled: NDArray[np.float32]
+    flux: NDArray[np.float32]
+    n_bad: NDArray[np.int64]
+    n_saturated: NDArray[np.int64]
+    residual: NDArray[np.float32]
+    n_iterations: NDArray[np.int64]
+    flags: NDArray[np.int64]
+
+    @classmethod
+    def joined(cls, parts: list[Phases], batch: tuple[int, ...]) -> Phases:
+        """Join parts of a batch, with one axis each, and return them in its shape."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        whole = (column[0] if len(column) == 1 else np.concatenate(column) for column in columns)
+        return cls(*(array.reshape((*batch, *array.shape[1:])) for array in whole))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Immutable):
+    """Sensor and camera of a bench: called on camera images, it returns their phases.
+
+    Make one with `of`, `calibrate` or `load`. It cannot be changed. Its pickle is small, and the model of the
+    sensor is made at the first call of each process.
+
+    Attributes
+    ----------
+    amplitude : ndarray, shape (ny, nx)
+        Of the pupil, 0 outside.
+    diameter : float, pixels
+        Of the pupil, D.
+    center : (float, float), pixels
+        Row and column of the optical axis on the grid of the pupil.
+    optics : Optics
+    shape : (int, int)
+        Rows and columns of a camera image.
+    n_images : int
+        Camera images of an exposure: 1 with both pupils on it, or 2.
+    places : ndarray, shape (2, 2, ny, nx), pixels
+        Row and column at which each point of the grid of the pupil lies on the camera, for both frames.
+    dark, bad : ndarray of float32 and of bool, shape (n_images, ny_camera, nx_camera)
+        Counts without light, and pixels that are ignored in all frames.
+    good : ndarray of bool, shape (ny, nx)
+        Points of the pupil that are good.
+    background, unit : ndarray, shape (2,), counts
+        Stray light of the frames, and counts that make an intensity of 1.
+    weights, offset : ndarray, shapes (2, 2) and (2, ny, nx)
+        Frames of an ideal sensor are weights @ intensities + offset: scale, leakage, unmasked light.
+    balance : bool
+        Whether both frames are scaled to the same light.
+    light : ndarray, shape (2,)
+        Mean intensity of the calibration's frames in the pupil.
+    residual : float
+        Rms difference of the calibration's frames and their model.
+    saturation : float, counts
+        Pixels that reach it are saturated, the dark included.
+    bunit : str
+        Unit of the calibration's frames, BUNIT of their header; empty if unknown.
+    n_iterations : int
+        Largest number of iterations.
+    tolerance : float, radian
+        As for `PhaseShifted`: with 0, all iterations are done.
+    """
+
+    amplitude: NDArray[np.float64]
+    diameter: float
+    center: tuple[float, float]
+    optics: Optics
+    shape: tuple[int, int]
+    n_images: int
+    places: NDArray[np.float64]
+    dark: NDArray[np.float32]
+    bad: NDArray[np.bool_]
+    good: NDArray[np.bool_]
+    background: NDArray[np.float64]
+    unit: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    balance: bool
+    light: NDArray[np.float64]
+    residual: float
+    saturation: float
+    bunit: str = ""
+    n_iterations: int = 25
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        _check.integer("n_iterations", self.n_iterations, 1)
+        _check.number("tolerance", self.tolerance, 0)
+        if self.saturation != np.inf:
+            _check.number("saturation", self.saturation, 0, open_low=True)
+        for one in fields(self):
+            object.__setattr__(self, one.name, read_only(getattr(self, one.name)))
+
+    def __repr__(self) -> str:
+        return (
+            f"Calibration(pupil of {self.diameter:.2f} pixels, {self.n_images} camera image"
+            f"{'s' * (self.n_images > 1)} of {self.shape}, residual={self.residual:.3g})"
+        )
+
+    @classmethod
+    def of(
+        cls,
+        measurement: Measurement,
+        dark: ArrayLike | None = None,
+        *,
+        saturation: float = np.inf,
+        bunit: str = "",
+        n_iterations: int = 25,
+        tolerance: float = 1e-3,
+    ) -> Calibration:
+        """Calibration of a measurement; pixels that are bad on its frames are ignored from then on.
+
+        Parameters
+        ----------
+        measurement : Measurement
+            Of frames that are taken as those to come, and of clear frames.
+        dark : array_like, shape (ny, nx) or (n_images, ny, nx), counts, optional
+            That was subtracted from the frames of the measurement; none if left out.
+        saturation : float, counts
+        bunit : str
+        n_iterations : int
+        tolerance : float, radian
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a value is of the wrong kind, shape or range.
+        """
+        _check.instance("measurement", measurement, Measurement)
+        _check.instance("bunit", bunit, str)
+        recording, pupil = measurement.recording, measurement.pupil
+        images = recording.frames[: 1 if recording.frames[0] is recording.frames[1] else 2]
+        shape = images[0].counts.shape
+        if images[-1].counts.shape != shape:
+            raise ValueError(f"the frames have shapes {shape} and {images[-1].counts.shape}: expected the same")
+        counts, _ = recording.frames_on_grid()
+        unit, background = measurement.counts * recording.exposure, measurement.background[:2]
+        inner = (..., *measurement.window)
+        good = measurement.good
+        weights, offset = _undoing(measurement)
+        made = cls(
+            amplitude=pupil.amplitude,
+            diameter=pupil.n_pixels,
+            center=pupil.center,
+            optics=measurement.optics,
+            shape=shape,
+            n_images=len(images),
+            places=_places(recording, pupil.shape),
+            dark=_dark(dark, (len(images), *shape)),
+            bad=np.stack([image.bad for image in images]),
+            good=good,
+            background=background,
+            unit=unit,
+            weights=weights,
+            offset=offset[inner],
+            balance=bool(recording.balance and measurement.optics.opposite),
+            light=(counts[:, good].mean(axis=1) - background) / unit,
+            residual=0.0,
+            saturation=saturation,
+            bunit=bunit,
+            n_iterations=n_iterations,
+            tolerance=tolerance,
+        )
+        frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
+        *_, residual = made._solve(frames, np.broadcast_to(good, (1, *good.shape)), None, judge=True)
+        return replace(made, residual=float(residual[0]))
+
+    def save(self, path: str | Path) -> None:
+        """Write the calibration as NPZ, in one step; the same calibration gives the same bytes.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the path is none, or names a file that is not a calibration.
+        """
+        path = path_of("path", path)
+        if path.exists() and not (path.is_file() and _is_calibration(path)):
+            raise ValueError(f"path = {str(path)!r} exists and is not a calibration: expected a new name")
+        write_file(path, self._content)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Calibration:
+        """Read a calibration that `save` wrote.
+
+        Raises
+        ------
+        FileNotFoundError
+        FileError
+            A ValueError: if the file is no calibration, broken, or of another format.
+        TypeError, ValueError
+            If the path is none.
+        """
+        path = path_of("path", path)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file: expected a calibration")
+        if not _is_calibration(path):
+            raise FileError(f"{path.name}: expected a calibration, which `calibrate` writes")
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                values: dict[str, Any] = json.loads(str(file["values"]))
+                found = values.pop("format")
+                if found == FORMAT:
+                    arrays: dict[str, Any] = {name: file[name] for name in file.files if name != "values"}
+                    optics = values.pop("optics")
+                    optics["phase_shifts"] = tuple(optics["phase_shifts"])
+                    pairs: dict[str, Any] = {name: tuple(values.pop(name)) for name in ("center", "shape")}
+                    return cls(**values, **arrays, **pairs, optics=Optics(**optics))
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise FileError(f"{path.name}: a broken calibration: {' '.join(str(error).split())[:200]}") from None
+        raise FileError(
+            f"{path.name}: a calibration of format {found}: expected format {FORMAT}; make it again with this "
+            "version of zwfs"
+        )
+
+    @cached_property
+    def sha256(self) -> str:
+        """Checksum of the file that `save` writes."""
+        return hashlib.sha256(self._content).hexdigest()
+
+    @property
+    def sensor(self) -> ZernikeSensor:
+        """Model of the sensor, on the grid of the pupil."""
+        return self._work.reconstruct.sensor
+
+    def __call__(
+        self,
+        counts: ArrayLike,
+        start: NDArray | None = None,
+        *,
+        saturation: float | None = None,
+        largest_residual: float = np.inf,
+        judge: bool = True,
+    ) -> Phases:
+        """Phases of camera images.
+
+        Parameters
+        ----------
+        counts : array_like, shape (..., ny, nx), or (..., 2, ny, nx) where an exposure has two images
+            As the camera gives them, of any real type, the dark included.
+        start : ndarray, shape (ny, nx) or (..., ny, nx), radian, optional
+            Phase at which the iteration starts, such as `filled` of the frames before; flat if left out.
+        saturation : float, counts, optional
+            Replaces that of the calibration.
+        largest_residual : float
+            Residual above which a frame is inconsistent.
+        judge : bool
+            Whether to compute the residual, which takes a tenth of the time; without it the residual is NaN.
+
+        Returns
+        -------
+        Phases
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is of the wrong kind or shape.
+        """
+        counts = _check.plain_array("counts", counts)
+        if counts.dtype.kind not in "biuf":
+            raise TypeError(f"counts has dtype {counts.dtype}: expected real numbers")
+        image = self.shape if self.n_images == 1 else (2, *self.shape)
+        _check.trailing_shape("counts", counts, image, "the camera image of the calibration")
+        batch = counts.shape[: -len(image)]
+        level = min(self.saturation if saturation is None else saturation, _check.LARGEST)
+        counts = counts.reshape(-1, self.n_images, *self.shape)
+        starts = None
+        if start is not None:
+            starts = np.broadcast_to(start, (*batch, *self.good.shape)).reshape(-1, *self.good.shape)
+        parts = []
+        for first in range(0, len(counts), _PIECE):
+            piece = slice(first, first + _PIECE)
+            some = None if starts is None else starts[piece]
+            parts.append(self._phases(counts[piece], some, level, largest_residual, judge))
+        return Phases.joined(parts, batch)
+
+    def modal_matrix(self, modes: ArrayLike) -> NDArray[np.float64]:
+        """Matrix that fits modes to a phase: least squares over the good points, without the piston.
+
+        Parameters
+        ----------
+        modes : array_like, shape (n_modes, ny, nx)
+            On the grid of the pupil.
+
+        Returns
+        -------
+        ndarray, shape (n_points, n_modes)
+            `coefficients` multiplies the phases of the points of the pupil by it.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the modes are of the wrong kind or shape, or not independent on the good points.
+        """
+        values = check_modes(self.sensor.pupil, modes)
+        good = self.sensor.pupil.gather(self.good)
+        centred = values[:, good] - values[:, good].mean(axis=1, keepdims=True)
+        rank = int(np.linalg.matrix_rank(centred))
+        if rank < len(values):
+            raise ValueError(f"modes: {rank} of {len(values)} are independent on the good points: expected all")
+        matrix = np.zeros((good.size, len(values)))
+        matrix[good] = np.linalg.pinv(centred)
+        return matrix
+
+    def coefficients(self, phases: Phases, matrix: NDArray) -> NDArray[np.float32]:
+        """Coefficients of modes, (..., n_modes), radian, by one product with a `modal_matrix`."""
+        values = without_piston(self.sensor.pupil.gather(phases.filled))
+        return (values.reshape(-1, len(matrix)) @ matrix.astype(values.dtype)).reshape((*values.shape[:-1], -1))
+
+    def sigma(
+        self, phases: Phases, photons: float, read_noise: float = 0.0, modes: ArrayLike | None = None
+    ) -> NDArray[np.float32]:
+        """Standard error that photon noise and read noise cause: the Cramer-Rao bound at each phase.
+
+        The phase-shifted iteration reaches it to within 13 % for dimples of up to 2 lambda/D. Errors of the model
+        are not part of it. It takes longer than the phases, since the information of each frame is inverted.
+
+        Parameters
+        ----------
+        phases : Phases
+        photons : float
+            That an intensity of 1 puts into a pixel: `unit` times the electrons per count.
+        read_noise : float, electrons rms / pixel
+        modes : array_like, shape (n_modes, ny, nx), optional
+            Modes that make up the phase, as for `cramer_rao`; the phases of all points if left out.
+
+        Returns
+        -------
+        ndarray, shape (..., ny, nx) or (..., n_modes), radian
+            NaN outside the pupil, at bad points and for lost frames.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a value is of the wrong kind, shape or range.
+        """
+        pupil, model = self.sensor.pupil, propagator(self.sensor, Kind.numpy())
+        basis = None if modes is None else pupil.scatter(check_modes(pupil, modes), fill=0)
+        estimator = Estimator(self._work.response, Noise.checked(photons, read_noise), False, basis)
+        maps = phases.filled.reshape(-1, 1, *pupil.shape).astype(np.float64)
+        lost = phases.flags.reshape(-1) & Flag.LOST > 0
+        result = np.full((len(maps), *(pupil.shape if basis is None else (len(basis),))), np.nan, np.float32)
+        for index in np.flatnonzero(~lost):
+            psi = split(maps[index], model.amplitude)
+            points, of_modes = estimator.variance(psi, model.propagate(psi))
+            result[index] = np.sqrt(points[0, 0] if of_modes is None else of_modes[0])
+        result = result.reshape((*phases.flags.shape, *result.shape[1:]))
+        return result if basis is not None else np.where(np.isfinite(phases.phase), result, np.float32(np.nan))
+
+    @cached_property
+    def _content(self) -> bytes:
+        """Bytes of the file."""
+        plain = {one.name: getattr(self, one.name) for one in fields(self)}
+        arrays: dict[str, Any] = {name: value for name, value in plain.items() if isinstance(value, np.ndarray)}
+        values = {name: value for name, value in plain.items() if name not in arrays}
+        values |= {"format": FORMAT, "optics": asdict(self.optics)}
+        stream = io.BytesIO()
+        np.savez(stream, values=np.array(json.dumps(values, sort_keys=True)), **arrays)
+        return stream.getvalue()
+
+    @cached_property
+    def _work(self) -> _Work:
+        return _Work.of(self)
+
+    def _phases(self, counts: NDArray, start: NDArray | None, level: float, limit: float, judge: bool) -> Phases:
+        """Phases of camera images, (k, n_images, ny_camera, nx_camera)."""
+        work, k = self._work, len(counts)
+        values, good, n_bad, n_saturated = work.on_grid(counts, level, self.good)
+        n_good = np.maximum(np.count_nonzero(good, axis=(1, 2)), 1)
+        flux = np.vecdot(values, good.reshape(k, 1, -1).astype(np.float32)) / (n_good[:, np.newaxis] * self.unit)
+        relative = flux / self.light
+        with np.errstate(invalid="ignore", divide="ignore"):
+            enough = (relative.min(axis=1) >= _DIM) & (n_good >= (1 - _MOST_BAD) * work.n_points)
+            gain = (flux.mean(axis=1, keepdims=True) / flux if self.balance else np.ones_like(flux)) / self.unit
+        weights = (self.weights * np.where(enough[:, np.newaxis], gain, 0)[:, np.newaxis, :]).astype(np.float32)
+        frames = (weights @ values).reshape(k, *self.offset.shape)
+        frames += work.offset
+        np.maximum(frames, 0, out=frames)
+        if not enough.all():
+            frames[~enough] = work.flat_frames  # of a flat wavefront: they converge at once
+        filled, n_iterations, converged, residual = self._solve(frames, good, start, judge)
+        with np.errstate(invalid="ignore"):
+            inconsistent = residual > limit
+        flags = (
+            Flag.BAD_PIXELS * (n_bad > 0)
+            + Flag.SATURATED * (n_saturated > 0)
+            + Flag.INCONSISTENT * inconsistent
+            + Flag.NOT_CONVERGED * (~converged & (self.tolerance > 0))
+        )
+        flags = np.where(enough, flags, Flag.LOST + (flags & (Flag.BAD_PIXELS + Flag.SATURATED)))
+        phase = np.where(good & enough[:, np.newaxis, np.newaxis], filled, np.float32(np.nan))
+        residual = np.where(enough, residual, np.float32(np.nan))
+        light = relative.mean(axis=1).astype(np.float32)
+        return Phases(phase, filled, light, n_bad, n_saturated, residual, n_iterations, flags)
+
+    def _solve(
+        self, frames: NDArray, good: NDArray, start: NDArray | None, judge: bool
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Phases with bad points filled, iterations, whether they converged, and residuals of ideal frames.
+
+        Bad points take no part: in a second iteration their intensity is that of the model. The frames, shape
+        (k, 2, ny, nx), are changed.
+        """
+        reconstruct, inside = self._work.reconstruct, self.sensor.pupil.inside
+        found = reconstruct(frames, start)
+        phase, n_iterations, converged = found.phase, found.n_iterations, found.converged
+        phase[:, ~inside] = 0
+        holes = inside & ~good
+        some = np.flatnonzero(holes.any(axis=(1, 2)))
+        if some.size:
+            phase[some] = self._work.filled(phase[some], good[some])
+            modelled = self.sensor.measure(phase[some])
+            frames[some] = np.where(holes[some, np.newaxis], modelled, frames[some])
+            found = reconstruct(frames[some], phase[some])
+            again = np.where(inside, found.phase, 0)
+            phase[some] = self._work.filled(again, good[some])
+            n_iterations[some] += found.n_iterations
+            converged[some] = found.converged
+        if judge:
+            residual = reconstruct.settings.residual(phase, frames)
+        else:
+            residual = np.full(len(phase), np.nan, np.float32)
+        return phase, n_iterations, converged, residual
+
+
+class _Work(NamedTuple):
+    """Constants of the calls of a calibration, in single precision, on a box of the camera around each pupil."""
+
+    reconstruct: PhaseShifted
+    response: Response
+    n_points: int
+    offset: NDArray[np.float32]
+    flat_frames: NDArray[np.float32]
+    boxes: list[tuple[int, Any, Any]]  # image, rows and columns
+    dark: NDArray[np.float32]  # (2, h, w), background included
+    bad: NDArray[np.bool_]  # (2, h, w)
+    watched: NDArray[np.bool_]  # (2, h, w), good pixels from which the pupil is made
+    repairs: list[tuple[NDArray, NDArray]]  # bad pixels of each box, and their nearest good ones
+    filters: tuple[NDArray[np.float32], NDArray[np.float32]]  # spline coefficients along rows and columns
+    splines: list[Any]  # sparse (ny nx, h w), cubic
+    touching: list[Any]  # sparse (ny nx, h w), linear
+    holes: tuple[NDArray, NDArray]  # bad points of the pupil, and their nearest good ones
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> _Work:
+        pupil = Pupil.from_amplitude(calibration.amplitude, calibration.diameter, calibration.center)
+        masks = (Dimple(calibration.optics.diameter, shift) for shift in calibration.optics.phase_shifts)
+        sensor = ZernikeSensor(pupil, *masks, tolerance=1e-6)
+        settings: dict[str, Any] = {"n_iterations": calibration.n_iterations, "tolerance": calibration.tolerance}
+        places = calibration.places.reshape(2, 2, -1)
+        low = np.floor(places.min(axis=2)).astype(int) - _REACH
+        size = (np.floor(places.max(axis=2)).astype(int) + _REACH + 2 - low).max(axis=0)
+        boxes = []
+        for index, (row, column) in enumerate(low):
+            axes = zip((row, column), size, calibration.shape, strict=True)
+            boxes.append((min(index, calibration.n_images - 1), *(_span(*axis) for axis in axes)))
+        dark = np.stack([calibration.dark[i][rows][:, columns] for i, rows, columns in boxes])
+        bad = np.stack([calibration.bad[i][rows][:, columns] for i, rows, columns in boxes])
+        corners = places - low[:, :, np.newaxis]
+        touching = [_linear(corner, tuple(size)) for corner in corners]
+        inside = pupil.inside.ravel().astype(float)
+        reached = np.stack([one.T @ inside > 0 for one in touching]).reshape(bad.shape)
+        return cls(
+            PhaseShifted(sensor, accelerate=True, **settings),
+            Response(sensor.factors, sensor.window, pupil),
+            pupil.n_points,
+            calibration.offset.astype(np.float32),
+            sensor.measure(np.zeros(pupil.shape)).astype(np.float32),
+            boxes,
+            dark + calibration.background[:, np.newaxis, np.newaxis].astype(np.float32),
+            bad,
+            reached & ~bad,
+            [_repair(one, ~one) for one in bad],
+            (_spline_filter(size[0]), _spline_filter(size[1])),
+            [_cubic(corner, tuple(size)) for corner in corners],
+            touching,
+            _repair(pupil.inside & ~calibration.good, calibration.good),
+        )
+
+    def on_grid(self, counts: NDArray, level: float, good: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Counts on the grid, (k, 2, n), good points, (k, ny, nx), and bad and saturated pixels, (k,)."""
+        k = len(counts)
+        raw = np.empty((k, *self.dark.shape), np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):  # larger numbers become infinite: bad pixels
+            for index, (image, rows, columns) in enumerate(self.boxes):
+                raw[:, index] = counts[:, image][:, rows][:, :, columns]
+            odd = ~((raw < level) & (raw > -_check.LARGEST) | self.bad)
+            good = np.broadcast_to(good, (k, *good.shape))
+            n_bad = n_saturated = np.zeros(k, int)
+            strange = odd.any(axis=(1, 2, 3))
+            if strange.any():
+                spoiled = odd & self.watched
+                n_bad = np.count_nonzero(spoiled, axis=(1, 2, 3))
+                n_saturated = np.count_nonzero(spoiled & (raw >= level), axis=(1, 2, 3))
+                good = good & ~self._touched(spoiled)
+            raw -= self.dark
+        for index, (pixels, nearest) in enumerate(self.repairs):
+            flat = raw[:, index].reshape(k, -1)
+            flat[:, pixels] = flat[:, nearest]
+            raw[:, index] = flat.reshape(raw[:, index].shape)
+        for place in np.flatnonzero(strange):
+            for index, one in enumerate(odd[place]):
+                usable = ~(one | self.bad[index])
+                raw[place, index] = nearest_good(raw[place, index], usable) if usable.any() else 0
+        coefficients = self.filters[0] @ raw @ self.filters[1].T
+        values = np.stack(
+            [spline @ coefficients[:, index].reshape(k, -1).T for index, spline in enumerate(self.splines)]
+        )
+        return np.ascontiguousarray(values.transpose(2, 0, 1)), good, n_bad, n_saturated
+
+    def filled(self, phase: NDArray, good: NDArray) -> NDArray:
+        """Phases (k, ny, nx) with bad points replaced by the nearest good one."""
+        flat = phase.reshape(len(phase), -1)
+        inside = self.reconstruct.sensor.pupil.inside
+        flat[:, self.holes[0]] = flat[:, self.holes[1]]
+        n_static = np.count_nonzero(inside) - len(self.holes[0])
+        for index in np.flatnonzero(np.count_nonzero(good, axis=(1, 2)) < n_static):
+            if good[index].any():
+                phase[index] = np.where(inside, nearest_good(phase[index], good[index]), 0)
+        return phase
+
+    def _touched(self, spoiled: NDArray) -> NDArray[np.bool_]:
+        """Points with a bad pixel on one of their sides: (k, 2, h, w) to (k, ny, nx)."""
+        k, shape = len(spoiled), self.offset.shape[1:]
+        weights = sum(
+            one @ spoiled[:, index].reshape(k, -1).T.astype(np.float32) for index, one in enumerate(self.touching)
+        )
+        return (weights.T > _TOUCHED).reshape(k, *shape)
+
+
+def calibrate(
+    frame_files: Sequence[str | Path],
+    pupil_files: Sequence[str | Path],
+    dark_files: Sequence[str | Path] = (),
+    bad_pixel_files: Sequence[str | Path] = (),
+    *,
+    diameter: float = 0.0,
+    phase_shifts: Sequence[float] = (),
+    saturation: float | None = None,
+    fitted: Sequence[str] = (),
+    n_iterations: int = 25,
+    tolerance: float = 1e-3,
+    **settings: Any,
+) -> Calibration:
+    """Calibration from camera files: frames as those to come, and clear frames.
+
+    Parameters
+    ----------
+    frame_files, pupil_files, dark_files, bad_pixel_files : sequence of str or Path
+        See `zwfs.frames.files.read_all`.
+    diameter : float, lambda/D
+        Of the dimple; 0 stands for DIMPLE of the header.
+    phase_shifts : sequence of two floats, radian
+        Of the two frames; those of the header, THETA1 and THETA2, if empty.
+    saturation : float, counts, optional
+        Of the camera, see `zwfs.frames.files.images`. Without it the frames to come are compared with SATURATE of
+        the header, or with the largest number of their type.
+    fitted : sequence of str
+        Parameters that `zwfs.frames.pipeline.fit` fits to these frames.
+    n_iterations : int
+    tolerance : float, radian
+    **settings
+        Of `zwfs.frames.registration.record`: pupil_centers, pupil_diameter, exposure, subpixel.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    FileNotFoundError
+    ImportError
+        If astropy is needed and missing.
+    TypeError, ValueError
+        If a file or a value is not as expected.
+    """
+    frames, clear_frames, sources = read_all(frame_files, pupil_files, dark_files, bad_pixel_files, saturation)
+    optics = sources[0].optics(diameter, phase_shifts)
+    recording = record(frames, clear_frames, **settings)
+    recording, optics = fit(recording, optics, fitted)
+    first = len(frame_files) + len(pupil_files)
+    darks = [image for source in sources[first : first + len(dark_files)] for image in source.images]
+    header = sources[0].header
+    level = sources[0].keyword("SATURATE") if saturation is None and "SATURATE" in header else saturation
+    return Calibration.of(
+        reduce_frames(recording, optics),
+        np.stack(darks) if darks else None,
+        saturation=np.inf if level is None else level,
+        bunit=str(header.get("BUNIT", "")),
+        n_iterations=n_iterations,
+        tolerance=tolerance,
+    )
+
+
+def _is_calibration(path: Path) -> bool:
+    """Whether a file is an NPZ file with the values of a calibration."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            return "values.npy" in file.namelist() and "places.npy" in file.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
+def _dark(dark: ArrayLike | None, shape: tuple[int, int, int]) -> NDArray[np.float32]:
+    """Checked counts without light, one map for each camera image."""
+    if dark is None:
+        return np.zeros(shape, np.float32)
+    maps = _check.real_array("dark", dark)
+    if maps.shape not in (shape[1:], (1, *shape[1:]), shape):
+        raise ValueError(f"dark has shape {maps.shape}: expected {shape}")
+    return np.broadcast_to(np.nan_to_num(maps, posinf=0, neginf=0).astype(np.float32), shape)
+
+
+def _undoing(measurement: Measurement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights (2, 2) and offset (2, ny', nx') that turn intensities into frames of an ideal sensor."""
+
+    def undone(*light: float) -> NDArray[np.float64]:
+        intensity = np.ones_like(measurement.intensity) * np.reshape(light, (2, 1, 1))
+        return ideal_frames(replace(measurement, intensity=intensity))
+
+    offset = undone(0, 0)
+    return np.stack([(undone(*light) - offset)[:, 0, 0] for light in ((1, 0), (0, 1))], axis=1), offset
+
+
+def _places(recording: Recording, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Row and column of each point of the grid on the two frames, (2, 2, ny, nx)."""
+    grid = np.indices(shape).astype(float)
+    return np.stack([grid + (recording.corner + one)[:, np.newaxis, np.newaxis] for one in recording.origins[:2]])
+
+
+def _span(low: int, size: int, length: int) -> Any:
+    """Indices of an axis of the camera; beyond the edge it is repeated."""
+    if low >= 0 and low + size <= length:
+        return slice(low, low + size)
+    return np.clip(np.arange(low, low + size), 0, length - 1)
+
+
+def _repair(bad: NDArray[np.bool_], good: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
+    """Flat indices of bad pixels and of the nearest good ones."""
+    if not bad.any() or not good.any():
+        return np.zeros(0, int), np.zeros(0, int)
+    nearest = nearest_good(np.arange(bad.size, dtype=float).reshape(bad.shape), good).astype(int)
+    return np.flatnonzero(bad), nearest[bad]
+
+
+def _spline_filter(size: int) -> NDArray[np.float32]:
+    """Matrix from samples to the coefficients of a cubic spline."""
+    matrix = ndimage.spline_filter1d(np.eye(size), 3, axis=0, mode="nearest")
+    return np.where(np.abs(matrix) > _NEGLIGIBLE, matrix, 0).astype(np.float32)
+
+
+def _cubic(places: NDArray, size: tuple[int, int]) -> Any:
+    """Sparse matrix from coefficients of cubic splines, (h w), to places (2, n)."""
+    base = np.floor(places)
+    t = places - base
+    u = 1 - t
+    weights = np.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / 6
+    return _interpolation(base.astype(int) - 1, weights, size)
+
+
+def _linear(places: NDArray, size: tuple[int, int]) -> Any:
+    """Sparse matrix of linear interpolation, from pixels (h w) to places (2, n)."""
+    base = np.floor(places)
+    return _interpolation(base.astype(int), np.stack([1 - (places - base), places - base]), size)
+
+
+def _interpolation(first: NDArray, weights: NDArray, size: tuple[int, int]) -> Any:
+    """Sparse matrix with weights (m, 2, n) of the m rows and m columns from the first, (2, n)."""
+    m, _, n = weights.shape
+    values = weights[:, np.newaxis, 0] * weights[np.newaxis, :, 1]
+    steps = np.arange(m)
+    rows = first[0] + steps[:, np.newaxis, np.newaxis]
+    columns = first[1] + steps[np.newaxis, :, np.newaxis]
+    pixels = rows * size[1] + columns
+    points = np.broadcast_to(np.arange(n), pixels.shape)
+    shape = n, size[0] * size[1]
+    matrix = sparse.csr_array((values.ravel(), (points.ravel(), pixels.ravel())), shape=shape, dtype=np.float32)
+    matrix.eliminate_zeros()
+    return matrix

@@ -1,0 +1,462 @@
+"""Telemetry in bulk: camera files of any length to phases or coefficients, with a table of all frames.
+
+`python -m zwfs.frames` is the command for it.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs import _check
+from zwfs._files import path_of, paths_of
+from zwfs._threads import one_thread
+from zwfs.frames._fits import fits_module
+from zwfs.frames._part import Cards, Part, Unit, plan_of
+from zwfs.frames._stack import Stack
+from zwfs.frames.calibration import Calibration, Flag, Phases
+from zwfs.frames.files import FileError, check_output
+from zwfs.modes import check_modes, zernike_basis
+
+_CHUNK = 2**24  # bytes of camera images that a thread handles at once
+_LONGEST = 256  # exposures of them
+_SAMPLE = 2**20  # frames from which the limit of the residual is computed, at most
+_FEWEST = 10  # frames from which on that is possible
+_SIGMAS, _MARGIN = 5.0, 0.2  # excess of an inconsistent residual: deviations, and relative to the median
+# Cards of the input that describe its own data.
+_OWN = ("SIMPLE", "XTENSION", "BITPIX", "NAXIS", "EXTEND", "EXTNAME", "PCOUNT", "GCOUNT", "BSCALE", "BZERO",
+        "BLANK", "BUNIT", "CHECKSUM", "DATASUM", "COMMENT", "HISTORY", "CONTINUE", "END", "")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Result of `reconstruct`.
+
+    Attributes
+    ----------
+    output : Path
+    n_frames : int
+    n_flagged : int
+        Frames with a flag.
+    counts : dict
+        Number of frames with each flag, by its name.
+    largest_residual : float
+        Residual above which a frame is inconsistent.
+    n_resumed : int
+        Frames that an interrupted run had done.
+    """
+
+    output: Path
+    n_frames: int
+    n_flagged: int
+    counts: dict[str, int]
+    largest_residual: float
+    n_resumed: int
+
+
+def reconstruct(
+    frames: str | Path | Sequence[str | Path],
+    calibration: Calibration | str | Path,
+    output: str | Path,
+    *,
+    second_frames: str | Path | Sequence[str | Path] = (),
+    modes: int | ArrayLike | None = None,
+    phases: bool | None = None,
+    photons: float | None = None,
+    read_noise: float = 0.0,
+    keywords: Sequence[str] = (),
+    saturation: float | None = None,
+    largest_residual: float | None = None,
+    n_workers: int | None = None,
+    restart: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[int, int], Any] | None = None,
+) -> Summary:
+    """Reconstruct all frames of camera files, and write phases or coefficients with a table as FITS.
+
+    The files may be larger than the memory: they are read in chunks, and the output is written in chunks. The
+    output appears when it is complete. An interrupted run keeps `.NAME.part` and `.NAME.journal` next to it. The
+    same call goes on from there, and the file has the same bytes as that of an undisturbed run. No frame is left
+    out: frames that cannot be reconstructed are NaN, and flagged in the table.
+
+    Parameters
+    ----------
+    frames : path, or sequence of paths
+        FITS or NPY files: cubes (n, ny, nx), or (n, 2, ny, nx) where an exposure has two images, or single
+        exposures. Two FITS extensions of one image each are the two images of an exposure.
+    calibration : Calibration or path
+    output : path
+        FITS file. An earlier phase map or telemetry file is replaced.
+    second_frames : path, or sequence of paths, optional
+        Files with the second images, as many as `frames`.
+    modes : int, or array_like, shape (n_modes, ny, nx), optional
+        Modes whose coefficients go to the table: that many Zernike modes, or maps on the grid of the pupil.
+    phases : bool, optional
+        Whether to write the phases; by default only without modes.
+    photons : float, optional
+        Photons that an intensity of 1 puts into a pixel: adds the standard error of all phases or coefficients,
+        see `Calibration.sigma`. It takes several times as long as the phases.
+    read_noise : float, electrons rms / pixel
+    keywords : sequence of str
+        Keywords of the headers that become columns of the table; each file must have them.
+    saturation : float, counts, optional
+        By default that of the calibration, SATURATE of the first header, or the largest number of an integer type.
+    largest_residual : float, optional
+        Residual above which a frame is inconsistent. By default it follows from the frames, if there are 10 or
+        more: median + 5 standard deviations, and at least 1.2 times the median. The deviation is 1.48 times the
+        median absolute deviation.
+    n_workers : int, optional
+        Threads; by default one for each core.
+    restart : bool
+        Whether to drop the part of an earlier run.
+    overwrite : bool
+        Whether `output` may be any file but an input.
+    progress : callable, optional
+        Called with the number of frames that are done, and of all frames.
+
+    Returns
+    -------
+    Summary
+
+    Raises
+    ------
+    FileNotFoundError
+    ImportError
+        If astropy is missing.
+    FileError
+        A ValueError: if a file is broken, truncated, of another shape, unit or type, or lacks a keyword.
+    TypeError, ValueError
+        If an argument is of the wrong kind or out of range, or `check_output` refuses the output.
+    OSError
+        If there is no space for the output.
+    """
+    fits_module()
+    if not isinstance(calibration, Calibration):
+        calibration = Calibration.load(calibration)
+    files, second_files = (
+        _paths(name, one) for name, one in (("frames", frames), ("second_frames", second_frames))
+    )
+    if not files:
+        raise ValueError("frames is empty: expected a file")
+    path = check_output(output, [*files, *second_files], overwrite=overwrite)
+    n_workers = _cores() if n_workers is None else _check.integer("n_workers", n_workers, 1, 256)
+    stack = Stack(files, second_files, calibration.n_images, calibration.shape)
+    job = _Job.checked(stack, calibration, modes, phases, photons, read_noise, keywords, saturation)
+    if largest_residual is not None:
+        largest_residual = _check.number("largest_residual", largest_residual, 0)
+    part = Part(path, job.units, job.plan(largest_residual), _check.flag("restart", restart))
+    try:
+        n_resumed = sum(stop - first for first, stop in part.done.items())
+        done = n_resumed
+        if progress is not None:
+            progress(done, stack.n)
+        if not part.done:
+            part.write(job.units[-1], 0, job.files())
+        for first, stop, checksum in job.run(part, n_workers):
+            part.note(first, stop, checksum)
+            done += stop - first
+            if progress is not None:
+                progress(done, stack.n)
+        summary = job.judge(part, path, largest_residual, n_resumed)
+        part.finish()
+        return summary
+    finally:
+        part.close()
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """Checked arguments of a run, and the units of its output: the table, and the list of files, come last."""
+
+    stack: Stack
+    calibration: Calibration
+    modes: NDArray | None
+    matrix: NDArray | None
+    photons: float | None
+    read_noise: float
+    keywords: dict[str, NDArray]
+    saturation: float
+    units: list[Unit]
+
+    @classmethod
+    def checked(
+        cls,
+        stack: Stack,
+        calibration: Calibration,
+        modes: Any,
+        phases: Any,
+        photons: Any,
+        read_noise: Any,
+        keywords: Any,
+        saturation: Any,
+    ) -> _Job:
+        pupil = calibration.sensor.pupil
+        _same_unit(stack, calibration)
+        if modes is not None:
+            modes = zernike_basis(pupil, modes) if isinstance(modes, int) else modes
+            modes = pupil.scatter(check_modes(pupil, modes), fill=0)
+        matrix = None if modes is None else calibration.modal_matrix(modes)
+        phases = modes is None if phases is None else _check.flag("phases", phases)
+        if not phases and modes is None:
+            raise ValueError("phases = False: expected True, or modes")
+        read_noise = _check.number("read_noise", read_noise, 0)
+        if photons is not None:
+            photons = _check.number("photons", photons, 0, open_low=True)
+        elif read_noise:
+            raise ValueError(f"read_noise = {read_noise:g}: expected a number of photons with it")
+        level = _saturation(stack, calibration) if saturation is None else saturation
+        if level != np.inf:
+            level = _check.number("saturation", level, 0, open_low=True)
+        columns = _columns(stack, keywords)
+        rows = _row_type(columns, None if modes is None else len(modes), photons is not None)
+        of_files = np.dtype(
+            [("NAME", f"S{max(len(_ascii(one.name)) for one in stack.segments)}"), ("FRAMES", ">i8")]
+        )
+        float32, n, shape = np.dtype(">f4"), stack.n, pupil.shape
+        cards = _cards(stack, calibration, photons, read_noise, level)
+        radian = ("BUNIT", "rad", "")
+        units = [
+            Unit("", float32, shape, n, [("BUNIT", "rad", "in (-pi, pi]; NaN outside, bad and lost"), *cards], {})
+            if phases
+            else Unit("", np.dtype("u1"), (), 0, cards, {})
+        ]
+        if phases and photons is not None:
+            units.append(Unit("SIGMA", float32, shape, n, [radian], {}))
+        in_radian = dict.fromkeys(("COEFFS", "SIGCOEFF", "SIGMA"), "rad")
+        units.append(Unit("FRAMES", rows, (), n, [], in_radian))
+        units.append(Unit("FILES", of_files, (), len(stack.segments), [], {}))
+        return cls(stack, calibration, modes, matrix, photons, read_noise, columns, level, units)
+
+    def plan(self, largest_residual: float | None) -> str:
+        """All that decides the bytes of the output."""
+        from zwfs import __version__
+
+        settings = [self.photons, self.read_noise, self.saturation, largest_residual, self.chunk]
+        modes = None if self.modes is None else zlib.crc32(np.ascontiguousarray(self.modes).tobytes())
+        headers = [unit.header().hex() for unit in self.units]
+        return plan_of(
+            version=__version__, files=self.stack.state(), calibration=self.calibration.sha256, settings=settings,
+            modes=modes, headers=headers,
+        )  # fmt: skip
+
+    @property
+    def chunk(self) -> int:
+        """Exposures that a thread handles at once."""
+        return max(1, min(_LONGEST, _CHUNK // self.stack.bytes_per_exposure))
+
+    def files(self) -> NDArray:
+        """Rows of the list of files."""
+        return np.array([(_ascii(one.name), one.n) for one in self.stack.segments], self.units[-1].dtype)
+
+    def run(self, part: Part, n_workers: int) -> Iterator[tuple[int, int, int]]:
+        """Reconstruct all chunks that are not yet done: first frame, last but one, and checksum of each."""
+        chunks = (
+            (first, min(first + self.chunk, self.stack.n))
+            for first in range(0, self.stack.n, self.chunk)
+            if first not in part.done
+        )
+        with one_thread(), ThreadPoolExecutor(n_workers) as pool:
+            waiting: deque[Future[tuple[int, int, int]]] = deque()
+            try:
+                for chunk in chunks:
+                    waiting.append(pool.submit(self._reconstruct, part, *chunk))
+                    if len(waiting) > n_workers:
+                        yield waiting.popleft().result()
+                while waiting:
+                    yield waiting.popleft().result()
+            finally:
+                for future in waiting:
+                    future.cancel()
+
+    def judge(self, part: Part, output: Path, limit: float | None, n_resumed: int) -> Summary:
+        """Flag inconsistent frames, count all flags, and put both into the header."""
+        table, n = self.units[-2], self.stack.n
+        size, step = max(1, _CHUNK // table.row), -(-n // _SAMPLE)
+        blocks = [(first, min(first + size, n)) for first in range(0, n, size)]
+        if limit is None:
+            limit = _limit(np.concatenate([part.read(table, *block)["RESIDUAL"][::step] for block in blocks]))
+        counts, n_flagged = {str(flag.name): 0 for flag in Flag}, 0
+        for first, stop in blocks:
+            rows = part.read(table, first, stop)
+            with np.errstate(invalid="ignore"):
+                rows["FLAGS"] |= np.where(rows["RESIDUAL"] > limit, Flag.INCONSISTENT.value, 0).astype(">i2")
+            part.write(table, first, rows)
+            n_flagged += int(np.count_nonzero(rows["FLAGS"]))
+            for flag in Flag:
+                counts[str(flag.name)] += int(np.count_nonzero(rows["FLAGS"] & flag))
+        self.units[0].cards = _with_counts(self.units[0].cards, counts, n_flagged, limit)
+        return Summary(output, n, n_flagged, counts, limit, n_resumed)
+
+    def _reconstruct(self, part: Part, first: int, stop: int) -> tuple[int, int, int]:
+        """Read, reconstruct and write some frames."""
+        counts = self.stack.read(first, stop)
+        found = self.calibration(counts[:, 0] if counts.shape[1] == 1 else counts, saturation=self.saturation)
+        values = {"": found.phase}
+        if self.photons is not None and any(unit.name == "SIGMA" for unit in self.units):
+            values["SIGMA"] = self.calibration.sigma(found, self.photons, self.read_noise)
+        values["FRAMES"] = self._rows(found, first, stop, values.get("SIGMA"))
+        checksum = 0
+        for unit in self.units[:-1]:
+            if unit.n:
+                checksum = zlib.crc32(part.write(unit, first, values[unit.name]), checksum)
+        return first, stop, checksum
+
+    def _rows(self, found: Phases, first: int, stop: int, sigma: NDArray | None) -> NDArray:
+        """Rows of the table."""
+        rows = np.zeros(stop - first, self.units[-2].dtype)
+        rows["FRAME"] = np.arange(first, stop)
+        at = 0
+        for segment, start, end in self.stack.places(first, stop):
+            some = slice(at, at + end - start)
+            rows["FILE"][some], rows["INDEX"][some] = segment, np.arange(start, end)
+            for name, values in self.keywords.items():
+                rows[name][some] = values[segment]
+            at += end - start
+        rows["FLAGS"], rows["FLUX"], rows["RESIDUAL"] = found.flags, found.flux, found.residual
+        rows["NBAD"], rows["NSATUR"], rows["NITER"] = found.n_bad, found.n_saturated, found.n_iterations
+        if sigma is not None:
+            lost = found.flags & Flag.LOST > 0
+            rows["SIGMA"][lost] = np.nan
+            rows["SIGMA"][~lost] = np.sqrt(np.nanmean(sigma[~lost] ** 2, axis=(1, 2)))
+        if self.matrix is not None:
+            lost = found.flags & Flag.LOST > 0
+            rows["COEFFS"] = np.where(
+                lost[:, np.newaxis], np.nan, self.calibration.coefficients(found, self.matrix)
+            )
+            if self.photons is not None:
+                rows["SIGCOEFF"] = self.calibration.sigma(found, self.photons, self.read_noise, self.modes)
+        return rows
+
+
+def _paths(name: str, value: Any) -> list[Path]:
+    return [path_of(name, value)] if isinstance(value, str | os.PathLike) else paths_of(name, value)
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _ascii(name: str) -> str:
+    return name if name.isascii() and name.isprintable() else ascii(name)[1:-1]
+
+
+def _same_unit(stack: Stack, calibration: Calibration) -> None:
+    """Refuse frames of another unit than those of the calibration."""
+    for segment in stack.segments:
+        unit = str(segment.header.get("BUNIT", "")).strip()
+        if calibration.bunit.strip() and unit and unit.lower() != calibration.bunit.strip().lower():
+            raise FileError(
+                f"{segment.name}: BUNIT = {unit!r}: expected {calibration.bunit!r}, that of the calibration"
+            )
+
+
+def _saturation(stack: Stack, calibration: Calibration) -> float:
+    """Level at which pixels are saturated."""
+    if calibration.saturation != np.inf:
+        return calibration.saturation
+    if "SATURATE" in stack.header:
+        return _check.number(f"{stack.segments[0].name}: SATURATE", stack.header["SATURATE"])
+    return stack.segments[0].blocks[0].full_scale
+
+
+def _columns(stack: Stack, keywords: Any) -> dict[str, NDArray]:
+    """Values of keywords for each file."""
+    _check.sequence("keywords", keywords, str, "a list of keywords")
+    columns: dict[str, NDArray] = {}
+    for key in keywords:
+        key = key.upper()
+        for segment in stack.segments:
+            if key not in segment.header:
+                raise FileError(f"{segment.name}: its header has no {key}: expected it, as one of the keywords")
+        values = [segment.header[key] for segment in stack.segments]
+        numbers = all(isinstance(value, int | float) for value in values)
+        columns[key] = (
+            np.array(values, float) if numbers else np.array([_ascii(str(one)).encode() for one in values])
+        )
+    return columns
+
+
+def _row_type(keywords: dict[str, NDArray], n_modes: int | None, errors: bool) -> np.dtype:
+    """Type of the rows of the table."""
+    columns: list[tuple] = [("FRAME", ">i8"), ("FILE", ">i4"), ("INDEX", ">i8"), ("FLAGS", ">i2"), ("FLUX", ">f4"),
+               ("RESIDUAL", ">f4"), ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4")]  # fmt: skip
+    if errors:
+        columns += [("SIGMA", ">f4")] if n_modes is None else [("SIGCOEFF", ">f4", (n_modes,))]
+    if n_modes is not None:
+        columns.append(("COEFFS", ">f4", (n_modes,)))
+    for name, values in keywords.items():
+        columns.append((name, values.dtype.newbyteorder(">")))
+    repeated = {name for name, *_ in columns if [one[0] for one in columns].count(name) > 1}
+    if repeated:
+        raise ValueError(f"keywords: {sorted(repeated)} are columns already: expected others")
+    return np.dtype(columns)
+
+
+def _cards(
+    stack: Stack, calibration: Calibration, photons: float | None, read_noise: float, level: float
+) -> Cards:
+    """Cards of the first header: numbers of the run, then those of the first file."""
+    from zwfs import __version__
+
+    optics = calibration.optics
+    cards: list[tuple[str, Any, str]] = [
+        ("CREATOR", f"zwfs {__version__}", ""),
+        ("NFRAMES", stack.n, "frames, all of them in the table"),
+        ("NFILES", len(stack.segments), ""),
+        *((key, 0, comment) for key, comment in _COUNTS.values()),
+        ("NFLAGGED", 0, "frames with any flag"),
+        ("RESLIMIT", 0.0, "residual above which a frame is inconsistent"),
+        ("RESCALIB", calibration.residual, "residual of the frames of the calibration"),
+        ("CALIBSHA", calibration.sha256, ""),
+        ("PUPDIAM", calibration.diameter, "[pixel] diameter D of the pupil"),
+        ("CENTROW", calibration.center[0], "[pixel] centre of the pupil, from 0"),
+        ("CENTCOL", calibration.center[1], "[pixel] centre of the pupil, from 0"),
+        ("DIMPLE", optics.diameter, "[lambda/D] diameter of the dimple"),
+        *((f"THETA{i}", value, f"[rad] phase shift, image {i}") for i, value in enumerate(optics.phase_shifts, 1)),
+        ("SATURATE", level, "[count] pixels that reach it are saturated"),
+        ("MAXITER", calibration.n_iterations, "largest number of iterations"),
+        ("TOLERANC", calibration.tolerance, "[rad] change that ends the iteration"),
+    ]
+    if photons is not None:
+        cards += [("PHOTONS", photons, "per pixel at an intensity of 1"), ("RDNOISE", read_noise, "[e-] rms")]
+    known = {key for key, *_ in cards}
+    for key, value in stack.header.items():
+        plain = isinstance(value, str | bool | int | float)
+        if plain and key not in known and not any(key == own or key.startswith("NAXIS") for own in _OWN):
+            cards.append((key, value, "of the first file" if len(str(value)) < 40 else ""))
+    return cards
+
+
+_COUNTS = {
+    "LOST": ("NLOST", "lost frames"),
+    "BAD_PIXELS": ("NBADPIX", "frames with more bad pixels"),
+    "SATURATED": ("NSATURAT", "frames with saturated pixels"),
+    "INCONSISTENT": ("NINCONS", "inconsistent frames"),
+    "NOT_CONVERGED": ("NNOTCONV", "frames that did not converge"),
+}
+
+
+def _with_counts(cards: Cards, counts: dict[str, int], n_flagged: int, limit: float) -> Cards:
+    """Cards with the numbers that are known at the end."""
+    values: dict[str, Any] = {key: counts[name] for name, (key, _) in _COUNTS.items()}
+    values |= {"NFLAGGED": n_flagged, "RESLIMIT": limit}
+    return [(key, values.get(key, value), comment) for key, value, comment in cards]
+
+
+def _limit(residuals: NDArray) -> float:
+    """Residual from which on a frame differs from the others."""
+    known = residuals[np.isfinite(residuals)].astype(float)
+    if known.size < _FEWEST:
+        return float("inf")
+    middle = np.median(known)
+    deviation = 1.4826 * np.median(np.abs(known - middle))
+    return float(middle + max(_SIGMAS * deviation, _MARGIN * middle))

@@ -13,7 +13,7 @@ import zwfs
 from zwfs import plots
 from zwfs.bench.model import Bench
 from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics, Step
-from zwfs.paper import identities
+from zwfs.paper import identities, one_pixel
 from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.paper.closed_loop import LoopRun
 from zwfs.paper.design import PUBLISHED, DesignMap
@@ -96,6 +96,9 @@ def drawn_methods(curves, pupil, classic, shifted):
         "linearity": ((curves, 0.05, two, 0.4), two),
         "convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in plots.LOOKS},), plots.LOOKS),
         "estimates": ((pupil, phase, dict.fromkeys(two, phase)), ()),
+        "sensor_steps": ((shifted, phase, one_pixel.lowest_pixel(shifted, phase)), ()),
+        "pixel_phasors": ((one_pixel.lowest_pixel(shifted, phase),), ()),
+        "one_or_two_images": ((pupil, phase, dict.fromkeys(two, phase)), ()),
         "approximation": ((three, lines, lines), ()),
         "diversity": ((identities.dimple_pairs(pupil, 1.06, 24, pupil.field(0 * phase)),), ()),
         "dimple_diameter": (({25: trial, 100: trial}, 0.05, 2.2), shifted_only),

@@ -59,6 +59,9 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
         image.parent.wrap(body.new_tag("div", **{"class": "wide-figure"}))
     for entry in body.select("[role=doc-biblioentry]"):
         entry["role"] = "listitem"  # the role of Sphinx is deprecated: a list has items
+    if body.find(id="phasor"):
+        app.add_css_file("phasor.css")
+        app.add_js_file("phasor.js", loading_method="defer")
     context["body"] = str(body)
     if app.config.html_baseurl:
         given = context.get("metatags", "")

@@ -147,4 +147,6 @@ LIMITS: dict[str, dict[str, Any]] = {
     "reconstructors": _limits(
         "n_pixels n_modes diameter phase_shift inputs n_screens exponent n_iterations extent"
     ),
+    "zernike_sensor": {name: _USUAL[name] for name in ("n_pixels", "diameter", "phase_shift")}
+    | {"height": (0.1, 3.0)},
 }

@@ -8,6 +8,7 @@ from zwfs.plots.frames import explained, gains, phase_map
 from zwfs.plots.identities import approximation, diversity
 from zwfs.plots.layouts import bench_layout, sensor_layout, vector_sensor
 from zwfs.plots.linearity import convergence, estimates, linearity
+from zwfs.plots.one_pixel import one_or_two_images, pixel_phasors, sensor_steps
 from zwfs.plots.phase_amplitude import amplitude_errors, phase_and_amplitude
 from zwfs.plots.phase_shifts import all_pairs, pair_noise
 from zwfs.plots.photon_noise import design_maps, error_bars, photon_noise
@@ -52,15 +53,18 @@ __all__ = [
     "linearity",
     "loop_runs",
     "measured_and_modelled",
+    "one_or_two_images",
     "pair_noise",
     "phase_and_amplitude",
     "phase_map",
     "photon_noise",
+    "pixel_phasors",
     "range_recovery",
     "range_starts",
     "reference_intensities",
     "segment_errors",
     "sensor_layout",
+    "sensor_steps",
     "show_intensity",
     "show_phase",
     "use_style",

@@ -1,0 +1,99 @@
+"""The first chapter: one pixel, the phases that explain its images, and the slider that moves its phase."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import zwfs
+from zwfs.companion.reports import zernike_sensor as report
+from zwfs.paper import one_pixel
+
+ROOT = Path(__file__).parent.parent
+STATIC = ROOT / "book" / "_static"
+
+
+@pytest.fixture(scope="module")
+def phase(pupil):
+    return one_pixel.bump_and_pit(pupil, 1.2)
+
+
+@pytest.fixture(scope="module")
+def pixel(shifted, phase):
+    return one_pixel.lowest_pixel(shifted, phase)
+
+
+def test_bump_and_pit_have_equal_heights_and_no_mean(pupil, phase):
+    inside = pupil.gather(phase)
+    assert inside.mean() == pytest.approx(0, abs=1e-12)
+    assert inside.max() == pytest.approx(-inside.min())
+    assert 1.1 < inside.max() < 1.2
+
+
+def test_pixel_has_the_intensities_of_the_sensor(shifted, phase, pixel):
+    measured = shifted.measure(phase)[:, pixel.row, pixel.column]
+    assert pixel.phase == pytest.approx(phase[shifted.pupil.inside].min())
+    np.testing.assert_allclose(pixel.intensities(pixel.phase), measured, rtol=1e-12)
+
+
+def test_each_image_allows_a_second_phase_and_both_images_only_one(pixel):
+    mirrored = pixel.intensities(pixel.mirrored)
+    same = pixel.intensities(pixel.phase)
+    np.testing.assert_allclose(np.diag(mirrored), same, rtol=1e-12)
+    assert np.abs(np.diag(mirrored[::-1]) - same[::-1]).min() > 0.5
+
+
+def test_pixel_is_that_of_a_larger_detector_too(pupil, phase, pixel):
+    masks = zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2)
+    wide = one_pixel.lowest_pixel(zwfs.ZernikeSensor(pupil, *masks, extent=2.0), phase)
+    np.testing.assert_allclose(wide.waves, pixel.waves, atol=1e-8)
+
+
+@pytest.fixture
+def page(browser, pixel, tmp_path):
+    """The slider alone on a page, as narrow as a phone."""
+    shutil.copy(STATIC / "phasor.js", tmp_path)
+    shutil.copy(STATIC / "phasor.css", tmp_path)
+    head = '<meta charset="utf-8"><link rel="stylesheet" href="phasor.css"><script defer src="phasor.js"></script>'
+    box = report.explorer(pixel).data
+    (tmp_path / "page.html").write_text(f"<!doctype html><html lang='en'>{head}<body>{box}</body></html>", "utf-8")
+    page = browser.new_page(viewport={"width": 390, "height": 800})
+    page.said = []
+    page.on("console", lambda message: page.said.append(message.text))
+    page.on("pageerror", lambda error: page.said.append(str(error)))
+    page.goto((tmp_path / "page.html").as_uri())
+    yield page
+    page.close()
+
+
+def angles(page):
+    text = page.locator("#phasor .phasor-says").inner_text().replace("−", "-")
+    return [float(number) for number in re.findall(r"[+-]\d\.\d\d", text)]
+
+
+def test_slider_states_the_phases_that_each_image_allows(page, pixel):
+    for phase in (-2.5, pixel.phase, 0.0, 1.3, 3.0):
+        page.locator("#phasor input").fill(f"{phase:.2f}")
+        moved = one_pixel.Pixel(pixel.row, pixel.column, float(f"{phase:.2f}"), pixel.waves)
+        expected = moved.phase, moved.mirrored[0], moved.phase, moved.mirrored[1], moved.phase
+        assert angles(page) == pytest.approx(expected, abs=0.011)
+    assert page.said == []
+
+
+def test_slider_obeys_the_keyboard_and_fits_a_phone(page, pixel):
+    page.locator("#phasor input").focus()
+    page.keyboard.press("ArrowRight")
+    assert angles(page)[0] == pytest.approx(round(pixel.phase, 2) + 0.01)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    sizes = page.eval_on_selector_all("#phasor text", "all => all.map(one => one.getBoundingClientRect().height)")
+    assert min(sizes) > 12
+
+
+def test_box_is_hidden_without_a_script(pixel):
+    text = report.explorer(pixel).data
+    assert " hidden>" in text
+    waves = json.loads(re.search(r'data-waves="([^"]+)"', text)[1])
+    np.testing.assert_allclose([complex(*wave) for wave in waves], pixel.waves, atol=1e-4)

@@ -1,0 +1,136 @@
+"""Figures of the first chapter: the steps of a sensor, the phasors of one pixel, and one image next to two."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+
+from zwfs.focal import focal_field
+from zwfs.metrics import wrapped_residual
+from zwfs.paper.one_pixel import Pixel
+from zwfs.plots.style import LOOKS, show_intensity, show_phase
+from zwfs.pupil import Pupil
+from zwfs.sensor import ZernikeSensor
+
+IMAGES = ("a", "#B2182B", "-"), ("b", "#313695", "--")
+"""Letter, colour and line of the images of both masks, as in Figure 2."""
+
+_WIDTH = 6.8  # inches: letters of 10 points are then as large as the prose
+_REACH = 3.0  # of the picture of the focal plane, lambda/D
+_GREY = "#777777"
+
+
+def sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Figure:
+    """Phase in the pupil, focal plane with the first mask, its reference wave and its image."""
+    pupil = sensor.pupil
+    field = pupil.field(phase)
+    wave = np.abs(sensor.reference_wave(field)[0]) ** 2
+    image = sensor.measure(phase)[0]
+    axis = np.linspace(-_REACH, _REACH, 121)
+    focus = np.abs(focal_field(pupil, field, axis, axis)) ** 2
+
+    figure, panels = plt.subplots(1, 4, figsize=(_WIDTH, 2.75))
+    inside = np.where(pupil.inside, phase, np.nan)
+    shown = (
+        show_phase(panels[0], inside, np.nanmax(np.abs(inside))),
+        show_intensity(panels[1], focus, 1.0),
+        show_intensity(panels[2], wave, wave.max()),
+        show_intensity(panels[3], image, image.max()),
+    )
+    shown[1].set(cmap="magma", norm="log", clim=(1e-3, 1), extent=(-_REACH, _REACH, -_REACH, _REACH))
+    panels[1].add_patch(Circle((0, 0), sensor.masks[0].diameter / 2, fill=False, ec="white", ls="--", lw=1.5))
+    titles = "1. pupil:\nphase", "2. focus:\ndimple (dashed)", "3. reference\nwave", "4. camera:\nimage"
+    units = "rad", "intensity", "intensity", "intensity"
+    for axes, picture, title, unit in zip(panels, shown, titles, units, strict=True):
+        axes.set_title(title, fontsize=10)
+        figure.colorbar(picture, ax=axes, location="bottom", label=unit, aspect=12, pad=0.03)
+    for axes in (panels[0], panels[3]):
+        axes.plot(pixel.column, pixel.row, "+", color="black" if axes is panels[0] else "white", ms=9, mew=1.5)
+    return figure
+
+
+def pixel_phasors(pixel: Pixel) -> Figure:
+    """Waves of one pixel as arrows in the complex plane, for both masks, and both intensities by its phase."""
+    figure, panels = plt.subplot_mosaic(
+        [["a", "b"], ["curves", "curves"]], figsize=(_WIDTH, 6.4), height_ratios=(5, 4)
+    )
+    curves = panels["curves"]
+    angles = np.linspace(-np.pi, np.pi, 361)
+    for k, (letter, color, line) in enumerate(IMAGES):
+        _phasors(panels[letter], pixel, k)
+        level = pixel.intensities(pixel.phase)[k]
+        curves.plot(angles, pixel.intensities(angles)[k], color=color, ls=line, lw=2)
+        curves.axhline(level, color=color, ls=line, lw=0.8)
+        curves.plot(pixel.mirrored[k], level, "o", color=color, mfc="white", mew=2, ms=9, zorder=4)
+        top = int(np.argmax(pixel.intensities(angles)[k]))
+        curves.text(angles[top], 3.05, f"image {letter}", ha="center", color=color)
+    curves.plot([pixel.phase] * 2, pixel.intensities(pixel.phase), "o", color="black", ms=9, zorder=5)
+    curves.axvline(pixel.phase, color=_GREY, lw=0.8, ls=":")
+    curves.set(xlabel="phase of the pixel (rad)", ylabel="intensity", xlim=(-np.pi, np.pi), ylim=(0, 3.4))
+    return figure
+
+
+def _phasors(axes: Axes, pixel: Pixel, k: int) -> None:
+    """Reference wave and wave of the pixel, tip to tail, for both phases with the same intensity."""
+    letter, color, _ = IMAGES[k]
+    wave, intensity = pixel.waves[k], pixel.intensities(pixel.phase)[k]
+    axes.add_patch(Circle((wave.real, wave.imag), 1, fill=False, ec=_GREY, ls=":", lw=1.5))
+    axes.add_patch(Circle((0, 0), np.sqrt(intensity), fill=False, ec=color, lw=1.5))
+    _arrow(axes, 0, wave, color=_GREY)
+    above = "bottom" if wave.imag > 0 else "top"
+    axes.text(0.98 * wave.real, 1.15 * wave.imag, "reference\nwave", color=_GREY, fontsize=9, ha="right", va=above)
+    axes.plot(0, 0, "+", color="black", ms=8)
+    for phase, line, shade in ((pixel.phase, "-", "black"), (pixel.mirrored[k], "--", color)):
+        turn = np.exp(1j * phase)
+        _arrow(axes, wave, wave + turn, color=shade, ls=line)
+        point, label = wave + turn, wave + 1.18 * turn
+        axes.plot(point.real, point.imag, "o", color=shade, mfc="white" if line == "--" else shade, mew=2, ms=8)
+        side = "left" if turn.real > 0.5 else "right" if turn.real < -0.5 else "center"
+        height = "top" if turn.imag < -0.5 else "bottom" if turn.imag > 0.5 else "center"
+        text = f"{phase:+.2f} rad".replace("-", "−")
+        axes.text(label.real, label.imag, text, color=shade, ha=side, va=height)
+    axes.set(title=f"image {letter}: intensity {intensity:.2f}", xlim=(-2.3, 1.7), ylim=(-2, 1.6), aspect="equal")
+    axes.set_axis_off()
+
+
+def _arrow(axes: Axes, start: complex, end: complex, **style: Any) -> None:
+    """Arrow in the complex plane."""
+    start, end = complex(start), complex(end)
+    shape = {"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0, "mutation_scale": 14, "lw": 2}
+    axes.annotate("", (end.real, end.imag), (start.real, start.imag), arrowprops=shape | style)
+
+
+def one_or_two_images(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) -> Figure:
+    """True phase (radian), and the phases that methods reconstruct, with their errors.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    truth : ndarray, shape (ny, nx), radian
+    phases : mapping of str to ndarray
+        By the name of the class of the method.
+    """
+    truth = np.where(pupil.inside, truth, np.nan)
+    limit = np.nanmax(np.abs(truth))
+    figure, panels = plt.subplots(1, 1 + len(phases), figsize=(_WIDTH, 2.7))
+    shown = show_phase(panels[0], truth, limit)
+    panels[0].set_title("true phase\n", fontsize=10)
+    for axes, (name, phase) in zip(panels[1:], phases.items(), strict=True):
+        residual = wrapped_residual(pupil, phase, truth)
+        show_phase(axes, truth + residual, limit)
+        error = float(np.sqrt(np.nanmean(residual**2)))
+        images = LOOKS[name].sees.replace("pupils", "images").replace("pupil", "image")
+        axes.set_title(f"from {images}:\n{_error(error)}", fontsize=10)
+    figure.colorbar(shown, ax=panels, label="phase (rad)", aspect=15)
+    return figure
+
+
+def _error(value: float) -> str:
+    return f"error {value:.2f} rad rms" if value >= 5e-3 else "no error"

@@ -94,9 +94,10 @@ def constants(module: ModuleType) -> dict[str, str]:
 def path(module: ModuleType, name: str) -> str:
     """Return the shortest path from which a name can be imported; a path can also be that of a module."""
     parts, taken = module.__name__.split("."), modules()
-    for package in (".".join(parts[:depth]) for depth in range(1, len(parts))):
-        if name in getattr(importlib.import_module(package), "__all__", ()) and f"{package}.{name}" not in taken:
-            return f"{package}.{name}"
+    for package in (importlib.import_module(".".join(parts[:depth])) for depth in range(1, len(parts))):
+        same = getattr(package, name, None) is vars(module)[name]
+        if same and name in package.__all__ and f"{package.__name__}.{name}" not in taken:
+            return f"{package.__name__}.{name}"
     return f"{module.__name__}.{name}"
 
 

@@ -62,14 +62,19 @@ def recorded(seed=1, flux=1.0, **moved):
     return images[:2], images[2:]
 
 
-def phase_error(found):
-    """Rms error of a measured phase on the camera pixels that are fully lit, radian."""
+def phase_difference(found):
+    """Measured phase less the true one, without piston, (ny, nx); NaN at pixels that are not fully lit."""
     phase, _, clear = fine_images()
     recording = found.measurement.recording
     window = tuple(slice(first, first + recording.n_pixels) for first in recording.corner)
-    lit = (_blocks(clear).min(axis=(1, 3)) > 0.5)[window] & np.isfinite(found.phase)
-    left = np.exp(1j * (found.phase - on_camera(phase)[window]))[lit]
-    return np.angle(left * np.conj(left.mean())).std()
+    lit = (_blocks(clear).min(axis=(1, 3)) > 0.5)[window]
+    left = np.where(lit, np.exp(1j * (found.phase - on_camera(phase)[window])), np.nan)
+    return np.angle(left * np.conj(np.nanmean(left)))
+
+
+def phase_error(found):
+    """Rms error of a measured phase at the camera pixels that are fully lit, radian."""
+    return np.nanstd(phase_difference(found))
 
 
 def _blocks(fine):

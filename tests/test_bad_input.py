@@ -28,7 +28,7 @@ from zwfs.reconstructors.base import Reconstructor
 MODULES = (
     *("pupil", "modes", "masks", "sensor", "detector", "metrics", "reconstructors", "reconstructors.base"),
     *("bench.model", "bench.segments", "bench.recording"),
-    *("units", "frames.files", "frames.registration", "frames.pipeline", "frames.order"),
+    *("units", "frames.files", "frames.registration", "frames.pipeline", "frames.order", "frames.verdict"),
     *("paper.curves", "paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
     *("paper.bench_linearity", "paper.closed_loop", "paper.photon_noise", "paper.design", "paper.recovery"),
     *("companion.sweeps", "companion.results", "companion.tables"),
@@ -120,7 +120,7 @@ def valid() -> dict:
     points = pupil.gather(phase)
     from zwfs.bench import model
     from zwfs.frames import files as camera
-    from zwfs.frames import pipeline, registration
+    from zwfs.frames import pipeline, registration, verdict
     from zwfs.paper import (
         bench_linearity,
         closed_loop,
@@ -138,6 +138,7 @@ def valid() -> dict:
     on_bench = model.normalise(small.frames(None, 2))
     flow = closed_loop.FrozenFlow(pupil, 0.2, 1, cutoff=1.0, seed=1)
     images, optics, recording, measurement, found = _recorded(pipeline, registration)
+    noise = verdict.CameraNoise(2.0, 5.0)
     poked = replace(measurement, intensity=measurement.intensity.copy())
     poked.intensity[:, 10:14, 10:14] += np.reshape([0.4, -0.3], (2, 1, 1))
     file = camera.CameraFile(
@@ -341,6 +342,10 @@ def valid() -> dict:
         "opd": points,
         "flat": measurement,
         "poked": poked,
+        "judge.result": found,
+        "error_bar.result": found,
+        "noise": noise,
+        "CameraNoise.gain": 2.0,
         "write_phase.phase": found,
         "bench_error.phase": found,
         "measured_pupil.images": np.ones((2, 12, 12)),
@@ -377,6 +382,7 @@ def valid() -> dict:
         "DesignMap": design.DesignMap(np.array([1.0]), np.array([1.5]), {"flat": np.array([[2.0]])}),
         "CameraFile": file,
         "MeasuredPhase": found,
+        "CameraNoise": noise,
     }
     return {"arguments": arguments, "instances": instances}
 

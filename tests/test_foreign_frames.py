@@ -1,10 +1,13 @@
 """Frames of a vector sensor that HCIPy simulates: registration and phase."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
 from zwfs.frames.registration import record
+from zwfs.frames.verdict import CameraNoise, judge, near_edges
 
 from . import foreign
 
@@ -33,3 +36,31 @@ def test_light_of_the_images_is_compared_whatever_their_size(case):
     given, recording = case
     ratios = reduce_frames(recording, Optics()).flux_ratio
     np.testing.assert_allclose(ratios, 1 / given.get("flux", 1), rtol=0.005)
+
+
+NOISE = CameraNoise(1.0, foreign.READ_NOISE)
+
+
+def test_noise_explains_the_frames_and_its_error_bar_holds(case):
+    found = reconstruct(reduce_frames(case[1], Optics()))
+    verdict = judge(found, NOISE)
+    assert verdict.explained
+    assert np.all(verdict.score > verdict.control + 0.5)
+    far = found.measurement.good & ~near_edges(found.measurement)
+    pulls = (foreign.phase_difference(found) / verdict.sigma)[far]
+    assert 0.8 < pulls.std() < 1.4
+
+
+@pytest.mark.parametrize("wrong", [Optics(1.3), Optics(scale=1.1), Optics(unmasked=0.1), Optics(background=0.05)])
+def test_wrong_model_is_not_explained(wrong):
+    recording = record(*foreign.recorded())
+    assert not judge(reconstruct(reduce_frames(recording, wrong)), NOISE).explained
+
+
+def test_frames_that_do_not_belong_together_score_like_the_control():
+    frames, clear_frames = foreign.recorded()
+    upside_down = [frames[0], replace(frames[1], counts=frames[1].counts[::-1])]
+    verdict = judge(reconstruct(reduce_frames(record(upside_down, clear_frames), Optics())))
+    assert np.all(verdict.score < 0.3)
+    assert verdict.explained is None
+    assert verdict.sigma is None

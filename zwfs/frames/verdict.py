@@ -1,0 +1,293 @@
+"""Whether a measured phase can be trusted: misfit over noise, a score on unseen data, and where to look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from zwfs import _check
+from zwfs.bounds import cramer_rao
+from zwfs.frames.pipeline import MeasuredPhase, Measurement, model, predict_other
+from zwfs.frames.registration import Placement, Recording, nearest_good
+
+_NEAR = 2  # pixels from a gap, vane or edge that count as near it
+_LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
+_EXPLAINED = 1.25  # misfit over the noise up to which noise explains the frames
+_LEAST_LEAD = 0.2  # of the score over that of the control
+_UNEVEN = 0.03  # difference of the two flux ratios that is worth a word
+_EXCESS = 0.02  # light around the pupil, 1 = mean of the pupil, that is worth a word
+_MANY = 0.01  # of the points
+_TURNED = 5.0  # standard errors: a rotation or magnification beyond them is real
+
+
+@dataclass(frozen=True)
+class CameraNoise:
+    """Noise of a camera.
+
+    Parameters
+    ----------
+    gain : float, electrons / count
+    read_noise : float, electrons rms / pixel
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of the wrong kind or out of range.
+    """
+
+    gain: float
+    read_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check.number("gain", self.gain, 0, open_low=True)
+        _check.number("read_noise", self.read_noise, 0)
+
+    def photons(self, measurement: Measurement) -> float:
+        """Photons that an intensity of 1 puts into a pixel of a frame, the mean of both images."""
+        _check.instance("measurement", measurement, Measurement)
+        return float(measurement.counts.mean() * measurement.recording.exposure * self.gain)
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Judgement of a measured phase.
+
+    Attributes
+    ----------
+    score, control : ndarray, shape (2,)
+        Correlation of each frame with its prediction from the other one alone; and the same with the second frame
+        turned upside down, which must fail.
+    inner, edge : float
+        Rms misfit of the frames over that of the noise: far from gaps, vanes and edges, and within 2 pixels of
+        them. 1 if noise is all of it; NaN if the noise of the camera is not known.
+    sigma : ndarray, shape (ny, nx), radian, or None
+        Error bar of the phase: the smallest that photon and read noise allow, without errors of the model.
+    findings : tuple of str
+        Sentences: the verdict first, then the facts, and where to look.
+    """
+
+    score: NDArray[np.float64]
+    control: NDArray[np.float64]
+    inner: float
+    edge: float
+    sigma: NDArray[np.float64] | None
+    findings: tuple[str, ...]
+
+    @property
+    def explained(self) -> bool | None:
+        """Whether noise explains the misfit far from the edges; None if the noise is not known."""
+        return None if np.isnan(self.inner) else bool(self.inner <= _EXPLAINED)
+
+
+def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations: int = 25) -> Verdict:
+    """Judge a measured phase, in words and numbers.
+
+    Parameters
+    ----------
+    result : MeasuredPhase
+    noise : CameraNoise, optional
+        Without it there is no error bar, and the misfit is not compared with the noise.
+    n_iterations : int
+        As for `reconstruct`.
+
+    Returns
+    -------
+    Verdict
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of the wrong kind or out of range.
+    """
+    _check.instance("result", result, MeasuredPhase)
+    measurement = result.measurement
+    score = predict_other(measurement, n_iterations)
+    control = predict_other(upside_down(measurement), n_iterations)
+    near = near_edges(measurement)
+    inner, edge, sigma = np.nan, np.nan, None
+    if noise is not None:
+        _check.instance("noise", noise, CameraNoise)
+        ratio = _over_noise(result, noise)
+        inner, edge = _rms(ratio[measurement.good & ~near]), _rms(ratio[measurement.good & near])
+        sigma = error_bar(result, noise)
+    findings = (
+        _of_fit(result, inner, edge, near),
+        _of_score(score, control),
+        _of_light(measurement),
+        _of_place(measurement.recording.placement),
+        *_warnings(result),
+    )
+    return Verdict(score, control, inner, edge, sigma, findings)
+
+
+def upside_down(measurement: Measurement) -> Measurement:
+    """Control of a measurement: its second frame upside down, so that the frames no longer belong together."""
+    _check.instance("measurement", measurement, Measurement)
+    flipped: dict[str, Any] = {}
+    for name in ("intensity", "bad"):
+        pair = getattr(measurement, name)
+        flipped[name] = np.stack([pair[0], pair[1, ::-1]])
+    return replace(measurement, **flipped)
+
+
+def near_edges(measurement: Measurement) -> NDArray[np.bool_]:
+    """Points within 2 pixels of one that is dark or partly lit, (ny, nx)."""
+    _check.instance("measurement", measurement, Measurement)
+    amplitude = np.where(measurement.pupil.inside, measurement.pupil.amplitude, 0)
+    # Compared with its surroundings, since the pupil may be lit unevenly.
+    around = ndimage.median_filter(amplitude, max(3, round(measurement.recording.diameter / 8)))
+    return ~np.asarray(ndimage.binary_erosion(amplitude > _LIT * around, np.ones((3, 3)), iterations=_NEAR))
+
+
+def error_bar(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64]:
+    """Smallest standard error of the phase that photon and read noise allow, at its estimate.
+
+    Noise of the clear frames and errors of the model are not part of it.
+
+    Parameters
+    ----------
+    result : MeasuredPhase
+    noise : CameraNoise
+
+    Returns
+    -------
+    ndarray, shape (ny, nx), radian
+        NaN outside the pupil and at bad points.
+    """
+    _check.instance("result", result, MeasuredPhase)
+    _check.instance("noise", noise, CameraNoise)
+    measurement = result.measurement
+    phase = nearest_good(np.nan_to_num(result.phase), measurement.good)
+    sigma = cramer_rao(model(measurement), phase, photons=noise.photons(measurement), read_noise=noise.read_noise)
+    return np.where(measurement.good, sigma, np.nan)
+
+
+def _over_noise(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64]:
+    """Misfit of the two frames at each point over its standard deviation, (ny, nx).
+
+    Two intensities share one phase, which takes up the part of the misfit along its slopes. The rest is normal to
+    them: one number at each point. It holds the noise of both frames, as interpolation leaves it, and of the clear
+    frames, which changes the squared amplitude of the model.
+    """
+    measurement = result.measurement
+    sensor, pupil, photons = model(measurement), measurement.pupil, noise.photons(measurement)
+    phase = nearest_good(np.nan_to_num(result.phase), measurement.good)
+    field = np.where(pupil.inside, pupil.amplitude * np.exp(1j * phase), 0)
+    waves = sensor.propagate(field)[(..., *sensor.window)]
+    slopes = 2 * np.real(np.conj(waves) * 1j * field)
+    normal = np.stack([slopes[1], -slopes[0]]) / np.maximum(np.hypot(*slopes), 1e-300)
+    growth = np.real(np.conj(waves) * field) / np.maximum(np.abs(field) ** 2, 1e-300)
+    frames, clear = _noise_kept(measurement.recording)
+    dark = noise.read_noise**2 / photons
+    of_frames = frames[:, np.newaxis, np.newaxis] * (np.maximum(np.abs(waves) ** 2, 0) + dark) / photons
+    exposure = measurement.recording.exposure
+    of_amplitude = clear.sum() / 4 * exposure * (np.abs(field) ** 2 + dark * exposure) / photons
+    variance = np.sum(normal**2 * of_frames, axis=0) + np.sum(normal * growth, axis=0) ** 2 * of_amplitude
+    misfit = (result.measured - result.modelled)[(..., *measurement.window)]
+    return np.sum(normal * misfit, axis=0) / np.sqrt(np.maximum(variance, 1e-300))
+
+
+def _noise_kept(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Part of the variance of white noise that interpolation keeps, in the two frames and the clear frames."""
+    rng = np.random.default_rng(0)
+
+    def noise(images: Any) -> Any:
+        return tuple(replace(one, counts=rng.normal(size=one.counts.shape)) for one in images)
+
+    white = replace(recording, frames=noise(recording.frames), clear_frames=noise(recording.clear_frames))
+    return white.frames_on_grid()[0].var(axis=(1, 2)), white.clear_on_grid()[0].var(axis=(1, 2))
+
+
+def _rms(values: NDArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
+
+
+def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.bool_]) -> str:
+    """Whether the model explains the frames, and where it does not."""
+    good = result.measurement.good
+    squares = np.sum((result.measured - result.modelled)[(..., *result.measurement.window)] ** 2, axis=0)
+    share, area = squares[good & near].sum() / squares[good].sum(), np.mean(near[good])
+    edges = "gaps, vanes and edges"
+    look = (
+        "registration, focus, blur and partly lit pixels"
+        if share > 1.2 * area
+        else "dimple, leakage and background"
+    )
+    where = (
+        f"{share:.0%} of the squared misfit lies within {_NEAR} pixels of {edges} ({area:.0%} of the points): "
+        f"look at {look}."
+    )
+    if np.isnan(inner):
+        size = f"the rms misfit is {np.mean(result.residual):.3f} of the mean light"
+        return f"Not compared with the noise of the camera, which is not known: {size}. {where}"
+    if inner > _EXPLAINED:
+        return f"Not explained: far from {edges} the misfit is {inner:.3g} times that of the noise. {where}"
+    verdict = f"Explained to within the noise: far from {edges} the misfit is {inner:.2f} times that of the noise."
+    if edge <= _EXPLAINED:
+        return verdict
+    return f"{verdict} Near them it is {edge:.3g} times the noise: look at partly lit pixels, focus and blur."
+
+
+def _of_score(score: NDArray, control: NDArray) -> str:
+    """Score on data that the phase has not seen, and its control."""
+    lead = float(np.min(score - control))
+    trust = "The frames belong together." if lead >= _LEAST_LEAD else "The frames hardly support this phase."
+    return (
+        f"Score on unseen data: predicted from the other frame alone, the frames correlate by {score[0]:.2f} and "
+        f"{score[1]:.2f} with the measured ones. Control, with the second frame upside down: {control[0]:.2f} and "
+        f"{control[1]:.2f}. {trust}"
+    )
+
+
+def _of_light(measurement: Measurement) -> str:
+    """Flux ratios of the images, and the assumption that balancing makes."""
+    masked, clear = measurement.flux_ratio
+    facts = (
+        f"Image 1 holds {masked:.3f} times the light of image 2 behind the mask, {clear:.3f} times without it. "
+    )
+    if not (measurement.recording.balance and measurement.optics.opposite):
+        return facts + "The frames are not balanced."
+    facts += "Balancing assumes equal ratios, as phase shifts of +theta and -theta give. "
+    if abs(masked / clear - 1) < _UNEVEN:
+        return facts + f"They agree to {abs(masked / clear - 1):.1%}."
+    return facts + (
+        f"They differ by {abs(masked / clear - 1):.0%}, which balancing hides: look for leakage, light that one "
+        "mask does not shift, and stray light."
+    )
+
+
+def _of_place(placement: Placement) -> str:
+    """Rotation and magnification between the images."""
+    facts = []
+    for name, unit, value, sigma in (
+        ("rotation", "degrees", placement.rotation, placement.sigma[2]),
+        ("magnification", "%", 100 * (placement.magnification - 1), 100 * placement.sigma[3]),
+    ):
+        if np.isnan(sigma):
+            facts.append(f"its {name} is not determined and taken as none")
+        else:
+            real = "undone" if abs(value) > _TURNED * sigma else "consistent with none"
+            facts.append(f"its {name} is {value:+.3f} +- {sigma:.3f} {unit} ({real})")
+    return "The second image, compared with the first: " + "; ".join(facts) + "."
+
+
+def _warnings(result: MeasuredPhase) -> list[str]:
+    """Facts that lower the trust in the phase."""
+    measurement, found = result.measurement, []
+    n_points = measurement.pupil.n_points
+    if not result.converged:
+        found.append("The iteration has not converged: raise n_iterations, or the phase is beyond its range.")
+    if result.n_unsolved > _MANY * n_points:
+        found.append(f"At {result.n_unsolved} of {n_points} points the equations have no unique solution.")
+    if measurement.n_bad > _MANY * n_points:
+        found.append(f"{measurement.n_bad} of {n_points} points are bad and have no phase.")
+    if abs(result.excess_light) > _EXCESS:
+        found.append(
+            f"Around the pupil the frames differ from the model by {result.excess_light:+.3f} of the mean light: "
+            "look at the dark, stray light and the diameter of the dimple."
+        )
+    return found

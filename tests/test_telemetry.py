@@ -1,9 +1,12 @@
 """A calibrated bench and its telemetry: phases, flags, what is refused, and that no frame is lost."""
 
+import gc
 import gzip
 import io
 import os
 import pickle
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -707,3 +710,42 @@ def test_full_disk_is_one_message_and_keeps_nothing(folder):
     assert "Traceback" not in shown.stderr
     assert not list(folder.glob("*phase.fits*"))
     assert not list(folder.glob(".*"))
+
+
+# The pages of the book
+
+PAGES = Path(__file__).parents[1] / "book"
+
+
+def blocks(page, language):
+    return re.findall(rf"```{language}\n(.*?)```", (PAGES / page).read_text("utf-8"), re.S)
+
+
+def test_page_on_telemetry_does_what_it_says(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    first, *rest = blocks("telemetry.md", "python")
+    names: dict = {}
+    exec(first, names)
+    for line in "".join(blocks("telemetry.md", "sh")).splitlines():
+        assert line.startswith("python -m zwfs.frames ")
+        assert main(shlex.split(line)[3:]) == 0
+    for code in rest:
+        exec(code, names)
+    assert "[0 1 6]" in capsys.readouterr().out
+    assert (names["table"]["FLAGS"] > 0).sum() == 2
+    assert names["phase"].shape[0] == 38
+    assert fits.getdata("modes.fits", "FRAMES")["SIGCOEFF"].shape == (40, 20)
+
+
+def test_page_on_real_time_runs_its_loop(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    try:
+        for code in blocks("real_time.md", "python"):
+            exec(code, names)
+    finally:
+        gc.enable()
+        gc.unfreeze()
+    assert names["flags"] == 0
+    assert names["command"].shape == (50,)
+    assert Path("bench.npz").exists()

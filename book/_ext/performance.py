@@ -97,6 +97,8 @@ def tables(speed: dict[str, Any]) -> dict[str, str]:
         "loop": table(["reconstructor", "time of a step (ms)"], loop),
         "limit": table(["part", "time (μs)", "share"], limit),
         "growth": growth(speed),
+        "telemetry": telemetry(speed["telemetry"]),
+        **latency(speed["latency"]),
     }
 
 
@@ -117,6 +119,37 @@ def rates(speed: dict[str, Any]) -> str:
         setting = f"{row['n_pixels']} pixels, float32, 1 iteration from the phase before"
         rows.append([setting, f"{row['rate']:.0f}", power(row["median error"]), ""])
     return table(["setting", "rate (1/s)", "median error (rad)", "largest error (rad)"], rows)
+
+
+def latency(rows: list[dict[str, Any]]) -> dict[str, str]:
+    """Return a table of the times of single frames, and one of the causes of late calls."""
+    settings = [f"{row['n_pixels']} pixels{'' if row['frozen'] else ', with garbage collector'}" for row in rows]
+    quantiles = "p50", "p99", "p99.9"
+    times = [
+        [setting, *(f"{1e6 * row[name]:.0f}" for name in quantiles), f"{row['p99 / p50']:.2f}"]
+        for setting, row in zip(settings, rows, strict=True)
+    ]
+    causes = [name for name in rows[0] if name.startswith("late")]
+    late = [
+        [name.removeprefix("late, ") if name != "late" else "late, all", *(f"{row[name]:.2%}" for row in rows)]
+        for name in causes
+    ]
+    return {
+        "latency": table(["", *(f"{name} (μs)" for name in quantiles), "p99 / p50"], times),
+        "late": table(["share of the calls", *settings], late),
+    }
+
+
+def telemetry(measured: dict[str, Any]) -> str:
+    """Return sentences on the time of a long cube."""
+    one = {name: 1e3 * time for name, time in measured["parts"].items()}
+    return (
+        f"{measured['frames']} simulated frame pairs of {measured['n_pixels']} pixels took "
+        f"{measured['time']:.1f} s with {measured['threads']} threads ({measured['processor time']:.1f} s of processor time), files "
+        f"included. One pair takes {one['whole']:.2f} ms of a core: {one['resampling']:.2f} ms for resampling, "
+        f"{one['iteration']:.2f} ms for the iteration and {one['residual']:.2f} ms for the residual. The memory "
+        f"grew by {measured['memory'] / 1e6:.0f} MB.\n"
+    )
 
 
 def growth(speed: dict[str, Any]) -> str:

@@ -34,6 +34,7 @@ from zwfs.paper.linearity import screens_at
 from zwfs.reconstructors import base
 
 from ..reference import HcipySensor
+from . import latency, telemetry
 
 DIMPLES = (Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
 REAL_TIME = {"n_iterations": 2, "tolerance": 0.0, "accelerate": True}
@@ -310,6 +311,8 @@ def results(seconds=2.0):
         "slope": slope(seconds),
         "others": others(seconds),
         "likelihood": likelihood(seconds),
+        "latency": latency.results(),
+        "telemetry": telemetry.telemetry(),
     }
 
 

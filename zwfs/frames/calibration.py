@@ -74,6 +74,9 @@ class Flag(IntFlag):
     NOT_CONVERGED = 16
 
 
+_LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED = (flag.value for flag in Flag)  # plain, and far quicker
+
+
 @dataclass(frozen=True, eq=False)
 class Phases:
     """Phases of camera images; `...` is the batch of the exposures.
@@ -405,7 +408,8 @@ class Calibration(Immutable):
     def coefficients(self, phases: Phases, matrix: NDArray) -> NDArray[np.float32]:
         """Coefficients of modes, (..., n_modes), radian, by one product with a `modal_matrix`."""
         values = without_piston(self.sensor.pupil.gather(phases.filled))
-        return (values.reshape(-1, len(matrix)) @ matrix.astype(values.dtype)).reshape((*values.shape[:-1], -1))
+        product = values.reshape(-1, len(matrix)) @ matrix.astype(values.dtype, copy=False)
+        return product.reshape((*values.shape[:-1], -1))
 
     def sigma(
         self, phases: Phases, photons: float, read_noise: float = 0.0, modes: ArrayLike | None = None
@@ -479,15 +483,9 @@ class Calibration(Immutable):
         if not enough.all():
             frames[~enough] = work.flat_frames  # of a flat wavefront: they converge at once
         filled, n_iterations, converged, residual = self._solve(frames, good, start, judge)
-        with np.errstate(invalid="ignore"):
-            inconsistent = residual > limit
-        flags = (
-            Flag.BAD_PIXELS * (n_bad > 0)
-            + Flag.SATURATED * (n_saturated > 0)
-            + Flag.INCONSISTENT * inconsistent
-            + Flag.NOT_CONVERGED * (~converged & (self.tolerance > 0))
-        )
-        flags = np.where(enough, flags, Flag.LOST + (flags & (Flag.BAD_PIXELS + Flag.SATURATED)))
+        flags = _BAD * (n_bad > 0) + _SATURATED * (n_saturated > 0)
+        faults = flags + _INCONSISTENT * (residual > limit) + _NOT_CONVERGED * (~converged & (self.tolerance > 0))
+        flags = np.where(enough, faults, _LOST + flags)
         phase = np.where(good & enough[:, np.newaxis, np.newaxis], filled, np.float32(np.nan))
         residual = np.where(enough, residual, np.float32(np.nan))
         light = relative.mean(axis=1).astype(np.float32)

@@ -1,0 +1,100 @@
+"""Time of single frames in a process that runs for long: python -m tests.benchmarks.latency [frames] prints JSON.
+
+Each frame pair goes from camera counts to the phase and 50 modes, as in the loop of the page on real time. The
+process is warm and uses one core. Set OMP_NUM_THREADS=1, as `make bench` does, and keep the computer quiet: unlike
+the other benchmarks this one takes the time of the clock, since a control loop waits for it.
+
+A call is late if it takes more than 1.3 times the median. For the late calls the benchmark counts the causes that
+the operating system and Python report: the scheduler took the core away, memory pages were mapped, the garbage
+collector ran. The other late calls had the core for all of their time: an interrupt of the hardware or of the host
+of a virtual machine, a change of the clock rate, or caches that another process has filled.
+"""
+
+import gc
+import json
+import resource
+import sys
+from dataclasses import replace
+from time import perf_counter_ns, thread_time_ns
+
+import numpy as np
+
+from zwfs import zernike_basis
+from zwfs.metrics import without_piston
+
+from .telemetry import camera
+
+LATE = 1.3  # times the median
+REAL_TIME = {"n_iterations": 3, "tolerance": 0.0}
+
+
+def latency(n_pixels, n_frames=10_000, *, frozen=True):
+    """Percentiles of the time of a call, seconds, and the causes of late calls.
+
+    `frozen` takes the garbage collector out of the loop.
+    """
+    calibration, frames = camera(n_pixels, 16)
+    calibration = replace(calibration, **REAL_TIME)
+    matrix = calibration.modal_matrix(zernike_basis(calibration.sensor.pupil, 50)).astype(np.float32)
+    gather = calibration.sensor.pupil.gather
+
+    def step(counts):
+        return without_piston(gather(calibration(counts, judge=False).filled)) @ matrix
+
+    for index in range(min(n_frames, 500)):
+        step(frames[index % len(frames)])
+    collections = []
+
+    def note(phase, info):
+        if phase == "start":
+            collections.append(info["generation"])
+
+    measured = np.zeros((n_frames, 5), np.int64)  # clock, processor, switches, pages, collections
+    gc.collect()
+    gc.callbacks.append(note)
+    if frozen:
+        gc.freeze()
+        gc.disable()
+    try:
+        for index in range(n_frames):
+            counts = frames[index % len(frames)]
+            before, n_before = resource.getrusage(resource.RUSAGE_THREAD), len(collections)
+            clock, busy = perf_counter_ns(), thread_time_ns()
+            step(counts)
+            clock, busy = perf_counter_ns() - clock, thread_time_ns() - busy
+            after = resource.getrusage(resource.RUSAGE_THREAD)
+            measured[index] = (
+                clock, busy, after.ru_nivcsw - before.ru_nivcsw, after.ru_minflt - before.ru_minflt,
+                len(collections) - n_before,
+            )  # fmt: skip
+    finally:
+        gc.callbacks.remove(note)
+        gc.enable()
+        gc.unfreeze()
+    return {"n_pixels": n_pixels, "n_frames": n_frames, "frozen": frozen} | _report(measured)
+
+
+def _report(measured):
+    clock, busy, switches, pages, collections = measured.T
+    median, p99, p999 = np.percentile(clock, (50, 99, 99.9)) * 1e-9
+    late = clock * 1e-9 > LATE * median
+    reported = (switches > 0) | (pages > 0) | (collections > 0)
+    return {
+        "p50": float(median), "p99": float(p99), "p99.9": float(p999), "largest": float(clock.max() * 1e-9),
+        "p99 / p50": float(p99 / median),
+        "processor p99 / p50": float(np.percentile(busy, 99) / np.percentile(busy, 50)),
+        "late": float(np.mean(late)),
+        "late, core taken away": float(np.mean(late & (switches > 0))),
+        "late, pages mapped": float(np.mean(late & (pages > 0))),
+        "late, garbage collector": float(np.mean(late & (collections > 0))),
+        "late, none of these": float(np.mean(late & ~reported)),
+    }  # fmt: skip
+
+
+def results(n_frames=10_000):
+    """Rows for 40 and 100 pixels, and for 40 pixels with the garbage collector."""
+    return [latency(40, n_frames), latency(40, n_frames, frozen=False), latency(100, n_frames)]
+
+
+if __name__ == "__main__":
+    print(json.dumps(results(*map(int, sys.argv[1:2])), indent=1))

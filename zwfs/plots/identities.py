@@ -26,7 +26,7 @@ def approximation(
     steps : mapping of label to sequence
         Error of the reconstructed phase over the input.
     """
-    figure, panels = plt.subplots(1, 2, figsize=(9, 4.1))
+    figure, panels = plt.subplots(1, 2, figsize=(7.2, 4.0))
     for axes, curves in zip(panels, (wave, steps), strict=True):
         for (label, values), style in zip(curves.items(), OTHER_STYLES, strict=False):
             axes.plot(rms, values, markersize=4.5, label=label, **style)
@@ -49,13 +49,13 @@ def diversity(pairs: DimplePairs) -> Figure:
     """Determinant of equation (10) and the one weighted with both reference waves, for many pairs of masks."""
     matches = {label: np.isclose(pairs.shifts, pair).all(axis=1) for label, pair in _NAMED.items()}
     named = {label: int(match.argmax()) for label, match in matches.items() if match.any()}
-    figure, panels = plt.subplots(1, 2, figsize=(9, 3.9), sharex=True)
+    figure, panels = plt.subplots(1, 2, figsize=(7.2, 3.8), sharex=True)
     for axes, values in zip(panels, (pairs.determinant, pairs.strength), strict=True):
         axes.plot(pairs.difference, values, ".", color="#56B4E9", ms=4)
         for (label, index), style in zip(named.items(), OTHER_STYLES, strict=False):
             point = pairs.difference[index], values[index]
             axes.plot(*point, label=label, markersize=8, **style | {"linestyle": "none"})
-        axes.set(xlabel=r"difference of the phase shifts, $\theta_b-\theta_a$ (rad)", ylim=(0, None))
+        axes.set(xlabel=r"difference $\theta_b-\theta_a$ (rad)", ylim=(0, None))
         axes.set_xticks(np.pi / 2 * np.arange(5), ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"])
     panels[0].set_ylabel(r"$|\det M|$")
     panels[1].set_ylabel("determinant with the waves' strength")

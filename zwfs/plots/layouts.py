@@ -51,7 +51,7 @@ def sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:
     frame = np.abs(sensor.propagate(field)[0]) ** 2
     inside = np.where(pupil.inside, 1, np.nan)
 
-    scene = _Scene(9, 4.7)
+    scene = _Scene(9, 4.7, size=10.5)
     y, half = 3.0, 0.8 * 0.98
     scene.beam([(0.1, half), (2.82, half), (4.5, 0), (6.18, half), (8.9, half)], origin=(0, y))
     scene.axis((0.1, y), (8.9, y))
@@ -68,10 +68,10 @@ def sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:
     # The axis runs from -4 to 4 lambda/D over 161 samples.
     focal.add_patch(Circle((80, 80), mask.diameter / 2 * 20, fill=False, ec="white", ls="--", lw=1.3))
     label = f"mask: {mask.diameter:g} $\\lambda/D$, {_shift(mask)} rad"
-    focal.text(80, 146, label, color="white", ha="center", fontsize=8)
+    focal.text(80, 146, label, color="white", ha="center", fontsize=9)
     focal.plot([80, 80], [80 + mask.diameter * 10, 142], color="white", lw=0.8)
     focal.plot([20, 60], [12, 12], color="white", lw=1.5)
-    focal.text(40, 17, r"2 $\lambda/D$", color="white", ha="center", fontsize=8)
+    focal.text(40, 17, r"2 $\lambda/D$", color="white", ha="center", fontsize=9.5)
     _plane(scene, 7.85, "detector plane", r"intensity $I_{out}$", INTENSITY_MAP, frame, 0, frame.max())
 
     interference = 2 * np.abs(pupil.amplitude * wave) * np.cos(np.angle(field * wave.conj()))
@@ -105,7 +105,7 @@ def vector_sensor(sensor: ZernikeSensor, phase: NDArray) -> Figure:
     """
     if sensor.n_masks != 2:
         raise ValueError(f"sensor has {sensor.n_masks} masks: expected two, one for each polarisation")
-    scene = _Scene(9, 7.25)
+    scene = _Scene(9, 7.25, size=10.5)
     for y, liquid in ((5.5, True), (2.05, False)):
         _vector_row(scene, y, sensor, phase, liquid=liquid)
     scene.axes.plot([0.2, 8.8], [3.86, 3.86], color="#cccccc", lw=0.8)
@@ -176,7 +176,7 @@ def _vector_row(scene: _Scene, y: float, sensor: ZernikeSensor, phase: NDArray, 
 
 _KINDS = {
     True: ("Liquid crystal", "geometric phase, of opposite sign for\nthe two circular polarisations"),
-    False: ("Metasurface", "structures smaller than the wavelength, for\nthe two linear polarisations directly"),
+    False: ("Metasurface", "structures below the wavelength, for\nthe two linear polarisations directly"),
 }
 
 
@@ -284,12 +284,12 @@ def _bench_pictures(scene: _Scene, bench: Bench, phase: NDArray, frames: NDArray
 
 
 class _Scene:
-    """Figure without axes to be seen, drawn upon in inches from its lower left corner."""
+    """Figure without visible axes: positions in inches from its lower left corner, text of `size` points."""
 
-    def __init__(self, width: float, height: float) -> None:
+    def __init__(self, width: float, height: float, size: float = 9) -> None:
         # Not "none": after it, a figure that is saved twice gets the layout engine of the style.
         self.figure = plt.figure(figsize=(width, height), layout=PlaceHolderLayoutEngine(True, True))
-        self.width, self.height = width, height
+        self.width, self.height, self.size = width, height, size
         self.axes = self.figure.add_axes((0, 0, 1, 1))
         self.axes.set(xlim=(0, width), ylim=(0, height))
         self.axes.set_axis_off()
@@ -326,13 +326,15 @@ class _Scene:
         axes = self._part(*box)
         flat = box[2] > box[3]
         bar = self.figure.colorbar(shown, cax=axes, orientation="horizontal" if flat else "vertical")
-        bar.set_label(name, fontsize=8)
-        axes.tick_params(labelsize=8, length=2, pad=1)
+        bar.set_label(name, fontsize=self.size - 1)
+        axes.tick_params(labelsize=self.size - 1, length=2, pad=1)
         axes.locator_params(nbins=ticks)
 
-    def label(self, x: float, y: float, text: str, size: float = 9, ha: str = "center", **style: Any) -> None:
-        """Text, centred on x unless said otherwise."""
-        self.axes.text(x, y, text, ha=ha, fontsize=size, **style)
+    def label(
+        self, x: float, y: float, text: str, size: float | None = None, ha: str = "center", **style: Any
+    ) -> None:
+        """Text, centred on x unless said otherwise, in points; the size is that of the scene if None."""
+        self.axes.text(x, y, text, ha=ha, fontsize=size or self.size, **style)
 
     def beam(self, profile: _Profile, origin: _Point, angle: float = 0.0) -> None:
         """Beam of light: (distance along the axis, half of the width) at its corners."""

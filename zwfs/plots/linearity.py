@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
@@ -61,7 +62,7 @@ def convergence(errors: Mapping[str, Mapping[float, NDArray]]) -> Figure:
         A method without iterations has two columns: before and after.
     """
     inputs = list(next(iter(errors.values())))
-    figure, panels = plt.subplots(1, len(inputs), figsize=(9, 3.9), sharey=True, squeeze=False)
+    figure, panels = plt.subplots(1, len(inputs), figsize=(7.2, 4.2), sharey=True, squeeze=False)
     for axes, value in zip(panels[0], inputs, strict=True):
         for name, look in _looks(errors):
             middle, low, high = (np.quantile(errors[name][value], q, axis=0) for q in (0.5, 0.1, 0.9))
@@ -73,12 +74,12 @@ def convergence(errors: Mapping[str, Mapping[float, NDArray]]) -> Figure:
                 steps, middle, color=look.color, linestyle=look.line, marker=look.marker, ms=3.5, label=look.label
             )
             axes.fill_between(steps, low, high, color=look.color, alpha=0.15, lw=0)
-        axes.set(xlabel="iteration", title=f"input {value:g} rad rms")
+        axes.set(xlabel="iteration", title=f"input {value:g} rad")
         axes.xaxis.get_major_locator().set_params(integer=True)
     panels[0, 0].set_ylabel("error (rad rms)")
     panels[0, 0].set_ylim(3e-8, 2)
     handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9)
     return figure
 
 
@@ -86,7 +87,7 @@ def estimates(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) -> Fi
     """One screen, the phase (radian) that each method estimates, and the residual, on a scale four times finer."""
     truth = np.where(pupil.inside, truth, np.nan)
     limit = np.nanmax(np.abs(truth))
-    figure, panels = plt.subplots(2, len(phases) + 1, figsize=(9, 3.6))
+    figure, panels = plt.subplots(2, len(phases) + 1, figsize=(7.2, 3.0))
     image = show_phase(panels[0, 0], truth, limit)
     panels[0, 0].set_title("input", fontsize=9)
     panels[1, 0].set_axis_off()
@@ -95,9 +96,9 @@ def estimates(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) -> Fi
         residual = wrapped_residual(pupil, phases[name], truth)
         show_phase(panels[0, column], phases[name], limit)
         shown = show_phase(panels[1, column], residual, limit / 4)
-        panels[0, column].set_title(f"{look.name}\n({look.sees})", fontsize=9)
+        panels[0, column].set_title(textwrap.fill(look.name, 10), fontsize=9)
         rms = np.sqrt(np.nanmean(residual**2))
-        panels[1, column].set_xlabel(f"{_short(rms)} rad rms", fontsize=9)
+        panels[1, column].set_xlabel(f"{_short(rms)} rad", fontsize=9)
     figure.colorbar(image, ax=panels[0], label="phase (rad)", aspect=12)
     figure.colorbar(shown, ax=panels[1], label="residual (rad)", aspect=12, extend="both")
     return figure
@@ -105,4 +106,4 @@ def estimates(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) -> Fi
 
 def _short(value: float) -> str:
     """Two digits, or a bound where the digits would be those of rounding errors."""
-    return f"{value:.2g}" if value >= 1e-6 else "below $10^{-6}$"
+    return f"{value:.2g}" if value >= 1e-6 else "< $10^{-6}$"

@@ -145,8 +145,9 @@ def telemetry(measured: dict[str, Any]) -> str:
     one = {name: 1e3 * time for name, time in measured["parts"].items()}
     return (
         f"{measured['frames']} simulated frame pairs of {measured['n_pixels']} pixels took "
-        f"{measured['time']:.1f} s with {measured['threads']} threads ({measured['processor time']:.1f} s of processor time), files "
-        f"included. One pair takes {one['whole']:.2f} ms of a core: {one['resampling']:.2f} ms for resampling, "
+        f"{measured['time']:.1f} s with {measured['threads']} threads, files included "
+        f"({measured['processor time']:.1f} s of processor time). One pair takes "
+        f"{one['whole']:.2f} ms of a core: {one['resampling']:.2f} ms for resampling, "
         f"{one['iteration']:.2f} ms for the iteration and {one['residual']:.2f} ms for the residual. The memory "
         f"grew by {measured['memory'] / 1e6:.0f} MB.\n"
     )

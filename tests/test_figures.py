@@ -1,5 +1,6 @@
 import inspect
 import json
+import pickle
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb, to_rgba_array
 
 import zwfs
@@ -23,6 +25,7 @@ from zwfs.paper.phase_amplitude import WAYS, AmplitudeCurves
 from zwfs.paper.phase_shifts import DrawnNoise, PairMaps
 from zwfs.paper.photon_noise import EXPECTED, ErrorBars, PhotonCurves
 from zwfs.paper.recovery import DimpleLimits, RecoveryCurves
+from zwfs.plots.variants import variants
 
 
 @pytest.fixture(autouse=True)
@@ -77,6 +80,7 @@ def drawn_methods(curves, pupil, classic, shifted):
     limits = DimpleLimits(three, np.full((3, 2), 0.5), np.full((3, 2, 4), 2.0))
     recovered = RecoveryCurves(three, trials.errors, np.ones((3, 3), bool), np.ones((3, 3), int))
     loop = LoopRun(three, *np.full((3, 2, 3), 0.1))
+    saxton = zwfs.GerchbergSaxton(shifted)
     bad = np.zeros(frames.shape, bool)
     bad[:, 10, 10] = True
     measurement = Measurement(None, Optics(), frames, pupil, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0))
@@ -94,6 +98,14 @@ def drawn_methods(curves, pupil, classic, shifted):
         "bench_layout": ((bench, commands, bench.frames(commands, seed=1)), ()),
         "at_a_glance": ((pupil, phase, frames, dict.fromkeys(two, phase)), ()),
         "linearity": ((curves, 0.05, two, 0.4), two),
+        "saxton_widths": (
+            (
+                {"narrow": saxton},
+                replace(curves, errors={"narrow": curves.errors["Linear"]} | curves.errors),
+                0.05,
+            ),
+            ["Linear", "GerchbergSaxton"],
+        ),
         "convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in plots.LOOKS},), plots.LOOKS),
         "estimates": ((pupil, phase, dict.fromkeys(two, phase)), ()),
         "sensor_steps": ((shifted, phase, one_pixel.lowest_pixel(shifted, phase)), ()),
@@ -153,6 +165,36 @@ def colours(figure):
 
 def test_every_figure_is_tested_for_its_colours(drawn_methods):
     assert set(drawn_methods) == set(figure_functions())
+
+
+@pytest.mark.parametrize("name", figure_functions())
+def test_variants_are_dark_or_fit_a_phone_and_the_figure_stays(name, drawn_methods):
+    figure = figure_functions()[name](*drawn_methods[name][0])
+    before, numbers = pixels(figure), plt.get_fignums()
+    for kind, variant in variants(figure).items():
+        drawn = pixels(variant)
+        assert (drawn[0, 0, :3].max() < 60) == ("dark" in kind)
+        assert (variant.get_size_inches()[0] < 4) == ("narrow" in kind)
+    assert plt.get_fignums() == numbers
+    assert np.array_equal(pixels(figure), before)
+
+
+def pixels(figure):
+    """Draw a figure: (ny, nx, 4), 0 to 255."""
+    figure = pickle.loads(pickle.dumps(figure))
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    plt.close(figure)
+    return np.asarray(canvas.buffer_rgba())
+
+
+def test_curves_of_a_dark_figure_differ_for_every_reader():
+    figure, axes = plt.subplots()
+    for look in plots.LOOKS.values():
+        axes.plot([0, 1], **look.style)
+    dark = [line.get_color() for line in variants(figure)["dark"].axes[0].lines]
+    for vision in VISION:
+        assert min(np.linalg.norm(lab(a, vision) - lab(b, vision)) for a, b in combinations(dark, 2)) > 10
 
 
 @pytest.mark.parametrize("name", figure_functions())

@@ -125,6 +125,6 @@ def test_cells_that_set_up_or_draw_are_folded_and_one_that_computes_is_not(path)
 def test_front_figure_is_the_stored_figure_of_its_notebook():
     notebook = nbformat.read(NOTEBOOKS / f"{FRONT_FIGURE}.ipynb", 4)
     outputs = (output for cell in notebook.cells for output in cell.get("outputs", ()))
-    [stored] = [output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})]
+    stored = next(output.data["image/png"] for output in outputs if "image/png" in output.get("data", {}))
     front = imread(NOTEBOOKS.parent / "book" / "_static" / "front.png")
     assert np.array_equal(front, imread(io.BytesIO(base64.b64decode(stored))))

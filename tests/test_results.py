@@ -50,7 +50,8 @@ def test_figure_looks_the_same_with_and_without_a_folder(figure, tmp_path, monke
 
 def test_three_files_are_the_same_from_run_to_run(figure, tmp_path, monkeypatch):
     first = published(tmp_path / "first", monkeypatch, figure)
-    assert sorted(first) == ["plot.csv", "plot.pdf", "plot.png"]
+    kinds = "csv", "dark.png", "narrow-dark.png", "narrow.png", "pdf", "png"
+    assert sorted(first) == [f"plot.{kind}" for kind in kinds]
     assert published(tmp_path / "second", monkeypatch, figure) == first
     assert b"CreationDate" not in first["plot.pdf"]
     assert b"Software" not in first["plot.png"]

@@ -1,5 +1,6 @@
 """Finish of the pages: sizes of pictures, descriptions for links, MathJax without the network, quiet scripts."""
 
+import copy
 import importlib.util
 import os
 import re
@@ -19,6 +20,8 @@ from sphinx.util.fileutil import copy_asset_file
 
 from book._tools.project import PDF
 
+VARIANTS = "variants-"  # with which the class of a figure begins that may have dark and narrow variants
+PHONE = "(max-width: 600px)"
 CARD = "_static/social.png"
 CARD_SIZE = (1200, 630)  # pixels, as social networks expect
 CARD_ALT = "The logo and the title of the book above a wavefront, its two images, and three reconstructions."
@@ -57,6 +60,8 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
     for image in body.select("figure > img"):
         image.wrap(body.new_tag("a", href=image["src"], title="Open the figure alone"))
         image.parent.wrap(body.new_tag("div", **{"class": "wide-figure"}))
+    for figure in body.select(f"figure[class*={VARIANTS}]"):
+        add_variants(app, page, figure)
     for entry in body.select("[role=doc-biblioentry]"):
         entry["role"] = "listitem"  # the role of Sphinx is deprecated: a list has items
     if body.find(id="phasor"):
@@ -66,6 +71,32 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
     if app.config.html_baseurl:
         given = context.get("metatags", "")
         context["metatags"] = given + tags(app.config, page, body, given)
+
+
+def add_variants(app: Sphinx, page: str, figure: Tag) -> None:
+    """Show the dark and the narrow variants of a figure, in place, where its run wrote them."""
+    name = next(word for word in figure["class"] if word.startswith(VARIANTS)).removeprefix(VARIANTS)
+    run = Path(app.srcdir, app.config.executed_notebooks, f"{Path(page).name}.files")
+    variants = {kind: run / f"{name}.{kind}.png" for kind in ("dark", "narrow", "narrow-dark")}
+    variants = {kind: file for kind, file in variants.items() if file.exists()}
+    image, new = figure.img, BeautifulSoup("", "html.parser").new_tag
+    if "dark" not in variants or image is None:
+        return
+    sources = {}
+    folder = image["src"].rpartition("/")[0]
+    for kind, file in variants.items():
+        copy_asset_file(file, Path(app.outdir, "_images"))
+        width, height = map(str, size(file))
+        sources[kind] = {"src": f"{folder}/{file.name}", "width": width, "height": height}
+    dark = copy.copy(image)
+    image.insert_after(dark)
+    dark.attrs |= sources["dark"] | {"loading": "lazy"}
+    for one, narrow, mode in ((image, "narrow", "only-light"), (dark, "narrow-dark", "only-dark")):
+        picture = one.wrap(new("picture", **{"class": mode}))
+        if narrow in sources:
+            source = sources[narrow] | {"srcset": sources[narrow]["src"], "media": PHONE}
+            picture.insert(0, new("source", **{key: value for key, value in source.items() if key != "src"}))
+            figure["class"].append("narrow") if "narrow" not in figure["class"] else None
 
 
 def tags(config: Config, page: str, body: BeautifulSoup, given: str) -> str:

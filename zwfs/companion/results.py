@@ -29,9 +29,10 @@ _METADATA = {"png": {"Software": None}, "pdf": {"Creator": None, "Producer": Non
 def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike], *, dpi: float = 200) -> None:
     """Write a figure and its numbers to the folder that the environment variable ZWFS_RESULTS names.
 
-    The files are NAME.png, NAME.pdf and NAME.csv; they are the same byte for byte from run to run. If the variable
-    is not set nothing is written, but the arguments are checked and the figure is drawn. Drawing fixes its layout,
-    so a notebook shows the same figure with and without a folder.
+    The files are NAME.png, NAME.pdf and NAME.csv, and the pictures of `zwfs.plots.variants.variants`, such as
+    NAME.dark.png. They are the same byte for byte from run to run. If the variable is not set nothing is written,
+    but the arguments are checked and the figure is drawn. Drawing fixes its layout, so a notebook shows the same
+    figure with and without a folder.
 
     Parameters
     ----------
@@ -57,8 +58,15 @@ def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike], *, dpi:
     if not re.fullmatch(r"[a-z0-9][a-z0-9_-]*", name):
         raise ValueError(f"name = {_check.shown(name)}: expected lower-case letters, digits, - and _")
     dpi = _check.number("dpi", dpi, 0, open_low=True)
-    contents = {"csv": _csv(columns)} | _pictures(figure, dpi)
-    if folder := os.environ.get(FOLDER):
+    folder = os.environ.get(FOLDER)
+    contents = {"csv": _csv(columns)}
+    if folder:
+        from zwfs.plots.variants import variants
+
+        for name_of, variant in variants(figure).items():
+            contents[f"{name_of}.png"] = _pictures(variant, dpi)["png"]
+    contents |= _pictures(figure, dpi)
+    if folder:
         for kind, content in contents.items():
             write_file(Path(folder) / f"{name}.{kind}", content)
 

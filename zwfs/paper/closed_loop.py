@@ -135,6 +135,11 @@ class LoopRun:
         """Whether each loop settled below half of the error at its start, shape (n_screens,)."""
         return self.settled() < self.open_loop[:, 0] / 2
 
+    def held(self) -> float:
+        """Median residual (radian rms) at which the closed loops settled, NaN if none closed."""
+        settled = self.settled()[self.closed()]
+        return float(np.median(settled)) if settled.size else np.nan
+
 
 def close_loop(
     reconstructor: Any,

@@ -368,6 +368,14 @@ def count_work(reconstructors: Mapping[str, Any], phase: NDArray) -> tuple[dict[
     return passes, fourier
 
 
+def run_out(reconstructor: PhaseShifted, phase: NDArray) -> float:
+    """Error (radian rms) of 200 phase-shifted iterations without a stopping rule, for one wavefront in radian."""
+    _check.instance("reconstructor", reconstructor, PhaseShifted)
+    sensor = reconstructor.sensor
+    estimate = PhaseShifted(sensor, n_iterations=200, tolerance=0)(sensor.measure(phase))
+    return float(reconstruction_error(sensor.pupil, estimate.phase, phase))
+
+
 def model_accuracy(sensor: ZernikeSensor, phase: NDArray, tolerances: ArrayLike) -> NDArray[np.float64]:
     """Rank of the low-rank model of a sensor and error of the reference wave, for several tolerances.
 

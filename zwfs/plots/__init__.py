@@ -7,7 +7,7 @@ from zwfs.plots.dimple_diameter import diameter_methods, diameter_reasons, dimpl
 from zwfs.plots.frames import explained, gains, phase_map
 from zwfs.plots.identities import approximation, diversity
 from zwfs.plots.layouts import bench_layout, sensor_layout, vector_sensor
-from zwfs.plots.linearity import convergence, estimates, linearity
+from zwfs.plots.linearity import convergence, estimates, linearity, saxton_widths
 from zwfs.plots.one_pixel import one_or_two_images, pixel_phasors, sensor_steps
 from zwfs.plots.phase_amplitude import amplitude_errors, phase_and_amplitude
 from zwfs.plots.phase_shifts import all_pairs, pair_noise
@@ -62,6 +62,7 @@ __all__ = [
     "range_recovery",
     "range_starts",
     "reference_intensities",
+    "saxton_widths",
     "segment_errors",
     "sensor_layout",
     "sensor_steps",

@@ -19,21 +19,22 @@ def loop_runs(runs: Mapping[float, Mapping[str, LoopRun]]) -> Figure:
     ----------
     runs : mapping of magnitude to mapping of method to LoopRun
     """
-    figure, panels = plt.subplots(1, len(runs), figsize=(9, 3.9), sharey=True, squeeze=False)
+    figure, panels = plt.subplots(1, len(runs), figsize=(7, 3.9), sharey=True, squeeze=False)
     for axes, (magnitude, methods) in zip(panels[0], runs.items(), strict=True):
         for name, run in methods.items():
             look, time = LOOKS[name], 1e3 * run.times
             labels = [look.label, *[None] * (len(run.residual) - 1)]
             axes.semilogy(time, run.residual.T, lw=1, color=look.color, linestyle=look.line, label=labels)
         axes.semilogy(time, np.median(run.open_loop, axis=0), color="#777777", lw=1, label="without correction")
-        axes.set(xlabel="time (ms)", title=f"magnitude {magnitude:g}", xlim=(0, time[-1]))
+        axes.set(xlabel="time (ms)", xlim=(0, time[-1]))
+        axes.set_title(f"magnitude {magnitude:g}", fontsize=10)
     panels[0, 0].set_ylabel("residual (rad rms)")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
 
 def capture(inputs: Sequence[float], runs: Sequence[Mapping[str, LoopRun]]) -> Figure:
-    """Fraction of the loops that close, and the residual they settle at, against the wavefront error at the start.
+    """Fraction of the loops that close, and the residual of these, against the wavefront error at the start.
 
     Parameters
     ----------
@@ -41,16 +42,16 @@ def capture(inputs: Sequence[float], runs: Sequence[Mapping[str, LoopRun]]) -> F
     runs : sequence of mapping of method to LoopRun
         One for each input.
     """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.9))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7, 3.8))
     for name in runs[0]:
         look = LOOKS[name]
-        settled = np.array([methods[name].settled() for methods in runs])
         closed = [100 * np.mean(methods[name].closed()) for methods in runs]
         left.plot(inputs, closed, label=look.label, **look.style)
-        right.semilogy(inputs, np.median(settled, axis=1), label=look.label, **look.style)
-        right.fill_between(inputs, settled.min(1), settled.max(1), color=look.color, alpha=0.15, lw=0)
+        right.semilogy(inputs, [methods[name].held() for methods in runs], label=look.label, **look.style)
+        points = [(start, value) for start, one in zip(inputs, runs, strict=True) for value in one[name].settled()]
+        right.plot(*np.transpose(points), ".", color=look.color, ms=4, alpha=0.5)
     right.plot(inputs, inputs, color="#777777", lw=1, label="as at the start")
     left.set(xlabel="error at the start (rad rms)", ylabel="loops that close (%)", ylim=(-3, 103))
     right.set(xlabel="error at the start (rad rms)", ylabel="settled residual (rad rms)")
-    figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
+    figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure

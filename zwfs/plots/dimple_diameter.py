@@ -26,7 +26,7 @@ def dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float, clai
     claimed : float, lambda/D
         Diameter at which the error rises according to the paper, marked.
     """
-    figure, (plain, log) = plt.subplots(1, 2, figsize=(9, 4.2))
+    figure, (plain, log) = plt.subplots(1, 2, figsize=(7, 4))
     name, floor = "PhaseShifted", 1e-7
     look = LOOKS[name]
     (number, curve), *others = curves.items()
@@ -59,7 +59,7 @@ def diameter_methods(curves: Mapping[str, DiameterCurves], threshold: float, cla
     threshold, claimed : float
         As for `dimple_diameter`.
     """
-    figure, axes = plt.subplots(figsize=(9, 4.6))
+    figure, axes = plt.subplots(figsize=(7, 5))
     floor = 1e-7
     for name, look in _looks(curves):
         curve = curves[name]
@@ -69,8 +69,8 @@ def diameter_methods(curves: Mapping[str, DiameterCurves], threshold: float, cla
     axes.axhline(limit, color="#555555", lw=1)
     axes.text(0.05, limit * 1.2, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
     _diameters(axes, max(curve.diameters[-1] for curve in curves.values()), claimed)
-    axes.set(ylabel="mean error (rad rms)", ylim=(floor, 4))
-    figure.legend(loc="outside lower center", ncols=3, fontsize=9)
+    axes.set(ylabel="mean error (rad rms)", ylim=(floor / 2, 4))
+    figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 
@@ -83,7 +83,7 @@ def diameter_reasons(reasons: Contraction, claimed: float) -> Figure:
     claimed : float, lambda/D
         As for `dimple_diameter`.
     """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7, 4))
     color, diameters, aberrated = LOOKS["PhaseShifted"].color, reasons.diameters, reasons.aberrated
     flat_color, ring_color, *_ = (style["color"] for style in OTHER_STYLES)
     left.plot(diameters, reasons.flat, color=flat_color, lw=1.5, label="flat wavefront")
@@ -91,15 +91,16 @@ def diameter_reasons(reasons: Contraction, claimed: float) -> Figure:
     left.fill_between(diameters, low, high, color=color, alpha=0.3, lw=0, label="screens, range")
     left.plot(diameters, aberrated[:, 0], color=color, lw=1.5, label="first screen")
     observed = list(reasons.observed), list(reasons.observed.values())
-    left.plot(*observed, "o", mfc="none", mec=ring_color, label="first screen, observed")
+    left.plot(*observed, "o", mfc="none", mec=ring_color, label="observed")
     left.axhline(1, color="#555555", lw=1)
-    left.text(0.05, 1.015, "diverges above, converges below", color="#555555", fontsize=9)
-    left.set(ylabel="factor of the error, one iteration", ylim=(0, 1.2))
+    left.text(0.05, 1.015, "diverges above", color="#555555", fontsize=9)
+    left.set(ylabel="error after / before an iteration", ylim=(0, 1.2))
     left.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
     for (name, values), style in zip(reasons.sensitivity.items(), OTHER_STYLES, strict=False):
-        right.plot(diameters, values, lw=1.8, label=name, **style | {"marker": "none"})
-    right.set(ylabel="sensitivity of the two frames (1/rad)", ylim=(0, 2.8))
-    right.legend(loc="upper right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
+        right.plot(diameters, values, lw=1.8, **style | {"marker": "none"})
+        place = {"xytext": (-3, 12), "textcoords": "offset points", "ha": "right", "va": "center"}
+        right.annotate(name, (diameters[-1], values[-1]), color=style["color"], **place)
+    right.set(ylabel="sensitivity (1/rad)", ylim=(0, 2.4))
     for axes in (left, right):
         _diameters(axes, diameters[-1], claimed)
     return figure

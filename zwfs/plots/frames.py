@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -53,9 +54,7 @@ def phase_map(result: MeasuredPhase, wavelength: float) -> Figure:
         figure.legend(loc="outside lower center", fontsize=9)
     bar = figure.colorbar(shown, ax=axes, label="phase (rad)")
     scale = wavelength / (2 * np.pi)
-    nm = bar.ax.secondary_yaxis(
-        -0.9, functions=(lambda rad: np.multiply(rad, scale), lambda nm: np.divide(nm, scale))
-    )
+    nm = bar.ax.secondary_yaxis(-0.9, functions=(partial(np.multiply, scale), partial(np.multiply, 1 / scale)))
     nm.set_ylabel("wavefront (nm)")
     return figure
 

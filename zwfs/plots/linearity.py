@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 
 from zwfs.metrics import wrapped_residual
 from zwfs.paper.linearity import LinearityCurves
-from zwfs.plots.style import _looks, show_phase
+from zwfs.plots.style import LOOKS, _looks, show_phase
 from zwfs.pupil import Pupil
+from zwfs.reconstructors import GerchbergSaxton
 
 
 def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], rms_max: float) -> Figure:
@@ -29,7 +31,7 @@ def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], r
     rms_max : float, radian rms
         End of the axis.
     """
-    figure, (plain, ratio) = plt.subplots(1, 2, figsize=(9, 4.4))
+    figure, (plain, ratio) = plt.subplots(1, 2, figsize=(7, 4.6))
     drawn = curves.rms <= rms_max
     bright = drawn & (curves.rms > 0)
     rms = curves.rms[drawn]
@@ -49,7 +51,40 @@ def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], r
     ratio.text(0.6 * rms_max, threshold * 1.1, f"{threshold:.0%} of the input", **gray)
     plain.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
     ratio.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
-    figure.legend(loc="outside lower center", ncols=3, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
+    return figure
+
+
+def saxton_widths(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurves, threshold: float) -> Figure:
+    """Mean error over the input of Gerchberg-Saxton on detectors of several widths, and of the linear method.
+
+    Parameters
+    ----------
+    variants : mapping of str to GerchbergSaxton
+    curves : LinearityCurves
+        Of the variants and "Linear".
+    threshold : float
+        Ratio of error to input that is marked.
+    """
+    figure, axes = plt.subplots(figsize=(7, 4.6))
+    dashes = {"zero": cycle(("-", "-.", "--", ":")), "model": cycle(("-", "--"))}
+    for name, method in variants.items():
+        kind = method.unmeasured
+        look = LOOKS["GerchbergSaxtonModel" if kind == "model" else "GerchbergSaxton"]
+        label = f"{kind}, {method.sensor.extent:g} D, {method.settings.n_iterations} iterations"
+        axes.semilogy(
+            curves.rms,
+            curves.mean(name) / curves.rms,
+            label=label,
+            **look.style | {"linestyle": next(dashes[kind])},
+        )
+    axes.plot(curves.rms, curves.mean("Linear") / curves.rms, label="linear", **LOOKS["Linear"].style)
+    axes.axhline(threshold, color="#555555", lw=1)
+    axes.text(
+        curves.rms[-1], threshold * 0.9, f"{threshold:.0%} of the input", color="#555555", ha="right", va="top"
+    )
+    axes.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     return figure
 
 

@@ -21,7 +21,7 @@ _LINES = {"ignored": ":", "measured": "--", "estimated": "-"}
 
 def amplitude_errors(curves: Mapping[str, AmplitudeCurves]) -> Figure:
     """Error of each way and the bound against the variation of the amplitude, one panel for each kind."""
-    figure, panels = plt.subplots(1, len(curves), figsize=(9, 4.8), sharey=True, squeeze=False)
+    figure, panels = plt.subplots(1, len(curves), figsize=(7, 5), sharey=True, squeeze=False)
     for axes, (kind, one) in zip(panels[0], curves.items(), strict=True):
         percent = 100 * one.variations
         axes.semilogy(percent, one.bound, color="#999999", lw=5, solid_capstyle="round", label="bound", zorder=0)
@@ -35,7 +35,7 @@ def amplitude_errors(curves: Mapping[str, AmplitudeCurves]) -> Figure:
     panels[0, 0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     panels[0, 0].yaxis.set_major_formatter(FormatStrFormatter("%g"))
     panels[0, 0].yaxis.set_minor_formatter(NullFormatter())
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=1)
     return figure
 
 
@@ -51,7 +51,7 @@ def phase_and_amplitude(
     estimate : LikelihoodReconstruction
         Of one frame set, with an unknown amplitude.
     """
-    figure, panels = plt.subplots(2, 3, figsize=(9, 6), layout="constrained")
+    figure, panels = plt.subplots(2, 3, figsize=(7, 5), layout="constrained")
     outside = np.where(pupil.inside, 0.0, np.nan)
     residual = wrapped_residual(pupil, estimate.phase, phase)
     phases = phase + outside, phase + residual, residual
@@ -60,7 +60,7 @@ def phase_and_amplitude(
     limit, small = (max(float(np.nanmax(np.abs(one))) for one in some) for some in (phases[:2], phases[2:]))
     for axes, image, title in zip(panels[0], phases, titles, strict=True):
         shown = show_phase(axes, image, small if title == "difference" else limit)
-        axes.set_title(f"phase, {title}", fontsize=10)
+        axes.set_title(f"phase,\n{title}", fontsize=10)
         figure.colorbar(shown, ax=axes, label="rad", shrink=0.85)
     largest = float(np.nanmax(amplitudes[0]))
     for axes, image, title in zip(panels[1], amplitudes, titles, strict=True):
@@ -68,6 +68,6 @@ def phase_and_amplitude(
             shown = show_phase(axes, image, float(np.nanmax(np.abs(image))))
         else:
             shown = show_intensity(axes, image, largest)
-        axes.set_title(f"amplitude, {title}", fontsize=10)
+        axes.set_title(f"amplitude,\n{title}", fontsize=10)
         figure.colorbar(shown, ax=axes, shrink=0.85)
     return figure

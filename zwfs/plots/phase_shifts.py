@@ -20,7 +20,7 @@ def all_pairs(maps: PairMaps) -> Figure:
 
     Stars mark the best pairs. The angles of the maps must be evenly spaced.
     """
-    figure, panels = plt.subplots(1, 3, figsize=(9, 4.1), sharey=True)
+    figure, panels = plt.subplots(1, 3, figsize=(7, 3.6), sharey=True)
     half = (maps.angles[1] - maps.angles[0]) / 2 / np.pi
     ends = np.array([maps.angles[0], maps.angles[-1]]) / np.pi + np.array([-half, half])
     noise = Normalize(0.5, 3)
@@ -62,7 +62,7 @@ def pair_noise(angles: NDArray, noise: Mapping[str, NDArray], rows: Sequence[Dra
     rows : sequence of DrawnNoise
         Those of such pairs are drawn with their standard errors.
     """
-    figure, axes = plt.subplots(figsize=(9, 4.2))
+    figure, axes = plt.subplots(figsize=(7, 4.2))
     middle = int(np.argmin(np.abs(angles - np.pi / 2)))
     for (name, values), style in zip(noise.items(), OTHER_STYLES, strict=False):
         shade, scale = style["color"], values[middle]

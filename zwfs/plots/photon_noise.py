@@ -22,7 +22,7 @@ _MARKS = ("o", "s", "D", "*", "P", "X")
 def photon_noise(curves: PhotonCurves) -> Figure:
     """Error of each method and the bound against the number of photons, and their ratio; one column per input."""
     size = curves.rms.size
-    figure, panels = plt.subplots(2, size, figsize=(8, 6.6), sharex=True, sharey="row", squeeze=False)
+    figure, panels = plt.subplots(2, size, figsize=(7, 6.4), sharex=True, sharey="row", squeeze=False)
     for column, (errors, ratios) in enumerate(panels.T):
         bound = curves.bound[column]
         errors.loglog(
@@ -64,7 +64,7 @@ def design_maps(maps: DesignMap, designs: Sequence[Design]) -> Figure:
     A design is a mark at its diameter and half the difference of its phase shifts. A bar joins shifts of different
     size. The diameters and angles of the maps must be evenly spaced.
     """
-    figure, panels = plt.subplots(1, len(maps.costs), figsize=(8, 4.6), sharey=True, squeeze=False)
+    figure, panels = plt.subplots(1, len(maps.costs), figsize=(7, 4.4), sharey=True, squeeze=False)
     x, y = maps.diameters, maps.angles / np.pi
     half = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
     extent = x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1]
@@ -95,5 +95,5 @@ def design_maps(maps: DesignMap, designs: Sequence[Design]) -> Figure:
     bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     bar.ax.yaxis.set_minor_formatter(NullFormatter())
     handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5)
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, handletextpad=0.2, columnspacing=1)
     return figure

@@ -36,7 +36,7 @@ def dimple_recovery(curves: Mapping[float, DiameterCurves], threshold: float) ->
     threshold : float
         Largest ratio of error to input of a recovered screen.
     """
-    figure, panels = plt.subplots(2, len(curves), figsize=(9, 6.6), sharex=True, sharey="row", squeeze=False)
+    figure, panels = plt.subplots(2, len(curves), figsize=(7, 6), sharex=True, sharey="row", squeeze=False)
     for (share, error), (rms, curve) in zip(panels.T, curves.items(), strict=True):
         for name in curve.errors:
             line = _line(name)
@@ -54,7 +54,7 @@ def dimple_recovery(curves: Mapping[float, DiameterCurves], threshold: float) ->
         share.text(_span("Keck")[0], 1.02, "Keck", ha="left", **above)
     panels[0, 0].set(ylabel="screens recovered (%)", ylim=(-4, 104))
     panels[1, 0].set_ylabel("mean error (rad rms)")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
 
@@ -67,7 +67,7 @@ def dimple_limits(limits: DimpleLimits, rms: float) -> Figure:
     rms : float, radian rms
         Of its screens.
     """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7, 4))
     flat, color = OTHER_STYLES[1]["color"], LOOKS["PhaseShifted"].color
     screens = limits.factor[:, 1:]
     left.plot(limits.diameters, limits.factor[:, 0], color=flat, ls="--", label="flat wavefront")
@@ -75,7 +75,7 @@ def dimple_limits(limits: DimpleLimits, rms: float) -> Figure:
     left.fill_between(limits.diameters, screens.min(axis=1), screens.max(axis=1), color=color, alpha=0.25, lw=0)
     left.axhline(1, color=_INK, lw=1)
     left.text(0.52, 1.015, "diverges above", color=_INK, fontsize=9)
-    left.set(ylabel="factor of the error, one iteration", ylim=(0, 1.2))
+    left.set(ylabel="error after / before an iteration", ylim=(0, 1.2))
     for values, name, style in (
         (limits.tilt, "tilt", OTHER_STYLES[0]),
         (limits.others, "others", OTHER_STYLES[2]),
@@ -84,7 +84,7 @@ def dimple_limits(limits: DimpleLimits, rms: float) -> Figure:
         right.semilogy(limits.diameters, values[:, 0], color=color, ls="--", lw=1.2, label=f"{name}, flat")
         mean = np.sqrt(np.mean(values[:, 1:] ** 2, axis=1))
         right.semilogy(limits.diameters, mean, color=color, lw=1.8, label=f"{name}, {rms:g} rad rms")
-    right.set(ylabel="bound of a mode / ideal sensor", ylim=(0.9, 1000))
+    right.set(ylabel="bound / that of an ideal sensor", ylim=(0.9, 1000))
     for axes in (left, right):
         axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
         axes.text(
@@ -106,20 +106,20 @@ def range_recovery(curves: Mapping[float, RecoveryCurves], threshold: float) -> 
     threshold : float
         As for `dimple_recovery`.
     """
-    figure, panels = plt.subplots(1, len(curves), figsize=(9, 3.9), sharey=True, squeeze=False)
+    figure, panels = plt.subplots(1, len(curves), figsize=(7, 3.6), sharey=True, squeeze=False)
     for axes, (diameter, curve) in zip(panels[0], curves.items(), strict=True):
         for name in curve.errors:
             axes.plot(curve.rms, 100 * curve.recovered(name, threshold), **_line(name))
         axes.set_title(rf"{diameter:g} $\lambda/D$", fontsize=10)
         axes.set(xlabel="input (rad rms)", xlim=(0, None))
     panels[0, 0].set(ylabel="screens recovered (%)", ylim=(-4, 104))
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
 
 def range_starts(curves: Mapping[float, RecoveryCurves]) -> Figure:
     """Mean number of starts of maximum likelihood against the input, one line for each dimple."""
-    figure, axes = plt.subplots(figsize=(9, 3.6))
+    figure, axes = plt.subplots(figsize=(7, 3.4))
     styles = (OTHER_STYLES[index % len(OTHER_STYLES)] for index in range(len(curves)))
     for (diameter, curve), style in zip(curves.items(), styles, strict=True):
         axes.plot(curve.rms, curve.n_starts.mean(axis=1), label=rf"{diameter:g} $\lambda/D$", **style)

@@ -27,24 +27,24 @@ def star_columns(runs: StarRuns) -> dict[str, Any]:
 
 
 def stars(runs: StarRuns, photons: Mapping[float, float]) -> Table:
-    """Return the settled residual, the Strehl ratio and the number of closed loops for each star and method."""
+    """Return how many loops close, and the residual and the Strehl ratio of these, for each star and method."""
     return Table(
         [
             "magnitude",
             "photons per step",
             "reconstructor",
-            "settled residual (rad rms)",
-            "Strehl ratio",
             "loops that close",
+            "their residual (rad rms)",
+            "their Strehl ratio",
         ],
         [
             [
                 f"{magnitude:g}",
                 f"{photons[magnitude]:.2g}",
                 LOOKS[name].name,
-                f"{np.median(run.settled()):.2g}",
-                f"{np.median(run.strehl[:, run.last_third]):.2f}",
                 f"{np.count_nonzero(run.closed())} of {len(run.residual)}",
+                f"{run.held():.2g}",
+                f"{np.median(run.strehl[run.closed(), run.last_third]):.2f}" if run.closed().any() else "–",
             ]
             for magnitude, methods in runs.items()
             for name, run in methods.items()
@@ -57,11 +57,12 @@ def capture_columns(inputs: Sequence[float], runs: CaptureRuns) -> dict[str, Any
     columns: dict[str, Any] = {"start (rad rms)": inputs}
     for name in runs[0]:
         columns[f"{name}: loops that close"] = [np.mean(one[name].closed()) for one in runs]
-        columns[f"{name}: median residual (rad rms)"] = [np.median(one[name].settled()) for one in runs]
+        columns[f"{name}: median residual of these (rad rms)"] = [one[name].held() for one in runs]
     return columns
 
 
 def claims(
+    stars: StarRuns,
     lag: LoopRun,
     inputs: Sequence[float],
     runs: CaptureRuns,
@@ -70,9 +71,13 @@ def claims(
     n_iterations: int,
     cutoff: float,
 ) -> None:
-    """Glue settings, the residual of a run without noise, and the largest error from which all loops close."""
+    """Glue settings, the share and the residual of the loops that close, and the error up to which all close."""
     glue_numbers({"rms": rms, "delay": delay, "iterations": n_iterations, "cutoff": cutoff})
-    glue_numbers({"lag": np.median(lag.settled())})
+    bright, faint = stars[min(stars)], stars[max(stars)]
+    glue_numbers({"faintest": max(stars), "n_screens": len(lag.residual), "lag": lag.held()})
+    for name in bright:
+        glue_numbers({f"closed_{name}": max(int(one[name].closed().sum()) for one in stars.values())})
+        glue_numbers({f"bright_{name}": bright[name].held(), f"faint_{name}": faint[name].held()})
     for name in runs[0]:
         closing = [value for value, one in zip(inputs, runs, strict=True) if one[name].closed().all()]
         glue_numbers({f"all_close_{name}": max(closing, default=0.0)})

@@ -163,6 +163,7 @@ def claims(
     ratios = {name: curve.at(name, 2.6) / curve.at(name, 2.0) for name, curve in by_method.items()}
     lost = _start(by_method["GradientDescent"], "GradientDescent", threshold)
     numbers: dict[str, Any] = {
+        "iterations": next(iter(by_iterations)),
         "diameter_5_percent": paper.exceeds(ITERATION, limit),
         "diameter_1e3": paper.exceeds(ITERATION, 1e-3),
         "diameter_5_percent_400": longest.exceeds(ITERATION, limit),

@@ -127,6 +127,13 @@ def claims(maps: PairMaps, angles: NDArray, noise: Mapping[str, NDArray], rows: 
             f"best_noise{suffix}": value,
             f"noise_at_half_pi{suffix}": getattr(maps, name)[_half(maps)],
         }
+        numbers[f"best_pi{suffix}"] = abs(theta_a) / np.pi
+    place = tuple(abs(maps.angles - numbers[name]).argmin() for name in ("best_theta_a", "best_theta_b"))
+    numbers |= {
+        "gain_flat": 1 - numbers["best_noise"] / numbers["noise_at_half_pi"],
+        "gain_aberrated": 1 - numbers["best_noise_aberrated"] / numbers["noise_at_half_pi_aberrated"],
+        "gain_moved": 1 - maps.aberrated[place] / numbers["noise_at_half_pi_aberrated"],
+    }
     numbers["cut_best_theta_flat"] = angles[np.argmin(noise["photon noise, flat wavefront"])]
     numbers["drawn_difference"] = max(abs(row.drawn / row.expected - 1) for row in rows)
     glue_numbers(numbers, ".4g")

@@ -80,9 +80,7 @@ def saxton_widths(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurv
         )
     axes.plot(curves.rms, curves.mean("Linear") / curves.rms, label="linear", **LOOKS["Linear"].style)
     axes.axhline(threshold, color="#555555", lw=1)
-    axes.text(
-        curves.rms[-1], threshold * 0.9, f"{threshold:.0%} of the input", color="#555555", ha="right", va="top"
-    )
+    axes.text(0.01, threshold * 0.9, f"{threshold:.0%} of the input", color="#555555", fontsize=9, va="top")
     axes.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     return figure

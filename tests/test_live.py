@@ -1,4 +1,4 @@
-"""The live sensor: its script against zwfs, and its page, in a browser."""
+"""The live sensor: its scripts against zwfs, and its page, in a browser."""
 
 import re
 import shutil
@@ -9,23 +9,29 @@ import pytest
 
 import zwfs
 from book._ext import live
+from zwfs.focal import focal_field
+from zwfs.paper.design import Design, photon_costs
+from zwfs.paper.linearity import screens_at
 
 ROOT = Path(__file__).parent.parent
 STATIC = ROOT / "book" / "_static"
-MARKUP = re.search(r"```\{raw\} html\n(.*?)```", (ROOT / "book" / "live.md").read_text("utf-8"), re.DOTALL)[1]
+SOURCE = (ROOT / "book" / "live.md").read_text("utf-8")
+MARKUP = "".join(re.findall(r"```\{raw\} html\n(.*?)```", SOURCE, re.DOTALL))
+TRIES = "".join(re.findall(r"<button .*?</button>", SOURCE[SOURCE.index("## What to try") :]))
 # The simplest shifts, unequal ones, ones of one sign; wide and narrow dimples: rms, seed, diameter (lambda/D),
 # shifts (pi), iterations.
 SETTINGS = [
-    (0.5, 7, 1.06, (0.5, -0.5), 10),
+    (1.0, 7, 1.06, (0.5, -0.5), 20),
     (1.2, 3, 1.06, (0.5, -0.5), 25),
     (0.8, 50, 2.0, (0.5, -0.5), 8),
     (0.6, 11, 0.5, (0.7, -0.36), 12),
     (0.3, 1, 1.5, (0.5, 0.24), 10),
     (0.4, 24, 3.0, (0.5, -0.5), 4),
-    (0.7, 9, 1.3, (1.0, -0.4), 6),
+    (0.05, 9, 2.44, (0.5, -0.5), 5),
     (0.0, 2, 0.82, (0.5, -0.5), 1),
     (0.5, 5, 1.06, (0.5, -0.5), 0),
 ]
+DEFAULT = SETTINGS[0]
 
 
 @pytest.fixture(scope="module")
@@ -39,15 +45,21 @@ def modes(pupil):
 
 
 @pytest.fixture(scope="module")
-def page(browser, tmp_path_factory):
-    """The page of the live sensor without the book around it, opened as a file."""
+def file(tmp_path_factory):
+    """The page of the live sensor without the book around it."""
     book = tmp_path_factory.mktemp("site")
     static = book / "_static"
     shutil.copytree(STATIC, static)
     (static / Path(live.DATA).name).write_text(live.script(), "utf-8")
     (book / "book").mkdir()
     file = book / "book" / "live.html"
-    file.write_text(f'<!doctype html><html lang="en"><meta charset="utf-8"><body>{MARKUP}</body></html>', "utf-8")
+    body = f'<body class="bd-article">{TRIES}{MARKUP}</body>'
+    file.write_text(f'<!doctype html><html lang="en"><meta charset="utf-8">{body}</html>', "utf-8")
+    return file
+
+
+@pytest.fixture(scope="module")
+def page(browser, file):
     page = browser.new_page(viewport={"width": 1000, "height": 800})
     page.said, page.asked = [], []
     page.on("console", lambda message: page.said.append(message.text))
@@ -57,30 +69,47 @@ def page(browser, tmp_path_factory):
     return page
 
 
+@pytest.fixture
+def fresh(page):
+    """The page in its first state."""
+    page.click("#live-play")
+    page.click("button:text-is('The paper')")
+    page.wait_for_function("location.hash === ''")
+    return page
+
+
 COMPUTE = """settings => {
-    const photons = settings.photons ?? Infinity;
-    const made = window.zwfsLive.compute({ ...settings, photons });
-    const plain = (value) => (ArrayBuffer.isView(value) ? [...value] : value);
-    return { ...Object.fromEntries(Object.entries(made).map(([name, value]) => [name, plain(value)])),
-             frames: made.frames.map(plain) };
+    const live = window.zwfsLive;
+    const rows = (map) => {
+        const out = new Array(map.length);
+        map.forEach((value, k) => { out[live.places[k]] = value; });
+        return out;
+    };
+    const made = live.compute({ photons: Infinity, likelihood: false, ...settings });
+    const found = (one) => one && {
+        errors: one.errors,
+        residual: rows(one.residual),
+        phase: rows(one.estimate[0].map((re, k) => Math.atan2(one.estimate[1][k], re))),
+    };
+    return {
+        phase: rows(made.phase), frames: made.frames.map(rows), focal: [...made.focal], strehl: made.strehl,
+        linear: found(made.linear), arcsine: found(made.arcsine), shifted: found(made.shifted),
+        likelihood: found(made.likelihood),
+    };
 }"""
 
 
 @pytest.fixture
 def compute(page, pupil):
-    """Runs the script's model; maps come back as arrays."""
+    """Runs the model of the page; maps come back as arrays."""
 
-    def call(rms, seed, diameter, shifts, iterations, photons=None):
-        shifts = [shift * np.pi for shift in shifts]
-        made = page.evaluate(
-            COMPUTE,
-            {"rms": rms, "seed": seed, "diameter": diameter, "shifts": shifts, "iterations": iterations}
-            | ({"photons": photons} if photons else {}),
-        )
-        maps = {name: np.array(made[name]).reshape(-1, *pupil.shape) for name in ("phase", "frames")}
-        if not made["singular"]:
-            maps |= {name: np.array(made[name]).reshape(pupil.shape) for name in ("estimate", "residual")}
-        return made | maps
+    def call(rms, seed, diameter, shifts, iterations, **others):
+        settings = {"rms": rms, "seed": seed, "diameter": diameter, "iterations": iterations}
+        made = page.evaluate(COMPUTE, settings | {"shifts": [shift * np.pi for shift in shifts]} | others)
+        for maps in (made, *(made[name] or {} for name in ("linear", "arcsine", "shifted", "likelihood"))):
+            maps |= {name: np.array(maps[name]) for name in ("phase", "residual") if name in maps}
+            maps |= {name: maps[name].reshape(pupil.shape) for name in ("phase", "residual") if name in maps}
+        return made | {"frames": np.array(made["frames"]).reshape(-1, *pupil.shape)}
 
     return call
 
@@ -89,28 +118,70 @@ def sensor_of(pupil, diameter, shifts):
     return zwfs.ZernikeSensor(pupil, *(zwfs.Dimple(diameter, shift * np.pi) for shift in shifts))
 
 
-@pytest.mark.parametrize(("rms", "seed", "diameter", "shifts", "iterations"), SETTINGS)
-def test_script_agrees_with_zwfs(compute, pupil, modes, rms, seed, diameter, shifts, iterations):
-    made = compute(rms, seed, diameter, shifts, iterations)
-    phase = zwfs.power_law_screens(modes, rms, 1, seed=seed)[0] if rms else np.zeros(pupil.shape)
-    sensor = sensor_of(pupil, diameter, shifts)
-    frames = sensor.measure(phase)
-    np.testing.assert_allclose(made["phase"][0], phase, atol=1e-5)
-    np.testing.assert_allclose(made["frames"], frames, atol=1e-5)
-    assert made["strehl"] == pytest.approx(zwfs.strehl(pupil, phase), abs=1e-5)
+def screen_of(modes, rms, seed):
+    return zwfs.power_law_screens(modes, rms, 1, seed=seed)[0]
 
-    history = np.zeros((1, *pupil.shape))
-    if iterations:
-        reconstruct = zwfs.PhaseShifted(sensor, n_iterations=iterations, tolerance=0.0)
-        found = reconstruct(frames, history=True)
-        history = found.history
-        assert made["unsolved"] == found.n_unsolved
-    inside = pupil.inside
-    turn = np.angle(np.exp(1j * (made["estimate"] - history[-1])))
-    np.testing.assert_allclose(turn[inside], 0, atol=1e-5)
-    residual = zwfs.wrapped_residual(pupil, history[-1], phase)
-    np.testing.assert_allclose(made["residual"][inside], residual[inside], atol=1e-5)
-    np.testing.assert_allclose(made["errors"], zwfs.reconstruction_error(pupil, history, phase), atol=1e-5)
+
+def assert_same_phase(pupil, found, expected, tolerance=1e-5):
+    """Compare phases on the circle, without piston."""
+    difference = pupil.gather(zwfs.wrapped_residual(pupil, found, expected))
+    assert np.all(np.abs(difference) <= tolerance)
+
+
+@pytest.mark.parametrize(("rms", "seed", "diameter", "shifts", "iterations"), SETTINGS)
+def test_sensor_agrees_with_zwfs(compute, pupil, modes, rms, seed, diameter, shifts, iterations):
+    made = compute(rms, seed, diameter, shifts, iterations)
+    phase = screen_of(modes, rms, seed)
+    np.testing.assert_allclose(made["phase"], phase, atol=1e-5)
+    np.testing.assert_allclose(made["frames"], sensor_of(pupil, diameter, shifts).measure(phase), atol=1e-5)
+    assert made["strehl"] == pytest.approx(zwfs.strehl(pupil, phase), abs=1e-5)
+    axis = 4 * (2 * np.arange(64) - 63) / 64
+    focal = np.abs(focal_field(pupil, np.exp(1j * phase), axis, axis)) ** 2
+    np.testing.assert_allclose(np.reshape(made["focal"], focal.shape), focal, atol=1e-5)
+
+
+@pytest.mark.parametrize(("rms", "seed", "diameter", "shifts", "iterations"), SETTINGS)
+def test_reconstructors_agree_with_zwfs(compute, pupil, modes, rms, seed, diameter, shifts, iterations):
+    made = compute(rms, seed, diameter, shifts, iterations)
+    phase = screen_of(modes, rms, seed)
+    one, both = sensor_of(pupil, diameter, shifts[:1]), sensor_of(pupil, diameter, shifts)
+    histories = {"linear": zwfs.Linear(one, modes, poke=1e-4)(one.measure(phase)).phase[np.newaxis]}
+    for name, method, sensor in (("arcsine", zwfs.Arcsine, one), ("shifted", zwfs.PhaseShifted, both)):
+        histories[name] = np.zeros((1, *pupil.shape))
+        if iterations:
+            reconstruct = method(sensor, n_iterations=iterations, tolerance=0.0)
+            histories[name] = reconstruct(sensor.measure(phase), history=True).history
+    for name, history in histories.items():
+        assert_same_phase(pupil, made[name]["phase"], history[-1])
+        residual = zwfs.wrapped_residual(pupil, history[-1], phase)
+        np.testing.assert_allclose(pupil.gather(made[name]["residual"]), pupil.gather(residual), atol=1e-5)
+        errors = zwfs.reconstruction_error(pupil, history, phase)
+        np.testing.assert_allclose(made[name]["errors"], errors, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("rms", "seed", "diameter", "shifts", "photons"),
+    [
+        (1.0, 7, 1.06, (0.5, -0.5), None),
+        (2.0, 7, 1.06, (0.5, -0.5), None),
+        (0.5, 11, 2.6, (0.5, -0.5), None),
+        (0.4, 24, 3.0, (0.3, -0.68), None),
+        (0.7, 9, 1.3, (0.4, -0.8), 1e9),
+        (0.5, 7, 2.05, (0.33, -0.74), 1e8),
+    ],
+)
+def test_maximum_likelihood_agrees_with_zwfs(compute, pupil, rms, seed, diameter, shifts, photons):
+    noise = {} if photons is None else {"photons": photons}
+    made = compute(rms, seed, diameter, shifts, 30, likelihood=True, **noise)
+    sensor = sensor_of(pupil, diameter, shifts)
+    per_pixel = None if photons is None else photons / pupil.n_points
+    result = zwfs.MaximumLikelihood(sensor, photons=per_pixel)(made["frames"])
+    if photons is None:
+        assert_same_phase(pupil, made["likelihood"]["phase"], result.phase)
+        return
+    # Both stop at a step of a thousandth of the mean standard error: dark points are less certain.
+    assert_same_phase(pupil, made["likelihood"]["phase"], result.phase, 0.1 * pupil.gather(result.sigma))
+    assert zwfs.reconstruction_error(pupil, made["likelihood"]["phase"], result.phase) < 1e-5
 
 
 def test_noise_has_the_statistics_of_photons(compute, pupil):
@@ -129,13 +200,27 @@ def test_noise_has_the_statistics_of_photons(compute, pupil):
 
 
 @pytest.mark.parametrize("shifts", [(0.5, 0.5), (0.5, 0.0), (1.0, -1.0), (0.0, 1.0)])
-def test_singular_shifts_give_no_reconstruction(compute, pupil, shifts):
+def test_singular_shifts_give_no_reconstruction(compute, pupil, modes, shifts):
     made = compute(0.5, 7, 1.06, shifts, 10)
-    assert made["singular"]
-    assert made["estimate"] is None
-    assert made["errors"] is None
+    assert made["shifted"] is None
     with pytest.raises(ValueError, match="determinant"):
         zwfs.PhaseShifted(sensor_of(pupil, 1.06, shifts))
+    if shifts[0] in (0.0, 1.0):
+        assert made["linear"] is None
+        with pytest.raises(ValueError, match="sees none"):
+            zwfs.Linear(sensor_of(pupil, 1.06, shifts[:1]), modes)
+
+
+def test_designs_are_those_of_the_notebook(pupil, modes):
+    table = live.designs()
+    wavefronts = {"flat wavefront": np.zeros((1, *pupil.shape))} | {
+        f"{rms:g} rad rms": screens_at(modes, rms, 6, 2024, task, -2.0) for task, rms in enumerate((0.5, 1.0))
+    }
+    places = [(0, 0), (6, 8), (16, 4)]
+    theta = np.pi * np.array(table["shifts"])
+    chosen = [Design("", table["diameters"][x], theta[y], -theta[y]) for x, y in places]
+    for name, costs in photon_costs(pupil, chosen, wavefronts).items():
+        np.testing.assert_allclose([table["costs"][name][x][y] for x, y in places], costs, rtol=1e-5)
 
 
 def test_sliders_stay_in_the_range_of_the_data(page):
@@ -146,34 +231,127 @@ def test_sliders_stay_in_the_range_of_the_data(page):
     assert limits == {"seed": [1, live.N_SEEDS], "diameter": list(live.DIAMETERS)}
 
 
-def test_page_answers_the_keyboard_and_keeps_its_height(page):
-    def seen(name):
-        return page.inner_text(f"#live-{name}")
+def verdicts(page):
+    return [page.inner_text(f"#live-verdict-{place}")[0] for place in range(3)]
 
-    height = page.evaluate("document.documentElement.scrollHeight")
-    error = seen("error-rms")
-    page.focus("#live-rms")
-    page.keyboard.press("End")
-    page.wait_for_function("document.getElementById('live-input-rms').textContent === '1.50 rad rms'")
-    assert page.get_attribute("#live-rms", "aria-valuetext") == "1.50 rad"
-    assert seen("error-rms") != error
 
-    page.focus("#live-shift-b")
-    page.keyboard.press("End")
-    page.focus("#live-shift-a")
-    page.keyboard.press("End")
-    page.wait_for_selector("#live-error-rms:has-text('singular')")
-    assert "Singular" in seen("says")
-    page.wait_for_function("document.getElementById('live-announced').textContent.includes('singular')")
-    assert "singular" in page.get_attribute("#live-found", "aria-label")
-    assert page.evaluate("document.documentElement.scrollHeight") == height
+def wait_for_address(page, *parts):
+    for part in parts:
+        page.wait_for_function("part => location.hash.includes(part)", arg=part)
 
-    page.focus("#live-run")
-    page.keyboard.press("Enter")
-    page.wait_for_function("document.getElementById('live-seed').value === '9'")
-    page.click("#live-reset")
-    page.wait_for_function(f"document.getElementById('live-error-rms').textContent === '{error}'")
-    assert page.input_value("#live-seed") == "7"
+
+def test_the_first_state_shows_the_point_of_the_paper(fresh):
+    assert verdicts(fresh) == ["✗", "✗", "✓"]
+    assert "phase-shifted recovers the phase" in fresh.inner_text("#live-says")
+
+
+@pytest.mark.parametrize(
+    ("preset", "expected", "named"),
+    [
+        ("The paper", ["✗", "✗", "✓"], "phase-shifted"),
+        ("SEAL", ["✗", "✗", "✓"], "phase-shifted"),
+        ("Keck", ["✗", "✗", "✓"], "maximum likelihood"),
+        ("OZIRIIS", ["✗", "✗", "✓"], "maximum likelihood"),
+        ("Dimple too large", ["✗", "✗", "✗"], "phase-shifted"),
+        ("Out of range", ["✗", "✗", "✗"], "phase-shifted"),
+        ("The same with maximum likelihood", ["✗", "✗", "✓"], "maximum likelihood"),
+        ("A small input", ["✗", "✓", "✓"], "phase-shifted"),
+    ],
+)
+def test_presets_and_buttons_set_the_sensor_up(fresh, preset, expected, named):
+    fresh.click(f"button:text-is('{preset}')")
+    if fresh.inner_text("#live-play") == "■ Stop":
+        fresh.click("#live-play")
+        fresh.evaluate("window.zwfsLive.page.set({ iterations: '30' })")
+    fresh.wait_for_function(
+        "all => [0, 1, 2].every((k) => document.getElementById(`live-verdict-${k}`).textContent[0] === all[k])",
+        arg=expected,
+    )
+    assert fresh.inner_text("#live-name-2") == named
+
+
+def test_the_state_is_in_the_address(fresh, browser, file):
+    state = {"rms": "0.73", "diameter": "1.5", "shift-b": "-0.25", "likelihood": "1"}
+    fresh.evaluate("state => window.zwfsLive.page.set(state)", state)
+    wait_for_address(fresh, "rms=0.73", "diameter=1.5", "shift-b=-0.25", "likelihood=1")
+    assert "seed" not in fresh.url
+    shared = browser.new_page()
+    shared.goto(fresh.url)
+    same = "window.zwfsLive.page.settings()"
+    assert shared.evaluate(f"JSON.stringify({same})") == fresh.evaluate(f"JSON.stringify({same})")
+    assert shared.inner_text("#live-says") == fresh.inner_text("#live-says")
+    # A new address sets the sliders, within their range. That of a heading does not.
+    for text, rms in (("#rms=0.2", 0.2), ("#rms=7&seed=x", 2)):
+        shared.evaluate("text => { location.hash = text; }", text)
+        shared.wait_for_function(f"rms => {same}.rms === rms", arg=rms)
+        assert shared.evaluate(f"{same}.seed") == 7
+    shared.evaluate("location.hash = '#what-to-try'")
+    shared.wait_for_timeout(50)
+    assert shared.evaluate(f"{same}.rms") == 2
+    shared.close()
+
+
+def test_play_steps_through_the_iterations(fresh):
+    fresh.click("#live-play")
+    assert fresh.inner_text("#live-play") == "■ Stop"
+    seen = [fresh.input_value("#live-iterations")]
+    while seen[-1] != "3":
+        fresh.wait_for_function("last => document.getElementById('live-iterations').value !== last", arg=seen[-1])
+        seen.append(fresh.input_value("#live-iterations"))
+    assert seen == sorted(set(seen))
+    fresh.wait_for_function("document.getElementById('live-play').textContent === '▶ Play'")
+    assert fresh.input_value("#live-iterations") == "20"
+
+
+def test_page_answers_the_keyboard_and_keeps_its_height(fresh):
+    height = fresh.evaluate("document.documentElement.scrollHeight")
+    fresh.focus("#live-rms")
+    fresh.keyboard.press("End")
+    fresh.wait_for_function("document.getElementById('live-says').textContent.includes('2.00 rad rms')")
+    assert fresh.get_attribute("#live-rms", "aria-valuetext") == "2.00 rad"
+
+    fresh.focus("#live-shift-b")
+    fresh.keyboard.press("End")
+    fresh.focus("#live-shift-a")
+    fresh.keyboard.press("End")
+    fresh.wait_for_selector("#live-verdict-2:has-text('no solution')")
+    fresh.wait_for_function("document.getElementById('live-announced').textContent.includes('no solution')")
+    assert "no solution" in fresh.get_attribute("#live-found-2", "aria-label")
+
+    fresh.focus("#live-likelihood")
+    fresh.keyboard.press("Space")
+    fresh.wait_for_function("document.getElementById('live-name-2').textContent === 'maximum likelihood'")
+    assert fresh.evaluate("document.documentElement.scrollHeight") == height
+
+
+def test_a_design_is_chosen_by_mouse_and_by_keyboard(fresh):
+    design = "document.getElementById('live-design').textContent"
+    box = fresh.locator("#live-designs").bounding_box()
+    # The map has 23 diameters from 0.8 lambda/D on, and 14 shifts from 0.3 pi on, upwards.
+    place = {"x": box["width"] * 8.5 / 23, "y": box["height"] * (1 - 8.5 / 14)}
+    fresh.click("#live-designs", position=place)
+    fresh.wait_for_function(f"{design}.startsWith('1.60 λ/D, 0.70π')")
+    fresh.focus("#live-designs")
+    fresh.keyboard.press("ArrowRight")
+    fresh.keyboard.press("ArrowDown")
+    fresh.wait_for_function(f"{design}.startsWith('1.70 λ/D, 0.65π and −0.65π: ')")
+    wait_for_address(fresh, "diameter=1.7", "shift-a=0.65", "shift-b=-0.65")
+    assert "1.70" in fresh.get_attribute("#live-designs", "aria-label")
+    cost = live.designs()["costs"]["flat wavefront"][9][7]
+    fresh.check("input[value='flat wavefront']")
+    fresh.wait_for_function(f"{design}.includes('{cost:.2f} times')")
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_axe_finds_no_fault(browser, file, width):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    page = browser.new_page(viewport={"width": width, "height": 844})
+    page.goto(file.as_uri())
+    rules = {"resultTypes": ["violations"], "runOnly": ["wcag2a", "wcag2aa"]}
+    found = axe.run(page, options=rules).response["violations"]
+    assert [(fault["id"], fault["nodes"][0]["html"]) for fault in found if fault["id"] != "document-title"] == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.close()
 
 
 def test_page_says_nothing_and_asks_for_nothing_else(page):

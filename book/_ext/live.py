@@ -1,6 +1,7 @@
-"""The data of the live sensor: its dimples, its screens and the colours of the figures."""
+"""The data of the live sensor: its dimples, its screens, the map of designs and the colours of the figures."""
 
 import base64
+import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,10 @@ from numpy.typing import NDArray
 from sphinx.application import Sphinx
 
 import zwfs
-from zwfs._arrays import Kind
-from zwfs.lowrank import Factors, Plane
 from zwfs.plots.style import INTENSITY_MAP, PHASE_MAP
 
 DATA = "_static/live-data.js"
+DESIGNS = Path(__file__).with_name("design.csv")  # the data that the page of notebooks/design.ipynb offers
 
 N_PIXELS = 64
 N_MODES = 200
@@ -24,6 +24,7 @@ DIAMETERS = (0.5, 3.0)  # lambda/D
 # The core of a dimple is an entire function of the diameter: 14 samples interpolate it to 1e-7.
 N_DIAMETERS = 14
 TOLERANCE = 1e-7  # of the reference waves, which are stored in single precision
+COST_MAP = "cividis_r"
 
 
 def script() -> str:
@@ -34,51 +35,68 @@ def script() -> str:
 def data() -> dict[str, Any]:
     """Return the input of book/_static/live-model.js, ready for JSON."""
     pupil = zwfs.Pupil.circular(N_PIXELS)
-    diameters, factors = dimples(pupil)
+    diameters, functions, cores = dimples(pupil)
+    maps = {"phase": PHASE_MAP, "intensity": INTENSITY_MAP, "cost": COST_MAP}
     return {
         "inside": _encode(pupil.inside.astype(np.uint8)),
         "diameters": diameters.tolist(),
-        "pupil": _plane(factors.pupil.to(Kind.numpy(np.float32))),
-        "detector": _plane(factors.detector.to(Kind.numpy(np.float32))),
-        "cores": [_encode(-core.real.astype(np.float32)) for core in factors.core],
-        "screens": _plane(screens(pupil)),
-        "colors": {
-            "phase": _encode(colormaps[PHASE_MAP](np.arange(256), bytes=True)),
-            "intensity": _encode(colormaps[INTENSITY_MAP](np.arange(256), bytes=True)),
-        },
+        "functions": _encode(functions),
+        "cores": _encode(cores.astype(np.float32)),
+        "orders": [zwfs.noll_to_nm(j) for j in range(2, N_MODES + 2)],
+        "screens": _encode(screens(pupil).astype(np.float32)),
+        "designs": designs(),
+        "colors": {name: _encode(colormaps[color](np.arange(256), bytes=True)) for name, color in maps.items()},
     }
 
 
-def dimples(pupil: zwfs.Pupil) -> tuple[NDArray, Factors]:
-    """Return Chebyshev points in the range of diameters, and the factors of dark dimples of these diameters.
+def dimples(pupil: zwfs.Pupil) -> tuple[NDArray, NDArray, NDArray]:
+    """Return diameters, functions of an axis, and the light through dimples of these diameters, in the functions.
 
-    A dark dimple blocks its light: its reference wave is minus that light. Its core is real: minus the core of the
-    kernel without the factor exp(i theta) - 1.
+    A dark dimple blocks its light: its reference wave is minus that light. Its core is real and symmetric. The
+    functions of an axis are even or odd, so products of them belong to one of four classes: 2 (odd in y) + (odd in
+    x). A core couples functions of one class only.
+
+    Returns
+    -------
+    diameters : ndarray, shape (n,), lambda/D
+        Chebyshev points.
+    functions : ndarray, shape (a, n_pixels)
+        Even and odd ones in turn.
+    cores : ndarray, shape (n, 4, b, b)
+        For each class, between products of a function of y and one of x.
     """
     low, high = DIAMETERS
     angles = np.pi * (np.arange(N_DIAMETERS) + 0.5) / N_DIAMETERS
     diameters = (low + high) / 2 - (high - low) / 2 * np.cos(angles)
     dark = [zwfs.Dimple(diameter, phase=0.0, amplitude=0.0) for diameter in diameters]
-    return diameters, zwfs.ZernikeSensor(pupil, *dark, tolerance=TOLERANCE).factors
+    factors = zwfs.ZernikeSensor(pupil, *dark, tolerance=TOLERANCE).factors
+    functions = factors.pupil.along_y
+    cores = -(factors.detector.combine @ factors.core.real @ factors.pupil.combine.T)
+    a = len(functions)
+    cores = cores.reshape(-1, a, a, a, a)
+    blocks = [cores[:, y::2, x::2, y::2, x::2] for y in (0, 1) for x in (0, 1)]
+    size = (a // 2) ** 2
+    return diameters, functions, np.stack([block.reshape(-1, size, size) for block in blocks], axis=1)
 
 
-def screens(pupil: zwfs.Pupil) -> Plane:
-    """Return the screens of the seeds from 1 on, unit rms, as combinations of products of Legendre polynomials.
-
-    Zernike modes are polynomials in x and y of a degree up to the radial order of the last mode. They are huge in
-    the corners of the square outside the pupil: the coefficients need double precision.
-    """
-    degree = zwfs.noll_to_nm(N_MODES + 1)[0]
+def screens(pupil: zwfs.Pupil) -> NDArray:
+    """Return the coefficients of the screens of the seeds from 1 on, unit rms: (n_seeds, n_modes)."""
     modes = zwfs.zernike_basis(pupil, N_MODES)
     maps = np.concatenate([zwfs.power_law_screens(modes, 1.0, 1, seed=1 + k) for k in range(N_SEEDS)])
-    along_y, along_x = (np.polynomial.legendre.legvander(2 * axis, degree).T for axis in (pupil.y, pupil.x))
-    products = np.einsum("iy,jx->ijyx", along_y, along_x).reshape(-1, *pupil.shape)
-    combine = np.linalg.lstsq(pupil.gather(products).T, pupil.gather(maps).T)[0]
-    return Plane(along_y, along_x, combine)
+    return np.linalg.lstsq(pupil.gather(modes).T, pupil.gather(maps).T)[0].T
 
 
-def _plane(plane: Plane) -> dict[str, Any]:
-    return {"y": _encode(plane.along_y), "x": _encode(plane.along_x), "combine": _encode(plane.combine)}
+def designs() -> dict[str, Any]:
+    """Return the photon costs of designs, a row for each diameter, by the name of the wavefronts."""
+    with DESIGNS.open(encoding="utf-8", newline="") as file:
+        header, *rows = csv.reader(file)
+    table = np.array(rows, float)
+    diameters, shifts = np.unique(table[:, 0]), np.unique(table[:, 1])
+    costs = {
+        name.rpartition(", ")[2]: table[:, column].reshape(diameters.size, shifts.size).tolist()
+        for column, name in enumerate(header[2:], 2)
+    }
+    return {"diameters": diameters.tolist(), "shifts": (shifts / np.pi).round(6).tolist(), "costs": costs}
 
 
 def _encode(array: NDArray) -> dict[str, Any]:

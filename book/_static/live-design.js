@@ -1,0 +1,89 @@
+// The map of designs on the live page: photons that a sensor needs, over the diameter and the phase shifts.
+// A click or the arrow keys choose a design of the map for the sensor above.
+"use strict";
+
+(() => {
+  const { designs, colors, page } = window.zwfsLive;
+  const { diameters, shifts, costs } = designs;
+  const MOST = 10; // end of the scale of photons
+  const find = (name) => document.getElementById(`live-${name}`);
+  const map = find("designs");
+  const choices = [...document.querySelectorAll("input[name=live-cost]")];
+
+  const stepOf = (values) => (values.at(-1) - values[0]) / (values.length - 1);
+  const nearest = (values, value) => Math.round((value - values[0]) / stepOf(values));
+  const within = (values, place) => Math.min(values.length - 1, Math.max(0, place));
+  const cost = () => costs[choices.find((choice) => choice.checked).value];
+
+  // Position in the drawing, in cells, of a diameter and a shift.
+  const across = (diameter) => (diameter - diameters[0]) / stepOf(diameters) + 0.5;
+  const down = (shift) => shifts.length - 0.5 - (shift - shifts[0]) / stepOf(shifts);
+
+  function paint() {
+    const canvas = find("cost");
+    const context = canvas.getContext("2d");
+    const image = context.createImageData(diameters.length, shifts.length);
+    cost().forEach((row, x) =>
+      row.forEach((value, y) => {
+        const level = Math.floor((256 * Math.log(value)) / Math.log(MOST));
+        const from = 4 * Math.min(255, Math.max(0, level));
+        const to = 4 * ((shifts.length - 1 - y) * diameters.length + x);
+        image.data.set(colors.cost.subarray(from, from + 4), to);
+      }),
+    );
+    context.putImageData(image, 0, 0);
+  }
+
+  // A bar from one shift to the other, or a point if they are of equal size.
+  function mark(element, diameter, [a, b]) {
+    const [x, high, low] = [across(diameter), down(Math.abs(a)), down(Math.abs(b))];
+    element.setAttribute("d", `M${x} ${high}V${low}`);
+  }
+
+  function words(diameter, [a, b]) {
+    const place = [nearest(diameters, diameter), nearest(shifts, Math.abs(a))];
+    const signs = `${diameter.toFixed(2)} λ/D, ${a.toFixed(2)}π and ${b.toFixed(2)}π`.replaceAll("-", "−");
+    const known = Math.abs(a + b) < 0.01 && cost()[place[0]]?.[place[1]];
+    return known ? `${signs}: ${known.toPrecision(3)} times the photons of an ideal sensor` : `${signs}: not on this map`;
+  }
+
+  let current = [diameters[0], [shifts[0], -shifts[0]]];
+  function follow({ diameter, shifts: radian }) {
+    current = [diameter, radian.map((shift) => shift / Math.PI)];
+    for (const element of map.querySelectorAll(".live-own")) mark(element, ...current);
+    find("design").textContent = words(...current);
+    map.setAttribute("aria-label", `Map of designs. Chosen: ${words(...current)}. Arrow keys choose another one.`);
+  }
+
+  function choose(x, y) {
+    const shift = shifts[within(shifts, y)].toFixed(2);
+    page.set({ diameter: diameters[within(diameters, x)].toFixed(2), "shift-a": shift, "shift-b": `-${shift}` });
+  }
+
+  map.addEventListener("click", (event) => {
+    const box = find("cost").getBoundingClientRect();
+    const x = Math.floor(((event.clientX - box.left) / box.width) * diameters.length);
+    const y = Math.floor(((box.bottom - event.clientY) / box.height) * shifts.length);
+    choose(x, y);
+  });
+  map.addEventListener("keydown", (event) => {
+    const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    if (!move) return;
+    event.preventDefault();
+    const [diameter, [a]] = current;
+    choose(nearest(diameters, diameter) + move[0], nearest(shifts, Math.abs(a)) + move[1]);
+  });
+  for (const choice of choices) {
+    choice.addEventListener("change", () => {
+      paint();
+      follow(page.settings());
+    });
+  }
+  for (const element of map.querySelectorAll("[data-design]")) {
+    const [diameter, ...pair] = element.dataset.design.split(" ").map(Number);
+    mark(element, diameter, pair);
+  }
+  page.listen(follow);
+  paint();
+  follow(page.settings());
+})();

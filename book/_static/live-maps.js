@@ -1,0 +1,78 @@
+// The pictures of the live page, all with fixed scales: phases, errors, images, the focal plane and the curves.
+"use strict";
+
+(() => {
+  const { size, places, inside, FOCAL, colors } = window.zwfsLive;
+  const PHASE = Math.PI; // radian, end of the scale of phases,
+  const ERROR = 1; // of that of errors,
+  const BRIGHT = 3; // and of that of images
+  const DECADES = 4; // of the focal plane
+  const SMALLEST = 1e-6; // errors below it are rounding and differ from machine to machine
+
+  const find = (name) => document.getElementById(`live-${name}`);
+  const palettes = Object.fromEntries(Object.entries(colors).map(([name, map]) => [name, new Uint32Array(map.buffer)]));
+  const all = Int32Array.from(places, (_, k) => k);
+  const upright = (place, width) => (width - 1 - Math.floor(place / width)) * width + (place % width);
+  const pixels = places.map((place) => upright(place, size));
+  const focalPixels = Int32Array.from({ length: FOCAL.size ** 2 }, (_, k) => upright(k, FOCAL.size));
+  const focalPoints = Int32Array.from(focalPixels, (_, k) => k);
+
+  function power(number) {
+    const exponent = String(Math.round(Math.log10(number)));
+    return `10${[...exponent].map((digit) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[digit] ?? "⁻").join("")}`;
+  }
+
+  function scientific(number) {
+    const [digits, exponent] = number.toExponential(1).split("e");
+    return `${digits} × ${power(10 ** Number(exponent))}`;
+  }
+
+  function error(number) {
+    if (number < SMALLEST) return `< ${power(SMALLEST)}`;
+    return number < 0.01 ? scientific(number) : number.toPrecision(2);
+  }
+
+  // Paint values on a canvas, transparent elsewhere; level turns a value into a share of the palette.
+  const images = {};
+  function paint(name, values, palette, level, points = inside, where = pixels) {
+    const canvas = find(name);
+    canvas.parentElement.classList.toggle("live-empty", !values);
+    const context = canvas.getContext("2d");
+    const image = (images[name] ??= context.createImageData(canvas.width, canvas.height));
+    const words = new Uint32Array(image.data.buffer);
+    words.fill(0);
+    if (values) for (const k of points) words[where[k]] = palette[Math.min(255, Math.max(0, level(values[k]) * 256)) | 0];
+    context.putImageData(image, 0, 0);
+  }
+
+  const phase = (name, map) => paint(name, map, palettes.phase, (value) => (value / PHASE + 1) / 2);
+  const difference = (name, map) => paint(name, map, palettes.phase, (value) => (value / ERROR + 1) / 2);
+  const image = (name, map) => paint(name, map, palettes.intensity, (value) => value / BRIGHT, all);
+
+  function focal(name, light, diameter) {
+    const level = (value) => 1 + Math.log10(value) / DECADES;
+    paint(name, light, palettes.intensity, level, focalPoints, focalPixels);
+    for (const circle of document.querySelectorAll(".live-dimple circle")) circle.setAttribute("r", diameter / 2);
+  }
+
+  // A line for each method, on a logarithmic axis from 10 to 1e-6 radian; the linear method has no iterations.
+  function curves(methods) {
+    for (const [name, method] of Object.entries(methods)) {
+      const errors = method ? method.errors : [];
+      const ends = errors.length === 1 ? [errors[0], errors[0]] : errors;
+      const step = errors.length === 1 ? Number(find("iterations").max) : 1;
+      const points = ends.map((value, i) => `${i * step},${1 - Math.log10(Math.max(value, SMALLEST))}`);
+      find(`line-${name}`).setAttribute("points", points.join(" "));
+    }
+  }
+
+  function bars() {
+    for (const bar of document.querySelectorAll("canvas.live-bar")) {
+      const ramp = bar.getContext("2d").createImageData(256, 1);
+      ramp.data.set(colors[bar.dataset.colors]);
+      bar.getContext("2d").putImageData(ramp, 0, 0);
+    }
+  }
+
+  window.zwfsLive.draw = { SMALLEST, scientific, error, phase, difference, image, focal, curves, bars };
+})();

@@ -612,6 +612,15 @@ def test_seal_frames_are_explained(seal_work):
     assert seal_work[-1].result.measurement.n_bad == 0
     # One frame predicts the other one far better than the outlines alone let it.
     assert np.all(seal_work[-1].predicted > seal_work[0].predicted + 0.05)
+    assert np.all(seal_work[-1].predicted > seal_work[-1].control + 0.25)
+
+
+@pytest.mark.slow
+def test_seal_images_hold_uneven_light_and_do_not_show_a_rotation(seal_work):
+    measurement = seal_work[-1].result.measurement
+    assert measurement.flux_ratio == pytest.approx((1.22, 1.02), abs=0.01)
+    assert np.isnan(measurement.recording.placement.sigma[2:]).all()
+    assert np.all(measurement.recording.placement.sigma[:2] < 0.5)
 
 
 @pytest.mark.slow

@@ -102,6 +102,8 @@ def write_bench(
         ("THETA1", bench.phase, "[rad] phase shift of the left image"),
         ("THETA2", -bench.phase, "[rad] phase shift of the right image"),
         ("SATURATE", 65535, "[adu] pixels that reach it are saturated"),
+        ("EGAIN", 1 / gain, "[electron/adu] gain"),
+        ("RDNOISE", bench.read_noise, "[electron] read noise"),
         origin,
     ]
     for name, pair in counts.items():

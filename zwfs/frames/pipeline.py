@@ -500,6 +500,16 @@ def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[n
     return correlations(frames[(..., *window)][:, good], predicted)
 
 
+def upside_down(measurement: Measurement) -> Measurement:
+    """Control of a measurement: its second frame upside down, so that the frames no longer belong together."""
+    _check.instance("measurement", measurement, Measurement)
+    flipped: dict[str, Any] = {}
+    for name in ("intensity", "bad"):
+        pair = getattr(measurement, name)
+        flipped[name] = np.stack([pair[0], pair[1, ::-1]])
+    return replace(measurement, **flipped)
+
+
 def fit(
     recording: Recording, optics: Optics, names: Sequence[str], n_iterations: int = 25, n_steps: int = 8
 ) -> tuple[Recording, Optics]:
@@ -645,11 +655,14 @@ class Step:
     result : MeasuredPhase
     predicted : ndarray, shape (2,)
         Correlation of each frame with the prediction from the other one alone, see `predict_other`.
+    control : ndarray, shape (2,)
+        The same with the second frame upside down.
     """
 
     name: str
     result: MeasuredPhase
     predicted: NDArray[np.float64]
+    control: NDArray[np.float64]
 
 
 def steps(
@@ -706,7 +719,8 @@ def steps(
 
     def add(name: str, recording: Recording, optics: Optics) -> None:
         measurement = reduce_frames(recording, optics)
-        work.append(Step(name, reconstruct(measurement, n_iterations), predict_other(measurement, n_iterations)))
+        scores = (predict_other(one, n_iterations) for one in (measurement, upside_down(measurement)))
+        work.append(Step(name, reconstruct(measurement, n_iterations), *scores))
 
     switches: dict[str, Any] = dict.fromkeys(("subpixel", "background", "balance"), False)
     add("outlines of the pupils", record(frames, clear_frames, **settings, **switches), optics)

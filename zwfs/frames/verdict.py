@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from zwfs import _check
 from zwfs.bounds import cramer_rao
-from zwfs.frames.pipeline import MeasuredPhase, Measurement, model, predict_other
+from zwfs.frames.pipeline import MeasuredPhase, Measurement, model, predict_other, upside_down
 from zwfs.frames.registration import Placement, Recording, nearest_good
 
 _NEAR = 2  # pixels from a gap, vane or edge that count as near it
@@ -66,8 +66,8 @@ class Verdict:
         them. 1 if noise is all of it; NaN if the noise of the camera is not known.
     sigma : ndarray, shape (ny, nx), radian, or None
         Error bar of the phase: the smallest that photon and read noise allow, without errors of the model.
-    findings : tuple of str
-        Sentences: the verdict first, then the facts, and where to look.
+    findings : dict of str
+        Sentences by their topic: fit, unseen data, light, registration, and warnings if there are any.
     """
 
     score: NDArray[np.float64]
@@ -75,7 +75,7 @@ class Verdict:
     inner: float
     edge: float
     sigma: NDArray[np.float64] | None
-    findings: tuple[str, ...]
+    findings: dict[str, str]
 
     @property
     def explained(self) -> bool | None:
@@ -114,24 +114,15 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
         ratio = _over_noise(result, noise)
         inner, edge = _rms(ratio[measurement.good & ~near]), _rms(ratio[measurement.good & near])
         sigma = error_bar(result, noise)
-    findings = (
-        _of_fit(result, inner, edge, near),
-        _of_score(score, control),
-        _of_light(measurement),
-        _of_place(measurement.recording.placement),
-        *_warnings(result),
-    )
+    findings = {
+        "fit": _of_fit(result, inner, edge, near),
+        "unseen data": _of_score(score, control),
+        "light": _of_light(measurement),
+        "registration": _of_place(measurement.recording.placement),
+    }
+    if warnings := " ".join(_warnings(result)):
+        findings["warnings"] = warnings
     return Verdict(score, control, inner, edge, sigma, findings)
-
-
-def upside_down(measurement: Measurement) -> Measurement:
-    """Control of a measurement: its second frame upside down, so that the frames no longer belong together."""
-    _check.instance("measurement", measurement, Measurement)
-    flipped: dict[str, Any] = {}
-    for name in ("intensity", "bad"):
-        pair = getattr(measurement, name)
-        flipped[name] = np.stack([pair[0], pair[1, ::-1]])
-    return replace(measurement, **flipped)
 
 
 def near_edges(measurement: Measurement) -> NDArray[np.bool_]:
@@ -237,9 +228,9 @@ def _of_score(score: NDArray, control: NDArray) -> str:
     lead = float(np.min(score - control))
     trust = "The frames belong together." if lead >= _LEAST_LEAD else "The frames hardly support this phase."
     return (
-        f"Score on unseen data: predicted from the other frame alone, the frames correlate by {score[0]:.2f} and "
-        f"{score[1]:.2f} with the measured ones. Control, with the second frame upside down: {control[0]:.2f} and "
-        f"{control[1]:.2f}. {trust}"
+        f"Predicted from the other frame alone, the frames correlate by {score[0]:.2f} and {score[1]:.2f} with "
+        "the measured ones. "
+        f"Control, with the second frame upside down: {control[0]:.2f} and {control[1]:.2f}. {trust}"
     )
 
 
@@ -271,7 +262,7 @@ def _of_place(placement: Placement) -> str:
             facts.append(f"its {name} is not determined and taken as none")
         else:
             real = "undone" if abs(value) > _TURNED * sigma else "consistent with none"
-            facts.append(f"its {name} is {value:+.3f} +- {sigma:.3f} {unit} ({real})")
+            facts.append(f"its {name} is {value:+.3f} ± {sigma:.3f} {unit} ({real})")
     return "The second image, compared with the first: " + "; ".join(facts) + "."
 
 

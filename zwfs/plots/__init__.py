@@ -4,7 +4,7 @@ from zwfs.plots.at_a_glance import at_a_glance
 from zwfs.plots.bench import bench_linearity, budget, measured_and_modelled, reference_intensities, segment_errors
 from zwfs.plots.closed_loop import capture, loop_runs
 from zwfs.plots.dimple_diameter import diameter_methods, diameter_reasons, dimple_diameter
-from zwfs.plots.frames import explained, gains, phase_map
+from zwfs.plots.frames import explained, gains, phase_map, signs
 from zwfs.plots.identities import approximation, diversity
 from zwfs.plots.layouts import bench_layout, sensor_layout, vector_sensor
 from zwfs.plots.linearity import convergence, estimates, linearity, saxton_widths
@@ -68,6 +68,7 @@ __all__ = [
     "sensor_steps",
     "show_intensity",
     "show_phase",
+    "signs",
     "use_style",
     "vector_sensor",
 ]

@@ -49,6 +49,18 @@ def test_bzero_and_extension_and_stack(tmp_path):
     np.testing.assert_array_equal(second.counts - first.counts, 1)
 
 
+def test_two_images_in_two_extensions_are_both_read(tmp_path):
+    both = [fits.PrimaryHDU(), fits.ImageHDU(FRAME), fits.ImageHDU(FRAME + 1)]
+    fits.HDUList(both).writeto(tmp_path / "a.fits")
+    np.testing.assert_array_equal(camera.read(tmp_path / "a.fits").images, [FRAME, FRAME + 1])
+    for others in ([FRAME, FRAME], [FRAME[1:]]):
+        fits.HDUList([fits.PrimaryHDU(FRAME), *map(fits.ImageHDU, others)]).writeto(
+            tmp_path / "b.fits", overwrite=True
+        )
+        with pytest.raises(camera.FileError, match=r"b\.fits: images of shapes"):
+            camera.read(tmp_path / "b.fits")
+
+
 def test_compressed_files_are_read(tmp_path):
     plain, packed = tmp_path / "plain.fits", tmp_path / "packed.fits.gz"
     fits.PrimaryHDU(FRAME.astype(np.int16), fits.Header({"WAVELEN": 633.0})).writeto(plain)

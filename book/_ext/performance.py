@@ -135,7 +135,9 @@ def latency(rows: list[dict[str, Any]]) -> dict[str, str]:
         for name in causes
     ]
     return {
-        "latency": table(["", *(f"{name} (μs)" for name in quantiles), "p99 / p50"], times),
+        "latency": table(
+            [f"{rows[0]['n_frames']} frames", *(f"{name} (μs)" for name in quantiles), "p99 / p50"], times
+        ),
         "late": table(["share of the calls", *settings], late),
     }
 
@@ -143,13 +145,12 @@ def latency(rows: list[dict[str, Any]]) -> dict[str, str]:
 def telemetry(measured: dict[str, Any]) -> str:
     """Return sentences on the time of a long cube."""
     one = {name: 1e3 * time for name, time in measured["parts"].items()}
+    files = f"{measured['frames']} simulated frame pairs of {measured['n_pixels']} pixels"
     return (
-        f"{measured['frames']} simulated frame pairs of {measured['n_pixels']} pixels took "
-        f"{measured['time']:.1f} s with {measured['threads']} threads, files included "
-        f"({measured['processor time']:.1f} s of processor time). One pair takes "
-        f"{one['whole']:.2f} ms of a core: {one['resampling']:.2f} ms for resampling, "
-        f"{one['iteration']:.2f} ms for the iteration and {one['residual']:.2f} ms for the residual. The memory "
-        f"grew by {measured['memory'] / 1e6:.0f} MB.\n"
+        f"{files} took {measured['time']:.1f} s with {measured['threads']} threads, files included. "
+        f"The processor time is {measured['processor time']:.1f} s. A pair takes {one['whole']:.2f} ms of a core: "
+        f"{one['resampling']:.2f} ms for resampling, {one['iteration']:.2f} ms for the iteration and "
+        f"{one['residual']:.2f} ms for the residual. The memory grew by {measured['memory'] / 1e6:.0f} MB.\n"
     )
 
 

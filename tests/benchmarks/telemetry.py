@@ -1,7 +1,7 @@
 """Reconstruction of a long cube: python -m tests.benchmarks.telemetry [frame pairs] [threads] prints JSON.
 
 Simulated frame pairs of a hexagonal pupil of 90 pixels, 16-bit FITS, photon noise. The phase goes to a FITS file
-on the disk of this folder. Set OMP_NUM_THREADS=1, as `make bench` does.
+in the folder for temporary files. Set OMP_NUM_THREADS=1, as `make bench` does.
 """
 
 import json
@@ -83,7 +83,7 @@ def parts(calibration, frames):
 def telemetry(n=10_000, n_workers=2, n_pixels=90, **settings):
     """Times of a cube: by the clock, of the processor, of its parts for each frame pair; and memory, bytes."""
     calibration, frames = camera(n_pixels, _DISTINCT)
-    with tempfile.TemporaryDirectory(dir=".") as folder:
+    with tempfile.TemporaryDirectory() as folder:
         cube, output = Path(folder, "cube.fits"), Path(folder, "phase.fits")
         write_cube(cube, frames, n)
         calibration(frames[:1])

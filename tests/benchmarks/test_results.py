@@ -2,7 +2,7 @@
 
 import json
 
-from . import arrays, speed
+from . import arrays, latency, speed, telemetry
 from .report import KEPT, fingerprint
 
 
@@ -59,3 +59,15 @@ def test_every_library_at_hand_finds_the_same():
     found = list(arrays.rates(21, 40))
     assert found[0][0] == "NumPy"
     assert all(rate > 0 and error < 0.01 for _, rate, error in found)
+
+
+def test_causes_of_late_calls_are_shares_of_all_calls():
+    row = latency.latency(40, 30)
+    assert row["p50"] <= row["p99"] <= row["p99.9"] <= row["largest"]
+    assert all(0 <= row[name] <= row["late"] <= 1 for name in row if name.startswith("late"))
+
+
+def test_long_cube_is_reconstructed_without_a_flag():
+    found = telemetry.telemetry(70, 1, 40)
+    assert found["output"] > 70 * 4 * 40**2
+    assert found["parts"]["whole"] > found["parts"]["resampling"] > 0

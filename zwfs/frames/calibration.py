@@ -31,7 +31,7 @@ from zwfs._pickle import Immutable
 from zwfs._propagator import propagator, split
 from zwfs.frames.files import FileError, read_all
 from zwfs.frames.pipeline import Measurement, Optics, fit, ideal_frames, reduce_frames
-from zwfs.frames.registration import Recording, nearest_good, record
+from zwfs.frames.registration import Image, Recording, nearest_good, record
 from zwfs.masks import Dimple
 from zwfs.metrics import without_piston
 from zwfs.modes import check_modes
@@ -41,6 +41,7 @@ from zwfs.sensor import ZernikeSensor
 
 FORMAT = 1  # of the file; another number is refused
 _NAME = "zwfs calibration"
+_FAR = 40  # pixels beyond the camera at which the edge of an image has no effect on the camera
 _REACH = 12  # pixels around the pupil that its splines need: farther ones weigh less than 2e-7
 _NEGLIGIBLE = 1e-10  # in a spline filter: smaller numbers only slow the product down
 _TOUCHED = 0.01  # weight of a bad pixel from which on a point is bad, as in `Recording`
@@ -239,6 +240,7 @@ class Calibration(Immutable):
             raise ValueError(f"the frames have shapes {shape} and {images[-1].counts.shape}: expected the same")
         counts, _ = recording.frames_on_grid()
         unit, background = measurement.counts * recording.exposure, measurement.background[:2]
+        places, response = _places(recording)
         inner = (..., *measurement.window)
         good = measurement.good
         weights, offset = _undoing(measurement)
@@ -249,12 +251,12 @@ class Calibration(Immutable):
             optics=measurement.optics,
             shape=shape,
             n_images=len(images),
-            places=_places(recording, pupil.shape),
+            places=places,
             dark=_dark(dark, (len(images), *shape)),
             bad=np.stack([image.bad for image in images]),
             good=good,
-            background=background,
-            unit=unit,
+            background=background / response,
+            unit=unit / response,
             weights=weights,
             offset=offset[inner],
             balance=bool(recording.balance and measurement.optics.opposite),
@@ -720,10 +722,22 @@ def _undoing(measurement: Measurement) -> tuple[NDArray[np.float64], NDArray[np.
     return np.stack([(undone(*light) - offset)[:, 0, 0] for light in ((1, 0), (0, 1))], axis=1), offset
 
 
-def _places(recording: Recording, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Row and column of each point of the grid on the two frames, (2, 2, ny, nx)."""
-    grid = np.indices(shape).astype(float)
-    return np.stack([grid + (recording.corner + one)[:, np.newaxis, np.newaxis] for one in recording.origins[:2]])
+def _places(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Row and column of each point of the grid on the two frames, (2, 2, ny, nx), and counts there of one count.
+
+    The recording resamples images whose counts are the number of the row or of the column. They reach beyond the
+    camera, since splines bend ramps at the edge.
+    """
+    wide = [length + 2 * _FAR for length in recording.frames[0].counts.shape]
+    origins = recording.origins + np.array([[_FAR], [_FAR], [0], [0]])
+
+    def on_grid(counts: NDArray) -> NDArray[np.float64]:
+        image = Image(counts, np.zeros(counts.shape, bool))
+        return replace(recording, frames=(image, image), origins=origins).frames_on_grid()[0]
+
+    response = on_grid(np.ones(wide))
+    ramps = np.indices(wide).astype(float) - _FAR
+    return np.stack([on_grid(ramp) / response for ramp in ramps], axis=1), response.mean(axis=(1, 2))
 
 
 def _span(low: int, size: int, length: int) -> Any:

@@ -61,7 +61,7 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
         image.wrap(body.new_tag("a", href=image["src"], title="Open the figure alone"))
         image.parent.wrap(body.new_tag("div", **{"class": "wide-figure"}))
     for figure in body.select(f"figure[class*={VARIANTS}]"):
-        add_variants(app, page, figure)
+        add_variants(app, figure)
     for entry in body.select("[role=doc-biblioentry]"):
         entry["role"] = "listitem"  # the role of Sphinx is deprecated: a list has items
     if body.find(id="phasor"):
@@ -73,12 +73,15 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
         context["metatags"] = given + tags(app.config, page, body, given)
 
 
-def add_variants(app: Sphinx, page: str, figure: Tag) -> None:
-    """Show the dark and the narrow variants of a figure, in place, where its run wrote them."""
+def add_variants(app: Sphinx, figure: Tag) -> None:
+    """Show the dark and the narrow variants of a figure, in place, where the run of its notebook wrote them."""
     name = next(word for word in figure["class"] if word.startswith(VARIANTS)).removeprefix(VARIANTS)
-    run = Path(app.srcdir, app.config.executed_notebooks, f"{Path(page).name}.files")
-    variants = {kind: run / f"{name}.{kind}.png" for kind in ("dark", "narrow", "narrow-dark")}
-    variants = {kind: file for kind, file in variants.items() if file.exists()}
+    runs = Path(app.srcdir, app.config.executed_notebooks)
+    variants = {
+        kind: file
+        for kind in ("dark", "narrow", "narrow-dark")
+        for file in runs.glob(f"*.files/{name}.{kind}.png")
+    }
     image, new = figure.img, BeautifulSoup("", "html.parser").new_tag
     if "dark" not in variants or image is None:
         return

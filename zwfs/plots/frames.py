@@ -74,7 +74,8 @@ def _two_scales(bar: Colorbar, wavelength: float) -> None:
     """Label a colour bar in radian below and in nm above."""
     bar.set_label("rad")
     nm = bar.ax.secondary_xaxis(
-        "top", functions=(partial(phase_to_opd, wavelength=wavelength), partial(opd_to_phase, wavelength=wavelength))
+        "top",
+        functions=(partial(phase_to_opd, wavelength=wavelength), partial(opd_to_phase, wavelength=wavelength)),
     )
     nm.set_xlabel("nm of wavefront")
 

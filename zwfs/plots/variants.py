@@ -48,9 +48,10 @@ def _stacked(figure: Figure) -> Figure:
     entries = 0
     for legend in list(figure.legends):
         texts = legend.get_texts()
+        handles: Any = legend.legend_handles
         legend.remove()
         figure.legend(
-            legend.legend_handles,
+            handles,
             [text.get_text() for text in texts],
             loc="outside lower center",
             fontsize=texts[0].get_fontsize(),

@@ -74,32 +74,32 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
 
 
 def add_variants(app: Sphinx, figure: Tag) -> None:
-    """Show the dark and the narrow variants of a figure, in place, where the run of its notebook wrote them."""
+    """Show the dark and the narrow variants of a figure, in place, if the run of its notebook wrote them."""
     name = next(word for word in figure["class"] if word.startswith(VARIANTS)).removeprefix(VARIANTS)
     runs = Path(app.srcdir, app.config.executed_notebooks)
-    variants = {
-        kind: file
-        for kind in ("dark", "narrow", "narrow-dark")
-        for file in runs.glob(f"*.files/{name}.{kind}.png")
-    }
-    image, new = figure.img, BeautifulSoup("", "html.parser").new_tag
-    if "dark" not in variants or image is None:
+    run = next((file.parent for file in runs.glob(f"*.files/{name}.dark.png")), None)
+    light = figure.img
+    if light is None or run is None:
         return
-    sources = {}
-    folder = image["src"].rpartition("/")[0]
-    for kind, file in variants.items():
-        copy_asset_file(file, Path(app.outdir, "_images"))
-        width, height = map(str, size(file))
-        sources[kind] = {"src": f"{folder}/{file.name}", "width": width, "height": height}
-    dark = copy.copy(image)
-    image.insert_after(dark)
-    dark.attrs |= sources["dark"] | {"loading": "lazy"}
-    for one, narrow, mode in ((image, "narrow", "only-light"), (dark, "narrow-dark", "only-dark")):
-        picture = one.wrap(new("picture", **{"class": mode}))
-        if narrow in sources:
-            source = sources[narrow] | {"srcset": sources[narrow]["src"], "media": PHONE}
-            picture.insert(0, new("source", **{key: value for key, value in source.items() if key != "src"}))
-            figure["class"].append("narrow") if "narrow" not in figure["class"] else None
+    files = {kind: run / f"{name}.{kind}.png" for kind in ("dark", "narrow", "narrow-dark")}
+    dark = copy.copy(light)
+    light.insert_after(dark)
+    dark.attrs |= shown(app, light, files["dark"], "src") | {"loading": "lazy"}
+    new = BeautifulSoup("", "html.parser").new_tag
+    for image, narrow, mode in ((light, "narrow", "only-light"), (dark, "narrow-dark", "only-dark")):
+        image.wrap(new("picture", **{"class": mode}))
+        if files[narrow].exists():
+            source = new("source", media=PHONE, **shown(app, light, files[narrow], "srcset"))
+            image.insert_before(source)
+    if figure.source:
+        figure["class"].append("narrow")
+
+
+def shown(app: Sphinx, image: Tag, file: Path, name: str) -> dict[str, str]:
+    """Copy a picture to the folder of `image`; return its size, and its address under a name."""
+    copy_asset_file(file, Path(app.outdir, "_images"))
+    width, height = map(str, size(file))
+    return {name: f"{image['src'].rpartition('/')[0]}/{file.name}", "width": width, "height": height}
 
 
 def tags(config: Config, page: str, body: BeautifulSoup, given: str) -> str:

@@ -40,11 +40,27 @@
     element.setAttribute("d", `M${x} ${high}V${low}`);
   }
 
-  function words(diameter, [a, b]) {
-    const place = [nearest(diameters, diameter), nearest(shifts, Math.abs(a))];
-    const signs = `${diameter.toFixed(2)} λ/D, ${a.toFixed(2)}π and ${b.toFixed(2)}π`.replaceAll("-", "−");
-    const known = Math.abs(a + b) < 0.01 && cost()[place[0]]?.[place[1]];
-    return known ? `${signs}: ${known.toPrecision(3)} times the photons of an ideal sensor` : `${signs}: not on this map`;
+  // Cell below a value and the share of the next one; undefined outside the map.
+  function between(values, value) {
+    const place = (value - values[0]) / stepOf(values);
+    const cell = Math.min(Math.floor(place + 1e-6), values.length - 2);
+    return place > -1e-6 && place < values.length - 1 + 1e-6 ? [cell, place - cell] : undefined;
+  }
+
+  // Photons of a design with shifts of equal size: linear interpolation of the logarithm.
+  function photons(diameter, [a, b]) {
+    const [x, y] = [between(diameters, diameter), between(shifts, Math.abs(a))];
+    if (!x || !y || Math.abs(a + b) > 1e-6) return undefined;
+    const log = (i, j) => Math.log(cost()[x[0] + i][y[0] + j]);
+    const along = (i) => (1 - y[1]) * log(i, 0) + y[1] * log(i, 1);
+    return Math.exp((1 - x[1]) * along(0) + x[1] * along(1));
+  }
+
+  function words(diameter, pair) {
+    const [a, b] = pair.map((shift) => `${shift.toFixed(2)}π`.replace("-", "−"));
+    const known = photons(diameter, pair);
+    const answer = known ? `${known.toPrecision(3)} times the photons of an ideal sensor` : "not on this map";
+    return `${diameter.toFixed(2)} λ/D, ${a} and ${b}: ${answer}`;
   }
 
   let current = [diameters[0], [shifts[0], -shifts[0]]];

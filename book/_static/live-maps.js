@@ -5,7 +5,7 @@
   const { size, places, inside, FOCAL, colors } = window.zwfsLive;
   const PHASE = Math.PI; // radian, end of the scale of phases,
   const ERROR = 1; // of that of errors,
-  const BRIGHT = 3; // and of that of images
+  const BRIGHT = 2.5; // and of that of images
   const DECADES = 4; // of the focal plane
   const SMALLEST = 1e-6; // errors below it are rounding and differ from machine to machine
 

@@ -10,7 +10,7 @@ window.zwfsLive = (() => {
   const TYPES = { uint8: Uint8Array, float32: Float32Array, float64: Float64Array };
   const SMALLEST = 1e-7; // of the light through a dimple, relative to its strongest part: what is less is left out
   const NORMAL = 30; // mean number of photons above which Poisson's distribution is taken to be normal
-  const FOCAL = { size: 64, reach: 4 }; // pixels, and lambda/D from the axis to the edge
+  const FOCAL = { size: 48, reach: 4 }; // pixels, and lambda/D from the axis to the edge
 
   const data = window.zwfsLiveData;
 

@@ -94,14 +94,22 @@
     return `Input ${set.rms.toFixed(2)} rad rms, Strehl ratio ${made.strehl.toFixed(2)}. Errors: ${parts.join(", ")}.`;
   }
 
+  // The phase of a method with the piston of the input: on the branch of the input where they agree, else the principal
+  // value.
+  function found(input, residual) {
+    const phase = input.map((value, k) => value + residual[k]);
+    for (const k of live.inside)
+      if (Math.abs(residual[k]) > Math.PI / 2) phase[k] -= 2 * Math.PI * Math.round(phase[k] / (2 * Math.PI));
+    return phase;
+  }
+
   function show(made, set) {
     draw.phase("phase", made.phase);
     draw.focal("focal", made.focal, set.diameter);
     draw.image("image-a", made.frames[0]);
     draw.image("image-b", made.frames[1]);
     columns(made, set).forEach(({ name, made: one }, place) => {
-      const found = one && one.residual.map((turn, k) => made.phase[k] + turn);
-      draw.phase(`found-${place}`, found);
+      draw.phase(`found-${place}`, one && found(made.phase, one.residual));
       draw.difference(`error-${place}`, one?.residual);
       const error = one?.errors.at(-1);
       const verdict = one ? `${succeeds(error, set.rms) ? "✓" : "✗"} error ${draw.error(error)} rad` : "no solution";

@@ -68,7 +68,7 @@ CONTENT = {
 }
 # Only what they must refuse is tested, not their answers.
 SLOW = {"error_budget", "contraction", "other_curves", "steps", "fit"}
-INTERNAL |= {"frames_on_grid", "clear_on_grid", "fits_module", "fits_bytes", "published"}
+INTERNAL |= {"frames_on_grid", "clear_on_grid", "places", "fits_module", "fits_bytes", "published"}
 INTERNAL |= {"small", "glue_numbers"}  # for the notebooks of the book
 
 

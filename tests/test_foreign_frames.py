@@ -38,6 +38,22 @@ def test_light_of_the_images_is_compared_whatever_their_size(case):
     np.testing.assert_allclose(ratios, 1 / given.get("flux", 1), rtol=0.005)
 
 
+def test_bad_pixel_of_the_second_image_spoils_the_points_around_its_place():
+    frames, clear_frames = foreign.recorded(**foreign.CASES["everything"])
+    cosine, sine = np.cos(np.radians(1.5)), np.sin(np.radians(1.5))
+    turned = np.array([[cosine, sine], [-sine, cosine]])
+    middle, there = (foreign.SIDE - 1) / 2, np.array([-20.0, 33.0])  # from the middle of the first image
+    row, column = np.round(middle + np.array([0.4, -0.7]) + 1.02 * turned @ there).astype(int)
+    bad = np.zeros_like(frames[1].bad)
+    bad[row, column] = True
+    recording = record([frames[0], replace(frames[1], bad=bad)], clear_frames)
+    measurement = reduce_frames(recording, Optics())
+    spoiled = np.argwhere(measurement.bad[1]) + recording.corner - measurement.margin - middle
+    assert 1 <= len(spoiled) <= 9
+    assert np.abs(spoiled - there).max() < 2
+    assert not measurement.bad[0].any()
+
+
 NOISE = CameraNoise(1.0, foreign.READ_NOISE)
 
 

@@ -618,7 +618,7 @@ def _backgrounds(recording: Recording) -> NDArray[np.float64]:
             far &= radius(far.shape, (circle.row, circle.column)) > 0.58 * circle.diameter
         enough = np.count_nonzero(far) >= 100 and not image.cut
         levels.append(float(np.median(image.counts[far])) if enough else 0.0)
-    dark = np.array(levels) * np.linalg.det(recording.matrices)  # counts of a pixel of the first image
+    dark = np.array(levels) * recording.areas[2:]
     return np.concatenate([dark * recording.exposure, dark])
 
 

@@ -191,10 +191,15 @@ class Recording:
         first, second = self.pupils
         return (first.diameter + second.diameter / self.placement.magnification) / 2
 
-    @property
+    @cached_property
     def matrices(self) -> NDArray[np.float64]:
-        """Rotation and magnification of the first and second image, (2, 2, 2), in the sense of `Placement`."""
-        return np.stack([np.eye(2), self.placement.matrix])
+        """Rotation and magnification of each image, (4, 2, 2), in the sense of `Placement`."""
+        return np.stack([np.eye(2), self.placement.matrix] * 2)
+
+    @cached_property
+    def areas(self) -> NDArray[np.float64]:
+        """Area of a point of the grid on each image, (4,), in pixels."""
+        return np.linalg.det(self.matrices)
 
     @cached_property
     def n_pixels(self) -> int:
@@ -212,8 +217,8 @@ class Recording:
         """Pixels around the grid of the pupil that both frames hold."""
         half = (self.n_pixels - 1) / 2
         room = [_MARGIN * self.diameter]
-        for image, offset, matrix in zip(self.frames, self._offsets(self.origins[:2]), self.matrices, strict=True):
-            middle = offset + matrix @ (self.corner + half)
+        for image, places, matrix in zip(self.frames, self.places(), self.matrices, strict=False):
+            middle = places.mean(axis=(1, 2))
             ends = np.minimum(middle, np.array(image.counts.shape) - 1 - middle)
             room += list(ends / np.abs(matrix).sum(axis=1) - half)
         if self.frames[0] is self.frames[1]:
@@ -221,36 +226,34 @@ class Recording:
             room.append((np.abs(self.origins[1] - self.origins[0]).max() - self.n_pixels) / 2)
         return max(0, math.floor(min(room)))
 
+    def places(self, margin: int = 0) -> NDArray[np.float64]:
+        """Row and column of each point of the grid with a margin around it, on each image, (4, 2, ny', nx')."""
+        center = np.array([self.pupils[0].row, self.pupils[0].column])
+        start = self.corner - margin - center
+        grid = np.indices((self.n_pixels + 2 * margin,) * 2) + start[:, np.newaxis, np.newaxis]
+        return (
+            np.einsum("kij,jyx->kiyx", self.matrices, grid) + (self.origins + center)[..., np.newaxis, np.newaxis]
+        )
+
     def frames_on_grid(self, margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Frames and their bad pixels, (2, ny', nx') each, on the grid of the pupil with a margin around it."""
-        return self._on_grid(self.frames, self.origins[:2], margin)
+        return self._on_grid(slice(0, 2), margin)
 
     def clear_on_grid(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Clear frames and their bad pixels, (2, ny, nx) each, on the grid of the pupil."""
-        return self._on_grid(self.clear_frames, self.origins[2:], 0)
+        return self._on_grid(slice(2, 4), 0)
 
-    def _on_grid(
-        self, images: tuple[Image, Image], origins: NDArray, margin: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def _on_grid(self, which: slice, margin: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Images on the grid, interpolated once; counts are those of a pixel of the first image."""
-        size = (self.n_pixels + 2 * margin,) * 2
-        counts, bad = np.empty((2, *size)), np.empty((2, *size), bool)
-        for index, (image, offset, matrix) in enumerate(
-            zip(images, self._offsets(origins), self.matrices, strict=True)
-        ):
-            # A matrix without off-diagonal terms is faster as a vector. Beyond an image its edge is repeated.
-            step = matrix if np.any(matrix[[0, 1], [1, 0]]) else np.diag(matrix)
-            grid = {"offset": offset + matrix @ (self.corner - margin), "output_shape": size, "mode": "nearest"}
-            counts[index] = ndimage.affine_transform(image.counts, step, order=_ORDER, **grid)
-            counts[index] *= np.linalg.det(matrix)
+        places = self.places(margin)[which]
+        counts, bad = np.empty((2, *places.shape[2:])), np.empty((2, *places.shape[2:]), bool)
+        for index, image in enumerate(self.images[which]):
+            # Beyond an image its edge is repeated.
+            counts[index] = ndimage.map_coordinates(image.counts, places[index], order=_ORDER, mode="nearest")
             # A bad pixel spoils the points on all its sides.
-            bad[index] = ndimage.affine_transform(image.bad.astype(float), step, order=1, **grid) > 0.01
-        return counts, bad
-
-    def _offsets(self, origins: NDArray) -> NDArray[np.float64]:
-        """Place of the first clear frame's pixel (0, 0) on two images, (2, 2)."""
-        center = np.array([self.pupils[0].row, self.pupils[0].column])
-        return origins + center - self.matrices @ center
+            spoiled = ndimage.map_coordinates(image.bad.astype(float), places[index], order=1, mode="nearest")
+            bad[index] = spoiled > 0.01
+        return counts * self.areas[which, np.newaxis, np.newaxis], bad
 
 
 def record(

@@ -74,10 +74,16 @@ def parts(calibration, frames):
     def on_grid(some):
         work.on_grid(some[:, np.newaxis], 65535, calibration.good)
 
+    found = calibration(frames[:k])
+    modes = zernike_basis(calibration.sensor.pupil, 50)
     whole = best(calibration)
     unjudged = best(lambda some: calibration(some, judge=False))
     grid = best(on_grid)
-    return {"resampling": grid, "iteration": unjudged - grid, "residual": whole - unjudged, "whole": whole}
+    return {
+        "resampling": grid, "iteration": unjudged - grid, "residual": whole - unjudged, "whole": whole,
+        "sigma": best(lambda _: calibration.sigma(found, PHOTONS)),
+        "sigma of 50 modes": best(lambda _: calibration.sigma(found, PHOTONS, modes=modes)),
+    }  # fmt: skip
 
 
 def telemetry(n=10_000, n_workers=2, n_pixels=90, **settings):

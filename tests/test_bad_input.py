@@ -29,6 +29,7 @@ MODULES = (
     *("pupil", "modes", "masks", "sensor", "detector", "metrics", "reconstructors", "reconstructors.base"),
     *("bench.model", "bench.segments", "bench.recording"),
     *("units", "frames.files", "frames.registration", "frames.pipeline", "frames.order", "frames.verdict"),
+    *("frames.calibration",),
     *("paper.curves", "paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
     *("paper.bench_linearity", "paper.closed_loop", "paper.photon_noise", "paper.design", "paper.recovery"),
     *("companion.sweeps", "companion.results", "companion.tables"),
@@ -69,6 +70,7 @@ CONTENT = {
 # Only what they must refuse is tested, not their answers.
 SLOW = {"error_budget", "contraction", "other_curves", "steps", "fit"}
 INTERNAL |= {"frames_on_grid", "clear_on_grid", "places", "fits_module", "fits_bytes", "published"}
+INTERNAL |= {"calibrate", "load"}  # need the files of a bench: see test_telemetry.py
 INTERNAL |= {"small", "glue_numbers"}  # for the notebooks of the book
 
 
@@ -119,8 +121,8 @@ def valid() -> dict:
     method = methods["PhaseShifted"]
     points = pupil.gather(phase)
     from zwfs.bench import model
+    from zwfs.frames import calibration, pipeline, registration, verdict
     from zwfs.frames import files as camera
-    from zwfs.frames import pipeline, registration, verdict
     from zwfs.paper import (
         bench_linearity,
         closed_loop,
@@ -141,6 +143,7 @@ def valid() -> dict:
     noise = verdict.CameraNoise(2.0, 5.0)
     poked = replace(measurement, intensity=measurement.intensity.copy())
     poked.intensity[:, 10:14, 10:14] += np.reshape([0.4, -0.3], (2, 1, 1))
+    calibrated = calibration.Calibration.of(measurement)
     file = camera.CameraFile(
         images[0].counts[np.newaxis],
         "frame",
@@ -346,6 +349,14 @@ def valid() -> dict:
         "error_bar.result": found,
         "noise": noise,
         "CameraNoise.gain": 2.0,
+        "Calibration.__call__.start": None,
+        "Calibration.__call__.counts": np.stack([images[0].counts, 0 * images[0].counts]),
+        "Calibration.of.dark": np.zeros(images[0].counts.shape),
+        "Calibration.modal_matrix.modes": zwfs.zernike_basis(calibrated.sensor.pupil, 4),
+        "Calibration.sigma.modes": None,
+        "Calibration.save.path": Path("bench.npz"),
+        "matrix": calibrated.modal_matrix(zwfs.zernike_basis(calibrated.sensor.pupil, 4)),
+        "phases": calibrated(images[0].counts),
         "write_phase.phase": found,
         "bench_error.phase": found,
         "measured_pupil.images": np.ones((2, 12, 12)),
@@ -383,6 +394,7 @@ def valid() -> dict:
         "CameraFile": file,
         "MeasuredPhase": found,
         "CameraNoise": noise,
+        "Calibration": calibrated,
     }
     return {"arguments": arguments, "instances": instances}
 

@@ -185,10 +185,7 @@ class Calibration(Immutable):
     tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
-        _check.integer("n_iterations", self.n_iterations, 1)
-        _check.number("tolerance", self.tolerance, 0)
-        if self.saturation != np.inf:
-            _check.number("saturation", self.saturation, 0, open_low=True)
+        _check_settings(self.n_iterations, self.tolerance, self.saturation)
         for one in fields(self):
             object.__setattr__(self, one.name, read_only(getattr(self, one.name)))
 
@@ -233,6 +230,7 @@ class Calibration(Immutable):
         """
         _check.instance("measurement", measurement, Measurement)
         _check.instance("bunit", bunit, str)
+        _check_settings(n_iterations, tolerance, saturation)
         recording, pupil = measurement.recording, measurement.pupil
         images = recording.frames[: 1 if recording.frames[0] is recording.frames[1] else 2]
         shape = images[0].counts.shape
@@ -367,11 +365,12 @@ class Calibration(Immutable):
         image = self.shape if self.n_images == 1 else (2, *self.shape)
         _check.trailing_shape("counts", counts, image, "the camera image of the calibration")
         batch = counts.shape[: -len(image)]
-        level = min(self.saturation if saturation is None else saturation, _check.LARGEST)
+        if 0 in counts.shape:
+            raise ValueError(f"counts has shape {counts.shape}: expected at least one exposure")
+        level = min(self.saturation if saturation is None else _limit("saturation", saturation), _check.LARGEST)
+        largest_residual, judge = _limit("largest_residual", largest_residual), _check.flag("judge", judge)
         counts = counts.reshape(-1, self.n_images, *self.shape)
-        starts = None
-        if start is not None:
-            starts = np.broadcast_to(start, (*batch, *self.good.shape)).reshape(-1, *self.good.shape)
+        starts = None if start is None else self._starts(start, batch)
         parts = []
         for first in range(0, len(counts), _PIECE):
             piece = slice(first, first + _PIECE)
@@ -409,6 +408,11 @@ class Calibration(Immutable):
 
     def coefficients(self, phases: Phases, matrix: NDArray) -> NDArray[np.float32]:
         """Coefficients of modes, (..., n_modes), radian, by one product with a `modal_matrix`."""
+        _check.instance("phases", phases, Phases)
+        matrix = _check.real_array("matrix", matrix)
+        if matrix.ndim != 2 or len(matrix) != self.sensor.pupil.n_points:
+            raise ValueError(f"matrix has shape {matrix.shape}: expected ({self.sensor.pupil.n_points}, n_modes)")
+        _check.finite("matrix", matrix)
         values = without_piston(self.sensor.pupil.gather(phases.filled))
         product = values.reshape(-1, len(matrix)) @ matrix.astype(values.dtype, copy=False)
         return product.reshape((*values.shape[:-1], -1))
@@ -440,6 +444,8 @@ class Calibration(Immutable):
         TypeError, ValueError
             If a value is of the wrong kind, shape or range.
         """
+        _check.instance("phases", phases, Phases)
+        photons = _check.number("photons", photons, 1e-6, 1e12)
         pupil, model = self.sensor.pupil, propagator(self.sensor, Kind.numpy())
         basis = None if modes is None else pupil.scatter(check_modes(pupil, modes), fill=0)
         estimator = Estimator(self._work.response, Noise.checked(photons, read_noise), False, basis)
@@ -452,6 +458,14 @@ class Calibration(Immutable):
             result[index] = np.sqrt(points[0, 0] if of_modes is None else of_modes[0])
         result = result.reshape((*phases.flags.shape, *result.shape[1:]))
         return result if basis is not None else np.where(np.isfinite(phases.phase), result, np.float32(np.nan))
+
+    def _starts(self, start: ArrayLike, batch: tuple[int, ...]) -> NDArray:
+        """Checked phases at which the iterations start, one for each exposure."""
+        maps, shape = _check.real_array("start", start), self.good.shape
+        if maps.shape not in (shape, (*batch, *shape)):
+            raise ValueError(f"start has shape {maps.shape}: expected {shape} or {(*batch, *shape)}")
+        _check.moderate("start", maps)
+        return np.broadcast_to(maps, (*batch, *shape)).reshape(-1, *shape)
 
     @cached_property
     def _content(self) -> bytes:
@@ -674,6 +688,7 @@ def calibrate(
     TypeError, ValueError
         If a file or a value is not as expected.
     """
+    _check_settings(n_iterations, tolerance, np.inf if saturation is None else saturation)
     frames, clear_frames, sources = read_all(frame_files, pupil_files, dark_files, bad_pixel_files, saturation)
     optics = sources[0].optics(diameter, phase_shifts)
     recording = record(frames, clear_frames, **settings)
@@ -699,6 +714,20 @@ def _is_calibration(path: Path) -> bool:
             return "values.npy" in file.namelist() and "places.npy" in file.namelist()
     except (OSError, zipfile.BadZipFile):
         return False
+
+
+def _limit(name: str, value: Any) -> float:
+    """Return a number of at least 0, or infinity."""
+    if isinstance(value, float) and value == np.inf:
+        return value
+    return _check.number(name, value, 0)
+
+
+def _check_settings(n_iterations: Any, tolerance: Any, saturation: Any) -> None:
+    """Check the numbers that a calibration keeps."""
+    _check.integer("n_iterations", n_iterations, 1)
+    _check.number("tolerance", tolerance, 0, 2 * np.pi)
+    _limit("saturation", saturation)
 
 
 def _dark(dark: ArrayLike | None, shape: tuple[int, int, int]) -> NDArray[np.float32]:

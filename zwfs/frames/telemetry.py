@@ -210,7 +210,7 @@ class _Job:
             raise ValueError("phases = False: expected True, or modes")
         read_noise = _check.number("read_noise", read_noise, 0)
         if photons is not None:
-            photons = _check.number("photons", photons, 0, open_low=True)
+            photons = _check.number("photons", photons, 1e-6, 1e12)
         elif read_noise:
             raise ValueError(f"read_noise = {read_noise:g}: expected a number of photons with it")
         level = _saturation(stack, calibration) if saturation is None else saturation

@@ -18,7 +18,7 @@ _PARTS = "color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"
 
 
 def variants(figure: Figure) -> dict[str, Figure]:
-    """Return copies of a figure that was not saved yet: "dark", and with a grid "narrow" and "narrow-dark"."""
+    """Return copies of a figure: "dark", and if its panels lie on a grid "narrow" and "narrow-dark"."""
     state = pickle.dumps(figure)
     made = {"dark": _darkened(_copy(state))}
     if any(axes.get_subplotspec() for axes in figure.axes):
@@ -47,17 +47,14 @@ def _stacked(figure: Figure) -> Figure:
         axes.set_subplotspec(grid[place // columns, place % columns])
     entries = 0
     for legend in list(figure.legends):
-        texts = legend.get_texts()
         handles: Any = legend.legend_handles
+        texts = legend.get_texts()
         legend.remove()
-        figure.legend(
-            handles,
-            [text.get_text() for text in texts],
-            loc="outside lower center",
-            fontsize=texts[0].get_fontsize(),
-        )
+        labels, size = [text.get_text() for text in texts], texts[0].get_fontsize()
+        figure.legend(handles, labels, loc="outside lower center", fontsize=size)
         entries += len(texts)
     figure.set_size_inches(_WIDTH, rows * height + 0.2 * entries)
+    figure.set_layout_engine("constrained")  # a saved figure has none
     return figure
 
 

@@ -71,9 +71,11 @@
     map.setAttribute("aria-label", `Map of designs. Chosen: ${words(...current)}. Arrow keys choose another one.`);
   }
 
+  // The sensor follows at the next frame of the screen; the next key may come before.
   function choose(x, y) {
-    const shift = shifts[within(shifts, y)].toFixed(2);
-    page.set({ diameter: diameters[within(diameters, x)].toFixed(2), "shift-a": shift, "shift-b": `-${shift}` });
+    const [diameter, shift] = [diameters[within(diameters, x)], shifts[within(shifts, y)]];
+    current = [diameter, [shift, -shift]];
+    page.set({ diameter: diameter.toFixed(2), "shift-a": shift.toFixed(2), "shift-b": (-shift).toFixed(2) });
   }
 
   map.addEventListener("click", (event) => {

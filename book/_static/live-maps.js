@@ -41,7 +41,8 @@
     const image = (images[name] ??= context.createImageData(canvas.width, canvas.height));
     const words = new Uint32Array(image.data.buffer);
     words.fill(0);
-    if (values) for (const k of points) words[where[k]] = palette[Math.min(255, Math.max(0, level(values[k]) * 256)) | 0];
+    const color = (value) => palette[Math.min(255, Math.max(0, level(value) * 256)) | 0];
+    if (values) for (const k of points) words[where[k]] = color(values[k]);
     context.putImageData(image, 0, 0);
   }
 

@@ -218,7 +218,8 @@
     if (kept.rms !== rms) {
       const phase = kept.screen.map((value) => value * rms);
       const truth = phasors(phase);
-      Object.assign(kept, { rms, wavefront: { phase, truth, strehl: live.strehl(truth), focal: live.focalPlane(truth) } });
+      const wave = { phase, truth, strehl: live.strehl(truth), focal: live.focalPlane(truth) };
+      Object.assign(kept, { rms, wavefront: wave });
     }
     return kept.wavefront;
   }

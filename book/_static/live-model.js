@@ -154,7 +154,8 @@ window.zwfsLive = (() => {
         for (let k = 1; k < nProducts; k++) if (core[k * (nProducts + 1)] > core[best * (nProducts + 1)]) best = k;
         const pivot = core[best * (nProducts + 1)];
         if (found.length === nProducts || pivot <= SMALLEST * (found[0]?.pivot ?? 0) || pivot <= 0) return found;
-        const column = Float64Array.from({ length: nProducts }, (_, k) => core[k * nProducts + best] / Math.sqrt(pivot));
+        const root = Math.sqrt(pivot);
+        const column = Float64Array.from({ length: nProducts }, (_, k) => core[k * nProducts + best] / root);
         for (let i = 0; i < nProducts; i++)
           for (let j = 0; j < nProducts; j++) core[i * nProducts + j] -= column[i] * column[j];
         found.push({ kind, pivot, column });
@@ -306,7 +307,7 @@ window.zwfsLive = (() => {
   const colors = Object.fromEntries(Object.entries(data.colors).map(([name, encoded]) => [name, decode(encoded)]));
   return {
     ...{ size, places, inside, nQuarter, nInside, modes, colors, designs: data.designs, FOCAL },
-    ...{ map, field, mirrored, dots, accumulate, grouped, project, expand, dimple, through, step, screen, phasors, behind, intensity },
-    ...{ expose, strehl, focalPlane },
+    ...{ map, field, mirrored, dots, accumulate, grouped, project, expand },
+    ...{ dimple, through, step, screen, phasors, behind, intensity, expose, strehl, focalPlane },
   };
 })();

@@ -8,6 +8,7 @@
   const PAUSE = 800; // ms without a change before the numbers are read out
   const SETTLED = 300; // ms without a change before the address changes: browsers count such changes
   const TURN = 250; // ms of each iteration that is played
+  const AGREE = 0.5; // rad: a phase that is nearer to the input, on the circle, is shown on its branch
   const TOLERATED = 0.05; // error that counts as a success, relative to the input, as in the paper
 
   const find = (name) => document.getElementById(`live-${name}`);
@@ -99,7 +100,7 @@
   function found(input, residual) {
     const phase = input.map((value, k) => value + residual[k]);
     for (const k of live.inside)
-      if (Math.abs(residual[k]) > Math.PI / 2) phase[k] -= 2 * Math.PI * Math.round(phase[k] / (2 * Math.PI));
+      if (Math.abs(residual[k]) > AGREE) phase[k] -= 2 * Math.PI * Math.round(phase[k] / (2 * Math.PI));
     return phase;
   }
 
@@ -112,9 +113,10 @@
       draw.phase(`found-${place}`, one && found(made.phase, one.residual));
       draw.difference(`error-${place}`, one?.residual);
       const error = one?.errors.at(-1);
-      const verdict = one ? `${succeeds(error, set.rms) ? "✓" : "✗"} error ${draw.error(error)} rad` : "no solution";
-      find(`verdict-${place}`).textContent = verdict;
-      find(`verdict-${place}`).className = `live-verdict ${one && succeeds(error, set.rms) ? "live-good" : "live-bad"}`;
+      const good = one && succeeds(error, set.rms);
+      const verdict = find(`verdict-${place}`);
+      verdict.textContent = one ? `${good ? "✓" : "✗"} error ${draw.error(error)} rad` : "no solution";
+      verdict.className = `live-verdict ${good ? "live-good" : "live-bad"}`;
       find(`name-${place}`).textContent = name;
     });
     draw.curves({ linear: made.linear, arcsine: made.arcsine, shifted: made.shifted, likelihood: made.likelihood });

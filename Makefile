@@ -31,10 +31,10 @@ export RERUN := $(value FIGURE) $(value ARGS)
 unexport FIGURE ARGS
 
 .DELETE_ON_ERROR:
-.PHONY: help book pdf lab test figures rerun lint bench lock clean
+.PHONY: help book pdf lab test figures rerun lint bench release-check pythons lock clean
 
 help: ## list these commands
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 21
 
 book: $(READY) ## run the notebooks that changed and build the book in _build/html
 	@$(BIN)/python -m book._tools book
@@ -67,6 +67,12 @@ bench: $(READY) ## time the reconstructors, next to other packages, for the perf
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only --benchmark-json=_build/measured.json
 	$(BIN)/python -m tests.benchmarks.report _build/measured.json
 
+release-check: $(READY) ## build the package, and test it in an empty environment
+	@$(BIN)/python -m book._tools release-check
+
+pythons: $(READY) ## run examples and core tests on every supported Python, and with the oldest dependencies
+	@$(BIN)/python -m book._tools pythons $(PYTHONS)
+
 lock: $(BIN)/uv ## pin the newest allowed version of every dependency
 	$(UV) pip compile pyproject.toml --extra book --extra lab --extra test --upgrade \
 		--universal --python-version 3.11 --fork-strategy fewest --generate-hashes --no-emit-index-url \
@@ -74,7 +80,7 @@ lock: $(BIN)/uv ## pin the newest allowed version of every dependency
 
 # Other files in _build belong to the user, above all the results of make rerun.
 clean: ## remove the results of these commands, except those of make rerun
-	rm -rf $(addprefix _build/,home html html.json jupyter_execute measured.json notebooks performance building-* running-* rerunning-*)
+	rm -rf $(addprefix _build/,home html html.json jupyter_execute measured.json notebooks performance dist building-* running-* rerunning-* releasing-*)
 	rm -rf build $(VENV) *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name _build -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 	@if [ -d _build ] && ! rmdir _build 2>/dev/null; then echo "kept: $$(echo _build/*)"; fi

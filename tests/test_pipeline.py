@@ -67,6 +67,7 @@ def template(tmp_path_factory):
     write(project, "third", publish("numbers.csv", "1"))
     (project.root / "environment").mkdir()
     (project.root / "environment" / "requirements.lock").write_text("numpy==2\n")
+    shutil.copy(ROOT / "CITATION.cff", project.root)
     run_all(project)
     return project
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from zwfs import sensor as sensor
     from zwfs import units as units
 
-__version__ = "0.1.0"
+    __version__: str
 
 __all__ = [
     "RECONSTRUCTORS",
@@ -80,11 +80,13 @@ def _modules() -> list[str]:
 
 if not TYPE_CHECKING:  # A type checker would take any misspelt name for a module.
 
-    def __getattr__(name: str) -> ModuleType:
+    def __getattr__(name: str) -> ModuleType | str:
+        if name == "__version__":  # pyproject.toml is its only place
+            return importlib.import_module("importlib.metadata").version(__name__)
         if name in _modules():
             return importlib.import_module(f"{__name__}.{name}")
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_modules()})
+    return sorted({*globals(), *_modules(), "__version__"})

@@ -18,7 +18,10 @@ USAGE = """usage: python -m book._tools COMMAND
   book      run the notebooks that changed and build the book, with its PDF where there is a Chromium
   pdf       the same, but fail without a Chromium
   figures   replace the committed notebooks and the front figure by freshly run ones
-  rerun     run one notebook with other parameters: rerun --help lists the options"""
+  rerun     run one notebook with other parameters: rerun --help lists the options
+  metadata  write the files for archives from CITATION.cff and pyproject.toml
+  release-check   build the package and test it in an empty environment
+  pythons   run examples and core tests: pythons 3.12 lowest; all by default"""
 
 
 def main(arguments: list[str], project: Project | None = None) -> int:
@@ -37,6 +40,15 @@ def main(arguments: list[str], project: Project | None = None) -> int:
 
             end_cleanly_on_signals()
             getattr(book, command)(project)
+        elif command == "metadata" and not options:
+            from .metadata import metadata
+
+            metadata(project)
+        elif command == "pythons" or (command == "release-check" and not options):
+            from . import release
+
+            end_cleanly_on_signals()
+            release.pythons(project, options) if command == "pythons" else release.release_check(project)
         else:
             print(USAGE, file=sys.stderr)
             return 2

@@ -15,6 +15,7 @@ import yaml
 from zwfs._files import write_file
 
 from . import pdf as printing
+from .crate import describe_book
 from .project import EXECUTED, PDF, Project, ToolError
 from .record import commit, digest, digest_files
 from .run import refresh, run
@@ -118,6 +119,7 @@ def build(project: Project, chromium: str | None = None) -> bool:
         pages = _write_pages(project, scratch, {PDF: printing.NAME} if chromium else {})
         if chromium:
             (pages / printing.NAME).write_bytes(printing.print_book(project.root, pages, chromium))
+        describe_book(project, pages, commit(project.root)[0])
         swap(pages, html, scratch / "earlier")
     write_file(record, json.dumps(made_from).encode())
     return True
@@ -126,7 +128,7 @@ def build(project: Project, chromium: str | None = None) -> bool:
 def _digest(project: Project, printed: bool) -> str:
     """Return a digest of everything that the book depends on."""
     root = project.root
-    files = [root / name for name in ("_config.yml", "_toc.yml", "pyproject.toml")]
+    files = [root / name for name in ("_config.yml", "_toc.yml", "pyproject.toml", "CITATION.cff")]
     files += [file for file in (root / "book").rglob("*") if "__pycache__" not in file.parts]
     files += [*project.sources(), *project.shared_inputs()]
     for notebook in project.sources():

@@ -292,7 +292,7 @@ def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, 
         if (free := shutil.disk_usage(scratch).free) < ROOM:
             raise ParameterError(f"{within}: {free / 1e6:.0f} MB are free: expected at least {ROOM / 1e6:.0f} MB")
         # Not at the top: these imports take seconds, and only a run needs them.
-        from . import page
+        from . import crate, page
         from .execute import Run, execute
 
         run, new = Run(project, name, scratch, changed), scratch / "new"
@@ -319,8 +319,9 @@ def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, 
             "changed_since": changed_since,
             "key": run.key,
             "seconds": run.seconds,
-            "files": digests(new, [file.name for file in new.iterdir()]),
         }
+        crate.describe_rerun(new, about)
+        about["files"] = digests(new, [file.name for file in new.iterdir()])
         (new / RECORD).write_text(json.dumps(about, indent=2) + "\n", "utf-8")
         folder.parent.mkdir(parents=True, exist_ok=True)
         swap(new, folder, scratch / "earlier")

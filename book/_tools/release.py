@@ -1,0 +1,164 @@
+"""Check of a release, and of every supported Python: the package as a stranger would install it."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from .project import Project, ToolError
+from .scratch import scratch_folder, swap
+
+UV = Path(sys.executable).with_name("uv")
+# Tests without these words read no file outside tests/ and need no part of the book.
+READS_CHECKOUT = re.compile(r"\bROOT\b|\bbook\b|notebooks|bs4|myst_nb")
+# Those of the sensor and of what it stands on: for other versions of Python, next to all examples.
+CORE = ("detector", "focal", "metrics", "modes", "pupil", "sensor")
+
+
+class ReleaseError(ToolError):
+    """Reason why this tree cannot be released."""
+
+
+def release_check(project: Project) -> None:
+    """Build the package, test it in an empty environment, check the changelog and the install line."""
+    version = about(project)["version"]
+    check_changelog((project.root / "CHANGELOG.md").read_text("utf-8"), version)
+    with scratch_folder(project.build, "releasing-") as scratch:
+        wheel, _ = build(project, version, scratch / "dist")
+        python = environment(project, scratch / "env", f"zwfs[test] @ {wheel.as_uri()}")
+        test(project, python, scratch, unit_tests(project))
+        check_install_line(project, wheel, scratch / "colab")
+        swap(scratch / "dist", project.build / "dist", scratch / "earlier")
+    print(f"zwfs {version} can be released: _build/dist")
+
+
+def pythons(project: Project, asked: list[str]) -> None:
+    """Run the examples and the core tests on versions of Python, and with the oldest dependencies on "lowest"."""
+    known = supported(project)
+    for name in asked or [*known, "lowest"]:
+        if name not in (*known, "lowest"):
+            raise ReleaseError(f"{name}: expected one of {', '.join(known)}, lowest")
+        lowest = ["--resolution", "lowest-direct"] if name == "lowest" else []
+        with scratch_folder(project.build, "releasing-") as scratch:
+            wheel, _ = build(project, about(project)["version"], scratch / "dist")
+            options = ["--python", interpreter(known[0] if lowest else name), *lowest]
+            python = environment(project, scratch / "env", f"zwfs[test] @ {wheel.as_uri()}", *options)
+            test(project, python, scratch, [f"tests/test_{name}.py" for name in CORE], "--doctest-modules")
+        print(f"Python {name}: passed")
+
+
+def about(project: Project) -> dict[str, Any]:
+    """Return the table `project` of pyproject.toml."""
+    return tomllib.loads((project.root / "pyproject.toml").read_text("utf-8"))["project"]
+
+
+def supported(project: Project) -> list[str]:
+    """Return the supported versions of Python, the oldest first."""
+    found = re.findall(r"Python :: (3\.\d+)", "\n".join(about(project)["classifiers"]))
+    return sorted(found, key=lambda version: int(version.split(".")[1]))
+
+
+def interpreter(version: str) -> str:
+    """Return the Python of a version that pyenv installed, or the version, which uv then looks for or fetches."""
+    folder = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"), "versions")
+    return str(next(iter(sorted(folder.glob(f"{version}.*/bin/python"), reverse=True)), version))
+
+
+def check_changelog(text: str, version: str) -> None:
+    """Require an entry of a version, with changes under it.
+
+    Raises
+    ------
+    ReleaseError
+        If the newest entry is of another version, or empty.
+    """
+    newest = re.search(r"(?m)^## \[?(?:Unreleased\] - )?(\d[^\]\s]*)\]?.*\n((?:(?!## ).*\n?)*)", text)
+    if not newest or newest[1] != version:
+        raise ReleaseError(f"CHANGELOG.md: the newest entry is {newest and newest[1]}: expected {version}")
+    if not re.search(r"(?m)^- ", newest[2]):
+        raise ReleaseError(f"CHANGELOG.md: the entry of {version} lists no change: expected at least one")
+
+
+def build(project: Project, version: str, folder: Path) -> tuple[Path, Path]:
+    """Build the source distribution, and the wheel from it, in a folder."""
+    call(project, UV, "build", "--quiet", "--no-build-isolation", "--python", sys.executable, "--out-dir", folder)
+    wheel, source = folder / f"zwfs-{version}-py3-none-any.whl", folder / f"zwfs-{version}.tar.gz"
+    if missing := [file.name for file in (wheel, source) if not file.is_file()]:
+        raise ReleaseError(f"the build made no {', '.join(missing)}")
+    return wheel, source
+
+
+def environment(project: Project, folder: Path, requirement: str, *options: str) -> Path:
+    """Install a requirement into an empty environment, with the locked versions unless a resolution is named."""
+    version = options[options.index("--python") + 1] if "--python" in options else sys.executable
+    rest = options[2:] if "--python" in options else options
+    call(project, UV, "venv", "--quiet", "--python", version, folder)
+    constraints = [] if rest else ["--constraint", pins(project, folder)]
+    python = folder / "bin" / "python"
+    call(project, UV, "pip", "install", "--quiet", "--python", python, *constraints, *rest, requirement)
+    return python
+
+
+def pins(project: Project, folder: Path) -> Path:
+    """Write the versions of the lock without their hashes, which the package under test has not."""
+    lock = (project.root / "environment" / "requirements.lock").read_text("utf-8")
+    file = folder.with_suffix(".pins")
+    lines = [line.rstrip(" \\") for line in lock.splitlines() if re.match(r"[\w.-]+==", line)]
+    file.write_text("\n".join(lines) + "\n", "utf-8")
+    return file
+
+
+def unit_tests(project: Project) -> list[str]:
+    """Return the tests that read no file outside tests/."""
+    files = sorted((project.root / "tests").glob("test_*.py"))
+    return [f"tests/{file.name}" for file in files if not READS_CHECKOUT.search(file.read_text("utf-8"))]
+
+
+def test(project: Project, python: Path, scratch: Path, files: list[str], *options: str) -> None:
+    """Run tests against an installed package, in a folder without its source."""
+    place = scratch / "tests-only"
+    shutil.copytree(project.root / "tests", place / "tests", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(project.root / "pyproject.toml", place)
+    examples = ["--pyargs", "zwfs"] if "--doctest-modules" in options else []
+    ask = [python, "-c", "import zwfs; print(zwfs.__file__)"]
+    where = subprocess.run(ask, cwd=place, capture_output=True, text=True)
+    if not Path(where.stdout.strip()).is_relative_to(scratch):
+        raise ReleaseError(f"the environment imports {where.stdout.strip() or where.stderr}: expected the wheel")
+    quick = ["-q", "--numprocesses", "auto", "--dist", "loadfile", "--benchmark-disable", "-m", "not slow"]
+    call(project, python, "-m", "pytest", *quick, *options, *examples, *files, folder=place)
+
+
+def check_install_line(project: Project, wheel: Path, folder: Path) -> None:
+    """Run the install line of the notebooks with the wheel for the repository, and import what they do."""
+    cells = [
+        "".join(cell["source"])
+        for source in project.sources()
+        for cell in json.loads(source.read_text("utf-8"))["cells"]
+        if cell["cell_type"] == "code"
+    ]
+    lines = {line for cell in cells for line in re.findall(r'%pip install -q "(.+?) @ git\+\S+"', cell)}
+    if len(lines) != 1:
+        raise ReleaseError(f"the notebooks install {sorted(lines)}: expected one and the same requirement")
+    python = environment(project, folder, f"{lines.pop()} @ {wheel.as_uri()}")
+    modules = {name for cell in cells for name in re.findall(r"(?m)^(?:from|import) ([\w.]+)", cell)}
+    modules -= {"google.colab"}
+    call(project, python, "-I", "-c", f"import {', '.join(sorted(modules))}", folder=folder)
+
+
+def call(project: Project, *command: str | Path, folder: Path | None = None) -> None:
+    """Run a command with its output on the terminal.
+
+    Raises
+    ------
+    ReleaseError
+        If it fails.
+    """
+    clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    done = subprocess.run([str(part) for part in command], cwd=folder or project.root, env=clean)
+    if done.returncode:
+        raise ReleaseError(f"{Path(command[0]).name} {command[1]} failed with status {done.returncode}")

@@ -1,0 +1,100 @@
+"""What a release needs: files for archives that agree, a changelog with an entry, and a careful workflow."""
+
+import json
+import re
+
+import pytest
+import yaml
+
+import zwfs
+from book._tools import release
+from book._tools.metadata import contents
+from book._tools.project import Project
+
+from .conftest import ROOT
+
+PROJECT = Project(ROOT)
+
+
+@pytest.mark.parametrize("name", ["CITATION.cff", "codemeta.json", ".zenodo.json", "codecheck.yml"])
+def test_files_for_archives_are_current(name):
+    # After a change: .venv/bin/python -m book._tools metadata
+    assert (ROOT / name).read_text("utf-8") == contents(PROJECT)[name]
+
+
+def test_files_for_archives_agree():
+    codemeta, zenodo = (json.loads((ROOT / name).read_text("utf-8")) for name in ("codemeta.json", ".zenodo.json"))
+    check, citation = (
+        yaml.safe_load((ROOT / name).read_text("utf-8")) for name in ("codecheck.yml", "CITATION.cff")
+    )
+    assert {codemeta["version"], zenodo["version"], citation["version"]} == {zwfs.__version__}
+    assert {codemeta["name"], zenodo["title"]} == {citation["title"]}
+    doi = citation["preferred-citation"]["doi"]
+    assert codemeta["referencePublication"]["@id"] == check["paper"]["reference"] == f"https://doi.org/{doi}"
+    assert doi in [one["identifier"] for one in zenodo["related_identifiers"]]
+    assert [one["name"].split()[-1] for one in check["paper"]["authors"]] == [
+        one["familyName"].split()[-1] for one in codemeta["referencePublication"]["author"]
+    ]
+
+
+def test_manifest_names_every_notebook_and_no_missing_file():
+    check = yaml.safe_load((ROOT / "codecheck.yml").read_text("utf-8"))
+    files = [entry["file"] for entry in check["manifest"]]
+    assert all((ROOT / file).is_file() for file in files)
+    assert {f"notebooks/{path.name}" for path in PROJECT.sources()} <= set(files)
+    assert all(entry["comment"] for entry in check["manifest"])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("## [Unreleased] - 1.2.0\n\n- New.\n", None),
+        ("## [1.2.0] - 2026-01-01\n\n### Added\n\n- New.\n\n## [1.1.0]\n", None),
+        ("## [1.2.0]\n\n## [1.1.0]\n\n- Old.\n", "lists no change"),
+        ("## [1.1.0]\n\n- Old.\n", "the newest entry is 1.1.0: expected 1.2.0"),
+        ("", "the newest entry is None"),
+    ],
+)
+def test_changelog_needs_an_entry_of_the_version(text, message):
+    if message is None:
+        release.check_changelog(text, "1.2.0")
+    else:
+        with pytest.raises(release.ReleaseError, match=message):
+            release.check_changelog(text, "1.2.0")
+
+
+def test_unit_tests_are_those_of_the_package():
+    tests = release.unit_tests(PROJECT)
+    assert {"tests/test_sensor.py", "tests/test_pupil.py"} <= set(tests)
+    assert "tests/test_book.py" not in tests
+    assert all((ROOT / f"tests/test_{name}.py").is_file() for name in release.CORE)
+
+
+def test_unknown_python_is_refused():
+    with pytest.raises(release.ReleaseError, match=r"2\.7: expected one of 3\.11, 3\.12, 3\.13, lowest"):
+        release.pythons(PROJECT, ["2.7"])
+
+
+@pytest.mark.parametrize("name", ["ci.yml", "release.yml"])
+def test_workflows_pin_actions_and_have_the_least_privileges(name):
+    text = (ROOT / ".github" / "workflows" / name).read_text("utf-8")
+    used = re.findall(r"uses: (\S+)@(\S+)", text)
+    assert used
+    assert all(re.fullmatch("[0-9a-f]{40}", commit) for _, commit in used)
+    workflow = yaml.safe_load(text)
+    assert workflow["permissions"] in ({}, {"contents": "read"})
+    checkouts = [step for job in workflow["jobs"].values() for step in job["steps"] if "checkout" in str(step)]
+    assert all(step["with"]["persist-credentials"] is False for step in checkouts)
+    for job in workflow["jobs"].values():
+        writes = {right for right, level in job.get("permissions", {}).items() if level == "write"}
+        assert writes <= {"attestations", "id-token", "pages"}
+        # What can publish runs no code of this repository.
+        assert not (writes and any("run" in step for step in job["steps"]))
+
+
+def test_readme_shows_its_pictures_on_other_sites():
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", (ROOT / "README.md").read_text("utf-8"))
+    assert pictures
+    start = "https://raw.githubusercontent.com/zwfs/zwfs/main/"
+    assert all((ROOT / picture.removeprefix(start)).is_file() for picture in pictures)
+    assert all(picture.startswith(start) for picture in pictures)

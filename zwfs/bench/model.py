@@ -25,6 +25,7 @@ from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
+_LATER = "clear_focus", "astigmatism", "unmodulated", "coherent", "halo"
 _N_MODES = 200  # that random segment commands are made of
 
 Seed = int | np.random.Generator | np.random.SeedSequence | None
@@ -39,7 +40,9 @@ def _error(size: float) -> Any:
 class Bench:
     """A vector-Zernike sensor with a segmented mirror, imperfect in ways that can be switched on one by one.
 
-    The first group of parameters is the layout, the second the errors: 0 is ideal for each of them.
+    The first group of parameters is the layout, the second the errors: 0 is ideal for each of them. The last
+    group, from `clear_focus` on, is 0 by default: effects that the real frames show, and the published figures
+    lack.
 
     Parameters
     ----------
@@ -88,6 +91,19 @@ class Bench:
         Stray light and dark current of a pixel, 7 % of the light of one in the pupil; darks show it.
     seed : int
         Of the static aberration, which belongs to the bench.
+    clear_focus : float
+        Distance of the planes in focus in the two clear frames, in addition to that of the frames, times
+        lambda / D^2: + and - half of it. The four images then have a plane each.
+    astigmatism : float
+        Difference of focus between light that is spread along x and along y, times lambda / D^2: + and - half of
+        it in the two images. On the real bench, 2e-4 to 6e-4.
+    unmodulated : float
+        Fraction of the light that the mask does not shift. It does not interfere, as in unpolarised light.
+    coherent : float
+        The same fraction for linearly polarised light, where it interferes in quadrature.
+    halo : float
+        Light of the neighbour in the middle of each image, over the mean of the pupil. It falls with the square of
+        the distance, and the neighbour stands to the right of the first image and to the left of the second one.
 
     Raises
     ------
@@ -129,6 +145,11 @@ class Bench:
     read_noise: float = 30.0
     background: float = 60000.0
     seed: int = 0
+    clear_focus: float = 0.0
+    astigmatism: float = 0.0
+    unmodulated: float = 0.0
+    coherent: float = 0.0
+    halo: float = 0.0
 
     def __post_init__(self) -> None:
         _check.integer("n_pixels", self.n_pixels, 2)
@@ -142,7 +163,11 @@ class Bench:
         _check.number_field(self, "focus_difference", 0, 1e-2)
         _check.number_field(self, "misregistration", 0, 10)
         _check.number_field(self, "flux_imbalance", -1, 1, open_low=True, open_high=True)
-        for name in ("blur", "static", "quilting", "photons", "read_noise", "background"):
+        _check.number_field(self, "clear_focus", -1e-2, 1e-2)
+        _check.number_field(self, "astigmatism", -1e-2, 1e-2)
+        _check.number_field(self, "unmodulated", 0, 1, open_high=True)
+        _check.number_field(self, "coherent", 0, 0.5, open_high=True)
+        for name in ("halo", "blur", "static", "quilting", "photons", "read_noise", "background"):
             _check.number_field(self, name, 0)
         _check.integer_seed("seed", self.seed)
         if not self.photons and (self.read_noise or self.background):
@@ -166,7 +191,7 @@ class Bench:
 
     def single_errors(self) -> dict[str, Bench]:
         """Benches with each error of this one alone, "none" of them (first), the "noise", and "all" (last)."""
-        layout = {field.name: getattr(self, field.name) for field in fields(self)}
+        layout = {field.name: getattr(self, field.name) for field in fields(self) if field.name not in _LATER}
         cases: dict[str, dict[str, float]] = {"none": {}}
         cases |= {name: {name: layout.pop(name)} for name in self.errors()}
         cases["noise"] = {name: layout.pop(name) for name in ("photons", "read_noise", "background")}
@@ -233,14 +258,14 @@ class Bench:
         phase = 0.0 if pistons is None else self.commanded_phase(pistons)
         field = self._field * np.exp(1j * phase)
         flat = field.reshape(-1, *field.shape[-2:])
-        images = np.stack([self._image(self._sensor.propagate(one)) for one in flat])
+        images = np.stack([self._image(*self._behind_mask(one)) for one in flat])
         return self._expose(images.reshape(*field.shape[:-2], *images.shape[1:]), rng)
 
     def clear_frames(self, seed: Seed = None) -> NDArray:
         """Counts of the camera with the mask taken out and a flat command, shape (2, ny', nx')."""
         rng = _check.generator("seed", seed)
         field = np.pad(self._field, self._margin)
-        return self._expose(self._image(np.stack([field, field])), rng)
+        return self._expose(self._image(np.stack([field, field]), clear=True), rng)
 
     def dark(self, seed: Seed = None) -> NDArray:
         """Counts of the camera without light, shape (2, ny', nx')."""
@@ -279,28 +304,49 @@ class Bench:
         ny, nx = self._sensor.detector_shape
         return ny - 2 * margin, nx - 2 * margin
 
-    def _image(self, waves: NDArray[np.complexfloating]) -> NDArray[np.float64]:
+    def _behind_mask(self, field: NDArray) -> tuple[NDArray[np.complexfloating], NDArray | None]:
+        """Waves of the two polarisations, (2, ny, nx), and the one that no mask has shifted, if it counts."""
+        waves, plain = self._sensor.propagate(field), np.pad(field, self._margin)
+        if self.coherent:
+            waves = np.sqrt(1 - self.coherent) * waves + 1j * np.sqrt(self.coherent) * plain
+        return waves, plain if self.unmodulated else None
+
+    def _image(
+        self, waves: NDArray[np.complexfloating], plain: NDArray | None = None, *, clear: bool = False
+    ) -> NDArray[np.float64]:
         """Intensity on the camera of the two polarisations, (2, ny, nx) to (2, ny', nx')."""
         images = np.empty(waves.shape)
+        focus = self.focus_difference + clear * self.clear_focus
         for arm, sign in enumerate((1, -1)):
-            shift = sign * self.misregistration / 2 / self.n_pixels
-            seen = np.abs(self._relay(waves, sign * self.focus_difference / 2, shift)) ** 2
+            relay = sign * focus / 2, sign * self.misregistration / 2 / self.n_pixels, sign * self.astigmatism / 2
+            seen = np.abs(self._relay(waves, *relay)) ** 2
             image = (1 - self.leakage) * seen[arm] + self.leakage * seen[1 - arm]
+            if plain is not None:
+                unshifted = np.abs(self._relay(plain[np.newaxis], *relay)[0]) ** 2
+                image = (1 - self.unmodulated) * image + self.unmodulated * unshifted
             images[arm] = ndimage.gaussian_filter(image, self.blur, mode="nearest")
         margin = (waves.shape[-1] - self._camera_shape[-1]) // 2
         inner = slice(margin, waves.shape[-1] - margin)
-        return images[:, inner, inner]
+        return images[:, inner, inner] + self._halo() if self.halo else images[:, inner, inner]
+
+    def _halo(self) -> NDArray[np.float64]:
+        """Light of the neighbour on each image, (2, ny', nx')."""
+        y, x = ((np.arange(n) - (n - 1) / 2) / self.n_pixels for n in self._camera_shape)
+        away = np.array([self.extent, -self.extent])[:, np.newaxis, np.newaxis]
+        return self.halo * self.extent**2 / np.maximum((x - away) ** 2 + y[:, np.newaxis] ** 2, 0.25)
 
     def _relay(
-        self, waves: NDArray[np.complexfloating], distance: float, shift: float
+        self, waves: NDArray[np.complexfloating], distance: float, shift: float, astigmatism: float = 0.0
     ) -> NDArray[np.complexfloating]:
         """Fresnel propagation by a distance in units of D^2 / lambda, and a shift along both axes in D."""
-        if not distance and not shift:
+        if not distance and not shift and not astigmatism:
             return waves
         v, u = (fft.fftfreq(n, 1 / self.n_pixels) for n in waves.shape[-2:])
         v = v[:, np.newaxis]
-        transfer = np.exp(-1j * np.pi * (distance * (u**2 + v**2) + 2 * shift * (u + v)))
-        return fft.ifft2(fft.fft2(waves) * transfer)
+        path = distance * (u**2 + v**2) + 2 * shift * (u + v)
+        if astigmatism:
+            path = path + astigmatism * (u**2 - v**2)
+        return fft.ifft2(fft.fft2(waves) * np.exp(-1j * np.pi * path))
 
     def _expose(self, images: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         flux = np.array([1 + self.flux_imbalance, 1 - self.flux_imbalance])[:, np.newaxis, np.newaxis]

@@ -48,7 +48,10 @@ class Optics:
     leakage : float
         Fraction of the light of each image that belongs to the other one, as in `zwfs.bench.model.Bench`.
     unmasked : float
-        Fraction of the light that the mask does not shift, because its retardance is not half a wave.
+        Fraction of the light that the mask does not shift, because its retardance is not half a wave. It is added
+        as an intensity, which is right for unpolarised light. In linearly polarised light it interferes with the
+        shifted light, which changes the frames by some tenths of the mean intensity: `quadrature` of
+        `zwfs.frames.optics_model.MaskPair` describes that case.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Model of a bench: optics from frames of a mirror in known states, and phases of other frames with them.
 
-`fit_bench` sets up the joint fit of `zwfs.frames.joint` for a camera behind two masks. `FittedSensor` keeps all that
-was fitted, and seeks only the phase of a pair of frames.
+`fit_bench` sets up the joint fit of `zwfs.frames.joint` for a camera behind two masks. `FittedSensor` keeps all
+that was fitted, and seeks only the phase of a pair of frames.
 """
 
 from __future__ import annotations

@@ -13,7 +13,14 @@ from .test_package import PUBLIC
 SHOWN_BY_NOTEBOOKS = ("zwfs.paper", "zwfs.plots", "zwfs.companion")
 # Results and states that only functions make, whose examples show them.
 SHOWN_BY_OTHERS = {
+    "zwfs.frames.calibration": {"Phases"},
+    "zwfs.frames.joint": {"Estimate", "JointFit", "Score"},
+    "zwfs.frames.optics_model": {"ArmValues", "Coefficients", "Linearised", "MaskValues"},
+    "zwfs.frames.order": {"ImageOrder"},
     "zwfs.frames.pipeline": {"Measurement", "MeasuredPhase", "Step"},
+    "zwfs.frames.registration": {"Placement"},
+    "zwfs.frames.telemetry": {"Summary"},
+    "zwfs.frames.verdict": {"Verdict"},
     "zwfs.lowrank": {"Operator"},
     "zwfs.reconstructors.base": {"Solution", "State", "Estimate"},
 }

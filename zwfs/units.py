@@ -60,6 +60,12 @@ def opd_to_phase(opd: ArrayLike, wavelength: float) -> NDArray[np.float64]:
     ------
     TypeError, ValueError
         If the OPD is not real, or the wavelength is not above 0.
+
+    Examples
+    --------
+    >>> import zwfs
+    >>> float(zwfs.opd_to_phase(317.5, 635.0).round(6))
+    3.141593
     """
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
     return _check.real_array("opd", opd) * (2 * np.pi / wavelength)

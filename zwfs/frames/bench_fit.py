@@ -76,6 +76,23 @@ def fit_bench(
     ------
     TypeError, ValueError
         If a value is of the wrong kind, shape or range, or a clear frame holds no light.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
+    >>> from zwfs.frames.bench_fit import fit_bench
+    >>> from zwfs.frames.joint import MapPrior
+    >>> from zwfs.frames.optics_model import MaskPair, Parameter
+    >>> pupil = Pupil.circular(12)
+    >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1.5)
+    >>> known = 0.4 * np.stack([0 * pupil.amplitude, zernike_basis(pupil, 3)[2]])
+    >>> clear = np.stack([np.pad(pupil.amplitude**2, 3)] * 2)
+    >>> settings = {"amplitude_prior": MapPrior(0.05), "n_steps": 2, "n_inner": 10, "errors": False}
+    >>> mask = MaskPair(diameter=Parameter.fitted(1.0))
+    >>> fit = fit_bench(sensor.measure(known), clear, known, n_pixels=12, mask=mask, noise=0.02, **settings)
+    >>> round(fit.mask.diameter, 2)
+    1.06
     """
     frames, clear = _check.real_map("frames", frames, 4), _check.real_map("clear_frames", clear_frames, 3)
     known = _check.real_map("known", known, 3)
@@ -124,7 +141,15 @@ def fit_bench(
 
 
 def free_arm(flux: float, *, fixed_flux: bool = False) -> Arm:
-    """Arm with focus, astigmatism, shift, flux and background free, rotation and magnification fixed."""
+    """Arm with focus, astigmatism, shift, flux and background free, rotation and magnification fixed.
+
+    Examples
+    --------
+    >>> from zwfs.frames.bench_fit import free_arm
+    >>> arm = free_arm(2000.0)
+    >>> arm.focus.free, arm.rotation.free, arm.flux.value
+    (True, False, 2000.0)
+    """
     flux = _check.number("flux", float(flux), 0, open_low=True)
     focus, shift = Parameter.fitted(0.0, -_FARTHEST, _FARTHEST), Parameter.fitted(0.0, -5.0, 5.0)
     return Arm(
@@ -139,7 +164,15 @@ def free_arm(flux: float, *, fixed_flux: bool = False) -> Arm:
 
 
 def free_masks(diameter: float = 1.06, first: float = np.pi / 2, second: float = -np.pi / 2) -> MaskPair:
-    """Masks with diameter, phase shifts, leakage and blur free; they start at the design."""
+    """Masks with diameter, phase shifts, leakage and blur free; they start at the design.
+
+    Examples
+    --------
+    >>> from zwfs.frames.bench_fit import free_masks
+    >>> mask = free_masks(diameter=1.06)
+    >>> mask.diameter.free, mask.diameter.low, mask.diameter.high
+    (True, 0.53, 1.59)
+    """
     diameter = _check.number("diameter", diameter, 0, open_low=True)
 
     def shift(name: str, value: float) -> Parameter:
@@ -171,6 +204,25 @@ class FittedSensor:
         Of the phase, less that of the start.
     n_steps : int
         Of each of the four rounds of the fit of a pair, at most.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
+    >>> from zwfs.frames.bench_fit import FittedSensor, fit_bench
+    >>> from zwfs.frames.joint import MapPrior
+    >>> from zwfs.frames.optics_model import MaskPair, Parameter
+    >>> pupil = Pupil.circular(12)
+    >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1.5)
+    >>> known = 0.4 * np.stack([0 * pupil.amplitude, zernike_basis(pupil, 3)[2]])
+    >>> clear = np.stack([np.pad(pupil.amplitude**2, 3)] * 2)
+    >>> settings = {"amplitude_prior": MapPrior(0.05), "n_steps": 2, "n_inner": 10, "errors": False}
+    >>> mask = MaskPair(diameter=Parameter.fitted(1.0))
+    >>> fit = fit_bench(sensor.measure(known), clear, known, n_pixels=12, mask=mask, noise=0.02, **settings)
+    >>> phase = 0.3 * zernike_basis(pupil, 5)[0]
+    >>> error = FittedSensor(fit, n_steps=1)(sensor.measure(phase), 0.02) - phase
+    >>> bool(error[pupil.inside].std() < 0.01)
+    True
     """
 
     fit: JointFit

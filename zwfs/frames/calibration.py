@@ -66,6 +66,12 @@ class Flag(IntFlag):
         No phase explains the frame: its residual exceeds the limit of the call.
     NOT_CONVERGED
         The iteration used all its steps.
+
+    Examples
+    --------
+    >>> from zwfs.frames.calibration import Flag
+    >>> [flag.name for flag in Flag(6)]
+    ['BAD_PIXELS', 'SATURATED']
     """
 
     LOST = 1
@@ -160,6 +166,22 @@ class Calibration(Immutable):
         Largest number of iterations.
     tolerance : float, radian
         As for `PhaseShifted`: with 0, all iterations are done.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.frames.calibration import Calibration
+    >>> from zwfs.frames.pipeline import Optics, reduce_frames
+    >>> from zwfs.frames.registration import Image, record
+    >>> bench = Bench(n_pixels=40, photons=1e8)
+    >>> pairs = bench.frames(seed=1), bench.clear_frames(seed=2)
+    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
+    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
+    >>> calibration = Calibration.of(measurement)
+    >>> phases = calibration(np.stack([frame.counts, 0 * frame.counts]))
+    >>> phases.phase.shape, phases.flags  # the second image holds no light
+    ((2, 42, 42), array([0, 1]))
     """
 
     amplitude: NDArray[np.float64]
@@ -687,6 +709,19 @@ def calibrate(
         If astropy is needed and missing.
     TypeError, ValueError
         If a file or a value is not as expected.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames.calibration import calibrate
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)
+    ...     calibration = calibrate([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> calibration.optics.diameter, round(calibration.diameter)
+    (1.06, 40)
     """
     _check_settings(n_iterations, tolerance, np.inf if saturation is None else saturation)
     frames, clear_frames, sources = read_all(frame_files, pupil_files, dark_files, bad_pixel_files, saturation)

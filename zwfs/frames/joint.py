@@ -54,6 +54,13 @@ class MapPrior:
     ------
     TypeError, ValueError
         If a number is of the wrong kind or out of range.
+
+    Examples
+    --------
+    >>> from zwfs.frames.joint import MapPrior
+    >>> spectrum = MapPrior(rms=0.5, exponent=2.0).spectrum(32, n_pixels=24)
+    >>> spectrum.shape, bool(spectrum[0, 1] > spectrum[0, 2])
+    ((32, 17), True)
     """
 
     rms: float
@@ -103,6 +110,21 @@ class JointProblem:
     -----
     Some combinations of maps and parameters change no image, and need a fixed parameter: the flux of one arm where
     the amplitude is free, and, without known states of the mirror, the shift and the focus of one arm.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
+    >>> from zwfs.frames.joint import JointProblem, MapPrior
+    >>> from zwfs.frames.optics_model import Arm, MaskPair, Parameter, Picture
+    >>> pupil = Pupil.circular(12)
+    >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1.5)
+    >>> phase = 0.1 * zernike_basis(pupil, 6).sum(axis=0)
+    >>> pictures = [Picture(counts, 0, side, sigma=0.02) for side, counts in enumerate(sensor.measure(phase))]
+    >>> mask = MaskPair(diameter=Parameter.fitted(1.0))
+    >>> problem = JointProblem(pictures, [Arm()], mask, pupil.amplitude, 12, amplitude_prior=MapPrior(0.01))
+    >>> [problem.named[index][0] for index in problem.free]
+    ['diameter']
     """
 
     pictures: Sequence[Picture]
@@ -361,6 +383,22 @@ def fit_jointly(
     ------
     TypeError, ValueError
         If a value is of the wrong kind or out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
+    >>> from zwfs.frames.joint import JointProblem, MapPrior, fit_jointly
+    >>> from zwfs.frames.optics_model import Arm, MaskPair, Parameter, Picture
+    >>> pupil = Pupil.circular(12)
+    >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1.5)
+    >>> phase = 0.1 * zernike_basis(pupil, 6).sum(axis=0)
+    >>> pictures = [Picture(counts, 0, side, sigma=0.02) for side, counts in enumerate(sensor.measure(phase))]
+    >>> mask = MaskPair(diameter=Parameter.fitted(1.0))
+    >>> problem = JointProblem(pictures, [Arm()], mask, pupil.amplitude, 12, amplitude_prior=MapPrior(0.01))
+    >>> fit = fit_jointly(problem, n_inner=20, errors=False)
+    >>> fit.converged, round(fit.mask.diameter, 2)
+    (True, 1.06)
     """
     _check.instance("problem", problem, JointProblem)
     n_steps = _check.integer("n_steps", n_steps, 1)
@@ -740,6 +778,23 @@ def held_out_blocks(
     ------
     TypeError, ValueError
         If a value is of the wrong kind or out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
+    >>> from zwfs.frames.joint import JointProblem, MapPrior, held_out_blocks
+    >>> from zwfs.frames.optics_model import Arm, MaskPair, Parameter, Picture
+    >>> pupil = Pupil.circular(12)
+    >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1.5)
+    >>> phase = 0.1 * zernike_basis(pupil, 6).sum(axis=0)
+    >>> pictures = [Picture(counts, 0, side, sigma=0.02) for side, counts in enumerate(sensor.measure(phase))]
+    >>> mask = MaskPair(diameter=Parameter.fitted(1.0))
+    >>> problem = JointProblem(pictures, [Arm()], mask, pupil.amplitude, 12, amplitude_prior=MapPrior(0.01))
+    >>> control = problem.upside_down(1)
+    >>> scores = [held_out_blocks(one, block=2, n_steps=4, n_inner=15) for one in (problem, control)]
+    >>> [bool(score.correlation[1] > 0.7) for score in scores]
+    [True, False]
     """
     _check.instance("problem", problem, JointProblem)
     fraction = _check.number("fraction", fraction, 0, 0.9, open_low=True)
@@ -775,6 +830,23 @@ def predict_image(problem: JointProblem, index: int, fit: JointFit, n_steps: int
     Returns
     -------
     Score
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
+    >>> from zwfs.frames.joint import JointProblem, MapPrior, fit_jointly, predict_image
+    >>> from zwfs.frames.optics_model import Arm, MaskPair, Parameter, Picture
+    >>> pupil = Pupil.circular(12)
+    >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1.5)
+    >>> phase = 0.1 * zernike_basis(pupil, 6).sum(axis=0)
+    >>> pictures = [Picture(counts, 0, side, sigma=0.02) for side, counts in enumerate(sensor.measure(phase))]
+    >>> mask = MaskPair(diameter=Parameter.fitted(1.0))
+    >>> problem = JointProblem(pictures, [Arm()], mask, pupil.amplitude, 12, amplitude_prior=MapPrior(0.01))
+    >>> fit = fit_jointly(problem, n_steps=3, n_inner=10, errors=False)
+    >>> score = predict_image(problem, 1, fit, n_steps=3, n_inner=10)
+    >>> bool(score.correlation[1] > 0.7)
+    True
     """
     _check.instance("problem", problem, JointProblem)
     _check.instance("fit", fit, JointFit)

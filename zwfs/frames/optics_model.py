@@ -48,6 +48,12 @@ class Parameter:
     ------
     TypeError, ValueError
         If a number is of the wrong kind, or the value is outside the limits.
+
+    Examples
+    --------
+    >>> from zwfs.frames.optics_model import Parameter
+    >>> Parameter(1.06).free, Parameter.fitted(1.06, low=0.5).free
+    (False, True)
     """
 
     value: float
@@ -100,6 +106,13 @@ class Arm:
     background : Parameter, counts
     halo : Parameter, counts
         Light of the neighbour at the middle of this image, see `Picture.neighbour`.
+
+    Examples
+    --------
+    >>> from zwfs.frames.optics_model import Arm, Parameter
+    >>> arm = Arm(row=Parameter.fitted(0.0, -5.0, 5.0), flux=Parameter(2000.0))
+    >>> arm.row.free, arm.flux.free, arm.magnification.value
+    (True, False, 1.0)
     """
 
     focus: Parameter = _ZERO
@@ -136,6 +149,13 @@ class MaskPair:
         Gaussian blur of the images.
     halo_slope : Parameter
         The halo of the neighbour falls with its distance to this power.
+
+    Examples
+    --------
+    >>> from zwfs.frames.optics_model import MaskPair, Parameter
+    >>> mask = MaskPair(leakage=Parameter.fitted(0.01, 0.0, 0.5))
+    >>> mask.diameter.value, mask.leakage.free
+    (1.06, True)
     """
 
     diameter: Parameter = _DESIGN[0]
@@ -210,6 +230,14 @@ class Picture:
     ------
     TypeError, ValueError
         If a value is of the wrong kind, shape or range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.frames.optics_model import Picture
+    >>> picture = Picture(np.ones((4, 4)), arm=0, mask=1, sigma=0.5, good=np.eye(4) == 0)
+    >>> picture.weight[0]
+    array([0., 2., 2., 2.])
     """
 
     counts: NDArray[np.float64]
@@ -247,7 +275,15 @@ class Picture:
 
 
 def parameters(arms: Sequence[Arm], mask: MaskPair) -> list[tuple[str, Parameter]]:
-    """Return all parameters with their names, in the order of the vector: each arm, then the masks."""
+    """Return all parameters with their names, in the order of the vector: each arm, then the masks.
+
+    Examples
+    --------
+    >>> from zwfs.frames.optics_model import Arm, MaskPair, parameters
+    >>> named = parameters([Arm(), Arm()], MaskPair())
+    >>> len(named), named[0][0], named[-1][0]
+    (29, 'arm 0 focus', 'halo_slope')
+    """
     named = [
         (f"arm {index} {field.name}", getattr(arm, field.name))
         for index, arm in enumerate(arms)
@@ -271,6 +307,13 @@ def coefficients(mask: MaskValues) -> Coefficients:
     A share q_j of the light carries psi + s_j b, with s_j = (exp(i theta_j) - 1) / (1 + in_phase + i quadrature):
     (1 - incoherent) (1 - leakage) of this mask, (1 - incoherent) leakage of the other one, and incoherent with
     s = 0. So c_1 = sum q_j s_j and c_2 = sum q_j |s_j|^2.
+
+    Examples
+    --------
+    >>> from zwfs.frames.optics_model import MaskPair, MaskValues, coefficients, parameters
+    >>> mask = MaskValues(*(parameter.value for _, parameter in parameters([], MaskPair())))
+    >>> coefficients(mask).first.round(6), coefficients(mask).second.round(6)
+    (array([-1.+1.j, -1.-1.j]), array([2., 2.]))
     """
     factor = 1 / (1 + mask.in_phase + 1j * mask.quadrature)
     turn = np.exp(1j * np.array([mask.first, mask.second]))
@@ -312,6 +355,20 @@ class Forward:
     ------
     TypeError, ValueError
         If a picture does not fit the grid of the pupil, or has the number of an arm that does not exist.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
+    >>> from zwfs.frames.optics_model import Arm, Forward, MaskPair, Picture, parameters
+    >>> pupil = Pupil.circular(16)
+    >>> forward = Forward([Picture(np.zeros((24, 24)), arm=0, mask=0)], [Arm()], pupil.inside, 16)
+    >>> values = np.array([parameter.value for _, parameter in parameters([Arm()], MaskPair())])
+    >>> phase = 0.3 * zernike_basis(pupil, 3)[0]
+    >>> (image,) = forward.at(pupil.amplitude * np.exp(1j * phase), values).images
+    >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), extent=1.5)
+    >>> bool(np.allclose(image, sensor.measure(phase)[0], rtol=0, atol=1e-6))
+    True
     """
 
     def __init__(

@@ -60,6 +60,24 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
     TypeError, ValueError
         If a value is of the wrong kind, the measurements do not fit together, or the change of phase between them
         is not that of one poke.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.frames.order import order_of_images
+    >>> from zwfs.frames.pipeline import Optics, reduce_frames
+    >>> from zwfs.frames.registration import Image, record
+    >>> bench = Bench(n_pixels=40)
+    >>> wrong = Optics(bench.diameter, (-bench.phase, bench.phase))
+    >>> def measured(pistons):
+    ...     pairs = bench.frames(pistons), bench.clear_frames()
+    ...     frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
+    ...     return reduce_frames(record([frame], [clear]), wrong)
+    ...
+    >>> poke = 0.5 * (np.arange(bench.n_segments) == 5)
+    >>> order_of_images(measured(0 * poke), measured(poke)).exchanged
+    True
     """
     _check.instance("flat", flat, Measurement)
     _check.instance("poked", poked, Measurement)

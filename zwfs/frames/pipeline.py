@@ -459,7 +459,21 @@ def model(measurement: Measurement) -> ZernikeSensor:
 
 
 def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:
-    """Frames of a measurement as those of an ideal sensor: its optics are undone. They may be negative."""
+    """Frames of a measurement as those of an ideal sensor: its optics are undone. They may be negative.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.frames.pipeline import Optics, ideal_frames, reduce_frames
+    >>> from zwfs.frames.registration import Image, record
+    >>> bench = Bench(n_pixels=40, photons=1e8)
+    >>> pairs = bench.frames(seed=1), bench.clear_frames(seed=2)
+    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
+    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
+    >>> bool(np.array_equal(ideal_frames(measurement), measurement.intensity))
+    True
+    """
     _check.instance("measurement", measurement, Measurement)
     return _unmix(_scaled(measurement), measurement)
 
@@ -504,7 +518,21 @@ def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[n
 
 
 def upside_down(measurement: Measurement) -> Measurement:
-    """Control of a measurement: its second frame upside down, so that the frames no longer belong together."""
+    """Control of a measurement: its second frame upside down, so that the frames no longer belong together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.frames.pipeline import Optics, predict_other, reduce_frames, upside_down
+    >>> from zwfs.frames.registration import Image, record
+    >>> bench = Bench(n_pixels=40, photons=1e8)
+    >>> pairs = bench.frames(seed=1), bench.clear_frames(seed=2)
+    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
+    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
+    >>> bool(np.all(predict_other(measurement) > predict_other(upside_down(measurement))))
+    True
+    """
     _check.instance("measurement", measurement, Measurement)
     flipped: dict[str, Any] = {}
     for name in ("intensity", "bad"):

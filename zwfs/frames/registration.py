@@ -452,7 +452,7 @@ def register(
     >>> from zwfs.frames.registration import register
     >>> y, x = np.mgrid[:48, :48]
     >>> spot, moved = (np.exp(-np.hypot(x - 20 - d, y - 25) ** 2 / 50) for d in (0.0, 1.5))
-    >>> register(moved, spot, np.hypot(x - 24, y - 24) < 18).round(2) + 0.0
+    >>> register(moved, spot, np.hypot(x - 24, y - 24) < 18).shift.round(2) + 0.0
     array([0. , 1.5])
     """
     image, reference = _check.real_map("image", image, 2), _check.real_map("reference", reference, 2)

@@ -138,6 +138,20 @@ def reconstruct(
         If an argument is of the wrong kind or out of range, or `check_output` refuses the output.
     OSError
         If there is no space for the output.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.frames import calibrate, reconstruct
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)
+    ...     calibration = calibrate([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...     summary = reconstruct(files["frame"], calibration, f"{folder}/phases.fits", n_workers=1)
+    ...
+    >>> summary.n_frames, summary.n_flagged
+    (1, 0)
     """
     fits_module()
     if not isinstance(calibration, Calibration):

@@ -37,6 +37,22 @@ class CameraNoise:
     ------
     TypeError, ValueError
         If a value is of the wrong kind or out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.frames.pipeline import Optics, reduce_frames
+    >>> from zwfs.frames.registration import Image, record
+    >>> from zwfs.frames.verdict import CameraNoise
+    >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
+    >>> pistons = 0.5 * np.arange(-3, 4) / 3
+    >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
+    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
+    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
+    >>> photons = CameraNoise(gain=1.0).photons(measurement)
+    >>> round(photons * measurement.pupil.n_points / bench.photons, 1)
+    1.0
     """
 
     gain: float
@@ -102,6 +118,22 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
     ------
     TypeError, ValueError
         If a value is of the wrong kind or out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.registration import Image, record
+    >>> from zwfs.frames.verdict import judge
+    >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
+    >>> pistons = 0.5 * np.arange(-3, 4) / 3
+    >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
+    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
+    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
+    >>> verdict = judge(reconstruct(measurement))
+    >>> verdict.score.round(1), bool(np.all(verdict.score > verdict.control + 0.2))
+    (array([0.9, 0.9]), True)
     """
     _check.instance("result", result, MeasuredPhase)
     measurement = result.measurement
@@ -126,7 +158,24 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
 
 
 def near_edges(measurement: Measurement) -> NDArray[np.bool_]:
-    """Points within 2 pixels of one that is dark or partly lit, (ny, nx)."""
+    """Points within 2 pixels of one that is dark or partly lit, (ny, nx).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.frames.pipeline import Optics, reduce_frames
+    >>> from zwfs.frames.registration import Image, record
+    >>> from zwfs.frames.verdict import near_edges
+    >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
+    >>> pistons = 0.5 * np.arange(-3, 4) / 3
+    >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
+    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
+    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
+    >>> near = near_edges(measurement)
+    >>> round(float(near[measurement.good].mean()), 1)  # of the good points
+    0.6
+    """
     _check.instance("measurement", measurement, Measurement)
     amplitude = np.where(measurement.pupil.inside, measurement.pupil.amplitude, 0)
     # Compared with its surroundings, since the pupil may be lit unevenly.
@@ -148,6 +197,23 @@ def error_bar(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64]:
     -------
     ndarray, shape (ny, nx), radian
         NaN outside the pupil and at bad points.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.registration import Image, record
+    >>> from zwfs.frames.verdict import CameraNoise, error_bar
+    >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
+    >>> pistons = 0.5 * np.arange(-3, 4) / 3
+    >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
+    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
+    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
+    >>> noise = CameraNoise(gain=1.0, read_noise=bench.read_noise)
+    >>> sigma = error_bar(reconstruct(measurement), noise)
+    >>> round(float(np.nanmedian(sigma) * noise.photons(measurement) ** 0.5), 1)
+    0.6
     """
     _check.instance("result", result, MeasuredPhase)
     _check.instance("noise", noise, CameraNoise)

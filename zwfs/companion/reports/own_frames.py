@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from zwfs.companion.reports import middle_rows
 from zwfs.companion.results import glue_numbers
 from zwfs.companion.tables import Table
-from zwfs.frames.files import CameraFile, read
+from zwfs.frames._fits import fits_module
+from zwfs.frames.files import CameraFile
 from zwfs.frames.pipeline import MeasuredPhase, Step
 from zwfs.frames.registration import Image
 from zwfs.frames.verdict import CameraNoise, Verdict
@@ -127,7 +128,7 @@ def steps(work: Sequence[Step], errors: Sequence[float] | None) -> Table:
 
 def phase_file(path: str) -> Table:
     """Return some keywords of the phase map."""
-    header = read(path).header
+    header = fits_module().getheader(path)
     return Table(["keyword", "value"], [[key, header[key]] for key in SHOWN], digits=5)
 
 

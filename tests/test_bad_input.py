@@ -70,7 +70,7 @@ CONTENT = {
 # Only what they must refuse is tested, not their answers.
 SLOW = {"error_budget", "contraction", "other_curves", "steps", "fit"}
 INTERNAL |= {"frames_on_grid", "clear_on_grid", "places", "fits_module", "fits_bytes", "published"}
-INTERNAL |= {"calibrate", "load"}  # need the files of a bench: see test_telemetry.py
+INTERNAL |= {"calibrate", "load", "joined"}  # need the files of a bench: see test_telemetry.py
 INTERNAL |= {"small", "glue_numbers"}  # for the notebooks of the book
 
 

@@ -142,7 +142,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "explained": ((found,), ()),
         "phase_map": ((found, 635.0), ()),
         "gains": (
-            ([Step("outlines", found, np.ones(2))] * 2, [0.1, 0.2]),
+            ([Step("outlines", found, np.ones(2), np.zeros(2))] * 2, [0.1, 0.2]),
             (),
         ),
         "loop_runs": (({4.0: dict.fromkeys(two, loop)},), two),

@@ -684,7 +684,7 @@ def test_command_explains_itself(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_command_that_is_stopped_goes_on_to_the_same_bytes(folder, bench, calibration, number):
-    np.save("long.npy", np.concatenate([bench.frames] * 100))
+    np.save("long.npy", np.concatenate([bench.frames] * 300))
     arguments = ["reconstruct", "long.npy", "--calibration", "bench.npz", "-o"]
     reconstruct("long.npy", calibration, "whole.fits", saturation=65535)
     process = subprocess.Popen([sys.executable, "-m", "zwfs.frames", *arguments, "phase.fits"], cwd=folder)

@@ -187,7 +187,7 @@ class Recording:
 
     @cached_property
     def diameter(self) -> float:
-        """Diameter of the pupil in pixels of the first image: the mean of both, less the magnification."""
+        """Diameter of the pupil in pixels of the first image, as the mean of both less the magnification."""
         first, second = self.pupils
         return (first.diameter + second.diameter / self.placement.magnification) / 2
 

@@ -4,6 +4,7 @@ import pickle
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -83,7 +84,8 @@ def drawn_methods(curves, pupil, classic, shifted):
     saxton = zwfs.GerchbergSaxton(shifted)
     bad = np.zeros(frames.shape, bool)
     bad[:, 10, 10] = True
-    measurement = Measurement(None, Optics(), frames, pupil, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0))
+    recording = SimpleNamespace(diameter=float(pupil.n_pixels))
+    measurement = Measurement(recording, Optics(), frames, pupil, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0))
     found = MeasuredPhase(phase, frames, 0.9 * frames, measurement, True, 0)
     varied = AmplitudeCurves(three, dict.fromkeys(WAYS, np.full((3, 2), 0.1)), {}, three)
     triple = zwfs.ZernikeSensor(pupil, *shifted.masks, zwfs.Dimple(1, 0))
@@ -96,7 +98,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "sensor_layout": ((classic, phase), ()),
         "vector_sensor": ((shifted, phase), ()),
         "bench_layout": ((bench, commands, bench.frames(commands, seed=1)), ()),
-        "at_a_glance": ((pupil, phase, frames, dict.fromkeys(two, phase)), ()),
+        "at_a_glance": ((pupil, phase, frames, dict.fromkeys([*two, "Arcsine"], phase)), ()),
         "linearity": ((curves, 0.05, two, 0.4), two),
         "saxton_widths": (
             (
@@ -145,6 +147,7 @@ def drawn_methods(curves, pupil, classic, shifted):
             ([Step("outlines", found, np.ones(2), np.zeros(2))] * 2, [0.1, 0.2]),
             (),
         ),
+        "signs": ((measurement,), ()),
         "loop_runs": (({4.0: dict.fromkeys(two, loop)},), two),
         "capture": (
             (three, [dict.fromkeys(two, loop)] * 3),

@@ -627,7 +627,7 @@ def test_seal_images_hold_uneven_light_and_do_not_show_a_rotation(seal_work):
 def test_seal_frames_that_do_not_belong_together_are_refused(seal, seal_steps):
     frame = seal[0][0]
     left, right = np.hsplit(frame.counts, 2)
-    with pytest.raises(ValueError, match="the best shift of the images is .* the end of the search"):
+    with pytest.raises(ValueError, match=r"the best shift of the images is .* the end of the search"):
         seal_steps(Image(np.hstack([left, right[::-1]]), frame.bad, "nonsense"))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 import pickle
+import warnings
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -21,9 +22,17 @@ def variants(figure: Figure) -> dict[str, Figure]:
     """Return copies of a figure: "dark", and if its panels lie on a grid "narrow" and "narrow-dark"."""
     state = pickle.dumps(figure)
     made = {"dark": _darkened(_copy(state))}
-    if any(axes.get_subplotspec() for axes in figure.axes):
+    if any(axes.get_subplotspec() for axes in figure.axes) and _fits(_stacked(_copy(state))):
         made |= {"narrow": _stacked(_copy(state)), "narrow-dark": _darkened(_stacked(_copy(state)))}
     return made
+
+
+def _fits(figure: Figure) -> bool:
+    """Whether there is room for all panels of a figure with their labels."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        figure.draw_without_rendering()
+    return not any("constrained_layout not applied" in str(one.message) for one in said)
 
 
 def _copy(state: bytes) -> Figure:

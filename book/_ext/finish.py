@@ -97,7 +97,9 @@ def add_variants(app: Sphinx, figure: Tag) -> None:
 
 def shown(app: Sphinx, image: Tag, file: Path, name: str) -> dict[str, str]:
     """Copy a picture to the folder of `image`; return its size, and its address under a name."""
-    copy_asset_file(file, Path(app.outdir, "_images"))
+    images = Path(app.outdir, "_images")
+    images.mkdir(parents=True, exist_ok=True)
+    copy_asset_file(file, images)
     width, height = map(str, size(file))
     return {name: f"{image['src'].rpartition('/')[0]}/{file.name}", "width": width, "height": height}
 

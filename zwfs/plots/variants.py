@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import colorsys
 import pickle
-import warnings
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -19,20 +18,16 @@ _PARTS = "color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"
 
 
 def variants(figure: Figure) -> dict[str, Figure]:
-    """Return copies of a figure: "dark", and if its panels lie on a grid "narrow" and "narrow-dark"."""
+    """Return copies of a figure: "dark", and if its panels lie on a grid "narrow" and "narrow-dark".
+
+    Figures with pictures that have no axes get no narrow variant: they lose little when they are small.
+    """
     state = pickle.dumps(figure)
     made = {"dark": _darkened(_copy(state))}
-    if any(axes.get_subplotspec() for axes in figure.axes) and _fits(_stacked(_copy(state))):
+    panels = [axes for axes in figure.axes if axes.get_subplotspec()]
+    if panels and all(axes.get_xticks().size for axes in panels):
         made |= {"narrow": _stacked(_copy(state)), "narrow-dark": _darkened(_stacked(_copy(state)))}
     return made
-
-
-def _fits(figure: Figure) -> bool:
-    """Whether there is room for all panels of a figure with their labels."""
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        figure.draw_without_rendering()
-    return not any("constrained_layout not applied" in str(one.message) for one in said)
 
 
 def _copy(state: bytes) -> Figure:
@@ -43,17 +38,14 @@ def _copy(state: bytes) -> Figure:
 
 
 def _stacked(figure: Figure) -> Figure:
-    """Put the panels of a figure below each other, in place; pictures without axes in two columns."""
+    """Put the panels of a figure below each other, in place."""
     panels = [axes for axes in figure.axes if axes.get_subplotspec()]
-    square = any(axes.get_aspect() != "auto" for axes in panels)
-    columns = 2 if square and len(panels) > 1 and not any(axes.get_xticks().size for axes in panels) else 1
-    height = (_HEIGHT if not square else _WIDTH) / columns
-    rows = -(-len(panels) // columns)
+    height = _WIDTH if any(axes.get_aspect() != "auto" for axes in panels) else _HEIGHT
     for axes in panels:
         _label(axes, panels)
-    grid = figure.add_gridspec(rows, columns)
+    grid = figure.add_gridspec(len(panels), 1)
     for place, axes in enumerate(panels):
-        axes.set_subplotspec(grid[place // columns, place % columns])
+        axes.set_subplotspec(grid[place, 0])
     entries = 0
     for legend in list(figure.legends):
         handles: Any = legend.legend_handles
@@ -62,7 +54,7 @@ def _stacked(figure: Figure) -> Figure:
         labels, size = [text.get_text() for text in texts], texts[0].get_fontsize()
         figure.legend(handles, labels, loc="outside lower center", fontsize=size)
         entries += len(texts)
-    figure.set_size_inches(_WIDTH, rows * height + 0.2 * entries)
+    figure.set_size_inches(_WIDTH, len(panels) * height + 0.2 * entries)
     figure.set_layout_engine("constrained")  # a saved figure has none
     return figure
 

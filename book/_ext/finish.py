@@ -77,11 +77,12 @@ def add_variants(app: Sphinx, figure: Tag) -> None:
     """Show the dark and the narrow variants of a figure, in place, if the run of its notebook wrote them."""
     name = next(word for word in figure["class"] if word.startswith(VARIANTS)).removeprefix(VARIANTS)
     runs = Path(app.srcdir, app.config.executed_notebooks)
-    run = next((file.parent for file in runs.glob(f"*.files/{name}.dark.png")), None)
-    light = figure.img
-    if light is None or run is None:
+    # In the class of a directive, Docutils writes hyphens.
+    named = runs.glob(f"*.files/{name.replace('-', '[-_]')}.dark.png")
+    first, light = next(named, None), figure.img
+    if light is None or first is None:
         return
-    files = {kind: run / f"{name}.{kind}.png" for kind in ("dark", "narrow", "narrow-dark")}
+    files = {kind: first.with_suffix("").with_suffix(f".{kind}.png") for kind in ("dark", "narrow", "narrow-dark")}
     dark = copy.copy(light)
     light.insert_after(dark)
     dark.attrs |= shown(app, light, files["dark"], "src") | {"loading": "lazy"}

@@ -14,6 +14,7 @@ from zwfs.plots.style import LOOKS, show_intensity, show_phase
 from zwfs.pupil import Pupil
 
 _SEES = {"one pupil": "from image 1", "two pupils": "from both images"}
+_LETTERS = 13  # points: on a phone the figure is as wide as the page
 _RIGHT = 1.0  # radian, error up to which a point is drawn on the branch of the true phase
 
 
@@ -33,20 +34,23 @@ def at_a_glance(pupil: Pupil, phase: NDArray, frames: NDArray, estimates: Mappin
     limit = 3 * rms
     figure, panels = plt.subplots(2, 3, figsize=(7.2, 5.3))
     shown = show_phase(panels[0, 0], truth, limit)
-    panels[0, 0].set_title(f"Wavefront: {rms:.1f} rad rms", fontsize=11)
+    panels[0, 0].set_title(f"Input: {rms:.1f} rad rms", fontsize=_LETTERS)
     top = np.quantile(frames, 0.99)
     for axes, frame, number in zip(panels[0, 1:], frames, ("1", "2"), strict=True):
         light = show_intensity(axes, np.where(pupil.inside, frame, np.nan), top)
-        axes.set_title(f"Image {number}", fontsize=11)
+        axes.set_title(f"Image {number}", fontsize=_LETTERS)
     for axes, (name, estimate) in zip(panels[1], estimates.items(), strict=True):
         look, error = LOOKS[name], wrapped_residual(pupil, estimate, phase)
         right = np.abs(error) < _RIGHT
         piston = np.mean((estimate - truth)[right]) if right.any() else 0.0
         show_phase(axes, np.where(right, truth + error, estimate - piston), limit)
-        axes.set_title(f"{look.name.capitalize()},\n{_SEES[look.sees]}", fontsize=11)
-        axes.set_xlabel(_error(np.sqrt(np.nanmean(error**2))), fontsize=11)
-    figure.colorbar(light, ax=panels[0], label="intensity", aspect=18, extend="max")
-    figure.colorbar(shown, ax=panels[1], label="phase (rad)", aspect=18, extend="both")
+        axes.set_title(f"{look.name.capitalize()},\n{_SEES[look.sees]}", fontsize=_LETTERS)
+        axes.set_xlabel(_error(np.sqrt(np.nanmean(error**2))), fontsize=_LETTERS)
+    bars = [figure.colorbar(light, ax=panels[0], aspect=18, extend="max")]
+    bars += [figure.colorbar(shown, ax=panels[1], aspect=18, extend="both")]
+    for bar, label in zip(bars, ("intensity", "phase (rad)"), strict=True):
+        bar.set_label(label, fontsize=_LETTERS)
+        bar.ax.tick_params(labelsize=_LETTERS - 1)
     return figure
 
 

@@ -257,7 +257,7 @@ def test_figures_open_alone(page):
     page.goto(address("notebooks/fig03_dynamic_range.html"))
     page.locator(".wide-figure a").first.click()
     page.wait_for_url("**/_images/*.png")
-    assert page.evaluate("document.images[0].naturalWidth") == 1800
+    assert page.evaluate("document.images[0].naturalWidth") == 1400
 
 
 def test_the_logo_is_the_same_in_both_formats(browser, tmp_path):

@@ -17,8 +17,8 @@ FOLD = "Set-up and drawing"
 def put_in_order(notebook: NotebookNode) -> None:
     """Move the code of each figure to the end of the section that follows the figure, in place.
 
-    The code that computes stays visible there; what sets up and draws is folded. The parameters disappear, since
-    the card of each figure shows them, and so does the code that only prints a table.
+    The code that computes stays visible there; what sets up and draws is folded. The page omits two kinds of code:
+    the parameters, which the card of the first figure shows, and code that only prints a table.
     """
     cells: list[NotebookNode] = []
     ahead: list[NotebookNode] = []  # code of the next figure

@@ -14,7 +14,7 @@ from zwfs.frames.telemetry import reconstruct
 
 _EXIT_CODES = """exit codes:
   0    complete
-  1    a file or a value was refused, or there is no space; the message says which
+  1    a file or a value was refused, or the disk is full; the message names the cause
   2    the command line is wrong
   3    complete, but frames are flagged (only with --strict)
   130  interrupted; the same command goes on from there"""

@@ -421,7 +421,7 @@ def _recorded(pipeline, registration):
     optics = pipeline.Optics()
     recording = registration.record(images[:1], images[1:])
     measurement = pipeline.reduce_frames(recording, optics)
-    return images, optics, recording, measurement, pipeline.reconstruct(measurement, 3)
+    return images, optics, recording, measurement, pipeline.recover_phase(measurement, 3)
 
 
 RAGGED = [[1.0, 2.0], [3.0]]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
 from zwfs.frames.registration import record
 from zwfs.frames.verdict import CameraNoise, judge, near_edges
 
@@ -20,7 +20,7 @@ def case(request):
 
 def test_phase_is_recovered_however_the_second_image_stands(case):
     _, recording = case
-    assert foreign.phase_error(reconstruct(reduce_frames(recording, Optics()))) < 0.015
+    assert foreign.phase_error(recover_phase(reduce_frames(recording, Optics()))) < 0.015
 
 
 def test_placement_of_the_second_image_is_measured_within_its_errors(case):
@@ -58,7 +58,7 @@ NOISE = CameraNoise(1.0, foreign.READ_NOISE)
 
 
 def test_noise_explains_the_frames_and_its_error_bar_holds(case):
-    found = reconstruct(reduce_frames(case[1], Optics()))
+    found = recover_phase(reduce_frames(case[1], Optics()))
     verdict = judge(found, NOISE)
     assert verdict.explained
     assert np.all(verdict.score > verdict.control + 0.5)
@@ -70,13 +70,13 @@ def test_noise_explains_the_frames_and_its_error_bar_holds(case):
 @pytest.mark.parametrize("wrong", [Optics(1.3), Optics(scale=1.1), Optics(unmasked=0.1), Optics(background=0.05)])
 def test_wrong_model_is_not_explained(wrong):
     recording = record(*foreign.recorded())
-    assert not judge(reconstruct(reduce_frames(recording, wrong)), NOISE).explained
+    assert not judge(recover_phase(reduce_frames(recording, wrong)), NOISE).explained
 
 
 def test_frames_that_do_not_belong_together_score_like_the_control():
     frames, clear_frames = foreign.recorded()
     upside_down = [frames[0], replace(frames[1], counts=frames[1].counts[::-1])]
-    verdict = judge(reconstruct(reduce_frames(record(upside_down, clear_frames), Optics())))
+    verdict = judge(recover_phase(reduce_frames(record(upside_down, clear_frames), Optics())))
     assert np.all(verdict.score < 0.3)
     assert verdict.explained is None
     assert verdict.sigma is None

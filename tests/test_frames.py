@@ -13,7 +13,7 @@ from zwfs.bench.model import Bench, BenchModel, segment_screens
 from zwfs.bench.segments import segment_residual
 from zwfs.frames import files as camera
 from zwfs.frames.order import order_of_images
-from zwfs.frames.pipeline import Optics, fit, measured_pupil, predict_other, reconstruct, reduce_frames, steps
+from zwfs.frames.pipeline import Optics, fit, measured_pupil, predict_other, recover_phase, reduce_frames, steps
 from zwfs.frames.registration import (
     Circle,
     Image,
@@ -144,7 +144,7 @@ def test_two_frames_are_one_frame_cut_in_two(recorded):
               for name, one in (("masked", masked), ("bare", bare))]  # fmt: skip
     one, two = record([image(masked)], [image(bare)]), record(*halves)
     np.testing.assert_allclose(two.origins[:, 1], one.origins[:, 1] - [0, 92, 0, 92], atol=0.01)
-    found = [reconstruct(reduce_frames(r, Optics())) for r in (one, two)]
+    found = [recover_phase(reduce_frames(r, Optics())) for r in (one, two)]
     assert np.nanstd(found[0].phase - found[1].phase) < 0.01
 
 
@@ -171,12 +171,12 @@ def test_cropped_mask_out_images_are_found_on_the_frames():
 def test_phase_is_recovered(recorded, screen):
     _, masked, bare = recorded
     recording = record([image(masked)], [image(bare)])
-    found = reconstruct(reduce_frames(recording, Optics()))
+    found = recover_phase(reduce_frames(recording, Optics()))
     # Blur and interpolation, which the model knows nothing of, leave most of it, at the gaps.
     assert error(found, recording, screen) < 0.1
     assert found.correlation.min() > 0.97
     worse = record([image(masked)], [image(bare)], subpixel=False)
-    assert error(reconstruct(reduce_frames(worse, Optics())), worse, screen) > error(found, recording, screen)
+    assert error(recover_phase(reduce_frames(worse, Optics())), worse, screen) > error(found, recording, screen)
 
 
 def test_background_and_flux_are_measured(recorded):
@@ -221,9 +221,9 @@ def test_exchanged_phase_shifts_change_the_sign(recorded):
     _, masked, bare = recorded
     recording = record([image(masked)], [image(bare)])
     optics = Optics()
-    found = reconstruct(reduce_frames(recording, optics))
+    found = recover_phase(reduce_frames(recording, optics))
     swapped = replace(optics, phase_shifts=optics.phase_shifts[::-1])
-    other = reconstruct(reduce_frames(recording, swapped))
+    other = recover_phase(reduce_frames(recording, swapped))
     np.testing.assert_allclose(np.nan_to_num(other.phase), -np.nan_to_num(found.phase), atol=1e-6)
     np.testing.assert_allclose(other.correlation, found.correlation, atol=1e-9)
 
@@ -235,12 +235,12 @@ def test_masked_pixels_are_left_out_and_do_little_harm(recorded, screen):
     spoilt = np.where(bad, 0.0, masked)
     recording = record([image(spoilt, bad=bad)], [image(bare)])
     measurement = reduce_frames(recording, Optics())
-    found = reconstruct(measurement)
+    found = recover_phase(measurement)
     # Each one spoils up to four points of the grid, in one image or the other.
     assert 60 < measurement.n_bad < 500
     assert np.count_nonzero(np.isfinite(found.phase)) == measurement.pupil.n_points - measurement.n_bad
     clean = record([image(masked)], [image(bare)])
-    best = error(reconstruct(reduce_frames(clean, Optics())), clean, screen)
+    best = error(recover_phase(reduce_frames(clean, Optics())), clean, screen)
     assert error(found, recording, screen) < best + 0.02
 
 
@@ -252,11 +252,11 @@ def test_leakage_and_unmasked_light_are_undone(screen):
     bare = np.stack([np.pad(pupil.amplitude**2, MARGIN)] * 2)
     mixed = 0.8 * (0.9 * ideal + 0.1 * ideal[::-1]) + 0.2 * bare
     recording = record([image(np.hstack(mixed))], [image(np.hstack(bare))], subpixel=False, **EXACT)
-    found = reconstruct(reduce_frames(recording, optics), 100)
+    found = recover_phase(reduce_frames(recording, optics), 100)
     assert error(found, recording, screen) < 1e-3
     np.testing.assert_allclose(found.correlation, 1, atol=1e-5)
     plain = Optics()
-    assert error(reconstruct(reduce_frames(recording, plain), 100), recording, screen) > 0.03
+    assert error(recover_phase(reduce_frames(recording, plain), 100), recording, screen) > 0.03
 
 
 def test_fit_finds_the_diameter_and_the_scale(screen):
@@ -277,7 +277,7 @@ def test_prediction_tells_a_pair_from_a_mere_juxtaposition(recorded):
     for frame in (masked, np.hstack([left, right[::-1]])):
         measurement = reduce_frames(record([image(frame)], [image(bare)]), Optics())
         scores.append((predict_other(measurement).min(),
-                       reconstruct(measurement).correlation.min()))  # fmt: skip
+                       recover_phase(measurement).correlation.min()))  # fmt: skip
     (right_pair, correlation), (wrong_pair, spurious) = scores
     assert right_pair > 0.9
     assert wrong_pair < 0.7
@@ -495,7 +495,7 @@ def test_bench_writes_what_the_pipeline_reads(tmp_path):
     recording = record(frames, clear_frames)
     # The bench sets the images half a pixel apart.
     np.testing.assert_allclose(recording.origins[3], [-0.5, 89.5], atol=0.1)
-    found = reconstruct(reduce_frames(recording, Optics()))
+    found = recover_phase(reduce_frames(recording, Optics()))
     error = bench_error(bench, commanded, found)
     known = reconstruct_with(BenchModel.from_images(bench, 1), bench, commanded)
     assert error < known + 0.03  # as good as one who knows where the pupils stand
@@ -525,7 +525,7 @@ def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
     bad[40, 50] = True
     recording = record([image(masked, bad=bad)], [image(bare)])
     optics = Optics(diameter=1.1)
-    found = reconstruct(reduce_frames(recording, optics))
+    found = recover_phase(reduce_frames(recording, optics))
     source = camera.CameraFile(masked[np.newaxis], "frame.fits", "ab" * 32, {"DATE-OBS": "2023-05-01"})
     for name in ("a.fits", "b.fits"):
         camera.write_phase(tmp_path / name, found, 635.0, [source])
@@ -550,7 +550,7 @@ def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
 def test_phase_file_replaces_no_source_and_nothing_but_a_phase_map(tmp_path, recorded, monkeypatch):
     _, masked, bare = recorded
     recording = record([image(masked)], [image(bare)])
-    found = reconstruct(reduce_frames(recording, Optics()))
+    found = recover_phase(reduce_frames(recording, Optics()))
     monkeypatch.chdir(tmp_path)
     np.save("größe.npy", masked)
     raw, target = (tmp_path / "größe.npy").read_bytes(), tmp_path / "a.fits"

@@ -131,7 +131,7 @@ def bench_error(bench: Bench, commanded: ArrayLike, phase: MeasuredPhase) -> flo
     >>> from zwfs.bench.model import Bench
     >>> from zwfs.bench.recording import bench_error, write_bench
     >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
     >>> from zwfs.frames.registration import record
     >>> bench = Bench(n_pixels=40)
     >>> pistons = np.linspace(-0.5, 0.5, bench.n_segments)
@@ -140,7 +140,7 @@ def bench_error(bench: Bench, commanded: ArrayLike, phase: MeasuredPhase) -> flo
     ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
     ...
     >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
-    >>> phase = reconstruct(reduce_frames(record(frames, clear_frames), optics))
+    >>> phase = recover_phase(reduce_frames(record(frames, clear_frames), optics))
     >>> bench_error(bench, pistons, phase) < 0.2
     True
     """

@@ -1,8 +1,8 @@
 """A calibrated bench: what is computed once, so that camera images become phases in one call.
 
 `Calibration.of` takes it from a measurement with clear frames, `save` and `load` keep it in a file, and a call
-turns camera images into phases. It does the same as `reduce_frames` and `reconstruct` of `zwfs.frames.pipeline` in
-single precision, without making the model anew for each pair of frames.
+turns camera images into phases. It does the same as `reduce_frames` and `recover_phase` of `zwfs.frames.pipeline`,
+in single precision, without making the model anew for each pair of frames.
 """
 
 from __future__ import annotations

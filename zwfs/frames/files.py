@@ -206,7 +206,7 @@ def read_all(
     >>> from zwfs.bench.model import Bench
     >>> from zwfs.bench.recording import write_bench
     >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
     >>> from zwfs.frames.registration import record
     >>> bench = Bench(n_pixels=40)
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -398,7 +398,7 @@ def write_phase(
     >>> from zwfs.bench.model import Bench
     >>> from zwfs.bench.recording import write_bench
     >>> from zwfs.frames.files import read_all, write_phase
-    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
     >>> from zwfs.frames.registration import record
     >>> bench = Bench(n_pixels=40)
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -407,7 +407,7 @@ def write_phase(
     ...
     >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
     >>> measurement = reduce_frames(record(frames, clear_frames), optics)
-    >>> phase = reconstruct(measurement)
+    >>> phase = recover_phase(measurement)
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_phase(f"{folder}/phase.fits", phase, 635.0, sources)
     ...

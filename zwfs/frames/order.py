@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics, reconstruct
+from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics, recover_phase
 
 _LEAST = 0.5  # skewness of the change of phase: that of noise is about 0, that of one poke 1
 
@@ -49,7 +49,7 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
         1 if the poke lengthens the optical path, that is if it pulls a mirror away from the incoming light and so
         raises the phase; -1 if it shortens it.
     n_iterations : int
-        As for `reconstruct`.
+        As for `recover_phase`.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
     optics = flat.optics
     choices = [optics, replace(optics, phase_shifts=optics.phase_shifts[::-1])]
     scores = [
-        sign * _skewness(*(reconstruct(replace(one, optics=choice), n_iterations) for one in (flat, poked)))
+        sign * _skewness(*(recover_phase(replace(one, optics=choice), n_iterations) for one in (flat, poked)))
         for choice in choices
     ]
     best = int(np.argmax(scores))

@@ -264,7 +264,7 @@ def reduce_frames(recording: Recording, optics: Optics, margin: int | None = Non
     >>> from zwfs.bench.model import Bench
     >>> from zwfs.bench.recording import write_bench
     >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
     >>> from zwfs.frames.registration import record
     >>> bench = Bench(n_pixels=40)
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -368,7 +368,7 @@ def measured_pupil(
     return pupil, scale * np.mean(amplitude[pupil.inside] ** 2)
 
 
-def reconstruct(measurement: Measurement, n_iterations: int = 25) -> MeasuredPhase:
+def recover_phase(measurement: Measurement, n_iterations: int = 25) -> MeasuredPhase:
     """Phase of a measurement by the phase-shifted iteration, and its modelled frames.
 
     Bad pixels take no part: their intensity is that of the model, with the phase of the nearest good point, so
@@ -396,7 +396,7 @@ def reconstruct(measurement: Measurement, n_iterations: int = 25) -> MeasuredPha
     >>> from zwfs.bench.model import Bench
     >>> from zwfs.bench.recording import write_bench
     >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
     >>> from zwfs.frames.registration import record
     >>> bench = Bench(n_pixels=40)
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -405,7 +405,7 @@ def reconstruct(measurement: Measurement, n_iterations: int = 25) -> MeasuredPha
     ...
     >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
     >>> measurement = reduce_frames(record(frames, clear_frames), optics)
-    >>> phase = reconstruct(measurement)
+    >>> phase = recover_phase(measurement)
     >>> phase.converged, phase.phase.shape == measurement.pupil.shape
     (True, True)
     """
@@ -484,7 +484,7 @@ def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[n
     The phase-shifted iteration sees both frames, and could explain part of their noise. Here the arcsine
     reconstruction sees one frame, and the model predicts the other one from its phase.
 
-    Parameters, as for `reconstruct`.
+    Parameters, as for `recover_phase`.
 
     Examples
     --------
@@ -558,7 +558,7 @@ def fit(
         Parameters of `Optics` other than the phase shifts; "registration" stands for the shifts of all images
         but the first clear frame, six numbers.
     n_iterations : int
-        As for `reconstruct`.
+        As for `recover_phase`.
     n_steps : int
         Of the least-squares search, at most.
 
@@ -612,7 +612,7 @@ def fit(
         return replace(recording, origins=origins), replace(optics, **changes)
 
     def residuals(unknowns: NDArray) -> NDArray:
-        return reconstruct(_reduce(*trial(unknowns), margin), n_iterations).mismatch.ravel()
+        return recover_phase(_reduce(*trial(unknowns), margin), n_iterations).mismatch.ravel()
 
     best = optimize.least_squares(
         residuals, start, bounds=(low, high), x_scale=step, diff_step=1e-4, max_nfev=n_steps
@@ -713,7 +713,7 @@ def steps(
     fitted : sequence of str
         Parameters to fit, see `fit`: with each step one more, and all earlier ones again.
     n_iterations : int
-        As for `reconstruct`.
+        As for `recover_phase`.
     **settings
         Of `record`: pupil_centers, pupil_diameter, exposure.
 
@@ -751,7 +751,7 @@ def steps(
     def add(name: str, recording: Recording, optics: Optics) -> None:
         measurement = reduce_frames(recording, optics)
         scores = (predict_other(one, n_iterations) for one in (measurement, upside_down(measurement)))
-        work.append(Step(name, reconstruct(measurement, n_iterations), *scores))
+        work.append(Step(name, recover_phase(measurement, n_iterations), *scores))
 
     switches: dict[str, Any] = dict.fromkeys(("subpixel", "background", "balance"), False)
     add("outlines of the pupils", record(frames, clear_frames, **settings, **switches), optics)

@@ -159,7 +159,7 @@ class Recording:
     >>> from zwfs.bench.model import Bench
     >>> from zwfs.bench.recording import write_bench
     >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
     >>> from zwfs.frames.registration import record
     >>> bench = Bench(n_pixels=40)
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -307,7 +307,7 @@ def record(
     >>> from zwfs.bench.model import Bench
     >>> from zwfs.bench.recording import write_bench
     >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
     >>> from zwfs.frames.registration import record
     >>> bench = Bench(n_pixels=40)
     >>> with tempfile.TemporaryDirectory() as folder:

@@ -108,7 +108,7 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
     noise : CameraNoise, optional
         Without it there is no error bar, and the misfit is not compared with the noise.
     n_iterations : int
-        As for `reconstruct`.
+        As for `recover_phase`.
 
     Returns
     -------
@@ -123,7 +123,7 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
     --------
     >>> import numpy as np
     >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
     >>> from zwfs.frames.registration import Image, record
     >>> from zwfs.frames.verdict import judge
     >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
@@ -131,7 +131,7 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
     >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
     >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
     >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
-    >>> verdict = judge(reconstruct(measurement))
+    >>> verdict = judge(recover_phase(measurement))
     >>> verdict.score.round(1), bool(np.all(verdict.score > verdict.control + 0.2))
     (array([0.9, 0.9]), True)
     """
@@ -202,7 +202,7 @@ def error_bar(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64]:
     --------
     >>> import numpy as np
     >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames.pipeline import Optics, reconstruct, reduce_frames
+    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
     >>> from zwfs.frames.registration import Image, record
     >>> from zwfs.frames.verdict import CameraNoise, error_bar
     >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
@@ -211,7 +211,7 @@ def error_bar(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64]:
     >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
     >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
     >>> noise = CameraNoise(gain=1.0, read_noise=bench.read_noise)
-    >>> sigma = error_bar(reconstruct(measurement), noise)
+    >>> sigma = error_bar(recover_phase(measurement), noise)
     >>> round(float(np.nanmedian(sigma) * noise.photons(measurement) ** 0.5), 1)
     0.6
     """

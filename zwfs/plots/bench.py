@@ -19,12 +19,12 @@ _ARMS = ("+θ", "−θ")
 
 def reference_intensities(frames: NDArray, clear_frames: NDArray) -> Figure:
     """Figure 6: the two images of a flat command, mask in, and the clear frames, (2, ny, nx) each."""
-    figure, panels = plt.subplots(1, 4, figsize=(9, 3.4))
+    figure, panels = plt.subplots(1, 4, figsize=(7, 3.1))
     for pair, images, label in ((panels[:2], frames, "mask in"), (panels[2:], clear_frames, "mask out")):
         top = np.quantile(images, 0.9995)
         for axes, image, arm in zip(pair, images, _ARMS, strict=True):
             shown = show_intensity(axes, image, top)
-            axes.set_title(f"{label}, image {arm}", fontsize=10)
+            axes.set_title(f"{label},\nimage {arm}", fontsize=10)
         figure.colorbar(shown, ax=pair, label="intensity", location="bottom", shrink=0.7, aspect=30)
     return figure
 
@@ -39,7 +39,7 @@ def measured_and_modelled(measured: NDArray, modelled: NDArray, phase: NDArray) 
         Reconstructed phase.
     """
     figure, panels = plt.subplot_mosaic(
-        [["m0", "f0", "d0", "phase"], ["m1", "f1", "d1", "phase"]], figsize=(9, 4.6), width_ratios=[1, 1, 1, 1.4]
+        [["m0", "f0", "d0", "phase"], ["m1", "f1", "d1", "phase"]], figsize=(7, 4.1), width_ratios=[1, 1, 1, 1.4]
     )
     top = np.quantile(np.stack([measured, modelled]), 0.999)
     for row, (arm, frame, model) in enumerate(zip(_ARMS, measured, modelled, strict=True)):
@@ -47,7 +47,12 @@ def measured_and_modelled(measured: NDArray, modelled: NDArray, phase: NDArray) 
         show_intensity(panels[f"f{row}"], model, top)
         difference = show_phase(panels[f"d{row}"], frame - model, top / 4)
         panels[f"m{row}"].set_ylabel(f"image {arm}")
-    for key, title in (("m0", "measured"), ("f0", "modelled"), ("d0", "difference"), ("phase", "phase found")):
+    for key, title in (
+        ("m0", "measured"),
+        ("f0", "modelled"),
+        ("d0", "difference"),
+        ("phase", "reconstructed\nphase"),
+    ):
         panels[key].set_title(title, fontsize=10)
     found = show_phase(panels["phase"], phase, np.nanmax(np.abs(phase)))
     bars: dict[str, Any] = {"location": "bottom", "aspect": 25, "shrink": 0.85}
@@ -66,13 +71,13 @@ def segment_errors(bench: Bench, commanded: NDArray, errors: Mapping[str, NDArra
     commanded : ndarray, shape (n_segments,), radian
     errors : mapping of method to ndarray, shape (n_segments,), radian
     """
-    pistons = {"commanded": commanded} | {f"error, {LOOKS[name].name}": values for name, values in errors.items()}
+    pistons = {"commanded": commanded} | {f"error,\n{LOOKS[name].name}": values for name, values in errors.items()}
     maps = {
         title: np.where(bench.segments > 0, bench.commanded_phase(values), np.nan)
         for title, values in pistons.items()
     }
     figure, panels = plt.subplot_mosaic(
-        [["points"] * len(maps), list(maps)], figsize=(9, 5.2), height_ratios=[1, 1.1]
+        [["points"] * len(maps), list(maps)], figsize=(7, 5.2), height_ratios=[1, 1]
     )
     points = panels["points"]
     for name, values in errors.items():
@@ -92,8 +97,8 @@ def segment_errors(bench: Bench, commanded: NDArray, errors: Mapping[str, NDArra
 
 
 def bench_linearity(curves: BenchCurves) -> Figure:
-    """Figure 9: error of the segments against the input, and the gain, measured over commanded pistons."""
-    figure, (plain, gain) = plt.subplots(1, 2, figsize=(9, 4.2))
+    """Figure 9: error of the segments against the input, and the gain, estimated over commanded pistons."""
+    figure, (plain, gain) = plt.subplots(1, 2, figsize=(7, 4.4))
     for name, look in _looks(curves.residuals):
         mean, std = curves.mean(name), curves.std(name)
         plain.plot(curves.rms, mean, markersize=4, label=look.label, **look.style)
@@ -102,14 +107,16 @@ def bench_linearity(curves: BenchCurves) -> Figure:
         gain.plot(curves.rms, curves.gain(name), markersize=4, **look.style)
     gain.axhline(1, color="#555555", lw=1)
     plain.set(xlabel="input (rad rms over the segments)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
-    gain.set(xlabel="input (rad rms over the segments)", ylabel="gain: found / commanded", xlim=(0, None))
+    gain.set(
+        xlabel="input (rad rms over the segments)", ylabel="gain: estimated / commanded piston", xlim=(0, None)
+    )
     gain.set_ylim(0, 1.5)
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
     return figure
 
 
 def budget(curves: Mapping[str, BenchCurves], name: str) -> Figure:
-    """Effect of each error of the bench alone: offset at a flat command, and gain and error at the second input.
+    """Effect of each error of the bench alone: offset at a flat command, gain and error at the first other input.
 
     Parameters
     ----------
@@ -117,12 +124,16 @@ def budget(curves: Mapping[str, BenchCurves], name: str) -> Figure:
     name : str
         Reconstructor.
     """
-    figure, panels = plt.subplots(1, 3, figsize=(9, 3.4), sharey=True)
+    figure, panels = plt.subplots(1, 3, figsize=(7, 3.6), sharey=True)
     rows = np.arange(len(curves))[::-1]
+    value = next(iter(curves.values())).rms[1]
     quantities = (
-        ("offset at a flat command\n(rad rms)", [one.mean(name)[0] for one in curves.values()]),
-        ("change of the gain\n(%)", [100 * (one.gain(name)[1] - 1) for one in curves.values()]),
-        ("error\n(rad rms)", [one.mean(name)[1] for one in curves.values()]),
+        ("error at a flat\ncommand (rad rms)", [one.mean(name)[0] for one in curves.values()]),
+        (
+            f"change of the gain at\n{value:g} rad rms (%)",
+            [100 * (one.gain(name)[1] - 1) for one in curves.values()],
+        ),
+        (f"error at {value:g} rad\nrms (rad rms)", [one.mean(name)[1] for one in curves.values()]),
     )
     for axes, (title, values) in zip(panels, quantities, strict=True):
         axes.barh(rows, values, color=LOOKS[name].color, height=0.65)

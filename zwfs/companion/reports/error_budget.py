@@ -43,18 +43,18 @@ def leakage(swept: Mapping[float, BenchCurves]) -> Table:
 
 
 def claims(budget: Curves, swept: Mapping[float, BenchCurves]) -> Table:
-    """Glue the numbers of some errors and of 10 % leakage, and show which errors are the largest."""
+    """Glue the numbers of some errors and of 10 % leakage, and show which errors have the largest effect."""
     offsets, gains, _ = (dict(zip(budget, values, strict=True)) for values in _numbers(budget))
     for case in ("leakage", "focus_difference", "static", "all"):
         glue_numbers({f"offset_{case}": offsets[case], f"gain_{case}": gains[case]})
     glue_numbers({"gain_leakage_10": swept[0.1].gain(NAME)[0] if 0.1 in swept else np.nan})
     alone = [error for error in budget if error not in ("none", "all")]
     return Table(
-        ["question", "answer"],
+        ["quantity", "value"],
         [
-            ["which error makes the largest offset", _words(max(alone, key=lambda error: offsets[error]))],
+            ["error with the largest offset", _words(max(alone, key=lambda error: offsets[error]))],
             [
-                "which error makes the strongest underestimation",
+                "error with the lowest gain",
                 _words(min(alone, key=lambda error: gains[error])),
             ],
             ["gain without any error", f"{gains['none']:.3f}"],

@@ -20,12 +20,13 @@ def claims(
     inside = model.shifted.pupil.inside
     first, second = (float(np.corrcoef(one[inside], other[inside])[0, 1]) for one, other in pairs)
     error = segment_residual(model.pistons(estimate.phase), commanded)
-    glue_numbers({"correlation_first": first, "correlation_second": second})
+    share = error.std() / commanded.std() if commanded.any() else np.nan
+    glue_numbers({"correlation_first": first, "correlation_second": second, "error_share": share})
     return Table(
         ["quantity", "value"],
         [
             ["correlation of measured and modelled, first image", first],
-            ["the same, second image", second],
+            ["correlation of measured and modelled, second image", second],
             ["rms difference of the frames (mean intensity of the pupil)", float(estimate.residual)],
             ["error of the segments (rad rms)", float(error.std())],
             ["points without a unique solution", int(estimate.n_unsolved)],

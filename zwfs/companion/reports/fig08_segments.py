@@ -14,7 +14,9 @@ from zwfs.plots import LOOKS
 
 def claims(numbers: NDArray, errors: Mapping[str, NDArray]) -> Table:
     """Glue and show the error of each reconstructor, (n_segments,) in radian, over the segments' `numbers`."""
-    glue_numbers({"linear_at_08": errors["Linear"].std(), "shifted_at_08": errors["PhaseShifted"].std()})
+    linear, shifted = errors["Linear"], errors["PhaseShifted"]
+    glue_numbers({"linear_at_08": linear.std(), "shifted_at_08": shifted.std()})
+    glue_numbers({"linear_worst": np.abs(linear).max(), "shifted_worst": np.abs(shifted).max()})
     rows = []
     for name, values in errors.items():
         worst = np.abs(values).argmax()

@@ -49,6 +49,11 @@ def reach(curves: BenchCurves, name: str, ratio: float = 0.25) -> float:
     return float(curves.rms[good].max(initial=0.0))
 
 
+def _at(curves: BenchCurves, name: str, rms: float) -> float:
+    """Mean error at one input (rad rms); NaN where that input was not used."""
+    return next(iter(curves.mean(name)[curves.rms == rms]), np.nan)
+
+
 def claims(curves: BenchCurves) -> Table:
     """Glue and show offset, reach and gain of each reconstructor."""
     large = curves.rms >= 0.3
@@ -58,15 +63,26 @@ def claims(curves: BenchCurves) -> Table:
     }
     numbers["arcsine_over_linear"] = round(np.median(alike), 3) if alike.size else np.nan
     numbers |= {f"reach_{short}": reach(curves, name) for short, name in GLUED.items()}
+    numbers["shifted_worst"] = curves.mean("PhaseShifted").max()
+    numbers["largest_input"] = curves.rms.max()
+    numbers["shifted_share_at_01"] = _at(curves, "PhaseShifted", 0.1) / 0.1
+    numbers["saxton_worse_up_to"] = curves.rms[curves.mean("GerchbergSaxton") > curves.mean("Linear")].max(
+        initial=0.0
+    )
     glue_numbers(numbers)
     smallest = np.flatnonzero(curves.rms > 0)[0]
     return Table(
-        ["reconstructor", "offset (rad rms)", "error below 25 % up to (rad rms)", "gain at the smallest input"],
+        [
+            "reconstructor",
+            "error at a flat command (rad rms)",
+            "largest input with an error below 25 % (rad rms)",
+            "gain at the smallest input",
+        ],
         [
             [
                 LOOKS[name].name,
                 f"{curves.mean(name)[0]:.2g}",
-                reach(curves, name) or "nowhere",
+                reach(curves, name) or "none",
                 float(curves.gain(name)[smallest]),
             ]
             for name in curves.residuals

@@ -179,7 +179,7 @@ def start_sleeping_run(project):
     process = subprocess.Popen(
         [sys.executable, "-c", code], cwd=ROOT, stderr=subprocess.DEVNULL, preexec_fn=heed_signals
     )
-    wait_until(lambda: pid.exists() and pid.read_text(), seconds=60)
+    wait_until(lambda: pid.exists() and pid.read_text(), seconds=180)
     return process, int(pid.read_text())
 
 

@@ -10,6 +10,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import time
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -681,16 +682,27 @@ def test_command_explains_itself(tmp_path):
         assert "exit codes:" in shown.stdout
 
 
+# The command with a pause after each chunk: it cannot end before the test stops it.
+SLOW = """
+import sys, time
+from zwfs.frames import __main__ as command
+
+fast = command.reconstruct
+command.reconstruct = lambda *args, **options: fast(*args, **{**options, "progress": lambda *_: time.sleep(0.1)})
+sys.exit(command.main(sys.argv[1:]))
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_command_that_is_stopped_goes_on_to_the_same_bytes(folder, bench, calibration, number):
-    np.save("long.npy", np.concatenate([bench.frames] * 300))
+    np.save("long.npy", np.concatenate([bench.frames] * 40))
     arguments = ["reconstruct", "long.npy", "--calibration", "bench.npz", "-o"]
     reconstruct("long.npy", calibration, "whole.fits", saturation=65535)
-    process = subprocess.Popen([sys.executable, "-m", "zwfs.frames", *arguments, "phase.fits"], cwd=folder)
+    process = subprocess.Popen([sys.executable, "-c", SLOW, *arguments, "phase.fits"], cwd=folder)
     journal = Path(".phase.fits.journal")
     while process.poll() is None and not (journal.exists() and len(journal.read_text().splitlines()) > 2):
-        pass
+        time.sleep(0.01)
     process.send_signal(number)
     expected = -signal.SIGKILL if number == signal.SIGKILL else 130
     assert process.wait() == expected

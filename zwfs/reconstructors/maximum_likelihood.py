@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind, read_only
-from zwfs._information import Information, Response
+from zwfs._information import Inverse, Response
 from zwfs._likelihood import Estimator, Noise, require_information, tangents
 from zwfs._propagator import Propagator, angle, split, square
 from zwfs.modes import check_modes, power_law_screens, zernike_basis
@@ -391,24 +391,69 @@ class MaximumLikelihood(Reconstructor):
         return _Fit(frames, psi, waves, light, cost, coefficients)
 
     def _step(self, fit: _Fit) -> None:
-        """Try one step (`eq-step`) on every frame set; take it where the cost falls.
+        """Try a step (`eq-step`) on every frame set; take it where the cost falls.
+
+        The next step is about the square of this one. Where that square is within the tolerance, the next step is
+        taken at once with the same Hessian. It costs less than a new Hessian, and mostly confirms the solution.
 
         The damping follows Nielsen 1999: it falls the more, the better the quadratic model predicted the cost.
+        """
+        xp = Kind.of(fit.psi).xp
+        hessian = self._hessian(fit)
+        cost = fit.cost
+        better, promised, size = self._try(fit, hessian, fit.n_iterations >= 0)
+        ratio = (cost - fit.cost) / (promised + _NOTHING)
+        cut = xp.clip(1 - (2 * ratio - 1) ** 3, _LEAST_CUT, None)
+        fit.damping = fit.damping * xp.where(better, cut, fit.growth)
+        fit.growth = xp.where(better, _GROWTH + 0 * fit.growth, 2 * fit.growth)
+        last = self.settings.tolerance + 0 * size
+        if self._exact.noise.photons is not None:
+            last = xp.maximum(last, _NEGLIGIBLE / xp.sqrt(hessian.scale))
+        near = (size > last) & (size * size <= last)
+        if xp.any(near):
+            size = xp.where(near, self._try(fit, hessian, near)[2], size)
+        fit.converged = size <= last
+        fit.n_iterations = fit.n_iterations + 1
+
+    def _hessian(self, fit: _Fit) -> _Hessian:
+        """Damped information at the field of a fit."""
+        estimator, kind = self._exact, Kind.of(fit.psi)
+        xp = kind.xp
+        change = tangents(fit.psi, self.settings.model(kind).stop, estimator.unknown_amplitude, xp)
+        information = self._rough.response.information(change, fit.waves, estimator.noise.weights(fit.light))
+        scale = information.scale[:, 0, 0]
+        if estimator.modes is None:
+            absolute = fit.damping[:, np.newaxis, np.newaxis] * information.scale
+            return _Hessian(scale, absolute, information.inverse(absolute))
+        modes = kind.array(estimator.modes)
+        matrix = self._rough.of_modes(information)
+        eye = kind.array(np.eye(modes.shape[0]))
+        absolute = (fit.damping * xp.sum(matrix * eye, axis=(1, 2)) / modes.shape[0])[:, np.newaxis, np.newaxis]
+        return _Hessian(scale, absolute, matrix + absolute * eye)
+
+    def _try(
+        self, fit: _Fit, hessian: _Hessian, some: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.bool_], NDArray, NDArray]:
+        """Take a step on some frame sets, (k,), where the cost falls.
+
+        Returns
+        -------
+        better : array of bool, shape (k,)
+            Whether the cost falls.
+        promised : array, shape (k,)
+            Fall of the cost that the quadratic model promises.
+        size : array, shape (k,), radian rms
+            Length of the step.
         """
         kind, estimator = Kind.of(fit.psi), self._exact
         xp, model = kind.xp, self.settings.model(kind)
         change = tangents(fit.psi, model.stop, estimator.unknown_amplitude, xp)
-        weights, difference = estimator.noise.weights(fit.light), fit.light - fit.frames
-        weighted = difference if weights is None else weights * difference
-        back = model.adjoint(fit.waves * weighted[:, :, np.newaxis, ...])
-        products = change * back[:, np.newaxis, ...]
-        gradient = 2 * (products[:, :, 0, ...] + products[:, :, 1, ...])
-        information = self._rough.response.information(change, fit.waves, weights)
+        gradient = self._gradient(fit, change)
         coefficients = fit.coefficients
         if coefficients is None:
-            step, promised = _points_step(information, gradient, fit.damping)
+            step, promised = _points_step(hessian, gradient)
         else:
-            jump, promised = self._modes_step(information, gradient, coefficients, fit.damping)
+            jump, promised = self._modes_step(hessian, gradient, coefficients)
             coefficients = coefficients + jump
             step = self._of_modes(jump)[:, np.newaxis, ...]
         if estimator.unknown_amplitude:
@@ -418,17 +463,17 @@ class MaximumLikelihood(Reconstructor):
         else:
             psi = split(self._of_modes(coefficients), model.amplitude)
         trial = self._at(psi, coefficients, fit.frames)
-        ratio = (fit.cost - trial.cost) / (promised + _NOTHING)
-        better = trial.cost < fit.cost
-        cut = xp.clip(1 - (2 * ratio - 1) ** 3, _LEAST_CUT, None)
-        fit.damping = fit.damping * xp.where(better, cut, fit.growth)
-        fit.growth = xp.where(better, _GROWTH + 0 * fit.growth, 2 * fit.growth)
+        better = some & (trial.cost < fit.cost)
         fit.take(better, trial, xp)
-        size = xp.sqrt(xp.sum(step * step, axis=(1, 2, 3)) / model.pupil.n_points)
-        fit.converged = size <= self.settings.tolerance
-        if weights is not None:
-            fit.converged = fit.converged | (size <= _NEGLIGIBLE / xp.sqrt(information.scale[:, 0, 0]))
-        fit.n_iterations = fit.n_iterations + 1
+        return better, promised, xp.sqrt(xp.sum(step * step, axis=(1, 2, 3)) / model.pupil.n_points)
+
+    def _gradient(self, fit: _Fit, change: NDArray) -> NDArray:
+        """Half the gradient of the cost for changes of the field (k, c, 2, ny, nx): (k, c, ny, nx)."""
+        weights, difference = self._exact.noise.weights(fit.light), fit.light - fit.frames
+        weighted = difference if weights is None else weights * difference
+        back = self.settings.model(Kind.of(fit.psi)).adjoint(fit.waves * weighted[:, :, np.newaxis, ...])
+        products = change * back[:, np.newaxis, ...]
+        return 2 * (products[:, :, 0, ...] + products[:, :, 1, ...])
 
     def _reflect(self, fit: _Fit) -> None:
         """Try to leave local minima of single points, where frame sets have converged.
@@ -467,22 +512,15 @@ class MaximumLikelihood(Reconstructor):
         part.n_reflections = part.n_reflections + 1
         fit.put(some, part)
 
-    def _modes_step(
-        self, information: Information, gradient: NDArray, coefficients: NDArray, damping: NDArray
-    ) -> tuple[NDArray, NDArray]:
+    def _modes_step(self, hessian: _Hessian, gradient: NDArray, coefficients: NDArray) -> tuple[NDArray, NDArray]:
         """Step of the coefficients, (k, m), and the fall of the cost that it promises, (k,)."""
-        kind = information.constants.kind
-        xp = kind.xp
-        modes = kind.array(self._exact.modes)
-        hessian = self._rough.of_modes(information)
+        kind = Kind.of(gradient)
+        xp, modes = kind.xp, kind.array(self._exact.modes)
         slope = xp.reshape(gradient, (gradient.shape[0], -1)) @ xp.reshape(modes, (modes.shape[0], -1)).T
         if self._exact.precision is not None:
             slope = slope + coefficients @ kind.array(self._exact.precision)
-        eye = kind.array(np.eye(modes.shape[0]))
-        damping = damping * xp.sum(hessian * eye, axis=(1, 2)) / modes.shape[0]
-        damped = hessian + damping[:, np.newaxis, np.newaxis] * eye
-        step = -xp.linalg.solve(damped, slope[..., np.newaxis])[..., 0]
-        return step, xp.vecdot(step, damping[:, np.newaxis] * step - slope)
+        step = -xp.linalg.solve(hessian.inverse, slope[..., np.newaxis])[..., 0]
+        return step, xp.vecdot(step, hessian.damping[:, 0, ...] * step - slope)
 
     def _phase(self, fit: _Fit) -> NDArray:
         """Phase of fits, (k, ny, nx)."""
@@ -614,13 +652,20 @@ class _Slopes(NamedTuple):
         return xp.atan2(xp.sin(slopes), xp.cos(slopes)) @ kind.array(self.inverse).T
 
 
-def _points_step(information: Information, gradient: NDArray, damping: NDArray) -> tuple[NDArray, NDArray]:
+class _Hessian(NamedTuple):
+    """Damped information of k frame sets."""
+
+    scale: NDArray  # (k,), mean over the pupil of the information about the phase
+    damping: NDArray  # (k, 1, 1), added to the diagonal
+    inverse: Inverse | NDArray  # for points; for modes the damped matrices themselves, (k, m, m)
+
+
+def _points_step(hessian: _Hessian, gradient: NDArray) -> tuple[NDArray, NDArray]:
     """Step at every point, (k, c, ny, nx), and the fall of the cost that it promises, (k,)."""
-    xp = information.constants.kind.xp
-    absolute = damping[:, np.newaxis, np.newaxis] * information.scale
+    xp = Kind.of(gradient).xp
     slopes = [gradient[:, c, ...] for c in range(gradient.shape[1])]
-    step = -xp.stack(information.inverse(absolute) @ slopes, axis=1)
-    promised = absolute[..., np.newaxis] * step - gradient
+    step = -xp.stack(hessian.inverse @ slopes, axis=1)
+    promised = hessian.damping[..., np.newaxis] * step - gradient
     return step, xp.sum(step * promised, axis=(1, 2, 3))
 
 

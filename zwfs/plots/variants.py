@@ -85,15 +85,15 @@ def _darkened(figure: Figure) -> Figure:
             parts = [part for part in _PARTS if hasattr(artist, f"get_{part}") and hasattr(artist, f"set_{part}")]
             colors = {part: getattr(artist, f"get_{part}")() for part in parts}  # all, as one may follow another
             for part, color in colors.items():
-                dark = [_dark(one) for one in to_rgba_array(color)]
+                dark = [dark_color(one) for one in to_rgba_array(color)]
                 getattr(artist, f"set_{part}")(dark if np.ndim(color) == 2 else dark[0] if dark else color)
-    ink, grid = map(_dark, ("#000000", "#dddddd"))
+    ink, grid = map(dark_color, ("#000000", "#dddddd"))
     for axes in figure.axes:
         axes.tick_params(which="both", color=ink, labelcolor=ink, grid_color=grid)
     return figure
 
 
-def _dark(color: Any) -> tuple[float, ...]:
+def dark_color(color: Any) -> tuple[float, ...]:
     """Return a colour for a dark ground: grays inverted, others brighter, the dark ones most."""
     *rgb, alpha = to_rgba(color)
     hue, light, saturation = colorsys.rgb_to_hls(*rgb)

@@ -25,13 +25,17 @@ SHORT = {
 }
 
 
-def paper_columns(curve: DiameterCurves) -> dict[str, NDArray]:
-    """Columns of the figure of the paper."""
-    return {
-        "diameter (lambda/D)": curve.diameters,
-        "mean error (rad rms)": curve.mean(ITERATION),
-        "standard deviation (rad rms)": curve.std(ITERATION),
-    }
+def iteration_columns(curves: Mapping[int, DiameterCurves]) -> dict[str, NDArray]:
+    """Columns of the figure of the paper, by the number of iterations; NaN where a curve was not computed."""
+    diameters = next(iter(curves.values())).diameters
+    columns = {"diameter (lambda/D)": diameters}
+    for n, curve in curves.items():
+        computed = np.isin(diameters, curve.diameters)
+        both = {"mean error": curve.mean(ITERATION), "standard deviation": curve.std(ITERATION)}
+        for quantity, values in both.items():
+            column = columns[f"{n} iterations: {quantity} (rad rms)"] = np.full(diameters.size, np.nan)
+            column[computed] = values
+    return columns
 
 
 def limits(curves: Mapping[int, DiameterCurves], threshold: float) -> Table:

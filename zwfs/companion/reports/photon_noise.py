@@ -20,7 +20,7 @@ def columns(curves: PhotonCurves) -> dict[str, NDArray]:
     grid = {
         "input (rad rms)": np.repeat(curves.rms, size[1]),
         "photons per point": np.tile(curves.photons, size[0]),
-        "bound (rad rms)": curves.bound.ravel(),
+        "bound: error (rad rms)": curves.bound.ravel(),
     }
     return grid | {f"{name}: error (rad rms)": curves.error(name).ravel() for name in curves.errors}
 

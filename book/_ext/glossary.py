@@ -1,0 +1,79 @@
+"""Links to the glossary: the first use of each of its terms on a page."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from docutils import nodes
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.transforms import SphinxTransform
+
+GLOSSARY = "book/glossary"
+WITHOUT = {GLOSSARY, "book/api", "book/bibliography", "book/index", "book/notation"}
+TERM = re.compile(r"^(\w.*)\n  \S", re.MULTILINE)
+PROSE = (nodes.paragraph, nodes.emphasis, nodes.strong, nodes.list_item)
+
+
+class LinkTerms(SphinxTransform):
+    """Link the first use of each term in the prose of a page, unless a role ``{term}`` links it."""
+
+    default_priority = 500
+
+    def apply(self) -> None:
+        """Split the texts that use a term."""
+        if self.env.docname in WITHOUT:
+            return
+        source = Path(self.env.doc2path(GLOSSARY))
+        self.env.note_dependency(str(source))
+        by_roles = (xref for xref in self.document.findall(pending_xref) if xref["reftype"] == "term")
+        done = {xref["reftarget"].lower() for xref in by_roles}
+        missing = {term.lower(): term for term in terms(source) if term.lower() not in done}
+        for text in list(self.document.findall(nodes.Text)):
+            if missing and in_prose(text):
+                text.parent.replace(text, list(self.linked(str(text), missing)))
+
+    def linked(self, text: str, missing: dict[str, str]) -> Iterator[nodes.Node]:
+        """Yield the parts of a text, with links to the missing terms, which are missing no longer."""
+        while missing and (found := pattern(missing).search(text)):
+            term = missing.pop(found[1].lower())
+            yield nodes.Text(text[: found.start()])
+            yield pending_xref(
+                "",
+                nodes.inline("", found[0], classes=["xref", "std", "std-term"]),
+                refdomain="std",
+                reftype="term",
+                reftarget=term,
+                refexplicit=True,
+                refwarn=True,
+                refdoc=self.env.docname,
+            )
+            text = text[found.end() :]
+        yield nodes.Text(text)
+
+
+def terms(glossary: Path) -> list[str]:
+    """Return the terms that the page of the glossary defines."""
+    return TERM.findall(glossary.read_text("utf-8").partition("```{glossary}")[2])
+
+
+def pattern(missing: dict[str, str]) -> re.Pattern[str]:
+    """Return the pattern of a term or its plural; a longer term goes before one that it contains."""
+    either = "|".join(re.escape(term) for term in sorted(missing, key=len, reverse=True))
+    return re.compile(rf"(?<![-\w])({either})s?(?![-\w]| sens| shift)", re.IGNORECASE)
+
+
+def in_prose(text: nodes.Text) -> bool:
+    """Whether a text stands in a paragraph, and not in a link, in a table or in the text of another page."""
+    parent = text.parent
+    while isinstance(parent, PROSE):
+        if isinstance(parent, nodes.paragraph):
+            return not isinstance(parent.parent, nodes.entry)
+        parent = parent.parent
+    return False
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Add the links to each page."""
+    app.add_transform(LinkTerms)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

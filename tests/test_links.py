@@ -1,0 +1,49 @@
+"""Links of the book: from equations to code and tests, and from the first use of a term to the glossary."""
+
+import pytest
+from docutils import nodes
+from docutils.utils import new_document
+
+from book._ext import equations, glossary
+
+from .conftest import ROOT
+
+
+def test_equations_lead_to_the_code_that_cites_them_and_to_its_tests():
+    found = equations.implementations(ROOT)
+    assert found["eq-phase-shifted"] == ["zwfs.PhaseShifted"]
+    assert found["eq-reference"] == ["zwfs.ZernikeSensor.reference_wave"], "the method, not its class"
+    assert len(found) >= 25
+    assert equations.tests(ROOT, "zwfs.ZernikeSensor.adjoint") == ["test_sensor.py"]
+    assert equations.tests(ROOT, "zwfs.cramer_rao") == ["test_bounds.py"]
+    for paths in found.values():
+        assert all((ROOT / "tests" / file).is_file() for path in paths for file in equations.tests(ROOT, path))
+
+
+@pytest.mark.parametrize(
+    ("text", "terms"),
+    [
+        ("The reference waves interfere.", ["reference waves"]),
+        ("The wavefront error of a wavefront", ["wavefront error", "wavefront"]),
+        ("A wavefront sensor, a phase shift, and a phase-shifted iteration", []),
+        ("Maximum likelihood, then maximum likelihood", ["Maximum likelihood"]),
+    ],
+)
+def test_terms_are_linked_at_their_first_use(text, terms):
+    names = glossary.terms(ROOT / "book" / "glossary.md")
+    assert len(names) > 25
+    missing, found = {name.lower(): name for name in names}, []
+    while match := glossary.pattern(missing).search(text):
+        del missing[match[1].lower()]
+        found.append(match[0])
+        text = text[match.end() :]
+    assert found == terms
+
+
+def test_titles_tables_and_code_stay_without_links():
+    document = new_document("page")
+    document += nodes.title("", "The phase")
+    document += nodes.paragraph("", "", nodes.literal("", "phase"), nodes.strong("", "the phase"))
+    document += nodes.entry("", nodes.paragraph("", "phase"))
+    prose = [glossary.in_prose(text) for text in document.findall(nodes.Text)]
+    assert prose == [False, False, True, False]

@@ -25,7 +25,9 @@ from zwfs.plots.style import LOOKS, Look
 from zwfs.plots.variants import dark_color
 
 FOLDER = "_static/explore"
-LIBRARY = ("bokeh.min.js", "bokeh-api.min.js")
+LIBRARY = [
+    Path(bokeh.__file__).parent / "server" / "static" / "js" / f"{name}.min.js" for name in ("bokeh", "bokeh-api")
+]
 HEADER = re.compile(r"([^:,]+)[:,] (.+)")  # a column is "NAME: QUANTITY" or "NAME, QUANTITY"
 MEAN, SPREAD = "mean error (rad rms)", "standard deviation (rad rms)"
 INPUT, DIAMETER = "input (rad rms)", "diameter (lambda/D)"
@@ -110,8 +112,9 @@ def button(figure: str) -> list[str]:
     if figure not in FIGURES and figure != MAP:
         return []
     text = "Explore the map" if figure == MAP else "Explore the curves"
-    tag = f'<p class="explore d-print-none"><button type="button" data-explore="{figure}">{text}</button></p>'
-    return ["", "```{raw} html", tag, "```"]
+    size = sum(file.stat().st_size for file in LIBRARY) / 1e6
+    tag = f'<button type="button" data-explore="{figure}">{text}</button> loads {size:.1f} MB'
+    return ["", "```{raw} html", f'<p class="explore d-print-none">{tag}</p>', "```"]
 
 
 def drawing(figure: str, file: Path) -> dict[str, Any]:
@@ -230,8 +233,8 @@ def add_script(app: Sphinx, page: str, template: str, context: dict[str, Any], t
 def write(folder: Path, files: Iterable[Path]) -> None:
     """Write the data of the CSV files of figures to a folder, next to Bokeh."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in LIBRARY:
-        copy_asset_file(Path(bokeh.__file__).parent / "server" / "static" / "js" / name, folder)
+    for script in LIBRARY:
+        copy_asset_file(script, folder)
     for file in files:
         # Browsers block pages from the file system from reading data files.
         text = json.dumps(drawing(file.stem, file), separators=(",", ":"), allow_nan=False)

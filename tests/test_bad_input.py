@@ -26,7 +26,17 @@ import zwfs
 from zwfs.reconstructors.base import Reconstructor
 
 MODULES = (
-    *("pupil", "modes", "masks", "sensor", "detector", "metrics", "reconstructors", "reconstructors.base"),
+    *(
+        "pupil",
+        "modes",
+        "turbulence",
+        "masks",
+        "sensor",
+        "detector",
+        "metrics",
+        "reconstructors",
+        "reconstructors.base",
+    ),
     *("bench.model", "bench.segments", "bench.recording"),
     *("units", "frames.files", "frames.registration", "frames.pipeline", "frames.order", "frames.verdict"),
     *("frames.calibration",),
@@ -43,6 +53,8 @@ INFINITE |= {
     "DiameterCurves.exceeds",
     "phase_noise",
     "Detector.full_well",
+    "structure_function",
+    "turbulent_screens",
     "Detector",
 }
 
@@ -177,6 +189,8 @@ def valid() -> dict:
         "stop": 0.9,
         "threshold": 0.1,
         "rms": 0.2,
+        "r0": 0.2,
+        "separation": np.array([0.1, 0.5]),
         "n_screens": 1,
         "exponent": -2.0,
         "seed": 1,

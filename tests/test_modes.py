@@ -4,6 +4,7 @@ from scipy.special import eval_jacobi
 
 import zwfs
 from zwfs import Pupil, noll_to_nm, power_law_screens, zernike_basis
+from zwfs.modes import fourier_basis, mode_frequencies
 
 # Noll's table I; negative m for the sines.
 NOLL = {1: (0, 0), 2: (1, 1), 3: (1, -1), 4: (2, 0), 5: (2, -2), 6: (2, 2), 7: (3, -1), 8: (3, 1), 9: (3, -3),
@@ -119,6 +120,47 @@ def test_variance_of_the_coefficients_follows_the_power_law(exponent):
     # The logarithm turns the scaling of each screen into an offset that all its modes share.
     level = np.log(coefficients**2).mean(axis=0)
     assert np.polyfit(np.log(orders), level, 1)[0] == pytest.approx(exponent, abs=0.03)
+
+
+@pytest.mark.parametrize("exponent", [-2.0, -11 / 3])
+def test_variance_of_other_modes_follows_their_frequency(exponent):
+    pupil = Pupil.from_amplitude(np.ones((48, 48)))  # where whole cycles are orthogonal
+    modes = fourier_basis(pupil, 120)
+    frequencies = mode_frequencies(pupil, modes)
+    screens = power_law_screens(modes, 1, 2000, exponent, seed=2, frequencies=frequencies)
+    coefficients = pupil.gather(screens) @ pupil.gather(modes).T / pupil.n_points
+    level = np.log(coefficients**2).mean(axis=0)
+    assert np.polyfit(np.log(frequencies), level, 1)[0] == pytest.approx(exponent, abs=0.05)
+
+
+def test_fourier_modes_have_their_frequency(pupil):
+    modes = fourier_basis(pupil, 61)
+    assert len(modes) == 61
+    np.testing.assert_allclose(pupil.rms(modes), 1, rtol=1e-12)
+    assert np.linalg.matrix_rank(pupil.gather(modes)) == 61
+    x, y = np.meshgrid(pupil.x, pupil.y)
+    wave = np.cos(2 * np.pi * (5 * x + 3 * y)) * pupil.inside
+    assert mode_frequencies(pupil, wave[np.newaxis])[0] == pytest.approx(np.hypot(5, 3), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "made", [fourier_basis, lambda p, n: zernike_basis(p, n)[::-1], lambda p, n: zernike_basis(p, n + 3)[3:]]
+)
+def test_modes_of_unknown_order_are_refused(pupil, made):
+    modes = made(pupil, 20)
+    with pytest.raises(ValueError, match="expected their frequencies"):
+        power_law_screens(modes, 1, 1)
+    with pytest.raises(ValueError, match="20 positive numbers"):
+        power_law_screens(modes, 1, 1, frequencies=np.ones(19))
+    power_law_screens(modes, 1, 1, frequencies=mode_frequencies(pupil, modes))
+
+
+@pytest.mark.parametrize("orthonormal", [False, True])
+@pytest.mark.parametrize("n_modes", [1, 2, 4, 30])
+def test_zernike_modes_on_any_pupil_are_known(orthonormal, n_modes):
+    pupil = Pupil.hexagonal(40, n_rings=2, gap=0.02, missing=[1, 9])
+    modes = zernike_basis(pupil, n_modes, orthonormal=orthonormal, dtype=np.float32)
+    assert np.isfinite(power_law_screens(modes, 1, 1, seed=1)).all()
 
 
 def test_coefficients_are_independent(pupil):

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from zwfs import pupil as pupil
     from zwfs import reconstructors as reconstructors
     from zwfs import sensor as sensor
+    from zwfs import turbulence as turbulence
     from zwfs import units as units
 
     __version__: str

@@ -1,4 +1,4 @@
-"""Zernike modes and random phase screens made of them."""
+"""Zernike and Fourier modes, and random phase screens made of modes."""
 
 from __future__ import annotations
 
@@ -112,6 +112,8 @@ def power_law_screens(
     n_screens: int,
     exponent: float = -2.0,
     seed: int | np.random.Generator | np.random.SeedSequence | None = None,
+    *,
+    frequencies: ArrayLike | None = None,
 ) -> NDArray[np.floating]:
     """Random phase screens whose power spectral density falls as a power of the spatial frequency.
 
@@ -123,8 +125,8 @@ def power_law_screens(
     Parameters
     ----------
     modes : array_like, shape (n_modes, ny, nx)
-        Modes in Noll's order from 2 on, of zero mean and unit rms, 0 outside the pupil, as `zernike_basis` gives
-        them.
+        Modes of zero mean and unit rms, 0 outside the pupil. Without `frequencies` they are Zernike modes in
+        Noll's order from 2 on, as `zernike_basis` returns them.
     rms : float, radian
         Every screen is scaled to exactly this rms over the pupil, piston removed.
     n_screens : int
@@ -132,6 +134,9 @@ def power_law_screens(
         Exponent of the power spectral density, in [-20, 20].
     seed : int, Generator or SeedSequence, optional
         Fewer screens from the same integer seed are the first of more.
+    frequencies : array_like, shape (n_modes,), cycles / D, optional
+        Spatial frequency of each mode, for modes in another order, see `mode_frequencies`. The variance of a mode
+        is proportional to its frequency to the power of `exponent`.
 
     Returns
     -------
@@ -141,8 +146,8 @@ def power_law_screens(
     Raises
     ------
     ValueError
-        If the modes are not three-dimensional, empty, not finite, 0 or of different rms, or a number is out of
-        range.
+        If the modes are not three-dimensional, empty, not finite, 0 or of different rms, if they need
+        `frequencies`, or a number is out of range.
 
     References
     ----------
@@ -169,13 +174,102 @@ def power_law_screens(
     n_points = np.einsum("ij,ij->i", flat, flat, dtype=np.float64)
     if not (0 < n_points.min() < np.inf and np.allclose(n_points, n_points[0], rtol=1e-3)):
         raise ValueError("modes have different rms: expected unit rms each, as zernike_basis gives them")
-    orders = np.array([noll_to_nm(j)[0] for j in range(2, len(modes) + 2)])
+    scales = _noll_orders(modes) if frequencies is None else _frequencies(frequencies, len(modes))
     coefficients = rng.standard_normal((n_screens, len(modes)))
-    coefficients *= orders ** (exponent / 2)
+    coefficients *= scales ** (exponent / 2)
     screens = coefficients.astype(modes.dtype) @ flat
     power = np.einsum("ij,ij->i", screens, screens, dtype=np.float64) / n_points[0]
     screens *= (rms / np.sqrt(power)).astype(modes.dtype)[:, np.newaxis]
     return screens.reshape(n_screens, *modes.shape[1:])
+
+
+def _noll_orders(modes: NDArray) -> NDArray[np.float64]:
+    """Radial orders of modes that must be Zernike modes: the first five are polynomials of their order."""
+    y, x = np.nonzero(np.any(modes[:5] != 0, axis=0))
+    u, v = (2 * axis / max(axis.max(initial=1), 1) - 1 for axis in (x, y))
+    orders = np.array([noll_to_nm(j)[0] for j in range(2, len(modes) + 2)], np.float64)
+    for order in (1, 2):
+        first = modes[:5][orders[:5] == order][:, y, x].T
+        terms = np.stack([u**i * v**j for i in range(order + 1) for j in range(order + 1 - i)], axis=-1)
+        basis = np.linalg.qr(terms)[0]
+        if np.linalg.norm(first - basis @ (basis.T @ first)) > 1e-3 * np.linalg.norm(first):
+            raise ValueError(
+                "modes are not Zernike modes in Noll's order: expected their frequencies, such as "
+                "frequencies=mode_frequencies(pupil, modes)"
+            )
+    return orders
+
+
+def _frequencies(values: ArrayLike, n_modes: int) -> NDArray[np.float64]:
+    values = _check.real_map("frequencies", values, n_axes=1)
+    if len(values) != n_modes or values.min() <= 0:
+        raise ValueError(f"frequencies = {_check.shown(values)}: expected {n_modes} positive numbers")
+    return values
+
+
+def fourier_basis(pupil: Pupil, n_modes: int) -> NDArray[np.float64]:
+    """Cosines and sines of whole cycles per D in each direction, by growing frequency.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    n_modes : int
+        Number of modes: a cosine, then a sine, of each frequency.
+
+    Returns
+    -------
+    ndarray, shape (n_modes, ny, nx)
+        0 outside. Each mode has zero mean and unit rms over the points inside.
+
+    Raises
+    ------
+    ValueError
+        If a frequency would exceed half a cycle per pixel.
+
+    Examples
+    --------
+    >>> import zwfs
+    >>> from zwfs.modes import fourier_basis, mode_frequencies
+    >>> pupil = zwfs.Pupil.circular(64)
+    >>> mode_frequencies(pupil, fourier_basis(pupil, 200))[[0, 50, 100, 198]].round(1)
+    array([1.1, 4.1, 5.8, 7.9])
+    """
+    _check.instance("pupil", pupil, Pupil)
+    n_modes = _check.integer("n_modes", n_modes, 1)
+    reach = isqrt(n_modes) + 1
+    # One of each pair of opposite frequencies, whose modes are the same.
+    half = [(u, v) for u in range(reach + 1) for v in range(-reach, reach + 1) if u > 0 or v > 0]
+    half = sorted(half, key=lambda uv: (uv[0] ** 2 + uv[1] ** 2, -uv[0], -uv[1]))[: (n_modes + 1) // 2]
+    highest = max(max(abs(u), abs(v)) for u, v in half)
+    if 2 * highest >= pupil.n_pixels or n_modes >= pupil.n_points:
+        raise ValueError(f"n_modes = {n_modes}: expected fewer on a pupil of {pupil.n_pixels:g} pixels")
+    phases = 2 * np.pi * pupil.points @ np.array(half, float).T
+    values = np.stack([np.cos(phases), np.sin(phases)], axis=-1).reshape(pupil.n_points, -1)[:, :n_modes].T
+    values = values - values.mean(axis=1, keepdims=True)
+    return pupil.scatter(values / values.std(axis=1, keepdims=True), fill=0.0)
+
+
+def mode_frequencies(pupil: Pupil, modes: ArrayLike) -> NDArray[np.float64]:
+    """Spatial frequency of each mode: the rms of its slope over 2 pi times its rms.
+
+    For cosines and sines of one cycle per D it is right to 10 %, for more cycles it is more accurate.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    modes : array_like, shape (n_modes, ny, nx)
+
+    Returns
+    -------
+    ndarray, shape (n_modes,), cycles / D
+    """
+    _check.instance("pupil", pupil, Pupil)
+    values = pupil.scatter(check_modes(pupil, modes))
+    power = np.zeros(len(values))
+    for axis in (-2, -1):
+        slopes = np.diff(values, axis=axis) * pupil.n_pixels
+        power += np.nanmean(slopes**2, axis=(-2, -1))
+    return np.sqrt(power) / (2 * np.pi * np.nanstd(values, axis=(-2, -1)))
 
 
 def check_modes(pupil: Pupil, modes: ArrayLike) -> NDArray[np.float64]:

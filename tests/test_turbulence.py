@@ -1,0 +1,84 @@
+"""Screens of turbulence have the structure function and the Zernike variances of the theory."""
+
+from math import inf
+
+import numpy as np
+import pytest
+
+from zwfs import Pupil, zernike_basis
+from zwfs.turbulence import structure_function, turbulent_screens
+
+
+@pytest.fixture(scope="module")
+def pupil():
+    return Pupil.circular(32)
+
+
+@pytest.fixture(scope="module")
+def kolmogorov(pupil):
+    return turbulent_screens(pupil, r0=1.0, n_screens=3000, seed=1)
+
+
+def test_kolmogorov_is_the_limit_of_a_large_outer_scale():
+    separation = np.array([0.0, 0.01, 0.3, 1.0])
+    expected = 6.88388 * (separation / 0.2) ** (5 / 3)
+    np.testing.assert_allclose(structure_function(separation, 0.2), expected, rtol=1e-5)
+    near = separation < 0.1
+    np.testing.assert_allclose(structure_function(separation[near], 0.2, 1e5), expected[near], rtol=1e-2)
+
+
+def test_an_outer_scale_saturates_at_twice_the_variance():
+    # The integral of 0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) over the plane is 0.0229 (6 pi / 5) (L0 / r0)^(5/3).
+    variance = 0.022896 * 6 * np.pi / 5 * 4 ** (5 / 3)
+    assert structure_function(100.0, 0.5, 2.0) == pytest.approx(2 * variance, rel=1e-4)
+
+
+@pytest.mark.parametrize("outer_scale", [inf, 20.0, 0.6])
+def test_structure_function_of_the_screens(pupil, outer_scale):
+    """At every separation, up to the whole diameter, along axes and diagonals."""
+    screens = turbulent_screens(pupil, 0.3, 2000, outer_scale, seed=2)
+    screens = np.where(pupil.inside, screens, np.nan)
+    for dy, dx in [(0, 1), (1, 1), (0, 5), (8, 8), (16, 0), (20, 18), (0, 30)]:
+        difference = screens[:, dy:, dx:] - screens[:, : 32 - dy, : 32 - dx]
+        expected = structure_function(np.hypot(dy, dx) / 32, 0.3, outer_scale)
+        assert np.nanmean(difference**2) == pytest.approx(expected, rel=0.08)
+
+
+def test_variances_of_noll(pupil, kolmogorov):
+    """Noll 1976, tables I and IV, for D / r0 = 1; the standard error of a variance is 2.6 %."""
+    assert np.mean(pupil.rms(kolmogorov) ** 2) == pytest.approx(1.0299, rel=0.06)
+    modes = pupil.gather(zernike_basis(pupil, 20, orthonormal=True))
+    coefficients = pupil.gather(kolmogorov) @ modes.T / pupil.n_points
+    variances = np.var(coefficients, axis=0)
+    np.testing.assert_allclose(variances[:2], 0.448, rtol=0.1)
+    np.testing.assert_allclose(variances[2:5], 0.0232, rtol=0.1)
+    residuals = np.mean(pupil.rms(kolmogorov) ** 2) - np.cumsum(np.mean(coefficients**2, axis=0))
+    np.testing.assert_allclose(residuals[[1, 2, 4, 9]], [0.134, 0.111, 0.0648, 0.0401], rtol=0.06)
+
+
+def test_screens_scale_with_r0_and_the_seed_decides(pupil):
+    one, half = (turbulent_screens(pupil, r0, 3, 5.0, seed=4) for r0 in (1.0, 0.5))
+    np.testing.assert_allclose(half, one * 2 ** (5 / 6), atol=1e-12)
+    np.testing.assert_array_equal(one[:1], turbulent_screens(pupil, 1.0, 1, 5.0, seed=4))
+    assert not one[:, ~pupil.inside].any()
+    np.testing.assert_allclose(pupil.gather(one).mean(axis=-1), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("n_pixels", [8, 33])
+@pytest.mark.parametrize("outer_scale", [0.2, 1.0, 1.5, 100.0, inf])
+def test_the_embedded_covariance_is_positive(n_pixels, outer_scale, monkeypatch):
+    """Were it not, the clipped eigenvalues would change the structure function."""
+    seen = []
+    real = np.maximum
+    monkeypatch.setattr(np, "maximum", lambda a, b: seen.append(np.min(a)) or real(a, b))
+    turbulent_screens(Pupil.circular(n_pixels), 0.1, 1, outer_scale, seed=0)
+    assert seen[-1] > -1e-9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"r0": 0}, "r0 = 0"), ({"outer_scale": 0.1}, "outer_scale = 0.1"), ({"n_screens": 0}, "n_screens = 0")],
+)
+def test_bad_input_is_named(pupil, change, message):
+    with pytest.raises(ValueError, match=message):
+        turbulent_screens(**{"pupil": pupil, "r0": 0.1, "n_screens": 1} | change)

@@ -237,7 +237,7 @@ def valid() -> dict:
         "extents": np.array([1.0, 2.0]),
         "tolerances": np.array([1e-2, 1e-6]),
         "diameter_curves.make": lambda diameter: {"shifted": method},
-        "own_reconstructor.path": "",
+        "paths": [],
         **dict.fromkeys(("saxton_by_width.reconstructors", "repaired_reconstructors.reconstructors"), paper),
         "sensors": {"shifted": shifted},
         "recovery_curves.rms": np.array([0.1]),

@@ -1,3 +1,7 @@
+import re
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,13 +20,14 @@ from zwfs.paper.linearity import (
     light_lost,
     linearity_curves,
     model_accuracy,
-    own_reconstructor,
+    own_reconstructors,
     paper_reconstructors,
     repaired_reconstructors,
     saxton_by_width,
     screens_at,
 )
 
+ROOT = Path(__file__).parent.parent
 RMS = (0.05, 0.3, 0.6)
 
 
@@ -170,15 +175,15 @@ def own_module(tmp_path, monkeypatch):
 
 def test_an_own_reconstructor_gets_the_sensor_with_its_number_of_masks(own_module, pupil, modes):
     methods = paper_reconstructors(pupil, modes, 1.06, np.pi / 2)
-    [(name, own)] = own_reconstructor(f"{own_module}:Nothing", methods).items()
+    [(name, own)] = own_reconstructors([f"{own_module}:Nothing"], methods).items()
     assert (name, own.sensor.n_masks) == ("Nothing", 1)
-    assert own_reconstructor(f"{own_module}:NothingOfTwo", methods)["NothingOfTwo"].sensor.n_masks == 2
-    assert own_reconstructor("", methods) == {}
+    assert own_reconstructors([f"{own_module}:NothingOfTwo"], methods)["NothingOfTwo"].sensor.n_masks == 2
+    assert own_reconstructors([], methods) == {}
     with parallel_config(n_jobs=1):  # other workers may have started before the module was there
         curves = linearity_curves({name: own}, modes, [0.1, 0.2], 2)
     np.testing.assert_allclose(curves.mean(name), [0.1, 0.2], rtol=1e-3)
     with pytest.raises(ValueError, match="path = 'own_methods:Linear': expected a name other than Linear"):
-        own_reconstructor(f"{own_module}:Linear", methods)
+        own_reconstructors([f"{own_module}:Linear"], methods)
 
 
 def test_paper_reconstructors_take_masks_and_settings(pupil, modes):
@@ -241,3 +246,14 @@ def test_model_is_as_accurate_as_its_tolerance(classic, screens):
         assert error < tolerance
     ranks = [rank for _, rank, _ in rows]
     assert ranks == sorted(set(ranks))
+
+
+def test_the_reconstructor_on_the_page_stands_next_to_the_five(tmp_path):
+    page = (ROOT / "book" / "your_reconstructor.md").read_text("utf-8")
+    [code] = re.findall(r"```python\n(.*?)```", page, re.S)
+    assert len([line for line in code.splitlines() if line.strip()]) <= 30
+    (tmp_path / "flat_reference.py").write_text(code)
+    run = [sys.executable, "flat_reference.py"]
+    printed = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    errors = {name: [float(one) for one in values] for name, *values in map(str.split, printed.splitlines())}
+    assert errors["PhaseShifted"][1] < 0.001 < errors["FlatReference"][1] < errors["Linear"][1]

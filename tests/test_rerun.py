@@ -544,6 +544,18 @@ def test_page_runs_and_embeds_nothing_foreign_even_if_a_notebook_escapes_nothing
 
 
 @pytest.mark.slow
+def test_real_figure_with_a_nested_parameter(tmp_path):
+    target = tmp_path / "figure"
+    bench = {"n_rings": 2, "missing": [], "leakage": 0.1}
+    arguments = ["6", "-p", "n_pixels=40", "-p", f"bench={json.dumps(bench)}", "--output", str(target)]
+    rerun.rerun(Project(ROOT), arguments)
+    assert json.loads((target / rerun.RECORD).read_text())["changed"]["bench"] == bench
+    crate = ROCrate(str(target))
+    assert json.loads(crate.get("#bench")["value"]) == bench
+    assert "n_rings" in (target / "fig06_reference.html").read_text()
+
+
+@pytest.mark.slow
 def test_real_figure_with_other_parameters(tmp_path):
     target = tmp_path / "figure"
     project = Project(ROOT)

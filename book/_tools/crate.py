@@ -1,5 +1,6 @@
 """RO-Crates: descriptions of results that programs can read, next to the files."""
 
+import json
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,10 @@ def describe_rerun(folder: Path, about: dict[str, Any]) -> None:
         for name in sorted(file.name for file in folder.iterdir())
     ]
     software = [_software(crate, name, version) for name, version in about["versions"].items()]
-    values = [_entity(crate, f"#{name}", "PropertyValue", name=name, value=value)
-              for name, value in about["parameters"].items()]  # fmt: skip
+    # A value of a crate is no mapping.
+    plain = {name: json.dumps(value) if isinstance(value, dict) else value
+             for name, value in about["parameters"].items()}  # fmt: skip
+    values = [_entity(crate, f"#{name}", "PropertyValue", name=name, value=value) for name, value in plain.items()]
     run = _entity(crate, "#run", "CreateAction", name=about["command"], endTime=about["made"])
     run["instrument"], run["object"], run["result"] = software, values, files
     crate.root_dataset["mentions"] = run

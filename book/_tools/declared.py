@@ -2,12 +2,15 @@
 
 import ast
 import difflib
+import inspect
 import io
 import math
 import operator
+import re
 import tokenize
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pkgutil import resolve_name
 from typing import Any
 
 from nbformat import NotebookNode
@@ -17,12 +20,14 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event
 
 from zwfs.companion.limits import LIMITS
-from zwfs.companion.parameters import check_parameters
+from zwfs.companion.parameters import Fields, check_parameters
 
 from .project import ToolError, one_line
 
 # A unit is one of these behind the last comma of a parameter's comment; other words there belong to the meaning.
 UNITS = ("rad", "rad rms", "lambda/D", "D", "D²/lambda", "nm", "m", "s", "Hz", "pixels", "electrons", "photons")
+
+UNIT_NAMES = {"radian": "rad", "radian rms": "rad rms", "pixels rms": "pixels", "electrons rms": "electrons"}
 
 # Limits that are types.
 TYPES = {"str": str, "bool": bool}
@@ -65,9 +70,12 @@ class Parameter:
     @property
     def kind(self) -> str:
         """Name of the type for a reader."""
-        if isinstance(self.default, list):
-            return f"list of {type(_scalar(self.limits)).__name__}"
-        return type(self.default).__name__
+        if isinstance(self.limits, Fields):
+            return "mapping"
+        depth, limits = 0, self.limits
+        while isinstance(limits, list):
+            depth, limits = depth + 1, limits[0]
+        return "list of " * depth + type(_scalar(limits)).__name__
 
     @property
     def allowed(self) -> str:
@@ -75,9 +83,34 @@ class Parameter:
         limits = self.limits
         while isinstance(limits, list):
             limits = limits[0]
-        if limits is None or isinstance(limits, type):
+        if limits is None or isinstance(limits, type | Fields):
             return ""
         return ", ".join(limits) if isinstance(limits[0], str) else f"{limits[0]:g} to {limits[1]:.10g}"
+
+    def fields(self) -> dict[str, "Parameter"]:
+        """Return the values of a mapping as parameters, with meanings from the docstring of what takes them."""
+        if not isinstance(self.limits, Fields):
+            return {}
+        of = resolve_name(self.limits.of)
+        defaults = {name: one.default for name, one in inspect.signature(of).parameters.items()}
+        documented = _documented(of)
+        return {
+            name: Parameter(defaults.get(name), *documented.get(name, ("", "")), limit)
+            for name, limit in self.limits.every().items()
+        }
+
+
+def _documented(of: Any) -> dict[str, tuple[str, str]]:
+    """Return meaning, in a sentence, and unit of each parameter in a docstring of numpydoc."""
+    found = {}
+    for names, kind, text in re.findall(
+        r"^([\w, ]+?)(?: : (.*))?\n((?:    .+\n?)+)", inspect.getdoc(of) or "", re.MULTILINE
+    ):
+        sentence = re.split(r"(?<=\w)[.;:](?:\s|$)", " ".join(text.split()))[0]
+        unit = kind.rpartition(",")[2].strip()
+        for name in names.split(", "):
+            found[name] = sentence, unit if unit in UNITS else UNIT_NAMES.get(unit, "")
+    return found
 
 
 def _scalar(limits: Any) -> Any:
@@ -222,6 +255,8 @@ def nearest(name: str, known: Any) -> str:
 
 def _typed(value: Any, limits: Any) -> Any:
     """Return a checked value, with floats in place of integers where the limits are floats."""
+    if isinstance(limits, Fields):
+        return {name: _typed(one, limits.every()[name]) for name, one in value.items()}
     if isinstance(value, list):
         return [_typed(item, limits[0]) for item in value]
     return float(value) if isinstance(_scalar(limits), float) else value

@@ -182,9 +182,12 @@ def _title_cell(notebook: NotebookNode) -> int:
 
 def description(project: Project, name: str) -> str:
     """List the parameters of a notebook."""
-    known = declared.parameters(read(project.source(name)))
+    listed = {}
+    for key, one in declared.parameters(read(project.source(name))).items():
+        listed |= {key: one} | {f"{key}.{field}": value for field, value in one.fields().items()}
     rows = [
-        [key, one.kind, json.dumps(one.default), one.allowed, one.unit, one.meaning] for key, one in known.items()
+        [key, one.kind, "" if one.default is None else json.dumps(one.default), one.allowed, one.unit, one.meaning]
+        for key, one in listed.items()
     ]
     return f"{name}\n\n{table(['parameter', 'type', 'default', 'allowed', 'unit', 'meaning'], rows)}"
 

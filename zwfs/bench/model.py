@@ -87,6 +87,7 @@ class Bench:
         Photons of each image with the mask out, in all the exposures that make a frame: a hundred of 1e8 each, for
         the high signal-to-noise ratio of the paper. 0 for frames without noise.
     read_noise : float, electrons rms
+        Read noise of a pixel.
     background : float, electrons
         Stray light and dark current of a pixel, 7 % of the light of one in the pupil; darks show it.
     seed : int

@@ -4,6 +4,75 @@ from __future__ import annotations
 
 from typing import Any
 
+from zwfs.companion.parameters import Fields
+
+_CUT = {"obstruction": (0.0, 0.9), "vanes": [[(-6.2832, 6.2832)], ...]}
+_RINGS = _CUT | {"n_rings": (1, 50), "gap": (0.0, 0.1), "missing": [(1, 10000), ...], "stop": (0.1, 1.0)}
+_BASIS = {"basis": ("zernike", "fourier")}
+_SETUP = {
+    "pupil": Fields(
+        "zwfs.paper.setups:make_pupil",
+        kinds={
+            "circular": _CUT,
+            "vlt": _CUT,
+            "hexagonal": _RINGS,
+            "keck": _RINGS,
+            "elt": _RINGS,
+            "seal": _RINGS,
+            "file": {"file": str},
+        },
+    ),
+    "screens": Fields(
+        "zwfs.paper.setups:make_screens",
+        _BASIS,
+        {
+            "power_law": {},
+            "kolmogorov": {},
+            "von_karman": {"outer_scale": (0.2, 1e5)},
+            "segments": {},
+            "file": {"file": str},
+        },
+    ),
+    "noise": Fields("zwfs.paper.setups:Noise", {"photons": (0.0, 1e12), "read_noise": (0.0, 1e6)}),
+    "reconstructors": [str, ...],
+}
+
+
+_BENCH = {
+    "n_pixels": (32, 1024),
+    "extent": (1.0, 4.0),
+    "n_rings": (1, 10),
+    "gap": (0.0, 0.2),
+    "missing": [(1, 1000), ...],
+    "stop": (0.1, 1.0),
+    "diameter": (0.1, 8.0),
+    "phase": (0.01, 3.13),
+    "illumination": (0.0, 1.9),
+    "leakage": (0.0, 0.5),
+    "focus_difference": (0.0, 0.01),
+    "misregistration": (0.0, 10.0),
+    "blur": (0.0, 20.0),
+    "flux_imbalance": (-0.9, 0.9),
+    "dimple_error": (-0.9, 10.0),
+    "static": (0.0, 3.0),
+    "quilting": (0.0, 3.0),
+    "photons": (0.0, 1e18),
+    "read_noise": (0.0, 1e6),
+    "background": (0.0, 1e12),
+    "seed": (0, 4294967295),
+    "clear_focus": (-0.01, 0.01),
+    "astigmatism": (-0.01, 0.01),
+    "unmodulated": (0.0, 0.9),
+    "coherent": (0.0, 0.49),
+    "halo": (0.0, 10.0),
+}
+
+
+def _bench(*others: str) -> Fields:
+    """Limits of the fields of the bench, but for those that are parameters of the notebook."""
+    return Fields("zwfs.bench.model:Bench", {name: limit for name, limit in _BENCH.items() if name not in others})
+
+
 _USUAL = {
     "n_pixels": (16, 1024),
     "n_modes": (1, 1000),
@@ -65,7 +134,12 @@ LIMITS: dict[str, dict[str, Any]] = {
         n_angles=(2, 100),
         added=(-1.0, 1.0),
     ),
-    "error_budget": _limits("inputs n_screens n_iterations", n_pixels=(32, 1024), leakages=[(0.0, 0.49), ...]),
+    "error_budget": _limits(
+        "inputs n_screens n_iterations",
+        n_pixels=(32, 1024),
+        leakages=[(0.0, 0.49), ...],
+        bench=_bench("n_pixels"),
+    ),
     "fig01_sensor_layout": _limits("n_pixels diameter rms", phase_shift=(-6.2832, 6.2832)),
     "fig02_vector_sensor": _limits("n_pixels diameter phase_shift rms"),
     "fig03_dynamic_range": _limits(
@@ -73,7 +147,7 @@ LIMITS: dict[str, dict[str, Any]] = {
         "threshold",
         rms_beyond=[(0.0, 4.0), ...],
         extents=[(1.0, 8.0)],
-        own_reconstructor=str,
+        **_SETUP,
     ),
     "fig04_dimple_diameter": _limits(
         "n_pixels phase_shift n_screens exponent n_iterations extent threshold",
@@ -85,16 +159,18 @@ LIMITS: dict[str, dict[str, Any]] = {
         step_fine=(0.01, 0.3),
         n_screens_few=(1, 1000),
         claimed=(0.1, 8.0),
+        **_SETUP,
     ),
-    "fig05_seal_bench": _limits("rms exponent", wavelength=(100.0, 20000.0)),
-    "fig06_reference": _limits(n_pixels=(32, 1024)),
-    "fig07_frames": _limits("rms exponent n_iterations", n_pixels=(32, 1024)),
-    "fig08_segments": _limits("rms exponent n_iterations", n_pixels=(32, 1024)),
+    "fig05_seal_bench": _limits("rms exponent", wavelength=(100.0, 20000.0), bench=_bench()),
+    "fig06_reference": _limits(n_pixels=(32, 1024), bench=_bench("n_pixels")),
+    "fig07_frames": _limits("rms exponent n_iterations", n_pixels=(32, 1024), bench=_bench("n_pixels")),
+    "fig08_segments": _limits("rms exponent n_iterations", n_pixels=(32, 1024), bench=_bench("n_pixels")),
     "fig09_bench_linearity": _limits(
         "rms_max n_rms rms_fine n_screens exponent n_iterations",
         n_pixels=(32, 1024),
         extent=(1.0, 4.0),
         poke=(0.001, 1.5),
+        bench=_bench("n_pixels", "extent"),
     ),
     "identities": _limits(
         "n_pixels n_modes diameter rms inputs n_screens",

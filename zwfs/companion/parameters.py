@@ -3,9 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
 from typing import Any
 
 from zwfs import _check
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Limits of a mapping of arguments to values, any of which may be left out.
+
+    Attributes
+    ----------
+    of : str
+        Path "module:name" of the function or class with these arguments; its docstring gives their meanings.
+    limits : dict
+        Limits of each argument.
+    kinds : dict of dict
+        Limits of more arguments, by the value of the argument "kind"; the first kind is the default.
+    """
+
+    of: str
+    limits: Mapping[str, Any] = field(default_factory=dict)
+    kinds: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def of_kind(self, kind: str) -> dict[str, Any]:
+        """Return the limits of all arguments of a kind."""
+        return ({"kind": tuple(self.kinds), **self.kinds[kind]} if self.kinds else {}) | dict(self.limits)
+
+    def every(self) -> dict[str, Any]:
+        """Return the limits of the arguments of all kinds."""
+        return {name: limit for kind in self.kinds or ("",) for name, limit in self.of_kind(kind).items()}
 
 
 def check_parameters(values: Mapping[str, Any], /, **limits: Any) -> None:
@@ -26,7 +55,8 @@ def check_parameters(values: Mapping[str, Any], /, **limits: Any) -> None:
         - a tuple of str: one of these;
         - ``str`` or ``bool``: any text, or True or False;
         - ``[limits]``: a list of one or more values, each within the limits;
-        - ``[limits, ...]``: the same, or an empty list.
+        - ``[limits, ...]``: the same, or an empty list;
+    - `Fields`: a mapping of known names to values within their limits.
 
     Raises
     ------
@@ -58,6 +88,8 @@ def _check_value(name: str, value: Any, limit: Any) -> None:
                 raise ValueError(f"{name} = {value!r}: expected at least one value")
             for index, item in enumerate(value):
                 _check_value(f"{name}[{index}]", item, within)
+        case Fields():
+            _check_fields(name, value, limit)
         case (str(), *_) if all(isinstance(choice, str) for choice in limit):
             if value not in limit:
                 error = ValueError if isinstance(value, str) else TypeError
@@ -70,3 +102,20 @@ def _check_value(name: str, value: Any, limit: Any) -> None:
             raise TypeError(
                 f"limits of {name} = {limit!r}: expected (low, high), strings, a type, or a list of one of these"
             )
+
+
+def _check_fields(name: str, values: Any, fields: Fields) -> None:
+    if not isinstance(values, Mapping):
+        raise TypeError(f"{name} = {values!r}: expected a mapping, as in {{{', '.join(fields.every())}}}")
+    if "kind" in values and fields.kinds:
+        _check_value(f"{name}.kind", values["kind"], tuple(fields.kinds))
+    kind = values.get("kind", next(iter(fields.kinds), ""))
+    known = fields.of_kind(kind)
+    for key, value in values.items():
+        if key not in known:
+            similar = get_close_matches(str(key), known, n=1)
+            expected = f"did you mean {similar[0]!r}?" if similar else f"expected one of {', '.join(known)}"
+            raise ValueError(
+                f"unknown parameter {f'{name}.{key}'!r}{f' of kind {kind!r}' if kind else ''}: {expected}"
+            )
+        _check_value(f"{name}.{key}", value, known[key])

@@ -12,7 +12,7 @@ estimate before, and keeps its phase: the phase shifts drop out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,8 @@ from zwfs.lowrank import factorise
 from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error, wrapped_residual
 from zwfs.paper.curves import ErrorCurves, crossing
-from zwfs.paper.linearity import check_reconstructors, paper_reconstructors
+from zwfs.paper.linearity import check_reconstructors, own_reconstructors, paper_reconstructors
+from zwfs.paper.setups import NOISELESS, Noise
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
@@ -67,7 +68,12 @@ class DiameterCurves(ErrorCurves):
 
 
 def diameter_curves(
-    make: Callable[[float], Mapping[str, Any]], diameters: ArrayLike, screens: NDArray
+    make: Callable[[float], Mapping[str, Any]],
+    diameters: ArrayLike,
+    screens: NDArray,
+    *,
+    noise: Noise = NOISELESS,
+    seed: int = 0,
 ) -> DiameterCurves:
     """Errors of reconstructors on the same screens for dimples of several diameters: the experiment of Figure 4.
 
@@ -79,6 +85,10 @@ def diameter_curves(
         `make(diameter)` returns reconstructors by name, for sensors with dimples of that diameter (lambda/D).
     diameters : array_like, shape (n_diameters,), lambda/D
     screens : ndarray, shape (n_screens, ny, nx), radian
+    noise : Noise
+        Of the camera.
+    seed : int
+        Of the noise, which is the same at all diameters.
 
     Returns
     -------
@@ -96,7 +106,9 @@ def diameter_curves(
     _check.function("make", make)
     diameters = _check_diameters(diameters)
     screens = _check.screens("screens", screens)
-    points = sweeps.run(_diameter_point, diameters.tolist(), make, screens, name="diameter_curves")
+    _check.instance("noise", noise, Noise)
+    seed = _check.integer_seed("seed", seed)
+    points = sweeps.run(_diameter_point, diameters.tolist(), make, screens, noise, seed, name="diameter_curves")
     rms, errors = zip(*points, strict=True)
     return DiameterCurves(
         np.array(rms), {name: np.array([point[name] for point in errors]) for name in errors[0]}, diameters
@@ -104,7 +116,7 @@ def diameter_curves(
 
 
 def _diameter_point(
-    diameter: float, make: Callable[[float], Mapping[str, Any]], screens: NDArray
+    diameter: float, make: Callable[[float], Mapping[str, Any]], screens: NDArray, noise: Noise, seed: int
 ) -> tuple[float, dict[str, NDArray[np.floating]]]:
     """One diameter of the curves: rms of the screens, and errors on each of them, (n_screens,)."""
     reconstructors = make(diameter)
@@ -113,7 +125,7 @@ def _diameter_point(
     for name, reconstructor in reconstructors.items():
         sensor = reconstructor.sensor
         screens = _check.screens("screens", screens, sensor.pupil)
-        estimate = reconstructor(sensor.measure(screens))
+        estimate = reconstructor(noise(sensor, screens, seed))
         errors[name] = reconstruction_error(sensor.pupil, estimate.phase, screens)
     return float(np.mean(sensor.pupil.rms(screens))), errors
 
@@ -128,29 +140,42 @@ def sampled_diameters(step: float, diameter_max: float, step_fine: float) -> NDA
 
 
 def iteration_curves(
-    pupil: Pupil, phase_shift: float, n_iterations: int, diameters: ArrayLike, screens: NDArray
+    pupil: Pupil, phase_shift: float, n_iterations: int, diameters: ArrayLike, screens: NDArray, **noise: Any
 ) -> DiameterCurves:
-    """Errors of the phase-shifted iteration, without an early stop; see `diameter_curves`."""
+    """Errors of the phase-shifted iteration, without an early stop; `noise` and `seed` as in `diameter_curves`."""
     phase_shift = _check.number("phase_shift", phase_shift, 0.01, 3.13)
 
     def make(diameter: float) -> dict[str, Any]:
         sensor = ZernikeSensor(pupil, Dimple(diameter, phase_shift), Dimple(diameter, -phase_shift))
         return {"PhaseShifted": PhaseShifted(sensor, n_iterations=n_iterations, tolerance=0.0)}
 
-    return diameter_curves(make, diameters, screens)
+    return diameter_curves(make, diameters, screens, **noise)
 
 
 def other_curves(
-    pupil: Pupil, modes: NDArray, phase_shift: float, screens: NDArray, **settings: Any
+    pupil: Pupil,
+    modes: NDArray,
+    phase_shift: float,
+    screens: NDArray,
+    *,
+    own: Sequence[str] = (),
+    noise: Noise = NOISELESS,
+    seed: int = 0,
+    **settings: Any,
 ) -> DiameterCurves:
-    """Errors of the other methods, at few diameters; settings are those of `paper_reconstructors`."""
+    """Errors of the other methods, at few diameters.
+
+    Settings are those of `paper_reconstructors`, `own` are the paths of `own_reconstructors`. See
+    `diameter_curves` for `noise` and `seed`.
+    """
 
     def make(diameter: float) -> dict[str, Any]:
         methods = paper_reconstructors(pupil, modes, diameter, phase_shift, **settings)
+        methods |= own_reconstructors(own, methods)
         del methods["PhaseShifted"]
         return methods
 
-    return diameter_curves(make, FEW, screens)
+    return diameter_curves(make, FEW, screens, noise=noise, seed=seed)
 
 
 class DimpleLight:

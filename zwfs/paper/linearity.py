@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cProfile
 import pstats
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error, strehl
 from zwfs.modes import power_law_screens
 from zwfs.paper.curves import ErrorCurves
+from zwfs.paper.setups import NOISELESS, Noise, Screens
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import (
     Arcsine,
@@ -54,11 +55,17 @@ class LinearityCurves(ErrorCurves):
 
 
 def screens_at(
-    modes: NDArray, rms: float, n_screens: int, seed: int, task: int, exponent: float = -2.0
+    modes: NDArray | Screens, rms: float, n_screens: int, seed: int, task: int, exponent: float = -2.0
 ) -> NDArray[np.floating]:
-    """Screens of one task of an experiment: they depend on the seed and the task's number, not on the order."""
+    """Screens of one task of an experiment: they depend on the seed and the task's number, not on the order.
+
+    `modes` are Zernike modes of power-law screens, or a source of screens, such as `make_screens` returns.
+    """
     seed, task = _check.integer_seed("seed", seed), _check.integer("task", task, 0)
-    return power_law_screens(modes, rms, n_screens, exponent, np.random.SeedSequence(seed, spawn_key=(task,)))
+    sequence = np.random.SeedSequence(seed, spawn_key=(task,))
+    if isinstance(modes, Screens):
+        return modes(rms, n_screens, sequence)
+    return power_law_screens(modes, rms, n_screens, exponent, sequence)
 
 
 def check_rms(rms: ArrayLike) -> NDArray[np.floating]:
@@ -168,35 +175,38 @@ def repaired_reconstructors(reconstructors: Mapping[str, Any]) -> dict[str, Any]
     }
 
 
-def own_reconstructor(path: str, reconstructors: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a reader's reconstructor by the name of its class, for a sensor of the paper's reconstructors.
+def own_reconstructors(paths: Sequence[str], reconstructors: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a reader's reconstructors by the names of their classes, for sensors of the paper's reconstructors.
 
-    The class is that of `path`, "module:Class", see `zwfs.reconstructors.base.load`; there is none if `path` is
-    empty. It is called with the sensor of one dimple if its `n_masks` is 1, else with that of two.
+    Each path is "module:Class", see `zwfs.reconstructors.base.load`. A class is called with the sensor of one
+    dimple if its `n_masks` is 1, else with that of two.
 
     Raises
     ------
     TypeError, ValueError
-        If the path leads to no class of a reconstructor, or its name is one of `reconstructors`.
+        If a path leads to no class of a reconstructor, or its name is one of `reconstructors`.
     """
     check_reconstructors(reconstructors)
-    if isinstance(path, str) and not path:
-        return {}
-    method = load(path)
-    if method.__name__ in reconstructors:
-        raise ValueError(f"path = {path!r}: expected a name other than {', '.join(reconstructors)}")
-    like = "Arcsine" if getattr(method, "n_masks", 2) == 1 else "PhaseShifted"
-    return {method.__name__: method(reconstructors[like].sensor)}
+    _check.sequence("paths", paths, expected="a list of 'module:Class'")
+    own: dict[str, Any] = {}
+    for path in paths:
+        method = load(path)
+        if method.__name__ in {**reconstructors, **own}:
+            raise ValueError(f"path = {path!r}: expected a name other than {', '.join([*reconstructors, *own])}")
+        like = "Arcsine" if getattr(method, "n_masks", 2) == 1 else "PhaseShifted"
+        own[method.__name__] = method(reconstructors[like].sensor)
+    return own
 
 
 def linearity_curves(
     reconstructors: Mapping[str, Any],
-    modes: NDArray,
+    modes: NDArray | Screens,
     rms: ArrayLike,
     n_screens: int,
     *,
     exponent: float = -2.0,
     seed: int = 0,
+    noise: Noise = NOISELESS,
 ) -> LinearityCurves:
     """Error of reconstructors on random screens of growing rms: the experiment of section 4.1.
 
@@ -208,14 +218,16 @@ def linearity_curves(
     reconstructors : mapping of str to reconstructor
         For sensors on the same pupil. Anything with a `sensor` counts that takes the frames of that sensor and
         returns an object with `phase`, (n_screens, ny, nx), and `converged`, (n_screens,).
-    modes : ndarray, shape (n_modes, ny, nx)
-        Modes that the screens are made of.
+    modes : ndarray, shape (n_modes, ny, nx), or Screens
+        Zernike modes that the screens are made of, or a source of screens.
     rms : array_like, shape (n_rms,), radian rms
     n_screens : int
         Screens for each rms.
     exponent : float
-        Exponent of the power spectral density of the screens.
+        Exponent of the power spectral density of the screens; a source of screens has its own.
     seed : int
+    noise : Noise
+        Of the camera; reconstructors with the same sensor see the same frames.
 
     Returns
     -------
@@ -230,7 +242,8 @@ def linearity_curves(
     exponent = _check.number("exponent", exponent)
     seed = _check.integer_seed("seed", seed)
     check_reconstructors(reconstructors)
-    shared = dict(reconstructors), modes, n_screens, exponent, seed
+    _check.instance("noise", noise, Noise)
+    shared = dict(reconstructors), modes, n_screens, exponent, seed, noise
     points = sweeps.run(_linearity_point, enumerate(rms.tolist()), *shared, name="linearity_curves")
     errors, converged, *light = zip(*points, strict=True)
     return LinearityCurves(
@@ -244,10 +257,11 @@ def linearity_curves(
 def _linearity_point(
     point: tuple[int, float],
     reconstructors: Mapping[str, Any],
-    modes: NDArray,
+    modes: NDArray | Screens,
     n_screens: int,
     exponent: float,
     seed: int,
+    noise: Noise,
 ) -> tuple[dict[str, NDArray], dict[str, NDArray], NDArray, NDArray, NDArray]:
     """One input of the linearity curves: errors, converged, wrapped, folded and Strehl, (n_screens,) each."""
     task, rms = point
@@ -256,7 +270,8 @@ def _linearity_point(
     phase = pupil.gather(screens)
     errors, converged = {}, {}
     for name, reconstructor in reconstructors.items():
-        estimate = reconstructor(reconstructor.sensor.measure(screens))
+        drawn = np.random.SeedSequence(seed, spawn_key=(task, 0))
+        estimate = reconstructor(noise(reconstructor.sensor, screens, drawn))
         errors[name] = reconstruction_error(pupil, estimate.phase, screens)
         converged[name] = estimate.converged
     wrapped, folded = np.mean(np.abs(phase) > np.pi, axis=-1), np.mean(phase < -np.pi / 4, axis=-1)
@@ -296,12 +311,10 @@ def iteration_errors(
 
 def saxton_by_width(
     reconstructors: Mapping[str, Any],
-    modes: NDArray,
+    modes: NDArray | Screens,
     extents: ArrayLike,
     n_screens: int,
-    *,
-    exponent: float = -2.0,
-    seed: int = 0,
+    **settings: Any,
 ) -> tuple[dict[str, GerchbergSaxton], LinearityCurves]:
     """Error of variants of Gerchberg-Saxton on detectors of several widths, and of the linear method.
 
@@ -312,7 +325,7 @@ def saxton_by_width(
     ----------
     reconstructors : mapping of str to reconstructor
         With "Linear" and "GerchbergSaxton", whose masks and settings the variants have.
-    modes, n_screens, exponent, seed
+    modes, n_screens, **settings
         As for `linearity_curves`.
     extents : array_like, shape (n_extents,), pupil diameters
 
@@ -339,7 +352,7 @@ def saxton_by_width(
         for extent, unmeasured, n in chosen
     }
     methods, inputs = {"Linear": reconstructors["Linear"], **variants}, [0.1, 0.2, 0.3, 0.5, 0.8]
-    return variants, linearity_curves(methods, modes, inputs, n_screens, exponent=exponent, seed=seed)
+    return variants, linearity_curves(methods, modes, inputs, n_screens, **settings)
 
 
 def light_lost(sensor: ZernikeSensor) -> float:

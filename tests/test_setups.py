@@ -1,0 +1,151 @@
+"""Pupils, screens and noise that nested parameters choose: the paper's by default, and what they say otherwise."""
+
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from book._tools import declared
+from book._tools.notebook import read
+from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, zernike_basis
+from zwfs.bench.model import Bench
+from zwfs.companion.limits import LIMITS
+from zwfs.companion.parameters import Fields, check_parameters
+from zwfs.paper.linearity import linearity_curves, screens_at
+from zwfs.paper.setups import PUPILS, SCREENS, Noise, make_pupil, make_screens
+
+NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
+NESTED = [(name, key) for name, limits in LIMITS.items() for key, one in limits.items() if isinstance(one, Fields)]
+
+
+def default(name):
+    known = declared.parameters(read(NOTEBOOKS / f"{name}.ipynb"))
+    return {key: one.default for key, one in known.items()}
+
+
+@pytest.mark.parametrize("name", ["fig03_dynamic_range", "fig04_dimple_diameter"])
+def test_defaults_are_those_of_the_paper(name):
+    """A circular pupil, a power law of Zernike modes, no noise: bit for bit, so that no stored output moves."""
+    chosen = default(name)
+    pupil = make_pupil(40, **chosen["pupil"])
+    plain = Pupil.circular(40)
+    np.testing.assert_array_equal(pupil.amplitude, plain.amplitude)
+    source = make_screens(pupil, 30, -2.0, **chosen["screens"])
+    np.testing.assert_array_equal(source.modes, zernike_basis(plain, 30))
+    expected = power_law_screens(zernike_basis(plain, 30), 0.5, 2, -2.0, np.random.SeedSequence(7, spawn_key=(3,)))
+    np.testing.assert_array_equal(screens_at(source, 0.5, 2, 7, 3), expected)
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2))
+    np.testing.assert_array_equal(Noise(**chosen["noise"])(sensor, expected, 1), sensor.measure(expected))
+    assert chosen["reconstructors"] == []
+
+
+@pytest.mark.parametrize("kind", [kind for kind in PUPILS if kind != "file"])
+def test_pupils_of_every_kind_carry_modes(kind):
+    pupil = make_pupil(64, kind)
+    assert len(zernike_basis(pupil, 100)) == 100
+    if kind not in ("circular", "hexagonal"):
+        assert pupil.n_points < make_pupil(64).n_points
+
+
+def test_a_change_is_made_to_the_preset():
+    seal, whole = make_pupil(64, "seal"), make_pupil(64, "seal", missing=[])
+    assert set(np.unique(whole.segments)) - set(np.unique(seal.segments)) == {21}
+    assert (whole.segments == Pupil.hexagonal(64, 3, 0.015, (), 0.78).segments).all()
+    cut = make_pupil(64, "seal", obstruction=0.5)
+    x, y = np.meshgrid(cut.x, cut.y)
+    assert not cut.inside[np.hypot(x, y) < 0.25].any()
+
+
+@pytest.mark.parametrize("kind", [kind for kind in SCREENS if kind != "file"])
+@pytest.mark.parametrize("basis", ["zernike", "fourier"])
+def test_screens_of_every_kind_have_the_rms_and_the_seed_decides(kind, basis):
+    pupil = make_pupil(32, "hexagonal")
+    source = make_screens(pupil, 20, -2.0, kind=kind, basis=basis)
+    screens = source(0.4, 3, 1)
+    np.testing.assert_allclose(pupil.rms(screens), 0.4, rtol=1e-9)
+    np.testing.assert_array_equal(screens, source(0.4, 3, 1))
+    assert not np.allclose(screens, source(0.4, 3, 2))
+    if kind == "segments":
+        assert len(np.unique(screens[0].round(12))) <= 38
+
+
+def test_a_file_gives_pupil_and_screens(tmp_path):
+    image = np.clip(np.add.outer(np.arange(20.0), np.arange(20.0)), 3, None)
+    np.save(tmp_path / "pupil.npy", image)
+    pupil = make_pupil(20, "file", file=str(tmp_path / "pupil.npy"))
+    np.testing.assert_allclose(pupil.amplitude / pupil.amplitude.max(), image / image.max())
+    with pytest.raises(ValueError, match="expected n_pixels = 24"):
+        make_pupil(24, "file", file=str(tmp_path / "pupil.npy"))
+    maps = np.random.default_rng(1).normal(size=(4, 20, 20))
+    np.save(tmp_path / "screens.npy", maps)
+    inside = Pupil.circular(20)
+    source = make_screens(inside, 5, -2.0, kind="file", file=str(tmp_path / "screens.npy"))
+    drawn = inside.gather(source(0.3, 4, 1))
+    correlation = np.corrcoef(drawn, inside.gather(maps))[:4, 4:]
+    assert sorted(correlation.argmax(axis=1)) == [0, 1, 2, 3]
+    with pytest.raises(ValueError, match="at most the 4"):
+        source(0.3, 5, 1)
+
+
+def test_noise_is_that_of_the_photons():
+    pupil = make_pupil(32)
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
+    phase, photons, read_noise = np.zeros((200, *pupil.shape)), 2000.0, 10.0
+    frames = pupil.gather(Noise(photons, read_noise)(sensor, phase, 1))
+    each = photons / 2
+    mean = pupil.gather(sensor.measure(phase[0]))
+    assert np.mean(frames.var(axis=0) / (mean / each + (read_noise / each) ** 2)) == pytest.approx(1, abs=0.02)
+    with pytest.raises(ValueError, match=r"noise.read_noise = 1 with photons = 0"):
+        Noise(read_noise=1.0)
+
+
+def test_noise_reaches_the_curves_and_sensors_share_it():
+    pupil = make_pupil(24)
+    source = make_screens(pupil, 8, -2.0)
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
+    methods = {"one": PhaseShifted(sensor), "same": PhaseShifted(sensor), "linear": Linear(sensor, source.modes)}
+    noisy = linearity_curves(methods, source, [0.1, 0.2], 2, seed=1, noise=Noise(100.0))
+    clean = linearity_curves(methods, source, [0.1, 0.2], 2, seed=1)
+    assert (noisy.mean("one") > 10 * clean.mean("one")).all()
+    np.testing.assert_array_equal(noisy.errors["one"], noisy.errors["same"])
+
+
+def test_segments_need_a_segmented_pupil():
+    with pytest.raises(ValueError, match="two or more segments"):
+        make_screens(make_pupil(24), 8, -2.0, kind="segments")
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "message"),
+    [
+        ({"obstruction": 1.2}, ValueError, r"pupil.obstruction = 1.2: expected a finite number in \[0, 0.9\]"),
+        ({"obstuction": 0.2}, ValueError, "'pupil.obstuction' of kind 'circular': did you mean 'obstruction'"),
+        ({"gap": 0.01}, ValueError, "unknown parameter 'pupil.gap' of kind 'circular'"),
+        ({"kind": "keck", "missing": [1, 0]}, ValueError, r"pupil.missing\[1\] = 0"),
+        ({"kind": "kek"}, ValueError, "pupil.kind = 'kek': expected one of 'circular'"),
+        ({"kind": ["keck"]}, TypeError, "pupil.kind = "),
+        ({"vanes": [[0.0, "a"]]}, TypeError, r"pupil.vanes\[0\]\[1\] = 'a'"),
+        ([], TypeError, r"pupil = \[\]: expected a mapping"),
+    ],
+)
+def test_a_bad_nested_value_is_refused_with_its_path(values, error, message):
+    with pytest.raises(error, match=message):
+        check_parameters({"pupil": values}, pupil=LIMITS["fig03_dynamic_range"]["pupil"])
+
+
+@pytest.mark.parametrize(("name", "key"), NESTED)
+def test_every_field_is_listed_with_a_meaning_and_its_default_is_allowed(name, key):
+    parameter = declared.parameters(read(NOTEBOOKS / f"{name}.ipynb"))[key]
+    for field, one in parameter.fields().items():
+        assert one.meaning, field
+        if one.default not in (None, "", inspect.Parameter.empty):
+            value = list(one.default) if isinstance(one.default, tuple) else one.default
+            check_parameters({field: value}, **{field: one.limits})
+
+
+@pytest.mark.parametrize("name", [name for name, limits in LIMITS.items() if "bench" in limits])
+def test_every_field_of_the_bench_is_a_parameter(name):
+    known = set(inspect.signature(Bench).parameters)
+    assert set(LIMITS[name]["bench"].every()) | set(LIMITS[name]) >= known
+    assert default(name)["bench"] == {}

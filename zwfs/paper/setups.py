@@ -1,0 +1,260 @@
+"""Pupils, screens and noise that the nested parameters of a notebook choose, such as ``pupil={"kind": "vlt"}``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zwfs import _check
+from zwfs.detector import Detector
+from zwfs.frames._fits import fits_module
+from zwfs.frames.files import read
+from zwfs.modes import fourier_basis, mode_frequencies, power_law_screens, zernike_basis
+from zwfs.pupil import Pupil
+from zwfs.sensor import ZernikeSensor
+from zwfs.turbulence import turbulent_screens
+
+_CROSS = [[0.785, 0.005], [2.356, 0.005], [3.927, 0.005], [5.498, 0.005]]
+_STAR = [[0.524 + 1.0472 * n, 0.013] for n in range(6)]
+
+PUPILS: dict[str, dict[str, Any]] = {
+    "circular": {},
+    "vlt": {"obstruction": 0.14, "vanes": _CROSS},
+    "hexagonal": {"n_rings": 3},
+    "keck": {"n_rings": 3, "missing": [1], "obstruction": 0.24},
+    "elt": {"n_rings": 17, "missing": list(range(1, 62)), "stop": 0.93, "vanes": _STAR},
+    "seal": {"n_rings": 3, "gap": 0.015, "missing": [21], "stop": 0.78},
+    "file": {},
+}
+"""Kinds of pupils, with the arguments of `make_pupil` that differ from its defaults.
+
+Those of telescopes are approximate: a vane narrower than a pixel may fall between the samples.
+"""
+
+
+def make_pupil(n_pixels: int, kind: str = "circular", **changes: Any) -> Pupil:
+    """Pupil of a kind, see `PUPILS`.
+
+    Parameters
+    ----------
+    n_pixels : int, pixels
+        Samples across D.
+    kind : str
+        Kind of the pupil; the other parameters change its values.
+    obstruction : float, D
+        Diameter of the central obscuration.
+    vanes : list of [angle, width]
+        Spider vanes from the centre to the edge: angle (rad) and width (D).
+    n_rings : int
+        Rings of segments around the central one.
+    gap : float, D
+        Width of the gaps between segments.
+    missing : list of int
+        Numbers of the missing segments.
+    stop : float
+        Diameter of the stop over that of the circle around all segments.
+    file : str
+        FITS or NPY file of the field amplitude; its longer side has `n_pixels`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of the wrong kind or out of range, or the file has another number of pixels.
+
+    Examples
+    --------
+    >>> from zwfs.paper.setups import make_pupil
+    >>> make_pupil(64, "keck", missing=[1, 20]).segments.max()
+    np.int64(37)
+    """
+    _check.choice("kind", kind, PUPILS)
+    values = PUPILS[kind] | changes
+    cut = {"obstruction": values.pop("obstruction", 0.0), "vanes": values.pop("vanes", ())}
+    window = Pupil.circular(n_pixels, cut["obstruction"], [tuple(vane) for vane in cut["vanes"]])
+    if kind == "file":
+        return _pupil_of_file(n_pixels, **values)
+    if "n_rings" not in values:
+        return window
+    segments = Pupil.hexagonal(n_pixels, **values).segments
+    return Pupil.from_segments(np.where(window.inside, segments, 0))
+
+
+def _pupil_of_file(n_pixels: int, file: str = "") -> Pupil:
+    image = read(file).images[0]
+    if max(image.shape) != n_pixels:
+        raise ValueError(f"{file} is {max(image.shape)} pixels wide: expected n_pixels = {n_pixels}")
+    return Pupil.from_amplitude(image)
+
+
+@dataclass(frozen=True)
+class Screens:
+    """Random screens of a kind, each scaled to an rms; made by `make_screens`.
+
+    Attributes
+    ----------
+    pupil : Pupil
+    modes : ndarray, shape (n_modes, ny, nx)
+        Modes of the screens of kind "power_law", and of the modal reconstructors.
+    kind : str
+    exponent : float
+        Exponent of the power spectral density of the screens of kinds "power_law" and "segments".
+    outer_scale : float, D
+        Outer scale of the screens of kind "von_karman".
+    frequencies : ndarray, shape (n_modes,), cycles / D, optional
+        Of modes other than Zernike modes.
+    recorded : ndarray, shape (n, ny, nx), optional
+        Screens of kind "file".
+    """
+
+    pupil: Pupil
+    modes: NDArray
+    kind: str
+    exponent: float
+    outer_scale: float = inf
+    frequencies: NDArray | None = None
+    recorded: NDArray | None = None
+
+    def __call__(self, rms: float, n_screens: int, seed: Any) -> NDArray[np.floating]:
+        """Return screens of an rms (radian), shape (n_screens, ny, nx), 0 outside the pupil."""
+        if self.kind == "power_law":
+            return power_law_screens(self.modes, rms, n_screens, self.exponent, seed, frequencies=self.frequencies)
+        values = self.pupil.gather(self._shapes(n_screens, seed))
+        values = values - values.mean(axis=-1, keepdims=True)
+        return self.pupil.scatter(values * (rms / values.std(axis=-1, keepdims=True)), fill=0.0)
+
+    def _shapes(self, n_screens: int, seed: Any) -> NDArray:
+        """Screens before they are scaled."""
+        if self.recorded is not None:
+            if n_screens > len(self.recorded):
+                raise ValueError(f"n_screens = {n_screens}: expected at most the {len(self.recorded)} of the file")
+            return self.recorded[np.random.default_rng(seed).permutation(len(self.recorded))[:n_screens]]
+        if self.kind == "segments":
+            smooth = power_law_screens(
+                self.modes, 1.0, n_screens, self.exponent, seed, frequencies=self.frequencies
+            )
+            numbers = self.pupil.gather(self.pupil.segments)
+            members = (numbers == np.unique(numbers)[:, np.newaxis]).astype(float)
+            means = self.pupil.gather(smooth) @ (members / members.sum(axis=1, keepdims=True)).T
+            return self.pupil.scatter(means @ members)
+        return turbulent_screens(self.pupil, 1.0, n_screens, self.outer_scale, seed)
+
+
+def make_screens(
+    pupil: Pupil,
+    n_modes: int,
+    exponent: float,
+    kind: str = "power_law",
+    basis: str = "zernike",
+    outer_scale: float = 10.0,
+    file: str = "",
+) -> Screens:
+    """Source of random screens of a kind.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    n_modes : int
+        Number of modes of the basis.
+    exponent : float
+        Exponent of the power spectral density of the kinds "power_law" and "segments".
+    kind : str
+        Kind of the screens; each screen is scaled to the rms of the input.
+    basis : str
+        Modes of power-law screens and of the modal reconstructors.
+    outer_scale : float, D
+        Outer scale of von Karman's spectrum.
+    file : str
+        FITS or NPY file of screens (n, ny, nx) in radian; the seed chooses among them.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of the wrong kind or out of range, the pupil has a single segment, or the file does not fit.
+
+    Examples
+    --------
+    >>> from zwfs.paper.setups import make_pupil, make_screens
+    >>> pupil = make_pupil(32)
+    >>> pupil.rms(make_screens(pupil, 20, -2.0, kind="kolmogorov")(0.3, 2, seed=1)).round(6)
+    array([0.3, 0.3])
+    """
+    _check.instance("pupil", pupil, Pupil)
+    exponent = _check.number("exponent", exponent)
+    _check.choice("kind", kind, SCREENS)
+    _check.choice("basis", basis, ["zernike", "fourier"])
+    if kind == "segments" and len(np.unique(pupil.segments)) < 3:
+        raise ValueError('screens.kind = "segments": expected a pupil of two or more segments')
+    modes, frequencies = (
+        zernike_basis(pupil, n_modes) if basis == "zernike" else fourier_basis(pupil, n_modes),
+        None,
+    )
+    if basis == "fourier":
+        frequencies = mode_frequencies(pupil, modes)
+    recorded = _screens_of_file(pupil, file) if kind == "file" else None
+    scale = outer_scale if kind == "von_karman" else inf
+    return Screens(pupil, modes, kind, exponent, scale, frequencies, recorded)
+
+
+def _screens_of_file(pupil: Pupil, file: str) -> NDArray:
+    """Return the screens of a file: read as an image stack by numpy or astropy."""
+    path = Path(file)
+    screens = np.load(path) if path.suffix == ".npy" else fits_module().getdata(path)
+    return _check.screens(file, screens, pupil)
+
+
+SCREENS = ("power_law", "kolmogorov", "von_karman", "segments", "file")
+"""Kinds of screens."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of a camera, for every sensor.
+
+    Parameters
+    ----------
+    photons : float, photons
+        Photons per point of the pupil, all frames together; 0 for frames without noise.
+    read_noise : float, electrons
+        Read noise of a pixel, rms.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is negative or no number, or read noise is without photons.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> from zwfs.paper.setups import Noise
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
+    >>> Noise(photons=1000)(sensor, np.zeros(pupil.shape), seed=1).shape
+    (1, 32, 32)
+    """
+
+    photons: float = 0.0
+    read_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check.number_field(self, "photons", 0)
+        _check.number_field(self, "read_noise", 0)
+        if self.read_noise and not self.photons:
+            raise ValueError(f"noise.read_noise = {self.read_noise:g} with photons = 0: expected photons above 0")
+
+    def __call__(self, sensor: ZernikeSensor, phase: NDArray, seed: Any) -> NDArray[np.floating]:
+        """Return the normalised frames of phases, none below 0, with the light divided between the masks."""
+        frames = sensor.measure(phase)
+        if not self.photons:
+            return frames
+        pupil = sensor.pupil
+        camera = Detector(pupil, self.photons * pupil.n_points / sensor.n_masks, read_noise=self.read_noise)
+        return camera.normalise(camera.expose(frames, seed), floor=0.0)
+
+
+NOISELESS = Noise()
+"""Frames as the model of the sensor returns them."""

@@ -73,8 +73,9 @@ release-check: $(READY) ## build the package, and test it in an empty environmen
 pythons: $(READY) ## run examples and core tests on every supported Python, and with the oldest dependencies
 	@$(BIN)/python -m book._tools pythons $(PYTHONS)
 
-lock: $(BIN)/uv ## pin the newest allowed version of every dependency
-	$(UV) pip compile pyproject.toml --extra book --extra lab --extra test --upgrade \
+lock: $(BIN)/uv ## pin the newest allowed version of every dependency, or of one: make lock PACKAGE=numpy
+	$(UV) pip compile pyproject.toml --extra book --extra cluster --extra lab --extra tables --extra test \
+		$(if $(PACKAGE),--upgrade-package $(PACKAGE),--upgrade) \
 		--universal --python-version 3.11 --fork-strategy fewest --generate-hashes --no-emit-index-url \
 		--custom-compile-command "make lock" --output-file $(LOCK)
 

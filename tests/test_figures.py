@@ -15,6 +15,7 @@ from matplotlib.colors import to_hex, to_rgb, to_rgba_array
 import zwfs
 from zwfs import plots
 from zwfs.bench.model import Bench
+from zwfs.companion.sweeps import Grid
 from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics, Step
 from zwfs.paper import identities, one_pixel
 from zwfs.paper.bench_linearity import BenchCurves
@@ -95,6 +96,7 @@ def drawn_methods(curves, pupil, classic, shifted):
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
     return {
+        "grid_slice": ((Grid({"x": (1, 2), "screen": (0,)}, {"error": np.ones((2, 1))}), "error", "x"), ()),
         "sensor_layout": ((classic, phase), ()),
         "vector_sensor": ((shifted, phase), ()),
         "bench_layout": ((bench, commands, bench.frames(commands, seed=1)), ()),

@@ -5,25 +5,34 @@ the sweep chooses other workers. Without joblib, or with a single task, they run
 the same to the last bit wherever and in whatever order the tasks run: random numbers depend on the number of the
 task, and BLAS uses one thread. Without threadpoolctl BLAS keeps its threads, and the last digits may differ.
 
-Two environment variables are read when a sweep begins:
+Three environment variables are read when a sweep begins:
 
 - ``ZWFS_SWEEPS`` names a folder that keeps the result of each finished task. A sweep that was stopped and is run
   again computes only the missing results. The files are pickles: use a folder that only you can write to.
 - ``ZWFS_PROGRESS`` names a file to which each finished task appends a line:
   ``{"name": "linearity_curves", "done": 3, "total": 22}``.
+- ``ZWFS_CLUSTER`` is the address of the scheduler of a Dask cluster, such as ``tcp://host:8786``. The tasks run
+  there unless a `joblib.parallel_config` chooses a number of jobs or another cluster.
+
+`grid` is a sweep over all combinations of several inputs, with a labelled result.
 """
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import json
 import os
 import pickle
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from types import CodeType, ModuleType, SimpleNamespace
 from typing import Any
@@ -31,13 +40,15 @@ from uuid import uuid4
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs._files import write_file
+from zwfs._files import path_of, write_file
 from zwfs._threads import one_thread
 
 STORE = "ZWFS_SWEEPS"
 PROGRESS = "ZWFS_PROGRESS"
+CLUSTER = "ZWFS_CLUSTER"
 
 _PROCESS = uuid4().hex  # identifies this process among those of all machines
 _IN_TASK = ContextVar("_IN_TASK", default=False)
@@ -106,13 +117,187 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
     return [finished[index][0] for index in range(len(inputs))]
 
 
+@dataclass(frozen=True)
+class Grid:
+    """Labelled result of `grid`.
+
+    Attributes
+    ----------
+    axes : dict of tuple
+        Values of each axis; the last axis, "screen", numbers the screens.
+    values : dict of ndarray, shape of the axes
+        Results by name.
+    """
+
+    axes: Mapping[str, tuple[Any, ...]]
+    values: Mapping[str, NDArray]
+
+    def select(self, **fixed: Any) -> Grid:
+        """Return the slice at given values of some axes.
+
+        Raises
+        ------
+        ValueError
+            If there is no axis of a name, or the axis does not have the value.
+        """
+        axes, index = dict(self.axes), []
+        for name in fixed:
+            _check.choice("axis", name, list(axes))
+        for name, known in self.axes.items():
+            if name in fixed and fixed[name] not in known:
+                raise ValueError(f"{name} = {fixed[name]!r}: expected one of {_check.shown(list(known))}")
+            if name in fixed:
+                del axes[name]
+            index.append(known.index(fixed[name]) if name in fixed else slice(None))
+        return Grid(axes, {name: values[tuple(index)] for name, values in self.values.items()})
+
+    def columns(self) -> dict[str, NDArray]:
+        """Return the long table: a column for each axis and each result, a row for each screen of each point."""
+        mesh = np.meshgrid(*map(np.asarray, self.axes.values()), indexing="ij")
+        columns = {name: one.ravel() for name, one in zip(self.axes, mesh, strict=True)}
+        return columns | {name: one.ravel() for name, one in self.values.items()}
+
+    def write(self, path: str | Path) -> None:
+        """Write the long table to a file: CSV, or Parquet if the name ends in ``.parquet``.
+
+        Raises
+        ------
+        ImportError
+            If Parquet needs pyarrow: ``pip install zwfs[tables]``.
+        """
+        path, columns = path_of("path", path), self.columns()
+        if path.suffix == ".parquet":
+            if not find_spec("pyarrow"):
+                raise ImportError("Parquet needs pyarrow: pip install zwfs[tables]")
+            import pyarrow
+            from pyarrow import parquet
+
+            parquet.write_table(pyarrow.table(columns), path)
+            return
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*(one.tolist() for one in columns.values()), strict=True))
+        write_file(path, text.getvalue().encode())
+
+    def to_xarray(self) -> Any:
+        """Return an `xarray.Dataset` with the axes as coordinates: ``pip install zwfs[tables]``."""
+        if not find_spec("xarray"):
+            raise ImportError("to_xarray needs xarray: pip install zwfs[tables]")
+        from xarray import Dataset
+
+        names = tuple(self.axes)
+        return Dataset(
+            {name: (names, one) for name, one in self.values.items()},
+            {axis: list(known) for axis, known in self.axes.items()},
+        )
+
+
+def grid(
+    task: Callable[..., Mapping[str, Any]],
+    *,
+    n_screens: int,
+    seed: int = 0,
+    block: int = 20,
+    name: str = "grid",
+    **axes: Iterable[Any],
+) -> Grid:
+    """Run a task at every combination of some inputs, for a number of random screens.
+
+    Every combination uses the same random numbers: two results differ because of the inputs. The result of a
+    combination does not depend on the other ones, so that a larger grid computes only what is new, see
+    ``ZWFS_SWEEPS``.
+
+    Parameters
+    ----------
+    task : callable
+        Called with a value of each axis, `n_screens` and a SeedSequence, `seed`, by name. It returns arrays of
+        shape (n_screens,) by name; `zwfs.paper.grids.Recovery` is one.
+    n_screens : int
+        Screens at each combination.
+    seed : int
+    block : int
+        Largest number of screens in a task of the sweep. Smaller blocks occupy more workers.
+    name : str
+        Name of the sweep.
+    **axes
+        Values of each axis, at least one.
+
+    Returns
+    -------
+    Grid
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of the wrong kind or out of range, or the task returns other shapes.
+
+    Examples
+    --------
+    >>> from zwfs.companion import sweeps
+    >>> def task(x, y, n_screens, seed):
+    ...     return {"sum": [x + y] * n_screens}
+    ...
+    >>> result = sweeps.grid(task, x=[1, 2], y=[10, 20, 30], n_screens=2)
+    >>> result.values["sum"].shape, result.select(y=20, screen=0).values["sum"]
+    ((2, 3, 2), array([21, 22]))
+    """
+    _check.function("task", task)
+    n_screens, block = _check.integer("n_screens", n_screens, 1), _check.integer("block", block, 1)
+    seed = _check.integer_seed("seed", seed)
+    listed = {axis: tuple(_check.items(axis, values, "a list of values")) for axis, values in axes.items()}
+    if not listed or not all(listed.values()):
+        raise ValueError(f"axes = {_check.shown(listed)}: expected at least one axis, and a value on each")
+    plain = {
+        axis: tuple(v.item() if isinstance(v, np.generic) else v for v in one) for axis, one in listed.items()
+    }
+    points = [tuple(zip(plain, point, strict=True)) for point in product(*plain.values())]
+    blocks = [(start, min(block, n_screens - start)) for start in range(0, n_screens, block)]
+    parts = run(_grid_block, product(points, blocks), task, seed, name=name)
+    shape = *map(len, plain.values()), n_screens
+    values = {key: np.concatenate([part[key] for part in parts]).reshape(shape) for key in parts[0]}
+    return Grid(plain | {"screen": tuple(range(n_screens))}, values)
+
+
+def _grid_block(
+    value: tuple[tuple[tuple[str, Any], ...], tuple[int, int]], task: Callable[..., Mapping[str, Any]], seed: int
+) -> dict[str, NDArray]:
+    """Results of one block of screens at one point of a grid."""
+    point, (start, n) = value
+    drawn = task(**dict(point), n_screens=n, seed=np.random.SeedSequence(seed, spawn_key=(start,)))
+    arrays = {name: np.asarray(one) for name, one in drawn.items()}
+    for name, one in arrays.items():
+        if one.shape != (n,):
+            raise ValueError(f"the task returns {name} of shape {one.shape}: expected ({n},)")
+    return arrays
+
+
 def _results(waiting: list[tuple[int, Any]], shared: tuple[Any, ...], name: str) -> Iterator[tuple[int, Any]]:
     """Yield number and result of each task as it finishes."""
     with one_thread():
         if len(waiting) < 2 or not find_spec("joblib"):
             yield from (_work(shared, index, (value,), name, _PROCESS) for index, value in waiting)
         else:
-            yield from _parallel_results(waiting, shared, name)
+            with _cluster():
+                yield from _parallel_results(waiting, shared, name)
+
+
+@contextmanager
+def _cluster() -> Iterator[None]:
+    """Use the cluster that the environment names, unless other workers were chosen."""
+    from joblib import parallel_config
+    from joblib.parallel import get_active_backend
+
+    address, (backend, n_jobs) = os.environ.get(CLUSTER), get_active_backend()
+    if not address or n_jobs is not None or getattr(backend, "client", None) is not None:
+        yield
+        return
+    if not find_spec("distributed"):
+        raise ImportError(f"{CLUSTER} needs distributed: pip install zwfs[cluster]")
+    from distributed import Client
+
+    with Client(address, set_as_default=False) as client, parallel_config(backend="dask", client=client):
+        yield
 
 
 def _parallel_results(

@@ -5,6 +5,7 @@ from zwfs.plots.bench import bench_linearity, budget, measured_and_modelled, ref
 from zwfs.plots.closed_loop import capture, loop_runs
 from zwfs.plots.dimple_diameter import diameter_methods, diameter_reasons, dimple_diameter
 from zwfs.plots.frames import explained, gains, phase_map, signs
+from zwfs.plots.grids import grid_slice
 from zwfs.plots.identities import approximation, diversity
 from zwfs.plots.layouts import bench_layout, sensor_layout, vector_sensor
 from zwfs.plots.linearity import convergence, estimates, linearity, saxton_widths
@@ -50,6 +51,7 @@ __all__ = [
     "estimates",
     "explained",
     "gains",
+    "grid_slice",
     "linearity",
     "loop_runs",
     "measured_and_modelled",

@@ -10,6 +10,7 @@ from zwfs.detector import Detector
 from zwfs.masks import Dimple, Patch
 from zwfs.metrics import dynamic_range, reconstruction_error, strehl, wrapped_residual
 from zwfs.modes import noll_to_nm, power_law_screens, zernike_basis
+from zwfs.polychromatic import PolychromaticSensor
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import (
     RECONSTRUCTORS,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from zwfs import modes as modes
     from zwfs import paper as paper
     from zwfs import plots as plots
+    from zwfs import polychromatic as polychromatic
     from zwfs import pupil as pupil
     from zwfs import reconstructors as reconstructors
     from zwfs import sensor as sensor
@@ -59,6 +61,7 @@ __all__ = [
     "MaximumLikelihood",
     "Patch",
     "PhaseShifted",
+    "PolychromaticSensor",
     "Pupil",
     "Reconstruction",
     "ZernikeSensor",

@@ -10,6 +10,9 @@ weights W the information is diagonal but for a matrix of rank 4 r (`eq-informat
 
     F = sum_k D_k^T W D_k + K B^T + B K^T + K M K^T,    B = sum_k D_k^T W H_k,    M = sum_k H_k^T W H_k.
 
+With several wavelengths every sum over fields is one over wavelengths, too: H_k, K and B get columns for each, so
+that the rank is 4 r n_wavelengths.
+
 The columns of K and B are smooth functions times maps. All their inner products are therefore those of pairs of
 functions of y and pairs of functions of x, and no matrix of a size n_points x r is ever stored.
 
@@ -19,10 +22,11 @@ Shapes: k frame sets, c unknowns per point (1: phase; 2: phase and amplitude), m
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import add, mul
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +35,9 @@ from zwfs._arrays import Kind, per_kind
 from zwfs._pickle import Immutable
 from zwfs.lowrank import Factors
 from zwfs.pupil import Pupil
+
+if TYPE_CHECKING:
+    from zwfs.sensor import Sensor
 
 _SMALLEST = 1e-12  # of the diagonal, relative to its mean: a point that no frame shows has no information
 
@@ -102,33 +109,41 @@ class Response(Immutable):
     window : (slice, slice)
         Rows and columns of the detector in which the grid of the pupil lies.
     pupil : Pupil
+    ratios : tuple of float
+        Reference wavelength over each wavelength.
     """
 
-    def __init__(self, factors: Factors, window: tuple[slice, slice], pupil: Pupil) -> None:
-        self._factors, self._window, self._pupil = factors, window, pupil
+    def __init__(
+        self, factors: Factors, window: tuple[slice, slice], pupil: Pupil, ratios: tuple[float, ...] = (1.0,)
+    ) -> None:
+        self._factors, self._window, self._pupil, self._ratios = factors, window, pupil, ratios
+
+    @classmethod
+    def of(cls, sensor: Sensor) -> Response:
+        """Response of a sensor."""
+        return cls(sensor.factors, sensor.window, sensor.pupil, sensor.channels.ratios)
 
     @per_kind
     def constants(self, kind: Kind) -> _Constants:
         """Arrays of one kind."""
         inner, outer = self._factors.pupil, self._factors.detector
-        # The cores of dimples of one size are multiples of one another: combine masks whose cores are.
-        cores = self._factors.core
-        turns, strength, bases = np.linalg.svd(cores.reshape(len(cores), -1), full_matrices=False)
-        n = max(1, int(np.count_nonzero(strength > 1e-13 * strength[0])))
-        turns, bases = turns[:, :n], (strength[:n, np.newaxis] * bases[:n]).reshape(n, *cores.shape[1:])
-        split = np.concatenate([np.block([[c.real, -c.imag], [c.imag, c.real]]) for c in bases])  # (n 2 q, 2 r)
-        q, r = cores.shape[1:]
+        q, r = self._factors.core.shape[-2:]
+        cores = self._factors.core.reshape(-1, len(self._ratios), q, r)
+        turns, bases = zip(*(_bases(cores[:, index]) for index in range(len(self._ratios))), strict=True)
+        n_inputs = 2 * r * len(self._ratios)
+        split = _side_by_side([one.reshape(-1, q, 2 * r) for one in bases])  # (n_sets, q, n_inputs)
         # The functions of the detector, on the grid of the pupil, are sums of those of the pupil.
         cut = outer.cut(*self._window)
         to_y, to_x = cut.along_y @ inner.along_y.T, cut.along_x @ inner.along_x.T
         left = np.einsum("ia,jb,ijq->abq", to_y, to_x, outer.combine.reshape(len(to_y), len(to_x), q))
         left = left.reshape(-1, q)
-        columns = np.zeros((2 + 2 * n, len(inner.combine), 4 * r))
-        columns[0, :, :r] = columns[1, :, r : 2 * r] = inner.combine
-        columns[2:, :, 2 * r :] = left @ split.reshape(2 * n, q, 2 * r)
-        detector = outer.combine @ split.reshape(2 * n, q, 2 * r)
+        n_parts = 2 * len(self._ratios)
+        columns = np.zeros((n_parts + len(split), len(inner.combine), 2 * n_inputs))
+        columns[:n_parts, :, :n_inputs] = _side_by_side([inner.combine[np.newaxis]] * n_parts)
+        columns[n_parts:, :, n_inputs:] = left @ split
+        detector = outer.combine @ split
         return _Constants(
-            kind, self._pupil.n_points, self._window,
+            kind, self._pupil.n_points, self._window, self._ratios,
             kind.array(self._pupil.inside), kind.array(np.where(self._pupil.inside, _SMALLEST, 1.0)),
             _Pairs.of(inner.along_y, inner.along_x, kind), _Pairs.of(outer.along_y, outer.along_x, kind),
             kind.array(columns), kind.array(detector), turns,
@@ -139,9 +154,9 @@ class Response(Immutable):
 
         Parameters
         ----------
-        tangents : array, shape (k, c, 2, ny, nx)
+        tangents : array, shape (k, c, 2 n_wavelengths, ny, nx)
             Changes of the field per unit of the unknowns, as split fields; 0 outside the pupil.
-        waves : array, shape (k, n_masks, 2, ny', nx')
+        waves : array, shape (k, n_masks, 2 n_wavelengths, ny', nx')
             Fields on the detector.
         weights : array, shape (k, n_masks, ny', nx'), or None
             Inverse variances of the frames; 1 if left out.
@@ -154,13 +169,14 @@ class _Constants:
     kind: Kind
     n_points: int
     window: tuple[slice, slice]
+    ratios: tuple[float, ...]  # reference wavelength over each wavelength
     stop: NDArray  # (ny, nx), 1 in the pupil
     outside: NDArray  # (ny, nx), 1 outside, and the smallest share of information inside
     inner: _Pairs
     outer: _Pairs
-    columns: NDArray  # (s, a * b, 4 r), functions times maps to columns of K and B
-    detector: NDArray  # (2 n, a' * b', 2 r), the same for H
-    turns: NDArray[np.complex128]  # (n_masks, n), factors of which the core of a mask is made
+    columns: NDArray  # (s, a * b, 4 r n_wavelengths), functions times maps to columns of K and B
+    detector: NDArray  # (n_sets, a' * b', 2 r n_wavelengths), the same for H
+    turns: tuple[NDArray[np.complex128], ...]  # (n_masks, n) for each wavelength: factors of the cores of a mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +192,7 @@ class Information:
         Diagonal blocks sum_k D_k^T W D_k; outside the pupil a multiple of the identity.
     sets : list of lists of maps
         Factors of the columns of K, then of B: real and imaginary part of each.
-    gram : array, shape (k, 2 r, 2 r)
+    gram : array, shape (k, 2 r n_wavelengths, 2 r n_wavelengths)
         M.
     scale : array, shape (k, 1, 1)
         Mean over the pupil of the diagonal for the phase.
@@ -193,22 +209,24 @@ class Information:
         """Sum the contributions of all masks."""
         xp, window, n_unknowns = constants.kind.xp, constants.window, tangents.shape[1]
         unknowns = range(n_unknowns)
-        real, imag = ([tangents[:, c, part, ...] for c in unknowns] for part in (0, 1))
-        n_sets = 2 * constants.turns.shape[1]
+        parts = [[tangents[:, c, part, ...] for c in unknowns] for part in range(tangents.shape[2])]
         pairs: list[Any] = []
         local: list[Any] = []
         mixed: list[Any] = []
-        for mask, turns in enumerate(constants.turns):
+        for mask in range(waves.shape[1]):
             wave = waves[:, mask, ...]
             # dI per unit of the real and imaginary part of a coefficient: 2 Re and -2 Im of conj(o) times the turn
             along = [
-                (2 * t.real) * wave[:, 0, ...] + (2 * t.imag) * wave[:, 1, ...]
-                for turn in turns for t in (turn, turn * 1j)
+                (2 * t.real) * wave[:, 2 * index, ...] + (2 * t.imag) * wave[:, 2 * index + 1, ...]
+                for index, turns in enumerate(constants.turns) for turn in turns[mask] for t in (turn, turn * 1j)
             ]  # fmt: skip
+            n_sets = len(along)
             weight: Any = None if weights is None else weights[:, mask, ...]
             weighted = along if weight is None else [weight * one for one in along]
             inside = 2 * wave[(..., *window)]
-            change = [inside[:, 0, ...] * real[c] + inside[:, 1, ...] * imag[c] for c in unknowns]
+            change = [
+                reduce(add, (inside[:, part, ...] * one[c] for part, one in enumerate(parts))) for c in unknowns
+            ]
             seen = change if weight is None else [weight[(..., *window)] * one for one in change]
             _accumulate(pairs, [along[i] * weighted[j] for i, j in _pairs_of(n_sets)])
             _accumulate(local, [change[i] * seen[j] for i in unknowns for j in unknowns])
@@ -218,7 +236,7 @@ class Information:
         blocks = [local[c * n_unknowns : (c + 1) * n_unknowns] for c in unknowns]
         for c in unknowns:
             blocks[c][c] += scale * constants.outside
-        sets = [real, imag, *(mixed[s * n_unknowns : (s + 1) * n_unknowns] for s in range(n_sets))]
+        sets = [*parts, *(mixed[s * n_unknowns : (s + 1) * n_unknowns] for s in range(n_sets))]
         return cls(constants, blocks, sets, gram, scale)
 
     def inverse(self, damping: NDArray | float = 0.0) -> Inverse:
@@ -325,6 +343,32 @@ class Inverse:
             wave = constants.inner.expand(weights[:, :-1] @ matrix.T, constants.kind.xp)
             _accumulate(total, [new * wave for new in one])
         return total
+
+
+def _bases(cores: NDArray[np.complex128]) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
+    """Factors (n_masks, n) and split cores (n, 2, q, 2 r) whose combinations are the cores of all masks.
+
+    The cores of dimples of one size are multiples of one another, so n is 1 for them.
+    """
+    turns, strength, bases = np.linalg.svd(cores.reshape(len(cores), -1), full_matrices=False)
+    n = max(1, int(np.count_nonzero(strength > 1e-13 * strength[0])))
+    bases = (strength[:n, np.newaxis] * bases[:n]).reshape(n, *cores.shape[1:])
+    split = np.stack(
+        [np.concatenate([bases.real, -bases.imag], axis=2), np.concatenate([bases.imag, bases.real], axis=2)],
+        axis=1,
+    )
+    return turns[:, :n], split
+
+
+def _side_by_side(blocks: Sequence[NDArray]) -> NDArray:
+    """Stack blocks (s, m, n) along the first axis, each with columns of its own: the others are 0."""
+    n = blocks[0].shape[-1]
+    result = np.zeros((sum(map(len, blocks)), blocks[0].shape[1], n * len(blocks)))
+    first = 0
+    for index, block in enumerate(blocks):
+        result[first : first + len(block), :, index * n : (index + 1) * n] = block
+        first += len(block)
+    return result
 
 
 def _pairs_of(n: int) -> list[tuple[int, int]]:

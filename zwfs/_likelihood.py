@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from zwfs import _check
 from zwfs._arrays import Kind
 from zwfs._information import Information, Response
-from zwfs._propagator import square
-from zwfs.sensor import ZernikeSensor
+from zwfs._propagator import along_phase, square
+from zwfs.sensor import Sensor
 
 _DARK = 1e-12  # electrons: a modelled pixel that is darker counts as this bright
 _DISTINCT = 1e-6  # difference of two masks, relative to the strongest response, from which on they are different
@@ -94,19 +94,24 @@ class Noise:
         return misfit, mean, variance
 
 
-def tangents(psi: NDArray, stop: NDArray, unknown_amplitude: bool, xp: Any) -> NDArray:
-    """Change of the field per radian of phase, and per unit of amplitude: (k, 2, ny, nx) to (k, c, 2, ny, nx)."""
-    along_phase = xp.stack([-psi[:, 1, ...], psi[:, 0, ...]], axis=1)
+def tangents(
+    psi: NDArray, stop: NDArray, unknown_amplitude: bool, xp: Any, ratios: tuple[float, ...] = (1.0,)
+) -> NDArray:
+    """Change of the field per radian of phase, and per unit of amplitude: (k, p, ny, nx) to (k, c, p, ny, nx).
+
+    The amplitude is that of one wavelength.
+    """
+    turned = along_phase(psi, ratios, xp)
     if not unknown_amplitude:
-        return along_phase[:, np.newaxis, ...]
+        return turned[:, np.newaxis, ...]
     modulus = xp.sqrt(square(psi))[:, np.newaxis, ...]
     dark = modulus == 0
     # The phase of a dark point is undefined: any direction will do.
     flat = xp.stack([stop, 0 * stop])[np.newaxis, ...]
-    return xp.stack([along_phase, xp.where(dark, flat, psi / xp.where(dark, modulus + 1, modulus))], axis=1)
+    return xp.stack([turned, xp.where(dark, flat, psi / xp.where(dark, modulus + 1, modulus))], axis=1)
 
 
-def require_information(sensor: ZernikeSensor, unknown_amplitude: bool) -> None:
+def require_information(sensor: Sensor, unknown_amplitude: bool) -> None:
     """Require masks that determine the phase, or the phase and the amplitude.
 
     With a reference wave t_k R behind mask k, each point of the frame gives |psi|^2 + 2 Re(conj(t_k R) psi). Three
@@ -130,6 +135,21 @@ def require_information(sensor: ZernikeSensor, unknown_amplitude: bool) -> None:
             f"amplitude is unknown and the sensor has {len(different)} different "
             f"mask{'s' * (len(different) > 1)}: expected at least 3, since two frames allow two fields at every "
             "point; a clear frame is that of a mask that changes nothing, such as Dimple(1, 0)"
+        )
+
+
+def require_one_wavelength(sensor: Sensor) -> None:
+    """Require one wavelength, for an unknown amplitude.
+
+    Raises
+    ------
+    ValueError
+        If there are several.
+    """
+    if len(sensor.channels.ratios) > 1:
+        raise ValueError(
+            f"amplitude is unknown and the sensor has {len(sensor.channels.ratios)} wavelengths: expected a known "
+            "amplitude, or a ZernikeSensor"
         )
 
 
@@ -157,10 +177,10 @@ class Estimator:
     precision: NDArray | None = None
 
     def information(self, psi: NDArray, waves: NDArray) -> Information:
-        """Information at fields (k, 2, ny, nx) in the pupil and (k, n_masks, 2, ny', nx') on the detector."""
+        """Information at split fields: (k, p, ny, nx) in the pupil, (k, n_masks, p, ny', nx') on the detector."""
         kind = Kind.of(psi)
         constants = self.response.constants(kind)
-        change = tangents(psi, constants.stop, self.unknown_amplitude, kind.xp)
+        change = tangents(psi, constants.stop, self.unknown_amplitude, kind.xp, constants.ratios)
         return self.response.information(change, waves, self.noise.weights(square(waves)))
 
     def of_modes(self, information: Information) -> NDArray:

@@ -4,13 +4,19 @@
 
 A split field has shape (..., 2, ny, nx): the real part, then the imaginary part. It is 0 outside the pupil. A
 phasor is exp(i phase) as a split field. `k` is the number of frame sets in a batch.
+
+With several wavelengths, a split field has two parts for each of them: (..., 2 n_wavelengths, ny, nx). The root of
+the weight of a wavelength is a factor of its field, so an intensity is the sum of the squares of all parts
+(`Channels`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 from math import prod
-from typing import TYPE_CHECKING, Any
+from operator import add
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,9 +27,27 @@ from zwfs.lowrank import Factors, Operator
 from zwfs.pupil import Pupil
 
 if TYPE_CHECKING:
-    from zwfs.sensor import ZernikeSensor
+    from zwfs.sensor import Sensor
 
 _VANISHING = 1e-30  # modulus, or its square, of a field that counts as 0
+
+
+class Channels(NamedTuple):
+    """Wavelengths of a sensor: each has the field sqrt(weight) amplitude exp(i ratio phase).
+
+    Attributes
+    ----------
+    ratios : tuple of float
+        Reference wavelength over wavelength: a phase is an optical path, so it scales with the ratio.
+    weights : tuple of float
+        Share of the light; their sum is 1.
+    """
+
+    ratios: tuple[float, ...] = (1.0,)
+    weights: tuple[float, ...] = (1.0,)
+
+
+ONE_WAVELENGTH = Channels()
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +75,7 @@ class Propagator:
         Amplitude of the incoming field, 0 outside.
     flat : array, shape (1, 2, ny, nx)
         Phasor of a flat wavefront.
+    channels : Channels
     """
 
     kind: Kind
@@ -62,9 +87,17 @@ class Propagator:
     no_data: NDArray[np.floating]
     amplitude: NDArray[np.floating]
     flat: NDArray[np.floating]
+    channels: Channels
 
     @classmethod
-    def of(cls, factors: Factors, window: tuple[slice, slice], pupil: Pupil, kind: Kind) -> Propagator:
+    def of(
+        cls,
+        factors: Factors,
+        window: tuple[slice, slice],
+        pupil: Pupil,
+        kind: Kind,
+        channels: Channels = ONE_WAVELENGTH,
+    ) -> Propagator:
         """Convert the factors of a sensor and the maps of its pupil."""
         stop = read_only(kind.array(pupil.inside))
         model = cls(
@@ -77,6 +110,7 @@ class Propagator:
             no_data=read_only(kind.array(np.where(pupil.inside, 0, np.nan))),
             amplitude=stop,
             flat=read_only(kind.xp.stack((stop, 0 * stop))[np.newaxis, ...]),
+            channels=channels,
         )
         return model.with_amplitude(pupil.amplitude)
 
@@ -88,6 +122,14 @@ class Propagator:
     def field(self, phasor: NDArray) -> NDArray:
         """Field of a phasor, (k, 2, ny, nx); for a uniform amplitude the phasor itself."""
         return phasor if self.amplitude is self.stop else phasor * self.amplitude
+
+    def incoming(self, phase: NDArray, amplitude: NDArray | None = None) -> NDArray:
+        """Field of a phase, (k, ny, nx), at every wavelength: (k, 2 n_wavelengths, ny, nx)."""
+        amplitude = self.amplitude if amplitude is None else amplitude
+        if self.channels == ONE_WAVELENGTH:
+            return split(phase, amplitude)
+        parts = [split(s * phase, w**0.5 * amplitude) for s, w in zip(*self.channels, strict=True)]
+        return self.kind.xp.concat(parts, axis=1)
 
     def reference(self, psi: NDArray) -> NDArray:
         """Reference waves on the grid of the pupil: (k, 2, ny, nx) to (k, n_masks, 2, ny, nx)."""
@@ -112,19 +154,19 @@ class Propagator:
         The phase is 0 outside the pupil, (k, ny, nx). The frames are cut to the grid of the pupil,
         (k, n_masks, ny, nx). The result has shape (k,).
         """
-        psi = split(phase, self.amplitude)
+        psi = self.incoming(phase)
         difference = (square(self.reference(psi) + psi[:, np.newaxis, ...]) - light) * self.stop
         difference = self.kind.xp.reshape(difference, (psi.shape[0], -1))
         return self.kind.xp.vecdot(difference, difference)
 
 
 @per_kind
-def propagator(sensor: ZernikeSensor, kind: Kind) -> Propagator:
+def propagator(sensor: Sensor, kind: Kind) -> Propagator:
     """Return the model of a sensor for arrays of one kind."""
-    return Propagator.of(sensor.factors, sensor.window, sensor.pupil, kind)
+    return Propagator.of(sensor.factors, sensor.window, sensor.pupil, kind, sensor.channels)
 
 
-def pupil_maps(name: str, maps: ArrayLike, sensor: ZernikeSensor) -> tuple[NDArray[np.floating], tuple[int, ...]]:
+def pupil_maps(name: str, maps: ArrayLike, sensor: Sensor) -> tuple[NDArray[np.floating], tuple[int, ...]]:
     """Return checked real maps, (k, ny, nx) with 0 outside the pupil, and the shape of their batch."""
     shape = sensor.pupil.shape
     maps = _check.real_any(name, maps)
@@ -139,7 +181,7 @@ def pupil_maps(name: str, maps: ArrayLike, sensor: ZernikeSensor) -> tuple[NDArr
 
 
 def amplitude_maps(
-    amplitude: ArrayLike | None, sensor: ZernikeSensor, kind: Kind
+    amplitude: ArrayLike | None, sensor: Sensor, kind: Kind
 ) -> tuple[NDArray[np.floating], tuple[int, ...]]:
     """Return checked amplitudes, (k, ny, nx) with 0 outside, and the shape of their batch; None: the pupil's."""
     if amplitude is None:
@@ -165,9 +207,22 @@ def split(phase: NDArray, amplitude: NDArray) -> NDArray:
 
 
 def square(waves: NDArray) -> NDArray:
-    """Squared modulus: (..., 2, ny, nx) to (..., ny, nx)."""
-    squares = waves * waves
-    return squares[..., 0, :, :] + squares[..., 1, :, :]
+    """Squared modulus, summed over the wavelengths: (..., 2 n_wavelengths, ny, nx) to (..., ny, nx)."""
+    return parts_sum(waves * waves)
+
+
+def parts_sum(products: NDArray) -> NDArray:
+    """Sum over the parts of a split field: (..., n_parts, ny, nx) to (..., ny, nx)."""
+    return reduce(add, (products[..., part, :, :] for part in range(products.shape[-3])))
+
+
+def along_phase(psi: NDArray, ratios: tuple[float, ...], xp: Any) -> NDArray:
+    """Change of a split field per radian of the phase, i ratio psi at each wavelength: the shape of `psi`."""
+    parts: list[NDArray] = []
+    for index, ratio in enumerate(ratios):
+        real, imag = psi[:, 2 * index, ...], psi[:, 2 * index + 1, ...]
+        parts += [-imag, real] if ratio == 1 else [-ratio * imag, ratio * real]
+    return xp.stack(parts, axis=1)
 
 
 def modulus_of(field: NDArray, xp: Any) -> NDArray:

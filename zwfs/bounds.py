@@ -8,14 +8,15 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs._arrays import Kind
 from zwfs._information import Response
-from zwfs._likelihood import Estimator, Noise, require_information
-from zwfs._propagator import amplitude_maps, propagator, pupil_maps, split
+from zwfs._likelihood import Estimator, Noise, require_information, require_one_wavelength
+from zwfs._propagator import amplitude_maps, propagator, pupil_maps
 from zwfs.modes import check_modes
+from zwfs.polychromatic import PolychromaticSensor, check_sensor
 from zwfs.sensor import ZernikeSensor
 
 
 def cramer_rao(
-    sensor: ZernikeSensor,
+    sensor: ZernikeSensor | PolychromaticSensor,
     phase: ArrayLike,
     *,
     photons: float,
@@ -32,8 +33,8 @@ def cramer_rao(
 
     Parameters
     ----------
-    sensor : ZernikeSensor
-        With any number of masks.
+    sensor : ZernikeSensor or PolychromaticSensor
+        With any number of masks. The phase is that at its reference wavelength.
     phase : array_like, shape (..., ny, nx), radian
         True phase; only the points of the pupil count.
     photons : float
@@ -72,18 +73,20 @@ def cramer_rao(
     >>> round(float(np.nanmean(bound)), 4)  # radian
     0.0161
     """
-    _check.instance("sensor", sensor, ZernikeSensor)
+    check_sensor("sensor", sensor)
     if photons is None:
         raise TypeError("photons = None: expected a number, since the bound is that of photon noise")
     noise = Noise.checked(photons, read_noise)
     unknown = not _check.flag("amplitude_known", amplitude_known)
     if unknown and modes is not None:
         raise ValueError("amplitude_known = False: expected True with modes, which describe the phase only")
+    if unknown:
+        require_one_wavelength(sensor)
     require_information(sensor, unknown)
     pupil = sensor.pupil
     basis = None if modes is None else pupil.scatter(check_modes(pupil, modes), fill=0)
     maps, batch = pupil_maps("phase", _check.real_array("phase", phase), sensor)
-    estimator = Estimator(Response(sensor.factors, sensor.window, pupil), noise, unknown, basis)
+    estimator = Estimator(Response.of(sensor), noise, unknown, basis)
     model = propagator(sensor, Kind.numpy())
     if amplitude is not None:
         strength, amplitude_batch = amplitude_maps(amplitude, sensor, Kind.numpy())
@@ -92,7 +95,7 @@ def cramer_rao(
         model = model.with_amplitude(strength[0])
     sigma = []
     for one in maps.astype(np.float64):  # one at a time: the memory does not grow with the batch
-        psi = split(one[np.newaxis], model.amplitude)
+        psi = model.incoming(one[np.newaxis])
         points, coefficients = estimator.variance(psi, model.propagate(psi))
         sigma.append(np.sqrt(points[0, 0] if coefficients is None else coefficients[0]))
     result = np.array(sigma)

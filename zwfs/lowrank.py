@@ -127,7 +127,7 @@ class Factors(Immutable):
     ----------
     pupil, detector : Plane
         Functions on the two planes, of rank r and q.
-    core : ndarray of complex, shape (n_masks, q, r)
+    core : ndarray of complex, shape (n_masks, q, r) or (n_masks, n_wavelengths, q, r)
         Kept as a read-only view.
 
     Examples
@@ -150,6 +150,8 @@ class Factors(Immutable):
 class Operator:
     """The factors as arrays of one kind, and the products that sensors and reconstructors compute with them.
 
+    With several wavelengths a split field has two parts for each of them, real part first, which do not mix.
+
     Parameters
     ----------
     factors : Factors
@@ -166,6 +168,7 @@ class Operator:
         self._window = factors.detector.cut(*window).to(kind)
         self._complex_pupil, self._complex_detector = self._pupil.for_complex(), self._detector.for_complex()
         self._split_core = kind.array(split_core(factors.core))
+        self._n_parts = 2 * (factors.core.shape[1] if factors.core.ndim == 4 else 1)
         core = factors.core.reshape(-1, factors.core.shape[-1]).T
         self._core = kind.array(core.real) + 1j * kind.array(core.imag)
 
@@ -193,12 +196,12 @@ class Operator:
     def split_expand(self, coefficients: NDArray, *, in_window: bool = False) -> NDArray:
         """Split waves of coefficients, (k, n 2 q) to (k, n, 2, ny', nx'); sizes as for `split_reference`."""
         plane = self._window if in_window else self._detector
-        return plane.expand(self._by_mask(coefficients, plane, 2))
+        return plane.expand(self._by_mask(coefficients, plane, self._n_parts))
 
     def split_adjoint(self, waves: NDArray) -> NDArray:
         """Adjoint of `split_reference` on the whole detector: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
         coefficients = self._in_a_row(self._detector.project(waves)) @ self._split_core.T
-        return self._pupil.expand(self._xp.reshape(coefficients, (-1, 2, self._pupil.rank)))
+        return self._pupil.expand(self._xp.reshape(coefficients, (-1, self._n_parts, self._pupil.rank)))
 
     def _in_a_row(self, coefficients: NDArray) -> NDArray:
         return self._xp.reshape(coefficients, (coefficients.shape[0], -1))
@@ -210,6 +213,8 @@ class Operator:
 def split_core(core: NDArray[np.complex128]) -> NDArray[np.float64]:
     """Cores (n, q, r) as a real matrix that acts from the right: coefficients (k, 2 r) to (k, n 2 q).
 
+    Those of w wavelengths, (n, w, q, r), act on the coefficients of each one apart: (k, w 2 r) to (k, n w 2 q).
+
     Examples
     --------
     >>> import numpy as np, zwfs
@@ -217,6 +222,9 @@ def split_core(core: NDArray[np.complex128]) -> NDArray[np.float64]:
     (2, 2)
     """
     block = np.block([[core.real, -core.imag], [core.imag, core.real]])
+    if block.ndim == 4:
+        n, w, rows, columns = block.shape
+        block = np.einsum("nwij,wv->nwivj", block, np.eye(w)).reshape(n * w * rows, w * columns)
     return np.ascontiguousarray(block.reshape(-1, block.shape[-1]).T)
 
 

@@ -12,7 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs._arrays import Kind
 from zwfs._pickle import Immutable
-from zwfs._propagator import amplitude_maps, propagator, pupil_maps, split, square
+from zwfs._propagator import (
+    ONE_WAVELENGTH,
+    Channels,
+    Propagator,
+    along_phase,
+    amplitude_maps,
+    parts_sum,
+    propagator,
+    pupil_maps,
+    square,
+)
 from zwfs.lowrank import Factors, factorise
 from zwfs.masks import Mask
 from zwfs.pupil import Pupil
@@ -21,7 +31,220 @@ _DEGREES = 20.0  # radian rms; no phase map reaches it, the same map in degrees 
 _MOST_PIXELS = 2**14  # across the detector: a frame of them takes 2 GiB
 
 
-class ZernikeSensor(Immutable):
+class Sensor(Immutable):
+    """Base of the sensors: a pupil, masks and a detector, and the frames of a phase.
+
+    The constructors of `ZernikeSensor` and `PolychromaticSensor` check its arguments and set its factors.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> sensor = zwfs.ZernikeSensor(zwfs.Pupil.circular(32), zwfs.Dimple(1.06, np.pi / 2))
+    >>> isinstance(sensor, zwfs.sensor.Sensor), sensor.channels.weights
+    (True, (1.0,))
+    """
+
+    _factors: Factors
+
+    def __init__(
+        self, pupil: Pupil, masks: tuple[Mask, ...], extent: float, tolerance: float, channels: Channels
+    ) -> None:
+        self._tolerance = _check.number("tolerance", tolerance, 1e-16, 0.1)
+        self._margin = _margin(extent, pupil)
+        self._pupil = pupil
+        self._masks = masks
+        m = self._margin
+        ny, nx = pupil.shape
+        self._detector_shape = ny + 2 * m, nx + 2 * m
+        self._window = slice(m, m + ny), slice(m, m + nx)
+        self._channels = channels
+
+    @property
+    def pupil(self) -> Pupil:
+        """Pupil of the sensor."""
+        return self._pupil
+
+    @property
+    def masks(self) -> tuple[Mask, ...]:
+        """Masks, in the order of the frames."""
+        return self._masks
+
+    @property
+    def extent(self) -> float:
+        """Width of the detector plane in D, after rounding to whole pixels."""
+        return 1 + 2 * self._margin / self._pupil.n_pixels
+
+    @property
+    def tolerance(self) -> float:
+        """Error of the reference wave, relative to the strongest response of the masks."""
+        return self._tolerance
+
+    @property
+    def detector_shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        return self._detector_shape
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of a frame in which the grid of the pupil lies."""
+        return self._window
+
+    @property
+    def n_masks(self) -> int:
+        """Number of masks, and of frames that one measurement makes."""
+        return len(self.masks)
+
+    @property
+    def channels(self) -> Channels:
+        """Ratio and weight of each wavelength."""
+        return self._channels
+
+    @property
+    def rank(self) -> int:
+        """Number of coefficients that the reference waves are made of."""
+        return self._factors.pupil.rank
+
+    @property
+    def factors(self) -> Factors:
+        """Matrices of `eq-low-rank`, common to all masks but for the cores: to compute with them elsewhere."""
+        return self._factors
+
+    def measure(self, phase: ArrayLike, amplitude: ArrayLike | None = None) -> NDArray[np.floating]:
+        """Frames without noise.
+
+        Parameters
+        ----------
+        phase : array_like, shape (..., ny, nx), radian
+            Only the points of the pupil count; NaN or anything else is allowed outside.
+        amplitude : array_like, shape (..., ny, nx), optional
+            Field amplitude; that of the pupil if left out. Points outside the pupil stay dark.
+
+        Returns
+        -------
+        ndarray, shape (..., n_masks, ny_detector, nx_detector)
+            Intensity; 1 is the mean intensity in the pupil with the mask taken out. float32 if the phase is.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If phase or amplitude are complex, of the wrong shape, or not finite inside the pupil, or if the
+            amplitude is negative.
+
+        Warns
+        -----
+        UserWarning
+            If the rms of a phase is above 20 rad: it may be in degrees or nanometres.
+
+        References
+        ----------
+        Chambouleyron et al. 2024, equation (5).
+        """
+        maps, batch = pupil_maps("phase", phase, self)
+        kind = Kind.of(maps)
+        rms = self._largest_rms(maps, kind.xp)
+        if rms > _DEGREES:
+            warnings.warn(
+                f"phase has an rms of {rms:.4g}: expected radian, less than {_DEGREES:g} rms; is it in degrees?",
+                UserWarning,
+                stacklevel=2,
+            )
+        strength, strength_batch = amplitude_maps(amplitude, self, kind)
+        if strength_batch:
+            xp, shape = kind.xp, self.pupil.shape
+            maps, strength = xp.reshape(maps, (*batch, *shape)), xp.reshape(strength, (*strength_batch, *shape))
+            full = _check.broadcast(phase=maps, amplitude=strength)
+            maps, strength = (xp.reshape(xp.broadcast_to(one, full), (-1, *shape)) for one in (maps, strength))
+            batch = full[:-2]
+        model = propagator(self, kind)
+        frames = square(model.propagate(model.incoming(maps, strength)))
+        return kind.xp.reshape(frames, (*batch, self.n_masks, *self.detector_shape))
+
+    def jacobian(self, phase: ArrayLike, change: ArrayLike) -> NDArray[np.floating]:
+        """Change of the frames per change of the phase: the derivative of `measure` at a phase, times a change.
+
+        Parameters
+        ----------
+        phase, change : array_like, shape (..., ny, nx), radian
+            Of one batch.
+
+        Returns
+        -------
+        ndarray, shape (..., n_masks, ny_detector, nx_detector)
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is complex, of the wrong shape, or not finite inside the pupil.
+
+        References
+        ----------
+        `eq-jacobian` of the book.
+        """
+        maps, batch = pupil_maps("phase", phase, self)
+        kind = Kind.of(maps)
+        changes, other = pupil_maps(
+            "change", _check.in_kind("change", _check.real_any("change", change), kind), self
+        )
+        if other != batch:
+            raise ValueError(f"change has shape {(*other, *self.pupil.shape)}: expected that of phase")
+        model, psi, waves = self._waves(maps)
+        turned = along_phase(psi, self.channels.ratios, kind.xp) * changes[:, np.newaxis, ...]
+        result = 2 * parts_sum(waves * model.propagate(turned))
+        return kind.xp.reshape(result, (*batch, *result.shape[1:]))
+
+    def jacobian_adjoint(self, phase: ArrayLike, frames: ArrayLike) -> NDArray[np.floating]:
+        """Exact adjoint of `jacobian`: the gradient of sum(frames * measure(phase)) with respect to the phase.
+
+        Parameters
+        ----------
+        phase : array_like, shape (..., ny, nx), radian
+        frames : array_like, shape (..., n_masks, ny_detector, nx_detector)
+
+        Returns
+        -------
+        ndarray, shape (..., ny, nx)
+            0 outside the pupil.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is complex, of the wrong shape, or not finite (the phase: inside the pupil).
+
+        References
+        ----------
+        Chambouleyron et al. 2024, equation (16); `eq-gradient` of the book.
+        """
+        maps, batch = pupil_maps("phase", phase, self)
+        kind, shape = Kind.of(maps), (self.n_masks, *self.detector_shape)
+        frames = _check.in_kind("frames", _check.real_any("frames", frames), kind)
+        if tuple(frames.shape) != (*batch, *shape):
+            raise ValueError(f"frames has shape {tuple(frames.shape)}: expected {(*batch, *shape)}")
+        _check.moderate("frames", frames)
+        model, psi, waves = self._waves(maps)
+        back = model.adjoint(waves * kind.xp.reshape(frames, (-1, *shape))[:, :, np.newaxis, ...])
+        gradient = 2 * parts_sum(along_phase(psi, self.channels.ratios, kind.xp) * back)
+        return kind.xp.reshape(gradient, (*batch, *self.pupil.shape))
+
+    def _waves(self, maps: NDArray) -> tuple[Propagator, NDArray, NDArray]:
+        """Model, and the fields of checked phases in the pupil and on the detector."""
+        model = propagator(self, Kind.of(maps))
+        psi = model.incoming(maps)
+        return model, psi, model.propagate(psi)
+
+    def _axes(self) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
+        """Coordinates (y, x) of the pupil and of the detector, D."""
+        pupil, m = self._pupil, self._margin
+        y, x = (axis[0] + (np.arange(axis.size + 2 * m) - m) / pupil.n_pixels for axis in (pupil.y, pupil.x))
+        return (pupil.y, pupil.x), (y, x)
+
+    def _largest_rms(self, phase: NDArray, xp: Any) -> float:
+        """Largest rms of phases that are 0 outside the pupil, (k, ny, nx), piston removed."""
+        axes, n_points = (-2, -1), self.pupil.n_points
+        mean = xp.sum(phase, axis=axes) / n_points
+        return sqrt(max(float(xp.max(xp.sum(phase * phase, axis=axes) / n_points - mean * mean)), 0.0))
+
+
+class ZernikeSensor(Sensor):
     """A Zernike wavefront sensor with any number of masks.
 
     Fields and phases may be arrays of NumPy or of any library that follows the Python array API and lets arrays be
@@ -72,67 +295,16 @@ class ZernikeSensor(Immutable):
         _check.instance("pupil", pupil, Pupil)
         if not masks:
             raise ValueError("masks is empty: expected at least one mask, such as Dimple(1.06, np.pi / 2)")
-        self._tolerance = _check.number("tolerance", tolerance, 1e-16, 0.1)
-        self._margin = _margin(extent, pupil)
-        self._pupil = pupil
-        self._masks = masks
-        m = self._margin
-        ny, nx = pupil.shape
-        self._detector_shape = ny + 2 * m, nx + 2 * m
-        self._window = slice(m, m + ny), slice(m, m + nx)
-        detector_axes = tuple(
-            axis[0] + (np.arange(axis.size + 2 * m) - m) / pupil.n_pixels for axis in (pupil.y, pupil.x)
-        )
-        self._factors = factorise(masks, (pupil.y, pupil.x), detector_axes, pupil.n_pixels**-2.0, self._tolerance)
+        super().__init__(pupil, masks, extent, tolerance, ONE_WAVELENGTH)
+        self._factors = factorise(masks, *self._axes(), pupil.n_pixels**-2.0, self._tolerance)
 
     def __repr__(self) -> str:
         masks = ", ".join(map(repr, self.masks))
         return f"ZernikeSensor({self.pupil.n_points} points, {masks}, extent={self.extent:g}, rank={self.rank})"
 
-    @property
-    def pupil(self) -> Pupil:
-        """Pupil of the sensor."""
-        return self._pupil
-
-    @property
-    def masks(self) -> tuple[Mask, ...]:
-        """Masks, in the order of the frames."""
-        return self._masks
-
-    @property
-    def extent(self) -> float:
-        """Width of the detector plane in D, after rounding to whole pixels."""
-        return 1 + 2 * self._margin / self._pupil.n_pixels
-
-    @property
-    def tolerance(self) -> float:
-        """Error of the reference wave, relative to the strongest response of the masks."""
-        return self._tolerance
-
-    @property
-    def detector_shape(self) -> tuple[int, int]:
-        """Rows and columns of a frame."""
-        return self._detector_shape
-
-    @property
-    def window(self) -> tuple[slice, slice]:
-        """Rows and columns of a frame in which the grid of the pupil lies."""
-        return self._window
-
-    @property
-    def n_masks(self) -> int:
-        """Number of masks, and of frames that one measurement makes."""
-        return len(self.masks)
-
-    @property
-    def rank(self) -> int:
-        """Number of coefficients that the reference waves are made of."""
-        return self._factors.pupil.rank
-
-    @property
-    def factors(self) -> Factors:
-        """Matrices of `eq-low-rank`, common to all masks but for the cores: to compute with them elsewhere."""
-        return self._factors
+    def with_tolerance(self, tolerance: float) -> ZernikeSensor:
+        """Return the same sensor with another error of the reference wave."""
+        return ZernikeSensor(self.pupil, *self.masks, extent=self.extent, tolerance=tolerance)
 
     def propagate(self, field: ArrayLike) -> NDArray[np.complexfloating]:
         """Field on the detector behind each mask.
@@ -203,55 +375,6 @@ class ZernikeSensor(Immutable):
         psi *= model.stop
         return kind.xp.reshape(psi, (*batch, *self.pupil.shape))
 
-    def measure(self, phase: ArrayLike, amplitude: ArrayLike | None = None) -> NDArray[np.floating]:
-        """Frames without noise.
-
-        Parameters
-        ----------
-        phase : array_like, shape (..., ny, nx), radian
-            Only the points of the pupil count; NaN or anything else is allowed outside.
-        amplitude : array_like, shape (..., ny, nx), optional
-            Field amplitude; that of the pupil if left out. Points outside the pupil stay dark.
-
-        Returns
-        -------
-        ndarray, shape (..., n_masks, ny_detector, nx_detector)
-            Intensity; 1 is the mean intensity in the pupil with the mask taken out. float32 if the phase is.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If phase or amplitude are complex, of the wrong shape, or not finite inside the pupil, or if the
-            amplitude is negative.
-
-        Warns
-        -----
-        UserWarning
-            If the rms of a phase is above 20 rad: it may be in degrees or nanometres.
-
-        References
-        ----------
-        Chambouleyron et al. 2024, equation (5).
-        """
-        maps, batch = pupil_maps("phase", phase, self)
-        kind = Kind.of(maps)
-        rms = self._largest_rms(maps, kind.xp)
-        if rms > _DEGREES:
-            warnings.warn(
-                f"phase has an rms of {rms:.4g}: expected radian, less than {_DEGREES:g} rms; is it in degrees?",
-                UserWarning,
-                stacklevel=2,
-            )
-        strength, strength_batch = amplitude_maps(amplitude, self, kind)
-        if strength_batch:
-            xp, shape = kind.xp, self.pupil.shape
-            maps, strength = xp.reshape(maps, (*batch, *shape)), xp.reshape(strength, (*strength_batch, *shape))
-            full = _check.broadcast(phase=maps, amplitude=strength)
-            maps, strength = (xp.reshape(xp.broadcast_to(one, full), (-1, *shape)) for one in (maps, strength))
-            batch = full[:-2]
-        frames = square(propagator(self, kind).propagate(split(maps, strength)))
-        return kind.xp.reshape(frames, (*batch, self.n_masks, *self.detector_shape))
-
     def _pupil_field(self, field: ArrayLike) -> tuple[NDArray, tuple[int, ...], Kind]:
         """Checked complex maps, (k, ny, nx) with 0 outside the pupil, the batch, and the kind of their parts."""
         psi, batch, kind = self._field(field, self.pupil.shape, "the shape of the pupil")
@@ -271,12 +394,6 @@ class ZernikeSensor(Immutable):
         if kind.xp is np:
             field = np.ascontiguousarray(field)  # numbers side by side can be viewed as pairs of real ones
         return kind.xp.reshape(field, (-1, *shape)), batch, kind
-
-    def _largest_rms(self, phase: NDArray, xp: Any) -> float:
-        """Largest rms of phases that are 0 outside the pupil, (k, ny, nx), piston removed."""
-        axes, n_points = (-2, -1), self.pupil.n_points
-        mean = xp.sum(phase, axis=axes) / n_points
-        return sqrt(max(float(xp.max(xp.sum(phase * phase, axis=axes) / n_points - mean * mean)), 0.0))
 
 
 def _margin(extent: float, pupil: Pupil) -> int:

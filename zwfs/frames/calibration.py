@@ -598,7 +598,7 @@ class _Work(NamedTuple):
         reached = np.stack([one.T @ inside > 0 for one in touching]).reshape(bad.shape)
         return cls(
             PhaseShifted(sensor, accelerate=True, **settings),
-            Response(sensor.factors, sensor.window, pupil),
+            Response.of(sensor),
             pupil.n_points,
             calibration.offset.astype(np.float32),
             sensor.measure(np.zeros(pupil.shape)).astype(np.float32),

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from math import prod
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +27,8 @@ from zwfs import _check
 from zwfs._arrays import Kind, per_kind, read_only
 from zwfs._pickle import Immutable
 from zwfs._propagator import Propagator, amplitude_maps, angle, propagator, pupil_maps, split, unit
-from zwfs.sensor import ZernikeSensor
+from zwfs.polychromatic import PolychromaticSensor, check_sensor
+from zwfs.sensor import Sensor, ZernikeSensor
 
 # Detector pixels handled together: on the processor few enough for its fast memory, enough to vectorise.
 _CHUNK, _CHUNK_ELSEWHERE = 80_000, 40_000_000
@@ -109,7 +110,7 @@ class Settings(Immutable):
 
     Attributes
     ----------
-    sensor : ZernikeSensor
+    sensor : ZernikeSensor or PolychromaticSensor
     n_iterations : int
         Largest number of iterations.
     tolerance : float, radian
@@ -128,7 +129,7 @@ class Settings(Immutable):
     3
     """
 
-    sensor: ZernikeSensor
+    sensor: ZernikeSensor | PolychromaticSensor
     n_iterations: int
     tolerance: float
     amplitude: NDArray[np.float64]
@@ -143,7 +144,7 @@ class Settings(Immutable):
         TypeError, ValueError
             If an argument is of the wrong kind, shape or range.
         """
-        _check.instance("sensor", sensor, ZernikeSensor)
+        check_sensor("sensor", sensor)
         n_iterations = _check.integer("n_iterations", n_iterations, 1, _MOST_ITERATIONS)
         tolerance = _check.number("tolerance", tolerance, 0)
         maps, batch = amplitude_maps(amplitude, sensor, Kind.numpy())
@@ -232,6 +233,8 @@ class Reconstructor(Immutable, ABC):
         Fewest and most masks of a sensor; class attribute.
     iterative : bool
         Whether the method iterates and accepts a starting phase; class attribute.
+    polychromatic : bool
+        Whether the method accepts a `PolychromaticSensor`; class attribute.
     any_library : bool
         Whether `solve` accepts arrays of any library. If not, frames become arrays of NumPy. Class attribute.
 
@@ -249,16 +252,23 @@ class Reconstructor(Immutable, ABC):
 
     n_masks: ClassVar[tuple[int, float]] = (1, math.inf)
     iterative: ClassVar[bool] = True
+    polychromatic: ClassVar[bool] = False
     any_library: ClassVar[bool] = False
 
     def __init__(
         self,
-        sensor: ZernikeSensor,
+        sensor: ZernikeSensor | PolychromaticSensor,
         *,
         n_iterations: int = 25,
         tolerance: float = 1e-6,
         amplitude: ArrayLike | None = None,
     ) -> None:
+        if isinstance(sensor, PolychromaticSensor) and not self.polychromatic:
+            raise TypeError(
+                f"sensor is a PolychromaticSensor: expected a ZernikeSensor for {type(self).__name__}, such as "
+                "sensor.reference, which ignores the bandwidth; Linear, GradientDescent and MaximumLikelihood "
+                "accept both"
+            )
         self._settings = Settings.checked(sensor, n_iterations, tolerance, amplitude)
         self._light = self._settings.light  # of a clear frame; infinite where frames may come in any unit
         fewest, most = self.n_masks
@@ -277,7 +287,7 @@ class Reconstructor(Immutable, ABC):
         return self._settings
 
     @property
-    def sensor(self) -> ZernikeSensor:
+    def sensor(self) -> ZernikeSensor | PolychromaticSensor:
         """Sensor whose frames are reconstructed."""
         return self._settings.sensor
 
@@ -384,7 +394,7 @@ class ClosedForm(Reconstructor):
 
     iterative = False
 
-    def __init__(self, sensor: ZernikeSensor, *, amplitude: ArrayLike | None = None) -> None:
+    def __init__(self, sensor: ZernikeSensor | PolychromaticSensor, *, amplitude: ArrayLike | None = None) -> None:
         super().__init__(sensor, n_iterations=1, tolerance=0.0, amplitude=amplitude)
 
     @abstractmethod
@@ -444,6 +454,11 @@ class FixedPoint(Reconstructor):
     """
 
     any_library = True
+
+    @property
+    def sensor(self) -> ZernikeSensor:
+        """Sensor whose frames are reconstructed."""
+        return cast(ZernikeSensor, self._settings.sensor)
 
     def constants(self, kind: Kind) -> Any:
         """Arrays of one kind that all frames share; an override is decorated with `per_kind`."""
@@ -541,7 +556,7 @@ def pieces(frames: NDArray, kind: Kind, size: int | None = None) -> Iterator[sli
 
 
 def check_frames(
-    sensor: ZernikeSensor, frames: ArrayLike, name: str = "frames", *, light: float = math.inf
+    sensor: Sensor, frames: ArrayLike, name: str = "frames", *, light: float = math.inf
 ) -> tuple[NDArray[np.floating], tuple[int, ...]]:
     """Check frames and return them with one batch axis, (k, n_masks, ny', nx'), and the shape of their batch.
 
@@ -587,7 +602,7 @@ def check_frames(
     return flat, batch
 
 
-def _warn_of_counts(sensor: ZernikeSensor, name: str, frames: NDArray, light: float) -> None:
+def _warn_of_counts(sensor: Sensor, name: str, frames: NDArray, light: float) -> None:
     """Warn if frames (k, n_masks, ny', nx') are brighter inside the pupil than behind any mask."""
     kind = Kind.of(frames)
     inside = frames[(..., *sensor.window)] * propagator(sensor, kind).stop
@@ -604,7 +619,7 @@ def _warn_of_counts(sensor: ZernikeSensor, name: str, frames: NDArray, light: fl
 
 
 def check_phase(
-    name: str, phase: ArrayLike, sensor: ZernikeSensor, batch: tuple[int, ...], kind: Kind
+    name: str, phase: ArrayLike, sensor: Sensor, batch: tuple[int, ...], kind: Kind
 ) -> NDArray[np.floating]:
     """Check one phase, or one for each frame set, and return one for each: (k, ny, nx), 0 outside the pupil.
 

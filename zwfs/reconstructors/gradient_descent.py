@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind
-from zwfs._propagator import split, square
+from zwfs._propagator import along_phase, parts_sum, square
 from zwfs.modes import check_modes
+from zwfs.polychromatic import PolychromaticSensor
 from zwfs.reconstructors.base import Reconstructor, Solution, check_frames
 from zwfs.sensor import ZernikeSensor
 
@@ -32,7 +33,7 @@ class GradientDescent(Reconstructor):
 
     Parameters
     ----------
-    sensor : ZernikeSensor
+    sensor : ZernikeSensor or PolychromaticSensor
         With any number of masks.
     modes : array_like, shape (n_modes, ny, nx), optional
         Modes whose coefficients are sought; the phases of all points of the pupil if left out.
@@ -54,9 +55,11 @@ class GradientDescent(Reconstructor):
     True
     """
 
+    polychromatic = True
+
     def __init__(
         self,
-        sensor: ZernikeSensor,
+        sensor: ZernikeSensor | PolychromaticSensor,
         modes: ArrayLike | None = None,
         *,
         n_iterations: int = 25,
@@ -117,12 +120,11 @@ class GradientDescent(Reconstructor):
 
     def _cost(self, phase: NDArray, frames: NDArray) -> tuple[float, NDArray]:
         pupil, model = self.sensor.pupil, self.settings.model(Kind.of(frames))
-        psi = split(pupil.scatter(phase.astype(frames.dtype), fill=0)[np.newaxis], model.amplitude)
+        psi = model.incoming(pupil.scatter(phase.astype(frames.dtype), fill=0)[np.newaxis])
         waves = model.propagate(psi)
         mismatch = square(waves) - frames
         back = model.adjoint(waves * mismatch[:, :, np.newaxis])
-        # 2 Im(conj(psi) back)
-        gradient = 2 * (psi[0, 0] * back[0, 1] - psi[0, 1] * back[0, 0]) / mismatch.size
+        gradient = 2 * parts_sum(along_phase(psi, model.channels.ratios, np) * back)[0] / mismatch.size
         return float(np.vdot(mismatch, mismatch)) / (2 * mismatch.size), pupil.gather(gradient)
 
     def _descend(self, frames: NDArray, start: NDArray) -> tuple[list[NDArray], bool]:

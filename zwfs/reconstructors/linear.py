@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind, read_only
-from zwfs._propagator import split, square
+from zwfs._propagator import square
 from zwfs.modes import check_modes
+from zwfs.polychromatic import PolychromaticSensor
 from zwfs.reconstructors.base import ClosedForm, check_frames, check_phase
 from zwfs.sensor import ZernikeSensor
 
@@ -25,7 +26,7 @@ class Linear(ClosedForm):
 
     Parameters
     ----------
-    sensor : ZernikeSensor
+    sensor : ZernikeSensor or PolychromaticSensor
         With any number of masks.
     modes : array_like, shape (n_modes, ny, nx)
         Modes that the phase is made of, such as those of `zernike_basis`.
@@ -67,9 +68,11 @@ class Linear(ClosedForm):
     True
     """
 
+    polychromatic = True
+
     def __init__(
         self,
-        sensor: ZernikeSensor,
+        sensor: ZernikeSensor | PolychromaticSensor,
         modes: ArrayLike,
         *,
         poke: float = 0.01,
@@ -152,7 +155,7 @@ class Linear(ClosedForm):
 
     def _model(self, phase: NDArray) -> NDArray:
         model = self.settings.model(Kind.numpy())
-        return square(model.propagate(split(phase, model.amplitude)))
+        return square(model.propagate(model.incoming(phase)))
 
     def _signal(self, frames: NDArray) -> NDArray:
         """Values at the points of the pupil, all masks in a row: (k, n_masks * n_points)."""

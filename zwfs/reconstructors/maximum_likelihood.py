@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs._arrays import Kind, read_only
 from zwfs._information import Inverse, Response
-from zwfs._likelihood import Estimator, Noise, require_information, tangents
-from zwfs._propagator import Propagator, angle, split, square
+from zwfs._likelihood import Estimator, Noise, require_information, require_one_wavelength, tangents
+from zwfs._propagator import Propagator, angle, parts_sum, split, square
 from zwfs.modes import check_modes, power_law_screens, zernike_basis
+from zwfs.polychromatic import PolychromaticSensor
 from zwfs.reconstructors.arcsine import Arcsine
 from zwfs.reconstructors.base import FixedPoint, Reconstruction, Reconstructor, Solution, pieces
 from zwfs.reconstructors.phase_shifted import PhaseShifted
@@ -27,6 +28,7 @@ _DAMPING = 1e-3  # of the first step, relative to the mean of the information's 
 _LEAST_CUT = 0.1  # of the damping after a good step
 _KICK, _SHIFT = 1.0, 0.5  # radian rms, random phases of the other starts
 _KICK_MODES = 20
+_UNWRAPPED_MODES = 40  # of the smooth part of a phase that is known up to multiples of 2 pi
 _RESIDUAL = 1e-5  # rms, in units of the mean intensity, up to which frames without a noise model are explained
 _GROWTH = 2.0  # of the damping after a first step that raises the cost
 _NOTHING = 1e-300  # keeps quotients finite
@@ -136,7 +138,7 @@ class LikelihoodReconstruction(Reconstruction):
         xp, shape = model.kind.xp, (-1, *model.pupil.shape)
         phase = xp.reshape(xp.where(model.inside, self.phase, model.kind.array(0.0)), shape)
         if self.amplitude is None:
-            return split(phase, model.amplitude)
+            return model.incoming(phase)
         return split(phase, xp.reshape(xp.where(model.inside, self.amplitude, model.kind.array(0.0)), shape))
 
 
@@ -153,9 +155,13 @@ class MaximumLikelihood(Reconstructor):
     of the phase without piston. A dimple near 2.44 lambda/D hardly shows small tilts. A single mask hardly shows
     phases at which its intensity is extreme. The damping holds such directions, and `sigma` reports a large error.
 
+    With a `PolychromaticSensor` the phase is that at its reference wavelength, and is not wrapped. The first
+    iterations ignore the bandwidth. Their phase is unwrapped about a smooth one, since the frames hardly show
+    multiples of 2 pi.
+
     Parameters
     ----------
-    sensor : ZernikeSensor
+    sensor : ZernikeSensor or PolychromaticSensor
         With any number of masks.
     modes : array_like, shape (n_modes, ny, nx), optional
         Modes whose coefficients are estimated; the phases of all points if left out.
@@ -169,7 +175,7 @@ class MaximumLikelihood(Reconstructor):
     amplitude : array_like, shape (ny, nx), or "unknown", optional
         Measured amplitude A_in in the pupil; that of the sensor's pupil if left out. If unknown, the amplitude of
         every point is estimated, too. This takes three different masks or more; a clear frame is that of a mask
-        that changes nothing, such as `Dimple(1, 0)`.
+        that changes nothing, such as `Dimple(1, 0)`; and one wavelength.
     n_iterations : int
         Largest number of steps from one start.
     tolerance : float, radian
@@ -207,10 +213,11 @@ class MaximumLikelihood(Reconstructor):
     """
 
     any_library = True
+    polychromatic = True
 
     def __init__(
         self,
-        sensor: ZernikeSensor,
+        sensor: ZernikeSensor | PolychromaticSensor,
         modes: ArrayLike | None = None,
         *,
         photons: float | None = None,
@@ -234,18 +241,24 @@ class MaximumLikelihood(Reconstructor):
             raise ValueError(
                 "amplitude = 'unknown': expected a known one with modes, which describe the phase only"
             )
+        if unknown:
+            require_one_wavelength(sensor)
         require_information(sensor, unknown)
         pupil = sensor.pupil
         values = None if modes is None else check_modes(pupil, modes)
         basis = None if values is None else read_only(pupil.scatter(values, fill=0))
         precision = _precision(prior, values, noise)
-        rough = ZernikeSensor(pupil, *sensor.masks, extent=sensor.extent, tolerance=max(_COARSE, sensor.tolerance))
+        rough = sensor.with_tolerance(max(_COARSE, sensor.tolerance))
         self._exact, self._rough = (
-            Estimator(Response(one.factors, one.window, pupil), noise, unknown, basis, precision)
-            for one in (sensor, rough)
+            Estimator(Response.of(one), noise, unknown, basis, precision) for one in (sensor, rough)
         )
         self._first = self._first_method()
         self._slopes = None if basis is None else _Slopes.of(pupil.inside, basis)
+        self._smooth: NDArray[np.float64] | None = None
+        if basis is None and isinstance(sensor, PolychromaticSensor):
+            smooth = zernike_basis(pupil, min(_UNWRAPPED_MODES, pupil.n_points - 1))
+            self._smooth = read_only(np.where(pupil.inside, smooth, 0))
+            self._slopes = _Slopes.of(pupil.inside, self._smooth)
         n_low = min(_KICK_MODES, pupil.n_points - 1)
         self._kicks: NDArray[np.float64] = np.zeros((0, *pupil.shape))
         if n_starts > 1 and n_low:
@@ -330,14 +343,23 @@ class MaximumLikelihood(Reconstructor):
         if self._first is None:
             flat = 0 * frames[(..., *self.sensor.window)][:, 0, ...]
             return flat if start is None else start
-        return self._first.solve(frames, start, False).phase
+        return self._unwrapped(self._first.solve(frames, start, False).phase)
+
+    def _unwrapped(self, phase: NDArray) -> NDArray:
+        """Phase (k, ny, nx) with the multiples of 2 pi that bring it nearest to a smooth one, in a band."""
+        if self._smooth is None or self._slopes is None:
+            return phase
+        kind = Kind.of(phase)
+        flat = kind.xp.reshape(kind.array(self._smooth), (self._smooth.shape[0], -1))
+        smooth = kind.xp.reshape(self._slopes.fit(phase, kind) @ flat, phase.shape)
+        return phase - 2 * np.pi * kind.xp.round((phase - smooth) / (2 * np.pi))
 
     def _other_start(self, attempt: int, fit: _Fit) -> NDArray:
         """Phase from which the next attempt begins, (k, ny, nx); it depends on no other frame set."""
         kind, some = Kind.of(fit.psi), 0 * fit.psi[:, 0, ...]
         kick = kind.array(self._kicks[attempt - 1])
         if attempt % 2:
-            return angle(fit.psi, kind.xp) + kick
+            return (angle(fit.psi, kind.xp) if fit.phase is None else fit.phase) + kick
         return self._rough_phase(fit.frames, some + _SHIFT * kick)
 
     def _descend(self, frames: NDArray, start: NDArray, history: bool) -> _Fit:
@@ -368,19 +390,21 @@ class MaximumLikelihood(Reconstructor):
         """Return the fit at a starting phase, (k, ny, nx)."""
         kind, k = Kind.of(frames), frames.shape[0]
         model, coefficients = self.settings.model(kind), None
-        if self._slopes is not None:
+        if self._exact.modes is not None and self._slopes is not None:
             coefficients = self._slopes.fit(start, kind)
             start = self._of_modes(coefficients)
-        psi = split(start, model.amplitude)
+        psi = model.incoming(start)
         for _ in range(_LINEAR_ITERATIONS if self._exact.unknown_amplitude else 0):
             psi = _linear_field(frames, psi, model)
-        fit = self._at(psi, coefficients, frames)
+        fit = self._at(psi, coefficients, frames, None if self._smooth is None else start)
         zeros = kind.integers([0] * k)
         fit.damping, fit.growth = _DAMPING + kind.zeros(k), _GROWTH + kind.zeros(k)
         fit.n_iterations, fit.converged, fit.n_starts, fit.n_reflections = zeros, zeros > 0, zeros + 1, zeros
         return fit
 
-    def _at(self, psi: NDArray, coefficients: NDArray | None, frames: NDArray) -> _Fit:
+    def _at(
+        self, psi: NDArray, coefficients: NDArray | None, frames: NDArray, phase: NDArray | None = None
+    ) -> _Fit:
         """Return the model of the frames at a field, and its cost."""
         waves = self.settings.model(Kind.of(psi)).propagate(psi)
         light = square(waves)
@@ -388,7 +412,7 @@ class MaximumLikelihood(Reconstructor):
         if coefficients is not None and self._exact.precision is not None:
             precision = Kind.of(cost).array(self._exact.precision)
             cost = cost + Kind.of(cost).xp.vecdot(coefficients @ precision, coefficients)
-        return _Fit(frames, psi, waves, light, cost, coefficients)
+        return _Fit(frames, psi, waves, light, cost, coefficients, phase)
 
     def _step(self, fit: _Fit) -> None:
         """Try a step (`eq-step`) on every frame set; take it where the cost falls.
@@ -419,8 +443,8 @@ class MaximumLikelihood(Reconstructor):
         """Damped information at the field of a fit."""
         estimator, kind = self._exact, Kind.of(fit.psi)
         xp = kind.xp
-        change = tangents(fit.psi, self.settings.model(kind).stop, estimator.unknown_amplitude, xp)
-        information = self._rough.response.information(change, fit.waves, estimator.noise.weights(fit.light))
+        weights = estimator.noise.weights(fit.light)
+        information = self._rough.response.information(self._tangents(fit), fit.waves, weights)
         scale = information.scale[:, 0, 0]
         if estimator.modes is None:
             absolute = fit.damping[:, np.newaxis, np.newaxis] * information.scale
@@ -447,9 +471,9 @@ class MaximumLikelihood(Reconstructor):
         """
         kind, estimator = Kind.of(fit.psi), self._exact
         xp, model = kind.xp, self.settings.model(kind)
-        change = tangents(fit.psi, model.stop, estimator.unknown_amplitude, xp)
+        change = self._tangents(fit)
         gradient = self._gradient(fit, change)
-        coefficients = fit.coefficients
+        coefficients, phase = fit.coefficients, fit.phase
         if coefficients is None:
             step, promised = _points_step(hessian, gradient)
         else:
@@ -458,11 +482,14 @@ class MaximumLikelihood(Reconstructor):
             step = self._of_modes(jump)[:, np.newaxis, ...]
         if estimator.unknown_amplitude:
             psi = fit.psi + xp.sum(change * step[:, :, np.newaxis, ...], axis=1)
-        elif coefficients is None:
-            psi = _turned(fit.psi, step[:, 0, ...], xp)
+        elif coefficients is not None:
+            psi = model.incoming(self._of_modes(coefficients))
+        elif phase is not None:
+            phase = phase + 2 * xp.atan(step[:, 0, ...] / 2)  # the angle of `_turned`
+            psi = model.incoming(phase)
         else:
-            psi = split(self._of_modes(coefficients), model.amplitude)
-        trial = self._at(psi, coefficients, fit.frames)
+            psi = _turned(fit.psi, step[:, 0, ...], xp)
+        trial = self._at(psi, coefficients, fit.frames, phase)
         better = some & (trial.cost < fit.cost)
         fit.take(better, trial, xp)
         return better, promised, xp.sqrt(xp.sum(step * step, axis=(1, 2, 3)) / model.pupil.n_points)
@@ -472,8 +499,12 @@ class MaximumLikelihood(Reconstructor):
         weights, difference = self._exact.noise.weights(fit.light), fit.light - fit.frames
         weighted = difference if weights is None else weights * difference
         back = self.settings.model(Kind.of(fit.psi)).adjoint(fit.waves * weighted[:, :, np.newaxis, ...])
-        products = change * back[:, np.newaxis, ...]
-        return 2 * (products[:, :, 0, ...] + products[:, :, 1, ...])
+        return 2 * parts_sum(change * back[:, np.newaxis, ...])
+
+    def _tangents(self, fit: _Fit) -> NDArray:
+        """Change of the field per unit of the unknowns, (k, c, 2 n_wavelengths, ny, nx)."""
+        model = self.settings.model(Kind.of(fit.psi))
+        return tangents(fit.psi, model.stop, self._exact.unknown_amplitude, model.kind.xp, model.channels.ratios)
 
     def _reflect(self, fit: _Fit) -> None:
         """Try to leave local minima of single points, where frame sets have converged.
@@ -481,10 +512,11 @@ class MaximumLikelihood(Reconstructor):
         The intensity of a point depends on the angle between its field psi and the reference wave r of a mask. Its
         reflection at r gives the same intensity behind this mask (`eq-reflection`). A point may have converged to
         the wrong one of the two, mostly where a frame is dark. With the reference waves held, each point takes the
-        reflection that makes its frames most likely. Frame sets whose cost falls by this continue.
+        reflection that makes its frames most likely. Frame sets whose cost falls by this continue. In a band of
+        light the reflections of the wavelengths differ, and none is tried.
         """
         estimator = self._exact
-        if estimator.unknown_amplitude or estimator.modes is not None:
+        if estimator.unknown_amplitude or estimator.modes is not None or fit.phase is not None:
             return
         xp = Kind.of(fit.psi).xp
         model = self.settings.model(Kind.of(fit.psi))
@@ -524,9 +556,9 @@ class MaximumLikelihood(Reconstructor):
 
     def _phase(self, fit: _Fit) -> NDArray:
         """Phase of fits, (k, ny, nx)."""
-        return (
-            angle(fit.psi, Kind.of(fit.psi).xp) if fit.coefficients is None else self._of_modes(fit.coefficients)
-        )
+        if fit.coefficients is not None:
+            return self._of_modes(fit.coefficients)
+        return angle(fit.psi, Kind.of(fit.psi).xp) if fit.phase is None else fit.phase
 
     def _of_modes(self, coefficients: NDArray) -> NDArray:
         """Phase of coefficients: (k, m) to (k, ny, nx)."""
@@ -566,10 +598,11 @@ class MaximumLikelihood(Reconstructor):
 
     def _first_method(self) -> FixedPoint | None:
         """Method of the first iterations; None for masks that no iteration of this package handles."""
-        method, options = (PhaseShifted, {"accelerate": True}) if self.sensor.n_masks > 1 else (Arcsine, {})
+        sensor = self.sensor.reference if isinstance(self.sensor, PolychromaticSensor) else self.sensor
+        method, options = (PhaseShifted, {"accelerate": True}) if sensor.n_masks > 1 else (Arcsine, {})
         try:
             return method(
-                self.sensor,
+                sensor,
                 n_iterations=_FIRST_ITERATIONS,
                 tolerance=0,
                 amplitude=self.settings.amplitude,
@@ -584,11 +617,12 @@ class _Fit:
     """State of the fits of k frame sets."""
 
     frames: NDArray[np.floating]  # (k, n_masks, ny', nx'), measured
-    psi: NDArray[np.floating]  # (k, 2, ny, nx), field in the pupil
-    waves: NDArray[np.floating]  # (k, n_masks, 2, ny', nx'), its fields on the detector
+    psi: NDArray[np.floating]  # (k, 2 n_wavelengths, ny, nx), field in the pupil
+    waves: NDArray[np.floating]  # (k, n_masks, 2 n_wavelengths, ny', nx'), its fields on the detector
     light: NDArray[np.floating]  # (k, n_masks, ny', nx'), their intensity
     cost: NDArray[np.floating]  # (k,), twice the negative logarithm of the likelihood and of the prior
     coefficients: NDArray[np.floating] | None = None  # (k, m), of the modes
+    phase: NDArray[np.floating] | None = None  # (k, ny, nx), in a band of light: not wrapped
     damping: Any = None  # (k,), relative to the mean of the diagonal of the information
     growth: Any = None  # (k,), of the damping after a step that raises the cost
     n_iterations: Any = None  # (k,)

@@ -1,0 +1,315 @@
+import pickle
+
+import numpy as np
+import pytest
+
+from zwfs import (
+    Arcsine,
+    Dimple,
+    GerchbergSaxton,
+    GradientDescent,
+    Linear,
+    MaximumLikelihood,
+    Patch,
+    PhaseShifted,
+    PolychromaticSensor,
+    Pupil,
+    ZernikeSensor,
+    cramer_rao,
+    power_law_screens,
+    reconstruction_error,
+    zernike_basis,
+)
+
+from .reference import HcipySensor, exact_frame
+
+WAVELENGTHS, WEIGHTS, REFERENCE = [600.0, 640.0, 700.0], [1.0, 3.0, 2.0], 650.0
+
+
+@pytest.fixture(scope="module")
+def pupil():
+    return Pupil.circular(24)
+
+
+@pytest.fixture(scope="module")
+def modes(pupil):
+    return zernike_basis(pupil, 30)
+
+
+@pytest.fixture(scope="module")
+def sensor(pupil):
+    return ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
+
+
+@pytest.fixture(scope="module")
+def phases(modes):
+    return power_law_screens(modes, 0.8, 2, exponent=-2, seed=1)
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["achromatic", "chromatic"])
+def band(sensor, request):
+    return PolychromaticSensor(
+        sensor, WAVELENGTHS, WEIGHTS, reference_wavelength=REFERENCE, chromatic=request.param
+    )
+
+
+def explicit(band, phases, amplitude=None):
+    """Sum of the frames of one sensor for each wavelength."""
+    total, light = 0, np.sum(WEIGHTS)
+    for wavelength, weight in zip(WAVELENGTHS, WEIGHTS, strict=True):
+        ratio = REFERENCE / wavelength
+        shift = ratio if band.chromatic else 1.0
+        masks = [Dimple(mask.diameter * ratio, mask.phase * shift) for mask in band.masks]
+        one = ZernikeSensor(band.pupil, *masks, extent=band.extent)
+        total = total + weight / light * one.measure(ratio * phases, amplitude)
+    return total
+
+
+def test_frames_are_the_sum_over_the_wavelengths(band, phases):
+    np.testing.assert_allclose(band.measure(phases), explicit(band, phases), atol=1e-9)
+    amplitude = band.pupil.inside * (1 + 0.2 * band.pupil.x)
+    np.testing.assert_allclose(band.measure(phases, amplitude), explicit(band, phases, amplitude), atol=1e-9)
+
+
+def test_frames_are_the_sum_on_a_wide_detector(sensor, phases):
+    wide = ZernikeSensor(sensor.pupil, *sensor.masks, extent=1.5)
+    band = PolychromaticSensor(wide, WAVELENGTHS, WEIGHTS, reference_wavelength=REFERENCE)
+    np.testing.assert_allclose(band.measure(phases), explicit(band, phases), atol=1e-9)
+
+
+def test_frames_are_those_of_the_exact_kernel(band, phases):
+    total = 0
+    for wavelength, weight in zip(band.wavelengths, band.weights, strict=True):
+        ratio = REFERENCE / wavelength
+        mask = Dimple(1.06 * ratio, np.pi / 2 * (ratio if band.chromatic else 1))
+        total = total + weight * exact_frame(band.pupil, mask, ratio * phases[0])
+    inside = band.pupil.inside
+    np.testing.assert_allclose(band.measure(phases[0])[0][inside], total[inside], atol=1e-8)
+
+
+def test_frames_agree_with_hcipy():
+    pupil = Pupil.circular(48)
+    band = PolychromaticSensor.flat_band(ZernikeSensor(pupil, Dimple(1.06, np.pi / 2)), 0.25, 3)
+    phase = power_law_screens(zernike_basis(pupil, 50), 0.5, 1, seed=1)[0]
+    theirs = 0
+    for wavelength, weight in zip(band.wavelengths, band.weights, strict=True):
+        one = HcipySensor(pupil, Dimple(1.06 / wavelength, np.pi / 2), num_pix=128)
+        theirs = theirs + weight * one.measure(phase / wavelength)[0]
+    ours, alone = band.measure(phase)[0], band.reference.measure(phase)[0]
+    assert np.abs(ours - theirs)[pupil.inside].max() < 2e-3
+    assert np.abs(alone - theirs)[pupil.inside].max() > 2e-2
+
+
+def test_one_wavelength_is_the_monochromatic_sensor(sensor, phases):
+    one = PolychromaticSensor(sensor, [633.0])
+    assert np.array_equal(one.measure(phases), sensor.measure(phases))
+    assert np.array_equal(PolychromaticSensor.flat_band(sensor, 0.0).measure(phases), sensor.measure(phases))
+    same = PolychromaticSensor(sensor, [633.0, 633.0], [1, 2])
+    np.testing.assert_allclose(same.measure(phases), sensor.measure(phases), atol=1e-12)
+    bounds = [cramer_rao(one_of, phases[0], photons=100) for one_of in (sensor, one, same)]
+    np.testing.assert_allclose(bounds[1], bounds[0], rtol=1e-12)
+    np.testing.assert_allclose(bounds[2], bounds[0], rtol=1e-8)
+
+
+@pytest.mark.parametrize("chromatic", [False, True])
+def test_difference_to_one_wavelength_falls_with_the_square_of_the_bandwidth(sensor, phases, chromatic):
+    alone = sensor.measure(phases)
+    small, large = (
+        np.abs(PolychromaticSensor.flat_band(sensor, width, chromatic=chromatic).measure(phases) - alone).max()
+        for width in (0.01, 0.04)
+    )
+    assert large / small == pytest.approx(16, rel=0.02)
+
+
+def test_five_wavelengths_are_enough_for_a_quarter_of_the_centre(sensor, phases):
+    few, many = (PolychromaticSensor.flat_band(sensor, 0.25, n).measure(phases) for n in (5, 20))
+    np.testing.assert_allclose(few, many, atol=1e-6)
+
+
+def test_only_ratios_of_wavelengths_and_weights_count(sensor, phases):
+    frames = [
+        PolychromaticSensor(sensor, scale * np.array(WAVELENGTHS), scale * np.array(WEIGHTS)).measure(phases)
+        for scale in (1, 1e-3)
+    ]
+    np.testing.assert_allclose(*frames, atol=1e-12)
+    band = PolychromaticSensor(sensor, WAVELENGTHS, WEIGHTS)
+    assert band.reference_wavelength == pytest.approx(np.average(WAVELENGTHS, weights=WEIGHTS))
+
+
+def test_a_patch_keeps_its_size_in_the_focal_plane(sensor, phases):
+    def shift(u, v):
+        return np.where(np.hypot(u, v) < 0.5, 1j, np.exp(0.3j))
+
+    patch = ZernikeSensor(sensor.pupil, Patch(1.06, shift, breaks=[1.0]))
+    total = 0
+    for wavelength in (0.9, 1.1):
+        scaled = Patch(
+            1.06 / wavelength, lambda u, v, w=wavelength: shift(u * w, v * w), breaks=[1.0 / wavelength]
+        )
+        total = total + ZernikeSensor(sensor.pupil, scaled).measure(phases / wavelength) / 2
+    band = PolychromaticSensor(patch, [0.9, 1.1])
+    np.testing.assert_allclose(band.measure(phases), total, atol=1e-9)
+    with pytest.raises(ValueError, match="chromatic = True: expected Dimples"):
+        PolychromaticSensor(patch, [0.9, 1.1], chromatic=True)
+
+
+@pytest.fixture(params=["one wavelength", "band"])
+def any_sensor(sensor, band, request):
+    return sensor if request.param == "one wavelength" else band
+
+
+def test_jacobian_is_the_derivative_of_the_frames(any_sensor, phases):
+    change, step = np.random.default_rng(1).standard_normal(phases.shape), 1e-5
+    expected = (any_sensor.measure(phases + step * change) - any_sensor.measure(phases - step * change)) / (
+        2 * step
+    )
+    np.testing.assert_allclose(any_sensor.jacobian(phases, change), expected, atol=1e-8)
+
+
+def test_adjoint_of_the_jacobian_has_the_same_products(any_sensor, phases):
+    rng = np.random.default_rng(2)
+    change = rng.standard_normal(phases.shape) * any_sensor.pupil.inside
+    frames = rng.standard_normal((len(phases), any_sensor.n_masks, *any_sensor.detector_shape))
+    left = np.vdot(any_sensor.jacobian(phases, change), frames)
+    right = np.vdot(change, any_sensor.jacobian_adjoint(phases, frames))
+    assert left == pytest.approx(right, rel=1e-12)
+
+
+def test_jacobian_refuses_maps_of_another_batch(any_sensor, phases):
+    with pytest.raises(ValueError, match="change has shape"):
+        any_sensor.jacobian(phases, phases[0])
+    frames = np.ones((2, 24, 24))
+    with pytest.raises(ValueError, match=r"frames has shape \(2, 24, 23\)"):
+        any_sensor.jacobian_adjoint(phases[0], frames[..., :23])
+    frames[0, 0, 0] = np.nan
+    with pytest.raises(ValueError, match="frames holds 1 NaN"):
+        any_sensor.jacobian_adjoint(phases[0], frames)
+
+
+def test_the_bound_is_that_of_the_dense_information(band, phases):
+    pupil = Pupil.circular(10)
+    small = PolychromaticSensor(
+        ZernikeSensor(pupil, *band.masks, extent=1.4), band.wavelengths, band.weights, chromatic=band.chromatic
+    )
+    rng = np.random.default_rng(3)
+    phase, n = pupil.scatter(0.5 * rng.standard_normal(pupil.n_points), fill=0), pupil.n_points
+    units = pupil.scatter(np.eye(n), fill=0)
+    rows = small.jacobian(np.broadcast_to(phase, units.shape), units).reshape(n, -1)
+    weights = 100.0**2 / (100.0 * small.measure(phase).ravel() + 4.0)
+    information = (rows * weights) @ rows.T
+    piston = np.ones((n, n)) / n
+    covariance = np.linalg.inv(information + piston) - piston
+    bound = pupil.gather(cramer_rao(small, phase, photons=100.0, read_noise=2.0))
+    np.testing.assert_allclose(bound, np.sqrt(np.diag(covariance)), rtol=1e-6)
+
+
+def test_methods_that_know_the_band_find_the_phase_and_those_that_ignore_it_do_not(band, modes, phases):
+    frames = band.measure(phases)
+
+    def error(method):
+        return reconstruction_error(band.pupil, method(frames).phase, phases).max()
+
+    assert error(MaximumLikelihood(band)) < 1e-6
+    assert error(MaximumLikelihood(band, modes)) < 1e-6
+    assert error(GradientDescent(band, modes, n_iterations=60)) < 1e-4
+    ignorant = PhaseShifted(band.reference), MaximumLikelihood(band.reference, n_starts=1)
+    assert min(map(error, ignorant)) > 1e-4
+    small = 0.01 * phases
+    wrong, right = (
+        reconstruction_error(band.pupil, Linear(one, modes)(band.measure(small)).phase, small).max()
+        for one in (band.reference, band)
+    )
+    assert right < wrong / 3
+
+
+def test_likelihood_follows_a_phase_beyond_pi(sensor, modes):
+    band = PolychromaticSensor.flat_band(sensor, 0.25)
+    phases = power_law_screens(modes, 1.6, 4, exponent=-3, seed=1)
+    assert np.abs(band.pupil.gather(phases)).max() > np.pi + 0.5
+    result = MaximumLikelihood(band)(band.measure(phases))
+    difference = band.pupil.gather(result.phase - phases)
+    difference -= difference.mean(axis=-1, keepdims=True)
+    assert np.abs(difference).max() < 1e-5  # without wrapping
+    assert result.consistent.all()
+    assert result.residual.max() < 1e-6
+
+
+def test_standard_errors_in_a_band_are_right(sensor, phases):
+    rough = sensor.with_tolerance(1e-5)
+    band = PolychromaticSensor.flat_band(rough, 0.25, 3)
+    rng, photons = np.random.default_rng(4), 1e4
+    frames = rng.poisson(photons * np.repeat(band.measure(phases[:1]), 12, axis=0)) / photons
+    result = MaximumLikelihood(band, photons=photons)(frames)
+    bound = np.sqrt(np.nanmean(cramer_rao(band, phases[0], photons=photons) ** 2))
+    error = reconstruction_error(band.pupil, result.phase, phases[0])
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(bound, rel=0.05)
+    assert np.sqrt(np.nanmean(MaximumLikelihood(band, photons=photons)(frames[0]).sigma ** 2)) == pytest.approx(
+        bound, rel=0.02
+    )
+    assert result.consistent.all()
+    assert np.mean(result.chi2) == pytest.approx(1, abs=0.02)
+
+
+def test_gradient_of_the_descent(band, phases):
+    descent = GradientDescent(band)
+    phase, frames = band.pupil.gather(phases[0]), band.measure(phases[1])
+    cost, gradient = descent.cost(phase, frames)
+    change, step = np.random.default_rng(5).standard_normal(phase.size), 1e-5
+    expected = (descent.cost(phase + step * change, frames)[0] - cost) / step
+    assert gradient @ change == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("method", [PhaseShifted, Arcsine, GerchbergSaxton])
+def test_methods_of_one_wavelength_refuse_a_band(band, method):
+    with pytest.raises(
+        TypeError, match=f"expected a ZernikeSensor for {method.__name__}, such as sensor.reference"
+    ):
+        method(band)
+
+
+def test_an_unknown_amplitude_needs_one_wavelength(sensor):
+    three = ZernikeSensor(sensor.pupil, *sensor.masks, Dimple(1, 0))
+    band = PolychromaticSensor.flat_band(three, 0.1, 3)
+    with pytest.raises(ValueError, match="the sensor has 3 wavelengths: expected a known amplitude"):
+        MaximumLikelihood(band, amplitude="unknown")
+    with pytest.raises(ValueError, match="the sensor has 3 wavelengths"):
+        cramer_rao(band, np.zeros(sensor.pupil.shape), photons=100, amplitude_known=False)
+
+
+def test_a_band_cannot_be_changed_and_survives_a_pickle(band, phases):
+    with pytest.raises(AttributeError):
+        band.chromatic = True
+    with pytest.raises(ValueError, match="read-only"):
+        band.weights[0] = 1
+    copy = pickle.loads(pickle.dumps(band))
+    assert np.array_equal(copy.measure(phases), band.measure(phases))
+    assert "3 wavelengths from 600 to 700" in repr(band)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "message"),
+    [
+        (([],), {}, "wavelengths has shape"),
+        (([600.0, -1.0],), {}, "wavelengths = "),
+        (([100.0, 600.0],), {}, "within a factor of 4"),
+        ((np.ones(65),), {}, "wavelengths has 65 values"),
+        (([600.0], [1.0, 2.0]), {}, "weights has shape"),
+        (([600.0, 700.0], [1.0, -2.0]), {}, "weights reaches down to -2"),
+        (([600.0, 700.0], [0.0, 0.0]), {}, "weights is 0"),
+        (([600.0],), {"reference_wavelength": 0.0}, "reference_wavelength = 0.0"),
+    ],
+)
+def test_bad_input_is_refused(sensor, arguments, options, message):
+    with pytest.raises(ValueError, match=message):
+        PolychromaticSensor(sensor, *arguments, **options)
+
+
+def test_bad_bands_are_refused(sensor, pupil):
+    with pytest.raises(ValueError, match="bandwidth = 1"):
+        PolychromaticSensor.flat_band(sensor, 1.5)
+    with pytest.raises(ValueError, match="n_wavelengths = 0"):
+        PolychromaticSensor.flat_band(sensor, 0.1, 0)
+    with pytest.raises(TypeError, match="sensor is a Pupil: expected a ZernikeSensor"):
+        PolychromaticSensor(pupil, [600.0])
+    with pytest.raises(TypeError, match="chromatic = 1"):
+        PolychromaticSensor(sensor, [600.0], chromatic=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from math import prod
@@ -35,6 +36,7 @@ _NOTHING = 1e-300  # keeps quotients finite
 _NEGLIGIBLE = 1e-3  # of the mean standard error: a smaller step is the last one
 _REFLECTIONS = 3  # largest number of times that points of one start are reflected
 _GAIN = 0.01  # of twice the logarithm of the likelihood, from which on a reflection counts
+_GAIN_TURN = 10.0  # the same, from which on a point is turned by 2 pi: a smooth phase is more probable
 _LINEAR_ITERATIONS = 5  # of the start of an unknown amplitude
 _RIDGE = 1e-6  # of the normal equations at points whose reference waves vanish
 _SIGMAS = 5.0  # excess of the misfit, in its standard deviations, up to which noise explains it
@@ -513,36 +515,52 @@ class MaximumLikelihood(Reconstructor):
         reflection at r gives the same intensity behind this mask (`eq-reflection`). A point may have converged to
         the wrong one of the two, mostly where a frame is dark. With the reference waves held, each point takes the
         reflection that makes its frames most likely. Frame sets whose cost falls by this continue. In a band of
-        light the reflections of the wavelengths differ, and none is tried.
+        light the reflections of the wavelengths differ. There a point may be 2 pi off, and the two phases at that
+        distance take their place.
         """
         estimator = self._exact
-        if estimator.unknown_amplitude or estimator.modes is not None or fit.phase is not None:
+        if estimator.unknown_amplitude or estimator.modes is not None:
             return
         xp = Kind.of(fit.psi).xp
-        model = self.settings.model(Kind.of(fit.psi))
         some = fit.converged & (fit.n_reflections < _REFLECTIONS)
         if estimator.noise.photons is None:
             some = some & ~self._consistent(fit)
         if not xp.any(some):
             return
         part = fit.at(some)
-        own, frames = part.psi, part.frames[(..., *model.window)]
-        references = part.waves[(..., *model.window)] - own[:, np.newaxis, ...]
-        least = estimator.noise.terms(part.light[(..., *model.window)], frames)
-        psi, gain = own, _GAIN * self._noise_variance(part)[:, np.newaxis, np.newaxis]
-        for mask in range(self.sensor.n_masks):
-            other = _reflected(own, references[:, mask, ...])
-            terms = estimator.noise.terms(square(other[:, np.newaxis, ...] + references), frames)
-            better = terms < least - gain
-            psi = xp.where(better[:, np.newaxis, ...], other, psi)
-            least = xp.where(better, terms, least)
-        trial = self._at(psi, None, part.frames)
-        better = trial.cost < part.cost - gain[:, 0, 0]
+        gain = (_GAIN if part.phase is None else _GAIN_TURN) * self._noise_variance(part)
+        trial = self._at(*self._best_points(part, gain[:, np.newaxis, np.newaxis]))
+        better = trial.cost < part.cost - gain
         part.take(better, trial, xp)
         part.converged = ~better
         part.damping = xp.where(better, _DAMPING + 0 * part.damping, part.damping)
         part.n_reflections = part.n_reflections + 1
         fit.put(some, part)
+
+    def _best_points(self, fit: _Fit, gain: NDArray) -> tuple[NDArray, None, NDArray, NDArray | None]:
+        """Arguments of `_at` for the field in which points take another phase that is more likely by `gain`."""
+        xp, noise, window = Kind.of(fit.psi).xp, self._exact.noise, self.sensor.window
+        frames = fit.frames[(..., *window)]
+        references = fit.waves[(..., *window)] - fit.psi[:, np.newaxis, ...]
+        least, psi, phase = noise.terms(fit.light[(..., *window)], frames), fit.psi, fit.phase
+        for other, other_phase in self._other_points(fit, references):
+            terms = noise.terms(square(other[:, np.newaxis, ...] + references), frames)
+            better = terms < least - gain
+            psi = xp.where(better[:, np.newaxis, ...], other, psi)
+            phase = None if other_phase is None else xp.where(better, other_phase, phase)
+            least = xp.where(better, terms, least)
+        return psi, None, fit.frames, phase
+
+    def _other_points(self, fit: _Fit, references: NDArray) -> Iterator[tuple[NDArray, NDArray | None]]:
+        """Fields whose points may be more likely than those of a fit, and their phases in a band of light."""
+        if fit.phase is None:
+            for mask in range(self.sensor.n_masks):
+                yield _reflected(fit.psi, references[:, mask, ...]), None
+            return
+        model = self.settings.model(Kind.of(fit.psi))
+        for turn in (2 * np.pi, -2 * np.pi):
+            phase = fit.phase + turn
+            yield model.incoming(phase), phase
 
     def _modes_step(self, hessian: _Hessian, gradient: NDArray, coefficients: NDArray) -> tuple[NDArray, NDArray]:
         """Step of the coefficients, (k, m), and the fall of the cost that it promises, (k,)."""

@@ -18,6 +18,8 @@ from zwfs.bench.model import Bench
 from zwfs.companion.sweeps import Grid
 from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics, Step
 from zwfs.paper import identities, one_pixel
+from zwfs.paper.bandwidth import WAYS as BAND_WAYS
+from zwfs.paper.bandwidth import BandCurves
 from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.paper.closed_loop import LoopRun
 from zwfs.paper.design import PUBLISHED, DesignMap
@@ -89,6 +91,7 @@ def drawn_methods(curves, pupil, classic, shifted):
     measurement = Measurement(recording, Optics(), frames, pupil, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0))
     found = MeasuredPhase(phase, frames, 0.9 * frames, measurement, True, 0)
     varied = AmplitudeCurves(three, dict.fromkeys(WAYS, np.full((3, 2), 0.1)), {}, three)
+    banded = BandCurves(three, dict.fromkeys(BAND_WAYS, three), {}, three, 1.0)
     triple = zwfs.ZernikeSensor(pupil, *shifted.masks, zwfs.Dimple(1, 0))
     both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(
         triple.measure(pupil.scatter(pupil.gather(phase), 0))
@@ -136,6 +139,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         ),
         "error_bars": (([ErrorBars(k, EXPECTED, k, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
         "design_maps": ((DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5}), PUBLISHED), ()),
+        "band_errors": (({(0.1, False): banded, (0.1, True): banded},), [*shifted_only, "MaximumLikelihood"]),
         "amplitude_errors": (({"dips": varied},), [*shifted_only, "MaximumLikelihood"]),
         "phase_and_amplitude": ((pupil, 0 * pupil.amplitude, pupil.amplitude, both), ()),
         "reference_intensities": ((frames, frames), ()),

@@ -99,6 +99,12 @@ def _limits(usual: str = "", **own: Any) -> dict[str, Any]:
 
 LIMITS: dict[str, dict[str, Any]] = {
     "at_a_glance": _limits("n_pixels n_modes diameter phase_shift rms exponent n_iterations"),
+    "bandwidth": _limits(
+        "n_modes diameter phase_shift inputs n_screens exponent",
+        n_pixels=(16, 200),
+        bandwidths=[(0.0, 1.0)],
+        photons=(1.0, 1e9),
+    ),
     "beyond_dimple": _limits(
         "n_pixels n_modes phase_shift inputs n_screens exponent n_iterations threshold",
         step=(0.05, 2.0),

@@ -1,6 +1,7 @@
 """The experiments of the paper, and those beyond it: one module for each section or group of figures."""
 
 from zwfs.paper import (
+    bandwidth,
     bench_linearity,
     closed_loop,
     design,
@@ -15,6 +16,7 @@ from zwfs.paper import (
 )
 
 __all__ = [
+    "bandwidth",
     "bench_linearity",
     "closed_loop",
     "design",

@@ -1,6 +1,7 @@
 """The figures: one function for each, and the style that they share. Only this subpackage needs matplotlib."""
 
 from zwfs.plots.at_a_glance import at_a_glance
+from zwfs.plots.bandwidth import band_errors
 from zwfs.plots.bench import bench_linearity, budget, measured_and_modelled, reference_intensities, segment_errors
 from zwfs.plots.closed_loop import capture, loop_runs
 from zwfs.plots.dimple_diameter import diameter_methods, diameter_reasons, dimple_diameter
@@ -35,6 +36,7 @@ __all__ = [
     "amplitude_errors",
     "approximation",
     "at_a_glance",
+    "band_errors",
     "bench_layout",
     "bench_linearity",
     "budget",

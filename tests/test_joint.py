@@ -75,20 +75,23 @@ def test_derivatives_are_those_of_finite_differences(forward, field):
         step = np.zeros(VALUES.size)
         step[index] = 1e-4 * scale
         up, down = (forward.at(field, VALUES + sign * step).images for sign in (1, -1))
-        for high, low, exact in zip(up, down, point.apply(0j * field, step), strict=True):
+        for picture, (high, low) in enumerate(zip(up, down, strict=True)):
+            exact = point.slope(picture, step)
             error = np.abs((high - low) / 2 - exact).max()
             assert error <= 1e-5 * max(np.abs(exact).max(), 1e-4), name
+    change = 1e-5 * np.exp(1j * np.arange(N))
+    up, down = (forward.at(field + sign * change, VALUES).images for sign in (1, -1))
+    for high, low, exact in zip(up, down, point.apply(change), strict=True):
+        np.testing.assert_allclose((high - low) / 2, exact, rtol=0, atol=1e-5 * np.abs(exact).max())
 
 
 def test_adjoint_is_that_of_the_derivative(forward, field):
     rng = np.random.default_rng(2)
     point = forward.at(field, VALUES)
     change = rng.normal(size=(2, N, N)).T @ [1, 1j]
-    values = rng.normal(size=VALUES.size) * SCALE
     pixels = [rng.normal(size=picture.counts.shape) for picture in forward.pictures]
-    seen = sum(np.vdot(one, image) for one, image in zip(pixels, point.apply(change, values), strict=True))
-    back, parameters_back = point.adjoint(pixels)
-    assert np.vdot(back, change).real + np.vdot(parameters_back, values) == pytest.approx(seen, rel=1e-9)
+    seen = sum(np.vdot(one, image) for one, image in zip(pixels, point.apply(change), strict=True))
+    assert np.vdot(point.adjoint(pixels), change).real == pytest.approx(seen, rel=1e-9)
 
 
 def test_unmodulated_light_of_unpolarised_and_polarised_light(field):

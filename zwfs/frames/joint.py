@@ -417,7 +417,7 @@ def fit_jointly(
     while step < n_steps and not converged:
         step += 1
         normal = _Normal(point)
-        stuck = unknowns.stuck(point.x, point.gradient)
+        stuck = unknowns.stuck(point.x, normal.gradient)
         for _ in range(8):
             change = normal.step(damping, stuck, n_inner)
             trial = _Point(unknowns, unknowns.within(point.x + change))
@@ -500,18 +500,18 @@ class _Unknowns:
         )
         return along * self.along + across * self.across
 
-    def adjoint(self, field: NDArray, values: NDArray) -> NDArray[np.float64]:
-        """Adjoint of `field` and `values`."""
+    def adjoint(self, field: NDArray) -> NDArray[np.float64]:
+        """Adjoint of `field`."""
         white = []
         for colour, unit in zip(self.filters, (self.along, self.across), strict=True):
             whole = np.zeros((self.size, self.size))
             whole[: self.n, : self.n] = (unit.conj() * field).real
             white.append(fft.irfft2(colour * fft.rfft2(whole), s=whole.shape).ravel())
-        return np.concatenate([*white, values[self.problem.free]])
+        return np.concatenate(white)
 
-    def values(self, x: NDArray, fixed: NDArray | None = None) -> NDArray[np.float64]:
+    def values(self, x: NDArray) -> NDArray[np.float64]:
         """All values: the free ones of the unknowns, the others fixed."""
-        values = (self.problem.values if fixed is None else fixed).copy()
+        values = self.problem.values.copy()
         values[self.problem.free] = x[self.n_white :]
         return values
 
@@ -534,16 +534,6 @@ class _Point:
         white = x[: unknowns.n_white]
         self.cost = float(squares + np.vdot(white, white) + np.vdot(self.excess, self.excess)) / 2
 
-    @cached_property
-    def gradient(self) -> NDArray[np.float64]:
-        """Of the cost."""
-        weights = self.unknowns.problem.weights
-        weighted = [weight * one for weight, one in zip(weights, self.residuals, strict=True)]
-        gradient = self.unknowns.adjoint(*self.model.adjoint(weighted))
-        gradient[: self.unknowns.n_white] += self.x[: self.unknowns.n_white]
-        gradient[self.unknowns.n_white :] += self.excess * self.unknowns.precision
-        return gradient
-
 
 class _Normal:
     """Gauss and Newton's matrix at a point, and its preconditioner."""
@@ -551,22 +541,49 @@ class _Normal:
     def __init__(self, point: _Point) -> None:
         self.point, self.unknowns = point, point.unknowns
         self._white = self.unknowns.n_white
-        self.block = self._parameters()
+        self._columns = [self._slopes(index) for index in range(len(point.residuals))]
+        self.block = np.diag(self.unknowns.precision**2 + 1e-300)
+        for which, slopes in self._columns:
+            self.block[np.ix_(which, which)] += slopes @ slopes.T
         self._response = self._probe()
+
+    @cached_property
+    def gradient(self) -> NDArray[np.float64]:
+        """Of the cost."""
+        gradient = self.back(self.point.residuals)
+        gradient[: self._white] += self.point.x[: self._white]
+        gradient[self._white :] += self.point.excess * self.unknowns.precision
+        return gradient
+
+    def _slopes(self, index: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Free parameters that change an image, and its changes over the noise with each, (k, ny * nx)."""
+        problem = self.unknowns.problem
+        arm = problem.pictures[index].arm
+        own = f"arm {arm} "
+        names = [problem.named[one][0] for one in problem.free]
+        which = np.array([k for k, name in enumerate(names) if not name.startswith("arm ") or name.startswith(own)], int)
+        unit = np.eye(len(problem.values))[problem.free[which]]
+        slopes = [(problem.weights[index] * self.point.model.slope(index, values)).ravel() for values in unit]
+        return which, np.reshape(slopes, (len(which), problem.weights[index].size))
 
     def change(self, d: NDArray) -> list[NDArray[np.float64]]:
         """Change of the images, over the noise, with the unknowns."""
-        problem = self.unknowns.problem
-        values = self.unknowns.values(d, np.zeros_like(problem.values))
-        images = self.point.model.apply(self.unknowns.field(d), values)
-        return [weight * image for weight, image in zip(problem.weights, images, strict=True)]
+        images = self.point.model.apply(self.unknowns.field(d))
+        changes = [weight * image for weight, image in zip(self.unknowns.problem.weights, images, strict=True)]
+        values = d[self._white :]
+        if values.any():
+            for change, (which, slopes) in zip(changes, self._columns, strict=True):
+                change += (values[which] @ slopes).reshape(change.shape)
+        return changes
 
     def back(self, images: Sequence[NDArray]) -> NDArray[np.float64]:
         """Adjoint of `change`."""
+        values = np.zeros(len(self.unknowns.center))
+        for image, (which, slopes) in zip(images, self._columns, strict=True):
+            values[which] += slopes @ image.ravel()
         weights = self.unknowns.problem.weights
-        return self.unknowns.adjoint(
-            *self.point.model.adjoint([weight * image for weight, image in zip(weights, images, strict=True)])
-        )
+        field = self.point.model.adjoint([weight * image for weight, image in zip(weights, images, strict=True)])
+        return np.concatenate([self.unknowns.adjoint(field), values])
 
     def product(self, d: NDArray) -> NDArray[np.float64]:
         """Matrix times a vector."""
@@ -584,7 +601,7 @@ class _Normal:
         def precondition(r: NDArray) -> NDArray:
             return np.where(stuck, 0, self.precondition(r)) / (1 + damping)
 
-        right = np.where(stuck, 0, -self.point.gradient)
+        right = np.where(stuck, 0, -self.gradient)
         return _conjugate_gradients(damped, right, precondition, n_inner, _ROUGHLY)
 
     def scale(self, d: NDArray) -> NDArray[np.float64]:
@@ -606,24 +623,6 @@ class _Normal:
             for one, response in zip(white, self._response, strict=True)
         ]
 
-    def _parameters(self) -> NDArray[np.float64]:
-        """Block of the parameters."""
-        columns = [
-            np.concatenate([one.ravel() for one in self.column(k)]) for k in range(len(self.unknowns.center))
-        ]
-        if not columns:
-            return np.zeros((0, 0))
-        matrix = np.array(columns)
-        return matrix @ matrix.T + np.diag(self.unknowns.precision**2 + 1e-300)
-
-    def column(self, index: int) -> list[NDArray[np.float64]]:
-        """Change of the images, over the noise, with one free parameter."""
-        problem = self.unknowns.problem
-        values = np.zeros_like(problem.values)
-        values[problem.free[index]] = 1
-        images = self.point.model.apply(None, values)
-        return [weight * image for weight, image in zip(problem.weights, images, strict=True)]
-
     def _probe(self) -> list[NDArray[np.float64]]:
         """Mean response of the images at each spatial frequency, for both maps, by a random probe."""
         unknowns, problem = self.unknowns, self.unknowns.problem
@@ -633,9 +632,9 @@ class _Normal:
         bins = np.minimum(np.hypot(u, v) * 2 * _BINS, _BINS - 1).astype(int)
         for colour, unit in zip(unknowns.filters, (unknowns.along, unknowns.across), strict=True):
             probe = rng.choice([-1.0, 1.0], (n, n)) * problem.inside
-            images = self.point.model.apply(probe * unit, np.zeros_like(problem.values))
+            images = self.point.model.apply(probe * unit)
             weighted = [weight**2 * image for weight, image in zip(problem.weights, images, strict=True)]
-            answer = (unit.conj() * self.point.model.adjoint(weighted)[0]).real
+            answer = (unit.conj() * self.point.model.adjoint(weighted)).real
             padded = np.zeros((2, size, size))
             padded[:, :n, :n] = probe, answer
             sent, got = fft.rfft2(padded)
@@ -680,8 +679,8 @@ def _covariance(normal: _Normal, n_inner: int) -> NDArray[np.float64]:
     maps_only = np.zeros(len(unknowns.start))
     maps_only[:n_white] = 1
     left, solved, products = [], [], []
-    for index in range(len(unknowns.center)):
-        right = normal.back(normal.column(index)) * maps_only
+    for index in range(n_white, len(maps_only)):
+        right = normal.product(np.eye(1, len(maps_only), index)[0]) * maps_only
         solution = _conjugate_gradients(
             lambda d: normal.product(d) * maps_only,
             right,

@@ -592,7 +592,9 @@ def _bspline(places: NDArray, size: int) -> tuple[NDArray, NDArray, NDArray]:
 
 
 class Linearised:
-    """Images at one point, their derivative (`apply`) and its adjoint (`adjoint`).
+    """Images at one point, their derivatives by the field (`apply`) and the parameters (`slope`).
+
+    `adjoint` is the adjoint of `apply`.
 
     Attributes
     ----------
@@ -607,6 +609,7 @@ class Linearised:
         self._blur = forward.blur(self._mask.blur)
         relays = [np.array(arm[:_N_RELAY]) for arm in self._arms]
         self._transfer = [forward.transfer(relay) for relay in relays]
+        self._turned_back = [transfer.conj() for transfer in self._transfer]
         masked = {picture.arm for picture in forward.pictures if picture.mask is not None}
         self._cores = {arm: forward.cores(self._mask.diameter, relays[arm]) for arm in masked}
         self._states = [self._source(field * known) for known in forward._known]
@@ -651,84 +654,75 @@ class Linearised:
             sampler=sampler,
         )
 
-    def apply(self, field: NDArray | None, values: NDArray) -> list[NDArray[np.float64]]:
-        """Change of the images with a change of the field, None for none, and of the parameters."""
-        forward = self._forward
-        still = 0 * self._states[0][0], 0 * self._states[0][1]
-        states = [still if field is None else self._source(field * known) for known in forward._known]
-        by_arm = values[:-_N_MASK].reshape(-1, _N_ARM)
-        by_mask = values[-_N_MASK:]
-        turns = [np.tensordot(row[:_N_RELAY], forward._relay, 1) if row.any() else None for row in by_arm]
-        changes = []
+    def apply(self, field: NDArray) -> list[NDArray[np.float64]]:
+        """Change of the images with a change of the field."""
+        forward, changes = self._forward, []
+        states = [self._source(field * known) for known in forward._known]
         for index, (picture, part) in enumerate(zip(forward.pictures, self._parts, strict=True)):
-            arm, row = self._arms[picture.arm], by_arm[picture.arm]
-            if field is None and not row.any() and not by_mask.any():
-                changes.append(np.zeros_like(part.image))
-                continue
-            (spectrum, coefficient) = self._states[forward._state[index]]
-            (new_spectrum, new_coefficient) = states[forward._state[index]]
-            turn = turns[picture.arm]
-            moved = new_spectrum if turn is None else new_spectrum - 1j * turn * spectrum
-            wave = fft.ifft2(self._transfer[picture.arm] * moved, norm="ortho")
-            intensity = 2 * (part.ahead.conj() * wave).real
+            spectrum, coefficient = states[forward._state[index]]
+            intensity = _twice(part.ahead, fft.ifft2(self._transfer[picture.arm] * spectrum, norm="ortho"))
             if picture.mask is not None:
-                cores, steps = self._cores[picture.arm], np.append(row[:_N_RELAY], by_mask[0])
-                light = cores[0] @ new_coefficient + steps @ (cores[1:] @ coefficient)
-                intensity += 2 * (part.across.conj() * forward.planes[1].expand(light)).real
-                first = self._coefficients.first_slope[picture.mask] @ by_mask
-                second = self._coefficients.second_slope[picture.mask] @ by_mask
-                if first or second:
-                    intensity += 2 * (first * part.field.conj() * part.light).real
-                    intensity += second * (part.light.real**2 + part.light.imag**2)
-            transform = self._blur[0] * fft.rfft2(intensity)
-            if by_mask[_BLUR]:
-                transform += by_mask[_BLUR] * self._blur[1] * fft.rfft2(part.intensity)
-            out = arm.flux * part.sampler(fft.irfft2(part.sampler.prefilter * transform, s=intensity.shape))
-            rotation, magnification, flux, background, halo = row[_ROTATION:]
-            out += flux * part.seen + background + halo * part.halo + by_mask[-1] * arm.halo * part.halo_slope
-            if rotation or magnification:
-                out += arm.flux * np.tensordot(row[_ROTATION:_FLUX], part.sampler.slopes(part.blurred), 1)
-            changes.append(out)
+                light = forward.planes[1].expand(self._cores[picture.arm][0] @ coefficient)
+                intensity += _twice(part.across, light)
+            changes.append(self._on_camera(picture, part, self._blur[0] * fft.rfft2(intensity)))
         return changes
 
-    def adjoint(self, pixels: Sequence[NDArray]) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
-        """Adjoint of `apply`, for the inner product Re <a, b> of fields: a field and parameters."""
+    def slope(self, index: int, values: NDArray) -> NDArray[np.float64]:
+        """Change of one image with a change of the parameters."""
+        forward, picture, part = self._forward, self._forward.pictures[index], self._parts[index]
+        arm, by_mask = self._arms[picture.arm], values[-_N_MASK:]
+        row = values[:-_N_MASK].reshape(-1, _N_ARM)[picture.arm]
+        rotation, magnification, flux, background, halo = row[_ROTATION:]
+        out = flux * part.seen + background + halo * part.halo + by_mask[-1] * arm.halo * part.halo_slope
+        if rotation or magnification:
+            out += arm.flux * np.tensordot(row[_ROTATION:_FLUX], part.sampler.slopes(part.blurred), 1)
+        if not row[:_N_RELAY].any() and not by_mask[:-1].any():
+            return out
+        spectrum, coefficient = self._states[forward._state[index]]
+        intensity = np.zeros(part.intensity.shape)
+        if row[:_N_RELAY].any():
+            turned = -1j * np.tensordot(row[:_N_RELAY], forward._relay, 1) * spectrum
+            intensity += _twice(part.ahead, fft.ifft2(self._transfer[picture.arm] * turned, norm="ortho"))
+        if picture.mask is not None:
+            steps = np.append(row[:_N_RELAY], by_mask[0])
+            light = steps @ (self._cores[picture.arm][1:] @ coefficient)
+            first = self._coefficients.first_slope[picture.mask] @ by_mask
+            second = self._coefficients.second_slope[picture.mask] @ by_mask
+            intensity += _twice(part.across, forward.planes[1].expand(light))
+            intensity += 2 * (first * part.field.conj() * part.light).real
+            intensity += second * (part.light.real**2 + part.light.imag**2)
+        transform = self._blur[0] * fft.rfft2(intensity)
+        if by_mask[_BLUR]:
+            transform += by_mask[_BLUR] * self._blur[1] * fft.rfft2(part.intensity)
+        return out + self._on_camera(picture, part, transform)
+
+    def adjoint(self, pixels: Sequence[NDArray]) -> NDArray[np.complex128]:
+        """Adjoint of `apply`, for the inner product Re <a, b> of fields."""
         forward = self._forward
-        by_arm, by_mask = np.zeros((forward.n_arms, _N_ARM)), np.zeros(_N_MASK)
         spectra = [np.zeros((forward.size,) * 2, complex) for _ in self._states]
         inputs = [np.zeros(coefficient.shape, complex) for _, coefficient in self._states]
         for index, (picture, part) in enumerate(zip(forward.pictures, self._parts, strict=True)):
-            weight, arm, row = pixels[index], self._arms[picture.arm], by_arm[picture.arm]
-            state = forward._state[index]
-            spectrum, coefficient = self._states[state]
-            row[_ROTATION:_FLUX] += arm.flux * np.tensordot(part.sampler.slopes(part.blurred), weight, 2)
-            row[_FLUX:] += np.vdot(weight, part.seen), weight.sum(), np.vdot(weight, part.halo)
-            by_mask[-1] += arm.halo * np.vdot(weight, part.halo_slope)
-            back = part.sampler.prefilter * fft.rfft2(arm.flux * part.sampler.adjoint(weight))
+            weight, state = pixels[index], forward._state[index]
+            back = part.sampler.prefilter * fft.rfft2(2 * self._arms[picture.arm].flux * part.sampler.adjoint(weight))
             gain = fft.irfft2(self._blur[0] * back, s=part.field.shape)
-            spread = fft.irfft2(self._blur[1] * back, s=part.field.shape)
-            by_mask[_BLUR] += np.vdot(spread, part.intensity)
-            returned = fft.fft2(2 * gain * part.ahead, norm="ortho") * self._transfer[picture.arm].conj()
-            spectra[state] += returned
-            turned = (returned.conj() * spectrum).imag
-            row[:_N_RELAY] += np.tensordot(forward._relay, turned, 2)
-            if picture.mask is None:
-                continue
-            cores = self._cores[picture.arm]
-            light = forward.planes[1].project(2 * gain * part.across)
-            inputs[state] += cores[0].conj().T @ light
-            steps = (cores[1:] @ coefficient @ light.conj()).real
-            row[:_N_RELAY] += steps[:-1]
-            by_mask[0] += steps[-1]
-            product = 2 * np.vdot(part.field * gain, part.light)
-            power = np.vdot(gain, part.light.real**2 + part.light.imag**2)
-            by_mask += (self._coefficients.first_slope[picture.mask] * product).real
-            by_mask += self._coefficients.second_slope[picture.mask] * power
+            spectra[state] += fft.fft2(gain * part.ahead, norm="ortho") * self._turned_back[picture.arm]
+            if picture.mask is not None:
+                inputs[state] += self._cores[picture.arm][0].conj().T @ forward.planes[1].project(gain * part.across)
         field = np.zeros(forward.inside.shape, complex)
         for spectrum, light, known in zip(spectra, inputs, forward._known, strict=True):
             one = fft.ifft2(spectrum, norm="ortho")[forward._inner] + forward.planes[0].expand(light)
             field += one * np.conj(known)
-        return field * forward.inside, np.concatenate([by_arm.ravel(), by_mask])
+        return field * forward.inside
+
+    def _on_camera(self, picture: Picture, part: _Part, transform: NDArray) -> NDArray[np.float64]:
+        """Counts of a blurred intensity with a given transform."""
+        blurred = fft.irfft2(part.sampler.prefilter * transform, s=part.intensity.shape)
+        return self._arms[picture.arm].flux * part.sampler(blurred)
+
+
+def _twice(one: NDArray, other: NDArray) -> NDArray[np.float64]:
+    """2 Re(conj(one) other)."""
+    return 2 * (one.real * other.real + one.imag * other.imag)
 
 
 @dataclass(frozen=True, eq=False)

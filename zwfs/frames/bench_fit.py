@@ -24,6 +24,7 @@ from zwfs.sensor import ZernikeSensor
 _RELAY = "focus", "astigmatism", "astigmatism_45"
 _FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
 _ROUNDS = 4  # of a fit for small changes of the phase, which must not change the amplitude
+_FEW = 3  # states in the first steps of a fit
 _WIDE = MapPrior(0.5, 1.0)
 _DARKEST = 1e-2  # of the mean intensity: where the amplitude starts in gaps and beyond the outline
 
@@ -134,10 +135,13 @@ def fit_bench(
         phase_prior or _WIDE,
         amplitude_prior or MapPrior(0.5, 0.0),
     )
-    # Before the maps are about right, clear frames are explained by any focus: it waits.
+    # Before the maps are about right, clear frames are explained by any focus: it waits. The first states suffice.
     still = [replace(arm, **{name: replace(getattr(arm, name), free=False) for name in _RELAY}) for arm in arms]
-    first = fit_jointly(replace(problem, arms=still), **{**settings, "errors": False})
-    return fit_jointly(problem, start=first, **settings)
+    rough = replace(problem, pictures=pictures[: 2 + 2 * _FEW])
+    quick = {**settings, "errors": False}
+    fit = fit_jointly(replace(rough, arms=still), **{**quick, "n_inner": 15, "tolerance": 0.02})
+    fit = fit_jointly(rough, start=fit, **{**quick, "n_inner": 20, "tolerance": 2e-3})
+    return fit_jointly(problem, start=fit, **settings)
 
 
 def free_arm(flux: float, *, fixed_flux: bool = False) -> Arm:

@@ -432,7 +432,7 @@ def fit_jointly(
         point, damping = trial, max(damping / 8, 1e-5)
     covariance = np.full((len(problem.free),) * 2, np.nan)
     if errors and len(problem.free):
-        covariance = _covariance(_Normal(point), 20)
+        covariance = _covariance(_Normal(point), 10)
     return JointFit(
         problem,
         np.abs(point.field),
@@ -651,7 +651,11 @@ def _conjugate_gradients(
     n_steps: int,
     tolerance: float,
 ) -> NDArray[np.float64]:
-    """Solution of a positive definite system, to a relative error of the preconditioned residual."""
+    """Solution of a positive definite system, to a relative error of the preconditioned residual.
+
+    `scipy.sparse.linalg.cg` would measure the residual without the preconditioner, in units that differ between
+    the parameters by many orders of magnitude.
+    """
     x, r = np.zeros_like(right), right
     z = precondition(r)
     d, size = z, float(np.vdot(r, z))
@@ -672,7 +676,7 @@ def _covariance(normal: _Normal, n_inner: int) -> NDArray[np.float64]:
     """Covariance of the free parameters: the inverse of Schur's complement of the maps.
 
     S = H_pp - 2 H_pm X + X^T H_mm X with an approximate X = H_mm^-1 H_mp: its error is of second order in that
-    of X.
+    of X. With ten conjugate gradients the standard deviations come out a few percent too small.
     """
     unknowns = normal.unknowns
     n_white = unknowns.n_white

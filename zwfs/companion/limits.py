@@ -116,6 +116,14 @@ LIMITS: dict[str, dict[str, Any]] = {
     "beyond_range": _limits(
         "n_pixels n_modes phase_shift inputs n_screens exponent n_iterations threshold", diameters=[(0.1, 8.0)]
     ),
+    "calibration": _limits(
+        "inputs n_screens n_iterations",
+        n_pixels=(32, 200),
+        extent=(1.1, 2.0),
+        n_commands=(2, 50),
+        rms_commands=(0.05, 2.0),
+        photons=(100.0, 1e9),
+    ),
     "closed_loop": _limits(
         "n_modes diameter phase_shift n_screens exponent n_iterations",
         n_pixels=(16, 200),

@@ -262,8 +262,36 @@ class FittedSensor:
         if len(frames) != 2:
             raise ValueError(f"frames has {len(frames)} images: expected 2")
         sigma = np.broadcast_to(_check.real_array("sigma", sigma), frames.shape)
-        fit, phase = self.fit, self._start(frames)
-        problem = JointProblem(
+        problem, phase = self._problem(frames, sigma), self._start(frames)
+        for _ in range(_ROUNDS):
+            problem = replace(problem, phase=phase)
+            phase = fit_jointly(problem, n_steps=self.n_steps, n_inner=30, errors=False).phase
+        return phase
+
+    def frames(self, phase: ArrayLike) -> NDArray[np.float64]:
+        """Frames that the model predicts for a phase.
+
+        Parameters
+        ----------
+        phase : array_like, shape (n, n), radian
+            That of the optics included.
+
+        Returns
+        -------
+        ndarray, shape (2, ny, nx), counts
+        """
+        phase = _check.real_map("phase", phase, 2)
+        _check.trailing_shape("phase", phase, self.flat.shape, "the grid of the pupil")
+        camera = next(picture.counts for picture in self.fit.problem.pictures if picture.mask is not None)
+        blank = np.zeros((2, *camera.shape))
+        problem = self._problem(blank, np.ones(blank.shape))
+        field = (problem.amplitude * np.exp(1j * phase)).astype(complex)
+        return np.stack(problem.forward.at(field, problem.values).images)
+
+    def _problem(self, frames: NDArray, sigma: NDArray) -> JointProblem:
+        """The problem of the phase alone of a pair of frames."""
+        fit = self.fit
+        return JointProblem(
             [Picture(frames[side], side, side, sigma[side]) for side in (0, 1)],
             [_frozen(arm, values) for arm, values in zip(fit.problem.arms[:2], fit.arms[:2], strict=True)],
             _frozen(fit.problem.mask, fit.mask),
@@ -272,10 +300,6 @@ class FittedSensor:
             self.prior,
             MapPrior(1e-6),
         )
-        for _ in range(_ROUNDS):
-            problem = replace(problem, phase=phase)
-            phase = fit_jointly(problem, n_steps=self.n_steps, n_inner=30, errors=False).phase
-        return phase
 
     def _start(self, frames: NDArray) -> NDArray[np.float64]:
         """Phase of the phase-shifted iteration, for which the light is unmixed and the images are shifted back."""
@@ -291,7 +315,8 @@ class FittedSensor:
             v, u = (np.fft.fftfreq(length) for length in image.shape)
             ramp = np.exp(2j * np.pi * (v[:, None] * arm.row + u * arm.column))
             light[side] = np.fft.ifft2(np.fft.fft2(image) * ramp).real[rows : rows + n, columns : columns + n]
-        light = ((1 - mask.leakage) * light - mask.leakage * light[::-1]) / (1 - 2 * mask.leakage)
+        leaked = min(mask.leakage, 0.4)  # half of the light cannot be unmixed
+        light = ((1 - leaked) * light - leaked * light[::-1]) / (1 - 2 * leaked)
         phase = PhaseShifted(sensor, tolerance=1e-3)(np.maximum(light, 0)).phase
         phase = np.where(np.isfinite(phase), phase, 0)
         turn = np.angle(np.mean(np.exp(1j * phase[pupil.inside])))

@@ -34,6 +34,7 @@ from zwfs.frames.registration import correlations
 _FLAT: Any = None
 _BINS = 24  # of spatial frequency, for the preconditioner
 _ROUGHLY, _WELL = 0.1, 0.03  # relative errors of a step, and of the solutions that make the covariance
+_FAINTEST = 0.02  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
 _WEAK = 10.0  # a combination that is so many times less certain than its parameters are one by one is reported
 
 
@@ -561,7 +562,9 @@ class _Normal:
         arm = problem.pictures[index].arm
         own = f"arm {arm} "
         names = [problem.named[one][0] for one in problem.free]
-        which = np.array([k for k, name in enumerate(names) if not name.startswith("arm ") or name.startswith(own)], int)
+        which = np.array(
+            [k for k, name in enumerate(names) if not name.startswith("arm ") or name.startswith(own)], int
+        )
         unit = np.eye(len(problem.values))[problem.free[which]]
         slopes = [(problem.weights[index] * self.point.model.slope(index, values)).ravel() for values in unit]
         return which, np.reshape(slopes, (len(which), problem.weights[index].size))
@@ -640,7 +643,8 @@ class _Normal:
             sent, got = fft.rfft2(padded)
             power = np.bincount(bins.ravel(), (np.abs(sent) ** 2).ravel(), _BINS)
             heard = np.bincount(bins.ravel(), (sent.conj() * got).real.ravel(), _BINS)
-            responses.append(colour**2 * np.maximum(heard / np.maximum(power, 1e-300), 0)[bins])
+            response = heard / np.maximum(power, 1e-300)
+            responses.append(colour**2 * np.maximum(response, _FAINTEST * response.max())[bins])
         return responses
 
 

@@ -703,11 +703,15 @@ class Linearised:
         inputs = [np.zeros(coefficient.shape, complex) for _, coefficient in self._states]
         for index, (picture, part) in enumerate(zip(forward.pictures, self._parts, strict=True)):
             weight, state = pixels[index], forward._state[index]
-            back = part.sampler.prefilter * fft.rfft2(2 * self._arms[picture.arm].flux * part.sampler.adjoint(weight))
+            back = part.sampler.prefilter * fft.rfft2(
+                2 * self._arms[picture.arm].flux * part.sampler.adjoint(weight)
+            )
             gain = fft.irfft2(self._blur[0] * back, s=part.field.shape)
             spectra[state] += fft.fft2(gain * part.ahead, norm="ortho") * self._turned_back[picture.arm]
             if picture.mask is not None:
-                inputs[state] += self._cores[picture.arm][0].conj().T @ forward.planes[1].project(gain * part.across)
+                inputs[state] += self._cores[picture.arm][0].conj().T @ forward.planes[1].project(
+                    gain * part.across
+                )
         field = np.zeros(forward.inside.shape, complex)
         for spectrum, light, known in zip(spectra, inputs, forward._known, strict=True):
             one = fft.ifft2(spectrum, norm="ortho")[forward._inner] + forward.planes[0].expand(light)

@@ -3,6 +3,7 @@
 from zwfs.paper import (
     bandwidth,
     bench_linearity,
+    calibration,
     closed_loop,
     design,
     dimple_diameter,
@@ -18,6 +19,7 @@ from zwfs.paper import (
 __all__ = [
     "bandwidth",
     "bench_linearity",
+    "calibration",
     "closed_loop",
     "design",
     "dimple_diameter",

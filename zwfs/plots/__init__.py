@@ -3,6 +3,7 @@
 from zwfs.plots.at_a_glance import at_a_glance
 from zwfs.plots.bandwidth import band_errors
 from zwfs.plots.bench import bench_linearity, budget, measured_and_modelled, reference_intensities, segment_errors
+from zwfs.plots.calibration import calibration_errors, calibration_frames
 from zwfs.plots.closed_loop import capture, loop_runs
 from zwfs.plots.dimple_diameter import diameter_methods, diameter_reasons, dimple_diameter
 from zwfs.plots.frames import explained, gains, phase_map, signs
@@ -40,6 +41,8 @@ __all__ = [
     "bench_layout",
     "bench_linearity",
     "budget",
+    "calibration_errors",
+    "calibration_frames",
     "capture",
     "convergence",
     "design_maps",

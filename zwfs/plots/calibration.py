@@ -1,0 +1,68 @@
+"""Figures of the calibrated bench: errors of the segments and differences of frames, before and after."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+from numpy.typing import NDArray
+
+from zwfs.paper.bench_linearity import BenchCurves
+from zwfs.paper.calibration import WAYS, Example
+from zwfs.plots.style import LOOKS, show_intensity, show_phase
+
+_COLORS = LOOKS["PhaseShifted"].color, "#56B4E9", LOOKS["MaximumLikelihood"].color, "#777777"
+_STYLES: dict[str, dict[str, Any]] = {
+    name: {"color": color, "marker": marker, "linestyle": line}
+    for name, color, marker, line in zip(WAYS, _COLORS, "v<*x", (":", "--", "-", "-."), strict=True)
+}
+_ARMS = ("+θ", "−θ")
+
+
+def calibration_errors(curves: BenchCurves, example: Example, numbers: NDArray) -> Figure:
+    """Error of the segments against the input, for each model, and the errors of one screen.
+
+    Parameters
+    ----------
+    curves : BenchCurves
+    example : Example
+    numbers : ndarray of int, shape (n_segments,)
+        Of the segments.
+    """
+    figure, (linearity, points) = plt.subplots(1, 2, figsize=(9, 4.6))
+    for name, label in WAYS.items():
+        style = _STYLES[name]
+        linearity.semilogy(curves.rms, curves.mean(name), ms=7, label=label, **style)
+        if name != "shuffled":
+            points.plot(numbers, example.residuals[name], **{**style, "linestyle": ""}, ms=6)
+    linearity.set(xlabel="input (rad rms over the segments)", ylabel="error (rad rms)", xlim=(0, None))
+    linearity.yaxis.set_major_locator(LogLocator())
+    linearity.yaxis.set_minor_formatter(NullFormatter())
+    points.axhline(0, color="#555555", lw=1)
+    points.set(xlabel="segment number", ylabel="error of the piston (rad)")
+    figure.legend(*linearity.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9)
+    return figure
+
+
+def calibration_frames(example: Example) -> Figure:
+    """Measured frames of one screen, and their differences from the frames of each model in units of the noise."""
+    names = {"design": "model of\nthe design", "calibrated": "calibrated\nmodel", "shuffled": "control"}
+    figure, panels = plt.subplots(2, 1 + len(names), figsize=(9, 5.2))
+    counts, sigma = example.measured
+    top = np.quantile(counts, 0.999)
+    limit = float(np.quantile(np.abs(example.modelled["design"] - counts) / sigma, 0.99))
+    for row, arm, image, noise, index in zip(panels, _ARMS, counts, sigma, (0, 1), strict=True):
+        light = show_intensity(row[0], image / top, 1.0)
+        row[0].set_ylabel(f"image {arm}")
+        for axes, name in zip(row[1:], names, strict=True):
+            difference = show_phase(axes, (image - example.modelled[name][index]) / noise, limit)
+    for axes, title in zip(panels[0], ("measured", *names.values()), strict=True):
+        axes.set_title(title, fontsize=10)
+    bars: dict[str, Any] = {"location": "bottom", "shrink": 0.85}
+    figure.colorbar(light, ax=panels[:, 0], label="intensity", aspect=12, **bars)
+    label = "measured less modelled, over the noise"
+    figure.colorbar(difference, ax=panels[:, 1:], label=label, extend="both", aspect=30, **bars)
+    return figure

@@ -13,6 +13,7 @@ from zwfs.metrics import wrapped_residual
 from zwfs.plots.style import LOOKS, show_intensity, show_phase
 from zwfs.pupil import Pupil
 
+_ROUNDING = 1e-15  # rad
 _SEES = {"one pupil": "from image 1", "two pupils": "from both images"}
 _LETTERS = 13  # points: on a phone the figure is as wide as the page
 _RIGHT = 1.0  # radian, error up to which a point is drawn on the branch of the true phase
@@ -56,6 +57,6 @@ def at_a_glance(pupil: Pupil, phase: NDArray, frames: NDArray, estimates: Mappin
 
 def _error(rms: float) -> str:
     """Two digits, or a bound where the digits would be those of rounding errors."""
-    return (
-        f"error: {rms:.2f} rad rms" if rms >= 0.005 else f"error: below $10^{{{np.ceil(np.log10(rms)):.0f}}}$ rad"
-    )
+    if rms >= 0.005:
+        return f"error: {rms:.2f} rad rms"
+    return f"error: below $10^{{{np.ceil(np.log10(max(rms, _ROUNDING))):.0f}}}$ rad"

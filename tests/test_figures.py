@@ -21,6 +21,8 @@ from zwfs.paper import identities, one_pixel
 from zwfs.paper.bandwidth import WAYS as BAND_WAYS
 from zwfs.paper.bandwidth import BandCurves
 from zwfs.paper.bench_linearity import BenchCurves
+from zwfs.paper.calibration import WAYS as WAYS_OF_BENCH
+from zwfs.paper.calibration import Example, Shot
 from zwfs.paper.closed_loop import LoopRun
 from zwfs.paper.design import PUBLISHED, DesignMap
 from zwfs.paper.dimple_diameter import Contraction, DiameterCurves
@@ -98,6 +100,11 @@ def drawn_methods(curves, pupil, classic, shifted):
     )
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
+    ways = dict.fromkeys(WAYS_OF_BENCH, 0.1 * commands)
+    example = Example(commands, Shot(frames, frames), dict.fromkeys(WAYS_OF_BENCH, 0.9 * frames), ways)
+    calibrated = BenchCurves(
+        np.array([0.5]), commands[None, None], {name: one[None, None] for name, one in ways.items()}
+    )
     return {
         "grid_slice": ((Grid({"x": (1, 2), "screen": (0,)}, {"error": np.ones((2, 1))}), "error", "x"), ()),
         "sensor_layout": ((classic, phase), ()),
@@ -147,6 +154,8 @@ def drawn_methods(curves, pupil, classic, shifted):
         "segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),
         "bench_linearity": ((bench_curves,), two),
         "budget": ((dict.fromkeys(["none", "blur"], bench_curves), "PhaseShifted"), shifted_only),
+        "calibration_errors": ((calibrated, example, bench.numbers), shifted_only),
+        "calibration_frames": ((example,), ()),
         "explained": ((found,), ()),
         "phase_map": ((found, 635.0), ()),
         "gains": (

@@ -14,12 +14,18 @@ from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.paper.calibration import WAYS, Example
 from zwfs.plots.style import LOOKS, show_intensity, show_phase
 
-_COLORS = LOOKS["PhaseShifted"].color, "#56B4E9", LOOKS["MaximumLikelihood"].color, "#777777"
-_STYLES: dict[str, dict[str, Any]] = {
-    name: {"color": color, "marker": marker, "linestyle": line}
-    for name, color, marker, line in zip(WAYS, _COLORS, "v<*x", (":", "--", "-", "-."), strict=True)
-}
+_LINES = {"design": ":", "design, less flat": "--", "calibrated": "-", "shuffled": "-."}
 _ARMS = ("+θ", "−θ")
+
+
+def _style(name: str) -> dict[str, Any]:
+    """Keywords of a curve for `plot`; the model of the design has the colour of its reconstructor."""
+    look = LOOKS["PhaseShifted"]
+    color, marker = {"calibrated": ("#333333", "*"), "shuffled": ("#999999", "x")}.get(
+        name, (look.color, look.marker)
+    )
+    hollow = {"markerfacecolor": "none"} if name == "design, less flat" else {}
+    return {"color": color, "marker": marker, "linestyle": _LINES[name]} | hollow
 
 
 def calibration_errors(curves: BenchCurves, example: Example, numbers: NDArray) -> Figure:
@@ -34,7 +40,7 @@ def calibration_errors(curves: BenchCurves, example: Example, numbers: NDArray) 
     """
     figure, (linearity, points) = plt.subplots(1, 2, figsize=(9, 4.6))
     for name, label in WAYS.items():
-        style = _STYLES[name]
+        style = _style(name)
         linearity.semilogy(curves.rms, curves.mean(name), ms=7, label=label, **style)
         if name != "shuffled":
             points.plot(numbers, example.residuals[name], **{**style, "linestyle": ""}, ms=6)

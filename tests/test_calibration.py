@@ -85,7 +85,7 @@ def test_a_bench_on_a_finer_grid_is_measured_better_than_with_the_model_of_the_d
     finer = dimmed(FineBench(**LAYOUT), 1e5)
     recording = record(finer, 3, 0.6, seed=1)
     known = finer.commanded_phase(recording.commands)
-    settings = {"n_pixels": finer.n_pixels, "noise": recording.noise, "n_inner": 30, "tolerance": 5e-4}
+    settings = {"n_pixels": finer.n_pixels, "noise": recording.noise, "n_inner": 30, "n_steps": 10}
     fit = fit_bench(recording.frames, recording.clear, known, **settings, errors=False)
     curves, _ = measure_segments(recording, {"calibrated": fit}, [0.3, 0.8], 1, seed=1)
     error = curves.mean("calibrated").mean()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from zwfs.bounds import cramer_rao
 from zwfs.detector import Detector
+from zwfs.loop import LoopRecord, Mirror, close_loop, hold_drift
 from zwfs.masks import Dimple, Patch
 from zwfs.metrics import dynamic_range, reconstruction_error, strehl, wrapped_residual
 from zwfs.modes import noll_to_nm, power_law_screens, zernike_basis
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from zwfs import detector as detector
     from zwfs import focal as focal
     from zwfs import frames as frames
+    from zwfs import loop as loop
     from zwfs import lowrank as lowrank
     from zwfs import masks as masks
     from zwfs import metrics as metrics
@@ -58,15 +60,19 @@ __all__ = [
     "GradientDescent",
     "LikelihoodReconstruction",
     "Linear",
+    "LoopRecord",
     "MaximumLikelihood",
+    "Mirror",
     "Patch",
     "PhaseShifted",
     "PolychromaticSensor",
     "Pupil",
     "Reconstruction",
     "ZernikeSensor",
+    "close_loop",
     "cramer_rao",
     "dynamic_range",
+    "hold_drift",
     "noll_to_nm",
     "opd_to_phase",
     "phase_to_opd",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zwfs import _check
+from zwfs import _check, loop
 from zwfs.detector import Detector
-from zwfs.metrics import strehl, without_piston
+from zwfs.loop import Mirror
 from zwfs.modes import check_modes
 from zwfs.paper.linearity import check_reconstructors
 from zwfs.pupil import Pupil
@@ -199,35 +198,23 @@ def close_loop(
     modes = check_modes(sensor.pupil, modes)
     n_steps = _check.integer("n_steps", n_steps, 1)
     rate = _check.number("rate", rate, 0, open_low=True)
-    gain = _check.number("gain", gain, 0, 2, open_low=True, open_high=True)
-    delay = _check.integer("delay", delay, 1)
-    stroke = np.inf if stroke is None else _check.number("stroke", stroke, 0, open_low=True)
     camera = None
     if photons is not None:
         photons = _check.number("photons", photons, 0, open_low=True)
         camera = Detector(pupil, photons / sensor.n_masks)
-    rng = _check.generator("seed", seed)
     times = np.arange(n_steps) / rate
-    open_loop, residual, ratio = np.empty((3, flow.n_screens, n_steps))
-    fit = np.linalg.pinv(modes)
-    mirror = deque([np.zeros((flow.n_screens, pupil.n_points))] * delay)
-    for step, time in enumerate(times):
-        screens = pupil.gather(flow(time))
-        left = pupil.scatter(screens - mirror[0], fill=0)
-        open_loop[:, step] = screens.std(axis=-1)
-        residual[:, step], ratio[:, step] = pupil.rms(left), strehl(pupil, left)
-        frames = sensor.measure(left)
-        if camera is not None:
-            frames = camera.normalise(camera.expose(frames, rng), floor=0.0)
-        found = np.zeros((flow.n_screens, pupil.n_points))
-        # A frame without a photon holds no information: the mirror keeps its figure.
-        seen = frames.any(axis=(-2, -1)).all(axis=-1)
-        if seen.any():
-            found[seen] = without_piston(pupil.gather(reconstructor(frames[seen]).phase))
-        figure = mirror[-1] + gain * (found @ fit) @ modes
-        mirror.append(figure / np.maximum(figure.std(axis=-1, keepdims=True) / stroke, 1))
-        mirror.popleft()
-    return LoopRun(times, open_loop, residual, ratio)
+    record = loop.close_loop(
+        sensor,
+        Mirror(pupil, pupil.scatter(modes, fill=0)),
+        reconstructor,
+        (flow(time) for time in times),
+        gain=gain,
+        delay=delay,
+        stroke=stroke,
+        camera=camera,
+        seed=seed,
+    )
+    return LoopRun(times, record.open_loop, record.residual, record.strehl)
 
 
 def close_loops(

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from distributed import Client, LocalCluster
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from rocrate.rocrate import ROCrate
 
@@ -161,6 +162,9 @@ def refused(project, *arguments):
         (["1", "-f", "/dev/zero"], "-f /dev/zero: expected a regular file"),
         (["1", "-f", "."], "-f .: expected a regular file"),
         (["1", "-f", "a" * 300], "File name too long"),
+        (["1", "--jobs", "0"], "--jobs 0: expected at least 1"),
+        (["1", "--jobs", "two"], "argument --jobs: invalid int value: 'two'"),
+        (["1", "--cluster", "nowhere"], "--cluster nowhere: expected an address, as in tcp://host:8786"),
         (["--line=1 -p n=10"], "n = 10: expected an integer in [1, 9]"),
         (["--line=1 -p 'n=10"], "No closing quotation"),
         (["--line=1", "--list"], "--line replaces all other arguments"),
@@ -588,3 +592,29 @@ def test_pages_of_unusual_parameters_have_no_gaps(tmp_path, capsys, figure, para
     values = [text for value in FEW + parameters for text in ("-p", value)]
     rerun.rerun(Project(ROOT), [figure, *values, "--output", str(tmp_path / "figure")])
     assert capsys.readouterr().err == ""
+
+
+SWEEP = """import os, pathlib
+from zwfs.companion import sweeps
+# Defined here, the task travels to the workers by value.
+def where(value):
+    import os
+    return os.getpid()
+found = sweeps.run(where, range(6), name="where")
+folder = pathlib.Path(os.environ["ZWFS_RESULTS"])
+_ = (folder / "numbers.csv").write_text(" ".join(map(str, found)))"""
+
+
+@pytest.mark.slow
+def test_sweeps_of_a_notebook_run_on_a_cluster_or_on_few_processes(project):
+    write(project, "fig02_works", new_code_cell(SWEEP))
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        rerun.rerun(project, ["2", "--cluster", cluster.scheduler_address])
+        workers = set(client.run(os.getpid).values())
+    ran = (result(project) / "numbers.csv").read_text().split()
+    assert {int(one) for one in ran} <= workers
+    rerun.rerun(project, ["2", "--jobs", "1", "--force"])
+    assert len(set((result(project) / "numbers.csv").read_text().split())) == 1

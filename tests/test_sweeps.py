@@ -6,8 +6,10 @@ import os
 import pickle
 import re
 import signal
+import socket
 import subprocess
 import sys
+import textwrap
 import threading
 import time
 from pathlib import Path
@@ -15,6 +17,7 @@ from pathlib import Path
 import joblib
 import numpy as np
 import pytest
+import yaml
 from distributed import Client, LocalCluster
 
 from tests.conftest import heed_signals
@@ -405,3 +408,64 @@ def test_one_process_needs_no_joblib(pupil, modes, monkeypatch):
         monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
     without = linearity_curves(methods, modes, [0.1, 0.2], 2)
     np.testing.assert_allclose(without.errors["linear"], with_it.errors["linear"], rtol=1e-9)
+
+
+def commands_on_the_page():
+    """The commands of the containers in the recipe for Kubernetes: those of the scheduler and of a worker."""
+    page = (ROOT / "book" / "sweeps.md").read_text("utf-8")
+    [recipe] = [block for block in re.findall(r"```yaml\n(.*?)```", page, re.S) if "kind: Deployment" in block]
+    parts = [part for part in yaml.safe_load_all(recipe) if part["kind"] == "Deployment"]
+    return [part["spec"]["template"]["spec"]["containers"][0]["command"] for part in parts]
+
+
+def test_the_recipe_for_kubernetes_starts_a_cluster(tmp_path, monkeypatch):
+    """Its commands, here with the environment of the test in place of the container's, and its port."""
+    home = re.search(r"(?m)^WORKDIR (.*)$", (ROOT / "environment" / "Dockerfile").read_text())[1]
+    processes = []
+    try:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = str(free.getsockname()[1])
+        for command in commands_on_the_page():
+            assert command[0] == f"{home}/.venv/bin/dask"
+            own = [word.replace("8786", port).replace("//zwfs:", "//127.0.0.1:") for word in command[1:]]
+            run = [str(Path(sys.executable).parent / "dask"), *own]
+            processes.append(subprocess.Popen(run, cwd=tmp_path, stderr=subprocess.DEVNULL))
+        processes.append(subprocess.Popen(run, cwd=tmp_path, stderr=subprocess.DEVNULL))
+        with Client(f"tcp://127.0.0.1:{port}", timeout=60, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=120)
+        monkeypatch.setenv("ZWFS_CLUSTER", f"tcp://127.0.0.1:{port}")
+        assert os.getpid() not in sweeps.run(process_of, range(6), name="where")
+    finally:
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.wait(30)
+
+
+def process_of(value):
+    return os.getpid()
+
+
+def test_the_recipe_for_slurm_submits_workers():
+    page = (ROOT / "book" / "sweeps.md").read_text("utf-8")
+    [recipe] = [block for block in re.findall(r"```python\n(.*?)```", page, re.S) if "SLURMCluster(" in block]
+    made = {}
+    exec(recipe.replace("cluster.scale(jobs=10)", ""), made)
+    with made["cluster"] as cluster:
+        script = cluster.job_script()
+    for part in (
+        "#SBATCH -p short",
+        "/shared/zwfs/.venv/bin/python -m distributed",
+        "--nthreads 1",
+        "--nworkers 16",
+    ):
+        assert part in script
+
+
+def test_the_grid_on_the_page_runs(tmp_path):
+    page = (ROOT / "book" / "sweeps.md").read_text("utf-8")
+    [block] = [block for block in re.findall(r"```python\n(.*?)```", page, re.S) if "grid(" in block]
+    smaller = textwrap.indent(block.replace("make_pupil(64), 100", "make_pupil(24), 20"), "    ")
+    (tmp_path / "script.py").write_text(f'if __name__ == "__main__":\n{smaller}')
+    subprocess.run([sys.executable, "script.py"], cwd=tmp_path, check=True)
+    assert len((tmp_path / "grid.csv").read_text().splitlines()) == 1 + 4 * 3 * 4 * 20

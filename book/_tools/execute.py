@@ -55,6 +55,8 @@ class Run:
         A folder for everything that the run writes.
     parameters : dict, optional
         Values that replace defaults in the cell tagged ``parameters``.
+    environment : dict, optional
+        More environment variables of the kernel; no result depends on them.
 
     Attributes
     ----------
@@ -75,9 +77,15 @@ class Run:
     _stopped = False
 
     def __init__(
-        self, project: Project, name: str, scratch: Path, parameters: dict[str, Any] | None = None
+        self,
+        project: Project,
+        name: str,
+        scratch: Path,
+        parameters: dict[str, Any] | None = None,
+        environment: dict[str, str] | None = None,
     ) -> None:
         self.project, self.name, self.parameters = project, name, parameters or {}
+        self._environment = environment or {}
         self.folder = scratch / f"{name}.files"
         self._target, self._log, self._progress = (
             scratch / f"{name}{end}" for end in (".ipynb", ".log", ".progress")
@@ -128,7 +136,7 @@ class Run:
             progress_bar=False,
             request_save_on_cell_execute=False,
             run=self,
-            environment=os.environ | ENVIRONMENT | own,
+            environment=os.environ | ENVIRONMENT | own | self._environment,
         )
 
     def start_kernel(self, client: PapermillNotebookClient, environment: dict[str, str]) -> None:

@@ -18,7 +18,7 @@ from . import pdf as printing
 from .crate import describe_book
 from .project import EXECUTED, PDF, Project, ToolError
 from .record import commit, digest, digest_files
-from .run import refresh, run
+from .run import moved_numbers, refresh, run
 from .scratch import scratch_folder, swap
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
@@ -53,10 +53,11 @@ def pdf(project: Project) -> None:
 
 
 def figures(project: Project) -> None:
-    """Replace the committed notebooks and the front figure by freshly run ones."""
+    """Replace the committed notebooks and the front figure by freshly run ones; print the numbers that moved."""
     run(project)
+    numbers = moved_numbers(project)
     for name in refresh(project):
-        print(f"{name} is new")
+        print(f"{name} is new", *numbers.get(name, ()), sep="\n  ")
 
 
 def check_contents(project: Project) -> None:

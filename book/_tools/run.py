@@ -3,13 +3,15 @@
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 
 from tqdm import tqdm
 
 from zwfs._files import write_file
 
 from .execute import Run, execute
-from .notebook import to_bytes
+from .notebook import read, to_bytes
 from .project import Project
 from .record import digest_result, key, read_record, versions
 from .scratch import scratch_folder
@@ -68,6 +70,38 @@ def _store(run: Run) -> None:
     shutil.rmtree(executed / run.folder.name, ignore_errors=True)
     run.folder.rename(executed / run.folder.name)
     write_file(executed / f"{run.name}.json", json.dumps(record, indent=1).encode())
+
+
+def moved_numbers(project: Project) -> dict[str, list[str]]:
+    """Return the glued numbers that differ between committed and executed notebooks, by committed file."""
+    return {
+        committed.relative_to(project.root).as_posix(): differences(_glued(committed), _glued(fresh))
+        for committed in project.sources()
+        if (fresh := project.executed / committed.name).exists()
+    }
+
+
+def _glued(path: Path) -> dict[str, str]:
+    """Return what a notebook glues, as text by name."""
+    found = {}
+    for cell in read(path).cells:
+        for output in cell.get("outputs", ()):
+            if name := output.get("metadata", {}).get("scrapbook", {}).get("name"):
+                found[name] = next((text for kind, text in output.data.items() if kind.endswith("text/plain")), "")
+    return found
+
+
+def differences(before: dict[str, str], after: dict[str, str]) -> list[str]:
+    """Return the values that differ, in words, with the relative change of numbers."""
+    lines = []
+    for name in sorted(before.keys() | after.keys()):
+        old, new = before.get(name, "none"), after.get(name, "none")
+        if old != new:
+            change = ""
+            with suppress(ValueError, ZeroDivisionError):  # not numbers
+                change = f" ({100 * (float(new) / float(old) - 1):+.2g} %)"
+            lines.append(f"{name}: {old} -> {new}{change}")
+    return lines
 
 
 def refresh(project: Project) -> list[str]:

@@ -107,6 +107,17 @@ def test_recovery_is_the_error_of_the_reconstructor():
     np.testing.assert_array_equal(part["converged"], estimate.converged)
 
 
+def test_single_precision_gives_nearly_the_same_errors():
+    source = make_screens(make_pupil(24), 20, -2.0)
+    one, half = (
+        sweeps.grid(Recovery(source, dtype=dtype), rms=[0.2, 0.5], n_screens=3).values["error"]
+        for dtype in ("float64", "float32")
+    )
+    np.testing.assert_allclose(half, one, atol=1e-4)
+    with pytest.raises(TypeError, match="dtype = 'int8'"):
+        Recovery(source, dtype="int8")
+
+
 def test_a_slice_is_drawn(result):
     figure = plots.grid_slice(result, "value", "x", lines="y")
     curves = figure.axes[0].get_lines()

@@ -35,7 +35,7 @@ INPUT, DIAMETER = "input (rad rms)", "diameter (lambda/D)"
 # Markers and dashes of matplotlib, in the words of Bokeh.
 MARKERS = {"o": "circle", "s": "square", "^": "triangle", "v": "inverted_triangle", "x": "x", "+": "cross"}
 MARKERS |= {"D": "diamond", "d": "diamond", "*": "star", "P": "plus"}
-DASHES = {"-": (), "--": "dashed", "-.": "dashdot", ":": "dotted"}
+DASHES = {"--": "dashed", "-.": "dashdot", ":": "dotted"}
 
 Columns = dict[str, NDArray[np.float64]]
 
@@ -176,16 +176,24 @@ def points(columns: Columns, panel: Panel, name: str) -> dict[str, list[float]]:
 
 def entry(look: Look, shown: bool = True) -> dict[str, Any]:
     """Return an entry of the legend: the look of a curve on a light and on a dark page."""
-    dashes = rcParams[f"lines.{DASHES[look.line]}_pattern"] if DASHES.get(look.line) else look.line[1:]
     return {
         "name": look.label,
         "light": look.color,
         "dark": to_hex(dark_color(look.color)),
-        "dash": [2 * length for length in (dashes[0] if isinstance(look.line, tuple) else dashes)],
+        "dash": dashes(look),
         "marker": MARKERS.get(look.marker, ""),
-        "width": 1.5 if look.marker or look.line != "-" else 5,
+        "width": 5 if look is OTHERS["bound"] else 1.5,
         "shown": shown,
     }
+
+
+def dashes(look: Look) -> list[float]:
+    """Return the lengths of the dashes and gaps of a line, pixels."""
+    if isinstance(look.line, tuple):
+        pattern = look.line[1]
+    else:
+        pattern = rcParams[f"lines.{DASHES[look.line]}_pattern"] if look.line in DASHES else ()
+    return [2 * length for length in pattern]
 
 
 def maps(columns: Columns) -> dict[str, Any]:

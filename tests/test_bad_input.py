@@ -42,7 +42,7 @@ MODULES = (
     *("frames.calibration",),
     *("paper.curves", "paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
     *("paper.bench_linearity", "paper.closed_loop", "paper.photon_noise", "paper.design", "paper.recovery"),
-    *("companion.sweeps", "companion.results", "companion.tables"),
+    *("companion.sweeps", "companion.results", "companion.tables", "polychromatic", "loop"),
 )
 
 # Results that may be infinite: the limit lies beyond what was sampled, or the noise diverges.
@@ -60,7 +60,7 @@ INFINITE |= {
 
 # Hooks of the base classes of reconstructors, and the checks of what they get.
 INTERNAL = {"Settings", "Solution", "State", "Estimate", "model", "solve", "invert", "begin", "step", "constants"}
-INTERNAL |= {"check_frames", "check_phase", "check_modes", "pieces"}
+INTERNAL |= {"check_frames", "check_phase", "check_modes", "check_sensor", "pieces"}
 HANDED_ON = {"run.shared"}  # to the task, as it is
 PASSED = {
     "Pupil.gather",
@@ -99,7 +99,7 @@ def targets():
             ):
                 continue
             if inspect.isfunction(thing):
-                found[name if name not in found else f"{module.__name__[5:]}.{name}"] = thing
+                found[name if name not in found else f"{name} of {module.__name__[5:]}"] = thing
             elif inspect.isclass(thing) and not getattr(thing, "_is_protocol", False):
                 # A class that documents attributes only is a result: functions of the package make it.
                 if inspect.isabstract(thing):
@@ -130,7 +130,7 @@ def valid() -> dict:
         options = {"n_iterations": 3} if kind.iterative else {}
         options |= {"modes": modes} if kind is zwfs.Linear else {}
         methods[kind.__name__] = kind(shifted if kind.n_masks[1] > 1 else classic, **options)
-    method = methods["PhaseShifted"]
+    method, mirror = methods["PhaseShifted"], zwfs.Mirror(pupil, modes)
     points = pupil.gather(phase)
     from zwfs.bench import model
     from zwfs.frames import calibration, pipeline, registration, verdict
@@ -304,6 +304,21 @@ def valid() -> dict:
         "change": phase,
         "ZernikeSensor.with_tolerance.tolerance": 1e-3,
         "PolychromaticSensor.with_tolerance.tolerance": 1e-3,
+        "mirror": mirror,
+        "plant": shifted,
+        "influence": modes,
+        "commands": np.zeros(5),
+        "disturbance": phase[np.newaxis],
+        "camera": zwfs.Detector(pupil, 1e5),
+        "gain": 0.5,
+        "leak": 0.1,
+        "delay": 1,
+        "drift": 10.0,
+        "speed": 1.0,
+        "n_actuators": 9,
+        "coupling": 0.3,
+        "conditioning": 1e-3,
+        "n_cycles": 1,
         "wavelengths": [600.0, 650.0],
         "weights": [1.0, 2.0],
         "reference_wavelength": 620.0,
@@ -392,6 +407,8 @@ def valid() -> dict:
         "Patch": zwfs.Patch(1.0, lambda u, v: 0.9 * np.exp(1j * u / 9)),
         "Sensor": shifted,
         "ZernikeSensor": shifted,
+        "Mirror": mirror,
+        "LoopRecord": zwfs.close_loop(shifted, mirror, method, phase[np.newaxis]),
         "PolychromaticSensor": zwfs.PolychromaticSensor(shifted, [600.0, 650.0]),
         "Detector": zwfs.Detector(pupil, 1e5, gain=1.0, full_well=1e4),
         **methods,

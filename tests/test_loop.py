@@ -56,7 +56,7 @@ def test_gaussian_influence_functions_couple_to_their_neighbours():
 def test_a_gaussian_mirror_makes_smooth_wavefronts(pupil, modes):
     mirror = Mirror.gaussian(pupil, 97)
     left = modes - mirror.wavefront(mirror.fit(modes))
-    assert pupil.rms(left).max() < 0.05
+    assert pupil.rms(left).max() < 0.1
     with pytest.raises(ValueError, match=r"n_actuators = 98: expected .* \[97, "):
         Mirror.gaussian(pupil, 98)
 

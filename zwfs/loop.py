@@ -55,7 +55,7 @@ class Mirror(Immutable):
         _check.instance("pupil", pupil, Pupil)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
         self._pupil = pupil
-        self._influence = read_only(check_modes(pupil, influence))
+        self._influence = read_only(check_modes(pupil, influence, "influence"))
         self._inverse = read_only(np.linalg.pinv(self._influence, rcond=conditioning))
 
     @classmethod
@@ -401,8 +401,9 @@ def hold_drift(
     8.4
     """
     check_sensor("sensor", sensor)
+    modes = sensor.pupil.scatter(check_modes(sensor.pupil, modes), fill=0)
     drift = _check.number("drift", drift, 0)
-    photons = _check.number("photons", photons, 0, open_low=True)
+    photons = _check.number("photons", photons, 1e-6)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
     speed = _check.number("speed", speed, 0)
     if gain is None and not drift:
@@ -412,8 +413,7 @@ def hold_drift(
     sigma = cramer_rao(sensor, around, photons=per_point, modes=modes) * (1e3 * wavelength / (2 * np.pi))
     step, constant = drift / math.sqrt(sigma.size), speed / math.sqrt(sigma.size)
     if gain is None:
-        q = (step / sigma) ** 2
-        gains = 2 / (1 + np.sqrt(1 + 4 / q))
+        gains = 2 * step / (step + np.hypot(step, 2 * sigma))
     else:
         gains = np.full(sigma.size, _check.number("gain", gain, 0, 2, open_low=True, open_high=True))
     lag = np.sqrt((constant / gains) ** 2 + step**2 / (gains * (2 - gains)))

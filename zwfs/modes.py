@@ -272,7 +272,7 @@ def mode_frequencies(pupil: Pupil, modes: ArrayLike) -> NDArray[np.float64]:
     return np.sqrt(power) / (2 * np.pi * np.nanstd(values, axis=(-2, -1)))
 
 
-def check_modes(pupil: Pupil, modes: ArrayLike) -> NDArray[np.float64]:
+def check_modes(pupil: Pupil, modes: ArrayLike, name: str = "modes") -> NDArray[np.float64]:
     """Checked modes at the points of the pupil, shape (n_modes, n_points).
 
     Raises
@@ -287,13 +287,13 @@ def check_modes(pupil: Pupil, modes: ArrayLike) -> NDArray[np.float64]:
     >>> zwfs.modes.check_modes(pupil, zwfs.zernike_basis(pupil, 5)).shape
     (5, 812)
     """
-    modes = _check.real_array("modes", modes)
+    modes = _check.real_array(name, modes)
     if modes.ndim != 3 or not len(modes):
-        raise ValueError(f"modes has shape {modes.shape}: expected (n_modes, ny, nx)")
-    values = _check.values_inside("modes", modes, pupil).astype(np.float64)
+        raise ValueError(f"{name} has shape {modes.shape}: expected (n_modes, ny, nx)")
+    values = _check.values_inside(name, modes, pupil).astype(np.float64)
     if len(values) > values.shape[1]:
         raise ValueError(
-            f"modes: {len(values)} of them, expected at most the {values.shape[1]} points of the pupil"
+            f"{name}: {len(values)} of them, expected at most the {values.shape[1]} points of the pupil"
         )
     return read_only(values)
 

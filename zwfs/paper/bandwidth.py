@@ -55,6 +55,7 @@ class BandCurves:
 
     def at(self, bandwidth: float) -> int:
         """Place of the bandwidth that is nearest."""
+        bandwidth = _check.number("bandwidth", bandwidth)
         return int(np.argmin(np.abs(self.bandwidths - bandwidth)))
 
     def equal_photons(self, way: str) -> NDArray[np.float64]:

@@ -83,6 +83,7 @@ CONTENT = {
 SLOW = {"error_budget", "contraction", "other_curves", "steps", "fit"}
 INTERNAL |= {"frames_on_grid", "clear_on_grid", "places", "fits_module", "fits_bytes", "published"}
 INTERNAL |= {"calibrate", "load", "joined"}  # need the files of a bench: see test_telemetry.py
+INTERNAL |= {"grid", "Grid"}  # need axes of any name: see test_grid.py
 INTERNAL |= {"small", "glue_numbers"}  # for the notebooks of the book
 
 

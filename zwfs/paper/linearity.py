@@ -189,8 +189,11 @@ def own_reconstructors(paths: Sequence[str], reconstructors: Mapping[str, Any]) 
     check_reconstructors(reconstructors)
     _check.sequence("paths", paths, expected="a list of 'module:Class'")
     own: dict[str, Any] = {}
-    for path in paths:
-        method = load(path)
+    for index, path in enumerate(paths):
+        try:
+            method = load(path)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"paths[{index}]: {error}") from error
         if method.__name__ in {**reconstructors, **own}:
             raise ValueError(f"path = {path!r}: expected a name other than {', '.join([*reconstructors, *own])}")
         like = "Arcsine" if getattr(method, "n_masks", 2) == 1 else "PhaseShifted"

@@ -605,7 +605,7 @@ def test_history_begins_with_the_start_as_it_was_given(make, method, pupil, scre
 def test_tolerance_stops_early(make, method, screens, pupil):
     frames = make(method)[1].measure(screens(0.2))
     loose = make(method, n_iterations=500, tolerance=1e-3)[0](frames, history=True)
-    tight = make(method, n_iterations=500, tolerance=1e-5)[0](frames)
+    tight = make(method, n_iterations=500, tolerance=1e-8)[0](frames)
     assert loose.converged.all()
     assert np.all(loose.n_iterations < tight.n_iterations)
     for history, n in zip(loose.history, loose.n_iterations, strict=True):

@@ -221,7 +221,7 @@ def test_values_are_read_as_people_mean_them(text, value):
 
 def test_command_line_wins_over_the_file(project, monkeypatch):
     made = []
-    monkeypatch.setattr(rerun, "make", lambda project, name, changed, known, folder: made.append(changed) or 1.0)
+    monkeypatch.setattr(rerun, "make", lambda project, name, changed, *rest: made.append(changed) or 1.0)
     (project.root / "mine.yaml").write_text("n: 5\nwidth: 2\n")
     rerun.rerun(project, ["fig01_small", "-f", str(project.root / "mine.yaml"), "-p", "n=6"])
     rerun.rerun(project, ["fig01", "-p", "width=1.5", "-p", "steps=[]"])

@@ -688,7 +688,7 @@ import sys, time
 from zwfs.frames import __main__ as command
 
 fast = command.reconstruct
-command.reconstruct = lambda *args, **options: fast(*args, **{**options, "progress": lambda *_: time.sleep(0.1)})
+command.reconstruct = lambda *args, **options: fast(*args, **{**options, "progress": lambda *_: time.sleep(0.5)})
 sys.exit(command.main(sys.argv[1:]))
 """
 
@@ -696,7 +696,7 @@ sys.exit(command.main(sys.argv[1:]))
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_command_that_is_stopped_goes_on_to_the_same_bytes(folder, bench, calibration, number):
-    np.save("long.npy", np.concatenate([bench.frames] * 40))
+    np.save("long.npy", np.concatenate([bench.frames] * 200))
     arguments = ["reconstruct", "long.npy", "--calibration", "bench.npz", "-o"]
     reconstruct("long.npy", calibration, "whole.fits", saturation=65535)
     process = subprocess.Popen([sys.executable, "-c", SLOW, *arguments, "phase.fits"], cwd=folder)

@@ -262,6 +262,15 @@ def mode_frequencies(pupil: Pupil, modes: ArrayLike) -> NDArray[np.float64]:
     Returns
     -------
     ndarray, shape (n_modes,), cycles / D
+
+    Examples
+    --------
+    >>> import zwfs
+    >>> from zwfs.modes import mode_frequencies
+    >>> pupil = zwfs.Pupil.circular(64)
+    >>> tilt, *_, last = mode_frequencies(pupil, zwfs.zernike_basis(pupil, 200))
+    >>> print(f"{tilt:.2f}, {last:.2f}")
+    0.64, 12.01
     """
     _check.instance("pupil", pupil, Pupil)
     values = pupil.scatter(check_modes(pupil, modes))

@@ -70,8 +70,9 @@ def docstrings() -> Iterator[tuple[str, str]]:
             thing, path = vars(module)[own], api.path(module, own)
             yield path, inspect.getdoc(thing) or ""
             for member in vars(thing) if inspect.isclass(thing) else ():
-                if not member.startswith("_"):
-                    yield f"{path}.{member}", inspect.getdoc(getattr(thing, member)) or ""
+                value = getattr(thing, member)
+                if not (member.startswith("_") or inspect.isclass(value)):
+                    yield f"{path}.{member}", inspect.getdoc(value) or ""
 
 
 @cache

@@ -168,6 +168,7 @@ def other_curves(
     Settings are those of `paper_reconstructors`, `own` are the paths of `own_reconstructors`. See
     `diameter_curves` for `noise` and `seed`.
     """
+    _check.sequence("own", own, expected="a list of 'module:Class'")
 
     def make(diameter: float) -> dict[str, Any]:
         methods = paper_reconstructors(pupil, modes, diameter, phase_shift, **settings)

@@ -113,7 +113,7 @@ def button(figure: str) -> list[str]:
         return []
     text = "Explore the map" if figure == MAP else "Explore the curves"
     size = sum(file.stat().st_size for file in LIBRARY) / 1e6
-    tag = f'<button type="button" data-explore="{figure}">{text}</button> loads {size:.1f} MB'
+    tag = f'<button type="button" data-explore="{figure}">{text}</button> This loads {size:.1f} MB.'
     return ["", "```{raw} html", f'<p class="explore d-print-none">{tag}</p>', "```"]
 
 

@@ -169,7 +169,7 @@
       tools.append(button);
     }
     const panels = make("div", { className: "explore-panels" });
-    const help = "Point at a mark for its values. Drag to zoom. Click a name to hide or show its marks.";
+    const help = "Point at a mark to see its values. Drag to zoom. Click a name to hide or show its marks.";
     box.replaceChildren(make("p", { textContent: help }), legend, panels, tools, table(drawing.table));
     redraw();
     new MutationObserver(redraw).observe(document.documentElement, { attributeFilter: ["data-theme"] });
@@ -194,7 +194,7 @@
       try {
         await draw(button.dataset.explore, box);
       } catch {
-        box.textContent = "The interactive version cannot be loaded. The figure and the CSV file have the same values.";
+        box.textContent = "The interactive version cannot be loaded. The figure and the CSV file show the same values.";
       }
     });
   }

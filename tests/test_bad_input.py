@@ -420,7 +420,7 @@ def valid() -> dict:
         ),
         "LinearityCurves": curve,
         "FrozenFlow": flow,
-        "LoopRun": closed_loop.close_loop(method, modes, flow, 2),
+        "LoopRun": closed_loop.follow_flow(method, modes, flow, 2),
         "ErrorCurves": curve,
         "DiameterCurves": dimple_diameter.DiameterCurves(
             np.array([0.5, 0.6]), {"shifted": np.array([[0.01], [0.1]])}, np.array([1.0, 2.0])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
-from zwfs.paper.closed_loop import FrozenFlow, close_loop
+from zwfs.paper.closed_loop import FrozenFlow, follow_flow
 
 PLUS, MINUS = Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2)
 
@@ -63,7 +63,7 @@ def test_a_still_screen_is_corrected_by_the_gain_in_each_step(pupil, modes, shif
     screens = pupil.gather(flow(0.0))
     flat = pupil.gather(modes)
     fitted = np.linalg.lstsq(flat.T, screens.T, rcond=None)[0].T
-    run = close_loop(shifted, modes, flow, 6, gain=0.5, delay=1)
+    run = follow_flow(shifted, modes, flow, 6, gain=0.5, delay=1)
     for step in range(6):
         left = screens - (1 - 0.5**step) * fitted @ flat
         np.testing.assert_allclose(run.residual[:, step], left.std(axis=-1), rtol=1e-4)
@@ -72,7 +72,7 @@ def test_a_still_screen_is_corrected_by_the_gain_in_each_step(pupil, modes, shif
 
 def test_a_correction_takes_the_delay(pupil, modes, shifted):
     flow = FrozenFlow(pupil, 0.3, 1, speed=0.0, cutoff=1.0, seed=4)
-    residual = close_loop(shifted, modes, flow, 5, gain=0.5, delay=3).residual[0]
+    residual = follow_flow(shifted, modes, flow, 5, gain=0.5, delay=3).residual[0]
     np.testing.assert_allclose(residual[:3], 0.3)
     assert residual[3] < 0.2
 
@@ -80,7 +80,7 @@ def test_a_correction_takes_the_delay(pupil, modes, shifted):
 def test_noise_falls_with_the_root_of_the_photons(pupil, modes, shifted):
     flow = FrozenFlow(pupil, 0.0, 4, seed=1)
     few, many = (
-        close_loop(shifted, modes, flow, 60, photons=photons, seed=5).settled().mean() for photons in (1e6, 1e8)
+        follow_flow(shifted, modes, flow, 60, photons=photons, seed=5).settled().mean() for photons in (1e6, 1e8)
     )
     assert few / many == pytest.approx(10, rel=0.15)
 
@@ -90,15 +90,15 @@ def test_the_phase_shifted_loop_closes_where_the_linear_one_does_not(pupil, mode
     few = PhaseShifted(ZernikeSensor(pupil, PLUS, MINUS), n_iterations=5)
     flow = FrozenFlow(pupil, 0.9, 6, seed=1)
     options = {"gain": 0.4, "delay": 2, "stroke": 4.0}
-    assert close_loop(few, modes, flow, 80, **options).closed().all()
-    lost = close_loop(plain, modes, flow, 80, **options)
+    assert follow_flow(few, modes, flow, 80, **options).closed().all()
+    lost = follow_flow(plain, modes, flow, 80, **options)
     assert not lost.closed().all()
     assert np.all(lost.residual <= 4.0 + lost.open_loop + 1e-9)
 
 
 def test_the_same_seed_gives_the_same_run(pupil, modes, shifted):
     runs = [
-        close_loop(shifted, modes, FrozenFlow(pupil, 0.5, 2, seed=1), 5, photons=1e4, seed=seed)
+        follow_flow(shifted, modes, FrozenFlow(pupil, 0.5, 2, seed=1), 5, photons=1e4, seed=seed)
         for seed in (2, 2, 3)
     ]
     assert np.array_equal(runs[0].residual, runs[1].residual)
@@ -107,9 +107,9 @@ def test_the_same_seed_gives_the_same_run(pupil, modes, shifted):
 
 def test_the_mirror_stays_where_no_photon_came(pupil, modes, shifted):
     flow = FrozenFlow(pupil, 0.5, 8, seed=1)
-    dark = close_loop(shifted, modes, flow, 3, photons=1e-9, seed=2)
+    dark = follow_flow(shifted, modes, flow, 3, photons=1e-9, seed=2)
     np.testing.assert_allclose(dark.residual, dark.open_loop)
-    faint = close_loop(shifted, modes, flow, 2, photons=3.0, seed=2)
+    faint = follow_flow(shifted, modes, flow, 2, photons=3.0, seed=2)
     stayed = np.isclose(faint.residual, faint.open_loop)[:, 1]
     assert 0 < stayed.sum() < len(stayed)
 
@@ -128,14 +128,14 @@ def test_the_mirror_stays_where_no_photon_came(pupil, modes, shifted):
 def test_bad_input_is_refused(pupil, modes, shifted, change, message):
     arguments = {"modes": modes, "flow": FrozenFlow(pupil, 0.5, 1, seed=1), "n_steps": 3} | change
     with pytest.raises(ValueError, match=message):
-        close_loop(shifted, **arguments)
+        follow_flow(shifted, **arguments)
 
 
 def test_a_flow_for_another_pupil_is_refused(modes, shifted):
     with pytest.raises(ValueError, match="flow has Pupil"):
-        close_loop(shifted, modes, FrozenFlow(Pupil.circular(16), 0.5, 1), 3)
+        follow_flow(shifted, modes, FrozenFlow(Pupil.circular(16), 0.5, 1), 3)
     with pytest.raises(TypeError, match="flow is a float"):
-        close_loop(shifted, modes, 0.5, 3)
+        follow_flow(shifted, modes, 0.5, 3)
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ class LoopRun:
         return float(np.median(settled)) if settled.size else np.nan
 
 
-def close_loop(
+def follow_flow(
     reconstructor: Any,
     modes: ArrayLike,
     flow: FrozenFlow,
@@ -217,9 +217,9 @@ def close_loop(
     return LoopRun(times, record.open_loop, record.residual, record.strehl)
 
 
-def close_loops(
+def compare_loops(
     reconstructors: Mapping[str, Any], modes: ArrayLike, flow: FrozenFlow, n_steps: int, **settings: Any
 ) -> dict[str, LoopRun]:
-    """Close the loop with each of several reconstructors, on the same screens; see `close_loop`."""
+    """Close the loop with each of several reconstructors, on the same screens; see `follow_flow`."""
     check_reconstructors(reconstructors)
-    return {name: close_loop(one, modes, flow, n_steps, **settings) for name, one in reconstructors.items()}
+    return {name: follow_flow(one, modes, flow, n_steps, **settings) for name, one in reconstructors.items()}

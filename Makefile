@@ -31,7 +31,7 @@ export RERUN := $(value FIGURE) $(value ARGS)
 unexport FIGURE ARGS
 
 .DELETE_ON_ERROR:
-.PHONY: help book pdf lab test figures rerun lint bench release-check pythons lock clean
+.PHONY: help book pdf lab test figures rerun lint bench mutants release-check pythons lock clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 21
@@ -66,6 +66,9 @@ bench: $(READY) ## time the reconstructors, next to other packages, for the perf
 	@mkdir -p _build
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only --benchmark-json=_build/measured.json
 	$(BIN)/python -m tests.benchmarks.report _build/measured.json
+
+mutants: $(READY) ## put defects into the package one by one, and name those that no test notices
+	@$(BIN)/python -m tests.mutants
 
 release-check: $(READY) ## build the package, and test it in an empty environment
 	@$(BIN)/python -m book._tools release-check

@@ -240,18 +240,20 @@ def test_focus_difference_is_free_space_to_either_side(perfect, commands, distan
     assert unlike > 50 * distance
 
 
-@pytest.mark.parametrize("distance", [3e-4, 1e-3])
-def test_focus_difference_turns_a_phase_grating_into_opposite_contrasts(distance):
+@pytest.mark.parametrize(("distance", "astigmatism"), [(3e-4, 0), (1e-3, 0), (3e-4, 2e-4)])
+def test_focus_difference_turns_a_phase_grating_into_opposite_contrasts(distance, astigmatism):
     # Talbot: exp(i q cos(2 pi f x)) becomes 1 + 2 q sin(pi z f^2) cos(2 pi f x) in intensity, for a small q.
     q, f = 0.01, 22
     open_pupil = {"n_rings": 0, "missing": (), "illumination": 0, "focus_difference": distance}
+    open_pupil["astigmatism"] = astigmatism
     graved, plain = (ideal(**open_pupil, quilting=value).clear_frames() for value in (q, 0))
     x, y = np.meshgrid(LAYOUT.x, LAYOUT.x)
     centre = np.hypot(x, y) < 0.25
     waves = np.stack([np.cos(2 * np.pi * f * x), np.cos(2 * np.pi * f * y), np.ones_like(x)])[:, centre]
     for arm, sign in enumerate((1, -1)):
         found = np.linalg.lstsq(waves.T, inner(graved - plain)[arm][centre])[0]
-        expected = 2 * q * np.sin(sign * np.pi * distance / 2 * f**2)
+        along = distance + np.array([astigmatism, -astigmatism])  # x and y
+        expected = 2 * q * np.sin(sign * np.pi * along / 2 * f**2)
         np.testing.assert_allclose(found[:2], expected, rtol=0.05)
 
 

@@ -113,6 +113,17 @@ def test_phase_is_that_of_the_pipeline(bench, optics, n_bad):
     assert not found.flags.any()
 
 
+def test_longer_exposure_time_of_the_frames_changes_no_phase(bench, calibration):
+    def longer(counts):
+        return 3.0 * counts - 2 * DARK
+
+    recording = record([bench.image(longer(bench.flat))], [bench.image(bench.clear)], exposure=3.0)
+    other = Calibration.of(reduce_frames(recording, Optics()), bench.dark, saturation=1e6)
+    found, expected = other(longer(bench.frames[:2])), calibration(bench.frames[:2])
+    np.testing.assert_allclose(found.phase, expected.phase, rtol=0, atol=1e-4)
+    assert not found.flags.any()
+
+
 def test_phase_is_that_which_was_put_in(bench, calibration):
     corner = calibration.places[0, :, 0, 0] - MARGIN
     grid = np.rint(corner).astype(int)

@@ -31,7 +31,7 @@ export RERUN := $(value FIGURE) $(value ARGS)
 unexport FIGURE ARGS
 
 .DELETE_ON_ERROR:
-.PHONY: help book pdf lab test figures rerun lint bench mutants release-check pythons lock clean
+.PHONY: help book pdf lab test fuzz mutants figures rerun lint bench release-check pythons lock clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 21
@@ -50,6 +50,9 @@ test: $(READY) ## test the package and the tools, and compare each notebook with
 	$(BIN)/python -m pytest --numprocesses auto --doctest-modules zwfs
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --nbval --nbval-current-env \
 		--nbval-cell-timeout 600 notebooks
+
+fuzz: $(READY) ## try 1000 new camera files, calibrations and parameters for each property, in about 10 minutes
+	$(BIN)/python -m pytest --numprocesses auto --hypothesis-profile fuzz tests/test_fuzzing.py
 
 figures: $(READY) ## replace the committed notebooks by freshly run ones
 	@$(BIN)/python -m book._tools figures

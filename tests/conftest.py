@@ -20,6 +20,7 @@ def new_reconstructor():
 
 
 settings.register_profile("zwfs", derandomize=True, deadline=None, max_examples=25)
+settings.register_profile("fuzz", deadline=None, max_examples=1000, print_blob=True)
 settings.load_profile("zwfs")
 
 

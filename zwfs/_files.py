@@ -26,7 +26,7 @@ def path_of(name: str, value: Any) -> Path:
     """Path that the operating system accepts."""
     try:
         path = Path(value)
-        if b"\0" not in os.fsencode(path):
+        if value != "" and b"\0" not in os.fsencode(path):
             return path
     except TypeError:
         raise TypeError(f"{name} = {_check.shown(value)}: expected a str or a Path") from None

@@ -262,8 +262,18 @@ def _typed(value: Any, limits: Any) -> Any:
     return float(value) if isinstance(_scalar(limits), float) else value
 
 
+def _whole(text: str) -> str:
+    """Return a text with one character for each pair of surrogates, which JSON writes; half a pair raises."""
+    return text.encode("utf-16", "surrogatepass").decode("utf-16")
+
+
 class _Constructor(SafeConstructor):
     """Constructor that reads dates as strings: no parameter is a date."""
+
+    def construct_scalar(self, node: Any) -> Any:
+        """Return the text of a scalar."""
+        value = super().construct_scalar(node)
+        return _whole(value) if isinstance(value, str) else value
 
 
 _Constructor.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
@@ -303,7 +313,7 @@ def _check_plain(events: Iterator[Event]) -> None:
     depth = 0
     for event in events:
         depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-        (getattr(event, "value", None) or "").encode()  # raises on half of a character, as in "\\ud800"
+        _whole(getattr(event, "value", None) or "")
         special = any(getattr(event, name, None) for name in ("anchor", "tag", "tags", "version"))
         if special or isinstance(event, AliasEvent) or getattr(event, "value", None) == "<<":
             raise MarkedYAMLError(problem=NOT_PLAIN, problem_mark=event.start_mark)

@@ -12,6 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 FIRST_BYTES = b"SIMPLE  ="
+# Types of the numbers of an image, by BITPIX, and the cards that give them a meaning, with their defaults.
+TYPES = {bits: np.dtype(kind) for bits, kind in
+         {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}.items()}  # fmt: skip
+SCALING = {"BSCALE": 1, "BZERO": 0, "BLANK": None}
 
 
 def fits_module() -> ModuleType:

@@ -14,8 +14,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from zwfs.frames._fits import fits_module
-from zwfs.frames.files import _GZIP, _NPY, FileError, _broken, _content, _header_cards, _npy_header
+from zwfs import _check
+from zwfs.frames._fits import SCALING, TYPES, fits_module
+from zwfs.frames.files import _GZIP, _NPY, FileError, _broken, _content, _header_cards, _npy_header, full_scale
 
 _MOST_UNPACKED = 2**29  # bytes of a gzip file, which is unpacked in memory
 
@@ -67,7 +68,7 @@ class Block:
     @property
     def full_scale(self) -> float:
         """Largest value that the type of the numbers can hold; infinity for floats."""
-        return np.iinfo(self.dtype).max * self.scale + self.zero if self.dtype.kind in "iu" else np.inf
+        return full_scale(self.dtype, self.scale, self.zero)
 
 
 @dataclass(frozen=True)
@@ -239,7 +240,7 @@ def _units(path: Path, shape: tuple[int, int]) -> tuple[list[Block], dict[str, A
             raise FileError(f"{label}: its numbers are {dtype}: expected real ones")
         if (
             len(full) not in (2, 3, 4)
-            or 0 in full
+            or min(full) < 1
             or full[-2:] != shape
             or (len(full) == 4 and full[1] not in (1, 2))
         ):
@@ -257,7 +258,6 @@ def _fits_units(stream: BinaryIO, name: str) -> tuple[list[_Image], dict[str, An
     fits = fits_module()
     found: list[_Image] = []
     header: dict[str, Any] = {}
-    types = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
     with _broken(f"{name}: a broken FITS file"), fits.open(stream, memmap=False, lazy_load_hdus=False) as units:
         for index, unit in enumerate(units):
             if isinstance(unit, fits.CompImageHDU):
@@ -265,13 +265,18 @@ def _fits_units(stream: BinaryIO, name: str) -> tuple[list[_Image], dict[str, An
             if not unit.is_image or not unit.shape:
                 continue
             cards = _header_cards(unit.header)
-            numbers = {"scale": cards.get("BSCALE", 1), "zero": cards.get("BZERO", 0), "blank": cards.get("BLANK")}
-            if "BITPIX" not in cards or cards["BITPIX"] < 0:
-                numbers["blank"] = None
+            scale, zero, blank = (cards.get(key, plain) for key, plain in SCALING.items())
+            numbers = {
+                "scale": _check.number("BSCALE", scale),
+                "zero": _check.number("BZERO", zero),
+                "blank": None,
+            }
+            if blank is not None and cards["BITPIX"] > 0:
+                numbers["blank"] = _check.integer("BLANK", blank, -(2**63))
             label = f"{name}[{index}]" if len(units) > 1 else name
             header = header or _header_cards(units[0].header) | cards
             offset = unit.fileinfo()["datLoc"]
-            found.append((label, tuple(unit.shape), np.dtype(types[cards["BITPIX"]]), offset, numbers))
+            found.append((label, tuple(unit.shape), TYPES[cards["BITPIX"]], offset, numbers))
     if not found:
         raise FileError(f"{name}: a FITS file without an image")
     return found, header

@@ -29,7 +29,7 @@ from zwfs._information import Response
 from zwfs._likelihood import Estimator, Noise
 from zwfs._pickle import Immutable
 from zwfs._propagator import propagator, split
-from zwfs.frames.files import FileError, read_all
+from zwfs.frames.files import FileError, _broken, read_all
 from zwfs.frames.pipeline import Measurement, Optics, fit, ideal_frames, reduce_frames
 from zwfs.frames.registration import Image, Recording, nearest_good, record
 from zwfs.masks import Dimple
@@ -208,6 +208,20 @@ class Calibration(Immutable):
 
     def __post_init__(self) -> None:
         _check_settings(self.n_iterations, self.tolerance, self.saturation)
+        _check.instance("bunit", self.bunit, str)
+        _check.flag("balance", self.balance)
+        _check.number("residual", self.residual, 0)
+        grid, camera = np.shape(self.amplitude), (self.n_images, *self.shape)
+        for name, shape in {"bad": camera, "good": grid}.items():
+            _check.flag_map(name, getattr(self, name), shape)
+        for name, shape in {
+            "places": (2, 2, *grid), "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2),
+            "offset": (2, *grid), "light": (2,),
+        }.items():  # fmt: skip
+            array = _check.real_array(name, getattr(self, name))
+            if array.shape != shape:
+                raise ValueError(f"{name} has shape {array.shape}: expected {shape}")
+            _check.finite(name, array)
         for one in fields(self):
             object.__setattr__(self, one.name, read_only(getattr(self, one.name)))
 
@@ -321,18 +335,17 @@ class Calibration(Immutable):
             raise FileNotFoundError(f"{path}: no such file: expected a calibration")
         if not _is_calibration(path):
             raise FileError(f"{path.name}: expected a calibration, which `calibrate` writes")
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                values: dict[str, Any] = json.loads(str(file["values"]))
-                found = values.pop("format")
-                if found == FORMAT:
-                    arrays: dict[str, Any] = {name: file[name] for name in file.files if name != "values"}
-                    optics = values.pop("optics")
-                    optics["phase_shifts"] = tuple(optics["phase_shifts"])
-                    pairs: dict[str, Any] = {name: tuple(values.pop(name)) for name in ("center", "shape")}
-                    return cls(**values, **arrays, **pairs, optics=Optics(**optics))
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise FileError(f"{path.name}: a broken calibration: {' '.join(str(error).split())[:200]}") from None
+        with _broken(f"{path.name}: a broken calibration"), np.load(path, allow_pickle=False) as file:
+            values: dict[str, Any] = json.loads(str(file["values"]))
+            found = values.pop("format")
+            if found == FORMAT:
+                arrays: dict[str, Any] = {name: file[name] for name in file.files if name != "values"}
+                optics = values.pop("optics")
+                optics["phase_shifts"] = tuple(optics["phase_shifts"])
+                pairs: dict[str, Any] = {name: tuple(values.pop(name)) for name in ("center", "shape")}
+                made = cls(**values, **arrays, **pairs, optics=Optics(**optics))
+                made._work  # noqa: B018, every call needs it, and it fails where the values do not fit together
+                return made
         raise FileError(
             f"{path.name}: a calibration of format {found}: expected format {FORMAT}; make it again with this "
             "version of zwfs"

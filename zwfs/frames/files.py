@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs._files import is_there, path_of, paths_of, write_file
-from zwfs.frames._fits import FIRST_BYTES, fits_content, fits_module, has_card
+from zwfs.frames._fits import FIRST_BYTES, SCALING, TYPES, fits_content, fits_module, has_card
 from zwfs.frames.pipeline import MeasuredPhase, Optics
 from zwfs.frames.registration import Image, nearest_good
 
@@ -170,16 +170,16 @@ def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
     if content.getbuffer()[: len(_NPY)] == _NPY:
         with _broken(f"{name}: a broken NPY file"):
             data, header = _read_npy(content, name, max_bytes), dict[str, Any]()
+            highest = full_scale(data.dtype)
     else:
         fits = fits_module()
         with _broken(f"{name}: a broken FITS file"):
-            data, header = _read_fits(fits, content, name, max_bytes)
+            data, header, highest = _read_fits(fits, content, name, max_bytes)
     if data.dtype.kind not in "biuf":
         raise TypeError(f"{name}: its numbers are {data.dtype}: expected real ones")
-    full_scale = float(np.iinfo(data.dtype).max) if data.dtype.kind in "iu" else np.inf
     with np.errstate(over="ignore", invalid="ignore"):  # wider floats become infinite: bad pixels
         images = data.astype(np.float64).reshape(-1, *data.shape[-2:])
-    return CameraFile(images, name, sha256, header, full_scale, path.resolve())
+    return CameraFile(images, name, sha256, header, highest, path.resolve())
 
 
 def read_all(
@@ -513,7 +513,7 @@ def _accept(name: str, shape: tuple[int, ...], max_bytes: int) -> None:
 
 
 def _npy_header(content: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, whether columns come first, and type of the numbers of an NPY file; its data follow."""
+    """Shape, whether columns come first, and type of the numbers of an NPY file, which ends with its data."""
     version = np.lib.format.read_magic(content)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:
@@ -521,6 +521,11 @@ def _npy_header(content: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
     shape, columns_first, dtype = readers[version](content)
     if dtype.hasobject:
         raise ValueError("it holds objects of Python: expected numbers")
+    start = content.tell()
+    surplus = content.seek(0, os.SEEK_END) - start - math.prod(shape) * dtype.itemsize
+    content.seek(start)
+    if min(shape, default=0) > 0 and surplus > 0:
+        raise ValueError(f"{surplus} bytes follow the array of shape {shape}: expected none")
     return shape, columns_first, dtype
 
 
@@ -531,10 +536,19 @@ def _read_npy(content: io.BytesIO, name: str, max_bytes: int) -> NDArray:
     return data.reshape(shape, order="F" if columns_first else "C")
 
 
-def _read_fits(fits: ModuleType, content: io.BytesIO, name: str, max_bytes: int) -> tuple[NDArray, dict[str, Any]]:
-    # Odd header cards are no reason to refuse a file; missing pixels are.
-    warnings.filterwarnings("error", message=".*truncated.*")
-    with fits.open(content, memmap=False) as units:
+def full_scale(dtype: np.dtype, scale: float = 1.0, zero: float = 0.0) -> float:
+    """Largest value that numbers of a type can stand for, each times `scale` plus `zero`; infinity for floats."""
+    if dtype.kind not in "iu":
+        return np.inf
+    return max(float(end) * scale + zero for end in (np.iinfo(dtype).min, np.iinfo(dtype).max))
+
+
+def _read_fits(
+    fits: ModuleType, content: io.BytesIO, name: str, max_bytes: int
+) -> tuple[NDArray, dict[str, Any], float]:
+    # Odd header cards are no reason to refuse a file; missing or altered pixels are.
+    warnings.filterwarnings("error", message=".*truncated.*|Datasum verification failed.*")
+    with fits.open(content, memmap=False, checksum=True) as units:
         images = [unit for unit in units if unit.is_image and unit.shape]
         if not images:
             raise FileError(f"{name}: a FITS file without an image")
@@ -542,8 +556,20 @@ def _read_fits(fits: ModuleType, content: io.BytesIO, name: str, max_bytes: int)
         if len(images) > 2 or shapes[0] != shapes[-1] or (len(images) == 2 and len(shapes[0]) != 2):
             raise FileError(f"{name}: images of shapes {shapes}: expected one, or two of the same (ny, nx)")
         _accept(name, shapes[0] if len(images) == 1 else (2, *shapes[0]), max_bytes)
-        data = images[0].data if len(images) == 1 else np.stack([unit.data for unit in images])
-        return data, _header_cards(units[0].header) | _header_cards(images[0].header)
+        cards = _header_cards(units[0].header) | _header_cards(images[0].header)
+        pixels, scales = zip(*map(_pixels, images), strict=True)
+        return pixels[0] if len(images) == 1 else np.stack(pixels), cards, min(scales)
+
+
+def _pixels(unit: Any) -> tuple[NDArray, float]:
+    """Numbers of an image, NaN where it has none, and the largest value that their type can stand for."""
+    scale, zero, blank = (unit.header.get(key, plain) for key, plain in SCALING.items())
+    data = unit.data
+    if unit.header["BITPIX"] < 0:
+        return data, np.inf
+    if blank is not None and data.dtype.kind == "u":  # astropy overlooks BLANK in unsigned numbers
+        data = np.where(data == blank + zero, np.nan, data)
+    return data, full_scale(TYPES[unit.header["BITPIX"]], scale, zero)
 
 
 def _header_cards(header: Any) -> dict[str, Any]:

@@ -378,8 +378,11 @@ def _saturation(stack: Stack, calibration: Calibration) -> float:
     if calibration.saturation != np.inf:
         return calibration.saturation
     if "SATURATE" in stack.header:
-        return _check.number(f"{stack.segments[0].name}: SATURATE", stack.header["SATURATE"])
-    return stack.segments[0].blocks[0].full_scale
+        name, level = "SATURATE", stack.header["SATURATE"]
+    else:
+        name, level = "largest number of its type", stack.segments[0].blocks[0].full_scale
+    name = f"{stack.segments[0].name}: {name}"
+    return level if level == np.inf else _check.number(name, level, 0, open_low=True)
 
 
 def _columns(stack: Stack, keywords: Any) -> dict[str, NDArray]:

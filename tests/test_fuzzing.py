@@ -1,0 +1,508 @@
+"""Camera files and parameters at random: each is used exactly as it was written, or refused by name.
+
+`make test` tries 50 examples of each property, always the same ones. `make fuzz` tries 1000 new ones.
+"""
+
+import gzip
+import io
+import json
+import re
+import shlex
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+
+from book._tools import __main__ as tools
+from book._tools import declared, rerun
+from book._tools.notebook import read as read_notebook
+from book._tools.project import Project
+from zwfs.bench import Bench, write_bench
+from zwfs.companion.parameters import Fields
+from zwfs.frames import Calibration, calibrate
+from zwfs.frames import __main__ as command
+from zwfs.frames import files as camera
+
+examples = settings(max_examples=max(50, settings.default.max_examples))
+
+# Camera files
+
+
+@dataclass(frozen=True)
+class Written:
+    """Content of a file, and the images that it holds."""
+
+    content: bytes
+    images: np.ndarray
+
+    def __repr__(self):
+        return f"Written({self.content[:40]!r}..., shape {self.images.shape})"
+
+
+def npy(image, version=(1, 0)):
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, image, version)
+    return stream.getvalue()
+
+
+def fits_file(units, **cards):
+    """A FITS file whose units are an image, raw numbers with cards that scale them, or nothing."""
+    made = fits.HDUList()
+    for image in units:
+        made.append(fits.ImageHDU(image) if made else fits.PrimaryHDU(image))
+    made[-1].header.update({"EXPTIME": 0.5, "DIMPLE": 1.06, "THETA1": np.pi / 2, "THETA2": -np.pi / 2})
+    for unit in made:
+        unit.add_checksum(when="then")  # by default the time, which no example repeats
+    stream = io.BytesIO()
+    made.writeto(stream)
+    content = stream.getvalue()
+    # astropy would convert the numbers itself if it knew of these cards.
+    old = next(iter(re.findall(rb"EXPTIME = .{70}", content)))
+    lines = b"".join(f"{name:8}= {value:>20}".ljust(80).encode() for name, value in cards.items())
+    place = content.index(old) + 80
+    end = content.index(b"END".ljust(80), place) + 80
+    header = content[:place] + lines + content[place:end]
+    return header.ljust(-(-len(header) // 2880) * 2880) + content[-(-end // 2880) * 2880 :] if cards else content
+
+
+@st.composite
+def pixels(draw, shape, dtype):
+    """Numbers of a type, which float64 holds exactly, with a few extreme ones."""
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    kind = np.dtype(dtype).kind
+    if kind == "f":
+        image = rng.uniform(0, 1000, shape).astype(dtype)
+        special = [np.nan, np.inf, -np.inf, 0, -1, np.finfo(dtype).max]
+    else:
+        image = rng.integers(0, 100, shape).astype(dtype)
+        limits = np.iinfo(dtype)
+        special = [limits.min, min(limits.max, 2**53), 0]
+    for value in draw(st.lists(st.sampled_from(special), max_size=3)):
+        image.flat[rng.integers(image.size)] = value
+    return image
+
+
+SMALL = st.tuples(st.integers(1, 12), st.integers(1, 12))
+
+
+@st.composite
+def written(draw, shapes=SMALL):
+    """Files of one image or two as cameras and programs write them."""
+    shape, n = draw(shapes), draw(st.integers(1, 2))
+    stacked = draw(st.booleans()) if n == 1 else True
+    dtype = draw(st.sampled_from(["u1", "<i2", ">i2", "<u2", ">u4", "<i4", ">i8", "<f4", ">f4", "<f8", ">f8"]))
+    image = draw(pixels((n, *shape) if stacked else shape, dtype))
+    images = image.astype(np.float64).reshape(-1, *shape)
+    match draw(st.integers(0, 5)):
+        case 0:
+            content = npy(image, draw(st.sampled_from([(1, 0), (2, 0)])))
+        case 1:
+            content = npy(np.asfortranarray(image))
+        case 2:
+            content = fits_file([image])
+        case 3:
+            content = fits_file([None, image])
+        case 4:
+            content = fits_file([None, *image] if stacked else [None, image])
+        case 5:
+            raw = draw(pixels(shape, ">i2"))
+            scale, zero = draw(st.sampled_from([(1, 32768), (0.5, 0), (4, -8), (1, 0)]))
+            cards = {"BSCALE": scale, "BZERO": zero, "BLANK": -32768}
+            content = fits_file([raw], **draw(st.sampled_from([cards, dict(list(cards.items())[:2])])))
+            images = (raw.astype(np.float64) * scale + zero)[np.newaxis]
+            if b"BLANK" in content:
+                images = np.where(raw == -32768, np.nan, images)
+    if draw(st.booleans()):
+        content = gzip.compress(content, 1, mtime=0)
+    return Written(content, images)
+
+
+PIECES = [
+    *(b"NAXIS", b"BITPIX", b"9999999", b"-1", b"'", b"(((", b"|O", b"nan", b"(20, 30)", b"(99999999, 99999999)"),
+    *(card.ljust(80) for card in (b"END", b"NAXIS1  = 9999999999", b"BSCALE  = 1e308", b"ZTILE1  = 99999999")),
+    *(card.ljust(80) for card in (b"XTENSION= 'BINTABLE'", b"ZNAXIS1 = 99999999", b"PCOUNT  = 1e400")),
+    *(card.ljust(80) for card in (b"BSCALE  = 'much'", b"BZERO   = T", b"BLANK   = 'no'", b"SATURATE= -1")),
+    *(card.ljust(80) for card in (b"SATURATE= 'high'", b"THETA1  = 'left'", b"DIMPLE  = 1e99", b"GROUPS  = T")),
+]
+
+
+@st.composite
+def damaged(draw, files):
+    """A file that is cut, or has flipped bits, other characters, wrong header cards, gaps or a tail."""
+    content = draw(files).content
+    packed = content[:2] == b"\x1f\x8b" and draw(st.booleans())
+    content = bytearray(gzip.decompress(content) if packed else content)
+    for _ in range(draw(st.integers(1, 3))):
+        size = len(content)
+        place = draw(st.integers(0, min(size, draw(st.sampled_from([128, 1000, 6000, size])))))
+        match draw(st.integers(0, 5)):
+            case 0:
+                del content[place:]
+            case 1 if place < size:
+                content[place] ^= 1 << draw(st.integers(0, 7))
+            case 2 if place < size:
+                content[place] = draw(st.integers(32, 126))
+            case 3:
+                piece = draw(st.sampled_from(PIECES))
+                place -= place % 80 if len(piece) == 80 else 0
+                content[place : place + len(piece)] = piece
+            case 4:
+                del content[place : place + draw(st.sampled_from([1, 80, 160]))]
+            case 5:
+                content += draw(st.binary(min_size=1, max_size=3000))
+    return gzip.compress(content, 1, mtime=0) if packed else bytes(content)
+
+
+# No extension says what a file holds, and none is needed.
+names = st.sampled_from(["image.fits", "image.npy", "image.npz", "image.jpg", "image", "image é (1).fits.gz"])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("fuzzing")
+
+
+def check_message(error, name):
+    """Require one line that names the file or the parameter."""
+    assert name in str(error)
+    assert "\n" not in str(error)
+
+
+def put(folder, name, content):
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.filterwarnings("error")
+@examples
+@given(written(), names)
+@example(Written(fits_file([np.full((2, 2), -32768, ">i2")], BSCALE=1, BZERO=32768, BLANK=-32768),
+                 np.full((1, 2, 2), np.nan)), "image.fits")  # fmt: skip
+def test_image_is_read_exactly(folder, file, name):
+    path = put(folder, name, file.content)
+    found = camera.read(path)
+    np.testing.assert_array_equal(found.images, file.images)
+    assert found.name == name
+
+
+@pytest.mark.filterwarnings("error")
+@examples
+@given(written(), st.floats(0, 1, exclude_max=True))
+def test_cut_file_is_refused(folder, file, share):
+    content = file.content[: int(share * len(file.content))]
+    path = put(folder, "cut.dat", content)
+    try:
+        found = camera.read(path).images
+    except camera.FileError as error:
+        check_message(error, "cut.dat")
+    else:  # a FITS file that is cut between its extensions is whole
+        assert len(content) % 2880 == 0
+        np.testing.assert_array_equal(found, file.images[:1])
+
+
+@pytest.mark.filterwarnings("error")
+@examples
+@given(damaged(written()))
+@example(npy(np.ones((3, 4), "<f4")) + bytes(48))
+def test_damaged_file_is_read_or_refused_by_name(folder, content):
+    path = put(folder, "damaged.dat", content)
+    try:
+        frames, clear_frames, _ = camera.read_all([path], [path])
+    except (TypeError, ValueError) as error:
+        check_message(error, "damaged.dat")
+    else:
+        assert all(np.isfinite(one.counts).all() for one in (*frames, *clear_frames))
+    if content.startswith(b"\x93NUMPY"):
+        with pytest.raises((TypeError, ValueError), match=r"damaged\.dat"):
+            camera.read(put(folder, "damaged.dat", content + b"\0"))
+
+
+# Calibration and telemetry
+
+
+@pytest.fixture(scope="module")
+def bench(folder):
+    """Files of a bench and its calibration."""
+    files = write_bench(folder, Bench(n_pixels=32), seed=1)
+    calibrate([files["frame"]], [files["pupils"]], [files["dark"]]).save(folder / "bench.npz")
+    return {name: str(path) for name, path in files.items()}
+
+
+@pytest.fixture(scope="module")
+def calibration(folder, bench):
+    return Calibration.load(folder / "bench.npz")
+
+
+def run(arguments):
+    """Exit code and messages of the command; a traceback would end the test."""
+    messages = io.StringIO()
+    with redirect_stderr(messages), redirect_stdout(io.StringIO()):
+        try:
+            code = command.main([str(one) for one in arguments])
+        except SystemExit as end:  # argparse
+            code = end.code
+    return code, messages.getvalue()
+
+
+def check_refusal(code, messages, *named):
+    """Require exit code 1 and one line that names the cause, or 2 and the usage."""
+    assert code in (1, 2)
+    assert "Traceback" not in messages
+    if code == 1:
+        assert re.fullmatch(r"error: [^\n]+\n", messages)
+        assert any(one in messages for one in named)
+
+
+SHAPE = 42, 84  # of the images of the bench
+COUNTS = np.random.default_rng(1).uniform(0, 1e4, (1, *SHAPE))
+
+
+@pytest.mark.filterwarnings("error")
+@examples
+@given(written(st.just(SHAPE)).flatmap(lambda whole: damaged(st.just(whole)) | st.just(whole.content)))
+@example(fits_file([np.ones(SHAPE, ">i2")], SATURATE=-1))
+@example(fits_file([np.ones(SHAPE, ">i2")], BSCALE="'much'"))
+@example(npy(np.ones((1, *SHAPE))).replace(b"(1, 42", b"(-5,42"))
+def test_telemetry_is_that_of_the_counts_or_refused_by_name(folder, calibration, content):
+    path, output = put(folder, "telemetry.dat", content), folder / "phases.fits"
+    code, messages = run(
+        ["reconstruct", path, "--calibration", folder / "bench.npz", "-o", output, "--workers", 1]
+    )
+    if code:
+        check_refusal(code, messages, "telemetry.dat")
+        assert not output.exists()
+        return
+    found = fits.getdata(output)
+    output.unlink()
+    try:
+        counts = camera.read(path).images
+    except ValueError as error:
+        check_message(error, "telemetry.dat")
+        return
+    expected = calibration(counts)
+    np.testing.assert_allclose(found, expected.phase, atol=1e-4)
+
+
+@examples
+@given(st.data())
+def test_damaged_calibration_is_whole_or_refused_by_name(folder, calibration, data):
+    whole = (folder / "bench.npz").read_bytes()
+    path = put(folder, "damaged.npz", data.draw(damaged(st.just(Written(whole, np.empty(0))))))
+    try:
+        found = Calibration.load(path)
+    except (TypeError, ValueError) as error:
+        check_message(error, "damaged.npz")
+    else:
+        assert found.sha256 == calibration.sha256
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@examples
+@given(st.data())
+def test_calibration_with_other_values_loads_or_is_refused_by_name(folder, bench, data):
+    with np.load(folder / "bench.npz") as file:
+        arrays = dict(file)
+    values = json.loads(str(arrays["values"]))
+    name = data.draw(st.sampled_from([*values, *arrays]))
+    value = data.draw(json_values)
+    if name == "values":
+        values = value
+    elif name in values:
+        values[name] = value
+    else:
+        try:
+            arrays[name] = data.draw(
+                st.sampled_from([np.array(value), arrays[name][..., :1], arrays[name] * np.nan])
+            )
+        except (ValueError, TypeError, OverflowError):
+            assume(False)
+    arrays["values"] = np.array(json.dumps(values))
+    np.savez(folder / "other.npz", **arrays)
+    try:
+        Calibration.load(folder / "other.npz")(COUNTS)
+    except (TypeError, ValueError) as error:
+        check_message(error, "other.npz")
+
+
+words = st.sampled_from(
+    ["0", "-1", "1", "nan", "inf", "1e999", "1.5", "9" * 30, "high", "", "EXPTIME", "frame.fits"]
+)
+CALIBRATE = ["--dark", "--bad-pixels", "--diameter", "--phase-shifts", "--pupil-centers", "--pupil-diameter",
+             "--exposure", "--saturation", "--fit", "--iterations", "--tolerance"]  # fmt: skip
+RECONSTRUCT = ["--second", "--modes", "--photons", "--read-noise", "--keywords", "--saturation", "--workers",
+               "--largest-residual"]  # fmt: skip
+
+
+@examples
+@given(st.lists(st.tuples(st.sampled_from(RECONSTRUCT), st.lists(words, max_size=2)), max_size=2))
+def test_options_of_telemetry_are_used_or_refused(folder, bench, options):
+    given_options = [one for name, values in options for one in (name, *values)]
+    output = folder / "options.fits"
+    code, messages = run(
+        ["reconstruct", bench["frame"], "--calibration", folder / "bench.npz", "-o", output, *given_options]
+    )
+    if code:
+        check_refusal(
+            code, messages, *(name.lstrip("-").replace("-", "_") for name, _ in options), *words.elements
+        )
+    else:
+        output.unlink()
+
+
+@examples
+@given(st.sampled_from(CALIBRATE), st.lists(words, max_size=4))
+@example("--dark", [""])
+def test_options_of_a_calibration_are_used_or_refused(folder, bench, name, values):
+    code, messages = run(
+        [
+            "calibrate",
+            folder / "options.npz",
+            "--frames",
+            bench["frame"],
+            "--pupils",
+            bench["pupils"],
+            name,
+            *values,
+        ]
+    )
+    if code:
+        check_refusal(code, messages, name.strip("-s").replace("-", "_"), *filter(None, values), "fitted")
+
+
+@examples
+@given(st.sampled_from(["--frames", "--pupils", "--dark", "--bad-pixels"]), damaged(written(st.just(SHAPE))))
+def test_calibration_of_a_damaged_file_is_made_or_refused_by_name(folder, bench, name, content):
+    path = put(folder, "part.dat", content)
+    files = {"--frames": bench["frame"], "--pupils": bench["pupils"], "--dark": bench["dark"]} | {name: path}
+    code, messages = run(["calibrate", folder / "part.npz", *(one for pair in files.items() for one in pair)])
+    if code:
+        check_refusal(code, messages, "part.dat")
+
+
+# Parameters of a rerun
+
+PROJECT = Project(Path(__file__).parent.parent)
+KNOWN = {path.stem: declared.parameters(read_notebook(path)) for path in PROJECT.sources()}
+
+
+def within(limits):
+    """Values that limits allow."""
+    match limits:
+        case Fields():
+            kinds = {kind: limits.of_kind(kind) for kind in limits.kinds or ("",)}
+            return st.sampled_from(sorted(kinds)).flatmap(lambda kind: of_kind(kind, kinds[kind]))
+        case [one, *more] if isinstance(limits, list):
+            return st.lists(within(one), min_size=0 if more else 1, max_size=3)
+        case type():
+            return st.booleans() if limits is bool else st.text(max_size=8)
+        case (str(), *_):
+            return st.sampled_from(limits)
+        case (int() as low, int() as high):
+            return st.integers(low, high)
+        case (low, high):
+            return st.floats(low, high, allow_subnormal=False)
+
+
+def of_kind(kind, limits):
+    chosen = {"kind": st.just(kind)} if kind else {}
+    return st.fixed_dictionaries(
+        chosen, optional={name: within(one) for name, one in limits.items() if name != "kind"}
+    )
+
+
+@st.composite
+def runs(draw):
+    """A notebook, and values for some of its parameters."""
+    notebook = draw(st.sampled_from(sorted(KNOWN)))
+    chosen = draw(st.lists(st.sampled_from(sorted(KNOWN[notebook])), max_size=4, unique=True))
+    return notebook, {name: draw(within(KNOWN[notebook][name].limits)) for name in chosen}
+
+
+@examples
+@given(runs())
+@example(("own_frames", {"output": "\U0001f52d.fits"}))  # in JSON, a pair of surrogates
+def test_parameters_are_used_as_written(run):
+    notebook, values = run
+    known = KNOWN[notebook]
+    changed = {name: value for name, value in values.items() if value != known[name].default}
+    text = "".join(f"{name}: {json.dumps(value)}\n" for name, value in values.items())
+    assert declared.accept(declared.mapping(text or "{}", "file"), known) == changed
+    # The command that a record keeps repeats the run.
+    again = rerun.parse(shlex.split(rerun.command(notebook, changed).removeprefix(rerun.COMMAND)))
+    assert declared.accept(declared.assignments(again.p), known) == changed
+    assert len(rerun.folder_name(notebook, changed)) < 200
+
+
+@examples
+@given(st.sampled_from(sorted(KNOWN)), st.data())
+def test_other_values_are_refused_by_name(notebook, data):
+    name = data.draw(st.sampled_from(sorted(KNOWN[notebook])))
+    limits = KNOWN[notebook][name].limits
+    value = data.draw(json_values | (st.fixed_dictionaries({}, optional=dict.fromkeys(limits.every(), json_values))
+                                     if isinstance(limits, Fields) else st.nothing()))  # fmt: skip
+    try:
+        changed = declared.accept({name: value}, KNOWN[notebook])
+    except declared.ParameterError as error:
+        check_message(error, name)
+    else:
+        assert changed in ({}, {name: value})
+
+
+numbers = st.text("0189.eExob_+-# ", max_size=7)
+yaml_texts = numbers | st.text("[]{}:,-?!&*<>|%@`'\"#=\n\t\\\0 019.E\x85\u2028\ud800", max_size=20) | st.text()
+
+
+@examples
+@given(yaml_texts)
+@example("-_")
+def test_text_is_a_plain_value_or_refused_by_name(text):
+    for read, origin in ((declared.load, "-p x"), (declared.mapping, "-f mine.yaml")):
+        try:
+            value = read(text, origin)
+        except declared.ParameterError as error:
+            check_message(error, origin)
+            continue
+        assert isinstance(value, str | int | float | list | dict | None)
+        if isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value):
+            digits = text.partition("#")[0].strip().replace("_", "")
+            assert value == (int(digits, 0) if re.match("[-+]?0[xob]", digits) else type(value)(digits))
+
+
+arguments = st.sampled_from([
+    "1", "3", "fig03_dynamic_range", "own_frames", "nowhere", "-p", "-f", "--list", "--output", "--jobs",
+    "--force", "--cluster", "--line", "n_screens=5", "rms=[", "rms=.nan", "=", "seed=1", "mine.yaml", "/dev/null",
+    "0", ".", "tcp://nowhere:1", "'", "-x", "--", "%s", "-p=-p", "\ud800", "a" * 300,
+])  # fmt: skip
+
+
+@examples
+@given(st.lists(arguments | yaml_texts, max_size=5).map(lambda rest: ["3", *rest]), yaml_texts)
+@example(["--list"], "")
+def test_command_line_of_a_rerun_is_served_or_refused(folder, given_arguments, text):
+    (folder / "mine.yaml").write_bytes(text.encode("utf-8", "surrogatepass"))
+    messages = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stderr(messages), redirect_stdout(io.StringIO()):
+        patch.chdir(folder)
+        patch.setattr("book._tools.__main__.end_cleanly_on_signals", lambda: None)
+        patch.setattr(rerun, "make", lambda *_: 0.0)
+        patch.setattr(rerun, "_check_cluster", lambda _: None)
+        patch.setattr(rerun.record, "key", lambda *_: "")
+        try:
+            code = tools.main(["rerun", *given_arguments], PROJECT)
+        except SystemExit as end:  # --help
+            code = end.code
+    assert code in (0, 1, 2)
+    assert (code == 0) == (not messages.getvalue())
+    assert re.fullmatch(r"(rerun: [^\n]+\n)?", messages.getvalue())

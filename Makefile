@@ -49,7 +49,7 @@ test: $(READY) ## test the package and the tools, and compare each notebook with
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --benchmark-disable tests
 	$(BIN)/python -m pytest --numprocesses auto --doctest-modules zwfs
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --nbval --nbval-current-env \
-		--nbval-cell-timeout 600 notebooks
+		--nbval-cell-timeout 1200 notebooks
 
 fuzz: $(READY) ## try 1000 new camera files, calibrations and parameters for each property, in about 10 minutes
 	$(BIN)/python -m pytest --numprocesses auto --hypothesis-profile fuzz tests/test_fuzzing.py

@@ -38,7 +38,7 @@ def calibration_errors(curves: BenchCurves, example: Example, numbers: NDArray) 
     numbers : ndarray of int, shape (n_segments,)
         Of the segments.
     """
-    figure, (linearity, points) = plt.subplots(1, 2, figsize=(9, 4.6))
+    figure, (linearity, points) = plt.subplots(1, 2, figsize=(7, 4.6))
     for name, label in WAYS.items():
         style = _style(name)
         linearity.semilogy(curves.rms, curves.mean(name), ms=7, label=label, **style)
@@ -56,7 +56,7 @@ def calibration_errors(curves: BenchCurves, example: Example, numbers: NDArray) 
 def calibration_frames(example: Example) -> Figure:
     """Measured frames of one screen, and their differences from the frames of each model in units of the noise."""
     names = {"design": "model of\nthe design", "calibrated": "calibrated\nmodel", "shuffled": "control"}
-    figure, panels = plt.subplots(2, 1 + len(names), figsize=(9, 5.2))
+    figure, panels = plt.subplots(2, 1 + len(names), figsize=(7, 4.6))
     counts, sigma = example.measured
     top = np.quantile(counts, 0.999)
     limit = float(np.quantile(np.abs(example.modelled["design"] - counts) / sigma, 0.99))

@@ -695,9 +695,10 @@ def test_command_explains_itself(tmp_path):
 
 # The command with a pause after each chunk: it cannot end before the test stops it.
 SLOW = """
-import sys, time
+import signal, sys, time
 from zwfs.frames import __main__ as command
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for its background jobs
 fast = command.reconstruct
 command.reconstruct = lambda *args, **options: fast(*args, **{**options, "progress": lambda *_: time.sleep(0.5)})
 sys.exit(command.main(sys.argv[1:]))

@@ -264,7 +264,9 @@ def _typed(value: Any, limits: Any) -> Any:
 
 def _whole(text: str) -> str:
     """Return a text with one character for each pair of surrogates, which JSON writes; half a pair raises."""
-    return text.encode("utf-16", "surrogatepass").decode("utf-16")
+    whole = text.encode("utf-16", "surrogatepass").decode("utf-16", "surrogatepass")
+    whole.encode()
+    return whole
 
 
 class _Constructor(SafeConstructor):

@@ -58,3 +58,10 @@ def card_value(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(f"{value:.9g}") if np.isfinite(value) else "NaN"
     return bool(value) if isinstance(value, np.bool_) else value
+
+
+def full_scale(dtype: np.dtype, scale: float = 1.0, zero: float = 0.0) -> float:
+    """Largest value that numbers of a type can stand for, each times `scale` plus `zero`; infinity for floats."""
+    if dtype.kind not in "iu":
+        return np.inf
+    return max(float(end) * scale + zero for end in (np.iinfo(dtype).min, np.iinfo(dtype).max))

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs.frames._fits import SCALING, TYPES, fits_module
-from zwfs.frames.files import _GZIP, _NPY, FileError, _broken, _content, _header_cards, _npy_header, full_scale
+from zwfs.frames._fits import SCALING, TYPES, fits_module, full_scale
+from zwfs.frames.files import _GZIP, _NPY, FileError, _broken, _content, _header_cards, _npy_header
 
 _MOST_UNPACKED = 2**29  # bytes of a gzip file, which is unpacked in memory
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs._files import is_there, path_of, paths_of, write_file
-from zwfs.frames._fits import FIRST_BYTES, SCALING, TYPES, fits_content, fits_module, has_card
+from zwfs.frames._fits import FIRST_BYTES, SCALING, TYPES, fits_content, fits_module, full_scale, has_card
 from zwfs.frames.pipeline import MeasuredPhase, Optics
 from zwfs.frames.registration import Image, nearest_good
 
@@ -534,13 +534,6 @@ def _read_npy(content: io.BytesIO, name: str, max_bytes: int) -> NDArray:
     _accept(name, shape, max_bytes)
     data = np.frombuffer(content.read(math.prod(shape) * dtype.itemsize), dtype)
     return data.reshape(shape, order="F" if columns_first else "C")
-
-
-def full_scale(dtype: np.dtype, scale: float = 1.0, zero: float = 0.0) -> float:
-    """Largest value that numbers of a type can stand for, each times `scale` plus `zero`; infinity for floats."""
-    if dtype.kind not in "iu":
-        return np.inf
-    return max(float(end) * scale + zero for end in (np.iinfo(dtype).min, np.iinfo(dtype).max))
 
 
 def _read_fits(

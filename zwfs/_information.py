@@ -361,7 +361,7 @@ def _bases(cores: NDArray[np.complex128]) -> tuple[NDArray[np.complex128], NDArr
 
 
 def _side_by_side(blocks: Sequence[NDArray]) -> NDArray:
-    """Stack blocks (s, m, n) along the first axis, each with columns of its own: the others are 0."""
+    """Stack p blocks (s, m, n) along the first axis, and give each its own n of the p n columns; the rest is 0."""
     n = blocks[0].shape[-1]
     result = np.zeros((sum(map(len, blocks)), blocks[0].shape[1], n * len(blocks)))
     first = 0

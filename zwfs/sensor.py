@@ -261,7 +261,7 @@ class ZernikeSensor(Sensor):
     *masks : Dimple, Patch or any Mask
     extent : float, D
         Width of the detector plane, at least 1 (rounded to whole pixels on each side) and at most 16384 pixels.
-        Light leaves the geometric pupil; a wider detector catches more of it.
+        The masks diffract light out of the geometric pupil; a wider detector records more of that light.
     tolerance : float
         Error of the reference wave, relative to the strongest response of the masks (spectral norm). It decides
         the rank; the speed hardly depends on it. At 1e-14 the kernel is exact to rounding.
@@ -269,8 +269,8 @@ class ZernikeSensor(Sensor):
     Raises
     ------
     TypeError, ValueError
-        If there is no mask, or an argument is of the wrong kind or out of range: a mask may be at most as many
-        lambda/D wide as there are pixels across D, and less on a wide detector.
+        If there is no mask, or an argument is of the wrong kind or out of range. The diameter of a mask in
+        lambda/D must not exceed the number of pixels across D; on a wide detector the limit is lower.
 
     Warns
     -----

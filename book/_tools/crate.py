@@ -32,7 +32,7 @@ def describe_rerun(folder: Path, about: dict[str, Any]) -> None:
         for name in sorted(file.name for file in folder.iterdir())
     ]
     software = [_software(crate, name, version) for name, version in about["versions"].items()]
-    # A value of a crate is no mapping.
+    # The value of a property in a crate cannot be a mapping: JSON text stands for it.
     plain = {name: json.dumps(value) if isinstance(value, dict) else value
              for name, value in about["parameters"].items()}  # fmt: skip
     values = [_entity(crate, f"#{name}", "PropertyValue", name=name, value=value) for name, value in plain.items()]

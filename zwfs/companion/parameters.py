@@ -56,7 +56,7 @@ def check_parameters(values: Mapping[str, Any], /, **limits: Any) -> None:
         - ``str`` or ``bool``: any text, or True or False;
         - ``[limits]``: a list of one or more values, each within the limits;
         - ``[limits, ...]``: the same, or an empty list;
-    - `Fields`: a mapping of known names to values within their limits.
+        - `Fields`: a mapping of known names to values within their limits.
 
     Raises
     ------

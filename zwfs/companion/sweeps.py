@@ -138,7 +138,7 @@ class Grid:
         Raises
         ------
         ValueError
-            If there is no axis of a name, or the axis does not have the value.
+            If the grid has no axis of that name, or the axis has no such value.
         """
         axes, index = dict(self.axes), []
         for name in fixed:

@@ -30,8 +30,8 @@ from zwfs._likelihood import Estimator, Noise
 from zwfs._pickle import Immutable
 from zwfs._propagator import propagator, split
 from zwfs.frames.files import FileError, _broken, read_all
-from zwfs.frames.pipeline import Measurement, Optics, fit, ideal_frames, reduce_frames
-from zwfs.frames.registration import Image, Recording, nearest_good, record
+from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, fit, ideal_frames, reduce_frames
+from zwfs.frames.registration import _TOUCHED, Image, Recording, nearest_good, record
 from zwfs.masks import Dimple
 from zwfs.metrics import without_piston
 from zwfs.modes import check_modes
@@ -44,8 +44,6 @@ _NAME = "zwfs calibration"
 _FAR = 40  # pixels beyond the camera at which the edge of an image has no effect on the camera
 _REACH = 12  # pixels around the pupil that its splines need: farther ones weigh less than 2e-7
 _NEGLIGIBLE = 1e-10  # in a spline filter: smaller numbers only slow the product down
-_TOUCHED = 0.01  # weight of a bad pixel from which on a point is bad, as in `Recording`
-_MOST_BAD = 0.2  # of the points of the pupil, as in `reduce_frames`: a frame with more is lost
 _DIM = 0.1  # of the light of the calibration: a frame with less is lost
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 

@@ -23,6 +23,7 @@ _Item = TypeVar("_Item")
 _REACH = 6  # pixels by which an image may be off its neighbour before sub-pixel registration
 _SMALLEST = 8  # pixels across a pupil: with fewer there is no outline
 _MARGIN = 0.25  # of the diameter: more of the dark surroundings adds nothing
+_TOUCHED = 0.01  # weight of a bad pixel from which on a point is bad
 _ORDER = 3  # of the splines that interpolate an image
 # A rotation or magnification is fitted if its standard error is below so many pixels at the edge of the pupil, or
 # below this part of its value.
@@ -252,7 +253,7 @@ class Recording:
             counts[index] = ndimage.map_coordinates(image.counts, places[index], order=_ORDER, mode="nearest")
             # A bad pixel spoils the points on all its sides.
             spoiled = ndimage.map_coordinates(image.bad.astype(float), places[index], order=1, mode="nearest")
-            bad[index] = spoiled > 0.01
+            bad[index] = spoiled > _TOUCHED
         return counts * self.areas[which, np.newaxis, np.newaxis], bad
 
 

@@ -14,6 +14,7 @@ from zwfs.bounds import cramer_rao
 from zwfs.companion import sweeps
 from zwfs.masks import Dimple
 from zwfs.paper.phase_shifts import _check_wavefronts, _rms
+from zwfs.paper.recovery import MASKS
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
@@ -29,10 +30,16 @@ class Design(NamedTuple):
     theta_b: float
 
 
+def _instrument(name: str, *masks: str) -> Design:
+    """Design of an instrument, with the mean diameter of its masks in `MASKS`."""
+    first, second = MASKS[masks[0]]
+    return Design(name, float(np.mean([MASKS[one][0].diameter for one in masks])), first.phase, second.phase)
+
+
 PUBLISHED = (
     Design("paper", 1.06, np.pi / 2, -np.pi / 2),
-    Design("Keck", 2.4, 0.30 * np.pi, -0.68 * np.pi),
-    Design("OZIRIIS", 2.05, 0.33 * np.pi, -0.74 * np.pi),
+    _instrument("Keck", "Keck"),
+    _instrument("OZIRIIS", "OZIRIIS, on the sky", "OZIRIIS, in the laboratory"),
 )
 """Design of the paper and of two instruments; the diameter of OZIRIIS is the middle of 1.96 to 2.14 lambda/D."""
 

@@ -193,8 +193,21 @@ def test_variants_are_dark_or_fit_a_phone_and_the_figure_stays(name, drawn_metho
         drawn = pixels(variant)
         assert (drawn[0, 0, :3].max() < 60) == ("dark" in kind)
         assert (variant.get_size_inches()[0] < 4) == ("narrow" in kind)
+        if kind == "narrow":
+            assert not cut_off(variant)
     assert plt.get_fignums() == numbers
     assert np.array_equal(pixels(figure), before)
+
+
+def cut_off(figure):
+    """Titles, labels and entries of legends that do not fit the width of a figure, by more than a pixel."""
+    FigureCanvasAgg(figure).draw()
+    texts = [text for legend in figure.legends for text in legend.get_texts()]
+    for axes in figure.axes:
+        texts += [axes.title, axes.xaxis.label, axes.yaxis.label]
+    texts = [text for text in texts if text.get_text()]
+    boxes = [text.get_window_extent() for text in texts]
+    return [text for text, box in zip(texts, boxes, strict=True) if box.x0 < -1 or box.x1 > figure.bbox.width + 1]
 
 
 def pixels(figure):

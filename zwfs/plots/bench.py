@@ -87,7 +87,7 @@ def segment_errors(bench: Bench, commanded: NDArray, errors: Mapping[str, NDArra
         points.plot(bench.numbers, values, look.marker, color=look.color, ms=5, label=label, alpha=0.9)
     points.axhline(0, color="#555555", lw=1)
     points.set(xlabel="segment number", ylabel="error of the piston (rad)")
-    points.legend(loc="upper center", bbox_to_anchor=(0.5, 1.2), ncols=2, fontsize=9)
+    figure.legend(loc="outside upper center", ncols=2, fontsize=9)
     limit = max(np.nanmax(np.abs(image)) for image in maps.values())
     for title, image in maps.items():
         shown = show_phase(panels[title], image, limit)

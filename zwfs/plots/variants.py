@@ -12,20 +12,21 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba, to_rgba_array
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 _WIDTH, _HEIGHT = 3.7, 2.7  # of a narrow figure and of each panel in it, inch
+_LETTERS = 11  # points, at most: some figures have larger ones, as pages show them smaller than they are
+_LONE = 0.7  # width of a picture alone in its row, over that of the figure
+_ENTRY = 420  # points times letters: an entry of a legend with so many letters is as wide as the figure
+_BAR = 0.6  # height of a colour bar with its numbers and its label, inch
 _PARTS = "color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"
 
 
 def variants(figure: Figure) -> dict[str, Figure]:
-    """Return copies of a figure: "dark", and if its panels lie on a grid "narrow" and "narrow-dark".
-
-    Figures with pictures that have no axes get no narrow variant: they lose little when they are small.
-    """
+    """Return copies of a figure: "dark", and if its panels lie on a grid "narrow" and "narrow-dark"."""
     state = pickle.dumps(figure)
     made = {"dark": _darkened(_copy(state))}
-    panels = [axes for axes in figure.axes if axes.get_subplotspec()]
-    if panels and all(axes.get_xticks().size for axes in panels):
+    if any(axes.get_subplotspec() for axes in figure.axes):
         made |= {"narrow": _stacked(_copy(state)), "narrow-dark": _darkened(_stacked(_copy(state)))}
     return made
 
@@ -38,25 +39,85 @@ def _copy(state: bytes) -> Figure:
 
 
 def _stacked(figure: Figure) -> Figure:
-    """Put the panels of a figure below each other, in place."""
+    """Put the panels of a figure below each other, in place, and pictures in pairs, column by column."""
     panels = [axes for axes in figure.axes if axes.get_subplotspec()]
-    height = _WIDTH if any(axes.get_aspect() != "auto" for axes in panels) else _HEIGHT
     for axes in panels:
         _label(axes, panels)
-    grid = figure.add_gridspec(len(panels), 1)
-    for place, axes in enumerate(panels):
-        axes.set_subplotspec(grid[place, 0])
+    rows = _rows(panels)
+    heights = [_height(row) for row in rows]
+    grid = figure.add_gridspec(len(rows), 2, height_ratios=heights)
+    for place, row in enumerate(rows):
+        for column, axes in enumerate(row):
+            axes.set_subplotspec(grid[place, column] if len(row) == 2 else grid[place, :])
+    bars = sum(_lower(figure, axes) for axes in list(figure.axes) if axes.get_label() == "<colorbar>")
     entries = 0
     for legend in list(figure.legends):
         handles: Any = legend.legend_handles
         texts = legend.get_texts()
         legend.remove()
-        labels, size = [text.get_text() for text in texts], texts[0].get_fontsize()
+        labels = [text.get_text() for text in texts]
+        size = min(texts[0].get_fontsize(), _ENTRY / max(map(len, labels)))
         figure.legend(handles, labels, loc="outside lower center", fontsize=size)
         entries += len(texts)
-    figure.set_size_inches(_WIDTH, len(panels) * height + 0.2 * entries)
+    for text in figure.findobj(Text):
+        text.set_fontsize(min(text.get_fontsize(), _LETTERS))
+    figure.set_size_inches(_WIDTH, sum(heights) + _BAR * bars + 0.2 * entries)
     figure.set_layout_engine("constrained")  # a saved figure has none
     return figure
+
+
+def _rows(panels: list[Axes]) -> list[list[Axes]]:
+    """Order panels by columns; two pictures that follow each other make a row, and all others stand alone."""
+    specs: dict[Axes, Any] = {axes: axes.get_subplotspec() for axes in panels}
+    rows: list[list[Axes]] = []
+    for axes in sorted(panels, key=lambda one: (specs[one].colspan.start, specs[one].rowspan.start)):
+        pair = [*rows[-1], axes] if rows else []
+        if len(pair) == 2 and all(map(_fits_half, pair)):
+            rows[-1] = pair
+        else:
+            rows.append([axes])
+    return rows
+
+
+def _is_picture(axes: Axes) -> bool:
+    return not axes.get_xticks().size
+
+
+def _fits_half(axes: Axes) -> bool:
+    """Whether a panel is a picture that is not too wide, nor its title, for half of a narrow figure."""
+    size = min(float(axes.title.get_fontsize()), _LETTERS)
+    letters = max(map(len, axes.get_title().split("\n")))
+    return _is_picture(axes) and _proportion(axes) > 0.6 and letters * size <= _ENTRY / 2
+
+
+def _proportion(axes: Axes) -> float:
+    """Height of a picture over its width."""
+    return abs(np.ptp(axes.get_ylim()) / np.ptp(axes.get_xlim()))
+
+
+def _height(row: list[Axes]) -> float:
+    """Height of a row of panels with their titles, inch."""
+    if _is_picture(row[0]):
+        texts = [axes.get_title() + "\n" * bool(axes.get_title()) + axes.get_xlabel() for axes in row]
+        lines = max(len(text.splitlines()) for text in texts)
+        return (_WIDTH / 2 if len(row) == 2 else _WIDTH * _LONE) * max(map(_proportion, row)) + 0.2 * lines
+    return _WIDTH if row[0].get_aspect() != "auto" else _HEIGHT
+
+
+def _lower(figure: Figure, axes: Axes) -> bool:
+    """Put a colour bar at the side of pictures below them; return whether a bar is below pictures now."""
+    info = axes._colorbar_info  # type: ignore[attr-defined]  # the only record of the panels that share the bar
+    parents = info["parents"]
+    if info["location"] == "right" and all(map(_is_picture, parents)):
+        old: Any = axes._colorbar  # type: ignore[attr-defined]
+        label, size = axes.get_ylabel(), axes.yaxis.label.get_fontsize()
+        ticks = axes.get_yticklabels()[0].get_fontsize()
+        mappable, extend = old.mappable, old.extend
+        old.remove()
+        bar = figure.colorbar(mappable, ax=parents, location="bottom", extend=extend, aspect=20)
+        bar.set_label(label, fontsize=size)
+        bar.ax.tick_params(labelsize=ticks)
+    return all(map(_is_picture, parents))
 
 
 def _label(axes: Axes, panels: list[Axes]) -> None:

@@ -118,7 +118,9 @@
       verdict.textContent = one ? `${good ? "✓" : "✗"} error ${draw.error(error)} rad` : "no solution";
       verdict.className = `live-verdict ${good ? "live-good" : "live-bad"}`;
       find(`name-${place}`).textContent = name;
+      find(`error-name-${place}`).textContent = name;
     });
+    document.querySelector(".live-legend .live-likelihood").hidden = !made.likelihood;
     draw.curves({ linear: made.linear, arcsine: made.arcsine, shifted: made.shifted, likelihood: made.likelihood });
     find("says").textContent = sentence(made, set);
     listeners.forEach((listener) => listener(set, made));

@@ -97,10 +97,9 @@ def diameter_reasons(reasons: Contraction, claimed: float) -> Figure:
     left.set(ylabel="error after / before an iteration", ylim=(0, 1.2))
     left.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
     for (name, values), style in zip(reasons.sensitivity.items(), OTHER_STYLES, strict=False):
-        right.plot(diameters, values, lw=1.8, **style | {"marker": "none"})
-        place = {"xytext": (-3, 12), "textcoords": "offset points", "ha": "right", "va": "center"}
-        right.annotate(name, (diameters[-1], values[-1]), color=style["color"], **place)
-    right.set(ylabel="sensitivity (1/rad)", ylim=(0, 2.4))
+        right.plot(diameters, values, lw=1.8, label=name, **style | {"marker": "none"})
+    right.set(ylabel="sensitivity (1/rad)", ylim=(0, 3))
+    right.legend(loc="upper left", fontsize=9)
     for axes in (left, right):
         _diameters(axes, diameters[-1], claimed)
     return figure

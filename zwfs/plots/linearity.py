@@ -29,11 +29,11 @@ def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], r
     names : sequence of str
         Curves to draw.
     rms_max : float, radian rms
-        End of the axis.
+        End of the first axis; the second has all inputs.
     """
     figure, (plain, ratio) = plt.subplots(1, 2, figsize=(7, 4.6))
     drawn = curves.rms <= rms_max
-    bright = drawn & (curves.rms > 0)
+    bright = curves.rms > 0
     rms = curves.rms[drawn]
     for name, look in _looks(names):
         mean, std = curves.mean(name), curves.std(name)[drawn]
@@ -43,7 +43,7 @@ def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], r
         plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
         ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], **line)
         limit = curves.dynamic_range(name, threshold)
-        if 0 < limit <= rms_max:
+        if 0 < limit <= curves.rms[-1]:
             ratio.plot(limit, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
     plain.plot(rms, threshold * rms, color="#555555", lw=1)
     ratio.axhline(threshold, color="#555555", lw=1)

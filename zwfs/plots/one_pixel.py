@@ -84,8 +84,11 @@ def _phasors(axes: Axes, pixel: Pixel, k: int) -> None:
     axes.add_patch(Circle((wave.real, wave.imag), 1, fill=False, ec=_GREY, ls=":", lw=1.5))
     axes.add_patch(Circle((0, 0), np.sqrt(intensity), fill=False, ec=color, lw=1.5))
     _arrow(axes, 0, wave, color=_GREY)
-    above = "bottom" if wave.imag > 0 else "top"
-    axes.text(0.98 * wave.real, 1.15 * wave.imag, "reference\nwave", color=_GREY, fontsize=9, ha="right", va=above)
+    middle, label = (wave.real / 2, wave.imag / 2), (-1.4, 2.4 * wave.imag)
+    line = {"arrowstyle": "-", "color": _GREY, "lw": 0.6}
+    axes.annotate(
+        "reference\nwave", middle, label, color=_GREY, fontsize=9, ha="right", va="center", arrowprops=line
+    )
     axes.plot(0, 0, "+", color="black", ms=8)
     for phase, line, shade in ((pixel.phase, "-", "black"), (pixel.mirrored[k], "--", color)):
         turn = np.exp(1j * phase)

@@ -84,13 +84,15 @@ def design_maps(maps: DesignMap, designs: Sequence[Design]) -> Figure:
             size = {"*": 15}.get(mark, 8)
             axes.plot(
                 design.diameter, (low + high) / 2, mark, mfc="#ffffff", mec="#000000", mew=1.2, ms=size,
-                label=label, ls="none",
+                label=label, ls="none", clip_on=False, zorder=5,
             )  # fmt: skip
         axes.set(xlim=extent[:2], ylim=extent[2:], xlabel="diameter (λ/D)")
         axes.set_title(name, fontsize=10)
         axes.yaxis.set_major_formatter(FormatStrFormatter("±%gπ"))
     panels[0, 0].set_ylabel("phase shifts (rad)")
-    bar = figure.colorbar(shown, ax=list(panels[0]), label="photons, ideal sensor: 1", extend="max", aspect=25)
+    bar = figure.colorbar(
+        shown, ax=list(panels[0]), label="photons / photons of an ideal sensor", extend="max", aspect=25
+    )
     bar.ax.yaxis.set_major_locator(FixedLocator([1, 2, 3, 5, 10]))
     bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     bar.ax.yaxis.set_minor_formatter(NullFormatter())

@@ -424,9 +424,9 @@ def on_the_bench(n: Numbers) -> Finding:
     """Alike within a third; twice the range; at a flat command ten times the error of the linear method."""
     measured = (
         f"on the simulated bench, from 0.3 rad rms on, the arcsine has {n.arcsine_over_linear:.2f} times the "
-        f"error of the linear method; the largest input with an error below a quarter of it is {n.reach_linear:.1f} "
-        f"(linear) and {n.reach_shifted:.1f} rad rms (phase-shifted); at a flat command the phase-shifted error is "
-        f"{n.offset_shifted:.3f} rad"
+        "error of the linear method; the largest input with an error below a quarter of it is "
+        f"{n.reach_linear:.1f} (linear) and {n.reach_shifted:.1f} rad rms (phase-shifted); at a flat command the "
+        f"phase-shifted error is {n.offset_shifted:.3f} rad"
     )
     right = 0.75 <= n.arcsine_over_linear <= 1.33 and n.reach_shifted >= 2 * n.reach_linear
     remark = (

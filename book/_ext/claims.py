@@ -312,7 +312,8 @@ def reach(n: Numbers) -> Finding:
 @rule(13)
 def real_time(n: Numbers) -> Finding:
     """The paper's reason is tested; speed depends on the machine, and a verdict must not."""
-    measured = f"functions for Fourier transforms that any reconstructor calls: {n.fourier_functions:.0f}"
+    calls = f"{n.fourier_functions:.0f} functions" if n.fourier_functions else "no function"
+    measured = f"the reconstructors call {calls} for Fourier transforms"
     remark = (
         f"The methods need no transform, although code may use them: {n.rank:.0f} "
         "coefficients describe the reference waves to a relative error "

@@ -44,9 +44,12 @@ def pythons(project: Project, asked: list[str]) -> None:
         if name not in (*known, "lowest"):
             raise ReleaseError(f"{name}: expected one of {', '.join(known)}, lowest")
         lowest = ["--resolution", "lowest-direct"] if name == "lowest" else []
+        if (python := interpreter(known[0] if lowest else name)) is None:
+            print(f"Python {name}: not tested, because it is not installed and uv cannot fetch it here")
+            continue
         with scratch_folder(project.build, "releasing-") as scratch:
             wheel, _ = build(project, about(project)["version"], scratch / "dist")
-            options = ["--python", interpreter(known[0] if lowest else name), *lowest]
+            options = ["--python", python, *lowest]
             python = environment(project, scratch / "env", f"zwfs[test] @ {wheel.as_uri()}", *options)
             test(project, python, scratch, [f"tests/test_{name}.py" for name in CORE], "--doctest-modules")
         print(f"Python {name}: passed")
@@ -63,10 +66,16 @@ def supported(project: Project) -> list[str]:
     return sorted(found, key=lambda version: int(version.split(".")[1]))
 
 
-def interpreter(version: str) -> str:
-    """Return the Python of a version that pyenv installed, or the version, which uv then looks for or fetches."""
+def interpreter(version: str) -> str | None:
+    """Return the Python of a version: one of pyenv, else one that uv finds or fetches; None if there is none."""
     folder = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"), "versions")
-    return str(next(iter(sorted(folder.glob(f"{version}.*/bin/python"), reverse=True)), version))
+    installed = sorted(folder.glob(f"{version}.*/bin/python"), reverse=True)
+    if installed:
+        return str(installed[0])
+    find, install = ([UV, "python", verb, version] for verb in ("find", "install"))
+    if subprocess.run(find, capture_output=True).returncode:
+        subprocess.run(install, capture_output=True)
+    return subprocess.run(find, capture_output=True, text=True).stdout.strip() or None
 
 
 def check_changelog(text: str, version: str) -> None:

@@ -233,6 +233,19 @@ def test_killed_run_leaves_no_kernel_and_the_next_run_removes_its_pieces(project
     assert [folder.name for folder in project.build.iterdir()] == ["notebooks"]
 
 
+def test_second_command_waits_for_the_first(tmp_path):
+    code = (
+        "import pathlib; from book._tools.scratch import one_at_a_time\n"
+        f"with one_at_a_time(pathlib.Path({str(tmp_path)!r})): print('has begun')"
+    )
+    with scratch.one_at_a_time(tmp_path):
+        second = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=-1, stderr=-1, text=True)
+        assert "waiting for its end" in second.stderr.readline()
+        assert second.poll() is None
+    assert second.communicate(timeout=20)[0] == "has begun\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_scratch_folder_of_a_living_process_and_foreign_folders_stay(tmp_path):
     (tmp_path / "running-of-somebody-else").mkdir()
     with scratch.scratch_folder(tmp_path, "running-") as first, scratch.scratch_folder(tmp_path, "running-"):

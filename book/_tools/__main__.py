@@ -10,7 +10,7 @@ if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is not signal.SIG_
     signal.signal(signal.SIGINT, lambda *_: (os.write(2, b"interrupted\n"), os._exit(1)))
 
 from .project import Project, ToolError, one_line
-from .scratch import end_cleanly_on_signals
+from .scratch import end_cleanly_on_signals, one_at_a_time
 
 ROOT = Path(__file__).resolve().parents[2]
 USAGE = """usage: python -m book._tools COMMAND
@@ -39,7 +39,8 @@ def main(arguments: list[str], project: Project | None = None) -> int:
             from . import book
 
             end_cleanly_on_signals()
-            getattr(book, command)(project)
+            with one_at_a_time(project.build):
+                getattr(book, command)(project)
         elif command == "metadata" and not options:
             from .metadata import metadata
 

@@ -16,6 +16,7 @@ from zwfs._files import write_file
 
 from . import pdf as printing
 from .crate import describe_book
+from .execute import TRACEBACK_LINES
 from .project import EXECUTED, PDF, Project, ToolError
 from .record import commit, digest, digest_files
 from .run import moved_numbers, refresh, run
@@ -152,7 +153,8 @@ def _write_pages(project: Project, output: Path, environment: dict[str, str]) ->
         env=os.environ | executed | environment,
     )
     if done.returncode:
-        lines = COLOUR.sub("", done.stdout).replace(f"{project.root}{os.sep}", "").splitlines()
+        said = COLOUR.sub("", done.stdout).replace(f"{project.root}{os.sep}", "")
+        lines = said.partition("\nThe above exception was the direct cause")[0].strip().splitlines()
         marked = [line for line in lines if "WARNING:" in line or "ERROR:" in line]
-        raise BookError("\n".join(["the book was not built:", *(marked or lines[-40:])]))
+        raise BookError("\n".join(["the book was not built:", *(marked or lines[-TRACEBACK_LINES:])]))
     return output / "_build" / "html"

@@ -31,7 +31,7 @@ export RERUN := $(value FIGURE) $(value ARGS)
 unexport FIGURE ARGS
 
 .DELETE_ON_ERROR:
-.PHONY: help book pdf lab test fuzz mutants figures rerun lint bench release-check pythons lock clean
+.PHONY: help book pdf lab test fuzz mutants torture figures rerun lint bench release-check pythons lock clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 21
@@ -72,6 +72,9 @@ bench: $(READY) ## time the reconstructors, next to other packages, for the perf
 
 mutants: $(READY) ## put defects into the package one by one, and name those that no test notices
 	@$(BIN)/python -m tests.mutants
+
+torture: $(READY) ## kill builds, fill the disk, and more: the book must stay whole, in about 15 minutes
+	@$(BIN)/python -m tests.torture
 
 release-check: $(READY) ## build the package, and test it in an empty environment
 	@$(BIN)/python -m book._tools release-check

@@ -121,6 +121,7 @@ def build(project: Project, chromium: str | None = None) -> bool:
         pages = _write_pages(project, scratch, {PDF: printing.NAME} if chromium else {})
         if chromium:
             (pages / printing.NAME).write_bytes(printing.print_book(project.root, pages, chromium))
+        (pages / ".buildinfo").unlink()  # for a later build in the same place; its digest depends on the place
         describe_book(project, pages, commit(project.root)[0])
         swap(pages, html, scratch / "earlier")
     write_file(record, json.dumps(made_from).encode())

@@ -39,6 +39,9 @@ MUTANTS = [
     Mutant("lowrank", "max(1e-3 * tolerance, 1e-18)", "max(tolerance, 1e-18)", "sensor -k quadrature"),
     Mutant("reconstructors/phase_shifted", "_PARALLEL = 1e-6", "_PARALLEL = 1e-5", "reconstructors -k parallel"),
     Mutant("reconstructors/phase_shifted", "_PARALLEL = 1e-6", "_PARALLEL = 1e-7", "reconstructors -k parallel"),
+    # c is real only next to a phase shift of pi. Between +pi/2 and -pi/2 the signal would turn by 90 degrees.
+    Mutant("reconstructors/phase_shifted", "w = -c.conj() * p", "w = -c * p",
+           "reconstructors -k fixed_point_of_the_phase"),
     Mutant("reconstructors/arcsine", "cross >= -_IN_LINE", "cross > _IN_LINE", "reconstructors -k in_line"),
     Mutant("bench/model", 'self.blur, mode="nearest"', 'self.blur, mode="wrap"', "bench -k blur"),
     Mutant("frames/pipeline", "(flux.mean() / flux)[:", "(flux / flux.mean())[:", "frames -k balance"),

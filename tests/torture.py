@@ -147,7 +147,7 @@ def kills(folder: Path) -> str:
     asked, draw, hit = int(os.environ.get("KILLS") or 20), random.Random(SEED), 0
     signals, completed = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL), 0
     while hit < asked:
-        number = signals[hit % len(signals)]
+        earlier, number = set(scratch(root)), signals[hit % len(signals)]
         with building(root) as (process, output):
             try:
                 process.wait(draw.uniform(0.02, 1) * seconds)
@@ -157,8 +157,9 @@ def kills(folder: Path) -> str:
                 process.wait(PATIENCE)
                 hit, said = hit + 1, output()
                 where = f"kill {hit}, {number.name}"
-                if "Traceback" in said or (number != signal.SIGKILL and scratch(root)):
-                    raise FaultError(f"{where}: {scratch(root)} {said[-1000:]}") from None
+                pieces = set() if number == signal.SIGKILL else set(scratch(root)) - earlier
+                if "Traceback" in said or pieces:
+                    raise FaultError(f"{where}: {pieces or ''} {said[-1000:]}") from None
         if (root / "_build" / "html").exists() and files(root / "_build" / "html") != expected["html"]:
             raise FaultError(f"{where}: _build/html is not whole")
         if process.returncode == 0:  # begin again, so that later kills hit the notebooks, too

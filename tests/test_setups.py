@@ -12,8 +12,10 @@ from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, power_law_s
 from zwfs.bench.model import Bench
 from zwfs.companion.limits import LIMITS
 from zwfs.companion.parameters import Fields, check_parameters
+from zwfs.modes import mode_frequencies
 from zwfs.paper.linearity import linearity_curves, screens_at
-from zwfs.paper.setups import PUPILS, SCREENS, Noise, make_pupil, make_screens
+from zwfs.paper.setups import BASES, PUPILS, SCREENS, Noise, make_pupil, make_screens
+from zwfs.turbulence import karhunen_loeve_basis
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 NESTED = [(name, key) for name, limits in LIMITS.items() for key, one in limits.items() if isinstance(one, Fields)]
@@ -58,7 +60,7 @@ def test_a_change_is_made_to_the_preset():
 
 
 @pytest.mark.parametrize("kind", [kind for kind in SCREENS if kind != "file"])
-@pytest.mark.parametrize("basis", ["zernike", "fourier"])
+@pytest.mark.parametrize("basis", BASES)
 def test_screens_of_every_kind_have_the_rms_and_the_seed_decides(kind, basis):
     pupil = make_pupil(32, "hexagonal")
     source = make_screens(pupil, 20, -2.0, kind=kind, basis=basis)
@@ -68,6 +70,29 @@ def test_screens_of_every_kind_have_the_rms_and_the_seed_decides(kind, basis):
     assert not np.allclose(screens, source(0.4, 3, 2))
     if kind == "segments":
         assert len(np.unique(screens[0].round(12))) <= 38
+
+
+def test_hexagonal_modes_are_orthonormal_on_the_pupil_and_zernike_modes_on_a_circle():
+    pupil = make_pupil(48, "hexagonal", n_rings=1)
+    values = pupil.gather(make_screens(pupil, 30, -2.0, basis="hexagonal").modes)
+    np.testing.assert_allclose(values @ values.T / pupil.n_points, np.eye(30), atol=1e-10)
+    # Mode j is mode j of Zernike less earlier ones: it adds only polynomials of its order.
+    zernike = pupil.gather(zernike_basis(pupil, 30))
+    np.testing.assert_allclose(np.tril(zernike @ values.T), zernike @ values.T, atol=1e-8 * pupil.n_points)
+    circle = make_pupil(100)
+    plain, orthonormal = (make_screens(circle, 15, -2.0, basis=basis).modes for basis in ("zernike", "hexagonal"))
+    assert circle.rms(plain - orthonormal).max() < 0.05
+
+
+def test_karhunen_loeve_modes_are_those_of_the_turbulence():
+    pupil = make_pupil(24)
+    short, long = (
+        make_screens(pupil, 10, -2.0, "von_karman", "kl", outer_scale).modes for outer_scale in (0.2, 1e5)
+    )
+    np.testing.assert_array_equal(long, karhunen_loeve_basis(pupil, 10, 1e5)[0])
+    assert np.abs(short - long).max() > 0.01
+    source = make_screens(pupil, 10, -2.0, basis="kl")
+    np.testing.assert_array_equal(source.frequencies, mode_frequencies(pupil, source.modes))
 
 
 def test_a_file_gives_pupil_and_screens(tmp_path):

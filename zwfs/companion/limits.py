@@ -8,7 +8,7 @@ from zwfs.companion.parameters import Fields
 
 _CUT = {"obstruction": (0.0, 0.9), "vanes": [[(-6.2832, 6.2832)], ...]}
 _RINGS = _CUT | {"n_rings": (1, 50), "gap": (0.0, 0.1), "missing": [(1, 10000), ...], "stop": (0.1, 1.0)}
-_BASIS = {"basis": ("zernike", "fourier")}
+_BASIS = {"basis": ("zernike", "fourier", "hexagonal", "kl")}
 _SETUP = {
     "pupil": Fields(
         "zwfs.paper.setups:make_pupil",

@@ -14,10 +14,10 @@ from zwfs import _check
 from zwfs.detector import Detector
 from zwfs.frames._fits import fits_module
 from zwfs.frames.files import read
-from zwfs.modes import fourier_basis, mode_frequencies, power_law_screens, zernike_basis
+from zwfs.modes import fourier_basis, mode_frequencies, noll_to_nm, power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
-from zwfs.turbulence import turbulent_screens
+from zwfs.turbulence import karhunen_loeve_basis, turbulent_screens
 
 _CROSS = [[0.785, 0.005], [2.356, 0.005], [3.927, 0.005], [5.498, 0.005]]
 _STAR = [[0.524 + 1.0472 * n, 0.013] for n in range(6)]
@@ -100,23 +100,23 @@ class Screens:
     pupil : Pupil
     modes : ndarray, shape (n_modes, ny, nx)
         Modes of the screens of kind "power_law", and of the modal reconstructors.
+    frequencies : ndarray, shape (n_modes,), cycles / D
+        Spatial frequencies of the modes.
     kind : str
     exponent : float
         Exponent of the power spectral density of the screens of kinds "power_law" and "segments".
     outer_scale : float, D
         Outer scale of the screens of kind "von_karman".
-    frequencies : ndarray, shape (n_modes,), cycles / D, optional
-        Of modes other than Zernike modes.
     recorded : ndarray, shape (n, ny, nx), optional
         Screens of kind "file".
     """
 
     pupil: Pupil
     modes: NDArray
+    frequencies: NDArray
     kind: str
     exponent: float
     outer_scale: float = inf
-    frequencies: NDArray | None = None
     recorded: NDArray | None = None
 
     def __call__(self, rms: float, n_screens: int, seed: Any) -> NDArray[np.floating]:
@@ -165,7 +165,7 @@ def make_screens(
     kind : str
         Kind of the screens; each screen is scaled to the rms of the input.
     basis : str
-        Modes of power-law screens and of the modal reconstructors.
+        Modes of power-law screens and of the modal reconstructors, see `BASES`.
     outer_scale : float, D
         Outer scale of von Karman's spectrum.
     file : str
@@ -186,18 +186,25 @@ def make_screens(
     _check.instance("pupil", pupil, Pupil)
     exponent = _check.number("exponent", exponent)
     _check.choice("kind", kind, SCREENS)
-    _check.choice("basis", basis, ["zernike", "fourier"])
+    _check.choice("basis", basis, BASES)
     if kind == "segments" and len(np.unique(pupil.segments)) < 3:
         raise ValueError('screens.kind = "segments": expected a pupil of two or more segments')
-    modes, frequencies = (
-        zernike_basis(pupil, n_modes) if basis == "zernike" else fourier_basis(pupil, n_modes),
-        None,
-    )
-    if basis == "fourier":
-        frequencies = mode_frequencies(pupil, modes)
-    recorded = _screens_of_file(pupil, file) if kind == "file" else None
     scale = outer_scale if kind == "von_karman" else inf
-    return Screens(pupil, modes, kind, exponent, scale, frequencies, recorded)
+    modes, frequencies = _modes(pupil, n_modes, basis, scale)
+    recorded = _screens_of_file(pupil, file) if kind == "file" else None
+    return Screens(pupil, modes, frequencies, kind, exponent, scale, recorded)
+
+
+def _modes(pupil: Pupil, n_modes: int, basis: str, outer_scale: float) -> tuple[NDArray, NDArray]:
+    """Return the modes of a basis and their spatial frequencies."""
+    if basis in ("zernike", "hexagonal"):
+        modes = zernike_basis(pupil, n_modes, orthonormal=basis == "hexagonal")
+        return modes, np.array([noll_to_nm(j)[0] for j in range(2, n_modes + 2)]) / 2
+    if basis == "kl":
+        modes, _ = karhunen_loeve_basis(pupil, n_modes, outer_scale)
+    else:
+        modes = fourier_basis(pupil, n_modes)
+    return modes, mode_frequencies(pupil, modes)
 
 
 def _screens_of_file(pupil: Pupil, file: str) -> NDArray:
@@ -209,6 +216,17 @@ def _screens_of_file(pupil: Pupil, file: str) -> NDArray:
 
 SCREENS = ("power_law", "kolmogorov", "von_karman", "segments", "file")
 """Kinds of screens."""
+
+BASES = ("zernike", "fourier", "hexagonal", "kl")
+"""Bases of modes, each of unit rms and without piston.
+
+- "zernike": Zernike modes in Noll's order, on any pupil those of the circle around it;
+- "fourier": cosines and sines of whole cycles per D;
+- "hexagonal": the hexagonal polynomials of Mahajan and Dai (2006, Opt. Lett. 31, 2462), which are Zernike modes
+  made orthonormal on the pupil in Noll's order. The pupil may have any shape;
+- "kl": Karhunen-Loeve modes of turbulence, see `zwfs.turbulence.karhunen_loeve_basis`. The turbulence is that of
+  von Karman for screens of kind "von_karman", and that of Kolmogorov for all others.
+"""
 
 
 @dataclass(frozen=True)

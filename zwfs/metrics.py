@@ -81,7 +81,7 @@ def without_piston(phase: ArrayLike) -> NDArray[Any]:
     if 0 in (phase.ndim, phase.size):
         raise ValueError(f"phase has shape {phase.shape}: expected (..., n_points), not empty")
     _check.finite("phase", phase)
-    phasor = np.exp(1j * phase)
+    phasor = np.cos(phase) + 1j * np.sin(phase)  # np.exp of complex64 is 20 times slower
     return np.angle(phasor * np.conj(phasor.mean(axis=-1, keepdims=True)))
 
 

@@ -1,16 +1,18 @@
 """Pupils, screens and noise that nested parameters choose: the paper's by default, and what they say otherwise."""
 
 import inspect
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from book._tools import declared
+from book._tools import declared, rerun
 from book._tools.notebook import read
+from book._tools.project import Project
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, zernike_basis
 from zwfs.bench.model import Bench
-from zwfs.companion.limits import LIMITS
+from zwfs.companion.limits import LIMITS, TOGETHER
 from zwfs.companion.parameters import Fields, check_parameters
 from zwfs.modes import mode_frequencies
 from zwfs.paper.linearity import linearity_curves, screens_at
@@ -157,6 +159,37 @@ def test_segments_need_a_segmented_pupil():
 def test_a_bad_nested_value_is_refused_with_its_path(values, error, message):
     with pytest.raises(error, match=message):
         check_parameters({"pupil": values}, pupil=LIMITS["fig03_dynamic_range"]["pupil"])
+
+
+@pytest.mark.parametrize(
+    ("figure", "given", "message"),
+    [
+        ("3", ["n_pixels=16", "n_modes=300"], "n_modes = 300: expected at most 207 with the 208 points of pupil"),
+        ("3", ["n_pixels=24", "screens={basis: kl}"], "n_modes = 200: expected at most 112 with the 448 points"),
+        (
+            "3",
+            ["pupil={kind: keck, missing: [40]}"],
+            r"pupil.missing = \[40\]: expected segment numbers from 1 to 37",
+        ),
+        ("4", ["pupil={vanes: [[0.0, 3.0], [3.1416, 3.0]]}"], r"pupil: spiders\[0\] width = 3.0"),
+        ("3", ["screens={kind: segments}"], "screens.kind = .segments.: expected a pupil of two or more segments"),
+        ("4", ["noise={read_noise: 1.0}"], "noise.read_noise = 1 with photons = 0"),
+        ("3", ["pupil={kind: file, file: nowhere.fits}"], "nowhere.fits"),
+        ("5", ["bench={missing: [38]}"], r"bench.missing = \[38\]: expected segment numbers from 1 to 37"),
+        ("9", ["n_pixels=32", "bench={diameter: 8.0, dimple_error: 9.0}"], "bench.diameter = 8"),
+        ("7", ["bench={photons: 0.0, read_noise: 1.0}"], "bench.photons = 0 with read_noise = 1"),
+    ],
+)
+def test_values_that_contradict_each_other_are_refused_before_a_kernel_starts(figure, given, message):
+    begin = time.process_time()
+    with pytest.raises(declared.ParameterError, match=message):
+        rerun.rerun(Project(NOTEBOOKS.parent), [figure, *(text for one in given for text in ("-p", one))])
+    assert time.process_time() - begin < 2
+
+
+@pytest.mark.parametrize("name", TOGETHER)
+def test_defaults_do_not_contradict_each_other(name):
+    declared.accept_together(name, default(name))
 
 
 @pytest.mark.parametrize(("name", "key"), NESTED)

@@ -19,7 +19,7 @@ from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event
 
-from zwfs.companion.limits import LIMITS
+from zwfs.companion.limits import LIMITS, TOGETHER
 from zwfs.companion.parameters import Fields, check_parameters
 
 from .project import ToolError, one_line
@@ -245,6 +245,21 @@ def accept(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]
     # In the order of the notebook: the order on the command line makes no difference.
     typed = {name: _typed(given[name], one.limits) for name, one in known.items() if name in given}
     return {name: value for name, value in typed.items() if value != known[name].default}
+
+
+def accept_together(name: str, values: dict[str, Any]) -> None:
+    """Check all values of a notebook together.
+
+    Raises
+    ------
+    ParameterError
+        If some of them contradict each other.
+    """
+    if name in TOGETHER:
+        try:
+            resolve_name(TOGETHER[name])(**values)
+        except (TypeError, ValueError, OSError) as error:
+            raise ParameterError(str(error)) from None
 
 
 def nearest(name: str, known: Any) -> str:

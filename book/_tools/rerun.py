@@ -8,6 +8,7 @@ import shlex
 import shutil
 import stat
 import sys
+from contextlib import chdir
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
@@ -100,6 +101,8 @@ def rerun(project: Project, arguments: list[str]) -> None:
         return
     known = declared.parameters(read(project.source(name)))
     changed = declared.accept(_given(asked), known)
+    with chdir(project.notebooks):  # as the notebook runs: its files are named from there
+        declared.accept_together(name, {key: one.default for key, one in known.items()} | changed)
     folder = _folder(project, asked.output or project.build / "rerun" / folder_name(name, changed))
     earlier, workers = read_result(folder, name), _workers(asked)
     if not asked.force and is_current(earlier, folder, record.key(project, name, changed)):

@@ -11,7 +11,7 @@ _RINGS = _CUT | {"n_rings": (1, 50), "gap": (0.0, 0.1), "missing": [(1, 10000), 
 _BASIS = {"basis": ("zernike", "fourier", "hexagonal", "kl")}
 _SETUP = {
     "pupil": Fields(
-        "zwfs.paper.setups:make_pupil",
+        "zwfs.paper.setups.make_pupil",
         kinds={
             "circular": _CUT,
             "vlt": _CUT,
@@ -23,7 +23,7 @@ _SETUP = {
         },
     ),
     "screens": Fields(
-        "zwfs.paper.setups:make_screens",
+        "zwfs.paper.setups.make_screens",
         _BASIS,
         {
             "power_law": {},
@@ -33,7 +33,7 @@ _SETUP = {
             "file": {"file": str},
         },
     ),
-    "noise": Fields("zwfs.paper.setups:Noise", {"photons": (0.0, 1e12), "read_noise": (0.0, 1e6)}),
+    "noise": Fields("zwfs.paper.setups.Noise", {"photons": (0.0, 1e12), "read_noise": (0.0, 1e6)}),
     "reconstructors": [str, ...],
 }
 
@@ -70,7 +70,7 @@ _BENCH = {
 
 def _bench(*others: str) -> Fields:
     """Limits of the fields of the bench, but for those that are parameters of the notebook."""
-    return Fields("zwfs.bench.model:Bench", {name: limit for name, limit in _BENCH.items() if name not in others})
+    return Fields("zwfs.bench.model.Bench", {name: limit for name, limit in _BENCH.items() if name not in others})
 
 
 _USUAL = {
@@ -242,3 +242,8 @@ LIMITS: dict[str, dict[str, Any]] = {
     "zernike_sensor": {name: _USUAL[name] for name in ("n_pixels", "diameter", "phase_shift")}
     | {"height": (0.1, 3.0)},
 }
+
+TOGETHER = dict.fromkeys(("fig03_dynamic_range", "fig04_dimple_diameter"), "zwfs.paper.setups.check_setup") | {
+    name: "zwfs.paper.bench_linearity.check_bench" for name, limits in LIMITS.items() if "bench" in limits
+}
+"""Full name of the function that refuses contradictory values, by notebook; it is called with all parameters."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any
@@ -17,7 +18,7 @@ class Fields:
     Attributes
     ----------
     of : str
-        Path "module:name" of the function or class with these arguments; its docstring gives their meanings.
+        Full name of the function or class with these arguments; its docstring gives their meanings.
     limits : dict
         Limits of each argument.
     kinds : dict of dict
@@ -74,6 +75,33 @@ def check_parameters(values: Mapping[str, Any], /, **limits: Any) -> None:
         if name not in values:
             raise ValueError(f"{name} has limits but no value: expected a parameter of that name")
         _check_value(name, values[name], limit)
+
+
+@contextmanager
+def within(path: str, names: Iterable[str]) -> Iterator[None]:
+    """Put the path of a nested parameter before the errors of the code that takes its values.
+
+    Parameters
+    ----------
+    path : str
+        Path of the parameter.
+    names : iterable of str
+        Names of its values, with which an error may begin.
+
+    Examples
+    --------
+    >>> from zwfs.companion.parameters import within
+    >>> with within("pupil", ["gap"]):
+    ...     raise ValueError("gap = 2: expected less")
+    Traceback (most recent call last):
+    ValueError: pupil.gap = 2: expected less
+    """
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        message = str(error)
+        begins = message.startswith(tuple(f"{name} " for name in names))
+        raise type(error)(f"{path}{'.' if begins else ': '}{message}") from None
 
 
 def _check_value(name: str, value: Any, limit: Any) -> None:

@@ -13,6 +13,7 @@ from zwfs import _check
 from zwfs.bench.model import Bench, BenchModel, Seed, segment_screens
 from zwfs.bench.segments import segment_residual
 from zwfs.companion import sweeps
+from zwfs.companion.parameters import within
 from zwfs.paper.curves import ErrorCurves
 from zwfs.paper.linearity import check_reconstructors, check_rms
 from zwfs.reconstructors import RECONSTRUCTORS, Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
@@ -20,6 +21,19 @@ from zwfs.reconstructors import RECONSTRUCTORS, Arcsine, GerchbergSaxton, Gradie
 # Smallest singular value of the interaction matrix that is inverted, over the largest. No sensor sees the piston
 # of all segments together: its singular value is the noise of the calibration, and is left out.
 _CONDITIONING = 0.1
+
+
+def check_bench(bench: Mapping[str, Any], **others: Any) -> None:
+    """Refuse fields of the bench that contradict each other, or the pixels and extent of a notebook.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `Bench` does; the message begins with the path of the field.
+    """
+    own = {name: others[name] for name in ("n_pixels", "extent") if name in others}
+    with within("bench", bench):
+        Bench(**own, **bench)
 
 
 @dataclass(frozen=True)

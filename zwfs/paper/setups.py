@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
+from zwfs.companion.parameters import within
 from zwfs.detector import Detector
 from zwfs.frames._fits import fits_module
 from zwfs.frames.files import read
@@ -187,12 +189,53 @@ def make_screens(
     exponent = _check.number("exponent", exponent)
     _check.choice("kind", kind, SCREENS)
     _check.choice("basis", basis, BASES)
-    if kind == "segments" and len(np.unique(pupil.segments)) < 3:
-        raise ValueError('screens.kind = "segments": expected a pupil of two or more segments')
+    _require_segments(pupil, kind)
     scale = outer_scale if kind == "von_karman" else inf
     modes, frequencies = _modes(pupil, n_modes, basis, scale)
     recorded = _screens_of_file(pupil, file) if kind == "file" else None
     return Screens(pupil, modes, frequencies, kind, exponent, scale, recorded)
+
+
+def check_setup(
+    n_pixels: int,
+    n_modes: int,
+    pupil: Mapping[str, Any],
+    screens: Mapping[str, Any],
+    noise: Mapping[str, float],
+    **_: Any,
+) -> None:
+    """Refuse parameters of a notebook that contradict each other, before any work.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the pupil cannot be made, has too few points for the modes or no segments for the screens, a file does
+        not fit, or the noise is impossible. The message begins with the path of the parameter.
+
+    Examples
+    --------
+    >>> from zwfs.paper.setups import check_setup
+    >>> check_setup(64, 100, {"kind": "keck", "missing": [40]}, {}, {})
+    Traceback (most recent call last):
+    ValueError: pupil.missing = [40]: expected segment numbers from 1 to 37
+    """
+    Noise(**noise)
+    with within("pupil", [*pupil, "missing"]):
+        aperture = make_pupil(n_pixels, **pupil)
+    _require_segments(aperture, screens.get("kind", SCREENS[0]))
+    most = aperture.n_points // 4 if screens.get("basis") == "kl" else aperture.n_points - 1
+    if n_modes > most:
+        raise ValueError(
+            f"n_modes = {n_modes}: expected at most {most} with the {aperture.n_points} points of pupil"
+        )
+    if "file" in screens:
+        with within("screens", ["file"]):
+            _screens_of_file(aperture, screens["file"])
+
+
+def _require_segments(pupil: Pupil, kind: str) -> None:
+    if kind == "segments" and len(np.unique(pupil.segments)) < 3:
+        raise ValueError('screens.kind = "segments": expected a pupil of two or more segments')
 
 
 def _modes(pupil: Pupil, n_modes: int, basis: str, outer_scale: float) -> tuple[NDArray, NDArray]:

@@ -254,7 +254,8 @@ def test_environment_is_set_up_again_when_its_python_is_gone(clone):
 
 
 def test_clean_keeps_what_belongs_to_the_user(clone):
-    for name in ("html/index.html", "notebooks/a.ipynb", "running-1/a", "rerun/mine/record.json", "other/a"):
+    results = "html/index.html", "notebooks/a.ipynb", "kept/a/1/a.json", "running-1/a"
+    for name in (*results, "rerun/mine/record.json", "other/a"):
         (clone / "_build" / name).parent.mkdir(parents=True, exist_ok=True)
         (clone / "_build" / name).write_text("")
     status, said = make(clone, "-s", "clean")

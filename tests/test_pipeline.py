@@ -62,7 +62,7 @@ def template(tmp_path_factory):
     picture = (
         "import matplotlib.pyplot as plt\nplt.rcParams['svg.hashsalt'] = 'fixed'\nplt.plot([1, 2])\nplt.show()"
     )
-    write(project, "first", "print(n * width)", noisy)
+    write(project, "first", "def later():\n    import zwfs\n    return zwfs.gain", "print(n * width)", noisy)
     write(project, "second", "%config InlineBackend.figure_formats = ['svg']", picture, "{n}")
     write(project, "third", publish("numbers.csv", "1"))
     (project.root / "environment").mkdir()
@@ -81,6 +81,7 @@ def ran(template, tmp_path):
 def test_two_runs_give_identical_bytes(ran):
     before = results(ran)
     shutil.rmtree(ran.executed)
+    shutil.rmtree(ran.kept)
     assert run_all(ran)[0]
     assert results(ran) == before
     assert len(before) == 3
@@ -88,6 +89,39 @@ def test_two_runs_give_identical_bytes(ran):
 
 def test_unchanged_notebooks_are_not_run_again(ran):
     assert run_all(ran) == ([], ["notebooks: 0 run, 3 unchanged"])
+
+
+def test_undoing_a_change_runs_nothing(ran):
+    before, source = results(ran), ran.source("third").read_bytes()
+    published = ran.published("third")[0].read_bytes()
+    for text in ("2", "3"):
+        write(ran, "third", publish("numbers.csv", text))
+        assert run_all(ran) == (["third"], [f"third: {read_seconds(ran)} s", "notebooks: 1 run, 2 unchanged"])
+        assert ran.published("third")[0].read_text() == text
+    ran.source("third").write_bytes(source)
+    assert run_all(ran) == ([], ["notebooks: 0 run, 1 from earlier runs, 2 unchanged"])
+    assert results(ran) == before
+    assert ran.published("third")[0].read_bytes() == published
+    # A damaged result is replaced by the kept one; without a whole one the notebook runs.
+    (ran.executed / "first.ipynb").write_text("half of a noteb")
+    assert run_all(ran)[0] == []
+    assert results(ran) == before
+    for file in (ran.executed / "first.ipynb", *ran.kept.glob("first/*/first.ipynb")):
+        file.write_text("half of a noteb")
+    assert run_all(ran)[0] == ["first"]
+
+
+def read_seconds(project):
+    return record.read_record(project, "third")["seconds"]
+
+
+def test_few_results_of_a_notebook_are_kept(ran, monkeypatch):
+    monkeypatch.setattr(run, "KEPT", 2)
+    for text in ("2", "3"):
+        write(ran, "third", publish("numbers.csv", text))
+        run_all(ran)
+    assert len(list((ran.kept / "third").iterdir())) == 2
+    assert run_all(ran)[0] == []
 
 
 def test_refreshed_notebooks_are_current(ran, monkeypatch):
@@ -135,8 +169,8 @@ def test_numbers_that_moved_are_listed_with_their_change(project):
 @pytest.mark.parametrize(
     ("change", "stale"),
     [
-        (lambda p: (p.root / "zwfs" / "__init__.py").write_text("gain = 2\n"), {"first", "second", "third"}),
-        (lambda p: (p.root / "zwfs" / "more.py").write_text(""), {"first", "second", "third"}),
+        (lambda p: (p.root / "zwfs" / "__init__.py").write_text("gain = 2\n"), {"first"}),
+        (lambda p: (p.root / "zwfs" / "more.py").write_text(""), set()),
         (
             lambda p: (p.root / "environment" / "requirements.lock").write_text("numpy==3\n"),
             {"first", "second", "third"},
@@ -169,7 +203,7 @@ def test_failure_is_named_and_leaves_earlier_results(ran):
     assert "parameters in force: n = 2, width = 1.5" in message
     assert message.endswith("ValueError: no light")
     assert results(ran) == before
-    assert sorted(os.listdir(ran.build)) == ["notebooks"]
+    assert sorted(os.listdir(ran.build)) == ["kept", "notebooks"]
 
 
 def test_failure_leaves_the_files_of_the_earlier_run(ran):
@@ -230,7 +264,7 @@ def test_killed_run_leaves_no_kernel_and_the_next_run_removes_its_pieces(project
     wait_until(lambda: not alive(kernel), seconds=20)
     write(project, "sleeps", "n")
     run_all(project)
-    assert [folder.name for folder in project.build.iterdir()] == ["notebooks"]
+    assert sorted(os.listdir(project.build)) == ["kept", "notebooks"]
 
 
 def test_second_command_waits_for_the_first(tmp_path):
@@ -347,7 +381,7 @@ def test_book_is_built_once_and_a_failure_keeps_it(fake_book):
     with pytest.raises(book.BookError, match=r"book/index.md:3: WARNING: unknown document"):
         book.build(fake_book)
     assert (fake_book.build / "html" / "index.html").read_text() == before
-    assert sorted(os.listdir(fake_book.build)) == ["html", "notebooks"]
+    assert sorted(os.listdir(fake_book.build)) == ["html", "kept", "notebooks"]
     # The pages are built again even if the change is undone: they may lack a part.
     index.write_text(before)
     assert book.build(fake_book)

@@ -133,7 +133,7 @@ def _digest(project: Project, printed: bool) -> str:
     root = project.root
     files = [root / name for name in ("_config.yml", "_toc.yml", "pyproject.toml", "CITATION.cff")]
     files += [file for file in (root / "book").rglob("*") if "__pycache__" not in file.parts]
-    files += [*project.sources(), *project.shared_inputs()]
+    files += [*project.sources(), *project.modules(), project.lock]
     for notebook in project.sources():
         executed = project.executed / notebook.name
         files += [executed, executed.with_suffix(".json"), *project.published(notebook.stem)]

@@ -47,6 +47,11 @@ class Project:
         """Folder of the executed notebooks, each with its published files and its record."""
         return self.build / "notebooks"
 
+    @property
+    def kept(self) -> Path:
+        """Folder of the last results of each notebook, by key: NAME/KEY/ has the content of `executed`."""
+        return self.build / "kept"
+
     def source(self, name: str) -> Path:
         """Return the file of a committed notebook."""
         return self.notebooks / f"{name}.ipynb"
@@ -55,11 +60,15 @@ class Project:
         """Return the files of the committed notebooks, in order."""
         return sorted(self.notebooks.glob("*.ipynb"))
 
-    def published(self, name: str) -> list[Path]:
-        """Return the figures and tables that the last run of a notebook published, in order."""
-        return sorted((self.executed / f"{name}.files").glob("[!.]*"))
+    def published(self, name: str, folder: Path | None = None) -> list[Path]:
+        """Return the figures and tables of a result in a folder, by default that of the last run, in order."""
+        return sorted(((folder or self.executed) / f"{name}.files").glob("[!.]*"))
 
-    def shared_inputs(self) -> list[Path]:
-        """Return the files that the result of every notebook depends on."""
-        lock = self.root / "environment" / "requirements.lock"
-        return [file for file in (*sorted((self.root / "zwfs").rglob("*.py")), lock) if file.exists()]
+    @property
+    def lock(self) -> Path:
+        """Pinned versions of all packages."""
+        return self.root / "environment" / "requirements.lock"
+
+    def modules(self) -> list[Path]:
+        """Return the files of the package."""
+        return sorted((self.root / "zwfs").rglob("*.py"))

@@ -11,7 +11,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from IPython.core.inputtransformer2 import TransformerManager
+
 from . import notebook
+from .imports import Graph
 from .project import Project
 
 # The modules that the content of an executed notebook depends on.
@@ -33,23 +36,35 @@ def digest_files(files: dict[str, Path]) -> str:
 
 def key(project: Project, name: str, parameters: dict[str, Any]) -> str:
     """Return a digest of everything that the result of a notebook depends on."""
-    files = {str(file.relative_to(project.root)): file for file in project.shared_inputs()}
+    cells = notebook.read(project.source(name)).cells
+    code = "\n".join(TransformerManager().transform_cell(c.source) for c in cells if c.cell_type == "code")
+    try:
+        inputs = {*Graph(project.notebooks, project.root).files(code, _texts(parameters)), project.lock}
+    except SyntaxError:  # what it imports cannot be read
+        inputs = {*project.modules(), project.lock}
+    files = {str(file.relative_to(project.root)): file for file in inputs if file.exists()}
     files |= {f"runner {file.name}": file for file in RUNNER}
-    files |= {f"parameter {file}": file for file in _named_files(project.notebooks, parameters)}
-    cells = [[cell.cell_type, cell.source, cell.metadata] for cell in notebook.read(project.source(name)).cells]
-    own = [list(sys.version_info[:2]), parameters, cells]
+    files |= {f"parameter {file}": file for file in _named_files(project.notebooks, _texts(parameters))}
+    content = [[cell.cell_type, cell.source, cell.metadata] for cell in cells]
+    own = [list(sys.version_info[:2]), parameters, content]
     return digest([json.dumps(own, sort_keys=True).encode(), digest_files(files).encode()])
 
 
-def _named_files(folder: Path, value: Any) -> Iterator[Path]:
-    """Return the files that parameters name: their contents count as much as their names."""
-    if isinstance(value, dict | list | tuple):
+def _texts(value: Any) -> Iterator[str]:
+    """Return the texts in parameters."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list | tuple):
         for one in value.values() if isinstance(value, dict) else value:
-            yield from _named_files(folder, one)
-    elif isinstance(value, str):
+            yield from _texts(one)
+
+
+def _named_files(folder: Path, texts: Iterable[str]) -> Iterator[Path]:
+    """Return the files that texts name: their contents count as much as their names."""
+    for text in texts:
         with suppress(OSError, ValueError):  # not the name of a file
-            if (folder / value).is_file():
-                yield folder / value
+            if (folder / text).is_file():
+                yield folder / text
 
 
 def digest_result(executed: bytes, files: list[Path]) -> str:
@@ -57,12 +72,13 @@ def digest_result(executed: bytes, files: list[Path]) -> str:
     return digest([executed, digest_files({file.name: file for file in files}).encode()])
 
 
-def read_record(project: Project, name: str) -> dict[str, Any]:
-    """Return the record of the last result of a notebook; empty if the result is missing or was changed."""
-    result = project.executed / f"{name}.ipynb"
+def read_record(project: Project, name: str, folder: Path | None = None) -> dict[str, Any]:
+    """Return the record of a result in a folder, by default that of the last run; empty if it is not whole."""
+    result = (folder or project.executed) / f"{name}.ipynb"
     try:
         record = json.loads(result.with_suffix(".json").read_bytes())
-        return record if record["result"] == digest_result(result.read_bytes(), project.published(name)) else {}
+        content = digest_result(result.read_bytes(), project.published(name, folder))
+        return record if record["result"] == content else {}
     except (OSError, ValueError, KeyError):
         return {}
 

@@ -1,6 +1,7 @@
 """Runs of the notebooks that changed, and the results of these runs."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
@@ -14,13 +15,16 @@ from .execute import Run, execute
 from .notebook import read, to_bytes
 from .project import Project
 from .record import digest_result, key, read_record, versions
-from .scratch import scratch_folder
+from .scratch import scratch_folder, swap
 
+KEPT = 4  # results of each notebook
 FRONT_FIGURE = "at_a_glance"  # shown in the README and on the front page, as book/_static/front.png
 
 
 def run(project: Project, say: Callable[[str], None] = tqdm.write) -> list[str]:
-    """Run every notebook whose result is not current, with its defaults.
+    """Run every notebook that has no result for its key, with its defaults.
+
+    The last results of each notebook are kept, so that undoing a change runs nothing.
 
     Parameters
     ----------
@@ -40,8 +44,11 @@ def run(project: Project, say: Callable[[str], None] = tqdm.write) -> list[str]:
     """
     names = [path.stem for path in project.sources()]
     records = {name: read_record(project, name) for name in names}
-    stale = [name for name in names if records[name].get("key") != key(project, name, {})]
+    keys = {name: key(project, name, {}) for name in names}
+    changed = [name for name in names if records[name].get("key") != keys[name]]
+    restored = [name for name in changed if _restore(project, name, keys[name])]
     # The longest first, as measured in earlier runs: the others fill the gaps.
+    stale = [name for name in changed if name not in restored]
     stale.sort(key=lambda name: -records[name].get("seconds", float("inf")))
 
     def finished(run: Run) -> None:
@@ -52,24 +59,52 @@ def run(project: Project, say: Callable[[str], None] = tqdm.write) -> list[str]:
     if stale:
         with scratch_folder(project.build, "running-") as scratch:
             execute([Run(project, name, scratch) for name in stale], finished)
-    say(f"notebooks: {len(stale)} run, {len(names) - len(stale)} unchanged")
+    again = f"{len(restored)} from earlier runs, " if restored else ""
+    say(f"notebooks: {len(stale)} run, {again}{len(names) - len(changed)} unchanged")
     return stale
 
 
 def _store(run: Run) -> None:
-    """Replace the stored result of a notebook."""
-    executed, result = run.project.executed, to_bytes(run.notebook)
+    """Keep the result of a notebook under its key, and show it."""
+    result, name = to_bytes(run.notebook), run.name
     record = {
         "key": run.key,
         "result": digest_result(result, run.files),
         "seconds": run.seconds,
         "versions": versions(),
     }
-    # Parts of two runs may lie together for a moment; only the record, which comes last, makes them a result.
-    write_file(executed / f"{run.name}.ipynb", result)
-    shutil.rmtree(executed / run.folder.name, ignore_errors=True)
-    run.folder.rename(executed / run.folder.name)
-    write_file(executed / f"{run.name}.json", json.dumps(record, indent=1).encode())
+    new = run.folder.with_name(f"{name}.result")
+    new.mkdir()
+    run.folder.rename(new / run.folder.name)
+    (new / f"{name}.ipynb").write_bytes(result)
+    (new / f"{name}.json").write_text(json.dumps(record, indent=1))
+    _show(run.project, name, new)
+    if run.key:
+        kept = run.project.kept / name
+        kept.mkdir(parents=True, exist_ok=True)
+        swap(new, kept / run.key, new.with_suffix(".earlier"))
+        for old in sorted(kept.iterdir(), key=lambda folder: folder.stat().st_mtime)[:-KEPT]:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def _restore(project: Project, name: str, key: str) -> bool:
+    """Show the result that was kept under a key, and return whether there is one."""
+    folder = project.kept / name / key
+    if not read_record(project, name, folder):
+        return False
+    _show(project, name, folder)
+    os.utime(folder)
+    return True
+
+
+def _show(project: Project, name: str, folder: Path) -> None:
+    """Copy the result in a folder to the place where the book reads it."""
+    # Parts of two results may lie together for a moment; only the record, which comes last, makes them a result.
+    shown = project.executed / f"{name}.files"
+    write_file(project.executed / f"{name}.ipynb", (folder / f"{name}.ipynb").read_bytes())
+    shutil.rmtree(shown, ignore_errors=True)
+    shutil.copytree(folder / shown.name, shown)
+    write_file(project.executed / f"{name}.json", (folder / f"{name}.json").read_bytes())
 
 
 def moved_numbers(project: Project) -> dict[str, list[str]]:

@@ -5,6 +5,7 @@ from zwfs.plots.bandwidth import band_errors
 from zwfs.plots.bench import bench_linearity, budget, measured_and_modelled, reference_intensities, segment_errors
 from zwfs.plots.calibration import calibration_errors, calibration_frames
 from zwfs.plots.closed_loop import capture, loop_runs
+from zwfs.plots.dark_zone import held_drift
 from zwfs.plots.dimple_diameter import diameter_methods, diameter_reasons, dimple_diameter
 from zwfs.plots.frames import explained, gains, phase_map, signs
 from zwfs.plots.grids import grid_slice
@@ -57,6 +58,7 @@ __all__ = [
     "explained",
     "gains",
     "grid_slice",
+    "held_drift",
     "linearity",
     "loop_runs",
     "measured_and_modelled",

@@ -73,8 +73,8 @@ MUTANTS = [
     Mutant("loop", "(1 - leak) * figure + step", "figure + step", "loop -k leak"),
     Mutant("loop", "step**2 / (gains * (2 - gains))", "step**2 / gains", "loop -k held"),
     # The bench and its frames.
-    Mutant("bench/model", "2 * shift * (u + v)", "shift * (u + v)", "bench -k misregistration"),
-    Mutant("bench/model", "astigmatism * (u**2 - v**2)", "astigmatism * (u**2 + v**2)", "bench -k grating"),
+    Mutant("bench/relay", "2 * shift * u", "shift * u", "bench -k misregistration"),
+    Mutant("bench/model", "focus - oval", "focus + oval", "bench -k grating"),
     Mutant("frames/registration", "return counts * self.areas[which, np.newaxis, np.newaxis]", "return counts",
            "foreign_frames -k light"),
     Mutant("frames/pipeline", "/ (1 - 2 * optics.leakage)", "/ (1 - optics.leakage)", "frames -k leakage"),

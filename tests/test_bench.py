@@ -96,11 +96,12 @@ def test_blur_widens_the_images_and_loses_no_light(perfect):
 def test_blur_mixes_neighbours_only():
     lit = {"n_rings": 1, "stop": None, "missing": (1, 2, 3, 4, 5, 7)}  # the first rows alone: the last are dark
     sharp, blurred = (ideal(**lit, extent=2.0, blur=blur).frames() for blur in (0.0, 1.5))
-    reach = (1, 13, 13)  # 4 standard deviations on either side
+    reach = (1, 19, 19)  # 6 standard deviations on either side
     highest, lowest = ndimage.maximum_filter(sharp, reach), ndimage.minimum_filter(sharp, reach)
     assert highest[:, 0].max() > 5 * highest[:, -1].max()
     assert np.all(blurred <= highest * (1 + 1e-9))
-    assert np.all(blurred >= lowest * (1 - 1e-9))
+    edge = (slice(None), slice(9, -9), slice(9, -9))  # light from beyond the camera reaches the rest
+    assert np.all(blurred[edge] >= lowest[edge] * (1 - 1e-9))
 
 
 def test_errors_are_named_and_0_on_an_ideal_bench(perfect):
@@ -126,17 +127,19 @@ def test_ideal_bench_is_the_sensor(illumination, commands):
     flat = sensor.measure(np.zeros(LAYOUT.shape))
     np.testing.assert_allclose(bench.frames(), flat, rtol=0, atol=1e-10)
     lit = np.pad(sensor.pupil.amplitude**2, MARGIN)
-    np.testing.assert_allclose(bench.clear_frames(), [lit, lit], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(bench.clear_frames(), [lit, lit], rtol=0, atol=1e-12)
     assert not bench.dark().any()
 
 
+@pytest.mark.parametrize("relay", [{}, {"misregistration": 0.5, "focus_difference": 3e-4, "blur": 0.8}])
 @pytest.mark.parametrize("extent", [1, EXTENT, 2.5])
-def test_frames_do_not_depend_on_the_width_of_the_camera(perfect, extent, commands):
-    frames = ideal(extent=extent).frames(commands)
+def test_frames_do_not_depend_on_the_width_of_the_camera(relay, extent, commands):
+    """The relay moves light over the edge of the camera, and none comes back."""
+    frames = ideal(extent=extent, **relay).frames(commands)
     margin = (frames.shape[-1] - N) // 2
     assert margin == round((extent - 1) * N / 2)
     centre = frames[..., margin : margin + N, margin : margin + N]
-    np.testing.assert_allclose(centre, inner(perfect.frames(commands)), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(centre, inner(ideal(**relay).frames(commands)), rtol=0, atol=1e-9)
 
 
 def test_reconstructors_find_the_commands_on_an_ideal_bench(perfect, model, commands):
@@ -228,14 +231,14 @@ def fresnel(field, distance, n_wide):
 def test_focus_difference_is_free_space_to_either_side(perfect, commands, distance):
     bench = ideal(focus_difference=distance)
     sensor = design(bench)
-    wide = ZernikeSensor(sensor.pupil, *sensor.masks, extent=2)
+    wide = ZernikeSensor(sensor.pupil, *sensor.masks, extent=4)
     waves = wide.propagate(sensor.pupil.amplitude * np.exp(1j * bench.commanded_phase(commands[0])))
     expected = np.stack(
-        [np.abs(fresnel(w, s * distance / 2, 2 * N)) ** 2 for w, s in zip(waves, (1, -1), strict=True)]
+        [np.abs(fresnel(w, s * distance / 2, 12 * N)) ** 2 for w, s in zip(waves, (1, -1), strict=True)]
     )
-    cut = N // 2 - MARGIN
-    # The sensor's tolerance is all that differs.
-    np.testing.assert_allclose(bench.frames(commands[0]), expected[:, cut:-cut, cut:-cut], rtol=0, atol=1e-9)
+    cut = 3 * N // 2 - MARGIN
+    # The light that comes back from the other side of the plane is all that differs.
+    np.testing.assert_allclose(bench.frames(commands[0]), expected[:, cut:-cut, cut:-cut], rtol=0, atol=3e-5)
     unlike = np.abs(bench.frames(commands[0]) - perfect.frames(commands[0])).max()
     assert unlike > 50 * distance
 
@@ -260,13 +263,11 @@ def test_focus_difference_turns_a_phase_grating_into_opposite_contrasts(distance
 @pytest.mark.parametrize("distance", [1e-4, 1e-2])
 def test_focus_difference_loses_no_light(distance):
     images = ideal(extent=4, focus_difference=distance).clear_frames()
-    np.testing.assert_allclose(images.sum(axis=(1, 2)), np.count_nonzero(LAYOUT.inside), rtol=1e-10)
-    # Nor does it come back from the other side on the narrower plane.
+    np.testing.assert_allclose(images.sum(axis=(1, 2)), np.count_nonzero(LAYOUT.inside), rtol=1e-7)
+    # A narrower camera sees the same light.
     narrow = ideal(focus_difference=distance).clear_frames()
     cut = 3 * N // 2 - MARGIN
-    np.testing.assert_allclose(
-        narrow, images[:, cut:-cut, cut:-cut], rtol=0, atol=2e-2 if distance > 1e-3 else 1e-3
-    )
+    np.testing.assert_allclose(narrow, images[:, cut:-cut, cut:-cut], rtol=0, atol=1e-12)
 
 
 def test_a_flat_wavefront_looks_the_same_on_either_side_of_focus(perfect):

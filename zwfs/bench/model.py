@@ -7,16 +7,18 @@ model from the images alone.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft, ndimage
+from scipy import ndimage
 
 from zwfs import _check
 from zwfs._pickle import Immutable
+from zwfs.bench.relay import Relay
 from zwfs.bench.segments import segment_pistons
 from zwfs.detector import Detector
 from zwfs.frames.pipeline import measured_pupil
@@ -25,8 +27,10 @@ from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
-_LATER = "clear_focus", "astigmatism", "unmodulated", "coherent", "halo"
+_LATER = "focus", "astigmatism", "unmodulated", "coherent", "halo"
 _N_MODES = 200  # that random segment commands are made of
+_REACH = 6.0  # standard deviations of the blur
+_SIGNS = np.array([1, -1])[:, np.newaxis, np.newaxis]  # of the mask's phase shift for the two polarisations
 
 Seed = int | np.random.Generator | np.random.SeedSequence | None
 
@@ -41,7 +45,7 @@ class Bench:
     """A vector-Zernike sensor with a segmented mirror, imperfect in ways that can be switched on one by one.
 
     The first group of parameters is the layout, the second the errors: 0 is ideal for each of them. The last
-    group, from `clear_focus` on, is 0 by default: effects that the real frames show, and the published figures
+    group, from `focus` on, is 0 by default: effects that the real frames show, and the published figures
     lack.
 
     Parameters
@@ -92,9 +96,9 @@ class Bench:
         Stray light and dark current of a pixel, 7 % of the light of one in the pupil; darks show it.
     seed : int
         Of the static aberration, which belongs to the bench.
-    clear_focus : float
-        Distance of the planes in focus in the two clear frames, in addition to that of the frames, times
-        lambda / D^2: + and - half of it. The four images then have a plane each.
+    focus : sequence of four floats
+        Distance from the pupil to the plane in focus in each image, times lambda / D^2, in addition to + and -
+        half of `focus_difference`: two frames, then two clear frames. The real ones differ by about 5e-4.
     astigmatism : float
         Difference of focus between light that is spread along x and along y, times lambda / D^2: + and - half of
         it in the two images. On the real bench, 2e-4 to 6e-4.
@@ -146,7 +150,7 @@ class Bench:
     read_noise: float = 30.0
     background: float = 60000.0
     seed: int = 0
-    clear_focus: float = 0.0
+    focus: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     astigmatism: float = 0.0
     unmodulated: float = 0.0
     coherent: float = 0.0
@@ -164,7 +168,11 @@ class Bench:
         _check.number_field(self, "focus_difference", 0, 1e-2)
         _check.number_field(self, "misregistration", 0, 10)
         _check.number_field(self, "flux_imbalance", -1, 1, open_low=True, open_high=True)
-        _check.number_field(self, "clear_focus", -1e-2, 1e-2)
+        _check.sequence("focus", self.focus, expected="four numbers, one for each image")
+        if len(self.focus) != 4:
+            raise ValueError(f"focus has {len(self.focus)} values: expected four, one for each image")
+        for index, distance in enumerate(self.focus):
+            _check.number(f"focus[{index}]", distance, -1e-2, 1e-2)
         _check.number_field(self, "astigmatism", -1e-2, 1e-2)
         _check.number_field(self, "unmodulated", 0, 1, open_high=True)
         _check.number_field(self, "coherent", 0, 0.5, open_high=True)
@@ -177,7 +185,7 @@ class Bench:
                 "expected 0 for both where frames are to be without noise"
             )
         # Whatever else is out of range shows when the parts are made.
-        _ = self._sensor
+        _ = self._dimples
 
     @classmethod
     def errors(cls) -> tuple[str, ...]:
@@ -259,14 +267,13 @@ class Bench:
         phase = 0.0 if pistons is None else self.commanded_phase(pistons)
         field = self._field * np.exp(1j * phase)
         flat = field.reshape(-1, *field.shape[-2:])
-        images = np.stack([self._image(*self._behind_mask(one)) for one in flat])
+        images = np.stack([self._image(one) for one in flat])
         return self._expose(images.reshape(*field.shape[:-2], *images.shape[1:]), rng)
 
     def clear_frames(self, seed: Seed = None) -> NDArray:
         """Counts of the camera with the mask taken out and a flat command, shape (2, ny', nx')."""
         rng = _check.generator("seed", seed)
-        field = np.pad(self._field, self._margin)
-        return self._expose(self._image(np.stack([field, field]), clear=True), rng)
+        return self._expose(self._image(self._field, clear=True), rng)
 
     def dark(self, seed: Seed = None) -> NDArray:
         """Counts of the camera without light, shape (2, ny', nx')."""
@@ -278,15 +285,30 @@ class Bench:
         return Pupil.from_segments(whole.segments, np.sqrt(1 + self.illumination * whole.x))
 
     @cached_property
-    def _sensor(self) -> ZernikeSensor:
+    def _relays(self) -> list[Relay]:
+        """Relays of the four images: the frames, then the clear frames."""
         diameter = self.diameter * (1 + self.dimple_error)
-        masks = Dimple(diameter, self.phase), Dimple(diameter, -self.phase)
-        # Defocus spreads light: on a plane wider than the camera it does not come back on the other side.
-        return ZernikeSensor(self._pupil, *masks, extent=max(2.0, self.extent))
+        relays = []
+        for index, focus in enumerate(self.focus):
+            sign = 1 - 2 * (index % 2)
+            focus = focus + sign * self.focus_difference / 2
+            oval, shift = sign * self.astigmatism / 2, sign * self.misregistration / 2 / self.n_pixels
+            relays.append(Relay(diameter, focus + oval, focus - oval, shift))
+        return relays
+
+    @cached_property
+    def _dimples(self) -> ZernikeSensor:
+        """Its reference waves are the light of the dimple in the two images."""
+        return ZernikeSensor(self._pupil, *self._relays[:2], extent=1 + 2 * self._margin / self.n_pixels)
+
+    @property
+    def _spill(self) -> int:
+        """Pixels beyond the camera whose light the blur moves onto it."""
+        return math.ceil(_REACH * self.blur)
 
     @property
     def _margin(self) -> int:
-        return self._sensor.window[0].start
+        return self._spill + round((self.extent - 1) * self.n_pixels / 2)
 
     @cached_property
     def _field(self) -> NDArray[np.complex128]:
@@ -301,53 +323,34 @@ class Bench:
 
     @property
     def _camera_shape(self) -> tuple[int, int]:
-        margin = self._margin - round((self.extent - 1) * self.n_pixels / 2)
-        ny, nx = self._sensor.detector_shape
-        return ny - 2 * margin, nx - 2 * margin
+        return (self.n_pixels + 2 * (self._margin - self._spill),) * 2
 
-    def _behind_mask(self, field: NDArray) -> tuple[NDArray[np.complexfloating], NDArray | None]:
-        """Waves of the two polarisations, (2, ny, nx), and the one that no mask has shifted, if it counts."""
-        waves, plain = self._sensor.propagate(field), np.pad(field, self._margin)
-        if self.coherent:
-            waves = np.sqrt(1 - self.coherent) * waves + 1j * np.sqrt(self.coherent) * plain
-        return waves, plain if self.unmodulated else None
+    def _image(self, field: NDArray[np.complexfloating], *, clear: bool = False) -> NDArray[np.float64]:
+        """Intensity on the camera of the two polarisations, (ny, nx) to (2, ny', nx')."""
+        size = self.n_pixels + 2 * self._margin
+        waves = [relay.direct(field, size, self.n_pixels) for relay in self._relays[2 * clear :][:2]]
+        unshifted = np.abs(waves) ** 2
+        images = unshifted if clear else self._behind_mask(np.array(waves), self._dimples.reference_wave(field))
+        if not clear and self.unmodulated:
+            images = (1 - self.unmodulated) * images + self.unmodulated * unshifted
+        blurred = ndimage.gaussian_filter(images, (0, self.blur, self.blur), mode="nearest", truncate=_REACH)
+        camera = slice(self._spill, size - self._spill)
+        return blurred[:, camera, camera] + (self._halo() if self.halo else 0)
 
-    def _image(
-        self, waves: NDArray[np.complexfloating], plain: NDArray | None = None, *, clear: bool = False
-    ) -> NDArray[np.float64]:
-        """Intensity on the camera of the two polarisations, (2, ny, nx) to (2, ny', nx')."""
-        images = np.empty(waves.shape)
-        focus = self.focus_difference + clear * self.clear_focus
-        for arm, sign in enumerate((1, -1)):
-            relay = sign * focus / 2, sign * self.misregistration / 2 / self.n_pixels, sign * self.astigmatism / 2
-            seen = np.abs(self._relay(waves, *relay)) ** 2
-            image = (1 - self.leakage) * seen[arm] + self.leakage * seen[1 - arm]
-            if plain is not None:
-                unshifted = np.abs(self._relay(plain[np.newaxis], *relay)[0]) ** 2
-                image = (1 - self.unmodulated) * image + self.unmodulated * unshifted
-            images[arm] = ndimage.gaussian_filter(image, self.blur, mode="nearest")
-        margin = (waves.shape[-1] - self._camera_shape[-1]) // 2
-        inner = slice(margin, waves.shape[-1] - margin)
-        return images[:, inner, inner] + self._halo() if self.halo else images[:, inner, inner]
+    def _behind_mask(self, waves: NDArray, light: NDArray) -> NDArray[np.float64]:
+        """Intensity of both images: the light of the dimple is shifted, and joins the waves past it."""
+        shifted, kept = np.sqrt(1 - self.coherent), 1j * np.sqrt(self.coherent)
+        own, other = (
+            np.abs((shifted + kept) * waves + shifted * (np.exp(1j * sign * _SIGNS * self.phase) - 1) * light) ** 2
+            for sign in (1, -1)
+        )
+        return (1 - self.leakage) * own + self.leakage * other
 
     def _halo(self) -> NDArray[np.float64]:
         """Light of the neighbour on each image, (2, ny', nx')."""
         y, x = ((np.arange(n) - (n - 1) / 2) / self.n_pixels for n in self._camera_shape)
         away = np.array([self.extent, -self.extent])[:, np.newaxis, np.newaxis]
         return self.halo * self.extent**2 / np.maximum((x - away) ** 2 + y[:, np.newaxis] ** 2, 0.25)
-
-    def _relay(
-        self, waves: NDArray[np.complexfloating], distance: float, shift: float, astigmatism: float = 0.0
-    ) -> NDArray[np.complexfloating]:
-        """Fresnel propagation by a distance in units of D^2 / lambda, and a shift along both axes in D."""
-        if not distance and not shift and not astigmatism:
-            return waves
-        v, u = (fft.fftfreq(n, 1 / self.n_pixels) for n in waves.shape[-2:])
-        v = v[:, np.newaxis]
-        path = distance * (u**2 + v**2) + 2 * shift * (u + v)
-        if astigmatism:
-            path = path + astigmatism * (u**2 - v**2)
-        return fft.ifft2(fft.fft2(waves) * np.exp(-1j * np.pi * path))
 
     def _expose(self, images: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         flux = np.array([1 + self.flux_imbalance, 1 - self.flux_imbalance])[:, np.newaxis, np.newaxis]

@@ -60,7 +60,7 @@ _BENCH = {
     "read_noise": (0.0, 1e6),
     "background": (0.0, 1e12),
     "seed": (0, 4294967295),
-    "clear_focus": (-0.01, 0.01),
+    "focus": [(-0.01, 0.01), ...],
     "astigmatism": (-0.01, 0.01),
     "unmodulated": (0.0, 0.9),
     "coherent": (0.0, 0.49),

@@ -200,6 +200,7 @@ class MaskValues(NamedTuple):
 
 _N_ARM, _N_MASK = len(ArmValues._fields), len(MaskValues._fields)
 _N_RELAY = 5  # the first parameters of an arm act on the spectrum of the field
+_ROW = ArmValues._fields.index("row")
 _ROTATION, _FLUX = ArmValues._fields.index("rotation"), ArmValues._fields.index("flux")
 _BLUR = MaskValues._fields.index("blur")
 
@@ -382,22 +383,26 @@ class Forward:
         self.pictures, self.n_arms, self.inside, self.n_pixels = tuple(pictures), len(arms), inside, n_pixels
         self._turned = [_turned(arm) for arm in arms]
         n = inside.shape[-1]
-        widest = max(n, *(max(picture.counts.shape) for picture in self.pictures))
-        widest += 8 + n // 8  # light that defocus or a shift moves over the edge must not come back
+        largest_picture = max(n, *(max(picture.counts.shape) for picture in self.pictures))
+        widest = largest_picture + 16  # blurred light that crosses the edge comes back on the other side
         while (widest - n) % 2 or fft.next_fast_len(widest, real=True) != widest:
             widest += 1
         self.size = widest
-        self._inner = (slice((widest - n) // 2, (widest + n) // 2),) * 2
+        inner = slice((widest - n) // 2, (widest + n) // 2)
+        # What the relay moves over the edge of so long a grid does not come back to any pixel of a picture.
+        self._length = max(n + largest_picture, widest)
+        while self._length % 2 == 0 or fft.next_fast_len(self._length) != self._length:
+            self._length += 1
         for index, picture in enumerate(self.pictures):
             self._check_picture(index, picture)
         known = {id(picture.known): picture.known for picture in self.pictures}
         self._state = [list(known).index(id(picture.known)) for picture in self.pictures]
         self._known = [1.0 if phase is None else np.exp(1j * phase) for phase in known.values()]
-        v, u = np.meshgrid(*(fft.fftfreq(widest),) * 2, indexing="ij")
-        self._relay = self._polynomials(u, v)
+        self._frequency = fft.fftfreq(self._length)
+        self._relay = self._polynomials(*np.meshgrid(self._frequency, self._frequency))[:_ROW]
         axis = (np.arange(widest) - (widest - 1) / 2) / n_pixels
         spread = math.sqrt(2) * (len(inside) + widest) / n_pixels
-        self.planes = tuple(_Plane(one, largest, spread) for one in (axis[self._inner[0]], axis))
+        self.planes = tuple(_Plane(one, largest, spread) for one in (axis[inner], axis))
         self._spread = spread
 
     def _check_picture(self, index: int, picture: Picture) -> None:
@@ -457,9 +462,36 @@ class Forward:
         source, target = (plane.spectra(u, v) for plane in self.planes)
         return (target.conj() * factors[:, np.newaxis, :]) @ source.T
 
-    def transfer(self, relay: NDArray) -> NDArray[np.complex128]:
-        """Transfer function of the relay of an arm, (size, size)."""
-        return np.exp(-1j * np.tensordot(relay, self._relay, 1))
+    def spectrum(self, field: NDArray) -> NDArray[np.complex128]:
+        """Spectrum of a field that begins at the first row and column, (n, n) to (length, length)."""
+        return fft.fft(fft.fft(field, self._length, 1, "ortho"), self._length, 0, "ortho")
+
+    def field(self, spectrum: NDArray, size: int) -> NDArray[np.complex128]:
+        """The first rows and columns of the field of a spectrum: the adjoint of `spectrum`."""
+        return fft.ifft(fft.ifft(spectrum, axis=0, norm="ortho")[:size], norm="ortho")[:, :size]
+
+    def transfer(self, relay: NDArray) -> tuple[NDArray[np.complex128], list[NDArray[np.complex128]]]:
+        """Transfer function of the relay of an arm, (length, length), and its derivatives by row and column."""
+        spread = np.exp(-1j * np.tensordot(relay[:_ROW], self._relay, 1))
+        rows, columns = (self._shift(distance) for distance in relay[_ROW:])
+        pairs = (rows[0], columns[0]), (rows[1], columns[0]), (rows[0], columns[1])
+        transfer, *slopes = (spread * np.multiply.outer(*pair) for pair in pairs)
+        return transfer, slopes
+
+    def _shift(self, distance: float) -> NDArray[np.complex128]:
+        """Transfer function of a shift along one axis, in pixels, and its derivative, (2, length).
+
+        A shift by part of a pixel is a convolution with a sinc. It falls so slowly that its period on a grid of
+        finite length matters: here it is cut where it would come back. An odd length keeps its alternating signs.
+        """
+        places = np.rint(self._frequency * self._length)
+        x = places - distance
+        sinc = np.sinc(x)
+        slope = np.where(np.abs(x) > 1e-6, (sinc - np.cos(np.pi * x)) / np.where(x, x, 1), 0)
+        margin = (
+            self.size - len(self.inside)
+        ) // 2  # of the pupil, whose field begins at the first row and column
+        return fft.fft([sinc, slope]) * np.exp(-2j * np.pi * margin * self._frequency)
 
     def blur(self, sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Transfer function of a Gaussian that is sampled at the pixels, and its derivative, on half the plane."""
@@ -608,7 +640,7 @@ class Linearised:
         self._coefficients = coefficients(self._mask)
         self._blur = forward.blur(self._mask.blur)
         relays = [np.array(arm[:_N_RELAY]) for arm in self._arms]
-        self._transfer = [forward.transfer(relay) for relay in relays]
+        self._transfer, self._shifted = zip(*(forward.transfer(relay) for relay in relays), strict=True)
         self._turned_back = [transfer.conj() for transfer in self._transfer]
         masked = {picture.arm for picture in forward.pictures if picture.mask is not None}
         self._cores = {arm: forward.cores(self._mask.diameter, relays[arm]) for arm in masked}
@@ -618,16 +650,14 @@ class Linearised:
 
     def _source(self, field: NDArray) -> tuple[NDArray, NDArray]:
         """Spectrum of a field on the pupil, and its coefficients for the light of the dimple."""
-        whole = np.zeros((self._forward.size,) * 2, complex)
         field = field * self._forward.inside
-        whole[self._forward._inner] = field
-        return fft.fft2(whole, norm="ortho"), self._forward.planes[0].project(field)
+        return self._forward.spectrum(field), self._forward.planes[0].project(field)
 
     def _image(self, index: int) -> _Part:
         forward, picture = self._forward, self._forward.pictures[index]
         arm = self._arms[picture.arm]
         spectrum, coefficient = self._states[forward._state[index]]
-        field = fft.ifft2(self._transfer[picture.arm] * spectrum, norm="ortho")
+        field = forward.field(self._transfer[picture.arm] * spectrum, forward.size)
         light = across = np.zeros(0, complex)
         ahead, intensity = field, field.real**2 + field.imag**2
         if picture.mask is not None:
@@ -660,7 +690,8 @@ class Linearised:
         states = [self._source(field * known) for known in forward._known]
         for index, (picture, part) in enumerate(zip(forward.pictures, self._parts, strict=True)):
             spectrum, coefficient = states[forward._state[index]]
-            intensity = _twice(part.ahead, fft.ifft2(self._transfer[picture.arm] * spectrum, norm="ortho"))
+            wave = forward.field(self._transfer[picture.arm] * spectrum, forward.size)
+            intensity = _twice(part.ahead, wave)
             if picture.mask is not None:
                 light = forward.planes[1].expand(self._cores[picture.arm][0] @ coefficient)
                 intensity += _twice(part.across, light)
@@ -681,8 +712,10 @@ class Linearised:
         spectrum, coefficient = self._states[forward._state[index]]
         intensity = np.zeros(part.intensity.shape)
         if row[:_N_RELAY].any():
-            turned = -1j * np.tensordot(row[:_N_RELAY], forward._relay, 1) * spectrum
-            intensity += _twice(part.ahead, fft.ifft2(self._transfer[picture.arm] * turned, norm="ortho"))
+            slope = -1j * np.tensordot(row[:_ROW], forward._relay, 1) * self._transfer[picture.arm]
+            for change, by_shift in zip(row[_ROW:_N_RELAY], self._shifted[picture.arm], strict=True):
+                slope += change * by_shift
+            intensity += _twice(part.ahead, forward.field(slope * spectrum, forward.size))
         if picture.mask is not None:
             steps = np.append(row[:_N_RELAY], by_mask[0])
             light = steps @ (self._cores[picture.arm][1:] @ coefficient)
@@ -699,7 +732,7 @@ class Linearised:
     def adjoint(self, pixels: Sequence[NDArray]) -> NDArray[np.complex128]:
         """Adjoint of `apply`, for the inner product Re <a, b> of fields."""
         forward = self._forward
-        spectra = [np.zeros((forward.size,) * 2, complex) for _ in self._states]
+        spectra = [np.zeros(spectrum.shape, complex) for spectrum, _ in self._states]
         inputs = [np.zeros(coefficient.shape, complex) for _, coefficient in self._states]
         for index, (picture, part) in enumerate(zip(forward.pictures, self._parts, strict=True)):
             weight, state = pixels[index], forward._state[index]
@@ -707,14 +740,14 @@ class Linearised:
                 2 * self._arms[picture.arm].flux * part.sampler.adjoint(weight)
             )
             gain = fft.irfft2(self._blur[0] * back, s=part.field.shape)
-            spectra[state] += fft.fft2(gain * part.ahead, norm="ortho") * self._turned_back[picture.arm]
+            spectra[state] += forward.spectrum(gain * part.ahead) * self._turned_back[picture.arm]
             if picture.mask is not None:
                 inputs[state] += self._cores[picture.arm][0].conj().T @ forward.planes[1].project(
                     gain * part.across
                 )
         field = np.zeros(forward.inside.shape, complex)
         for spectrum, light, known in zip(spectra, inputs, forward._known, strict=True):
-            one = fft.ifft2(spectrum, norm="ortho")[forward._inner] + forward.planes[0].expand(light)
+            one = forward.field(spectrum, len(field)) + forward.planes[0].expand(light)
             field += one * np.conj(known)
         return field * forward.inside
 

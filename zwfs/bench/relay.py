@@ -1,0 +1,85 @@
+"""Relay optics of the simulated bench: from the plane of the pupil to the camera, on a plane without an end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zwfs.lowrank import _bandwidth
+
+_ROUNDING = 1e-13
+
+
+@dataclass(frozen=True)
+class Relay:
+    """Path of the light of one image: free space and a shift.
+
+    Relay and dimple multiply the same spectrum. The light of the dimple behind the relay is therefore the
+    reference wave of a mask, which this class is: its transmission less 1 is that of the relay.
+
+    Parameters
+    ----------
+    diameter : float, lambda/D
+        Of the dimple.
+    along_x, along_y : float, D^2 / lambda
+        Distance from the pupil to the plane in focus, for light that is spread along x and along y.
+    shift : float, D
+        Of the image, along both axes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.relay import Relay
+    >>> relay = Relay(1.06, 0.0, 0.0, shift=0.25)  # by a pixel
+    >>> np.abs(relay.direct(np.ones((4, 4)), 6, 4)[3]).round(6)
+    array([0., 0., 1., 1., 1., 1.])
+    """
+
+    diameter: float
+    along_x: float
+    along_y: float
+    shift: float
+    breaks = ()
+    n_samples = 0
+
+    def transmission(self, u: NDArray, v: NDArray) -> NDArray[np.complex128]:
+        """1 + the transfer function of the relay at focal coordinates, lambda/D."""
+        return 1 + _transfer(u, self.along_x, self.shift) * _transfer(v, self.along_y, self.shift)
+
+    def direct(self, field: NDArray, n_camera: int, n_pixels: int) -> NDArray[np.complex128]:
+        """Field of n_camera x n_camera pixels of a field on the pupil, whose middle is the same.
+
+        Parameters
+        ----------
+        field : ndarray, shape (n, n)
+            Samples; the field between them is a sum of sinc functions, and 0 at all pixels beyond.
+        n_camera : int, pixels
+            As even or odd as n.
+        n_pixels : int, pixels
+            Diameter D.
+
+        Returns
+        -------
+        ndarray, shape (n_camera, n_camera)
+        """
+        sizes = n_camera, len(field), n_pixels
+        rows = _kernel(*sizes, self.along_y, self.shift)
+        columns = rows if self.along_x == self.along_y else _kernel(*sizes, self.along_x, self.shift)
+        return rows @ field @ columns.T
+
+
+def _transfer(u: NDArray, distance: float, shift: float) -> NDArray[np.complex128]:
+    """Transfer function along one axis."""
+    return np.exp(-1j * np.pi * (distance * u**2 + 2 * shift * u))
+
+
+def _kernel(n_camera: int, n_source: int, n_pixels: int, distance: float, shift: float) -> NDArray[np.complex128]:
+    """Matrix from samples on an axis to samples on a longer one: the integral over all frequencies of the grid."""
+    farthest = (n_camera + n_source) / 2 + (abs(distance) * n_pixels + abs(shift)) * n_pixels
+    unit, weights = np.polynomial.legendre.leggauss(_bandwidth(np.pi * farthest, _ROUNDING) // 2 + 8)
+    steps = np.arange(1 - n_source, n_camera) - (n_camera - n_source) // 2
+    waves = np.exp(1j * np.pi * np.outer(steps, unit))
+    line = waves @ (weights / 2 * _transfer(unit * n_pixels / 2, distance, shift))
+    return line[np.subtract.outer(np.arange(n_camera), np.arange(n_source)) + n_source - 1]

@@ -43,7 +43,8 @@ FORMAT = 1  # of the file; another number is refused
 _NAME = "zwfs calibration"
 _FAR = 40  # pixels beyond the camera at which the edge of an image has no effect on the camera
 _REACH = 12  # pixels around the pupil that its splines need: farther ones weigh less than 2e-7
-_NEGLIGIBLE = 1e-10  # in a spline filter: smaller numbers only slow the product down
+_CUT = _REACH - 1  # of these, those without a coefficient of a spline in the pupil
+_NEGLIGIBLE = 1e-10  # of a weight: smaller ones only slow products down, much so if their products are subnormal
 _DIM = 0.1  # of the light of the calibration: a frame with less is lost
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 
@@ -584,7 +585,7 @@ class _Work(NamedTuple):
     watched: NDArray[np.bool_]  # (2, h, w), good pixels from which the pupil is made
     repairs: list[tuple[NDArray, NDArray]]  # bad pixels of each box, and their nearest good ones
     filters: tuple[NDArray[np.float32], NDArray[np.float32]]  # spline coefficients along rows and columns
-    splines: list[Any]  # sparse (ny nx, h w), cubic
+    splines: list[Any]  # sparse (ny nx, h' w'), cubic, 0 outside the pupil
     touching: list[Any]  # sparse (ny nx, h w), linear
     holes: tuple[NDArray, NDArray]  # bad points of the pupil, and their nearest good ones
 
@@ -619,7 +620,7 @@ class _Work(NamedTuple):
             reached & ~bad,
             [_repair(one, ~one) for one in bad],
             (_spline_filter(size[0]), _spline_filter(size[1])),
-            [_cubic(corner, tuple(size)) for corner in corners],
+            [_cubic(corner - _CUT, tuple(size - 2 * _CUT), pupil.inside.ravel()) for corner in corners],
             touching,
             _repair(pupil.inside & ~calibration.good, calibration.good),
         )
@@ -641,10 +642,9 @@ class _Work(NamedTuple):
                 n_saturated = np.count_nonzero(spoiled & (raw >= level), axis=(1, 2, 3))
                 good = good & ~self._touched(spoiled)
             raw -= self.dark
+        flat = raw.reshape(k, len(self.boxes), -1)
         for index, (pixels, nearest) in enumerate(self.repairs):
-            flat = raw[:, index].reshape(k, -1)
-            flat[:, pixels] = flat[:, nearest]
-            raw[:, index] = flat.reshape(raw[:, index].shape)
+            flat[:, index, pixels] = flat[:, index, nearest]
         for place in np.flatnonzero(strange):
             for index, one in enumerate(odd[place]):
                 usable = ~(one | self.bad[index])
@@ -831,18 +831,19 @@ def _repair(bad: NDArray[np.bool_], good: NDArray[np.bool_]) -> tuple[NDArray, N
 
 
 def _spline_filter(size: int) -> NDArray[np.float32]:
-    """Matrix from samples to the coefficients of a cubic spline."""
+    """Matrix from samples to the coefficients of a cubic spline near the pupil."""
     matrix = ndimage.spline_filter1d(np.eye(size), 3, axis=0, mode="nearest")
-    return np.where(np.abs(matrix) > _NEGLIGIBLE, matrix, 0).astype(np.float32)
+    matrix = np.where(np.abs(matrix) > _NEGLIGIBLE, matrix, 0).astype(np.float32)
+    return np.ascontiguousarray(matrix[_CUT:-_CUT])
 
 
-def _cubic(places: NDArray, size: tuple[int, int]) -> Any:
-    """Sparse matrix from coefficients of cubic splines, (h w), to places (2, n)."""
+def _cubic(places: NDArray, size: tuple[int, int], inside: NDArray) -> Any:
+    """Sparse matrix from coefficients of cubic splines, (h w), to places (2, n); 0 to those not inside."""
     base = np.floor(places)
     t = places - base
     u = 1 - t
     weights = np.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / 6
-    return _interpolation(base.astype(int) - 1, weights, size)
+    return _interpolation(base.astype(int) - 1, weights * inside, size)
 
 
 def _linear(places: NDArray, size: tuple[int, int]) -> Any:
@@ -855,6 +856,7 @@ def _interpolation(first: NDArray, weights: NDArray, size: tuple[int, int]) -> A
     """Sparse matrix with weights (m, 2, n) of the m rows and m columns from the first, (2, n)."""
     m, _, n = weights.shape
     values = weights[:, np.newaxis, 0] * weights[np.newaxis, :, 1]
+    values = np.where(np.abs(values) > _NEGLIGIBLE, values, 0)
     steps = np.arange(m)
     rows = first[0] + steps[:, np.newaxis, np.newaxis]
     columns = first[1] + steps[np.newaxis, :, np.newaxis]
@@ -863,4 +865,6 @@ def _interpolation(first: NDArray, weights: NDArray, size: tuple[int, int]) -> A
     shape = n, size[0] * size[1]
     matrix = sparse.csr_array((values.ravel(), (points.ravel(), pixels.ravel())), shape=shape, dtype=np.float32)
     matrix.eliminate_zeros()
+    # Half the bytes of each index: reading them takes much of the time of a product.
+    matrix.indices, matrix.indptr = matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32)
     return matrix

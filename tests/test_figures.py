@@ -24,6 +24,7 @@ from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.paper.calibration import WAYS as WAYS_OF_BENCH
 from zwfs.paper.calibration import Example, Shot
 from zwfs.paper.closed_loop import LoopRun
+from zwfs.paper.dark_zone import IDEAL, Drift
 from zwfs.paper.design import PUBLISHED, DesignMap
 from zwfs.paper.dimple_diameter import Contraction, DiameterCurves
 from zwfs.paper.linearity import linearity_curves
@@ -147,6 +148,17 @@ def drawn_methods(curves, pupil, classic, shifted):
         "error_bars": (([ErrorBars(k, EXPECTED, k, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
         "design_maps": ((DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5}), PUBLISHED), ()),
         "band_errors": (({(0.1, False): banded, (0.1, True): banded},), [*shifted_only, "MaximumLikelihood"]),
+        "held_drift": (
+            (
+                {"pair": np.ones(6), IDEAL: np.ones(6)},
+                Drift(np.ones((6, 2, 2)), 10.0, 500.0),
+                {"pair": np.array([20.0, 10.0])},
+                [1e2, 1e4],
+                {1e3: np.array([30.0, 20.0])},
+                [0.1, 0.5],
+            ),
+            (),
+        ),
         "amplitude_errors": (({"dips": varied},), [*shifted_only, "MaximumLikelihood"]),
         "phase_and_amplitude": ((pupil, 0 * pupil.amplitude, pupil.amplitude, both), ()),
         "reference_intensities": ((frames, frames), ()),

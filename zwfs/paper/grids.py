@@ -34,7 +34,7 @@ class Recovery:
         Called with the sensor of a pair of dimples of opposite phase shifts; returns a reconstructor.
     noise : Noise
     dtype : "float64" or "float32"
-        Precision of screens, sensor and frames. Single precision takes a third of the time, and limits errors to
+        Precision of screens, sensor and frames. Single precision takes half the time, and limits errors to
         1e-5 rad or more.
 
     Raises

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
 
 from zwfs import _check
 from zwfs._pickle import Immutable
@@ -27,7 +27,7 @@ from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
-_LATER = "focus", "astigmatism", "unmodulated", "coherent", "halo"
+_LATER = "focus", "astigmatism", "unmodulated", "coherent", "halo", "subpixels"
 _N_MODES = 200  # that random segment commands are made of
 _REACH = 6.0  # standard deviations of the blur
 _SIGNS = np.array([1, -1])[:, np.newaxis, np.newaxis]  # of the mask's phase shift for the two polarisations
@@ -56,8 +56,8 @@ class Bench:
         Width of what the camera records of each pupil image, at most 10: 180 pixels of 136 on the real bench.
     n_rings, gap, missing, stop
         Layout of the segmented mirror, see `Pupil.hexagonal`. The defaults look like the real one: 37 segments,
-        5.5 across the stop, gaps of two pixels (those of the real mirror are narrower, and would be sampled
-        unevenly), and one segment missing at the top right.
+        5.5 across the stop, gaps of two pixels (those of the real mirror are narrower, which takes `subpixels`),
+        and one segment missing at the top right.
     diameter : float, lambda/D
         Diameter of the dimple by design.
     phase : float, radian
@@ -109,6 +109,10 @@ class Bench:
     halo : float
         Light of the neighbour in the middle of each image, over the mean of the pupil. It falls with the square of
         the distance, and the neighbour stands to the right of the first image and to the left of the second one.
+    subpixels : int
+        Parts of a pixel along each side. The field of a pixel is the mean of its parts, so gaps below a pixel are
+        grey, and finer structure is lost. 1 for pixels that are open or closed; 8 resolves a gap of a fifth of a
+        pixel.
 
     Raises
     ------
@@ -155,9 +159,11 @@ class Bench:
     unmodulated: float = 0.0
     coherent: float = 0.0
     halo: float = 0.0
+    subpixels: int = 1
 
     def __post_init__(self) -> None:
         _check.integer("n_pixels", self.n_pixels, 2)
+        _check.integer("subpixels", self.subpixels, 1, 16)
         _check.number_field(self, "extent", 1, 10)
         _check.sequence("missing", self.missing, expected="segment numbers, such as (21,)")
         _check.number_field(self, "dimple_error", -0.9, 10)
@@ -264,11 +270,18 @@ class Bench:
             Image of the polarisation that sees +`phase`, then of the other one.
         """
         rng = _check.generator("seed", seed)
-        phase = 0.0 if pistons is None else self.commanded_phase(pistons)
-        field = self._field * np.exp(1j * phase)
+        field = self._field * (1.0 if pistons is None else self._commanded(pistons))
         flat = field.reshape(-1, *field.shape[-2:])
         images = np.stack([self._image(one) for one in flat])
         return self._expose(images.reshape(*field.shape[:-2], *images.shape[1:]), rng)
+
+    def _commanded(self, pistons: ArrayLike) -> NDArray[np.complex128]:
+        """Mean phasor of each pixel that segment commands ask for, (..., ny, nx)."""
+        phase = self.commanded_phase(pistons)
+        phasors = np.exp(1j * np.asarray(pistons, float)).reshape(-1, self.n_segments)
+        parts = self._parts[:, self.numbers]
+        mean = (parts @ phasors.T) / np.maximum(parts.sum(axis=1), 1)[:, np.newaxis]
+        return mean.T.reshape(phase.shape)
 
     def clear_frames(self, seed: Seed = None) -> NDArray:
         """Counts of the camera with the mask taken out and a flat command, shape (2, ny', nx')."""
@@ -281,8 +294,22 @@ class Bench:
 
     @cached_property
     def _pupil(self) -> Pupil:
-        whole = Pupil.hexagonal(self.n_pixels, self.n_rings, self.gap, self.missing, self.stop)
-        return Pupil.from_segments(whole.segments, np.sqrt(1 + self.illumination * whole.x))
+        parts = self._parts
+        covered = parts.sum(axis=1).reshape((self.n_pixels,) * 2)
+        segments = np.where(covered > 0, np.reshape(parts.argmax(axis=1), covered.shape), 0)
+        x = (np.arange(self.n_pixels) - (self.n_pixels - 1) / 2) / self.n_pixels
+        brightness = np.sqrt(1 + self.illumination * x)
+        return Pupil.from_segments(segments, covered / self.subpixels**2 * brightness)
+
+    @cached_property
+    def _parts(self) -> sparse.csr_array:
+        """Sub-pixels of each pixel that lie on each segment, (n_pixels^2, 1 + largest number)."""
+        n, k = self.n_pixels, self.subpixels
+        fine = Pupil.hexagonal(n * k, self.n_rings, self.gap, self.missing, self.stop).segments
+        index = np.arange(n * k) // k
+        lit, pixel = fine > 0, np.add.outer(n * index, index)
+        shape = n * n, int(fine.max()) + 1
+        return sparse.coo_array((np.ones(np.count_nonzero(lit)), (pixel[lit], fine[lit])), shape=shape).tocsr()
 
     @cached_property
     def _relays(self) -> list[Relay]:

@@ -65,6 +65,7 @@ _BENCH = {
     "unmodulated": (0.0, 0.9),
     "coherent": (0.0, 0.49),
     "halo": (0.0, 10.0),
+    "subpixels": (1, 16),
 }
 
 

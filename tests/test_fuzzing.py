@@ -269,6 +269,8 @@ COUNTS = np.random.default_rng(1).uniform(0, 1e4, (1, *SHAPE))
 @example(fits_file([np.ones(SHAPE, ">i2")], SATURATE=-1))
 @example(fits_file([np.ones(SHAPE, ">i2")], BSCALE="'much'"))
 @example(npy(np.ones((1, *SHAPE))).replace(b"(1, 42", b"(-5,42"))
+@example(fits_file([None, np.ones(SHAPE, np.uint8)]).replace(b"BITPIX", b"\2ITPIX", 1))
+@example(fits_file([None, np.ones(SHAPE, np.uint8)]).replace(b"BITPIX", b"@ITPIX", 1))
 def test_telemetry_is_that_of_the_counts_or_refused_by_name(folder, calibration, content):
     path, output = put(folder, "telemetry.dat", content), folder / "phases.fits"
     code, messages = run(

@@ -10,6 +10,7 @@ import hashlib
 import io
 import math
 import os
+import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -31,6 +32,7 @@ _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do 
 _GZIP, _NPY = b"\x1f\x8b", b"\x93NUMPY"  # first bytes of a file
 # Header card of a phase map: no other file is replaced.
 _PHASE_CARD = b"CREATOR = 'zwfs "
+_KEYWORD = re.compile("[A-Z0-9_ -]*")  # of the standard, with the blanks of the convention HIERARCH
 _LONGEST = 240  # bytes of a file name; a partial file has a few more, and most file systems allow 255
 
 
@@ -570,7 +572,8 @@ def _header_cards(header: Any) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for card in header.cards:
         with suppress(fits_module().VerifyError):
-            values.setdefault(card.keyword, card.value)
+            if _KEYWORD.fullmatch(card.keyword):
+                values.setdefault(card.keyword, card.value)
     return values
 
 

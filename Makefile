@@ -106,7 +106,7 @@ $(BIN)/uv:
 # The compatible mode puts this folder on the path of Python. The default mode fails in a folder with a folder zwfs.
 $(READY): $(LOCK) pyproject.toml $(BIN)/uv
 	@rm -f $@
-	@$(UV) pip sync --python $(BIN)/python --require-hashes $(LOCK)
+	@$(UV) pip sync --python $(BIN)/python --compile-bytecode --require-hashes $(LOCK)
 	@$(UV) pip install --python $(BIN)/python --no-deps --no-build-isolation \
 		--config-settings editable_mode=compat --editable .
 	@$(IDENTITY) > $@

@@ -121,7 +121,8 @@ def build(project: Project, chromium: str | None = None) -> bool:
         pages = _write_pages(project, scratch, {PDF: printing.NAME} if chromium else {})
         if chromium:
             (pages / printing.NAME).write_bytes(printing.print_book(project.root, pages, chromium))
-        (pages / ".buildinfo").unlink()  # for a later build in the same place; its digest depends on the place
+        # Sphinx needs it for a later build in the same place. Its digest depends on the place.
+        (pages / ".buildinfo").unlink(missing_ok=True)
         describe_book(project, pages, commit(project.root)[0])
         swap(pages, html, scratch / "earlier")
     write_file(record, json.dumps(made_from).encode())

@@ -142,7 +142,7 @@ LIMITS: dict[str, dict[str, Any]] = {
         n_steps_capture=(3, 100000),
     ),
     "dark_zone": _limits(
-        "n_modes",
+        "n_modes diameter phase_shift",
         n_pixels=(16, 100),
         diameter_best=(0.1, 8.0),
         phase_shift_best=(0.01, 3.13),

@@ -292,6 +292,7 @@ def valid() -> dict:
         "Dimple.amplitude": 1.0,
         "Dimple.phase": 1.5,
         "Bench.phase": 1.5,
+        "check_bench.bench": {"blur": 0.1},
         "Bench.n_pixels": 17,
         "Bench.missing": (),
         "FrozenFlow.cutoff": 1.0,

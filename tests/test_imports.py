@@ -130,7 +130,8 @@ source, ran = sys.stdin.read(), set()
 sys.setprofile(lambda frame, event, _: ran.add(frame.f_code.co_filename))
 exec(compile(source, "notebook", "exec"), {"__name__": "__main__"})
 sys.setprofile(None)
-print(json.dumps(sorted(file for file in ran if os.sep + "zwfs" + os.sep in file)))
+package = os.path.dirname(zwfs.__file__) + os.sep
+print(json.dumps(sorted(file for file in ran if file.startswith(package))))
 """
 
 

@@ -182,7 +182,8 @@ class Bench:
         _check.number_field(self, "astigmatism", -1e-2, 1e-2)
         _check.number_field(self, "unmodulated", 0, 1, open_high=True)
         _check.number_field(self, "coherent", 0, 0.5, open_high=True)
-        for name in ("halo", "blur", "static", "quilting", "photons", "read_noise", "background"):
+        _check.number_field(self, "blur", 0, self.n_pixels)
+        for name in ("halo", "static", "quilting", "photons", "read_noise", "background"):
             _check.number_field(self, name, 0)
         _check.integer_seed("seed", self.seed)
         if not self.photons and (self.read_noise or self.background):

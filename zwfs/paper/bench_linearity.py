@@ -31,6 +31,7 @@ def check_bench(bench: Mapping[str, Any], **others: Any) -> None:
     TypeError, ValueError
         As `Bench` does; the message begins with the path of the field.
     """
+    _check.instance("bench", bench, Mapping)
     own = {name: others[name] for name in ("n_pixels", "extent") if name in others}
     with within("bench", bench):
         Bench(**own, **bench)

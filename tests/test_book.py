@@ -198,6 +198,15 @@ def pdf_pages(pdf):
     return [plain(page.extract_text()) for page in pdf.pages]
 
 
+def test_prose_and_tables_have_powers_of_ten():
+    texts = [
+        text for article in articles() for text in article.find_all(string=re.compile(r"\d(e[+-]\d|·10[⁻¹-⁹])"))
+    ]
+    prose = [text for text in texts if not text.find_parent(["code", "pre", "script", "style"])]
+    assert prose
+    assert [text for text in prose if re.search(r"\de[+-]\d", text)] == []
+
+
 def test_front_page_links_the_pdf_only_if_there_is_one():
     linked = read(HTML / "book" / "index.html").find("a", href="../zwfs.pdf")
     assert (linked is not None) == (HTML / "zwfs.pdf").exists()

@@ -1,4 +1,4 @@
-"""Finish of the pages: sizes of pictures, descriptions for links, MathJax without the network, quiet scripts."""
+"""Finish of the pages: numbers, sizes of pictures, descriptions for links, MathJax without the network."""
 
 import copy
 import importlib.util
@@ -28,6 +28,8 @@ CARD_ALT = "The logo and the title of the book above a wavefront, its two images
 LENGTH = 200  # characters of a description
 MATH = {"lambda": "λ", "theta": "θ", "pi": "π", "pm": "±"}
 TEX = re.compile(r"\\(?:[()]|([a-z]+))")
+POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e([+-])0*(\d+)\b")
+DIGITS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 CONSOLE = re.compile(r"\bconsole\.(?:log|info|debug)\(")
 FORWARD = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"/><title>{title}</title>
@@ -53,6 +55,7 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
     file, and scrolls on narrow screens.
     """
     body = BeautifulSoup(context.get("body", ""), "html.parser")
+    write_powers(body)
     pictures = {name: Path(app.srcdir, source) for source, name in app.builder.images.items()}
     for image in body.find_all("img"):
         if picture := pictures.get(unquote(image["src"].rpartition("/")[2])):
@@ -71,6 +74,20 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
     if app.config.html_baseurl:
         given = context.get("metatags", "")
         context["metatags"] = given + tags(app.config, page, body, given)
+
+
+def write_powers(body: Tag) -> None:
+    """Write numbers such as 1.4e+08 as 1.4·10⁸, but not in code."""
+    for text in body.find_all(string=POWER):
+        if not text.find_parent(["code", "pre", "samp", "script", "style"]):
+            text.replace_with(POWER.sub(power, text))
+
+
+def power(number: re.Match[str]) -> str:
+    """Write one such number with a superscript; a factor of 1 is left out."""
+    factor, sign, exponent = number.groups()
+    ten = f"10{(sign.replace('+', '') + exponent).translate(DIGITS)}"
+    return ten if factor == "1" else f"{factor.replace('-', '−')}·{ten}"
 
 
 def add_variants(app: Sphinx, figure: Tag) -> None:

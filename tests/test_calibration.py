@@ -57,19 +57,19 @@ def bench():
 
 
 @pytest.fixture(scope="module")
-def same(bench):
+def calibrated(bench):
     return measured(bench)
 
 
-def test_parameters_of_the_bench_are_recovered_within_their_error_bars(bench, same):
-    for one in recovered(bench, same[0]["calibrated"]):
+def test_parameters_of_the_bench_are_recovered_within_their_error_bars(bench, calibrated):
+    for one in recovered(bench, calibrated[0]["calibrated"]):
         tolerance = next(value for name, value in TOLERANCES.items() if one.name.startswith(name))
         assert abs(one.value - one.true) <= tolerance, one.name
         assert abs(one.deviation) <= 3.5, one.name
 
 
-def test_calibrated_model_measures_new_screens_and_the_control_fails(same):
-    _, curves, examples = same
+def test_calibrated_model_measures_new_screens_and_the_control_fails(calibrated):
+    _, curves, examples = calibrated
     assert set(curves.residuals) == set(WAYS)
     assert curves.mean("calibrated").max() < 0.01
     assert curves.mean("design, less flat").min() > 3 * curves.mean("calibrated").max()
@@ -80,7 +80,7 @@ def test_calibrated_model_measures_new_screens_and_the_control_fails(same):
     assert misfits["calibrated"] < 1.3 < 10 < min(misfits["design"], misfits["shuffled"])
 
 
-def test_a_bench_on_a_finer_grid_is_measured_better_than_with_the_model_of_the_design(same):
+def test_a_bench_on_a_finer_grid_is_measured_better_than_with_the_model_of_the_design(calibrated):
     """The model shares no grid with this bench. The gain is smaller, and its parameters are not those put in."""
     finer = dimmed(FineBench(**LAYOUT), 1e5)
     recording = record(finer, 3, 0.6, seed=1)
@@ -89,7 +89,7 @@ def test_a_bench_on_a_finer_grid_is_measured_better_than_with_the_model_of_the_d
     fit = fit_bench(recording.frames, recording.clear, known, **settings, errors=False)
     curves, _ = measure_segments(recording, {"calibrated": fit}, [0.3, 0.8], 1, seed=1)
     error = curves.mean("calibrated").mean()
-    assert 3 * same[1].mean("calibrated").mean() < error < 0.5 * curves.mean("design, less flat").mean()
+    assert 3 * calibrated[1].mean("calibrated").mean() < error < 0.5 * curves.mean("design, less flat").mean()
 
 
 def test_exposures_keep_the_share_of_the_background():

@@ -20,7 +20,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -278,10 +278,13 @@ def factorise(
     for index, mask in enumerate(masks):
         _check_mask(index, mask, pixel_area**-0.5, (*pupil_axes, *detector_axes), reach)
     radius = max(mask.diameter for mask in masks) / 2
-    from_pupil, to_detector = (
-        tuple((_axis_functions(axis, radius, tolerance), axis) for axis in axes)
-        for axes in (pupil_axes, detector_axes)
-    )
+
+    def along(axes: tuple[NDArray, NDArray]) -> tuple[tuple[NDArray, NDArray], ...]:
+        return tuple((_axis_functions(axis, radius, tolerance), axis) for axis in axes)
+
+    from_pupil = along(pupil_axes)
+    same = all(map(np.array_equal, pupil_axes, detector_axes))
+    to_detector = from_pupil if same else along(detector_axes)
 
     def core_of(index: int, refinement: float = 1.0) -> NDArray[np.complex128]:
         u, v, weights = _quadrature(masks[index], reach, tolerance, refinement)
@@ -289,7 +292,8 @@ def factorise(
         total: Any = 0
         for some in (slice(first, first + _NODES) for first in range(0, u.size, _NODES)):
             spectra = _spectra(from_pupil, u[some], v[some])
-            total = total + _spectra(to_detector, u[some], v[some]).conj() * change[some] @ spectra.T
+            seen = spectra if same else _spectra(to_detector, u[some], v[some])
+            total = total + seen.conj() * change[some] @ spectra.T
         return total
 
     core = np.array([core_of(index) for index in range(len(masks))])
@@ -359,11 +363,25 @@ def _warn_of_quadrature(index: int, mask: Mask, error: float, tolerance: float) 
 def _axis_functions(axis: NDArray, radius: float, tolerance: float) -> NDArray:
     """Orthonormal functions on an axis that hold all waves of frequencies up to `radius`: (a, n)."""
     n_nodes = _bandwidth(2 * np.pi * radius * np.ptp(axis), tolerance)
-    unit, weights = np.polynomial.legendre.leggauss(n_nodes)
+    unit, weights = gauss_legendre(n_nodes)
     angle = np.pi * radius * np.outer(unit + 1, axis)
     waves = np.sqrt(weights)[:, np.newaxis] * np.stack([np.cos(angle), np.sin(angle)])
     _, strength, functions = np.linalg.svd(waves.reshape(-1, axis.size), full_matrices=False)
     return functions[: _rank(strength, max(tolerance, 1e-16))]
+
+
+@cache
+def gauss_legendre(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Nodes and weights of the Gauss-Legendre quadrature on (-1, 1), (n,) each.
+
+    Examples
+    --------
+    >>> from zwfs.lowrank import gauss_legendre
+    >>> gauss_legendre(1)
+    (array([0.]), array([2.]))
+    """
+    unit, weights = np.polynomial.legendre.leggauss(n)
+    return read_only(unit), read_only(weights)
 
 
 def _quadrature(
@@ -373,7 +391,7 @@ def _quadrature(
     edges = np.array([0.0, *mask.breaks, mask.diameter]) / 2
     n_angles = max(_bandwidth(2 * np.pi * edges[-1] * reach, tolerance), mask.n_samples + mask.n_samples % 2)
     n_angles = 2 * round(n_angles * refinement / 2)
-    unit, unit_weights = np.polynomial.legendre.leggauss(n_angles // 2)
+    unit, unit_weights = gauss_legendre(n_angles // 2)
     low, high = edges[:-1, np.newaxis], edges[1:, np.newaxis]
     radius = (low + (high - low) * (unit + 1) / 2).ravel()
     ring = radius * ((high - low) / 2 * unit_weights).ravel()

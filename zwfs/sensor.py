@@ -269,8 +269,8 @@ class ZernikeSensor(Sensor):
     Raises
     ------
     TypeError, ValueError
-        If there is no mask, or an argument is of the wrong kind or out of range. The diameter of a mask in
-        lambda/D must not exceed the number of pixels across D; on a wide detector the limit is lower.
+        If there is no mask, or an argument has the wrong type or a value out of range. The largest diameter of a
+        mask, in lambda/D, is the number of pixels across D. On a wide detector it is smaller.
 
     Warns
     -----

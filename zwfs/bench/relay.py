@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zwfs.lowrank import _bandwidth
+from zwfs._arrays import read_only
+from zwfs.lowrank import _bandwidth, gauss_legendre
 
 _ROUNDING = 1e-13
 
@@ -75,11 +77,12 @@ def _transfer(u: NDArray, distance: float, shift: float) -> NDArray[np.complex12
     return np.exp(-1j * np.pi * (distance * u**2 + 2 * shift * u))
 
 
+@lru_cache(maxsize=16)  # each image of a bench needs its kernels again
 def _kernel(n_camera: int, n_source: int, n_pixels: int, distance: float, shift: float) -> NDArray[np.complex128]:
     """Matrix from samples on an axis to samples on a longer one: the integral over all frequencies of the grid."""
     farthest = (n_camera + n_source) / 2 + (abs(distance) * n_pixels + abs(shift)) * n_pixels
-    unit, weights = np.polynomial.legendre.leggauss(_bandwidth(np.pi * farthest, _ROUNDING) // 2 + 8)
+    unit, weights = gauss_legendre(_bandwidth(np.pi * farthest, _ROUNDING) // 2 + 8)
     steps = np.arange(1 - n_source, n_camera) - (n_camera - n_source) // 2
     waves = np.exp(1j * np.pi * np.outer(steps, unit))
     line = waves @ (weights / 2 * _transfer(unit * n_pixels / 2, distance, shift))
-    return line[np.subtract.outer(np.arange(n_camera), np.arange(n_source)) + n_source - 1]
+    return read_only(line[np.subtract.outer(np.arange(n_camera), np.arange(n_source)) + n_source - 1])

@@ -456,8 +456,8 @@ class Calibration(Immutable):
     ) -> NDArray[np.float32]:
         """Standard error that photon noise and read noise cause: the Cramer-Rao bound at each phase.
 
-        The phase-shifted iteration reaches it to within 13 % for dimples of up to 2 lambda/D. Errors of the model
-        are not part of it. It takes longer than the phases, since the information of each frame is inverted.
+        At 0.5 rad rms and 1.06 lambda/D the phase-shifted iteration is 6 % above it. Errors of the model are not
+        part of it. It takes longer than the phases, since the information of each frame is inverted.
 
         Parameters
         ----------

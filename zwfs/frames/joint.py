@@ -228,6 +228,7 @@ class Estimate:
     ----------
     name : str
     value : float
+        Less the bias, see `JointFit.bias`.
     sigma : float
         One standard deviation, with the maps and all other parameters free. NaN if it was not computed.
     at_limit : bool
@@ -250,9 +251,13 @@ class JointFit:
     amplitude, phase : ndarray, shape (n, n)
         0 where no light comes through.
     values : ndarray, shape (n_values,)
-        Of all parameters.
+        Of all parameters: with the maps, they minimise the cost.
     covariance : ndarray, shape (n_free, n_free)
         Of the free parameters, with the maps marginalised; NaN if it was not computed.
+    bias : ndarray, shape (n_free,)
+        Mean error of the free parameters that the noise of the maps causes; 0 if it was not computed. In units of
+        the error bars it grows with the root of the number of pixels, and falls with the root of the light.
+        `estimates` subtracts it. `values` keeps it, since these values belong to the noisy maps.
     images : list of ndarray, counts
     misfit : ndarray, shape (n_pictures,)
         Mean square of the difference of image and model over the noise: 1 for a right model with a right noise.
@@ -269,6 +274,7 @@ class JointFit:
     phase: NDArray[np.float64]
     values: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    bias: NDArray[np.float64]
     images: list[NDArray[np.float64]]
     misfit: NDArray[np.float64]
     cost: float
@@ -291,10 +297,11 @@ class JointFit:
         """Free parameters, with their errors."""
         sigma = np.sqrt(np.diagonal(self.covariance)).tolist()
         return [
-            Estimate(name, value, error, not parameter.low < value < parameter.high)
-            for (name, parameter), value, error in zip(
+            Estimate(name, value - bias, error, not parameter.low < value < parameter.high)
+            for (name, parameter), value, bias, error in zip(
                 (self.problem.named[index] for index in self.problem.free),
                 self.values[self.problem.free].tolist(),
+                self.bias.tolist(),
                 sigma,
                 strict=True,
             )
@@ -374,7 +381,8 @@ def fit_jointly(
     tolerance : float
         The fit has converged when a step lowers the cost by less than this fraction.
     errors : bool
-        Compute the covariance of the parameters, which costs as many solutions as there are free parameters.
+        Compute the covariance of the parameters, which costs as many solutions as there are free parameters, and
+        their bias.
 
     Returns
     -------
@@ -384,6 +392,10 @@ def fit_jointly(
     ------
     TypeError, ValueError
         If a value is of the wrong kind or out of range.
+
+    References
+    ----------
+    M. J. Box, Bias in nonlinear estimation, J. R. Stat. Soc. B 33, 171 (1971): the bias of the parameters.
 
     Examples
     --------
@@ -420,7 +432,7 @@ def fit_jointly(
         normal = _Normal(point)
         stuck = unknowns.stuck(point.x, normal.gradient)
         for _ in range(8):
-            change = normal.step(damping, stuck, n_inner)
+            change = normal.solve(-normal.gradient, stuck, n_inner, _ROUGHLY, damping)
             trial = _Point(unknowns, unknowns.within(point.x + change))
             gain = point.cost - trial.cost
             if gain >= 0:
@@ -431,15 +443,17 @@ def fit_jointly(
             break
         converged = gain <= tolerance * point.cost
         point, damping = trial, max(damping / 8, 1e-5)
-    covariance = np.full((len(problem.free),) * 2, np.nan)
+    covariance, bias = np.full((len(problem.free),) * 2, np.nan), np.zeros(len(problem.free))
     if errors and len(problem.free):
-        covariance = _covariance(_Normal(point), 10)
+        normal = _Normal(point)
+        covariance, bias = _covariance(normal, 10), _bias(normal, 60)
     return JointFit(
         problem,
         np.abs(point.field),
         np.where(problem.inside, problem.phase + np.angle(point.field * np.exp(-1j * problem.phase)), 0),
         point.values,
         covariance,
+        bias,
         point.model.images,
         np.array([_mean_square(r, w) for r, w in zip(point.residuals, problem.weights, strict=True)]),
         point.cost,
@@ -595,17 +609,18 @@ class _Normal:
         out[self._white :] += d[self._white :] * self.unknowns.precision**2
         return out
 
-    def step(self, damping: float, stuck: NDArray[np.bool_], n_inner: int) -> NDArray[np.float64]:
-        """Damped step from the point; what is stuck stays."""
+    def solve(
+        self, right: NDArray, stuck: NDArray[np.bool_], n_inner: int, tolerance: float, damping: float = 0.0
+    ) -> NDArray[np.float64]:
+        """Solution of the damped equations with a right side; what is stuck stays."""
 
         def damped(d: NDArray) -> NDArray:
-            return self.product(d) + damping * self.scale(d)
+            return self.product(d) + damping * self.scale(d) if damping else self.product(d)
 
         def precondition(r: NDArray) -> NDArray:
             return np.where(stuck, 0, self.precondition(r)) / (1 + damping)
 
-        right = np.where(stuck, 0, -self.gradient)
-        return _conjugate_gradients(damped, right, precondition, n_inner, _ROUGHLY)
+        return _conjugate_gradients(damped, np.where(stuck, 0, right), precondition, n_inner, tolerance)
 
     def scale(self, d: NDArray) -> NDArray[np.float64]:
         """Damping times a vector: the preconditioner for maps, the diagonal for parameters."""
@@ -683,27 +698,38 @@ def _covariance(normal: _Normal, n_inner: int) -> NDArray[np.float64]:
     of X. With ten conjugate gradients the standard deviations come out a few percent too small.
     """
     unknowns = normal.unknowns
-    n_white = unknowns.n_white
-    maps_only = np.zeros(len(unknowns.start))
-    maps_only[:n_white] = 1
+    n_white, n_all = unknowns.n_white, len(unknowns.start)
+    parameters = np.arange(n_all) >= n_white
     left, solved, products = [], [], []
-    for index in range(n_white, len(maps_only)):
-        right = normal.product(np.eye(1, len(maps_only), index)[0]) * maps_only
-        solution = _conjugate_gradients(
-            lambda d: normal.product(d) * maps_only,
-            right,
-            lambda r: normal.precondition(r) * maps_only,
-            n_inner,
-            _WELL,
-        )
+    for index in range(n_white, n_all):
+        right = normal.product(np.eye(1, n_all, index)[0])
+        solution = normal.solve(right, parameters, n_inner, _WELL)
         left.append(right[:n_white])
         solved.append(solution[:n_white])
-        products.append((normal.product(solution) * maps_only)[:n_white])
+        products.append(normal.product(solution)[:n_white])
     cross = np.array(left) @ np.array(solved).T
     schur = normal.block - cross - cross.T + np.array(solved) @ np.array(products).T
     unit = np.sqrt(np.diagonal(normal.block))
     schur = (schur + schur.T) / 2 / np.outer(unit, unit)
     return linalg.pinvh(schur, rtol=1e-13) / np.outer(unit, unit)
+
+
+def _bias(normal: _Normal, n_inner: int) -> NDArray[np.float64]:
+    """Mean error of the free parameters that is caused by the noise of the maps, of second order in the noise.
+
+    Noise d of the maps changes the images by F d + q. The mean of q is not 0: noise of the maps adds light,
+    most of it at the frequencies that the blur hides, and this light does not interfere with that of the dimple.
+    The fit compensates for it by -H^-1 F^T q. One draw of d suffices, since q is summed over all pixels.
+    """
+    point, unknowns = normal.point, normal.unknowns
+    rng = np.random.default_rng(0)  # the choice changes the result by a small part of an error bar
+    parameters = np.arange(len(point.x)) >= unknowns.n_white
+    noise = [rng.choice([-1.0, 1.0], weight.shape) * (weight > 0) for weight in unknowns.problem.weights]
+    change = normal.solve(normal.back(noise), parameters, n_inner, _WELL)
+    both = [_Point(unknowns, point.x + sign * change).residuals for sign in (1, -1)]
+    added = [(plus + minus) / 2 - here for plus, minus, here in zip(*both, point.residuals, strict=True)]
+    stuck = unknowns.stuck(point.x, normal.gradient)
+    return -normal.solve(normal.back(added), stuck, n_inner, _WELL)[parameters]
 
 
 def _mean_square(residual: NDArray, weight: NDArray) -> float:

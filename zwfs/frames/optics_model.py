@@ -444,10 +444,11 @@ class Forward:
             ]
         )
 
-    def cores(self, diameter: float, relay: NDArray) -> NDArray[np.complex128]:
-        """Operator of the dimple's light through the relay of an arm, between coefficients of the two planes.
+    def cores(self, diameter: float, relays: Sequence[NDArray]) -> list[NDArray[np.complex128]]:
+        """Operators of the dimple's light through the relays of arms, between coefficients of the two planes.
 
-        It comes first, then its derivatives by the parameters of the relay and by the diameter, (7, q, r).
+        In each, (7, q, r), the operator comes first, then its derivatives by the parameters of the relay and by
+        the diameter.
         """
         u, v, weights = _quadrature(Dimple(diameter, 0.0), self._spread, _TOLERANCE)
         n_angles = round(math.sqrt(2 * u.size))
@@ -458,9 +459,9 @@ class Forward:
         v = np.concatenate([v, diameter / 2 * np.sin(angle)])
         polynomials = self._polynomials(u / self.n_pixels, v / self.n_pixels)
         factors = np.concatenate([[disc], -1j * polynomials * disc, [rim]])
-        factors *= np.exp(-1j * np.tensordot(relay, polynomials, 1)) / self.n_pixels**2
         source, target = (plane.spectra(u, v) for plane in self.planes)
-        return (target.conj() * factors[:, np.newaxis, :]) @ source.T
+        through = (np.exp(-1j * np.tensordot(relay, polynomials, 1)) / self.n_pixels**2 for relay in relays)
+        return [(target.conj() * (factors * one)[:, np.newaxis, :]) @ source.T for one in through]
 
     def spectrum(self, field: NDArray) -> NDArray[np.complex128]:
         """Spectrum of a field that begins at the first row and column, (n, n) to (length, length)."""
@@ -488,9 +489,8 @@ class Forward:
         x = places - distance
         sinc = np.sinc(x)
         slope = np.where(np.abs(x) > 1e-6, (sinc - np.cos(np.pi * x)) / np.where(x, x, 1), 0)
-        margin = (
-            self.size - len(self.inside)
-        ) // 2  # of the pupil, whose field begins at the first row and column
+        # The field of the pupil begins at the first row and column.
+        margin = (self.size - len(self.inside)) // 2
         return fft.fft([sinc, slope]) * np.exp(-2j * np.pi * margin * self._frequency)
 
     def blur(self, sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -642,8 +642,9 @@ class Linearised:
         relays = [np.array(arm[:_N_RELAY]) for arm in self._arms]
         self._transfer, self._shifted = zip(*(forward.transfer(relay) for relay in relays), strict=True)
         self._turned_back = [transfer.conj() for transfer in self._transfer]
-        masked = {picture.arm for picture in forward.pictures if picture.mask is not None}
-        self._cores = {arm: forward.cores(self._mask.diameter, relays[arm]) for arm in masked}
+        masked = sorted({picture.arm for picture in forward.pictures if picture.mask is not None})
+        cores = forward.cores(self._mask.diameter, [relays[arm] for arm in masked])
+        self._cores = dict(zip(masked, cores, strict=True))
         self._states = [self._source(field * known) for known in forward._known]
         self._parts = [self._image(index) for index in range(len(forward.pictures))]
         self.images = [part.image for part in self._parts]

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -431,12 +432,15 @@ def _check_diameters(diameters: ArrayLike) -> NDArray[np.floating]:
     return diameters
 
 
+_light = lru_cache(maxsize=64)(DimpleLight)  # one for all wavefronts
+
+
 def _linearised(pupil: Pupil, diameter: float, phase: ArrayLike | None) -> tuple[DimpleLight, NDArray, NDArray]:
     """Light in the dimple, and the field and its beta at the points of the pupil, (n_points,) each."""
     _check.instance("pupil", pupil, Pupil)
     phase = np.zeros(pupil.shape) if phase is None else _check.map_inside("phase", phase, pupil)
     psi = pupil.gather(pupil.field(phase))
-    light = DimpleLight(pupil, diameter)
+    light = _light(pupil, _check.number("diameter", diameter))
     beta = light(psi[np.newaxis])[0]
     if not beta.any():
         raise ValueError(f"diameter = {diameter}: no light passes through the dimple: expected a larger one")

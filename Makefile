@@ -31,7 +31,7 @@ export RERUN := $(value FIGURE) $(value ARGS)
 unexport FIGURE ARGS
 
 .DELETE_ON_ERROR:
-.PHONY: help book pdf lab test fuzz mutants torture figures rerun lint bench release-check pythons lock clean
+.PHONY: help book pdf lab test test-slow fuzz mutants torture figures rerun lint bench release-check pythons lock clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 21
@@ -46,10 +46,13 @@ lab: $(READY) ## open the notebooks in JupyterLab
 	$(BIN)/jupyter lab notebooks
 
 test: $(READY) ## test the package and the tools, and compare each notebook with a fresh run
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --benchmark-disable tests
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --benchmark-disable -m "not slow" tests
 	$(BIN)/python -m pytest --numprocesses auto --doctest-modules zwfs
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --nbval --nbval-current-env \
 		--nbval-cell-timeout 1200 notebooks
+
+test-slow: $(READY) ## the rest of the tests: real builds of the book, kills, clusters, long fits, full books in a browser
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --benchmark-disable -m slow tests
 
 fuzz: $(READY) ## try 1000 new camera files, calibrations and parameters for each property, in about 10 minutes
 	$(BIN)/python -m pytest --numprocesses auto --hypothesis-profile fuzz tests/test_fuzzing.py

@@ -24,6 +24,16 @@ settings.register_profile("fuzz", deadline=None, max_examples=1000, print_blob=T
 settings.load_profile("zwfs")
 
 
+# Fixtures that start kernels, clusters, set-ups or a browser, build a book, calibrate a bench or need real frames.
+SLOW = {"browser", "calibrated", "clone", "cluster", "plain_book", "real", "seal", "template"}
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if SLOW & set(item.fixturenames):
+            item.add_marker(pytest.mark.slow)
+
+
 def heed_signals():
     """Restore in a child the signals that a shell in the background (SIGINT) and nohup (SIGHUP) ignore."""
     for number in (signal.SIGINT, signal.SIGHUP):

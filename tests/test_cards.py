@@ -74,6 +74,7 @@ def test_the_commit_is_that_of_this_folder_alone(tmp_path):
     assert cards.commit(tmp_path / "within") == "not known"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not HTML.is_dir(), reason="the book is not built: make book")
 def test_every_figure_has_a_card_whose_links_work():
     for path in NOTEBOOKS:

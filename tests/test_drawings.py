@@ -75,6 +75,7 @@ def saved(figure):
     return stream.getvalue()
 
 
+@pytest.mark.slow
 def test_saving_is_silent_and_repeatable(draw):
     figure = draw()
     with warnings.catch_warnings():

@@ -248,6 +248,7 @@ def test_model_is_as_accurate_as_its_tolerance(classic, screens):
     assert ranks == sorted(set(ranks))
 
 
+@pytest.mark.slow
 def test_the_reconstructor_on_the_page_stands_next_to_the_five(tmp_path):
     page = (ROOT / "book" / "your_reconstructor.md").read_text("utf-8")
     [code] = re.findall(r"```python\n(.*?)```", page, re.S)

@@ -103,6 +103,7 @@ def test_code_that_cannot_be_read_depends_on_the_whole_package(tmp_path):
     assert len({before, broken, record.key(project, "bandwidth", {})}) == 3
 
 
+@pytest.mark.slow
 def test_a_default_in_the_bench_concerns_only_the_notebooks_of_the_bench(tmp_path):
     for name in ("notebooks", "zwfs", "environment"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -135,6 +136,7 @@ print(json.dumps(sorted(file for file in ran if file.startswith(package))))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["zernike_sensor", "fig06_reference"])
 def test_no_file_that_runs_is_missed(name, tmp_path):
     """With all modules imported before, every function that a notebook calls lies in a file that it depends on."""

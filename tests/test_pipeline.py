@@ -220,6 +220,7 @@ def test_new_files_replace_the_old_ones(ran):
     assert ran.published("first") == []
 
 
+@pytest.mark.slow
 def test_dead_kernel_is_named(project):
     write(project, "dies", "import os\nos._exit(3)")
     with pytest.raises(NotebookError, match=r"notebooks/dies.ipynb failed in cell 3 of 3"):
@@ -247,6 +248,7 @@ def start_sleeping_run(project):
     return process, int(pid.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_interruption_leaves_no_kernel_and_no_pieces(project, number):
     process, kernel = start_sleeping_run(project)
@@ -256,6 +258,7 @@ def test_interruption_leaves_no_kernel_and_no_pieces(project, number):
     wait_until(lambda: not alive(kernel), seconds=20)
 
 
+@pytest.mark.slow
 def test_killed_run_leaves_no_kernel_and_the_next_run_removes_its_pieces(project):
     process, kernel = start_sleeping_run(project)
     process.kill()
@@ -297,6 +300,7 @@ def alive(pid):
     )
 
 
+@pytest.mark.slow
 def test_result_of_a_notebook_that_was_edited_meanwhile_is_not_current(project):
     edit = "p.write_text(p.read_text().replace('# edited', '# later'))"
     write(project, "edited", f"import pathlib\np = pathlib.Path('edited.ipynb')\n{edit}")
@@ -351,12 +355,15 @@ def test_the_book_shows_runs_and_offers_their_files_and_links_must_work(small_bo
     assert "missing.csv" in str(caught.value)
 
 
-# In place of Jupyter Book: it copies the front page, or fails with a warning.
+# In place of Jupyter Book: it copies the front page, or fails with a warning, or with many on a full disk.
 FAKE = f"""#!{sys.executable}
 import pathlib, sys
 index = pathlib.Path("book/index.md").read_text()
 if "nowhere" in index:
     sys.exit("book/index.md:3: WARNING: unknown document")
+if "full disk" in index:
+    lines = (f"WARNING: cannot copy {{name}}: OSError(28, 'No space left on device')" for name in range(40))
+    sys.exit("\\n".join(lines))
 output = pathlib.Path(sys.argv[sys.argv.index("--path-output") + 1], "_build", "html")
 output.mkdir(parents=True)
 (output / "index.html").write_text(index)
@@ -382,6 +389,12 @@ def test_book_is_built_once_and_a_failure_keeps_it(fake_book):
         book.build(fake_book)
     assert (fake_book.build / "html" / "index.html").read_text() == before
     assert sorted(os.listdir(fake_book.build)) == ["html", "kept", "notebooks"]
+    index.write_text("a full disk")
+    with pytest.raises(book.BookError) as caught:
+        book.build(fake_book)
+    assert str(caught.value).splitlines() == [
+        "the book was not built:", "WARNING: cannot copy 39: OSError(28, 'No space left on device')"
+    ]  # fmt: skip
     # The pages are built again even if the change is undone: they may lack a part.
     index.write_text(before)
     assert book.build(fake_book)

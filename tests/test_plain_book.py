@@ -15,8 +15,6 @@ from book._ext import api
 
 from .conftest import ROOT
 
-pytestmark = pytest.mark.slow
-
 
 def read(file):
     return BeautifulSoup(file.read_text("utf-8"), "html.parser")

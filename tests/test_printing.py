@@ -97,6 +97,7 @@ def test_parts_hold_their_pages_and_the_sections_below_them(book):
     assert printing.parts(toc) == [(None, ["book/index"]), ("The sensor", ["book/theory", "notebooks/one"])]
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_chapters_are_bookmarked_and_listed_with_their_page(book):
     pdf = printed(book)
@@ -116,12 +117,14 @@ def test_chapters_are_bookmarked_and_listed_with_their_page(book):
         assert "".join(entry.title.split()) + str(place + 1) in listed
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_same_pages_give_the_same_file(book):
     assert printing.print_book(*book, CHROMIUM) == printing.print_book(*book, CHROMIUM)
     assert not list(book[1].glob(".*"))
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_wide_things_are_made_smaller_and_stay_whole(book):
     cells = "".join(f"<td>column-{n}</td>" for n in range(60))
@@ -129,6 +132,7 @@ def test_wide_things_are_made_smaller_and_stay_whole(book):
     assert "column-59" in "".join(printed(book).pages[-1].extract_text().split())
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_what_cannot_be_made_to_fit_is_refused(book):
     table = '<table class="lost" style="margin-left: 900px"><tr><td>1</td></tr></table>'

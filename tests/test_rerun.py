@@ -387,6 +387,7 @@ def heard(terminal):
     return said.decode()
 
 
+@pytest.mark.slow
 def test_progress_within_a_cell_is_shown(project):
     process, terminal = run_command(project, "2")
     said = heard(terminal)
@@ -403,6 +404,7 @@ def start_sleeping_run(project):
     return process, terminal
 
 
+@pytest.mark.slow
 def test_interruption_leaves_nothing(project):
     process, terminal = start_sleeping_run(project)
     process.send_signal(signal.SIGINT)

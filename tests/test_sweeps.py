@@ -235,6 +235,7 @@ def test_a_cluster_that_loses_workers_gives_the_full_result(cluster, all_of_them
     assert not lost & set(cluster.run(os.getpid).values())
 
 
+@pytest.mark.slow
 def test_a_cluster_of_one_core_works_too():
     with (
         LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0") as single,
@@ -272,6 +273,7 @@ def start_sweep(folder, store):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_is_taken_up_again(tmp_path):
     log, store = tmp_path / "log", tmp_path / "store"
     log.mkdir()
@@ -389,6 +391,7 @@ def test_what_was_looked_at_does_not_change_a_pickle(modes):
     np.testing.assert_array_equal(copy.pupil.points, pupil.points)
 
 
+@pytest.mark.slow
 def test_the_script_on_the_page_runs(tmp_path):
     page = (ROOT / "book" / "sweeps.md").read_text("utf-8")
     (block,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.S) if " LocalCluster(" in block]
@@ -418,6 +421,7 @@ def commands_on_the_page():
     return [part["spec"]["template"]["spec"]["containers"][0]["command"] for part in parts]
 
 
+@pytest.mark.slow
 def test_the_recipe_for_kubernetes_starts_a_cluster(tmp_path, monkeypatch):
     """Its commands, here with the environment of the test in place of the container's, and its port."""
     home = re.search(r"(?m)^WORKDIR (.*)$", (ROOT / "environment" / "Dockerfile").read_text())[1]
@@ -462,6 +466,7 @@ def test_the_recipe_for_slurm_submits_workers():
         assert part in script
 
 
+@pytest.mark.slow
 def test_the_grid_on_the_page_runs(tmp_path):
     page = (ROOT / "book" / "sweeps.md").read_text("utf-8")
     [block] = [block for block in re.findall(r"```python\n(.*?)```", page, re.S) if "grid(" in block]

@@ -750,7 +750,7 @@ def test_page_on_telemetry_does_what_it_says(tmp_path, monkeypatch, capsys):
     first, *rest = blocks("telemetry.md", "python")
     names: dict = {}
     exec(first, names)
-    for line in "".join(blocks("telemetry.md", "sh")).splitlines():
+    for line in "".join(blocks("telemetry.md", "sh")).replace("\\\n", "").splitlines():
         assert line.startswith("python -m zwfs.frames ")
         assert main(shlex.split(line)[3:]) == 0
     for code in rest:

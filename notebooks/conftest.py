@@ -40,7 +40,11 @@ def pytest_collectstart(collector):
 def pytest_runtest_call(item):
     """Compare the rest after nbval has executed a cell and compared its text."""
     cell = getattr(item, "cell", None)
-    if cell is not None and cell.source.strip() and cell.execution_count is None:
+    if (
+        cell is not None
+        and cell.source.strip()
+        and cell.execution_count is None
+    ):
         pytest.fail("the cell was never run: it has no execution count")
     yield
     if cell is not None:
@@ -64,7 +68,9 @@ def compare(old, new):
     if old.data.keys() != new.data.keys():
         return f"{list(old.data)} stored, {list(new.data)} in the fresh run"
     if "image/svg+xml" in old.data:
-        return compare_svg(old.data["image/svg+xml"], new.data["image/svg+xml"])
+        return compare_svg(
+            old.data["image/svg+xml"], new.data["image/svg+xml"]
+        )
     if "image/png" in old.data:
         return compare_png(old.data["image/png"], new.data["image/png"])
     return None
@@ -73,7 +79,10 @@ def compare(old, new):
 def compare_png(old, new):
     """Return how two PNG files in base64 differ; None if they agree."""
     files = (io.BytesIO(base64.b64decode(data)) for data in (old, new))
-    a, b = (np.asarray(Image.open(file).convert("RGBA"), float) for file in files)
+    a, b = (
+        np.asarray(Image.open(file).convert("RGBA"), float)
+        for file in files
+    )
     if a.shape != b.shape:
         return f"a picture of shape {a.shape} stored, {b.shape} in the fresh run"
     rms, pixel = calculate_rms(a, b), abs(a - b).max()

@@ -17,7 +17,10 @@ ROOT = Path(__file__).parent.parent
 HTML = ROOT / "_build" / "html"
 CARD = "_static/social.png"
 
-pytestmark = pytest.mark.skipif(not HTML.is_dir(), reason="the book is not built: make book")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not HTML.is_dir(), reason="the book is not built: make book"),
+]
 
 
 def read(file):

@@ -24,7 +24,7 @@ from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.paper.calibration import WAYS as WAYS_OF_BENCH
 from zwfs.paper.calibration import Example, Shot
 from zwfs.paper.closed_loop import LoopRun
-from zwfs.paper.dark_zone import IDEAL, Drift
+from zwfs.paper.dark_zone import IDEAL, Drift, DriftCurves
 from zwfs.paper.design import PUBLISHED, DesignMap
 from zwfs.paper.dimple_diameter import Contraction, DiameterCurves
 from zwfs.paper.linearity import linearity_curves
@@ -94,6 +94,14 @@ def drawn_methods(curves, pupil, classic, shifted):
     measurement = Measurement(recording, Optics(), frames, pupil, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0))
     found = MeasuredPhase(phase, frames, 0.9 * frames, measurement, True, 0)
     varied = AmplitudeCurves(three, dict.fromkeys(WAYS, np.full((3, 2), 0.1)), {}, three)
+    held = DriftCurves(
+        Drift(np.ones((6, 2, 2)), 10.0, 500.0),
+        {"pair": np.ones(6), IDEAL: np.ones(6)},
+        [1e2, 1e4],
+        {"pair": np.array([20.0, 10.0])},
+        [0.1, 0.5],
+        {1e3: np.array([30.0, 20.0])},
+    )
     banded = BandCurves(three, dict.fromkeys(BAND_WAYS, three), {}, three, 1.0)
     triple = zwfs.ZernikeSensor(pupil, *shifted.masks, zwfs.Dimple(1, 0))
     both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(
@@ -148,17 +156,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "error_bars": (([ErrorBars(k, EXPECTED, k, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
         "design_maps": ((DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5}), PUBLISHED), ()),
         "band_errors": (({(0.1, False): banded, (0.1, True): banded},), [*shifted_only, "MaximumLikelihood"]),
-        "held_drift": (
-            (
-                {"pair": np.ones(6), IDEAL: np.ones(6)},
-                Drift(np.ones((6, 2, 2)), 10.0, 500.0),
-                {"pair": np.array([20.0, 10.0])},
-                [1e2, 1e4],
-                {1e3: np.array([30.0, 20.0])},
-                [0.1, 0.5],
-            ),
-            (),
-        ),
+        "held_drift": ((held,), ()),
         "amplitude_errors": (({"dips": varied},), [*shifted_only, "MaximumLikelihood"]),
         "phase_and_amplitude": ((pupil, 0 * pupil.amplitude, pupil.amplitude, both), ()),
         "reference_intensities": ((frames, frames), ()),
@@ -197,6 +195,7 @@ def test_every_figure_is_tested_for_its_colours(drawn_methods):
     assert set(drawn_methods) == set(figure_functions())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", figure_functions())
 def test_variants_are_dark_or_fit_a_phone_and_the_figure_stays(name, drawn_methods):
     figure = figure_functions()[name](*drawn_methods[name][0])
@@ -209,6 +208,16 @@ def test_variants_are_dark_or_fit_a_phone_and_the_figure_stays(name, drawn_metho
             assert not cut_off(variant)
     assert plt.get_fignums() == numbers
     assert np.array_equal(pixels(figure), before)
+
+
+def test_phases_of_a_dark_figure_are_dark_at_zero():
+    figure, axes = plt.subplots()
+    figure.colorbar(plots.show_phase(axes, np.zeros((2, 2)), 1.0))
+    dark = variants(figure)["dark"]
+    assert pixels(figure)[200, 200, :3].min() > 200
+    assert pixels(dark)[200, 200, :3].max() < 60
+    bar = dark.axes[1].collections[-1]
+    assert bar.get_cmap() == dark.axes[0].images[0].get_cmap()
 
 
 def cut_off(figure):

@@ -341,6 +341,21 @@ def test_a_design_is_chosen_by_mouse_and_by_keyboard(fresh):
     fresh.wait_for_function(f"{design}.includes('{cost:.2f} times')")
 
 
+def test_photons_between_the_designs_of_the_map_are_those_of_the_bound(fresh, modes, pupil):
+    paper, screens = Design("", 1.06, np.pi / 2, -np.pi / 2), screens_at(modes, 1.0, 6, 2024, 1)
+    [cost] = photon_costs(pupil, [paper], {"screens": screens})["screens"]
+    fresh.check("input[value='1 rad rms']")
+    fresh.wait_for_function(f"document.getElementById('live-design').textContent.includes(' {cost:.2f} times')")
+
+
+def test_dark_mode_has_dark_colours_of_phases(fresh):
+    bar = "document.querySelector('.live-bar[data-colors=phase]')"
+    middle = f"[...{bar}.getContext('2d').getImageData(128, 0, 1, 1).data]"
+    assert min(fresh.evaluate(middle)) > 200
+    fresh.evaluate("document.documentElement.dataset.theme = 'dark'")
+    fresh.wait_for_function(f"Math.max(...{middle}.slice(0, 3)) < 60")
+
+
 @pytest.mark.parametrize("width", [1280, 390])
 def test_axe_finds_no_fault(browser, file, width):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()

@@ -19,6 +19,7 @@ from book._tools.run import FRONT_FIGURE
 from zwfs.companion.results import published
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
+WIDTH = 76  # letters of code that fit a page in a window 1280 pixels wide
 
 
 def png(changed=0, level=0, value=255, shape=(800, 1200)):
@@ -120,6 +121,20 @@ def test_cells_that_set_up_or_draw_are_folded_and_one_that_computes_is_not(path)
     assert not all(
         hidden or "parameters" in cell.metadata.get("tags", ()) for cell, hidden in zip(cells, folded, strict=True)
     )
+
+
+def shown_code():
+    """Each block of code that a page of the book shows, by the name of its file."""
+    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
+        yield from ((path.name, cell.source) for cell in nbformat.read(path, 4).cells if cell.cell_type == "code")
+    for path in sorted(NOTEBOOKS.with_name("book").glob("*.md")):
+        blocks = re.findall(r"(?ms)^ *```\w+\n(.*?)^ *```$", path.read_text("utf-8"))
+        yield from ((path.name, block) for block in blocks)
+
+
+def test_no_line_of_code_is_cut_off_on_a_page():
+    lines = [(name, line) for name, code in shown_code() for line in code.splitlines()]
+    assert not [(name, line) for name, line in lines if len(line) > WIDTH]
 
 
 def test_front_figure_is_the_stored_figure_of_its_notebook():

@@ -413,11 +413,16 @@ def hold_drift(
     sigma = cramer_rao(sensor, around, photons=per_point, modes=modes) * (1e3 * wavelength / (2 * np.pi))
     step, constant = drift / math.sqrt(sigma.size), speed / math.sqrt(sigma.size)
     if gain is None:
-        gains = 2 * step / (step + np.hypot(step, 2 * sigma))
+        gains = _best_gains(step, sigma)
     else:
         gains = np.full(sigma.size, _check.number("gain", gain, 0, 2, open_low=True, open_high=True))
     lag = np.sqrt((constant / gains) ** 2 + step**2 / (gains * (2 - gains)))
     return HeldDrift(gains, lag, sigma * np.sqrt(gains / (2 - gains)))
+
+
+def _best_gains(step: float, noise: ArrayLike) -> NDArray[np.float64]:
+    """Gain of the smallest residual: g^2 + q g - q = 0, where q is the step over the noise, both squared."""
+    return 2 * step / (step + np.hypot(step, 2 * np.asarray(noise)))
 
 
 def _checked_screens(disturbance: Any, pupil: Pupil) -> Iterator[NDArray[np.float64]]:

@@ -508,7 +508,7 @@ def count(judged: dict[Claim, Finding]) -> str:
     """Return a line with the number of claims of each verdict."""
     numbers = Counter(finding.verdict for finding in judged.values())
     listed = ", ".join(f"{numbers[verdict]} {_marked(verdict)}" for verdict in SIGNS if numbers[verdict])
-    return f"The {len(judged)} claims of the paper, {{doc}}`one by one <claims>`: {listed}."
+    return f"The {len(judged)} claims of the paper: {listed}."
 
 
 def table(judged: dict[Claim, Finding]) -> str:

@@ -29,6 +29,8 @@ LENGTH = 200  # characters of a description
 MATH = {"lambda": "λ", "theta": "θ", "pi": "π", "pm": "±"}
 TEX = re.compile(r"\\(?:[()]|([a-z]+))")
 POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e([+-])0*(\d+)\b")
+MINUS = re.compile(r"(?<![\w.)-])-(?=\d)")
+PERCENT = re.compile(r"(?:(?<=\d)|^) ?%")  # after a number, which may stand in an element of its own
 DIGITS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 CONSOLE = re.compile(r"\bconsole\.(?:log|info|debug)\(")
 FORWARD = """<!DOCTYPE html>
@@ -55,7 +57,7 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
     file, and scrolls on narrow screens.
     """
     body = BeautifulSoup(context.get("body", ""), "html.parser")
-    write_powers(body)
+    write_numbers(body)
     pictures = {name: Path(app.srcdir, source) for source, name in app.builder.images.items()}
     for image in body.find_all("img"):
         if picture := pictures.get(unquote(image["src"].rpartition("/")[2])):
@@ -76,11 +78,12 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
         context["metatags"] = given + tags(app.config, page, body, given)
 
 
-def write_powers(body: Tag) -> None:
-    """Write numbers such as 1.4e+08 as 1.4·10⁸, but not in code."""
-    for text in body.find_all(string=POWER):
+def write_numbers(body: Tag) -> None:
+    """Write 1.4e+08 as 1.4·10⁸, -1 as −1, and per cent after a space that breaks no line, but not in code."""
+    for text in body.find_all(string=re.compile(r"\d|%")):
         if not text.find_parent(["code", "pre", "samp", "script", "style"]):
-            text.replace_with(POWER.sub(power, text))
+            minus = "-" if text.find_parent(class_=["math", "py"]) else "−"  # names of classes of Sphinx
+            text.replace_with(PERCENT.sub("\u00a0%", MINUS.sub(minus, POWER.sub(power, text))))
 
 
 def power(number: re.Match[str]) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sphinx.application import Sphinx
 
 import zwfs
-from zwfs.plots.style import INTENSITY_MAP, PHASE_MAP
+from zwfs.plots.style import DARK_PHASE_MAP, INTENSITY_MAP, PHASE_MAP
 
 DATA = "_static/live-data.js"
 DESIGNS = Path(__file__).with_name("design.csv")  # the data that the page of notebooks/design.ipynb offers
@@ -36,7 +36,7 @@ def data() -> dict[str, Any]:
     """Return the input of book/_static/live-model.js, ready for JSON."""
     pupil = zwfs.Pupil.circular(N_PIXELS)
     diameters, functions, cores = dimples(pupil)
-    maps = {"phase": PHASE_MAP, "intensity": INTENSITY_MAP, "cost": COST_MAP}
+    maps = {"phase": PHASE_MAP, "darkPhase": DARK_PHASE_MAP, "intensity": INTENSITY_MAP, "cost": COST_MAP}
     return {
         "inside": _encode(pupil.inside.astype(np.uint8)),
         "diameters": diameters.tolist(),

@@ -40,20 +40,22 @@
     element.setAttribute("d", `M${x} ${high}V${low}`);
   }
 
-  // Cell below a value and the share of the next one; undefined outside the map.
-  function between(values, value) {
+  // Places around a value with their weights, for a cubic interpolation; undefined outside the map.
+  function around(values, value) {
     const place = (value - values[0]) / stepOf(values);
-    const cell = Math.min(Math.floor(place + 1e-6), values.length - 2);
-    return place > -1e-6 && place < values.length - 1 + 1e-6 ? [cell, place - cell] : undefined;
+    if (place < -1e-6 || place > values.length - 1 + 1e-6) return undefined;
+    const first = Math.min(Math.max(Math.floor(place) - 1, 0), values.length - 4);
+    const four = [0, 1, 2, 3];
+    const weight = (i) => four.reduce((w, j) => (j === i ? w : (w * (place - first - j)) / (i - j)), 1);
+    return four.map((i) => [first + i, weight(i)]);
   }
 
-  // Photons of a design with shifts of equal size: linear interpolation of the logarithm.
+  // Photons of a design with shifts of equal size, from the logarithms of the map.
   function photons(diameter, [a, b]) {
-    const [x, y] = [between(diameters, diameter), between(shifts, Math.abs(a))];
-    if (!x || !y || Math.abs(a + b) > 1e-6) return undefined;
-    const log = (i, j) => Math.log(cost()[x[0] + i][y[0] + j]);
-    const along = (i) => (1 - y[1]) * log(i, 0) + y[1] * log(i, 1);
-    return Math.exp((1 - x[1]) * along(0) + x[1] * along(1));
+    const [xs, ys] = [around(diameters, diameter), around(shifts, Math.abs(a))];
+    if (!xs || !ys || Math.abs(a + b) > 1e-6) return undefined;
+    const terms = xs.flatMap(([x, u]) => ys.map(([y, v]) => u * v * Math.log(cost()[x][y])));
+    return Math.exp(terms.reduce((sum, term) => sum + term));
   }
 
   function words(diameter, pair) {

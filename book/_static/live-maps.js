@@ -10,7 +10,8 @@
   const SMALLEST = 1e-6; // errors below it are rounding and differ from machine to machine
 
   const find = (name) => document.getElementById(`live-${name}`);
-  const palettes = Object.fromEntries(Object.entries(colors).map(([name, map]) => [name, new Uint32Array(map.buffer)]));
+  const dark = () => document.documentElement.dataset.theme === "dark";
+  const colorsOf = (name) => colors[name === "phase" && dark() ? "darkPhase" : name];
   const all = Int32Array.from(places, (_, k) => k);
   const upright = (place, width) => (width - 1 - Math.floor(place / width)) * width + (place % width);
   const pixels = places.map((place) => upright(place, size));
@@ -34,25 +35,26 @@
 
   // Paint values on a canvas, transparent elsewhere; level turns a value into a share of the palette.
   const images = {};
-  function paint(name, values, palette, level, points = inside, where = pixels) {
+  function paint(name, values, map, level, points = inside, where = pixels) {
     const canvas = find(name);
     canvas.parentElement.classList.toggle("live-empty", !values);
     const context = canvas.getContext("2d");
     const image = (images[name] ??= context.createImageData(canvas.width, canvas.height));
     const words = new Uint32Array(image.data.buffer);
     words.fill(0);
+    const palette = new Uint32Array(colorsOf(map).buffer);
     const color = (value) => palette[Math.min(255, Math.max(0, level(value) * 256)) | 0];
     if (values) for (const k of points) words[where[k]] = color(values[k]);
     context.putImageData(image, 0, 0);
   }
 
-  const phase = (name, map) => paint(name, map, palettes.phase, (value) => (value / PHASE + 1) / 2);
-  const difference = (name, map) => paint(name, map, palettes.phase, (value) => (value / ERROR + 1) / 2);
-  const image = (name, map) => paint(name, map, palettes.intensity, (value) => value / BRIGHT, all);
+  const phase = (name, map) => paint(name, map, "phase", (value) => (value / PHASE + 1) / 2);
+  const difference = (name, map) => paint(name, map, "phase", (value) => (value / ERROR + 1) / 2);
+  const image = (name, map) => paint(name, map, "intensity", (value) => value / BRIGHT, all);
 
   function focal(name, light, diameter) {
     const level = (value) => 1 + Math.log10(value) / DECADES;
-    paint(name, light, palettes.intensity, level, focalPoints, focalPixels);
+    paint(name, light, "intensity", level, focalPoints, focalPixels);
     for (const circle of document.querySelectorAll(".live-dimple circle")) circle.setAttribute("r", diameter / 2);
   }
 
@@ -70,7 +72,7 @@
   function bars() {
     for (const bar of document.querySelectorAll("canvas.live-bar")) {
       const ramp = bar.getContext("2d").createImageData(256, 1);
-      ramp.data.set(colors[bar.dataset.colors]);
+      ramp.data.set(colorsOf(bar.dataset.colors));
       bar.getContext("2d").putImageData(ramp, 0, 0);
     }
   }

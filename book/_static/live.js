@@ -132,7 +132,7 @@
     find("focal").setAttribute("aria-label", `Focal plane, dimple of ${set.diameter.toFixed(2)} lambda over D`);
     ["a", "b"].forEach((letter, m) => {
       const brightest = made.frames[m].reduce((a, b) => Math.max(a, b));
-      find(`image-${letter}`).setAttribute("aria-label", `Image ${letter}, brightest ${brightest.toFixed(2)}`);
+      find(`image-${letter}`).setAttribute("aria-label", `Image ${m + 1}, brightest ${brightest.toFixed(2)}`);
     });
     columns(made, set).forEach(({ name, made: one }, place) => {
       const error = one ? `error ${draw.error(one.errors.at(-1))} radian rms` : "no solution";
@@ -202,6 +202,11 @@
     });
   }
   addEventListener("hashchange", (event) => fromAddress(event.newURL));
+
+  new MutationObserver(() => {
+    draw.bars();
+    ask();
+  }).observe(document.documentElement, { attributeFilter: ["data-theme"] });
 
   live.page = { set, settings, listen: (listener) => listeners.push(listener) };
   draw.bars();

@@ -8,7 +8,7 @@
   const waves = JSON.parse(box.dataset.waves); // of both masks: real and imaginary part
   const SCALE = 50; // SVG units of an amplitude of 1
   const [WIDE, HIGH, TOP] = [500, 190, 3.2]; // of the curves; TOP is the largest intensity
-  const LETTERS = ["a", "b"];
+  const IMAGES = ["1", "2"];
   const NEAR = 0.02; // rad; closer solutions are one
 
   const wrap = (angle) => angle - 2 * Math.PI * Math.round(angle / (2 * Math.PI));
@@ -30,15 +30,15 @@
   const dot = ([x, y], kind) => `<circle class="${kind}" cx="${x}" cy="${y}" r="6"/>`;
   const dotAt = (point, kind) => dot(at(point).split(" "), kind);
 
-  function plane(wave, phase, letter) {
+  function plane(wave, phase, number) {
     const other = mirrored(wave, phase);
     const radius = SCALE * Math.sqrt(intensity(wave, phase));
     const [x, y] = at(wave).split(" ");
     return `<g class="phasor-faint"><circle class="phasor-dots" cx="${x}" cy="${y}" r="${SCALE}"/>
       ${arrow([0, 0], wave, "")}</g>
-      <g class="phasor-${letter}"><circle cx="0" cy="0" r="${round(radius)}"/>
+      <g class="phasor-${number}"><circle cx="0" cy="0" r="${round(radius)}"/>
       ${arrow(wave, tip(wave, other), "phasor-dashes")}${dotAt(tip(wave, other), "phasor-open")}
-      <text x="-112" y="-104">image ${letter}: ${round(intensity(wave, phase))}</text></g>
+      <text x="-112" y="-104">image ${number}: ${round(intensity(wave, phase))}</text></g>
       ${arrow(wave, tip(wave, phase), "")}${dotAt(tip(wave, phase), "phasor-full")}`;
   }
 
@@ -48,7 +48,7 @@
       const level = intensity(wave, phase);
       const line = steps.map((angle) => place(angle, intensity(wave, angle)).join(" ")).join("L");
       const [, height] = place(0, level);
-      return `<g class="phasor-${LETTERS[k]}"><path class="${k ? "phasor-dashes" : ""}" d="M${line}"/>
+      return `<g class="phasor-${IMAGES[k]}"><path class="${k ? "phasor-dashes" : ""}" d="M${line}"/>
         <path class="phasor-faint phasor-dots" d="M0 ${height}H${WIDE}"/>
         ${dot(place(mirrored(wave, phase), level), "phasor-open")}</g>${dot(place(phase, level), "phasor-full")}`;
     });
@@ -65,14 +65,14 @@
     const one = (k) => {
       const other = mirrored(waves[k], phase);
       const single = Math.abs(wrap(other - phase)) < NEAR;
-      return `Image ${LETTERS[k]} allows ${single ? `${signed(phase)} rad only` : `${signed(phase)} and ${signed(other)} rad`}.`;
+      return `Image ${IMAGES[k]} allows ${single ? `${signed(phase)} rad only` : `${signed(phase)} and ${signed(other)} rad`}.`;
     };
     return `${one(0)} ${one(1)} Only ${signed(phase)} rad explains both.`;
   }
 
   box.innerHTML = `<label for="phasor-phase"><span>Phase of the pixel</span><output for="phasor-phase"></output></label>
     <input type="range" id="phasor-phase" min="-3.14" max="3.14" step="0.01" value="${box.dataset.phase}" autocomplete="off">
-    <div class="phasor-planes">${LETTERS.map((letter) => `<svg id="phasor-${letter}" viewBox="-115 -120 215 215" role="img"></svg>`).join("")}</div>
+    <div class="phasor-planes">${IMAGES.map((number) => `<svg id="phasor-${number}" viewBox="-115 -120 215 215" role="img"></svg>`).join("")}</div>
     <svg id="phasor-curves" viewBox="-2 -10 504 245" role="img"></svg>
     <p class="phasor-says" role="status"></p>`;
   const slider = box.querySelector("input");
@@ -80,10 +80,10 @@
   function update() {
     const phase = Number(slider.value);
     const says = sentences(phase);
-    LETTERS.forEach((letter, k) => {
-      const svg = box.querySelector(`#phasor-${letter}`);
-      svg.innerHTML = plane(waves[k], phase, letter);
-      svg.setAttribute("aria-label", `Waves of image ${letter}, intensity ${round(intensity(waves[k], phase))}`);
+    IMAGES.forEach((number, k) => {
+      const svg = box.querySelector(`#phasor-${number}`);
+      svg.innerHTML = plane(waves[k], phase, number);
+      svg.setAttribute("aria-label", `Waves of image ${number}, intensity ${round(intensity(waves[k], phase))}`);
     });
     const svg = box.querySelector("#phasor-curves");
     svg.innerHTML = curves(phase);

@@ -64,8 +64,9 @@ def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike], *, dpi:
         from zwfs.plots.variants import variants
 
         for name_of, variant in variants(figure).items():
-            contents[f"{name_of}.png"] = _pictures(variant, dpi)["png"]
-    contents |= _pictures(figure, dpi)
+            contents[f"{name_of}.png"] = _picture(variant, dpi, "png")
+    for kind in _METADATA if folder else ("png",):  # the first one fixes the layout
+        contents[kind] = _picture(figure, dpi, kind)
     if folder:
         for kind, content in contents.items():
             write_file(Path(folder) / f"{name}.{kind}", content)
@@ -102,21 +103,18 @@ def published(source: str) -> list[str]:
     return [ast.literal_eval(call.args[1]) for call in named]
 
 
-def _pictures(figure: Figure, dpi: float) -> dict[str, bytes]:
-    """Draw a figure in every format, with one layout."""
+def _picture(figure: Figure, dpi: float, kind: str) -> bytes:
+    """Draw a figure in a format, with the layout of the first one."""
     from matplotlib import rc_context
 
-    pictures = {}
+    stream = io.BytesIO()
     # After a save matplotlib asks these settings for a layout, even if the figure was made without one.
     with rc_context({"figure.constrained_layout.use": False, "figure.autolayout": False}):
-        for kind, metadata in _METADATA.items():
-            stream = io.BytesIO()
-            figure.savefig(stream, format=kind, dpi=dpi, metadata=metadata)
-            pictures[kind] = stream.getvalue()
-            if figure.get_layout_engine() is not None:
-                # Constrained layout goes on moving the axes each time it runs.
-                figure.set_layout_engine("none")
-    return pictures
+        figure.savefig(stream, format=kind, dpi=dpi, metadata=_METADATA[kind])
+        if figure.get_layout_engine() is not None:
+            # Constrained layout goes on moving the axes each time it runs.
+            figure.set_layout_engine("none")
+    return stream.getvalue()
 
 
 def _csv(columns: Mapping[str, ArrayLike]) -> bytes:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
 
 from zwfs import _check
 from zwfs.detector import Detector
-from zwfs.loop import Mirror, close_loop, hold_drift
+from zwfs.loop import Mirror, _best_gains, close_loop, hold_drift
 from zwfs.reconstructors import MaximumLikelihood
 from zwfs.sensor import ZernikeSensor
 
@@ -47,6 +48,56 @@ class Drift:
     def scale(self) -> float:
         """Wavefront per phase, pm / radian."""
         return 1e3 * self.wavelength / (2 * np.pi)
+
+
+@dataclass(frozen=True)
+class DriftCurves:
+    """Residuals of simulated loops, and the errors that limit them.
+
+    Attributes
+    ----------
+    drift : Drift
+    errors : dict of str to ndarray, shape (n_modes,), pm rms
+        Of each mode for one photon, by the name of the sensor, and of an ideal one: see `errors_of_one_photon`.
+    photons : sequence of float
+        In a cycle.
+    held : dict of str to ndarray, pm rms
+        Residuals with the best gain for each number of photons, by the name of the sensor.
+    gains : sequence of float
+    by_gain : dict of float to ndarray, pm rms
+        Residuals of the last sensor for each gain, by the photons of a cycle.
+    """
+
+    drift: Drift
+    errors: dict[str, NDArray[np.float64]]
+    photons: Sequence[float]
+    held: dict[str, NDArray[np.float64]]
+    gains: Sequence[float]
+    by_gain: dict[float, NDArray[np.float64]]
+
+
+def drift_curves(
+    sensors: Mapping[str, ZernikeSensor],
+    drift: Drift,
+    photons: Sequence[float],
+    photons_gain: Sequence[float],
+    gains: Sequence[float],
+) -> DriftCurves:
+    """Simulate loops with the best gain for several numbers of photons, and with several gains for others.
+
+    Parameters
+    ----------
+    sensors : mapping of str to ZernikeSensor
+        The gains are those of the last one.
+    drift : Drift
+    photons, photons_gain : sequence of float
+        In a cycle.
+    gains : sequence of float
+    """
+    errors, (*_, last) = errors_of_one_photon(sensors, drift), sensors.values()
+    held = {name: hold(sensor, drift, photons, errors[name]) for name, sensor in sensors.items()}
+    by_gain = {light: simulate(last, drift, light, gains) for light in photons_gain}
+    return DriftCurves(drift, errors, photons, held, gains, by_gain)
 
 
 def errors_of_one_photon(sensors: Mapping[str, ZernikeSensor], drift: Drift) -> dict[str, NDArray[np.float64]]:
@@ -94,11 +145,8 @@ def integrator_residual(errors: ArrayLike, drift: Drift, photons: float, gains: 
 def photons_to_hold(errors: ArrayLike, drift: Drift, residual: float) -> float:
     """Photons per cycle for which `kalman_limit` is a residual (pm rms) above the rms of the drift."""
     residual = _check.number("residual", residual, drift.rms, open_low=True)
-    low, high = 1e-3, 1e30
-    for _ in range(200):
-        middle = np.sqrt(low * high)
-        low, high = (low, middle) if kalman_limit(errors, drift, middle) < residual else (middle, high)
-    return float(high)
+    root = brentq(lambda decades: kalman_limit(errors, drift, 10**decades) - residual, -3, 30)
+    return float(10**root)
 
 
 def simulate(sensor: ZernikeSensor, drift: Drift, photons: float, gains: Iterable[float]) -> NDArray[np.float64]:
@@ -125,6 +173,5 @@ def hold(sensor: ZernikeSensor, drift: Drift, photons: Iterable[float], errors: 
 
 
 def best_gain(errors: ArrayLike, drift: Drift, photons: float) -> float:
-    """Gain of the smallest `integrator_residual`: g^2 + r g - r = 0, where r is drift over noise, both squared."""
-    noise = float(np.sqrt(np.sum(np.square(errors)) / photons))
-    return 2 * drift.rms / (drift.rms + float(np.hypot(drift.rms, 2 * noise)))
+    """Gain of the smallest `integrator_residual`."""
+    return float(_best_gains(drift.rms, np.sqrt(np.sum(np.square(errors)) / photons)))

@@ -14,7 +14,7 @@ from zwfs.bench.model import Bench
 from zwfs.paper.bench_linearity import BenchCurves
 from zwfs.plots.style import LOOKS, _looks, show_intensity, show_phase
 
-_ARMS = ("+θ", "−θ")
+_ARMS = ("1 (+θ)", "2 (−θ)")
 
 
 def reference_intensities(frames: NDArray, clear_frames: NDArray) -> Figure:

@@ -15,7 +15,7 @@ from zwfs.paper.calibration import WAYS, Example
 from zwfs.plots.style import LOOKS, show_intensity, show_phase
 
 _LINES = {"design": ":", "design, less flat": "--", "calibrated": "-", "shuffled": "-."}
-_ARMS = ("+θ", "−θ")
+_ARMS = ("1 (+θ)", "2 (−θ)")
 
 
 def _style(name: str) -> dict[str, Any]:
@@ -54,21 +54,27 @@ def calibration_errors(curves: BenchCurves, example: Example, numbers: NDArray) 
 
 
 def calibration_frames(example: Example) -> Figure:
-    """Measured frames of one screen, and their differences from the frames of each model in units of the noise."""
-    names = {"design": "model of\nthe design", "calibrated": "calibrated\nmodel", "shuffled": "control"}
-    figure, panels = plt.subplots(2, 1 + len(names), figsize=(7, 4.6))
+    """Measured frames of one screen, and their differences from the frames of each model in units of the noise.
+
+    The calibrated model has a finer scale.
+    """
+    titles = {"design": "model of\nthe design", "shuffled": "control", "calibrated": "calibrated\nmodel"}
+    figure, panels = plt.subplots(2, 1 + len(titles), figsize=(7, 4.6))
     counts, sigma = example.measured
-    top = np.quantile(counts, 0.999)
-    limit = float(np.quantile(np.abs(example.modelled["design"] - counts) / sigma, 0.99))
-    for row, arm, image, noise, index in zip(panels, _ARMS, counts, sigma, (0, 1), strict=True):
-        light = show_intensity(row[0], image / top, 1.0)
-        row[0].set_ylabel(f"image {arm}")
-        for axes, name in zip(row[1:], names, strict=True):
-            difference = show_phase(axes, (image - example.modelled[name][index]) / noise, limit)
-    for axes, title in zip(panels[0], ("measured", *names.values()), strict=True):
-        axes.set_title(title, fontsize=10)
+    misfits = {name: (counts - example.modelled[name]) / sigma for name in titles}
+    limits = {name: float(np.quantile(np.abs(misfits[name]), 0.99)) for name in ("design", "calibrated")}
+    for axes, image, arm in zip(panels[:, 0], counts / np.quantile(counts, 0.999), _ARMS, strict=True):
+        light = show_intensity(axes, image, 1.0)
+        axes.set_ylabel(f"image {arm}")
+    shown = {}
+    for column, (name, title) in zip(panels[:, 1:].T, titles.items(), strict=True):
+        for axes, image in zip(column, misfits[name], strict=True):
+            shown[name] = show_phase(axes, image, limits.get(name, limits["design"]))
+        column[0].set_title(title, fontsize=10)
+    panels[0, 0].set_title("measured", fontsize=10)
     bars: dict[str, Any] = {"location": "bottom", "shrink": 0.85}
     figure.colorbar(light, ax=panels[:, 0], label="intensity", aspect=12, **bars)
-    label = "measured less modelled, over the noise"
-    figure.colorbar(difference, ax=panels[:, 1:], label=label, extend="both", aspect=30, **bars)
+    misfit: dict[str, Any] = {"label": "misfit / noise", "extend": "both"} | bars
+    figure.colorbar(shown["design"], ax=panels[:, 1:3], aspect=25, **misfit)
+    figure.colorbar(shown["calibrated"], ax=panels[:, 3], aspect=12, **misfit)
     return figure

@@ -158,9 +158,8 @@ def _vector_row(scene: _Scene, y: float, sensor: ZernikeSensor, phase: NDArray, 
         _symbol(scene, 6.65, y + sign * 1.08, linear, look.color)
         center = y + sign * apart
         shown = scene.picture(images, center, 1.02, frames[index], INTENSITY_MAP, 0, frames.max(), edge=look.color)
-        output = f"$I_{{out}}^{{{'ab'[index]}}}$"
-        scene.label(images - 0.38, center + sign * 0.64, output, va="center", color=look.color, size=10)
-    scene.scale(shown, (images - 0.12, y - 1.25, 0.6, 0.06), ticks=2)
+        scene.label(images - 0.24, center + sign * 0.64, f"image {index + 1}", va="center", color=look.color)
+    scene.scale(shown, (images + 0.15, y - 1.25, 0.35, 0.06), ticks=2)
 
     scene.plate(focus, y, 0.07, 0.34, _RETARDER)
     scene.label(focus - 0.13, y - 0.09, "mask", ha="right", va="top")
@@ -276,9 +275,9 @@ def _bench_pictures(scene: _Scene, bench: Bench, phase: NDArray, frames: NDArray
     _mask_picture(scene, left, lower, size, mask, halo, 4, _PLUS)
     scene.label(left, lower + 0.73, f"focus, dimple of {_shift(mask, plus=True)}")
 
-    for frame, x, look, letter in zip(frames, (1.2, 3.05), (_PLUS, _MINUS), "ab", strict=True):
+    for frame, x, look, number in zip(frames, (1.2, 3.05), (_PLUS, _MINUS), (1, 2), strict=True):
         scene.picture(x, 3.27, 1.72, frame, INTENSITY_MAP, 0, frames.max(), edge=look.color)
-        scene.label(x, 4.2, f"$I_{{out}}^{{{letter}}}$", color=look.color, size=10)
+        scene.label(x, 4.2, f"image {number}", color=look.color, size=10)
     for y, look, text in ((5.12, _PLUS, r"sees phase $+\theta$"), (4.82, _MINUS, r"sees phase $-\theta$")):
         scene.key(0.35, y, look, text)
 

@@ -47,8 +47,10 @@ def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], r
             ratio.plot(limit, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
     plain.plot(rms, threshold * rms, color="#555555", lw=1)
     ratio.axhline(threshold, color="#555555", lw=1)
-    gray = {"color": "#555555", "fontsize": 9, "ha": "center", "va": "bottom"}
-    ratio.text(0.6 * rms_max, threshold * 1.1, f"{threshold:.0%} of the input", **gray)
+    end = ratio.get_yaxis_transform()  # the right end of the line, which no curve crosses
+    ratio.text(
+        1.02, threshold, f"{threshold:.0%}\nof the\ninput", transform=end, color="#555555", fontsize=9, va="center"
+    )
     plain.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
     ratio.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)

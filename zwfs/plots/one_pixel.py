@@ -19,10 +19,10 @@ from zwfs.plots.style import LOOKS, show_intensity, show_phase
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
-IMAGES = ("a", "#B2182B", "-"), ("b", "#313695", "--")
-"""Letter, colour and line of the images of both masks, as in Figure 2."""
+IMAGES = ("1", "#B2182B", "-"), ("2", "#313695", "--")
+"""Name, colour and line of the images of both masks, as in Figure 2."""
 
-_WIDTH = 6.8  # inches: letters of 10 points are then as large as the prose
+_WIDTH = 6.8  # inches: names of 10 points are then as large as the prose
 _REACH = 3.0  # of the picture of the focal plane, lambda/D
 _GREY = "#777777"
 
@@ -59,18 +59,18 @@ def sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Figure:
 def pixel_phasors(pixel: Pixel) -> Figure:
     """Waves of one pixel as arrows in the complex plane, for both masks, and both intensities by its phase."""
     figure, panels = plt.subplot_mosaic(
-        [["a", "b"], ["curves", "curves"]], figsize=(_WIDTH, 6.4), height_ratios=(5, 4)
+        [["1", "2"], ["curves", "curves"]], figsize=(_WIDTH, 6.4), height_ratios=(5, 4)
     )
     curves = panels["curves"]
     angles = np.linspace(-np.pi, np.pi, 361)
-    for k, (letter, color, line) in enumerate(IMAGES):
-        _phasors(panels[letter], pixel, k)
+    for k, (name, color, line) in enumerate(IMAGES):
+        _phasors(panels[name], pixel, k)
         level = pixel.intensities(pixel.phase)[k]
         curves.plot(angles, pixel.intensities(angles)[k], color=color, ls=line, lw=2)
         curves.axhline(level, color=color, ls=line, lw=0.8)
         curves.plot(pixel.mirrored[k], level, "o", color=color, mfc="white", mew=2, ms=9, zorder=4)
         top = int(np.argmax(pixel.intensities(angles)[k]))
-        curves.text(angles[top], 3.05, f"image {letter}", ha="center", color=color)
+        curves.text(angles[top], 3.05, f"image {name}", ha="center", color=color)
     curves.plot([pixel.phase] * 2, pixel.intensities(pixel.phase), "o", color="black", ms=9, zorder=5)
     curves.axvline(pixel.phase, color=_GREY, lw=0.8, ls=":")
     curves.set(xlabel="phase of the pixel (rad)", ylabel="intensity", xlim=(-np.pi, np.pi), ylim=(0, 3.4))
@@ -79,7 +79,7 @@ def pixel_phasors(pixel: Pixel) -> Figure:
 
 def _phasors(axes: Axes, pixel: Pixel, k: int) -> None:
     """Reference wave and wave of the pixel, tip to tail, for both phases with the same intensity."""
-    letter, color, _ = IMAGES[k]
+    name, color, _ = IMAGES[k]
     wave, intensity = pixel.waves[k], pixel.intensities(pixel.phase)[k]
     axes.add_patch(Circle((wave.real, wave.imag), 1, fill=False, ec=_GREY, ls=":", lw=1.5))
     axes.add_patch(Circle((0, 0), np.sqrt(intensity), fill=False, ec=color, lw=1.5))
@@ -99,7 +99,7 @@ def _phasors(axes: Axes, pixel: Pixel, k: int) -> None:
         height = "top" if turn.imag < -0.5 else "bottom" if turn.imag > 0.5 else "center"
         text = f"{phase:+.2f} rad".replace("-", "−")
         axes.text(label.real, label.imag, text, color=shade, ha=side, va=height)
-    axes.set(title=f"image {letter}: intensity {intensity:.2f}", xlim=(-2.3, 1.7), ylim=(-2, 1.6), aspect="equal")
+    axes.set(title=f"image {name}: intensity {intensity:.2f}", xlim=(-2.3, 1.7), ylim=(-2, 1.6), aspect="equal")
     axes.set_axis_off()
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from zwfs.reconstructors import RECONSTRUCTORS
 
 PHASE_MAP, INTENSITY_MAP = "RdBu_r", "viridis"
+DARK_PHASE_MAP = "berlin"  # of phases on a dark ground: 0 is dark, the signs keep their hues
 
 
 @dataclass(frozen=True)

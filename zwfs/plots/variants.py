@@ -14,6 +14,8 @@ from matplotlib.colors import to_rgba, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from zwfs.plots.style import DARK_PHASE_MAP, PHASE_MAP
+
 _WIDTH, _HEIGHT = 3.7, 2.7  # of a narrow figure and of each panel in it, inch
 _LETTERS = 11  # points, at most: some figures have larger ones, as pages show them smaller than they are
 _LONE = 0.7  # width of a picture alone in its row, over that of the figure
@@ -135,9 +137,14 @@ def _label(axes: Axes, panels: list[Axes]) -> None:
 
 
 def _darkened(figure: Figure) -> Figure:
-    """Draw a figure in light colours on a dark ground, in place; maps and the marks on them stay."""
+    """Draw a figure in light colours on a dark ground, in place; maps and their marks stay, but phases darken."""
+    phases = [image for axes in figure.axes for image in axes.images if image.get_cmap().name == PHASE_MAP]
+    for image in phases:
+        image.set_cmap(DARK_PHASE_MAP)
+        if image.colorbar:  # a copy does not follow its map
+            image.colorbar.update_normal(image)
     kept: set[Artist] = {figure, *figure.axes}  # their patches are found as well
-    for axes in figure.axes:
+    for axes in {*figure.axes} - {image.axes for image in phases}:
         if axes.images or axes.get_label() == "<colorbar>":
             drawn = (*axes.images, *axes.lines, *axes.collections, *axes.patches, *axes.texts)
             kept.update(part for artist in drawn for part in artist.findobj())

@@ -72,6 +72,8 @@ def claims(curves: Mapping[float, RecoveryCurves], threshold: float, settings: M
         "largest": next(iter(curves.values())).rms[-1],
         "n_screens": next(iter(curves.values())).n_starts.shape[1],
         "n_all": sum(total),
+        "n_right": total.consistent_right + total.inconsistent_right,
+        "n_wrong": total.consistent_wrong + total.inconsistent_wrong,
         "false_alarms": total.inconsistent_right,
         "false_trust": total.consistent_wrong,
         "once": np.mean(used == 1),

@@ -2,50 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
 from zwfs.companion.results import glue_numbers
 from zwfs.companion.tables import Table
-from zwfs.paper.dark_zone import IDEAL, Drift, best_gain, kalman_limit, photons_to_hold
+from zwfs.paper.dark_zone import IDEAL, DriftCurves, best_gain, kalman_limit, photons_to_hold
 
 _TARGETS = 1.2, 1.5, 2.0, 3.0
 """Residuals in the table, over the step of the drift."""
 
 
-def columns(
-    errors: Mapping[str, NDArray], drift: Drift, held: Mapping[str, NDArray], photons: Sequence[float]
-) -> dict[str, NDArray]:
+def columns(curves: DriftCurves) -> dict[str, NDArray]:
     """Columns of the simulated residuals and their limits."""
-    found = {"photons per cycle": np.array(photons)}
-    for name, one in errors.items():
-        found[f"{name}: limit (pm rms)"] = kalman_limit(one, drift, photons)
-        if name in held:
-            found[f"{name}: simulated (pm rms)"] = held[name]
+    found = {"photons per cycle": np.array(curves.photons)}
+    for name, errors in curves.errors.items():
+        found[f"{name}: limit (pm rms)"] = kalman_limit(errors, curves.drift, curves.photons)
+        if name in curves.held:
+            found[f"{name}: simulated (pm rms)"] = curves.held[name]
     return found
 
 
-def needed(errors: Mapping[str, NDArray], drift: Drift) -> Table:
+def needed(curves: DriftCurves) -> Table:
     """Photons per cycle that hold the drift at several residuals."""
+    drift = curves.drift
     header = ["sensor", *(f"{factor * drift.rms:g} pm" for factor in _TARGETS)]
     rows = [
-        [name, *(f"{photons_to_hold(one, drift, factor * drift.rms):.2g}" for factor in _TARGETS)]
-        for name, one in errors.items()
+        [name, *(f"{photons_to_hold(errors, drift, factor * drift.rms):.2g}" for factor in _TARGETS)]
+        for name, errors in curves.errors.items()
     ]
     return Table(header, rows)
 
 
-def numbers(
-    errors: Mapping[str, NDArray],
-    drift: Drift,
-    held: Mapping[str, NDArray],
-    photons: Sequence[float],
-    by_gain: Mapping[float, NDArray],
-    gains: Sequence[float],
-) -> None:
+def numbers(curves: DriftCurves) -> None:
     """Glue photons, residuals and gains; sensors are numbered in their order."""
+    drift, errors, held = curves.drift, curves.errors, curves.held
+    photons, gains, by_gain = curves.photons, curves.gains, curves.by_gain
     target = 1.5 * drift.rms
     found = {"drift": drift.rms, "target": target, "n_modes": float(len(drift.modes))}
     names = [name for name in errors if name != IDEAL]

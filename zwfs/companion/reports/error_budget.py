@@ -34,7 +34,7 @@ def errors(budget: Curves) -> Table:
         [_words(error), f"{offset:.1g}" if (offset := curves.mean(NAME)[0]) > 1e-6 else "0", *_row(curves)]
         for error, curves in budget.items()
     ]
-    return Table(["error alone", "offset (rad rms)", *_header(budget)], rows)
+    return Table(["error switched on", "offset (rad rms)", *_header(budget)], rows)
 
 
 def leakage(swept: Mapping[float, BenchCurves]) -> Table:
@@ -54,7 +54,7 @@ def claims(budget: Curves, swept: Mapping[float, BenchCurves]) -> Table:
         [
             ["error with the largest offset", _words(max(alone, key=lambda error: offsets[error]))],
             [
-                "error with the lowest gain",
+                "error with the lowest gain at the smaller input",
                 _words(min(alone, key=lambda error: gains[error])),
             ],
             ["gain without any error", f"{gains['none']:.3f}"],

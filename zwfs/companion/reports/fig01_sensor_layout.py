@@ -35,10 +35,13 @@ def identity(
         ["quantity", "value"],
         [
             ["the two sides differ by less than 1e-13", bool(np.abs(measured - two_waves).max() < 1e-13)],
-            ["light inside the pupil again", float(measured[pupil.inside].sum() / pupil.n_points)],
-            ["mean intensity of the reference wave inside", float(reference[pupil.inside].mean())],
+            [
+                "share of the light inside the image of the pupil",
+                float(measured[pupil.inside].sum() / pupil.n_points),
+            ],
+            ["mean intensity of the reference wave inside the pupil", float(reference[pupil.inside].mean())],
             ["Strehl ratio of the screen", float(strehl(pupil, phase))],
-            ["numbers that make the reference wave", sensor.rank],
+            ["coefficients of the reference wave", sensor.rank],
             ["points of the pupil", pupil.n_points],
         ],
     )

@@ -17,8 +17,8 @@ def columns(pupil: Pupil, phase: NDArray, frames: NDArray) -> dict[str, NDArray]
         "x (D)": x,
         "y (D)": y,
         "input phase (rad)": pupil.gather(phase),
-        "image a (mean of the pupil)": pupil.gather(frames[0]),
-        "image b (mean of the pupil)": pupil.gather(frames[1]),
+        "image 1 (mean of the pupil)": pupil.gather(frames[0]),
+        "image 2 (mean of the pupil)": pupil.gather(frames[1]),
     }
 
 
@@ -33,8 +33,8 @@ def pair(plus: Dimple, minus: Dimple, turn: NDArray, images: NDArray) -> Table:
             ["between the reference waves, mean (π)", float(np.abs(turn).mean() / np.pi)],
             ["det M, smallest modulus in the pupil", float(determinant.min())],
             ["the modulus is that of sin(Δθ/2) within 1e-12", bool(np.abs(determinant - expected).max() < 1e-12)],
-            ["light of image a inside the pupil", float(images[0].mean())],
-            ["light of image b inside the pupil", float(images[1].mean())],
+            ["light of image 1 inside the pupil", float(images[0].mean())],
+            ["light of image 2 inside the pupil", float(images[1].mean())],
             ["correlation of the two images", float(np.corrcoef(*images)[0, 1])],
         ],
     )

@@ -45,20 +45,13 @@ def cut(pupil: Pupil, screen: NDArray, phases: Mapping[str, NDArray]) -> dict[st
 def results(pupil: Pupil, screen: NDArray, found: Mapping[str, Reconstruction]) -> Table:
     """Result that each method reports, and its error."""
     return Table(
-        [
-            "reconstructor",
-            "iterations",
-            "mismatch of the frames",
-            "error (rad rms)",
-            "points without a unique solution",
-        ],
+        ["reconstructor", "iterations", "mismatch of the frames (rms)", "error (rad rms)"],
         [
             [
                 LOOKS[name].name,
                 int(result.n_iterations),
                 small(float(result.residual)),
                 small(float(reconstruction_error(pupil, result.phase, screen))),
-                int(result.n_unsolved),
             ]
             for name, result in found.items()
         ],

@@ -19,7 +19,7 @@ def columns(pupil: Pupil, phase: NDArray, frames: NDArray, pixel: Pixel) -> dict
     return {
         "x (D)": pupil.x,
         "phase (rad)": np.where(pupil.inside, phase, np.nan)[pixel.row],
-        "image a": frames[0, pixel.row],
+        "image 1": frames[0, pixel.row],
         "image b": frames[1, pixel.row],
     }
 
@@ -28,7 +28,7 @@ def curves(pixel: Pixel) -> dict[str, NDArray]:
     """Columns of both intensities against the phase of the pixel."""
     phases = np.linspace(-np.pi, np.pi, 361)
     first, second = pixel.intensities(phases)
-    return {"phase of the pixel (rad)": phases, "image a": first, "image b": second}
+    return {"phase of the pixel (rad)": phases, "image 1": first, "image 2": second}
 
 
 def cut(pupil: Pupil, truth: NDArray, one: NDArray, two: NDArray, pixel: Pixel) -> dict[str, NDArray]:

@@ -32,6 +32,7 @@ from zwfs.paper.phase_amplitude import WAYS, AmplitudeCurves
 from zwfs.paper.phase_shifts import DrawnNoise, PairMaps
 from zwfs.paper.photon_noise import EXPECTED, ErrorBars, PhotonCurves
 from zwfs.paper.recovery import DimpleLimits, RecoveryCurves
+from zwfs.plots.style import DARK_PHASE_MAP
 from zwfs.plots.variants import variants
 
 
@@ -218,6 +219,20 @@ def test_phases_of_a_dark_figure_are_dark_at_zero():
     assert pixels(dark)[200, 200, :3].max() < 60
     bar = dark.axes[1].collections[-1]
     assert bar.get_cmap() == dark.axes[0].images[0].get_cmap()
+
+
+def test_opposite_phases_of_a_dark_figure_are_equally_light():
+    phases = np.linspace(0, 1, 9)
+    lightness = [[lab(DARK_PHASE_MAP(0.5 + sign * one / 2), "normal")[0] for one in phases] for sign in (-1, 1)]
+    np.testing.assert_allclose(*lightness, atol=3)
+    assert np.all(np.diff(lightness) > 0)
+
+
+def test_arrows_of_a_dark_figure_are_light():
+    figure, axes = plt.subplots()
+    axes.annotate("", (0, 0), (1, 1), arrowprops={"color": "black"})
+    (arrow,) = (text.arrow_patch for text in variants(figure)["dark"].axes[0].texts)
+    assert min(arrow.get_facecolor()) > 0.8
 
 
 def cut_off(figure):

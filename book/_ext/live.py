@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
+from matplotlib.pyplot import get_cmap
 from numpy.typing import NDArray
 from sphinx.application import Sphinx
 
@@ -45,7 +45,7 @@ def data() -> dict[str, Any]:
         "orders": [zwfs.noll_to_nm(j) for j in range(2, N_MODES + 2)],
         "screens": _encode(screens(pupil).astype(np.float32)),
         "designs": designs(),
-        "colors": {name: _encode(colormaps[color](np.arange(256), bytes=True)) for name, color in maps.items()},
+        "colors": {name: _encode(get_cmap(color)(np.arange(256), bytes=True)) for name, color in maps.items()},
     }
 
 

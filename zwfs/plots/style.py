@@ -9,13 +9,18 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from zwfs.reconstructors import RECONSTRUCTORS
 
 PHASE_MAP, INTENSITY_MAP = "RdBu_r", "viridis"
-DARK_PHASE_MAP = "berlin"  # of phases on a dark ground: 0 is dark, the signs keep their hues
+
+# Of phases on a dark ground: 0 is dark, the signs keep their hues, and opposite phases are equally light.
+DARK_PHASE_MAP = LinearSegmentedColormap.from_list(
+    "zwfs_dark_phase", ["#9fd2ff", "#2f7fc9", "#2a2a2e", "#d1493f", "#ffb8ad"]
+)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba, to_rgba_array
 from matplotlib.figure import Figure
-from matplotlib.text import Text
+from matplotlib.text import Annotation, Text
 
 from zwfs.plots.style import DARK_PHASE_MAP, PHASE_MAP
 
@@ -148,7 +148,9 @@ def _darkened(figure: Figure) -> Figure:
         if axes.images or axes.get_label() == "<colorbar>":
             drawn = (*axes.images, *axes.lines, *axes.collections, *axes.patches, *axes.texts)
             kept.update(part for artist in drawn for part in artist.findobj())
-    for artist in set(figure.findobj()) - kept:
+    darkened = set(figure.findobj()) - kept
+    darkened |= {artist.arrow_patch for artist in darkened if isinstance(artist, Annotation)} - {None}
+    for artist in darkened:
         if getattr(artist, "get_array", lambda: None)() is None:  # else its colours come from a map
             parts = [part for part in _PARTS if hasattr(artist, f"get_{part}") and hasattr(artist, f"set_{part}")]
             colors = {part: getattr(artist, f"get_{part}")() for part in parts}  # all, as one may follow another

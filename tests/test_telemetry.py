@@ -347,7 +347,8 @@ def test_frames_between_bad_ones_stay_and_none_is_left_out(folder, bench, calibr
         assert np.isnan(phase[[3, 7]]).all()
         assert np.isnan(table["COEFFS"][[3, 7]]).all()
         others = np.delete(np.arange(12), [3, 7])
-        np.testing.assert_array_equal(phase[others], calibration(bench.frames).phase[others])
+        expected = calibration(bench.frames).phase[others]  # other batches, so the sums are rounded otherwise
+        np.testing.assert_allclose(phase[others], expected, rtol=0, atol=1e-6)
 
 
 def small_chunks(monkeypatch, exposures=5):

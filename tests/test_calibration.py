@@ -92,6 +92,23 @@ def test_a_bench_on_a_finer_grid_is_measured_better_than_with_the_model_of_the_d
     assert 3 * calibrated[1].mean("calibrated").mean() < error < 0.5 * curves.mean("design, less flat").mean()
 
 
+@pytest.mark.slow
+def test_frames_are_explained_where_a_segment_is_missing():
+    """The fitted amplitude is small there, not zero, so its phase must be that of the calibration."""
+    bench, whole = (dimmed(Bench(**LAYOUT | {"missing": missing}), 1e5) for missing in ((3,), ()))
+    recording = record(bench, 3, 0.6, seed=1)
+    known = bench.commanded_phase(recording.commands)
+    settings = {"n_pixels": bench.n_pixels, "noise": recording.noise, "n_inner": 30, "tolerance": 5e-4}
+    fit = fit_bench(recording.frames, recording.clear, known, **settings, errors=False)
+    [[example]] = measure_segments(recording, {"calibrated": fit}, [0.8], 1, seed=1)[1]
+    counts, sigma = example.measured
+    margin = (counts.shape[-1] - bench.n_pixels) // 2
+    dark = np.pad((whole.segments > 0) & (bench.segments == 0), margin)
+    assert np.count_nonzero(dark) > 50
+    misfit = (counts - example.modelled["calibrated"]) / sigma
+    assert abs(misfit[:, dark].mean()) < 0.5
+
+
 def test_exposures_keep_the_share_of_the_background():
     bench = Bench(n_pixels=40)
     short = dimmed(bench, 1e4)

@@ -318,9 +318,11 @@ class FittedSensor:
         leaked = min(mask.leakage, 0.4)  # half of the light cannot be unmixed
         light = ((1 - leaked) * light - leaked * light[::-1]) / (1 - 2 * leaked)
         phase = PhaseShifted(sensor, tolerance=1e-3)(np.maximum(light, 0)).phase
-        phase = np.where(np.isfinite(phase), phase, 0)
-        turn = np.angle(np.mean(np.exp(1j * phase[pupil.inside])))
-        return np.where(pupil.inside, np.angle(np.exp(1j * (phase - turn))), 0)
+        # Dim points hardly change the frames, so they keep the phase that explained the frames of the calibration.
+        waves = np.exp(1j * np.stack([np.where(np.isfinite(phase), phase, 0), self.flat]))
+        turns = np.mean(waves[:, pupil.inside], axis=1)[:, np.newaxis, np.newaxis]
+        measured, flat = np.angle(waves * turns.conj())
+        return np.where(pupil.inside, measured, flat)
 
 
 def _frozen(owner: Any, values: Any) -> Any:

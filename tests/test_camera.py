@@ -171,7 +171,7 @@ def test_saturation_is_given_in_the_header_of_the_type_or_seen():
         (lambda: camera.images([]), "files: 0 images: expected one or two"),
         (lambda: camera.images([file_of(FRAME)] * 3), "3 images: expected one or two"),
         (lambda: camera.images([file_of(FRAME)], [file_of(FRAME[1:])]), r"darks: a\.fits has shape \(19, 30\)"),
-        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME)] * 2), "darks: 2 images for the 1 of"),
+        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME)] * 2), "darks: a.fits: 2 images for the 1 of"),
         (lambda: camera.images([file_of(FRAME)], [], [file_of(FRAME.T)]), r"bad_pixels: a\.fits has shape"),
         (lambda: camera.images([file_of(FRAME + 1.0)], saturation=0.5), "all pixels are bad or saturated"),
         (lambda: camera.images([file_of(FRAME)], saturation=-1), "saturation = -1"),

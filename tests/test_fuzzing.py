@@ -6,6 +6,7 @@
 import gzip
 import io
 import json
+import math
 import re
 import shlex
 from contextlib import redirect_stderr, redirect_stdout
@@ -179,7 +180,7 @@ def put(folder, name, content):
     return path
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::hypothesis.errors.HypothesisWarning")
 @examples
 @given(written(), names)
 @example(Written(fits_file([np.full((2, 2), -32768, ">i2")], BSCALE=1, BZERO=32768, BLANK=-32768),
@@ -191,7 +192,7 @@ def test_image_is_read_exactly(folder, file, name):
     assert found.name == name
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::hypothesis.errors.HypothesisWarning")
 @examples
 @given(written(), st.floats(0, 1, exclude_max=True))
 def test_cut_file_is_refused(folder, file, share):
@@ -206,7 +207,7 @@ def test_cut_file_is_refused(folder, file, share):
         np.testing.assert_array_equal(found, file.images[:1])
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::hypothesis.errors.HypothesisWarning")
 @examples
 @given(damaged(written()))
 @example(npy(np.ones((3, 4), "<f4")) + bytes(48))
@@ -216,8 +217,8 @@ def test_damaged_file_is_read_or_refused_by_name(folder, content):
         frames, clear_frames, _ = camera.read_all([path], [path])
     except (TypeError, ValueError) as error:
         check_message(error, "damaged.dat")
-    else:
-        assert all(np.isfinite(one.counts).all() for one in (*frames, *clear_frames))
+        return
+    assert all(np.isfinite(one.counts).all() for one in (*frames, *clear_frames))
     if content.startswith(b"\x93NUMPY"):
         with pytest.raises((TypeError, ValueError), match=r"damaged\.dat"):
             camera.read(put(folder, "damaged.dat", content + b"\0"))
@@ -263,7 +264,7 @@ SHAPE = 42, 84  # of the images of the bench
 COUNTS = np.random.default_rng(1).uniform(0, 1e4, (1, *SHAPE))
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::hypothesis.errors.HypothesisWarning", "ignore:.*raw counts")
 @examples
 @given(written(st.just(SHAPE)).flatmap(lambda whole: damaged(st.just(whole)) | st.just(whole.content)))
 @example(fits_file([np.ones(SHAPE, ">i2")], SATURATE=-1))
@@ -380,7 +381,9 @@ def test_options_of_a_calibration_are_used_or_refused(folder, bench, name, value
         ]
     )
     if code:
-        check_refusal(code, messages, name.strip("-s").replace("-", "_"), *filter(None, values), "fitted")
+        check_refusal(
+            code, messages, name.strip("-s").replace("-", "_"), *filter(None, values), "fitted", "pixels wide"
+        )
 
 
 @examples
@@ -390,7 +393,8 @@ def test_calibration_of_a_damaged_file_is_made_or_refused_by_name(folder, bench,
     files = {"--frames": bench["frame"], "--pupils": bench["pupils"], "--dark": bench["dark"]} | {name: path}
     code, messages = run(["calibrate", folder / "part.npz", *(one for pair in files.items() for one in pair)])
     if code:
-        check_refusal(code, messages, "part.dat")
+        # Whole files may hold pixels that are not those of a bench.
+        check_refusal(code, messages, "part.dat", "shift of the images", "points of the pupil")
 
 
 # Parameters of a rerun
@@ -477,8 +481,8 @@ def test_text_is_a_plain_value_or_refused_by_name(text):
             check_message(error, origin)
             continue
         assert isinstance(value, str | int | float | list | dict | None)
-        if isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value):
-            digits = text.partition("#")[0].strip().replace("_", "")
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            digits = re.sub("#[^\n\r\x85\u2028\u2029]*", "", text).strip().replace("_", "")
             assert value == (int(digits, 0) if re.match("[-+]?0[xob]", digits) else type(value)(digits))
 
 

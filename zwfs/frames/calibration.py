@@ -30,7 +30,7 @@ from zwfs._likelihood import Estimator, Noise
 from zwfs._pickle import Immutable
 from zwfs._propagator import propagator, split
 from zwfs.frames.files import FileError, _broken, read_all
-from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, fit, ideal_frames, reduce_frames
+from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, _check_fit, fit, ideal_frames, reduce_frames
 from zwfs.frames.registration import _TOUCHED, Image, Recording, nearest_good, record
 from zwfs.masks import Dimple
 from zwfs.metrics import without_piston
@@ -210,6 +210,7 @@ class Calibration(Immutable):
         _check.instance("bunit", self.bunit, str)
         _check.flag("balance", self.balance)
         _check.number("residual", self.residual, 0)
+        _check.integer("n_images", self.n_images, 1, 2)
         grid, camera = np.shape(self.amplitude), (self.n_images, *self.shape)
         for name, shape in {"bad": camera, "good": grid}.items():
             _check.flag_map(name, getattr(self, name), shape)
@@ -221,6 +222,8 @@ class Calibration(Immutable):
             if array.shape != shape:
                 raise ValueError(f"{name} has shape {array.shape}: expected {shape}")
             _check.finite(name, array)
+            if name in ("unit", "light") and np.any(array <= 0):
+                raise ValueError(f"{name} = {_check.shown(array)}: expected values above 0")
         for one in fields(self):
             object.__setattr__(self, one.name, read_only(getattr(self, one.name)))
 
@@ -737,6 +740,7 @@ def calibrate(
     _check_settings(n_iterations, tolerance, np.inf if saturation is None else saturation)
     frames, clear_frames, sources = read_all(frame_files, pupil_files, dark_files, bad_pixel_files, saturation)
     optics = sources[0].optics(diameter, phase_shifts)
+    _check_fit("fitted", fitted, optics)
     recording = record(frames, clear_frames, **settings)
     recording, optics = fit(recording, optics, fitted)
     first = len(frame_files) + len(pupil_files)

@@ -277,7 +277,7 @@ def images(
         saturation = _check.number("saturation", saturation, 0, open_low=True)
     recorded = [(file, counts) for file in files for counts in file.images]
     if len(recorded) not in (1, 2):
-        names = ", ".join(file.name for file in files) or "files"
+        names = ", ".join(dict.fromkeys(file.name for file in files)) or "files"
         raise ValueError(f"{names}: {len(recorded)} images: expected one or two")
     result: list[Image] = []
     for (file, counts), dark, marked in zip(
@@ -469,10 +469,14 @@ def write_phase(
 
 @contextmanager
 def _broken(message: str) -> Iterator[None]:
-    """Turn whatever a parser raises on broken bytes into one error that names the file; warnings are ignored."""
+    """Turn whatever a parser raises on broken bytes into one error that names the file; warnings are ignored.
+
+    But astropy only warns of an extension whose header is cut off, and then leaves out its image.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            warnings.filterwarnings("error", message="Error validating header")
             yield
     except FileError:
         raise
@@ -594,8 +598,10 @@ def _companions(
         return [np.zeros(())] * len(recorded)
     n = len(recorded)
     if len(maps) not in (1, n):
+        names = ", ".join(dict.fromkeys(file.name for file in files))
         raise ValueError(
-            f"{argument}: {len(maps)} images for the {n} of {recorded[0][0].name}: expected one, or one for each"
+            f"{argument}: {names}: {len(maps)} images for the {n} of {recorded[0][0].name}: "
+            "expected one, or one for each"
         )
     maps = maps * n if len(maps) == 1 else maps
     for (name, image), (file, counts) in zip(maps, recorded, strict=True):

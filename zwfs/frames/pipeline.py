@@ -103,6 +103,7 @@ _RANGES = {
     "leakage": (0.0, 0.45, 0.05),
     "unmasked": (0.0, 0.9, 0.1),
 }
+_CHANGE = 0.1  # for a derivative, over the typical change: across smaller ones, single points jump too much
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,6 +280,10 @@ def reduce_frames(recording: Recording, optics: Optics, margin: int | None = Non
     _check.instance("recording", recording, Recording)
     _check.instance("optics", optics, Optics)
     margin = recording.margin if margin is None else _check.integer("margin", margin, 0, recording.margin)
+    if optics.diameter > recording.diameter:
+        raise ValueError(
+            f"diameter = {optics.diameter:g} lambda/D: expected at most {recording.diameter:.4g} (pixels of D)"
+        )
     return _reduce(recording, optics, margin)
 
 
@@ -368,7 +373,7 @@ def measured_pupil(
     return pupil, scale * np.mean(amplitude[pupil.inside] ** 2)
 
 
-def recover_phase(measurement: Measurement, n_iterations: int = 25) -> MeasuredPhase:
+def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: float = 1e-4) -> MeasuredPhase:
     """Phase of a measurement by the phase-shifted iteration, and its modelled frames.
 
     Bad pixels take no part: their intensity is that of the model, with the phase of the nearest good point, so
@@ -379,6 +384,8 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25) -> MeasuredP
     measurement : Measurement
     n_iterations : int
         Largest number of iterations.
+    tolerance : float, radian
+        Rms of the change of the phase at which the iteration ends.
 
     Returns
     -------
@@ -411,7 +418,7 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25) -> MeasuredP
     """
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     sensor = model(measurement)
-    iterate = PhaseShifted(sensor, n_iterations=n_iterations, tolerance=1e-4)
+    iterate = PhaseShifted(sensor, n_iterations=n_iterations, tolerance=tolerance)
     measured = _scaled(measurement)
     frames = np.maximum(ideal_frames(measurement), 0)
     inner = (..., *sensor.window)
@@ -603,6 +610,7 @@ def fit(
     n_shifts = 2 * len(images)
     start = [*(getattr(optics, name) for name in values), *[0.0] * n_shifts]
     low, high, step = np.transpose([*(_RANGES[name] for name in values), *[_SHIFT_RANGE] * n_shifts])
+    change = _CHANGE * step
     margin = recording.margin  # the same in each trial, so that the number of residuals stays
 
     def trial(unknowns: NDArray) -> tuple[Recording, Optics]:
@@ -612,11 +620,16 @@ def fit(
         return replace(recording, origins=origins), replace(optics, **changes)
 
     def residuals(unknowns: NDArray) -> NDArray:
-        return recover_phase(_reduce(*trial(unknowns), margin), n_iterations).mismatch.ravel()
+        # Finite differences need a smooth function, so no trial may end an iteration earlier than its neighbours.
+        return recover_phase(_reduce(*trial(unknowns), margin), n_iterations, 1e-8).mismatch.ravel()
 
-    best = optimize.least_squares(
-        residuals, start, bounds=(low, high), x_scale=step, diff_step=1e-4, max_nfev=n_steps
-    )
+    def jacobian(unknowns: NDArray) -> NDArray:
+        base = residuals(unknowns)
+        around = unknowns + np.diag(np.where(unknowns + change > high, -change, change))
+        slopes = [(residuals(one) - base) / (one - unknowns)[index] for index, one in enumerate(around)]
+        return np.transpose(slopes)
+
+    best = optimize.least_squares(residuals, start, jacobian, bounds=(low, high), x_scale=step, max_nfev=n_steps)
     return trial(best.x)
 
 

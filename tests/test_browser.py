@@ -233,6 +233,17 @@ class Quiet(SimpleHTTPRequestHandler):
         pass
 
 
+def test_a_wide_table_fades_until_its_end_is_in_sight(browser):
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    page.goto(address("notebooks/design.html"))
+    table = page.locator(".pst-scrollable-table-container", has_text="all-round")
+    fades = "box => getComputedStyle(box).maskImage !== 'none'"
+    assert table.evaluate(fades)
+    table.evaluate("box => { box.scrollLeft = box.scrollWidth; }")
+    page.wait_for_function(f"box => !({fades})(box)", arg=table.element_handle())
+    page.close()
+
+
 @pytest.fixture(scope="module")
 def served():
     """Address of the book on a server of this machine: from the file system a browser opens what it would save."""

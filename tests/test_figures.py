@@ -155,7 +155,10 @@ def drawn_methods(curves, pupil, classic, shifted):
             plots.LOOKS,
         ),
         "error_bars": (([ErrorBars(k, EXPECTED, k, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
-        "design_maps": ((DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5}), PUBLISHED), ()),
+        "design_maps": (
+            (DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5}), PUBLISHED, {"flat": three}),
+            (),
+        ),
         "band_errors": (({(0.1, False): banded, (0.1, True): banded},), [*shifted_only, "MaximumLikelihood"]),
         "held_drift": ((held,), ()),
         "amplitude_errors": (({"dips": varied},), [*shifted_only, "MaximumLikelihood"]),
@@ -236,14 +239,17 @@ def test_arrows_of_a_dark_figure_are_light():
 
 
 def cut_off(figure):
-    """Titles, labels and entries of legends that do not fit the width of a figure, by more than a pixel."""
+    """Titles, labels and entries of legends that do not fit into a figure, by more than a pixel."""
     FigureCanvasAgg(figure).draw()
     texts = [text for legend in figure.legends for text in legend.get_texts()]
     for axes in figure.axes:
         texts += [axes.title, axes.xaxis.label, axes.yaxis.label]
     texts = [text for text in texts if text.get_text()]
     boxes = [text.get_window_extent() for text in texts]
-    return [text for text, box in zip(texts, boxes, strict=True) if box.x0 < -1 or box.x1 > figure.bbox.width + 1]
+    page = figure.bbox.padded(1)
+    corners = [box.corners() for box in boxes]
+    inside = [all(page.contains(*corner) for corner in four) for four in corners]
+    return [text for text, fits in zip(texts, inside, strict=True) if not fits]
 
 
 def pixels(figure):

@@ -55,13 +55,13 @@ def test_strehl_weighs_points_with_their_amplitude():
 
 
 def test_dynamic_range_interpolates_the_ratio():
-    # Ratios 0, 0.02, 0.1: the threshold of 0.05 lies 3/8 of the way from 1 to 2.
-    assert dynamic_range([0, 0.5, 1, 2], [9, 0, 0.02, 0.2]) == pytest.approx(1 + 3 / 8)
+    # Ratios 0.02 and 0.08: the threshold, their geometric mean, lies half of the way from 1 to 2.
+    assert dynamic_range([0, 0.5, 1, 2], [9, 0, 0.02, 0.16], threshold=0.04) == pytest.approx(1.5)
     assert dynamic_range([0.5, 1, 2], [0, 0.02, 0.2], threshold=0.02) == pytest.approx(1)
 
 
 def test_dynamic_range_ends_at_the_first_crossing():
-    assert dynamic_range([1, 2, 3, 4], [0, 0.2, 0, 0.4]) == pytest.approx(1.5)
+    assert dynamic_range([1, 2, 3, 4], [0.025, 0.2, 0, 0.4]) == pytest.approx(1.5)
 
 
 def test_dynamic_range_without_a_crossing():

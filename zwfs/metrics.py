@@ -120,7 +120,7 @@ def strehl(pupil: Pupil, phase: ArrayLike) -> NDArray[np.floating]:
 def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> float:
     """Input rms at which the error of a reconstructor first exceeds a fraction of the input.
 
-    The ratio of error to input is interpolated linearly between the samples around the place where it crosses the
+    The logarithm of the ratio of error to input is interpolated linearly between the samples where it crosses the
     threshold for the first time. Samples at an input of 0 have no ratio and are left out.
 
     Parameters
@@ -151,7 +151,7 @@ def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> 
     --------
     >>> import zwfs
     >>> round(zwfs.dynamic_range([0.1, 0.2, 0.3], [0.001, 0.004, 0.03]), 3)
-    0.237
+    0.257
     """
     rms, error = _check.real_array("rms", rms), _check.real_array("error", error)
     if rms.ndim != 1 or rms.shape != error.shape or not rms.size:
@@ -173,7 +173,8 @@ def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> 
     last = above[0]
     if last == 0:
         return 0.0
-    step = (threshold - ratio[last - 1]) / (ratio[last] - ratio[last - 1])
+    low, high = np.log(np.maximum(ratio[last - 1 : last + 1], np.finfo(float).tiny))
+    step = (np.log(threshold) - low) / (high - low)
     return float(rms[last - 1] + step * (rms[last] - rms[last - 1]))
 
 

@@ -16,5 +16,14 @@ function nameWideTables() {
   }
 }
 
-addEventListener("load", nameWideTables);
-addEventListener("resize", nameWideTables);
+// They fade at the right until their end is in sight.
+function fadeWideTables() {
+  for (const box of document.querySelectorAll(".pst-scrollable-table-container"))
+    box.classList.toggle("more", box.scrollLeft + box.clientWidth < box.scrollWidth - 1);
+}
+
+for (const event of ["load", "resize"]) {
+  addEventListener(event, nameWideTables);
+  addEventListener(event, fadeWideTables);
+}
+addEventListener("scroll", fadeWideTables, { capture: true, passive: true });

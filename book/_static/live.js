@@ -67,6 +67,16 @@
     if (inputs.some((input) => nameOf(input) in state)) set(state, standard);
   }
 
+  // The preset whose state is that of the controls looks pressed.
+  const presets = [...document.querySelectorAll(".live-presets button")];
+  function markPreset() {
+    for (const button of presets) {
+      const goal = parse(button.dataset.live);
+      const same = (input) => Number(read(input)) === Number(goal[nameOf(input)] ?? standard(input));
+      button.setAttribute("aria-pressed", inputs.every(same));
+    }
+  }
+
   const listeners = []; // of other panels: they are called with the settings and what was computed
   const settings = () => ({
     rms: value("rms"),
@@ -151,6 +161,7 @@
     const made = live.compute(set);
     find("time").textContent = `Computed in ${(performance.now() - start).toFixed(0)} ms.`;
     show(made, set);
+    markPreset();
     clearTimeout(rest);
     rest = setTimeout(() => describe(made, set), PAUSE);
     clearTimeout(settle);

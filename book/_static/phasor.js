@@ -35,7 +35,8 @@
     const radius = SCALE * Math.sqrt(intensity(wave, phase));
     const [x, y] = at(wave).split(" ");
     return `<g class="phasor-faint"><circle class="phasor-dots" cx="${x}" cy="${y}" r="${SCALE}"/>
-      ${arrow([0, 0], wave, "")}</g>
+      ${arrow([0, 0], wave, "")}
+      <path d="M-6 0H6M0 -6V6"/></g>
       <g class="phasor-${number}"><circle cx="0" cy="0" r="${round(radius)}"/>
       ${arrow(wave, tip(wave, other), "phasor-dashes")}${dotAt(tip(wave, other), "phasor-open")}
       <text x="-112" y="-104">image ${number}: ${round(intensity(wave, phase))}</text></g>
@@ -73,7 +74,8 @@
   box.innerHTML = `<label for="phasor-phase"><span>Phase of the pixel</span><output for="phasor-phase"></output></label>
     <input type="range" id="phasor-phase" min="-3.14" max="3.14" step="0.01" value="${box.dataset.phase}" autocomplete="off">
     <div class="phasor-planes">${IMAGES.map((number) => `<svg id="phasor-${number}" viewBox="-115 -120 215 215" role="img"></svg>`).join("")}</div>
-    <svg id="phasor-curves" viewBox="-2 -10 504 245" role="img"></svg>
+    <p class="phasor-key">Grey arrow: reference wave. Cross: no light.</p>
+    <svg id="phasor-curves" viewBox="-2 -24 504 259" role="img"></svg>
     <p class="phasor-says" role="status"></p>`;
   const slider = box.querySelector("input");
 

@@ -14,7 +14,7 @@ from zwfs.plots.style import LOOKS, show_intensity, show_phase
 from zwfs.pupil import Pupil
 
 _ROUNDING = 1e-15  # rad
-_SEES = {"one pupil": "from image 1", "two pupils": "from both images"}
+_SEES = {"one image": "from image 1", "two images": "from both images"}
 _LETTERS = 13  # points: on a phone the figure is as wide as the page
 _RIGHT = 1.0  # radian, error up to which a point is drawn on the branch of the true phase
 

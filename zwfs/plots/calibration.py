@@ -21,7 +21,7 @@ _ARMS = ("1 (+θ)", "2 (−θ)")
 def _style(name: str) -> dict[str, Any]:
     """Keywords of a curve for `plot`; the model of the design has the colour of its reconstructor."""
     look = LOOKS["PhaseShifted"]
-    color, marker = {"calibrated": ("#333333", "*"), "shuffled": ("#999999", "x")}.get(
+    color, marker = {"calibrated": ("#333333", "*"), "shuffled": ("#777777", "x")}.get(
         name, (look.color, look.marker)
     )
     hollow = {"markerfacecolor": "none"} if name == "design, less flat" else {}

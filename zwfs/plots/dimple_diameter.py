@@ -37,15 +37,14 @@ def dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float, clai
         axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0)
         _diameters(axes, curve.diameters[-1], claimed)
         axes.set_ylabel("error (rad rms)")
-    for (number, other), dashes in zip(others, ("--", ":", "-."), strict=False):
-        label = f"{number} iterations"
-        log.plot(other.diameters, other.mean(name), color="#555555", ls=dashes, lw=1.5, label=label)
+    for (number, other), style in zip(others, OTHER_STYLES[1:], strict=False):
+        log.plot(other.diameters, other.mean(name), ms=4, label=f"{number} iterations", **style)
     limit = threshold * curve.rms[0]
     log.axhline(limit, color="#555555", lw=1)
     log.text(0.1, limit * 1.3, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
     plain.set_ylim(0, None)
     log.set(yscale="log", ylim=(floor, 4))
-    log.legend(loc="upper left", bbox_to_anchor=(0, 0.72), fontsize=9)
+    log.legend(loc="upper left", bbox_to_anchor=(0, 0.68), fontsize=9)
     return figure
 
 
@@ -99,7 +98,7 @@ def diameter_reasons(reasons: Contraction, claimed: float) -> Figure:
     for (name, values), style in zip(reasons.sensitivity.items(), OTHER_STYLES, strict=False):
         right.plot(diameters, values, lw=1.8, label=name, **style | {"marker": "none"})
     right.set(ylabel="sensitivity (1/rad)", ylim=(0, 3))
-    right.legend(loc="upper left", fontsize=9)
+    right.legend(loc="upper left", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
     for axes in (left, right):
         _diameters(axes, diameters[-1], claimed)
     return figure

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
+from numpy.typing import NDArray
 
 from zwfs.paper.design import Design, DesignMap
 from zwfs.paper.photon_noise import EXPECTED, SIGMAS, ErrorBars, PhotonCurves
@@ -58,24 +59,32 @@ def error_bars(rows: Sequence[ErrorBars]) -> Figure:
     return figure
 
 
-def design_maps(maps: DesignMap, designs: Sequence[Design]) -> Figure:
+def design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[str, NDArray]) -> Figure:
     """Photon cost against diameter and phase shift, one panel for each kind of wavefront.
 
-    A design is a mark at its diameter and half the difference of its phase shifts. A bar joins shifts of different
-    size. The diameters and angles of the maps must be evenly spaced.
+    A design is a mark at its diameter and half the difference of its phase shifts, in the colour of its cost. A
+    bar joins shifts of different size. The diameters and angles of the maps must be evenly spaced.
+
+    Parameters
+    ----------
+    maps : DesignMap
+    designs : sequence of Design
+    costs : mapping of str to ndarray, shape (n_designs,)
+        Photon cost of the designs by the name of the wavefronts.
     """
     figure, panels = plt.subplots(1, len(maps.costs), figsize=(7, 4.4), sharey=True, squeeze=False)
     x, y = maps.diameters, maps.angles / np.pi
     half = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
     extent = x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1]
-    for axes, (name, costs) in zip(panels[0], maps.costs.items(), strict=True):
+    for axes, (name, grid) in zip(panels[0], maps.costs.items(), strict=True):
         axes.grid(False)
         shown = axes.imshow(
-            costs.T, cmap="cividis_r", norm=LogNorm(1, 10), extent=extent, aspect="auto", interpolation="bilinear"
+            grid.T, cmap="cividis_r", norm=LogNorm(1, 10), extent=extent, aspect="auto", interpolation="bilinear"
         )
-        lines = axes.contour(x, y, costs.T, list(_LINES), colors=list(_LINES.values()), linewidths=0.8)
+        lines = axes.contour(x, y, grid.T, list(_LINES), colors=list(_LINES.values()), linewidths=0.8)
         axes.clabel(lines, fmt="%g", fontsize=9)
-        for design, mark in zip((*designs, maps.best(name)), _MARKS, strict=False):
+        marked = zip((*designs, maps.best(name)), (*costs[name], grid.min()), _MARKS, strict=False)
+        for design, cost, mark in marked:
             low, high = sorted(abs(theta) / np.pi for theta in design[2:])
             if high > low + 1e-9:
                 axes.plot([design.diameter] * 2, [low, high], color="#ffffff", lw=4)
@@ -83,7 +92,7 @@ def design_maps(maps: DesignMap, designs: Sequence[Design]) -> Figure:
             label = "best of each map" if design.name.startswith("best") else design.name
             size = {"*": 15}.get(mark, 8)
             axes.plot(
-                design.diameter, (low + high) / 2, mark, mfc="#ffffff", mec="#000000", mew=1.2, ms=size,
+                design.diameter, (low + high) / 2, mark, mfc=shown.to_rgba(cost), mec="#000000", mew=1.2, ms=size,
                 label=label, ls="none", clip_on=False, zorder=5,
             )  # fmt: skip
         axes.set(xlim=extent[:2], ylim=extent[2:], xlabel="diameter (λ/D)")

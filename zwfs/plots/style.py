@@ -61,14 +61,14 @@ class _Looks(dict[str, Look]):
 LOOKS = _Looks()
 """Look of each method, by the name of its class; a name that is not listed gets a spare look at its first use."""
 LOOKS |= {
-    "Linear": Look("linear", "one pupil", "#000000", "o", "-"),
-    "Arcsine": Look("arcsine", "one pupil", "#E69F00", "s", "--"),
-    "GerchbergSaxton": Look("Gerchberg-Saxton", "two pupils", "#009E73", "^", "-."),
-    "GerchbergSaxtonModel": Look("Gerchberg-Saxton, model kept", "two pupils", "#608040", "x", "-"),
-    "GradientDescent": Look("gradient descent", "two pupils", "#CC79A7", "D", (0, (3, 1, 1, 1, 1, 1))),
-    "GradientDescentPoints": Look("gradient descent on points", "two pupils", "#D55E00", "d", "--"),
-    "GradientDescentStarted": Look("gradient descent, phase-shifted start", "two pupils", "#7010E0", "+", "-."),
-    "PhaseShifted": Look("phase-shifted", "two pupils", "#0072B2", "v", ":"),
+    "Linear": Look("linear", "one image", "#000000", "o", "-"),
+    "Arcsine": Look("arcsine", "one image", "#E69F00", "s", "--"),
+    "GerchbergSaxton": Look("Gerchberg-Saxton", "two images", "#009E73", "^", "-."),
+    "GerchbergSaxtonModel": Look("Gerchberg-Saxton, model kept", "two images", "#608040", "x", "-"),
+    "GradientDescent": Look("gradient descent", "two images", "#CC79A7", "D", (0, (3, 1, 1, 1, 1, 1))),
+    "GradientDescentPoints": Look("gradient descent on points", "two images", "#D55E00", "d", "--"),
+    "GradientDescentStarted": Look("gradient descent, phase-shifted start", "two images", "#7010E0", "+", "-."),
+    "PhaseShifted": Look("phase-shifted", "two images", "#0072B2", "v", ":"),
     "MaximumLikelihood": Look("maximum likelihood", "", "#661100", "*", "-"),
 }
 for _method in RECONSTRUCTORS:

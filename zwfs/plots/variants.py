@@ -18,8 +18,11 @@ from zwfs.plots.style import DARK_PHASE_MAP, PHASE_MAP
 
 _WIDTH, _HEIGHT = 3.7, 2.7  # of a narrow figure and of each panel in it, inch
 _LETTERS = 11  # points, at most: some figures have larger ones, as pages show them smaller than they are
-_LONE = 0.7  # width of a picture alone in its row, over that of the figure
+_LONE = 0.7  # width of pictures that stand alone in their rows, over that of the figure
 _ENTRY = 420  # points times letters: an entry of a legend with so many letters is as wide as the figure
+_MARGIN = 0.05  # above and below what is drawn, inch
+_ROUNDS = 12  # at most, to find the height
+_STEP = 1.8  # of the height over the gaps, which fall by about half of it
 _BAR = 0.6  # height of a colour bar with its numbers and its label, inch
 _PARTS = "color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"
 
@@ -29,7 +32,8 @@ def variants(figure: Figure) -> dict[str, Figure]:
     state = pickle.dumps(figure)
     made = {"dark": _darkened(_copy(state))}
     if any(axes.get_subplotspec() for axes in figure.axes):
-        made |= {"narrow": _stacked(_copy(state)), "narrow-dark": _darkened(_stacked(_copy(state)))}
+        made["narrow"] = _stacked(_copy(state))
+        made["narrow-dark"] = _darkened(_copy(pickle.dumps(made["narrow"])))
     return made
 
 
@@ -46,7 +50,8 @@ def _stacked(figure: Figure) -> Figure:
     for axes in panels:
         _label(axes, panels)
     rows = _rows(panels)
-    heights = [_height(row) for row in rows]
+    paired = any(len(row) == 2 for row in rows)
+    heights = [_height(row, _WIDTH / 2 if paired else _WIDTH * _LONE) for row in rows]
     grid = figure.add_gridspec(len(rows), 2, height_ratios=heights)
     for place, row in enumerate(rows):
         for column, axes in enumerate(row):
@@ -65,14 +70,26 @@ def _stacked(figure: Figure) -> Figure:
         text.set_fontsize(min(text.get_fontsize(), _LETTERS))
     figure.set_size_inches(_WIDTH, sum(heights) + _BAR * bars + 0.2 * entries)
     figure.set_layout_engine("constrained")  # a saved figure has none
+    _fit_height(figure)
     return figure
+
+
+def _fit_height(figure: Figure) -> None:
+    """Adapt the height, as pictures keep their proportions and the layout leaves gaps or cuts labels off."""
+    for _ in range(_ROUNDS):
+        for _ in range(2):  # the layout has settled after the second time
+            figure.draw_without_rendering()
+        change = figure.get_tightbbox().height + 2 * _MARGIN - figure.get_figheight()
+        if abs(change) < _MARGIN:
+            return
+        figure.set_figheight(round(figure.get_figheight() + _STEP * change, 2))
 
 
 def _rows(panels: list[Axes]) -> list[list[Axes]]:
     """Order panels by columns; two pictures that follow each other make a row, and all others stand alone."""
     specs: dict[Axes, Any] = {axes: axes.get_subplotspec() for axes in panels}
     rows: list[list[Axes]] = []
-    for axes in sorted(panels, key=lambda one: (specs[one].colspan.start, specs[one].rowspan.start)):
+    for axes in sorted(panels, key=lambda one: (specs[one].colspan.stop, specs[one].rowspan.start)):
         pair = [*rows[-1], axes] if rows else []
         if len(pair) == 2 and all(map(_fits_half, pair)):
             rows[-1] = pair
@@ -97,12 +114,12 @@ def _proportion(axes: Axes) -> float:
     return abs(np.ptp(axes.get_ylim()) / np.ptp(axes.get_xlim()))
 
 
-def _height(row: list[Axes]) -> float:
-    """Height of a row of panels with their titles, inch."""
+def _height(row: list[Axes], width: float) -> float:
+    """Height of a row of panels with their titles, inch: of pictures of that width."""
     if _is_picture(row[0]):
         texts = [axes.get_title() + "\n" * bool(axes.get_title()) + axes.get_xlabel() for axes in row]
         lines = max(len(text.splitlines()) for text in texts)
-        return (_WIDTH / 2 if len(row) == 2 else _WIDTH * _LONE) * max(map(_proportion, row)) + 0.2 * lines
+        return width * max(map(_proportion, row)) + 0.2 * lines
     return _WIDTH if row[0].get_aspect() != "auto" else _HEIGHT
 
 
@@ -146,11 +163,11 @@ def _darkened(figure: Figure) -> Figure:
     kept: set[Artist] = {figure, *figure.axes}  # their patches are found as well
     for axes in {*figure.axes} - {image.axes for image in phases}:
         if axes.images or axes.get_label() == "<colorbar>":
-            drawn = (*axes.images, *axes.lines, *axes.collections, *axes.patches, *axes.texts)
-            kept.update(part for artist in drawn for part in artist.findobj())
-    darkened = set(figure.findobj()) - kept
-    darkened |= {artist.arrow_patch for artist in darkened if isinstance(artist, Annotation)} - {None}
-    for artist in darkened:
+            marks = (*axes.images, *axes.lines, *axes.collections, *axes.patches, *axes.texts)
+            kept.update(part for artist in marks for part in artist.findobj())
+    drawn = set(figure.findobj()) - kept
+    arrows = [text.arrow_patch for text in drawn if isinstance(text, Annotation) and text.arrow_patch]
+    for artist in drawn.union(arrows):
         if getattr(artist, "get_array", lambda: None)() is None:  # else its colours come from a map
             parts = [part for part in _PARTS if hasattr(artist, f"get_{part}") and hasattr(artist, f"set_{part}")]
             colors = {part: getattr(artist, f"get_{part}")() for part in parts}  # all, as one may follow another

@@ -20,7 +20,7 @@ def columns(pupil: Pupil, phase: NDArray, frames: NDArray, pixel: Pixel) -> dict
         "x (D)": pupil.x,
         "phase (rad)": np.where(pupil.inside, phase, np.nan)[pixel.row],
         "image 1": frames[0, pixel.row],
-        "image b": frames[1, pixel.row],
+        "image 2": frames[1, pixel.row],
     }
 
 

@@ -85,7 +85,7 @@ def diameter_reasons(reasons: Contraction, claimed: float) -> Figure:
     figure, (left, right) = plt.subplots(1, 2, figsize=(7, 4))
     color, diameters, aberrated = LOOKS["PhaseShifted"].color, reasons.diameters, reasons.aberrated
     flat_color, ring_color, *_ = (style["color"] for style in OTHER_STYLES)
-    left.plot(diameters, reasons.flat, color=flat_color, lw=1.5, label="flat wavefront")
+    left.plot(diameters, reasons.flat, color=flat_color, lw=2, ls="--", zorder=3, label="flat wavefront")
     low, high = aberrated.min(axis=1), aberrated.max(axis=1)
     left.fill_between(diameters, low, high, color=color, alpha=0.3, lw=0, label="screens, range")
     left.plot(diameters, aberrated[:, 0], color=color, lw=1.5, label="first screen")

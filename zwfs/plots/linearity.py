@@ -70,6 +70,7 @@ def saxton_widths(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurv
     """
     figure, axes = plt.subplots(figsize=(7, 4.6))
     dashes = {"zero": cycle(("-", "-.", "--", ":")), "model": cycle(("-", "--"))}
+    markers = {"zero": cycle("^<v>"), "model": cycle("x+")}
     for name, method in variants.items():
         kind = method.unmeasured
         look = LOOKS["GerchbergSaxtonModel" if kind == "model" else "GerchbergSaxton"]
@@ -78,7 +79,7 @@ def saxton_widths(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurv
             curves.rms,
             curves.mean(name) / curves.rms,
             label=label,
-            **look.style | {"linestyle": next(dashes[kind])},
+            **look.style | {"linestyle": next(dashes[kind]), "marker": next(markers[kind])},
         )
     axes.plot(curves.rms, curves.mean("Linear") / curves.rms, label="linear", **LOOKS["Linear"].style)
     axes.axhline(threshold, color="#555555", lw=1)

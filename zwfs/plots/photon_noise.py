@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -105,6 +107,9 @@ def design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[str, 
     bar.ax.yaxis.set_major_locator(FixedLocator([1, 2, 3, 5, 10]))
     bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     bar.ax.yaxis.set_minor_formatter(NullFormatter())
-    handles, labels = panels[0, 0].get_legend_handles_labels()
+    marks, labels = panels[0, 0].get_legend_handles_labels()
+    handles: list[Any] = [copy(mark) for mark in marks]
+    for handle in handles:  # a mark has another colour in each panel
+        handle.set_markerfacecolor("#ffffff")
     figure.legend(handles, labels, loc="outside lower center", ncols=5, handletextpad=0.2, columnspacing=1)
     return figure

@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
 from numpy.typing import NDArray
 
@@ -19,6 +20,7 @@ from zwfs.plots.style import LOOKS, OTHER_STYLES, _looks
 
 # Photon costs at which a line is drawn, and its colour, which differs from that of the map.
 _LINES = dict.fromkeys((1.25, 1.5, 2), "#222222") | dict.fromkeys((3, 5, 10), "#ffffff")
+_OUTLINE = withStroke(linewidth=3, foreground="#ffffff")  # of the marks, on dark colours of the map
 _MARKS = ("o", "s", "D", "*", "P", "X")
 
 
@@ -95,7 +97,7 @@ def design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[str, 
             size = {"*": 15}.get(mark, 8)
             axes.plot(
                 design.diameter, (low + high) / 2, mark, mfc=shown.to_rgba(cost), mec="#000000", mew=1.2, ms=size,
-                label=label, ls="none", clip_on=False, zorder=5,
+                label=label, ls="none", clip_on=False, zorder=5, path_effects=[_OUTLINE],
             )  # fmt: skip
         axes.set(xlim=extent[:2], ylim=extent[2:], xlabel="diameter (λ/D)")
         axes.set_title(name, fontsize=10)

@@ -394,7 +394,7 @@ def test_calibration_of_a_damaged_file_is_made_or_refused_by_name(folder, bench,
     code, messages = run(["calibrate", folder / "part.npz", *(one for pair in files.items() for one in pair)])
     if code:
         # Whole files may hold pixels that are not those of a bench.
-        check_refusal(code, messages, "part.dat", "shift of the images", "points of the pupil")
+        check_refusal(code, messages, "part.dat", "shift of the images", "points of the pupil", "of the light of")
 
 
 # Parameters of a rerun

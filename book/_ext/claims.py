@@ -370,9 +370,9 @@ def diameter(n: Numbers) -> Finding:
     )
     drastic = n.error_at_26 > 10 * n.error_at_20 and 2.0 <= n.diameter_5_percent <= 2.4
     slow = (
-        f"With 400 iterations the error exceeds 5 % only above {n.diameter_5_percent_400:.2f}: up to "
-        f"{n.contraction_crosses_1:.2f} $\\lambda/D$ the iteration converges slowly, above it diverges, for a "
-        "flat wavefront."
+        f"With 400 iterations the error exceeds 5 % only above {n.diameter_5_percent_400:.2f}. Around a flat "
+        f"wavefront the iteration converges slowly up to {n.contraction_crosses_1:.2f} $\\lambda/D$ and diverges "
+        "above."
     )
     return first(
         measured,

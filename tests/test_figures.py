@@ -33,7 +33,7 @@ from zwfs.paper.phase_shifts import DrawnNoise, PairMaps
 from zwfs.paper.photon_noise import EXPECTED, ErrorBars, PhotonCurves
 from zwfs.paper.recovery import DimpleLimits, RecoveryCurves
 from zwfs.plots.style import DARK_PHASE_MAP
-from zwfs.plots.variants import variants
+from zwfs.plots.variants import dark_color, variants
 
 
 @pytest.fixture(autouse=True)
@@ -268,6 +268,12 @@ def test_curves_of_a_dark_figure_differ_for_every_reader():
     dark = [line.get_color() for line in variants(figure)["dark"].axes[0].lines]
     for vision in VISION:
         assert min(np.linalg.norm(lab(a, vision) - lab(b, vision)) for a, b in combinations(dark, 2)) > 10
+
+
+def test_colours_of_a_dark_figure_can_be_read():
+    light = [look.color for look in plots.LOOKS.values()] + [style["color"] for style in plots.style.OTHER_STYLES]
+    colors = [dark_color(color) for color in (*light, *(color for _, color, _ in plots.one_pixel.IMAGES))]
+    assert min(lab(color, "normal")[0] for color in colors) > 53  # a contrast of 4.5 with the ground
 
 
 @pytest.mark.parametrize("name", figure_functions())

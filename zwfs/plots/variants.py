@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 import pickle
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -24,6 +25,7 @@ _MARGIN = 0.05  # above and below what is drawn, inch
 _ROUNDS = 12  # at most, to find the height
 _STEP = 1.8  # of the height over the gaps, which fall by about half of it
 _BAR = 0.6  # height of a colour bar with its numbers and its label, inch
+_DIMMEST = 0.22  # luminance of a colour on the dark ground: a contrast of 4.7, enough for letters
 _PARTS = "color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"
 
 
@@ -185,4 +187,12 @@ def dark_color(color: Any) -> tuple[float, ...]:
     *rgb, alpha = to_rgba(color)
     hue, light, saturation = colorsys.rgb_to_hls(*rgb)
     light = 0.94 - 0.87 * light if saturation < 0.1 or light > 0.8 else max(light, 0.455 + 0.3 * light)
+    while saturation >= 0.1 and _luminance(colorsys.hls_to_rgb(hue, light, saturation)) < _DIMMEST:
+        light += 0.01
     return (*colorsys.hls_to_rgb(hue, light, saturation), alpha)
+
+
+def _luminance(rgb: Sequence[float]) -> float:
+    """Relative luminance of a colour, 1 for white."""
+    red, green, blue = (part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in rgb)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue

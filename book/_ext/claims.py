@@ -398,7 +398,7 @@ def others_alike(n: Numbers) -> Finding:
         (
             bool(other),
             FAILS,
-            f"{other[:1].upper()}{other[1:]}: other behaviour, each for its own reason (Figure 4). "
+            f"{other[:1].upper()}{other[1:]} behave differently, each for its own reason (Figure 4). "
             "The paper may mean methods with two images.",
         ),
     )

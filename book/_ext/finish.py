@@ -30,7 +30,7 @@ MATH = {"lambda": "λ", "theta": "θ", "pi": "π", "pm": "±"}
 TEX = re.compile(r"\\(?:[()]|([a-z]+))")
 POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e([+-])0*(\d+)\b")
 MINUS = re.compile(r"(?<![\w.)-])-(?=\d)")
-PERCENT = re.compile(r"(?:(?<=\d)|^) ?%")  # after a number, which may stand in an element of its own
+PERCENT = re.compile(r"(?:(?<=\d)|^) ?%")  # the number may be in the element before
 DIGITS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 CONSOLE = re.compile(r"\bconsole\.(?:log|info|debug)\(")
 FORWARD = """<!DOCTYPE html>

@@ -103,7 +103,7 @@ _RANGES = {
     "leakage": (0.0, 0.45, 0.05),
     "unmasked": (0.0, 0.9, 0.1),
 }
-_CHANGE = 0.1  # for a derivative, over the typical change: across smaller ones, single points jump too much
+_CHANGE = 0.1  # step of a derivative over the typical change: smaller steps amplify the jumps of single points
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,8 @@ from zwfs.paper.phase_amplitude import WAYS, AmplitudeCurves
 from zwfs.paper.phase_shifts import DrawnNoise, PairMaps
 from zwfs.paper.photon_noise import EXPECTED, ErrorBars, PhotonCurves
 from zwfs.paper.recovery import DimpleLimits, RecoveryCurves
-from zwfs.plots.style import DARK_PHASE_MAP
+from zwfs.plots.photon_noise import label_places
+from zwfs.plots.style import ALONE, DARK_PHASE_MAP
 from zwfs.plots.variants import dark_color, variants
 
 
@@ -212,6 +213,36 @@ def test_variants_are_dark_or_fit_a_phone_and_the_figure_stays(name, drawn_metho
             assert not cut_off(variant)
     assert plt.get_fignums() == numbers
     assert np.array_equal(pixels(figure), before)
+
+
+def test_pictures_with_titles_stay_in_the_order_of_reading_on_a_phone():
+    figure, panels = plt.subplots(2, 3)
+    for number, axes in enumerate(panels.flat):
+        plots.show_phase(axes, np.zeros((2, 2)), 1.0).axes.set_title(f"{number}")
+    panels[0, 0].set_gid(ALONE)
+    boxes = panel_boxes(variants(figure)["narrow"])
+    lines = {top for _, top, _ in boxes.values()}
+    rows = [sorted(name for name, (_, top, _) in boxes.items() if top == line) for line in sorted(lines)]
+    assert rows[::-1] == [["0"], ["1", "2"], ["3", "4"], ["5"]]
+    assert len({width for *_, width in boxes.values()}) == 1
+
+
+def panel_boxes(figure):
+    """Left end, upper end and width of each panel by its title, in pixels."""
+    FigureCanvasAgg(figure).draw()
+    boxes = {axes.get_title(): axes.get_window_extent() for axes in figure.axes}
+    return {name: tuple(round(value) for value in (box.x0, box.y1, box.width)) for name, box in boxes.items()}
+
+
+def test_labels_of_contours_have_room():
+    line = np.linspace(0, 1, 21)
+    near, far = ([np.stack([line, np.full(21, height)], axis=1)] for height in (0.1, 0.6))
+    mark = np.array([[0.2, 0.6]])
+    places = label_places({1.0: near, 2.0: far, 3.0: []}, mark, (0, 1, 0, 1), (1, 1))
+    assert set(places) == {2.0}  # the first is 0.1 inch from the frame, and the third has no line
+    assert tuple(places[2.0]) == pytest.approx((0.6, 0.6))
+    both = label_places({1.0: near, 2.0: far}, mark, (0, 1, 0, 1), (10, 10))
+    assert set(both) == {1.0, 2.0}
 
 
 def test_phases_of_a_dark_figure_are_dark_at_zero():

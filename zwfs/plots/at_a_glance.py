@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from zwfs.metrics import wrapped_residual
-from zwfs.plots.style import LOOKS, show_intensity, show_phase
+from zwfs.plots.style import ALONE, LOOKS, show_intensity, show_phase
 from zwfs.pupil import Pupil
 
 _ROUNDING = 1e-15  # rad
@@ -35,6 +35,7 @@ def at_a_glance(pupil: Pupil, phase: NDArray, frames: NDArray, estimates: Mappin
     limit = 3 * rms
     figure, panels = plt.subplots(2, 3, figsize=(7.2, 5.3))
     shown = show_phase(panels[0, 0], truth, limit)
+    panels[0, 0].set_gid(ALONE)
     panels[0, 0].set_title(f"Input: {rms:.1f} rad rms", fontsize=_LETTERS)
     top = np.quantile(frames, 0.99)
     for axes, frame, number in zip(panels[0, 1:], frames, ("1", "2"), strict=True):

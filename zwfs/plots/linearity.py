@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import cycle
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -35,6 +38,7 @@ def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], r
     drawn = curves.rms <= rms_max
     bright = curves.rms > 0
     rms = curves.rms[drawn]
+    limits = {name: curves.dynamic_range(name, threshold) for name in names}
     for name, look in _looks(names):
         mean, std = curves.mean(name), curves.std(name)[drawn]
         line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
@@ -42,9 +46,14 @@ def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], r
         low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
         plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
         ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], **line)
-        limit = curves.dynamic_range(name, threshold)
+        limit = limits[name]
         if 0 < limit <= curves.rms[-1]:
             ratio.plot(limit, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
+    longest = max(limits, key=lambda name: limits[name])
+    if 0 < limits[longest] <= curves.rms[-1]:
+        style: dict[str, Any] = {"color": LOOKS[longest].color, "fontsize": 9, "ha": "left", "va": "top"}
+        label = f"{limits[longest]:.2g}", (limits[longest], threshold), (7, -5)
+        ratio.annotate(*label, textcoords="offset points", **style)
     plain.plot(rms, threshold * rms, color="#555555", lw=1)
     ratio.axhline(threshold, color="#555555", lw=1)
     end = ratio.get_yaxis_transform()  # the right end of the line, which no curve crosses
@@ -71,22 +80,36 @@ def saxton_widths(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurv
     figure, axes = plt.subplots(figsize=(7, 4.6))
     dashes = {"zero": cycle(("-", "-.", "--", ":")), "model": cycle(("-", "--"))}
     markers = {"zero": cycle("^<v>"), "model": cycle("x+")}
+    looks = {"zero": LOOKS["GerchbergSaxton"], "model": LOOKS["GerchbergSaxtonModel"]}
+    counts = Counter(method.unmeasured for method in variants.values())
+    shades = {kind: iter(_shades(looks[kind].color, count)) for kind, count in counts.items()}
     for name, method in variants.items():
         kind = method.unmeasured
-        look = LOOKS["GerchbergSaxtonModel" if kind == "model" else "GerchbergSaxton"]
         label = f"{kind}, {method.sensor.extent:g} D, {method.settings.n_iterations} iterations"
         axes.semilogy(
             curves.rms,
             curves.mean(name) / curves.rms,
             label=label,
-            **look.style | {"linestyle": next(dashes[kind]), "marker": next(markers[kind])},
+            color=next(shades[kind]),
+            linestyle=next(dashes[kind]),
+            marker=next(markers[kind]),
         )
+        if kind == "zero":
+            start = curves.rms[0], curves.mean(name)[0] / curves.rms[0]
+            place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "center"}
+            axes.annotate(f"{method.sensor.extent:g} D", start, (-7, 0), fontsize=9, **place)
     axes.plot(curves.rms, curves.mean("Linear") / curves.rms, label="linear", **LOOKS["Linear"].style)
     axes.axhline(threshold, color="#555555", lw=1)
     axes.text(0.01, threshold * 0.9, f"{threshold:.0%} of the input", color="#555555", fontsize=9, va="top")
     axes.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     return figure
+
+
+def _shades(color: str, count: int) -> list[tuple[float, ...]]:
+    """Return shades of a colour, from dark to light."""
+    ends = LinearSegmentedColormap.from_list("shades", ["black", color, "white"])
+    return [ends(level) for level in np.linspace(0.3, 0.65, count)] if count > 1 else [to_rgba(color)]
 
 
 def convergence(errors: Mapping[str, Mapping[float, NDArray]]) -> Figure:

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from zwfs.focal import focal_field
@@ -45,12 +46,16 @@ def sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Figure:
         show_intensity(panels[3], image, image.max()),
     )
     shown[1].set(cmap="magma", norm="log", clim=(1e-3, 1), extent=(-_REACH, _REACH, -_REACH, _REACH))
-    panels[1].add_patch(Circle((0, 0), sensor.masks[0].diameter / 2, fill=False, ec="white", ls="--", lw=1.5))
+    for width, edge, line in ((3.2, "black", "-"), (1.5, "white", "--")):
+        radius = sensor.masks[0].diameter / 2
+        panels[1].add_patch(Circle((0, 0), radius, fill=False, ec=edge, ls=line, lw=width))
     titles = "1. pupil:\nphase", "2. focus:\ndimple (dashed)", "3. reference\nwave", "4. camera:\nimage"
     units = "rad", "intensity", "intensity", "intensity"
     for axes, picture, title, unit in zip(panels, shown, titles, units, strict=True):
         axes.set_title(title, fontsize=10)
-        figure.colorbar(picture, ax=axes, location="bottom", label=unit, aspect=12, pad=0.03)
+        bar = figure.colorbar(picture, ax=axes, location="bottom", label=unit, aspect=12, pad=0.03)
+        if axes is panels[2]:
+            bar.locator = MaxNLocator(2)
     for axes in (panels[0], panels[3]):
         axes.plot(pixel.column, pixel.row, "+", color="black" if axes is panels[0] else "white", ms=9, mew=1.5)
     return figure

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
+from itertools import pairwise
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -13,13 +14,16 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from zwfs.paper.design import Design, DesignMap
 from zwfs.paper.photon_noise import EXPECTED, SIGMAS, ErrorBars, PhotonCurves
 from zwfs.plots.style import LOOKS, OTHER_STYLES, _looks
 
-# Photon costs at which a line is drawn, and its colour, which differs from that of the map.
-_LINES = dict.fromkeys((1.25, 1.5, 2), "#222222") | dict.fromkeys((3, 5, 10), "#ffffff")
+COST_LINES = dict.fromkeys((1.25, 1.5, 2), "#222222") | dict.fromkeys((3, 5, 10), "#ffffff")
+"""Photon costs at which a line is drawn, and its colour, which differs from that of the map."""
+
+_NEAREST = 0.11  # of a label to anything else, inch
 _OUTLINE = withStroke(linewidth=3, foreground="#ffffff")  # of the marks, on dark colours of the map
 _MARKS = ("o", "s", "D", "*", "P", "X")
 
@@ -80,13 +84,14 @@ def design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[str, 
     x, y = maps.diameters, maps.angles / np.pi
     half = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
     extent = x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1]
+    contours: list[dict[float, list[NDArray]]] = []
     for axes, (name, grid) in zip(panels[0], maps.costs.items(), strict=True):
         axes.grid(False)
         shown = axes.imshow(
             grid.T, cmap="cividis_r", norm=LogNorm(1, 10), extent=extent, aspect="auto", interpolation="bilinear"
         )
-        lines = axes.contour(x, y, grid.T, list(_LINES), colors=list(_LINES.values()), linewidths=0.8)
-        axes.clabel(lines, fmt="%g", fontsize=9)
+        lines = axes.contour(x, y, grid.T, list(COST_LINES), colors=list(COST_LINES.values()), linewidths=0.8)
+        contours.append(dict(zip(COST_LINES, lines.allsegs, strict=True)))
         marked = zip((*designs, maps.best(name)), (*costs[name], grid.min()), _MARKS, strict=False)
         for design, cost, mark in marked:
             low, high = sorted(abs(theta) / np.pi for theta in design[2:])
@@ -114,4 +119,53 @@ def design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[str, 
     for handle in handles:  # a mark has another colour in each panel
         handle.set_markerfacecolor("#ffffff")
     figure.legend(handles, labels, loc="outside lower center", ncols=5, handletextpad=0.2, columnspacing=1)
+    figure.draw_without_rendering()  # which decides the size of the panels
+    for axes, paths in zip(panels[0], contours, strict=True):
+        marks = np.concatenate([_dense(line.get_xydata()) for line in axes.lines])
+        size = axes.get_window_extent().size / figure.dpi
+        for cost, (across, up) in label_places(paths, marks, extent, size).items():
+            patch = {"facecolor": shown.to_rgba(cost), "edgecolor": "none", "boxstyle": "square,pad=0.1"}
+            style: dict[str, Any] = {"color": COST_LINES[cost], "fontsize": 9, "bbox": patch}
+            axes.text(across, up, f"{cost:g}", ha="center", va="center", **style)
     return figure
+
+
+def label_places(
+    paths: Mapping[float, Sequence[NDArray]], marks: NDArray, extent: Sequence[float], size: Sequence[float]
+) -> dict[float, NDArray]:
+    """Choose a place for the label of each contour: far from other contours, marks, labels and the frame.
+
+    Parameters
+    ----------
+    paths : mapping of float to sequence of ndarray, shape (n, 2)
+        Parts of each contour by its level.
+    marks : ndarray, shape (n, 2)
+        Places to keep free.
+    extent : sequence of float
+        Left, right, lower and upper end of the map.
+    size : sequence of float
+        Width and height of the map, inch.
+
+    Returns
+    -------
+    dict of ndarray, shape (2,)
+        Place by level. A contour without room for a label is left out.
+    """
+    left, right, low, high = extent
+    scale = np.divide(size, (right - left, high - low))
+    frame = _dense(np.array([(left, low), (right, low), (right, high), (left, high), (left, low)]))
+    points = {level: np.concatenate([np.empty((0, 2)), *parts]) for level, parts in paths.items()}
+    places: dict[float, NDArray] = {}
+    for level, own in points.items():
+        others = [other for key, other in points.items() if key != level]
+        taken = np.concatenate([frame, marks, *others, *(place[np.newaxis] for place in places.values())])
+        distances = cdist(own * scale, taken * scale).min(axis=1)
+        if distances.size and distances.max() > _NEAREST:
+            places[level] = own[distances.argmax()]
+    return places
+
+
+def _dense(corners: NDArray) -> NDArray:
+    """Points on a line with these corners."""
+    steps = np.linspace(0, 1, 25)[:, np.newaxis]
+    return np.concatenate([corners[:1], *(a + steps * (b - a) for a, b in pairwise(corners))])

@@ -17,6 +17,9 @@ from zwfs.reconstructors import RECONSTRUCTORS
 
 PHASE_MAP, INTENSITY_MAP = "RdBu_r", "viridis"
 
+ALONE = "alone"
+"""Group of the panels that share their row with no other on a phone."""
+
 # Of phases on a dark ground: 0 is dark, the signs keep their hues, and opposite phases are equally light.
 DARK_PHASE_MAP = LinearSegmentedColormap.from_list(
     "zwfs_dark_phase", ["#9fd2ff", "#2f7fc9", "#2a2a2e", "#d1493f", "#ffb8ad"]

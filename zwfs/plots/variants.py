@@ -15,7 +15,7 @@ from matplotlib.colors import to_rgba, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation, Text
 
-from zwfs.plots.style import DARK_PHASE_MAP, PHASE_MAP
+from zwfs.plots.style import ALONE, DARK_PHASE_MAP, PHASE_MAP
 
 _WIDTH, _HEIGHT = 3.7, 2.7  # of a narrow figure and of each panel in it, inch
 _LETTERS = 11  # points, at most: some figures have larger ones, as pages show them smaller than they are
@@ -24,6 +24,7 @@ _ENTRY = 420  # points times letters: an entry of a legend with so many letters 
 _MARGIN = 0.05  # above and below what is drawn, inch
 _ROUNDS = 12  # at most, to find the height
 _STEP = 1.8  # of the height over the gaps, which fall by about half of it
+_PAD = 0.07  # above and below a panel, inch: the label of one and the title of the next must not touch
 _BAR = 0.6  # height of a colour bar with its numbers and its label, inch
 _DIMMEST = 0.22  # luminance of a colour on the dark ground: a contrast of 4.7, enough for letters
 _PARTS = "color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"
@@ -47,11 +48,12 @@ def _copy(state: bytes) -> Figure:
 
 
 def _stacked(figure: Figure) -> Figure:
-    """Put the panels of a figure below each other, in place, and pictures in pairs, column by column."""
+    """Put the panels of a figure below each other, in place, and pictures in pairs."""
     panels = [axes for axes in figure.axes if axes.get_subplotspec()]
+    by_columns = any(not axes.get_title() for axes in panels)  # the title of a column stands above it only
     for axes in panels:
         _label(axes, panels)
-    rows = _rows(panels)
+    rows = _rows(panels, by_columns=by_columns)
     paired = any(len(row) == 2 for row in rows)
     heights = [_height(row, _WIDTH / 2 if paired else _WIDTH * _LONE) for row in rows]
     grid = figure.add_gridspec(len(rows), 2, height_ratios=heights)
@@ -71,7 +73,7 @@ def _stacked(figure: Figure) -> Figure:
     for text in figure.findobj(Text):
         text.set_fontsize(min(text.get_fontsize(), _LETTERS))
     figure.set_size_inches(_WIDTH, sum(heights) + _BAR * bars + 0.2 * entries)
-    figure.set_layout_engine("constrained")  # a saved figure has none
+    figure.set_layout_engine("constrained", h_pad=_PAD)  # a saved figure has none
     _fit_height(figure)
     return figure
 
@@ -87,11 +89,16 @@ def _fit_height(figure: Figure) -> None:
         figure.set_figheight(round(figure.get_figheight() + _STEP * change, 2))
 
 
-def _rows(panels: list[Axes]) -> list[list[Axes]]:
-    """Order panels by columns; two pictures that follow each other make a row, and all others stand alone."""
-    specs: dict[Axes, Any] = {axes: axes.get_subplotspec() for axes in panels}
+def _rows(panels: list[Axes], *, by_columns: bool) -> list[list[Axes]]:
+    """Order panels by columns or rows; two pictures that follow each other make a row, all others stand alone."""
+
+    def order(axes: Axes) -> tuple[int, int]:
+        spec: Any = axes.get_subplotspec()
+        place = spec.colspan.stop, spec.rowspan.start
+        return place if by_columns else place[::-1]
+
     rows: list[list[Axes]] = []
-    for axes in sorted(panels, key=lambda one: (specs[one].colspan.stop, specs[one].rowspan.start)):
+    for axes in sorted(panels, key=order):
         pair = [*rows[-1], axes] if rows else []
         if len(pair) == 2 and all(map(_fits_half, pair)):
             rows[-1] = pair
@@ -108,11 +115,12 @@ def _fits_half(axes: Axes) -> bool:
     """Whether a panel is a picture that is not too wide, nor its title, for half of a narrow figure."""
     size = min(float(axes.title.get_fontsize()), _LETTERS)
     letters = max(map(len, axes.get_title().split("\n")))
-    return _is_picture(axes) and _proportion(axes) > 0.6 and letters * size <= _ENTRY / 2
+    fits = _proportion(axes) > 0.6 and letters * size <= _ENTRY / 2
+    return _is_picture(axes) and fits and axes.get_gid() != ALONE
 
 
 def _proportion(axes: Axes) -> float:
-    """Height of a picture over its width."""
+    """Height of a panel with equal units on both axes over its width."""
     return abs(np.ptp(axes.get_ylim()) / np.ptp(axes.get_xlim()))
 
 
@@ -122,7 +130,7 @@ def _height(row: list[Axes], width: float) -> float:
         texts = [axes.get_title() + "\n" * bool(axes.get_title()) + axes.get_xlabel() for axes in row]
         lines = max(len(text.splitlines()) for text in texts)
         return width * max(map(_proportion, row)) + 0.2 * lines
-    return _WIDTH if row[0].get_aspect() != "auto" else _HEIGHT
+    return _WIDTH * _proportion(row[0]) if row[0].get_aspect() != "auto" else _HEIGHT
 
 
 def _lower(figure: Figure, axes: Axes) -> bool:

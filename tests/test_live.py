@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 
 import zwfs
 from book._ext import live
@@ -74,7 +75,13 @@ def fresh(page):
     page.click("#live-play")
     page.click("button:text-is('The paper')")
     page.wait_for_function("location.hash === ''")
+    wait_for_drawing(page)
     return page
+
+
+def wait_for_drawing(page):
+    """Wait until the page has been drawn again: what it says may be the same before and after."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 
 COMPUTE = """settings => {
@@ -222,6 +229,21 @@ def test_designs_are_those_of_the_notebook(pupil, modes):
         np.testing.assert_allclose([table["costs"][name][x][y] for x, y in places], costs, rtol=1e-5)
 
 
+@pytest.mark.parametrize("name", live.designs()["costs"])
+def test_contours_and_the_best_design_are_those_of_the_map(fresh, name):
+    fresh.check(f"input[value='{name}']")
+    table = live.designs()
+    costs, contours = np.array(table["costs"][name]), table["contours"][name]
+    logs = RegularGridInterpolator([np.arange(size) + 0.5 for size in costs.shape], np.log(costs))
+    for label in contours["labels"]:
+        x, y = label["place"]
+        assert np.exp(logs((x, costs.shape[1] - y))) == pytest.approx(float(label["text"]), rel=0.05)
+    assert fresh.locator("#live-costs span").all_inner_texts() == [label["text"] for label in contours["labels"]]
+    column, row = np.unravel_index(costs.argmin(), costs.shape)
+    place = re.findall(r"[\d.]+", fresh.get_attribute("path.live-best >> nth=0", "d"))
+    assert [float(value) for value in place[:2]] == pytest.approx([column + 0.5, costs.shape[1] - row - 0.5])
+
+
 def test_sliders_stay_in_the_range_of_the_data(page):
     limits = {
         name: [float(page.get_attribute(f"#live-{name}", end)) for end in ("min", "max")]
@@ -262,8 +284,7 @@ def test_presets_and_buttons_set_the_sensor_up(fresh, preset, expected, named):
     if fresh.inner_text("#live-play") == "■ Stop":
         fresh.click("#live-play")
         fresh.evaluate("window.zwfsLive.page.set({ iterations: '30' })")
-    # Verdicts may be the same before and after, so wait until the page has been drawn again.
-    fresh.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    wait_for_drawing(fresh)
     assert verdicts(fresh) == expected
     assert fresh.inner_text("#live-name-2") == named
 

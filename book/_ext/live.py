@@ -7,11 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import LogNorm, to_hex
+from matplotlib.figure import Figure
 from matplotlib.pyplot import get_cmap
 from numpy.typing import NDArray
 from sphinx.application import Sphinx
 
 import zwfs
+from zwfs.paper.design import PUBLISHED
+from zwfs.plots.photon_noise import COST_LINES, label_places
 from zwfs.plots.style import DARK_PHASE_MAP, INTENSITY_MAP, PHASE_MAP
 
 DATA = "_static/live-data.js"
@@ -25,6 +29,8 @@ DIAMETERS = (0.5, 3.0)  # lambda/D
 N_DIAMETERS = 14
 TOLERANCE = 1e-7  # of the reference waves, which are stored in single precision
 COST_MAP = "cividis_r"
+MOST = 10  # photons at the end of its scale, as in live-design.js
+MAP_SIZE = 2.9, 2.4  # of the map of designs on a phone, inch
 
 
 def script() -> str:
@@ -87,16 +93,67 @@ def screens(pupil: zwfs.Pupil) -> NDArray:
 
 
 def designs() -> dict[str, Any]:
-    """Return the photon costs of designs, a row for each diameter, by the name of the wavefronts."""
+    """Return the photon costs of designs, a row for each diameter, and their contours, by the wavefronts."""
     with DESIGNS.open(encoding="utf-8", newline="") as file:
         header, *rows = csv.reader(file)
     table = np.array(rows, float)
-    diameters, shifts = np.unique(table[:, 0]), np.unique(table[:, 1])
+    diameters, shifts = np.unique(table[:, 0]), np.unique(table[:, 1]) / np.pi
     costs = {
-        name.rpartition(", ")[2]: table[:, column].reshape(diameters.size, shifts.size).tolist()
+        name.rpartition(", ")[2]: table[:, column].reshape(diameters.size, shifts.size)
         for column, name in enumerate(header[2:], 2)
     }
-    return {"diameters": diameters.tolist(), "shifts": (shifts / np.pi).round(6).tolist(), "costs": costs}
+    return {
+        "diameters": diameters.tolist(),
+        "shifts": shifts.round(6).tolist(),
+        "costs": {name: cost.tolist() for name, cost in costs.items()},
+        "contours": {name: contours(diameters, shifts, cost) for name, cost in costs.items()},
+    }
+
+
+def contours(diameters: NDArray, shifts: NDArray, costs: NDArray) -> dict[str, Any]:
+    """Return the contours of a map as paths by their colours, and their labels; units are cells of the map.
+
+    Parameters
+    ----------
+    diameters : ndarray, shape (a,), lambda/D
+    shifts : ndarray, shape (b,), units of pi
+    costs : ndarray, shape (a, b)
+
+    Returns
+    -------
+    dict
+        "paths": path by colour. "labels": list of text, color, ground, and place from the left and from the top.
+    """
+    cells = np.arange(diameters.size) + 0.5, shifts.size - np.arange(shifts.size) - 0.5
+    lines = Figure().subplots().contour(*cells, costs.T, list(COST_LINES)).allsegs
+    parts = dict(zip(COST_LINES, lines, strict=True))
+    ends = [(design.diameter, abs(angle) / np.pi) for design in PUBLISHED for angle in design[2:]]
+    best = np.unravel_index(costs.argmin(), costs.shape)
+    across, up = np.transpose([*ends, (diameters[best[0]], shifts[best[1]])])
+    marks = [np.interp(across, diameters, cells[0]), np.interp(up, shifts, cells[1])]
+    places = label_places(parts, np.transpose(marks), (0, diameters.size, 0, shifts.size), MAP_SIZE)
+    paths = dict.fromkeys(COST_LINES.values(), "")
+    for level, color in COST_LINES.items():
+        paths[color] += "".join(_path(part) for part in parts[level] if part.size)
+    labels = [
+        {
+            "text": f"{level:g}",
+            "color": COST_LINES[level],
+            "ground": _ground(level),
+            "place": place.round(2).tolist(),
+        }
+        for level, place in places.items()
+    ]
+    return {"paths": paths, "labels": labels}
+
+
+def _ground(cost: float) -> str:
+    """Return the colour of a cost on the map."""
+    return to_hex(get_cmap(COST_MAP)(LogNorm(1, MOST)(cost)))
+
+
+def _path(points: NDArray) -> str:
+    return "M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in points)
 
 
 def _encode(array: NDArray) -> dict[str, Any]:

@@ -4,7 +4,7 @@
 
 (() => {
   const { designs, colors, page } = window.zwfsLive;
-  const { diameters, shifts, costs } = designs;
+  const { diameters, shifts, costs, contours } = designs;
   const MOST = 10; // end of the scale of photons
   const find = (name) => document.getElementById(`live-${name}`);
   const map = find("designs");
@@ -13,7 +13,8 @@
   const stepOf = (values) => (values.at(-1) - values[0]) / (values.length - 1);
   const nearest = (values, value) => Math.round((value - values[0]) / stepOf(values));
   const within = (values, place) => Math.min(values.length - 1, Math.max(0, place));
-  const cost = () => costs[choices.find((choice) => choice.checked).value];
+  const wavefronts = () => choices.find((choice) => choice.checked).value;
+  const cost = () => costs[wavefronts()];
 
   // Position in the drawing, in cells, of a diameter and a shift.
   const across = (diameter) => (diameter - diameters[0]) / stepOf(diameters) + 0.5;
@@ -32,6 +33,42 @@
       }),
     );
     context.putImageData(image, 0, 0);
+    drawContours(contours[wavefronts()]);
+    markBest();
+  }
+
+  function drawContours({ paths, labels }) {
+    const lines = Object.entries(paths).map(([color, path]) => {
+      const line = document.createElementNS("http://www.w3.org/2000/svg", "path");
+      line.setAttribute("d", path);
+      line.style.stroke = color;
+      return line;
+    });
+    const texts = labels.map(({ text, color, ground, place }) => {
+      const label = document.createElement("span");
+      label.textContent = text;
+      label.style.color = color;
+      label.style.background = ground;
+      put(label, ...place);
+      return label;
+    });
+    find("contours").replaceChildren(...lines);
+    find("costs").replaceChildren(...texts);
+  }
+
+  // Position on the map, in cells.
+  function put(element, x, y) {
+    element.style.left = `${(100 * x) / diameters.length}%`;
+    element.style.top = `${(100 * y) / shifts.length}%`;
+  }
+
+  // The design of the map that needs the fewest photons.
+  function markBest() {
+    const least = Math.min(...cost().flat());
+    const x = cost().findIndex((row) => row.includes(least));
+    const shift = shifts[cost()[x].indexOf(least)];
+    for (const element of map.querySelectorAll(".live-best")) mark(element, diameters[x], [shift, -shift]);
+    put(find("best"), across(diameters[x]), down(shift));
   }
 
   // A bar from one shift to the other, or a point if they are of equal size.

@@ -233,14 +233,21 @@ class Quiet(SimpleHTTPRequestHandler):
         pass
 
 
-def test_a_wide_table_fades_until_its_end_is_in_sight(browser):
+@pytest.mark.parametrize(
+    ("name", "box", "text"),
+    [
+        ("notebooks/design", ".pst-scrollable-table-container", "all-round"),
+        ("notebooks/zernike_sensor", ".highlight pre", "bump_and_pit"),
+    ],
+)
+def test_a_wide_table_or_code_fades_until_its_end_is_in_sight(browser, name, box, text):
     page = browser.new_page(viewport={"width": 390, "height": 844})
-    page.goto(address("notebooks/design.html"))
-    table = page.locator(".pst-scrollable-table-container", has_text="all-round")
+    page.goto(address(f"{name}.html"))
+    wide = page.locator(box, has_text=text).first
     fades = "box => getComputedStyle(box).maskImage !== 'none'"
-    assert table.evaluate(fades)
-    table.evaluate("box => { box.scrollLeft = box.scrollWidth; }")
-    page.wait_for_function(f"box => !({fades})(box)", arg=table.element_handle())
+    assert wide.evaluate(fades)
+    wide.evaluate("box => { box.scrollLeft = box.scrollWidth; }")
+    page.wait_for_function(f"box => !({fades})(box)", arg=wide.element_handle())
     page.close()
 
 

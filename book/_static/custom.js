@@ -16,14 +16,14 @@ function nameWideTables() {
   }
 }
 
-// They fade at the right until their end is in sight.
-function fadeWideTables() {
-  for (const box of document.querySelectorAll(".pst-scrollable-table-container"))
+// They and wide code fade at the right until their end is in sight.
+function fadeWideBoxes() {
+  for (const box of document.querySelectorAll(".pst-scrollable-table-container, .highlight pre"))
     box.classList.toggle("more", box.scrollLeft + box.clientWidth < box.scrollWidth - 1);
 }
 
 for (const event of ["load", "resize"]) {
   addEventListener(event, nameWideTables);
-  addEventListener(event, fadeWideTables);
+  addEventListener(event, fadeWideBoxes);
 }
-addEventListener("scroll", fadeWideTables, { capture: true, passive: true });
+addEventListener("scroll", fadeWideBoxes, { capture: true, passive: true });

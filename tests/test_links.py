@@ -25,7 +25,7 @@ def test_equations_lead_to_the_code_that_cites_them_and_to_its_tests():
     [
         ("The reference waves interfere.", ["reference waves"]),
         ("The wavefront error of a wavefront", ["wavefront error", "wavefront"]),
-        ("A wavefront sensor, a phase shift, and a phase-shifted iteration", []),
+        ("A wavefront sensor, a phase shift, and a phase-shifted iteration", ["phase shift"]),
         ("Maximum likelihood, then maximum likelihood", ["Maximum likelihood"]),
     ],
 )

@@ -11,7 +11,7 @@ from scipy.interpolate import RegularGridInterpolator
 import zwfs
 from book._ext import live
 from zwfs.focal import focal_field
-from zwfs.paper.design import Design, photon_costs
+from zwfs.paper.design import Design, DesignMap, photon_costs
 from zwfs.paper.linearity import screens_at
 
 ROOT = Path(__file__).parent.parent
@@ -229,6 +229,16 @@ def test_designs_are_those_of_the_notebook(pupil, modes):
         np.testing.assert_allclose([table["costs"][name][x][y] for x, y in places], costs, rtol=1e-5)
 
 
+def test_all_round_design_is_that_of_the_map():
+    table = live.designs()
+    costs = {name: np.array(cost) for name, cost in table["costs"].items()}
+    best = DesignMap(np.array(table["diameters"]), np.pi * np.array(table["shifts"]), costs).all_round
+    place = f"{best.diameter:g} {best.theta_a / np.pi:.3g} {best.theta_b / np.pi:.3g}"
+    assert SOURCE.count(f'data-design="{place}"') == 2
+    settings = "diameter={}&amp;shift-a={}&amp;shift-b={}".format(*place.split())
+    assert re.search(rf'data-live="[^"]*{settings}[^"]*">All-round</button>', SOURCE)
+
+
 @pytest.mark.parametrize("name", live.designs()["costs"])
 def test_contours_and_the_best_design_are_those_of_the_map(fresh, name):
     fresh.check(f"input[value='{name}']")
@@ -273,6 +283,7 @@ def test_the_first_state_shows_the_point_of_the_paper(fresh):
         ("SEAL", ["✗", "✗", "✓"], "phase-shifted"),
         ("Keck", ["✗", "✗", "✓"], "maximum likelihood"),
         ("OZIRIIS", ["✗", "✗", "✓"], "maximum likelihood"),
+        ("All-round", ["✗", "✗", "✓"], "maximum likelihood"),
         ("Dimple too large", ["✗", "✗", "✗"], "phase-shifted"),
         ("Out of range", ["✗", "✗", "✗"], "phase-shifted"),
         ("The same with maximum likelihood", ["✗", "✗", "✓"], "maximum likelihood"),

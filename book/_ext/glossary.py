@@ -60,7 +60,7 @@ def terms(glossary: Path) -> list[str]:
 def pattern(missing: dict[str, str]) -> re.Pattern[str]:
     """Return the pattern of a term or its plural; a longer term goes before one that it contains."""
     either = "|".join(re.escape(term) for term in sorted(missing, key=len, reverse=True))
-    return re.compile(rf"(?<![-\w])({either})s?(?![-\w]| sens| shift)", re.IGNORECASE)
+    return re.compile(rf"(?<![-\w])({either})s?(?![-\w]| sens)", re.IGNORECASE)
 
 
 def in_prose(text: nodes.Text) -> bool:

@@ -282,7 +282,7 @@ def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.b
         size = f"the rms misfit is {np.mean(result.residual):.3f} of the mean light"
         return f"Not compared with the noise of the camera, which is not known: {size}. {where}"
     if inner > _EXPLAINED:
-        return f"Not explained: far from {edges} the misfit is {inner:.3g} times that of the noise. {where}"
+        return f"Not explained. {where} Far from {edges} the misfit is {inner:.3g} times that of the noise."
     verdict = f"Explained to within the noise: far from {edges} the misfit is {inner:.2f} times that of the noise."
     if edge <= _EXPLAINED:
         return verdict

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from zwfs.bench.model import Bench
 from zwfs.paper.bench_linearity import BenchCurves
-from zwfs.plots.style import LOOKS, _looks, show_intensity, show_phase
+from zwfs.plots.style import ALONE, LOOKS, _looks, show_intensity, show_phase
 
 _ARMS = ("1 (+θ)", "2 (−θ)")
 
@@ -89,6 +89,7 @@ def segment_errors(bench: Bench, commanded: NDArray, errors: Mapping[str, NDArra
     points.set(xlabel="segment number", ylabel="error of the piston (rad)")
     figure.legend(loc="outside upper center", ncols=2, fontsize=9)
     limit = max(np.nanmax(np.abs(image)) for image in maps.values())
+    panels["commanded"].set_gid(ALONE)
     for title, image in maps.items():
         shown = show_phase(panels[title], image, limit)
         panels[title].set_title(title, fontsize=10)

@@ -13,23 +13,27 @@ from zwfs.plots.style import LOOKS
 
 
 def loop_runs(runs: Mapping[float, Mapping[str, LoopRun]]) -> Figure:
-    """Residual against time, one panel for each star and one line for each screen.
+    """Residual against time: a column for each star, a row for each method, and a line for each screen.
 
     Parameters
     ----------
     runs : mapping of magnitude to mapping of method to LoopRun
     """
-    figure, panels = plt.subplots(1, len(runs), figsize=(7, 3.9), sharey=True, squeeze=False)
-    for axes, (magnitude, methods) in zip(panels[0], runs.items(), strict=True):
-        for name, run in methods.items():
+    n_rows = len(next(iter(runs.values())))
+    figure, panels = plt.subplots(
+        n_rows, len(runs), figsize=(7, 0.8 + 2.1 * n_rows), sharex=True, sharey=True, squeeze=False
+    )
+    for column, (magnitude, methods) in zip(panels.T, runs.items(), strict=True):
+        column[0].set_title(f"magnitude {magnitude:g}", fontsize=10)
+        column[-1].set_xlabel("time (ms)")
+        for axes, (name, run) in zip(column, methods.items(), strict=True):
             look, time = LOOKS[name], 1e3 * run.times
-            labels = [look.label, *[None] * (len(run.residual) - 1)]
-            axes.semilogy(time, run.residual.T, lw=1, color=look.color, linestyle=look.line, label=labels)
-        axes.semilogy(time, np.median(run.open_loop, axis=0), color="#777777", lw=1, label="without correction")
-        axes.set(xlabel="time (ms)", xlim=(0, time[-1]))
-        axes.set_title(f"magnitude {magnitude:g}", fontsize=10)
-    panels[0, 0].set_ylabel("residual (rad rms)")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+            axes.semilogy(time, run.residual.T, lw=1, color=look.color)
+            axes.semilogy(time, np.median(run.open_loop, axis=0), color="#777777", lw=1.5, ls="--")
+            axes.set_xlim(0, time[-1])
+            panels[list(methods).index(name), 0].set_ylabel(f"{look.name}\nresidual (rad rms)")
+    place = 0.97 * time[-1], 1.25 * run.open_loop.mean()
+    panels[-1, 0].text(*place, "no correction", ha="right", va="bottom", color="#777777")
     return figure
 
 

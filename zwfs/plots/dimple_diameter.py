@@ -41,10 +41,11 @@ def dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float, clai
         log.plot(other.diameters, other.mean(name), ms=4, label=f"{number} iterations", **style)
     limit = threshold * curve.rms[0]
     log.axhline(limit, color="#555555", lw=1)
-    log.text(0.1, limit * 1.3, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
+    start, end = 0.64 * claimed, 1.4 * claimed
+    log.text(1.01 * start, limit * 1.3, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
     plain.set_ylim(0, None)
-    log.set(yscale="log", ylim=(floor, 4))
-    log.legend(loc="upper left", bbox_to_anchor=(0, 0.68), fontsize=9)
+    log.set(yscale="log", xlim=(start, end), ylim=(floor, 60))  # room for the legend
+    log.legend(loc="upper left", fontsize=9)
     return figure
 
 
@@ -97,7 +98,7 @@ def diameter_reasons(reasons: Contraction, claimed: float) -> Figure:
     left.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
     for (name, values), style in zip(reasons.sensitivity.items(), OTHER_STYLES, strict=False):
         right.plot(diameters, values, lw=1.8, label=name, **style | {"marker": "none"})
-    right.set(ylabel="sensitivity (1/rad)", ylim=(0, 3))
+    right.set(ylabel="sensitivity (1/rad)", ylim=(0, 3.5))  # room for the legend on phones
     right.legend(loc="upper left", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
     for axes in (left, right):
         _diameters(axes, diameters[-1], claimed)

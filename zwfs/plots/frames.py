@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from zwfs.frames.pipeline import MeasuredPhase, Measurement, Step, model
@@ -61,7 +62,8 @@ def phase_map(result: MeasuredPhase, wavelength: float, sigma: NDArray | None = 
     if bad.any():
         axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=2, label=f"{bad.sum()} bad points")
         figure.legend(loc="outside lower left", fontsize=9)
-    _two_scales(figure.colorbar(shown, ax=axes, location="bottom", aspect=30, extend="both"), wavelength)
+    bar = figure.colorbar(shown, ax=axes, location="bottom", aspect=30, extend="both")
+    _two_scales(bar, wavelength)
     if sigma is not None:
         shown = show_intensity(panels[0, 1], sigma, 2 * np.nanmedian(sigma))
         panels[0, 1].set_title("error bar: photon and read noise", fontsize=10)
@@ -73,11 +75,13 @@ def phase_map(result: MeasuredPhase, wavelength: float, sigma: NDArray | None = 
 def _two_scales(bar: Colorbar, wavelength: float) -> None:
     """Label a colour bar in radian below and in nm above."""
     bar.set_label("rad")
+    bar.locator = MaxNLocator(4)
     nm = bar.ax.secondary_xaxis(
         "top",
         functions=(partial(phase_to_opd, wavelength=wavelength), partial(opd_to_phase, wavelength=wavelength)),
     )
     nm.set_xlabel("nm of wavefront")
+    nm.xaxis.set_major_locator(MaxNLocator(4))
 
 
 def gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> Figure:
@@ -91,21 +95,23 @@ def gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> Figure
     """
     figure, panels = plt.subplots(1, 2 + (errors is not None), figsize=(9, 3.8), sharey=True)
     rows = np.arange(len(work))[::-1]
-    # Digits for the images: colours would stand for methods.
+    # Markers for the images: colours would stand for methods.
     for label, color, values in (
-        ("score", "#444444", [step.predicted for step in work]),
-        ("control: second frame upside down", "#999999", [step.control for step in work]),
+        ("score", "#333333", [step.predicted for step in work]),
+        ("control", "#999999", [step.control for step in work]),
     ):
-        for index, points in enumerate(np.transpose(values), start=1):
-            apart = 0.14 * (3 - 2 * index)
-            panels[0].plot(points, rows + apart, linestyle="-", lw=0.6, color=color, marker=f"${index}$", ms=6)
-        panels[0].plot([], [], linestyle="-", color=color, label=label)
+        for index, (points, marker) in enumerate(zip(np.transpose(values), "os", strict=True), start=1):
+            face = color if index == 1 else "none"
+            panels[0].plot(
+                points, rows + 0.3 * (1.5 - index), ls="-", lw=0.6, color=color, marker=marker, ms=5, mfc=face,
+                label=f"{label}, frame {index}",
+            )  # fmt: skip
     panels[0].set(xlabel="correlation of frames 1 and 2\nwith their prediction")
     panels[1].plot([step.result.misfit for step in work], rows, color="#444444", marker="o", ms=5)
-    panels[1].set(xlabel="rms misfit\nover contrast", xlim=(0, None))
+    panels[1].set(xlabel="rms misfit\nover contrast", xlim=(0, 1.08 * max(step.result.misfit for step in work)))
     if errors is not None:
         panels[2].plot(errors, rows, color="#444444", marker="o", ms=5)
-        panels[2].set(xlabel="error of the segments\n(rad rms)", xlim=(0, None))
+        panels[2].set(xlabel="error of the segments\n(rad rms)", xlim=(0, 1.08 * max(errors)))
     panels[0].set_yticks(rows, [step.name for step in work])
     figure.legend(loc="outside upper center", ncols=2, fontsize=9)
     return figure

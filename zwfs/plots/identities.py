@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -10,6 +11,8 @@ from matplotlib.figure import Figure
 
 from zwfs.paper.identities import DimplePairs
 from zwfs.plots.style import OTHER_STYLES
+
+_SPARE = {"color": "#777777", "marker": "s", "linestyle": (0, (4, 1))}
 
 
 def approximation(
@@ -24,13 +27,15 @@ def approximation(
     wave : mapping of label to sequence
         Errors of the reference wave.
     steps : mapping of label to sequence
-        Error of the reconstructed phase over the input.
+        Error of the reconstructed phase over the input. A label that occurs in both has the same look.
     """
     figure, panels = plt.subplots(1, 2, figsize=(7.2, 4.0))
+    styles = dict(zip(dict.fromkeys([*steps, *wave]), cycle((*OTHER_STYLES, _SPARE)), strict=False))
     for axes, curves in zip(panels, (wave, steps), strict=True):
-        for (label, values), style in zip(curves.items(), OTHER_STYLES, strict=False):
-            axes.plot(rms, values, markersize=4.5, label=label, **style)
-        axes.set(xlabel="input phase (rad rms)", xlim=(0, None), ylim=(0, None))
+        for label, values in curves.items():
+            axes.plot(rms, values, markersize=4.5, label=label, **styles[label])
+        top = max(max(values) for values in curves.values())
+        axes.set(xlabel="input phase (rad rms)", xlim=(0, None), ylim=(0, 1.4 * top))  # room for the legend
         axes.legend(fontsize=8)
     panels[0].set_ylabel("error of the reference wave")
     panels[1].set_ylabel("error of the phase / input")
@@ -58,7 +63,7 @@ def diversity(pairs: DimplePairs) -> Figure:
         axes.set(xlabel=r"difference $\theta_b-\theta_a$ (rad)", ylim=(0, None))
         axes.set_xticks(np.pi / 2 * np.arange(5), ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"])
     panels[0].set_ylabel(r"$|\det M|$")
-    panels[1].set_ylabel("determinant with the waves' strength")
+    panels[1].set_ylabel("weighted determinant")
     if named:
         panels[0].legend(fontsize=9, loc="lower center")  # below the arch, where no pair is
     return figure

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from zwfs.metrics import wrapped_residual
 from zwfs.paper.linearity import LinearityCurves
-from zwfs.plots.style import LOOKS, _looks, show_phase
+from zwfs.plots.style import ALONE, LOOKS, _looks, show_phase
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import GerchbergSaxton
 
@@ -55,6 +55,10 @@ def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], r
         label = f"{limits[longest]:.2g}", (limits[longest], threshold), (7, -5)
         ratio.annotate(*label, textcoords="offset points", **style)
     plain.plot(rms, threshold * rms, color="#555555", lw=1)
+    plain.annotate(
+        f"{threshold:.0%}", (rms[-1], threshold * rms[-1]), (4, 0), textcoords="offset points", color="#555555",
+        fontsize=9, va="center",
+    )  # fmt: skip
     ratio.axhline(threshold, color="#555555", lw=1)
     end = ratio.get_yaxis_transform()  # the right end of the line, which no curve crosses
     ratio.text(
@@ -100,7 +104,9 @@ def saxton_widths(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurv
             axes.annotate(f"{method.sensor.extent:g} D", start, (-7, 0), fontsize=9, **place)
     axes.plot(curves.rms, curves.mean("Linear") / curves.rms, label="linear", **LOOKS["Linear"].style)
     axes.axhline(threshold, color="#555555", lw=1)
-    axes.text(0.01, threshold * 0.9, f"{threshold:.0%} of the input", color="#555555", fontsize=9, va="top")
+    end = axes.get_yaxis_transform()
+    style: dict[str, Any] = {"color": "#555555", "fontsize": 9, "ha": "right", "va": "top"}
+    axes.text(0.99, threshold * 0.9, f"{threshold:.0%} of the input", transform=end, **style)
     axes.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     return figure
@@ -146,20 +152,21 @@ def estimates(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) -> Fi
     """One screen, the phase (radian) that each method estimates, and the residual, on a scale four times finer."""
     truth = np.where(pupil.inside, truth, np.nan)
     limit = np.nanmax(np.abs(truth))
-    figure, panels = plt.subplots(2, len(phases) + 1, figsize=(7.2, 3.0))
+    figure, panels = plt.subplots(2, len(phases) + 1, figsize=(7.2, 3.6))
     image = show_phase(panels[0, 0], truth, limit)
     panels[0, 0].set_title("input", fontsize=9)
-    panels[1, 0].set_axis_off()
-    panels[1, 0].text(0.5, 0.5, "residual", ha="center", va="center", transform=panels[1, 0].transAxes)
+    panels[0, 0].set_gid(ALONE)
+    panels[1, 0].remove()
+    panels[1, 1].set_ylabel("residual")
     for column, (name, look) in enumerate(_looks(phases), start=1):
         residual = wrapped_residual(pupil, phases[name], truth)
         show_phase(panels[0, column], phases[name], limit)
         shown = show_phase(panels[1, column], residual, limit / 4)
-        panels[0, column].set_title(textwrap.fill(look.name, 10), fontsize=9)
-        rms = np.sqrt(np.nanmean(residual**2))
-        panels[1, column].set_xlabel(f"{_short(rms)} rad", fontsize=9)
+        short, rms = textwrap.fill(look.name, 10), np.sqrt(np.nanmean(residual**2))
+        panels[0, column].set_title(short, fontsize=9)
+        panels[1, column].set_title(f"{short}\n{_short(rms)} rad", fontsize=9)
     figure.colorbar(image, ax=panels[0], label="phase (rad)", aspect=12)
-    figure.colorbar(shown, ax=panels[1], label="residual (rad)", aspect=12, extend="both")
+    figure.colorbar(shown, ax=list(panels[1, 1:]), label="residual (rad)", aspect=12, extend="both")
     return figure
 
 

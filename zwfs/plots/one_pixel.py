@@ -89,11 +89,8 @@ def _phasors(axes: Axes, pixel: Pixel, k: int) -> None:
     axes.add_patch(Circle((wave.real, wave.imag), 1, fill=False, ec=_GREY, ls=":", lw=1.5))
     axes.add_patch(Circle((0, 0), np.sqrt(intensity), fill=False, ec=color, lw=1.5))
     _arrow(axes, 0, wave, color=_GREY)
-    middle, label = (wave.real / 2, wave.imag / 2), (-1.4, 2.4 * wave.imag)
-    lead = {"arrowstyle": "-", "color": _GREY, "lw": 0.6}
-    axes.annotate(
-        "reference\nwave", middle, label, color=_GREY, fontsize=9, ha="right", va="center", arrowprops=lead
-    )
+    style: dict[str, Any] = {"color": _GREY, "fontsize": 9, "ha": "right", "va": "center"}
+    axes.text(wave.real + 0.04, 0.1 * wave.imag, "reference\nwave", **style)
     axes.plot(0, 0, "+", color="black", ms=8)
     for phase, line, shade in ((pixel.phase, "-", "black"), (pixel.mirrored[k], "--", color)):
         turn = np.exp(1j * phase)

@@ -31,7 +31,7 @@ def amplitude_errors(curves: Mapping[str, AmplitudeCurves]) -> Figure:
             axes.plot(percent, one.error(name), label=f"{look.name}, amplitude {way.amplitude}", **style)
         axes.set_title(kind, fontsize=10)
         axes.set(xlabel="variation of the amplitude (%)", xlim=(0, None))
-    panels[0, 0].set_ylabel("error of the phase (rad rms)")
+    panels[0, 0].set_ylabel("phase error (rad rms)")
     panels[0, 0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     panels[0, 0].yaxis.set_major_formatter(FormatStrFormatter("%g"))
     panels[0, 0].yaxis.set_minor_formatter(NullFormatter())

@@ -21,7 +21,7 @@ _WIDTH, _HEIGHT = 3.7, 2.7  # of a narrow figure and of each panel in it, inch
 _LETTERS = 11  # points, at most: some figures have larger ones, as pages show them smaller than they are
 _LONE = 0.7  # width of pictures that stand alone in their rows, over that of the figure
 _ENTRY = 420  # points times letters: an entry of a legend with so many letters is as wide as the figure
-_MARGIN = 0.05  # above and below what is drawn, inch
+_MARGIN = 0.1  # around what is drawn, inch
 _ROUNDS = 12  # at most, to find the height
 _STEP = 1.8  # of the height over the gaps, which fall by about half of it
 _PAD = 0.07  # above and below a panel, inch: the label of one and the title of the next must not touch
@@ -50,7 +50,7 @@ def _copy(state: bytes) -> Figure:
 def _stacked(figure: Figure) -> Figure:
     """Put the panels of a figure below each other, in place, and pictures in pairs."""
     panels = [axes for axes in figure.axes if axes.get_subplotspec()]
-    by_columns = any(not axes.get_title() for axes in panels)  # the title of a column stands above it only
+    by_columns = _have_common_titles(panels)
     for axes in panels:
         _label(axes, panels)
     rows = _rows(panels, by_columns=by_columns)
@@ -62,7 +62,8 @@ def _stacked(figure: Figure) -> Figure:
             axes.set_subplotspec(grid[place, column] if len(row) == 2 else grid[place, :])
     bars = sum(_lower(figure, axes) for axes in list(figure.axes) if axes.get_label() == "<colorbar>")
     entries = 0
-    for legend in list(figure.legends):
+    alone = panels[0].get_legend() if len(panels) == 1 else None
+    for legend in [*figure.legends, *([alone] if alone else [])]:
         handles: Any = legend.legend_handles
         texts = legend.get_texts()
         legend.remove()
@@ -75,7 +76,20 @@ def _stacked(figure: Figure) -> Figure:
     figure.set_size_inches(_WIDTH, sum(heights) + _BAR * bars + 0.2 * entries)
     figure.set_layout_engine("constrained", h_pad=_PAD)  # a saved figure has none
     _fit_height(figure)
+    for axes in panels:
+        # The layout ignores the width of labels.
+        if axes.xaxis.label.get_window_extent().x1 > figure.bbox.x1 - figure.dpi * _MARGIN:
+            axes.set_xlabel(axes.get_xlabel(), loc="right")
     return figure
+
+
+def _have_common_titles(panels: list[Axes]) -> bool:
+    """Whether the title of a panel stands for others below it."""
+    columns: dict[Any, set[bool]] = {}
+    for axes in panels:
+        spec: Any = axes.get_subplotspec()
+        columns.setdefault((spec.colspan.start, spec.colspan.stop), set()).add(bool(axes.get_title()))
+    return any(len(kinds) == 2 for kinds in columns.values())
 
 
 def _fit_height(figure: Figure) -> None:
@@ -90,7 +104,7 @@ def _fit_height(figure: Figure) -> None:
 
 
 def _rows(panels: list[Axes], *, by_columns: bool) -> list[list[Axes]]:
-    """Order panels by columns or rows; two pictures that follow each other make a row, all others stand alone."""
+    """Order panels by columns or rows; two pictures of one that follow each other share a row."""
 
     def order(axes: Axes) -> tuple[int, int]:
         spec: Any = axes.get_subplotspec()
@@ -100,7 +114,7 @@ def _rows(panels: list[Axes], *, by_columns: bool) -> list[list[Axes]]:
     rows: list[list[Axes]] = []
     for axes in sorted(panels, key=order):
         pair = [*rows[-1], axes] if rows else []
-        if len(pair) == 2 and all(map(_fits_half, pair)):
+        if len(pair) == 2 and len({order(one)[0] for one in pair}) == 1 and all(map(_fits_half, pair)):
             rows[-1] = pair
         else:
             rows.append([axes])

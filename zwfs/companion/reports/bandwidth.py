@@ -76,7 +76,7 @@ def _ignorant(curves: Mapping[tuple[float, bool], BandCurves]) -> list[str]:
 
 
 def _method(way: str) -> str:
-    return {"shifted": "phase-shifted", "ignored": "likelihood"}[_SHORT[way]]
+    return {"shifted": "phase-shifted", "ignored": "max. lik."}[_SHORT[way]]
 
 
 def _kind(chromatic: bool) -> str:

@@ -31,9 +31,9 @@ def approximation(inputs: Sequence[float], errors: Errors) -> tuple[Curves, Curv
         return [value / rms for value, rms in zip(values, inputs, strict=True)]
 
     wave = {"phase (rad rms)": [one.phase for one in errors[BEST]]}
-    wave |= {f"amplitude, {name} (relative)": [one.amplitude for one in errors[name]] for name in (BEST, LITERAL)}
-    steps = {f"two images, {name}": over_input([one.two_images for one in some]) for name, some in errors.items()}
-    steps[f"one image, {BEST}"] = over_input([one.one_image for one in errors[BEST]])
+    wave |= {name: [one.amplitude for one in errors[name]] for name in (BEST, LITERAL)}
+    steps = {name: over_input([one.two_images for one in some]) for name, some in errors.items()}
+    steps[f"{BEST}, one image"] = over_input([one.one_image for one in errors[BEST]])
     return wave, steps
 
 

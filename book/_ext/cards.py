@@ -86,7 +86,8 @@ def files(name: str, figure: str, links: dict[str, str]) -> str:
 def parameters(notebook: NotebookNode, name: str) -> list[str]:
     """Return the lines of the fold that shows the parameters of a notebook, and the command that changes one."""
     code = next((c.source for c in notebook.cells if "parameters" in c.metadata.get("tags", ())), "")
-    numbers = (f"{key}={value}" for key, (value, _) in assigned(notebook).items() if value.isnumeric())
+    numbers = {key: int(value) for key, (value, _) in assigned(notebook).items() if value.isnumeric()}
+    changed = f"seed={numbers['seed'] + 1}" if "seed" in numbers else "NAME=VALUE"
     return [
         ":::{dropdown} Parameters (click to change and re-run)",
         "```python",
@@ -96,7 +97,7 @@ def parameters(notebook: NotebookNode, name: str) -> list[str]:
         "To re-run the notebook from the root of a clone, with one parameter or more changed:",
         "",
         "```sh",
-        f'make rerun FIGURE={name} ARGS="-p {next(numbers, "NAME=VALUE")}"',
+        f'make rerun FIGURE={name} ARGS="-p {changed}"',
         "```",
     ]
 

@@ -18,6 +18,7 @@ from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.util.fileutil import copy_asset_file
 
+from book._ext.performance import PICTURES
 from book._tools.project import PDF
 
 VARIANTS = "variants-"  # with which the class of a figure begins that may have dark and narrow variants
@@ -81,7 +82,7 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
 def write_numbers(body: Tag) -> None:
     """Write 1.4e+08 as 1.4·10⁸, -1 as −1, and per cent after a space that breaks no line, but not in code."""
     for text in body.find_all(string=re.compile(r"\d|%")):
-        if not text.find_parent(["code", "pre", "samp", "script", "style"]):
+        if not text.find_parent(["code", "pre", "samp", "script", "style"]) and not text.find_parent(class_="sig"):
             minus = "-" if text.find_parent(class_=["math", "py"]) else "−"  # names of classes of Sphinx
             text.replace_with(PERCENT.sub("\u00a0%", MINUS.sub(minus, POWER.sub(power, text))))
 
@@ -94,11 +95,11 @@ def power(number: re.Match[str]) -> str:
 
 
 def add_variants(app: Sphinx, figure: Tag) -> None:
-    """Show the dark and the narrow variants of a figure, in place, if the run of its notebook wrote them."""
+    """Show the dark and the narrow variants of a figure, in place, if there are files of them."""
     name = next(word for word in figure["class"] if word.startswith(VARIANTS)).removeprefix(VARIANTS)
-    runs = Path(app.srcdir, app.config.executed_notebooks)
+    folders = *Path(app.srcdir, app.config.executed_notebooks).glob("*.files"), Path(app.srcdir, PICTURES)
     # In the class of a directive, Docutils writes hyphens.
-    named = runs.glob(f"*.files/{name.replace('-', '[-_]')}.dark.png")
+    named = (file for folder in folders for file in folder.glob(f"{name.replace('-', '[-_]')}.dark.png"))
     first, light = next(named, None), figure.img
     if light is None or first is None:
         return

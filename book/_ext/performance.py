@@ -13,6 +13,7 @@ from sphinx.config import Config
 
 from zwfs import plots
 from zwfs._files import write_file
+from zwfs.plots.variants import variants
 
 MEASURED = "book/_ext/performance.json"
 PICTURES = "_build/performance"
@@ -46,10 +47,12 @@ def add_substitutions(app: Sphinx, config: Config) -> None:
             "growth": time_against_pixels(kept["speed"]["slope"]),
         }
         for name, figure in figures.items():
-            stream = io.BytesIO()
-            figure.savefig(stream, format="png", dpi=200, metadata={"Software": None})
+            drawn = {name: figure} | {f"{name}.{kind}": one for kind, one in variants(figure).items()}
+            for file, one in drawn.items():
+                stream = io.BytesIO()
+                one.savefig(stream, format="png", dpi=200, metadata={"Software": None})
+                write_file(Path(app.srcdir, PICTURES, f"{file}.png"), stream.getvalue())
             plt.close(figure)
-            write_file(Path(app.srcdir, PICTURES, f"{name}.png"), stream.getvalue())
 
 
 def table(header: list[str], rows: Iterable[Iterable[str]]) -> str:
@@ -91,7 +94,7 @@ def tables(speed: dict[str, Any]) -> dict[str, str]:
         "batches": table(["frame pairs in a call", "time of each (ms)", memory], batches),
         "methods": table(["method", "time (ms)"], methods),
         "likelihood": table(
-            ["task", "time relative to one propagation of HCIPy"],
+            ["task", "time, in propagations of HCIPy"],
             [[name.replace("lambda/D", "λ/D"), f"{ratio:.2g}"] for name, ratio in speed["likelihood"].items()],
         ),
         "loop": table(["reconstructor", "time of a step (ms)"], loop),

@@ -32,6 +32,17 @@ def held_drift(curves: DriftCurves) -> Figure:
         left.plot(many, kalman_limit(errors[name], drift, many), **style | {"marker": ""})
         left.plot(photons, held[name], **style | {"linestyle": ""}, label=name)
     left.set(xscale="log", yscale="log", xlabel="photons per cycle", ylabel="residual (pm rms)")
+    _, *pairs = held
+    if len(pairs) > 1:
+        level = 1.5 * drift.rms
+        ends = [np.interp(-level, -kalman_limit(errors[name], drift, many), many) for name in pairs[-2:]]
+        left.annotate(
+            "", (ends[1], level), (ends[0], level), arrowprops={"arrowstyle": "<->", "shrinkA": 0, "shrinkB": 0}
+        )
+        left.annotate(
+            f"{ends[0] / ends[1]:.1f} times the photons", (ends[0], level), (3, 3), textcoords="offset points",
+            fontsize=9,
+        )  # fmt: skip
     left.text(many[0], 0.95 * drift.rms, "step of the drift", va="top")
     *_, last = held
     dense = np.linspace(min(gains) / 1.3, 1.05 * max(gains), 100)

@@ -45,7 +45,7 @@ def dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float, clai
     log.text(1.01 * start, limit * 1.3, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
     plain.set_ylim(0, None)
     log.set(yscale="log", xlim=(start, end), ylim=(floor, 60))  # room for the legend
-    log.legend(loc="upper left", fontsize=9)
+    log.legend(loc="upper left", fontsize=9, handlelength=1.6)
     return figure
 
 

@@ -66,7 +66,9 @@ def sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:
         scene, 4.5, "focal plane", r"$|\hat\psi_{in}|^2$ (log$_{10}$)", FOCUS_MAP, _halo(pupil, field, 4), -4, 0
     )
     # The axis runs from -4 to 4 lambda/D over 161 samples.
-    focal.add_patch(Circle((80, 80), mask.diameter / 2 * 20, fill=False, ec="white", ls="--", lw=1.3))
+    for color, line, width in (("black", "-", 2.8), ("white", "--", 1.3)):
+        radius = mask.diameter / 2 * 20
+        focal.add_patch(Circle((80, 80), radius, fill=False, ec=color, ls=line, lw=width))
     label = f"mask: {mask.diameter:g} $\\lambda/D$, {_shift(mask)} rad"
     focal.text(80, 146, label, color="white", ha="center", fontsize=9)
     focal.plot([80, 80], [80 + mask.diameter * 10, 142], color="white", lw=0.8)
@@ -495,8 +497,8 @@ def _legend(scene: _Scene, y: float) -> None:
     for x, kind, text in (
         (3.7, "left", ""),
         (4.02, "right", "circular"),
-        (5.05, "along", "linear, in the drawing's plane"),
-        (7.6, "across", "linear, across it"),
+        (5.05, "along", "linear, in the drawing"),
+        (7.0, "across", "linear, perpendicular"),
     ):
         _symbol(scene, x, y + 0.05, kind, gray)
         scene.label(x + 0.18, y, text, ha="left")

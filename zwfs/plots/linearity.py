@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import Any
@@ -42,18 +41,14 @@ def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], r
     for name, look in _looks(names):
         mean, std = curves.mean(name), curves.std(name)[drawn]
         line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
-        plain.plot(rms, mean[drawn], label=look.label, **line)
+        limit = limits[name]
+        reach = f": {limit:.2g} rad" if 0 < limit <= curves.rms[-1] else ""
+        plain.plot(rms, mean[drawn], label=look.label + reach, **line)
         low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
         plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
         ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], **line)
-        limit = limits[name]
         if 0 < limit <= curves.rms[-1]:
             ratio.plot(limit, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
-    longest = max(limits, key=lambda name: limits[name])
-    if 0 < limits[longest] <= curves.rms[-1]:
-        style: dict[str, Any] = {"color": LOOKS[longest].color, "fontsize": 9, "ha": "left", "va": "top"}
-        label = f"{limits[longest]:.2g}", (limits[longest], threshold), (7, -5)
-        ratio.annotate(*label, textcoords="offset points", **style)
     plain.plot(rms, threshold * rms, color="#555555", lw=1)
     plain.annotate(
         f"{threshold:.0%}", (rms[-1], threshold * rms[-1]), (4, 0), textcoords="offset points", color="#555555",
@@ -81,34 +76,36 @@ def saxton_widths(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurv
     threshold : float
         Ratio of error to input that is marked.
     """
-    figure, axes = plt.subplots(figsize=(7, 4.6))
-    dashes = {"zero": cycle(("-", "-.", "--", ":")), "model": cycle(("-", "--"))}
-    markers = {"zero": cycle("^<v>"), "model": cycle("x+")}
-    looks = {"zero": LOOKS["GerchbergSaxton"], "model": LOOKS["GerchbergSaxtonModel"]}
-    counts = Counter(method.unmeasured for method in variants.values())
-    shades = {kind: iter(_shades(looks[kind].color, count)) for kind, count in counts.items()}
-    for name, method in variants.items():
-        kind = method.unmeasured
-        label = f"{kind}, {method.sensor.extent:g} D, {method.settings.n_iterations} iterations"
-        axes.semilogy(
-            curves.rms,
-            curves.mean(name) / curves.rms,
-            label=label,
-            color=next(shades[kind]),
-            linestyle=next(dashes[kind]),
-            marker=next(markers[kind]),
-        )
-        if kind == "zero":
-            start = curves.rms[0], curves.mean(name)[0] / curves.rms[0]
-            place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "center"}
-            axes.annotate(f"{method.sensor.extent:g} D", start, (-7, 0), fontsize=9, **place)
-    axes.plot(curves.rms, curves.mean("Linear") / curves.rms, label="linear", **LOOKS["Linear"].style)
-    axes.axhline(threshold, color="#555555", lw=1)
-    end = axes.get_yaxis_transform()
+    figure, panels = plt.subplots(1, 2, figsize=(7, 4.2), sharex=True)
+    kinds = {
+        "zero": ("GerchbergSaxton", "zero where not measured", cycle(("-", "-.", "--", ":")), cycle("^<v>")),
+        "model": ("GerchbergSaxtonModel", "modelled field kept", cycle(("-", "--")), cycle("x+")),
+    }
+    for axes, (kind, (family, title, dashes, markers)) in zip(panels, kinds.items(), strict=True):
+        drawn = {name: method for name, method in variants.items() if method.unmeasured == kind}
+        colors = _shades(LOOKS[family].color, len(drawn))
+        for (name, method), color in zip(drawn.items(), colors, strict=True):
+            ratio = curves.mean(name) / curves.rms
+            axes.semilogy(curves.rms, ratio, color=color, linestyle=next(dashes), marker=next(markers))
+            place: dict[str, Any]
+            text, place = f"{method.sensor.extent:g} D", {"xytext": (-7, 0), "ha": "right", "va": "center"}
+            if kind == "model":
+                title = f"modelled field kept, {text}"
+                text, place = f"{method.settings.n_iterations} iterations", {"xytext": (6, -8), "va": "top"}
+            axes.annotate(text, (curves.rms[0], ratio[0]), textcoords="offset points", fontsize=9, **place)
+        axes.plot(curves.rms, curves.mean("Linear") / curves.rms, **LOOKS["Linear"].style)
+        axes.axhline(threshold, color="#555555", lw=1)
+        axes.set(xlabel="input phase (rad rms)", xlim=(0, None))
+        axes.set_title(title, fontsize=10)
+    panels[0].set_ylabel("error / input")
     style: dict[str, Any] = {"color": "#555555", "fontsize": 9, "ha": "right", "va": "top"}
-    axes.text(0.99, threshold * 0.9, f"{threshold:.0%} of the input", transform=end, **style)
-    axes.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
-    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
+    panels[0].text(
+        0.99, 0.9 * threshold, f"{threshold:.0%} of the input", transform=panels[0].get_yaxis_transform(), **style
+    )
+    panels[0].set_ylim(bottom=threshold / 2)
+    panels[1].set_ylim(bottom=panels[1].get_ylim()[0] / 4)  # room for the labels
+    linear = panels[0].lines[-2]  # before the line of the threshold
+    figure.legend([linear], ["linear"], loc="outside lower center", fontsize=9)
     return figure
 
 

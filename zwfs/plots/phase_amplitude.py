@@ -28,6 +28,7 @@ def amplitude_errors(curves: Mapping[str, AmplitudeCurves]) -> Figure:
         for name, way in WAYS.items():
             look = LOOKS[way.method]
             style = {"color": look.color, "marker": look.marker, "linestyle": _LINES[way.amplitude], "ms": 6}
+            style["markerfacecolor"] = "white" if way.amplitude == "measured" else look.color
             axes.plot(percent, one.error(name), label=f"{look.name}, amplitude {way.amplitude}", **style)
         axes.set_title(kind, fontsize=10)
         axes.set(xlabel="variation of the amplitude (%)", xlim=(0, None))

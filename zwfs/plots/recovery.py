@@ -84,7 +84,7 @@ def dimple_limits(limits: DimpleLimits, rms: float) -> Figure:
         right.semilogy(limits.diameters, values[:, 0], color=color, ls="--", lw=1.2, label=f"{name}, flat")
         mean = np.sqrt(np.mean(values[:, 1:] ** 2, axis=1))
         right.semilogy(limits.diameters, mean, color=color, lw=1.8, label=f"{name}, {rms:g} rad rms")
-    right.set(ylabel="bound / that of an ideal sensor", ylim=(0.9, 1000))
+    right.set(ylabel="bound / that of an ideal sensor", ylim=(0.9, 3e4))  # room for the legend
     for axes in (left, right):
         axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
         axes.text(

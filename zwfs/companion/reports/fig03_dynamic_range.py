@@ -161,6 +161,7 @@ def claims(
             "saxton_limit": limits["GerchbergSaxton"],
             "shifted_limit": limits["PhaseShifted"],
             "gain": gain,
+            "gain_arcsine": limits["PhaseShifted"] / limits["Arcsine"] if limits["Arcsine"] else np.inf,
             "arcsine_over_linear": np.max(mean["Arcsine"][low] / mean["Linear"][low], initial=0),
             "arcsine_ratio_at_05": mean["Arcsine"][half] / rms[half],
             "alike_up_to": alike,

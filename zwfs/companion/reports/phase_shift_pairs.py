@@ -131,6 +131,7 @@ def claims(maps: PairMaps, angles: NDArray, noise: Mapping[str, NDArray], rows: 
     place = tuple(abs(maps.angles - numbers[name]).argmin() for name in ("best_theta_a", "best_theta_b"))
     numbers |= {
         "gain_flat": 1 - numbers["best_noise"] / numbers["noise_at_half_pi"],
+        "photons_saved_flat": 1 - (numbers["best_noise"] / numbers["noise_at_half_pi"]) ** 2,
         "gain_aberrated": 1 - numbers["best_noise_aberrated"] / numbers["noise_at_half_pi_aberrated"],
         "gain_moved": 1 - maps.aberrated[place] / numbers["noise_at_half_pi_aberrated"],
     }

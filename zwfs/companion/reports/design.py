@@ -33,7 +33,7 @@ def _slug(design: Design) -> str:
 def designs(listed: Sequence[Design], costs: Mapping[str, NDArray]) -> Table:
     """Photon costs of designs, and their share of the photons that the first one needs."""
     return Table(
-        ["design", "d (λ/D)", "shifts", *(f"photons, {name}" for name in costs)],
+        ["design", "d (λ/D)", "shifts", *(name.removesuffix(" wavefront") for name in costs)],
         [
             [
                 design.name,

@@ -256,5 +256,6 @@ def test_the_reconstructor_on_the_page_stands_next_to_the_five(tmp_path):
     (tmp_path / "flat_reference.py").write_text(code)
     run = [sys.executable, "flat_reference.py"]
     printed = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    assert printed in page
     errors = {name: [float(one) for one in values] for name, *values in map(str.split, printed.splitlines())}
     assert errors["PhaseShifted"][1] < 0.001 < errors["FlatReference"][1] < errors["Linear"][1]

@@ -356,7 +356,7 @@ def best_pair(n: Numbers) -> Finding:
         f"dimples of 1.06 $\\lambda/D$, $\\pm{abs(n.best_theta_a) / math.pi:.1f}\\pi$ is better."
     )
     return first(
-        f"the best pair of the map has less noise than $\\pm\\pi/2$, by {listed}",
+        f"compared with $\\pm\\pi/2$, the best pair of the map has less noise by {listed}",
         (len(better) == len(gains), FAILS),
         (bool(better), REMARK, remark),
     )
@@ -437,8 +437,8 @@ def on_the_bench(n: Numbers) -> Finding:
     end = "at least " if n.reach_shifted >= n.largest_input else ""
     measured = (
         f"on the simulated bench, from 0.3 rad rms on, the error of the arcsine is {n.arcsine_over_linear:.2f} "
-        "times that of the linear method. The error stays below a quarter of the input up to "
-        f"{n.reach_linear:.1f} rad rms with the linear method, and up to {end}{n.reach_shifted:.1f} with the "
+        "times that of the linear method. The largest input with an error below a quarter of it is "
+        f"{n.reach_linear:.1f} rad rms with the linear method, and {end}{n.reach_shifted:.1f} with the "
         f"phase-shifted one. At a flat command the phase-shifted error is {n.offset_shifted:.3f} rad"
     )
     right = 0.75 <= n.arcsine_over_linear <= 1.33 and n.reach_shifted >= 2 * n.reach_linear

@@ -30,7 +30,8 @@ def held_drift(curves: DriftCurves) -> Figure:
     left.plot(many, kalman_limit(errors[IDEAL], drift, many), color="#777777", ls=":", label=IDEAL)
     for name, style in styles.items():
         left.plot(many, kalman_limit(errors[name], drift, many), **style | {"marker": ""})
-        left.plot(photons, held[name], **style | {"linestyle": ""}, label=name)
+        left.plot(photons, held[name], **style | {"linestyle": ""})
+        left.plot([], [], **style, label=name)
     left.set(xscale="log", yscale="log", xlabel="photons per cycle", ylabel="residual (pm rms)")
     _, *pairs = held
     if len(pairs) > 1:
@@ -40,7 +41,7 @@ def held_drift(curves: DriftCurves) -> Figure:
             "", (ends[1], level), (ends[0], level), arrowprops={"arrowstyle": "<->", "shrinkA": 0, "shrinkB": 0}
         )
         left.annotate(
-            f"{ends[0] / ends[1]:.1f} times the photons", (ends[0], level), (3, 3), textcoords="offset points",
+            f"{ends[0] / ends[1]:.2f} times the photons", (ends[0], level), (3, 3), textcoords="offset points",
             fontsize=9,
         )  # fmt: skip
     left.text(many[0], 0.95 * drift.rms, "step of the drift", va="top")

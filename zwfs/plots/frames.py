@@ -108,10 +108,13 @@ def gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> Figure
             )  # fmt: skip
     panels[0].set(xlabel="correlation of frames 1 and 2\nwith their prediction")
     panels[1].plot([step.result.misfit for step in work], rows, color="#444444", marker="o", ms=5)
-    panels[1].set(xlabel="rms misfit\nover contrast", xlim=(0, 1.08 * max(step.result.misfit for step in work)))
+    panels[1].set(xlabel="rms misfit\nover contrast")
     if errors is not None:
         panels[2].plot(errors, rows, color="#444444", marker="o", ms=5)
-        panels[2].set(xlabel="error of the segments\n(rad rms)", xlim=(0, 1.08 * max(errors)))
+        panels[2].set(xlabel="error of the segments\n(rad rms)")
+    for axes in panels[1:]:
+        axes.margins(x=0.15)
+        axes.set_xlim(left=0)
     panels[0].set_yticks(rows, [step.name for step in work])
     figure.legend(loc="outside upper center", ncols=2, fontsize=9)
     return figure

@@ -91,7 +91,7 @@ def saxton_widths(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurv
             text, place = f"{method.sensor.extent:g} D", {"xytext": (-7, 0), "ha": "right", "va": "center"}
             if kind == "model":
                 title = f"modelled field kept, {text}"
-                text, place = f"{method.settings.n_iterations} iterations", {"xytext": (6, -8), "va": "top"}
+                text, place = f"{method.settings.n_iterations} iterations", {"xytext": (6, -11), "va": "top"}
             axes.annotate(text, (curves.rms[0], ratio[0]), textcoords="offset points", fontsize=9, **place)
         axes.plot(curves.rms, curves.mean("Linear") / curves.rms, **LOOKS["Linear"].style)
         axes.axhline(threshold, color="#555555", lw=1)
@@ -112,7 +112,7 @@ def saxton_widths(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurv
 def _shades(color: str, count: int) -> list[tuple[float, ...]]:
     """Return shades of a colour, from dark to light."""
     ends = LinearSegmentedColormap.from_list("shades", ["black", color, "white"])
-    return [ends(level) for level in np.linspace(0.3, 0.65, count)] if count > 1 else [to_rgba(color)]
+    return [ends(level) for level in np.linspace(0.3, 0.65, count)] if count != 1 else [to_rgba(color)]
 
 
 def convergence(errors: Mapping[str, Mapping[float, NDArray]]) -> Figure:
@@ -149,7 +149,7 @@ def estimates(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) -> Fi
     """One screen, the phase (radian) that each method estimates, and the residual, on a scale four times finer."""
     truth = np.where(pupil.inside, truth, np.nan)
     limit = np.nanmax(np.abs(truth))
-    figure, panels = plt.subplots(2, len(phases) + 1, figsize=(7.2, 3.6))
+    figure, panels = plt.subplots(2, len(phases) + 1, figsize=(7.2, 4.6))
     image = show_phase(panels[0, 0], truth, limit)
     panels[0, 0].set_title("input", fontsize=9)
     panels[0, 0].set_gid(ALONE)
@@ -162,8 +162,9 @@ def estimates(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) -> Fi
         short, rms = textwrap.fill(look.name, 10), np.sqrt(np.nanmean(residual**2))
         panels[0, column].set_title(short, fontsize=9)
         panels[1, column].set_title(f"{short}\n{_short(rms)} rad", fontsize=9)
-    figure.colorbar(image, ax=panels[0], label="phase (rad)", aspect=12)
-    figure.colorbar(shown, ax=list(panels[1, 1:]), label="residual (rad)", aspect=12, extend="both")
+    below: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 40}
+    figure.colorbar(image, ax=panels[0], label="phase (rad)", **below)
+    figure.colorbar(shown, ax=list(panels[1, 1:]), label="residual (rad)", extend="both", **below)
     return figure
 
 

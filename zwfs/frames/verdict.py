@@ -304,11 +304,12 @@ def _of_light(measurement: Measurement) -> str:
     """Flux ratios of the images, and the assumption that balancing makes."""
     masked, clear = measurement.flux_ratio
     facts = (
-        f"Image 1 holds {masked:.3f} times the light of image 2 behind the mask, {clear:.3f} times without it. "
+        f"The light of image 1 is {masked:.3f} times that of image 2 behind the mask, and {clear:.3f} times "
+        "without it. "
     )
     if not (measurement.recording.balance and measurement.optics.opposite):
         return facts + "The frames are not balanced."
-    facts += "Balancing assumes equal ratios, as phase shifts of +theta and -theta give. "
+    facts += "For opposite phase shifts the two ratios should be equal, and balancing assumes it. "
     if abs(masked / clear - 1) < _UNEVEN:
         return facts + f"They agree to {abs(masked / clear - 1):.1%}."
     return facts + (

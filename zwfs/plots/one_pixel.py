@@ -54,6 +54,8 @@ def sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Figure:
     for axes, picture, title, unit in zip(panels, shown, titles, units, strict=True):
         axes.set_title(title, fontsize=10)
         bar = figure.colorbar(picture, ax=axes, location="bottom", label=unit, aspect=12, pad=0.03)
+        if axes is panels[1]:
+            bar.set_ticks([1e-2, 1e-1])  # none at the ends, next to those of other panels
         if axes is panels[2]:
             bar.locator = MaxNLocator(2)
     for axes in (panels[0], panels[3]):
@@ -90,7 +92,7 @@ def _phasors(axes: Axes, pixel: Pixel, k: int) -> None:
     axes.add_patch(Circle((0, 0), np.sqrt(intensity), fill=False, ec=color, lw=1.5))
     _arrow(axes, 0, wave, color=_GREY)
     style: dict[str, Any] = {"color": _GREY, "fontsize": 9, "ha": "right", "va": "center"}
-    axes.text(wave.real + 0.04, 0.1 * wave.imag, "reference\nwave", **style)
+    axes.text(wave.real + 0.04, 0.1 * wave.imag + 0.12, "reference\nwave", **style)
     axes.plot(0, 0, "+", color="black", ms=8)
     for phase, line, shade in ((pixel.phase, "-", "black"), (pixel.mirrored[k], "--", color)):
         turn = np.exp(1j * phase)

@@ -25,4 +25,5 @@ def numbers(pupil: Pupil, phase: NDArray, estimates: Mapping[str, NDArray]) -> N
     rms = {"input": float(pupil.rms(phase))}
     for name, estimate in estimates.items():
         rms[f"error_{name}"] = float(reconstruction_error(pupil, estimate, phase))
-    glue_numbers(rms, ".1g")
+    for name, value in rms.items():
+        glue_numbers({name: value}, ".2g" if value > 0.01 else ".1g")  # the digits of small errors are rounding

@@ -89,7 +89,7 @@ def result(result: MeasuredPhase) -> Table:
             ["points of the pupil", measurement.pupil.n_points],
             ["of these, bad", measurement.n_bad],
             ["points without a unique solution", result.n_unsolved],
-            ["correlation of the frames with their fit (flatters)", _pair(result.correlation, 3)],
+            ["correlation of the frames with their fit (too optimistic)", _pair(result.correlation, 3)],
             ["rms difference of the frames (mean = 1)", _pair(result.residual, 3)],
             ["excess light around the pupil (mean = 1)", f"{result.excess_light:.3f}"],
         ],

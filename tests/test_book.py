@@ -205,9 +205,17 @@ def test_prose_and_tables_have_powers_of_ten():
     texts = [
         text for article in articles() for text in article.find_all(string=re.compile(r"\d(e[+-]\d|·10[⁻¹-⁹])"))
     ]
-    prose = [text for text in texts if not text.find_parent(["code", "pre", "script", "style"])]
+    code = ["code", "pre", "script", "style"]
+    prose = [text for text in texts if not text.find_parent(code) and not text.find_parent(class_="sig")]
     assert prose
     assert [text for text in prose if re.search(r"\de[+-]\d", text)] == []
+
+
+def test_signatures_are_python():
+    [api] = [read(page) for page in HTML.glob("book/api.html")]
+    signatures = [one.get_text() for one in api.select("dt.sig") if "tolerance" in one.get_text()]
+    assert [one for one in signatures if re.search(r"10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]", one)] == []
+    assert any("1e-" in one for one in signatures)
 
 
 def test_front_page_links_the_pdf_only_if_there_is_one():

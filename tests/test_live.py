@@ -363,6 +363,33 @@ def test_page_answers_the_keyboard_and_keeps_its_height(fresh):
     assert fresh.evaluate("document.documentElement.scrollHeight") == height
 
 
+@pytest.mark.parametrize("width", [390, 1280])
+def test_maps_of_the_errors_stand_next_to_their_phases(browser, file, width):
+    page = browser.new_page(viewport={"width": width, "height": 844})
+    page.goto(file.as_uri())
+    names = "phase", "found-0", "found-1", "found-2", "error-0", "error-1", "error-2", "focal", "image-a"
+    boxes = [page.locator(f"#live-{name}").bounding_box() for name in names]
+    order = [
+        name for _, _, name in sorted((box["y"], box["x"], name) for box, name in zip(boxes, names, strict=True))
+    ]
+    if width == 390:
+        assert order == list(names)
+    else:
+        assert order == [
+            "phase",
+            "found-0",
+            "found-1",
+            "found-2",
+            "focal",
+            "error-0",
+            "error-1",
+            "error-2",
+            "image-a",
+        ]
+        assert [box["x"] for box in boxes[1:4]] == [box["x"] for box in boxes[4:7]]
+    page.close()
+
+
 def test_a_design_is_chosen_by_mouse_and_by_keyboard(fresh):
     design = "document.getElementById('live-design').textContent"
     box = fresh.locator("#live-designs").bounding_box()

@@ -269,8 +269,8 @@ class ZernikeSensor(Sensor):
     Raises
     ------
     TypeError, ValueError
-        If there is no mask, or an argument has the wrong type or is out of range. A mask may be as many lambda/D
-        wide as there are pixels across D, on a wide detector less.
+        If there is no mask, or an argument has the wrong type or is out of range. The diameter of a mask, in
+        lambda/D, may not exceed the number of pixels across D. On a wide detector the limit is lower.
 
     Warns
     -----

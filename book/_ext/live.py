@@ -29,7 +29,7 @@ DIAMETERS = (0.5, 3.0)  # lambda/D
 N_DIAMETERS = 14
 TOLERANCE = 1e-7  # of the reference waves, which are stored in single precision
 COST_MAP = "cividis_r"
-MOST = 10  # photons at the end of its scale, as in live-design.js
+MOST = 10  # photon cost at the end of its scale
 MAP_SIZE = 2.9, 2.4  # of the map of designs on a phone, inch
 
 
@@ -106,6 +106,7 @@ def designs() -> dict[str, Any]:
         "diameters": diameters.tolist(),
         "shifts": shifts.round(6).tolist(),
         "costs": {name: cost.tolist() for name, cost in costs.items()},
+        "most": MOST,
         "contours": {name: contours(diameters, shifts, cost) for name, cost in costs.items()},
     }
 

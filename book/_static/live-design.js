@@ -4,8 +4,7 @@
 
 (() => {
   const { designs, colors, page } = window.zwfsLive;
-  const { diameters, shifts, costs, contours } = designs;
-  const MOST = 10; // end of the scale of photons
+  const { diameters, shifts, costs, contours, most } = designs;
   const find = (name) => document.getElementById(`live-${name}`);
   const map = find("designs");
   const choices = [...document.querySelectorAll("input[name=live-cost]")];
@@ -26,7 +25,7 @@
     const image = context.createImageData(diameters.length, shifts.length);
     cost().forEach((row, x) =>
       row.forEach((value, y) => {
-        const level = Math.floor((256 * Math.log(value)) / Math.log(MOST));
+        const level = Math.floor((256 * Math.log(value)) / Math.log(most));
         const from = 4 * Math.min(255, Math.max(0, level));
         const to = 4 * ((shifts.length - 1 - y) * diameters.length + x);
         image.data.set(colors.cost.subarray(from, from + 4), to);

@@ -27,11 +27,12 @@ def loop_runs(runs: Mapping[float, Mapping[str, LoopRun]]) -> Figure:
         column[0].set_title(f"magnitude {magnitude:g}", fontsize=10)
         column[-1].set_xlabel("time (ms)")
         for axes, (name, run) in zip(column, methods.items(), strict=True):
-            look, time = LOOKS[name], 1e3 * run.times
-            axes.semilogy(time, run.residual.T, lw=1, color=look.color)
+            time = 1e3 * run.times
+            axes.semilogy(time, run.residual.T, lw=1, color=LOOKS[name].color)
             axes.semilogy(time, np.median(run.open_loop, axis=0), color="#777777", lw=1.5, ls="--")
             axes.set_xlim(0, time[-1])
-            panels[list(methods).index(name), 0].set_ylabel(f"{look.name}\nresidual (rad rms)")
+    for axes, name in zip(panels[:, 0], methods, strict=True):
+        axes.set_ylabel(f"{LOOKS[name].name}\nresidual (rad rms)")
     place = 0.97 * time[-1], 1.25 * run.open_loop.mean()
     panels[-1, 0].text(*place, "no correction", ha="right", va="bottom", color="#777777")
     return figure

@@ -6,6 +6,7 @@ from itertools import cycle
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
 
@@ -33,19 +34,12 @@ def held_drift(curves: DriftCurves) -> Figure:
         left.plot(photons, held[name], **style | {"linestyle": ""})
         left.plot([], [], **style, label=name)
     left.set(xscale="log", yscale="log", xlabel="photons per cycle", ylabel="residual (pm rms)")
-    _, *pairs = held
-    if len(pairs) > 1:
-        level = 1.5 * drift.rms
-        ends = [np.interp(-level, -kalman_limit(errors[name], drift, many), many) for name in pairs[-2:]]
-        left.annotate(
-            "", (ends[1], level), (ends[0], level), arrowprops={"arrowstyle": "<->", "shrinkA": 0, "shrinkB": 0}
-        )
-        left.annotate(
-            f"{ends[0] / ends[1]:.2f} times the photons", (ends[0], level), (3, 3), textcoords="offset points",
-            fontsize=9,
-        )  # fmt: skip
-    left.text(many[0], 0.95 * drift.rms, "step of the drift", va="top")
     *_, last = held
+    if len(held) > 1:
+        level = 1.5 * drift.rms
+        more, less = (np.interp(-level, -kalman_limit(errors[name], drift, many), many) for name in [*held][-2:])
+        _mark_factor(left, less, more, level)
+    left.text(many[0], 0.95 * drift.rms, "step of the drift", va="top")
     dense = np.linspace(min(gains) / 1.3, 1.05 * max(gains), 100)
     for (light, simulated), (gray, marker) in zip(curves.by_gain.items(), cycle(_LIGHTS), strict=False):
         right.plot(dense, integrator_residual(errors[last], drift, light, dense), color=gray)
@@ -61,3 +55,11 @@ def held_drift(curves: DriftCurves) -> Figure:
     left.set_ylim(bottom=0.7 * drift.rms)
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
+
+
+def _mark_factor(axes: Axes, less: float, more: float, level: float) -> None:
+    """Arrow between two numbers of photons that give the same residual, and their ratio."""
+    arrow = {"arrowstyle": "<->", "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", (less, level), (more, level), arrowprops=arrow)
+    text = f"{more / less:.2f} times the photons"
+    axes.annotate(text, (more, level), (3, 3), textcoords="offset points", fontsize=9)

@@ -62,8 +62,7 @@ def phase_map(result: MeasuredPhase, wavelength: float, sigma: NDArray | None = 
     if bad.any():
         axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=2, label=f"{bad.sum()} bad points")
         figure.legend(loc="outside lower left", fontsize=9)
-    bar = figure.colorbar(shown, ax=axes, location="bottom", aspect=30, extend="both")
-    _two_scales(bar, wavelength)
+    _two_scales(figure.colorbar(shown, ax=axes, location="bottom", aspect=30, extend="both"), wavelength)
     if sigma is not None:
         shown = show_intensity(panels[0, 1], sigma, 2 * np.nanmedian(sigma))
         panels[0, 1].set_title("error bar: photon and read noise", fontsize=10)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure
 from zwfs.paper.identities import DimplePairs
 from zwfs.plots.style import OTHER_STYLES
 
-_SPARE = {"color": "#777777", "marker": "s", "linestyle": (0, (4, 1))}
+_FIFTH: dict[str, Any] = {"color": "#777777", "marker": "s", "linestyle": (0, (4, 1))}
 
 
 def approximation(
@@ -30,7 +31,7 @@ def approximation(
         Error of the reconstructed phase over the input. A label that occurs in both has the same look.
     """
     figure, panels = plt.subplots(1, 2, figsize=(7.2, 4.0))
-    styles = dict(zip(dict.fromkeys([*steps, *wave]), cycle((*OTHER_STYLES, _SPARE)), strict=False))
+    styles = dict(zip(dict.fromkeys([*steps, *wave]), cycle((*OTHER_STYLES, _FIFTH)), strict=False))
     for axes, curves in zip(panels, (wave, steps), strict=True):
         for label, values in curves.items():
             axes.plot(rms, values, markersize=4.5, label=label, **styles[label])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from zwfs.bench.model import Bench
 from zwfs.focal import focal_field
 from zwfs.masks import Dimple, Mask
-from zwfs.plots.style import INTENSITY_MAP, PHASE_MAP
+from zwfs.plots.style import INTENSITY_MAP, PHASE_MAP, dashed_circle
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
@@ -66,9 +66,7 @@ def sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:
         scene, 4.5, "focal plane", r"$|\hat\psi_{in}|^2$ (log$_{10}$)", FOCUS_MAP, _halo(pupil, field, 4), -4, 0
     )
     # The axis runs from -4 to 4 lambda/D over 161 samples.
-    for color, line, width in (("black", "-", 2.8), ("white", "--", 1.3)):
-        radius = mask.diameter / 2 * 20
-        focal.add_patch(Circle((80, 80), radius, fill=False, ec=color, ls=line, lw=width))
+    dashed_circle(focal, (80, 80), mask.diameter / 2 * 20)
     label = f"mask: {mask.diameter:g} $\\lambda/D$, {_shift(mask)} rad"
     focal.text(80, 146, label, color="white", ha="center", fontsize=9)
     focal.plot([80, 80], [80 + mask.diameter * 10, 142], color="white", lw=0.8)

@@ -19,6 +19,12 @@ from zwfs.plots.style import ALONE, LOOKS, _looks, show_phase
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import GerchbergSaxton
 
+# Look and title of the variants of Gerchberg-Saxton, by what they do where nothing is measured.
+_UNMEASURED = {
+    "zero": ("GerchbergSaxton", "zero where not measured"),
+    "model": ("GerchbergSaxtonModel", "modelled field kept"),
+}
+
 
 def linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], rms_max: float) -> Figure:
     """Figure 3: mean error and its standard deviation against the input, and their ratio on a logarithmic axis.
@@ -77,36 +83,33 @@ def saxton_widths(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurv
         Ratio of error to input that is marked.
     """
     figure, panels = plt.subplots(1, 2, figsize=(7, 4.2), sharex=True)
-    kinds = {
-        "zero": ("GerchbergSaxton", "zero where not measured", cycle(("-", "-.", "--", ":")), cycle("^<v>")),
-        "model": ("GerchbergSaxtonModel", "modelled field kept", cycle(("-", "--")), cycle("x+")),
-    }
-    for axes, (kind, (family, title, dashes, markers)) in zip(panels, kinds.items(), strict=True):
+    for axes, (kind, (family, title)) in zip(panels, _UNMEASURED.items(), strict=True):
         drawn = {name: method for name, method in variants.items() if method.unmeasured == kind}
         colors = _shades(LOOKS[family].color, len(drawn))
-        for (name, method), color in zip(drawn.items(), colors, strict=True):
+        for (name, method), color, line in zip(drawn.items(), colors, cycle(("-", "-.", "--", ":")), strict=False):
             ratio = curves.mean(name) / curves.rms
-            axes.semilogy(curves.rms, ratio, color=color, linestyle=next(dashes), marker=next(markers))
-            place: dict[str, Any]
-            text, place = f"{method.sensor.extent:g} D", {"xytext": (-7, 0), "ha": "right", "va": "center"}
-            if kind == "model":
-                title = f"modelled field kept, {text}"
-                text, place = f"{method.settings.n_iterations} iterations", {"xytext": (6, -11), "va": "top"}
+            axes.semilogy(curves.rms, ratio, **LOOKS[family].style | {"color": color, "linestyle": line})
+            text, place = _variant_label(method)
             axes.annotate(text, (curves.rms[0], ratio[0]), textcoords="offset points", fontsize=9, **place)
-        axes.plot(curves.rms, curves.mean("Linear") / curves.rms, **LOOKS["Linear"].style)
+        [linear] = axes.plot(curves.rms, curves.mean("Linear") / curves.rms, **LOOKS["Linear"].style)
         axes.axhline(threshold, color="#555555", lw=1)
         axes.set(xlabel="input phase (rad rms)", xlim=(0, None))
         axes.set_title(title, fontsize=10)
-    panels[0].set_ylabel("error / input")
+    zero, model = panels
+    zero.set(ylabel="error / input", ylim=(threshold / 2, None))
     style: dict[str, Any] = {"color": "#555555", "fontsize": 9, "ha": "right", "va": "top"}
-    panels[0].text(
-        0.99, 0.9 * threshold, f"{threshold:.0%} of the input", transform=panels[0].get_yaxis_transform(), **style
-    )
-    panels[0].set_ylim(bottom=threshold / 2)
-    panels[1].set_ylim(bottom=panels[1].get_ylim()[0] / 4)  # room for the labels
-    linear = panels[0].lines[-2]  # before the line of the threshold
+    line = f"{threshold:.0%} of the input"
+    zero.text(0.99, 0.9 * threshold, line, transform=zero.get_yaxis_transform(), **style)
+    model.set_ylim(bottom=model.get_ylim()[0] / 4)  # room for the labels
     figure.legend([linear], ["linear"], loc="outside lower center", fontsize=9)
     return figure
+
+
+def _variant_label(method: GerchbergSaxton) -> tuple[str, dict[str, Any]]:
+    """What distinguishes a variant from the others in its panel, and where to write it at the first point."""
+    if method.unmeasured == "zero":
+        return f"{method.sensor.extent:g} D", {"xytext": (-7, 0), "ha": "right", "va": "center"}
+    return f"{method.settings.n_iterations} iterations", {"xytext": (6, -11), "va": "top"}
 
 
 def _shades(color: str, count: int) -> list[tuple[float, ...]]:

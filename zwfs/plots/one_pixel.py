@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from zwfs.focal import focal_field
 from zwfs.metrics import wrapped_residual
 from zwfs.paper.one_pixel import Pixel
-from zwfs.plots.style import LOOKS, show_intensity, show_phase
+from zwfs.plots.style import LOOKS, dashed_circle, show_intensity, show_phase
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
@@ -46,9 +46,7 @@ def sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Figure:
         show_intensity(panels[3], image, image.max()),
     )
     shown[1].set(cmap="magma", norm="log", clim=(1e-3, 1), extent=(-_REACH, _REACH, -_REACH, _REACH))
-    for width, edge, line in ((3.2, "black", "-"), (1.5, "white", "--")):
-        radius = sensor.masks[0].diameter / 2
-        panels[1].add_patch(Circle((0, 0), radius, fill=False, ec=edge, ls=line, lw=width))
+    dashed_circle(panels[1], (0, 0), sensor.masks[0].diameter / 2)
     titles = "1. pupil:\nphase", "2. focus:\ndimple (dashed)", "3. reference\nwave", "4. camera:\nimage"
     units = "rad", "intensity", "intensity", "intensity"
     for axes, picture, title, unit in zip(panels, shown, titles, units, strict=True):

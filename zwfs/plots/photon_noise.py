@@ -9,6 +9,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
@@ -121,13 +122,19 @@ def design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[str, 
     figure.legend(handles, labels, loc="outside lower center", ncols=5, handletextpad=0.2, columnspacing=1)
     figure.draw_without_rendering()  # which decides the size of the panels
     for axes, paths in zip(panels[0], contours, strict=True):
-        marks = np.concatenate([_dense(line.get_xydata()) for line in axes.lines])
-        size = axes.get_window_extent().size / figure.dpi
-        for cost, (across, up) in label_places(paths, marks, extent, size).items():
-            patch = {"facecolor": shown.to_rgba(cost), "edgecolor": "none", "boxstyle": "square,pad=0.1"}
-            style: dict[str, Any] = {"color": COST_LINES[cost], "fontsize": 9, "bbox": patch}
-            axes.text(across, up, f"{cost:g}", ha="center", va="center", **style)
+        _label_contours(axes, paths, extent)
     return figure
+
+
+def _label_contours(axes: Axes, paths: Mapping[float, Sequence[NDArray]], extent: Sequence[float]) -> None:
+    """Write the cost of each contour on it, on the colour that the map has there."""
+    marks = np.concatenate([_dense(np.asarray(line.get_xydata())) for line in axes.lines])
+    shown: Any = axes.images[0]
+    size = axes.get_window_extent().size / shown.figure.dpi
+    for cost, (across, up) in label_places(paths, marks, extent, size).items():
+        patch = {"facecolor": shown.to_rgba(cost), "edgecolor": "none", "boxstyle": "square,pad=0.1"}
+        style: dict[str, Any] = {"color": COST_LINES[cost], "fontsize": 9, "bbox": patch}
+        axes.text(across, up, f"{cost:g}", ha="center", va="center", **style)
 
 
 def label_places(

@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.image import AxesImage
+from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 from zwfs.reconstructors import RECONSTRUCTORS
@@ -129,6 +130,12 @@ def show_phase(axes: Axes, phase: NDArray, limit: float) -> AxesImage:
 def show_intensity(axes: Axes, frame: NDArray, limit: float) -> AxesImage:
     """Intensity from 0 to `limit`."""
     return _show(axes, frame, INTENSITY_MAP, 0, limit)
+
+
+def dashed_circle(axes: Axes, center: tuple[float, float], radius: float) -> None:
+    """Edge of a dimple: white dashes on black, to be seen on dark and on bright light."""
+    for color, line, width in (("black", "-", 3.0), ("white", "--", 1.4)):
+        axes.add_patch(Circle(center, radius, fill=False, ec=color, ls=line, lw=width))
 
 
 def _show(axes: Axes, image: NDArray, colors: str, low: float, high: float) -> AxesImage:

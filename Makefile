@@ -4,8 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 LOCK := environment/requirements.lock
 READY := $(VENV)/.ready
+UV_LOCK := environment/uv.txt
 UV := $(BIN)/uv --quiet
-UV_REQUIREMENT := uv==0.13.8
+PIN = $(UV) pip compile $(if $(PACKAGE),--upgrade-package $(PACKAGE),--upgrade) --generate-hashes \
+	--no-emit-index-url --custom-compile-command "make lock"
 
 # The folder and the Python of the environment. The set-up writes them to $(READY) at its end. After an interruption,
 # a move of the folder or a change of Python they differ, and the set-up is repeated.
@@ -25,6 +27,9 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export MKL_NUM_THREADS = 1
 export VECLIB_MAXIMUM_THREADS = 1
+
+# Linked files would be shared with the cache and with every other environment: damage to one would reach all.
+export UV_LINK_MODE = copy
 
 # Neither make nor the shell expands these: only the command rerun reads them, from an environment variable.
 export RERUN := $(value FIGURE) $(value ARGS)
@@ -86,10 +91,9 @@ pythons: $(READY) ## run examples and core tests on every supported Python, and 
 	@$(BIN)/python -m book._tools pythons $(PYTHONS)
 
 lock: $(BIN)/uv ## pin the newest allowed version of every dependency, or of one: make lock PACKAGE=numpy
-	$(UV) pip compile pyproject.toml --extra book --extra cluster --extra lab --extra tables --extra test \
-		$(if $(PACKAGE),--upgrade-package $(PACKAGE),--upgrade) \
-		--universal --python-version 3.11 --fork-strategy fewest --generate-hashes --no-emit-index-url \
-		--custom-compile-command "make lock" --output-file $(LOCK)
+	$(PIN) pyproject.toml --extra book --extra cluster --extra lab --extra tables --extra test \
+		--universal --python-version 3.11 --fork-strategy fewest --output-file $(LOCK)
+	echo uv | $(PIN) - --no-annotate --output-file $(UV_LOCK)
 
 # Other files in _build belong to the user, above all the results of make rerun.
 clean: ## remove the results of these commands, except those of make rerun
@@ -104,7 +108,7 @@ $(BIN)/uv:
 		"Choose another: make PYTHON=python3.12" >&2; exit 1; }
 	@echo "setting up $(VENV)"
 	@$(PYTHON) -m venv --clear $(VENV)
-	@$(BIN)/python -m pip --quiet --disable-pip-version-check install $(UV_REQUIREMENT)
+	@$(BIN)/python -m pip --quiet --disable-pip-version-check install --require-hashes --requirement $(UV_LOCK)
 
 # The compatible mode puts this folder on the path of Python. The default mode fails in a folder with a folder zwfs.
 $(READY): $(LOCK) pyproject.toml $(BIN)/uv
@@ -112,4 +116,5 @@ $(READY): $(LOCK) pyproject.toml $(BIN)/uv
 	@$(UV) pip sync --python $(BIN)/python --compile-bytecode --require-hashes $(LOCK)
 	@$(UV) pip install --python $(BIN)/python --no-deps --no-build-isolation \
 		--config-settings editable_mode=compat --editable .
+	@$(BIN)/python -I environment/check.py
 	@$(IDENTITY) > $@

@@ -23,6 +23,8 @@ import zwfs
 
 ROOT = Path(__file__).parent.parent
 LOCK = "environment/requirements.lock"
+UV_LOCK = "environment/uv.txt"
+CHECK = "environment/check.py"
 INSTALLERS = [
     "environment/environment.yml",
     "environment/Dockerfile",
@@ -97,7 +99,7 @@ def pins(text):
 
 @pytest.mark.parametrize("name", INSTALLERS)
 def test_environments_ask_for_no_version_but_the_locked(name):
-    known = LOCKED | {"python": supported()[-1], "uv": found(r"uv==(\S+)", "Makefile").pop()}
+    known = LOCKED | {"python": supported()[-1], "uv": found(r"uv==(\S+)", UV_LOCK).pop()}
     assert {n: v for n, v in pins(read(name)).items() if known.get(n) != v} == {}
 
 
@@ -185,12 +187,15 @@ def test_every_editable_installation_is_compatible():
         assert found(r"(\S+ \S+) --editable \.", name) == {"--config-settings editable_mode=compat"}
 
 
-# In place of pip: it installs a uv that succeeds without doing anything, or is killed meanwhile, and make with it.
+# In place of pip: it installs a uv that does nothing but check that it copies files, or is killed meanwhile, and make
+# with it.
 PIP = """
 import os, pathlib, signal, sys
 
 uv = pathlib.Path(sys.executable).with_name("uv")
-uv.write_text("#!/bin/sh")
+uv.write_text('#!/bin/sh\\n[ "$UV_LINK_MODE" = copy ]')
+if "--require-hashes" not in sys.argv:
+    sys.exit("uv is not checked")
 if "KILLED" in os.environ:
     os.killpg(0, signal.SIGKILL)
 uv.chmod(0o755)
@@ -206,7 +211,7 @@ def clone(tmp_path):
     """A folder with what a set-up needs, and programs that do it without the network."""
     folder = tmp_path / "clone"
     (folder / "environment").mkdir(parents=True)
-    for name in ("Makefile", "pyproject.toml", LOCK):
+    for name in ("Makefile", "pyproject.toml", LOCK, UV_LOCK, CHECK):
         shutil.copy(ROOT / name, folder / name)
     (tmp_path / "pip.py").write_text(PIP)
     (tmp_path / "python").write_text(PYTHON.format(sys.executable))
@@ -251,6 +256,28 @@ def test_environment_is_set_up_again_when_its_python_is_gone(clone):
     python.unlink()
     python.symlink_to("/usr/bin/python0")
     assert make(clone, "-s", ".venv/.ready") == (0, READY)
+
+
+@pytest.mark.parametrize("damage", [lambda file: os.truncate(file, 3), Path.unlink], ids=["cut", "missing"])
+@pytest.mark.parametrize("name", ["module.py", "module-1.0.dist-info/RECORD"])
+def test_set_up_stops_at_a_damaged_file_and_says_how_to_repair_it(clone, tmp_path, name, damage):
+    packages = tmp_path / "packages"
+    (packages / "module-1.0.dist-info").mkdir(parents=True)
+    (packages / "module.py").write_text("a = 1\n")
+    # The hash: hashlib.sha256(b"a = 1\n") in base64.
+    record = "module.py,sha256=y3i9ihf3t1H-DUZjNm3LwlcgQDPvfd1ksfKWlXO1suI,6\nmodule-1.0.dist-info/RECORD,,\n"
+    (packages / "module-1.0.dist-info" / "RECORD").write_text(record)
+    copy = f"shutil.copytree({str(packages)!r}, sysconfig.get_path('purelib'), dirs_exist_ok=True)"
+    (tmp_path / "pip.py").write_text(f"import shutil, sysconfig\n{PIP}\n{copy}\n")
+    assert make(clone, "-s", ".venv/.ready") == (0, READY)
+    damage(packages / name)
+    (clone / ".venv" / ".ready").unlink()
+    assert make(clone, "-s", ".venv/.ready")[0] != 0
+    assert not (clone / ".venv" / ".ready").exists()
+    said = subprocess.run([clone / ".venv/bin/python", clone / CHECK], capture_output=True, text=True).stderr
+    assert name in said
+    assert "rm -rf .venv && UV_NO_CACHE=1 make .venv/.ready" in said
+    assert said.count("\n") == 1
 
 
 def test_clean_keeps_what_belongs_to_the_user(clone):

@@ -1,7 +1,9 @@
 """What a release needs: files for archives that agree, a changelog with an entry, and a careful workflow."""
 
 import json
+import os
 import re
+import subprocess
 import sys
 
 import pytest
@@ -100,6 +102,15 @@ def test_workflows_pin_actions_and_have_the_least_privileges(name):
         assert writes <= {"attestations", "id-token", "pages"}
         # What can publish runs no code of this repository.
         assert not (writes and any("run" in step for step in job["steps"]))
+
+
+@pytest.mark.parametrize(("pattern", "passes"), [("{}", True), (".*", False), ("{}.1", False)])
+def test_a_release_needs_the_version_of_the_package_in_its_tag(pattern, passes):
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text("utf-8"))
+    (step,) = [one for one in workflow["jobs"]["build"]["steps"] if "tag" in one.get("name", "")]
+    tag = {"GITHUB_REF_NAME": f"v{pattern.format(zwfs.__version__)}"}
+    done = subprocess.run(["bash", "-c", step["run"]], cwd=ROOT, env=os.environ | tag, capture_output=True)
+    assert (done.returncode == 0) == passes
 
 
 def test_readme_shows_its_pictures_on_other_sites():

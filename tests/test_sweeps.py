@@ -321,6 +321,29 @@ def test_a_damaged_file_is_made_again(store, damage):
     assert file.read_bytes() == whole
 
 
+@pytest.mark.parametrize("mode", [0o770, 0o707, 0o720, 0o1777])
+@pytest.mark.parametrize("inner", [False, True])
+def test_a_folder_that_others_can_write_to_is_refused(store, monkeypatch, mode, inner):
+    folder = store / "finished"
+    monkeypatch.setenv(sweeps.STORE, str(folder))
+    store.chmod(0o1777)  # the parent may be one like /tmp
+    sweeps.run(square, range(4), 1, name="squares")
+    assert {path.stat().st_mode & 0o777 for path in (folder, *folder.iterdir())} == {0o700}
+    square.calls.clear()
+    shared = next(folder.iterdir()) if inner else folder
+    shared.chmod(mode)
+    with pytest.raises(PermissionError, match=rf"ZWFS_SWEEPS: other users can write to {shared}, "):
+        sweeps.run(square, range(4), 1, name="squares")
+    assert square.calls == []
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder to another user")
+def test_a_folder_of_another_user_is_refused(store):
+    os.chown(store, 12345, -1)
+    with pytest.raises(PermissionError, match="expected a folder of your own"):
+        sweeps.run(square, range(4), 1, name="squares")
+
+
 def test_other_inputs_are_other_tasks(store, tmp_path, monkeypatch):
     monkeypatch.setenv(sweeps.PROGRESS, str(tmp_path / "progress"))
     sweeps.run(square, range(4), 1, name="squares")

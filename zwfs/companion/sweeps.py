@@ -8,7 +8,8 @@ task, and BLAS uses one thread. Without threadpoolctl BLAS keeps its threads, an
 Three environment variables are read when a sweep begins:
 
 - ``ZWFS_SWEEPS`` names a folder that keeps the result of each finished task. A sweep that was stopped and is run
-  again computes only the missing results. The files are pickles: use a folder that only you can write to.
+  again computes only the missing results. The files are pickles, and reading a pickle can run any code: a folder that
+  other users can write to is refused.
 - ``ZWFS_PROGRESS`` names a file to which each finished task appends a line:
   ``{"name": "linearity_curves", "done": 3, "total": 22}``.
 - ``ZWFS_CLUSTER`` is the address of the scheduler of a Dask cluster, such as ``tcp://host:8786``. The tasks run
@@ -25,6 +26,7 @@ import io
 import json
 import os
 import pickle
+import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -79,6 +81,8 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
     ------
     TypeError, ValueError
         If the task is not a function, the inputs are not iterable, or the name is not an identifier.
+    PermissionError
+        If other users can write to the folder of ``ZWFS_SWEEPS``.
     ImportError
         If joblib or a folder for the results needs cloudpickle or threadpoolctl, and one of them is missing.
     Exception
@@ -363,7 +367,8 @@ class _Store:
         self._folder = None
         if folder := os.environ.get(STORE):
             self._folder = Path(folder) / f"{name}-{_digest(shared)}"
-            self._folder.mkdir(parents=True, exist_ok=True)
+            _make_private(Path(folder))
+            _make_private(self._folder)
 
     def load(self, value: Any) -> list[Any] | None:
         """Return the result for a value, in a list; None if its file is missing or damaged."""
@@ -382,6 +387,17 @@ class _Store:
 
     def _path(self, value: Any) -> Path | None:
         return self._folder and self._folder / f"{_digest(value)}.pickle"
+
+
+def _make_private(folder: Path) -> None:
+    """Make a folder for pickles unless it exists; refuse one in which another user could put or change files."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    about = folder.stat()
+    if os.name == "posix" and (about.st_uid != os.getuid() or about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
+        raise PermissionError(
+            f"{STORE}: other users can write to {folder}, and reading its pickles can run any code: "
+            "expected a folder of your own that nobody else can write to (chmod go-w)"
+        )
 
 
 def _digest(value: Any) -> str:

@@ -8,8 +8,8 @@ task, and BLAS uses one thread. Without threadpoolctl BLAS keeps its threads, an
 Three environment variables are read when a sweep begins:
 
 - ``ZWFS_SWEEPS`` names a folder that keeps the result of each finished task. A sweep that was stopped and is run
-  again computes only the missing results. The files are pickles, and reading a pickle can run any code: a folder that
-  other users can write to is refused.
+  again computes only the missing results. The files are pickles, and reading a pickle can run any code: a folder
+  that other users can write to is refused.
 - ``ZWFS_PROGRESS`` names a file to which each finished task appends a line:
   ``{"name": "linearity_curves", "done": 3, "total": 22}``.
 - ``ZWFS_CLUSTER`` is the address of the scheduler of a Dask cluster, such as ``tcp://host:8786``. The tasks run
@@ -108,7 +108,7 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
         return [task(value, *shared) for value in inputs]
     needed = ("cloudpickle", "threadpoolctl") if find_spec("joblib") or os.environ.get(STORE) else ()
     if missing := [package for package in needed if not find_spec(package)]:
-        raise ImportError(f"sweeps need {', '.join(missing)}: pip install zwfs[sweeps]")
+        raise ImportError(f"sweeps need {', '.join(missing)}: pip install {' '.join(missing)}")
     store = _Store(name, (task, *shared))
     finished = {index: kept for index, value in enumerate(inputs) if (kept := store.load(value)) is not None}
     if finished:
@@ -167,12 +167,12 @@ class Grid:
         Raises
         ------
         ImportError
-            If Parquet needs pyarrow: ``pip install zwfs[tables]``.
+            If Parquet needs pyarrow: ``pip install pyarrow``.
         """
         path, columns = path_of("path", path), self.columns()
         if path.suffix == ".parquet":
             if not find_spec("pyarrow"):
-                raise ImportError("Parquet needs pyarrow: pip install zwfs[tables]")
+                raise ImportError("Parquet needs pyarrow: pip install pyarrow")
             import pyarrow
             from pyarrow import parquet
 
@@ -185,9 +185,9 @@ class Grid:
         write_file(path, text.getvalue().encode())
 
     def to_xarray(self) -> Any:
-        """Return an `xarray.Dataset` with the axes as coordinates: ``pip install zwfs[tables]``."""
+        """Return an `xarray.Dataset` with the axes as coordinates: ``pip install xarray``."""
         if not find_spec("xarray"):
-            raise ImportError("to_xarray needs xarray: pip install zwfs[tables]")
+            raise ImportError("to_xarray needs xarray: pip install xarray")
         from xarray import Dataset
 
         names = tuple(self.axes)
@@ -297,7 +297,7 @@ def _cluster() -> Iterator[None]:
         yield
         return
     if not find_spec("distributed"):
-        raise ImportError(f"{CLUSTER} needs distributed: pip install zwfs[cluster]")
+        raise ImportError(f"{CLUSTER} needs distributed: pip install distributed")
     from distributed import Client
 
     with Client(address, set_as_default=False) as client, parallel_config(backend="dask", client=client):

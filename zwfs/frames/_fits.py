@@ -1,4 +1,4 @@
-"""FITS files. The only module that imports astropy: `pip install zwfs[frames]`."""
+"""FITS files. The only module that imports astropy: `pip install astropy`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def fits_module() -> ModuleType:
     try:
         from astropy.io import fits
     except ImportError:
-        raise ImportError("FITS files need astropy: pip install zwfs[frames]; NPY files do not") from None
+        raise ImportError("FITS files need astropy: pip install astropy; NPY files do not") from None
     return fits
 
 

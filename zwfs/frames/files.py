@@ -1,6 +1,6 @@
 """Camera files: read frames from FITS or NPY, write the phase as FITS.
 
-FITS files need astropy: `pip install zwfs[frames]`.
+FITS files need astropy: `pip install astropy`.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ import yaml
 from bs4 import BeautifulSoup
 from PIL import Image
 from pypdf import PdfReader
-from rocrate.rocrate import ROCrate
 
 ROOT = Path(__file__).parent.parent
 HTML = ROOT / "_build" / "html"
@@ -136,15 +135,6 @@ def test_card_is_what_social_networks_show():
 
 def test_front_page_leads_to_the_book(book_pages):
     assert "book/index.html" in book_pages[HTML / "index.html"].links
-
-
-def test_crate_describes_the_book():
-    crate = ROCrate(HTML)
-    pages = {page.id for page in crate.data_entities}
-    assert "index.html" in pages
-    assert all((HTML / page).is_file() for page in pages)
-    assert {f"notebooks/{path.stem}.html" for path in (ROOT / "notebooks").glob("*.ipynb")} < pages
-    assert crate.root_dataset["isBasedOn"]["@id"].endswith("arXiv.2409.04547")
 
 
 def test_no_file_names_this_machine():

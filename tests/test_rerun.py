@@ -18,7 +18,6 @@ import nbformat
 import pytest
 from distributed import Client, LocalCluster
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
-from rocrate.rocrate import ROCrate
 
 from book._tools import declared, record, rerun
 from book._tools.__main__ import main
@@ -278,7 +277,7 @@ def test_names_of_folders_tell_parameters_and_differ():
 def test_folder_holds_all_that_was_made(ran):
     folder = result(ran)
     about = json.loads((folder / "record.json").read_text())
-    files = {"fig01_small.html", "fig01_small.ipynb", "numbers.csv", "ro-crate-metadata.json"}
+    files = {"fig01_small.html", "fig01_small.ipynb", "numbers.csv"}
     assert {file.name for file in folder.iterdir()} == {*files, "record.json"}
     assert (folder / "numbers.csv").read_text() == "2,3.0"
     assert about["parameters"] == {"n": 2, "width": 3.0, "steps": [1, 2], "seed": 7}
@@ -289,16 +288,6 @@ def test_folder_holds_all_that_was_made(ran):
     assert os.listdir(ran.build) == ["rerun"]
     notebook = read(folder / "fig01_small.ipynb")
     assert notebook.cells[2].source.endswith("| `width` | `3.0` | `1.5` | rad | of the slit |")
-
-
-def test_crate_describes_the_run(ran):
-    folder = result(ran)
-    crate = ROCrate(folder)
-    assert {file.id for file in crate.data_entities} == {"fig01_small.html", "fig01_small.ipynb", "numbers.csv"}
-    (run,) = crate.get_by_type("CreateAction")
-    assert {one["name"]: one["value"] for one in run["object"]}["width"] == 3.0
-    assert run["name"] == json.loads((folder / "record.json").read_text())["command"]
-    assert "NumPy" in {one["name"] for one in run["instrument"]}
 
 
 def test_page_has_everything_in_it(ran):
@@ -556,8 +545,6 @@ def test_real_figure_with_a_nested_parameter(tmp_path):
     arguments = ["6", "-p", "n_pixels=40", "-p", f"bench={json.dumps(bench)}", "--output", str(target)]
     rerun.rerun(Project(ROOT), arguments)
     assert json.loads((target / rerun.RECORD).read_text())["changed"]["bench"] == bench
-    crate = ROCrate(str(target))
-    assert json.loads(crate.get("#bench")["value"]) == bench
     assert "n_rings" in (target / "fig06_reference.html").read_text()
 
 

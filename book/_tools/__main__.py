@@ -19,7 +19,6 @@ USAGE = """usage: python -m book._tools COMMAND
   pdf       the same, but fail without a Chromium
   figures   replace the committed notebooks and the front figure by freshly run ones
   rerun     run one notebook with other parameters: rerun --help lists the options
-  metadata  write the files for archives from CITATION.cff and pyproject.toml
   release-check   build the package and test it in an empty environment
   pythons   run examples and core tests: pythons 3.12 lowest; all by default"""
 
@@ -41,10 +40,6 @@ def main(arguments: list[str], project: Project | None = None) -> int:
             end_cleanly_on_signals()
             with one_at_a_time(project.build):
                 getattr(book, command)(project)
-        elif command == "metadata" and not options:
-            from .metadata import metadata
-
-            metadata(project)
         elif command == "pythons" or (command == "release-check" and not options):
             from . import release
 

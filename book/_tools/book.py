@@ -16,7 +16,6 @@ import yaml
 from zwfs._files import write_file
 
 from . import pdf as printing
-from .crate import describe_book
 from .execute import TRACEBACK_LINES
 from .project import EXECUTED, PDF, Project, ToolError
 from .record import commit, digest, digest_files
@@ -125,7 +124,6 @@ def build(project: Project, chromium: str | None = None) -> bool:
             (pages / printing.NAME).write_bytes(printing.print_book(project.root, pages, chromium))
         # Sphinx needs it for a later build in the same place. Its digest depends on the place.
         (pages / ".buildinfo").unlink(missing_ok=True)
-        describe_book(project, pages, commit(project.root)[0])
         swap(pages, html, scratch / "earlier")
     write_file(record, json.dumps(made_from).encode())
     return True
@@ -134,7 +132,7 @@ def build(project: Project, chromium: str | None = None) -> bool:
 def _digest(project: Project, printed: bool) -> str:
     """Return a digest of everything that the book depends on."""
     root = project.root
-    files = [root / name for name in ("_config.yml", "_toc.yml", "pyproject.toml", "CITATION.cff")]
+    files = [root / name for name in ("_config.yml", "_toc.yml", "pyproject.toml")]
     files += [file for file in (root / "book").rglob("*") if "__pycache__" not in file.parts]
     files += [*project.sources(), *project.modules(), project.lock]
     for notebook in project.sources():

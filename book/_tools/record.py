@@ -89,15 +89,6 @@ def versions() -> dict[str, str]:
     return {"Python": platform.python_version()} | {name: metadata.version(p) for name, p in packages.items()}
 
 
-def commit_date(root: Path) -> str | None:
-    """Return when the commit of a working tree was made; None without a history."""
-    identifier, _ = commit(root)
-    if identifier is None:
-        return None
-    show = ["git", "-C", str(root), "show", "--no-patch", "--format=%cI", identifier]
-    return subprocess.run(show, capture_output=True, text=True, check=True).stdout.strip()
-
-
 def commit(root: Path) -> tuple[str | None, bool | None]:
     """Return the commit of a working tree, and whether the tree has changes; None without a history.
 

@@ -340,7 +340,7 @@ def make(
         if (free := shutil.disk_usage(scratch).free) < ROOM:
             raise ParameterError(f"{within}: {free / 1e6:.0f} MB are free: expected at least {ROOM / 1e6:.0f} MB")
         # Not at the top: these imports take seconds, and only a run needs them.
-        from . import crate, page
+        from . import page
         from .execute import Run, execute
 
         run, new = Run(project, name, scratch, changed, workers), scratch / "new"
@@ -368,7 +368,6 @@ def make(
             "key": run.key,
             "seconds": run.seconds,
         }
-        crate.describe_rerun(new, about)
         about["files"] = digests(new, [file.name for file in new.iterdir()])
         (new / RECORD).write_text(json.dumps(about, indent=2) + "\n", "utf-8")
         folder.parent.mkdir(parents=True, exist_ok=True)

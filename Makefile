@@ -36,7 +36,7 @@ export RERUN := $(value FIGURE) $(value ARGS)
 unexport FIGURE ARGS
 
 .DELETE_ON_ERROR:
-.PHONY: help book pdf lab test test-slow fuzz mutants torture figures rerun lint bench release-check pythons lock clean
+.PHONY: help book pdf lab test test-slow fuzz mutants torture figures rerun lint bench release-check pythons address lock clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 21
@@ -89,6 +89,9 @@ release-check: $(READY) ## build the package, and test it in an empty environmen
 
 pythons: $(READY) ## run examples and core tests on every supported Python, and with the oldest dependencies
 	@$(BIN)/python -m book._tools pythons $(PYTHONS)
+
+address: $(READY) ## write the public address in pyproject.toml to every file that names it
+	@$(BIN)/python -m book._tools address
 
 lock: $(BIN)/uv ## pin the newest allowed version of every dependency, or of one: make lock PACKAGE=numpy
 	$(PIN) pyproject.toml --extra book --extra cluster --extra lab --extra tables --extra test \

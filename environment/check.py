@@ -13,7 +13,7 @@ REPAIR = "rm -rf .venv && UV_NO_CACHE=1 make .venv/.ready"
 
 
 def damaged(record: Path) -> Iterator[Path]:
-    """Yield the files of a package that are missing or differ from its record; compiled files have no hash there."""
+    """Yield the files of a package that are missing or differ from its record; compiled files have no hash."""
     rows = list(csv.reader(record.read_text("utf-8").splitlines())) if record.is_file() else []
     if [f"{record.parent.name}/RECORD", "", ""] not in rows:  # it lists itself, too
         yield record

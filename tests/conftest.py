@@ -25,7 +25,7 @@ settings.load_profile("zwfs")
 
 
 # Fixtures that start kernels, clusters, set-ups or a browser, build a book, calibrate a bench or need real frames.
-SLOW = {"browser", "calibrated", "clone", "cluster", "plain_book", "real", "seal", "template"}
+SLOW = {"browser", "calibrated", "clone", "cluster", "plain_book", "published_book", "real", "seal", "template"}
 
 
 def pytest_collection_modifyitems(items):

@@ -7,14 +7,14 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
-import yaml
 from bs4 import BeautifulSoup
 from PIL import Image
 from pypdf import PdfReader
 
+from book._tools.address import setting
+
 ROOT = Path(__file__).parent.parent
 HTML = ROOT / "_build" / "html"
-CARD = "_static/social.png"
 
 pytestmark = [
     pytest.mark.slow,
@@ -109,15 +109,14 @@ def test_figures_say_what_they_show_and_keep_their_place():
 
 
 def test_pages_tell_what_they_are_about(book_pages):
-    config = yaml.safe_load((ROOT / "_config.yml").read_text("utf-8"))
+    address = setting(ROOT).book
     seen = {}
     for file in book_pages:
         head = read(file).head
         told = {
             tag.get("property") or tag.get("name"): tag["content"] for tag in head.find_all("meta", content=True)
         }
-        assert told["og:url"] == config["html"]["baseurl"] + file.relative_to(HTML).as_posix()
-        assert told["og:image"] == config["html"]["baseurl"] + CARD
+        assert told.get("og:url") == (f"{address}{file.relative_to(HTML).as_posix()}" if address else None)
         assert told["og:title"]
         seen[file.relative_to(HTML).as_posix()] = told.get("description")
     assert 60 < len(seen["index.html"]) <= 250
@@ -125,12 +124,6 @@ def test_pages_tell_what_they_are_about(book_pages):
     described = [text for name, text in seen.items() if name.startswith(("book/", "notebooks/"))]
     assert len(set(described)) == len(described)
     assert not [text for text in described if not text or "\\" in text]
-
-
-def test_card_is_what_social_networks_show():
-    with Image.open(HTML / CARD) as card:
-        assert card.size == (1200, 630)
-        assert len(card.convert("RGB").getcolors(1 << 20)) > 100
 
 
 def test_front_page_leads_to_the_book(book_pages):
@@ -143,29 +136,7 @@ def test_no_file_names_this_machine():
     assert not [file.name for file in texts for place in places if f"{place}/" in file.read_text("utf-8")]
 
 
-# Launch buttons and the PDF
-
-
-def launches(file):
-    """Where the launch buttons of a page lead."""
-    links = {link["href"] for link in read(file).find_all("a", href=True)}
-    return {link for link in links if urlsplit(link).netloc in ("mybinder.org", "colab.research.google.com")}
-
-
-def test_launch_buttons_open_the_notebook_of_their_page():
-    repository = yaml.safe_load((ROOT / "_config.yml").read_text("utf-8"))["repository"]
-    owner, branch = repository["url"].removeprefix("https://github.com/"), repository["branch"]
-    for notebook in (ROOT / "notebooks").glob("*.ipynb"):
-        assert launches(HTML / "notebooks" / f"{notebook.stem}.html") == {
-            f"https://mybinder.org/v2/gh/{owner}/{branch}?urlpath=lab/tree/notebooks/{notebook.name}",
-            f"https://colab.research.google.com/github/{owner}/blob/{branch}/notebooks/{notebook.name}",
-        }
-
-
-def test_pages_that_are_no_notebooks_have_no_launch_buttons():
-    others = [HTML / "index.html", *(HTML / "book").glob("*.html")]
-    assert len(others) > 3
-    assert [file.name for file in others if launches(file)] == []
+# The PDF
 
 
 def plain(text):

@@ -41,7 +41,6 @@ def read(name):
 
 
 PROJECT = tomllib.loads(read("pyproject.toml"))["project"]
-CONFIG = yaml.safe_load(read("_config.yml"))
 PINS = re.findall(r"(?m)^([\w.-]+)==([^\s;]+)", read(LOCK))
 LOCKED = {canonicalize_name(name): version for name, version in PINS}
 
@@ -130,16 +129,6 @@ def test_version_of_the_package_is_the_same_everywhere():
     assert {PROJECT["version"], citation["version"], zwfs.__version__, latest} == {PROJECT["version"]}
 
 
-def test_repository_is_the_same_everywhere():
-    owner, name = CONFIG["repository"]["url"].removeprefix("https://github.com/").split("/")
-    for file in ("README.md", "CITATION.cff"):
-        told = re.findall(r"https://(?:github\.com/|mybinder\.org/v2/gh/)([\w.-]+/[\w.-]+)", read(file))
-        told += ["/".join(site) for site in re.findall(r"https://([\w-]+)\.github\.io/([\w.-]+)", read(file))]
-        # Another project is named where its frames are spoken of.
-        assert set(told) - {"chambou/OWL"} == {f"{owner}/{name}"}
-    assert f"/{CONFIG['repository']['branch']}?urlpath" in read("README.md")
-
-
 def test_citation_names_the_paper_as_the_bibliography_does():
     citation = yaml.safe_load(read("CITATION.cff"))
     entry = pybtex.database.parse_file(ROOT / "book" / "references.bib").entries["Chambouleyron:24"]
@@ -150,15 +139,6 @@ def test_citation_names_the_paper_as_the_bibliography_does():
     assert str(paper["year"]) == entry.fields["year"]
     assert paper["url"].endswith(entry.fields["eprint"])
     assert paper["doi"].endswith(entry.fields["eprint"])
-
-
-@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
-def test_notebook_installs_the_package_on_colab_and_nowhere_else(path):
-    cell = next(cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code")
-    condition, command = 'if "google.colab" in sys.modules:', f"git+{CONFIG['repository']['url']}"
-    assert cell.source == f'import sys\n\n{condition}\n    %pip install -q "zwfs[notebooks] @ {command}"'
-    assert cell.metadata.tags == ["remove-cell"]
-    assert not cell.outputs
 
 
 def imported(source):
@@ -187,8 +167,7 @@ def test_every_editable_installation_is_compatible():
         assert found(r"(\S+ \S+) --editable \.", name) == {"--config-settings editable_mode=compat"}
 
 
-# In place of pip: it installs a uv that does nothing but check that it copies files, or is killed meanwhile, and make
-# with it.
+# In place of pip: it installs a uv that only checks that it would copy, or is killed meanwhile, and make with it.
 PIP = """
 import os, pathlib, signal, sys
 

@@ -6,26 +6,30 @@ import shutil
 import subprocess
 import sys
 from importlib import import_module
+from urllib.parse import urlsplit
 
 import pytest
 from bs4 import BeautifulSoup
+from PIL import Image
 
 import zwfs
 from book._ext import api
 
 from .conftest import ROOT
+from .test_address import NOWHERE, PUBLISHED, give
 
 
 def read(file):
     return BeautifulSoup(file.read_text("utf-8"), "html.parser")
 
 
-def build(root):
+def build(root, public=NOWHERE):
     """Run Jupyter Book on a copy of the tracked files, warnings as errors, and return the folder of pages."""
     listed = subprocess.run(["git", "-C", ROOT, "ls-files"], capture_output=True, text=True, check=True).stdout
     for name in filter(lambda name: (ROOT / name).is_file(), listed.splitlines()):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / name, root / name)
+    give(root, public)
     jupyter_book = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()"]
     command = [*jupyter_book, "build", "-W", "-n", "--keep-going", "."]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True)
@@ -90,6 +94,51 @@ def test_a_build_in_another_folder_gives_the_same_bytes(plain_book, tmp_path):
     assert [
         name for name in sorted(files[0]) if (plain_book / name).read_bytes() != (again / name).read_bytes()
     ] == []
+
+
+# The address of the project
+
+
+@pytest.fixture(scope="module")
+def published_book(tmp_path_factory):
+    return build(tmp_path_factory.mktemp("published"), PUBLISHED)
+
+
+def links(file):
+    return {link["href"] for link in read(file).find_all("a", href=True)}
+
+
+def launches(file):
+    return {link for link in links(file) if urlsplit(link).netloc in ("mybinder.org", "colab.research.google.com")}
+
+
+def test_book_without_an_address_promises_none(plain_book):
+    for file in plain_book.glob("**/*.html"):
+        assert not launches(file), file.name
+        assert not [link for link in links(file) if "executablebooks" in link or "/issues/new" in link], file.name
+        assert not read(file).select("link[rel=canonical], meta[property='og:url'], meta[property='og:image']")
+    assert "pip install .\n" in read(plain_book / "book" / "index.html").article.get_text()
+    assert "git clone" not in read(plain_book / "book" / "checking.html").article.get_text()
+
+
+def test_book_with_an_address_has_buttons_links_and_a_card(published_book):
+    notebook = "notebooks/fig03_dynamic_range"
+    assert launches(published_book / f"{notebook}.html") == {
+        f"https://mybinder.org/v2/gh/reader/sensor/main?urlpath=lab/tree/{notebook}.ipynb",
+        f"https://colab.research.google.com/github/reader/sensor/blob/main/{notebook}.ipynb",
+    }
+    front = published_book / "book" / "index.html"
+    assert not launches(front)
+    assert {PUBLISHED.repository, f"{PUBLISHED.repository}/edit/main/book/index.md"} <= links(front)
+    assert [link for link in links(front) if link.startswith(f"{PUBLISHED.repository}/issues/new")]
+    assert 'pip install "zwfs @ git+https://github.com/reader/sensor"' in read(front).article.get_text()
+    assert f"git clone {PUBLISHED.repository}\n" in read(front.with_name("checking.html")).article.get_text()
+    told = {tag["property"]: tag["content"] for tag in read(front).head.select("meta[property]")}
+    assert told["og:url"] == f"{PUBLISHED.book}book/index.html"
+    assert told["og:image"] == f"{PUBLISHED.book}_static/social.png"
+    with Image.open(published_book / "_static" / "social.png") as card:
+        assert card.size == (1200, 630)
+        assert len(card.convert("RGB").getcolors(1 << 20)) > 100
 
 
 # The API page

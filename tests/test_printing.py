@@ -23,8 +23,8 @@ FILES = {
               - file: book/theory
                 sections:
                   - file: notebooks/one""",
-    "_config.yml": "{title: A book, author: Some & others, repository: {url: 'https://example.org'}}",
-    "pyproject.toml": "[project]\nversion = '1.2.3'",
+    "_config.yml": "{title: A book, author: Some & others}",
+    "pyproject.toml": "[project]\nversion = '1.2.3'\n[tool.zwfs]\nrepository = 'https://github.com/reader/sensor'",
 }
 PAGES = {
     "book/index": "<h1>A book</h1><p>Begin with <a href='theory.html'>the theory</a>.</p>",
@@ -111,6 +111,7 @@ def test_chapters_are_bookmarked_and_listed_with_their_page(book):
     ]
     text = [page.extract_text() for page in pdf.pages]
     listed = "".join("".join(text).split("Contents")[1].split())
+    assert "https://github.com/reader/sensor" in text[0]
     for entry in chapters:
         place = pdf.get_destination_page_number(entry)
         assert entry.title in text[place]

@@ -92,11 +92,3 @@ def test_a_release_needs_the_version_of_the_package_in_its_tag(pattern, passes):
     tag = {"GITHUB_REF_NAME": f"v{pattern.format(zwfs.__version__)}"}
     done = subprocess.run(["bash", "-c", step["run"]], cwd=ROOT, env=os.environ | tag, capture_output=True)
     assert (done.returncode == 0) == passes
-
-
-def test_readme_shows_its_pictures_on_other_sites():
-    pictures = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", (ROOT / "README.md").read_text("utf-8"))
-    assert pictures
-    start = "https://raw.githubusercontent.com/zwfs/zwfs/main/"
-    assert all((ROOT / picture.removeprefix(start)).is_file() for picture in pictures)
-    assert all(picture.startswith(start) for picture in pictures)

@@ -19,6 +19,7 @@ from sphinx.config import Config
 from sphinx.util.fileutil import copy_asset_file
 
 from book._ext.performance import PICTURES
+from book._tools.address import setting
 from book._tools.project import PDF
 
 VARIANTS = "variants-"  # with which the class of a figure begins that may have dark and narrow variants
@@ -42,6 +43,17 @@ FORWARD = """<!DOCTYPE html>
 """
 # Browsers block pages from the file system from reading other files, so a search cannot show summaries there.
 SUMMARY = ("else if (showSearchSummary)", 'else if (showSearchSummary && location.protocol !== "file:")')
+
+
+def add_address(app: Sphinx, config: Config) -> None:
+    """Add what needs the address of the project: buttons, links to the published book, ``{{ address.install }}``.
+
+    Without an address the book has none of them.
+    """
+    public = setting(Path(app.srcdir))
+    config.html_baseurl = public.book
+    config.html_theme_options = config.html_theme_options | public.theme()
+    config.myst_substitutions = config.myst_substitutions | {"address": public.texts()}
 
 
 def add_substitutions(app: Sphinx, config: Config) -> None:
@@ -74,9 +86,8 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
         app.add_css_file("phasor.css")
         app.add_js_file("phasor.js", loading_method="defer")
     context["body"] = str(body)
-    if app.config.html_baseurl:
-        given = context.get("metatags", "")
-        context["metatags"] = given + tags(app.config, page, body, given)
+    given = context.get("metatags", "")
+    context["metatags"] = given + tags(app.config, page, body, given)
 
 
 def write_numbers(body: Tag) -> None:
@@ -136,13 +147,16 @@ def tags(config: Config, page: str, body: BeautifulSoup, given: str) -> str:
         "og:site_name": config.html_title,
         "og:title": plain(body.h1) if body.h1 else config.html_title,
         "og:description": text,
-        "og:url": f"{config.html_baseurl}{page}.html",
-        "og:image": f"{config.html_baseurl}{CARD}",
-        "og:image:width": str(CARD_SIZE[0]),
-        "og:image:height": str(CARD_SIZE[1]),
-        "og:image:alt": CARD_ALT,
-        "twitter:card": "summary_large_image",
     }
+    if config.html_baseurl:
+        described |= {
+            "og:url": f"{config.html_baseurl}{page}.html",
+            "og:image": f"{config.html_baseurl}{CARD}",
+            "og:image:width": str(CARD_SIZE[0]),
+            "og:image:height": str(CARD_SIZE[1]),
+            "og:image:alt": CARD_ALT,
+            "twitter:card": "summary_large_image",
+        }
     if not own:
         described["description"] = text
     made = (
@@ -177,7 +191,8 @@ def finish_files(app: Sphinx, exception: Exception | None) -> None:
         return
     html, sources = Path(app.outdir), Path(app.srcdir, "book", "_static")
     copy_mathjax(html / "_static" / "mathjax")
-    draw_card(html / CARD, sources / "logo.png", sources / "front.png", app.config.html_title)
+    if app.config.html_baseurl:
+        draw_card(html / CARD, sources / "logo.png", sources / "front.png", app.config.html_title)
     for script in (html / "search.html", *sorted((html / "_static").rglob("*.js"))):
         if "mathjax" not in script.parts:
             script.write_text(CONSOLE.sub("void(", script.read_text("utf-8")).replace(*SUMMARY), "utf-8")
@@ -217,6 +232,7 @@ def draw_card(card: Path, logo: Path, figure: Path, title: str) -> None:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Finish each page, and their folder at the end."""
+    app.connect("config-inited", add_address)
     app.connect("config-inited", add_substitutions)
     app.connect("html-page-context", finish_page)
     # Before the extension that would write another index.html.

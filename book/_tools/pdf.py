@@ -21,6 +21,7 @@ from pypdf.generic import DictionaryObject, NameObject, TextStringObject
 from sphinx_external_toc.api import SiteMap, TocTree
 from sphinx_external_toc.parsing import parse_toc_yaml
 
+from .address import setting
 from .project import ToolError
 
 STYLE = Path(__file__).with_name("print.css")
@@ -146,7 +147,7 @@ def _assemble(root: Path, book: Path) -> BeautifulSoup:
 <html lang="en" data-theme="light"><head><meta charset="utf-8"><title>{title}</title>
 {sheets}<style>{STYLE.read_text("utf-8")}</style>{mathjax}</head>
 <body><header><p class="title">{title}</p><p id="authors">{author}</p><p>zwfs {version}</p>
-<p>{config["repository"]["url"]}</p><p>Text and figures: CC-BY-4.0. Code: MIT.</p></header>
+<p>{setting(root).repository}</p><p>Text and figures: CC-BY-4.0. Code: MIT.</p></header>
 <nav><p class="contents">Contents</p>{contents}</nav>{body}</body></html>""",
         "html.parser",
     )

@@ -25,14 +25,14 @@ class ReleaseError(ToolError):
 
 
 def release_check(project: Project) -> None:
-    """Build the package, test it in an empty environment, check the changelog and the install line."""
+    """Build the package, test it in an empty environment, check the changelog and what notebooks import."""
     version = about(project)["version"]
     check_changelog((project.root / "CHANGELOG.md").read_text("utf-8"), version)
     with scratch_folder(project.build, "releasing-") as scratch:
         wheel, _ = build(project, version, scratch / "dist")
         python = environment(project, scratch / "env", f"zwfs[test] @ {wheel.as_uri()}")
         test(project, python, scratch, unit_tests(project))
-        check_install_line(project, wheel, scratch / "colab")
+        check_imports(project, wheel, scratch / "notebooks")
         swap(scratch / "dist", project.build / "dist", scratch / "earlier")
     print(f"zwfs {version} can be released: _build/dist")
 
@@ -142,20 +142,16 @@ def test(project: Project, python: Path, scratch: Path, files: list[str], *optio
     call(project, python, "-m", "pytest", *quick, *options, *examples, *files, folder=place)
 
 
-def check_install_line(project: Project, wheel: Path, folder: Path) -> None:
-    """Run the install line of the notebooks with the wheel for the repository, and import what they do."""
+def check_imports(project: Project, wheel: Path, folder: Path) -> None:
+    """Install the wheel with the extra of the notebooks, and import what they do."""
     cells = [
         "".join(cell["source"])
         for source in project.sources()
         for cell in json.loads(source.read_text("utf-8"))["cells"]
         if cell["cell_type"] == "code"
     ]
-    lines = {line for cell in cells for line in re.findall(r'%pip install -q "(.+?) @ git\+\S+"', cell)}
-    if len(lines) != 1:
-        raise ReleaseError(f"the notebooks install {sorted(lines)}: expected one and the same requirement")
-    python = environment(project, folder, f"{lines.pop()} @ {wheel.as_uri()}")
+    python = environment(project, folder, f"zwfs[notebooks] @ {wheel.as_uri()}")
     modules = {name for cell in cells for name in re.findall(r"(?m)^(?:from|import) ([\w.]+)", cell)}
-    modules -= {"google.colab"}
     call(project, python, "-I", "-c", f"import {', '.join(sorted(modules))}", folder=folder)
 
 

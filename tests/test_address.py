@@ -112,6 +112,7 @@ def test_a_cell_of_a_notebook_fetches_the_repository_on_colab_and_does_nothing_e
         ('book = "https://example.org"', "expected https://SITE/ with a slash at its end"),
         ('doi = "https://doi.org/10.1/a"', "expected 10.NUMBER/NAME"),
         ("doi = 10", "doi = 10: expected"),
+        ("doi = '10.1234/a\\1'", "expected 10.NUMBER/NAME"),
         ('url = ""', "url: expected one of repository, book, doi"),
     ],
 )

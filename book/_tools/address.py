@@ -15,7 +15,7 @@ from .project import Project, ToolError
 EXPECTED = {
     "repository": (r"https://github\.com/[\w-]+/[\w.-]+(?<!\.git)", "https://github.com/OWNER/NAME"),
     "book": (r"https://[\w.-]+(/[\w.-]+)*/", "https://SITE/ with a slash at its end"),
-    "doi": (r"10\.\d{4,}/\S+", "10.NUMBER/NAME"),
+    "doi": (r"10\.\d{4,}/[\w.;()/-]+", "10.NUMBER/NAME"),
 }
 BRANCH = "main"
 BUTTONS = "use_repository_button", "use_issues_button", "use_edit_page_button"

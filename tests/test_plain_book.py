@@ -2,6 +2,7 @@
 
 import inspect
 import pkgutil
+import re
 import shutil
 import subprocess
 import sys
@@ -115,7 +116,9 @@ def launches(file):
 def test_book_without_an_address_promises_none(plain_book):
     for file in plain_book.glob("**/*.html"):
         assert not launches(file), file.name
-        assert not [link for link in links(file) if "executablebooks" in link or "/issues/new" in link], file.name
+        assert not [link for link in links(file) if re.search("executablebooks|/issues/new|/blob/", link)], (
+            file.name
+        )
         assert not read(file).select("link[rel=canonical], meta[property='og:url'], meta[property='og:image']")
     assert "pip install .\n" in read(plain_book / "book" / "index.html").article.get_text()
     assert "git clone" not in read(plain_book / "book" / "checking.html").article.get_text()
@@ -133,6 +136,7 @@ def test_book_with_an_address_has_buttons_links_and_a_card(published_book):
     assert [link for link in links(front) if link.startswith(f"{PUBLISHED.repository}/issues/new")]
     assert 'pip install "zwfs @ git+https://github.com/reader/sensor"' in read(front).article.get_text()
     assert f"git clone {PUBLISHED.repository}\n" in read(front.with_name("checking.html")).article.get_text()
+    assert f"{PUBLISHED.repository}/blob/main/tests/test_sensor.py" in links(front.with_name("methods.html"))
     told = {tag["property"]: tag["content"] for tag in read(front).head.select("meta[property]")}
     assert told["og:url"] == f"{PUBLISHED.book}book/index.html"
     assert told["og:image"] == f"{PUBLISHED.book}_static/social.png"

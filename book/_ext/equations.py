@@ -25,16 +25,23 @@ class LinkCode(SphinxTransform):
 
     def apply(self) -> None:
         """Add the lines of a page."""
-        root, options = Path(self.app.srcdir), self.config.html_theme_options
-        source = f"{options['repository_url']}/blob/{options['repository_branch']}/tests"
+        root = Path(self.app.srcdir)
         for equation in list(self.document.findall(nodes.math_block)):
             if paths := implementations(root).get(equation.get("label", "")):
                 line = nodes.paragraph("", "In code: ", classes=["equation-code"])
                 line += joined([self.link(path) for path in paths])
                 files = dict.fromkeys(file for path in paths for file in tests(root, path))
                 line += nodes.Text(". Tests: " if files else "")
-                line += joined([nodes.reference("", file, refuri=f"{source}/{file}") for file in files])
+                line += joined([self.test(file) for file in files])
                 equation.parent.insert(equation.parent.index(equation) + 1, line)
+
+    def test(self, file: str) -> nodes.Node:
+        """Return the name of a file of tests, with a link if the repository has an address."""
+        options = self.config.html_theme_options
+        if not options["repository_url"]:
+            return nodes.Text(file)
+        source = f"{options['repository_url']}/blob/{options['repository_branch']}/tests"
+        return nodes.reference("", file, refuri=f"{source}/{file}")
 
     def link(self, path: str) -> nodes.Node:
         """Return a link to a name on the API page."""

@@ -620,3 +620,55 @@ def test_sweeps_of_a_notebook_run_on_a_cluster_or_on_few_processes(project):
     assert {int(one) for one in ran} <= workers
     rerun.rerun(project, ["2", "--jobs", "1", "--force"])
     assert len(set((result(project) / "numbers.csv").read_text().split())) == 1
+
+
+@pytest.mark.parametrize(
+    ("paths", "message"),
+    [
+        (["os:system"], "path = 'os:system': expected the class of a reconstructor, got <built-in"),
+        (["nope:X"], "path = 'nope:X': expected a module that can be imported (ModuleNotFoundError: "),
+        (["zwfs:Pupil"], "path = 'zwfs:Pupil': expected the class of a reconstructor"),
+        (["zwfs:Nobody"], "path = 'zwfs:Nobody': expected the class of a reconstructor, got None"),
+        (["zwfs:Linear"], "path = 'zwfs:Linear': expected a name other than Linear, Arcsine"),
+        (["own:Own", "own:Own"], "path = 'own:Own': expected a name other than Linear, "),
+        (["broken:Own"], "expected a module that can be imported (SyntaxError: "),
+        (["leaves:Own"], "expected a module that can be imported (SystemExit: 0)"),
+        (["ends:Own"], 'reconstructors = ["ends:Own"]: a module ends Python with exit status 0'),
+    ],
+)
+def test_classes_that_cannot_be_used_are_refused_before_the_notebook_starts(project, monkeypatch, paths, message):
+    own_project(project)
+    monkeypatch.setattr(rerun, "make", lambda *arguments: pytest.fail("the notebook was started"))
+    assert message in refused(project, "2", "-p", f"reconstructors={json.dumps(paths)}")
+
+
+def own_project(project):
+    modules = {
+        "own": "class Own:\n    def __call__(self, frames): ...",
+        "broken": "class Own(:",
+        "leaves": "print('accepted')\nimport sys; sys.exit(0)",
+        "ends": "import os; os._exit(0)",
+        "leaves_kernels": "import sys\nif 'ipykernel' in sys.modules:\n    sys.exit(0)\nclass Own:\n"
+        "    def __call__(self, frames): ...",
+    }
+    limits = (
+        "from zwfs.companion.parameters import check_parameters\n"
+        "check_parameters(globals(), reconstructors=[str, ...])"
+    )
+    code = "from importlib import import_module\n_ = [import_module(one.split(':')[0]) for one in reconstructors]"
+    cells = new_code_cell(code), new_code_cell("light = 1")
+    write(project, "fig02_works", *cells, defaults="reconstructors = []  # of a reader", limits=limits)
+    for name, source in modules.items():
+        (project.notebooks / f"{name}.py").write_text(source)
+
+
+@pytest.mark.slow
+def test_incomplete_notebooks_are_not_stored(project, capsys):
+    own_project(project)
+    assert main(["rerun", "2", "-p", "reconstructors=[own:Own]"], project) == 0
+    assert main(["rerun", "2", "-p", "reconstructors=[leaves_kernels:Own]"], project) == 1
+    assert "failed in cell 6 of 7" in capsys.readouterr().err
+    assert len(os.listdir(project.build / "rerun")) == 1
+    write(project, "fig02_works", new_code_cell("import sys\nsys.exit()"))  # its last cell
+    assert main(["rerun", "2", "--force"], project) == 1
+    assert "RuntimeError: the cell ended Python" in capsys.readouterr().err

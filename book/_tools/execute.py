@@ -118,6 +118,8 @@ class Run:
                 if self.cell or self._stopped:
                     raise
                 self._papermill(source, cores)
+            if not _complete(self.notebook):
+                raise RuntimeError("the cell ended Python: expected all cells to run")
             # The result of a notebook that is edited during the run is not current.
             self.key = made_from if key(self.project, self.name, self.parameters) == made_from else None
         except Exception as error:
@@ -181,6 +183,12 @@ class Run:
             return "\n".join([*lines, *(traceback or [f"{error.ename}: {error.evalue}"])])
         log = self._log.read_text(errors="replace")[-LOG_CHARACTERS:] if self._log.exists() else ""
         return "\n".join([*lines, *log.splitlines(), f"{type(error).__name__}: {error}"])
+
+
+def _complete(notebook: NotebookNode) -> bool:
+    """Return whether every cell of code has run to its end; papermill takes sys.exit(0) for an end."""
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code" and cell.source.strip()]
+    return all(c.execution_count and all(one.output_type != "error" for one in c.outputs) for c in cells)
 
 
 class Engine(NBClientEngine):

@@ -662,6 +662,39 @@ def own_project(project):
         (project.notebooks / f"{name}.py").write_text(source)
 
 
+def test_damaged_environment_names_its_repair_in_one_line(tmp_path):
+    (tmp_path / "yaml.py").write_text("def cut(")
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); sys.prefix = {str(tmp_path)!r}\n"
+        "from book._tools.__main__ import main; sys.exit(main(['metadata']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    [line] = done.stderr.splitlines()
+    assert done.returncode == 1
+    assert str(tmp_path / "yaml.py") in line
+    assert line.endswith(": run make clean, then repeat the command")
+
+
+@pytest.mark.slow
+def test_damaged_environment_of_a_notebook_names_its_repair(project, monkeypatch):
+    write(project, "fig02_works", new_code_cell("import cut_off"))
+    (project.notebooks / "cut_off.py").write_text("def cut(")
+    with pytest.raises(NotebookError, match=r"SyntaxError: .* closed$"):
+        rerun.rerun(project, ["2"])
+    monkeypatch.setattr(sys, "prefix", str(project.notebooks))
+    with pytest.raises(NotebookError, match=r"SyntaxError: .* closed\n.* run make clean, then repeat"):
+        rerun.rerun(project, ["2"])
+
+
+@pytest.mark.parametrize("content", ["[1]", "[]", '"x"', "3", "null", '{"files": [[1]]}', "{", '{"made_by": []}'])
+def test_damaged_record_of_a_result_is_refused(project, content):
+    folder = project.root / "folder"
+    folder.mkdir()
+    (folder / rerun.RECORD).write_text(content)
+    with pytest.raises(ParameterError, match="holds no result of fig02_works"):
+        rerun.rerun(project, ["2", "--output", str(folder)])
+
+
 @pytest.mark.slow
 def test_incomplete_notebooks_are_not_stored(project, capsys):
     own_project(project)

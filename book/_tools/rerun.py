@@ -290,7 +290,7 @@ def is_current(earlier: dict[str, Any], folder: Path, key: str) -> bool:
     """Return whether an earlier result has the same inputs, and is unchanged."""
     try:
         return earlier.get("key") == key and earlier["files"] == digests(folder, earlier["files"])
-    except (OSError, KeyError):
+    except (OSError, KeyError, TypeError):
         return False
 
 

@@ -16,7 +16,7 @@ from book._tools import book, notebook, record, run, scratch
 from book._tools.__main__ import main
 from book._tools.execute import NotebookError
 from book._tools.project import Project
-from tests.conftest import heed_signals, wait_until
+from tests.conftest import alive, heed_signals, wait_until
 from zwfs._files import write_file
 
 ROOT = Path(__file__).parent.parent
@@ -306,16 +306,6 @@ def test_damaged_record_is_no_record(ran, content):
     for damaged in (content, json.dumps(whole | {"seconds": "x"}), json.dumps([whole])):
         (ran.executed / "first.json").write_text(damaged)
         assert run_all(ran) == ([], ["notebooks: 0 run, 1 from earlier runs, 2 unchanged"])
-
-
-def alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return (
-        "Z (zombie)" not in (Path("/proc") / str(pid) / "status").read_text() if Path("/proc").exists() else True
-    )
 
 
 @pytest.mark.slow

@@ -47,6 +47,14 @@ def wait_until(condition, seconds):
         time.sleep(0.1)
 
 
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+        return not Path("/proc").exists() or "Z (zombie)" not in Path(f"/proc/{pid}/status").read_text()
+    except (ProcessLookupError, FileNotFoundError):
+        return False
+
+
 @pytest.fixture(scope="session")
 def pupil():
     return zwfs.Pupil.circular(40)

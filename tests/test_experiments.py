@@ -15,6 +15,7 @@ from zwfs import (
     reconstruction_error,
 )
 from zwfs.paper.linearity import (
+    PAPER,
     count_work,
     iteration_errors,
     light_lost,
@@ -179,6 +180,7 @@ def test_an_own_reconstructor_gets_the_sensor_with_its_number_of_masks(own_modul
     assert (name, own.sensor.n_masks) == ("Nothing", 1)
     assert own_reconstructors([f"{own_module}:NothingOfTwo"], methods)["NothingOfTwo"].sensor.n_masks == 2
     assert own_reconstructors([], methods) == {}
+    assert tuple(methods) == PAPER
     with parallel_config(n_jobs=1):  # other workers may have started before the module was there
         curves = linearity_curves({name: own}, modes, [0.1, 0.2], 2)
     np.testing.assert_allclose(curves.mean(name), [0.1, 0.2], rtol=1e-3)

@@ -13,9 +13,10 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from book._tools import book, notebook, record, run, scratch
+from book._tools.__main__ import main
 from book._tools.execute import NotebookError
 from book._tools.project import Project
-from tests.conftest import heed_signals, wait_until
+from tests.conftest import alive, heed_signals, wait_until
 from zwfs._files import write_file
 
 ROOT = Path(__file__).parent.parent
@@ -290,14 +291,21 @@ def test_scratch_folder_of_a_living_process_and_foreign_folders_stay(tmp_path):
     assert [folder.name for folder in tmp_path.iterdir()] == ["running-of-somebody-else"]
 
 
-def alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return (
-        "Z (zombie)" not in (Path("/proc") / str(pid) / "status").read_text() if Path("/proc").exists() else True
-    )
+def test_every_command_removes_the_scratch_folders_of_killed_ones(project, monkeypatch):
+    killed = project.build / "rerunning-x"
+    killed.mkdir(parents=True)
+    (killed / scratch.LOCK).touch()
+    monkeypatch.setattr(book, "book", lambda project: None)
+    assert main(["book"], project) == 0
+    assert list(project.build.iterdir()) == []
+
+
+@pytest.mark.parametrize("content", ["[1]", '"x"', "1", "null", '{"result": 1}', "{"])
+def test_damaged_record_is_no_record(ran, content):
+    whole = json.loads((ran.executed / "first.json").read_text())
+    for damaged in (content, json.dumps(whole | {"seconds": "x"}), json.dumps([whole])):
+        (ran.executed / "first.json").write_text(damaged)
+        assert run_all(ran) == ([], ["notebooks: 0 run, 1 from earlier runs, 2 unchanged"])
 
 
 @pytest.mark.slow

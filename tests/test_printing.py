@@ -127,6 +127,18 @@ def test_same_pages_give_the_same_file(book):
 
 @pytest.mark.slow
 @needs_chromium
+def test_numbers_that_chromium_gives_to_headers_of_tables_change_no_byte(book):
+    rows, prints = "<tr><th>a</th><td>b</td></tr>" * 20, []
+    for unseen in ("", "<p hidden>x</p>" * 9):  # counts, but is not printed
+        article = page(f"<h1>One</h1>{unseen}<table>{rows}</table>")
+        (book[1] / "notebooks" / "one.html").write_text(article, "utf-8")
+        prints.append(printing.print_book(*book, CHROMIUM))
+    assert b"/Headers" in prints[0]
+    assert prints[0] == prints[1]
+
+
+@pytest.mark.slow
+@needs_chromium
 def test_wide_things_are_made_smaller_and_stay_whole(book):
     cells = "".join(f"<td>column-{n}</td>" for n in range(60))
     (book[1] / "notebooks" / "one.html").write_text(page(f"<h1>One</h1><table><tr>{cells}</tr></table>"), "utf-8")

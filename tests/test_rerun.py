@@ -607,3 +607,88 @@ def test_sweeps_of_a_notebook_run_on_a_cluster_or_on_few_processes(project):
     assert {int(one) for one in ran} <= workers
     rerun.rerun(project, ["2", "--jobs", "1", "--force"])
     assert len(set((result(project) / "numbers.csv").read_text().split())) == 1
+
+
+@pytest.mark.parametrize(
+    ("paths", "message"),
+    [
+        (["os:system"], "path = 'os:system': expected the class of a reconstructor, got <built-in"),
+        (["nope:X"], "path = 'nope:X': expected a module that can be imported (ModuleNotFoundError: "),
+        (["zwfs:Pupil"], "path = 'zwfs:Pupil': expected the class of a reconstructor"),
+        (["zwfs:Nobody"], "path = 'zwfs:Nobody': expected the class of a reconstructor, got None"),
+        (["zwfs:Linear"], "path = 'zwfs:Linear': expected a name other than Linear, Arcsine"),
+        (["own:Own", "own:Own"], "path = 'own:Own': expected a name other than Linear, "),
+        (["broken:Own"], "expected a module that can be imported (SyntaxError: "),
+        (["leaves:Own"], "expected a module that can be imported (SystemExit: 0)"),
+        (["ends:Own"], 'reconstructors = ["ends:Own"]: a module ends Python with exit status 0'),
+    ],
+)
+def test_classes_that_cannot_be_used_are_refused_before_the_notebook_starts(project, monkeypatch, paths, message):
+    own_project(project)
+    monkeypatch.setattr(rerun, "make", lambda *arguments: pytest.fail("the notebook was started"))
+    assert message in refused(project, "2", "-p", f"reconstructors={json.dumps(paths)}")
+
+
+def own_project(project):
+    modules = {
+        "own": "class Own:\n    def __call__(self, frames): ...",
+        "broken": "class Own(:",
+        "leaves": "print('accepted')\nimport sys; sys.exit(0)",
+        "ends": "import os; os._exit(0)",
+        "leaves_kernels": "import sys\nif 'ipykernel' in sys.modules:\n    sys.exit(0)\nclass Own:\n"
+        "    def __call__(self, frames): ...",
+    }
+    limits = (
+        "from zwfs.companion.parameters import check_parameters\n"
+        "check_parameters(globals(), reconstructors=[str, ...])"
+    )
+    code = "from importlib import import_module\n_ = [import_module(one.split(':')[0]) for one in reconstructors]"
+    cells = new_code_cell(code), new_code_cell("light = 1")
+    write(project, "fig02_works", *cells, defaults="reconstructors = []  # of a reader", limits=limits)
+    for name, source in modules.items():
+        (project.notebooks / f"{name}.py").write_text(source)
+
+
+def test_damaged_environment_names_its_repair_in_one_line(tmp_path):
+    (tmp_path / "yaml.py").write_text("def cut(")
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); sys.prefix = {str(tmp_path)!r}\n"
+        "from book._tools.__main__ import main; sys.exit(main(['metadata']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    [line] = done.stderr.splitlines()
+    assert done.returncode == 1
+    assert str(tmp_path / "yaml.py") in line
+    assert line.endswith(": run make clean, then repeat the command")
+
+
+@pytest.mark.slow
+def test_damaged_environment_of_a_notebook_names_its_repair(project, monkeypatch):
+    write(project, "fig02_works", new_code_cell("import cut_off"))
+    (project.notebooks / "cut_off.py").write_text("def cut(")
+    with pytest.raises(NotebookError, match=r"SyntaxError: .* closed$"):
+        rerun.rerun(project, ["2"])
+    monkeypatch.setattr(sys, "prefix", str(project.notebooks))
+    with pytest.raises(NotebookError, match=r"SyntaxError: .* closed\n.* run make clean, then repeat"):
+        rerun.rerun(project, ["2"])
+
+
+@pytest.mark.parametrize("content", ["[1]", "[]", '"x"', "3", "null", '{"files": [[1]]}', "{", '{"made_by": []}'])
+def test_damaged_record_of_a_result_is_refused(project, content):
+    folder = project.root / "folder"
+    folder.mkdir()
+    (folder / rerun.RECORD).write_text(content)
+    with pytest.raises(ParameterError, match="holds no result of fig02_works"):
+        rerun.rerun(project, ["2", "--output", str(folder)])
+
+
+@pytest.mark.slow
+def test_incomplete_notebooks_are_not_stored(project, capsys):
+    own_project(project)
+    assert main(["rerun", "2", "-p", "reconstructors=[own:Own]"], project) == 0
+    assert main(["rerun", "2", "-p", "reconstructors=[leaves_kernels:Own]"], project) == 1
+    assert "failed in cell 6 of 7" in capsys.readouterr().err
+    assert len(os.listdir(project.build / "rerun")) == 1
+    write(project, "fig02_works", new_code_cell("import sys\nsys.exit()"))  # its last cell
+    assert main(["rerun", "2", "--force"], project) == 1
+    assert "RuntimeError: the cell ended Python" in capsys.readouterr().err

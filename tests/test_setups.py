@@ -1,6 +1,7 @@
 """Pupils, screens and noise that nested parameters choose: the paper's by default, and what they say otherwise."""
 
 import inspect
+import re
 import time
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from book._tools import declared, rerun
 from book._tools.notebook import read
 from book._tools.project import Project
+from tests.test_camera import broken
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, zernike_basis
 from zwfs.bench.model import Bench
 from zwfs.companion.limits import LIMITS, TOGETHER
@@ -19,6 +21,7 @@ from zwfs.paper.linearity import linearity_curves, screens_at
 from zwfs.paper.setups import BASES, PUPILS, SCREENS, Noise, make_pupil, make_screens
 from zwfs.turbulence import karhunen_loeve_basis
 
+FIGURE_3 = "fig03_dynamic_range"
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 NESTED = [(name, key) for name, limits in LIMITS.items() for key, one in limits.items() if isinstance(one, Fields)]
 
@@ -113,6 +116,51 @@ def test_a_file_gives_pupil_and_screens(tmp_path):
     assert sorted(correlation.argmax(axis=1)) == [0, 1, 2, 3]
     with pytest.raises(ValueError, match="at most the 4"):
         source(0.3, 5, 1)
+
+
+def refusal(**values):
+    known = {key: one.default for key, one in declared.parameters(read(NOTEBOOKS / f"{FIGURE_3}.ipynb")).items()}
+    begin = time.process_time()
+    with pytest.raises(declared.ParameterError) as caught:
+        declared.accept_together(FIGURE_3, known | {"n_pixels": 24, "n_modes": 10} | values)
+    assert time.process_time() - begin < 2
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("parameter", ["pupil", "screens"])
+@pytest.mark.parametrize("kind", ["text", "truncated", "header", "npy", "gzip", "table", "pickle", "complex"])
+def test_broken_files_are_refused_by_their_name(parameter, kind, tmp_path):
+    file = broken(tmp_path, kind)
+    message = refusal(**{parameter: {"kind": "file", "file": str(file)}})
+    assert message.startswith(f"{parameter}: {file.name}: ")
+
+
+@pytest.mark.parametrize(
+    ("parameter", "values", "message"),
+    [
+        ("screens", np.ones((3, 24, 24)), r"screens: a.npy\[0\] is flat or beyond 1e.38: expected a wavefront"),
+        ("screens", np.eye(24) * 1e300, "screens: a.npy.* expected a wavefront"),
+        ("screens", np.full((3, 24, 24), np.nan), "screens: a.npy holds .* NaN"),
+        ("screens", np.stack([np.eye(24)] * 2), "n_screens = 20: expected at most the 2 of the file"),
+        ("pupil", np.ones((24, 24)), "pupil: pupil reaches 0.6776 D from its axis"),
+        ("pupil", np.ones((2, 24, 24)), r"pupil: a.npy: its shape is \(2, 24, 24\): expected"),
+        ("pupil", np.full((24, 24), -1.0), "pupil: a.npy: "),
+    ],
+)
+def test_files_that_do_not_fit_are_refused_before_any_work(parameter, values, message, tmp_path):
+    np.save(tmp_path / "a.npy", values)
+    assert re.match(message, refusal(**{parameter: {"kind": "file", "file": str(tmp_path / "a.npy")}}))
+
+
+def test_endless_and_huge_files_are_not_read(tmp_path):
+    with (tmp_path / "a.npy").open("wb") as file:  # zeros that take no place on the disk
+        np.lib.format.write_array_header_1_0(
+            file, {"shape": (1000, 775, 775), "fortran_order": False, "descr": "<f8"}
+        )
+        file.truncate(4_805_000_128)
+    assert "a.npy: it is larger than" in refusal(screens={"kind": "file", "file": str(tmp_path / "a.npy")})
+    assert "/dev/zero: no such file" in refusal(screens={"kind": "file", "file": "/dev/zero"})
+    assert "screens: path = ''" in refusal(screens={"kind": "file"})
 
 
 def test_noise_is_that_of_the_photons():

@@ -20,7 +20,7 @@ import pytest
 import yaml
 from distributed import Client, LocalCluster
 
-from tests.conftest import heed_signals
+from tests.conftest import alive, heed_signals, wait_until
 from zwfs import Arcsine, Dimple, GradientDescent, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
 from zwfs.bench.model import Bench, BenchModel
 from zwfs.companion import sweeps
@@ -294,6 +294,22 @@ def test_an_interrupted_sweep_is_taken_up_again(tmp_path):
     assert {file: file.stat().st_mtime_ns for file in kept} == kept
     total = float(np.linspace(0, 1, 1000).sum())
     assert json.loads(found) == [2.0 * (value + total) for value in range(8)]
+
+
+KILLED = """import os, sys, time
+from zwfs.companion import sweeps
+def task(value, log):
+    open(f"{log}/{os.getpid()}", "w").close()
+    time.sleep(30)
+sweeps.run(task, range(4), sys.argv[1], name="killed")"""
+
+
+def test_workers_end_with_the_process_of_the_sweep(tmp_path):
+    cores = os.environ | {"LOKY_MAX_CPU_COUNT": "2"}
+    with subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path)], cwd=ROOT, env=cores) as killed:
+        wait_until(lambda: len(list(tmp_path.iterdir())) == 2, seconds=60)
+        killed.kill()
+    wait_until(lambda: not any(map(alive, map(int, os.listdir(tmp_path)))), seconds=10)
 
 
 def square(value, offset):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import time
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from zwfs.companion import results, sweeps
 
 from . import declared
 from .notebook import read, to_bytes
-from .project import Project, ToolError
+from .project import Project, ToolError, repair
 from .record import key
 
 # One thread for each kernel: the numbers do not depend on how many notebooks run at the same time.
@@ -118,6 +119,8 @@ class Run:
                 if self.cell or self._stopped:
                     raise
                 self._papermill(source, cores)
+            if not _complete(self.notebook):
+                raise RuntimeError("the cell ended Python: expected all cells to run")
             # The result of a notebook that is edited during the run is not current.
             self.key = made_from if key(self.project, self.name, self.parameters) == made_from else None
         except Exception as error:
@@ -178,9 +181,17 @@ class Run:
         lines += [f"  parameters in force: {values or '(none)'}", ""]
         if isinstance(error, PapermillExecutionError):
             traceback = strip_color("\n".join(error.traceback)).splitlines()[-TRACEBACK_LINES:]
-            return "\n".join([*lines, *(traceback or [f"{error.ename}: {error.evalue}"])])
+            files = re.findall(r"^ *File (.*):\d+$", "\n".join(traceback), re.MULTILINE)
+            advice = [repair(files[-1])] if files and error.ename == "SyntaxError" else []
+            return "\n".join([*lines, *(traceback or [f"{error.ename}: {error.evalue}"]), *filter(None, advice)])
         log = self._log.read_text(errors="replace")[-LOG_CHARACTERS:] if self._log.exists() else ""
         return "\n".join([*lines, *log.splitlines(), f"{type(error).__name__}: {error}"])
+
+
+def _complete(notebook: NotebookNode) -> bool:
+    """Return whether every cell of code has run to its end; papermill takes sys.exit(0) for an end."""
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code" and cell.source.strip()]
+    return all(c.execution_count and all(one.output_type != "error" for one in c.outputs) for c in cells)
 
 
 class Engine(NBClientEngine):

@@ -5,6 +5,7 @@ import html
 import io
 import logging
 import os
+import re
 import shutil
 import tomllib
 from collections.abc import Iterator
@@ -32,6 +33,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 
 # Elements that make sense on a screen only.
 SCREEN_ONLY = [".run-card", "script", "style", "button", ".headerlink", ".d-print-none", "details.above-input"]
+NODE = re.compile(rb"\(node\d{8}\)")
 HEADINGS = [f"h{level}" for level in range(1, 7)]
 STYLES = ["pygments.css", "sphinx-design.min.css", "custom.css"]
 
@@ -242,7 +244,7 @@ def _places(printed: bytes) -> dict[str, int]:
 
 
 def _finish(printed: bytes, pages: BeautifulSoup) -> bytes:
-    """Remove dates and versions, so that two prints are equal, and repair the bookmarks."""
+    """Remove dates, versions and numbers of nodes, so that two prints are equal, and repair the bookmarks."""
     writer = PdfWriter(clone_from=io.BytesIO(printed))
     writer.metadata = {"/Title": pages.title.string, "/Author": pages.select_one("#authors").string}
     headings = [" ".join(heading.get_text().split()) for heading in pages.find_all(HEADINGS)]
@@ -253,7 +255,9 @@ def _finish(printed: bytes, pages: BeautifulSoup) -> bytes:
         entry[NameObject("/Title")] = TextStringObject(whole.get("".join(title.split()), title))
     result = io.BytesIO()
     writer.write(result)
-    return result.getvalue()
+    # Chromium's numbers for the headers of tables differ from one print to the next; their order does not.
+    names = {name: b"(node%08d)" % n for n, name in enumerate(sorted(set(NODE.findall(result.getvalue()))))}
+    return NODE.sub(lambda match: names[match[0]], result.getvalue())
 
 
 def _entries(parent: DictionaryObject) -> Iterator[DictionaryObject]:

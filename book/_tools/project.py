@@ -1,5 +1,6 @@
 """Places of the files of a project."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,12 @@ def one_line(text: str) -> str:
     """Return a text for the terminal: on one line, without control characters, cut in the middle if it is long."""
     line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
     return line if len(line) <= 400 else f"{line[:250]} ... {line[-140:]}"
+
+
+def repair(file: str) -> str:
+    """Return the advice for a file that cannot be imported: empty unless it belongs to the environment."""
+    ours = file.startswith(f"{sys.prefix}/")
+    return "the environment is damaged: run make clean, then repeat the command" if ours else ""
 
 
 @dataclass(frozen=True)

@@ -78,8 +78,8 @@ def read_record(project: Project, name: str, folder: Path | None = None) -> dict
     try:
         record = json.loads(result.with_suffix(".json").read_bytes())
         content = digest_result(result.read_bytes(), project.published(name, folder))
-        return record if record["result"] == content else {}
-    except (OSError, ValueError, KeyError):
+        return record if record["result"] == content and record["seconds"] >= 0 else {}
+    except (OSError, ValueError, KeyError, TypeError):  # TypeError: it is JSON of another kind
         return {}
 
 

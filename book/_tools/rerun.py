@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 import stat
+import subprocess
 import sys
 from contextlib import chdir
 from datetime import UTC, datetime
@@ -31,6 +32,8 @@ MAKER = "zwfs rerun"  # marks the record of a folder with results
 COMMAND = ".venv/bin/python -m book._tools rerun"
 READABLE = 60  # characters of a folder's name for the parameters
 ROOM = 50_000_000  # bytes on the disk for the scratch files of a run
+# Ends with this line of output only if the notebook can import all classes.
+CHECK = "import sys; from zwfs.paper.linearity import _own_classes; _own_classes(sys.argv[1:]); print('accepted')"
 EXAMPLES = """examples:
   rerun                                     list the notebooks
   rerun 3 --list                            list the parameters of Figure 3
@@ -103,6 +106,8 @@ def rerun(project: Project, arguments: list[str]) -> None:
     changed = declared.accept(_given(asked), known)
     with chdir(project.notebooks):  # as the notebook runs: its files are named from there
         declared.accept_together(name, {key: one.default for key, one in known.items()} | changed)
+        if classes := changed.get("reconstructors"):
+            _check_classes(classes)
     folder = _folder(project, asked.output or project.build / "rerun" / folder_name(name, changed))
     earlier, workers = read_result(folder, name), _workers(asked)
     if not asked.force and is_current(earlier, folder, record.key(project, name, changed)):
@@ -200,6 +205,18 @@ def _folder(project: Project, asked: Path) -> Path:
     return folder
 
 
+def _check_classes(paths: list[str]) -> None:
+    """Refuse classes that the notebook could not use. Their modules run here first, in a process of their own."""
+    command = [sys.executable, "-c", CHECK, *paths]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace")
+    if done.returncode == 0 and done.stdout.endswith("accepted\n"):
+        return
+    reason = f"a module ends Python with exit status {done.returncode}"
+    if done.returncode == 1 and "Traceback" in done.stderr:
+        reason = re.sub("^(Type|Value)Error: ", "", done.stderr.strip().splitlines()[-1])
+    raise ParameterError(f"reconstructors = {json.dumps(paths)}: {reason}")
+
+
 def titles(project: Project) -> str:
     """List the notebooks: number, name, title."""
     lines = []
@@ -273,7 +290,7 @@ def is_current(earlier: dict[str, Any], folder: Path, key: str) -> bool:
     """Return whether an earlier result has the same inputs, and is unchanged."""
     try:
         return earlier.get("key") == key and earlier["files"] == digests(folder, earlier["files"])
-    except (OSError, KeyError):
+    except (OSError, KeyError, TypeError):
         return False
 
 

@@ -41,9 +41,6 @@ def one_at_a_time(folder: Path) -> Iterator[None]:
 def scratch_folder(parent: Path, prefix: str) -> Iterator[Path]:
     """Create a folder for unfinished results and remove it at the end; remove those of killed processes first.
 
-    The system releases a lock when the process that holds it ends, in whatever way. A folder whose lock is free
-    therefore belongs to no running process. Folders without a lock file are not touched.
-
     Parameters
     ----------
     parent : Path
@@ -52,10 +49,7 @@ def scratch_folder(parent: Path, prefix: str) -> Iterator[Path]:
         Start of the names of such folders.
     """
     parent.mkdir(parents=True, exist_ok=True)
-    for lock in parent.glob(f"{prefix}*/{LOCK}"):
-        with suppress(OSError), lock.open("r") as file:  # another process holds the lock or has just removed it
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(lock.parent, ignore_errors=True)
+    remove_abandoned(parent)
     with tempfile.TemporaryDirectory(dir=parent, prefix=prefix) as name:
         new = Path(name) / f"{LOCK}.new"
         with new.open("w") as file:
@@ -63,6 +57,18 @@ def scratch_folder(parent: Path, prefix: str) -> Iterator[Path]:
                 fcntl.flock(file, fcntl.LOCK_EX)
             new.rename(new.with_name(LOCK))  # whoever sees the lock file finds it locked
             yield Path(name)
+
+
+def remove_abandoned(parent: Path) -> None:
+    """Remove the scratch folders of killed processes, of any command.
+
+    The system releases a lock when the process that holds it ends, in whatever way. A folder whose lock is free
+    therefore belongs to no running process. Folders without a lock file are not touched.
+    """
+    for lock in parent.glob(f"*/{LOCK}"):
+        with suppress(OSError), lock.open("r") as file:  # another process holds the lock or has just removed it
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(lock.parent, ignore_errors=True)
 
 
 def swap(new: Path, current: Path, earlier: Path) -> None:

@@ -36,6 +36,8 @@ from functools import cache
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
+from threading import Thread
+from time import sleep
 from types import CodeType, ModuleType, SimpleNamespace
 from typing import Any
 from uuid import uuid4
@@ -52,7 +54,8 @@ STORE = "ZWFS_SWEEPS"
 PROGRESS = "ZWFS_PROGRESS"
 CLUSTER = "ZWFS_CLUSTER"
 
-_PROCESS = uuid4().hex  # identifies this process among those of all machines
+_PROCESS = os.getpid(), uuid4().hex  # identifies this process among those of all machines
+_PERIOD = 0.5  # second between two looks of a worker at its parent
 _IN_TASK = ContextVar("_IN_TASK", default=False)
 
 
@@ -326,10 +329,10 @@ def _parallel_results(
     yield from Parallel(n_jobs=n_jobs or -1, return_as="generator_unordered", **sizes)(calls)
 
 
-def _work(shared: Any, index: int, value: tuple[Any], name: str, caller: str) -> tuple[int, Any]:
+def _work(shared: Any, index: int, value: tuple[Any], name: str, caller: tuple[int, str]) -> tuple[int, Any]:
     """Run one task, in the caller's process or in a worker."""
     if caller != _PROCESS:
-        _limit_threads()
+        _begin_worker(caller[0])
     if not isinstance(shared, tuple):
         shared = shared.result()  # on a cluster of one core joblib runs tasks in the caller's process
     task, *rest = shared
@@ -344,9 +347,18 @@ def _work(shared: Any, index: int, value: tuple[Any], name: str, caller: str) ->
 
 
 @cache
-def _limit_threads() -> None:
-    """Limit BLAS to one thread in this worker process from now on."""
+def _begin_worker(caller: int) -> None:
+    """Limit BLAS to one thread in this worker process from now on, and end it with the caller, its parent."""
     one_thread()
+    if os.getppid() == caller:  # not so for a worker of a cluster, which has other work to do
+        Thread(target=_end_with, args=(caller,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """End this process as soon as its parent has ended, in whatever way: nobody waits for its results."""
+    while os.getppid() == parent:
+        sleep(_PERIOD)
+    os._exit(1)
 
 
 def _report_progress(name: str, done: int, total: int) -> None:

@@ -119,7 +119,7 @@ class CameraFile:
         return Optics(diameter or self.keyword("DIMPLE"), tuple(shifts))
 
 
-def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
+def read(path: str | Path, *, max_bytes: int = 2**29, max_images: int = 2) -> CameraFile:
     """Read a FITS or NPY file, plain or packed with gzip; the first bytes decide which.
 
     Integers, big-endian numbers, BZERO and BSCALE all become float64. Two images in two extensions of a FITS file
@@ -131,6 +131,8 @@ def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
     max_bytes : int
         Largest size of the file, also when it is unpacked, and of its images as float64. A larger file is refused
         before its images are in memory.
+    max_images : int
+        Largest number of images.
 
     Returns
     -------
@@ -142,8 +144,8 @@ def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
     ImportError
         If astropy is needed and missing.
     FileError
-        A ValueError: if the file is of another kind, broken, too large, holds no image, or one that is not
-        (ny, nx), (1, ny, nx) or (2, ny, nx).
+        A ValueError: if the file is of another kind, broken, too large, holds no image, too many of them, or an
+        array that is neither (ny, nx) nor (n, ny, nx).
     TypeError
         If an argument is of the wrong type, or the numbers of the file are not real.
 
@@ -160,23 +162,23 @@ def read(path: str | Path, *, max_bytes: int = 2**29) -> CameraFile:
     ('frame.npy', (1, 16, 16))
     """
     path = path_of("path", path)
-    max_bytes = _check.integer("max_bytes", max_bytes, 1)
+    limits = _check.integer("max_bytes", max_bytes, 1), _check.integer("max_images", max_images, 1)
     if not os.path.isfile(path):
         where = "" if path.is_absolute() else f" in {Path.cwd()}"
         raise FileNotFoundError(f"{path}: no such file{where}")
     name = path.name
     with path.open("rb") as file:
-        content = _content(file, name, max_bytes)
+        content = _content(file, name, limits[0])
         file.seek(0)
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     if content.getbuffer()[: len(_NPY)] == _NPY:
         with _broken(f"{name}: a broken NPY file"):
-            data, header = _read_npy(content, name, max_bytes), dict[str, Any]()
+            data, header = _read_npy(content, name, limits), dict[str, Any]()
             highest = full_scale(data.dtype)
     else:
         fits = fits_module()
         with _broken(f"{name}: a broken FITS file"):
-            data, header, highest = _read_fits(fits, content, name, max_bytes)
+            data, header, highest = _read_fits(fits, content, name, limits)
     if data.dtype.kind not in "biuf":
         raise TypeError(f"{name}: its numbers are {data.dtype}: expected real ones")
     with np.errstate(over="ignore", invalid="ignore"):  # wider floats become infinite: bad pixels
@@ -507,10 +509,12 @@ def _content(file: BinaryIO, name: str, max_bytes: int) -> io.BytesIO:
     return content
 
 
-def _accept(name: str, shape: tuple[int, ...], max_bytes: int) -> None:
+def _accept(name: str, shape: tuple[int, ...], limits: tuple[int, int]) -> None:
     """Refuse images of a shape that a header announces, before there is memory for them."""
-    if len(shape) not in (2, 3) or min(shape) < 1 or (len(shape) == 3 and shape[0] > 2):
-        raise FileError(f"{name}: its shape is {shape}: expected (ny, nx), or (2, ny, nx) for two images")
+    max_bytes, max_images = limits
+    if len(shape) not in (2, 3) or min(shape) < 1 or (len(shape) == 3 and shape[0] > max_images):
+        expected = f"(ny, nx), or (n, ny, nx) with n up to {max_images}"
+        raise FileError(f"{name}: its shape is {shape}: expected {expected}")
     if 8 * math.prod(shape) > max_bytes:
         raise FileError(
             f"{name}: its shape is {shape}, {8 * math.prod(shape)} bytes as float64: "
@@ -535,15 +539,15 @@ def _npy_header(content: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
     return shape, columns_first, dtype
 
 
-def _read_npy(content: io.BytesIO, name: str, max_bytes: int) -> NDArray:
+def _read_npy(content: io.BytesIO, name: str, limits: tuple[int, int]) -> NDArray:
     shape, columns_first, dtype = _npy_header(content)
-    _accept(name, shape, max_bytes)
+    _accept(name, shape, limits)
     data = np.frombuffer(content.read(math.prod(shape) * dtype.itemsize), dtype)
     return data.reshape(shape, order="F" if columns_first else "C")
 
 
 def _read_fits(
-    fits: ModuleType, content: io.BytesIO, name: str, max_bytes: int
+    fits: ModuleType, content: io.BytesIO, name: str, limits: tuple[int, int]
 ) -> tuple[NDArray, dict[str, Any], float]:
     # Odd header cards are no reason to refuse a file; missing or altered pixels are.
     warnings.filterwarnings("error", message=".*truncated.*|Datasum verification failed.*")
@@ -554,7 +558,7 @@ def _read_fits(
         shapes = [unit.shape for unit in images]
         if len(images) > 2 or shapes[0] != shapes[-1] or (len(images) == 2 and len(shapes[0]) != 2):
             raise FileError(f"{name}: images of shapes {shapes}: expected one, or two of the same (ny, nx)")
-        _accept(name, shapes[0] if len(images) == 1 else (2, *shapes[0]), max_bytes)
+        _accept(name, shapes[0] if len(images) == 1 else (2, *shapes[0]), limits)
         cards = _header_cards(units[0].header) | _header_cards(images[0].header)
         pixels, scales = zip(*map(_pixels, images), strict=True)
         return pixels[0] if len(images) == 1 else np.stack(pixels), cards, min(scales)

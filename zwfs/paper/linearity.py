@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cProfile
 import pstats
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,9 @@ from zwfs.reconstructors import (
 )
 from zwfs.reconstructors.base import load
 from zwfs.sensor import ZernikeSensor
+
+PAPER = "Linear", "Arcsine", "GerchbergSaxton", "GradientDescent", "GradientDescentPoints", "PhaseShifted"
+"""Names of `paper_reconstructors`."""
 
 _PASSES = ("split_expand", "split_adjoint")  # functions that pass through the low-rank model of the sensor
 
@@ -187,17 +190,25 @@ def own_reconstructors(paths: Sequence[str], reconstructors: Mapping[str, Any]) 
         If a path leads to no class of a reconstructor, or its name is one of `reconstructors`.
     """
     check_reconstructors(reconstructors)
-    _check.sequence("paths", paths, expected="a list of 'module:Class'")
     own: dict[str, Any] = {}
-    for index, path in enumerate(paths):
-        try:
-            method = load(path)
-        except (TypeError, ValueError) as error:
-            raise type(error)(f"paths[{index}]: {error}") from error
-        if method.__name__ in {**reconstructors, **own}:
-            raise ValueError(f"path = {path!r}: expected a name other than {', '.join([*reconstructors, *own])}")
+    for method in _own_classes(paths, reconstructors):
         like = "Arcsine" if getattr(method, "n_masks", 2) == 1 else "PhaseShifted"
         own[method.__name__] = method(reconstructors[like].sensor)
+    return own
+
+
+def _own_classes(paths: Sequence[str], taken: Iterable[str] = PAPER) -> list[Any]:
+    """Return the classes behind the paths of `own_reconstructors`; their names differ from those taken."""
+    _check.sequence("paths", paths, expected="a list of 'module:Class'")
+    own, names = [], list(taken)
+    for index, path in enumerate(paths):
+        try:
+            own.append(load(path))
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"paths[{index}]: {error}") from error
+        if own[-1].__name__ in names:
+            raise ValueError(f"path = {path!r}: expected a name other than {', '.join(names)}")
+        names.append(own[-1].__name__)
     return own
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from zwfs import _check
 from zwfs.companion.parameters import within
 from zwfs.detector import Detector
-from zwfs.frames._fits import fits_module
 from zwfs.frames.files import read
 from zwfs.modes import fourier_basis, mode_frequencies, noll_to_nm, power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
@@ -22,6 +20,7 @@ from zwfs.sensor import ZernikeSensor
 from zwfs.turbulence import karhunen_loeve_basis, turbulent_screens
 
 _CROSS = [[0.785, 0.005], [2.356, 0.005], [3.927, 0.005], [5.498, 0.005]]
+_MAX_BYTES = 2**31  # of a file of screens: 1000 of them on 512 pixels
 _STAR = [[0.524 + 1.0472 * n, 0.013] for n in range(6)]
 
 PUPILS: dict[str, dict[str, Any]] = {
@@ -87,10 +86,12 @@ def make_pupil(n_pixels: int, kind: str = "circular", **changes: Any) -> Pupil:
 
 
 def _pupil_of_file(n_pixels: int, file: str = "") -> Pupil:
-    image = read(file).images[0]
+    found = read(file, max_images=1)
+    (image,) = found.images
     if max(image.shape) != n_pixels:
-        raise ValueError(f"{file} is {max(image.shape)} pixels wide: expected n_pixels = {n_pixels}")
-    return Pupil.from_amplitude(image)
+        raise ValueError(f"{found.name} is {max(image.shape)} pixels wide: expected n_pixels = {n_pixels}")
+    with within(found.name, ()):
+        return Pupil.from_amplitude(image)
 
 
 @dataclass(frozen=True)
@@ -132,8 +133,7 @@ class Screens:
     def _shapes(self, n_screens: int, seed: Any) -> NDArray:
         """Screens before they are scaled."""
         if self.recorded is not None:
-            if n_screens > len(self.recorded):
-                raise ValueError(f"n_screens = {n_screens}: expected at most the {len(self.recorded)} of the file")
+            _require_screens(self.recorded, n_screens)
             return self.recorded[np.random.default_rng(seed).permutation(len(self.recorded))[:n_screens]]
         if self.kind == "segments":
             smooth = power_law_screens(
@@ -202,6 +202,7 @@ def check_setup(
     pupil: Mapping[str, Any],
     screens: Mapping[str, Any],
     noise: Mapping[str, float],
+    n_screens: int = 1,
     **_: Any,
 ) -> None:
     """Refuse parameters of a notebook that contradict each other, before any work.
@@ -222,15 +223,18 @@ def check_setup(
     Noise(**noise)
     with within("pupil", [*pupil, "missing"]):
         aperture = make_pupil(n_pixels, **pupil)
+        if screens.get("basis", "zernike") in ("zernike", "hexagonal"):
+            zernike_basis(aperture, 1)  # the pupil of a file may be larger than their circle
     _require_segments(aperture, screens.get("kind", SCREENS[0]))
     most = aperture.n_points // 4 if screens.get("basis") == "kl" else aperture.n_points - 1
     if n_modes > most:
         raise ValueError(
             f"n_modes = {n_modes}: expected at most {most} with the {aperture.n_points} points of pupil"
         )
-    if "file" in screens:
-        with within("screens", ["file"]):
-            _screens_of_file(aperture, screens["file"])
+    if screens.get("kind") == "file":
+        with within("screens", ()):
+            recorded = _screens_of_file(aperture, screens.get("file", ""))
+        _require_screens(recorded, n_screens)
 
 
 def _require_segments(pupil: Pupil, kind: str) -> None:
@@ -251,10 +255,19 @@ def _modes(pupil: Pupil, n_modes: int, basis: str, outer_scale: float) -> tuple[
 
 
 def _screens_of_file(pupil: Pupil, file: str) -> NDArray:
-    """Return the screens of a file: read as an image stack by numpy or astropy."""
-    path = Path(file)
-    screens = np.load(path) if path.suffix == ".npy" else fits_module().getdata(path)
-    return _check.screens(file, screens, pupil)
+    """Return the screens of a file, each of which can be scaled to an rms."""
+    found = read(file, max_bytes=_MAX_BYTES, max_images=_MAX_BYTES)
+    values = pupil.gather(_check.screens(found.name, found.images, pupil))
+    size, spread = np.abs(values).max(axis=-1), np.ptp(values, axis=-1)
+    wrong = np.flatnonzero((size > _check.LARGEST) | (spread < 1 / _check.LARGEST))
+    if wrong.size:
+        raise ValueError(f"{found.name}[{wrong[0]}] is flat or beyond {_check.LARGEST:g}: expected a wavefront")
+    return found.images
+
+
+def _require_screens(recorded: NDArray, n_screens: int) -> None:
+    if n_screens > len(recorded):
+        raise ValueError(f"n_screens = {n_screens}: expected at most the {len(recorded)} of the file")
 
 
 SCREENS = ("power_law", "kolmogorov", "von_karman", "segments", "file")

@@ -673,8 +673,9 @@ def load(path: str) -> type:
         raise ValueError(f"path = {path!r}: expected 'module:Class', such as 'my_method:MyMethod'")
     try:
         method = getattr(import_module(module), name, None)
-    except ModuleNotFoundError as error:
-        raise ValueError(f"path = {path!r}: expected a module that can be imported ({error})") from error
+    except (Exception, SystemExit) as error:  # whatever code raises
+        reason = f"{type(error).__name__}: {error}"
+        raise ValueError(f"path = {path!r}: expected a module that can be imported ({reason})") from error
     if not isinstance(method, type) or "__call__" not in dir(method):
         raise ValueError(f"path = {path!r}: expected the class of a reconstructor, got {_check.shown(method)}")
     return method

@@ -275,6 +275,15 @@ def test_nearly_singular_shifts_are_refused_as_by_zwfs(compute, pupil, shift_a):
         assert None not in (made["shifted"], made["linear"], made["arcsine"])
 
 
+@pytest.mark.parametrize("diameter", [2.43014, 2.43017])
+def test_linear_method_leaves_out_the_tilts_that_zwfs_leaves_out(compute, pupil, modes, diameter):
+    made = compute(0.05, 9, diameter, (0.5, -0.5), 0)
+    sensor, phase = sensor_of(pupil, diameter, (0.5,)), screen_of(modes, 0.05, 9)
+    result = zwfs.Linear(sensor, modes, poke=1e-4)(sensor.measure(phase))
+    [error] = made["linear"]["errors"]
+    assert error == pytest.approx(zwfs.reconstruction_error(pupil, result.phase, phase), rel=0.01)
+
+
 @pytest.mark.parametrize("shift", [1.0, 0.999])
 def test_arcsine_takes_the_side_of_zwfs_where_waves_are_in_line(compute, pupil, modes, shift):
     made = compute(0.3, 6, 1.06, (shift, -0.5), 5)

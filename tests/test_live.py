@@ -275,6 +275,12 @@ def test_nearly_singular_shifts_are_refused_as_by_zwfs(compute, pupil, shift_a):
         assert None not in (made["shifted"], made["linear"], made["arcsine"])
 
 
+def test_maximum_likelihood_needs_one_dimple_that_changes_the_light(compute):
+    for shift, solved in ((0.0, False), (0.02, True)):
+        made = compute(0.3, 4, 1.06, (shift, -shift), 1, likelihood=True)
+        assert (made["likelihood"] is not None) == solved
+
+
 @pytest.mark.parametrize("diameter", [2.43014, 2.43017])
 def test_linear_method_leaves_out_the_tilts_that_zwfs_leaves_out(compute, pupil, modes, diameter):
     made = compute(0.05, 9, diameter, (0.5, -0.5), 0)

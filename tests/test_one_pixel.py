@@ -83,6 +83,13 @@ def test_slider_states_the_phases_that_each_image_allows(page, pixel):
     assert page.said == []
 
 
+def test_a_phase_that_is_its_own_mirror_image_is_the_only_one(page, pixel):
+    for k, wave in enumerate(pixel.waves):
+        page.locator("#phasor input").fill(f"{np.angle(wave):.2f}")
+        says = page.locator("#phasor .phasor-says").inner_text()
+        assert re.findall(r"Image (\d) allows \S+ rad only", says) == [f"{k + 1}"]
+
+
 def drawn(page, selector, count):
     """Points of the paths in a drawing that have `count` of them, as complex numbers, upwards: (n, count)."""
     paths = page.eval_on_selector_all(f"{selector} path", "all => all.map(one => one.getAttribute('d'))")

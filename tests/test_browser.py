@@ -184,6 +184,14 @@ def test_search_finds_a_name(page):
     assert said == outside(asked) == []
 
 
+def test_no_page_minds_a_query_in_its_address(page):
+    said, asked = watch(page)
+    for name in PAGES:
+        page.goto(f"{address(name)}?q=x")
+        settle(page)
+        assert said == outside(asked) == [], name
+
+
 def test_colour_switch(page):
     background = "getComputedStyle(document.body).backgroundColor"
     seen = {}

@@ -190,6 +190,39 @@ def test_maximum_likelihood_agrees_with_zwfs(compute, pupil, rms, seed, diameter
     assert zwfs.reconstruction_error(pupil, made["likelihood"]["phase"], result.phase) < 1e-5
 
 
+@pytest.mark.parametrize(
+    ("rms", "seed", "diameter", "shifts", "photons", "steps"),
+    [
+        (2.0, 7, 1.06, (0.5, -0.5), None, 7),
+        (0.5, 3, 1.06, (0.5, -0.5), 1e4, 11),  # pixels without a photon, steps that raise the cost
+        (1.2, 9, 1.3, (0.4, -0.8), 1e5, 12),
+    ],
+)
+def test_steps_of_maximum_likelihood_are_those_of_zwfs(
+    compute, pupil, modes, rms, seed, diameter, shifts, photons, steps
+):
+    noise = {} if photons is None else {"photons": photons}
+    made = compute(rms, seed, diameter, shifts, 2 + steps, likelihood=True, **noise)
+    history = likelihood_from_two_iterations(pupil, made, diameter, shifts, photons, steps).history
+    errors = zwfs.reconstruction_error(pupil, history, screen_of(modes, rms, seed))
+    np.testing.assert_allclose(made["likelihood"]["errors"][2:], errors, rtol=1e-3)
+
+
+def likelihood_from_two_iterations(pupil, made, diameter, shifts, photons, steps):
+    """Result of zwfs on the images of the page, from the phase from which the page starts."""
+    sensor = sensor_of(pupil, diameter, shifts)
+    start = zwfs.PhaseShifted(sensor, n_iterations=2, tolerance=0.0)(made["frames"]).phase
+    per_pixel = None if photons is None else photons / pupil.n_points
+    method = zwfs.MaximumLikelihood(sensor, photons=per_pixel, n_starts=1, n_iterations=steps)
+    return method(made["frames"], np.where(pupil.inside, start, 0), history=True)
+
+
+def test_points_are_reflected_as_by_zwfs(compute, pupil):
+    made = compute(1.5, 1, 2.0, (0.65, -0.65), 30, likelihood=True, photons=1e6)
+    result = likelihood_from_two_iterations(pupil, made, 2.0, (0.65, -0.65), 1e6, 28)
+    assert zwfs.reconstruction_error(pupil, made["likelihood"]["phase"], result.phase) < 1e-3
+
+
 def test_noise_has_the_statistics_of_photons(compute, pupil):
     settings = (0.5, 7, 1.06, (0.5, -0.5), 5)
     clean = compute(*settings)["frames"]
@@ -205,6 +238,20 @@ def test_noise_has_the_statistics_of_photons(compute, pupil):
     np.testing.assert_array_equal(again, counts)
 
 
+@pytest.mark.parametrize("per_pixel", [4, 15])
+def test_noise_of_few_photons_is_that_of_poisson(compute, pupil, per_pixel):
+    settings = (0.5, 7, 1.06, (0.5, -0.5), 0)
+    mean = per_pixel * compute(*settings)["frames"]
+    counts = per_pixel * compute(*settings, photons=per_pixel * pupil.n_points)["frames"]
+    some = (mean > 3) & (mean < 30)
+    mean, counts = mean[some], counts[some]
+    # The third central moment is the mean, and that of a normal distribution 0. The cube has a variance of
+    # 15 mean^3 + 24 mean^2 + mean.
+    error = np.sqrt(np.sum(15 * mean**3 + 24 * mean**2 + mean)) / mean.sum()
+    assert error < 0.25
+    assert abs(np.sum((counts - mean) ** 3) / mean.sum() - 1) < 3 * error
+
+
 @pytest.mark.parametrize("shifts", [(0.5, 0.5), (0.5, 0.0), (1.0, -1.0), (0.0, 1.0)])
 def test_singular_shifts_give_no_reconstruction(compute, pupil, modes, shifts):
     made = compute(0.5, 7, 1.06, shifts, 10)
@@ -215,6 +262,41 @@ def test_singular_shifts_give_no_reconstruction(compute, pupil, modes, shifts):
         assert made["linear"] is None
         with pytest.raises(ValueError, match="sees none"):
             zwfs.Linear(sensor_of(pupil, 1.06, shifts[:1]), modes)
+
+
+@pytest.mark.parametrize("shift_a", [0.5 + 3e-7, 0.5 + 4e-6, 1e-9 / np.pi, 1e-8 / np.pi])
+def test_nearly_singular_shifts_are_refused_as_by_zwfs(compute, pupil, shift_a):
+    made = compute(0.5, 7, 1.06, (shift_a, 0.5), 1)
+    try:
+        zwfs.PhaseShifted(sensor_of(pupil, 1.06, (shift_a, 0.5)))
+    except ValueError:
+        assert made["shifted"] is None
+    else:
+        assert None not in (made["shifted"], made["linear"], made["arcsine"])
+
+
+def test_maximum_likelihood_needs_one_dimple_that_changes_the_light(compute):
+    for shift, solved in ((0.0, False), (0.02, True)):
+        made = compute(0.3, 4, 1.06, (shift, -shift), 1, likelihood=True)
+        assert (made["likelihood"] is not None) == solved
+
+
+@pytest.mark.parametrize("diameter", [2.43014, 2.43017])
+def test_linear_method_leaves_out_the_tilts_that_zwfs_leaves_out(compute, pupil, modes, diameter):
+    made = compute(0.05, 9, diameter, (0.5, -0.5), 0)
+    sensor, phase = sensor_of(pupil, diameter, (0.5,)), screen_of(modes, 0.05, 9)
+    result = zwfs.Linear(sensor, modes, poke=1e-4)(sensor.measure(phase))
+    [error] = made["linear"]["errors"]
+    assert error == pytest.approx(zwfs.reconstruction_error(pupil, result.phase, phase), rel=0.01)
+
+
+@pytest.mark.parametrize("shift", [1.0, 0.999])
+def test_arcsine_takes_the_side_of_zwfs_where_waves_are_in_line(compute, pupil, modes, shift):
+    made = compute(0.3, 6, 1.06, (shift, -0.5), 5)
+    sensor, phase = sensor_of(pupil, 1.06, (shift,)), screen_of(modes, 0.3, 6)
+    history = zwfs.Arcsine(sensor, n_iterations=5, tolerance=0.0)(sensor.measure(phase), history=True).history
+    errors = zwfs.reconstruction_error(pupil, history, phase)
+    np.testing.assert_allclose(made["arcsine"]["errors"], errors, atol=1e-5)
 
 
 def test_designs_are_those_of_the_notebook(pupil, modes):

@@ -41,8 +41,12 @@ FORWARD = """<!DOCTYPE html>
 {tags}</head>
 <body><main><h1><a href="{address}">{title}</a></h1></main></body></html>
 """
-# Browsers block pages from the file system from reading other files, so a search cannot show summaries there.
-SUMMARY = ("else if (showSearchSummary)", 'else if (showSearchSummary && location.protocol !== "file:")')
+CHANGES = {  # of the scripts of the search
+    # Browsers block pages from the file system from reading other files, so a search cannot show summaries there.
+    "else if (showSearchSummary)": 'else if (showSearchSummary && location.protocol !== "file:")',
+    # Every page loads the search, which fails on pages that have no place for its results.
+    "if (query) Search": 'if (query && document.getElementById("search-results")) Search',
+}
 
 
 def add_address(app: Sphinx, config: Config) -> None:
@@ -195,7 +199,10 @@ def finish_files(app: Sphinx, exception: Exception | None) -> None:
         draw_card(html / CARD, sources / "logo.png", sources / "front.png", app.config.html_title)
     for script in (html / "search.html", *sorted((html / "_static").rglob("*.js"))):
         if "mathjax" not in script.parts:
-            script.write_text(CONSOLE.sub("void(", script.read_text("utf-8")).replace(*SUMMARY), "utf-8")
+            text = CONSOLE.sub("void(", script.read_text("utf-8"))
+            for old, new in CHANGES.items():
+                text = text.replace(old, new)
+            script.write_text(text, "utf-8")
     forward(html, f"{app.config.root_doc}.html")
 
 

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind, per_kind, read_only
-from zwfs.lowrank import Factors, Operator
+from zwfs._lowrank import Factors, Operator
 from zwfs.pupil import Pupil
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import read_only
+from zwfs._lowrank import Factors, factorise
 from zwfs._propagator import Channels
-from zwfs.lowrank import Factors, factorise
 from zwfs.masks import Dimple, Mask
 from zwfs.sensor import Sensor, ZernikeSensor
 

@@ -60,7 +60,7 @@ INFINITE |= {
 
 # Hooks of the base classes of reconstructors, and the checks of what they get.
 INTERNAL = {"Settings", "Solution", "State", "Estimate", "model", "solve", "invert", "begin", "step", "constants"}
-INTERNAL |= {"check_frames", "check_phase", "check_modes", "check_sensor", "pieces"}
+INTERNAL |= {"check_frames", "check_phase", "pieces"}
 HANDED_ON = {"run.shared"}  # to the task, as it is
 PASSED = {
     "Pupil.gather",

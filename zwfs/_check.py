@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zwfs._arrays import Kind, any_array
+from zwfs._arrays import Kind, any_array, read_only
 
 LARGEST = 1e38  # number in a map: the square of its sum is far from the range of a float
 
 
-def instance(name: str, value: Any, kind: type) -> None:
-    """Require that `value` is of a class."""
-    if not isinstance(value, kind):
-        raise TypeError(f"{name} is a {type(value).__name__}: expected a {kind.__name__}")
+def instance(name: str, value: Any, *kinds: type) -> None:
+    """Require that `value` is of one of the classes."""
+    if not isinstance(value, kinds):
+        expected = " or a ".join(kind.__name__ for kind in kinds)
+        raise TypeError(f"{name} is a {type(value).__name__}: expected a {expected}")
 
 
 def function(name: str, value: Any) -> None:
@@ -265,6 +266,19 @@ def values_inside(name: str, array: Any, pupil: Any) -> NDArray:
     values = pupil.gather(array)
     moderate(name, values, " inside the pupil")
     return values
+
+
+def modes(name: str, value: Any, pupil: Any) -> NDArray[np.float64]:
+    """Return modes, (n_modes, ny, nx), at the points of a pupil: (n_modes, n_points), read-only."""
+    array = real_array(name, value)
+    if array.ndim != 3 or not len(array):
+        raise ValueError(f"{name} has shape {array.shape}: expected (n_modes, ny, nx)")
+    values = values_inside(name, array, pupil).astype(np.float64)
+    if len(values) > values.shape[1]:
+        raise ValueError(
+            f"{name}: {len(values)} of them, expected at most the {values.shape[1]} points of the pupil"
+        )
+    return read_only(values)
 
 
 def map_inside(name: str, array: Any, pupil: Any) -> NDArray:

@@ -10,8 +10,7 @@ from zwfs._arrays import Kind
 from zwfs._information import Response
 from zwfs._likelihood import Estimator, Noise, require_information, require_one_wavelength
 from zwfs._propagator import amplitude_maps, propagator, pupil_maps
-from zwfs.modes import check_modes
-from zwfs.polychromatic import PolychromaticSensor, check_sensor
+from zwfs.polychromatic import PolychromaticSensor
 from zwfs.sensor import ZernikeSensor
 
 
@@ -73,7 +72,7 @@ def cramer_rao(
     >>> round(float(np.nanmean(bound)), 4)  # radian
     0.0161
     """
-    check_sensor("sensor", sensor)
+    _check.instance("sensor", sensor, ZernikeSensor, PolychromaticSensor)
     if photons is None:
         raise TypeError("photons = None: expected a number, since the bound is that of photon noise")
     noise = Noise.checked(photons, read_noise)
@@ -84,7 +83,7 @@ def cramer_rao(
         require_one_wavelength(sensor)
     require_information(sensor, unknown)
     pupil = sensor.pupil
-    basis = None if modes is None else pupil.scatter(check_modes(pupil, modes), fill=0)
+    basis = None if modes is None else pupil.scatter(_check.modes("modes", modes, pupil), fill=0)
     maps, batch = pupil_maps("phase", _check.real_array("phase", phase), sensor)
     estimator = Estimator(Response.of(sensor), noise, unknown, basis)
     model = propagator(sensor, Kind.numpy())

@@ -17,8 +17,7 @@ from zwfs._pickle import Immutable
 from zwfs.bounds import cramer_rao
 from zwfs.detector import Detector
 from zwfs.metrics import strehl, without_piston
-from zwfs.modes import check_modes
-from zwfs.polychromatic import PolychromaticSensor, check_sensor
+from zwfs.polychromatic import PolychromaticSensor
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
@@ -55,7 +54,7 @@ class Mirror(Immutable):
         _check.instance("pupil", pupil, Pupil)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
         self._pupil = pupil
-        self._influence = read_only(check_modes(pupil, influence, "influence"))
+        self._influence = _check.modes("influence", influence, pupil)
         self._inverse = read_only(np.linalg.pinv(self._influence, rcond=conditioning))
 
     @classmethod
@@ -400,8 +399,8 @@ def hold_drift(
     >>> round(held.residual, 1)  # pm rms
     8.4
     """
-    check_sensor("sensor", sensor)
-    modes = sensor.pupil.scatter(check_modes(sensor.pupil, modes), fill=0)
+    _check.instance("sensor", sensor, ZernikeSensor, PolychromaticSensor)
+    modes = sensor.pupil.scatter(_check.modes("modes", modes, sensor.pupil), fill=0)
     drift = _check.number("drift", drift, 0)
     photons = _check.number("photons", photons, 1e-6)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import read_only
 from zwfs.pupil import Pupil
 
 
@@ -273,38 +272,12 @@ def mode_frequencies(pupil: Pupil, modes: ArrayLike) -> NDArray[np.float64]:
     0.64, 12.01
     """
     _check.instance("pupil", pupil, Pupil)
-    values = pupil.scatter(check_modes(pupil, modes))
+    values = pupil.scatter(_check.modes("modes", modes, pupil))
     power = np.zeros(len(values))
     for axis in (-2, -1):
         slopes = np.diff(values, axis=axis) * pupil.n_pixels
         power += np.nanmean(slopes**2, axis=(-2, -1))
     return np.sqrt(power) / (2 * np.pi * np.nanstd(values, axis=(-2, -1)))
-
-
-def check_modes(pupil: Pupil, modes: ArrayLike, name: str = "modes") -> NDArray[np.float64]:
-    """Checked modes at the points of the pupil, shape (n_modes, n_points).
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the modes have no shape (n_modes, ny, nx), are not finite, or are more than the points of the pupil.
-
-    Examples
-    --------
-    >>> import zwfs
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> zwfs.modes.check_modes(pupil, zwfs.zernike_basis(pupil, 5)).shape
-    (5, 812)
-    """
-    modes = _check.real_array(name, modes)
-    if modes.ndim != 3 or not len(modes):
-        raise ValueError(f"{name} has shape {modes.shape}: expected (n_modes, ny, nx)")
-    values = _check.values_inside(name, modes, pupil).astype(np.float64)
-    if len(values) > values.shape[1]:
-        raise ValueError(
-            f"{name}: {len(values)} of them, expected at most the {values.shape[1]} points of the pupil"
-        )
-    return read_only(values)
 
 
 def _unnormalised(disc: NDArray[np.complex128], n_modes: int) -> NDArray[np.float64]:

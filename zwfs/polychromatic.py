@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -177,24 +176,6 @@ class PolychromaticSensor(Sensor):
             reference_wavelength=self.reference_wavelength,
             chromatic=self.chromatic,
         )
-
-
-def check_sensor(name: str, sensor: Any) -> None:
-    """Require a sensor of one wavelength or several.
-
-    Raises
-    ------
-    TypeError
-        If it is none.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> sensor = zwfs.ZernikeSensor(zwfs.Pupil.circular(32), zwfs.Dimple(1.06, np.pi / 2))
-    >>> zwfs.polychromatic.check_sensor("sensor", sensor)
-    """
-    if not isinstance(sensor, PolychromaticSensor):
-        _check.instance(name, sensor, ZernikeSensor)
 
 
 def _checked_light(

@@ -27,7 +27,7 @@ from zwfs import _check
 from zwfs._arrays import Kind, per_kind, read_only
 from zwfs._pickle import Immutable
 from zwfs._propagator import Propagator, amplitude_maps, angle, propagator, pupil_maps, split, unit
-from zwfs.polychromatic import PolychromaticSensor, check_sensor
+from zwfs.polychromatic import PolychromaticSensor
 from zwfs.sensor import Sensor, ZernikeSensor
 
 # Detector pixels handled together: on the processor few enough for its fast memory, enough to vectorise.
@@ -144,7 +144,7 @@ class Settings(Immutable):
         TypeError, ValueError
             If an argument is of the wrong kind, shape or range.
         """
-        check_sensor("sensor", sensor)
+        _check.instance("sensor", sensor, ZernikeSensor, PolychromaticSensor)
         n_iterations = _check.integer("n_iterations", n_iterations, 1, _MOST_ITERATIONS)
         tolerance = _check.number("tolerance", tolerance, 0)
         maps, batch = amplitude_maps(amplitude, sensor, Kind.numpy())

@@ -9,7 +9,7 @@ from zwfs import _check
 from zwfs._arrays import Kind
 from zwfs._information import Response
 from zwfs._likelihood import Estimator, Noise, require_information, require_one_wavelength
-from zwfs._propagator import amplitude_maps, propagator, pupil_maps
+from zwfs._propagator import amplitude_map, propagator, pupil_maps
 from zwfs.polychromatic import PolychromaticSensor
 from zwfs.sensor import ZernikeSensor
 
@@ -88,10 +88,7 @@ def cramer_rao(
     estimator = Estimator(Response.of(sensor), noise, unknown, basis)
     model = propagator(sensor, Kind.numpy())
     if amplitude is not None:
-        strength, amplitude_batch = amplitude_maps(amplitude, sensor, Kind.numpy())
-        if amplitude_batch:
-            raise ValueError(f"amplitude has shape {(*amplitude_batch, *pupil.shape)}: expected {pupil.shape}")
-        model = model.with_amplitude(strength[0])
+        model = model.with_amplitude(amplitude_map(amplitude, sensor))
     sigma = []
     for one in maps.astype(np.float64):  # one at a time: the memory does not grow with the batch
         psi = model.incoming(one[np.newaxis])

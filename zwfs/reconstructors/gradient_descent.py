@@ -108,7 +108,7 @@ class GradientDescent(Reconstructor):
         TypeError, ValueError
             If phase or frames are of the wrong shape, complex, not finite, or the frames negative or dark.
         """
-        frames, batch = check_frames(self.sensor, _check.real_array("frames", frames))
+        frames, batch = check_frames(self.sensor, _check.real_array("frames", frames), light=self._light)
         if batch not in ((), (1,)):
             raise ValueError(f"frames has a batch of {batch}: expected one set of frames")
         phase, expected = _check.real_array("phase", phase), (self.sensor.pupil.n_points,)

@@ -34,9 +34,9 @@ class Mutant(NamedTuple):
 
 MUTANTS = [
     # Known to have survived once.
-    Mutant("lowrank", "mask.breaks, mask.diameter]) / 2", "mask.breaks, mask.diameter])[:2] / 2",
+    Mutant("_lowrank", "mask.breaks, mask.diameter]) / 2", "mask.breaks, mask.diameter])[:2] / 2",
            "sensor -k rings"),
-    Mutant("lowrank", "max(1e-3 * tolerance, 1e-18)", "max(tolerance, 1e-18)", "sensor -k quadrature"),
+    Mutant("_lowrank", "max(1e-3 * tolerance, 1e-18)", "max(tolerance, 1e-18)", "sensor -k quadrature"),
     Mutant("reconstructors/phase_shifted", "_PARALLEL = 1e-6", "_PARALLEL = 1e-5", "reconstructors -k parallel"),
     Mutant("reconstructors/phase_shifted", "_PARALLEL = 1e-6", "_PARALLEL = 1e-7", "reconstructors -k parallel"),
     # c is real only next to a phase shift of pi. Between +pi/2 and -pi/2 the signal would turn by 90 degrees.
@@ -50,7 +50,7 @@ MUTANTS = [
     Mutant("paper/closed_loop", "(exponent / 2), 0)", "exponent, 0)", "closed_loop -k exponent"),
     Mutant("paper/linearity", "np.abs(phase) > np.pi", "phase > np.pi", "experiments -k wraps"),
     # The sensor.
-    Mutant("lowrank", "self._xp.conj(self._core).T", "self._core.T", "sensor -k adjoint"),
+    Mutant("_lowrank", "self._xp.conj(self._core).T", "self._core.T", "sensor -k adjoint"),
     Mutant("sensor", "axis.size + 2 * m) - m)", "axis.size + 2 * m) - m + 1)", "sensor -k airy"),
     Mutant("pupil", "radius >= obscuration / 2", "radius > obscuration / 2", "pupil"),
     Mutant("pupil", "(along >= -1e-12) &", "", "pupil"),

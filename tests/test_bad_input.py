@@ -1,4 +1,4 @@
-"""Bad input to every public function, class and method: a clear error or a right answer, never a wrong number.
+"""Bad input to the public functions, classes and methods: a clear error or a right answer, never a wrong number.
 
 Public names are collected from the modules, and their parameters from the signatures. Each parameter gets every
 bad value while the others keep the valid ones of `valid`. A new public name needs no entry here unless it has a
@@ -10,81 +10,32 @@ import inspect
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-from joblib import parallel_config
-from scipy.ndimage import gaussian_filter
 from threadpoolctl import threadpool_limits
 
 import zwfs
 from zwfs.reconstructors.base import Reconstructor
 
+# The public face: what simulates a sensor and reconstructs a phase. Tests of camera frames are in other files.
 MODULES = (
-    *(
-        "pupil",
-        "modes",
-        "turbulence",
-        "masks",
-        "sensor",
-        "detector",
-        "metrics",
-        "reconstructors",
-        "reconstructors.base",
-    ),
-    *("bench.model", "bench.segments", "bench.recording"),
-    *("units", "frames.files", "frames.registration", "frames.pipeline", "frames.order", "frames.verdict"),
-    *("frames.calibration",),
-    *("paper.curves", "paper.linearity", "paper.dimple_diameter", "paper.phase_shifts", "paper.identities"),
-    *("paper.bench_linearity", "paper.closed_loop", "paper.photon_noise", "paper.design", "paper.recovery"),
-    *("companion.sweeps", "companion.results", "companion.tables", "polychromatic", "loop"),
+    *("pupil", "modes", "turbulence", "masks", "sensor", "polychromatic", "detector", "bounds", "loop", "metrics"),
+    *("units", "focal", "reconstructors"),
 )
 
-# Results that may be infinite: the limit lies beyond what was sampled, or the noise diverges.
-INFINITE = {"dynamic_range", "LinearityCurves.dynamic_range", "BenchCurves.dynamic_range", "crossing"}
-INFINITE |= {
-    "ErrorCurves.dynamic_range",
-    "DiameterCurves.dynamic_range",
-    "DiameterCurves.exceeds",
-    "phase_noise",
-    "Detector.full_well",
-    "structure_function",
-    "turbulent_screens",
-    "Detector",
-}
-
-# Hooks of the base classes of reconstructors, and the checks of what they get.
-INTERNAL = {"Settings", "Solution", "State", "Estimate", "model", "solve", "invert", "begin", "step", "constants"}
-INTERNAL |= {"check_frames", "check_phase", "check_modes", "check_sensor", "pieces"}
-HANDED_ON = {"run.shared"}  # to the task, as it is
-PASSED = {
-    "Pupil.gather",
-    "Pupil.scatter",
-    "nearest_good",
-    "phase_to_opd",
-    "opd_to_phase",
-}  # give back what they are given, NaN and infinity too
+# Results that may be infinite: the limit lies beyond what was sampled, or no limit is set.
+INFINITE = {"dynamic_range", "Detector", "Detector.full_well", "structure_function", "turbulent_screens"}
+INFINITE |= {"karhunen_loeve_basis"}
+# Hooks of the base classes of reconstructors.
+INTERNAL = {"model", "solve", "invert", "begin", "step", "constants"}
+# Give back what they are given, NaN and infinity too.
+PASSED = {"Pupil.gather", "Pupil.scatter", "phase_to_opd", "opd_to_phase"}
 # Take complex numbers where the valid ones are real.
-COMPLEX = PASSED | {"DimpleLight.expand", "arccosine_phase", "pair_phase"}
-# The image or file whose content does not fit is named in place of the argument.
-CONTENT = {
-    "find_pupils": "frame",
-    "record": "clear",
-    "register": "images",
-    "measured_pupil": "image",
-    "CameraFile.keyword": "header",
-}
-# Only what they must refuse is tested, not their answers.
-SLOW = {"error_budget", "contraction", "other_curves", "steps", "fit"}
-INTERNAL |= {"frames_on_grid", "clear_on_grid", "places", "fits_module", "fits_bytes", "published"}
-INTERNAL |= {"calibrate", "load", "joined"}  # need the files of a bench: see test_telemetry.py
-INTERNAL |= {"grid", "Grid"}  # need axes of any name: see test_grid.py
-INTERNAL |= {"small", "glue_numbers"}  # for the notebooks of the book
+COMPLEX = {"Pupil.gather", "Pupil.scatter", "focal_field"}
 
 
 @cache
@@ -105,7 +56,7 @@ def targets():
                 # A class that documents attributes only is a result: functions of the package make it.
                 if inspect.isabstract(thing):
                     continue
-                if "Parameters\n" in (thing.__doc__ or "") or name in ("Pupil", "Table"):
+                if "Parameters\n" in (thing.__doc__ or "") or name == "Pupil":
                     found[name] = thing
                 inherited = {"__call__": thing.__call__} if issubclass(thing, Reconstructor) else {}
                 for key, member in (inherited | vars(thing)).items():
@@ -118,353 +69,72 @@ def targets():
 @cache
 def valid() -> dict:
     """Valid arguments: by the name of the parameter, or of the callable and the parameter."""
-    scene = gaussian_filter(np.random.default_rng(0).normal(size=(40, 40)), 2)
     pupil = zwfs.Pupil.circular(12)
     modes = zwfs.zernike_basis(pupil, 5)
     plus, minus = zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2)
     classic, shifted = zwfs.ZernikeSensor(pupil, plus), zwfs.ZernikeSensor(pupil, plus, minus)
     phase = zwfs.power_law_screens(modes, 0.2, 1, seed=1)[0]
     field = pupil.amplitude * np.exp(1j * phase)
-    waves = pupil.gather(shifted.reference_wave(field))
     methods = {}
     for kind in zwfs.RECONSTRUCTORS:
         options = {"n_iterations": 3} if kind.iterative else {}
         options |= {"modes": modes} if kind is zwfs.Linear else {}
         methods[kind.__name__] = kind(shifted if kind.n_masks[1] > 1 else classic, **options)
     method, mirror = methods["PhaseShifted"], zwfs.Mirror(pupil, modes)
-    points = pupil.gather(phase)
-    from zwfs.bench import model
-    from zwfs.frames import calibration, pipeline, registration, verdict
-    from zwfs.frames import files as camera
-    from zwfs.paper import (
-        bench_linearity,
-        closed_loop,
-        design,
-        dimple_diameter,
-        linearity,
-        phase_shifts,
-        photon_noise,
-        recovery,
-    )
-
-    paper = linearity.paper_reconstructors(pupil, modes, 1.06, 1.5, extent=1.0, n_iterations=2)
-    small = model.Bench(n_pixels=17, n_rings=1, missing=(), gap=0.0, static=0.0, photons=1e6, read_noise=1.0)
-    model = model.BenchModel.from_images(small, 1)
-    on_bench = model.normalise(small.frames(None, 2))
-    flow = closed_loop.FrozenFlow(pupil, 0.2, 1, cutoff=1.0, seed=1)
-    images, optics, recording, measurement, found = _recorded(pipeline, registration)
-    noise = verdict.CameraNoise(2.0, 5.0)
-    poked = replace(measurement, intensity=measurement.intensity.copy())
-    poked.intensity[:, 10:14, 10:14] += np.reshape([0.4, -0.3], (2, 1, 1))
-    calibrated = calibration.Calibration.of(measurement)
-    file = camera.CameraFile(
-        images[0].counts[np.newaxis],
-        "frame",
-        "0" * 64,
-        {"GAIN": 2.0, "DIMPLE": 1.06, "THETA1": 1.5, "THETA2": -1.5},
-    )
     arguments = {
-        "pupil": pupil,
-        "modes": modes,
-        "phase": phase,
-        "field": field,
-        "estimate": phase,
-        "truth": phase,
-        "sensor": shifted,
-        "masks": plus,
-        "mask": plus,
-        "maps": phase,
-        "values": points,
-        "image": np.abs(field) + 0.1,
-        "amplitude": 1.0,
-        "segments": (pupil.inside * 1).astype(int),
-        "center": (5.5, 5.5),
-        "n_pixels": 12,
-        "n_modes": 4,
-        "n_rings": 1,
-        "n_shifts": 4,
-        "unmeasured": "model",
-        "missing": (2,),
-        "spiders": ((0.3, 0.1),),
-        "gap": 0.02,
-        "stop": 0.9,
-        "threshold": 0.1,
-        "rms": 0.2,
-        "r0": 0.2,
-        "separation": np.array([0.1, 0.5]),
-        "n_screens": 1,
-        "exponent": -2.0,
-        "seed": 1,
-        "diameter": 1.06,
-        "function": lambda u, v: 0.9 * np.exp(1j * (u + v) / 9),
-        "breaks": (0.5,),
-        "u": np.linspace(0, 0.5, 4),
-        "v": np.linspace(0, 0.5, 4),
-        "j": 4,
-        "photons": 1e5,
-        "counts": np.abs(field),
-        "floor": 0.0,
-        "frames": shifted.measure(phase),
-        "start": 0.1 * phase,
-        "reference": 0.0 * phase,
-        "error": phase,
-        "away": 0.01 * phase,
-        "screens": phase[np.newaxis],
-        "reconstructor": method,
-        "reconstructors": {"shifted": method},
-        "name": "shifted",
-        "flow": flow,
-        "n_steps": 2,
-        "stroke": 1.0,
-        "time": 0.1,
-        "bench": small,
-        "benches": {"small": small},
-        "model": model,
-        "pistons": np.linspace(0, 0.1, small.n_segments),
-        "found": np.linspace(0, 0.1, 7),
-        "commanded": np.linspace(0, 0.1, small.n_segments),
-        "numbers": small.numbers,
-        "n_iterations": 3,
-        "diameters": np.array([1.0, 1.2]),
-        "angles": np.array([1.5, -1.5]),
-        "phase_shifts": (1.5, -1.5),
-        "n_draws": 2,
-        "phase_shift": 1.5,
-        "gaps": np.array([0.1, 0.2]),
-        "wavefronts": {"flat": np.zeros((1, 12, 12))},
-        "step": 0.5,
-        "diameter_max": 3.0,
-        "step_fine": 0.1,
-        "extents": np.array([1.0, 2.0]),
-        "tolerances": np.array([1e-2, 1e-6]),
-        "diameter_curves.make": lambda diameter: {"shifted": method},
-        "paths": [],
-        **dict.fromkeys(("saxton_by_width.reconstructors", "repaired_reconstructors.reconstructors"), paper),
-        "sensors": {"shifted": shifted},
-        "recovery_curves.rms": np.array([0.1]),
-        "contraction.modes": np.tile(modes, (30, 1, 1)),
-        "limit": 0.05,
-        "x": np.array([1.0, 2.0]),
-        "y": np.array([0.01, 0.1]),
-        "coefficients": np.ones((1, dimple_diameter.DimpleLight(pupil, 1.06).rank)),
-        "padding": 2,
-        "output": Path("new.fits"),
-        "text": "a",
-        "check_output.inputs": [Path("file.npy")],
-        "incoming": pupil.gather(field),
-        "frame": np.abs(waves[0]) + 1,
-        "first": waves[0],
-        "second": waves[1],
-        "references": waves,
-        "power": 0.5,
-        "task": lambda value, shared: 0.0,
-        "inputs": [1, 2],
-        "shared": 2,
-        "n": 1,
-        "path": Path("file"),
-        "folder": Path(),
-        "content": b"bytes",
-        "columns": {"x": [1.0, 2.0]},
-        "figure": _Figure(),
-        "dpi": 100.0,
-        "header": ["a"],
-        "rows": [[1.0]],
-        "digits": 3,
-        "key": "GAIN",
-        "files": [file],
-        "wavelength": 635.0,
-        "sources": [file],
-        "recording": recording,
-        "optics": optics,
-        "measurement": measurement,
-        "inside": np.pad(np.ones((20, 20), bool), 10),
-        "clear_frames": images[1:],
-        "names": ["scale"],
-        "fitted": ["scale"],
-        "n_pupils": 1,
-        "shape": (6, 6),
-        "margin": 1,
-        "good": np.ones((6, 6), bool),
+        "pupil": pupil, "modes": modes, "phase": phase, "opd": phase, "field": field, "estimate": phase,
+        "truth": phase, "sensor": shifted, "masks": plus, "maps": phase, "values": pupil.gather(phase),
+        "image": np.abs(field) + 0.1, "segments": (pupil.inside * 1).astype(int), "center": (5.5, 5.5),
+        "n_pixels": 12, "n_modes": 4, "n_rings": 1, "missing": (2,), "spiders": ((0.3, 0.1),), "gap": 0.02,
+        "stop": 0.9, "threshold": 0.1, "rms": 0.2, "r0": 0.2, "separation": np.array([0.1, 0.5]), "n_screens": 1,
+        "exponent": -2.0, "seed": 1, "diameter": 1.06, "function": lambda u, v: 0.9 * np.exp(1j * (u + v) / 9),
+        "breaks": (0.5,), "u": np.linspace(0, 0.5, 4), "v": np.linspace(0, 0.5, 4), "j": 4, "photons": 1e5,
+        "counts": np.abs(field), "floor": 0.0, "frames": shifted.measure(phase), "start": 0.1 * phase,
+        "reference": 0.0 * phase, "change": phase, "reconstructor": method, "mirror": mirror, "plant": shifted,
+        "influence": modes, "commands": np.zeros(5), "disturbance": phase[np.newaxis], "drift": 10.0,
+        "wavelength": 635.0, "n_actuators": 9, "n_cycles": 1, "wavelengths": [600.0, 650.0],
+        "weights": [1.0, 2.0], "bandwidth": 0.1, "n_wavelengths": 2, "n_iterations": 3, "tolerance": 1e-3,
         # of one callable
         "Pupil.amplitude": pupil.amplitude,
         "Pupil.segments": pupil.segments,
         "Pupil.from_segments.amplitude": 1.0,
         "Dimple.amplitude": 1.0,
         "Dimple.phase": 1.5,
-        "Bench.phase": 1.5,
-        "check_bench.bench": {"blur": 0.1},
-        "Bench.n_pixels": 17,
-        "Bench.missing": (),
-        "FrozenFlow.cutoff": 1.0,
+        "power_law_screens.frequencies": np.arange(1.0, 6.0),
+        "ZernikeSensor.adjoint.field": shifted.propagate(field),
+        "Sensor.measure.amplitude": pupil.amplitude,
+        "cramer_rao.modes": modes,
+        "cramer_rao.amplitude": pupil.amplitude,
+        "close_loop.stroke": 1.0,
+        "close_loop.camera": zwfs.Detector(pupil, 1e5),
+        "hold_drift.photons": 1e9,
+        "hold_drift.phase": phase,
+        "hold_drift.speed": 1.0,
+        "dynamic_range.rms": np.array([0.1, 0.2]),
+        "dynamic_range.error": np.array([0.001, 0.1]),
         "Linear.amplitude": pupil.amplitude,
+        "GradientDescent.modes": modes,
+        "GradientDescent.cost.phase": pupil.gather(phase),
+        "MaximumLikelihood.photons": 1e4,
+        "MaximumLikelihood.modes": modes,
+        "MaximumLikelihood.prior": np.eye(5),
         **{f"{name}.sensor": one.sensor for name, one in methods.items()},
         **{f"{name}.__call__.frames": one.sensor.measure(phase) for name, one in methods.items()},
         **{f"{name}.__call__.start": None for name, one in methods.items() if not one.iterative},
-        "load.path": "zwfs.reconstructors.linear:Linear",
-        "ZernikeSensor.adjoint.field": shifted.propagate(field),
-        "Sensor.measure.amplitude": pupil.amplitude,
-        "change": phase,
-        "ZernikeSensor.with_tolerance.tolerance": 1e-3,
-        "PolychromaticSensor.with_tolerance.tolerance": 1e-3,
-        "mirror": mirror,
-        "plant": shifted,
-        "influence": modes,
-        "commands": np.zeros(5),
-        "disturbance": phase[np.newaxis],
-        "camera": zwfs.Detector(pupil, 1e5),
-        "gain": 0.5,
-        "leak": 0.1,
-        "delay": 1,
-        "drift": 10.0,
-        "speed": 1.0,
-        "n_actuators": 9,
-        "coupling": 0.3,
-        "conditioning": 1e-3,
-        "n_cycles": 1,
-        "wavelengths": [600.0, 650.0],
-        "weights": [1.0, 2.0],
-        "reference_wavelength": 620.0,
-        "bandwidth": 0.1,
-        "n_wavelengths": 2,
-        "GradientDescent.cost.phase": points,
-        "dynamic_range.rms": np.array([0.1, 0.2]),
-        "dynamic_range.error": np.array([0.001, 0.1]),
-        "linearity_curves.rms": np.array([0.1]),
-        "bench_curves.rms": np.array([0.1]),
-        "bench_curves.reconstructors": {"shifted": zwfs.PhaseShifted(model.shifted, n_iterations=2)},
-        "error_budget.rms": np.array([0.1]),
-        "error_budget.names": ["PhaseShifted"],
-        "check_rms.rms": np.array([0.1]),
-        "find_pistons.reconstructor": zwfs.PhaseShifted(model.shifted, n_iterations=2),
-        "find_pistons.frames": on_bench,
-        "BenchModel.normalise.counts": small.frames(None, 2),
-        "BenchModel.pistons.phase": np.zeros(small.segments.shape),
-        "segment_pistons.phase": np.zeros(small.segments.shape),
-        "segment_pistons.segments": small.segments,
-        "drawn_noise.photons": 1e8,
-        "measured_factor.n_iterations": 4,
-        "approximation_errors.sensor": shifted,
-        "direct_reference_wave.n_samples": 4,
-        "two_waves.reference": waves[0],
-        "arccosine_phase.reference": waves[0],
-        "arccosine_phase.amplitude": np.abs(pupil.gather(field)),
-        "pair_phase.frames": np.abs(waves) + 1,
-        "pair_phase.amplitude": np.abs(pupil.gather(field)),
-        "DimpleLight.__call__.field": pupil.gather(field)[np.newaxis],
-        "DimpleLight.project.field": pupil.gather(field)[np.newaxis],
-        "PairMaps.best.name": "flat",
-        "photon_curves.rms": np.array([0.1]),
-        "photon_curves.photons": np.array([1e4]),
-        "error_bars.rms": np.array([0.1]),
-        "assumed": np.array([1.0]),
-        "design": design.PUBLISHED[0],
-        "shift": 0.1,
-        "designs": design.PUBLISHED[:1],
-        "design_map.angles": np.array([1.5, 1.6]),
-        "DesignMap.best.name": "flat",
-        "run.name": "squares",
-        "screens_at.task": 0,
-        "read.path": Path("file.npy"),
-        "frame_files": [Path("file.npy")],
-        "pupil_files": [Path("file.npy")],
-        "correlations.first": np.array([[1.0, 2, 4]]),
-        "correlations.second": np.array([[1.0, 3, 2]]),
-        "steps.fitted": (),
-        "publish.name": "name",
-        "record.frames": images[:1],
-        "steps.frames": images[:1],
-        "find_pupils.image": images[0],
-        "find_pupils.n_pupils": 2,
-        "find_pupils.diameter": None,
-        "record.diameter": None,
-        "nearest_good.image": np.ones((6, 6)),
-        "register.image": np.roll(scene, 1, axis=0),
-        "register.reference": scene,
-        "radius.center": (2.5, 2.5),
-        "opd": points,
-        "flat": measurement,
-        "poked": poked,
-        "judge.result": found,
-        "error_bar.result": found,
-        "noise": noise,
-        "CameraNoise.gain": 2.0,
-        "Calibration.__call__.start": None,
-        "Calibration.__call__.counts": np.stack([images[0].counts, 0 * images[0].counts]),
-        "Calibration.of.dark": np.zeros(images[0].counts.shape),
-        "Calibration.modal_matrix.modes": zwfs.zernike_basis(calibrated.sensor.pupil, 4),
-        "Calibration.sigma.modes": None,
-        "Calibration.save.path": Path("bench.npz"),
-        "matrix": calibrated.modal_matrix(zwfs.zernike_basis(calibrated.sensor.pupil, 4)),
-        "phases": calibrated(images[0].counts),
-        "write_phase.phase": found,
-        "bench_error.phase": found,
-        "measured_pupil.images": np.ones((2, 12, 12)),
-        "measured_pupil.inside": np.ones((12, 12), bool),
-        "measured_pupil.center": (5.5, 5.5),
-    }
-    curve = linearity.linearity_curves({"shifted": method}, modes, [0.1], 1)
+    }  # fmt: skip
     instances = {
         "Pupil": pupil,
         "Dimple": plus,
         "Patch": zwfs.Patch(1.0, lambda u, v: 0.9 * np.exp(1j * u / 9)),
         "Sensor": shifted,
         "ZernikeSensor": shifted,
-        "Mirror": mirror,
-        "LoopRecord": zwfs.close_loop(shifted, mirror, method, phase[np.newaxis]),
         "PolychromaticSensor": zwfs.PolychromaticSensor(shifted, [600.0, 650.0]),
         "Detector": zwfs.Detector(pupil, 1e5, gain=1.0, full_well=1e4),
+        "Mirror": mirror,
+        "LoopRecord": zwfs.close_loop(shifted, mirror, method, phase[np.newaxis]),
         **methods,
-        "Bench": small,
-        "BenchModel": model,
-        "BenchCurves": bench_linearity.BenchCurves(
-            np.array([0.1]), np.ones((1, 1, 2)), {"shifted": np.zeros((1, 1, 2))}
-        ),
-        "LinearityCurves": curve,
-        "FrozenFlow": flow,
-        "LoopRun": closed_loop.follow_flow(method, modes, flow, 2),
-        "ErrorCurves": curve,
-        "DiameterCurves": dimple_diameter.DiameterCurves(
-            np.array([0.5, 0.6]), {"shifted": np.array([[0.01], [0.1]])}, np.array([1.0, 2.0])
-        ),
-        "RecoveryCurves": recovery.recovery_curves({"shifted": shifted}, modes, [0.1], 1)["shifted"],
-        "Contraction": dimple_diameter.Contraction(
-            np.array([1.0, 2.0]), np.array([0.1, 0.8]), np.array([[0.1], [0.8]]), {1.06: 0.1}, {}
-        ),
-        "DimpleLight": dimple_diameter.DimpleLight(pupil, 1.06),
-        "PairMaps": phase_shifts.pair_maps(pupil, 1.06, [1.5, -1.5], phase[np.newaxis], 2),
-        "PhotonCurves": photon_noise.photon_curves(shifted, {"shifted": method}, modes, [0.1], [1e4], 1),
-        "DesignMap": design.DesignMap(np.array([1.0]), np.array([1.5]), {"flat": np.array([[2.0]])}),
-        "CameraFile": file,
-        "MeasuredPhase": found,
-        "CameraNoise": noise,
-        "Calibration": calibrated,
     }
     return {"arguments": arguments, "instances": instances}
-
-
-class _Figure:
-    """Figure that saves nothing."""
-
-    def savefig(self, *_, **__):
-        pass
-
-    def get_layout_engine(self):
-        return None
-
-
-def _recorded(pipeline, registration):
-    """Images of two pupils side by side with a vane each, and what the package makes of them."""
-    pupil = zwfs.Pupil.circular(24, spiders=((0.4, 0.12),))
-    bare = np.hstack([np.pad(pupil.amplitude**2, 8)] * 2)
-    masked = bare * (1 + 0.1 * np.sin(np.arange(bare.shape[1]) / 3))
-    images = [
-        registration.Image(1000.0 * counts + 20, np.zeros(counts.shape, bool), name)
-        for counts, name in ((masked, "frame"), (bare, "clear"))
-    ]
-    optics = pipeline.Optics()
-    recording = registration.record(images[:1], images[1:])
-    measurement = pipeline.reduce_frames(recording, optics)
-    return images, optics, recording, measurement, pipeline.recover_phase(measurement, 3)
 
 
 RAGGED = [[1.0, 2.0], [3.0]]
@@ -496,7 +166,9 @@ BAD = {
 }  # fmt: skip
 # What some take: they must then give a right answer, the one of the plain value where there is one.
 UNUSUAL = {
-    "0": 0, "-1": -1, "-0.5": -0.5, "0.0": 0.0, "1e-300": 1e-300, "True": True, "np.True_": np.True_,
+    "1e5": 1e5, "1e155": 1e155, "-1e155": -1e155, "1e308": 1e308, "5e-324": 5e-324,
+    "10**7": 10**7, "10**9": 10**9, "10**18": 10**18, "0": 0, "-1": -1, "-0.5": -0.5, "0.0": 0.0,
+    "1e-300": 1e-300, "True": True, "np.True_": np.True_,
     "Fraction": Fraction(1, 2), "float32": np.float32(0.5), "float16": np.float16(0.5), "int8": np.int8(1),
     "longdouble": np.longdouble(0.5), "0-d": np.array(0.5), "1-element": np.array([0.5]), "empty": np.array([]),
     "empty list": [], "empty tuple": (), "empty 3-d": np.zeros((0, 12, 12)), "wrong shape": np.ones((3, 7)),
@@ -516,6 +188,8 @@ def variants(value):
     hole.flat[value.size // 2], pole.flat[value.size // 2] = np.nan, np.inf
     yield "with nan", hole, None
     yield "with inf", pole, None
+    for factor in (0.0, 1e-300, 1e-155, 1e38, 1e155, 1e300):
+        yield f"times {factor:g}", factor * value, None
     yield "cut", value[..., :-1], None
     yield "empty batch", np.broadcast_to(value, (2, *value.shape))[:0], None
     yield "object", value.astype(object), None
@@ -648,23 +322,21 @@ def judge(call, parameter, label, value, plain):
     if "Callable" in str(call.parameters[parameter].annotation) and callable(value):
         return None  # what it raises is the caller's own
     annotation = str(call.parameters[parameter].annotation)
-    if f"{call.name}.{parameter}" in HANDED_ON or (call.name in SLOW and accepts(annotation, value)):
-        return None
     try:
         result = call(**{parameter: value})
     except (TypeError, ValueError) as error:
         # Of two arguments that do not fit either may be named.
         fit = "|".join(call.parameters) if "shape" in str(error) else parameter
-        if re.search(rf"(?<![A-Za-z])({fit}|{CONTENT.get(call.name, parameter)})(?![A-Za-z])", str(error)):
+        if re.search(rf"(?<![A-Za-z])({fit})(?![A-Za-z])", str(error)):
             return None
         return f"{type(error).__name__} does not name it: {str(error)[:150]}"
-    except OSError as error:
-        return None if "Path" in str(call.parameters[parameter].annotation) else f"{error!r:.150}"
     except Exception as error:
         return f"{error!r:.200}"
     refused = label == "as complex array" and call.name not in COMPLEX
     if plain is None and (refused or not accepts(annotation, value)):
         return f"accepted, as a {annotation}: {result!r:.80}"
+    if value is call.parameters[parameter].default:
+        return None
     whole = call.name not in INFINITE
     for path, array in leaves(result):
         finite = not is_number(array) or (np.isfinite(array) if whole else ~np.isnan(array)).all()
@@ -682,10 +354,8 @@ CASES = [(name, parameter) for name in targets() for parameter in parameters(nam
 
 
 @pytest.fixture(autouse=True)
-def _folder_and_process(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    np.save("file.npy", np.ones((4, 4)))
-    with parallel_config(n_jobs=1), threadpool_limits(1):
+def _one_thread():
+    with threadpool_limits(1):
         yield
 
 

@@ -98,7 +98,7 @@ def test_error_of_a_reconstruction_falls_with_the_root_of_the_photons(pupil, shi
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda p: Detector(p, 0), ValueError, r"photons = 0: .*\(0, inf"),
+        (lambda p: Detector(p, 0), ValueError, r"photons = 0: .*\[1e-12, "),
         (lambda p: Detector(p, 1, read_noise=-1), ValueError, "read_noise = -1"),
         (lambda p: Detector(p, 1, full_well=0), ValueError, "full_well = 0"),
         (lambda p: Detector(p, 1, gain=-2), ValueError, "gain = -2"),

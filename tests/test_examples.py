@@ -21,7 +21,6 @@ SHOWN_BY_OTHERS = {
     "zwfs.frames.registration": {"Placement"},
     "zwfs.frames.telemetry": {"Summary"},
     "zwfs.frames.verdict": {"Verdict"},
-    "zwfs.lowrank": {"Operator"},
     "zwfs.reconstructors.base": {"Solution", "State", "Estimate"},
 }
 

@@ -42,6 +42,17 @@ def test_equations_give_the_phase_back(shifted, screens):
     assert found[safe] == pytest.approx(truth[safe], abs=1e-6)
 
 
+def test_numbers_beyond_any_light_are_refused(pupil):
+    field, one = pupil.amplitude + 0j, np.ones(3)
+    with pytest.raises(ValueError, match="n_samples = 100000: expected an integer in"):
+        identities.direct_reference_wave(pupil, zwfs.Dimple(1.06, 1.0), field, n_samples=100_000)
+    for size in (1e155, 1e-155):
+        with pytest.raises(ValueError, match="amplitude"):
+            identities.pair_phase(np.ones((2, 3)), size * one, np.exp([[1j], [-1j]]) * one)
+    with pytest.raises(ValueError, match="incoming reaches 1e\\+155"):
+        identities.two_waves(1e155 * one, one)
+
+
 def test_determinant_is_the_sine_of_the_difference():
     angles = np.linspace(-3, 3, 13)
     a, b = np.exp(1j * angles)[:, np.newaxis], 2 * np.exp(1j * angles)

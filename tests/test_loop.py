@@ -186,6 +186,17 @@ def test_bad_drifts_are_refused(sensor, modes):
         hold_drift(sensor, modes, drift=0, photons=1e9, wavelength=635.0)
     with pytest.raises(TypeError, match="sensor is a int"):
         hold_drift(1, modes, drift=1, photons=1e9, wavelength=635.0)
+    for change in (
+        {"modes": 0 * modes},
+        {"modes": 2 * modes},
+        {"drift": 1e155},
+        {"speed": 1e155},
+        {"gain": 1e-300},
+    ):
+        with pytest.raises(ValueError, match=next(iter(change))):
+            hold_drift(sensor, **{"modes": modes, "drift": 1.0, "photons": 1e9, "wavelength": 635.0} | change)
+    with pytest.raises(ValueError, match="drift = 1e-100: expected more or a gain"):
+        hold_drift(sensor, modes, drift=1e-100, photons=1e9, wavelength=635.0)
 
 
 def test_a_mirror_on_another_pupil_is_refused(sensor, shifted):

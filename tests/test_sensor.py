@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import zwfs
-from zwfs import Detector, Dimple, Patch, Pupil, ZernikeSensor, lowrank, zernike_basis
+from zwfs import Detector, Dimple, Patch, Pupil, ZernikeSensor, _lowrank, zernike_basis
 
 from .reference import exact_reference
 
@@ -255,23 +255,42 @@ def assert_frozen(thing, path):
             assert_frozen(value, f"{path}[{index}]")
     if not type(thing).__module__.startswith("zwfs"):
         return
-    for name, value in attributes(thing).items():
+    public = attributes(thing)
+    for name in (*public, *getattr(thing, "__dict__", ()), "anything"):
         with pytest.raises(AttributeError):
-            setattr(thing, name, value)
+            setattr(thing, name, 1)
         with pytest.raises(AttributeError):
             delattr(thing, name)
+    for name, value in public.items():
         assert_frozen(value, f"{path}.{name}")
 
 
+def test_a_subclass_sets_attributes_in_its_constructor_only(rough_pupil):
+    class Named(ZernikeSensor):
+        def __init__(self, pupil, *masks):
+            super().__init__(pupil, *masks)
+            self.name = "a"
+
+    sensor = Named(rough_pupil, Dimple(1.06, 1.0))
+    with pytest.raises(AttributeError, match="name: a Named cannot be changed"):
+        sensor.name = "b"
+    assert copy.copy(sensor).name == sensor.name == "a"
+
+
 @pytest.mark.parametrize(
-    "again", [lambda thing: thing, lambda thing: pickle.loads(pickle.dumps(thing)), copy.deepcopy]
+    "again", [lambda thing: thing, lambda thing: pickle.loads(pickle.dumps(thing)), copy.copy, copy.deepcopy]
 )
 def test_no_public_object_can_be_changed(rough_pupil, again):
     sensor = again(ZernikeSensor(rough_pupil, Dimple(1.06, np.pi / 2), Patch(2.0, ramp, breaks=[1.0]), extent=1.5))
     detector = again(Detector(sensor.pupil, 1e6))
     phase = rough_pupil.x * np.ones(rough_pupil.shape)
     before = sensor.measure(phase), detector.expose(sensor.measure(phase), seed=1)
-    for thing in (sensor.pupil, sensor, *sensor.masks, sensor.factors, detector):
+    band = again(zwfs.PolychromaticSensor(sensor, [600.0, 650.0]))
+    mirror = again(zwfs.Mirror(rough_pupil, phase[np.newaxis]))
+    methods = [
+        again(kind(sensor)) for kind in zwfs.RECONSTRUCTORS if kind.n_masks[1] > 1 and kind is not zwfs.Linear
+    ]
+    for thing in (sensor.pupil, sensor, *sensor.masks, sensor.factors, detector, band, mirror, *methods):
         assert_frozen(thing, type(thing).__name__)
     after = sensor.measure(phase), detector.expose(sensor.measure(phase), seed=1)
     np.testing.assert_array_equal(after[0], before[0])
@@ -294,7 +313,7 @@ def test_objects_that_hold_arrays_compare_by_identity(shifted, pupil):
 def test_pieces_of_the_quadrature_add_up(pupil, complex_field, monkeypatch):
     field, masks = complex_field(pupil), (Dimple(1.06, 1.5), Patch(2.0, ramp))
     waves = ZernikeSensor(pupil, *masks).reference_wave(field)
-    monkeypatch.setattr(lowrank, "_NODES", 50)
+    monkeypatch.setattr(_lowrank, "_NODES", 50)
     np.testing.assert_allclose(ZernikeSensor(pupil, *masks).reference_wave(field), waves, atol=1e-9)
 
 

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from zwfs import focal as focal
     from zwfs import frames as frames
     from zwfs import loop as loop
-    from zwfs import lowrank as lowrank
     from zwfs import masks as masks
     from zwfs import metrics as metrics
     from zwfs import modes as modes

@@ -10,15 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zwfs._arrays import Kind, any_array
+from zwfs._arrays import Kind, any_array, read_only
 
+_STRONGEST = 1e15  # value of a mode, and of its inverse: squares summed over a pupil fit in single precision
 LARGEST = 1e38  # number in a map: the square of its sum is far from the range of a float
 
 
-def instance(name: str, value: Any, kind: type) -> None:
-    """Require that `value` is of a class."""
-    if not isinstance(value, kind):
-        raise TypeError(f"{name} is a {type(value).__name__}: expected a {kind.__name__}")
+def instance(name: str, value: Any, *kinds: type) -> None:
+    """Require that `value` is of one of the classes."""
+    if not isinstance(value, kinds):
+        expected = " or a ".join(kind.__name__ for kind in kinds)
+        raise TypeError(f"{name} is a {type(value).__name__}: expected a {expected}")
 
 
 def function(name: str, value: Any) -> None:
@@ -50,6 +52,7 @@ def sensor_of(name: str, reconstructor: Any) -> Any:
 
 
 _INT64 = 2**63 - 1  # largest integer that an array holds
+_MOST_NUMBERS = 2**30  # in a result: 8 GiB
 _NO_NUMBERS = bool, np.bool_, np.timedelta64  # though Python counts them among the integers
 
 
@@ -72,6 +75,15 @@ def integer(name: str, value: Any, low: int, high: float = _INT64) -> int:
         expected = f"at least {low}" if one_sided else f"an integer in [{low}, {high}]"
         raise ValueError(f"{name} = {shown(int(value))}: expected {expected}")
     return int(value)
+
+
+def count(name: str, value: Any, size: int) -> int:
+    """Return the number of maps in a result, of so many numbers each, as an int from 1 on."""
+    most = max(1, _MOST_NUMBERS // size)
+    number_of = integer(name, value, 1)
+    if number_of > most:
+        raise ValueError(f"{name} = {number_of}: expected at most {most}, which take 8 GiB")
+    return number_of
 
 
 def integer_seed(name: str, value: Any) -> int:
@@ -117,6 +129,11 @@ def number(
         left, right = "(" if open_low else "[", ")" if open_high else "]"
         raise ValueError(f"{name} = {shown(value)}: expected a finite number in {left}{low:g}, {high:g}{right}")
     return plain
+
+
+def wavelength(value: Any) -> float:
+    """Return a wavelength, of gamma rays to radio waves in any unit from nm to m."""
+    return number("wavelength", value, 1e-12, 1e12)
 
 
 def number_field(owner: Any, name: str, low: float = -math.inf, high: float = math.inf, **ends: bool) -> None:
@@ -265,6 +282,24 @@ def values_inside(name: str, array: Any, pupil: Any) -> NDArray:
     values = pupil.gather(array)
     moderate(name, values, " inside the pupil")
     return values
+
+
+def modes(name: str, value: Any, pupil: Any) -> NDArray[np.float64]:
+    """Return modes, (n_modes, ny, nx), at the points of a pupil: (n_modes, n_points), read-only."""
+    array = real_array(name, value)
+    if array.ndim != 3 or not len(array):
+        raise ValueError(f"{name} has shape {array.shape}: expected (n_modes, ny, nx)")
+    values = values_inside(name, array, pupil).astype(np.float64)
+    if len(values) > values.shape[1]:
+        raise ValueError(
+            f"{name}: {len(values)} of them, expected at most the {values.shape[1]} points of the pupil"
+        )
+    largest = np.abs(values).max()
+    if not 1 / _STRONGEST <= largest <= _STRONGEST:
+        raise ValueError(
+            f"{name} reaches {largest:.3g} in the pupil: expected between {1 / _STRONGEST:g} and {_STRONGEST:g}"
+        )
+    return read_only(values)
 
 
 def map_inside(name: str, array: Any, pupil: Any) -> NDArray:

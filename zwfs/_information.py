@@ -32,8 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs._arrays import Kind, per_kind
+from zwfs._lowrank import Factors
 from zwfs._pickle import Immutable
-from zwfs.lowrank import Factors
 from zwfs.pupil import Pupil
 
 if TYPE_CHECKING:

@@ -48,7 +48,7 @@ class Noise:
         """
         read_noise = _check.number("read_noise", read_noise, 0, 1e6)
         if photons is not None:
-            return cls(_check.number("photons", photons, 0, 1e12, open_low=True), read_noise)
+            return cls(_check.number("photons", photons, 1e-18, 1e12), read_noise)
         if read_noise:
             raise ValueError(f"read_noise = {read_noise:g}: expected 0, since there is no number of photons")
         return cls(None, 0.0)

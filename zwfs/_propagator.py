@@ -23,12 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind, per_kind, read_only
-from zwfs.lowrank import Factors, Operator
+from zwfs._lowrank import Factors, Operator
 from zwfs.pupil import Pupil
 
 if TYPE_CHECKING:
     from zwfs.sensor import Sensor
 
+_RANGE = 1e30  # of the light in the pupil, and of its inverse: its square is a number in single precision, too
 _VANISHING = 1e-30  # modulus, or its square, of a field that counts as 0
 
 
@@ -195,6 +196,17 @@ def amplitude_maps(
         maps = _check.in_kind("amplitude", maps, kind)
     _check.moderate("amplitude", maps)
     return maps, batch
+
+
+def amplitude_map(amplitude: ArrayLike | None, sensor: Sensor) -> NDArray[np.float64]:
+    """Return one checked amplitude, (ny, nx) with 0 outside, of a moderate brightness; None: the pupil's."""
+    maps, batch = amplitude_maps(amplitude, sensor, Kind.numpy())
+    if batch:
+        raise ValueError(f"amplitude has shape {(*batch, *sensor.pupil.shape)}: expected {sensor.pupil.shape}")
+    light = float(np.sum(maps[0] * maps[0]))
+    if not 1 / _RANGE < light < _RANGE:
+        raise ValueError(f"amplitude: its squares add up to {light:.3g}: expected {1 / _RANGE:g} to {_RANGE:g}")
+    return maps[0]
 
 
 def split(phase: NDArray, amplitude: NDArray) -> NDArray:

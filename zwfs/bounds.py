@@ -9,9 +9,8 @@ from zwfs import _check
 from zwfs._arrays import Kind
 from zwfs._information import Response
 from zwfs._likelihood import Estimator, Noise, require_information, require_one_wavelength
-from zwfs._propagator import amplitude_maps, propagator, pupil_maps
-from zwfs.modes import check_modes
-from zwfs.polychromatic import PolychromaticSensor, check_sensor
+from zwfs._propagator import amplitude_map, propagator, pupil_maps
+from zwfs.polychromatic import PolychromaticSensor
 from zwfs.sensor import ZernikeSensor
 
 
@@ -73,7 +72,7 @@ def cramer_rao(
     >>> round(float(np.nanmean(bound)), 4)  # radian
     0.0161
     """
-    check_sensor("sensor", sensor)
+    _check.instance("sensor", sensor, ZernikeSensor, PolychromaticSensor)
     if photons is None:
         raise TypeError("photons = None: expected a number, since the bound is that of photon noise")
     noise = Noise.checked(photons, read_noise)
@@ -84,15 +83,12 @@ def cramer_rao(
         require_one_wavelength(sensor)
     require_information(sensor, unknown)
     pupil = sensor.pupil
-    basis = None if modes is None else pupil.scatter(check_modes(pupil, modes), fill=0)
+    basis = None if modes is None else pupil.scatter(_check.modes("modes", modes, pupil), fill=0)
     maps, batch = pupil_maps("phase", _check.real_array("phase", phase), sensor)
     estimator = Estimator(Response.of(sensor), noise, unknown, basis)
     model = propagator(sensor, Kind.numpy())
     if amplitude is not None:
-        strength, amplitude_batch = amplitude_maps(amplitude, sensor, Kind.numpy())
-        if amplitude_batch:
-            raise ValueError(f"amplitude has shape {(*amplitude_batch, *pupil.shape)}: expected {pupil.shape}")
-        model = model.with_amplitude(strength[0])
+        model = model.with_amplitude(amplitude_map(amplitude, sensor))
     sigma = []
     for one in maps.astype(np.float64):  # one at a time: the memory does not grow with the batch
         psi = model.incoming(one[np.newaxis])

@@ -11,6 +11,7 @@ from zwfs import _check
 from zwfs.pupil import Pupil
 
 _BRIGHTEST = 9e18  # electrons in a pixel: 64 bits count no more
+_FAINTEST = 1e-12  # photons in a frame, or electrons in a count: other numbers are divided by them
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class Detector:
     ----------
     pupil : Pupil
     photons : float, photons / frame
-        Photons detected within the pupil in one frame with the mask taken out; those of one mask's image.
+        Photons detected within the pupil in one frame with the mask taken out; those of one mask's image. At least
+        1e-12.
     photon_noise : bool
         Draw the number of electrons of each pixel from the Poisson distribution.
     read_noise : float, electrons rms / pixel
@@ -33,7 +35,7 @@ class Detector:
     full_well : float, electrons / pixel
         A pixel holds no more than this.
     gain : float, electrons / count
-        Counts are rounded to integers; 0 leaves electrons as they are.
+        Counts are rounded to integers; 0 leaves electrons as they are. Otherwise at least 1e-12.
 
     Raises
     ------
@@ -63,13 +65,15 @@ class Detector:
 
     def __post_init__(self) -> None:
         _check.instance("pupil", self.pupil, Pupil)
-        _check.number_field(self, "photons", 0, open_low=True)
+        _check.number_field(self, "photons", _FAINTEST, _check.LARGEST)
         _check.flag("photon_noise", self.photon_noise)
-        _check.number_field(self, "read_noise", 0)
-        _check.number_field(self, "background", 0)
+        _check.number_field(self, "read_noise", 0, _BRIGHTEST)
+        _check.number_field(self, "background", 0, _BRIGHTEST)
         if not (isinstance(self.full_well, float) and self.full_well == np.inf):
-            _check.number_field(self, "full_well", 0, open_low=True)
-        _check.number_field(self, "gain", 0)
+            _check.number_field(self, "full_well", 0, _BRIGHTEST, open_low=True)
+        _check.number_field(self, "gain", 0, _BRIGHTEST)
+        if self.gain:
+            _check.number_field(self, "gain", _FAINTEST, _BRIGHTEST)
 
     @property
     def photons_per_pixel(self) -> float:
@@ -101,7 +105,8 @@ class Detector:
         _check.finite("frames", frames)
         _check.non_negative("frames", frames)
         rng = _check.generator("seed", seed)
-        electrons = frames.astype(np.float64) * self.photons_per_pixel + self.background
+        with np.errstate(over="ignore"):
+            electrons = frames.astype(np.float64) * self.photons_per_pixel + self.background
         brightest = electrons.max(initial=0.0)
         if not brightest < _BRIGHTEST:
             raise ValueError(
@@ -139,7 +144,7 @@ class Detector:
         TypeError, ValueError
             If the counts are complex or not finite.
         """
-        counts = _check.real_array("counts", counts)
-        _check.finite("counts", counts)
-        frames = (counts.astype(np.float64) * (self.gain or 1.0) - self.background) / self.photons_per_pixel
+        counts = _check.real_array("counts", counts).astype(np.float64, copy=False)
+        _check.moderate("counts", counts)
+        frames = (counts * (self.gain or 1.0) - self.background) / self.photons_per_pixel
         return frames if floor is None else np.maximum(frames, _check.number("floor", floor))

@@ -17,10 +17,13 @@ from zwfs._pickle import Immutable
 from zwfs.bounds import cramer_rao
 from zwfs.detector import Detector
 from zwfs.metrics import strehl, without_piston
-from zwfs.modes import check_modes
-from zwfs.polychromatic import PolychromaticSensor, check_sensor
+from zwfs.polychromatic import PolychromaticSensor
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
+
+_LONGEST_DELAY = 1000  # cycles: beyond it only a gain below 0.0016 is stable
+_FASTEST = 1e12  # pm / cycle: a metre
+_LOWEST_GAIN = 1e-9
 
 
 class Mirror(Immutable):
@@ -55,7 +58,7 @@ class Mirror(Immutable):
         _check.instance("pupil", pupil, Pupil)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
         self._pupil = pupil
-        self._influence = read_only(check_modes(pupil, influence, "influence"))
+        self._influence = _check.modes("influence", influence, pupil)
         self._inverse = read_only(np.linalg.pinv(self._influence, rcond=conditioning))
 
     @classmethod
@@ -90,6 +93,7 @@ class Mirror(Immutable):
         """
         _check.instance("pupil", pupil, Pupil)
         n_actuators = _check.integer("n_actuators", n_actuators, 4, pupil.n_points)
+        _check.count("n_actuators", n_actuators, 2 * pupil.n_points)
         coupling = _check.number("coupling", coupling, 0, 1, open_low=True, open_high=True)
         places = _actuators(n_actuators)
         pitch = 0.5 / np.abs(places).max()
@@ -239,9 +243,9 @@ def close_loop(
     leak : float
         Share of the figure that the integrator loses in each cycle, in [0, 1).
     delay : int, cycles
-        From a measurement to its correction, at least 1.
+        From a measurement to its correction, from 1 to 1000.
     stroke : float, radian rms, optional
-        Largest figure of the mirror; one beyond it is scaled down to it. Any figure if left out.
+        Largest figure of the mirror, at least 1e-12; one beyond it is scaled down to it. Any figure if left out.
     camera : Detector, optional
         Its noise is added to all frames; no noise if left out.
     seed : int, Generator or SeedSequence, optional
@@ -277,8 +281,8 @@ def close_loop(
         )
     gain = _check.number("gain", gain, 0, 2, open_low=True, open_high=True)
     leak = _check.number("leak", leak, 0, 1, open_high=True)
-    delay = _check.integer("delay", delay, 1)
-    stroke = math.inf if stroke is None else _check.number("stroke", stroke, 0, open_low=True)
+    delay = _check.integer("delay", delay, 1, _LONGEST_DELAY)
+    stroke = math.inf if stroke is None else _check.number("stroke", stroke, 1e-12)
     if camera is not None:
         _check.instance("camera", camera, Detector)
     rng = _check.generator("seed", seed)
@@ -310,7 +314,7 @@ def close_loop(
     return LoopRecord(*(np.stack(column, axis=1) for column in zip(*rows, strict=True)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HeldDrift:
     """Residual of an integrator that holds a drift, per mode: see `hold_drift`.
 
@@ -368,17 +372,17 @@ def hold_drift(
     ----------
     sensor : ZernikeSensor or PolychromaticSensor
     modes : array_like, shape (n_modes, ny, nx)
-        Modes that drift, of unit rms and nearly orthogonal, as those of `zernike_basis`.
+        Modes that drift, of unit rms to 1 % and nearly orthogonal, as those of `zernike_basis`.
     drift : float, pm rms / cycle
-        Random step of the wavefront, all modes together, divided equally among them.
+        Random step of the wavefront, all modes together, divided equally among them; at most 1e12, a metre.
     photons : float, photons / cycle
         Detected within the pupil with the mask out, divided equally among the masks.
     wavelength : float, nm
         At which the phase is in radian: that of the sensor, or its reference wavelength.
     speed : float, pm rms / cycle
-        Constant step of the wavefront, divided equally among the modes.
+        Constant step of the wavefront, divided equally among the modes; at most 1e12.
     gain : float, optional
-        In (0, 2), the same for all modes. If left out, the one that is best for the random drift of each mode.
+        In [1e-9, 2), the same for all modes. If left out, the one that is best for the random drift of each mode.
     phase : array_like, shape (ny, nx), radian, optional
         Static wavefront around which the loop works; flat if left out.
 
@@ -400,12 +404,14 @@ def hold_drift(
     >>> round(held.residual, 1)  # pm rms
     8.4
     """
-    check_sensor("sensor", sensor)
-    modes = sensor.pupil.scatter(check_modes(sensor.pupil, modes), fill=0)
-    drift = _check.number("drift", drift, 0)
+    _check.instance("sensor", sensor, ZernikeSensor, PolychromaticSensor)
+    rms = _check.modes("modes", modes, sensor.pupil).std(axis=1)
+    if np.abs(rms - 1).max() > 0.01:
+        raise ValueError(f"modes have an rms from {rms.min():.3g} to {rms.max():.3g}: expected unit rms")
+    drift = _check.number("drift", drift, 0, _FASTEST)
     photons = _check.number("photons", photons, 1e-6)
-    wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-    speed = _check.number("speed", speed, 0)
+    wavelength = _check.wavelength(wavelength)
+    speed = _check.number("speed", speed, 0, _FASTEST)
     if gain is None and not drift:
         raise ValueError("gain = None: expected a gain, since drift = 0 has no best one")
     around = np.zeros(sensor.pupil.shape) if phase is None else _check.map_inside("phase", phase, sensor.pupil)
@@ -414,8 +420,10 @@ def hold_drift(
     step, constant = drift / math.sqrt(sigma.size), speed / math.sqrt(sigma.size)
     if gain is None:
         gains = _best_gains(step, sigma)
+        if gains.min() < _LOWEST_GAIN:
+            raise ValueError(f"drift = {drift:g}: expected more or a gain, as its best one is {gains.min():.1g}")
     else:
-        gains = np.full(sigma.size, _check.number("gain", gain, 0, 2, open_low=True, open_high=True))
+        gains = np.full(sigma.size, _check.number("gain", gain, _LOWEST_GAIN, 2, open_high=True))
     lag = np.sqrt((constant / gains) ** 2 + step**2 / (gains * (2 - gains)))
     return HeldDrift(gains, lag, sigma * np.sqrt(gains / (2 - gains)))
 

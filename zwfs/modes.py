@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import read_only
 from zwfs.pupil import Pupil
+
+_STRONGEST = 1e9  # radian rms of a screen: 100 m of optical path
 
 
 def noll_to_nm(j: int) -> tuple[int, int]:
@@ -80,7 +81,7 @@ def zernike_basis(
     ((10, 32, 32), 1.0)
     """
     _check.instance("pupil", pupil, Pupil)
-    n_modes = _check.integer("n_modes", n_modes, 1)
+    n_modes = _check.count("n_modes", n_modes, pupil.amplitude.size)
     orthonormal = _check.flag("orthonormal", orthonormal)
     checked_dtype = _check.float_dtype("dtype", dtype)
     if n_modes >= pupil.n_points:
@@ -164,11 +165,11 @@ def power_law_screens(
     modes = _check.real_array("modes", modes)
     if modes.ndim != 3 or 0 in modes.shape:
         raise ValueError(f"modes has shape {modes.shape}: expected (n_modes, ny, nx)")
-    rms = _check.number("rms", rms, 0)
-    n_screens = _check.integer("n_screens", n_screens, 1)
+    rms = _check.number("rms", rms, 0, _STRONGEST)
+    n_screens = _check.count("n_screens", n_screens, max(modes[0].size, len(modes)))
     exponent = _check.number("exponent", exponent, -20, 20)
     rng = _check.generator("seed", seed)
-    _check.finite("modes", modes)
+    _check.moderate("modes", modes)
     flat = modes.reshape(len(modes), -1)
     # The sum of squares of a mode of unit rms is the number of points inside.
     n_points = np.einsum("ij,ij->i", flat, flat, dtype=np.float64)
@@ -203,7 +204,8 @@ def _noll_orders(modes: NDArray) -> NDArray[np.float64]:
 def _frequencies(values: ArrayLike, n_modes: int) -> NDArray[np.float64]:
     values = _check.real_map("frequencies", values, n_axes=1)
     if len(values) != n_modes or values.min() <= 0:
-        raise ValueError(f"frequencies = {_check.shown(values)}: expected {n_modes} positive numbers")
+        expected = f"{n_modes} positive numbers, one for each of the modes"
+        raise ValueError(f"frequencies = {_check.shown(values)}: expected {expected}")
     return values
 
 
@@ -235,13 +237,15 @@ def fourier_basis(pupil: Pupil, n_modes: int) -> NDArray[np.float64]:
     array([1.1, 4.1, 5.8, 7.9])
     """
     _check.instance("pupil", pupil, Pupil)
-    n_modes = _check.integer("n_modes", n_modes, 1)
+    n_modes = _check.count("n_modes", n_modes, pupil.amplitude.size)
+    if n_modes >= pupil.n_points:
+        raise ValueError(f"n_modes = {n_modes}: expected fewer than the {pupil.n_points} points of the pupil")
     reach = isqrt(n_modes) + 1
     # One of each pair of opposite frequencies, whose modes are the same.
     half = [(u, v) for u in range(reach + 1) for v in range(-reach, reach + 1) if u > 0 or v > 0]
     half = sorted(half, key=lambda uv: (uv[0] ** 2 + uv[1] ** 2, -uv[0], -uv[1]))[: (n_modes + 1) // 2]
     highest = max(max(abs(u), abs(v)) for u, v in half)
-    if 2 * highest >= pupil.n_pixels or n_modes >= pupil.n_points:
+    if 2 * highest >= pupil.n_pixels:
         raise ValueError(f"n_modes = {n_modes}: expected fewer on a pupil of {pupil.n_pixels:g} pixels")
     phases = 2 * np.pi * pupil.points @ np.array(half, float).T
     values = np.stack([np.cos(phases), np.sin(phases)], axis=-1).reshape(pupil.n_points, -1)[:, :n_modes].T
@@ -273,38 +277,15 @@ def mode_frequencies(pupil: Pupil, modes: ArrayLike) -> NDArray[np.float64]:
     0.64, 12.01
     """
     _check.instance("pupil", pupil, Pupil)
-    values = pupil.scatter(check_modes(pupil, modes))
+    at_points = _check.modes("modes", modes, pupil)
+    if np.any(np.ptp(at_points, axis=1) <= 1e-12 * np.abs(at_points).max(axis=1)):
+        raise ValueError("modes: some are constant in the pupil: expected modes other than piston")
+    values = pupil.scatter(at_points)
     power = np.zeros(len(values))
     for axis in (-2, -1):
         slopes = np.diff(values, axis=axis) * pupil.n_pixels
         power += np.nanmean(slopes**2, axis=(-2, -1))
     return np.sqrt(power) / (2 * np.pi * np.nanstd(values, axis=(-2, -1)))
-
-
-def check_modes(pupil: Pupil, modes: ArrayLike, name: str = "modes") -> NDArray[np.float64]:
-    """Checked modes at the points of the pupil, shape (n_modes, n_points).
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the modes have no shape (n_modes, ny, nx), are not finite, or are more than the points of the pupil.
-
-    Examples
-    --------
-    >>> import zwfs
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> zwfs.modes.check_modes(pupil, zwfs.zernike_basis(pupil, 5)).shape
-    (5, 812)
-    """
-    modes = _check.real_array(name, modes)
-    if modes.ndim != 3 or not len(modes):
-        raise ValueError(f"{name} has shape {modes.shape}: expected (n_modes, ny, nx)")
-    values = _check.values_inside(name, modes, pupil).astype(np.float64)
-    if len(values) > values.shape[1]:
-        raise ValueError(
-            f"{name}: {len(values)} of them, expected at most the {values.shape[1]} points of the pupil"
-        )
-    return read_only(values)
 
 
 def _unnormalised(disc: NDArray[np.complex128], n_modes: int) -> NDArray[np.float64]:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import read_only
+from zwfs._lowrank import Factors, factorise
 from zwfs._propagator import Channels
-from zwfs.lowrank import Factors, factorise
 from zwfs.masks import Dimple, Mask
 from zwfs.sensor import Sensor, ZernikeSensor
 
@@ -177,24 +176,6 @@ class PolychromaticSensor(Sensor):
             reference_wavelength=self.reference_wavelength,
             chromatic=self.chromatic,
         )
-
-
-def check_sensor(name: str, sensor: Any) -> None:
-    """Require a sensor of one wavelength or several.
-
-    Raises
-    ------
-    TypeError
-        If it is none.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> sensor = zwfs.ZernikeSensor(zwfs.Pupil.circular(32), zwfs.Dimple(1.06, np.pi / 2))
-    >>> zwfs.polychromatic.check_sensor("sensor", sensor)
-    """
-    if not isinstance(sensor, PolychromaticSensor):
-        _check.instance(name, sensor, ZernikeSensor)
 
 
 def _checked_light(

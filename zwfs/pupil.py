@@ -160,7 +160,9 @@ class Pupil(Immutable):
         segments = np.zeros(x.shape, int)
         for number, (cx, cy) in enumerate(centers, start=1):
             if number not in missing:
-                segments[_inside_hexagon(x - cx, y - cy, (pitch - gap) / 2)] = number
+                # The box around a segment: on the whole grid, many rings would take hours.
+                box = tuple(slice(*np.searchsorted(x[0], (c - pitch, c + pitch))) for c in (cy, cx))
+                segments[box][_inside_hexagon(x[box] - cx, y[box] - cy, (pitch - gap) / 2)] = number
         if stop is not None:
             segments[np.hypot(x, y) > 0.5] = 0
         _require_light("missing, gap, stop", segments > 0)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind
+from zwfs._lowrank import Factors, factorise
 from zwfs._pickle import Immutable
 from zwfs._propagator import (
     ONE_WAVELENGTH,
@@ -23,7 +24,6 @@ from zwfs._propagator import (
     pupil_maps,
     square,
 )
-from zwfs.lowrank import Factors, factorise
 from zwfs.masks import Mask
 from zwfs.pupil import Pupil
 
@@ -106,7 +106,12 @@ class Sensor(Immutable):
 
     @property
     def factors(self) -> Factors:
-        """Matrices of `eq-low-rank`, common to all masks but for the cores: to compute with them elsewhere."""
+        """Matrices of `eq-low-rank`, read-only, to compute with them elsewhere.
+
+        `pupil` and `detector` hold the functions of the two planes, r and q of them, which all masks share:
+        `along_y`, shape (a, ny), `along_x`, shape (b, nx), and `combine`, shape (a * b, r), which combines their
+        products. `core` has the shape (n_masks, q, r), or (n_masks, n_wavelengths, q, r).
+        """
         return self._factors
 
     def measure(self, phase: ArrayLike, amplitude: ArrayLike | None = None) -> NDArray[np.floating]:

@@ -27,7 +27,7 @@ def structure_function(separation: ArrayLike, r0: float = 1.0, outer_scale: floa
     r0 : float, D
         Fried's parameter.
     outer_scale : float, D
-        Outer scale of von Karman's spectrum, at most 1e5; infinity for Kolmogorov's.
+        Outer scale of von Karman's spectrum, from 1e-9 to 1e5; infinity for Kolmogorov's.
 
     Returns
     -------
@@ -43,8 +43,8 @@ def structure_function(separation: ArrayLike, r0: float = 1.0, outer_scale: floa
     >>> structure_function([0.0, 1.0], r0=0.5).round(3)
     array([ 0.   , 21.855])
     """
-    distance = _check.real_array("separation", separation)
-    _check.finite("separation", distance)
+    distance = _check.real_array("separation", separation).astype(np.float64, copy=False)
+    _check.moderate("separation", distance)
     _check.non_negative("separation", distance)
     r0, outer_scale = _scales(r0, outer_scale)
     if outer_scale == inf:
@@ -98,7 +98,7 @@ def turbulent_screens(
     """
     _check.instance("pupil", pupil, Pupil)
     r0, outer_scale = _scales(r0, outer_scale, smallest=0.2)
-    n_screens = _check.integer("n_screens", n_screens, 1)
+    n_screens = _check.count("n_screens", n_screens, pupil.amplitude.size)
     rng = _check.generator("seed", seed)
     rows, columns = np.unravel_index(pupil.indices, pupil.shape)
     # All points lie within half of this distance from the middle of their bounding box.
@@ -161,7 +161,7 @@ def karhunen_loeve_basis(
     ((20, 32, 32), array([0.45, 0.45, 0.02]))
     """
     _check.instance("pupil", pupil, Pupil)
-    n_modes, n_points = _check.integer("n_modes", n_modes, 1), pupil.n_points
+    n_modes, n_points = _check.count("n_modes", n_modes, pupil.amplitude.size), pupil.n_points
     if 4 * n_modes > n_points:
         raise ValueError(f"n_modes = {n_modes}: expected at most {n_points // 4}, a quarter of the pupil's points")
     _, outer_scale = _scales(1.0, outer_scale, smallest=0.2)
@@ -241,9 +241,9 @@ def _plateau(r0: float, outer_scale: float) -> float:
     return factor * (outer_scale / r0) ** (5 / 3)
 
 
-def _scales(r0: float, outer_scale: float, smallest: float = 0.0) -> tuple[float, float]:
+def _scales(r0: float, outer_scale: float, smallest: float = 1e-9) -> tuple[float, float]:
     """Return checked scales."""
     r0 = _check.number("r0", r0, 1e-9)
     if isinstance(outer_scale, float) and outer_scale == inf:
         return r0, inf
-    return r0, _check.number("outer_scale", outer_scale, smallest, 1e5, open_low=not smallest)
+    return r0, _check.number("outer_scale", outer_scale, smallest, 1e5)

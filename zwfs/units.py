@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 
+_LARGEST = 1e20  # phase or path difference: the result is a number in single precision, too
+
 
 def phase_to_opd(phase: ArrayLike, wavelength: float) -> NDArray[np.float64]:
     """Optical path difference of a phase: phase times wavelength over 2 pi.
@@ -31,7 +33,7 @@ def phase_to_opd(phase: ArrayLike, wavelength: float) -> NDArray[np.float64]:
     Raises
     ------
     TypeError, ValueError
-        If the phase is not real, or the wavelength is not above 0.
+        If the phase is not real or beyond 1e20, or the wavelength is not between 1e-12 and 1e12.
 
     Examples
     --------
@@ -39,8 +41,7 @@ def phase_to_opd(phase: ArrayLike, wavelength: float) -> NDArray[np.float64]:
     >>> float(zwfs.phase_to_opd(3.14159265, 635.0).round(3))
     317.5
     """
-    wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-    return _check.real_array("phase", phase) * (wavelength / (2 * np.pi))
+    return _bounded("phase", phase) * (_check.wavelength(wavelength) / (2 * np.pi))
 
 
 def opd_to_phase(opd: ArrayLike, wavelength: float) -> NDArray[np.float64]:
@@ -59,7 +60,7 @@ def opd_to_phase(opd: ArrayLike, wavelength: float) -> NDArray[np.float64]:
     Raises
     ------
     TypeError, ValueError
-        If the OPD is not real, or the wavelength is not above 0.
+        If the OPD is not real or beyond 1e20, or the wavelength is not between 1e-12 and 1e12.
 
     Examples
     --------
@@ -67,5 +68,13 @@ def opd_to_phase(opd: ArrayLike, wavelength: float) -> NDArray[np.float64]:
     >>> float(zwfs.opd_to_phase(317.5, 635.0).round(6))
     3.141593
     """
-    wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-    return _check.real_array("opd", opd) * (2 * np.pi / wavelength)
+    return _bounded("opd", opd) * (2 * np.pi / _check.wavelength(wavelength))
+
+
+def _bounded(name: str, values: ArrayLike) -> NDArray:
+    """Return real numbers, or NaN, that are small enough to be converted."""
+    array = _check.real_array(name, values)
+    largest = np.fmax.reduce(np.abs(array), axis=None, initial=0.0)
+    if largest > _LARGEST:
+        raise ValueError(f"{name} reaches {largest:.3g}: expected at most {_LARGEST:g}")
+    return array

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs._arrays import read_only
-from zwfs.lowrank import _bandwidth, gauss_legendre
+from zwfs._lowrank import _bandwidth, gauss_legendre
 
 _ROUNDING = 1e-13
 

@@ -34,7 +34,6 @@ from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, _check_fit, fit
 from zwfs.frames.registration import _TOUCHED, Image, Recording, nearest_good, record
 from zwfs.masks import Dimple
 from zwfs.metrics import without_piston
-from zwfs.modes import check_modes
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
@@ -433,7 +432,7 @@ class Calibration(Immutable):
         TypeError, ValueError
             If the modes are of the wrong kind or shape, or not independent on the good points.
         """
-        values = check_modes(self.sensor.pupil, modes)
+        values = _check.modes("modes", modes, self.sensor.pupil)
         good = self.sensor.pupil.gather(self.good)
         centred = values[:, good] - values[:, good].mean(axis=1, keepdims=True)
         rank = int(np.linalg.matrix_rank(centred))
@@ -484,7 +483,7 @@ class Calibration(Immutable):
         _check.instance("phases", phases, Phases)
         photons = _check.number("photons", photons, 1e-6, 1e12)
         pupil, model = self.sensor.pupil, propagator(self.sensor, Kind.numpy())
-        basis = None if modes is None else pupil.scatter(check_modes(pupil, modes), fill=0)
+        basis = None if modes is None else pupil.scatter(_check.modes("modes", modes, pupil), fill=0)
         estimator = Estimator(self._work.response, Noise.checked(photons, read_noise), False, basis)
         maps = phases.filled.reshape(-1, 1, *pupil.shape).astype(np.float64)
         lost = phases.flags.reshape(-1) & Flag.LOST > 0

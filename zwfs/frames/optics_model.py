@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, sparse
 
 from zwfs import _check
-from zwfs.lowrank import _axis_functions, _quadrature, _spectra
+from zwfs._lowrank import _axis_functions, _quadrature, _spectra
 from zwfs.masks import Dimple
 
 _ALL: Any = None

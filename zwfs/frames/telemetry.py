@@ -25,7 +25,7 @@ from zwfs.frames._part import Cards, Part, Unit, plan_of
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration, Flag, Phases
 from zwfs.frames.files import FileError, check_output
-from zwfs.modes import check_modes, zernike_basis
+from zwfs.modes import zernike_basis
 
 _CHUNK = 2**24  # bytes of camera images that a thread handles at once
 _LONGEST = 256  # exposures of them
@@ -217,7 +217,7 @@ class _Job:
         _same_unit(stack, calibration)
         if modes is not None:
             modes = zernike_basis(pupil, modes) if isinstance(modes, int) else modes
-            modes = pupil.scatter(check_modes(pupil, modes), fill=0)
+            modes = pupil.scatter(_check.modes("modes", modes, pupil), fill=0)
         matrix = None if modes is None else calibration.modal_matrix(modes)
         phases = modes is None if phases is None else _check.flag("phases", phases)
         if not phases and modes is None:

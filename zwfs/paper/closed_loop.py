@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check, loop
 from zwfs.detector import Detector
 from zwfs.loop import Mirror
-from zwfs.modes import check_modes
 from zwfs.paper.linearity import check_reconstructors
 from zwfs.pupil import Pupil
 
@@ -195,7 +194,7 @@ def follow_flow(
         raise ValueError(
             f"flow has {_check.shown(flow.pupil)}: expected that of the reconstructor, {_check.shown(pupil)}"
         )
-    modes = check_modes(sensor.pupil, modes)
+    modes = _check.modes("modes", modes, sensor.pupil)
     n_steps = _check.integer("n_steps", n_steps, 1)
     rate = _check.number("rate", rate, 0, open_low=True)
     camera = None

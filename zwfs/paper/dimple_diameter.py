@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
+from zwfs._lowrank import factorise
 from zwfs.companion import sweeps
-from zwfs.lowrank import factorise
 from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error, wrapped_residual
 from zwfs.paper.curves import ErrorCurves, crossing

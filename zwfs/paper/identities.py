@@ -18,6 +18,9 @@ from zwfs.sensor import ZernikeSensor
 
 # Fields have the phases of the equations as their arguments: psi = sqrt(I) exp(i phi).
 
+_STRONGEST = 1e30  # wave or frame, and inverse of a wave: their squares and products are numbers
+_MOST_SAMPLES = 256  # half a gigabyte for 100 pixels
+
 # Of the Strehl ratio, with which the common approximation scales the amplitude of the reference wave.
 POWERS = {"amplitude × √S": 0.5, "intensity × √S": 0.25, "not scaled": 0.0}
 
@@ -75,7 +78,7 @@ def direct_reference_wave(pupil: Pupil, mask: Mask, field: NDArray, n_samples: i
     mask : Dimple, Patch or any Mask
     field : ndarray of complex, shape (ny, nx)
     n_samples : int
-        Nodes along a radius; around the axis there are twice as many.
+        Nodes along a radius, at most 256; around the axis there are twice as many.
 
     Returns
     -------
@@ -83,7 +86,7 @@ def direct_reference_wave(pupil: Pupil, mask: Mask, field: NDArray, n_samples: i
         In the plane of the detector, on the grid of the pupil.
     """
     light = _light(pupil, mask, field) / pupil.n_pixels**2
-    nodes, weights = np.polynomial.legendre.leggauss(_check.integer("n_samples", n_samples, 2))
+    nodes, weights = np.polynomial.legendre.leggauss(_check.integer("n_samples", n_samples, 2, _MOST_SAMPLES))
     radius = (nodes + 1) * mask.diameter / 4
     angles = np.arange(2 * n_samples) * np.pi / n_samples
     u, v = np.outer(radius, np.cos(angles)).ravel(), np.outer(radius, np.sin(angles)).ravel()
@@ -368,6 +371,8 @@ def _arrays(**values: NDArray) -> list[NDArray]:
         check = _check.complex_array if array.dtype.kind == "c" else _check.real_array
         arrays[name] = check(name, array)
         _check.finite(name, arrays[name])
+        if np.abs(arrays[name]).max(initial=0) > _STRONGEST:
+            raise ValueError(f"{name} reaches {np.abs(arrays[name]).max():.3g}: expected at most {_STRONGEST:g}")
     _check.broadcast(**arrays)
     return list(arrays.values())
 
@@ -375,8 +380,9 @@ def _arrays(**values: NDArray) -> list[NDArray]:
 def _lit(**waves: NDArray) -> None:
     """Require waves that vanish nowhere."""
     for name, wave in waves.items():
-        if not wave.all():
-            raise ValueError(f"{name} is 0 at {np.count_nonzero(wave == 0)} points: expected light at every point")
+        dark = np.count_nonzero(np.abs(wave) < 1 / _STRONGEST)
+        if dark:
+            raise ValueError(f"{name} is 0 at {dark} points: expected light at every point")
 
 
 def _light(pupil: Pupil, mask: Mask, field: NDArray) -> NDArray[np.complexfloating]:

@@ -15,7 +15,7 @@ from zwfs.bounds import cramer_rao
 from zwfs.companion import sweeps
 from zwfs.detector import Detector
 from zwfs.metrics import reconstruction_error
-from zwfs.modes import check_modes, power_law_screens
+from zwfs.modes import power_law_screens
 from zwfs.paper.linearity import screens_at
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import LikelihoodReconstruction, MaximumLikelihood, PhaseShifted, Reconstruction
@@ -120,7 +120,7 @@ def amplitude_maps(
         If an argument is of the wrong kind, shape or range.
     """
     _check.instance("pupil", pupil, Pupil)
-    check_modes(pupil, modes)
+    _check.modes("modes", modes, pupil)
     _check.choice("kind", kind, KINDS)
     variation = _check.number("variation", variation, 0, _LARGEST)
     n_maps = _check.integer("n_maps", n_maps, 1)
@@ -196,7 +196,7 @@ def amplitude_curves(
         If an argument is of the wrong kind, shape or range.
     """
     _check_sensor(sensor)
-    check_modes(sensor.pupil, modes)
+    _check.modes("modes", modes, sensor.pupil)
     variations = _check.real_map("variations", variations, 1)
     for value in variations.tolist():
         _check.number("variations", value, 0, _LARGEST)

@@ -16,7 +16,6 @@ from zwfs.bounds import cramer_rao
 from zwfs.companion import sweeps
 from zwfs.detector import Detector
 from zwfs.metrics import reconstruction_error, wrapped_residual
-from zwfs.modes import check_modes
 from zwfs.paper.linearity import check_rms, screens_at
 from zwfs.paper.phase_shifts import _rms
 from zwfs.reconstructors import LikelihoodReconstruction, MaximumLikelihood
@@ -105,7 +104,7 @@ def photon_curves(
     for name, method in reconstructors.items():
         if _check.sensor_of(f"reconstructors[{name!r}]", method).pupil.shape != sensor.pupil.shape:
             raise ValueError(f"reconstructors[{name!r}] is for another pupil: expected that of the sensor")
-    check_modes(sensor.pupil, modes)
+    _check.modes("modes", modes, sensor.pupil)
     rms, photons = check_rms(rms), _check_photons(photons)
     n_screens = _check.integer("n_screens", n_screens, 1)
     exponent, seed = _check.number("exponent", exponent), _check.integer_seed("seed", seed)
@@ -204,7 +203,7 @@ def error_bars(
         One for each number in `assumed`.
     """
     _check.instance("sensor", sensor, ZernikeSensor)
-    check_modes(sensor.pupil, modes)
+    _check.modes("modes", modes, sensor.pupil)
     photons, assumed = _check.number("photons", photons, 10, 1e9), _check.real_map("assumed", assumed, 1)
     if not np.all((assumed >= 0.01) & (assumed <= 100)):
         raise ValueError(f"assumed = {_check.shown(assumed)}: expected a list of values between 0.01 and 100")

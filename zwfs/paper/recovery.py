@@ -17,7 +17,6 @@ from zwfs.bounds import cramer_rao
 from zwfs.companion import sweeps
 from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error
-from zwfs.modes import check_modes
 from zwfs.paper.curves import ErrorCurves
 from zwfs.paper.dimple_diameter import (
     DARK_RING,
@@ -140,7 +139,7 @@ def dimple_limits(
         If an argument is of the wrong kind, shape or range.
     """
     _check.instance("pupil", pupil, Pupil)
-    basis = pupil.scatter(check_modes(pupil, modes), fill=0)
+    basis = pupil.scatter(_check.modes("modes", modes, pupil), fill=0)
     if len(basis) <= _TILTS:
         raise ValueError(f"modes has shape {basis.shape}: expected more than {_TILTS} modes")
     phase_shift = _check.number("phase_shift", phase_shift, 0.01, 3.13)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs._arrays import Kind
+from zwfs._lowrank import split_core
 from zwfs._propagator import with_piston_of
-from zwfs.lowrank import split_core
 from zwfs.reconstructors.base import State
 from zwfs.sensor import ZernikeSensor
 

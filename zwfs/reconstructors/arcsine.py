@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs._arrays import Kind, for_each, per_kind
+from zwfs._lowrank import split_core
 from zwfs._propagator import Propagator, count, square, turn, with_piston_of
-from zwfs.lowrank import split_core
 from zwfs.reconstructors.base import Estimate, FixedPoint, State
 
 _IN_LINE = 1e-6  # sine of the angle between a field and its reference wave below which they count as in line

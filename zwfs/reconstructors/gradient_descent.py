@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs._arrays import Kind
 from zwfs._propagator import along_phase, parts_sum, square
-from zwfs.modes import check_modes
 from zwfs.polychromatic import PolychromaticSensor
 from zwfs.reconstructors.base import Reconstructor, Solution, check_frames
 from zwfs.sensor import ZernikeSensor
@@ -67,7 +66,7 @@ class GradientDescent(Reconstructor):
         amplitude: ArrayLike | None = None,
     ) -> None:
         super().__init__(sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=amplitude)
-        self._modes = None if modes is None else check_modes(sensor.pupil, modes)
+        self._modes = None if modes is None else _check.modes("modes", modes, sensor.pupil)
 
     @property
     def modes(self) -> NDArray[np.float64] | None:
@@ -109,7 +108,7 @@ class GradientDescent(Reconstructor):
         TypeError, ValueError
             If phase or frames are of the wrong shape, complex, not finite, or the frames negative or dark.
         """
-        frames, batch = check_frames(self.sensor, _check.real_array("frames", frames))
+        frames, batch = check_frames(self.sensor, _check.real_array("frames", frames), light=self._light)
         if batch not in ((), (1,)):
             raise ValueError(f"frames has a batch of {batch}: expected one set of frames")
         phase, expected = _check.real_array("phase", phase), (self.sensor.pupil.n_points,)

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs._arrays import Kind, read_only
 from zwfs._propagator import square
-from zwfs.modes import check_modes
 from zwfs.polychromatic import PolychromaticSensor
 from zwfs.reconstructors.base import ClosedForm, check_frames, check_phase
 from zwfs.sensor import ZernikeSensor
@@ -82,7 +81,7 @@ class Linear(ClosedForm):
         calibration: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
     ) -> None:
         super().__init__(sensor, amplitude=amplitude)
-        self._modes = check_modes(sensor.pupil, modes)
+        self._modes = _check.modes("modes", modes, sensor.pupil)
         poke = _check.number("poke", poke, 1e-10, np.pi)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
         flat = np.zeros(sensor.pupil.shape) if reference is None else reference

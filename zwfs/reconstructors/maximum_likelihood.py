@@ -16,7 +16,7 @@ from zwfs._arrays import Kind, read_only
 from zwfs._information import Inverse, Response
 from zwfs._likelihood import Estimator, Noise, require_information, require_one_wavelength, tangents
 from zwfs._propagator import Propagator, angle, parts_sum, split, square
-from zwfs.modes import check_modes, power_law_screens, zernike_basis
+from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.polychromatic import PolychromaticSensor
 from zwfs.reconstructors.arcsine import Arcsine
 from zwfs.reconstructors.base import FixedPoint, Reconstruction, Reconstructor, Solution, pieces
@@ -247,7 +247,7 @@ class MaximumLikelihood(Reconstructor):
             require_one_wavelength(sensor)
         require_information(sensor, unknown)
         pupil = sensor.pupil
-        values = None if modes is None else check_modes(pupil, modes)
+        values = None if modes is None else _check.modes("modes", modes, pupil)
         basis = None if values is None else read_only(pupil.scatter(values, fill=0))
         precision = _precision(prior, values, noise)
         rough = sensor.with_tolerance(max(_COARSE, sensor.tolerance))

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind, for_each, per_kind
+from zwfs._lowrank import split_core
 from zwfs._propagator import Propagator, count, square, turn, with_piston_of
-from zwfs.lowrank import split_core
 from zwfs.reconstructors._acceleration import Acceleration, Path, dimming
 from zwfs.reconstructors.base import Estimate, FixedPoint, Solution
 from zwfs.sensor import ZernikeSensor

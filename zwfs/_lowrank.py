@@ -218,7 +218,7 @@ def split_core(core: NDArray[np.complex128]) -> NDArray[np.float64]:
     Examples
     --------
     >>> import numpy as np, zwfs
-    >>> zwfs.lowrank.split_core(np.array([[[1 + 2j]]])).shape
+    >>> zwfs._lowrank.split_core(np.array([[[1 + 2j]]])).shape
     (2, 2)
     """
     block = np.block([[core.real, -core.imag], [core.imag, core.real]])
@@ -270,7 +270,7 @@ def factorise(
     >>> pupil = zwfs.Pupil.circular(32)
     >>> dimple = zwfs.Dimple(1.06, np.pi / 2)
     >>> axes = pupil.y, pupil.x
-    >>> factors = zwfs.lowrank.factorise([dimple], axes, axes, pupil.n_pixels**-2, tolerance=1e-6)
+    >>> factors = zwfs._lowrank.factorise([dimple], axes, axes, pupil.n_pixels**-2, tolerance=1e-6)
     >>> factors.core.shape
     (1, 17, 17)
     """
@@ -356,7 +356,7 @@ def _warn_of_quadrature(index: int, mask: Mask, error: float, tolerance: float) 
         "of its quadrature: name circles at which it jumps in `breaks`, or raise `n_samples` (now "
         f"{mask.n_samples})",
         UserWarning,
-        stacklevel=4,  # the caller of the sensor
+        stacklevel=5,  # the caller of the sensor, beyond the end of its constructor
     )
 
 
@@ -376,7 +376,7 @@ def gauss_legendre(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
     Examples
     --------
-    >>> from zwfs.lowrank import gauss_legendre
+    >>> from zwfs._lowrank import gauss_legendre
     >>> gauss_legendre(1)
     (array([0.]), array([2.]))
     """

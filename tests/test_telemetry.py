@@ -13,6 +13,7 @@ import sys
 import time
 import tracemalloc
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -331,8 +332,10 @@ def test_coefficients_go_to_the_table(folder, bench, calibration):
         assert units[0].data is None
         np.testing.assert_allclose(units["FRAMES"].data["COEFFS"], expected, rtol=1e-6)
         assert (units["FRAMES"].data["SIGCOEFF"] > 0).all()
-    reconstruct("cube.fits", calibration, "both.fits", modes=6, phases=True)
-    assert fits.getdata("both.fits").shape[0] == 12
+    reconstruct("cube.fits", calibration, "both.fits", modes=6, phases=True, photons=1e4)
+    with fits.open("both.fits") as units:
+        assert units[0].data.shape[0] == units["SIGMA"].data.shape[0] == 12
+        assert all((units["FRAMES"].data[name] > 0).all() for name in ("SIGMA", "SIGCOEFF"))
 
 
 def test_frames_between_bad_ones_stay_and_none_is_left_out(folder, bench, calibration):
@@ -685,6 +688,51 @@ def test_command_calibrates_and_reconstructs(folder, capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["reconstruct"])
     assert stopped.value.code == 2
+
+
+# Options of the command that exclude no other, with other values than their defaults.
+RECONSTRUCT = [
+    "--modes 5", "--modes 5 --phases", "--photons 1e4", "--photons 1e4 --read-noise 3", "--keywords EXPTIME BUNIT",
+    "--saturation 60000", "--largest-residual 0.5", "--workers 1", "--restart", "--overwrite", "--strict", "--quiet",
+]  # fmt: skip
+CALIBRATE = [
+    "--dark dark.fits", "--bad-pixels bad.npy", "--diameter 1.1", "--phase-shifts 1.5 -1.5", "--no-registration",
+    "--pupil-centers 27.5 27.5 27.5 83.5 --pupil-diameter 40", "--exposure 1.1", "--saturation 60000",
+    "--fit registration", "--iterations 10", "--tolerance 0.01",
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", list(combinations(RECONSTRUCT, 2)), ids=" ".join)
+def test_every_pair_of_options_reconstructs(folder, bench, pair):
+    fits.PrimaryHDU(bench.frames[:2], fits.Header(OPTICS | {"EXPTIME": 0.01})).writeto("two.fits")
+    options = " ".join(pair)
+    files = ["two.fits", "--calibration", "bench.npz", "--output", "phase.fits"]
+    assert main(["reconstruct", *files, *options.split()]) == 0
+    with fits.open("phase.fits") as units:
+        units.verify("exception")
+        table = units["FRAMES"].data
+        modes, photons = "--modes" in options, "--photons" in options
+        phases = not modes or "--phases" in options
+        assert (units[0].data is not None) == phases
+        assert ("SIGMA" in units) == ("SIGMA" in table.names) == (phases and photons)
+        assert ("SIGCOEFF" in table.names) == (modes and photons)
+        assert ("COEFFS" in table.names) == modes
+        assert ("EXPTIME" in table.names) == ("--keywords" in options)
+        for name in {"SIGMA", "SIGCOEFF", "COEFFS"} & set(table.names):
+            assert np.isfinite(table[name]).all()
+        if phases and photons:
+            rms_sigma = np.sqrt(np.nanmean(units["SIGMA"].data ** 2, axis=(1, 2)))
+            np.testing.assert_allclose(table["SIGMA"], rms_sigma, rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", list(combinations(CALIBRATE, 2)), ids=" ".join)
+def test_every_pair_of_options_calibrates(folder, bench, pair):
+    np.save("bad.npy", np.zeros(bench.flat.shape))
+    files = ["--frames", "frame.fits", "--pupils", "pupils.fits"]
+    assert main(["calibrate", "new.npz", *files, *" ".join(pair).split()]) == 0
+    assert np.isfinite(Calibration.load("new.npz")(bench.frames[:1]).flux).all()
 
 
 def test_command_explains_itself(tmp_path):

@@ -231,7 +231,7 @@ class _Job:
         if level != np.inf:
             level = _check.number("saturation", level, 0, open_low=True)
         columns = _columns(stack, keywords)
-        rows = _row_type(columns, None if modes is None else len(modes), photons is not None)
+        rows = _row_type(columns, None if modes is None else len(modes), phases, photons is not None)
         of_files = np.dtype(
             [("NAME", f"S{max(len(_ascii(one.name)) for one in stack.segments)}"), ("FRAMES", ">i8")]
         )
@@ -402,12 +402,14 @@ def _columns(stack: Stack, keywords: Any) -> dict[str, NDArray]:
     return columns
 
 
-def _row_type(keywords: dict[str, NDArray], n_modes: int | None, errors: bool) -> np.dtype:
+def _row_type(keywords: dict[str, NDArray], n_modes: int | None, phases: bool, errors: bool) -> np.dtype:
     """Type of the rows of the table."""
     columns: list[tuple] = [("FRAME", ">i8"), ("FILE", ">i4"), ("INDEX", ">i8"), ("FLAGS", ">i2"), ("FLUX", ">f4"),
                ("RESIDUAL", ">f4"), ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4")]  # fmt: skip
-    if errors:
-        columns += [("SIGMA", ">f4")] if n_modes is None else [("SIGCOEFF", ">f4", (n_modes,))]
+    if errors and phases:
+        columns.append(("SIGMA", ">f4"))
+    if errors and n_modes is not None:
+        columns.append(("SIGCOEFF", ">f4", (n_modes,)))
     if n_modes is not None:
         columns.append(("COEFFS", ">f4", (n_modes,)))
     for name, values in keywords.items():

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from zwfs import _check
 from zwfs._files import is_there, path_of, paths_of, write_file
 from zwfs.frames._fits import FIRST_BYTES, SCALING, TYPES, fits_content, fits_module, full_scale, has_card
+from zwfs.frames._part import scratch_of
 from zwfs.frames.pipeline import MeasuredPhase, Optics
 from zwfs.frames.registration import Image, nearest_good
 
@@ -311,7 +312,7 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     output : str or Path
         May be an earlier phase map, which is recognised by its header.
     inputs : sequence of str or Path
-        Files that are never replaced: camera frames, darks, and the like.
+        Files that are never replaced: camera frames, darks, the calibration, and the like.
     overwrite : bool
         Whether `output` may also be a file that is not a phase map; it may never be an input.
 
@@ -324,7 +325,7 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     ------
     TypeError, ValueError
         If `output` is one of the inputs, also under another name or as a hard link, is a file that `write_phase`
-        did not write, is a folder, or cannot be written.
+        did not write, is a folder, or cannot be written, or if an input lies in its scratch folder.
 
     Examples
     --------
@@ -348,6 +349,8 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     for source in sources:
         if there and os.path.exists(source) and os.path.samefile(path, source):
             raise ValueError(f"{named} is the input {str(source)!r}: expected another file")
+        if scratch_of(path) in source.resolve().parents:
+            raise ValueError(f"{named}: its scratch folder holds the input {str(source)!r}: expected another file")
     if there and not path.is_file():
         raise ValueError(f"{named}: expected a file, not a folder or a device")
     if there and not overwrite and not has_card(path, _PHASE_CARD):

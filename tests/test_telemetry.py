@@ -171,6 +171,18 @@ def rewritten(path, **changes):
     np.savez(path, **(arrays | {"values": np.array(json.dumps(values))}))
 
 
+def of_newer_zip(content):
+    """The same file, damaged in the byte that holds the version of ZIP that it needs."""
+    place = content.index(b"PK\1\2") + 6
+    return content[:place] + bytes([75]) + content[place + 1 :]
+
+
+def rewritten_array(path, name, change):
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **(arrays | {name: arrays[name] + change}))
+
+
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
@@ -178,8 +190,10 @@ def rewritten(path, **changes):
         (lambda path: path.write_bytes(pickle.dumps([1, 2])), "bench.npz: expected a calibration"),
         (lambda path: path.write_bytes(path.read_bytes()[:5000]), "bench.npz: expected a calibration"),
         (lambda path: np.savez(path, x=np.ones(3)), "bench.npz: expected a calibration"),
+        (lambda path: path.write_bytes(of_newer_zip(path.read_bytes())), "bench.npz: expected a calibration"),
         (lambda path: rewritten(path, format=99), "bench.npz: a calibration of format 99: expected format 1"),
         (lambda path: rewritten(path, n_iterations="many"), "bench.npz: a broken calibration: n_iterations"),
+        (lambda path: rewritten_array(path, "offset", -1e20), "bench.npz: a broken calibration: .*hold no light"),
         (lambda path: rewritten(path, surplus=1), "bench.npz: a broken calibration"),
         (lambda path: np.savez(path, values=np.array([{}]), places=0), "bench.npz: a broken calibration: Object"),
     ],
@@ -189,6 +203,26 @@ def test_file_that_is_no_calibration_is_named(folder, break_it, message):
     with pytest.raises(FileError, match=message):
         reconstruct("cube.fits", "bench.npz", "phase.fits")
     assert not list(folder.glob("*phase*"))
+
+
+SPOIL = {
+    "dark beyond all counts": ("dark.fits", lambda image: image + 1e38),
+    "bad half of the dark": ("dark.fits", lambda image: np.where(np.arange(112) < 56, np.nan, image)),
+    "bad half of the map": ("map.fits", lambda image: np.arange(112) + 0 * image < 56),
+    "frames without light": ("frame.fits", lambda image: 0 * image),
+    "equal phase shifts": ("frame.fits", lambda image: image),
+}
+
+
+@pytest.mark.parametrize("kind", SPOIL)
+def test_refusal_of_a_calibration_names_the_bad_file(folder, bench, kind):
+    name, spoil = SPOIL[kind]
+    fits.PrimaryHDU(np.zeros(bench.flat.shape)).writeto("map.fits")
+    header = fits.Header(OPTICS | ({"THETA2": 1e-30} if kind == "equal phase shifts" else {}))
+    image = spoil(fits.getdata(name).astype(float))
+    fits.PrimaryHDU(image.astype(float), header).writeto(name, overwrite=True)
+    with pytest.raises(ValueError, match=name):
+        calibrate(["frame.fits"], ["pupils.fits"], ["dark.fits"], ["map.fits"])
 
 
 def test_calibration_replaces_no_other_file(folder, calibration):
@@ -606,9 +640,10 @@ def test_failure_before_the_first_chunk_keeps_nothing(folder, monkeypatch):
     def fail(*_, **__):
         raise Stopped
 
+    calibration = Calibration.load("bench.npz")
     monkeypatch.setattr(Calibration, "__call__", fail)
     with pytest.raises(Stopped):
-        reconstruct("cube.fits", Calibration.load("bench.npz"), "phase.fits")
+        reconstruct("cube.fits", calibration, "phase.fits")
     assert not list(folder.glob("*phase.fits*"))
     assert not list(folder.glob(".*"))
 
@@ -969,16 +1004,22 @@ def test_command_that_is_stopped_goes_on_to_the_same_bytes(folder, bench, calibr
     assert Path("phase.fits").read_bytes() == Path("whole.fits").read_bytes()
 
 
-def test_full_disk_is_one_message_and_keeps_nothing(folder):
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("reconstruct cube.fits --calibration bench.npz -o full",
+         "error: output = '.*/full' cannot be written .File too large.: expected .*\n"),
+        ("calibrate full --frames frame.fits --pupils pupils.fits", "error: full: File too large\n"),
+    ],
+)  # fmt: skip
+def test_full_disk_is_one_message_and_keeps_nothing(folder, arguments, message):
     shown = subprocess.run(
-        ["bash", "-c", f"ulimit -f 40; exec '{sys.executable}' -m zwfs.frames reconstruct cube.fits "
-         "--calibration bench.npz -o phase.fits"],
+        ["bash", "-c", f"ulimit -f 40; exec '{sys.executable}' -m zwfs.frames {arguments}"],
         cwd=folder, capture_output=True, text=True,
     )  # fmt: skip
     assert shown.returncode == 1
-    assert "phase.fits' cannot be written (File too large): expected" in shown.stderr
-    assert "Traceback" not in shown.stderr
-    assert not list(folder.glob("*phase.fits*"))
+    assert re.fullmatch(message, shown.stderr)
+    assert not list(folder.glob("*full*"))
     assert not list(folder.glob(".*"))
 
 

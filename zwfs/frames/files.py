@@ -294,8 +294,9 @@ def images(
             counts = counts - dark
         bad |= ~_usable(counts) | (marked != 0)
         if bad.all():
+            names = ", ".join([file.name, *(one.name for one in (*darks, *bad_pixels))])
             raise ValueError(
-                f"{file.name}: all pixels are bad or saturated (saturation = {level:g}): expected an image"
+                f"{names}: all pixels are bad or saturated (saturation = {level:g}): expected an image"
             )
         name = file.name if len(file.images) == 1 else f"{file.name}[{len(result)}]"
         result.append(Image(nearest_good(counts, ~bad), bad, name))

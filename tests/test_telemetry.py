@@ -192,6 +192,7 @@ def rewritten_array(path, name, change):
         (lambda path: np.savez(path, x=np.ones(3)), "bench.npz: expected a calibration"),
         (lambda path: path.write_bytes(of_newer_zip(path.read_bytes())), "bench.npz: expected a calibration"),
         (lambda path: rewritten(path, format=99), "bench.npz: a calibration of format 99: expected format 1"),
+        (lambda path: rewritten(path, saturation=0), "bench.npz: a broken calibration: saturation = 0"),
         (lambda path: rewritten(path, n_iterations="many"), "bench.npz: a broken calibration: n_iterations"),
         (lambda path: rewritten_array(path, "offset", -1e20), "bench.npz: a broken calibration: .*hold no light"),
         (lambda path: rewritten(path, surplus=1), "bench.npz: a broken calibration"),

@@ -769,18 +769,18 @@ def _is_calibration(path: Path) -> bool:
         return False
 
 
-def _limit(name: str, value: Any) -> float:
+def _limit(name: str, value: Any, *, open_low: bool = False) -> float:
     """Return a number of at least 0, or infinity."""
     if isinstance(value, float) and value == np.inf:
         return value
-    return _check.number(name, value, 0)
+    return _check.number(name, value, 0, open_low=open_low)
 
 
 def _check_settings(n_iterations: Any, tolerance: Any, saturation: Any) -> None:
     """Check the numbers that a calibration keeps."""
     _check.integer("n_iterations", n_iterations, 1)
     _check.number("tolerance", tolerance, 0, 2 * np.pi)
-    _limit("saturation", saturation)
+    _limit("saturation", saturation, open_low=True)
 
 
 def _dark(dark: ArrayLike | None, shape: tuple[int, int, int]) -> NDArray[np.float32]:

@@ -1,5 +1,6 @@
 import csv
 import io
+import os
 import pickle
 
 import matplotlib
@@ -67,6 +68,15 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
         write_file(file, "text")
     assert file.read_bytes() == b"second"
     assert list(file.parent.iterdir()) == [file]
+
+
+def test_a_file_is_not_written_through_a_link(tmp_path):
+    (tmp_path / "raw").write_bytes(b"raw")
+    (tmp_path / f".data.{os.getpid()}").symlink_to("raw")
+    (tmp_path / "data").symlink_to("raw")
+    write_file(tmp_path / "data", b"new")
+    assert (tmp_path / "raw").read_bytes() == b"raw"
+    assert (tmp_path / "data").read_bytes() == b"new"
 
 
 def test_png_has_200_dots_per_inch(figure, tmp_path, monkeypatch):

@@ -7,12 +7,16 @@ import os
 import pickle
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
 import time
 import tracemalloc
+import warnings
+from contextlib import nullcontext
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -167,6 +171,18 @@ def rewritten(path, **changes):
     np.savez(path, **(arrays | {"values": np.array(json.dumps(values))}))
 
 
+def of_newer_zip(content):
+    """The same file, damaged in the byte that holds the version of ZIP that it needs."""
+    place = content.index(b"PK\1\2") + 6
+    return content[:place] + bytes([75]) + content[place + 1 :]
+
+
+def rewritten_array(path, name, change):
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **(arrays | {name: arrays[name] + change}))
+
+
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
@@ -174,8 +190,11 @@ def rewritten(path, **changes):
         (lambda path: path.write_bytes(pickle.dumps([1, 2])), "bench.npz: expected a calibration"),
         (lambda path: path.write_bytes(path.read_bytes()[:5000]), "bench.npz: expected a calibration"),
         (lambda path: np.savez(path, x=np.ones(3)), "bench.npz: expected a calibration"),
+        (lambda path: path.write_bytes(of_newer_zip(path.read_bytes())), "bench.npz: expected a calibration"),
         (lambda path: rewritten(path, format=99), "bench.npz: a calibration of format 99: expected format 1"),
+        (lambda path: rewritten(path, saturation=0), "bench.npz: a broken calibration: saturation = 0"),
         (lambda path: rewritten(path, n_iterations="many"), "bench.npz: a broken calibration: n_iterations"),
+        (lambda path: rewritten_array(path, "offset", -1e20), "bench.npz: a broken calibration: .*hold no light"),
         (lambda path: rewritten(path, surplus=1), "bench.npz: a broken calibration"),
         (lambda path: np.savez(path, values=np.array([{}]), places=0), "bench.npz: a broken calibration: Object"),
     ],
@@ -185,6 +204,26 @@ def test_file_that_is_no_calibration_is_named(folder, break_it, message):
     with pytest.raises(FileError, match=message):
         reconstruct("cube.fits", "bench.npz", "phase.fits")
     assert not list(folder.glob("*phase*"))
+
+
+SPOIL = {
+    "dark beyond all counts": ("dark.fits", lambda image: image + 1e38),
+    "bad half of the dark": ("dark.fits", lambda image: np.where(np.arange(112) < 56, np.nan, image)),
+    "bad half of the map": ("map.fits", lambda image: np.arange(112) + 0 * image < 56),
+    "frames without light": ("frame.fits", lambda image: 0 * image),
+    "equal phase shifts": ("frame.fits", lambda image: image),
+}
+
+
+@pytest.mark.parametrize("kind", SPOIL)
+def test_refusal_of_a_calibration_names_the_bad_file(folder, bench, kind):
+    name, spoil = SPOIL[kind]
+    fits.PrimaryHDU(np.zeros(bench.flat.shape)).writeto("map.fits")
+    header = fits.Header(OPTICS | ({"THETA2": 1e-30} if kind == "equal phase shifts" else {}))
+    image = spoil(fits.getdata(name).astype(float))
+    fits.PrimaryHDU(image.astype(float), header).writeto(name, overwrite=True)
+    with pytest.raises(ValueError, match=name):
+        calibrate(["frame.fits"], ["pupils.fits"], ["dark.fits"], ["map.fits"])
 
 
 def test_calibration_replaces_no_other_file(folder, calibration):
@@ -331,8 +370,10 @@ def test_coefficients_go_to_the_table(folder, bench, calibration):
         assert units[0].data is None
         np.testing.assert_allclose(units["FRAMES"].data["COEFFS"], expected, rtol=1e-6)
         assert (units["FRAMES"].data["SIGCOEFF"] > 0).all()
-    reconstruct("cube.fits", calibration, "both.fits", modes=6, phases=True)
-    assert fits.getdata("both.fits").shape[0] == 12
+    reconstruct("cube.fits", calibration, "both.fits", modes=6, phases=True, photons=1e4)
+    with fits.open("both.fits") as units:
+        assert units[0].data.shape[0] == units["SIGMA"].data.shape[0] == 12
+        assert all((units["FRAMES"].data[name] > 0).all() for name in ("SIGMA", "SIGCOEFF"))
 
 
 def test_frames_between_bad_ones_stay_and_none_is_left_out(folder, bench, calibration):
@@ -377,14 +418,15 @@ def test_interrupted_run_goes_on_to_the_same_bytes(folder, monkeypatch, spoil):
     with pytest.raises(Stopped):
         reconstruct("cube.fits", "bench.npz", "phase.fits", n_workers=1, progress=stop_after(5))
     assert not Path("phase.fits").exists()
-    part = Path(".phase.fits.part")
+    part = Path(".phase.fits.part", "data")
     if spoil:  # as a crash of the machine may
         content = bytearray(part.read_bytes())
         content[2880 * 2 : 2880 * 4] = bytes(2 * 2880)
         part.write_bytes(content)
-        with Path(".phase.fits.journal").open("a") as file:
+        with Path(".phase.fits.part", "journal").open("a") as file:
             file.write("10 1")
-    found = reconstruct("cube.fits", "bench.npz", "phase.fits", n_workers=2)
+    with pytest.warns(UserWarning, match="journal: 1 of 1 lines") if spoil else nullcontext():
+        found = reconstruct("cube.fits", "bench.npz", "phase.fits", n_workers=2)
     assert (found.n_resumed > 0) != spoil
     assert Path("phase.fits").read_bytes() == Path("whole.fits").read_bytes()
     assert not list(folder.glob(".*"))
@@ -403,13 +445,206 @@ def test_part_of_another_run_is_not_taken_over(folder, monkeypatch, bench):
     assert not list(folder.glob(".*"))
 
 
+def interrupted(name="phase.fits"):
+    """Scratch folder of a run that was stopped after its first two pieces, of 3 and 3 of 12 frames."""
+    with pytest.raises(Stopped):
+        reconstruct("cube.fits", "bench.npz", name, n_workers=1, progress=stop_after(6))
+    return Path(f".{name}.part")
+
+
+DAMAGE = {
+    "far beyond the end": b"0 99999999999 5\n",
+    "before the start": b"-256 0 0\n",
+    "beyond all numbers": b"0 " + b"9" * 60 + b" 1\n",
+    "part of a piece": b"6 7 0\n",
+    "no numbers": b"\xff\x00 rows\n",
+    "cut": b"6 9 12",
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_damaged_journal_costs_only_what_it_does_not_list(folder, monkeypatch, kind):
+    small_chunks(monkeypatch, 3)
+    reconstruct("cube.fits", "bench.npz", "whole.fits")
+    journal = interrupted() / "journal"
+    with journal.open("ab") as file:
+        file.write(DAMAGE[kind])
+    named = pytest.warns(UserWarning, match=r"phase\.fits\.part/journal: 1 of \d lines")
+    with nullcontext() if kind == "cut" else named, pytest.raises(Stopped):
+        reconstruct("cube.fits", "bench.npz", "phase.fits", n_workers=1, progress=stop_after(9))
+    assert reconstruct("cube.fits", "bench.npz", "phase.fits").n_resumed >= 9  # that of the second run, too
+    assert Path("phase.fits").read_bytes() == Path("whole.fits").read_bytes()
+
+
+@pytest.mark.parametrize("n_bytes", [0, 30, 4000])
+def test_cut_scratch_file_is_written_again(folder, monkeypatch, n_bytes):
+    small_chunks(monkeypatch, 3)
+    reconstruct("cube.fits", "bench.npz", "whole.fits")
+    for name in ("journal", "data"):
+        os.truncate(interrupted() / name, n_bytes)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            reconstruct("cube.fits", "bench.npz", "phase.fits", restart=name == "journal" and n_bytes > 65)
+        assert Path("phase.fits").read_bytes() == Path("whole.fits").read_bytes()
+
+
+# Files of other people
+
+
+def left_alone(names):
+    return {name: Path(name).read_bytes() for name in names}
+
+
+@pytest.mark.parametrize("settings", [{}, {"overwrite": True, "restart": True}])
+@pytest.mark.parametrize("as_input", [False, True])
+def test_raw_data_named_like_scratch_files_stay(folder, settings, as_input):
+    for name in (".phase.fits.part", ".phase.fits.journal"):
+        shutil.copy("cube.fits", name)
+        before = left_alone([name, "cube.fits"])
+        frames = name if as_input else "cube.fits"
+        if name.endswith("part"):
+            with pytest.raises(ValueError, match=r"needs the folder \.phase\.fits\.part, which is there"):
+                reconstruct(frames, "bench.npz", "phase.fits", **settings)
+            os.remove(name)
+        else:
+            assert reconstruct(frames, "bench.npz", "phase.fits", **settings).n_flagged == 0
+        assert left_alone(set(before) - {".phase.fits.part"}).items() <= before.items()
+
+
+def a_link_to_a_file(scratch):
+    scratch.symlink_to("cube.fits")
+
+
+def a_link_to_nothing(scratch):
+    scratch.symlink_to("nowhere")
+
+
+def a_link_to_a_scratch_folder(scratch):
+    interrupted().rename("mine")
+    scratch.symlink_to("mine")
+
+
+def a_file(scratch):
+    scratch.write_bytes(b"raw data")
+
+
+def a_folder_without_marker(scratch):
+    scratch.mkdir()
+    shutil.copy("cube.fits", scratch / "data")
+
+
+def a_folder_of_another_output(scratch):
+    interrupted("other.fits").rename(scratch)
+
+
+def a_folder_with_a_pipe_as_marker(scratch):
+    scratch.mkdir()
+    os.mkfifo(scratch / "output")
+
+
+@pytest.mark.parametrize("settings", [{}, {"overwrite": True, "restart": True}])
+@pytest.mark.parametrize(
+    "put",
+    [
+        a_link_to_a_file, a_link_to_nothing, a_link_to_a_scratch_folder, a_file, a_folder_without_marker,
+        a_folder_of_another_output, a_folder_with_a_pipe_as_marker,
+    ],
+)  # fmt: skip
+def test_foreign_scratch_folder_is_refused_and_stays(folder, monkeypatch, put, settings):
+    small_chunks(monkeypatch, 3)
+    put(Path(".phase.fits.part"))
+    names = [path for path in folder.rglob("*") if path.is_file()]
+    before = left_alone(names)
+    with pytest.raises(ValueError, match=r"needs the folder \.phase\.fits\.part, which is there"):
+        reconstruct("cube.fits", "bench.npz", "phase.fits", **settings)
+    assert left_alone(names) == before
+    assert not os.path.lexists("nowhere")
+    assert not os.path.lexists("phase.fits")
+
+
+@pytest.mark.parametrize("settings", [{}, {"overwrite": True, "restart": True}])
+@pytest.mark.parametrize("link", [os.symlink, os.link])
+@pytest.mark.parametrize("name", ["data", "journal", "output"])
+def test_link_in_the_scratch_folder_leads_nowhere(folder, monkeypatch, name, link, settings):
+    small_chunks(monkeypatch, 3)
+    victim = folder / "cube.fits"
+    scratch = interrupted()
+    os.remove(scratch / name)
+    link(victim, scratch / name)
+    before = left_alone([victim])
+    with pytest.raises(ValueError, match=rf"its file '{name}' is a link"):
+        reconstruct("cube.fits", "bench.npz", "phase.fits", **settings)
+    assert left_alone([victim]) == before
+
+
+def test_scratch_folder_of_another_user_is_refused(folder, monkeypatch):
+    small_chunks(monkeypatch, 3)
+    scratch = interrupted()
+    assert scratch.stat().st_mode & 0o777 == 0o700
+    monkeypatch.setattr(os, "geteuid", lambda: scratch.stat().st_uid + 1)
+    with pytest.raises(ValueError, match="it belongs to another user"):
+        reconstruct("cube.fits", "bench.npz", "phase.fits", restart=True)
+
+
+def test_input_in_the_scratch_folder_is_refused(folder, monkeypatch):
+    small_chunks(monkeypatch, 3)
+    raw = interrupted() / "data"
+    shutil.copy("cube.fits", raw)
+    Path("link.fits").symlink_to(raw)
+    before = left_alone([raw])
+    for name in (raw, "link.fits"):
+        with pytest.raises(ValueError, match="its scratch folder holds the input"):
+            reconstruct(name, "bench.npz", "phase.fits", restart=True, overwrite=True)
+    assert left_alone([raw]) == before
+
+
+@pytest.mark.parametrize("way", ["itself", "symbolic link", "hard link", "link as output"])
+@pytest.mark.parametrize("role", ["frames", "second frames", "calibration"])
+def test_overwrite_replaces_no_input_and_no_calibration(folder, way, role):
+    names = {"frames": "cube.fits", "second frames": "frame.fits", "calibration": "bench.npz"}
+    target = names[role]
+    before, output = left_alone(names.values()), target
+    if way != "itself":
+        (os.link if way == "hard link" else os.symlink)(folder / target, "other")
+        if way == "link as output":
+            output = "other"
+        else:
+            names[role] = "other"
+    with pytest.raises(ValueError, match=f"output = '{output}' is the input '{names[role]}'"):
+        reconstruct(
+            names["frames"], names["calibration"], output, second_frames=names["second frames"], overwrite=True
+        )
+    assert left_alone(before) == before
+
+
+def test_only_overwrite_replaces_a_foreign_output(folder):
+    Path("phase.fits").write_bytes(b"mine")
+    with pytest.raises(ValueError, match="exists and is not a phase map of zwfs"):
+        reconstruct("cube.fits", "bench.npz", "phase.fits")
+    assert Path("phase.fits").read_bytes() == b"mine"
+    assert reconstruct("cube.fits", "bench.npz", "phase.fits", overwrite=True).n_frames == 12
+    assert reconstruct("cube.fits", "bench.npz", "phase.fits").n_frames == 12
+
+
+def test_foreign_output_that_appears_during_the_run_stays(folder):
+    def progress(done, total):
+        Path("phase.fits").write_bytes(b"mine")
+
+    with pytest.raises(ValueError, match="exists and is not a phase map of zwfs"):
+        reconstruct("cube.fits", "bench.npz", "phase.fits", progress=progress)
+    assert Path("phase.fits").read_bytes() == b"mine"
+    os.remove("phase.fits")
+    assert reconstruct("cube.fits", "bench.npz", "phase.fits").n_resumed == 12
+
+
 def test_failure_before_the_first_chunk_keeps_nothing(folder, monkeypatch):
     def fail(*_, **__):
         raise Stopped
 
+    calibration = Calibration.load("bench.npz")
     monkeypatch.setattr(Calibration, "__call__", fail)
     with pytest.raises(Stopped):
-        reconstruct("cube.fits", Calibration.load("bench.npz"), "phase.fits")
+        reconstruct("cube.fits", calibration, "phase.fits")
     assert not list(folder.glob("*phase.fits*"))
     assert not list(folder.glob(".*"))
 
@@ -687,6 +922,52 @@ def test_command_calibrates_and_reconstructs(folder, capsys):
     assert stopped.value.code == 2
 
 
+# Options of the command that exclude no other, with other values than their defaults.
+RECONSTRUCT = [
+    "--modes 5", "--modes 5 --phases", "--photons 1e4", "--photons 1e4 --read-noise 3", "--keywords EXPTIME BUNIT",
+    "--saturation 60000", "--largest-residual 0.5", "--workers 1", "--restart", "--overwrite", "--strict",
+    "--quiet",
+]  # fmt: skip
+CALIBRATE = [
+    "--dark dark.fits", "--bad-pixels bad.npy", "--diameter 1.1", "--phase-shifts 1.5 -1.5", "--no-registration",
+    "--pupil-centers 27.5 27.5 27.5 83.5 --pupil-diameter 40", "--exposure 1.1", "--saturation 60000",
+    "--fit registration", "--iterations 10", "--tolerance 0.01",
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", list(combinations(RECONSTRUCT, 2)), ids=" ".join)
+def test_every_pair_of_options_reconstructs(folder, bench, pair):
+    fits.PrimaryHDU(bench.frames[:2], fits.Header(OPTICS | {"EXPTIME": 0.01})).writeto("two.fits")
+    options = " ".join(pair)
+    files = ["two.fits", "--calibration", "bench.npz", "--output", "phase.fits"]
+    assert main(["reconstruct", *files, *options.split()]) == 0
+    with fits.open("phase.fits") as units:
+        units.verify("exception")
+        table = units["FRAMES"].data
+        modes, photons = "--modes" in options, "--photons" in options
+        phases = not modes or "--phases" in options
+        assert (units[0].data is not None) == phases
+        assert ("SIGMA" in units) == ("SIGMA" in table.names) == (phases and photons)
+        assert ("SIGCOEFF" in table.names) == (modes and photons)
+        assert ("COEFFS" in table.names) == modes
+        assert ("EXPTIME" in table.names) == ("--keywords" in options)
+        for name in {"SIGMA", "SIGCOEFF", "COEFFS"} & set(table.names):
+            assert np.isfinite(table[name]).all()
+        if phases and photons:
+            rms_sigma = np.sqrt(np.nanmean(units["SIGMA"].data ** 2, axis=(1, 2)))
+            np.testing.assert_allclose(table["SIGMA"], rms_sigma, rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", list(combinations(CALIBRATE, 2)), ids=" ".join)
+def test_every_pair_of_options_calibrates(folder, bench, pair):
+    np.save("bad.npy", np.zeros(bench.flat.shape))
+    files = ["--frames", "frame.fits", "--pupils", "pupils.fits"]
+    assert main(["calibrate", "new.npz", *files, *" ".join(pair).split()]) == 0
+    assert np.isfinite(Calibration.load("new.npz")(bench.frames[:1]).flux).all()
+
+
 def test_command_explains_itself(tmp_path):
     for arguments in ((), ("calibrate",), ("reconstruct",)):
         shown = command(*arguments, "--help", cwd=tmp_path)
@@ -713,7 +994,7 @@ def test_command_that_is_stopped_goes_on_to_the_same_bytes(folder, bench, calibr
     arguments = ["reconstruct", "long.npy", "--calibration", "bench.npz", "-o"]
     reconstruct("long.npy", calibration, "whole.fits", saturation=65535)
     process = subprocess.Popen([sys.executable, "-c", SLOW, *arguments, "phase.fits"], cwd=folder)
-    journal = Path(".phase.fits.journal")
+    journal = Path(".phase.fits.part", "journal")
     while process.poll() is None and not (journal.exists() and len(journal.read_text().splitlines()) > 2):
         time.sleep(0.01)
     process.send_signal(number)
@@ -724,16 +1005,22 @@ def test_command_that_is_stopped_goes_on_to_the_same_bytes(folder, bench, calibr
     assert Path("phase.fits").read_bytes() == Path("whole.fits").read_bytes()
 
 
-def test_full_disk_is_one_message_and_keeps_nothing(folder):
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("reconstruct cube.fits --calibration bench.npz -o full",
+         "error: output = '.*/full' cannot be written .File too large.: expected .*\n"),
+        ("calibrate full --frames frame.fits --pupils pupils.fits", "error: full: File too large\n"),
+    ],
+)  # fmt: skip
+def test_full_disk_is_one_message_and_keeps_nothing(folder, arguments, message):
     shown = subprocess.run(
-        ["bash", "-c", f"ulimit -f 40; exec '{sys.executable}' -m zwfs.frames reconstruct cube.fits "
-         "--calibration bench.npz -o phase.fits"],
+        ["bash", "-c", f"ulimit -f 40; exec '{sys.executable}' -m zwfs.frames {arguments}"],
         cwd=folder, capture_output=True, text=True,
     )  # fmt: skip
     assert shown.returncode == 1
-    assert "phase.fits' cannot be written (File too large): expected" in shown.stderr
-    assert "Traceback" not in shown.stderr
-    assert not list(folder.glob("*phase.fits*"))
+    assert re.fullmatch(message, shown.stderr)
+    assert not list(folder.glob("*full*"))
     assert not list(folder.glob(".*"))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,23 @@ from zwfs import _check
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file, and its folder if need be, in one step: whoever looks sees the old one or all of the new."""
+    """Write a file, and its folder if need be, in one step: whoever looks sees the old one or all of the new.
+
+    Raises
+    ------
+    OSError
+        With the name of the file, also where a disk is full.
+    """
     _check.instance("path", path, Path)
     _check.instance("content", content, bytes)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        partial.write_bytes(content)
+        with partial.open("xb") as file:
+            file.write(content)
         os.replace(partial, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         partial.unlink(missing_ok=True)
 

@@ -1,14 +1,17 @@
 """A FITS file that is written piece by piece: it appears when it is complete, and an interrupted run goes on.
 
-The pieces go to their places in `.NAME.part`. A line of `.NAME.journal` follows each piece, with its checksum. The
-next run with the same plan takes over the pieces whose checksums are right, and writes the others.
+The scratch folder `.NAME.part` holds the pieces at their places in `data`, and a line with the checksum of each in
+`journal`. The next run with the same plan takes over the pieces whose checksums are right, and writes the others.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
+import stat
+import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -22,6 +25,8 @@ from numpy.typing import NDArray
 from zwfs.frames._fits import card_value, fits_module
 
 _BLOCK = 2880  # bytes: all parts of a FITS file are multiples of it
+_LINE = 80  # bytes that no line of a journal exceeds
+_MARKER = "output"  # file of a scratch folder that holds the name of the output
 _FORMATS = {"i2": "I", "i4": "J", "i8": "K", "f4": "E", "f8": "D", "S": "A"}  # of the columns of a table
 
 Cards = Sequence[tuple[str, Any, str]]
@@ -95,6 +100,87 @@ class Unit:
         return header.tostring().encode("ascii")
 
 
+def scratch_of(output: Path) -> Path:
+    """Return the path of the scratch folder of an output: fixed, so that the next run finds it."""
+    return output.with_name(f".{output.name}.part")
+
+
+class Scratch:
+    """Scratch folder of an output, with a marker. Files in it are opened without following links.
+
+    Parameters
+    ----------
+    output : Path
+
+    Raises
+    ------
+    ValueError
+        If something else has the name of the folder, or a file in it is a link: it could be data of the user.
+    """
+
+    def __init__(self, output: Path) -> None:
+        self._output, self.path = output, scratch_of(output)
+        new = not os.path.lexists(self.path)
+        if new:
+            self.path.mkdir(0o700)
+        try:
+            self.folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except OSError as error:
+            raise self._refusal(str(error.strerror)) from None
+        self._files = [self.folder]
+        try:
+            self._check_marker(new)
+        except BaseException:
+            if new:
+                self.remove()
+            self.close()
+            raise
+
+    def open(self, name: str, flags: int) -> int:
+        """Open a file of the folder until `close`, and return its descriptor."""
+        reason = f"its file {name!r} is a link or a device"
+        try:
+            file = os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666, dir_fd=self.folder)
+        except OSError as error:
+            if error.errno == errno.ELOOP:
+                raise self._refusal(reason) from None
+            raise
+        self._files.append(file)
+        status = os.fstat(file)
+        if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+            raise self._refusal(reason)
+        return file
+
+    def close(self) -> None:
+        """Close all files."""
+        while self._files:
+            os.close(self._files.pop())
+
+    def remove(self) -> None:
+        """Remove the folder and our files."""
+        for name in ("data", "journal", _MARKER):
+            with suppress(FileNotFoundError):
+                os.unlink(name, dir_fd=self.folder)
+        with suppress(OSError):  # a file of somebody else remains
+            self.path.rmdir()
+
+    def _check_marker(self, new: bool) -> None:
+        """Write the marker of a new folder, or check who owns the folder and what the marker says."""
+        name = os.fsencode(self._output.name)
+        if new:
+            os.write(self.open(_MARKER, os.O_WRONLY | os.O_CREAT | os.O_EXCL), name)
+        elif os.fstat(self.folder).st_uid != os.geteuid():
+            raise self._refusal("it belongs to another user")
+        elif _MARKER not in os.listdir(self.folder) or os.read(self.open(_MARKER, os.O_RDONLY), 999) != name:
+            raise self._refusal(f"its file {_MARKER!r} does not hold the name of the output")
+
+    def _refusal(self, reason: str) -> ValueError:
+        return ValueError(
+            f"output = {str(self._output)!r} needs the folder {self.path.name}, which is there and which zwfs did "
+            f"not make ({reason}): expected no such file or folder; move it, or choose another output"
+        )
+
+
 class Part:
     """Partial file of an output, open for pieces.
 
@@ -104,6 +190,8 @@ class Part:
         Where the complete file will be.
     units : sequence of Unit
         All data have a fixed place from the start.
+    pieces : sequence of (int, int)
+        First row of each piece, and the first row after it.
     plan : str
         All that decides the bytes of the output. A part of another plan is refused.
     restart : bool
@@ -112,16 +200,16 @@ class Part:
     Raises
     ------
     ValueError
-        If there is a part of another plan, or another process writes it.
+        If there is a part of another plan, another process writes it, or `Scratch` refuses its folder.
     OSError
         If there is not enough space; the message names the file and the bytes.
     """
 
-    def __init__(self, output: Path, units: Sequence[Unit], plan: str, restart: bool) -> None:
-        self.output, self.units = output, units
-        self._part = output.with_name(f".{output.name}.part")
-        self._journal = output.with_name(f".{output.name}.journal")
-        self._plan = hashlib.sha256(plan.encode()).hexdigest()
+    def __init__(
+        self, output: Path, units: Sequence[Unit], pieces: Sequence[tuple[int, int]], plan: str, restart: bool
+    ) -> None:
+        self.output, self.units, self.pieces = output, units, pieces
+        self._plan = hashlib.sha256(plan.encode()).hexdigest().encode()
         offset = 0
         for unit in units:
             unit.offset = offset + len(unit.header())
@@ -129,21 +217,25 @@ class Part:
         self._size = offset
         with self._no_space():
             output.parent.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(self._part, os.O_RDWR | os.O_CREAT, 0o666)
+            self._scratch = Scratch(output)
+        self._keep = True
         try:
-            self._lock()
-            self.done = {} if restart else self._earlier()
-            self._noted = bool(self.done)
-            if not self.done:
+            with self._no_space():
+                self._file = self._scratch.open("data", os.O_RDWR | os.O_CREAT)
+                self._lock()
+                self._journal = self._scratch.open("journal", os.O_RDWR | os.O_CREAT | os.O_APPEND)
+                self.done = {} if restart else self._earlier()
+                self._keep = bool(self.done)
                 self._begin()
         except BaseException:
-            os.close(self._file)
+            self.close()
             raise
 
     def write(self, unit: Unit, first: int, rows: NDArray) -> bytes:
         """Write rows of a unit to their place, and return their bytes."""
         content = np.ascontiguousarray(rows, unit.dtype).tobytes()
-        self._write(content, unit.offset + first * unit.row)
+        with self._no_space():
+            self._write(content, unit.offset + first * unit.row)
         return content
 
     def read(self, unit: Unit, first: int, stop: int) -> NDArray:
@@ -153,52 +245,54 @@ class Part:
 
     def note(self, first: int, stop: int, checksum: int) -> None:
         """Add a finished piece to the journal: rows of all units, and the checksum of their bytes."""
-        with self._no_space(), self._journal.open("a", encoding="ascii") as file:
-            file.write(f"{first} {stop} {checksum}\n")
-        self._noted = True
+        with self._no_space():
+            os.write(self._journal, b"%d %d %d\n" % (first, stop, checksum))
+        self._keep = True
 
     def finish(self) -> None:
         """Write the headers, and give the file its name."""
-        for unit in self.units:
-            header = unit.header()
-            self._write(header, unit.offset - len(header))
         with self._no_space():
+            self._write_headers()
             os.fsync(self._file)
-            os.replace(self._part, self.output)
-        self._remove()
+            os.replace("data", self.output, src_dir_fd=self._scratch.folder)
+        self._keep = False
 
     def close(self) -> None:
         """Close the part; it is removed unless it holds a finished piece."""
-        os.close(self._file)
-        if not self._noted:
-            self._remove()
+        if not self._keep:
+            self._scratch.remove()
+        self._scratch.close()
 
     def _lock(self) -> None:
-        with suppress(ImportError):  # there is no fcntl on Windows
-            import fcntl
+        import fcntl  # not on Windows, where calibrations work
 
-            try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise ValueError(f"output = {str(self.output)!r} is being written by another process") from None
-
-    def _earlier(self) -> dict[int, int]:
-        """First and last but one row of the pieces of an earlier run that are whole."""
         try:
-            plan, *lines = self._journal.read_text("ascii").splitlines()
-        except (OSError, ValueError):
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ValueError(f"output = {str(self.output)!r} is being written by another process") from None
+
+    def _earlier(self) -> dict[tuple[int, int], int]:
+        """Checksums of the whole pieces of an earlier run."""
+        plan, *lines = os.pread(self._journal, _LINE * (len(self.pieces) + 1), 0).split(b"\n")
+        if not lines:  # the first line was not written to its end
             return {}
         if plan != self._plan:
             raise ValueError(
-                f"{self._part.name} is part of a run with other frames, another calibration or other settings: "
-                "expected the same; restart to drop it, or choose another output"
+                f"{self._scratch.path.name} is part of a run with other frames, another calibration or other "
+                "settings: expected the same; restart to drop it, or choose another output"
             )
-        done = {}
-        for line in lines:
-            with suppress(ValueError):  # the last line may be cut
+        pieces, done = set(self.pieces), {}
+        for line in lines[:-1]:  # the last one is empty, or cut
+            with suppress(ValueError):
                 first, stop, checksum = map(int, line.split())
-                if self._checksum(first, stop) == checksum:
-                    done[first] = stop
+                if (first, stop) in pieces and self._checksum(first, stop) == checksum:
+                    done[first, stop] = checksum
+        if n_damaged := len(lines) - 1 - len(done):
+            warnings.warn(
+                f"{self._scratch.path / 'journal'}: {n_damaged} of {len(lines) - 1} lines or the data that they "
+                "describe are damaged: their frames are reconstructed again",
+                stacklevel=4,
+            )
         return done
 
     def _checksum(self, first: int, stop: int) -> int:
@@ -210,32 +304,27 @@ class Part:
         return checksum
 
     def _begin(self) -> None:
-        """Reserve the space, and write the headers and the first line of the journal."""
-        try:
-            with self._no_space():
-                os.ftruncate(self._file, 0)
-                if hasattr(os, "posix_fallocate"):
-                    os.posix_fallocate(self._file, 0, self._size)
-                else:
-                    os.ftruncate(self._file, self._size)
-                self._journal.write_text(f"{self._plan}\n", "ascii")
-            for unit in self.units:
-                header = unit.header()
-                self._write(header, unit.offset - len(header))
-        except BaseException:
-            self._remove()
-            raise
+        """Reserve the space, and write the headers and the journal of the pieces that are done."""
+        if not self.done:
+            os.ftruncate(self._file, 0)
+        os.ftruncate(self._file, self._size)
+        if hasattr(os, "posix_fallocate"):  # not on macOS
+            os.posix_fallocate(self._file, 0, self._size)
+        os.ftruncate(self._journal, 0)
+        rows = (b"%d %d %d\n" % (*piece, checksum) for piece, checksum in self.done.items())
+        os.write(self._journal, b"".join((self._plan + b"\n", *rows)))
+        self._write_headers()
 
-    def _remove(self) -> None:
-        self._part.unlink(missing_ok=True)
-        self._journal.unlink(missing_ok=True)
+    def _write_headers(self) -> None:
+        for unit in self.units:
+            header = unit.header()
+            self._write(header, unit.offset - len(header))
 
     def _write(self, content: bytes, place: int) -> None:
         view = memoryview(content)
-        with self._no_space():
-            while view:
-                n = os.pwrite(self._file, view, place)
-                view, place = view[n:], place + n
+        while view:
+            n = os.pwrite(self._file, view, place)
+            view, place = view[n:], place + n
 
     @contextmanager
     def _no_space(self) -> Iterator[None]:
@@ -245,7 +334,7 @@ class Part:
             raise OSError(
                 error.errno,
                 f"output = {str(self.output)!r} cannot be written ({error.strerror}): expected "
-                f"{getattr(self, '_size', 0)} bytes of free space in a folder that can be written",
+                f"{self._size} bytes of free space in a folder that can be written",
             ) from None
 
 

@@ -345,7 +345,8 @@ class Calibration(Immutable):
                 optics["phase_shifts"] = tuple(optics["phase_shifts"])
                 pairs: dict[str, Any] = {name: tuple(values.pop(name)) for name in ("center", "shape")}
                 made = cls(**values, **arrays, **pairs, optics=Optics(**optics))
-                made._work  # noqa: B018, every call needs it, and it fails where the values do not fit together
+                level = np.mean(made.background + made.unit * made.light)
+                made(np.squeeze(made.dark + level, 0) if made.n_images == 1 else made.dark + level)  # a trial
                 return made
         raise FileError(
             f"{path.name}: a calibration of format {found}: expected format {FORMAT}; make it again with this "
@@ -738,22 +739,24 @@ def calibrate(
     """
     _check_settings(n_iterations, tolerance, np.inf if saturation is None else saturation)
     frames, clear_frames, sources = read_all(frame_files, pupil_files, dark_files, bad_pixel_files, saturation)
-    optics = sources[0].optics(diameter, phase_shifts)
-    _check_fit("fitted", fitted, optics)
-    recording = record(frames, clear_frames, **settings)
-    recording, optics = fit(recording, optics, fitted)
+    header = sources[0].header
     first = len(frame_files) + len(pupil_files)
     darks = [image for source in sources[first : first + len(dark_files)] for image in source.images]
-    header = sources[0].header
-    level = sources[0].keyword("SATURATE") if saturation is None and "SATURATE" in header else saturation
-    return Calibration.of(
-        reduce_frames(recording, optics),
-        np.stack(darks) if darks else None,
-        saturation=np.inf if level is None else level,
-        bunit=str(header.get("BUNIT", "")),
-        n_iterations=n_iterations,
-        tolerance=tolerance,
-    )
+    try:
+        optics = sources[0].optics(diameter, phase_shifts)
+        _check_fit("fitted", fitted, optics)
+        recording, optics = fit(record(frames, clear_frames, **settings), optics, fitted)
+        level = sources[0].keyword("SATURATE") if saturation is None and "SATURATE" in header else saturation
+        return Calibration.of(
+            reduce_frames(recording, optics),
+            np.stack(darks) if darks else None,
+            saturation=np.inf if level is None else level,
+            bunit=str(header.get("BUNIT", "")),
+            n_iterations=n_iterations,
+            tolerance=tolerance,
+        )
+    except ValueError as error:  # any of the files can be the cause
+        raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
 
 
 def _is_calibration(path: Path) -> bool:
@@ -761,22 +764,22 @@ def _is_calibration(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as file:
             return "values.npy" in file.namelist() and "places.npy" in file.namelist()
-    except (OSError, zipfile.BadZipFile):
+    except Exception:  # zipfile raises many kinds on damaged bytes
         return False
 
 
-def _limit(name: str, value: Any) -> float:
+def _limit(name: str, value: Any, *, open_low: bool = False) -> float:
     """Return a number of at least 0, or infinity."""
     if isinstance(value, float) and value == np.inf:
         return value
-    return _check.number(name, value, 0)
+    return _check.number(name, value, 0, open_low=open_low)
 
 
 def _check_settings(n_iterations: Any, tolerance: Any, saturation: Any) -> None:
     """Check the numbers that a calibration keeps."""
     _check.integer("n_iterations", n_iterations, 1)
     _check.number("tolerance", tolerance, 0, 2 * np.pi)
-    _limit("saturation", saturation)
+    _limit("saturation", saturation, open_low=True)
 
 
 def _dark(dark: ArrayLike | None, shape: tuple[int, int, int]) -> NDArray[np.float32]:

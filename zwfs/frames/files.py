@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from zwfs import _check
 from zwfs._files import is_there, path_of, paths_of, write_file
 from zwfs.frames._fits import FIRST_BYTES, SCALING, TYPES, fits_content, fits_module, full_scale, has_card
+from zwfs.frames._part import scratch_of
 from zwfs.frames.pipeline import MeasuredPhase, Optics
 from zwfs.frames.registration import Image, nearest_good
 
@@ -295,8 +296,9 @@ def images(
             counts = counts - dark
         bad |= ~_usable(counts) | (marked != 0)
         if bad.all():
+            names = ", ".join([file.name, *(one.name for one in (*darks, *bad_pixels))])
             raise ValueError(
-                f"{file.name}: all pixels are bad or saturated (saturation = {level:g}): expected an image"
+                f"{names}: all pixels are bad or saturated (saturation = {level:g}): expected an image"
             )
         name = file.name if len(file.images) == 1 else f"{file.name}[{len(result)}]"
         result.append(Image(nearest_good(counts, ~bad), bad, name))
@@ -313,7 +315,7 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     output : str or Path
         May be an earlier phase map, which is recognised by its header.
     inputs : sequence of str or Path
-        Files that are never replaced: camera frames, darks, and the like.
+        Files that are never replaced: camera frames, darks, the calibration, and the like.
     overwrite : bool
         Whether `output` may also be a file that is not a phase map; it may never be an input.
 
@@ -326,7 +328,7 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     ------
     TypeError, ValueError
         If `output` is one of the inputs, also under another name or as a hard link, is a file that `write_phase`
-        did not write, is a folder, or cannot be written.
+        did not write, is a folder, or cannot be written, or if an input lies in its scratch folder.
 
     Examples
     --------
@@ -350,6 +352,8 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     for source in sources:
         if there and os.path.exists(source) and os.path.samefile(path, source):
             raise ValueError(f"{named} is the input {str(source)!r}: expected another file")
+        if scratch_of(path) in source.resolve().parents:
+            raise ValueError(f"{named}: its scratch folder holds the input {str(source)!r}: expected another file")
     if there and not path.is_file():
         raise ValueError(f"{named}: expected a file, not a folder or a device")
     if there and not overwrite and not has_card(path, _PHASE_CARD):

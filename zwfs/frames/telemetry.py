@@ -84,9 +84,10 @@ def reconstruct(
     """Reconstruct all frames of camera files, and write phases or coefficients with a table as FITS.
 
     The files may be larger than the memory: they are read in chunks, and the output is written in chunks. The
-    output appears when it is complete. An interrupted run keeps `.NAME.part` and `.NAME.journal` next to it. The
-    same call goes on from there, and the file has the same bytes as that of an undisturbed run. No frame is left
-    out: frames that cannot be reconstructed are NaN, and flagged in the table.
+    output appears when it is complete. An interrupted run keeps the folder `.NAME.part` next to it. The same call
+    goes on from there, and the file has the same bytes as that of an undisturbed run. If data of that folder are
+    damaged, a warning names it and they are computed again. No frame is left out: frames that cannot be
+    reconstructed are NaN, and flagged in the table.
 
     Parameters
     ----------
@@ -119,7 +120,7 @@ def reconstruct(
     restart : bool
         Whether to drop the part of an earlier run.
     overwrite : bool
-        Whether `output` may be any file but an input.
+        Whether `output` may be any file but an input or the calibration.
     progress : callable, optional
         Called with the number of frames that are done, and of all frames.
 
@@ -135,7 +136,8 @@ def reconstruct(
     FileError
         A ValueError: if a file is broken, truncated, of another shape, unit or type, or lacks a keyword.
     TypeError, ValueError
-        If an argument is of the wrong kind or out of range, or `check_output` refuses the output.
+        If an argument is of the wrong kind or out of range, `check_output` refuses the output, or something that
+        zwfs did not make has the name of the folder.
     OSError
         If there is no space for the output.
 
@@ -154,33 +156,35 @@ def reconstruct(
     (1, 0)
     """
     fits_module()
-    if not isinstance(calibration, Calibration):
-        calibration = Calibration.load(calibration)
     files, second_files = (
         _paths(name, one) for name, one in (("frames", frames), ("second_frames", second_frames))
     )
     if not files:
         raise ValueError("frames is empty: expected a file")
-    path = check_output(output, [*files, *second_files], overwrite=overwrite)
+    inputs = [*files, *second_files]
+    if not isinstance(calibration, Calibration):
+        inputs.append(path_of("calibration", calibration))
+        calibration = Calibration.load(calibration)
+    path = check_output(output, inputs, overwrite=overwrite)
     n_workers = _cores() if n_workers is None else _check.integer("n_workers", n_workers, 1, 256)
     stack = Stack(files, second_files, calibration.n_images, calibration.shape)
     job = _Job.checked(stack, calibration, modes, phases, photons, read_noise, keywords, saturation)
     if largest_residual is not None:
         largest_residual = _check.number("largest_residual", largest_residual, 0)
-    part = Part(path, job.units, job.plan(largest_residual), _check.flag("restart", restart))
+    part = Part(path, job.units, job.pieces, job.plan(largest_residual), _check.flag("restart", restart))
     try:
-        n_resumed = sum(stop - first for first, stop in part.done.items())
+        n_resumed = sum(stop - first for first, stop in part.done)
         done = n_resumed
         if progress is not None:
             progress(done, stack.n)
-        if not part.done:
-            part.write(job.units[-1], 0, job.files())
+        part.write(job.units[-1], 0, job.files())
         for first, stop, checksum in job.run(part, n_workers):
             part.note(first, stop, checksum)
             done += stop - first
             if progress is not None:
                 progress(done, stack.n)
         summary = job.judge(part, path, largest_residual, n_resumed)
+        check_output(path, inputs, overwrite=overwrite)  # again: the run may have taken hours
         part.finish()
         return summary
     finally:
@@ -231,7 +235,7 @@ class _Job:
         if level != np.inf:
             level = _check.number("saturation", level, 0, open_low=True)
         columns = _columns(stack, keywords)
-        rows = _row_type(columns, None if modes is None else len(modes), photons is not None)
+        rows = _row_type(columns, None if modes is None else len(modes), phases, photons is not None)
         of_files = np.dtype(
             [("NAME", f"S{max(len(_ascii(one.name)) for one in stack.segments)}"), ("FRAMES", ">i8")]
         )
@@ -267,17 +271,18 @@ class _Job:
         """Exposures that a thread handles at once."""
         return max(1, min(_LONGEST, _CHUNK // self.stack.bytes_per_exposure))
 
+    @property
+    def pieces(self) -> list[tuple[int, int]]:
+        """First exposure of each chunk, and the first one after it."""
+        return [(first, min(first + self.chunk, self.stack.n)) for first in range(0, self.stack.n, self.chunk)]
+
     def files(self) -> NDArray:
         """Rows of the list of files."""
         return np.array([(_ascii(one.name), one.n) for one in self.stack.segments], self.units[-1].dtype)
 
     def run(self, part: Part, n_workers: int) -> Iterator[tuple[int, int, int]]:
-        """Reconstruct all chunks that are not yet done: first frame, last but one, and checksum of each."""
-        chunks = (
-            (first, min(first + self.chunk, self.stack.n))
-            for first in range(0, self.stack.n, self.chunk)
-            if first not in part.done
-        )
+        """Reconstruct all chunks that are not yet done: first frame, first one after it, and checksum of each."""
+        chunks = (piece for piece in part.pieces if piece not in part.done)
         with one_thread(), ThreadPoolExecutor(n_workers) as pool:
             waiting: deque[Future[tuple[int, int, int]]] = deque()
             try:
@@ -402,12 +407,14 @@ def _columns(stack: Stack, keywords: Any) -> dict[str, NDArray]:
     return columns
 
 
-def _row_type(keywords: dict[str, NDArray], n_modes: int | None, errors: bool) -> np.dtype:
+def _row_type(keywords: dict[str, NDArray], n_modes: int | None, phases: bool, errors: bool) -> np.dtype:
     """Type of the rows of the table."""
     columns: list[tuple] = [("FRAME", ">i8"), ("FILE", ">i4"), ("INDEX", ">i8"), ("FLAGS", ">i2"), ("FLUX", ">f4"),
                ("RESIDUAL", ">f4"), ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4")]  # fmt: skip
-    if errors:
-        columns += [("SIGMA", ">f4")] if n_modes is None else [("SIGCOEFF", ">f4", (n_modes,))]
+    if errors and phases:
+        columns.append(("SIGMA", ">f4"))
+    if errors and n_modes is not None:
+        columns.append(("SIGCOEFF", ">f4", (n_modes,)))
     if n_modes is not None:
         columns.append(("COEFFS", ">f4", (n_modes,)))
     for name, values in keywords.items():

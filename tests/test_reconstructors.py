@@ -642,6 +642,19 @@ def test_start_is_where_it_starts(make, method, screens, pupil):
         np.testing.assert_allclose(again.phase, longer.phase, atol=1e-8)
 
 
+@every
+@pytest.mark.parametrize("extent", [1.0, 1.6])
+def test_a_pickle_reconstructs_the_same_bits(method, extent):
+    pupil = zwfs.Pupil.circular(32)
+    modes = zwfs.zernike_basis(pupil, 10)
+    dimples = [Dimple(1.06, shift) for shift in (1.5, -1.5)[: int(min(2, method.n_masks[1]))]]
+    reconstruct = build(method, ZernikeSensor(pupil, *dimples, extent=extent), modes)
+    frames = reconstruct.sensor.measure(zwfs.power_law_screens(modes, 0.5, 3, seed=1))
+    copy = pickle.loads(pickle.dumps(reconstruct))
+    np.testing.assert_array_equal(copy(frames).phase, reconstruct(frames).phase)
+    assert copy.sensor.factors.detector.combine.strides == reconstruct.sensor.factors.detector.combine.strides
+
+
 @fixed_point
 def test_phase_lies_on_the_circle(make, method, screens):
     reconstruct, sensor = make(method)

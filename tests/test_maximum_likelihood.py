@@ -93,6 +93,15 @@ def test_read_noise_is_weighed(pupil, screens):
     assert error == pytest.approx(np.sqrt(np.nanmean(bound**2)), rel=0.08)
 
 
+def test_a_solution_that_has_not_converged_is_not_called_consistent(pupil, screens):
+    sensor = pair(pupil, 1.06, 0.5, -0.5)
+    cut = MaximumLikelihood(sensor, n_iterations=2, tolerance=1e-12)(sensor.measure(screens(0.5)))
+    assert cut.residual.max() < 1e-6
+    assert not cut.converged.any()
+    assert not cut.consistent.any()
+    assert np.all(cut.n_starts == 1)  # the frames are explained: no other start would do better
+
+
 def test_without_a_number_of_photons_sigma_follows_from_the_residual(pupil, screens):
     sensor, truth = pair(pupil, 1.06, 0.5, -0.5), screens(0.3, 1)[0]
     rng = np.random.default_rng(2)

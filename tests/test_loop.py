@@ -121,6 +121,14 @@ def test_a_ramp_lags_by_the_speed_over_the_gain(mirror, modes, sensor, shifted):
     assert held.residual == pytest.approx(speed / 0.4, rel=1e-3)
 
 
+def test_read_noise_does_not_lower_the_gain_of_the_loop(mirror, modes, sensor):
+    camera = Detector(sensor.pupil, 20 * sensor.pupil.n_points, read_noise=10.0)
+    likely = MaximumLikelihood(sensor, modes, photons=20, read_noise=10.0, n_starts=1)
+    still = np.broadcast_to(0.2 * modes[4], (2, 200, *sensor.pupil.shape))
+    record = close_loop(sensor, mirror, likely, still, gain=0.5, camera=camera, seed=1)
+    assert record.commands[:, 1, 4].mean() == pytest.approx(0.1, rel=0.03)
+
+
 @pytest.mark.parametrize("gain", [None, 0.8])
 def test_the_held_drift_is_that_of_a_simulated_loop(mirror, modes, sensor, gain):
     photons, drift = 1e6, 200.0  # per cycle; pm rms per cycle

@@ -85,12 +85,42 @@ def test_read_noise_is_weighed(pupil, screens):
     sensor, truth = pair(pupil, 1.06, 0.5, -0.5), screens(0.5, 1)[0]
     camera = Detector(pupil, 300 * pupil.n_points, read_noise=10.0)
     frames = np.broadcast_to(sensor.measure(truth), (20, *sensor.measure(truth).shape))
-    noisy = camera.normalise(camera.expose(frames, 1), floor=0.0)
+    noisy = camera.normalise(camera.expose(frames, 1))
     result = MaximumLikelihood(sensor, photons=300, read_noise=10.0)(noisy)
     bound = cramer_rao(sensor, truth, photons=300, read_noise=10.0)
     error = np.sqrt(np.nanmean(wrapped_residual(pupil, result.phase, truth) ** 2))
-    # Frames raised to 0 lose a little light information; an estimator that ignores the noise loses more.
-    assert error == pytest.approx(np.sqrt(np.nanmean(bound**2)), rel=0.08)
+    assert error == pytest.approx(np.sqrt(np.nanmean(bound**2)), rel=0.05)
+
+
+@pytest.mark.parametrize(("photons", "read_noise"), [(20, 10.0), (5, 1.0)])
+def test_negative_pixels_bias_nothing(pupil, modes, photons, read_noise):
+    """Electrons plus variance of the read noise are negative in 3 % of the pixels at 5 photons, in few at 20."""
+    sensor, basis = pair(pupil, 1.06, 0.5, -0.5), modes[:20]
+    true = np.random.default_rng(3).normal(0, 0.05, (100, 20))
+    camera = Detector(pupil, photons * pupil.n_points, read_noise=read_noise)
+    frames = sensor.measure(np.tensordot(true, np.where(pupil.inside, basis, 0), 1))
+    frames = camera.normalise(camera.expose(frames, 1))
+    method = MaximumLikelihood(sensor, basis, photons=photons, read_noise=read_noise, n_starts=1)
+    result, clipped = method(frames), method(np.maximum(frames, 0))
+    gain, clipped_gain = (np.sum(one.coefficients * true) / np.sum(true**2) for one in (result, clipped))
+    assert gain == pytest.approx(1, abs=0.02)
+    within = np.mean(np.abs(result.coefficients - true) < result.sigma_coefficients)
+    assert within == pytest.approx(0.683, abs=0.03)
+    assert np.mean(result.chi2) == pytest.approx(1, abs=0.01)
+    assert result.consistent.all()
+    assert clipped_gain < 0.97
+    assert np.mean(clipped.chi2) < 0.9
+
+
+def test_pixels_that_no_read_noise_explains_do_not_decide_the_phase(pupil, screens):
+    sensor, truth = pair(pupil, 2.0, 0.5, -0.5), screens(0.5, 3)
+    frames = sensor.measure(truth)
+    frames[..., 10:30:4, 10:30:4] = -1.0
+    for noise in ({"photons": 100}, {"photons": 100, "read_noise": 0.1}):
+        result = MaximumLikelihood(sensor, **noise, n_starts=1)(frames)
+        error = wrapped_residual(pupil, result.phase, truth)
+        assert np.nanmedian(np.abs(error)) < 0.1
+        assert not result.consistent.any()
 
 
 def test_a_solution_that_has_not_converged_is_not_called_consistent(pupil, screens):

@@ -172,6 +172,7 @@ class MaximumLikelihood(Reconstructor):
         Photons that an intensity of 1 puts into a pixel of each frame, `Detector.photons_per_pixel`. If left out,
         all pixels have the same weight, and `sigma` follows from the residual of the frames.
     read_noise : float, electrons rms / pixel
+        That of the frames, with the noise of a background that was subtracted.
     prior : array_like, shape (n_modes, n_modes), radian^2, optional
         Covariance of the coefficients before the measurement, of mean 0. The estimate then is the most probable
         one, not the most likely (maximum a posteriori).

@@ -121,6 +121,47 @@ def test_a_ramp_lags_by_the_speed_over_the_gain(mirror, modes, sensor, shifted):
     assert held.residual == pytest.approx(speed / 0.4, rel=1e-3)
 
 
+def test_speed_is_divided_among_the_modes(sensor, modes):
+    held = hold_drift(sensor, modes[:4], drift=0, speed=100.0, gain=0.4, photons=1e14, wavelength=635.0)
+    np.testing.assert_allclose(held.lag, 100 / np.sqrt(4) / 0.4)
+    assert held.residual == pytest.approx(100 / 0.4, rel=1e-3)
+
+
+def test_commands_and_figure_stay_within_the_stroke(mirror, modes, sensor, shifted):
+    still = np.repeat(0.3 * modes[np.newaxis, 4:5], 20, axis=0)
+    record = close_loop(sensor, mirror, shifted, still, stroke=0.1)
+    assert record.residual[0, -1] == pytest.approx(0.2, rel=1e-3)
+    np.testing.assert_allclose(record.commands[0, -1], 0.1 * np.eye(6)[4], atol=1e-5)
+    figures = sensor.pupil.rms(mirror.wavefront(record.commands[0]))
+    assert figures.max() == pytest.approx(0.1, rel=1e-9)
+
+
+def test_the_mirror_keeps_its_figure_where_one_of_two_frames_is_dark(mirror, modes, sensor, shifted):
+    class Blinking:
+        """Sensor whose second frame of the first screen is dark in the third cycle."""
+
+        cycle = 0
+
+        def measure(self, phase):
+            frames, self.cycle = sensor.measure(phase), self.cycle + 1
+            if self.cycle == 3:
+                frames[0, 1] = 0
+            return frames
+
+    still = np.broadcast_to(0.2 * modes[4], (5, 2, *sensor.pupil.shape))
+    commands = close_loop(Blinking(), mirror, shifted, still).commands[:, :, 4]
+    np.testing.assert_allclose(commands[0], [0, 0.1, 0.15, 0.15, 0.175], rtol=1e-3)
+    np.testing.assert_allclose(commands[1], [0, 0.1, 0.15, 0.175, 0.1875], rtol=1e-3)
+
+
+def test_read_noise_does_not_lower_the_gain_of_the_loop(mirror, modes, sensor):
+    camera = Detector(sensor.pupil, 20 * sensor.pupil.n_points, read_noise=10.0)
+    likely = MaximumLikelihood(sensor, modes, photons=20, read_noise=10.0, n_starts=1)
+    still = np.broadcast_to(0.2 * modes[4], (2, 200, *sensor.pupil.shape))
+    record = close_loop(sensor, mirror, likely, still, gain=0.5, camera=camera, seed=1)
+    assert record.commands[:, 1, 4].mean() == pytest.approx(0.1, rel=0.03)
+
+
 @pytest.mark.parametrize("gain", [None, 0.8])
 def test_the_held_drift_is_that_of_a_simulated_loop(mirror, modes, sensor, gain):
     photons, drift = 1e6, 200.0  # per cycle; pm rms per cycle

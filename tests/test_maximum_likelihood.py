@@ -85,12 +85,81 @@ def test_read_noise_is_weighed(pupil, screens):
     sensor, truth = pair(pupil, 1.06, 0.5, -0.5), screens(0.5, 1)[0]
     camera = Detector(pupil, 300 * pupil.n_points, read_noise=10.0)
     frames = np.broadcast_to(sensor.measure(truth), (20, *sensor.measure(truth).shape))
-    noisy = camera.normalise(camera.expose(frames, 1), floor=0.0)
+    noisy = camera.normalise(camera.expose(frames, 1))
     result = MaximumLikelihood(sensor, photons=300, read_noise=10.0)(noisy)
     bound = cramer_rao(sensor, truth, photons=300, read_noise=10.0)
     error = np.sqrt(np.nanmean(wrapped_residual(pupil, result.phase, truth) ** 2))
-    # Frames raised to 0 lose a little light information; an estimator that ignores the noise loses more.
-    assert error == pytest.approx(np.sqrt(np.nanmean(bound**2)), rel=0.08)
+    assert error == pytest.approx(np.sqrt(np.nanmean(bound**2)), rel=0.05)
+
+
+@pytest.mark.parametrize(("photons", "read_noise"), [(20, 10.0), (5, 1.0)])
+def test_negative_pixels_bias_nothing(pupil, modes, photons, read_noise):
+    """Electrons plus variance of the read noise are negative in 3 % of the pixels at 5 photons, in few at 20."""
+    sensor, basis = pair(pupil, 1.06, 0.5, -0.5), modes[:20]
+    true = np.random.default_rng(3).normal(0, 0.05, (100, 20))
+    camera = Detector(pupil, photons * pupil.n_points, read_noise=read_noise)
+    frames = sensor.measure(np.tensordot(true, np.where(pupil.inside, basis, 0), 1))
+    frames = camera.normalise(camera.expose(frames, 1))
+    method = MaximumLikelihood(sensor, basis, photons=photons, read_noise=read_noise, n_starts=1)
+    result, clipped = method(frames), method(np.maximum(frames, 0))
+    gain, clipped_gain = (np.sum(one.coefficients * true) / np.sum(true**2) for one in (result, clipped))
+    assert gain == pytest.approx(1, abs=0.02)
+    within = np.mean(np.abs(result.coefficients - true) < result.sigma_coefficients)
+    assert within == pytest.approx(0.683, abs=0.03)
+    assert np.mean(result.chi2) == pytest.approx(1, abs=0.01)
+    assert result.consistent.all()
+    assert clipped_gain < 0.97
+    assert np.mean(clipped.chi2) < 0.9
+
+
+def test_pixels_that_no_read_noise_explains_do_not_decide_the_phase(pupil, screens):
+    sensor, truth = pair(pupil, 2.0, 0.5, -0.5), screens(0.5, 3)
+    frames = sensor.measure(truth)
+    frames[..., 10:30:4, 10:30:4] = -1.0
+    for noise in ({"photons": 100}, {"photons": 100, "read_noise": 0.1}):
+        result = MaximumLikelihood(sensor, **noise, n_starts=1)(frames)
+        error = wrapped_residual(pupil, result.phase, truth)
+        assert np.nanmedian(np.abs(error)) < 0.1
+        assert not result.consistent.any()
+
+
+def test_a_solution_that_has_not_converged_is_not_called_consistent(pupil, screens):
+    sensor = pair(pupil, 1.06, 0.5, -0.5)
+    cut = MaximumLikelihood(sensor, n_iterations=2, tolerance=1e-12)(sensor.measure(screens(0.5)))
+    assert cut.residual.max() < 1e-6
+    assert not cut.converged.any()
+    assert not cut.consistent.any()
+    assert np.all(cut.n_starts == 1)  # the frames are explained: no other start would do better
+
+
+@pytest.mark.parametrize(("sigmas", "consistent"), [(4.8, True), (5.2, False)])
+def test_a_misfit_of_more_than_5_standard_deviations_is_not_consistent(pupil, modes, sigmas, consistent):
+    sensor, photons = pair(pupil, 1.06, 0.5, -0.5), 1e6
+    light = sensor.measure(np.zeros(pupil.shape))
+    noise = np.random.default_rng(1).normal(size=light.shape)
+    # The misfit is the sum of n squares, of variance 2 each; the fit of one mode takes one away.
+    n = light.size
+    noise *= np.sqrt((n - 1 + sigmas * np.sqrt(2 * n)) / np.sum(noise**2))
+    result = MaximumLikelihood(sensor, modes[:1], photons=photons)(light + noise * np.sqrt(light / photons))
+    assert result.converged
+    assert result.consistent == consistent
+
+
+def test_faint_photon_noise_is_consistent(pupil, modes):
+    """Squares of Poisson numbers spread more than those of a Gaussian: at 0.1 photons by a factor of 2.4."""
+    sensor = pair(pupil, 1.06, 0.5, -0.5)
+    frames = exposed(pupil, sensor.measure(np.zeros(pupil.shape)), 0.1, 300)
+    result = MaximumLikelihood(sensor, modes[:2], photons=0.1, n_starts=1)(frames)
+    assert result.consistent.all()
+    assert np.mean(result.chi2) == pytest.approx(1, abs=0.03)
+
+
+def test_one_photon_in_the_dark_does_not_decide_chi2(pupil, modes):
+    sensor = pair(pupil, 1.06, 0.5, -0.5, extent=2.0)
+    light = sensor.measure(np.zeros(pupil.shape))
+    assert 30 * light.min() < 1e-5
+    result = MaximumLikelihood(sensor, modes[:2], photons=30, n_starts=1)(exposed(pupil, light, 30, 60))
+    np.testing.assert_allclose(result.chi2, 1, atol=0.06)
 
 
 def test_without_a_number_of_photons_sigma_follows_from_the_residual(pupil, screens):
@@ -235,6 +304,8 @@ def test_what_it_refuses(pupil, modes):
         ({"prior": one, "modes": few}, "prior: expected a number of photons"),
         ({"prior": np.eye(4), "modes": few, "photons": 10}, r"prior has shape \(4, 4\)"),
         ({"prior": -one, "modes": few, "photons": 10}, "positive definite"),
+        ({"prior": np.diag([1.0, 1.0, -0.5]), "modes": few, "photons": 10}, "from -0.5 to 1: .*definite"),
+        ({"prior": np.diag([1.0, 1.0, 0.0]), "modes": few, "photons": 10}, "from 0 to 1: .*definite"),
         ({"prior": one + np.eye(3, k=1), "modes": few, "photons": 10}, "not symmetric"),
         ({"modes": np.ones((pupil.n_points + 1, *pupil.shape))}, "at most the"),
         ({"n_starts": 0}, "n_starts = 0"),
@@ -243,5 +314,8 @@ def test_what_it_refuses(pupil, modes):
     ):
         with pytest.raises((TypeError, ValueError), match=message):
             MaximumLikelihood(sensor, **options)
+    for shifts in ((0.5, -0.5, 0.5), (0.5, 0.5, -0.5), (0.5, -0.5, -0.5, 0.5)):
+        with pytest.raises(ValueError, match="2 different masks: expected at least 3"):
+            MaximumLikelihood(pair(pupil, 1.06, *shifts), amplitude="unknown")
     with pytest.raises(ValueError, match="none of its masks changes the light"):
         MaximumLikelihood(ZernikeSensor(pupil, CLEAR))

@@ -171,6 +171,8 @@ def test_noise_is_that_of_the_photons():
     each = photons / 2
     mean = pupil.gather(sensor.measure(phase[0]))
     assert np.mean(frames.var(axis=0) / (mean / each + (read_noise / each) ** 2)) == pytest.approx(1, abs=0.02)
+    faint = Noise(20.0, read_noise)(sensor, phase, 1)
+    assert np.mean(faint - sensor.measure(phase[0])) == pytest.approx(0, abs=0.01)  # negative pixels are kept
     with pytest.raises(ValueError, match=r"noise.read_noise = 1 with photons = 0"):
         Noise(read_noise=1.0)
 

@@ -334,11 +334,11 @@ def finite(name: str, array: Any, where: str = "") -> None:
         raise ValueError(f"{name} holds {bad} NaN or infinite values{where}: expected finite numbers")
 
 
-def non_negative(name: str, array: Any, hint: str = "") -> None:
+def non_negative(name: str, array: Any) -> None:
     """Require that no number of `array` is below 0."""
     lowest = float(any_array(array)[1].min(array)) if 0 not in array.shape else 0.0
     if lowest < 0:
-        raise ValueError(f"{name} reaches down to {lowest:.6g}: expected no negative values{hint}")
+        raise ValueError(f"{name} reaches down to {lowest:.6g}: expected no negative values")
 
 
 def radian(name: str, value: Any) -> float:

@@ -64,7 +64,8 @@ class Noise:
     def deviance(self, light: NDArray, frames: NDArray) -> NDArray:
         """Twice the logarithm of the best possible likelihood over that of a mean `light`: (k, ...) to (k,).
 
-        Without a number of photons it is the sum of squares.
+        Read noise may bring a pixel below 0 electrons plus variance, where no mean is the best: that of 1 electron
+        takes its place. Without a number of photons it is the sum of squares.
         """
         terms = self.terms(light, frames)
         return Kind.of(terms).xp.sum(terms, axis=(-2, -1))
@@ -76,7 +77,8 @@ class Noise:
             difference = light - frames
             return xp.sum(difference * difference, axis=1)
         expected, seen = self.electrons(light), self.electrons(frames)
-        return 2 * xp.sum(expected - seen + seen * xp.log(seen / expected), axis=1)
+        best = xp.where(seen > 0, seen, 1.0)
+        return 2 * xp.sum(expected - seen + seen * xp.log(best / expected), axis=1)
 
     def misfit(self, light: NDArray, frames: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Sum of squared differences over the variance, its expectation, and the variance of the sum: (k,) each.

@@ -91,11 +91,8 @@ class Plane(Immutable):
 
     def cut(self, rows: slice, columns: slice) -> Plane:
         """The same functions on a part of the grid."""
-        return Plane(
-            np.ascontiguousarray(self.along_y[:, rows]),
-            np.ascontiguousarray(self.along_x[:, columns]),
-            self.combine,
-        )
+        # Copies, also of the whole grid: NumPy rounds a product of an array and itself in another way.
+        return Plane(self.along_y[:, rows].copy(), self.along_x[:, columns].copy(), self.combine)
 
     def to(self, kind: Kind) -> Plane:
         """The same functions in another library, precision or device."""
@@ -427,7 +424,7 @@ def _compress(core: NDArray[np.complex128], tolerance: float) -> tuple[NDArray, 
     """
     parts = np.concatenate([core.real, core.imag])
     left, strength, _ = np.linalg.svd(np.concatenate(list(parts), axis=1), full_matrices=False)
-    left = left[:, : _rank(strength, tolerance)]
+    left = np.ascontiguousarray(left[:, : _rank(strength, tolerance)])
     _, strength, right = np.linalg.svd(np.concatenate(list(left.T @ parts)), full_matrices=False)
     right = right[: _rank(strength, tolerance)].T
     return left, left.T @ core @ right, right

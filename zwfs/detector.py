@@ -132,8 +132,8 @@ class Detector:
         ----------
         counts : array_like, any shape
         floor : float, optional
-            Raise intensities below this value to it. Noise makes some negative, which reconstructors refuse;
-            they stay as they are by default.
+            Raise intensities below this value to it. Noise makes some negative; they stay as they are by default,
+            since a floor biases what is estimated from the frames.
 
         Returns
         -------

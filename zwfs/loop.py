@@ -299,11 +299,11 @@ def close_loop(
         if camera is not None:
             counts = camera.expose(frames, rng)
             photons = counts.sum(axis=(-3, -2, -1)) * (camera.gain or 1.0)
-            frames = camera.normalise(counts, floor=0.0)
+            frames = camera.normalise(counts)
         rows.append((screens.std(axis=-1), pupil.rms(left), strehl(pupil, left), commands, photons))
         found = np.zeros(screens.shape)
         # A frame without a photon holds no information: the mirror keeps its figure.
-        seen = frames.any(axis=(-2, -1)).all(axis=-1)
+        seen = (frames.max(axis=(-2, -1)) > 0).all(axis=-1)
         if seen.any():
             found[seen] = without_piston(pupil.gather(reconstructor(frames[seen]).phase))
         step, (figure, commands) = gain * (found @ mirror.inverse), figures[-1]

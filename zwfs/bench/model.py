@@ -458,11 +458,11 @@ class BenchModel(Immutable):
         )
 
     def normalise(self, counts: ArrayLike) -> NDArray[np.float64]:
-        """Frames of counts, 1 = mean intensity of the model's pupil; what noise makes negative is raised to 0."""
+        """Frames of counts, 1 = mean intensity of the model's pupil; noise makes some of them negative."""
         counts = _check.real_array("counts", counts)
         _check.trailing_shape("counts", counts, self.dark.shape, "the two images of the bench")
         _check.finite("counts", counts)
-        return np.maximum((counts - self.dark) / self.scale, 0)
+        return (counts - self.dark) / self.scale
 
     @cached_property
     def modes(self) -> NDArray[np.float64]:

@@ -278,7 +278,7 @@ class _Design:
 
     def __call__(self, shot: Shot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Phase of a frame set and the frames that it makes in the model."""
-        estimate = self.reconstruct(np.maximum(shot.counts / self.model.scale, 0))
+        estimate = self.reconstruct(shot.counts / self.model.scale)
         return estimate.phase, self.model.shifted.measure(estimate.phase) * self.model.scale
 
     def reference(self, flat: Shot) -> NDArray[np.float64]:

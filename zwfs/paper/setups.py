@@ -321,13 +321,13 @@ class Noise:
             raise ValueError(f"noise.read_noise = {self.read_noise:g} with photons = 0: expected photons above 0")
 
     def __call__(self, sensor: ZernikeSensor, phase: NDArray, seed: Any) -> NDArray[np.floating]:
-        """Return the normalised frames of phases, none below 0, with the light divided between the masks."""
+        """Return the normalised frames of phases, with the light divided between the masks."""
         frames = sensor.measure(phase)
         if not self.photons:
             return frames
         pupil = sensor.pupil
         camera = Detector(pupil, self.photons * pupil.n_points / sensor.n_masks, read_noise=self.read_noise)
-        return camera.normalise(camera.expose(frames, seed), floor=0.0)
+        return camera.normalise(camera.expose(frames, seed))
 
 
 NOISELESS = Noise()

@@ -29,6 +29,9 @@ class GerchbergSaxton(FixedPoint):
     is a fixed point on a detector of any width, with masks of any transmission. No iteration increases the sum of
     (a - |o|)^2 over the detector. The cost is that of "zero".
 
+    The root needs frames without negative values: those that noise causes are raised to 0, which biases faint
+    frames.
+
     The piston stays near that of the start, since <psi, next> is real and positive.
 
     Parameters
@@ -81,7 +84,8 @@ class GerchbergSaxton(FixedPoint):
 
     def begin(self, frames: NDArray, phasor: NDArray | None, constants: Propagator) -> _State:
         """Return the measured amplitude on the detector."""
-        return _State(constants.kind.xp.sqrt(frames))
+        xp = constants.kind.xp
+        return _State(xp.sqrt(xp.clip(frames, 0, None)))
 
     def step(self, phasor: NDArray, state: _State, constants: Propagator) -> Estimate:
         """Propagate to the detector and back."""

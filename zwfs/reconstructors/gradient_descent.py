@@ -106,7 +106,7 @@ class GradientDescent(Reconstructor):
         Raises
         ------
         TypeError, ValueError
-            If phase or frames are of the wrong shape, complex, not finite, or the frames negative or dark.
+            If phase or frames are of the wrong shape, complex or not finite, or no pixel of a frame is above 0.
         """
         frames, batch = check_frames(self.sensor, _check.real_array("frames", frames), light=self._light)
         if batch not in ((), (1,)):

@@ -56,9 +56,10 @@ class LikelihoodReconstruction(Reconstruction):
         Reduced chi-square: about 1 where the model explains the frames. NaN without a number of photons, and where
         the frames have no more information than there are unknowns, as for one mask.
     consistent : ndarray of bool, shape (...)
-        Whether the phase explains the frames to within the noise: their misfit exceeds its expectation by less
-        than 5 standard deviations. Without a number of photons: whether the rms residual of the frames, over the
-        detector, is at most 1e-5 of the mean intensity. For one mask many phases explain a frame.
+        Whether the fit converged and its phase explains the frames to within the noise: their misfit exceeds its
+        expectation by less than 5 standard deviations. Without a number of photons, the rms residual of the
+        frames, over the detector, is at most 1e-5 of the mean intensity instead. For one mask many phases explain
+        a frame.
     n_starts : ndarray of int, shape (...)
         Number of starts that were tried.
     estimator : Estimator
@@ -171,6 +172,7 @@ class MaximumLikelihood(Reconstructor):
         Photons that an intensity of 1 puts into a pixel of each frame, `Detector.photons_per_pixel`. If left out,
         all pixels have the same weight, and `sigma` follows from the residual of the frames.
     read_noise : float, electrons rms / pixel
+        That of the frames, with the noise of a background that was subtracted.
     prior : array_like, shape (n_modes, n_modes), radian^2, optional
         Covariance of the coefficients before the measurement, of mean 0. The estimate then is the most probable
         one, not the most likely (maximum a posteriori).
@@ -295,7 +297,7 @@ class MaximumLikelihood(Reconstructor):
             amplitude=amplitude,
             coefficients=coefficients,
             chi2=shaped(self._chi2(fit)),
-            consistent=shaped(self._consistent(fit)),
+            consistent=shaped(fit.converged & self._explained(fit)),
             n_starts=shaped(fit.n_starts),
             noise_variance=shaped(self._noise_variance(fit)),
             estimator=self._exact,
@@ -329,7 +331,7 @@ class MaximumLikelihood(Reconstructor):
         if fit.history is not None and start is not None:
             fit.history[:, 0, ...] = start  # as it was given: modes may not represent it
         for attempt in range(1, self.n_starts):
-            poor = ~self._consistent(fit)
+            poor = ~self._explained(fit)
             if not xp.any(poor):
                 break
             best = fit.at(poor)
@@ -524,7 +526,7 @@ class MaximumLikelihood(Reconstructor):
         xp = Kind.of(fit.psi).xp
         some = fit.converged & (fit.n_reflections < _REFLECTIONS)
         if estimator.noise.photons is None:
-            some = some & ~self._consistent(fit)
+            some = some & ~self._explained(fit)
         if not xp.any(some):
             return
         part = fit.at(some)
@@ -599,7 +601,7 @@ class MaximumLikelihood(Reconstructor):
         freedom = expected - self._n_unknowns()
         return xp.where(freedom > 0, misfit, np.nan) / freedom
 
-    def _consistent(self, fit: _Fit) -> NDArray[np.bool_]:
+    def _explained(self, fit: _Fit) -> NDArray[np.bool_]:
         """Whether the noise explains the misfit, (k,)."""
         xp = Kind.of(fit.light).xp
         if self._exact.noise.photons is None:

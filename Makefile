@@ -35,8 +35,10 @@ export UV_LINK_MODE = copy
 export RERUN := $(value FIGURE) $(value ARGS)
 unexport FIGURE ARGS
 
+QUICK := --numprocesses auto --dist loadfile --benchmark-disable -m "not slow"
+
 .DELETE_ON_ERROR:
-.PHONY: help book pdf lab test test-slow fuzz mutants torture figures rerun lint bench release-check pythons address lock clean
+.PHONY: help book pdf lab test test-fast test-slow fuzz figures rerun lint bench release-check pythons address lock clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 21
@@ -50,11 +52,14 @@ pdf: $(READY) ## build the book and its PDF, _build/html/zwfs.pdf: needs Chromiu
 lab: $(READY) ## open the notebooks in JupyterLab
 	$(BIN)/jupyter lab notebooks
 
-test: $(READY) ## test the package and the tools, and compare each notebook with a fresh run
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --benchmark-disable -m "not slow" tests
+test: $(READY) ## test the package and the tools, print the coverage, and compare each notebook with a fresh run
+	$(BIN)/python -m pytest $(QUICK) --cov --cov-report term:skip-covered tests
 	$(BIN)/python -m pytest --numprocesses auto --doctest-modules zwfs
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --nbval --nbval-current-env \
 		--nbval-cell-timeout 1200 notebooks
+
+test-fast: $(READY) ## test the package only, in about 3 minutes
+	$(BIN)/python -m pytest $(QUICK) $$(grep -LE "ROOT|book|notebooks|studies" tests/test_*.py)
 
 test-slow: $(READY) ## the rest of the tests: real builds of the book, kills, clusters, long fits, full books in a browser
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --benchmark-disable -m slow tests
@@ -78,12 +83,6 @@ bench: $(READY) ## time the reconstructors, next to other packages, for the perf
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only --benchmark-json=_build/measured.json
 	$(BIN)/python -m tests.benchmarks.report _build/measured.json
 
-mutants: $(READY) ## put defects into the package one by one, and name those that no test notices
-	@$(BIN)/python -m tests.mutants
-
-torture: $(READY) ## kill builds, fill the disk, and more: the book must stay whole, in about 15 minutes
-	@$(BIN)/python -m tests.torture
-
 release-check: $(READY) ## build the package, and test it in an empty environment
 	@$(BIN)/python -m book._tools release-check
 
@@ -94,14 +93,14 @@ address: $(READY) ## write the public address in pyproject.toml to every file th
 	@$(BIN)/python -m book._tools address
 
 lock: $(BIN)/uv ## pin the newest allowed version of every dependency, or of one: make lock PACKAGE=numpy
-	$(PIN) pyproject.toml --extra book --extra cluster --extra lab --extra tables --extra test \
+	$(PIN) pyproject.toml --extra book --extra cluster --extra lab --extra test \
 		--universal --python-version 3.11 --fork-strategy fewest --output-file $(LOCK)
 	echo uv | $(PIN) - --no-annotate --output-file $(UV_LOCK)
 
 # Other files in _build belong to the user, above all the results of make rerun.
 clean: ## remove the results of these commands, except those of make rerun
 	rm -rf $(addprefix _build/,home html html.json jupyter_execute kept measured.json notebooks performance dist building-* running-* rerunning-* releasing-*)
-	rm -rf build $(VENV) *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf build $(VENV) *.egg-info .benchmarks .coverage* .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name _build -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 	@if [ -d _build ] && ! rmdir _build 2>/dev/null; then echo "kept: $$(echo _build/*)"; fi
 

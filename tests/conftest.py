@@ -1,3 +1,4 @@
+import inspect
 import os
 import re
 import signal
@@ -16,7 +17,14 @@ ROOT = Path(__file__).parent.parent
 def new_reconstructor():
     """Return the path and the code of the reconstructor in CONTRIBUTING."""
     text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
-    return re.search(r"^`(zwfs/reconstructors/\w+\.py)`.*?^```python\n(.*?)^```", text, re.M | re.S).groups()
+    path = r"`(zwfs/reconstructors/(?!__init__)\w+\.py)`"
+    return re.search(rf"{path}.*?^```python\n(.*?)^```", text, re.M | re.S).groups()
+
+
+def needs_modes(method):
+    """Whether a reconstructor cannot be made without modes."""
+    modes = inspect.signature(method).parameters.get("modes")
+    return modes is not None and modes.default is inspect.Parameter.empty
 
 
 settings.register_profile("zwfs", derandomize=True, deadline=None, max_examples=25)
@@ -25,7 +33,18 @@ settings.load_profile("zwfs")
 
 
 # Fixtures that start kernels, clusters, set-ups or a browser, build a book, calibrate a bench or need real frames.
-SLOW = {"browser", "calibrated", "clone", "cluster", "plain_book", "published_book", "real", "seal", "template"}
+SLOW = {
+    "browser",
+    "calibrated",
+    "clone",
+    "cluster",
+    "foreign_cluster",
+    "plain_book",
+    "published_book",
+    "real",
+    "seal",
+    "template",
+}
 
 
 def pytest_collection_modifyitems(items):

@@ -65,8 +65,8 @@ def recorded(seed=1, flux=1.0, **moved):
 def phase_difference(found):
     """Measured phase less the true one, without piston, (ny, nx); NaN at pixels that are not fully lit."""
     phase, _, clear = fine_images()
-    recording = found.measurement.recording
-    window = tuple(slice(first, first + recording.n_pixels) for first in recording.corner)
+    registered = found.measurement.registered
+    window = tuple(slice(first, first + registered.n_pixels) for first in registered.corner)
     lit = (_blocks(clear).min(axis=(1, 3)) > 0.5)[window]
     left = np.where(lit, np.exp(1j * (found.phase - on_camera(phase)[window])), np.nan)
     return np.angle(left * np.conj(np.nanmean(left)))

@@ -21,10 +21,12 @@ from threadpoolctl import threadpool_limits
 import zwfs
 from zwfs.reconstructors.base import Reconstructor
 
+from .conftest import needs_modes
+
 # The public face: what simulates a sensor and reconstructs a phase. Tests of camera frames are in other files.
 MODULES = (
     *("pupil", "modes", "turbulence", "masks", "sensor", "polychromatic", "detector", "bounds", "loop", "metrics"),
-    *("units", "focal", "reconstructors"),
+    *("units", "reconstructors"),
 )
 
 # Results that may be infinite: the limit lies beyond what was sampled, or no limit is set.
@@ -78,7 +80,7 @@ def valid() -> dict:
     methods = {}
     for kind in zwfs.RECONSTRUCTORS:
         options = {"n_iterations": 3} if kind.iterative else {}
-        options |= {"modes": modes} if kind is zwfs.Linear else {}
+        options |= {"modes": modes} if needs_modes(kind) else {}
         methods[kind.__name__] = kind(shifted if kind.n_masks[1] > 1 else classic, **options)
     method, mirror = methods["PhaseShifted"], zwfs.Mirror(pupil, modes)
     arguments = {

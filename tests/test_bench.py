@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from studies.kit.bench import find_pistons
 from zwfs import (
     Arcsine,
     Dimple,
@@ -12,9 +13,7 @@ from zwfs import (
     power_law_screens,
     zernike_basis,
 )
-from zwfs.bench.model import Bench, BenchModel, segment_screens
-from zwfs.bench.segments import segment_residual
-from zwfs.paper.bench_linearity import find_pistons
+from zwfs.bench.model import Bench, BenchModel, segment_residual, segment_screens
 
 N = 68  # half the camera: 11 pixels of margin
 SMALL = {"n_pixels": N, "gap": 0.02, "stop": 0.8}

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
+from studies.error_budget import error_budget
+from studies.kit.bench import BenchCurves, bench_curves, bench_reconstructors, find_pistons
 from zwfs import Linear, PhaseShifted, dynamic_range
-from zwfs.bench.model import Bench, BenchModel, segment_screens
-from zwfs.bench.segments import segment_residual
-from zwfs.paper.bench_linearity import BenchCurves, bench_curves, bench_reconstructors, error_budget, find_pistons
+from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 
 N = 68
 SMALL = {"n_pixels": N, "gap": 0.02, "stop": 0.8}
@@ -93,7 +93,7 @@ def test_calibration_is_divided_by_the_poke(perfect, model):
         (lambda f, p, q: (f, p[:-1], q), ValueError, r"calibration pushed has a batch of \(35,\): expected 36"),
         (lambda f, p, q: (f, p, f), ValueError, r"calibration pulled has a batch of \(\): expected 36"),
         (lambda f, p, q: (f, p, np.concatenate([q, q], 1)), ValueError, r"calibration pulled has shape \(36, 2, "),
-        (lambda f, p, q: (f, p, -q), ValueError, "calibration pulled reaches down to -"),
+        (lambda f, p, q: (f, p, -q), ValueError, "calibration pulled: 36 of 36 hold no light"),
         (lambda f, p, q: (0 * f, p, q), ValueError, "calibration flat: 1 of 1 hold no light"),
         (lambda f, p, q: (f, p, p), ValueError, "sensor sees none of them"),
         (lambda f, p, q: (f, p), ValueError, r"calibration (is|has) .*expected .*flat, pushed, pulled"),
@@ -201,25 +201,6 @@ def test_ideal_bench_holds_no_error_for_the_exact_methods(curves):
         np.testing.assert_allclose(curves.gain(name)[1:], 1, atol=tolerance * 10)
     # Beyond its range the linear method sees too little.
     assert curves.gain("Linear")[2] < 0.9
-
-
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda b, m, k: bench_curves(b, m, k, [-0.1], 1), ValueError, r"rms .*-0\.1"),
-        (lambda b, m, k: bench_curves(b, m, k, [0.1], 0), ValueError, "n_screens = 0: expected at least 1"),
-        (lambda b, m, k: bench_reconstructors(b, m, poke=0), ValueError, r"poke = 0: expected .*\(0, inf"),
-        (lambda b, m, k: bench_reconstructors(b, m, n_iterations=0), ValueError, "n_iterations = 0"),
-        (
-            lambda b, m, k: error_budget({"a": b}, ["Foo"], [0.1], 1),
-            ValueError,
-            r"names .*'Foo'.*: expected .* of .*'Linear'.*'PhaseShifted'",
-        ),
-    ],
-)  # fmt: skip
-def test_bad_input_is_named(perfect, model, known, call, error, message):
-    with pytest.raises(error, match=message):
-        call(perfect, model, known)
 
 
 # Error budget

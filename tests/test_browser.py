@@ -1,15 +1,11 @@
 """The built book in a real browser, opened from the file system, as wide as a screen and as a phone."""
 
 import json
-import threading
 from dataclasses import dataclass
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
-from PIL import Image, ImageChops, ImageStat
 
 ROOT = Path(__file__).parent.parent
 HTML = ROOT / "_build" / "html"
@@ -166,11 +162,6 @@ def test_axe_finds_no_serious_fault(opened, mode):
     assert faults == []
 
 
-def test_root_leads_to_the_front_page(page):
-    page.goto(address("index.html"))
-    page.wait_for_url(address("book/index.html"))
-
-
 def test_search_finds_a_name(page):
     said, asked = watch(page)
     page.goto(f"{address('search.html')}?q=Gerchberg")
@@ -192,18 +183,6 @@ def test_no_page_minds_a_query_in_its_address(page):
         assert said == outside(asked) == [], name
 
 
-def test_colour_switch(page):
-    background = "getComputedStyle(document.body).backgroundColor"
-    seen = {}
-    for _ in range(3):
-        page.locator(".theme-switch-button:visible").click()
-        seen[page.evaluate("document.documentElement.dataset.mode")] = page.evaluate(background)
-    assert set(seen) == {"light", "dark", "auto"}
-    assert seen["light"] == seen["auto"] != seen["dark"]
-    logos = page.eval_on_selector_all(".logo__image", "all => all.filter(one => one.offsetWidth).length")
-    assert logos == 1
-
-
 def test_keyboard_alone_reads_switches_and_searches(page):
     focus = "document.activeElement"
     page.keyboard.press("Tab")
@@ -222,77 +201,3 @@ def test_keyboard_alone_reads_switches_and_searches(page):
     page.keyboard.type("Gerchberg")
     page.keyboard.press("Enter")
     page.wait_for_url("**/search.html?q=Gerchberg")
-
-
-def test_a_phone_has_the_contents_in_a_menu(browser):
-    context = browser.new_context(viewport={"width": 390, "height": 900}, has_touch=True)
-    page = context.new_page()
-    page.goto(address("book/index.html"))
-    entry = page.locator("#pst-primary-sidebar-modal a, #pst-primary-sidebar a", has_text="Figure 3").first
-    assert not entry.is_visible()
-    page.locator("button.primary-toggle:visible").tap()
-    page.locator("a:visible", has_text="Figure 3").first.tap()
-    page.wait_for_url("**/fig03_dynamic_range.html")
-    context.close()
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *_):
-        pass
-
-
-@pytest.mark.parametrize(
-    ("name", "box", "text"),
-    [
-        ("notebooks/design", ".pst-scrollable-table-container", "all-round"),
-        ("notebooks/zernike_sensor", ".highlight pre", "bump_and_pit"),
-    ],
-)
-def test_a_wide_table_or_code_fades_until_its_end_is_in_sight(browser, name, box, text):
-    page = browser.new_page(viewport={"width": 390, "height": 844})
-    page.goto(address(f"{name}.html"))
-    wide = page.locator(box, has_text=text).first
-    fades = "box => getComputedStyle(box).maskImage !== 'none'"
-    assert wide.evaluate(fades)
-    wide.evaluate("box => { box.scrollLeft = box.scrollWidth; }")
-    page.wait_for_function(f"box => !({fades})(box)", arg=wide.element_handle())
-    page.close()
-
-
-@pytest.fixture(scope="module")
-def served():
-    """Address of the book on a server of this machine: from the file system a browser opens what it would save."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=HTML)) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-
-
-@pytest.mark.parametrize("kind", ["PNG", "PDF", "data (CSV)"])
-def test_downloads_give_files(page, served, kind):
-    page.goto(f"{served}/notebooks/fig03_dynamic_range.html")
-    link = page.locator("article a.download", has_text=kind).first
-    with page.expect_download() as download:
-        link.click()
-    content = Path(download.value.path()).read_bytes()
-    beginning = {"PNG": b"\x89PNG", "PDF": b"%PDF-", "data (CSV)": b"input (rad rms),"}[kind]
-    assert content.startswith(beginning)
-
-
-def test_figures_open_alone(page):
-    page.goto(address("notebooks/fig03_dynamic_range.html"))
-    page.locator(".wide-figure a").first.click()
-    page.wait_for_url("**/_images/*.png")
-    assert page.evaluate("document.images[0].naturalWidth") == 1400
-
-
-def test_the_logo_is_the_same_in_both_formats(browser, tmp_path):
-    static = ROOT / "book" / "_static"
-    page = browser.new_page(viewport={"width": 256, "height": 256})
-    page.set_content(f"<style>body {{ margin: 0 }}</style>{(static / 'logo.svg').read_text('utf-8')}")
-    page.screenshot(path=tmp_path / "drawn.png", omit_background=True)
-    page.close()
-    with Image.open(tmp_path / "drawn.png") as drawn, Image.open(static / "logo.png") as stored:
-        assert drawn.size == stored.size
-        difference = ImageChops.difference(drawn.convert("RGBA"), stored.convert("RGBA"))
-    assert max(ImageStat.Stat(difference).mean) < 2

@@ -5,9 +5,16 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from studies.calibration import (
+    WAYS,
+    dimmed,
+    fit_models,
+    fitted_parameters,
+    measure_segments,
+    take_calibration_frames,
+)
 from zwfs.bench import Bench
 from zwfs.frames import fit_bench
-from zwfs.paper.calibration import WAYS, calibrate, dimmed, measure_segments, record, recovered
 
 LAYOUT = {"extent": 1.25, "n_pixels": 32, "n_rings": 1, "gap": 0.05, "missing": (), "stop": 0.85, "quilting": 0.0}
 TOLERANCES = {
@@ -46,9 +53,9 @@ def binned(images):
 
 
 def measured(bench):
-    recording = record(bench, 3, 0.6, seed=1)
-    fits = calibrate(recording)
-    return fits, *measure_segments(recording, fits, [0.3, 0.8], 1, seed=1)
+    taken = take_calibration_frames(bench, 3, 0.6, seed=1)
+    fits = fit_models(taken)
+    return fits, *measure_segments(taken, fits, [0.3, 0.8], 1, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +69,7 @@ def calibrated(bench):
 
 
 def test_parameters_of_the_bench_are_recovered_within_their_error_bars(bench, calibrated):
-    for one in recovered(bench, calibrated[0]["calibrated"]):
+    for one in fitted_parameters(bench, calibrated[0]["calibrated"]):
         tolerance = next(value for name, value in TOLERANCES.items() if one.name.startswith(name))
         assert abs(one.value - one.true) <= tolerance, one.name
         assert abs(one.deviation) <= 3.5, one.name
@@ -83,11 +90,11 @@ def test_calibrated_model_measures_new_screens_and_the_control_fails(calibrated)
 def test_a_bench_on_a_finer_grid_is_measured_better_than_with_the_model_of_the_design(calibrated):
     """The model shares no grid with this bench. The gain is smaller, and its parameters are not those put in."""
     finer = dimmed(FineBench(**LAYOUT), 1e5)
-    recording = record(finer, 3, 0.6, seed=1)
-    known = finer.commanded_phase(recording.commands)
-    settings = {"n_pixels": finer.n_pixels, "noise": recording.noise, "n_inner": 30, "n_steps": 10}
-    fit = fit_bench(recording.frames, recording.clear, known, **settings, errors=False)
-    curves, _ = measure_segments(recording, {"calibrated": fit}, [0.3, 0.8], 1, seed=1)
+    taken = take_calibration_frames(finer, 3, 0.6, seed=1)
+    known = finer.commanded_phase(taken.commands)
+    settings = {"n_pixels": finer.n_pixels, "noise": taken.noise, "n_inner": 30, "n_steps": 10}
+    fit = fit_bench(taken.frames, taken.clear, known, **settings, errors=False)
+    curves, _ = measure_segments(taken, {"calibrated": fit}, [0.3, 0.8], 1, seed=1)
     error = curves.mean("calibrated").mean()
     assert 3 * calibrated[1].mean("calibrated").mean() < error < 0.5 * curves.mean("design, less flat").mean()
 
@@ -96,11 +103,11 @@ def test_a_bench_on_a_finer_grid_is_measured_better_than_with_the_model_of_the_d
 def test_frames_are_explained_where_a_segment_is_missing():
     """The fitted amplitude is small there, not zero, so its phase must be that of the calibration."""
     bench, whole = (dimmed(Bench(**LAYOUT | {"missing": missing}), 1e5) for missing in ((3,), ()))
-    recording = record(bench, 3, 0.6, seed=1)
-    known = bench.commanded_phase(recording.commands)
-    settings = {"n_pixels": bench.n_pixels, "noise": recording.noise, "n_inner": 30, "tolerance": 5e-4}
-    fit = fit_bench(recording.frames, recording.clear, known, **settings, errors=False)
-    [[example]] = measure_segments(recording, {"calibrated": fit}, [0.8], 1, seed=1)[1]
+    taken = take_calibration_frames(bench, 3, 0.6, seed=1)
+    known = bench.commanded_phase(taken.commands)
+    settings = {"n_pixels": bench.n_pixels, "noise": taken.noise, "n_inner": 30, "tolerance": 5e-4}
+    fit = fit_bench(taken.frames, taken.clear, known, **settings, errors=False)
+    [[example]] = measure_segments(taken, {"calibrated": fit}, [0.8], 1, seed=1)[1]
     counts, sigma = example.measured
     margin = (counts.shape[-1] - bench.n_pixels) // 2
     dark = np.pad((whole.segments > 0) & (bench.segments == 0), margin)

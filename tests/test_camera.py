@@ -3,7 +3,7 @@
 import gzip
 import hashlib
 import io
-import os
+import sys
 import tracemalloc
 from pathlib import Path
 
@@ -33,20 +33,12 @@ def test_every_type_of_number_reads_the_same(tmp_path, dtype):
         assert file.sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
 
 
-def test_bzero_and_extension_and_stack(tmp_path):
-    unsigned = (FRAME + 40_000).astype(np.uint16)
-    hdu = fits.ImageHDU(unsigned)
-    hdu.header["WAVELEN"] = 633.0
-    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / "a.fits")
+def test_unsigned_numbers_of_an_extension_are_read_with_their_full_scale(tmp_path):
+    unit = fits.ImageHDU((FRAME + 40_000).astype(np.uint16), fits.Header({"WAVELEN": 633.0}))
+    fits.HDUList([fits.PrimaryHDU(), unit]).writeto(tmp_path / "a.fits")
     file = camera.read(tmp_path / "a.fits")
-    assert fits.getheader(tmp_path / "a.fits", 1)["BZERO"] == 32768
     np.testing.assert_array_equal(file.images[0], FRAME + 40_000.0)
-    assert file.full_scale == 65535
-    assert file.keyword("WAVELEN") == 633
-    np.save(tmp_path / "two.npy", np.stack([FRAME, FRAME + 1]))
-    first, second = camera.images([camera.read(tmp_path / "two.npy")])
-    assert [first.name, second.name] == ["two.npy[0]", "two.npy[1]"]
-    np.testing.assert_array_equal(second.counts - first.counts, 1)
+    assert (file.full_scale, file.keyword("WAVELEN")) == (65535, 633)
 
 
 def test_two_images_in_two_extensions_are_both_read(tmp_path):
@@ -71,69 +63,44 @@ def test_compressed_files_are_read(tmp_path):
     assert other.sha256 == hashlib.sha256(packed.read_bytes()).hexdigest()
 
 
-def broken(tmp_path, kind):
-    path = tmp_path / f"{kind}.fits"
-    whole = tmp_path / "whole.fits"
-    fits.PrimaryHDU(FRAME.astype(float)).writeto(whole)
-    np.save(tmp_path / "whole.npy", FRAME)
-    contents = {
-        "text": b"not a picture",
-        "empty": b"",
-        "truncated": whole.read_bytes()[:4000],
-        "header": b"SIMPLE  = nonsense",
-        "gzip": gzip.compress(whole.read_bytes())[:200],
-        "npy": (tmp_path / "whole.npy").read_bytes()[:300],
-    }
-    if kind in contents:
-        path.write_bytes(contents[kind])
-    elif kind == "table":
-        column = fits.Column(name="x", format="D", array=np.zeros(3))
-        fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns([column])]).writeto(path)
-    elif kind == "cube":
-        fits.PrimaryHDU(np.zeros((5, 20, 30))).writeto(path)
-    elif kind == "complex":
-        with path.open("wb") as stream:
-            np.save(stream, FRAME + 1j)
-    elif kind == "pickle":
-        with path.open("wb") as stream:
-            np.save(stream, np.array([{}], dtype=object))
-    return path
+def fits_bytes(*units):
+    stream = io.BytesIO()
+    fits.HDUList(list(units)).writeto(stream)
+    return stream.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [
-        ("text", r"text\.fits: its first bytes are those of neither a FITS nor an NPY file"),
-        ("empty", r"empty\.fits: its first bytes"),
-        ("truncated", r"truncated\.fits: a broken FITS file"),
-        ("header", r"header\.fits: a "),
-        ("npy", r"npy\.fits: a broken NPY file"),
-        ("gzip", r"gzip\.fits: a broken gzip file"),
-        ("table", r"table\.fits: a FITS file without an image"),
-        ("cube", r"cube\.fits: its shape is \(5, 20, 30\): expected \(ny, nx\)"),
-        ("pickle", r"pickle\.fits: a broken NPY file"),
-    ],
-)
-def test_files_that_are_no_image_are_refused(tmp_path, kind, message):
-    with pytest.raises(ValueError, match=message):
-        camera.read(broken(tmp_path, kind))
+def npy_bytes(array):
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
 
 
-def test_complex_and_missing_files_are_refused(tmp_path):
-    with pytest.raises(TypeError, match=r"its numbers are complex128"):
-        camera.read(broken(tmp_path, "complex"))
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.fits: no such file"):
-        camera.read(tmp_path / "nowhere.fits")
+def column(name):
+    return fits.BinTableHDU.from_columns([fits.Column(name=name, format="D", array=np.zeros(3))])
 
 
-def test_missing_keyword_is_named(tmp_path):
-    fits.PrimaryHDU(FRAME).writeto(tmp_path / "a.fits")
-    with pytest.raises(ValueError, match=r"a\.fits: its header has no WAVELEN: give the value as a parameter"):
-        camera.read(tmp_path / "a.fits").keyword("WAVELEN")
+NO_IMAGES = [
+    (b"not a picture", "its first bytes are those of neither a FITS nor an NPY file"),
+    (b"SIMPLE  = nonsense", "a "),
+    (lambda: fits_bytes(fits.PrimaryHDU(FRAME))[:4000], "a broken FITS file"),
+    (lambda: npy_bytes(FRAME)[:300], "a broken NPY file"),
+    (lambda: npy_bytes(np.array([{}], dtype=object)), "a broken NPY file"),
+    (lambda: npy_bytes(FRAME + 1j), "its numbers are complex128"),
+    (lambda: gzip.compress(fits_bytes(fits.PrimaryHDU(FRAME)))[:200], "a broken gzip file"),
+    (lambda: fits_bytes(fits.PrimaryHDU(), column("x")), "a FITS file without an image"),
+    (lambda: fits_bytes(fits.PrimaryHDU(np.zeros((5, 20, 30)))), r"its shape is \(5, 20, 30\)"),
+]
 
 
-def file_of(counts, header=None, full_scale=np.inf, name="a.fits"):
-    return camera.CameraFile(np.asarray(counts, float)[np.newaxis], name, "", header or {}, full_scale)
+@pytest.mark.parametrize(("content", "message"), NO_IMAGES)
+def test_files_that_are_no_image_are_refused(tmp_path, content, message):
+    (tmp_path / "a.fits").write_bytes(content if isinstance(content, bytes) else content())
+    with pytest.raises((TypeError, ValueError), match=rf"a\.fits: {message}"):
+        camera.read(tmp_path / "a.fits")
+
+
+def file_of(counts, header=None, full_scale=np.inf):
+    return camera.CameraFile(np.asarray(counts, float)[np.newaxis], "a.fits", "", header or {}, full_scale)
 
 
 def test_nan_dark_and_bad_pixel_map():
@@ -166,74 +133,25 @@ def test_saturation_is_given_in_the_header_of_the_type_or_seen():
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("files", "message"),
     [
-        (lambda: camera.images([]), "files: 0 images: expected one or two"),
-        (lambda: camera.images([file_of(FRAME)] * 3), "3 images: expected one or two"),
-        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME[1:])]), r"darks: a\.fits has shape \(19, 30\)"),
-        (lambda: camera.images([file_of(FRAME)], [file_of(FRAME)] * 2), "darks: a.fits: 2 images for the 1 of"),
-        (lambda: camera.images([file_of(FRAME)], [], [file_of(FRAME.T)]), r"bad_pixels: a\.fits has shape"),
-        (lambda: camera.images([file_of(FRAME + 1.0)], saturation=0.5), "all pixels are bad or saturated"),
-        (lambda: camera.images([file_of(FRAME)], saturation=-1), "saturation = -1"),
+        (([],), "files: 0 images: expected one or two"),
+        (([file_of(FRAME)] * 3,), "3 images: expected one or two"),
+        (([file_of(FRAME)], [file_of(FRAME[1:])]), r"darks: a\.fits has shape \(19, 30\)"),
+        (([file_of(FRAME)], [file_of(FRAME)] * 2), "darks: a.fits: 2 images for the 1 of"),
+        (([file_of(FRAME)], [file_of(FRAME + np.nan)]), r"darks: a\.fits has no good pixel"),
+        (([file_of(FRAME)], [], [file_of(FRAME.T)]), r"bad_pixels: a\.fits has shape"),
     ],
 )
-def test_files_that_do_not_fit_together(call, message):
+def test_files_that_do_not_fit_together(files, message):
     with pytest.raises(ValueError, match=message):
-        call()
+        camera.images(*files)
 
 
 def test_astropy_is_named_where_it_is_missing(monkeypatch, tmp_path):
     fits.PrimaryHDU(FRAME).writeto(tmp_path / "a.fits")
-    monkeypatch.setitem(__import__("sys").modules, "astropy.io", None)
+    monkeypatch.setitem(sys.modules, "astropy.io", None)
     with pytest.raises(ImportError, match="pip install astropy"):
-        camera.read(tmp_path / "a.fits")
-
-
-def fits_bytes(*units):
-    stream = io.BytesIO()
-    fits.HDUList(list(units)).writeto(stream)
-    return stream.getvalue()
-
-
-def npy_bytes(array):
-    stream = io.BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
-
-
-def npy_announcing(shape, dtype="<f8"):
-    """An NPY file whose header announces an image that is not there."""
-    stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"shape": shape, "fortran_order": False, "descr": dtype})
-    return stream.getvalue() + bytes(100)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (npy_announcing((60_000, 60_000)), r"its shape is \(60000, 60000\), 28800000000 bytes as float64"),
-        (npy_announcing((60_000, 60_000), "|u1"), "28800000000 bytes as float64: expected at most max_bytes"),
-        (npy_announcing((-20, 30)), r"its shape is \(-20, 30\)"),
-        (npy_announcing((20, 30)), "a broken NPY file"),
-        (b"\x93NUMPY\x01\x00v\x00{'descr': (((", "a broken NPY file"),
-        (gzip.compress(npy_announcing((60_000, 60_000)), mtime=0), "28800000000 bytes as float64"),
-    ],
-)
-def test_npy_headers_that_announce_what_is_not_there(tmp_path, content, message):
-    (tmp_path / "a.npy").write_bytes(content)
-    with pytest.raises(camera.FileError, match=rf"a\.npy: .*{message}"):
-        camera.read(tmp_path / "a.npy")
-
-
-@pytest.mark.parametrize("compressed", [False, True])
-def test_fits_headers_that_announce_too_much(tmp_path, compressed):
-    kind = fits.CompImageHDU if compressed else fits.ImageHDU
-    content = fits_bytes(fits.PrimaryHDU(), kind(FRAME.astype(np.int16)))
-    old, new = (b"ZNAXIS1 =                   30", b"ZNAXIS1 =             60000000") if compressed else (
-        b"NAXIS1  =                   30", b"NAXIS1  =             60000000")  # fmt: skip
-    assert content.count(old) == 1
-    (tmp_path / "a.fits").write_bytes(content.replace(old, new))
-    with pytest.raises(camera.FileError, match=r"a\.fits: "):
         camera.read(tmp_path / "a.fits")
 
 
@@ -257,9 +175,6 @@ def test_largest_size_counts_the_file_and_the_images(tmp_path):
         camera.read(path, max_bytes=8 * FRAME.size - 1)
     with pytest.raises(camera.FileError, match=r"a\.npy: it is larger than 700 bytes"):
         camera.read(path, max_bytes=700)
-    for wrong, kind in ((0, ValueError), (1e9, TypeError), (True, TypeError)):
-        with pytest.raises(kind, match=f"max_bytes = {wrong}"):
-            camera.read(path, max_bytes=wrong)
 
 
 def test_cards_that_do_not_follow_the_standard_are_left_out(tmp_path):
@@ -271,22 +186,6 @@ def test_cards_that_do_not_follow_the_standard_are_left_out(tmp_path):
     assert file.keyword("WAVELEN") == 633
     with pytest.raises(ValueError, match=r"a\.fits: its header has no EXPTIME"):
         file.keyword("EXPTIME")
-
-
-def test_dark_and_map_without_a_good_pixel_are_named():
-    nothing, marked = file_of(np.full(FRAME.shape, np.nan), name="dark.fits"), file_of(FRAME + 1, name="map.fits")
-    with pytest.raises(ValueError, match=r"darks: dark\.fits has no good pixel"):
-        camera.images([file_of(FRAME)], [nothing])
-    with pytest.raises(ValueError, match=r"bad_pixels: map\.fits has no good pixel"):
-        camera.images([file_of(FRAME)], [], [marked])
-
-
-def test_difference_beyond_the_range_of_a_float_is_a_bad_pixel(recwarn):
-    counts, dark = FRAME.astype(float), np.zeros(FRAME.shape)
-    counts[2, 3], dark[2, 3] = 1.5e308, -1.5e308
-    (found,) = camera.images([file_of(counts)], [file_of(dark)])
-    assert np.argwhere(found.bad).tolist() == [[2, 3]]
-    assert not recwarn.list
 
 
 # Writing
@@ -310,32 +209,18 @@ def test_output_that_is_new_or_an_earlier_phase_map(folder):
     assert not (folder / "deep").exists()
 
 
-@pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize("name", ["phase.fits", "sub/../phase.fits", "./phase.fits", "link.fits", "hard.fits"])
-def test_output_is_never_an_input(folder, name, overwrite):
-    (folder / "link.fits").symlink_to("sub/../phase.fits")
-    os.link(folder / "phase.fits", folder / "hard.fits")
-    for given in (name, folder / name):
-        for source in ("phase.fits", folder / "link.fits"):
-            with pytest.raises(ValueError, match=r"output = .* is the input"):
-                camera.check_output(given, ["frame.fits", source], overwrite=overwrite)
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
         ("frame.fits", "exists and is not a phase map"),
         ("notes.md", "exists and is not a phase map"),
-        ("sub/../notes.md", "exists and is not a phase map"),
         ("link.md", "exists and is not a phase map"),
         ("sub", "expected a file, not a folder"),
         ("/dev/null", "expected a file, not a folder"),
         ("", "expected the name of a file"),
         ("notes.md/phase.fits", "expected a file in a folder"),
         ("x" * 250 + ".fits", "expected a name of at most 240 bytes"),
-        ("x" * 5000, "File name too long"),
         ("circle", "output = 'circle'"),
-        ("a\0b", "expected the name of a file"),
         ("\ud800", "expected the name of a file"),
     ],
 )

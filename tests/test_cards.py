@@ -1,6 +1,8 @@
 """The cards under the figures, and their links."""
 
+import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import nbformat
@@ -8,7 +10,8 @@ import pytest
 from bs4 import BeautifulSoup
 
 from book._ext import cards
-from zwfs.companion.results import published
+from book._tools.project import Project
+from studies.kit.results import published
 
 ROOT = Path(__file__).parent.parent
 HTML = ROOT / "_build" / "html"
@@ -36,25 +39,19 @@ def test_a_card_says_how_a_figure_was_made(carded):
         "rms = 0.5  # input, rad rms\nseed = 3",
         'publish(figure, "fig03_range", {})',
         "x = 1",
-        links={"fig03_range.ipynb": "fig03_range.ipynb", "fig03_range.png": "../run/fig03_range.png"},
+        links={"fig03_range.png": "../run/fig03_range.png"},
         versions="Python 3.12.1",
         commit="`abc`",
     )
     assert [cell.cell_type for cell in cells] == ["code", "code", "markdown", "code"]
     said = ["Figure 3 of the paper", "rms = 0.5  # input, rad rms\nseed = 3\n", "`abc`", "Python 3.12.1"]
-    said += ["<fig03_range.ipynb>", "<../run/fig03_range.png>", 'make rerun FIGURE=fig03_range ARGS="-p seed=4"']
+    said += [
+        'href="../_downloads/fig03_range.zip"',
+        "<../run/fig03_range.png>",
+        'make rerun FIGURE=fig03_range ARGS="-p seed=4"',
+    ]
     assert not [text for text in said if text not in cells[2].source]
     assert "CSV" not in cells[2].source, "there is no such file"
-
-
-def test_a_figure_that_is_not_in_the_paper(carded):
-    card = carded("fig04_dimple", "", 'publish(figure, "other", {})')[-1].source
-    assert "Not in the paper, goes with Figure 4 of the paper" in card
-
-
-def test_two_figures_of_a_cell_have_a_card_each(carded):
-    cells = carded("pairs", "n = 1", 'publish(a, "first", {})\npublish(b, "second", {})')
-    assert [cell.id for cell in cells[2:]] == ["card-first", "card-second"]
 
 
 def test_the_commit_is_that_of_this_folder_alone(tmp_path):
@@ -74,6 +71,20 @@ def test_the_commit_is_that_of_this_folder_alone(tmp_path):
     assert cards.commit(tmp_path / "within") == "not known"
 
 
+def test_a_notebook_is_downloaded_with_all_that_it_imports_of_the_studies(tmp_path):
+    source = ROOT / "notebooks" / "fig01_sensor_layout.ipynb"
+    for name in ("one.zip", "two.zip"):
+        cards.write_archive(tmp_path / name, Project(ROOT), source)
+    assert (tmp_path / "one.zip").read_bytes() == (tmp_path / "two.zip").read_bytes()
+    shutil.unpack_archive(tmp_path / "one.zip", tmp_path / "unpacked")
+    assert (tmp_path / "unpacked" / source.name).read_bytes() == source.read_bytes()
+    assert not (tmp_path / "unpacked" / "studies" / "fig09_bench_linearity.py").exists()
+    imports = "from studies import fig01_sensor_layout as s; from studies.kit import sweeps; print(s.__file__)"
+    command = [sys.executable, "-c", imports]
+    done = subprocess.run(command, cwd=tmp_path / "unpacked", capture_output=True, text=True, check=True)
+    assert Path(done.stdout.strip()).is_relative_to(tmp_path)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not HTML.is_dir(), reason="the book is not built: make book")
 def test_every_figure_has_a_card_whose_links_work():
@@ -87,6 +98,6 @@ def test_every_figure_has_a_card_whose_links_work():
             assert all(file.is_file() for file in files), name
             others = [f"{name}.{ending}" for ending in ("png", "pdf", "csv")]
             # A plain build has the notebooks as they are stored; only a run has the other files.
-            assert [file.name for file in files] in ([f"{path.stem}.ipynb", *others], [f"{path.stem}.ipynb"])
+            assert [file.name for file in files] in ([f"{path.stem}.zip", *others], [f"{path.stem}.zip"])
         folds = [card for card in found if card.summary]
         assert folds == found[:1], "the first card has the parameters, and no other one"

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from studies.closed_loop import FrozenFlow, follow_flow
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
-from zwfs.paper.closed_loop import FrozenFlow, follow_flow
 
 PLUS, MINUS = Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2)
 
@@ -112,40 +112,6 @@ def test_the_mirror_stays_where_no_photon_came(pupil, modes, shifted):
     faint = follow_flow(shifted, modes, flow, 2, photons=3.0, seed=2)
     stayed = np.isclose(faint.residual, faint.open_loop)[:, 1]
     assert 0 < stayed.sum() < len(stayed)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"n_steps": 0}, "n_steps = 0"),
-        ({"gain": 2.0}, "gain = 2.0"),
-        ({"delay": 0}, "delay = 0"),
-        ({"rate": 0.0}, "rate = 0.0"),
-        ({"stroke": 0.0}, "stroke = 0.0"),
-        ({"photons": -1.0}, "photons = -1.0"),
-    ],
-)
-def test_bad_input_is_refused(pupil, modes, shifted, change, message):
-    arguments = {"modes": modes, "flow": FrozenFlow(pupil, 0.5, 1, seed=1), "n_steps": 3} | change
-    with pytest.raises(ValueError, match=message):
-        follow_flow(shifted, **arguments)
-
-
-def test_a_flow_for_another_pupil_is_refused(modes, shifted):
-    with pytest.raises(ValueError, match="flow has Pupil"):
-        follow_flow(shifted, modes, FrozenFlow(Pupil.circular(16), 0.5, 1), 3)
-    with pytest.raises(TypeError, match="flow is a float"):
-        follow_flow(shifted, modes, 0.5, 3)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [((-1.0, 1), "rms = -1.0"), ((1.0, 0), "n_screens = 0"), ((1.0, 1, {"cutoff": 0.5}), "cutoff = 0.5")],
-)
-def test_a_bad_flow_is_refused(pupil, arguments, message):
-    *values, options = (*arguments, {}) if len(arguments) == 2 else arguments
-    with pytest.raises(ValueError, match=message):
-        FrozenFlow(pupil, *values, **options)
 
 
 @pytest.mark.parametrize("exponent", [-4.0, -2.0, 0.0])

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from zwfs import Dimple, Pupil, ZernikeSensor, hold_drift, zernike_basis
-from zwfs.paper.dark_zone import (
+from studies.dark_zone import (
     IDEAL,
     Drift,
     best_gain,
@@ -14,6 +13,7 @@ from zwfs.paper.dark_zone import (
     photons_to_hold,
     simulate,
 )
+from zwfs import Dimple, Pupil, ZernikeSensor, hold_drift, zernike_basis
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +59,6 @@ def test_best_gain_and_photons_to_hold(errors, drift):
     assert around[1] >= kalman_limit(errors["pair"], drift, 1e8)
     photons = photons_to_hold(errors["pair"], drift, 15.0)
     assert kalman_limit(errors["pair"], drift, photons) == pytest.approx(15.0)
-    with pytest.raises(ValueError, match="residual = 10"):
-        photons_to_hold(errors["pair"], drift, 10.0)
 
 
 def test_one_image_is_as_good_as_two_around_a_flat_wavefront_and_no_sensor_beats_the_ideal_one(errors):

@@ -11,14 +11,17 @@ import numpy as np
 import pytest
 
 import zwfs
-from zwfs import plots
+from studies.fig01_sensor_layout import draw_sensor_layout
+from studies.fig02_vector_sensor import draw_vector_sensor
+from studies.fig05_seal_bench import draw_bench_layout
+from studies.kit.style import use_style
 from zwfs.bench.model import Bench, segment_screens
 
 
 @pytest.fixture(autouse=True)
 def style():
     with plt.rc_context():
-        plots.use_style(vector=True)
+        use_style(vector=True)
         yield
     plt.close("all")
 
@@ -46,9 +49,9 @@ def frames(bench, pistons):
 @pytest.fixture(params=["sensor_layout", "vector_sensor", "bench_layout"])
 def draw(request, classic, shifted, phase, bench, pistons, frames):
     calls = {
-        "sensor_layout": lambda: plots.sensor_layout(classic, phase),
-        "vector_sensor": lambda: plots.vector_sensor(shifted, phase),
-        "bench_layout": lambda: plots.bench_layout(bench, pistons, frames),
+        "sensor_layout": lambda: draw_sensor_layout(classic, phase),
+        "vector_sensor": lambda: draw_vector_sensor(shifted, phase),
+        "bench_layout": lambda: draw_bench_layout(bench, pistons, frames),
     }
     return calls[request.param]
 
@@ -112,7 +115,7 @@ def test_pictures_are_upright_and_sharp(draw):
 
 
 def test_sensor_layout_shows_what_is_computed(classic, pupil, phase):
-    figure = plots.sensor_layout(classic, phase)
+    figure = draw_sensor_layout(classic, phase)
     field = pupil.amplitude * np.exp(1j * phase)
     assert holds(figure, np.where(pupil.inside, phase, np.nan)) == 1
     assert holds(figure, np.abs(classic.propagate(field)[0]) ** 2) == 2
@@ -122,19 +125,19 @@ def test_sensor_layout_shows_what_is_computed(classic, pupil, phase):
 
 
 def test_terms_of_sensor_layout_add_up(classic, phase):
-    total, incoming, reference, interference = pictures(plots.sensor_layout(classic, phase))[3:7]
+    total, incoming, reference, interference = pictures(draw_sensor_layout(classic, phase))[3:7]
     assert np.abs(total - incoming - reference - interference).max() < 1e-12
 
 
 def test_vector_sensor_shows_the_frames_in_both_rows(shifted, pupil, phase):
-    figure = plots.vector_sensor(shifted, phase)
+    figure = draw_vector_sensor(shifted, phase)
     for frame in shifted.measure(phase):
         assert holds(figure, frame) == 2
     assert holds(figure, np.where(pupil.inside, phase, np.nan)) == 2
 
 
 def test_vector_sensor_shows_both_masks(shifted, phase):
-    shown = pictures(plots.vector_sensor(shifted, phase))
+    shown = pictures(draw_vector_sensor(shifted, phase))
     for mask in shifted.masks:
         maps = [picture for picture in shown if np.nanmax(picture) == np.nanmin(picture) == mask.phase]
         assert len(maps) == 2
@@ -144,18 +147,13 @@ def test_vector_sensor_shows_both_masks(shifted, phase):
 
 
 def test_polarisations_differ_by_dashes_too(shifted, phase):
-    scene = plots.vector_sensor(shifted, phase).axes[0]
+    scene = draw_vector_sensor(shifted, phase).axes[0]
     styles = Counter(line.get_linestyle() for line in scene.lines)
     assert min(styles["-"], styles["--"]) >= 8
 
 
-def test_vector_sensor_refuses_another_number_of_masks(classic, phase):
-    with pytest.raises(ValueError, match="sensor has 1 masks: expected two"):
-        plots.vector_sensor(classic, phase)
-
-
 def test_bench_layout_shows_the_camera(bench, pistons, frames):
-    figure = plots.bench_layout(bench, pistons, frames)
+    figure = draw_bench_layout(bench, pistons, frames)
     for frame in frames:
         assert holds(figure, frame) == 1
     flat = Bench.ideal(n_pixels=60, quilting=bench.quilting).frames()[0]
@@ -163,7 +161,7 @@ def test_bench_layout_shows_the_camera(bench, pistons, frames):
 
 
 def test_bench_layout_shows_the_segments(bench, pistons, frames):
-    figure = plots.bench_layout(bench, pistons, frames)
+    figure = draw_bench_layout(bench, pistons, frames)
     commanded = np.where(bench.segments > 0, bench.commanded_phase(pistons), np.nan)
     assert holds(figure, commanded) == 1
     pupil = zwfs.Pupil.from_segments(bench.segments)
@@ -176,14 +174,7 @@ def test_bench_layout_shows_the_segments(bench, pistons, frames):
 
 
 def test_bench_layout_of_flat_segments(bench, frames):
-    figure = plots.bench_layout(bench, np.zeros(bench.n_segments), frames)
+    figure = draw_bench_layout(bench, np.zeros(bench.n_segments), frames)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         saved(figure)
-
-
-def test_bench_layout_refuses_what_does_not_fit(bench, pistons, frames):
-    with pytest.raises(ValueError, match="pistons"):
-        plots.bench_layout(bench, pistons[:-1], frames)
-    with pytest.raises(ValueError, match="frames has 1 images: expected two"):
-        plots.bench_layout(bench, pistons, frames[:1])

@@ -146,7 +146,7 @@ def imported(source):
 
 
 def test_notebooks_import_no_more_than_is_installed_on_colab():
-    known = {"numpy", "scipy", "matplotlib", "astropy", "joblib", "myst_nb", "zwfs", "IPython"}
+    known = {"numpy", "scipy", "matplotlib", "astropy", "joblib", "myst_nb", "studies", "zwfs", "IPython"}
     cells = [c for p in (ROOT / "notebooks").glob("*.ipynb") for c in nbformat.read(p, as_version=4).cells]
     names = {name for cell in cells if cell.cell_type == "code" for name in imported(cell.source)}
     assert {"numpy", "zwfs"} <= names

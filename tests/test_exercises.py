@@ -37,14 +37,3 @@ def test_the_code_of_an_answer_prints_its_number(name):
     with contextlib.redirect_stdout(printed):
         exec(CODE.search(body)[1], {})
     assert float(printed.getvalue()) == float(STATED.search(body)[1].rstrip(".").replace("−", "-"))
-
-
-NOTE = re.compile(r"^:::+\{div\} chapter-note\n(.+?)\n:::", re.MULTILINE | re.DOTALL)
-
-
-@pytest.mark.parametrize("text", [text for text in texts() if "chapter-note" in text], ids=lambda text: text[2:40])
-def test_a_note_states_goals_and_a_plausible_reading_time(text):
-    [note] = NOTE.findall(text)
-    minutes = re.search(r"Reading time: (\d+) minutes\. .*?You will learn ", note, re.DOTALL)
-    assert minutes, note
-    assert 60 < len(text.split()) / int(minutes[1]) < 200, "words per minute"

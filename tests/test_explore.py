@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from book._ext import explore
-from zwfs.plots.style import LOOKS
+from studies.kit.style import LOOKS
 
 from .conftest import ROOT
 from .test_browser import HTML, address, outside, settle, watch
@@ -79,11 +79,6 @@ def test_the_maps_mark_the_best_design(files):
     assert [panel["title"] for panel in panels] == ["flat wavefront", "1 rad rms"]
     assert [panel["curves"][-1]["x"] for panel in panels] == [[1.5], [1.5]]
     assert [panel["curves"][-1]["y"][0] * np.pi for panel in panels] == pytest.approx([2, 1])
-
-
-def test_a_file_without_the_curves_is_refused(files):
-    with pytest.raises(ValueError, match="expected curves of mean error"):
-        explore.drawing(CURVES, files / f"{GRID}.csv")
 
 
 # In a browser
@@ -213,15 +208,6 @@ def test_drag_zooms_and_reset_returns(opened):
     assert box.evaluate(ends) == pytest.approx(before)
 
 
-def test_colours_follow_the_page(opened):
-    page, box, *_ = opened(CURVES)
-    ink = "box => box.views[0].model.below[0].axis_label_text_color"
-    light = box.evaluate(ink)
-    page.evaluate("document.documentElement.dataset.theme = 'dark'")
-    page.wait_for_function("([box, light]) => box.views[0].model.below[0].axis_label_text_color !== light",
-                           arg=[box.element_handle(), light])  # fmt: skip
-
-
 def test_the_table_has_every_value_and_axe_finds_no_serious_fault(opened):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     page, box, *_ = opened(GRID, width=390)
@@ -231,15 +217,6 @@ def test_the_table_has_every_value_and_axe_finds_no_serious_fault(opened):
     assert box.locator("tbody tr").nth(3).inner_text().split() == ["1", "10", "0.1", "0.6"]
     found = axe.run(page, context=".explore-box", options={"resultTypes": ["violations"]}).response["violations"]
     assert [fault["id"] for fault in found if fault["impact"] in ("serious", "critical")] == []
-
-
-def test_a_failure_to_load_is_said(browser, site):
-    page = browser.new_page()
-    page.route("**/bokeh.min.js", lambda route: route.abort())
-    page.goto(site.as_uri())
-    page.locator(f"[data-explore={CURVES}]").click()
-    page.get_by_text("The interactive version cannot be loaded.").wait_for()
-    page.close()
 
 
 @pytest.mark.slow

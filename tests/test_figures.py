@@ -1,7 +1,7 @@
-import inspect
 import json
 import pickle
 from dataclasses import replace
+from importlib import import_module
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,35 +13,36 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb, to_rgba_array
 
 import zwfs
-from zwfs import plots
+from studies import bandwidth, calibration, phase_amplitude, zernike_sensor
+from studies.bandwidth import BandCurves
+from studies.beyond_dimple import DimpleLimits
+from studies.beyond_range import RecoveryCurves
+from studies.calibration import Example, Shot
+from studies.closed_loop import LoopRun
+from studies.dark_zone import IDEAL, Drift, DriftCurves
+from studies.design import PUBLISHED, DesignMap
+from studies.fig03_dynamic_range import draw_linearity, linearity_curves
+from studies.fig04_dimple_diameter import Contraction, DiameterCurves
+from studies.identities import dimple_pairs
+from studies.kit import grids
+from studies.kit.bench import BenchCurves
+from studies.kit.grids import Grid
+from studies.kit.style import ALONE, DARK_PHASE_MAP, LOOKS, OTHER_STYLES, show_phase, use_style
+from studies.kit.variants import dark_color, variants
+from studies.phase_amplitude import AmplitudeCurves
+from studies.phase_shift_pairs import DrawnNoise, PairMaps
+from studies.photon_noise import EXPECTED, ErrorBars, PhotonCurves
+from studies.reconstructors import draw_convergence
+from studies.zernike_sensor import lowest_pixel
 from zwfs.bench.model import Bench
-from zwfs.companion.sweeps import Grid
 from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics, Step
-from zwfs.paper import identities, one_pixel
-from zwfs.paper.bandwidth import WAYS as BAND_WAYS
-from zwfs.paper.bandwidth import BandCurves
-from zwfs.paper.bench_linearity import BenchCurves
-from zwfs.paper.calibration import WAYS as WAYS_OF_BENCH
-from zwfs.paper.calibration import Example, Shot
-from zwfs.paper.closed_loop import LoopRun
-from zwfs.paper.dark_zone import IDEAL, Drift, DriftCurves
-from zwfs.paper.design import PUBLISHED, DesignMap
-from zwfs.paper.dimple_diameter import Contraction, DiameterCurves
-from zwfs.paper.linearity import linearity_curves
-from zwfs.paper.phase_amplitude import WAYS, AmplitudeCurves
-from zwfs.paper.phase_shifts import DrawnNoise, PairMaps
-from zwfs.paper.photon_noise import EXPECTED, ErrorBars, PhotonCurves
-from zwfs.paper.recovery import DimpleLimits, RecoveryCurves
-from zwfs.plots.photon_noise import label_places
-from zwfs.plots.style import ALONE, DARK_PHASE_MAP
-from zwfs.plots.variants import dark_color, variants
 
 
 @pytest.fixture(autouse=True)
 def style():
     plt.switch_backend("Agg")
     with plt.rc_context():
-        plots.use_style()
+        use_style()
         yield
     plt.close("all")
 
@@ -57,18 +58,20 @@ def drawn(axes, look):
 
 
 def test_every_method_has_a_look_of_its_own():
-    assert {method.__name__ for method in zwfs.RECONSTRUCTORS} <= set(plots.LOOKS)
+    assert {method.__name__ for method in zwfs.RECONSTRUCTORS} <= set(LOOKS)
     for part in ("color", "marker", "label"):
-        assert len({getattr(look, part) for look in plots.LOOKS.values()}) == len(plots.LOOKS)
+        assert len({getattr(look, part) for look in LOOKS.values()}) == len(LOOKS)
 
 
 def figure_functions():
-    """Every function of the package that draws a figure."""
-    functions = {name: getattr(plots, name) for name in plots.__all__}
+    """Every function of the studies that draws a figure."""
+    studies = Path(__file__).parents[1] / "notebooks" / "studies"
+    modules = [import_module(f"studies.{file.stem}") for file in studies.glob("[a-z]*.py")]
     return {
         name: function
-        for name, function in functions.items()
-        if inspect.isfunction(function) and function.__annotations__["return"] == "Figure"
+        for module in (*modules, grids)
+        for name, function in vars(module).items()
+        if name.startswith("draw_") and function.__module__ == module.__name__
     }
 
 
@@ -80,7 +83,7 @@ def drawn_methods(curves, pupil, classic, shifted):
     phase = np.where(pupil.inside, np.add.outer(pupil.y, pupil.x), np.nan)
     frames = np.ones((2, *pupil.shape))
     pistons = np.linspace(-1, 1, 24).reshape(2, 3, 4)
-    trial = DiameterCurves(np.full(3, 0.5), dict.fromkeys(plots.LOOKS, np.full((3, 3), 0.1)), three)
+    trial = DiameterCurves(np.full(3, 0.5), dict.fromkeys(LOOKS, np.full((3, 3), 0.1)), three)
     lines = {f"curve {i}": three for i in range(4)}
     reasons = Contraction(three, three, np.full((3, 2), 0.5), {1.0: 0.5}, lines)
     bench_curves = BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(two, 0.1 * pistons))
@@ -95,7 +98,7 @@ def drawn_methods(curves, pupil, classic, shifted):
     recording = SimpleNamespace(diameter=float(pupil.n_pixels))
     measurement = Measurement(recording, Optics(), frames, pupil, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0))
     found = MeasuredPhase(phase, frames, 0.9 * frames, measurement, True, 0)
-    varied = AmplitudeCurves(three, dict.fromkeys(WAYS, np.full((3, 2), 0.1)), {}, three)
+    varied = AmplitudeCurves(three, dict.fromkeys(phase_amplitude.WAYS, np.full((3, 2), 0.1)), {}, three)
     held = DriftCurves(
         Drift(np.ones((6, 2, 2)), 10.0, 500.0),
         {"pair": np.ones(6), IDEAL: np.ones(6)},
@@ -104,26 +107,29 @@ def drawn_methods(curves, pupil, classic, shifted):
         [0.1, 0.5],
         {1e3: np.array([30.0, 20.0])},
     )
-    banded = BandCurves(three, dict.fromkeys(BAND_WAYS, three), {}, three, 1.0)
+    banded = BandCurves(three, dict.fromkeys(bandwidth.WAYS, three), {}, three, 1.0)
     triple = zwfs.ZernikeSensor(pupil, *shifted.masks, zwfs.Dimple(1, 0))
     both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(
         triple.measure(pupil.scatter(pupil.gather(phase), 0))
     )
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
-    ways = dict.fromkeys(WAYS_OF_BENCH, 0.1 * commands)
-    example = Example(commands, Shot(frames, frames), dict.fromkeys(WAYS_OF_BENCH, 0.9 * frames), ways)
+    ways = dict.fromkeys(calibration.WAYS, 0.1 * commands)
+    example = Example(commands, Shot(frames, frames), dict.fromkeys(calibration.WAYS, 0.9 * frames), ways)
     calibrated = BenchCurves(
         np.array([0.5]), commands[None, None], {name: one[None, None] for name, one in ways.items()}
     )
     return {
-        "grid_slice": ((Grid({"x": (1, 2), "screen": (0,)}, {"error": np.ones((2, 1))}), "error", "x"), ()),
-        "sensor_layout": ((classic, phase), ()),
-        "vector_sensor": ((shifted, phase), ()),
-        "bench_layout": ((bench, commands, bench.frames(commands, seed=1)), ()),
-        "at_a_glance": ((pupil, phase, frames, dict.fromkeys([*two, "Arcsine"], phase)), ()),
-        "linearity": ((curves, 0.05, two, 0.4), two),
-        "saxton_widths": (
+        "draw_slice": (
+            (Grid({"x": np.arange(2), "screen": np.zeros(2), "error": np.ones(2)}, ("x",)), "error", "x"),
+            (),
+        ),
+        "draw_sensor_layout": ((classic, phase), ()),
+        "draw_vector_sensor": ((shifted, phase), ()),
+        "draw_bench_layout": ((bench, commands, bench.frames(commands, seed=1)), ()),
+        "draw_steps": ((pupil, phase, frames, dict.fromkeys([*two, "Arcsine"], phase)), ()),
+        "draw_linearity": ((curves, 0.05, two, 0.4), two),
+        "draw_saxton_widths": (
             (
                 {"narrow": saxton},
                 replace(curves, errors={"narrow": curves.errors["Linear"]} | curves.errors),
@@ -131,55 +137,51 @@ def drawn_methods(curves, pupil, classic, shifted):
             ),
             ["Linear", "GerchbergSaxton"],
         ),
-        "convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in plots.LOOKS},), plots.LOOKS),
-        "estimates": ((pupil, phase, dict.fromkeys(two, phase)), ()),
-        "sensor_steps": ((shifted, phase, one_pixel.lowest_pixel(shifted, phase)), ()),
-        "pixel_phasors": ((one_pixel.lowest_pixel(shifted, phase),), ()),
-        "one_or_two_images": ((pupil, phase, dict.fromkeys(two, phase)), ()),
-        "approximation": ((three, lines, lines), ()),
-        "diversity": ((identities.dimple_pairs(pupil, 1.06, 24, pupil.field(0 * phase)),), ()),
-        "dimple_diameter": (({25: trial, 100: trial}, 0.05, 2.2), shifted_only),
-        "diameter_methods": ((dict.fromkeys(plots.LOOKS, trial), 0.05, 2.2), plots.LOOKS),
-        "diameter_reasons": ((reasons, 2.2), shifted_only),
-        "dimple_recovery": (({0.5: trials, 1.0: trials}, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
-        "dimple_limits": ((limits, 0.5), shifted_only),
-        "range_recovery": (({1.06: recovered}, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
-        "range_starts": (({1.06: recovered, 2.0: recovered},), ()),
-        "all_pairs": ((PairMaps(three, *np.full((5, 3, 3), 1.0)),), ()),
-        "pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
-        "photon_noise": (
-            (
-                PhotonCurves(
-                    three, three, dict.fromkeys(plots.LOOKS, np.ones((3, 3, 2))), np.eye(3) + 1, np.eye(3)
-                ),
-            ),
-            plots.LOOKS,
+        "draw_convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in LOOKS},), LOOKS),
+        "draw_estimates": ((pupil, phase, dict.fromkeys(two, phase)), ()),
+        "draw_sensor_steps": ((shifted, phase, lowest_pixel(shifted, phase)), ()),
+        "draw_pixel_phasors": ((lowest_pixel(shifted, phase),), ()),
+        "draw_one_or_two_images": ((pupil, phase, dict.fromkeys(two, phase)), ()),
+        "draw_approximation": ((three, lines, lines), ()),
+        "draw_diversity": ((dimple_pairs(pupil, 1.06, 24, pupil.field(0 * phase)),), ()),
+        "draw_dimple_diameter": (({25: trial, 100: trial}, 0.05, 2.2), shifted_only),
+        "draw_diameter_methods": ((dict.fromkeys(LOOKS, trial), 0.05, 2.2), LOOKS),
+        "draw_diameter_reasons": ((reasons, 2.2), shifted_only),
+        "draw_dimple_recovery": (({0.5: trials, 1.0: trials}, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
+        "draw_dimple_limits": ((limits, 0.5), shifted_only),
+        "draw_range_recovery": (({1.06: recovered}, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
+        "draw_range_starts": (({1.06: recovered, 2.0: recovered},), ()),
+        "draw_pairs": ((PairMaps(three, *np.full((5, 3, 3), 1.0)),), ()),
+        "draw_pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
+        "draw_photon_noise": (
+            (PhotonCurves(three, three, dict.fromkeys(LOOKS, np.ones((3, 3, 2))), np.eye(3) + 1, np.eye(3)),),
+            LOOKS,
         ),
-        "error_bars": (([ErrorBars(k, EXPECTED, k, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
-        "design_maps": (
+        "draw_error_bars": (([ErrorBars(k, EXPECTED, k, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
+        "draw_design_maps": (
             (DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5}), PUBLISHED, {"flat": three}),
             (),
         ),
-        "band_errors": (({(0.1, False): banded, (0.1, True): banded},), [*shifted_only, "MaximumLikelihood"]),
-        "held_drift": ((held,), ()),
-        "amplitude_errors": (({"dips": varied},), [*shifted_only, "MaximumLikelihood"]),
-        "phase_and_amplitude": ((pupil, 0 * pupil.amplitude, pupil.amplitude, both), ()),
-        "reference_intensities": ((frames, frames), ()),
-        "measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
-        "segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),
-        "bench_linearity": ((bench_curves,), two),
-        "budget": ((dict.fromkeys(["none", "blur"], bench_curves), "PhaseShifted"), shifted_only),
-        "calibration_errors": ((calibrated, example, bench.numbers), shifted_only),
-        "calibration_frames": ((example,), ()),
-        "explained": ((found,), ()),
-        "phase_map": ((found, 635.0), ()),
-        "gains": (
+        "draw_band_errors": (({(0.1, False): banded, (0.1, True): banded},), [*shifted_only, "MaximumLikelihood"]),
+        "draw_held_drift": ((held,), ()),
+        "draw_amplitude_errors": (({"dips": varied},), [*shifted_only, "MaximumLikelihood"]),
+        "draw_phase_and_amplitude": ((pupil, 0 * pupil.amplitude, pupil.amplitude, both), ()),
+        "draw_reference_intensities": ((frames, frames), ()),
+        "draw_measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
+        "draw_segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),
+        "draw_bench_linearity": ((bench_curves,), two),
+        "draw_budget": ((dict.fromkeys(["none", "blur"], bench_curves), "PhaseShifted"), shifted_only),
+        "draw_calibration_errors": ((calibrated, example, bench.numbers), shifted_only),
+        "draw_calibration_frames": ((example,), ()),
+        "draw_explained": ((found,), ()),
+        "draw_phase_map": ((found, 635.0), ()),
+        "draw_gains": (
             ([Step("outlines", found, np.ones(2), np.zeros(2))] * 2, [0.1, 0.2]),
             (),
         ),
-        "signs": ((measurement,), ()),
-        "loop_runs": (({4.0: dict.fromkeys(two, loop)},), two),
-        "capture": (
+        "draw_signs": ((measurement,), ()),
+        "draw_loop_runs": (({4.0: dict.fromkeys(two, loop)},), two),
+        "draw_capture": (
             (three, [dict.fromkeys(two, loop)] * 3),
             two,
         ),
@@ -218,7 +220,7 @@ def test_variants_are_dark_or_fit_a_phone_and_the_figure_stays(name, drawn_metho
 def test_pictures_with_titles_stay_in_the_order_of_reading_on_a_phone():
     figure, panels = plt.subplots(2, 3)
     for number, axes in enumerate(panels.flat):
-        plots.show_phase(axes, np.zeros((2, 2)), 1.0).axes.set_title(f"{number}")
+        show_phase(axes, np.zeros((2, 2)), 1.0).axes.set_title(f"{number}")
     panels[0, 0].set_gid(ALONE)
     boxes = panel_boxes(variants(figure)["narrow"])
     lines = {top for _, top, _ in boxes.values()}
@@ -234,20 +236,9 @@ def panel_boxes(figure):
     return {name: tuple(round(value) for value in (box.x0, box.y1, box.width)) for name, box in boxes.items()}
 
 
-def test_labels_of_contours_have_room():
-    line = np.linspace(0, 1, 21)
-    near, far = ([np.stack([line, np.full(21, height)], axis=1)] for height in (0.1, 0.6))
-    mark = np.array([[0.2, 0.6]])
-    places = label_places({1.0: near, 2.0: far, 3.0: []}, mark, (0, 1, 0, 1), (1, 1))
-    assert set(places) == {2.0}  # the first is 0.1 inch from the frame, and the third has no line
-    assert tuple(places[2.0]) == pytest.approx((0.6, 0.6))
-    both = label_places({1.0: near, 2.0: far}, mark, (0, 1, 0, 1), (10, 10))
-    assert set(both) == {1.0, 2.0}
-
-
 def test_phases_of_a_dark_figure_are_dark_at_zero():
     figure, axes = plt.subplots()
-    figure.colorbar(plots.show_phase(axes, np.zeros((2, 2)), 1.0))
+    figure.colorbar(show_phase(axes, np.zeros((2, 2)), 1.0))
     dark = variants(figure)["dark"]
     assert pixels(figure)[200, 200, :3].min() > 200
     assert pixels(dark)[200, 200, :3].max() < 60
@@ -260,13 +251,6 @@ def test_opposite_phases_of_a_dark_figure_are_equally_light():
     lightness = [[lab(DARK_PHASE_MAP(0.5 + sign * one / 2), "normal")[0] for one in phases] for sign in (-1, 1)]
     np.testing.assert_allclose(*lightness, atol=3)
     assert np.all(np.diff(lightness) > 0)
-
-
-def test_arrows_of_a_dark_figure_are_light():
-    figure, axes = plt.subplots()
-    axes.annotate("", (0, 0), (1, 1), arrowprops={"color": "black"})
-    (arrow,) = (text.arrow_patch for text in variants(figure)["dark"].axes[0].texts)
-    assert min(arrow.get_facecolor()) > 0.8
 
 
 def cut_off(figure):
@@ -294,7 +278,7 @@ def pixels(figure):
 
 def test_curves_of_a_dark_figure_differ_for_every_reader():
     figure, axes = plt.subplots()
-    for look in plots.LOOKS.values():
+    for look in LOOKS.values():
         axes.plot([0, 1], **look.style)
     dark = [line.get_color() for line in variants(figure)["dark"].axes[0].lines]
     for vision in VISION:
@@ -302,8 +286,8 @@ def test_curves_of_a_dark_figure_differ_for_every_reader():
 
 
 def test_colours_of_a_dark_figure_can_be_read():
-    light = [look.color for look in plots.LOOKS.values()] + [style["color"] for style in plots.style.OTHER_STYLES]
-    colors = [dark_color(color) for color in (*light, *(color for _, color, _ in plots.one_pixel.IMAGES))]
+    light = [look.color for look in LOOKS.values()] + [style["color"] for style in OTHER_STYLES]
+    colors = [dark_color(color) for color in (*light, *(color for _, color, _ in zernike_sensor.IMAGES))]
     assert min(lab(color, "normal")[0] for color in colors) > 53  # a contrast of 4.5 with the ground
 
 
@@ -311,10 +295,10 @@ def test_colours_of_a_dark_figure_can_be_read():
 def test_colours_of_methods_stand_for_nothing_else(name, drawn_methods, monkeypatch):
     """With methods in other colours, no artist has the colour of a method; black is also the colour of ink."""
     arguments, methods = drawn_methods[name]
-    usual = {look.color: method for method, look in plots.LOOKS.items() if look.color != "#000000"}
-    other = {method: f"#0{index}0{index}0{index}" for index, method in enumerate(plots.LOOKS, start=1)}
+    usual = {look.color: method for method, look in LOOKS.items() if look.color != "#000000"}
+    other = {method: f"#0{index}0{index}0{index}" for index, method in enumerate(LOOKS, start=1)}
     for method, color in other.items():
-        monkeypatch.setitem(plots.LOOKS, method, replace(plots.LOOKS[method], color=color))
+        monkeypatch.setitem(LOOKS, method, replace(LOOKS[method], color=color))
     shown = colours(figure_functions()[name](*arguments))
     assert {usual[color] for color in shown & set(usual)} == set()
     assert {method for method, color in other.items() if color in shown} == set(methods)
@@ -324,14 +308,7 @@ def test_notebooks_draw_no_colour_of_a_method():
     notebooks = (Path(__file__).parent.parent / "notebooks").glob("*.ipynb")
     cells = (cell for file in notebooks for cell in json.loads(file.read_bytes())["cells"])
     source = "".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code").upper()
-    assert not [look.color for look in plots.LOOKS.values() if look.color in source]
-
-
-def test_curves_of_no_method_have_other_colours_and_markers():
-    for part in ("color", "marker"):
-        values = {style[part] for style in plots.OTHER_STYLES}
-        assert len(values) == len(plots.OTHER_STYLES)
-        assert not values & {getattr(look, part) for look in plots.LOOKS.values()}
+    assert not [look.color for look in LOOKS.values() if look.color in source]
 
 
 # Linear RGB as it looks without one kind of cones (Machado, Oliveira and Fernandes 2009, severity 1).
@@ -357,73 +334,34 @@ def lab(color, vision):
 @pytest.mark.parametrize("vision", VISION)
 def test_colours_that_share_a_figure_differ_for_every_reader(vision):
     palettes = {
-        "methods": [look.color for look in plots.LOOKS.values()],
-        "other curves": [style["color"] for style in plots.OTHER_STYLES],
+        "methods": [look.color for look in LOOKS.values()],
+        "other curves": [style["color"] for style in OTHER_STYLES],
     }
     for colors in palettes.values():
         points = [lab(color, vision) for color in colors]
         assert min(np.linalg.norm(a - b) for a, b in combinations(points, 2)) > 15
 
 
-def test_a_method_looks_the_same_in_every_figure(curves):
-    errors = dict.fromkeys(plots.LOOKS, np.full((2, 3), 0.1))
-    trials = dict.fromkeys(plots.LOOKS, DiameterCurves(np.full(2, 0.5), errors, np.array([1.0, 2])))
-    steps = {name: {0.2: np.geomspace(1, 1e-6, 8) * np.ones((3, 8))} for name in plots.LOOKS}
-    two = ["Linear", "PhaseShifted"]
-    pistons = np.linspace(-1, 1, 24).reshape(2, 3, 4)
-    bench = BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(two, 0.1 * pistons))
-    mirror = Bench(n_pixels=60)
-    commands = np.linspace(-1, 1, mirror.n_segments)
-    segments = plots.segment_errors(mirror, commands, dict.fromkeys(two, commands))
-    shown = [
-        (plots.linearity(curves, 0.05, two, rms_max=0.4), two),
-        (plots.convergence(steps), list(plots.LOOKS)),
-        (plots.diameter_methods(trials, 0.05, 2.2), list(plots.LOOKS)),
-        (plots.bench_linearity(bench), two),
-        (segments, two),
-    ]
-    for figure, names in shown:
-        for look in map(plots.LOOKS.get, names):
-            lines = [line for axes in figure.axes for line in axes.lines]
-            found = {(line.get_color(), line.get_marker()) for line in lines if look.label in line.get_label()}
-            assert found == {(look.color, look.marker)}
-
-
 def test_linearity_draws_the_means_and_marks_where_they_leave(curves):
-    figure = plots.linearity(curves, 0.05, ["Linear", "PhaseShifted"], rms_max=0.2)
+    figure = draw_linearity(curves, 0.05, ["Linear", "PhaseShifted"], rms_max=0.2)
     plain, ratio = figure.axes
-    look = plots.LOOKS["Linear"]
+    look = LOOKS["Linear"]
     np.testing.assert_allclose(drawn(plain, look).get_ydata(), curves.mean("Linear")[:3])
     np.testing.assert_allclose(drawn(ratio, look).get_ydata(), curves.mean("Linear")[1:] / curves.rms[1:])
     marks = [line.get_xdata()[0] for line in ratio.lines if len(line.get_xdata()) == 1]
     assert marks == [pytest.approx(curves.dynamic_range("Linear", 0.05))]
 
 
-def test_estimates_show_what_they_were_given(pupil, screens):
-    truth = screens(0.5, 1)[0]
-    found = {"Linear": np.where(pupil.inside, truth / 2, np.nan)}
-    figure = plots.estimates(pupil, truth, found)
-    shown = [np.ma.filled(axes.images[0].get_array(), np.nan) for axes in figure.axes if axes.images]
-    np.testing.assert_array_equal(shown[1], found["Linear"])
-
-
-def test_convergence_has_a_panel_for_each_input():
-    errors = {"Linear": {0.2: np.ones((3, 2))}, "PhaseShifted": {0.2: np.geomspace(1, 1e-6, 8) * np.ones((3, 8))}}
-    figure = plots.convergence(errors)
-    line = drawn(figure.axes[0], plots.LOOKS["PhaseShifted"])
-    np.testing.assert_allclose(line.get_ydata(), np.geomspace(1, 1e-6, 8))
-
-
 def test_methods_of_a_reader_get_looks_of_their_own(monkeypatch):
     names = ["WhiteMagic", "Luck"]
     for name in names:
-        monkeypatch.setitem(plots.LOOKS, name, None)  # taken out again at the end
-        del plots.LOOKS[name]
-    assert [plots.LOOKS[name].label for name in names] == ["white magic", "luck"]
+        monkeypatch.setitem(LOOKS, name, None)  # taken out again at the end
+        del LOOKS[name]
+    assert [LOOKS[name].label for name in names] == ["white magic", "luck"]
     for part in ("color", "marker"):
-        assert len({getattr(look, part) for look in plots.LOOKS.values()}) == len(plots.LOOKS)
+        assert len({getattr(look, part) for look in LOOKS.values()}) == len(LOOKS)
     for vision in VISION:
-        points = [lab(look.color, vision) for look in plots.LOOKS.values()]
+        points = [lab(look.color, vision) for look in LOOKS.values()]
         assert min(np.linalg.norm(a - b) for a, b in combinations(points, 2)) > 15
-    figure = plots.convergence({name: {0.2: np.ones((3, 2))} for name in names})
-    assert {line.get_color() for line in figure.axes[0].lines} >= {plots.LOOKS[name].color for name in names}
+    figure = draw_convergence({name: {0.2: np.ones((3, 2))} for name in names})
+    assert {line.get_color() for line in figure.axes[0].lines} >= {LOOKS[name].color for name in names}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
-from zwfs.frames.registration import record
+from zwfs.frames.registration import register_frames
 from zwfs.frames.verdict import CameraNoise, judge, near_edges
 
 from . import foreign
@@ -15,17 +15,17 @@ from . import foreign
 @pytest.fixture(scope="module", params=foreign.CASES)
 def case(request):
     frames, clear_frames = foreign.recorded(**foreign.CASES[request.param])
-    return foreign.CASES[request.param], record(frames, clear_frames)
+    return foreign.CASES[request.param], register_frames(frames, clear_frames)
 
 
 def test_phase_is_recovered_however_the_second_image_stands(case):
-    _, recording = case
-    assert foreign.phase_error(recover_phase(reduce_frames(recording, Optics()))) < 0.015
+    _, registered = case
+    assert foreign.phase_error(recover_phase(reduce_frames(registered, Optics()))) < 0.015
 
 
 def test_placement_of_the_second_image_is_measured_within_its_errors(case):
-    given, recording = case
-    placement = recording.placement
+    given, registered = case
+    placement = registered.placement
     found = [*placement.shift, placement.rotation, placement.magnification]
     true = [*given.get("shift", (0, 0)), given.get("rotation", 0), given.get("magnification", 1)]
     assert np.all(np.abs(np.subtract(found, true)) < 4 * placement.sigma)
@@ -33,8 +33,8 @@ def test_placement_of_the_second_image_is_measured_within_its_errors(case):
 
 
 def test_light_of_the_images_is_compared_whatever_their_size(case):
-    given, recording = case
-    ratios = reduce_frames(recording, Optics()).flux_ratio
+    given, registered = case
+    ratios = reduce_frames(registered, Optics()).flux_ratio
     np.testing.assert_allclose(ratios, 1 / given.get("flux", 1), rtol=0.005)
 
 
@@ -46,9 +46,9 @@ def test_bad_pixel_of_the_second_image_spoils_the_points_around_its_place():
     row, column = np.round(middle + np.array([0.4, -0.7]) + 1.02 * turned @ there).astype(int)
     bad = np.zeros_like(frames[1].bad)
     bad[row, column] = True
-    recording = record([frames[0], replace(frames[1], bad=bad)], clear_frames)
-    measurement = reduce_frames(recording, Optics())
-    spoiled = np.argwhere(measurement.bad[1]) + recording.corner - measurement.margin - middle
+    registered = register_frames([frames[0], replace(frames[1], bad=bad)], clear_frames)
+    measurement = reduce_frames(registered, Optics())
+    spoiled = np.argwhere(measurement.bad[1]) + registered.corner - measurement.margin - middle
     assert 1 <= len(spoiled) <= 9
     assert np.abs(spoiled - there).max() < 2
     assert not measurement.bad[0].any()
@@ -69,14 +69,14 @@ def test_noise_explains_the_frames_and_its_error_bar_holds(case):
 
 @pytest.mark.parametrize("wrong", [Optics(1.3), Optics(scale=1.1), Optics(unmasked=0.1), Optics(background=0.05)])
 def test_wrong_model_is_not_explained(wrong):
-    recording = record(*foreign.recorded())
-    assert not judge(recover_phase(reduce_frames(recording, wrong)), NOISE).explained
+    registered = register_frames(*foreign.recorded())
+    assert not judge(recover_phase(reduce_frames(registered, wrong)), NOISE).explained
 
 
 def test_frames_that_do_not_belong_together_score_like_the_control():
     frames, clear_frames = foreign.recorded()
     upside_down = [frames[0], replace(frames[1], counts=frames[1].counts[::-1])]
-    verdict = judge(recover_phase(reduce_frames(record(upside_down, clear_frames), Optics())))
+    verdict = judge(recover_phase(reduce_frames(register_frames(upside_down, clear_frames), Optics())))
     assert np.all(verdict.score < 0.3)
     assert verdict.explained is None
     assert verdict.sigma is None

@@ -2,7 +2,15 @@ import numpy as np
 import pytest
 
 import zwfs
-from zwfs.paper import identities
+from studies.identities import (
+    approximation_errors,
+    arccosine_phase,
+    direct_reference_wave,
+    fourier_waves,
+    matrix_determinant,
+    pair_phase,
+    two_waves,
+)
 
 
 @pytest.fixture
@@ -14,18 +22,18 @@ def patch():
 def test_fourier_transforms_and_two_waves_agree(pupil, screens, patch, mask):
     mask = patch if mask == "patch" else zwfs.Dimple(1.06, np.pi / 2)
     field = pupil.amplitude * np.exp(1j * screens(0.5, 1)[0])
-    outgoing, incoming, reference = identities.fourier_waves(pupil, mask, field)
-    assert np.abs(outgoing) ** 2 == pytest.approx(identities.two_waves(incoming, reference), abs=1e-13)
+    outgoing, incoming, reference = fourier_waves(pupil, mask, field)
+    assert np.abs(outgoing) ** 2 == pytest.approx(two_waves(incoming, reference), abs=1e-13)
     # The transform's coarse mask edge limits how near it comes.
     corner = reference[: pupil.shape[0], : pupil.shape[1]]
-    exact = identities.direct_reference_wave(pupil, mask, field)
+    exact = direct_reference_wave(pupil, mask, field)
     assert np.abs(corner - exact).max() < 0.03 * np.abs(exact).max()
 
 
 def test_direct_sum_is_the_reference_wave(pupil, screens, patch):
     field = pupil.amplitude * np.exp(1j * screens(0.5, 1)[0])
     sensor = zwfs.ZernikeSensor(pupil, patch, tolerance=1e-14)
-    direct = identities.direct_reference_wave(pupil, patch, field)
+    direct = direct_reference_wave(pupil, patch, field)
     assert sensor.reference_wave(field)[0] == pytest.approx(direct, abs=1e-12)
 
 
@@ -35,41 +43,30 @@ def test_equations_give_the_phase_back(shifted, screens):
     amplitude, truth = pupil.gather(pupil.amplitude), pupil.gather(phase)
     waves = pupil.gather(shifted.reference_wave(pupil.amplitude * np.exp(1j * phase)))
     frames = pupil.gather(shifted.measure(phase))
-    assert identities.pair_phase(frames, amplitude, waves) == pytest.approx(truth, abs=1e-12)
+    assert pair_phase(frames, amplitude, waves) == pytest.approx(truth, abs=1e-12)
     # One image: on the side of the branch that the dimple of +pi/2 has.
     safe = np.abs(truth) < 0.5
-    found = identities.arccosine_phase(frames[:, 0], amplitude, waves[:, 0])
+    found = arccosine_phase(frames[:, 0], amplitude, waves[:, 0])
     assert found[safe] == pytest.approx(truth[safe], abs=1e-6)
-
-
-def test_numbers_beyond_any_light_are_refused(pupil):
-    field, one = pupil.amplitude + 0j, np.ones(3)
-    with pytest.raises(ValueError, match="n_samples = 100000: expected an integer in"):
-        identities.direct_reference_wave(pupil, zwfs.Dimple(1.06, 1.0), field, n_samples=100_000)
-    for size in (1e155, 1e-155):
-        with pytest.raises(ValueError, match="amplitude"):
-            identities.pair_phase(np.ones((2, 3)), size * one, np.exp([[1j], [-1j]]) * one)
-    with pytest.raises(ValueError, match="incoming reaches 1e\\+155"):
-        identities.two_waves(1e155 * one, one)
 
 
 def test_determinant_is_the_sine_of_the_difference():
     angles = np.linspace(-3, 3, 13)
     a, b = np.exp(1j * angles)[:, np.newaxis], 2 * np.exp(1j * angles)
     expected = np.sin(angles - angles[:, np.newaxis])
-    assert identities.matrix_determinant(a, b) == pytest.approx(expected, abs=1e-14)
+    assert matrix_determinant(a, b) == pytest.approx(expected, abs=1e-14)
 
 
 def test_approximation_is_right_to_second_order_in_amplitude_only(shifted, screens):
     shapes = screens(1.0, 4)
-    small, large = (identities.approximation_errors(shifted, rms * shapes) for rms in (0.05, 0.1))
+    small, large = (approximation_errors(shifted, rms * shapes) for rms in (0.05, 0.1))
     assert large.phase / small.phase == pytest.approx(2, rel=0.05)
     assert large.amplitude / small.amplitude == pytest.approx(4, rel=0.2)
     assert large.two_images / small.two_images == pytest.approx(2, rel=0.05)
-    unscaled = identities.approximation_errors(shifted, 0.1 * shapes, power=0)
+    unscaled = approximation_errors(shifted, 0.1 * shapes, power=0)
     assert unscaled.amplitude > large.amplitude
 
 
 def test_flat_wavefront_needs_no_approximation(shifted):
-    errors = identities.approximation_errors(shifted, np.zeros((1, *shifted.pupil.shape)))
+    errors = approximation_errors(shifted, np.zeros((1, *shifted.pupil.shape)))
     assert max(errors.phase, errors.amplitude, errors.wave, errors.two_images) < 1e-12

@@ -186,12 +186,6 @@ def test_calibrated_sensor_measures_segments(bench, calibrated):
     assert segment_residual(pistons, command).std() < 0.01
 
 
-def test_covariance_says_what_the_images_do_not_determine(calibrated):
-    assert np.all(np.diagonal(calibrated.covariance) > 0)
-    np.testing.assert_allclose(np.diagonal(calibrated.correlation), 1)
-    assert all("one standard deviation" in line for line in calibrated.undetermined(1.5))
-
-
 def test_bench_shows_what_the_real_frames_show():
     """The images of the bench, on its wider grid, are those of the model at the same values."""
     shown = {"focus": (0, 0, 2e-4, -2e-4), "astigmatism": 2e-4, "unmodulated": 0.2, "coherent": 0.1, "halo": 0.2}
@@ -264,32 +258,6 @@ def test_one_image_is_predicted_from_the_others(single):
 
 
 # Bad input
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Parameter(2.0, low=0.0, high=1.0), "value = 2.0"),
-        (lambda: Parameter(0.0, sigma=0.0), "sigma = 0"),
-        (lambda: Picture(np.zeros((4, 4)), 0, 2), "mask = 2"),
-        (lambda: Picture(np.zeros((4, 4)), 0, sigma=0.0), "sigma reaches down to 0"),
-        (lambda: Picture(np.full((4, 4), np.nan), 0), "counts holds 16 NaN"),
-        (lambda: Picture(np.zeros((4, 4)), 0, neighbour=(0, 0)), "neighbour"),
-        (lambda: MapPrior(0.0), "rms = 0"),
-        (lambda: Forward([Picture(np.zeros((5, 6)), 0)], ARMS, PUPIL.inside, N), "pictures.0. has shape .5, 6."),
-        (lambda: Forward([Picture(np.zeros((6, 6)), 3)], ARMS, PUPIL.inside, N), "arm = 3"),
-        (lambda: JointProblem([], ARMS, MaskPair(), np.ones((4, 4)), 4), "empty"),
-        (lambda: JointProblem([Picture(np.zeros((4, 4)), 0)], ARMS, MaskPair(), np.zeros((4, 4)), 4), "light"),
-        (lambda: fit_bench(np.ones((1, 2, 8, 8)), np.ones((2, 8, 8)), np.zeros((1, 8, 8)), n_pixels=8), "1 state"),
-        (
-            lambda: fit_bench(np.ones((3, 2, 8, 8)), np.ones((2, 8, 8)), np.zeros((2, 8, 8)), n_pixels=8),
-            "known has",
-        ),
-    ],
-)
-def test_bad_input_is_named(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
 
 
 # Real frames

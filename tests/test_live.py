@@ -10,9 +10,9 @@ from scipy.interpolate import RegularGridInterpolator
 
 import zwfs
 from book._ext import live
-from zwfs.focal import focal_field
-from zwfs.paper.design import Design, DesignMap, photon_costs
-from zwfs.paper.linearity import screens_at
+from studies.design import Design, photon_costs
+from studies.kit.curves import screens_at
+from zwfs.masks import focal_field
 
 ROOT = Path(__file__).parent.parent
 STATIC = ROOT / "book" / "_static"
@@ -311,16 +311,6 @@ def test_designs_are_those_of_the_notebook(pupil, modes):
         np.testing.assert_allclose([table["costs"][name][x][y] for x, y in places], costs, rtol=1e-5)
 
 
-def test_all_round_design_is_that_of_the_map():
-    table = live.designs()
-    costs = {name: np.array(cost) for name, cost in table["costs"].items()}
-    best = DesignMap(np.array(table["diameters"]), np.pi * np.array(table["shifts"]), costs).all_round
-    place = f"{best.diameter:g} {best.theta_a / np.pi:.3g} {best.theta_b / np.pi:.3g}"
-    assert SOURCE.count(f'data-design="{place}"') == 2
-    settings = "diameter={}&amp;shift-a={}&amp;shift-b={}".format(*place.split())
-    assert re.search(rf'data-live="[^"]*{settings}[^"]*">All-round</button>', SOURCE)
-
-
 @pytest.mark.parametrize("name", live.designs()["costs"])
 def test_contours_and_the_best_design_are_those_of_the_map(fresh, name):
     fresh.check(f"input[value='{name}']")
@@ -336,14 +326,6 @@ def test_contours_and_the_best_design_are_those_of_the_map(fresh, name):
     assert [float(value) for value in place[:2]] == pytest.approx([column + 0.5, costs.shape[1] - row - 0.5])
 
 
-def test_sliders_stay_in_the_range_of_the_data(page):
-    limits = {
-        name: [float(page.get_attribute(f"#live-{name}", end)) for end in ("min", "max")]
-        for name in ("seed", "diameter")
-    }
-    assert limits == {"seed": [1, live.N_SEEDS], "diameter": list(live.DIAMETERS)}
-
-
 def verdicts(page):
     return [page.inner_text(f"#live-verdict-{place}")[0] for place in range(3)]
 
@@ -351,11 +333,6 @@ def verdicts(page):
 def wait_for_address(page, *parts):
     for part in parts:
         page.wait_for_function("part => location.hash.includes(part)", arg=part)
-
-
-def test_the_first_state_shows_the_point_of_the_paper(fresh):
-    assert verdicts(fresh) == ["✗", "✗", "✓"]
-    assert "phase-shifted recovers the phase" in fresh.inner_text("#live-says")
 
 
 @pytest.mark.parametrize(
@@ -382,15 +359,6 @@ def test_presets_and_buttons_set_the_sensor_up(fresh, preset, expected, named):
     assert fresh.inner_text("#live-name-2") == named
 
 
-def test_the_preset_that_is_set_up_looks_pressed(fresh):
-    pressed = ".live-presets button[aria-pressed=true]"
-    for preset in ("Out of range", "The paper"):
-        fresh.click(f"button:text-is('{preset}')")
-        fresh.wait_for_function(f"document.querySelector('{pressed}')?.textContent === '{preset}'")
-    fresh.evaluate("window.zwfsLive.page.set({ rms: '0.9' })")
-    fresh.wait_for_function(f"document.querySelector('{pressed}') === null")
-
-
 def test_the_state_is_in_the_address(fresh, browser, file):
     state = {"rms": "0.73", "diameter": "1.5", "shift-b": "-0.25", "likelihood": "1"}
     fresh.evaluate("state => window.zwfsLive.page.set(state)", state)
@@ -412,18 +380,6 @@ def test_the_state_is_in_the_address(fresh, browser, file):
     shared.close()
 
 
-def test_play_steps_through_the_iterations(fresh):
-    fresh.click("#live-play")
-    assert fresh.inner_text("#live-play") == "■ Stop"
-    seen = [fresh.input_value("#live-iterations")]
-    while seen[-1] != "3":
-        fresh.wait_for_function("last => document.getElementById('live-iterations').value !== last", arg=seen[-1])
-        seen.append(fresh.input_value("#live-iterations"))
-    assert seen == sorted(set(seen))
-    fresh.wait_for_function("document.getElementById('live-play').textContent === '▶ Play'")
-    assert fresh.input_value("#live-iterations") == "15"
-
-
 def test_page_answers_the_keyboard_and_keeps_its_height(fresh):
     height = fresh.evaluate("document.documentElement.scrollHeight")
     fresh.focus("#live-rms")
@@ -443,33 +399,6 @@ def test_page_answers_the_keyboard_and_keeps_its_height(fresh):
     fresh.keyboard.press("Space")
     fresh.wait_for_function("document.getElementById('live-name-2').textContent === 'maximum likelihood'")
     assert fresh.evaluate("document.documentElement.scrollHeight") == height
-
-
-@pytest.mark.parametrize("width", [390, 1280])
-def test_maps_of_the_errors_stand_next_to_their_phases(browser, file, width):
-    page = browser.new_page(viewport={"width": width, "height": 844})
-    page.goto(file.as_uri())
-    names = "phase", "found-0", "found-1", "found-2", "error-0", "error-1", "error-2", "focal", "image-a"
-    boxes = [page.locator(f"#live-{name}").bounding_box() for name in names]
-    order = [
-        name for _, _, name in sorted((box["y"], box["x"], name) for box, name in zip(boxes, names, strict=True))
-    ]
-    if width == 390:
-        assert order == list(names)
-    else:
-        assert order == [
-            "phase",
-            "found-0",
-            "found-1",
-            "found-2",
-            "focal",
-            "error-0",
-            "error-1",
-            "error-2",
-            "image-a",
-        ]
-        assert [box["x"] for box in boxes[1:4]] == [box["x"] for box in boxes[4:7]]
-    page.close()
 
 
 def test_a_design_is_chosen_by_mouse_and_by_keyboard(fresh):
@@ -495,17 +424,6 @@ def test_photons_between_the_designs_of_the_map_are_those_of_the_bound(fresh, mo
     [cost] = photon_costs(pupil, [paper], {"screens": screens})["screens"]
     fresh.check("input[value='1 rad rms']")
     fresh.wait_for_function(f"document.getElementById('live-design').textContent.includes(' {cost:.2f} times')")
-
-
-def test_dark_mode_has_dark_colours_of_phases(fresh):
-    middle = """(() => {
-        const copy = new OffscreenCanvas(256, 1).getContext("2d", { willReadFrequently: true });
-        copy.drawImage(document.querySelector(".live-bar[data-colors=phase]"), 0, 0);
-        return [...copy.getImageData(128, 0, 1, 1).data];
-    })()"""
-    assert min(fresh.evaluate(middle)) > 200
-    fresh.evaluate("document.documentElement.dataset.theme = 'dark'")
-    fresh.wait_for_function(f"Math.max(...({middle}).slice(0, 3)) < 60")
 
 
 @pytest.mark.parametrize("width", [1280, 390])

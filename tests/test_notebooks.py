@@ -16,7 +16,7 @@ from nbformat.v4 import new_code_cell, new_notebook, new_output
 from PIL import Image
 
 from book._tools.run import FRONT_FIGURE
-from zwfs.companion.results import published
+from studies.kit.results import published
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 WIDTH = 76  # letters of code that fit a page in a window 1280 pixels wide

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import zwfs
-from zwfs.companion.reports import zernike_sensor as report
-from zwfs.paper import one_pixel
+from studies.zernike_sensor import Pixel, bump_and_pit, explorer, lowest_pixel
 
 ROOT = Path(__file__).parent.parent
 STATIC = ROOT / "book" / "_static"
@@ -18,12 +17,12 @@ STATIC = ROOT / "book" / "_static"
 
 @pytest.fixture(scope="module")
 def phase(pupil):
-    return one_pixel.bump_and_pit(pupil, 1.2)
+    return bump_and_pit(pupil, 1.2)
 
 
 @pytest.fixture(scope="module")
 def pixel(shifted, phase):
-    return one_pixel.lowest_pixel(shifted, phase)
+    return lowest_pixel(shifted, phase)
 
 
 def test_bump_and_pit_have_equal_heights_and_no_mean(pupil, phase):
@@ -48,7 +47,7 @@ def test_each_image_allows_a_second_phase_and_both_images_only_one(pixel):
 
 def test_pixel_is_that_of_a_larger_detector_too(pupil, phase, pixel):
     masks = zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2)
-    wide = one_pixel.lowest_pixel(zwfs.ZernikeSensor(pupil, *masks, extent=2.0), phase)
+    wide = lowest_pixel(zwfs.ZernikeSensor(pupil, *masks, extent=2.0), phase)
     np.testing.assert_allclose(wide.waves, pixel.waves, atol=1e-8)
 
 
@@ -58,7 +57,7 @@ def page(browser, pixel, tmp_path):
     shutil.copy(STATIC / "phasor.js", tmp_path)
     shutil.copy(STATIC / "phasor.css", tmp_path)
     head = '<meta charset="utf-8"><link rel="stylesheet" href="phasor.css"><script defer src="phasor.js"></script>'
-    box = report.explorer(pixel).data
+    box = explorer(pixel).data
     (tmp_path / "page.html").write_text(f"<!doctype html><html lang='en'>{head}<body>{box}</body></html>", "utf-8")
     page = browser.new_page(viewport={"width": 390, "height": 800})
     page.said = []
@@ -77,7 +76,7 @@ def angles(page):
 def test_slider_states_the_phases_that_each_image_allows(page, pixel):
     for phase in (-2.5, pixel.phase, 0.0, 1.3, 3.0):
         page.locator("#phasor input").fill(f"{phase:.2f}")
-        moved = one_pixel.Pixel(pixel.row, pixel.column, float(f"{phase:.2f}"), pixel.waves)
+        moved = Pixel(pixel.row, pixel.column, float(f"{phase:.2f}"), pixel.waves)
         expected = moved.phase, moved.mirrored[0], moved.phase, moved.mirrored[1], moved.phase
         assert angles(page) == pytest.approx(expected, abs=0.011)
     assert page.said == []
@@ -153,7 +152,7 @@ def test_slider_obeys_the_keyboard_and_fits_a_phone(page, pixel):
 
 
 def test_box_is_hidden_without_a_script(pixel):
-    text = report.explorer(pixel).data
+    text = explorer(pixel).data
     assert " hidden>" in text
     waves = json.loads(re.search(r'data-waves="([^"]+)"', text)[1])
     np.testing.assert_allclose([complex(*wave) for wave in waves], pixel.waves, atol=1e-4)

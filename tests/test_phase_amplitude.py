@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import zwfs
-from zwfs.paper.phase_amplitude import KINDS, WAYS, amplitude_curves, amplitude_maps, noisy_frames, reconstruct
+from studies.phase_amplitude import KINDS, WAYS, amplitude_curves, amplitude_maps, noisy_frames, reconstruct
 
 PUPIL = zwfs.Pupil.circular(24)
 MODES = zwfs.zernike_basis(PUPIL, 30)
@@ -109,32 +109,3 @@ def test_curves_do_not_depend_on_the_other_variations(curves):
     for kind in KINDS:
         for way in WAYS:
             assert np.array_equal(alone[kind].errors[way], curves[kind].errors[way][:2])
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"variations": [0.1, 0.5]}, "variations = 0.5"),
-        ({"photons": 0.5}, "photons = 0.5"),
-        ({"sensor": zwfs.ZernikeSensor(PUPIL, *PAIR)}, "a last one that changes nothing"),
-        (
-            {"sensor": zwfs.ZernikeSensor(PUPIL, zwfs.Dimple(1, 0), *PAIR)},
-            "a last one that changes nothing",
-        ),
-    ],
-)
-def test_bad_input_is_refused(change, message):
-    known = {
-        "sensor": SENSOR,
-        "modes": MODES,
-        "variations": [0.1],
-        "rms": 0.5,
-        "n_screens": 1,
-        "photons": 100.0,
-    }
-    with pytest.raises(ValueError, match=message):
-        amplitude_curves(**known | change)
-    with pytest.raises(ValueError, match="kind = 'clouds'"):
-        amplitude_maps(PUPIL, MODES, "clouds", 0.1, 1)
-    with pytest.raises(ValueError, match="way = 'guessed'"):
-        reconstruct("guessed", SENSOR, np.zeros((1, 3, *PUPIL.shape)), 100)

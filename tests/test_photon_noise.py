@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 import zwfs
-from zwfs.paper.design import CLASSIC, PUBLISHED, Design, DesignMap, design_map, photon_costs, uneven
-from zwfs.paper.linearity import paper_reconstructors, screens_at
-from zwfs.paper.photon_noise import EXPECTED, SIGMAS, error_bars, photon_curves
+from studies.design import CLASSIC, PUBLISHED, Design, DesignMap, design_map, photon_costs, uneven
+from studies.kit.curves import screens_at
+from studies.kit.methods import paper_reconstructors
+from studies.photon_noise import EXPECTED, SIGMAS, error_bars, photon_curves
 
 PHOTONS = [100.0, 1e4]
 ONE = int(np.flatnonzero(SIGMAS == 1)[0])

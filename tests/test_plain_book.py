@@ -50,17 +50,6 @@ def test_claims_have_their_verdicts(plain_book):
     assert "The 21 claims" in read(plain_book / "book" / "index.html").article.get_text()
 
 
-def test_performance_page_has_tables_and_pictures(plain_book):
-    page = read(plain_book / "book" / "performance.html")
-    assert len(page.select("article table")) >= 10
-    assert all((plain_book / "book" / image["src"]).is_file() for image in page.select("figure img"))
-
-
-def test_live_page_has_its_data(plain_book):
-    for script in read(plain_book / "book" / "live.html").select("article script[src]"):
-        assert (plain_book / "book" / script["src"]).stat().st_size > 0
-
-
 def test_every_figure_of_the_paper_has_a_card_with_its_notebook(plain_book):
     for page in (plain_book / "notebooks").glob("fig*.html"):
         cards = read(page).select(".run-card")
@@ -82,10 +71,6 @@ def test_equations_are_numbered_through_the_book_and_those_of_the_paper_as_there
     pages = [plain_book / "book" / page.replace(".md", ".html") for page in (*api.PAPER, "theory.md")]
     found = [int(number.get_text().strip("()#\uf0c1")) for page in pages for number in read(page).select(".eqno")]
     assert found == list(range(1, len(found) + 1))
-
-
-def test_no_pdf_is_linked(plain_book):
-    assert "zwfs.pdf" not in (plain_book / "book" / "index.html").read_text("utf-8")
 
 
 def test_a_build_in_another_folder_gives_the_same_bytes(plain_book, tmp_path):
@@ -169,11 +154,6 @@ def test_every_public_function_and_class_is_on_the_page_once(api_page):
                 package = module.__name__.split(".")[:-1]
                 places = [f"{'.'.join(package[:depth])}.{name}" for depth in range(1, len(package) + 1)]
                 assert sum(listed.count(place) for place in {*places, f"{module.__name__}.{name}"}) == 1, name
-
-
-def test_the_page_lists_constants_with_their_docstrings(api_page):
-    ring = api_page.find(id="zwfs.paper.dimple_diameter.DARK_RING")
-    assert "dark ring" in ring.parent.dd.get_text()
 
 
 def test_modules_are_sections_of_their_group(api_page):

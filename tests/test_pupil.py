@@ -208,7 +208,7 @@ POINTS = np.ones(Pupil.circular(4).n_points)
     ("make", "error", "message"),
     [
         (lambda: Pupil.circular(10**6), ValueError, "n_pixels = 1000000"),
-        (lambda: Pupil.circular(8, spiders=[(90, 0.1)]), ValueError, r"spiders\[0\] angle = 90: .*degrees"),
+        (lambda: Pupil.circular(8, spiders=[(90, 0.1)]), ValueError, r"spiders\[0\] angle = 90\.0: .*degrees"),
         (lambda: Pupil.circular(6, 0.99), ValueError, "central_obscuration"),
         (lambda: Pupil.hexagonal(50, n_rings=26), ValueError, "n_rings = 26: .*n_pixels = 50"),
         (lambda: Pupil.hexagonal(50, stop=1e-310), ValueError, "stop = 1e-310"),

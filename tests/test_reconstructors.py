@@ -1,10 +1,8 @@
 import inspect
-import os
 import pickle
-import shutil
-import subprocess
-import sys
+import pkgutil
 import warnings
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -18,14 +16,11 @@ from zwfs import (
     GerchbergSaxton,
     GradientDescent,
     Linear,
-    MaximumLikelihood,
     PhaseShifted,
     ZernikeSensor,
     reconstruction_error,
 )
-from zwfs.reconstructors.base import FixedPoint, load
-
-from .conftest import ROOT, new_reconstructor
+from zwfs.reconstructors.base import ClosedForm, FixedPoint, Reconstructor, load
 
 every = pytest.mark.parametrize("method", RECONSTRUCTORS)
 iterative = pytest.mark.parametrize("method", [method for method in RECONSTRUCTORS if method.iterative])
@@ -569,13 +564,13 @@ def test_one_wavefront_is_solved_by_the_truth(make, method, pupil):
 
 
 @every
-def test_history_leads_from_the_start_to_the_result(make, method, screens):
+def test_history_leads_from_the_start_to_the_result(make, method, pupil, screens):
     reconstruct, sensor = make(method)
     frames = sensor.measure(screens(0.3))
     found = reconstruct(frames, history=True)
     assert found.history.shape == (3, reconstruct.settings.n_iterations + 1, 40, 40)
-    if method is not MaximumLikelihood:  # its start is a few phase-shifted iterations
-        assert np.nanmax(np.abs(found.history[:, 0])) == 0
+    if issubclass(method, ClosedForm | FixedPoint | GradientDescent):  # others may start from a better guess
+        assert pupil.rms(found.history[:, 0]).max() < 1e-6
     np.testing.assert_array_equal(found.history[:, -1], found.phase)
     assert reconstruct(frames).history is None
 
@@ -594,11 +589,11 @@ def test_history_holds_the_results_of_shorter_runs(make, method, screens):
 
 
 @iterative
-def test_history_begins_with_the_start_as_it_was_given(make, method, pupil, screens):
+def test_history_begins_with_the_start_of_any_piston(make, method, pupil, screens):
     reconstruct, sensor = make(method, n_iterations=2)
     start = np.where(pupil.inside, 4.0 + screens(0.1, 1)[0], np.nan)
     found = reconstruct(sensor.measure(screens(0.1, 2)), start, history=True)
-    np.testing.assert_array_equal(found.history[0, 0], start)
+    assert reconstruction_error(pupil, found.history[0, 0], start) < 1e-6
 
 
 @iterative
@@ -631,10 +626,10 @@ def test_start_is_where_it_starts(make, method, screens, pupil):
     phase = screens(0.4)
     frames = sensor.measure(phase)
     each = reconstruct(frames, start=phase, history=True)
-    np.testing.assert_allclose(each.history[:, 0][:, pupil.inside], phase[:, pupil.inside])
+    assert reconstruction_error(pupil, each.history[:, 0], phase).max() < 1e-6
     same = reconstruct(frames, start=phase[0], history=True)
     np.testing.assert_allclose(same.history[0], each.history[0], atol=1e-9)
-    np.testing.assert_allclose(same.history[1, 0][pupil.inside], phase[0][pupil.inside])
+    assert reconstruction_error(pupil, same.history[1, 0], phase[0]) < 1e-6
     # Its own result, NaN outside, can be handed back in.
     again = reconstruct(frames, start=reconstruct(frames).phase)
     longer = make(method, n_iterations=6, tolerance=0)[0](frames)
@@ -737,12 +732,13 @@ def test_any_piston_of_the_start_gives_the_same_phase(shifted, pupil, screens, o
 
 
 @iterative
-def test_piston_of_the_start_is_kept(sensor_of, method, screens, pupil):
-    sensor = sensor_of(method)
-    reconstruct = method(sensor)  # of all points: no sum of modes is a piston
+def test_piston_of_the_start_does_not_matter(make, method, screens, pupil):
+    reconstruct, sensor = make(method)
     frames = sensor.measure(screens(0.1, 1)[0])
     plain, moved = (reconstruct(frames, start=np.full(pupil.shape, piston)).phase for piston in (0.0, 0.3))
-    np.testing.assert_allclose(moved[pupil.inside], plain[pupil.inside] + 0.3, atol=1e-6)
+    assert reconstruction_error(pupil, moved, plain) < 1e-6
+    if issubclass(method, FixedPoint):
+        np.testing.assert_allclose(moved[pupil.inside], plain[pupil.inside] + 0.3, atol=1e-6)
 
 
 # Points without an equation.
@@ -820,7 +816,7 @@ def test_no_frame_of_a_mask_is_taken_for_raw_counts(pupil, modes, screens, metho
     phase = np.concatenate([screens(0.0, 1), screens(0.5), screens(3.0)])
     rng = np.random.default_rng(0)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.filterwarnings("error", message="frames: ")  # a method may warn of other things
         for photons in (np.inf, 1e4, 1.0):
             frames = 1.5 * sensor.measure(phase)  # a brighter star than that of the calibration
             if photons < np.inf:
@@ -975,37 +971,10 @@ def test_reconstructors_and_results_print_as_one_line(make, method, screens):
     assert repr(result) == f"Reconstruction(phase {result.phase.shape}, {result.converged.sum()} of 3 converged)"
 
 
-@pytest.mark.slow
-def test_a_new_reconstructor_is_one_file(tmp_path):
-    """The file in CONTRIBUTING, added to a copy of the package, passes all tests of reconstructors."""
-    for name in ("zwfs", "tests", "book/_ext"):
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "pyproject.toml", tmp_path)
-    path, code = new_reconstructor()
-    (tmp_path / path).write_text(code)
-    use = """
-import api, zwfs
-from zwfs import plots
-from zwfs.paper.linearity import linearity_curves
-pupil = zwfs.Pupil.circular(40)
-sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, 1.5))
-modes = zwfs.zernike_basis(pupil, 30)
-method = zwfs.reconstructors.SecondOrder
-curves = linearity_curves({"SecondOrder": method(sensor), "Linear": zwfs.Linear(sensor, modes)}, modes, [0.05], 2)
-assert 0 < curves.mean("SecondOrder")[0] < 0.02
-plots.linearity(curves, 0.05, ["SecondOrder", "Linear"], 0.1)
-assert method in zwfs.RECONSTRUCTORS and method.__module__ in api.modules()
-assert plots.LOOKS["SecondOrder"].label == "second order"
-"""
-    tested = [f"tests/test_{name}.py" for name in ("reconstructors", "bad_input", "figures")]
-    for command in (
-        ["-c", use],
-        ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", "SecondOrder or look", *tested],
-        ["-m", "ruff", "check", path],
-        ["-m", "ruff", "format", "--check", path],
-    ):
-        environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{tmp_path / 'book' / '_ext'}"}
-        done = subprocess.run(
-            [sys.executable, *command], cwd=tmp_path, env=environment, capture_output=True, text=True
-        )
-        assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
+def test_every_reconstructor_is_listed():
+    folder = zwfs.reconstructors.__path__
+    modules = [import_module(f"zwfs.reconstructors.{module.name}") for module in pkgutil.iter_modules(folder)]
+    found = {thing for module in modules for thing in vars(module).values() if isinstance(thing, type)}
+    assert {one for one in found if issubclass(one, Reconstructor) and not inspect.isabstract(one)} == {
+        *RECONSTRUCTORS
+    }

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 import zwfs
-from zwfs.paper import recovery
-from zwfs.paper.dimple_diameter import DARK_RING, iteration_spectrum
-from zwfs.paper.linearity import screens_at
-from zwfs.paper.recovery import RecoveryCurves, Verdicts, compared_methods, opposite_dimples
+from studies.beyond_dimple import dimple_curves, dimple_limits
+from studies.beyond_range import RecoveryCurves, Verdicts, compared_methods, recovery_curves
+from studies.fig04_dimple_diameter import DARK_RING, iteration_spectrum
+from studies.kit.curves import screens_at
+from studies.kit.methods import opposite_dimples
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,7 @@ def modes(pupil):
 @pytest.fixture(scope="module")
 def curves(pupil, modes):
     sensors = {diameter: opposite_dimples(pupil, diameter, np.pi / 2) for diameter in (1.06, 3.0)}
-    return recovery.recovery_curves(sensors, modes, [0.5, 2.5], 4, seed=3)
+    return recovery_curves(sensors, modes, [0.5, 2.5], 4, seed=3)
 
 
 def test_only_maximum_likelihood_recovers_screens_beyond_the_dark_ring(curves):
@@ -66,7 +67,7 @@ def test_verdicts_count_every_screen_once():
 
 def test_frames_of_a_flat_wavefront_lose_tilt_where_the_eigenvalue_is_one_not_where_it_is_larger(pupil, modes):
     screen = screens_at(modes, 0.5, 1, seed=3, task=0)
-    limits = recovery.dimple_limits(pupil, modes, np.pi / 2, [1.06, 3.0], screen)
+    limits = dimple_limits(pupil, modes, np.pi / 2, [1.06, 3.0], screen)
     usual, ring, large = range(3)
     assert limits.diameters[ring] == DARK_RING
     np.testing.assert_allclose(
@@ -82,7 +83,7 @@ def test_frames_of_a_flat_wavefront_lose_tilt_where_the_eigenvalue_is_one_not_wh
 
 
 def test_bounds_are_rms_values_of_those_of_the_modes(pupil, modes):
-    limits = recovery.dimple_limits(pupil, modes, np.pi / 2, [2.0], np.zeros((1, *pupil.shape)))
+    limits = dimple_limits(pupil, modes, np.pi / 2, [2.0], np.zeros((1, *pupil.shape)))
     np.testing.assert_allclose(limits.factor[:, 0], limits.factor[:, 1])
     n_modes = len(modes)
     squares = 2 * limits.tilt**2 + (n_modes - 2) * limits.others**2
@@ -91,35 +92,8 @@ def test_bounds_are_rms_values_of_those_of_the_modes(pupil, modes):
 
 def test_diameters_are_compared_for_the_same_pair_of_shifts(pupil, modes):
     screens = screens_at(modes, 0.5, 2, seed=3, task=0)
-    curves = recovery.dimple_curves(pupil, np.pi / 2, 25, [1.06, 3.0], screens)
+    curves = dimple_curves(pupil, np.pi / 2, 25, [1.06, 3.0], screens)
     sensor = opposite_dimples(pupil, 3.0, np.pi / 2)
     phase = compared_methods(sensor, 25)["PhaseShifted"](sensor.measure(screens)).phase
     np.testing.assert_allclose(curves.errors["PhaseShifted"][1], zwfs.reconstruction_error(pupil, phase, screens))
     assert list(curves.errors) == ["PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood"]
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"sensors": {}}, ValueError, "sensors is empty"),
-        ({"sensors": [1]}, TypeError, "sensors"),
-        ({"sensors": {"a": 1}}, TypeError, r"sensors\['a'\]"),
-        ({"n_screens": 0}, ValueError, "n_screens = 0"),
-        ({"n_iterations": 0}, ValueError, "n_iterations = 0"),
-        ({"rms": []}, ValueError, "rms"),
-    ],
-)
-def test_bad_input_is_named(pupil, modes, change, error, message):
-    good = {
-        "sensors": {"a": opposite_dimples(pupil, 1.06, np.pi / 2)},
-        "modes": modes,
-        "rms": [0.1],
-        "n_screens": 1,
-    }
-    with pytest.raises(error, match=message):
-        recovery.recovery_curves(**(good | change))
-
-
-def test_modes_other_than_tilt_are_required(pupil, modes):
-    with pytest.raises(ValueError, match="expected more than 2 modes"):
-        recovery.dimple_limits(pupil, modes[:2], 1.5, [1.0], np.zeros((1, *pupil.shape)))

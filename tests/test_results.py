@@ -1,6 +1,5 @@
 import csv
 import io
-import os
 import pickle
 
 import matplotlib
@@ -8,8 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from zwfs._files import write_file
-from zwfs.companion.results import FOLDER, glue_numbers, publish
+from studies.kit.results import FOLDER, glue_numbers, publish, rounded
 
 matplotlib.use("agg")
 
@@ -60,23 +58,18 @@ def test_files_are_the_same_from_run_to_run(figure, tmp_path, monkeypatch):
     assert (tmp_path / "first" / "plot.pdf").read_bytes().startswith(b"%PDF")
 
 
-def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
-    file = tmp_path / "new" / "folder" / "data"
-    write_file(file, b"first")
-    write_file(file, b"second")
-    with pytest.raises(TypeError):
-        write_file(file, "text")
-    assert file.read_bytes() == b"second"
-    assert list(file.parent.iterdir()) == [file]
-
-
-def test_a_file_is_not_written_through_a_link(tmp_path):
+def test_a_file_is_replaced_and_not_written_through_a_link(figure, tmp_path, monkeypatch):
+    folder = tmp_path / "new" / "folder"
+    monkeypatch.setenv(FOLDER, str(folder))
+    publish(figure, "plot", {"x (D)": [1.0]})
     (tmp_path / "raw").write_bytes(b"raw")
-    (tmp_path / f".data.{os.getpid()}").symlink_to("raw")
-    (tmp_path / "data").symlink_to("raw")
-    write_file(tmp_path / "data", b"new")
+    (folder / "plot.csv").unlink()
+    (folder / "plot.csv").symlink_to(tmp_path / "raw")
+    names = sorted(file.name for file in folder.iterdir())
+    publish(figure, "plot", {"x (D)": [2.0]})
     assert (tmp_path / "raw").read_bytes() == b"raw"
-    assert (tmp_path / "data").read_bytes() == b"new"
+    assert (folder / "plot.csv").read_text() == "x (D)\n2\n"
+    assert sorted(file.name for file in folder.iterdir()) == names
 
 
 def test_png_has_200_dots_per_inch(figure, tmp_path, monkeypatch):
@@ -111,23 +104,30 @@ def test_columns_are_written_in_order_with_nine_digits(figure, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("name", "columns", "error", "message"),
+    ("name", "columns", "message"),
     [
-        ("Plot", {"x": [1]}, ValueError, "name = 'Plot'"),
-        ("../plot", {"x": [1]}, ValueError, "name = '../plot'"),
-        ("plot", {}, ValueError, "columns is empty"),
-        ("plot", {"x": [1, 2], "y": [1]}, ValueError, "differ in length: 'x': 2, 'y': 1"),
+        ("Plot", {"x": [1]}, "name = 'Plot'"),
+        ("../plot", {"x": [1]}, "name = '../plot'"),
+        ("plot", {"x": [1, 2], "y": [1]}, "differ in length: 'x': 2, 'y': 1"),
     ],
 )
-def test_bad_arguments_are_refused(figure, monkeypatch, name, columns, error, message):
+def test_bad_arguments_are_refused(figure, monkeypatch, name, columns, message):
     monkeypatch.delenv(FOLDER, raising=False)
-    with pytest.raises(error, match=message):
+    with pytest.raises(ValueError, match=message):
         publish(figure, name, columns)
 
 
-def test_numbers_are_glued_rounded_and_strings_as_they_are(monkeypatch):
+def test_numbers_are_rounded_and_strings_stay():
+    numbers = rounded({"error": np.float64(0.123456), "limit": np.inf, "where": "never"})
+    assert numbers == {"error": 0.1235, "limit": np.inf, "where": "never"}
+    assert rounded({"ratio": 3210.123}, ".2g") == {"ratio": 3200}
+
+
+def test_rounded_numbers_are_glued_as_they_are(monkeypatch):
     glued = {}
     monkeypatch.setattr("myst_nb.glue", lambda name, value, display: glued.update({name: value}))
-    glue_numbers({"error": np.float64(0.123456), "limit": np.inf, "where": "never"})
-    glue_numbers({"ratio": 3210.123}, ".2g")
-    assert glued == {"error": 0.1235, "limit": np.inf, "where": "never", "ratio": 3200}
+    numbers = rounded({"small": 1.2345e-7, "flag": True}, ".3g") | rounded(
+        {"large": 12345.67891, "where": "never"}
+    )
+    glue_numbers(numbers)
+    assert glued == {"small": 1.23e-7, "flag": 1.0, "large": 12345.6789, "where": "never"}

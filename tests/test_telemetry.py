@@ -2,7 +2,7 @@
 
 import gc
 import gzip
-import io
+import json
 import os
 import pickle
 import re
@@ -16,7 +16,6 @@ import tracemalloc
 import warnings
 from contextlib import nullcontext
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +31,7 @@ from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Flag
 from zwfs.frames.files import FileError
 from zwfs.frames.pipeline import Optics, reduce_frames
-from zwfs.frames.registration import Image, nearest_good, record
+from zwfs.frames.registration import Image, nearest_good, register_frames
 
 D, MARGIN, PHOTONS, DARK = 40, 8, 1e4, 500
 OPTICS = {"DIMPLE": 1.06, "THETA1": np.pi / 2, "THETA2": -np.pi / 2, "BUNIT": "adu"}
@@ -59,15 +58,15 @@ class Bench:
         bad = np.zeros(counts.shape, bool) if bad is None else bad
         return Image(nearest_good(counts - float(DARK), ~bad), bad, "camera.fits")
 
-    def recording(self, bad=None):
-        return record([self.image(self.flat, bad)], [self.image(self.clear)])
+    def registered(self, bad=None):
+        return register_frames([self.image(self.flat, bad)], [self.image(self.clear)])
 
     @property
     def dark(self):
         return np.full(self.flat.shape, float(DARK))
 
     def calibration(self, optics=Optics(), bad=None, **settings):  # noqa: B008
-        measurement = reduce_frames(self.recording(bad), optics)
+        measurement = reduce_frames(self.registered(bad), optics)
         return Calibration.of(measurement, self.dark, saturation=65535, **settings)
 
 
@@ -108,9 +107,9 @@ def test_phase_is_that_of_the_pipeline(bench, optics, n_bad):
     bad.flat[np.random.default_rng(2).choice(bad.size, n_bad, replace=False)] = True
     calibration = bench.calibration(optics, bad, tolerance=1e-5, n_iterations=50)
     found = calibration(np.where(bad, 0, bench.frames[:3]))
-    recording = bench.recording(bad)
+    registered = bench.registered(bad)
     for phase, counts in zip(found.phase, bench.frames, strict=False):
-        one = replace(recording, frames=(bench.image(counts, bad),) * 2)
+        one = replace(registered, frames=(bench.image(counts, bad),) * 2)
         expected = pipeline.recover_phase(reduce_frames(one, optics), n_iterations=60).phase
         assert rms(phase - expected) < 5e-4
         np.testing.assert_array_equal(np.isnan(phase), np.isnan(expected))
@@ -121,8 +120,8 @@ def test_longer_exposure_time_of_the_frames_changes_no_phase(bench, calibration)
     def longer(counts):
         return 3.0 * counts - 2 * DARK
 
-    recording = record([bench.image(longer(bench.flat))], [bench.image(bench.clear)], exposure=3.0)
-    other = Calibration.of(reduce_frames(recording, Optics()), bench.dark, saturation=1e6)
+    registered = register_frames([bench.image(longer(bench.flat))], [bench.image(bench.clear)], exposure=3.0)
+    other = Calibration.of(reduce_frames(registered, Optics()), bench.dark, saturation=1e6)
     found, expected = other(longer(bench.frames[:2])), calibration(bench.frames[:2])
     np.testing.assert_allclose(found.phase, expected.phase, rtol=0, atol=1e-4)
     assert not found.flags.any()
@@ -140,7 +139,7 @@ def test_two_images_of_an_exposure_are_the_halves_of_one(bench, calibration):
     half = bench.flat.shape[1] // 2
     parts = [bench.image(image[:, side]) for image in (bench.flat, bench.clear)
              for side in (slice(None, half), slice(half, None))]  # fmt: skip
-    two = Calibration.of(reduce_frames(record(parts[:2], parts[2:]), Optics()), bench.dark[:, :half])
+    two = Calibration.of(reduce_frames(register_frames(parts[:2], parts[2:]), Optics()), bench.dark[:, :half])
     frames = np.stack([bench.frames[..., :half], bench.frames[..., half:]], axis=1)
     assert two.n_images == 2
     assert rms(two(frames).phase - calibration(bench.frames).phase) < 0.01
@@ -163,45 +162,25 @@ def test_calibration_is_kept_in_a_file_and_in_a_pickle(tmp_path, bench, calibrat
 
 def rewritten(path, **changes):
     """The same file with other values."""
-    import json
-
     with np.load(path) as file:
         arrays = dict(file)
     values = json.loads(str(arrays["values"])) | changes
     np.savez(path, **(arrays | {"values": np.array(json.dumps(values))}))
 
 
-def of_newer_zip(content):
-    """The same file, damaged in the byte that holds the version of ZIP that it needs."""
-    place = content.index(b"PK\1\2") + 6
-    return content[:place] + bytes([75]) + content[place + 1 :]
-
-
-def rewritten_array(path, name, change):
-    with np.load(path) as file:
-        arrays = dict(file)
-    np.savez(path, **(arrays | {name: arrays[name] + change}))
-
-
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
-        (lambda path: path.write_bytes(b""), "bench.npz: expected a calibration"),
-        (lambda path: path.write_bytes(pickle.dumps([1, 2])), "bench.npz: expected a calibration"),
-        (lambda path: path.write_bytes(path.read_bytes()[:5000]), "bench.npz: expected a calibration"),
-        (lambda path: np.savez(path, x=np.ones(3)), "bench.npz: expected a calibration"),
-        (lambda path: path.write_bytes(of_newer_zip(path.read_bytes())), "bench.npz: expected a calibration"),
-        (lambda path: rewritten(path, format=99), "bench.npz: a calibration of format 99: expected format 1"),
-        (lambda path: rewritten(path, saturation=0), "bench.npz: a broken calibration: saturation = 0"),
-        (lambda path: rewritten(path, n_iterations="many"), "bench.npz: a broken calibration: n_iterations"),
-        (lambda path: rewritten_array(path, "offset", -1e20), "bench.npz: a broken calibration: .*hold no light"),
-        (lambda path: rewritten(path, surplus=1), "bench.npz: a broken calibration"),
-        (lambda path: np.savez(path, values=np.array([{}]), places=0), "bench.npz: a broken calibration: Object"),
+        (lambda path: path.write_bytes(b""), "expected a calibration"),
+        (lambda path: path.write_bytes(path.read_bytes()[:5000]), "expected a calibration"),
+        (lambda path: np.savez(path, x=np.ones(3)), "expected a calibration"),
+        (lambda path: rewritten(path, format=99), "a calibration of format 99: expected format 1"),
+        (lambda path: rewritten(path, saturation=0), "a broken calibration: saturation = 0"),
     ],
 )
 def test_file_that_is_no_calibration_is_named(folder, break_it, message):
     break_it(folder / "bench.npz")
-    with pytest.raises(FileError, match=message):
+    with pytest.raises(FileError, match=f"bench.npz: {message}"):
         reconstruct("cube.fits", "bench.npz", "phase.fits")
     assert not list(folder.glob("*phase*"))
 
@@ -211,7 +190,6 @@ SPOIL = {
     "bad half of the dark": ("dark.fits", lambda image: np.where(np.arange(112) < 56, np.nan, image)),
     "bad half of the map": ("map.fits", lambda image: np.arange(112) + 0 * image < 56),
     "frames without light": ("frame.fits", lambda image: 0 * image),
-    "equal phase shifts": ("frame.fits", lambda image: image),
 }
 
 
@@ -219,9 +197,8 @@ SPOIL = {
 def test_refusal_of_a_calibration_names_the_bad_file(folder, bench, kind):
     name, spoil = SPOIL[kind]
     fits.PrimaryHDU(np.zeros(bench.flat.shape)).writeto("map.fits")
-    header = fits.Header(OPTICS | ({"THETA2": 1e-30} if kind == "equal phase shifts" else {}))
     image = spoil(fits.getdata(name).astype(float))
-    fits.PrimaryHDU(image.astype(float), header).writeto(name, overwrite=True)
+    fits.PrimaryHDU(image.astype(float), fits.Header(OPTICS)).writeto(name, overwrite=True)
     with pytest.raises(ValueError, match=name):
         calibrate(["frame.fits"], ["pupils.fits"], ["dark.fits"], ["map.fits"])
 
@@ -232,17 +209,9 @@ def test_calibration_replaces_no_other_file(folder, calibration):
     calibration.save("bench.npz")
 
 
-@pytest.mark.parametrize(
-    ("counts", "error", "message"),
-    [
-        (np.zeros((3, 10, 10)), ValueError, r"counts has shape \(3, 10, 10\): expected \(\.\.\., 56, 112\)"),
-        (np.zeros((56, 112), complex), TypeError, "counts has dtype complex128"),
-        (np.zeros((56, 112), object), TypeError, "counts has dtype object"),
-    ],
-)
-def test_wrong_counts_are_named(calibration, counts, error, message):
-    with pytest.raises(error, match=message):
-        calibration(counts)
+def test_counts_of_another_camera_are_refused(calibration):
+    with pytest.raises(ValueError, match=r"counts has shape \(3, 10, 10\): expected \(\.\.\., 56, 112\)"):
+        calibration(np.zeros((3, 10, 10)))
 
 
 # Flags
@@ -495,61 +464,19 @@ def left_alone(names):
     return {name: Path(name).read_bytes() for name in names}
 
 
-@pytest.mark.parametrize("settings", [{}, {"overwrite": True, "restart": True}])
-@pytest.mark.parametrize("as_input", [False, True])
-def test_raw_data_named_like_scratch_files_stay(folder, settings, as_input):
-    for name in (".phase.fits.part", ".phase.fits.journal"):
-        shutil.copy("cube.fits", name)
-        before = left_alone([name, "cube.fits"])
-        frames = name if as_input else "cube.fits"
-        if name.endswith("part"):
-            with pytest.raises(ValueError, match=r"needs the folder \.phase\.fits\.part, which is there"):
-                reconstruct(frames, "bench.npz", "phase.fits", **settings)
-            os.remove(name)
-        else:
-            assert reconstruct(frames, "bench.npz", "phase.fits", **settings).n_flagged == 0
-        assert left_alone(set(before) - {".phase.fits.part"}).items() <= before.items()
-
-
-def a_link_to_a_file(scratch):
-    scratch.symlink_to("cube.fits")
-
-
-def a_link_to_nothing(scratch):
-    scratch.symlink_to("nowhere")
-
-
-def a_link_to_a_scratch_folder(scratch):
-    interrupted().rename("mine")
-    scratch.symlink_to("mine")
-
-
-def a_file(scratch):
-    scratch.write_bytes(b"raw data")
-
-
-def a_folder_without_marker(scratch):
-    scratch.mkdir()
-    shutil.copy("cube.fits", scratch / "data")
-
-
-def a_folder_of_another_output(scratch):
-    interrupted("other.fits").rename(scratch)
-
-
-def a_folder_with_a_pipe_as_marker(scratch):
-    scratch.mkdir()
-    os.mkfifo(scratch / "output")
+FOREIGN = {
+    "link to a file": lambda scratch: scratch.symlink_to("cube.fits"),
+    "link to nothing": lambda scratch: scratch.symlink_to("nowhere"),
+    "link to a scratch folder": lambda scratch: scratch.symlink_to(interrupted().rename("mine")),
+    "file": lambda scratch: scratch.write_bytes(b"raw data"),
+    "folder without marker": lambda scratch: (scratch.mkdir(), shutil.copy("cube.fits", scratch / "data")),
+    "folder of another output": lambda scratch: interrupted("other.fits").rename(scratch),
+    "folder with a pipe as marker": lambda scratch: (scratch.mkdir(), os.mkfifo(scratch / "output")),
+}
 
 
 @pytest.mark.parametrize("settings", [{}, {"overwrite": True, "restart": True}])
-@pytest.mark.parametrize(
-    "put",
-    [
-        a_link_to_a_file, a_link_to_nothing, a_link_to_a_scratch_folder, a_file, a_folder_without_marker,
-        a_folder_of_another_output, a_folder_with_a_pipe_as_marker,
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("put", FOREIGN.values(), ids=FOREIGN)
 def test_foreign_scratch_folder_is_refused_and_stays(folder, monkeypatch, put, settings):
     small_chunks(monkeypatch, 3)
     put(Path(".phase.fits.part"))
@@ -637,18 +564,6 @@ def test_foreign_output_that_appears_during_the_run_stays(folder):
     assert reconstruct("cube.fits", "bench.npz", "phase.fits").n_resumed == 12
 
 
-def test_failure_before_the_first_chunk_keeps_nothing(folder, monkeypatch):
-    def fail(*_, **__):
-        raise Stopped
-
-    calibration = Calibration.load("bench.npz")
-    monkeypatch.setattr(Calibration, "__call__", fail)
-    with pytest.raises(Stopped):
-        reconstruct("cube.fits", calibration, "phase.fits")
-    assert not list(folder.glob("*phase.fits*"))
-    assert not list(folder.glob(".*"))
-
-
 def test_memory_does_not_grow_with_the_cube(folder, monkeypatch, bench, calibration):
     small_chunks(monkeypatch, 12)
 
@@ -667,49 +582,29 @@ def test_memory_does_not_grow_with_the_cube(folder, monkeypatch, bench, calibrat
 # Kinds of files
 
 
-def kinds_of_files(bench):
-    """Names and writers of the same 12 exposures."""
-    frames = bench.frames
-    header = fits.Header(OPTICS)
-    scaled = fits.PrimaryHDU(((frames.astype(int) - 1000) // 1).astype(np.int32))
-    scaled.header["BSCALE"], scaled.header["BZERO"] = 1.0, 1000.0
-
-    def by_hand(path):  # astropy would scale the numbers
-        content = io.BytesIO()
-        plain = fits.PrimaryHDU((frames.astype(np.int32) - 1000) * 2)
-        plain.header["BLANK"] = -(2**31)
-        plain.writeto(content)
-        text = content.getvalue()
-        end = text.index(b"END" + b" " * 77)
-        cards = b"".join(
-            card.ljust(80) for card in (b"BSCALE  =                  0.5", b"BZERO   =               1000.0")
-        )
-        path.write_bytes(text[:end] + cards + text[end : 2880 - len(cards)] + text[2880:])
-
-    return {
-        "cube.fits": lambda path: fits.PrimaryHDU(frames, header).writeto(path),
-        "cube.npy": lambda path: np.save(path, frames),
-        "single.npy": lambda path: np.save(path, frames[:, np.newaxis]),
-        "float.npy": lambda path: np.save(path, frames.astype(">f8")),
-        "packed.fits": lambda path: path.write_bytes(gzip.compress(_bytes(fits.PrimaryHDU(frames, header)))),
-        "scaled.fits": by_hand,
-        "extensions.fits": lambda path: fits.HDUList(
-            [fits.PrimaryHDU(), fits.ImageHDU(frames[:7]), fits.ImageHDU(frames[7]), fits.ImageHDU(frames[8:])]
-        ).writeto(path),
-    }
+def scaled(path, frames):
+    """Half counts above 1000, and cards that say so: astropy would write the numbers without them."""
+    cards = {"BSCALE": 0.5, "BZERO": 1000.0, "BLANK": -(2**31)}
+    fits.PrimaryHDU((frames.astype(np.int32) - 1000) * 2).writeto(path)
+    with fits.open(path, mode="update", do_not_scale_image_data=True) as units:
+        units[0].header.update(cards)
 
 
-def _bytes(unit):
-    stream = io.BytesIO()
-    unit.writeto(stream)
-    return stream.getvalue()
+KINDS = {
+    "cube.npy": np.save,
+    "single.npy": lambda path, frames: np.save(path, frames[:, np.newaxis]),
+    "float.npy": lambda path, frames: np.save(path, frames.astype(">f8")),
+    "packed.fits": lambda path, _: path.write_bytes(gzip.compress(Path("cube.fits").read_bytes())),
+    "scaled.fits": scaled,
+    "extensions.fits": lambda path, frames: fits.HDUList(
+        [fits.PrimaryHDU(), *map(fits.ImageHDU, (frames[:7], frames[7], frames[8:]))]
+    ).writeto(path),
+}
 
 
-@pytest.mark.parametrize(
-    "name", ["cube.npy", "single.npy", "float.npy", "packed.fits", "scaled.fits", "extensions.fits"]
-)
+@pytest.mark.parametrize("name", KINDS)
 def test_every_kind_of_file_holds_the_same_frames(folder, bench, calibration, name):
-    kinds_of_files(bench)[name](folder / name)
+    KINDS[name](folder / name, bench.frames)
     stack = Stack([folder / name], [], 1, calibration.shape)
     assert stack.n == 12
     np.testing.assert_array_equal(stack.read(0, 12)[:, 0], bench.frames)
@@ -737,22 +632,18 @@ def test_list_of_files_is_one_cube(folder, bench, calibration):
 def test_second_image_is_read_wherever_it_is(tmp_path, kind):
     pairs = np.arange(5 * 2 * 6 * 7, dtype=np.int16).reshape(5, 2, 6, 7)
     path, other = tmp_path / "a.fits", tmp_path / "b.npy"
-    images, second, expected = [fits.PrimaryHDU(pairs)], [], pairs
-    if kind.startswith("single"):
-        pairs = expected = pairs[:1]
-    if kind == "extensions":
-        images = [fits.PrimaryHDU(), fits.ImageHDU(pairs[:, 0]), fits.ImageHDU(pairs[:, 1])]
-    elif kind == "second files":
-        images = [fits.PrimaryHDU(pairs[:, 0])]
-        np.save(other, pairs[:, 1].astype(">i2"))
-        second = [other]
-    elif kind == "single pair":
-        images = [fits.PrimaryHDU(pairs[0])]
-    elif kind == "single extensions":
-        images = [fits.PrimaryHDU(pairs[0, 0]), fits.ImageHDU(pairs[0, 1])]
-    fits.HDUList(images).writeto(path)
-    stack = Stack([path], second, 2, (6, 7))
-    np.testing.assert_array_equal(stack.read(0, stack.n), expected)
+    pairs = pairs[:1] if kind.startswith("single") else pairs
+    np.save(other, pairs[:, 1].astype(">i2"))
+    images = {
+        "pairs": [pairs],
+        "extensions": [None, pairs[:, 0], pairs[:, 1]],
+        "second files": [pairs[:, 0]],
+        "single pair": [pairs[0]],
+        "single extensions": [pairs[0, 0], pairs[0, 1]],
+    }[kind]
+    fits.HDUList([fits.PrimaryHDU(images[0]), *map(fits.ImageHDU, images[1:])]).writeto(path)
+    stack = Stack([path], [other] if kind == "second files" else [], 2, (6, 7))
+    np.testing.assert_array_equal(stack.read(0, stack.n), pairs)
 
 
 @settings(max_examples=40, deadline=None)
@@ -774,59 +665,22 @@ def test_any_range_of_any_files_is_read(tmp_path_factory, lengths, data):
 # Bad input
 
 
-@settings(max_examples=60, deadline=None)
-@given(st.data(), st.sampled_from(["a.fits", "a.npy", "a.fits.gz"]))
-def test_file_that_is_cut_or_spoiled_is_refused_by_name(tmp_path_factory, data, name):
-    path = tmp_path_factory.mktemp("cut") / name
-    content = _bytes(fits.PrimaryHDU(np.arange(60, dtype=np.int16).reshape(5, 3, 4)))[: 2880 + 120]
-    if name.endswith("npy"):
-        stream = io.BytesIO()
-        np.save(stream, np.arange(60.0).reshape(5, 3, 4))
-        content = stream.getvalue()
-    elif name.endswith("gz"):
-        content = gzip.compress(content, mtime=0)
-    if data.draw(st.booleans()):
-        content = content[: data.draw(st.integers(0, len(content) - 1))]
-    else:
-        place = data.draw(st.integers(0, min(len(content), 900) - 1))
-        content = content[:place] + data.draw(st.binary(min_size=1, max_size=9)) + content[place:]
-    path.write_bytes(content)
-    try:
-        stack = Stack([path], [], 1, (3, 4))
-        assert stack.read(0, stack.n).shape == (stack.n, 1, 3, 4)
-    except FileError as error:
-        assert name in str(error)  # noqa: PT017
-
-
 BAD = {
-    "empty": (lambda path, f: path.write_bytes(b""), "bad.fits: the file is empty"),
-    "text": (lambda path, f: path.write_text("not a picture"), "bad.fits: its first bytes are those of neither"),
-    "pickle": (
-        lambda path, f: path.write_bytes(pickle.dumps(f)),
-        "bad.fits: its first bytes are those of neither",
-    ),
-    "objects": (
-        lambda path, f: _save(path, np.array([{}, None])),
-        "bad.fits: a broken NPY file: it holds objects",
-    ),
-    "complex": (lambda path, f: _save(path, f.astype(complex)), "bad.fits: its numbers are complex128"),
-    "columns first": (lambda path, f: _save(path, np.asfortranarray(f)), "bad.fits: its columns come first"),
-    "shape": (
-        lambda path, f: _save(path, f[:, 1:]),
-        r"bad.fits: its shape is \(12, 55, 112\): expected images of",
-    ),
-    "no frame": (lambda path, f: _save(path, f[:0]), r"bad.fits: its shape is \(0, 56, 112\)"),
-    "five axes": (lambda path, f: _save(path, f[None, None]), r"bad.fits: its shape is \(1, 1, 12, 56, 112\)"),
-    "truncated NPY": (lambda path, f: _cut(path, f, "npy"), r"bad.fits: truncated: it ends in exposure 6 of 12"),
-    "truncated FITS": (lambda path, f: _cut(path, f, "fits"), r"bad.fits: truncated: it ends in exposure 6 of 12"),
-    "no image": (lambda path, f: fits.PrimaryHDU().writeto(path), "bad.fits: a FITS file without an image"),
+    "text": (lambda path, f: path.write_text("not a picture"), "its first bytes are those of neither"),
+    "complex": (lambda path, f: _save(path, f.astype(complex)), "its numbers are complex128"),
+    "columns first": (lambda path, f: _save(path, np.asfortranarray(f)), "its columns come first"),
+    "shape": (lambda path, f: _save(path, f[:, 1:]), r"its shape is \(12, 55, 112\): expected images of"),
+    "no frame": (lambda path, f: _save(path, f[:0]), r"its shape is \(0, 56, 112\)"),
+    "other numbers": (lambda path, f: _save(path, f.astype(float)), r"its type, BSCALE, BZERO and BLANK are"),
+    "truncated NPY": (lambda path, f: _cut(path, f, "npy"), r"truncated: it ends in exposure 6 of 12"),
+    "truncated FITS": (lambda path, f: _cut(path, f, "fits"), r"truncated: it ends in exposure 6 of 12"),
     "unit": (
         lambda path, f: fits.PrimaryHDU(f, fits.Header({"BUNIT": "electron"})).writeto(path),
-        "bad.fits: BUNIT = 'electron': expected 'adu', that of the calibration",
+        "BUNIT = 'electron': expected 'adu', that of the calibration",
     ),
     "compressed": (
         lambda path, f: fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(f)]).writeto(path),
-        "bad.fits: extension 1 is compressed: expected plain images; use funpack",
+        "extension 1 is compressed: expected plain images; use funpack",
     ),
 }
 
@@ -849,18 +703,10 @@ def _cut(path, frames, kind):
 def test_bad_file_is_refused_by_name_before_any_work(folder, bench, kind):
     write, message = BAD[kind]
     write(folder / "bad.fits", bench.frames)
-    with pytest.raises(FileError, match=message):
+    with pytest.raises(FileError, match=f"bad.fits: {message}"):
         reconstruct(["cube.fits", "bad.fits"], "bench.npz", "phase.fits")
     assert not Path("phase.fits").exists()
     assert not list(folder.glob(".*"))
-
-
-def test_missing_keyword_is_named_with_its_file(folder, bench):
-    with pytest.raises(FileError, match=r"cube.fits: its header has no DATE-OBS"):
-        reconstruct("cube.fits", "bench.npz", "phase.fits", keywords=["DATE-OBS"])
-    np.save("bare.npy", bench.flat)
-    with pytest.raises(ValueError, match=r"bare.npy: its header has no THETA1"):
-        calibrate(["bare.npy"], ["pupils.fits"])
 
 
 @pytest.mark.parametrize(
@@ -871,11 +717,8 @@ def test_missing_keyword_is_named_with_its_file(folder, bench):
         (["cube.fits"], {"second_frames": "cube.fits"}, ValueError, "second_files holds 1 files: expected none"),
         (["cube.fits"], {"phases": False}, ValueError, "phases = False: expected True, or modes"),
         (["cube.fits"], {"read_noise": 3.0}, ValueError, "read_noise = 3: expected a number of photons"),
-        (["cube.fits"], {"photons": -1}, ValueError, "photons = -1"),
-        (["cube.fits"], {"n_workers": 0}, ValueError, "n_workers = 0"),
         (["cube.fits"], {"keywords": ["FLAGS"]}, FileError, "cube.fits: its header has no FLAGS"),
         (["cube.fits"], {"modes": np.ones((2, 5, 5))}, ValueError, "modes has shape"),
-        (["cube.fits"], {"modes": 0}, ValueError, "= 0: expected"),
         (["cube.fits"], {"saturation": "high"}, TypeError, "saturation = 'high'"),
     ],
 )
@@ -883,19 +726,6 @@ def test_wrong_argument_is_named(folder, names, settings, error, message):
     with pytest.raises(error, match=message):
         reconstruct(names, "bench.npz", "phase.fits", **settings)
     assert not list(folder.glob("*phase.fits*"))
-
-
-def test_output_is_no_input(folder):
-    before = Path("cube.fits").read_bytes()
-    with pytest.raises(ValueError, match=r"output = 'cube.fits' is the input"):
-        reconstruct("cube.fits", "bench.npz", "cube.fits", overwrite=True)
-    assert Path("cube.fits").read_bytes() == before
-
-
-def test_files_of_two_kinds_are_refused(folder, bench):
-    np.save("other.npy", bench.frames.astype(float))
-    with pytest.raises(FileError, match=r"other.npy: its type, BSCALE, BZERO and BLANK are \('<f8'"):
-        reconstruct(["cube.fits", "other.npy"], "bench.npz", "phase.fits")
 
 
 # The command
@@ -907,72 +737,33 @@ def command(*arguments, cwd, **options):
     )
 
 
-def test_command_calibrates_and_reconstructs(folder, capsys):
-    files = ["--frames", "frame.fits", "--pupils", "pupils.fits", "--dark", "dark.fits"]
-    assert main(["calibrate", "new.npz", *files]) == 0
-    assert main(["reconstruct", "cube.fits", "--calibration", "new.npz", "-o", "phase.fits", "--strict"]) == 0
+def test_command_calibrates_and_reconstructs_with_all_of_its_options(folder, bench, capsys):
+    np.save("bad.npy", np.zeros(bench.flat.shape))
+    files = "--frames frame.fits --pupils pupils.fits --dark dark.fits --bad-pixels bad.npy"
+    places = "--no-registration --pupil-centers 27.5 27.5 27.5 83.5 --pupil-diameter 40 --exposure 1"
+    optics = "--diameter 1.06 --phase-shifts 1.5708 -1.5708 --fit scale --iterations 20 --tolerance 0.01"
+    assert main(["calibrate", "new.npz", *f"{files} {places} {optics} --saturation 60000".split()]) == 0
+    options = "--modes 5 --phases --photons 1e4 --read-noise 3 --keywords EXPTIME --workers 1 --strict"
+    arguments = f"reconstruct cube.fits --calibration new.npz -o phase.fits --largest-residual 0.5 {options}"
+    assert main(arguments.split()) == 0
     assert "12 frames, 0 flagged" in capsys.readouterr().out
-    assert main(["reconstruct", "none.fits", "--calibration", "new.npz", "-o", "phase.fits"]) == 1
+    with fits.open("phase.fits") as units:
+        units.verify("exception")
+        table = units["FRAMES"].data
+        assert units[0].data.shape[0] == units["SIGMA"].data.shape[0] == 12
+        assert {"COEFFS", "SIGCOEFF", "SIGMA", "EXPTIME"} <= set(table.names)
+        assert all(np.isfinite(table[name]).all() for name in ("COEFFS", "SIGCOEFF", "SIGMA"))
+
+
+def test_exit_code_says_how_the_command_ended(folder, capsys):
+    assert main(["reconstruct", "none.fits", "--calibration", "bench.npz", "-o", "phase.fits"]) == 1
     assert "error: none.fits: no such file" in capsys.readouterr().err
-    arguments = ["--calibration", "new.npz", "-o", "strict.fits", "--strict", "--largest-residual", "0"]
-    assert main(["reconstruct", "cube.fits", *arguments]) == 3
+    arguments = "--calibration bench.npz -o strict.fits --strict --largest-residual 0"
+    assert main(["reconstruct", "cube.fits", *arguments.split()]) == 3
     assert "12 flagged: 12 inconsistent" in capsys.readouterr().out
     with pytest.raises(SystemExit) as stopped:
         main(["reconstruct"])
     assert stopped.value.code == 2
-
-
-# Options of the command that exclude no other, with other values than their defaults.
-RECONSTRUCT = [
-    "--modes 5", "--modes 5 --phases", "--photons 1e4", "--photons 1e4 --read-noise 3", "--keywords EXPTIME BUNIT",
-    "--saturation 60000", "--largest-residual 0.5", "--workers 1", "--restart", "--overwrite", "--strict",
-    "--quiet",
-]  # fmt: skip
-CALIBRATE = [
-    "--dark dark.fits", "--bad-pixels bad.npy", "--diameter 1.1", "--phase-shifts 1.5 -1.5", "--no-registration",
-    "--pupil-centers 27.5 27.5 27.5 83.5 --pupil-diameter 40", "--exposure 1.1", "--saturation 60000",
-    "--fit registration", "--iterations 10", "--tolerance 0.01",
-]  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pair", list(combinations(RECONSTRUCT, 2)), ids=" ".join)
-def test_every_pair_of_options_reconstructs(folder, bench, pair):
-    fits.PrimaryHDU(bench.frames[:2], fits.Header(OPTICS | {"EXPTIME": 0.01})).writeto("two.fits")
-    options = " ".join(pair)
-    files = ["two.fits", "--calibration", "bench.npz", "--output", "phase.fits"]
-    assert main(["reconstruct", *files, *options.split()]) == 0
-    with fits.open("phase.fits") as units:
-        units.verify("exception")
-        table = units["FRAMES"].data
-        modes, photons = "--modes" in options, "--photons" in options
-        phases = not modes or "--phases" in options
-        assert (units[0].data is not None) == phases
-        assert ("SIGMA" in units) == ("SIGMA" in table.names) == (phases and photons)
-        assert ("SIGCOEFF" in table.names) == (modes and photons)
-        assert ("COEFFS" in table.names) == modes
-        assert ("EXPTIME" in table.names) == ("--keywords" in options)
-        for name in {"SIGMA", "SIGCOEFF", "COEFFS"} & set(table.names):
-            assert np.isfinite(table[name]).all()
-        if phases and photons:
-            rms_sigma = np.sqrt(np.nanmean(units["SIGMA"].data ** 2, axis=(1, 2)))
-            np.testing.assert_allclose(table["SIGMA"], rms_sigma, rtol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pair", list(combinations(CALIBRATE, 2)), ids=" ".join)
-def test_every_pair_of_options_calibrates(folder, bench, pair):
-    np.save("bad.npy", np.zeros(bench.flat.shape))
-    files = ["--frames", "frame.fits", "--pupils", "pupils.fits"]
-    assert main(["calibrate", "new.npz", *files, *" ".join(pair).split()]) == 0
-    assert np.isfinite(Calibration.load("new.npz")(bench.frames[:1]).flux).all()
-
-
-def test_command_explains_itself(tmp_path):
-    for arguments in ((), ("calibrate",), ("reconstruct",)):
-        shown = command(*arguments, "--help", cwd=tmp_path)
-        assert shown.returncode == 0
-        assert "exit codes:" in shown.stdout
 
 
 # The command with a pause after each chunk: it cannot end before the test stops it.

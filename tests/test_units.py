@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from zwfs import Dimple, Pupil, ZernikeSensor, opd_to_phase, phase_to_opd
-from zwfs.focal import focal_field
+from zwfs.masks import focal_field
 
 
 @pytest.mark.parametrize("wavelength", [500.0, 1650.0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from zwfs.paper.identities import direct_reference_wave
+from studies.identities import direct_reference_wave
 
 from .vectors import make, packages
 

@@ -1,14 +1,14 @@
-"""Arrays of NumPy, and of any other library that follows the Python array API standard.
+"""Arrays of NumPy and of any other library that follows the Python array API, and the objects that own them.
 
 Code for such arrays asks an array for its `Kind`, calls the functions of the namespace `xp`, and keeps one copy of
-its constants for each kind, see `per_kind`.
+its constants for each kind, see `per_kind`. `Immutable` is the base of objects whose arrays are read-only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
-from typing import Any, NamedTuple, TypeVar
+from functools import cached_property, wraps
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import array_api_compat
 import numpy as np
@@ -68,18 +68,19 @@ class Kind(NamedTuple):
 
 Owner = TypeVar("Owner")
 Constants = TypeVar("Constants")
-KEPT = "_kept"  # attribute that holds the results of methods decorated with `per_kind`
+_KEPT = "_kept"  # attribute that holds the results of methods decorated with `per_kind`
+_OPEN = "_open"  # attribute of an object while its constructor runs
 
 
 def per_kind(make: Callable[[Owner, Kind], Constants]) -> Callable[[Owner, Kind], Constants]:
     """Decorate a method of a kind of arrays: its result is computed once for each kind, then kept in the object.
 
-    This is for constants as arrays of that kind. `zwfs._pickle.Immutable` keeps them out of pickles.
+    This is for constants as arrays of that kind. `Immutable` keeps them out of pickles.
     """
 
     @wraps(make)
     def kept(owner: Owner, kind: Kind) -> Constants:
-        results = owner.__dict__.setdefault(KEPT, {})
+        results = owner.__dict__.setdefault(_KEPT, {})
         try:
             return results[make, kind]
         except KeyError:
@@ -111,8 +112,75 @@ def for_each(array: Any, k: int, xp: Any) -> Any:
     return xp.broadcast_to(array, (k, *array.shape[1:]))
 
 
+def is_complex(array: Any, xp: Any) -> bool:
+    """Whether the numbers of an array are complex."""
+    return array.dtype.kind == "c" if xp is np else xp.isdtype(array.dtype, "complex floating")
+
+
+def parted(values: Any, axis: int, xp: Any) -> Any:
+    """Real and imaginary parts of complex numbers, along a new axis."""
+    return xp.stack([xp.real(values), xp.imag(values)], axis=axis)
+
+
+def joined(parts: Any, axis: int) -> Any:
+    """Complex numbers of real and imaginary parts along an axis, which is negative: undo `parted`."""
+    rest = (slice(None),) * (-1 - axis)
+    numbers = 1j * parts[(..., 1, *rest)]
+    numbers += parts[(..., 0, *rest)]
+    return numbers
+
+
 def product(real: Any, maps: Any, xp: Any) -> Any:
-    """Matrix product of real numbers with large maps, real or complex."""
-    if xp is np and real.dtype != maps.dtype:  # parts side by side: half the time of a product of complex numbers
-        return (real @ maps.view(real.dtype)).view(maps.dtype)
-    return real @ maps
+    """Matrix product of real numbers with large complex maps."""
+    if xp is not np:
+        return joined(real @ parted(maps, -3, xp), -3)
+    pairs = real @ np.ascontiguousarray(maps).view(maps.real.dtype)  # parts side by side, without a copy
+    return pairs.view(np.result_type(pairs.dtype, np.complex64))
+
+
+class Immutable:
+    """Object that cannot be changed once it is made: its arrays are read-only, here and after a pickle.
+
+    A pickle holds neither cached properties nor constants per kind of arrays. They are cheap to compute again, and
+    the pickle of an object does not depend on its use.
+    """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "__init__" not in vars(cls):
+            return
+        construct: Callable[..., None] = cls.__init__
+
+        @wraps(construct)
+        def closing(self: Immutable, *arguments: Any, **named: Any) -> None:
+            if _OPEN in vars(self):  # called by the constructor of a subclass, which may set more
+                return construct(self, *arguments, **named)
+            vars(self)[_OPEN] = True
+            try:
+                construct(self, *arguments, **named)
+            finally:
+                del vars(self)[_OPEN]
+
+        cls.__init__ = closing  # type: ignore[assignment, method-assign]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if _OPEN not in vars(self):
+            self._refuse(name)
+        super().__setattr__(name, value)
+
+    def __delattr__(self, name: str) -> None:
+        self._refuse(name)
+
+    def _refuse(self, name: str) -> NoReturn:
+        raise AttributeError(f"{name}: a {type(self).__name__} cannot be changed; make another one")
+
+    def __getstate__(self) -> dict[str, Any]:
+        kind = type(self)
+        return {
+            name: value
+            for name, value in self.__dict__.items()
+            if name != _KEPT and not isinstance(getattr(kind, name, None), cached_property)
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({name: read_only(value) for name, value in state.items()})

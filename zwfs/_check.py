@@ -23,12 +23,6 @@ def instance(name: str, value: Any, *kinds: type) -> None:
         raise TypeError(f"{name} is a {type(value).__name__}: expected a {expected}")
 
 
-def function(name: str, value: Any) -> None:
-    """Require that `value` can be called."""
-    if not callable(value):
-        raise TypeError(f"{name} = {shown(value)}: expected a function")
-
-
 def sequence(name: str, values: Any, kind: type = object, expected: str = "") -> None:
     """Require a sequence of objects of a class; a string is none."""
     listed = isinstance(values, Sequence) and not isinstance(values, str | bytes)
@@ -86,18 +80,13 @@ def count(name: str, value: Any, size: int) -> int:
     return number_of
 
 
-def integer_seed(name: str, value: Any) -> int:
-    """Return a seed that must be an integer; it may be of any size."""
-    return integer(name, value, 0, math.inf)
-
-
 def generator(name: str, seed: Any) -> np.random.Generator:
     """Return the generator of a seed: an integer of at least 0, a SeedSequence, a Generator, or None for any."""
     if seed is None or isinstance(seed, np.random.Generator | np.random.SeedSequence):
         return np.random.default_rng(seed)
     if not isinstance(seed, Integral):
         raise TypeError(f"{name} is a {type(seed).__name__}: expected an integer, a SeedSequence or a Generator")
-    return np.random.default_rng(integer_seed(name, seed))
+    return np.random.default_rng(integer(name, seed, 0, math.inf))
 
 
 def flag(name: str, value: Any) -> bool:
@@ -308,17 +297,6 @@ def map_inside(name: str, array: Any, pupil: Any) -> NDArray:
     if array.shape != pupil.shape:
         raise ValueError(f"{name} has shape {array.shape}: expected {pupil.shape}")
     finite(name, pupil.gather(array), " inside the pupil")
-    return array
-
-
-def screens(name: str, array: Any, pupil: Any = None) -> NDArray:
-    """Return real screens, (n_screens, ny, nx), at least one, finite inside the pupil if it is given."""
-    array = real_array(name, array)
-    if array.ndim != 3 or 0 in array.shape:
-        raise ValueError(f"{name} has shape {array.shape}: expected (n_screens, ny, nx)")
-    if pupil is not None:
-        trailing_shape(name, array, pupil.shape, "the shape of the pupil")
-        finite(name, pupil.gather(array), " inside the pupil")
     return array
 
 

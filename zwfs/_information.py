@@ -26,41 +26,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import add, mul
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zwfs._arrays import Kind, per_kind
+from zwfs._arrays import Immutable, Kind, per_kind
 from zwfs._lowrank import Factors
-from zwfs._pickle import Immutable
+from zwfs._propagator import Optics
 from zwfs.pupil import Pupil
-
-if TYPE_CHECKING:
-    from zwfs.sensor import Sensor
 
 _SMALLEST = 1e-12  # of the diagonal, relative to its mean: a point that no frame shows has no information
 
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Products of two functions f_i(y) g_j(x) of a grid, and sums over maps of their products.
+    """Products of two functions f_i(y) g_j(x) of a grid, and sums over maps of their products."""
 
-    Attributes
-    ----------
-    along_y, along_x : array, shapes (a, ny) and (b, nx)
-    pairs_y, pairs_x : array, shapes (a (a + 1) / 2, ny) and (b (b + 1) / 2, nx)
-        Products of two functions of an axis.
-    unfold_y, unfold_x : array, shapes (a * a, a (a + 1) / 2) and (b * b, b (b + 1) / 2)
-        One where an ordered pair is that unordered pair.
-    """
-
-    along_y: NDArray
-    along_x: NDArray
-    pairs_y: NDArray
-    pairs_x: NDArray
-    unfold_y: NDArray
-    unfold_x: NDArray
+    along_y: NDArray  # (a, ny)
+    along_x: NDArray  # (b, nx)
+    pairs_y: NDArray  # (a (a + 1) / 2, ny), products of two functions of the axis
+    pairs_x: NDArray  # (b (b + 1) / 2, nx)
+    unfold_y: NDArray  # (a * a, a (a + 1) / 2), one where an ordered pair is that unordered pair
+    unfold_x: NDArray  # (b * b, b (b + 1) / 2)
 
     @classmethod
     def of(cls, along_y: NDArray, along_x: NDArray, kind: Kind) -> _Pairs:
@@ -119,7 +107,7 @@ class Response(Immutable):
         self._factors, self._window, self._pupil, self._ratios = factors, window, pupil, ratios
 
     @classmethod
-    def of(cls, sensor: Sensor) -> Response:
+    def of(cls, sensor: Optics) -> Response:
         """Response of a sensor."""
         return cls(sensor.factors, sensor.window, sensor.pupil, sensor.channels.ratios)
 
@@ -184,25 +172,13 @@ class Information:
     """Fisher information F at a field, for k frame sets: see the head of this module.
 
     Maps have shape (k, ny, nx). Lists of maps have one entry for each unknown of a point.
-
-    Attributes
-    ----------
-    constants : _Constants
-    local : list of lists of maps
-        Diagonal blocks sum_k D_k^T W D_k; outside the pupil a multiple of the identity.
-    sets : list of lists of maps
-        Factors of the columns of K, then of B: real and imaginary part of each.
-    gram : array, shape (k, 2 r n_wavelengths, 2 r n_wavelengths)
-        M.
-    scale : array, shape (k, 1, 1)
-        Mean over the pupil of the diagonal for the phase.
     """
 
     constants: _Constants
-    local: list[list[NDArray]]
-    sets: list[list[NDArray]]
-    gram: NDArray
-    scale: NDArray
+    local: list[list[NDArray]]  # diagonal blocks sum_k D_k^T W D_k; outside the pupil multiples of 1
+    sets: list[list[NDArray]]  # factors of the columns of K, then of B: real and imaginary part
+    gram: NDArray  # (k, 2 r n_wavelengths, 2 r n_wavelengths), M
+    scale: NDArray  # (k, 1, 1), mean over the pupil of the diagonal for the phase
 
     @classmethod
     def of(cls, constants: _Constants, tangents: NDArray, waves: NDArray, weights: NDArray | None) -> Information:

@@ -39,13 +39,7 @@ class Noise:
 
     @classmethod
     def checked(cls, photons: Any, read_noise: Any) -> Noise:
-        """Check the arguments.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If a number is out of range, or there is read noise without a number of photons.
-        """
+        """Check the arguments."""
         read_noise = _check.number("read_noise", read_noise, 0, 1e6)
         if photons is not None:
             return cls(_check.number("photons", photons, 1e-18, 1e12), read_noise)
@@ -141,13 +135,7 @@ def require_information(sensor: Sensor, unknown_amplitude: bool) -> None:
 
 
 def require_one_wavelength(sensor: Sensor) -> None:
-    """Require one wavelength, for an unknown amplitude.
-
-    Raises
-    ------
-    ValueError
-        If there are several.
-    """
+    """Require one wavelength, for an unknown amplitude."""
     if len(sensor.channels.ratios) > 1:
         raise ValueError(
             f"amplitude is unknown and the sensor has {len(sensor.channels.ratios)} wavelengths: expected a known "
@@ -157,26 +145,13 @@ def require_one_wavelength(sensor: Sensor) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """Unknowns of a fit and the noise of the frames: the information and its inverse at any field.
-
-    Attributes
-    ----------
-    response : Response
-        Of the sensor.
-    noise : Noise
-    unknown_amplitude : bool
-        Whether the amplitude of every point is unknown, too.
-    modes : array, shape (m, ny, nx), or None
-        Modes whose coefficients are the unknowns.
-    precision : array, shape (m, m), or None
-        Inverse of the covariance of the coefficients before the measurement.
-    """
+    """Unknowns of a fit and the noise of the frames: the information and its inverse at any field."""
 
     response: Response
     noise: Noise
-    unknown_amplitude: bool = False
-    modes: NDArray | None = None
-    precision: NDArray | None = None
+    unknown_amplitude: bool = False  # at every point
+    modes: NDArray | None = None  # (m, ny, nx), whose coefficients are the unknowns
+    precision: NDArray | None = None  # (m, m), inverse of their covariance before the measurement
 
     def information(self, psi: NDArray, waves: NDArray) -> Information:
         """Information at split fields: (k, p, ny, nx) in the pupil, (k, n_masks, p, ny', nx') on the detector."""

@@ -9,9 +9,8 @@ The functions of the factors are products of one-dimensional ones along y and x 
 two axes). Projecting a map of N x N pixels costs two thin matrix products, and nothing larger than N times the
 number of these functions is stored.
 
-The functions are real. A complex map is therefore two real ones, and the large products act on both at once. For
-arithmetic on every pixel, as in the reconstructors, the two maps stay apart: "split" fields have shape
-(..., 2, ny, nx), real part first.
+The functions are real. A complex map is therefore two real ones, which stay apart: "split" fields have shape
+(..., 2, ny, nx), real part first. The complex calls of a sensor split the coefficients only.
 """
 
 from __future__ import annotations
@@ -27,8 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind, any_array, product, read_only
-from zwfs._pickle import Immutable
+from zwfs._arrays import Immutable, Kind, any_array, is_complex, joined, parted, product, read_only
 from zwfs.masks import Dimple, Mask
 
 _NODES = 2048  # of a quadrature handled together: wide detectors and large masks have many
@@ -48,15 +46,6 @@ class Plane(Immutable):
     along_y : array, shape (a, ny)
     along_x : array, shape (b, nx)
     combine : array, shape (a * b, r)
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
-    >>> plane = sensor.factors.pupil
-    >>> plane.project(np.ones(pupil.shape)).shape == (plane.rank,)
-    True
     """
 
     along_y: NDArray
@@ -79,15 +68,31 @@ class Plane(Immutable):
 
     def project(self, maps: NDArray) -> NDArray:
         """Inner products with real or complex maps: (..., ny, nx) to (..., r)."""
-        xp = self.xp
-        pairs = product(self.along_y, maps, xp) @ self.along_x.T
-        return xp.reshape(pairs, (*maps.shape[:-2], -1)) @ self.combine
+        if is_complex(maps, self.xp):
+            return joined(self.project_complex(maps), -2)
+        return self._along_rows(self.along_y @ maps)
 
     def expand(self, coefficients: NDArray) -> NDArray:
         """Maps of real or complex coefficients: (..., r) to (..., ny, nx)."""
-        xp, pairs = self.xp, coefficients @ self.combine.T
+        if is_complex(coefficients, self.xp):
+            return self.expand_complex(parted(coefficients, -2, self.xp))
+        return self.along_y.T @ self._rows(coefficients)
+
+    def project_complex(self, maps: NDArray) -> NDArray:
+        """Real and imaginary parts of inner products with complex maps: (..., ny, nx) to (..., 2, r)."""
+        return self._along_rows(parted(product(self.along_y, maps, self.xp), -3, self.xp))
+
+    def expand_complex(self, parts: NDArray) -> NDArray:
+        """Complex maps of real and imaginary parts of coefficients: (..., 2, r) to (..., ny, nx)."""
+        return product(self.along_y.T, joined(self._rows(parts), -3), self.xp)
+
+    def _along_rows(self, rows: NDArray) -> NDArray:
+        pairs = rows @ self.along_x.T
+        return self.xp.reshape(pairs, (*rows.shape[:-2], -1)) @ self.combine
+
+    def _rows(self, coefficients: NDArray) -> NDArray:
         shape = (*coefficients.shape[:-1], self.along_y.shape[0], self.along_x.shape[0])
-        return product(self.along_y.T, xp.reshape(pairs, shape) @ self.along_x, xp)
+        return self.xp.reshape(coefficients @ self.combine.T, shape) @ self.along_x
 
     def cut(self, rows: slice, columns: slice) -> Plane:
         """The same functions on a part of the grid."""
@@ -97,11 +102,6 @@ class Plane(Immutable):
     def to(self, kind: Kind) -> Plane:
         """The same functions in another library, precision or device."""
         return Plane(*(kind.array(array) for array in (self.along_y, self.along_x, self.combine)))
-
-    def for_complex(self) -> Plane:
-        """The same functions, for complex maps."""
-        along_y = self.along_y if self.xp is np else self.along_y + 0j
-        return Plane(along_y, self.along_x + 0j, self.combine + 0j)
 
     def products(self, other: Plane, weight: NDArray) -> NDArray:
         """Weighted inner products of these functions with those of another plane on the same grid, (r, r')."""
@@ -126,14 +126,6 @@ class Factors(Immutable):
         Functions on the two planes, of rank r and q.
     core : ndarray of complex, shape (n_masks, q, r) or (n_masks, n_wavelengths, q, r)
         Kept as a read-only view.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
-    >>> sensor.factors.core.shape == (1, sensor.rank, sensor.rank)
-    True
     """
 
     pupil: Plane
@@ -163,28 +155,15 @@ class Operator:
         self._pupil = factors.pupil.to(kind)
         self._detector = factors.detector.to(kind)
         self._window = factors.detector.cut(*window).to(kind)
-        self._complex_pupil, self._complex_detector = self._pupil.for_complex(), self._detector.for_complex()
-        self._split_core = kind.array(split_core(factors.core))
+        self._core = kind.array(split_core(factors.core))
         self._n_parts = 2 * (factors.core.shape[1] if factors.core.ndim == 4 else 1)
-        core = factors.core.reshape(-1, factors.core.shape[-1]).T
-        self._core = kind.array(core.real) + 1j * kind.array(core.imag)
-
-    def reference(self, psi: NDArray) -> NDArray:
-        """Reference waves of complex fields on the pupil: (k, ny, nx) to (k, n_masks, ny', nx')."""
-        coefficients = self._complex_pupil.project(psi) @ self._core
-        return self._complex_detector.expand(self._by_mask(coefficients, self._detector))
-
-    def adjoint(self, waves: NDArray) -> NDArray:
-        """Adjoint of `reference`: (k, n_masks, ny', nx') to (k, ny, nx)."""
-        coefficients = self._in_a_row(self._complex_detector.project(waves))
-        return self._complex_pupil.expand(coefficients @ self._xp.conj(self._core).T)
 
     def split_reference(self, psi: NDArray, *, in_window: bool = False) -> NDArray:
         """Reference waves of split fields on the pupil, (k, 2, ny, nx) to (k, n_masks, 2, ny', nx').
 
         The primed sizes are those of the detector, or those of the pupil's grid if `in_window`.
         """
-        return self.split_expand(self.split_project(psi) @ self._split_core, in_window=in_window)
+        return self.split_expand(self.split_project(psi) @ self._core, in_window=in_window)
 
     def split_project(self, psi: NDArray) -> NDArray:
         """Coefficients of split fields on the pupil: (k, 2, ny, nx) to (k, 2 r), real parts first."""
@@ -193,30 +172,34 @@ class Operator:
     def split_expand(self, coefficients: NDArray, *, in_window: bool = False) -> NDArray:
         """Split waves of coefficients, (k, n 2 q) to (k, n, 2, ny', nx'); sizes as for `split_reference`."""
         plane = self._window if in_window else self._detector
-        return plane.expand(self._by_mask(coefficients, plane, self._n_parts))
+        return plane.expand(self._by_mask(coefficients, plane))
 
     def split_adjoint(self, waves: NDArray) -> NDArray:
         """Adjoint of `split_reference` on the whole detector: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
-        coefficients = self._in_a_row(self._detector.project(waves)) @ self._split_core.T
-        return self._pupil.expand(self._xp.reshape(coefficients, (-1, self._n_parts, self._pupil.rank)))
+        coefficients = self._in_a_row(self._detector.project(waves)) @ self._core.T
+        return self._pupil.expand(self._by_mask(coefficients, self._pupil)[:, 0, ...])
+
+    def complex_reference(self, psi: NDArray) -> NDArray:
+        """`split_reference` of complex fields: (k, ny, nx) to (k, n_masks, ny', nx')."""
+        coefficients = self._in_a_row(self._pupil.project_complex(psi)) @ self._core
+        return self._detector.expand_complex(self._by_mask(coefficients, self._detector))
+
+    def complex_adjoint(self, waves: NDArray) -> NDArray:
+        """`split_adjoint` of complex fields: (k, n_masks, ny', nx') to (k, ny, nx)."""
+        coefficients = self._in_a_row(self._detector.project_complex(waves)) @ self._core.T
+        return self._pupil.expand_complex(self._by_mask(coefficients, self._pupil)[:, 0, ...])
 
     def _in_a_row(self, coefficients: NDArray) -> NDArray:
         return self._xp.reshape(coefficients, (coefficients.shape[0], -1))
 
-    def _by_mask(self, coefficients: NDArray, plane: Plane, *parts: int) -> NDArray:
-        return self._xp.reshape(coefficients, (coefficients.shape[0], -1, *parts, plane.rank))
+    def _by_mask(self, coefficients: NDArray, plane: Plane) -> NDArray:
+        return self._xp.reshape(coefficients, (coefficients.shape[0], -1, self._n_parts, plane.rank))
 
 
 def split_core(core: NDArray[np.complex128]) -> NDArray[np.float64]:
     """Cores (n, q, r) as a real matrix that acts from the right: coefficients (k, 2 r) to (k, n 2 q).
 
     Those of w wavelengths, (n, w, q, r), act on the coefficients of each one apart: (k, w 2 r) to (k, n w 2 q).
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> zwfs._lowrank.split_core(np.array([[[1 + 2j]]])).shape
-    (2, 2)
     """
     block = np.block([[core.real, -core.imag], [core.imag, core.real]])
     if block.ndim == 4:
@@ -249,27 +232,10 @@ def factorise(
     -------
     Factors
 
-    Raises
-    ------
-    TypeError, ValueError
-        If a mask lacks an attribute of `Mask`, or transmits something that is not finite. If it is wider in
-        lambda/D than there are pixels across D: the focal field of a sampled pupil repeats beyond. If it is so
-        wide on so wide a detector that the factors are not small.
-
     Warns
     -----
     UserWarning
         If the quadrature of a transmission that varies over the mask misses the tolerance.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> dimple = zwfs.Dimple(1.06, np.pi / 2)
-    >>> axes = pupil.y, pupil.x
-    >>> factors = zwfs._lowrank.factorise([dimple], axes, axes, pupil.n_pixels**-2, tolerance=1e-6)
-    >>> factors.core.shape
-    (1, 17, 17)
     """
     reach = math.hypot(*(np.ptp(np.concatenate(pair)) for pair in zip(pupil_axes, detector_axes, strict=True)))
     for index, mask in enumerate(masks):
@@ -369,14 +335,7 @@ def _axis_functions(axis: NDArray, radius: float, tolerance: float) -> NDArray:
 
 @cache
 def gauss_legendre(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes and weights of the Gauss-Legendre quadrature on (-1, 1), (n,) each.
-
-    Examples
-    --------
-    >>> from zwfs._lowrank import gauss_legendre
-    >>> gauss_legendre(1)
-    (array([0.]), array([2.]))
-    """
+    """Nodes and weights of the Gauss-Legendre quadrature on (-1, 1), (n,) each."""
     unit, weights = np.polynomial.legendre.leggauss(n)
     return read_only(unit), read_only(weights)
 

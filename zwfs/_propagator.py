@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from math import prod
 from operator import add
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,9 +25,6 @@ from zwfs import _check
 from zwfs._arrays import Kind, per_kind, read_only
 from zwfs._lowrank import Factors, Operator
 from zwfs.pupil import Pupil
-
-if TYPE_CHECKING:
-    from zwfs.sensor import Sensor
 
 _RANGE = 1e30  # of the light in the pupil, and of its inverse: its square is a number in single precision, too
 _VANISHING = 1e-30  # modulus, or its square, of a field that counts as 0
@@ -51,67 +48,53 @@ class Channels(NamedTuple):
 ONE_WAVELENGTH = Channels()
 
 
+class Optics(Protocol):
+    """Parts of a sensor from which its model is made."""
+
+    @property
+    def pupil(self) -> Pupil: ...
+    @property
+    def factors(self) -> Factors: ...
+    @property
+    def window(self) -> tuple[slice, slice]: ...
+    @property
+    def channels(self) -> Channels: ...
+
+
 @dataclass(frozen=True, eq=False)
 class Propagator:
     """Propagation through a sensor, and the maps of its pupil, for arrays of one kind.
 
     Maps have shape (ny, nx); those of NumPy are read-only.
-
-    Attributes
-    ----------
-    kind : Kind
-        Of real arrays.
-    pupil : Pupil
-    operator : Operator
-        Low-rank operator from the pupil to the reference waves.
-    window : (slice, slice)
-        Rows and columns of the detector in which the grid of the pupil lies.
-    inside : array of bool
-        Whether a point lies inside the pupil.
-    stop : array
-        Transmission of the pupil stop: 1 inside, 0 outside.
-    no_data : array
-        0 inside, NaN outside: added to a map that people look at.
-    amplitude : array
-        Amplitude of the incoming field, 0 outside.
-    flat : array, shape (1, 2, ny, nx)
-        Phasor of a flat wavefront.
-    channels : Channels
     """
 
-    kind: Kind
+    kind: Kind  # of real arrays
     pupil: Pupil
     operator: Operator
-    window: tuple[slice, slice]
-    inside: NDArray[np.bool_]
-    stop: NDArray[np.floating]
-    no_data: NDArray[np.floating]
-    amplitude: NDArray[np.floating]
-    flat: NDArray[np.floating]
+    window: tuple[slice, slice]  # where the grid of the pupil lies on the detector
+    inside: NDArray[np.bool_]  # whether a point lies inside the pupil
+    stop: NDArray[np.floating]  # 1 inside, 0 outside
+    no_data: NDArray[np.floating]  # 0 inside, NaN outside: added to a map that people look at
+    amplitude: NDArray[np.floating]  # of the incoming field, 0 outside
+    flat: NDArray[np.floating]  # (1, 2, ny, nx), phasor of a flat wavefront
     channels: Channels
 
     @classmethod
-    def of(
-        cls,
-        factors: Factors,
-        window: tuple[slice, slice],
-        pupil: Pupil,
-        kind: Kind,
-        channels: Channels = ONE_WAVELENGTH,
-    ) -> Propagator:
+    def of(cls, sensor: Optics, kind: Kind) -> Propagator:
         """Convert the factors of a sensor and the maps of its pupil."""
+        pupil = sensor.pupil
         stop = read_only(kind.array(pupil.inside))
         model = cls(
             kind,
             pupil,
-            Operator(factors, window, kind),
-            window,
+            Operator(sensor.factors, sensor.window, kind),
+            sensor.window,
             inside=read_only(kind.flags(pupil.inside)),
             stop=stop,
             no_data=read_only(kind.array(np.where(pupil.inside, 0, np.nan))),
             amplitude=stop,
             flat=read_only(kind.xp.stack((stop, 0 * stop))[np.newaxis, ...]),
-            channels=channels,
+            channels=sensor.channels,
         )
         return model.with_amplitude(pupil.amplitude)
 
@@ -162,12 +145,12 @@ class Propagator:
 
 
 @per_kind
-def propagator(sensor: Sensor, kind: Kind) -> Propagator:
+def propagator(sensor: Optics, kind: Kind) -> Propagator:
     """Return the model of a sensor for arrays of one kind."""
-    return Propagator.of(sensor.factors, sensor.window, sensor.pupil, kind, sensor.channels)
+    return Propagator.of(sensor, kind)
 
 
-def pupil_maps(name: str, maps: ArrayLike, sensor: Sensor) -> tuple[NDArray[np.floating], tuple[int, ...]]:
+def pupil_maps(name: str, maps: ArrayLike, sensor: Optics) -> tuple[NDArray[np.floating], tuple[int, ...]]:
     """Return checked real maps, (k, ny, nx) with 0 outside the pupil, and the shape of their batch."""
     shape = sensor.pupil.shape
     maps = _check.real_any(name, maps)
@@ -182,7 +165,7 @@ def pupil_maps(name: str, maps: ArrayLike, sensor: Sensor) -> tuple[NDArray[np.f
 
 
 def amplitude_maps(
-    amplitude: ArrayLike | None, sensor: Sensor, kind: Kind
+    amplitude: ArrayLike | None, sensor: Optics, kind: Kind
 ) -> tuple[NDArray[np.floating], tuple[int, ...]]:
     """Return checked amplitudes, (k, ny, nx) with 0 outside, and the shape of their batch; None: the pupil's."""
     if amplitude is None:
@@ -198,7 +181,7 @@ def amplitude_maps(
     return maps, batch
 
 
-def amplitude_map(amplitude: ArrayLike | None, sensor: Sensor) -> NDArray[np.float64]:
+def amplitude_map(amplitude: ArrayLike | None, sensor: Optics) -> NDArray[np.float64]:
     """Return one checked amplitude, (ny, nx) with 0 outside, of a moderate brightness; None: the pupil's."""
     maps, batch = amplitude_maps(amplitude, sensor, Kind.numpy())
     if batch:

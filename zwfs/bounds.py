@@ -54,9 +54,8 @@ def cramer_rao(
 
     Raises
     ------
-    TypeError, ValueError
-        If an argument is of the wrong kind, shape or range, no mask changes the light, or the masks do not
-        determine an unknown amplitude.
+    ValueError
+        If no mask changes the light, or the masks do not determine an unknown amplitude.
 
     References
     ----------

@@ -37,11 +37,6 @@ class Detector:
     gain : float, electrons / count
         Counts are rounded to integers; 0 leaves electrons as they are. Otherwise at least 1e-12.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is of the wrong kind or out of range.
-
     Examples
     --------
     >>> import numpy as np, zwfs
@@ -98,8 +93,8 @@ class Detector:
 
         Raises
         ------
-        TypeError, ValueError
-            If the frames are complex, not finite, negative, or brighter than 9e18 electrons in a pixel.
+        ValueError
+            If a frame is negative, or brighter than 9e18 electrons in a pixel.
         """
         frames = _check.real_array("frames", frames)
         _check.finite("frames", frames)
@@ -138,11 +133,6 @@ class Detector:
         Returns
         -------
         ndarray, the shape of `counts`
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the counts are complex or not finite.
         """
         counts = _check.real_array("counts", counts).astype(np.float64, copy=False)
         _check.moderate("counts", counts)

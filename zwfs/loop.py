@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import read_only
-from zwfs._pickle import Immutable
+from zwfs._arrays import Immutable, read_only
 from zwfs.bounds import cramer_rao
 from zwfs.detector import Detector
 from zwfs.metrics import strehl, without_piston
@@ -40,10 +39,12 @@ class Mirror(Immutable):
     conditioning : float
         Singular values below this times the largest are left out of the fit, in [0, 1).
 
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is of the wrong kind, shape or range.
+    Attributes
+    ----------
+    influence : ndarray, shape (n_actuators, n_points), radian / command
+        Influence functions at the points of the pupil.
+    inverse : ndarray, shape (n_points, n_actuators)
+        Matrix from phases at the points of the pupil to commands.
 
     Examples
     --------
@@ -57,9 +58,9 @@ class Mirror(Immutable):
     def __init__(self, pupil: Pupil, influence: ArrayLike, *, conditioning: float = 1e-15) -> None:
         _check.instance("pupil", pupil, Pupil)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
-        self._pupil = pupil
-        self._influence = _check.modes("influence", influence, pupil)
-        self._inverse = read_only(np.linalg.pinv(self._influence, rcond=conditioning))
+        self.pupil = pupil
+        self.influence = _check.modes("influence", influence, pupil)
+        self.inverse = read_only(np.linalg.pinv(self.influence, rcond=conditioning))
 
     @classmethod
     def gaussian(
@@ -82,14 +83,8 @@ class Mirror(Immutable):
 
         Raises
         ------
-        TypeError, ValueError
-            If an argument is of the wrong kind or out of range, or no circle holds so many actuators.
-
-        Examples
-        --------
-        >>> import zwfs
-        >>> zwfs.Mirror.gaussian(zwfs.Pupil.circular(32), 97)
-        Mirror(97 actuators, 812 points)
+        ValueError
+            If no circle holds so many actuators.
         """
         _check.instance("pupil", pupil, Pupil)
         n_actuators = _check.integer("n_actuators", n_actuators, 4, pupil.n_points)
@@ -113,12 +108,6 @@ class Mirror(Immutable):
             With segments, such as `Pupil.hexagonal`.
         tilts : bool
             Whether the segments tilt, too.
-
-        Examples
-        --------
-        >>> import zwfs
-        >>> zwfs.Mirror.segments(zwfs.Pupil.hexagonal(48, n_rings=1))
-        Mirror(21 actuators, 1512 points)
         """
         _check.instance("pupil", pupil, Pupil)
         tilts = _check.flag("tilts", tilts)
@@ -136,35 +125,20 @@ class Mirror(Immutable):
         return f"Mirror({self.n_actuators} actuators, {self.pupil.n_points} points)"
 
     @property
-    def pupil(self) -> Pupil:
-        """Pupil on which the mirror acts."""
-        return self._pupil
-
-    @property
     def n_actuators(self) -> int:
         """Number of influence functions."""
-        return len(self._influence)
-
-    @property
-    def influence(self) -> NDArray[np.float64]:
-        """Influence functions at the points of the pupil, shape (n_actuators, n_points), radian / command."""
-        return self._influence
-
-    @property
-    def inverse(self) -> NDArray[np.float64]:
-        """Matrix from phases at the points of the pupil to commands, shape (n_points, n_actuators)."""
-        return self._inverse
+        return len(self.influence)
 
     def wavefront(self, commands: ArrayLike) -> NDArray[np.float64]:
         """Return the wavefront of commands: (..., n_actuators) to (..., ny, nx), radian, 0 outside the pupil."""
         commands = _check.real_array("commands", commands)
         _check.trailing_shape("commands", commands, (self.n_actuators,), "the actuators")
         _check.finite("commands", commands)
-        return self.pupil.scatter(commands @ self._influence, fill=0)
+        return self.pupil.scatter(commands @ self.influence, fill=0)
 
     def fit(self, phase: ArrayLike) -> NDArray[np.float64]:
         """Return the commands whose wavefront is nearest to a phase: (..., ny, nx) to (..., n_actuators)."""
-        return _check.values_inside("phase", phase, self.pupil) @ self._inverse
+        return _check.values_inside("phase", phase, self.pupil) @ self.inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,13 +157,6 @@ class LoopRecord:
         Of the mirror during each cycle.
     photons : ndarray, shape (n_screens, n_cycles)
         Electrons in all frames of a cycle; NaN without a camera.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> zero = np.zeros((1, 4))
-    >>> zwfs.loop.LoopRecord(zero, zero + 0.1, zero + 1, np.zeros((1, 4, 3)), zero).settled(2).round(3).tolist()
-    [0.1]
     """
 
     open_loop: NDArray[np.float64]
@@ -254,11 +221,6 @@ def close_loop(
     Returns
     -------
     LoopRecord
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is of the wrong kind, shape or range.
 
     Examples
     --------
@@ -325,13 +287,6 @@ class HeldDrift:
         Share of the drift.
     noise : ndarray, shape (n_modes,), pm rms
         Share of the photon noise.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> held = zwfs.loop.HeldDrift(np.array([0.5]), np.array([3.0]), np.array([4.0]))
-    >>> held.residual
-    5.0
     """
 
     gain: NDArray[np.float64]
@@ -392,8 +347,8 @@ def hold_drift(
 
     Raises
     ------
-    TypeError, ValueError
-        If an argument is of the wrong kind, shape or range, or there is neither a gain nor a random drift.
+    ValueError
+        If there is neither a gain nor a random drift.
 
     Examples
     --------

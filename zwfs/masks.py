@@ -1,4 +1,7 @@
-"""Masks: a patch of a few lambda/D in the focal plane that changes amplitude and phase of the light."""
+"""The focal plane: the field there, and masks that change its amplitude and phase on a patch of a few lambda/D.
+
+Sensors and reconstructors need masks only; `focal_field` is for pictures and for the design of masks.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +10,16 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
+from zwfs.pupil import Pupil
 
 _MOST_SAMPLES = 2048  # a quarter of a minute for 100 pixels
 
 
 class Mask(Protocol):
-    """Interface of a mask, whose transmission is 1 outside a disc around the axis.
-
-    Examples
-    --------
-    >>> import zwfs
-    >>> mask: zwfs.masks.Mask = zwfs.Dimple(1.06, 0.5)
-    >>> mask.diameter
-    1.06
-    """
+    """Interface of a mask, whose transmission is 1 outside a disc around the axis."""
 
     @property
     def diameter(self) -> float:
@@ -52,12 +48,6 @@ class Dimple:
         Phase shift theta of the light that goes through the dimple, from -2 pi to 2 pi.
     amplitude : float
         Amplitude transmission of the dimple, in [0, 1].
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the diameter is not above 0, the phase is more than a full turn, as a phase in degrees is, or the
-        amplitude is outside [0, 1].
 
     References
     ----------
@@ -116,11 +106,6 @@ class Patch:
         Smallest number of nodes around the axis, at most 2048; half as many are taken along each radius. Raise it
         for a transmission with fine structure or jumps across the angle.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If the diameter is not above 0, the function cannot be called, or a break is not inside the patch.
-
     References
     ----------
     Chambouleyron et al. 2024, section 2.1.
@@ -167,6 +152,52 @@ class Patch:
         if largest > 1 + 1e-12:
             raise ValueError(f"transmission reaches a modulus of {largest:.6g}: expected at most 1")
         return values
+
+
+def focal_field(pupil: Pupil, field: ArrayLike, u: ArrayLike, v: ArrayLike) -> NDArray[np.complexfloating]:
+    """Field in the focal plane: the Fourier sum over the pupil.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    field : array_like of complex, shape (..., ny, nx)
+        Field in the pupil plane; the stop blocks what lies outside the pupil.
+    u, v : array_like, shapes (nu,) and (nv,), lambda/D
+        Horizontal and vertical coordinates of the grid, at most half the number of pixels across D: the sum
+        repeats beyond.
+
+    Returns
+    -------
+    ndarray of complex, shape (..., nv, nu)
+        In units of the field of a flat wavefront on the axis times the mean amplitude: 1 at (0, 0) for a uniform
+        pupil and a flat wavefront.
+
+    Examples
+    --------
+    >>> import numpy as np, zwfs
+    >>> pupil = zwfs.Pupil.circular(32)
+    >>> u = np.array([0.0, 1.22])
+    >>> np.abs(zwfs.masks.focal_field(pupil, pupil.amplitude, u, [0.0])).round(2)
+    array([[1., 0.]])
+    """
+    _check.instance("pupil", pupil, Pupil)
+    field = _check.complex_array("field", field)
+    _check.trailing_shape("field", field, pupil.shape, "the shape of the pupil")
+    _check.moderate("field", field)
+    u, v = (_check.real_array(name, axis) for name, axis in (("u", u), ("v", v)))
+    for name, axis in (("u", u), ("v", v)):
+        if axis.ndim != 1:
+            raise ValueError(f"{name} has shape {axis.shape}: expected one dimension")
+        _check.finite(name, axis)
+        largest = np.abs(axis).max(initial=0.0)
+        if largest > pupil.n_pixels / 2:
+            raise ValueError(
+                f"{name} reaches {largest:g} lambda/D: expected at most {pupil.n_pixels / 2:g}, half the number "
+                "of pixels across D"
+            )
+    from_x = np.exp(-2j * np.pi * np.outer(pupil.x, u))
+    from_y = np.exp(-2j * np.pi * np.outer(v, pupil.y))
+    return from_y @ (field * pupil.inside) @ from_x / pupil.n_points
 
 
 def _coordinates(u: NDArray, v: NDArray) -> tuple[NDArray, NDArray]:

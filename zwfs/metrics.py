@@ -24,11 +24,6 @@ def wrapped_residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDA
     ndarray, shape (..., ny, nx), radian
         In (-pi, pi], NaN outside the pupil. The piston is the argument of the mean phasor of the difference.
 
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, there is no map, or a value inside the pupil is not finite.
-
     References
     ----------
     Chambouleyron et al. 2024, section 4.1; `eq-error` of the book.
@@ -66,11 +61,6 @@ def reconstruction_error(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) ->
 def without_piston(phase: ArrayLike) -> NDArray[Any]:
     """Phases on the circle around their mean phasor: (..., n_points) to the same, radian, in (-pi, pi].
 
-    Raises
-    ------
-    ValueError
-        If the array is empty, or a value is not finite.
-
     Examples
     --------
     >>> import numpy as np, zwfs
@@ -97,11 +87,6 @@ def strehl(pupil: Pupil, phase: ArrayLike) -> NDArray[np.floating]:
     Returns
     -------
     ndarray, shape (...)
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong, there is no map, or a value inside the pupil is not finite.
 
     Examples
     --------
@@ -140,8 +125,7 @@ def dynamic_range(rms: ArrayLike, error: ArrayLike, threshold: float = 0.05) -> 
     Raises
     ------
     ValueError
-        If the arrays differ in shape, hold no positive input or a negative error, or are not finite, or if `rms`
-        does not increase.
+        If `rms` does not increase, or no input is above 0.
 
     References
     ----------

@@ -18,11 +18,6 @@ def noll_to_nm(j: int) -> tuple[int, int]:
 
     Positive m stands for cos(m theta), negative m for sin(|m| theta); j = 1 is piston.
 
-    Raises
-    ------
-    ValueError
-        If j is below 1.
-
     References
     ----------
     Noll 1976, J. Opt. Soc. Am. 66, 207, table I.
@@ -147,8 +142,7 @@ def power_law_screens(
     Raises
     ------
     ValueError
-        If the modes are not three-dimensional, empty, not finite, 0 or of different rms, if they need
-        `frequencies`, or a number is out of range.
+        If the modes have different rms, or are no Zernike modes and have no `frequencies`.
 
     References
     ----------

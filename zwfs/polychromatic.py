@@ -50,11 +50,20 @@ class PolychromaticSensor(Sensor):
     chromatic : bool
         Whether the phase shifts of the dimples are those of an etched depth.
 
+    Attributes
+    ----------
+    reference : ZernikeSensor
+        Sensor at the reference wavelength; a reconstructor with this sensor ignores the bandwidth.
+    wavelengths, weights : ndarray, shape (n_wavelengths,)
+        Wavelengths, nm, and the share of the light at each.
+    reference_wavelength : float, nm
+        Wavelength at which phases are in radian and masks in lambda/D.
+    chromatic : bool
+
     Raises
     ------
-    TypeError, ValueError
-        If an argument is of the wrong kind, shape or range, a dimple is too wide at the shortest wavelength, or
-        masks other than a `Dimple` are to be chromatic.
+    ValueError
+        If a dimple is too wide at the shortest wavelength, or masks other than a `Dimple` are to be chromatic.
 
     References
     ----------
@@ -81,27 +90,27 @@ class PolychromaticSensor(Sensor):
         chromatic: bool = False,
     ) -> None:
         _check.instance("sensor", sensor, ZernikeSensor)
-        self._wavelengths, self._weights = _checked_light(wavelengths, weights)
-        mean = float(self._weights @ self._wavelengths)
-        self._reference_wavelength = (
+        self.wavelengths, self.weights = _checked_light(wavelengths, weights)
+        mean = float(self.weights @ self.wavelengths)
+        self.reference_wavelength = (
             mean
             if reference_wavelength is None
             else _check.number("reference_wavelength", reference_wavelength, mean / _WIDEST, mean * _WIDEST)
         )
-        self._chromatic = _check.flag("chromatic", chromatic)
-        self._reference = sensor
-        ratios = tuple((self._reference_wavelength / self._wavelengths).tolist())
+        self.chromatic = _check.flag("chromatic", chromatic)
+        self.reference = sensor
+        ratios = tuple((self.reference_wavelength / self.wavelengths).tolist())
         super().__init__(
             sensor.pupil,
             sensor.masks,
             sensor.extent,
             sensor.tolerance,
-            Channels(ratios, tuple(self._weights.tolist())),
+            Channels(ratios, tuple(self.weights.tolist())),
         )
-        masks = [_at(mask, ratio, self._chromatic) for mask in sensor.masks for ratio in ratios]
+        masks = [_at(mask, ratio, self.chromatic) for mask in sensor.masks for ratio in ratios]
         factors = factorise(masks, *self._axes(), sensor.pupil.n_pixels**-2.0, sensor.tolerance)
         core = factors.core.reshape(self.n_masks, len(ratios), *factors.core.shape[1:])
-        self._factors = Factors(factors.pupil, factors.detector, core)
+        self.factors = Factors(factors.pupil, factors.detector, core)
 
     @classmethod
     def flat_band(
@@ -141,31 +150,6 @@ class PolychromaticSensor(Sensor):
             f"PolychromaticSensor({self.reference!r}, {self.wavelengths.size} wavelengths from {low:g} to "
             f"{high:g}, {shifts})"
         )
-
-    @property
-    def reference(self) -> ZernikeSensor:
-        """Sensor at the reference wavelength; a reconstructor with this sensor ignores the bandwidth."""
-        return self._reference
-
-    @property
-    def wavelengths(self) -> NDArray[np.float64]:
-        """Wavelengths, shape (n_wavelengths,), nm."""
-        return self._wavelengths
-
-    @property
-    def weights(self) -> NDArray[np.float64]:
-        """Share of the light at each wavelength, shape (n_wavelengths,)."""
-        return self._weights
-
-    @property
-    def reference_wavelength(self) -> float:
-        """Wavelength at which phases are in radian and masks in lambda/D, nm."""
-        return self._reference_wavelength
-
-    @property
-    def chromatic(self) -> bool:
-        """Whether the phase shifts of the dimples are those of an etched depth."""
-        return self._chromatic
 
     def with_tolerance(self, tolerance: float) -> PolychromaticSensor:
         """Return the same sensor with another error of the reference wave."""

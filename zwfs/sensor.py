@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind
+from zwfs._arrays import Immutable, Kind
 from zwfs._lowrank import Factors, factorise
-from zwfs._pickle import Immutable
 from zwfs._propagator import (
     ONE_WAVELENGTH,
     Channels,
@@ -36,58 +35,40 @@ class Sensor(Immutable):
 
     The constructors of `ZernikeSensor` and `PolychromaticSensor` check its arguments and set its factors.
 
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> sensor = zwfs.ZernikeSensor(zwfs.Pupil.circular(32), zwfs.Dimple(1.06, np.pi / 2))
-    >>> isinstance(sensor, zwfs.sensor.Sensor), sensor.channels.weights
-    (True, (1.0,))
+    Attributes
+    ----------
+    pupil : Pupil
+    masks : tuple of Mask
+        In the order of the frames.
+    extent : float
+        Width of the detector plane in D, after rounding to whole pixels.
+    tolerance : float
+        Error of the reference wave, relative to the strongest response of the masks.
+    detector_shape : (int, int)
+        Rows and columns of a frame.
+    window : (slice, slice)
+        Rows and columns of a frame in which the grid of the pupil lies.
+    channels : Channels
+        Ratio and weight of each wavelength.
+    factors : Factors
+        Matrices of `eq-low-rank`, read-only, to compute with them elsewhere. `pupil` and `detector` hold the
+        functions of the two planes, r and q of them, which all masks share: `along_y`, shape (a, ny), `along_x`,
+        shape (b, nx), and `combine`, shape (a * b, r), which combines their products. `core` has the shape
+        (n_masks, q, r), or (n_masks, n_wavelengths, q, r).
     """
 
-    _factors: Factors
+    factors: Factors
 
     def __init__(
         self, pupil: Pupil, masks: tuple[Mask, ...], extent: float, tolerance: float, channels: Channels
     ) -> None:
-        self._tolerance = _check.number("tolerance", tolerance, 1e-16, 0.1)
-        self._margin = _margin(extent, pupil)
-        self._pupil = pupil
-        self._masks = masks
-        m = self._margin
+        self.tolerance = _check.number("tolerance", tolerance, 1e-16, 0.1)
+        self._margin = m = _margin(extent, pupil)
+        self.pupil, self.masks, self.channels = pupil, masks, channels
+        self.extent = 1 + 2 * m / pupil.n_pixels
         ny, nx = pupil.shape
-        self._detector_shape = ny + 2 * m, nx + 2 * m
-        self._window = slice(m, m + ny), slice(m, m + nx)
-        self._channels = channels
-
-    @property
-    def pupil(self) -> Pupil:
-        """Pupil of the sensor."""
-        return self._pupil
-
-    @property
-    def masks(self) -> tuple[Mask, ...]:
-        """Masks, in the order of the frames."""
-        return self._masks
-
-    @property
-    def extent(self) -> float:
-        """Width of the detector plane in D, after rounding to whole pixels."""
-        return 1 + 2 * self._margin / self._pupil.n_pixels
-
-    @property
-    def tolerance(self) -> float:
-        """Error of the reference wave, relative to the strongest response of the masks."""
-        return self._tolerance
-
-    @property
-    def detector_shape(self) -> tuple[int, int]:
-        """Rows and columns of a frame."""
-        return self._detector_shape
-
-    @property
-    def window(self) -> tuple[slice, slice]:
-        """Rows and columns of a frame in which the grid of the pupil lies."""
-        return self._window
+        self.detector_shape = ny + 2 * m, nx + 2 * m
+        self.window = slice(m, m + ny), slice(m, m + nx)
 
     @property
     def n_masks(self) -> int:
@@ -95,24 +76,9 @@ class Sensor(Immutable):
         return len(self.masks)
 
     @property
-    def channels(self) -> Channels:
-        """Ratio and weight of each wavelength."""
-        return self._channels
-
-    @property
     def rank(self) -> int:
         """Number of coefficients that the reference waves are made of."""
-        return self._factors.pupil.rank
-
-    @property
-    def factors(self) -> Factors:
-        """Matrices of `eq-low-rank`, read-only, to compute with them elsewhere.
-
-        `pupil` and `detector` hold the functions of the two planes, r and q of them, which all masks share:
-        `along_y`, shape (a, ny), `along_x`, shape (b, nx), and `combine`, shape (a * b, r), which combines their
-        products. `core` has the shape (n_masks, q, r), or (n_masks, n_wavelengths, q, r).
-        """
-        return self._factors
+        return self.factors.pupil.rank
 
     def measure(self, phase: ArrayLike, amplitude: ArrayLike | None = None) -> NDArray[np.floating]:
         """Frames without noise.
@@ -128,12 +94,6 @@ class Sensor(Immutable):
         -------
         ndarray, shape (..., n_masks, ny_detector, nx_detector)
             Intensity; 1 is the mean intensity in the pupil with the mask taken out. float32 if the phase is.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If phase or amplitude are complex, of the wrong shape, or not finite inside the pupil, or if the
-            amplitude is negative.
 
         Warns
         -----
@@ -176,11 +136,6 @@ class Sensor(Immutable):
         -------
         ndarray, shape (..., n_masks, ny_detector, nx_detector)
 
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is complex, of the wrong shape, or not finite inside the pupil.
-
         References
         ----------
         `eq-jacobian` of the book.
@@ -210,11 +165,6 @@ class Sensor(Immutable):
         ndarray, shape (..., ny, nx)
             0 outside the pupil.
 
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is complex, of the wrong shape, or not finite (the phase: inside the pupil).
-
         References
         ----------
         Chambouleyron et al. 2024, equation (16); `eq-gradient` of the book.
@@ -238,7 +188,7 @@ class Sensor(Immutable):
 
     def _axes(self) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
         """Coordinates (y, x) of the pupil and of the detector, D."""
-        pupil, m = self._pupil, self._margin
+        pupil, m = self.pupil, self._margin
         y, x = (axis[0] + (np.arange(axis.size + 2 * m) - m) / pupil.n_pixels for axis in (pupil.y, pupil.x))
         return (pupil.y, pupil.x), (y, x)
 
@@ -258,7 +208,7 @@ class ZernikeSensor(Sensor):
     One mask makes the classic sensor, two make the phase-shifted one. Detector pixels are as large as pupil
     pixels and stand at the same places, so the detector of an extent of 1 D is the grid of the pupil.
 
-    A sensor cannot be changed: its attributes are properties, and its arrays are read-only.
+    A sensor cannot be changed, and its arrays are read-only.
 
     Parameters
     ----------
@@ -273,9 +223,8 @@ class ZernikeSensor(Sensor):
 
     Raises
     ------
-    TypeError, ValueError
-        If there is no mask, or an argument has the wrong type or is out of range. The diameter of a mask, in
-        lambda/D, may not exceed the number of pixels across D. On a wide detector the limit is lower.
+    ValueError
+        If a mask is wider, in lambda/D, than there are pixels across D. On a wide detector the limit is lower.
 
     Warns
     -----
@@ -301,7 +250,7 @@ class ZernikeSensor(Sensor):
         if not masks:
             raise ValueError("masks is empty: expected at least one mask, such as Dimple(1.06, np.pi / 2)")
         super().__init__(pupil, masks, extent, tolerance, ONE_WAVELENGTH)
-        self._factors = factorise(masks, *self._axes(), pupil.n_pixels**-2.0, self._tolerance)
+        self.factors = factorise(masks, *self._axes(), pupil.n_pixels**-2.0, self.tolerance)
 
     def __repr__(self) -> str:
         masks = ", ".join(map(repr, self.masks))
@@ -323,32 +272,27 @@ class ZernikeSensor(Sensor):
         -------
         ndarray of complex, shape (..., n_masks, ny_detector, nx_detector)
 
-        Raises
-        ------
-        ValueError
-            If the shape is wrong or a value is not finite.
-
         References
         ----------
         Chambouleyron et al. 2024, equations (1) to (3).
         """
-        psi, batch, kind = self._pupil_field(field)
-        waves = propagator(self, kind).operator.reference(psi)
+        model, psi, batch = self._pupil_field(field)
+        waves = model.operator.complex_reference(psi)
         waves[(..., *self.window)] += psi[:, np.newaxis, ...]
-        return kind.xp.reshape(waves, (*batch, *waves.shape[1:]))
+        return model.kind.xp.reshape(waves, (*batch, *waves.shape[1:]))
 
     def reference_wave(self, field: ArrayLike) -> NDArray[np.complexfloating]:
         """Reference wave of each mask: `propagate` less the field itself.
 
-        Parameters, shapes and errors are those of `propagate`.
+        Parameters and shapes are those of `propagate`.
 
         References
         ----------
         Chambouleyron et al. 2024, equation (4).
         """
-        psi, batch, kind = self._pupil_field(field)
-        waves = propagator(self, kind).operator.reference(psi)
-        return kind.xp.reshape(waves, (*batch, *waves.shape[1:]))
+        model, psi, batch = self._pupil_field(field)
+        waves = model.operator.complex_reference(psi)
+        return model.kind.xp.reshape(waves, (*batch, *waves.shape[1:]))
 
     def adjoint(self, field: ArrayLike) -> NDArray[np.complexfloating]:
         """Exact adjoint of `propagate`: back-propagation from the detector planes to the pupil.
@@ -363,32 +307,26 @@ class ZernikeSensor(Sensor):
             Sum over the masks, 0 outside the pupil. With a mask of modulus 1 and an infinite detector it would
             be the inverse, too.
 
-        Raises
-        ------
-        ValueError
-            If the shape is wrong or a value is not finite.
-
         References
         ----------
         Chambouleyron et al. 2024, equation (14); `eq-adjoint` of the book.
         """
         shape = (self.n_masks, *self.detector_shape)
-        field, batch, kind = self._field(field, shape, "masks and detector")
-        model = propagator(self, kind)
-        psi = model.operator.adjoint(field)
-        psi += kind.xp.sum(field[(..., *self.window)], axis=1)
+        model, waves, batch = self._field(field, shape, "masks and detector")
+        xp, psi = model.kind.xp, model.operator.complex_adjoint(waves)
+        psi += xp.sum(waves[(..., *self.window)], axis=1)
         psi *= model.stop
-        return kind.xp.reshape(psi, (*batch, *self.pupil.shape))
+        return xp.reshape(psi, (*batch, *self.pupil.shape))
 
-    def _pupil_field(self, field: ArrayLike) -> tuple[NDArray, tuple[int, ...], Kind]:
-        """Checked complex maps, (k, ny, nx) with 0 outside the pupil, the batch, and the kind of their parts."""
-        psi, batch, kind = self._field(field, self.pupil.shape, "the shape of the pupil")
-        return psi * propagator(self, kind).stop, batch, kind
+    def _pupil_field(self, field: ArrayLike) -> tuple[Propagator, NDArray, tuple[int, ...]]:
+        """Model, checked complex fields (k, ny, nx) with 0 outside the pupil, and the batch."""
+        model, psi, batch = self._field(field, self.pupil.shape, "the shape of the pupil")
+        return model, psi * model.stop, batch
 
     def _field(
         self, field: ArrayLike, shape: tuple[int, ...], meaning: str
-    ) -> tuple[NDArray, tuple[int, ...], Kind]:
-        """Checked complex maps with one batch axis, the batch, and the kind of their parts."""
+    ) -> tuple[Propagator, NDArray, tuple[int, ...]]:
+        """Model, checked complex fields with one batch axis, and the batch."""
         field = _check.complex_any("field", field)
         _check.trailing_shape("field", field, shape, meaning)
         batch = tuple(field.shape[: -len(shape)])
@@ -396,9 +334,7 @@ class ZernikeSensor(Sensor):
             raise ValueError(f"field has shape {tuple(field.shape)}: expected at least one field")
         _check.moderate("field", field)
         kind = Kind.of(field).real
-        if kind.xp is np:
-            field = np.ascontiguousarray(field)  # numbers side by side can be viewed as pairs of real ones
-        return kind.xp.reshape(field, (-1, *shape)), batch, kind
+        return propagator(self, kind), kind.xp.reshape(field, (-1, *shape)), batch
 
 
 def _margin(extent: float, pupil: Pupil) -> int:

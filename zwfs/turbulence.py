@@ -143,11 +143,6 @@ def karhunen_loeve_basis(
     variances : ndarray, shape (n_modes,), radian^2
         Of the coefficients for r0 = D; multiply by r0^(-5/3) for another r0.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is of the wrong kind or out of range.
-
     References
     ----------
     Fried 1978, J. Opt. Soc. Am. 68, 1651; Roddier 1990, Opt. Eng. 29, 1174.

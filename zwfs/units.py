@@ -30,11 +30,6 @@ def phase_to_opd(phase: ArrayLike, wavelength: float) -> NDArray[np.float64]:
     -------
     ndarray, the shape of `phase`, nm
 
-    Raises
-    ------
-    TypeError, ValueError
-        If the phase is not real or beyond 1e20, or the wavelength is not between 1e-12 and 1e12.
-
     Examples
     --------
     >>> import zwfs
@@ -56,11 +51,6 @@ def opd_to_phase(opd: ArrayLike, wavelength: float) -> NDArray[np.float64]:
     Returns
     -------
     ndarray, the shape of `opd`, radian
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the OPD is not real or beyond 1e20, or the wavelength is not between 1e-12 and 1e12.
 
     Examples
     --------

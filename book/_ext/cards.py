@@ -1,10 +1,14 @@
-"""The notebooks of the book: they show their last run, with a card under each published figure."""
+"""The notebooks of the book: they show their last run, with a card under each published figure.
+
+A card offers the notebook with the studies that it imports, as a ZIP that is written next to the pages.
+"""
 
 import json
 import os
 import re
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import nbformat
 from nbformat import NotebookNode
@@ -16,8 +20,10 @@ from book._ext.finish import VARIANTS
 from book._ext.reading import CARD, put_in_order
 from book._tools import record
 from book._tools.declared import assigned
-from book._tools.project import EXECUTED
-from zwfs.companion.results import published
+from book._tools.project import EXECUTED, Project
+from studies.kit.results import published
+
+DOWNLOADS = "_downloads"  # folder of the pages
 
 
 def read_notebook(app: Sphinx, document: str, text: list[str]) -> None:
@@ -25,32 +31,24 @@ def read_notebook(app: Sphinx, document: str, text: list[str]) -> None:
     source = Path(app.env.doc2path(document))
     if source.suffix != ".ipynb":
         return
-    run = Path(app.srcdir, app.config.executed_notebooks, source.name)
-    if not run.exists():
-        run = source
+    run = run_of(app, source)
     app.env.note_dependency(os.path.relpath(run, app.srcdir))
     notebook = nbformat.reads(run.read_text("utf-8"), as_version=4)
     files = sorted(run.with_suffix(".files").glob("[!.]*"))
-    links = {file.name: Path(os.path.relpath(file, source.parent)).as_posix() for file in (run, *files)}
+    links = {file.name: Path(os.path.relpath(file, source.parent)).as_posix() for file in files}
     add_cards(notebook, source.stem, links, versions(run), commit(Path(app.srcdir)))
     put_in_order(notebook)
     text[0] = nbformat.writes(notebook)
 
 
-def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions: str, commit: str) -> None:
-    """Add a card under each figure of an executed notebook, in place; the first one shows the parameters.
+def run_of(app: Sphinx, source: Path) -> Path:
+    """Return the file of the last run of a notebook, or the notebook itself if it was not run."""
+    run = Path(app.srcdir, app.config.executed_notebooks, source.name)
+    return run if run.exists() else source
 
-    Parameters
-    ----------
-    notebook : NotebookNode
-        Run with its defaults.
-    name : str
-        The stem of its file.
-    links : dict of str
-        Addresses, from the page, of the files that the cards offer, by name.
-    versions, commit : str
-        See `versions` and `commit`.
-    """
+
+def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions: str, commit: str) -> None:
+    """Add a card under each figure of an executed notebook, in place; the first one shows the parameters."""
     cells = []
     fold = ["", *parameters(notebook, name), "", f"Commit: {commit}. Versions: {versions}.", ":::"]
     for cell in notebook.cells:
@@ -74,13 +72,13 @@ def files(name: str, figure: str, links: dict[str, str]) -> str:
     elif number:
         origin += f", goes with {of_paper}"
     offered = {
-        "notebook": name + ".ipynb",
         "PNG": figure + ".png",
         "PDF": figure + ".pdf",
         "data (CSV)": figure + ".csv",
     }
     shown = [f"{{download}}`{text} <{links[file]}>`" for text, file in offered.items() if file in links]
-    return " · ".join([origin, *shown])
+    archive = f'<a class="download" href="../{DOWNLOADS}/{name}.zip" download>notebook with its code (ZIP)</a>'
+    return " · ".join([origin, archive, *shown])
 
 
 def parameters(notebook: NotebookNode, name: str) -> list[str]:
@@ -117,9 +115,32 @@ def commit(root: Path) -> str:
     return f"`{head[:12]}`{', with changes' if changed else ''}" if head else "not known"
 
 
+def write_archives(app: Sphinx, exception: Exception | None) -> None:
+    """Write the ZIP of each notebook."""
+    if exception is not None or app.builder.format != "html":
+        return
+    project, folder = Project(Path(app.srcdir)), Path(app.outdir, DOWNLOADS)
+    folder.mkdir(exist_ok=True)
+    for source in project.sources():
+        if source.relative_to(project.root).with_suffix("").as_posix() in app.env.found_docs:
+            write_archive(folder / f"{source.stem}.zip", project, run_of(app, source))
+
+
+def write_archive(file: Path, project: Project, notebook: Path) -> None:
+    """Write a notebook and the studies that it imports to a ZIP; the same content gives the same bytes."""
+    studies = sorted(one for one in project.depends_on(notebook.stem) if one.is_relative_to(project.studies))
+    with ZipFile(file, "w", ZIP_DEFLATED) as archive:
+        for path in (notebook, *studies):
+            name = path.name if path == notebook else path.relative_to(project.notebooks).as_posix()
+            about = ZipInfo(name)  # its date is a constant
+            about.compress_type, about.external_attr = ZIP_DEFLATED, 0o644 << 16
+            archive.writestr(about, path.read_bytes())
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Read the notebooks of a run, with cards."""
     # By default the book shows the stored outputs; `make book` names the folder of its runs.
     app.add_config_value("executed_notebooks", os.environ.get(EXECUTED, "notebooks"), "env")
     app.connect("source-read", read_notebook)
+    app.connect("build-finished", write_archives)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from sphinx.application import Sphinx
 from sphinx.util.fileutil import copy_asset_file
 
-from zwfs.paper.design import PUBLISHED, DesignMap
-from zwfs.plots.style import LOOKS, Look
-from zwfs.plots.variants import dark_color
+from studies.design import PUBLISHED, DesignMap
+from studies.kit.style import LOOKS, Look
+from studies.kit.variants import dark_color
 
 FOLDER = "_static/explore"
 LIBRARY = [

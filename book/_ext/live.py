@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from sphinx.application import Sphinx
 
 import zwfs
-from zwfs.paper.design import PUBLISHED
-from zwfs.plots.photon_noise import COST_LINES, label_places
-from zwfs.plots.style import DARK_PHASE_MAP, INTENSITY_MAP, PHASE_MAP
+from studies.design import COST_LINES, PUBLISHED, label_places
+from studies.kit.style import DARK_PHASE_MAP, INTENSITY_MAP, PHASE_MAP
 
 DATA = "_static/live-data.js"
 DESIGNS = Path(__file__).with_name("design.csv")  # the data that the page of notebooks/design.ipynb offers

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from sphinx.application import Sphinx
 from sphinx.config import Config
 
-from zwfs import plots
-from zwfs._files import write_file
-from zwfs.plots.variants import variants
+from studies.kit.style import use_style
+from studies.kit.variants import variants
+from zwfs._system import write_file
 
 MEASURED = "book/_ext/performance.json"
 PICTURES = "_build/performance"
@@ -41,7 +41,7 @@ def add_substitutions(app: Sphinx, config: Config) -> None:
     added = tables(kept["speed"]) | {"peers": compared, "machine": kept["machine"]}
     config.myst_substitutions = config.myst_substitutions | {"performance": added}
     with plt.rc_context():
-        plots.use_style()
+        use_style()
         figures = {
             "peers": error_against_time(tasks["one frame"] + tasks["two frames"]),
             "growth": time_against_pixels(kept["speed"]["slope"]),

@@ -8,7 +8,7 @@ import copy
 from nbformat import NotebookNode
 from nbformat.v4 import new_code_cell
 
-from zwfs.companion.results import published
+from studies.kit.results import published
 
 CARD = "card-"  # with which the ids of the cards begin
 FOLD = "Set-up and drawing"

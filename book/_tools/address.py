@@ -24,21 +24,11 @@ COLAB = "google.colab"  # only the cell for Colab names it
 
 @dataclass(frozen=True)
 class Address:
-    """Where the project is published; each part is empty if there is none.
+    """Where the project is published; each part is empty if there is none."""
 
-    Parameters
-    ----------
-    repository : str
-        Such as ``https://github.com/OWNER/NAME``.
-    book : str
-        Address of the published book, which ends with a slash.
-    doi : str
-        Of the software, without ``https://doi.org/``.
-    """
-
-    repository: str = ""
-    book: str = ""
-    doi: str = ""
+    repository: str = ""  # such as https://github.com/OWNER/NAME
+    book: str = ""  # ends with a slash
+    doi: str = ""  # of the software, without https://doi.org/
 
     @property
     def name(self) -> str:
@@ -82,13 +72,7 @@ class Address:
 
 
 def setting(root: Path) -> Address:
-    """Return the table ``[tool.zwfs]`` of pyproject.toml.
-
-    Raises
-    ------
-    ToolError
-        If a key is unknown, or its value is neither empty nor an address.
-    """
+    """Return the table ``[tool.zwfs]`` of pyproject.toml; refuse what is no address."""
     table = tomllib.loads((root / "pyproject.toml").read_text("utf-8")).get("tool", {}).get("zwfs", {})
     for key, value in table.items():
         if key not in EXPECTED:

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from zwfs._files import write_file
+from zwfs._system import write_file
 
 from . import pdf as printing
 from .execute import TRACEBACK_LINES
@@ -63,13 +63,7 @@ def figures(project: Project) -> None:
 
 
 def check_contents(project: Project) -> None:
-    """Check that _toc.yml lists every page and every notebook, and nothing else.
-
-    Raises
-    ------
-    BookError
-        If not: Sphinx would omit a page without a warning.
-    """
+    """Check that _toc.yml lists every page and notebook, and nothing else: Sphinx would omit a page silently."""
     contents = yaml.safe_load((project.root / "_toc.yml").read_text("utf-8"))
     listed = {name.removesuffix(".md").removesuffix(".ipynb") for name in _entries(contents)}
     pages = [*sorted((project.root / "book").glob("[!_]*.md")), *project.sources()]
@@ -91,26 +85,9 @@ def _entries(contents: dict[str, Any]) -> Iterator[str]:
 
 
 def build(project: Project, chromium: str | None = None) -> bool:
-    """Build the book in _build/html, unless nothing that it depends on has changed.
+    """Build the book in _build/html unless it is current, and return whether it was built.
 
-    Parameters
-    ----------
-    project : Project
-        Its notebooks have been run.
-    chromium : str, optional
-        The browser that prints the PDF; None builds the book without a PDF.
-
-    Returns
-    -------
-    bool
-        Whether the book was built now.
-
-    Raises
-    ------
-    BookError
-        If Sphinx gives a warning or an error. The earlier book stays.
-    PrintError
-        If the PDF would not be whole. The earlier book stays.
+    With the path of a browser it gets a PDF. After an error or a warning the earlier book stays.
     """
     html, record = project.build / "html", project.build / "html.json"
     made_from = _digest(project, bool(chromium))

@@ -1,16 +1,14 @@
 """Parameters of a notebook, read without running it, and values for them from the command line and from files."""
 
-import ast
 import difflib
 import inspect
-import io
 import math
-import operator
 import re
-import tokenize
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib import import_module
 from pkgutil import resolve_name
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from nbformat import NotebookNode
@@ -19,24 +17,17 @@ from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event
 
-from zwfs.companion.limits import LIMITS, TOGETHER
-from zwfs.companion.parameters import Fields, check_parameters
+from studies.kit.parameters import Fields, check_parameters
 
 from .project import ToolError, one_line
 
 # A unit is one of these behind the last comma of a parameter's comment; other words there belong to the meaning.
 UNITS = ("rad", "rad rms", "lambda/D", "D", "D²/lambda", "nm", "m", "s", "Hz", "pixels", "electrons", "photons")
-
 UNIT_NAMES = {"radian": "rad", "radian rms": "rad rms", "pixels rms": "pixels", "electrons rms": "electrons"}
-
-# Limits that are types.
-TYPES = {"str": str, "bool": bool}
-
 
 # Limits of the YAML of parameters: a list of 1000 numbers is half as long, and no list is nested more than twice.
 LONGEST = 16384  # characters, read in a second
 DEEPEST = 8
-NOT_PLAIN = "tags (!), anchors (&), aliases (*), merges (<<) and directives (%) are not allowed; quote strings"
 
 
 class ParameterError(ToolError):
@@ -50,39 +41,25 @@ class ParameterError(ToolError):
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a notebook.
-
-    Attributes
-    ----------
-    default : Any
-        A literal.
-    meaning, unit : str
-        From the comment behind it, ``# meaning, unit``; the unit of a pure number is empty.
-    limits : Any
-        See `zwfs.companion.parameters.check_parameters`; None if the notebook gives none.
-    """
+    """A parameter of a notebook; its comment is ``# meaning, unit``, without a unit for a pure number."""
 
     default: Any
     meaning: str
     unit: str
-    limits: Any
+    limits: Any  # see `studies.kit.parameters.check_parameters`; None if the notebook gives none
 
     @property
     def kind(self) -> str:
         """Name of the type for a reader."""
         if isinstance(self.limits, Fields):
             return "mapping"
-        depth, limits = 0, self.limits
-        while isinstance(limits, list):
-            depth, limits = depth + 1, limits[0]
-        return "list of " * depth + type(_scalar(limits)).__name__
+        depth, within = _unlisted(self.limits)
+        return "list of " * depth + type(_example(within)).__name__
 
     @property
     def allowed(self) -> str:
         """Limits in words for a reader."""
-        limits = self.limits
-        while isinstance(limits, list):
-            limits = limits[0]
+        _, limits = _unlisted(self.limits)
         if limits is None or isinstance(limits, type | Fields):
             return ""
         return ", ".join(limits) if isinstance(limits[0], str) else f"{limits[0]:g} to {limits[1]:.10g}"
@@ -103,9 +80,8 @@ class Parameter:
 def _documented(of: Any) -> dict[str, tuple[str, str]]:
     """Return meaning, in a sentence, and unit of each parameter in a docstring of numpydoc."""
     found = {}
-    for names, kind, text in re.findall(
-        r"^([\w, ]+?)(?: : (.*))?\n((?:    .+\n?)+)", inspect.getdoc(of) or "", re.MULTILINE
-    ):
+    entries = r"^([\w, ]+?)(?: : (.*))?\n((?:    .+\n?)+)"
+    for names, kind, text in re.findall(entries, inspect.getdoc(of) or "", re.MULTILINE):
         sentence = re.split(r"(?<=\w)[.;:](?:\s|$)", " ".join(text.split()))[0]
         unit = kind.rpartition(",")[2].strip()
         for name in names.split(", "):
@@ -113,42 +89,48 @@ def _documented(of: Any) -> dict[str, tuple[str, str]]:
     return found
 
 
-def _scalar(limits: Any) -> Any:
-    """Return a value of the type that single values within some limits have."""
-    if isinstance(limits, list):
-        return _scalar(limits[0])
+def _unlisted(limits: Any) -> tuple[int, Any]:
+    """Return how deep values are listed within some limits, and the limits of the single values."""
+    depth = 0
+    while isinstance(limits, list):
+        depth, limits = depth + 1, limits[0]
+    return depth, limits
+
+
+def _example(limits: Any) -> Any:
+    """Return a value of the type that single values within some limits have: a float if one limit is a float."""
     if isinstance(limits, type):
         return limits()
-    floats = [limit for limit in limits or () if isinstance(limit, float)]
-    return floats[0] if floats else limits[0] if limits else None
+    return next((one for one in limits or () if isinstance(one, float)), limits[0] if limits else None)
 
 
 def parameters(notebook: NotebookNode) -> dict[str, Parameter]:
-    """Read the cell tagged ``parameters`` and the call of `check_parameters`.
-
-    Raises
-    ------
-    ParameterError
-        If a default or a limit is not a literal.
-    """
+    """Read the cell tagged ``parameters`` and the call of `check_parameters`."""
     limits = _limits(notebook)
     return {
-        name: Parameter(_literal(_expression(value)), *_meaning_and_unit(comment), limits.get(name))
-        for name, (value, comment) in assigned(notebook).items()
+        name: Parameter(
+            _evaluated(value, np=SimpleNamespace(pi=math.pi)), *_meaning_and_unit(text), limits.get(name)
+        )
+        for name, (value, text) in assigned(notebook).items()
     }
 
 
 def assigned(notebook: NotebookNode) -> dict[str, tuple[str, str]]:
     """Return value and comment of each parameter, as they are written in the cell tagged ``parameters``."""
-    source = next((c.source for c in notebook.cells if "parameters" in c.metadata.get("tags", ())), "")
-    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
-    comments = {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
-    return {
-        target.id: (ast.get_source_segment(source, node.value), comments.get(node.end_lineno, ""))
-        for node in ast.parse(source).body
-        if isinstance(node, ast.Assign)
-        for target in node.targets
-    }
+    # Not at the top: it takes a second, and some commands need no parameters.
+    from papermill.translators import papermill_translators
+
+    python = papermill_translators.find_translator("python3", "python")
+    cells = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", ())]
+    return {one.name: (one.default, one.help) for cell in cells[:1] for one in python.inspect(cell)}
+
+
+def _evaluated(text: str, **names: Any) -> Any:
+    """Return the value of an expression of literals and of some names."""
+    try:
+        return eval(text, {"__builtins__": {}, **names})
+    except Exception:
+        raise ParameterError(f"{text} is not a literal: it cannot be read without running it") from None
 
 
 def _meaning_and_unit(comment: str) -> tuple[str, str]:
@@ -163,76 +145,20 @@ def _meaning_and_unit(comment: str) -> tuple[str, str]:
 def _limits(notebook: NotebookNode) -> dict[str, Any]:
     """Return the limits by the name of the parameter."""
     for cell in notebook.cells:
-        # A cell of another kind need not be Python: it may hold a command of the notebook.
-        if cell.cell_type == "code" and f"{check_parameters.__name__}(" in cell.source:
-            for node in ast.walk(ast.parse(cell.source)):
-                if isinstance(node, ast.Call) and getattr(node.func, "id", "") == check_parameters.__name__:
-                    limits = {}
-                    for keyword in node.keywords:
-                        # Without a name the keyword is a mapping: **LIMITS["fig03_dynamic_range"].
-                        limits |= {keyword.arg: _limit(keyword.value)} if keyword.arg else _listed(keyword.value)
-                    return limits
+        if call := re.search(r"^check_parameters\(globals\(\),(.*)\)", cell.source, re.MULTILINE | re.DOTALL):
+            return _evaluated(f"dict({call[1]})", dict=dict, str=str, bool=bool, study=study_of(notebook))
     return {}
 
 
-def _listed(node: ast.expr) -> dict[str, Any]:
-    """Return the limits that the package lists under a name: ``LIMITS["name"]``."""
-    match node:
-        case ast.Subscript(value=ast.Name(id="LIMITS"), slice=ast.Constant(value=name)) if name in LIMITS:
-            return LIMITS[name]
-    raise ParameterError(
-        f"{ast.unparse(node)}: expected limits of zwfs.companion.limits, one of {', '.join(LIMITS)}"
-    )
-
-
-def _limit(node: ast.expr) -> Any:
-    """Return limits, which are literals but for the types that stand for any text or truth value."""
-    if isinstance(node, ast.List):
-        return [_limit(item) for item in node.elts]
-    return TYPES[node.id] if isinstance(node, ast.Name) and node.id in TYPES else _literal(node)
-
-
-def _expression(value: str) -> ast.expr:
-    # Of a value on several lines the parentheses may be missing.
-    return ast.parse(f"({value})", mode="eval").body
-
-
-def _literal(node: ast.expr) -> Any:
-    """Evaluate a literal, in which np.pi may stand: -np.pi / 2, 0.3 * np.pi."""
-    match node:
-        case ast.Attribute(value=ast.Name(id="np"), attr="pi"):
-            return math.pi
-        case ast.List(elts=items):
-            return [_literal(item) for item in items]
-        case ast.UnaryOp(op=ast.USub(), operand=operand):
-            return -_literal(operand)
-        case ast.BinOp(left=left, op=ast.Mult() | ast.Div() as operation, right=right):
-            return (operator.mul if isinstance(operation, ast.Mult) else operator.truediv)(
-                _literal(left), _literal(right)
-            )
-    try:
-        return ast.literal_eval(node)
-    except ValueError:
-        raise ParameterError(
-            f"{ast.unparse(node)} is not a literal: it cannot be read without running it"
-        ) from None
+def study_of(notebook: NotebookNode) -> ModuleType | None:
+    """Return the module of `studies` that a notebook imports as ``study``; None if it imports none."""
+    code = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code")
+    named = re.search(r"^from studies import (\w+) as study$", code, re.MULTILINE)
+    return import_module(f"studies.{named[1]}") if named else None
 
 
 def accept(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]:
-    """Check values, and return those that are not the defaults.
-
-    Parameters
-    ----------
-    given : dict
-        Values by name. An int may stand for a float, and becomes one.
-    known : dict of Parameter
-        The parameters of the notebook.
-
-    Raises
-    ------
-    ParameterError
-        If a name is unknown, or a value has another type or is out of the limits.
-    """
+    """Check values, and return those that are not the defaults."""
     for name in given:
         if name not in known:
             raise ParameterError(f"unknown parameter {name!r}: {nearest(name, known)}")
@@ -247,17 +173,11 @@ def accept(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]
     return {name: value for name, value in typed.items() if value != known[name].default}
 
 
-def accept_together(name: str, values: dict[str, Any]) -> None:
-    """Check all values of a notebook together.
-
-    Raises
-    ------
-    ParameterError
-        If some of them contradict each other.
-    """
-    if name in TOGETHER:
+def accept_together(notebook: NotebookNode, values: dict[str, Any]) -> None:
+    """Check all values of a notebook together."""
+    if check := getattr(study_of(notebook), "CHECK_TOGETHER", None):
         try:
-            resolve_name(TOGETHER[name])(**values)
+            check(**values)
         except (TypeError, ValueError, OSError) as error:
             raise ParameterError(str(error)) from None
 
@@ -274,42 +194,25 @@ def _typed(value: Any, limits: Any) -> Any:
         return {name: _typed(one, limits.every()[name]) for name, one in value.items()}
     if isinstance(value, list):
         return [_typed(item, limits[0]) for item in value]
-    return float(value) if isinstance(_scalar(limits), float) else value
-
-
-def _whole(text: str) -> str:
-    """Return a text with one character for each pair of surrogates, which JSON writes; half a pair raises."""
-    whole = text.encode("utf-16", "surrogatepass").decode("utf-16", "surrogatepass")
-    whole.encode()
-    return whole
+    return float(value) if isinstance(_example(limits), float) else value
 
 
 class _Constructor(SafeConstructor):
     """Constructor that reads dates as strings: no parameter is a date."""
 
     def construct_scalar(self, node: Any) -> Any:
-        """Return the text of a scalar."""
+        """Return a scalar; JSON writes two surrogates for one character."""
         value = super().construct_scalar(node)
-        return _whole(value) if isinstance(value, str) else value
+        if isinstance(value, str):
+            return value.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+        return value
 
 
 _Constructor.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
 
 
 def load(text: str, origin: str) -> Any:
-    """Read plain YAML 1.2: numbers, strings, lists and mappings, without tags, anchors and merged mappings.
-
-    Parameters
-    ----------
-    text : str
-    origin : str
-        The source of the text, for the error message.
-
-    Raises
-    ------
-    ParameterError
-        If the text is not plain YAML, is longer than `LONGEST`, or is nested deeper than `DEEPEST`.
-    """
+    """Read plain YAML 1.2: numbers, strings, lists and mappings, without tags and aliases."""
     if len(text) > LONGEST:
         raise ParameterError(f"{origin}: {len(text)} characters: expected at most {LONGEST}")
     yaml = YAML(typ="safe", pure=True)  # not the C parser: it reads YAML 1.1, in which yes is True and 010 is 8
@@ -325,17 +228,16 @@ def load(text: str, origin: str) -> Any:
         raise ParameterError(f"{origin}: {error}") from None
 
 
-def _check_plain(events: Iterator[Event]) -> None:
-    """Refuse all other YAML while it is still a stream: a few characters can stand for gigabytes."""
-    depth = 0
+def _check_plain(events: Iterable[Event]) -> None:
+    """Refuse tags and aliases, and what is nested too deep."""
+    depth, problem = 0, ""
     for event in events:
         depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-        _whole(getattr(event, "value", None) or "")
-        special = any(getattr(event, name, None) for name in ("anchor", "tag", "tags", "version"))
-        if special or isinstance(event, AliasEvent) or getattr(event, "value", None) == "<<":
-            raise MarkedYAMLError(problem=NOT_PLAIN, problem_mark=event.start_mark)
-        if depth > DEEPEST:
+        if isinstance(event, AliasEvent) or getattr(event, "tag", None):
+            problem = "tags (!) and aliases (*) are not allowed; quote strings"
+        elif depth > DEEPEST:
             problem = f"expected lists and mappings at most {DEEPEST} deep"
+        if problem:
             raise MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
 
 

@@ -18,7 +18,7 @@ from papermill.engines import NBClientEngine, papermill_engines
 from papermill.exceptions import PapermillExecutionError, strip_color
 from tqdm import tqdm
 
-from zwfs.companion import results, sweeps
+from studies.kit import results, sweeps
 
 from . import declared
 from .notebook import read, to_bytes
@@ -33,7 +33,7 @@ ENVIRONMENT = {
     "VECLIB_MAXIMUM_THREADS": "1",
     "PYTHONHASHSEED": "0",
 }
-CORES = "LOKY_MAX_CPU_COUNT"  # the number of cores for the sweeps of a notebook, see `zwfs.companion.sweeps`
+CORES = "LOKY_MAX_CPU_COUNT"  # the number of cores for the sweeps of a notebook, see `studies.kit.sweeps`
 
 PERIOD = 0.2  # of the progress bar, second
 TRACEBACK_LINES = 12
@@ -45,36 +45,13 @@ class NotebookError(ToolError):
 
 
 class Run:
-    """One execution of a notebook.
-
-    Parameters
-    ----------
-    project : Project
-    name : str
-        The stem of the notebook's file.
-    scratch : Path
-        A folder for everything that the run writes.
-    parameters : dict, optional
-        Values that replace defaults in the cell tagged ``parameters``.
-    environment : dict, optional
-        More environment variables of the kernel; no result depends on them.
-
-    Attributes
-    ----------
-    cells : list of NotebookNode
-    cell : int
-        The number of the cell that runs, from 1; 0 before the first one.
-    error : NotebookError or None
-    key : str or None
-        Digest of what the result was made from, see `record.key`; None if that changed during the run.
-    seconds : float
-    """
+    """One execution of a notebook, which writes to the folder `scratch`; no result depends on `environment`."""
 
     error: NotebookError | None = None
-    key: str | None = None
+    key: str | None = None  # see `record.key`; None if the inputs changed during the run
     seconds = 0.0
-    cell = 0
-    _client: PapermillNotebookClient | None = None
+    cell = 0  # the cell that runs, from 1; 0 before the first one
+    _client: Any = None
     _stopped = False
 
     def __init__(
@@ -219,24 +196,13 @@ papermill_engines.register("zwfs", Engine)
 
 
 def execute(runs: list[Run], finished: Callable[[Run], None], n_processes: int | None = None) -> None:
-    """Execute notebooks in parallel.
+    """Execute notebooks in parallel, by default on all cores; `finished` takes each run at its end.
 
-    Parameters
-    ----------
-    runs : list of Run
-        In the order in which they start.
-    finished : callable
-        Takes each run when it ends, whether it failed or not.
-    n_processes : int, optional
-        The number of notebooks that run at the same time; by default the number of cores.
-
-    Raises
-    ------
-    NotebookError
-        After the end of all notebooks, if some failed.
+    The error of all that failed is raised after the end of the last one.
     """
-    n_processes = min(n_processes or os.cpu_count(), len(runs))
-    cores = max(1, os.cpu_count() // n_processes)
+    available = os.cpu_count() or 1
+    n_processes = min(n_processes or available, len(runs))
+    cores = max(1, available // n_processes)
     with (
         tqdm(unit="cell", total=1, disable=None, leave=False, dynamic_ncols=True) as bar,
         ThreadPoolExecutor(n_processes) as pool,

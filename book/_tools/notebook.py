@@ -14,13 +14,7 @@ def read(path: Path) -> NotebookNode:
 
 
 def normalise(notebook: NotebookNode) -> NotebookNode:
-    """Return a copy of a notebook without times, versions and random names, and with joined streams.
-
-    Parameters
-    ----------
-    notebook : NotebookNode
-        Any notebook of format 4; it is not changed.
-    """
+    """Return a copy of a notebook without times, versions and random names, and with joined streams."""
     result = copy.deepcopy(notebook)
     result.nbformat, result.nbformat_minor = 4, 5
     result.metadata.pop("papermill", None)

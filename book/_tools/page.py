@@ -18,7 +18,7 @@ import bs4
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 
-from zwfs.companion.results import published
+from studies.kit.results import published
 
 from .notebook import to_bytes
 from .project import Project
@@ -56,28 +56,10 @@ ACTIVE = ["script", "iframe", "object", "embed", "base", "meta", "link", "form"]
 
 
 def page(project: Project, name: str, notebook: NotebookNode, files: list[Path], scratch: Path) -> tuple[str, str]:
-    """Build the page of a notebook.
+    """Build the page of an executed notebook; return it and the warnings of Sphinx, a line each.
 
     Sphinx reads the whole book with its settings and writes this page: equations have the same numbers as in the
     book. Links to other pages become plain text.
-
-    Parameters
-    ----------
-    project : Project
-    name : str
-        The stem of the notebook's file.
-    notebook : NotebookNode
-        Executed.
-    files : list of Path
-        Published by the notebook. The page links to them as files in its folder.
-    scratch : Path
-        A folder for temporary files.
-
-    Returns
-    -------
-    html : str
-    warnings : str
-        Warnings of Sphinx about this page, a line each.
     """
     source, output = scratch / "source", scratch / "html"
     _stage(project, name, notebook, files, source)

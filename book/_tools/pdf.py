@@ -88,27 +88,7 @@ def find_chromium() -> str | None:
 
 
 def print_book(root: Path, book: Path, chromium: str) -> bytes:
-    """Print a book.
-
-    Parameters
-    ----------
-    root : Path
-        The folder with _toc.yml, _config.yml and pyproject.toml.
-    book : Path
-        The folder with the built pages; a temporary page is written there.
-    chromium : str
-        The path of the browser.
-
-    Returns
-    -------
-    bytes
-        The PDF; it depends on the pages and the browser only.
-
-    Raises
-    ------
-    PrintError
-        If an element is wider than a page.
-    """
+    """Print the pages in the folder `book`; the bytes of the PDF depend on the pages and the browser only."""
     pages = _assemble(root, book)
     paper = book / ".print.html"
     try:

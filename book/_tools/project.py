@@ -1,5 +1,6 @@
 """Places of the files of a project."""
 
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,6 +8,12 @@ from pathlib import Path
 # Environment variables for the extensions of the book: the folder of the executed notebooks from the root, and the
 # name of the PDF.
 EXECUTED, PDF = "ZWFS_EXECUTED", "ZWFS_PDF"
+
+# Sets up the environment again, from new downloads: a damaged file may come from the cache.
+REPAIR = "rm -rf .venv && UV_NO_CACHE=1 make .venv/.ready"
+
+# Names after "from studies import" or "from studies.", in code and in the JSON of a notebook.
+IMPORTED = re.compile(r"from studies(?:\.(\w+) import| import (\w+))")
 
 
 class ToolError(Exception):
@@ -24,18 +31,12 @@ def one_line(text: str) -> str:
 def repair(file: str) -> str:
     """Return the advice for a file that cannot be imported: empty unless it belongs to the environment."""
     ours = file.startswith(f"{sys.prefix}/")
-    return "the environment is damaged: run make clean, then repeat the command" if ours else ""
+    return f"the environment is damaged: run {REPAIR}, then repeat the command" if ours else ""
 
 
 @dataclass(frozen=True)
 class Project:
-    """Places of the files of a project.
-
-    Parameters
-    ----------
-    root : Path
-        The folder with notebooks/, zwfs/, book/ and the lock. Results go to its _build/.
-    """
+    """Places of the files of a project."""
 
     root: Path
 
@@ -43,6 +44,11 @@ class Project:
     def notebooks(self) -> Path:
         """Folder of the committed notebooks."""
         return self.root / "notebooks"
+
+    @property
+    def studies(self) -> Path:
+        """Folder of the code of the notebooks."""
+        return self.notebooks / "studies"
 
     @property
     def build(self) -> Path:
@@ -77,5 +83,17 @@ class Project:
         return self.root / "environment" / "requirements.lock"
 
     def modules(self) -> list[Path]:
-        """Return the files of the package."""
-        return sorted((self.root / "zwfs").rglob("*.py"))
+        """Return the files of the package and of the studies."""
+        return sorted(file for folder in ("zwfs", "notebooks") for file in (self.root / folder).rglob("*.py"))
+
+    def depends_on(self, name: str) -> set[Path]:
+        """Return the code that a notebook depends on: all files but the studies that it does not import."""
+        studies = {file.stem: file for file in self.studies.glob("*.py")}
+        found: set[str] = set()
+        waiting = [self.source(name)]
+        while waiting:
+            text = waiting.pop().read_text("utf-8")
+            new = {one for pair in IMPORTED.findall(text) for one in pair if one in studies} - found
+            found |= new
+            waiting += [studies[one] for one in new]
+        return {*self.modules()} - {studies[one] for one in studies.keys() - found - {"__init__"}}

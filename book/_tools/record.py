@@ -11,10 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from IPython.core.inputtransformer2 import TransformerManager
-
 from . import notebook
-from .imports import Graph
 from .project import Project
 
 # The modules that the content of an executed notebook depends on.
@@ -37,11 +34,7 @@ def digest_files(files: dict[str, Path]) -> str:
 def key(project: Project, name: str, parameters: dict[str, Any]) -> str:
     """Return a digest of everything that the result of a notebook depends on."""
     cells = notebook.read(project.source(name)).cells
-    code = "\n".join(TransformerManager().transform_cell(c.source) for c in cells if c.cell_type == "code")
-    try:
-        inputs = {*Graph(project.notebooks, project.root).files(code, _texts(parameters)), project.lock}
-    except SyntaxError:  # what it imports cannot be read
-        inputs = {*project.modules(), project.lock}
+    inputs = [*project.depends_on(name), project.lock]
     files = {str(file.relative_to(project.root)): file for file in inputs if file.exists()}
     files |= {f"runner {file.name}": file for file in RUNNER}
     files |= {f"parameter {file}": file for file in _named_files(project.notebooks, _texts(parameters))}

@@ -15,9 +15,9 @@ from .scratch import scratch_folder, swap
 
 UV = Path(sys.executable).with_name("uv")
 # Tests without these words read no file outside tests/ and need no part of the book.
-READS_CHECKOUT = re.compile(r"\bROOT\b|\bbook\b|notebooks|bs4|myst_nb")
+READS_CHECKOUT = re.compile(r"\bROOT\b|\bbook\b|notebooks|studies|bs4|myst_nb")
 # Those of the sensor and of what it stands on: for other versions of Python, next to all examples.
-CORE = ("detector", "focal", "metrics", "modes", "pupil", "sensor")
+CORE = ("detector", "masks", "metrics", "modes", "pupil", "sensor")
 
 
 class ReleaseError(ToolError):
@@ -44,12 +44,12 @@ def pythons(project: Project, asked: list[str]) -> None:
         if name not in (*known, "lowest"):
             raise ReleaseError(f"{name}: expected one of {', '.join(known)}, lowest")
         lowest = ["--resolution", "lowest-direct"] if name == "lowest" else []
-        if (python := interpreter(known[0] if lowest else name)) is None:
+        if (found := interpreter(known[0] if lowest else name)) is None:
             print(f"Python {name}: not tested, because it is not installed and uv cannot fetch it here")
             continue
         with scratch_folder(project.build, "releasing-") as scratch:
             wheel, _ = build(project, about(project)["version"], scratch / "dist")
-            options = ["--python", python, *lowest]
+            options = ["--python", found, *lowest]
             python = environment(project, scratch / "env", f"zwfs[test] @ {wheel.as_uri()}", *options)
             test(project, python, scratch, [f"tests/test_{name}.py" for name in CORE], "--doctest-modules")
         print(f"Python {name}: passed")
@@ -79,13 +79,7 @@ def interpreter(version: str) -> str | None:
 
 
 def check_changelog(text: str, version: str) -> None:
-    """Require an entry of a version, with changes under it.
-
-    Raises
-    ------
-    ReleaseError
-        If the newest entry is of another version, or empty.
-    """
+    """Require an entry of a version, with changes under it."""
     newest = re.search(r"(?m)^## \[?(?:Unreleased\] - )?(\d[^\]\s]*)\]?.*\n((?:(?!## ).*\n?)*)", text)
     if not newest or newest[1] != version:
         raise ReleaseError(f"CHANGELOG.md: the newest entry is {newest and newest[1]}: expected {version}")
@@ -109,7 +103,7 @@ def environment(project: Project, folder: Path, requirement: str, *options: str)
     call(project, UV, "venv", "--quiet", "--python", version, folder)
     constraints = [] if rest else ["--constraint", pins(project, folder)]
     python = folder / "bin" / "python"
-    call(project, UV, "pip", "install", "--quiet", "--python", python, *constraints, *rest, requirement)
+    call(project, UV, "pip", "install", "--quiet", "--python", python, *map(str, constraints), *rest, requirement)
     return python
 
 
@@ -134,7 +128,7 @@ def test(project: Project, python: Path, scratch: Path, files: list[str], *optio
     shutil.copytree(project.root / "tests", place / "tests", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(project.root / "pyproject.toml", place)
     examples = ["--pyargs", "zwfs"] if "--doctest-modules" in options else []
-    ask = [python, "-c", "import zwfs; print(zwfs.__file__)"]
+    ask = [str(python), "-c", "import zwfs; print(zwfs.__file__)"]
     where = subprocess.run(ask, cwd=place, capture_output=True, text=True)
     if not Path(where.stdout.strip()).is_relative_to(scratch):
         raise ReleaseError(f"the environment imports {where.stdout.strip() or where.stderr}: expected the wheel")
@@ -143,7 +137,7 @@ def test(project: Project, python: Path, scratch: Path, files: list[str], *optio
 
 
 def check_imports(project: Project, wheel: Path, folder: Path) -> None:
-    """Install the wheel with the extra of the notebooks, and import what they do."""
+    """Install the wheel with the extra of the notebooks, and import what they and their studies do."""
     cells = [
         "".join(cell["source"])
         for source in project.sources()
@@ -152,17 +146,13 @@ def check_imports(project: Project, wheel: Path, folder: Path) -> None:
     ]
     python = environment(project, folder, f"zwfs[notebooks] @ {wheel.as_uri()}")
     modules = {name for cell in cells for name in re.findall(r"(?m)^(?:from|import) ([\w.]+)", cell)}
-    call(project, python, "-I", "-c", f"import {', '.join(sorted(modules))}", folder=folder)
+    modules |= {f"studies.{file.stem}" for file in project.studies.glob("[!_]*.py")}
+    code = f"import sys; sys.path.insert(0, sys.argv[1]); import {', '.join(sorted(modules))}"
+    call(project, python, "-I", "-c", code, project.notebooks, folder=folder)
 
 
 def call(project: Project, *command: str | Path, folder: Path | None = None) -> None:
-    """Run a command with its output on the terminal.
-
-    Raises
-    ------
-    ReleaseError
-        If it fails.
-    """
+    """Run a command with its output on the terminal."""
     clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     done = subprocess.run([str(part) for part in command], cwd=folder or project.root, env=clean)
     if done.returncode:

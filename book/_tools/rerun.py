@@ -18,8 +18,8 @@ from typing import Any, NoReturn
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 
-from zwfs.companion import sweeps
-from zwfs.companion.tables import plain
+from studies.kit import sweeps
+from studies.kit.tables import plain
 
 from . import declared, record
 from .declared import Parameter, ParameterError
@@ -33,7 +33,7 @@ COMMAND = ".venv/bin/python -m book._tools rerun"
 READABLE = 60  # characters of a folder's name for the parameters
 ROOM = 50_000_000  # bytes on the disk for the scratch files of a run
 # Ends with this line of output only if the notebook can import all classes.
-CHECK = "import sys; from zwfs.paper.linearity import _own_classes; _own_classes(sys.argv[1:]); print('accepted')"
+CHECK = "import sys; from studies.kit.methods import check_own; check_own(sys.argv[1:]); print('accepted')"
 EXAMPLES = """examples:
   rerun                                     list the notebooks
   rerun 3 --list                            list the parameters of Figure 3
@@ -56,8 +56,8 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     for argument in arguments:
         if re.search("[\ud800-\udfff]", argument):  # bytes that are not UTF-8
             raise ParameterError(f"{argument}: expected UTF-8")
-    options = {"description": __doc__, "epilog": EXAMPLES, "formatter_class": argparse.RawDescriptionHelpFormatter}
-    parser = Parser("rerun", **options)
+    layout = argparse.RawDescriptionHelpFormatter
+    parser = Parser("rerun", description=__doc__, epilog=EXAMPLES, formatter_class=layout)
     parser.add_argument("figure", nargs="?", help="number of a figure, or name of a notebook")
     parser.add_argument("-p", metavar="NAME=VALUE", action="append", default=[], help="a parameter, in YAML")
     file_help = "YAML file of parameters; -p overrides it"
@@ -81,15 +81,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
 
 
 def rerun(project: Project, arguments: list[str]) -> None:
-    """Serve a command line.
-
-    Raises
-    ------
-    ParameterError
-        If it asks for something impossible; no notebook has been started.
-    NotebookError
-        If the notebook fails; nothing has been written.
-    """
+    """Serve a command line; before a refusal nothing runs, and a notebook that fails leaves nothing."""
     asked = parse(arguments)
     if asked.figure in (None, "list"):
         if asked.p or asked.f or asked.output or asked.force:
@@ -102,10 +94,11 @@ def rerun(project: Project, arguments: list[str]) -> None:
     if asked.list:
         print(description(project, name))
         return
-    known = declared.parameters(read(project.source(name)))
+    notebook = read(project.source(name))
+    known = declared.parameters(notebook)
     changed = declared.accept(_given(asked), known)
     with chdir(project.notebooks):  # as the notebook runs: its files are named from there
-        declared.accept_together(name, {key: one.default for key, one in known.items()} | changed)
+        declared.accept_together(notebook, {key: one.default for key, one in known.items()} | changed)
         if classes := changed.get("reconstructors"):
             _check_classes(classes)
     folder = _folder(project, asked.output or project.build / "rerun" / folder_name(name, changed))
@@ -147,13 +140,7 @@ def _check_cluster(address: str) -> None:
 
 
 def resolve(project: Project, figure: str) -> str:
-    """Return the name of the notebook for a number of a figure or a name.
-
-    Raises
-    ------
-    ParameterError
-        If no notebook has this number or name.
-    """
+    """Return the name of the notebook for a number of a figure or a name."""
     names = [path.stem for path in project.sources()]
     wanted = Path(figure).name.removesuffix(".ipynb")
     if wanted in names:
@@ -235,7 +222,7 @@ def _title_cell(notebook: NotebookNode) -> int:
 
 def description(project: Project, name: str) -> str:
     """List the parameters of a notebook."""
-    listed = {}
+    listed: dict[str, Parameter] = {}
     for key, one in declared.parameters(read(project.source(name))).items():
         listed |= {key: one} | {f"{key}.{field}": value for field, value in one.fields().items()}
     rows = [
@@ -262,13 +249,7 @@ def folder_name(name: str, changed: dict[str, Any]) -> str:
 
 
 def read_result(folder: Path, name: str) -> dict[str, Any]:
-    """Return the record of an earlier result; empty if the folder does not exist or is empty.
-
-    Raises
-    ------
-    ParameterError
-        If the folder holds anything else: a run replaces the whole folder.
-    """
+    """Return the record of an earlier result, if there is one; refuse a folder with anything else."""
     if not folder.exists():
         return {}
     if not folder.is_dir():
@@ -330,26 +311,9 @@ def make(
     folder: Path,
     workers: dict[str, str] | None = None,
 ) -> float:
-    """Run a notebook, and move all its results into a folder in one step.
+    """Run a notebook, move all its results into a folder in one step, and return the seconds.
 
-    Parameters
-    ----------
-    project : Project
-    name : str
-        The notebook.
-    changed : dict
-        Checked values that are not the defaults.
-    known : dict of Parameter
-        The parameters of the notebook.
-    folder : Path
-        Absent, or an earlier result, which is replaced.
-    workers : dict of str, optional
-        Environment variables that choose the workers of sweeps.
-
-    Returns
-    -------
-    float
-        The time of the notebook in seconds.
+    The folder is absent or holds an earlier result, which is replaced. `workers` are environment variables.
     """
     within = project.build if folder.is_relative_to(project.build) else folder.parent
     commit, changed_since = record.commit(project.root)

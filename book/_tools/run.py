@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from zwfs._files import write_file
+from zwfs._system import write_file
 
 from .execute import Run, execute
 from .notebook import read, to_bytes
@@ -22,25 +22,9 @@ FRONT_FIGURE = "at_a_glance"  # shown in the README and on the front page, as bo
 
 
 def run(project: Project, say: Callable[[str], None] = tqdm.write) -> list[str]:
-    """Run every notebook that has no result for its key, with its defaults.
+    """Run every notebook that has no result for its key, with its defaults, and return their names.
 
     The last results of each notebook are kept, so that undoing a change runs nothing.
-
-    Parameters
-    ----------
-    project : Project
-    say : callable
-        Takes a line for each notebook that is finished.
-
-    Returns
-    -------
-    list of str
-        The names of the notebooks that were run.
-
-    Raises
-    ------
-    NotebookError
-        After the end of all others. The earlier results of the failed notebooks stay.
     """
     names = [path.stem for path in project.sources()]
     records = {name: read_record(project, name) for name in names}

@@ -39,15 +39,7 @@ def one_at_a_time(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def scratch_folder(parent: Path, prefix: str) -> Iterator[Path]:
-    """Create a folder for unfinished results and remove it at the end; remove those of killed processes first.
-
-    Parameters
-    ----------
-    parent : Path
-        The folder to create it in; created if it does not exist.
-    prefix : str
-        Start of the names of such folders.
-    """
+    """Create a folder for unfinished results and remove it at the end; remove those of killed processes first."""
     parent.mkdir(parents=True, exist_ok=True)
     remove_abandoned(parent)
     with tempfile.TemporaryDirectory(dir=parent, prefix=prefix) as name:

@@ -11,8 +11,8 @@ from time import perf_counter
 
 import numpy as np
 
+from studies.kit.curves import screens_at
 from zwfs import Dimple, PhaseShifted, Pupil, ZernikeSensor, reconstruction_error, zernike_basis
-from zwfs.paper.linearity import screens_at
 
 REPEATS = 3
 

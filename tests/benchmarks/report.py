@@ -11,7 +11,7 @@ import json
 import sys
 from pathlib import Path
 
-from zwfs._files import write_file
+from zwfs._system import write_file
 
 from . import speed
 

@@ -14,6 +14,7 @@ from time import perf_counter, thread_time
 
 import numpy as np
 
+from studies.kit.curves import screens_at
 from zwfs import (
     Arcsine,
     Dimple,
@@ -30,7 +31,6 @@ from zwfs import (
 from zwfs._arrays import Kind
 from zwfs._propagator import angle, unit
 from zwfs.metrics import without_piston
-from zwfs.paper.linearity import screens_at
 from zwfs.reconstructors import base
 
 from ..reference import HcipySensor

@@ -13,12 +13,12 @@ from time import perf_counter, process_time, thread_time
 
 import numpy as np
 
+from studies.kit.curves import screens_at
 from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
 from zwfs.frames import Calibration, reconstruct
 from zwfs.frames._fits import fits_module
 from zwfs.frames.pipeline import Optics, reduce_frames
-from zwfs.frames.registration import Image, record
-from zwfs.paper.linearity import screens_at
+from zwfs.frames.registration import Image, register_frames
 
 PHOTONS, MARGIN, DARK = 1e4, 12, 500
 DIMPLES = (Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
@@ -41,9 +41,9 @@ def camera(n_pixels, n_frames, rms=0.5):
 
     flat = exposed(sensor.measure(np.zeros(pupil.shape)))
     clear = exposed(np.stack([np.pad(pupil.amplitude**2, MARGIN)] * 2))
-    recording = record([image(flat)], [image(clear)])
+    registered = register_frames([image(flat)], [image(clear)])
     dark = np.full(flat.shape, float(DARK))
-    calibration = Calibration.of(reduce_frames(recording, Optics()), dark, saturation=65535)
+    calibration = Calibration.of(reduce_frames(registered, Optics()), dark, saturation=65535)
     return calibration, exposed(sensor.measure(screens))
 
 

@@ -110,64 +110,36 @@ def cases():
     dark = (0, 3), (5, 0)
     offset = Pupil(np.pad(disc.amplitude, dark), 32, np.pad(disc.segments, dark), (15.5, 20.5))
     shifts = tuple(Mask(1.06, theta) for theta in (0.3, 0.3 + 2 * np.pi / 3, 0.3 - 2 * np.pi / 3))
-    return [
+    wide, widest, dim, wedge = Mask(2.0), Mask(4.0, 0.7), Mask(amplitude=0.7), Mask(tilt=1.0)
+    known = [
         Case("circular_flat", "flat wavefront", disc, flat(disc), plus),
         Case("circular_tilt", "tilt of 0.3 lambda/D along +x", disc, tilt(disc, 0.3), pair),
-        Case("circular_small", "0.1 rad rms", disc, screen(disc, 0.1, 1), plus),
-        Case("circular_large", "1.5 rad rms", disc, screen(disc, 1.5, 2), plus),
-        Case("circular_pair_small", "0.1 rad rms, two masks", disc, screen(disc, 0.1, 3), pair),
-        Case("circular_pair_large", "1.5 rad rms, two masks", disc, screen(disc, 1.5, 4), pair),
-        Case("circular_three_shifts", "0.8 rad rms, three masks", disc, screen(disc, 0.8, 5), shifts),
-        Case("circular_dimple_2", "0.5 rad rms, dimple of 2 lambda/D", disc, screen(disc, 0.5, 6), (Mask(2.0),)),
-        Case(
-            "circular_dimple_4", "0.5 rad rms, dimple of 4 lambda/D", disc, screen(disc, 0.5, 7), (Mask(4.0, 0.7),)
-        ),
-        Case(
-            "circular_absorbing",
-            "0.5 rad rms, the dimple dims the light",
-            disc,
-            screen(disc, 0.5, 8),
-            (Mask(amplitude=0.7),),
-        ),
-        Case(
-            "circular_wedge", "0.5 rad rms, the dimple is a wedge", disc, screen(disc, 0.5, 9), (Mask(tilt=1.0),)
-        ),
-        Case("circular_wide", "0.8 rad rms, detector of 1.5 D", disc, screen(disc, 0.8, 10), plus, 8),
-        Case("odd_small", "33 pixels across, 0.1 rad rms", odd, screen(odd, 0.1, 11), plus),
-        Case("odd_pair_large", "33 pixels across, 1.5 rad rms, two masks", odd, screen(odd, 1.5, 12), pair),
-        Case(
-            "spiders_small",
-            "obstruction of 0.28 D and four vanes, 0.1 rad rms",
-            vanes,
-            screen(vanes, 0.1, 13),
-            plus,
-        ),
-        Case("spiders_pair_large", "the same, 1.5 rad rms, two masks", vanes, screen(vanes, 1.5, 14), pair),
-        Case(
-            "segmented_small",
-            "18 segments with piston and tilt, 0.1 rad rms",
-            hexagons,
-            pistons(hexagons, 0.1, 15),
-            plus,
-        ),
-        Case(
-            "segmented_pair_large", "the same, 1.2 rad rms, two masks", hexagons, pistons(hexagons, 1.2, 16), pair
-        ),
-        Case(
-            "uneven_pair",
-            "33 pixels, uneven amplitude, 0.8 rad rms, two masks",
-            uneven,
-            screen(uneven, 0.8, 17),
-            pair,
-        ),
-        Case(
-            "oblong_pair",
-            "35 by 37 pixels, D off their centre, 0.8 rad rms",
-            offset,
-            screen(offset, 0.8, 18),
-            pair,
-        ),
     ]
+    screens = [
+        ("circular_small", "0.1 rad rms", disc, 0.1, plus),
+        ("circular_large", "1.5 rad rms", disc, 1.5, plus),
+        ("circular_pair_small", "0.1 rad rms, two masks", disc, 0.1, pair),
+        ("circular_pair_large", "1.5 rad rms, two masks", disc, 1.5, pair),
+        ("circular_three_shifts", "0.8 rad rms, three masks", disc, 0.8, shifts),
+        ("circular_dimple_2", "0.5 rad rms, dimple of 2 lambda/D", disc, 0.5, (wide,)),
+        ("circular_dimple_4", "0.5 rad rms, dimple of 4 lambda/D", disc, 0.5, (widest,)),
+        ("circular_absorbing", "0.5 rad rms, the dimple dims the light", disc, 0.5, (dim,)),
+        ("circular_wedge", "0.5 rad rms, the dimple is a wedge", disc, 0.5, (wedge,)),
+        ("circular_wide", "0.8 rad rms, detector of 1.5 D", disc, 0.8, plus, 8),
+        ("odd_small", "33 pixels across, 0.1 rad rms", odd, 0.1, plus),
+        ("odd_pair_large", "33 pixels across, 1.5 rad rms, two masks", odd, 1.5, pair),
+        ("spiders_small", "obstruction of 0.28 D and four vanes, 0.1 rad rms", vanes, 0.1, plus),
+        ("spiders_pair_large", "the same, 1.5 rad rms, two masks", vanes, 1.5, pair),
+        ("segmented_small", "18 segments with piston and tilt, 0.1 rad rms", hexagons, 0.1, plus),
+        ("segmented_pair_large", "the same, 1.2 rad rms, two masks", hexagons, 1.2, pair),
+        ("uneven_pair", "33 pixels, uneven amplitude, 0.8 rad rms, two masks", uneven, 0.8, pair),
+        ("oblong_pair", "35 by 37 pixels, D off their centre, 0.8 rad rms", offset, 0.8, pair),
+    ]
+    made = []
+    for seed, (name, text, pupil, rms, masks, *margin) in enumerate(screens, start=1):
+        phase = (pistons if pupil is hexagons else screen)(pupil, rms, seed)
+        made.append(Case(name, text, pupil, phase, masks, *margin))
+    return known + made
 
 
 def rounded(pupil, phase):

@@ -1,8 +1,7 @@
 """A simulated bench: a segmented mirror and a vector-Zernike sensor with the errors that the paper names."""
 
-from zwfs.bench.model import Bench, BenchModel, segment_screens
-from zwfs.bench.recording import bench_error, write_bench
-from zwfs.bench.segments import segment_pistons, segment_residual
+from zwfs.bench.files import bench_error, write_bench
+from zwfs.bench.model import Bench, BenchModel, segment_pistons, segment_residual, segment_screens
 
 __all__ = [
     "Bench",

@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
 
 from zwfs import _check
-from zwfs._pickle import Immutable
+from zwfs._arrays import Immutable
 from zwfs.bench.relay import Relay
-from zwfs.bench.segments import segment_pistons
 from zwfs.detector import Detector
 from zwfs.frames.pipeline import measured_pupil
 from zwfs.masks import Dimple
+from zwfs.metrics import without_piston
 from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
@@ -114,11 +114,6 @@ class Bench:
         grey, and finer structure is lost. 1 for pixels that are open or closed; 8 resolves a gap of a fifth of a
         pixel.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If a parameter is of the wrong kind or out of range, such as a leakage outside [0, 0.5].
-
     References
     ----------
     Chambouleyron et al. 2024, sections 2.3 and 5.
@@ -185,7 +180,7 @@ class Bench:
         _check.number_field(self, "blur", 0, self.n_pixels)
         for name in ("halo", "static", "quilting", "photons", "read_noise", "background"):
             _check.number_field(self, name, 0)
-        _check.integer_seed("seed", self.seed)
+        _check.integer("seed", self.seed, 0, math.inf)
         if not self.photons and (self.read_noise or self.background):
             raise ValueError(
                 f"photons = 0 with read_noise = {self.read_noise:g} and background = {self.background:g}: "
@@ -241,11 +236,6 @@ class Bench:
         -------
         ndarray, shape (..., ny, nx), radian
             0 in gaps and outside.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the number of commands is wrong, or a command is not finite.
         """
         values = _check.real_array("pistons", pistons).astype(np.float64)
         _check.trailing_shape("pistons", values, (self.n_segments,), "a command for each usable segment")
@@ -484,7 +474,7 @@ class BenchModel(Immutable):
         Raises
         ------
         ValueError
-            If the shape is wrong, or no point of a segment is finite.
+            If no point of a segment is finite.
         """
         return segment_pistons(phase, self.segments, self.numbers)
 
@@ -511,8 +501,8 @@ def segment_screens(
 
     Raises
     ------
-    TypeError, ValueError
-        If an argument is of the wrong kind or out of range, or the bench has a single segment or too few points.
+    ValueError
+        If the bench has a single segment, or fewer points than the modes that the screens are made of.
 
     References
     ----------
@@ -537,3 +527,45 @@ def segment_screens(
     pistons = flat @ (members / members.sum(axis=1, keepdims=True)).T
     pistons -= pistons.mean(axis=1, keepdims=True)
     return pistons * (rms / pistons.std(axis=1, keepdims=True))
+
+
+def segment_pistons(phase: ArrayLike, segments: NDArray, numbers: NDArray) -> NDArray[np.float64]:
+    """Piston of each segment in a phase, see `BenchModel.pistons`: on a map of segment numbers (ny, nx)."""
+    phase = _check.real_array("phase", phase)
+    segments = _check.integer_array("segments", segments)
+    if segments.ndim != 2:
+        raise ValueError(f"segments has shape {segments.shape}: expected (ny, nx)")
+    numbers = _check.integer_array("numbers", numbers)
+    if numbers.ndim != 1 or not numbers.size:
+        raise ValueError(f"numbers has shape {numbers.shape}: expected (n_segments,), at least one")
+    _check.maps("phase", phase, segments.shape, "the grid of the segments")
+    on_segment = segments.ravel() > 0
+    flat = phase.reshape(*phase.shape[:-2], -1)[..., on_segment]
+    members = (segments.ravel()[on_segment] == numbers[:, np.newaxis]).astype(float)
+    sums = np.where(np.isfinite(flat), np.exp(1j * np.nan_to_num(flat)), 0) @ members.T
+    if not np.all(np.abs(sums) > 0):
+        raise ValueError(
+            "phase is NaN all over a segment, or segments lacks one of numbers: expected finite values"
+        )
+    return np.angle(sums)
+
+
+def segment_residual(found: ArrayLike, commanded: ArrayLike) -> NDArray[np.float64]:
+    """Difference of segment pistons on the circle, without their common piston.
+
+    Parameters
+    ----------
+    found, commanded : array_like, shapes (..., n_segments) that broadcast, radian
+
+    Returns
+    -------
+    ndarray, shape (..., n_segments), radian
+        In (-pi, pi].
+    """
+    found, commanded = _check.real_array("found", found), _check.real_array("commanded", commanded)
+    shape = _check.broadcast(found=found, commanded=commanded)
+    if not shape or 0 in shape:
+        raise ValueError(f"found and commanded have shape {shape}: expected (..., n_segments), at least one")
+    _check.finite("found", found)
+    _check.finite("commanded", commanded)
+    return without_piston(found - commanded)

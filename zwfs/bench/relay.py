@@ -29,14 +29,6 @@ class Relay:
         Distance from the pupil to the plane in focus, for light that is spread along x and along y.
     shift : float, D
         Of the image, along both axes.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs.bench.relay import Relay
-    >>> relay = Relay(1.06, 0.0, 0.0, shift=0.25)  # by a pixel
-    >>> np.abs(relay.direct(np.ones((4, 4)), 6, 4)[3]).round(6)
-    array([0., 0., 1., 1., 1., 1.])
     """
 
     diameter: float

@@ -1,10 +1,39 @@
 """Camera files to phase.
 
 `files` reads and writes, `registration` locates the pupils, `pipeline` reconstructs a pair of frames, `verdict`
-judges the result, and `order` finds which image has which phase shift. `calibration` keeps the constants of a
+judges the result and finds which image has which phase shift. `calibration` keeps the constants of a
 bench, and `telemetry` reconstructs files of any length with them. The command is `python -m zwfs.frames`.
 `joint` fits one model, `optics_model`, to all images of a recording; `bench_fit` takes a model of a bench from
 frames of a mirror in known states.
+
+Examples
+--------
+From files of the simulated bench to a phase:
+
+>>> import tempfile
+>>> from zwfs.bench import Bench, write_bench
+>>> from zwfs.frames.files import read_all, write_phase
+>>> from zwfs.frames.pipeline import Optics, fit, predict_other, recover_phase, reduce_frames, steps, upside_down
+>>> from zwfs.frames.registration import register_frames
+>>> bench, folder = Bench(n_pixels=40), tempfile.TemporaryDirectory()
+>>> files = write_bench(folder.name, bench, seed=1)
+>>> frames, clear_frames, sources = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
+>>> registered = register_frames(frames, clear_frames)
+>>> round(registered.diameter), registered.n_pixels
+(40, 42)
+>>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
+>>> measurement = reduce_frames(registered, optics)
+>>> bool((predict_other(measurement) > predict_other(upside_down(measurement))).all())
+True
+>>> result = recover_phase(measurement)
+>>> result.converged, result.phase.shape
+(True, (42, 42))
+>>> write_phase(f"{folder.name}/phase.fits", result, 635.0, sources)
+>>> bool(0.8 < fit(registered, optics, ["scale"], n_steps=2)[1].scale < 1.2)
+True
+>>> [step.name for step in steps(frames, clear_frames, optics, fitted=())][-1]
+'balance of the flux'
+>>> folder.cleanup()
 """
 
 from zwfs.frames import (
@@ -13,7 +42,6 @@ from zwfs.frames import (
     files,
     joint,
     optics_model,
-    order,
     pipeline,
     registration,
     telemetry,
@@ -21,9 +49,8 @@ from zwfs.frames import (
 )
 from zwfs.frames.bench_fit import FittedSensor, fit_bench
 from zwfs.frames.calibration import Calibration, calibrate
-from zwfs.frames.order import order_of_images
 from zwfs.frames.telemetry import reconstruct
-from zwfs.frames.verdict import CameraNoise, judge
+from zwfs.frames.verdict import CameraNoise, judge, order_of_images
 
 __all__ = [
     "Calibration",
@@ -37,7 +64,6 @@ __all__ = [
     "joint",
     "judge",
     "optics_model",
-    "order",
     "order_of_images",
     "pipeline",
     "reconstruct",

@@ -23,15 +23,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
 
 from zwfs import _check
-from zwfs._arrays import Kind, read_only
-from zwfs._files import path_of, write_file
+from zwfs._arrays import Immutable, Kind, read_only
 from zwfs._information import Response
 from zwfs._likelihood import Estimator, Noise
-from zwfs._pickle import Immutable
 from zwfs._propagator import propagator, split
+from zwfs._system import path_of, write_file
 from zwfs.frames.files import FileError, _broken, read_all
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, _check_fit, fit, ideal_frames, reduce_frames
-from zwfs.frames.registration import _TOUCHED, Image, Recording, nearest_good, record
+from zwfs.frames.registration import _TOUCHED, Image, RegisteredFrames, nearest_good, register_frames
 from zwfs.masks import Dimple
 from zwfs.metrics import without_piston
 from zwfs.pupil import Pupil
@@ -164,22 +163,6 @@ class Calibration(Immutable):
         Largest number of iterations.
     tolerance : float, radian
         As for `PhaseShifted`: with 0, all iterations are done.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames.calibration import Calibration
-    >>> from zwfs.frames.pipeline import Optics, reduce_frames
-    >>> from zwfs.frames.registration import Image, record
-    >>> bench = Bench(n_pixels=40, photons=1e8)
-    >>> pairs = bench.frames(seed=1), bench.clear_frames(seed=2)
-    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
-    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
-    >>> calibration = Calibration.of(measurement)
-    >>> phases = calibration(np.stack([frame.counts, 0 * frame.counts]))
-    >>> phases.phase.shape, phases.flags  # the second image holds no light
-    ((2, 42, 42), array([0, 1]))
     """
 
     amplitude: NDArray[np.float64]
@@ -259,23 +242,18 @@ class Calibration(Immutable):
         Returns
         -------
         Calibration
-
-        Raises
-        ------
-        TypeError, ValueError
-            If a value is of the wrong kind, shape or range.
         """
         _check.instance("measurement", measurement, Measurement)
         _check.instance("bunit", bunit, str)
         _check_settings(n_iterations, tolerance, saturation)
-        recording, pupil = measurement.recording, measurement.pupil
-        images = recording.frames[: 1 if recording.frames[0] is recording.frames[1] else 2]
+        registered, pupil = measurement.registered, measurement.pupil
+        images = registered.frames[: 1 if registered.frames[0] is registered.frames[1] else 2]
         shape = images[0].counts.shape
         if images[-1].counts.shape != shape:
             raise ValueError(f"the frames have shapes {shape} and {images[-1].counts.shape}: expected the same")
-        counts, _ = recording.frames_on_grid()
-        unit, background = measurement.counts * recording.exposure, measurement.background[:2]
-        places, response = _places(recording)
+        counts, _ = registered.frames_on_grid()
+        unit, background = measurement.counts * registered.exposure, measurement.background[:2]
+        places, response = _places(registered)
         inner = (..., *measurement.window)
         good = measurement.good
         weights, offset = _undoing(measurement)
@@ -294,7 +272,7 @@ class Calibration(Immutable):
             unit=unit / response,
             weights=weights,
             offset=offset[inner],
-            balance=bool(recording.balance and measurement.optics.opposite),
+            balance=bool(registered.balance and measurement.optics.opposite),
             light=(counts[:, good].mean(axis=1) - background) / unit,
             residual=0.0,
             saturation=saturation,
@@ -390,11 +368,6 @@ class Calibration(Immutable):
         Returns
         -------
         Phases
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is of the wrong kind or shape.
         """
         counts = _check.plain_array("counts", counts)
         if counts.dtype.kind not in "biuf":
@@ -475,11 +448,6 @@ class Calibration(Immutable):
         -------
         ndarray, shape (..., ny, nx) or (..., n_modes), radian
             NaN outside the pupil, at bad points and for lost frames.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If a value is of the wrong kind, shape or range.
         """
         _check.instance("phases", phases, Phases)
         photons = _check.number("photons", photons, 1e-6, 1e12)
@@ -710,7 +678,7 @@ def calibrate(
     n_iterations : int
     tolerance : float, radian
     **settings
-        Of `zwfs.frames.registration.record`: pupil_centers, pupil_diameter, exposure, subpixel.
+        Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel.
 
     Returns
     -------
@@ -728,7 +696,7 @@ def calibrate(
     --------
     >>> import tempfile
     >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.bench.files import write_bench
     >>> from zwfs.frames.calibration import calibrate
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)
@@ -745,10 +713,10 @@ def calibrate(
     try:
         optics = sources[0].optics(diameter, phase_shifts)
         _check_fit("fitted", fitted, optics)
-        recording, optics = fit(record(frames, clear_frames, **settings), optics, fitted)
+        registered, optics = fit(register_frames(frames, clear_frames, **settings), optics, fitted)
         level = sources[0].keyword("SATURATE") if saturation is None and "SATURATE" in header else saturation
         return Calibration.of(
-            reduce_frames(recording, optics),
+            reduce_frames(registered, optics),
             np.stack(darks) if darks else None,
             saturation=np.inf if level is None else level,
             bunit=str(header.get("BUNIT", "")),
@@ -803,18 +771,18 @@ def _undoing(measurement: Measurement) -> tuple[NDArray[np.float64], NDArray[np.
     return np.stack([(undone(*light) - offset)[:, 0, 0] for light in ((1, 0), (0, 1))], axis=1), offset
 
 
-def _places(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _places(registered: RegisteredFrames) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Row and column of each point of the grid on the two frames, (2, 2, ny, nx), and counts there of one count.
 
-    The recording resamples images whose counts are the number of the row or of the column. They reach beyond the
-    camera, since splines bend ramps at the edge.
+    `RegisteredFrames` resamples images whose counts are the number of the row or of the column. They reach beyond
+    the camera, since splines bend ramps at the edge.
     """
-    wide = [length + 2 * _FAR for length in recording.frames[0].counts.shape]
-    origins = recording.origins + np.array([[_FAR], [_FAR], [0], [0]])
+    wide = [length + 2 * _FAR for length in registered.frames[0].counts.shape]
+    origins = registered.origins + np.array([[_FAR], [_FAR], [0], [0]])
 
     def on_grid(counts: NDArray) -> NDArray[np.float64]:
         image = Image(counts, np.zeros(counts.shape, bool))
-        return replace(recording, frames=(image, image), origins=origins).frames_on_grid()[0]
+        return replace(registered, frames=(image, image), origins=origins).frames_on_grid()[0]
 
     response = on_grid(np.ones(wide))
     ramps = np.indices(wide).astype(float) - _FAR

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs._files import is_there, path_of, paths_of, write_file
+from zwfs._system import is_there, path_of, paths_of, write_file
 from zwfs.frames._fits import FIRST_BYTES, SCALING, TYPES, fits_content, fits_module, full_scale, has_card
 from zwfs.frames._part import scratch_of
 from zwfs.frames.pipeline import MeasuredPhase, Optics
@@ -65,11 +65,6 @@ class CameraFile:
         Largest value that the type of the file's numbers can hold; infinity for floats.
     path : Path, optional
         Of the file, absolute. `write_phase` never replaces it.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is of the wrong kind.
 
     Examples
     --------
@@ -203,23 +198,6 @@ def read_all(
     frames, clear_frames : tuple of Image
     sources : list of CameraFile
         All files; the first is that of the first frame.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
-    >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
-    >>> from zwfs.frames.registration import record
-    >>> bench = Bench(n_pixels=40)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, bench, seed=1)
-    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> len(frames), len(clear_frames), frames[0].counts.shape
-    (1, 1, (52, 104))
     """
     names = "frame_files", "pupil_files", "dark_files", "bad_pixel_files"
     given = frame_files, pupil_files, dark_files, bad_pixel_files
@@ -398,27 +376,6 @@ def write_phase(
         If astropy is missing.
     TypeError, ValueError
         If the wavelength is not above 0, or `check_output` refuses the file.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
-    >>> from zwfs.frames.files import read_all, write_phase
-    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
-    >>> from zwfs.frames.registration import record
-    >>> bench = Bench(n_pixels=40)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, bench, seed=1)
-    ...     frames, clear_frames, sources = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
-    >>> measurement = reduce_frames(record(frames, clear_frames), optics)
-    >>> phase = recover_phase(measurement)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_phase(f"{folder}/phase.fits", phase, 635.0, sources)
-    ...
     """
     from zwfs import __version__
 
@@ -427,12 +384,12 @@ def write_phase(
     _check.sequence("sources", sources, CameraFile)
     path = check_output(output, [source.path for source in sources if source.path], overwrite=overwrite)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-    measurement, recording, optics = phase.measurement, phase.measurement.recording, phase.measurement.optics
+    measurement, registered, optics = phase.measurement, phase.measurement.registered, phase.measurement.optics
     cards = [
         ("BUNIT", "rad", "in (-pi, pi]; NaN outside and at bad points"),
         ("WAVELEN", wavelength, "[nm] wavelength"),
-        ("PUPDIAM", recording.diameter, "[pixel] diameter D of the pupil"),
-        ("PIXSCALE", 1 / recording.diameter, "[D] width of a pixel"),
+        ("PUPDIAM", registered.diameter, "[pixel] diameter D of the pupil"),
+        ("PIXSCALE", 1 / registered.diameter, "[D] width of a pixel"),
         ("CENTROW", measurement.pupil.center[0], "[pixel] centre of the pupil, from 0"),
         ("CENTCOL", measurement.pupil.center[1], "[pixel] centre of the pupil, from 0"),
         ("DIMPLE", optics.diameter, "[lambda/D] diameter of the dimple"),
@@ -450,14 +407,14 @@ def write_phase(
         ("NBAD", measurement.n_bad, "of these, bad"),
         ("CONVERGE", phase.converged, "the iteration converged"),
     ]
-    placement = recording.placement
+    placement = registered.placement
     cards += [
         ("ROTATE", placement.rotation, "[deg] image 2 from image 1, x to y"),
         ("ROTERR", placement.sigma[2], "[deg] standard error; NaN: not determined"),
         ("MAGNIF", placement.magnification, "size of image 2 over that of image 1"),
         ("MAGERR", placement.sigma[3], "standard error; NaN: not determined"),
     ]
-    for index, (image, origin) in enumerate(zip(recording.images, recording.origins, strict=True), 1):
+    for index, (image, origin) in enumerate(zip(registered.images, registered.origins, strict=True), 1):
         cards += [
             (f"IMAGE{index}", image.name, "frames, then clear frames"),
             (f"ROW{index}", origin[0], "[pixel] pupil from its place on clear frame 1"),

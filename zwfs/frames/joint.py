@@ -51,11 +51,6 @@ class MapPrior:
     outer_scale : float, D
         Below one cycle over this length the density is flat.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If a number is of the wrong kind or out of range.
-
     Examples
     --------
     >>> from zwfs.frames.joint import MapPrior
@@ -104,28 +99,13 @@ class JointProblem:
 
     Raises
     ------
-    TypeError, ValueError
-        If a value is of the wrong kind or shape, or nothing is to be fitted.
+    ValueError
+        If nothing is to be fitted.
 
     Notes
     -----
     Some combinations of maps and parameters change no image, and need a fixed parameter: the flux of one arm where
     the amplitude is free, and, without known states of the mirror, the shift and the focus of one arm.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
-    >>> from zwfs.frames.joint import JointProblem, MapPrior
-    >>> from zwfs.frames.optics_model import Arm, MaskPair, Parameter, Picture
-    >>> pupil = Pupil.circular(12)
-    >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1.5)
-    >>> phase = 0.1 * zernike_basis(pupil, 6).sum(axis=0)
-    >>> pictures = [Picture(counts, 0, side, sigma=0.02) for side, counts in enumerate(sensor.measure(phase))]
-    >>> mask = MaskPair(diameter=Parameter.fitted(1.0))
-    >>> problem = JointProblem(pictures, [Arm()], mask, pupil.amplitude, 12, amplitude_prior=MapPrior(0.01))
-    >>> [problem.named[index][0] for index in problem.free]
-    ['diameter']
     """
 
     pictures: Sequence[Picture]
@@ -221,7 +201,7 @@ class JointProblem:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class FittedParameter:
     """Value of a free parameter.
 
     Attributes
@@ -293,11 +273,11 @@ class JointFit:
         return self.problem.forward.split(self.values)[1]
 
     @cached_property
-    def estimates(self) -> list[Estimate]:
+    def estimates(self) -> list[FittedParameter]:
         """Free parameters, with their errors."""
         sigma = np.sqrt(np.diagonal(self.covariance)).tolist()
         return [
-            Estimate(name, value - bias, error, not parameter.low < value < parameter.high)
+            FittedParameter(name, value - bias, error, not parameter.low < value < parameter.high)
             for (name, parameter), value, bias, error in zip(
                 (self.problem.named[index] for index in self.problem.free),
                 self.values[self.problem.free].tolist(),
@@ -388,11 +368,6 @@ def fit_jointly(
     -------
     JointFit
 
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is of the wrong kind or out of range.
-
     References
     ----------
     M. J. Box, Bias in nonlinear estimation, J. R. Stat. Soc. B 33, 171 (1971): the bias of the parameters.
@@ -401,7 +376,7 @@ def fit_jointly(
     --------
     >>> import numpy as np
     >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
-    >>> from zwfs.frames.joint import JointProblem, MapPrior, fit_jointly
+    >>> from zwfs.frames.joint import JointProblem, MapPrior, fit_jointly, held_out_blocks, predict_image
     >>> from zwfs.frames.optics_model import Arm, MaskPair, Parameter, Picture
     >>> pupil = Pupil.circular(12)
     >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1.5)
@@ -412,6 +387,11 @@ def fit_jointly(
     >>> fit = fit_jointly(problem, n_inner=20, errors=False)
     >>> fit.converged, round(fit.mask.diameter, 2)
     (True, 1.06)
+    >>> score = held_out_blocks(problem, block=2, n_steps=4, n_inner=15)
+    >>> control = held_out_blocks(problem.upside_down(1), block=2, n_steps=4, n_inner=15)
+    >>> other = predict_image(problem, 1, fit, n_steps=3, n_inner=10)
+    >>> [bool(one.correlation[1] > 0.7) for one in (score, control, other)]
+    [True, False, True]
     """
     _check.instance("problem", problem, JointProblem)
     n_steps = _check.integer("n_steps", n_steps, 1)
@@ -806,28 +786,6 @@ def held_out_blocks(
     Returns
     -------
     Score
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is of the wrong kind or out of range.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
-    >>> from zwfs.frames.joint import JointProblem, MapPrior, held_out_blocks
-    >>> from zwfs.frames.optics_model import Arm, MaskPair, Parameter, Picture
-    >>> pupil = Pupil.circular(12)
-    >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1.5)
-    >>> phase = 0.1 * zernike_basis(pupil, 6).sum(axis=0)
-    >>> pictures = [Picture(counts, 0, side, sigma=0.02) for side, counts in enumerate(sensor.measure(phase))]
-    >>> mask = MaskPair(diameter=Parameter.fitted(1.0))
-    >>> problem = JointProblem(pictures, [Arm()], mask, pupil.amplitude, 12, amplitude_prior=MapPrior(0.01))
-    >>> control = problem.upside_down(1)
-    >>> scores = [held_out_blocks(one, block=2, n_steps=4, n_inner=15) for one in (problem, control)]
-    >>> [bool(score.correlation[1] > 0.7) for score in scores]
-    [True, False]
     """
     _check.instance("problem", problem, JointProblem)
     fraction = _check.number("fraction", fraction, 0, 0.9, open_low=True)
@@ -863,23 +821,6 @@ def predict_image(problem: JointProblem, index: int, fit: JointFit, n_steps: int
     Returns
     -------
     Score
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
-    >>> from zwfs.frames.joint import JointProblem, MapPrior, fit_jointly, predict_image
-    >>> from zwfs.frames.optics_model import Arm, MaskPair, Parameter, Picture
-    >>> pupil = Pupil.circular(12)
-    >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1.5)
-    >>> phase = 0.1 * zernike_basis(pupil, 6).sum(axis=0)
-    >>> pictures = [Picture(counts, 0, side, sigma=0.02) for side, counts in enumerate(sensor.measure(phase))]
-    >>> mask = MaskPair(diameter=Parameter.fitted(1.0))
-    >>> problem = JointProblem(pictures, [Arm()], mask, pupil.amplitude, 12, amplitude_prior=MapPrior(0.01))
-    >>> fit = fit_jointly(problem, n_steps=3, n_inner=10, errors=False)
-    >>> score = predict_image(problem, 1, fit, n_steps=3, n_inner=10)
-    >>> bool(score.correlation[1] > 0.7)
-    True
     """
     _check.instance("problem", problem, JointProblem)
     _check.instance("fit", fit, JointFit)

@@ -46,8 +46,8 @@ class Parameter:
 
     Raises
     ------
-    TypeError, ValueError
-        If a number is of the wrong kind, or the value is outside the limits.
+    ValueError
+        If the value is outside the limits.
 
     Examples
     --------
@@ -226,11 +226,6 @@ class Picture:
         Phase that a known command adds to that of the maps.
     neighbour : (float, float), D, optional
         Distance of the other image along rows and columns. Its halo stands on this image.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is of the wrong kind, shape or range.
 
     Examples
     --------

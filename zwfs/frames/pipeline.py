@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from zwfs import _check
-from zwfs.frames.registration import Image, Recording, correlations, nearest_good, radius, record
+from zwfs.frames.registration import Image, RegisteredFrames, correlations, nearest_good, radius, register_frames
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
@@ -55,8 +55,8 @@ class Optics:
 
     Raises
     ------
-    TypeError, ValueError
-        If a value is of the wrong kind or out of range, or the phase shifts are the same or one of them is 0.
+    ValueError
+        If the phase shifts are the same or one of them is 0.
 
     Examples
     --------
@@ -112,7 +112,7 @@ class Measurement:
 
     Attributes
     ----------
-    recording : Recording
+    registered : RegisteredFrames
     optics : Optics
     intensity : ndarray, shape (2, ny', nx')
         Frames; 1 is the mean intensity of the pupil with the mask out. May be negative where there is noise.
@@ -131,7 +131,7 @@ class Measurement:
         with the mask out.
     """
 
-    recording: Recording
+    registered: RegisteredFrames
     optics: Optics
     intensity: NDArray[np.float64]
     pupil: Pupil
@@ -161,7 +161,7 @@ class Measurement:
     def surroundings(self) -> NDArray[np.bool_]:
         """Good points of the frames next to the pupil, clear of its edge, (2, ny', nx')."""
         center = self.margin + self.pupil.center[0], self.margin + self.pupil.center[1]
-        return ~self.bad & (radius(self.bad.shape[1:], center) > 0.53 * self.recording.diameter)
+        return ~self.bad & (radius(self.bad.shape[1:], center) > 0.53 * self.registered.diameter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,8 +233,8 @@ class MeasuredPhase:
         return frames[(..., *self.measurement.window)][:, self.measurement.good]
 
 
-def reduce_frames(recording: Recording, optics: Optics, margin: int | None = None) -> Measurement:
-    """Bring a recording on one grid and normalise it.
+def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | None = None) -> Measurement:
+    """Bring frames on the grid of the pupil and normalise them.
 
     The amplitude is common to both images: the mean of the clear frames, each scaled to the same flux. The light
     of the two frames is balanced where their phase shifts are opposite: the light that two such masks send into
@@ -243,7 +243,7 @@ def reduce_frames(recording: Recording, optics: Optics, margin: int | None = Non
 
     Parameters
     ----------
-    recording : Recording
+    registered : RegisteredFrames
     optics : Optics
         Of the model; here `pupil_background` is subtracted, and the balance depends on the phase shifts.
     margin : int, pixels, optional
@@ -255,52 +255,33 @@ def reduce_frames(recording: Recording, optics: Optics, margin: int | None = Non
 
     Raises
     ------
-    TypeError, ValueError
-        If a value is of the wrong kind or out of range, too much of the pupil is bad, or a clear frame is dark.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
-    >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
-    >>> from zwfs.frames.registration import record
-    >>> bench = Bench(n_pixels=40)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, bench, seed=1)
-    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
-    >>> measurement = reduce_frames(record(frames, clear_frames), optics)
-    >>> measurement.pupil.shape == measurement.good.shape
-    True
+    ValueError
+        If too much of the pupil is bad, or a clear frame is dark.
     """
-    _check.instance("recording", recording, Recording)
+    _check.instance("registered", registered, RegisteredFrames)
     _check.instance("optics", optics, Optics)
-    margin = recording.margin if margin is None else _check.integer("margin", margin, 0, recording.margin)
-    if optics.diameter > recording.diameter:
+    margin = registered.margin if margin is None else _check.integer("margin", margin, 0, registered.margin)
+    if optics.diameter > registered.diameter:
         raise ValueError(
-            f"diameter = {optics.diameter:g} lambda/D: expected at most {recording.diameter:.4g} (pixels of D)"
+            f"diameter = {optics.diameter:g} lambda/D: expected at most {registered.diameter:.4g} (pixels of D)"
         )
-    return _reduce(recording, optics, margin)
+    return _reduce(registered, optics, margin)
 
 
-def _reduce(recording: Recording, optics: Optics, margin: int) -> Measurement:
+def _reduce(registered: RegisteredFrames, optics: Optics, margin: int) -> Measurement:
     """Reduce as `reduce_frames` does, without a check: the frames may end a little before the margin does."""
-    n = recording.n_pixels
-    (frames, bad), (clear, clear_bad) = recording.frames_on_grid(margin), recording.clear_on_grid()
-    background = _backgrounds(recording) if recording.background else np.zeros(4)
+    n = registered.n_pixels
+    (frames, bad), (clear, clear_bad) = registered.frames_on_grid(margin), registered.clear_on_grid()
+    background = _backgrounds(registered) if registered.background else np.zeros(4)
     frames, clear = frames - background[:2, None, None], clear - background[2:, None, None]
-    center = recording.pupils[0].row - recording.corner[0], recording.pupils[0].column - recording.corner[1]
-    stop = radius((n, n), center) <= recording.diameter / 2
+    center = registered.pupils[0].row - registered.corner[0], registered.pupils[0].column - registered.corner[1]
+    stop = radius((n, n), center) <= registered.diameter / 2
     light = clear[:, stop].mean(axis=1)
     if np.any(light <= 0):
-        names = " and ".join(dict.fromkeys(image.name for image in recording.clear_frames))
+        names = " and ".join(dict.fromkeys(image.name for image in registered.clear_frames))
         raise ValueError(f"{names}: the pupils hold {light} counts on average: expected light")
     clear = clear - optics.pupil_background * light[:, None, None]
-    pupil, counts = measured_pupil(clear, stop, recording.diameter, center)
+    pupil, counts = measured_pupil(clear, stop, registered.diameter, center)
     inner = (..., slice(margin, margin + n), slice(margin, margin + n))
     bad[inner] |= clear_bad.any(axis=0) & pupil.inside
     good = pupil.inside & ~bad[inner].any(axis=0)
@@ -310,15 +291,15 @@ def _reduce(recording: Recording, optics: Optics, margin: int) -> Measurement:
             f"{n_bad} of the {pupil.n_points} points of the pupil are bad or saturated: "
             f"expected at most {_MOST_BAD:.0%}"
         )
-    intensity = frames / (counts[:, None, None] * recording.exposure)
+    intensity = frames / (counts[:, None, None] * registered.exposure)
     flux = intensity[inner][:, good].mean(axis=1)
     if np.any(flux <= 0):
         raise ValueError(f"the frames hold {flux} of the light of the clear frames: expected more than 0")
-    if recording.balance and optics.opposite:
+    if registered.balance and optics.opposite:
         intensity = intensity * (flux.mean() / flux)[:, None, None]
     flux = flux * counts
     ratio = flux[0] / flux[1], light[0] / light[1]
-    return Measurement(recording, optics, intensity, pupil, bad, margin, counts, background, ratio)
+    return Measurement(registered, optics, intensity, pupil, bad, margin, counts, background, ratio)
 
 
 def measured_pupil(
@@ -345,8 +326,8 @@ def measured_pupil(
 
     Raises
     ------
-    TypeError, ValueError
-        If a value is of the wrong kind or shape, or an image is dark.
+    ValueError
+        If an image is dark.
 
     Examples
     --------
@@ -390,31 +371,6 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: f
     Returns
     -------
     MeasuredPhase
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is of the wrong kind or out of range.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
-    >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
-    >>> from zwfs.frames.registration import record
-    >>> bench = Bench(n_pixels=40)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, bench, seed=1)
-    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
-    >>> measurement = reduce_frames(record(frames, clear_frames), optics)
-    >>> phase = recover_phase(measurement)
-    >>> phase.converged, phase.phase.shape == measurement.pupil.shape
-    (True, True)
     """
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     sensor = model(measurement)
@@ -438,49 +394,15 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: f
 
 
 def model(measurement: Measurement) -> ZernikeSensor:
-    """Sensor with the measured pupil, on the detector of the frames.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
-    >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, model, reduce_frames
-    >>> from zwfs.frames.registration import record
-    >>> bench = Bench(n_pixels=40)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, bench, seed=1)
-    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
-    >>> measurement = reduce_frames(record(frames, clear_frames), optics)
-    >>> model(measurement).n_masks
-    2
-    """
+    """Sensor with the measured pupil, on the detector of the frames."""
     _check.instance("measurement", measurement, Measurement)
     masks = (Dimple(measurement.optics.diameter, shift) for shift in measurement.optics.phase_shifts)
-    extent = 1 + 2 * measurement.margin / measurement.recording.diameter
+    extent = 1 + 2 * measurement.margin / measurement.registered.diameter
     return ZernikeSensor(measurement.pupil, *masks, extent=extent, tolerance=1e-6)
 
 
 def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:
-    """Frames of a measurement as those of an ideal sensor: its optics are undone. They may be negative.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames.pipeline import Optics, ideal_frames, reduce_frames
-    >>> from zwfs.frames.registration import Image, record
-    >>> bench = Bench(n_pixels=40, photons=1e8)
-    >>> pairs = bench.frames(seed=1), bench.clear_frames(seed=2)
-    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
-    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
-    >>> bool(np.array_equal(ideal_frames(measurement), measurement.intensity))
-    True
-    """
+    """Frames of a measurement as those of an ideal sensor: its optics are undone. They may be negative."""
     _check.instance("measurement", measurement, Measurement)
     return _unmix(_scaled(measurement), measurement)
 
@@ -492,25 +414,6 @@ def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[n
     reconstruction sees one frame, and the model predicts the other one from its phase.
 
     Parameters, as for `recover_phase`.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
-    >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, predict_other, reduce_frames
-    >>> from zwfs.frames.registration import record
-    >>> bench = Bench(n_pixels=40)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, bench, seed=1)
-    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
-    >>> measurement = reduce_frames(record(frames, clear_frames), optics)
-    >>> predict_other(measurement).shape
-    (2,)
     """
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     both = model(measurement)
@@ -525,21 +428,7 @@ def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[n
 
 
 def upside_down(measurement: Measurement) -> Measurement:
-    """Control of a measurement: its second frame upside down, so that the frames no longer belong together.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames.pipeline import Optics, predict_other, reduce_frames, upside_down
-    >>> from zwfs.frames.registration import Image, record
-    >>> bench = Bench(n_pixels=40, photons=1e8)
-    >>> pairs = bench.frames(seed=1), bench.clear_frames(seed=2)
-    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
-    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
-    >>> bool(np.all(predict_other(measurement) > predict_other(upside_down(measurement))))
-    True
-    """
+    """Control of a measurement: its second frame upside down, so that the frames no longer belong together."""
     _check.instance("measurement", measurement, Measurement)
     flipped: dict[str, Any] = {}
     for name in ("intensity", "bad"):
@@ -549,8 +438,8 @@ def upside_down(measurement: Measurement) -> Measurement:
 
 
 def fit(
-    recording: Recording, optics: Optics, names: Sequence[str], n_iterations: int = 25, n_steps: int = 8
-) -> tuple[Recording, Optics]:
+    registered: RegisteredFrames, optics: Optics, names: Sequence[str], n_iterations: int = 25, n_steps: int = 8
+) -> tuple[RegisteredFrames, Optics]:
     """Seek parameters of the model, and the registration, for which the modelled frames agree best.
 
     A least-squares search makes `MeasuredPhase.misfit` small. The light next to the pupil counts as much as that
@@ -558,7 +447,7 @@ def fit(
 
     Parameters
     ----------
-    recording : Recording
+    registered : RegisteredFrames
     optics : Optics
         Start of the search.
     names : sequence of str
@@ -571,39 +460,20 @@ def fit(
 
     Returns
     -------
-    Recording, Optics
+    RegisteredFrames, Optics
 
     Raises
     ------
-    TypeError, ValueError
-        If a value is of the wrong kind, a name is unknown or there twice, or `optics` begins out of the range of a
+    ValueError
+        If a name is unknown or there twice, or `optics` begins out of the range of a
         fit.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
-    >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, fit
-    >>> from zwfs.frames.registration import record
-    >>> bench = Bench(n_pixels=40)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, bench, seed=1)
-    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
-    >>> recording, fitted = fit(record(frames, clear_frames), optics, ["scale"], n_steps=2)
-    >>> bool(0.8 < fitted.scale < 1.2)
-    True
     """
-    _check.instance("recording", recording, Recording)
+    _check.instance("registered", registered, RegisteredFrames)
     _check_fit("names", names, optics)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     n_steps = _check.integer("n_steps", n_steps, 1)
     if not names:
-        return recording, optics
+        return registered, optics
     # The unknowns are values of the optics, then a shift (rows, columns) of each of these images.
     values = [name for name in names if name in _RANGES]
     images = [0, 1, 3] if "registration" in names else []
@@ -611,13 +481,13 @@ def fit(
     start = [*(getattr(optics, name) for name in values), *[0.0] * n_shifts]
     low, high, step = np.transpose([*(_RANGES[name] for name in values), *[_SHIFT_RANGE] * n_shifts])
     change = _CHANGE * step
-    margin = recording.margin  # the same in each trial, so that the number of residuals stays
+    margin = registered.margin  # the same in each trial, so that the number of residuals stays
 
-    def trial(unknowns: NDArray) -> tuple[Recording, Optics]:
-        origins = recording.origins.copy()
+    def trial(unknowns: NDArray) -> tuple[RegisteredFrames, Optics]:
+        origins = registered.origins.copy()
         origins[images] += unknowns[len(values) :].reshape(-1, 2)
         changes: dict[str, Any] = dict(zip(values, unknowns.tolist(), strict=False))
-        return replace(recording, origins=origins), replace(optics, **changes)
+        return replace(registered, origins=origins), replace(optics, **changes)
 
     def residuals(unknowns: NDArray) -> NDArray:
         # Finite differences need a smooth function, so no trial may end an iteration earlier than its neighbours.
@@ -651,19 +521,19 @@ def _check_fit(argument: str, names: Any, optics: Any) -> None:
             )
 
 
-def _backgrounds(recording: Recording) -> NDArray[np.float64]:
+def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:
     """Counts around the pupils of the clear frames, for frames and clear frames, (4,); 0 where cut."""
     levels = []
-    for index, image in enumerate(recording.clear_frames):
-        shared = recording.clear_frames[0] is recording.clear_frames[1]
-        circles = recording.pupils if shared else recording.pupils[index : index + 1]
+    for index, image in enumerate(registered.clear_frames):
+        shared = registered.clear_frames[0] is registered.clear_frames[1]
+        circles = registered.pupils if shared else registered.pupils[index : index + 1]
         far = ~image.bad
         for circle in circles:
             far &= radius(far.shape, (circle.row, circle.column)) > 0.58 * circle.diameter
         enough = np.count_nonzero(far) >= 100 and not image.cut
         levels.append(float(np.median(image.counts[far])) if enough else 0.0)
-    dark = np.array(levels) * recording.areas[2:]
-    return np.concatenate([dark * recording.exposure, dark])
+    dark = np.array(levels) * registered.areas[2:]
+    return np.concatenate([dark * registered.exposure, dark])
 
 
 def _scaled(measurement: Measurement) -> NDArray[np.float64]:
@@ -728,7 +598,7 @@ def steps(
     n_iterations : int
         As for `recover_phase`.
     **settings
-        Of `record`: pupil_centers, pupil_diameter, exposure.
+        Of `register_frames`: pupil_centers, pupil_diameter, exposure.
 
     Returns
     -------
@@ -738,44 +608,27 @@ def steps(
     Raises
     ------
     TypeError, ValueError
-        As `record`, `reduce_frames` and `fit` do.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
-    >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, steps
-    >>> bench = Bench(n_pixels=40)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, bench, seed=1)
-    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
-    >>> [step.name for step in steps(frames, clear_frames, optics, fitted=())][-1]
-    'balance of the flux'
+        As `register_frames`, `reduce_frames` and `fit` do.
     """
     _check_fit("fitted", fitted, optics)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     work = []
 
-    def add(name: str, recording: Recording, optics: Optics) -> None:
-        measurement = reduce_frames(recording, optics)
+    def add(name: str, registered: RegisteredFrames, optics: Optics) -> None:
+        measurement = reduce_frames(registered, optics)
         scores = (predict_other(one, n_iterations) for one in (measurement, upside_down(measurement)))
         work.append(Step(name, recover_phase(measurement, n_iterations), *scores))
 
     switches: dict[str, Any] = dict.fromkeys(("subpixel", "background", "balance"), False)
-    add("outlines of the pupils", record(frames, clear_frames, **settings, **switches), optics)
+    add("outlines of the pupils", register_frames(frames, clear_frames, **settings, **switches), optics)
     for switch, name in (
         ("subpixel", "registration by content"),
         ("background", "background around the pupils"),
         ("balance", "balance of the flux"),
     ):
         switches[switch] = True
-        add(name, record(frames, clear_frames, **settings, **switches), optics)
+        add(name, register_frames(frames, clear_frames, **settings, **switches), optics)
     for number, name in enumerate(fitted, 1):
         last = work[-1].result.measurement
-        add(f"fit of {name.replace('_', ' ')}", *fit(last.recording, last.optics, fitted[:number], n_iterations))
+        add(f"fit of {name.replace('_', ' ')}", *fit(last.registered, last.optics, fitted[:number], n_iterations))
     return work

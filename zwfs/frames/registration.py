@@ -1,7 +1,7 @@
 """Where the pupils stand on a camera: find them, and register them to a fraction of a pixel.
 
-The second image may be shifted, rotated and magnified with respect to the first. `record` measures all of it, and
-each image is interpolated once.
+The second image may be shifted, rotated and magnified with respect to the first. `register_frames` measures
+all of it, and each image is interpolated once.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Image:
 
     Raises
     ------
-    TypeError, ValueError
-        If a value is of the wrong kind or shape, or a count is not finite or beyond 1e38.
+    ValueError
+        If a count is not finite or beyond 1e38.
 
     Examples
     --------
@@ -131,10 +131,10 @@ class Placement:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class RegisteredFrames:
     """Two frames and two clear frames on the camera, and where the pupils stand on them.
 
-    Make one with `record`.
+    Make one with `register_frames`.
 
     Attributes
     ----------
@@ -152,24 +152,6 @@ class Recording:
     placement : Placement
         Of the second clear frame with respect to the first. Its rotation and magnification are also those of the
         second frame.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
-    >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
-    >>> from zwfs.frames.registration import record
-    >>> bench = Bench(n_pixels=40)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, bench, seed=1)
-    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> recording = record(frames, clear_frames)
-    >>> recording.frames_on_grid()[0].shape == (2, recording.n_pixels, recording.n_pixels)
-    True
     """
 
     frames: tuple[Image, Image]
@@ -257,7 +239,7 @@ class Recording:
         return counts * self.areas[which, np.newaxis, np.newaxis], bad
 
 
-def record(
+def register_frames(
     frames: Sequence[Image],
     clear_frames: Sequence[Image],
     *,
@@ -267,7 +249,7 @@ def record(
     subpixel: bool = True,
     background: bool = True,
     balance: bool = True,
-) -> Recording:
+) -> RegisteredFrames:
     """Find the pupils on the images and register these to each other.
 
     The second clear frame is registered to the first. Frames of the same format as the clear frames are taken to
@@ -290,34 +272,16 @@ def record(
     subpixel : bool
         Register to a fraction of a pixel. If not, pupils are put on each other by their outlines, to whole pixels.
     background, balance : bool
-        See `Recording`.
+        See `RegisteredFrames`.
 
     Returns
     -------
-    Recording
+    RegisteredFrames
 
     Raises
     ------
     TypeError, ValueError
         If the number of images is wrong, the pupils are not found, cut, or of different size.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
-    >>> from zwfs.frames.files import read_all
-    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
-    >>> from zwfs.frames.registration import record
-    >>> bench = Bench(n_pixels=40)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, bench, seed=1)
-    ...     frames, clear_frames, _ = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> recording = record(frames, clear_frames)
-    >>> round(recording.diameter)
-    40
     """
     diameter = None if pupil_diameter is None else _check.number("pupil_diameter", pupil_diameter, _SMALLEST)
     exposure = _check.number("exposure", exposure, 0, open_low=True)
@@ -344,7 +308,7 @@ def record(
                 raise ValueError(f"{image.name}: every pixel is {image.counts.flat[0]:.6g}: expected light")
     first = np.array([pupils[0].row, pupils[0].column])
     origins = np.array([[circle.row, circle.column] for circle in (*seen, *pupils)]) - first
-    rough = Recording(frames, clear_frames, pupils, np.round(origins), background, balance, exposure)
+    rough = RegisteredFrames(frames, clear_frames, pupils, np.round(origins), background, balance, exposure)
     return _register(rough, frames_too=moved) if subpixel else rough
 
 
@@ -444,8 +408,8 @@ def register(
 
     Raises
     ------
-    TypeError, ValueError
-        If a value is of the wrong kind or shape, or no shift of up to 6 pixels makes a maximum.
+    ValueError
+        If no shift of up to 6 pixels makes a maximum.
 
     Examples
     --------
@@ -730,19 +694,19 @@ def _extend(image: Image, circles: Sequence[Circle]) -> Image:
     return replace(image, counts=nearest_good(image.counts, ~unlit), cut=True)
 
 
-def _register(recording: Recording, frames_too: bool) -> Recording:
+def _register(registered: RegisteredFrames, frames_too: bool) -> RegisteredFrames:
     """Register the second clear frame to the first, and each frame to, or with, its clear frame."""
-    first, second = recording.pupils
+    first, second = registered.pupils
     center = np.array([first.row, first.column])
-    cut = any(image.cut for image in recording.clear_frames)
+    cut = any(image.cut for image in registered.clear_frames)
     # The outline takes part, unless software cut it out of its surroundings.
-    reach = 0.45 * recording.diameter if cut else recording.diameter / 2 + _EDGE
-    size = 2 * math.ceil(recording.diameter / 2) + 17
+    reach = 0.45 * registered.diameter if cut else registered.diameter / 2 + _EDGE
+    size = 2 * math.ceil(registered.diameter / 2) + 17
     reference, image = (
         ndimage.affine_transform(
             one.counts, (1, 1), center + np.round(origin) - (size - 1) / 2, (size, size), order=3, mode="nearest"
         )
-        for one, origin in zip(recording.clear_frames, recording.origins[2:], strict=True)
+        for one, origin in zip(registered.clear_frames, registered.origins[2:], strict=True)
     )
     placement = register(
         image,
@@ -758,15 +722,15 @@ def _register(recording: Recording, frames_too: bool) -> Recording:
         )
     shifts = np.zeros((4, 2))
     shifts[[1, 3]] = placement.shift
-    placement = replace(placement, shift=recording.origins[3] + placement.shift)
-    placed = replace(recording, origins=recording.origins + shifts, placement=placement)
+    placement = replace(placement, shift=registered.origins[3] + placement.shift)
+    placed = replace(registered, origins=registered.origins + shifts, placement=placement)
     if not frames_too:
         return placed
     (frames, _), (images, _) = placed.frames_on_grid(), placed.clear_on_grid()
     # Off the edge, which the mask makes bright or dark.
     middle = first.row - placed.corner[0], first.column - placed.corner[1]
-    inside = radius(images.shape[1:], middle) <= 0.45 * recording.diameter
+    inside = radius(images.shape[1:], middle) <= 0.45 * registered.diameter
     apart = [register(frame, image, inside).shift for frame, image in zip(frames, images, strict=True)]
     apart[1] = placement.matrix @ apart[1]
     shifts[:2] += apart
-    return replace(placed, origins=recording.origins + shifts)
+    return replace(placed, origins=registered.origins + shifts)

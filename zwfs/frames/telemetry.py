@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._files import path_of, paths_of
-from zwfs._threads import one_thread
+from zwfs._system import one_thread, path_of, paths_of
 from zwfs.frames._fits import fits_module
 from zwfs.frames._part import Cards, Part, Unit, plan_of
 from zwfs.frames._stack import Stack
@@ -135,8 +134,8 @@ def reconstruct(
         If astropy is missing.
     FileError
         A ValueError: if a file is broken, truncated, of another shape, unit or type, or lacks a keyword.
-    TypeError, ValueError
-        If an argument is of the wrong kind or out of range, `check_output` refuses the output, or something that
+    ValueError
+        If `check_output` refuses the output, or something that
         zwfs did not make has the name of the folder.
     OSError
         If there is no space for the output.
@@ -145,7 +144,7 @@ def reconstruct(
     --------
     >>> import tempfile
     >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.recording import write_bench
+    >>> from zwfs.bench.files import write_bench
     >>> from zwfs.frames import calibrate, reconstruct
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)

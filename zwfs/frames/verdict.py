@@ -1,4 +1,7 @@
-"""Whether a measured phase can be trusted: misfit over noise, a score on unseen data, and where to look."""
+"""Whether a measured phase can be trusted: misfit over noise, a score on unseen data, and where to look.
+
+The sign of the phase depends on the order of the two images, which `order_of_images` finds from one poke.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,16 @@ from scipy import ndimage
 
 from zwfs import _check
 from zwfs.bounds import cramer_rao
-from zwfs.frames.pipeline import MeasuredPhase, Measurement, model, predict_other, upside_down
-from zwfs.frames.registration import Placement, Recording, nearest_good
+from zwfs.frames.pipeline import (
+    MeasuredPhase,
+    Measurement,
+    Optics,
+    model,
+    predict_other,
+    recover_phase,
+    upside_down,
+)
+from zwfs.frames.registration import Placement, RegisteredFrames, nearest_good
 
 _NEAR = 2  # pixels from a gap, vane or edge that count as near it
 _LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
@@ -22,6 +33,7 @@ _UNEVEN = 0.03  # difference of the two flux ratios that is worth a word
 _EXCESS = 0.02  # light around the pupil, 1 = mean of the pupil, that is worth a word
 _MANY = 0.01  # of the points
 _TURNED = 5.0  # standard errors: a rotation or magnification beyond them is real
+_LEAST_SKEW = 0.5  # skewness of the change of phase: that of noise is about 0, that of one poke 1
 
 
 @dataclass(frozen=True)
@@ -32,27 +44,6 @@ class CameraNoise:
     ----------
     gain : float, electrons / count
     read_noise : float, electrons rms / pixel
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is of the wrong kind or out of range.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames.pipeline import Optics, reduce_frames
-    >>> from zwfs.frames.registration import Image, record
-    >>> from zwfs.frames.verdict import CameraNoise
-    >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
-    >>> pistons = 0.5 * np.arange(-3, 4) / 3
-    >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
-    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
-    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
-    >>> photons = CameraNoise(gain=1.0).photons(measurement)
-    >>> round(photons * measurement.pupil.n_points / bench.photons, 1)
-    1.0
     """
 
     gain: float
@@ -65,7 +56,7 @@ class CameraNoise:
     def photons(self, measurement: Measurement) -> float:
         """Photons that an intensity of 1 puts into a pixel of a frame, the mean of both images."""
         _check.instance("measurement", measurement, Measurement)
-        return float(measurement.counts.mean() * measurement.recording.exposure * self.gain)
+        return float(measurement.counts.mean() * measurement.registered.exposure * self.gain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,26 +105,27 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
     -------
     Verdict
 
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is of the wrong kind or out of range.
-
     Examples
     --------
     >>> import numpy as np
     >>> from zwfs.bench.model import Bench
     >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
-    >>> from zwfs.frames.registration import Image, record
-    >>> from zwfs.frames.verdict import judge
+    >>> from zwfs.frames.registration import Image, register_frames
+    >>> from zwfs.frames.verdict import CameraNoise, error_bar, judge
     >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
     >>> pistons = 0.5 * np.arange(-3, 4) / 3
     >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
     >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
-    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
+    >>> measurement = reduce_frames(register_frames([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
     >>> verdict = judge(recover_phase(measurement))
     >>> verdict.score.round(1), bool(np.all(verdict.score > verdict.control + 0.2))
     (array([0.9, 0.9]), True)
+    >>> photons = CameraNoise(gain=1.0).photons(measurement)
+    >>> round(photons * measurement.pupil.n_points / bench.photons, 1)
+    1.0
+    >>> sigma = error_bar(recover_phase(measurement), CameraNoise(1.0, bench.read_noise))
+    >>> round(float(np.nanmedian(sigma) * photons**0.5), 1)
+    0.6
     """
     _check.instance("result", result, MeasuredPhase)
     measurement = result.measurement
@@ -150,7 +142,7 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
         "fit": _of_fit(result, inner, edge, near),
         "unseen data": _of_score(score, control),
         "light": _of_light(measurement),
-        "registration": _of_place(measurement.recording.placement),
+        "registration": _of_place(measurement.registered.placement),
     }
     if warnings := " ".join(_warnings(result)):
         findings["warnings"] = warnings
@@ -158,28 +150,11 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
 
 
 def near_edges(measurement: Measurement) -> NDArray[np.bool_]:
-    """Points within 2 pixels of one that is dark or partly lit, (ny, nx).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames.pipeline import Optics, reduce_frames
-    >>> from zwfs.frames.registration import Image, record
-    >>> from zwfs.frames.verdict import near_edges
-    >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
-    >>> pistons = 0.5 * np.arange(-3, 4) / 3
-    >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
-    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
-    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
-    >>> near = near_edges(measurement)
-    >>> round(float(near[measurement.good].mean()), 1)  # of the good points
-    0.6
-    """
+    """Points within 2 pixels of one that is dark or partly lit, (ny, nx)."""
     _check.instance("measurement", measurement, Measurement)
     amplitude = np.where(measurement.pupil.inside, measurement.pupil.amplitude, 0)
     # Compared with its surroundings, since the pupil may be lit unevenly.
-    around = ndimage.median_filter(amplitude, max(3, round(measurement.recording.diameter / 8)))
+    around = ndimage.median_filter(amplitude, max(3, round(measurement.registered.diameter / 8)))
     return ~np.asarray(ndimage.binary_erosion(amplitude > _LIT * around, np.ones((3, 3)), iterations=_NEAR))
 
 
@@ -197,23 +172,6 @@ def error_bar(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64]:
     -------
     ndarray, shape (ny, nx), radian
         NaN outside the pupil and at bad points.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
-    >>> from zwfs.frames.registration import Image, record
-    >>> from zwfs.frames.verdict import CameraNoise, error_bar
-    >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
-    >>> pistons = 0.5 * np.arange(-3, 4) / 3
-    >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
-    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
-    >>> measurement = reduce_frames(record([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
-    >>> noise = CameraNoise(gain=1.0, read_noise=bench.read_noise)
-    >>> sigma = error_bar(recover_phase(measurement), noise)
-    >>> round(float(np.nanmedian(sigma) * noise.photons(measurement) ** 0.5), 1)
-    0.6
     """
     _check.instance("result", result, MeasuredPhase)
     _check.instance("noise", noise, CameraNoise)
@@ -238,24 +196,24 @@ def _over_noise(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64
     slopes = 2 * np.real(np.conj(waves) * 1j * field)
     normal = np.stack([slopes[1], -slopes[0]]) / np.maximum(np.hypot(*slopes), 1e-300)
     growth = np.real(np.conj(waves) * field) / np.maximum(np.abs(field) ** 2, 1e-300)
-    frames, clear = _noise_kept(measurement.recording)
+    frames, clear = _noise_kept(measurement.registered)
     dark = noise.read_noise**2 / photons
     of_frames = frames[:, np.newaxis, np.newaxis] * (np.maximum(np.abs(waves) ** 2, 0) + dark) / photons
-    exposure = measurement.recording.exposure
+    exposure = measurement.registered.exposure
     of_amplitude = clear.sum() / 4 * exposure * (np.abs(field) ** 2 + dark * exposure) / photons
     variance = np.sum(normal**2 * of_frames, axis=0) + np.sum(normal * growth, axis=0) ** 2 * of_amplitude
     misfit = (result.measured - result.modelled)[(..., *measurement.window)]
     return np.sum(normal * misfit, axis=0) / np.sqrt(np.maximum(variance, 1e-300))
 
 
-def _noise_kept(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _noise_kept(registered: RegisteredFrames) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Part of the variance of white noise that interpolation keeps, in the two frames and the clear frames."""
     rng = np.random.default_rng(0)
 
     def noise(images: Any) -> Any:
         return tuple(replace(one, counts=rng.normal(size=one.counts.shape)) for one in images)
 
-    white = replace(recording, frames=noise(recording.frames), clear_frames=noise(recording.clear_frames))
+    white = replace(registered, frames=noise(registered.frames), clear_frames=noise(registered.clear_frames))
     return white.frames_on_grid()[0].var(axis=(1, 2)), white.clear_on_grid()[0].var(axis=(1, 2))
 
 
@@ -307,7 +265,7 @@ def _of_light(measurement: Measurement) -> str:
         f"The light of image 1 is {masked:.3f} times that of image 2 behind the mask, and {clear:.3f} times "
         "without it. "
     )
-    if not (measurement.recording.balance and measurement.optics.opposite):
+    if not (measurement.registered.balance and measurement.optics.opposite):
         return facts + "The frames are not balanced."
     facts += "For opposite phase shifts the two ratios should be equal, and balancing assumes it. "
     if abs(masked / clear - 1) < _UNEVEN:
@@ -349,3 +307,100 @@ def _warnings(result: MeasuredPhase) -> list[str]:
             "look at the dark, stray light and the diameter of the dimple."
         )
     return found
+
+
+@dataclass(frozen=True)
+class ImageOrder:
+    """Result of `order_of_images`.
+
+    Attributes
+    ----------
+    optics : Optics
+        Those of the measurement, with the phase shifts in the right order.
+    exchanged : bool
+        Whether the phase shifts of the measurement were in the wrong order.
+    score, other : float
+        For the right order and for the wrong one: the sum of the cubed change of phase over that of its absolute
+        cube, times the sign of the poke. It is 1 for a change of one sign.
+    """
+
+    optics: Optics
+    exchanged: bool
+    score: float
+    other: float
+
+
+def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iterations: int = 25) -> ImageOrder:
+    """Find which image has which phase shift, from a poke of known sign.
+
+    No frame shows which image belongs to +theta and which to -theta: the exchange changes the sign of the phase
+    and nothing else. One known change decides it. Record the frames twice, the second time with one actuator or
+    segment poked by about 0.3 to 1 rad; where the poke stands need not be known.
+
+    Parameters
+    ----------
+    flat, poked : Measurement
+        From `reduce_frames`, before and after the poke, with the same optics and clear frames.
+    sign : int
+        1 if the poke lengthens the optical path, that is if it pulls a mirror away from the incoming light and so
+        raises the phase; -1 if it shortens it.
+    n_iterations : int
+        As for `recover_phase`.
+
+    Returns
+    -------
+    ImageOrder
+
+    Raises
+    ------
+    ValueError
+        If the measurements do not fit together, or the change of phase between them
+        is not that of one poke.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.frames.verdict import order_of_images
+    >>> from zwfs.frames.pipeline import Optics, reduce_frames
+    >>> from zwfs.frames.registration import Image, register_frames
+    >>> bench = Bench(n_pixels=40)
+    >>> wrong = Optics(bench.diameter, (-bench.phase, bench.phase))
+    >>> def measured(pistons):
+    ...     pairs = bench.frames(pistons), bench.clear_frames()
+    ...     frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
+    ...     return reduce_frames(register_frames([frame], [clear]), wrong)
+    ...
+    >>> poke = 0.5 * (np.arange(bench.n_segments) == 5)
+    >>> order_of_images(measured(0 * poke), measured(poke)).exchanged
+    True
+    """
+    _check.instance("flat", flat, Measurement)
+    _check.instance("poked", poked, Measurement)
+    if not (sign := _check.integer("sign", sign, -1, 1)):
+        raise ValueError("sign = 0: expected 1 or -1")
+    if flat.pupil.shape != poked.pupil.shape or flat.optics != poked.optics:
+        raise ValueError("flat and poked differ in optics or in the grid of the pupil: expected the same")
+    optics = flat.optics
+    choices = [optics, replace(optics, phase_shifts=optics.phase_shifts[::-1])]
+    scores = [
+        sign * _skewness(*(recover_phase(replace(one, optics=choice), n_iterations) for one in (flat, poked)))
+        for choice in choices
+    ]
+    best = int(np.argmax(scores))
+    score, other = scores[best], scores[1 - best]
+    if score < _LEAST_SKEW or score - other < _LEAST_SKEW:
+        raise ValueError(
+            f"flat and poked: the change of phase scores {scores[0]:.2f} and {scores[1]:.2f} for the two orders: "
+            f"expected one above {_LEAST_SKEW}, from a poke of one sign on less than half of the pupil"
+        )
+    return ImageOrder(choices[best], best == 1, score, other)
+
+
+def _skewness(flat: MeasuredPhase, poked: MeasuredPhase) -> float:
+    """How far the change of phase has one sign, in [-1, 1]; the cube weights the poke and not the noise."""
+    both = np.isfinite(flat.phase) & np.isfinite(poked.phase)
+    waves = np.exp(1j * (poked.phase - flat.phase)[both])
+    change: NDArray[np.float64] = np.angle(waves * np.exp(-1j * np.angle(waves.mean())))
+    cubes = (change - np.median(change)) ** 3
+    return float(cubes.sum() / max(np.abs(cubes).sum(), 1e-300))

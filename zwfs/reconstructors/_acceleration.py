@@ -30,21 +30,11 @@ class Path(State):
 
 @dataclass(frozen=True, eq=False)
 class Acceleration:
-    """Extrapolation of the coefficients of the reference waves from one iteration to the next.
+    """Extrapolation of the coefficients of the reference waves from one iteration to the next."""
 
-    Attributes
-    ----------
-    form : array, shape (2 r, 2 r)
-        Quadratic form of the coefficients: light that all masks together take out of the pupil.
-    lost : float
-        That light for a flat wavefront.
-    relaxation : float
-        Factor by which the change of an iteration is multiplied.
-    """
-
-    form: NDArray[np.floating]
-    lost: float
-    relaxation: float
+    form: NDArray[np.floating]  # (2 r, 2 r), light that all masks together take out of the pupil
+    lost: float  # that light for a flat wavefront
+    relaxation: float  # factor of the change by an iteration
 
     @classmethod
     def of(cls, sensor: ZernikeSensor, flat: NDArray[np.float64], remainder: float) -> Acceleration:

@@ -32,24 +32,9 @@ class Arcsine(FixedPoint):
     n_iterations, tolerance, amplitude
         As for `PhaseShifted`.
 
-    Raises
-    ------
-    ValueError
-        If the sensor has more than one mask, or an argument is out of range.
-
     References
     ----------
     Chambouleyron et al. 2024, equation (6); Steeves et al. 2020; Haffert 2024; `eq-branch` of the book.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
-    >>> truth = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 20), 0.05, 1, seed=1)[0]
-    >>> estimate = zwfs.Arcsine(sensor)(sensor.measure(truth))
-    >>> float(zwfs.reconstruction_error(pupil, estimate.phase, truth)) < 1e-3
-    True
     """
 
     n_masks = 1, 1

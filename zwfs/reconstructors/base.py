@@ -1,8 +1,8 @@
 """The base of all reconstructors: what each of them accepts and returns, and the loop of the iterative ones.
 
 A reconstructor without iteration derives from `ClosedForm` and computes a phase from frames. One that improves a
-field step by step derives from `FixedPoint`. Anything else derives from `Reconstructor`. A module in
-`zwfs.reconstructors` with such a class is all that a new method needs; `load` finds a class anywhere else.
+field step by step derives from `FixedPoint`. Anything else derives from `Reconstructor`. A new method is a module
+in `zwfs.reconstructors` with such a class, and an entry in `RECONSTRUCTORS`; `load` finds a class anywhere else.
 
 Frames arrive checked, with one batch axis: shape (k, n_masks, ny', nx') on the detector. Phases have shape
 (k, ny, nx) and are 0 outside the pupil; the base class puts NaN there.
@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind, per_kind, read_only
-from zwfs._pickle import Immutable
+from zwfs._arrays import Immutable, Kind, per_kind, read_only
 from zwfs._propagator import Propagator, amplitude_map, angle, propagator, pupil_maps, split, unit
 from zwfs.polychromatic import PolychromaticSensor
 from zwfs.sensor import Sensor, ZernikeSensor
@@ -61,18 +60,6 @@ class Reconstruction:
         Of the reconstructor.
     frames : ndarray, shape (..., n_masks, ny, nx)
         Copy of the reconstructed frames, cut to the grid of the pupil.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
-    >>> truth = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 20), 0.05, 1, seed=1)[0]
-    >>> estimate = zwfs.PhaseShifted(sensor)(sensor.measure(truth))
-    >>> estimate
-    Reconstruction(phase (32, 32), 1 of 1 converged)
-    >>> estimate.n_iterations.shape, float(estimate.residual) < 1e-5
-    ((), True)
     """
 
     phase: NDArray[np.floating]
@@ -118,14 +105,6 @@ class Settings(Immutable):
         Amplitude A_in of the incoming field, 0 outside the pupil.
     light : float
         Sum of the squared amplitude over the pupil: the light of a clear frame.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
-    >>> zwfs.PhaseShifted(sensor, n_iterations=3).settings.n_iterations
-    3
     """
 
     sensor: ZernikeSensor | PolychromaticSensor
@@ -136,13 +115,7 @@ class Settings(Immutable):
 
     @classmethod
     def checked(cls, sensor: Any, n_iterations: Any, tolerance: Any, amplitude: ArrayLike | None) -> Settings:
-        """Check the arguments; an amplitude of None is that of the sensor's pupil.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is of the wrong kind, shape or range.
-        """
+        """Check the arguments; an amplitude of None is that of the sensor's pupil."""
         _check.instance("sensor", sensor, ZernikeSensor, PolychromaticSensor)
         n_iterations = _check.integer("n_iterations", n_iterations, 1, _MOST_ITERATIONS)
         tolerance = _check.number("tolerance", tolerance, 0)
@@ -229,17 +202,6 @@ class Reconstructor(Immutable, ABC):
         Whether the method accepts a `PolychromaticSensor`; class attribute.
     any_library : bool
         Whether `solve` accepts arrays of any library. If not, frames become arrays of NumPy. Class attribute.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is of the wrong kind, shape or range, or the sensor has too few or too many masks.
-
-    Examples
-    --------
-    >>> import zwfs
-    >>> issubclass(zwfs.PhaseShifted, zwfs.reconstructors.base.Reconstructor)
-    True
     """
 
     n_masks: ClassVar[tuple[int, float]] = (1, math.inf)
@@ -308,8 +270,8 @@ class Reconstructor(Immutable, ABC):
 
         Raises
         ------
-        TypeError, ValueError
-            If frames or start are of the wrong shape, complex or not finite, or no pixel of a frame is above 0.
+        ValueError
+            If no pixel of a frame is above 0.
 
         Warns
         -----
@@ -438,12 +400,6 @@ class FixedPoint(Reconstructor):
     receive the `constants` of the arrays' kind: those of `Propagator`, unless the subclass computes others.
 
     Parameters are those of `Reconstructor`; with a tolerance of 0 all iterations are done.
-
-    Examples
-    --------
-    >>> import zwfs
-    >>> issubclass(zwfs.Arcsine, zwfs.reconstructors.base.FixedPoint)
-    True
     """
 
     any_library = True
@@ -531,16 +487,7 @@ def _small(change: NDArray, limit: float, xp: Any) -> NDArray[np.bool_]:
 
 
 def pieces(frames: NDArray, kind: Kind, size: int | None = None) -> Iterator[slice]:
-    """Slices of frames (n, ...) that are handled together.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs._arrays import Kind
-    >>> from zwfs.reconstructors.base import pieces
-    >>> list(pieces(np.ones((5, 1, 8, 8)), Kind.numpy(), size=2))
-    [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
-    """
+    """Slices of frames (n, ...) that are handled together."""
     if size is None:
         chunk = _CHUNK if kind.on_host else _CHUNK_ELSEWHERE
         size = max(1, chunk // prod(frames.shape[1:]))
@@ -561,20 +508,6 @@ def check_frames(
         Name of the frames in error messages.
     light : float
         Sum of a clear frame over the pupil. Frames that are more than 10 times as bright cause a warning.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the frames are of the wrong shape, complex or not finite, or no pixel of a frame is above 0.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
-    >>> frames, batch = zwfs.reconstructors.base.check_frames(sensor, np.ones((5, 1, 32, 32)))
-    >>> frames.shape, batch
-    ((5, 1, 32, 32), (5,))
     """
     frames = _check.real_any(name, frames)
     shape = (sensor.n_masks, *sensor.detector_shape)
@@ -614,22 +547,7 @@ def _warn_of_counts(sensor: Sensor, name: str, frames: NDArray, light: float) ->
 def check_phase(
     name: str, phase: ArrayLike, sensor: Sensor, batch: tuple[int, ...], kind: Kind
 ) -> NDArray[np.floating]:
-    """Check one phase, or one for each frame set, and return one for each: (k, ny, nx), 0 outside the pupil.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the phase is complex, of the wrong shape, not finite inside the pupil, or on another device.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> from zwfs._arrays import Kind
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
-    >>> zwfs.reconstructors.base.check_phase("start", 0 * pupil.amplitude, sensor, (2,), Kind.numpy()).shape
-    (2, 32, 32)
-    """
+    """Check one phase, or one for each frame set, and return one for each: (k, ny, nx), 0 outside the pupil."""
     shape = sensor.pupil.shape
     maps, own_batch = pupil_maps(name, phase, sensor)
     if own_batch not in ((), batch):

@@ -43,14 +43,16 @@ class Linear(ClosedForm):
 
     Attributes
     ----------
+    modes : ndarray, shape (n_modes, n_points)
+        At the points of the pupil.
     interaction_matrix : ndarray, shape (n_masks * n_points, n_modes), 1 / radian
     n_inverted : int
         Singular values above the conditioning.
 
     Raises
     ------
-    TypeError, ValueError
-        If an argument is of the wrong kind, shape or range, or if there are more modes than measurements.
+    ValueError
+        If the sensor sees none of the modes.
 
     References
     ----------
@@ -81,7 +83,7 @@ class Linear(ClosedForm):
         calibration: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
     ) -> None:
         super().__init__(sensor, amplitude=amplitude)
-        self._modes = _check.modes("modes", modes, sensor.pupil)
+        self.modes = _check.modes("modes", modes, sensor.pupil)
         poke = _check.number("poke", poke, 1e-10, np.pi)
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
         flat = np.zeros(sensor.pupil.shape) if reference is None else reference
@@ -90,36 +92,21 @@ class Linear(ClosedForm):
             self._light = math.inf
         signal, difference = self._simulated(poke) if calibration is None else self._recorded(calibration)
         self._reference_signal = signal
-        self._matrix = read_only(difference.T / (2 * poke))
-        u, strength, vt = np.linalg.svd(self._matrix, full_matrices=False)
+        self.interaction_matrix = read_only(difference.T / (2 * poke))
+        u, strength, vt = np.linalg.svd(self.interaction_matrix, full_matrices=False)
         # A frame of unit intensity is rounded at 1e-16, which the poke divides.
         if strength[0] <= 1e-14 * np.sqrt(len(u)) / poke:
             around = "" if reference is None else " around the reference"
             raise ValueError(f"modes: the sensor sees none of them{around}: expected modes other than piston")
-        self._n_inverted = int(np.count_nonzero(strength > conditioning * strength[0]))
-        kept = slice(0, self._n_inverted)
+        self.n_inverted = int(np.count_nonzero(strength > conditioning * strength[0]))
+        kept = slice(0, self.n_inverted)
         self._inverse = (vt[kept].T / strength[kept]) @ u[:, kept].T
-
-    @property
-    def modes(self) -> NDArray[np.float64]:
-        """Modes at the points of the pupil, shape (n_modes, n_points)."""
-        return self._modes
-
-    @property
-    def interaction_matrix(self) -> NDArray[np.float64]:
-        """Response of the frames to each mode, shape (n_masks * n_points, n_modes), 1 / radian."""
-        return self._matrix
-
-    @property
-    def n_inverted(self) -> int:
-        """Number of singular values above the conditioning."""
-        return self._n_inverted
 
     def invert(self, frames: NDArray) -> tuple[NDArray, int]:
         """Return the phase of the modes that explain the difference to the frames of the reference best."""
         coefficients = (self._signal(frames) - self._reference_signal) @ self._inverse.T
         pupil = self.sensor.pupil
-        return pupil.scatter(coefficients @ self._modes + pupil.gather(self._reference), fill=0), 0
+        return pupil.scatter(coefficients @ self.modes + pupil.gather(self._reference), fill=0), 0
 
     def _before(self) -> NDArray[np.float64]:
         return self._reference
@@ -127,8 +114,8 @@ class Linear(ClosedForm):
     def _simulated(self, poke: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Signal of the reference phase, and push less pull of each mode, (n_modes, n_masks * n_points)."""
         pupil = self.sensor.pupil
-        difference = np.empty((len(self._modes), self.sensor.n_masks * pupil.n_points))
-        for row, mode in zip(difference, self._modes, strict=True):
+        difference = np.empty((len(self.modes), self.sensor.n_masks * pupil.n_points))
+        for row, mode in zip(difference, self.modes, strict=True):
             push = pupil.scatter(np.stack([poke * mode, -poke * mode]), fill=0)
             pushed, pulled = self._signal(self._model(self._reference + push))
             np.subtract(pushed, pulled, out=row)
@@ -147,8 +134,8 @@ class Linear(ClosedForm):
         for name, frames, n_frames in (("flat", flat, 1), ("pushed", pushed, None), ("pulled", pulled, None)):
             name = f"calibration {name}"
             checked, batch = check_frames(self.sensor, _check.real_array(name, frames), name)
-            if len(checked) != (n_frames or len(self._modes)):
-                raise ValueError(f"{name} has a batch of {batch}: expected {n_frames or len(self._modes)}")
+            if len(checked) != (n_frames or len(self.modes)):
+                raise ValueError(f"{name} has a batch of {batch}: expected {n_frames or len(self.modes)}")
             signals.append(self._signal(checked.astype(np.float64)))
         return signals[0][0], signals[1] - signals[2]
 

@@ -6,18 +6,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from math import prod
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Kind, read_only
-from zwfs._information import Inverse, Response
+from zwfs._information import Response
 from zwfs._likelihood import Estimator, Noise, require_information, require_one_wavelength, tangents
 from zwfs._propagator import Propagator, angle, parts_sum, split, square
 from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.polychromatic import PolychromaticSensor
+from zwfs.reconstructors._fit import Fit, Hessian, Slopes, linear_field, points_step, reflected, turned
 from zwfs.reconstructors.arcsine import Arcsine
 from zwfs.reconstructors.base import FixedPoint, Reconstruction, Reconstructor, Solution, pieces
 from zwfs.reconstructors.phase_shifted import PhaseShifted
@@ -38,7 +38,6 @@ _REFLECTIONS = 3  # largest number of times that points of one start are reflect
 _GAIN = 0.01  # of twice the logarithm of the likelihood, from which on a reflection counts
 _GAIN_TURN = 10.0  # the same, from which on a point is turned by 2 pi: a smooth phase is more probable
 _LINEAR_ITERATIONS = 5  # of the start of an unknown amplitude
-_RIDGE = 1e-6  # of the normal equations at points whose reference waves vanish
 _SIGMAS = 5.0  # excess of the misfit, in its standard deviations, up to which noise explains it
 
 
@@ -64,16 +63,6 @@ class LikelihoodReconstruction(Reconstruction):
         Number of starts that were tried.
     estimator : Estimator
         Unknowns and noise, from which `sigma` is computed.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
-    >>> truth = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 20), 0.05, 1, seed=1)[0]
-    >>> estimate = zwfs.MaximumLikelihood(sensor)(sensor.measure(truth))
-    >>> bool(estimate.consistent), estimate.sigma.shape
-    (True, (32, 32))
     """
 
     amplitude: NDArray[np.floating] | None
@@ -194,10 +183,9 @@ class MaximumLikelihood(Reconstructor):
 
     Raises
     ------
-    TypeError, ValueError
-        If an argument is of the wrong kind, shape or range; if there is read noise or a prior without a number of
-        photons, or a prior without modes; if the prior is not positive definite; or if the masks do not determine
-        the unknowns.
+    ValueError
+        If there is read noise or a prior without a number of photons, or a prior without modes, or if the masks do
+        not determine the unknowns.
 
     References
     ----------
@@ -257,12 +245,12 @@ class MaximumLikelihood(Reconstructor):
             Estimator(Response.of(one), noise, unknown, basis, precision) for one in (sensor, rough)
         )
         self._first = self._first_method()
-        self._slopes = None if basis is None else _Slopes.of(pupil.inside, basis)
+        self._slopes = None if basis is None else Slopes.of(pupil.inside, basis)
         self._smooth: NDArray[np.float64] | None = None
         if basis is None and isinstance(sensor, PolychromaticSensor):
             smooth = zernike_basis(pupil, min(_UNWRAPPED_MODES, pupil.n_points - 1))
             self._smooth = read_only(np.where(pupil.inside, smooth, 0))
-            self._slopes = _Slopes.of(pupil.inside, self._smooth)
+            self._slopes = Slopes.of(pupil.inside, self._smooth)
         n_low = min(_KICK_MODES, pupil.n_points - 1)
         self._kicks: NDArray[np.float64] = np.zeros((0, *pupil.shape))
         if n_starts > 1 and n_low:
@@ -307,13 +295,13 @@ class MaximumLikelihood(Reconstructor):
         """Return the phase that makes the frames most likely."""
         return self._solution(self._fit(frames, start, history), Kind.of(frames))
 
-    def _solution(self, fit: _Fit, kind: Kind) -> Solution:
+    def _solution(self, fit: Fit, kind: Kind) -> Solution:
         xp, history = kind.xp, fit.history
         phase = xp.astype(self._phase(fit) if history is None else history[:, -1, ...], kind.dtype)
         history = None if history is None else xp.astype(history, kind.dtype)
         return Solution(phase, fit.n_iterations, fit.converged, 0 * fit.n_iterations, history)
 
-    def _fit(self, frames: NDArray, start: NDArray | None, history: bool) -> _Fit:
+    def _fit(self, frames: NDArray, start: NDArray | None, history: bool) -> Fit:
         """Fit all frame sets, in double precision."""
         kind = Kind.of(frames)
         frames = kind.xp.astype(frames, kind.xp.float64)
@@ -322,9 +310,9 @@ class MaximumLikelihood(Reconstructor):
             self._search(frames[piece, ...], None if start is None else start[piece, ...], history)
             for piece in pieces(frames, kind, 1 if history else None)
         ]
-        return _Fit.joined(fits, kind.xp)
+        return Fit.joined(fits, kind.xp)
 
-    def _search(self, frames: NDArray, start: NDArray | None, history: bool) -> _Fit:
+    def _search(self, frames: NDArray, start: NDArray | None, history: bool) -> Fit:
         """Fit from start after start, until every frame set is explained or the starts are used up."""
         xp = Kind.of(frames).xp
         fit = self._descend(frames, self._rough_phase(frames, None) if start is None else start, history)
@@ -358,7 +346,7 @@ class MaximumLikelihood(Reconstructor):
         smooth = kind.xp.reshape(self._slopes.fit(phase, kind) @ flat, phase.shape)
         return phase - 2 * np.pi * kind.xp.round((phase - smooth) / (2 * np.pi))
 
-    def _other_start(self, attempt: int, fit: _Fit) -> NDArray:
+    def _other_start(self, attempt: int, fit: Fit) -> NDArray:
         """Phase from which the next attempt begins, (k, ny, nx); it depends on no other frame set."""
         kind, some = Kind.of(fit.psi), 0 * fit.psi[:, 0, ...]
         kick = kind.array(self._kicks[attempt - 1])
@@ -366,7 +354,7 @@ class MaximumLikelihood(Reconstructor):
             return (angle(fit.psi, kind.xp) if fit.phase is None else fit.phase) + kick
         return self._rough_phase(fit.frames, some + _SHIFT * kick)
 
-    def _descend(self, frames: NDArray, start: NDArray, history: bool) -> _Fit:
+    def _descend(self, frames: NDArray, start: NDArray, history: bool) -> Fit:
         """Take steps from one start. Frame sets that are done leave, so no result depends on the others."""
         kind, n_iterations = Kind.of(frames), self.settings.n_iterations
         xp = kind.xp
@@ -388,9 +376,9 @@ class MaximumLikelihood(Reconstructor):
             fit.history = xp.stack(path + path[-1:] * (n_iterations + 1 - len(path)), axis=1)
         ended.append((places, fit))
         order = xp.argsort(xp.concat([some for some, _ in ended]))
-        return _Fit.joined([part for _, part in ended], xp).at(order)
+        return Fit.joined([part for _, part in ended], xp).at(order)
 
-    def _begin(self, frames: NDArray, start: NDArray) -> _Fit:
+    def _begin(self, frames: NDArray, start: NDArray) -> Fit:
         """Return the fit at a starting phase, (k, ny, nx)."""
         kind, k = Kind.of(frames), frames.shape[0]
         model, coefficients = self.settings.model(kind), None
@@ -399,7 +387,7 @@ class MaximumLikelihood(Reconstructor):
             start = self._of_modes(coefficients)
         psi = model.incoming(start)
         for _ in range(_LINEAR_ITERATIONS if self._exact.unknown_amplitude else 0):
-            psi = _linear_field(frames, psi, model)
+            psi = linear_field(frames, psi, model)
         fit = self._at(psi, coefficients, frames, None if self._smooth is None else start)
         zeros = kind.integers([0] * k)
         fit.damping, fit.growth = _DAMPING + kind.zeros(k), _GROWTH + kind.zeros(k)
@@ -408,7 +396,7 @@ class MaximumLikelihood(Reconstructor):
 
     def _at(
         self, psi: NDArray, coefficients: NDArray | None, frames: NDArray, phase: NDArray | None = None
-    ) -> _Fit:
+    ) -> Fit:
         """Return the model of the frames at a field, and its cost."""
         waves = self.settings.model(Kind.of(psi)).propagate(psi)
         light = square(waves)
@@ -416,9 +404,9 @@ class MaximumLikelihood(Reconstructor):
         if coefficients is not None and self._exact.precision is not None:
             precision = Kind.of(cost).array(self._exact.precision)
             cost = cost + Kind.of(cost).xp.vecdot(coefficients @ precision, coefficients)
-        return _Fit(frames, psi, waves, light, cost, coefficients, phase)
+        return Fit(frames, psi, waves, light, cost, coefficients, phase)
 
-    def _step(self, fit: _Fit) -> None:
+    def _step(self, fit: Fit) -> None:
         """Try a step (`eq-step`) on every frame set; take it where the cost falls.
 
         The next step is about the square of this one. Where that square is within the tolerance, the next step is
@@ -443,7 +431,7 @@ class MaximumLikelihood(Reconstructor):
         fit.converged = size <= last
         fit.n_iterations = fit.n_iterations + 1
 
-    def _hessian(self, fit: _Fit) -> _Hessian:
+    def _hessian(self, fit: Fit) -> Hessian:
         """Damped information at the field of a fit."""
         estimator, kind = self._exact, Kind.of(fit.psi)
         xp = kind.xp
@@ -452,15 +440,15 @@ class MaximumLikelihood(Reconstructor):
         scale = information.scale[:, 0, 0]
         if estimator.modes is None:
             absolute = fit.damping[:, np.newaxis, np.newaxis] * information.scale
-            return _Hessian(scale, absolute, information.inverse(absolute))
+            return Hessian(scale, absolute, information.inverse(absolute))
         modes = kind.array(estimator.modes)
         matrix = self._rough.of_modes(information)
         eye = kind.array(np.eye(modes.shape[0]))
         absolute = (fit.damping * xp.sum(matrix * eye, axis=(1, 2)) / modes.shape[0])[:, np.newaxis, np.newaxis]
-        return _Hessian(scale, absolute, matrix + absolute * eye)
+        return Hessian(scale, absolute, matrix + absolute * eye)
 
     def _try(
-        self, fit: _Fit, hessian: _Hessian, some: NDArray[np.bool_]
+        self, fit: Fit, hessian: Hessian, some: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], NDArray, NDArray]:
         """Take a step on some frame sets, (k,), where the cost falls.
 
@@ -479,7 +467,7 @@ class MaximumLikelihood(Reconstructor):
         gradient = self._gradient(fit, change)
         coefficients, phase = fit.coefficients, fit.phase
         if coefficients is None:
-            step, promised = _points_step(hessian, gradient)
+            step, promised = points_step(hessian, gradient)
         else:
             jump, promised = self._modes_step(hessian, gradient, coefficients)
             coefficients = coefficients + jump
@@ -489,28 +477,28 @@ class MaximumLikelihood(Reconstructor):
         elif coefficients is not None:
             psi = model.incoming(self._of_modes(coefficients))
         elif phase is not None:
-            phase = phase + 2 * xp.atan(step[:, 0, ...] / 2)  # the angle of `_turned`
+            phase = phase + 2 * xp.atan(step[:, 0, ...] / 2)  # the angle of `turned`
             psi = model.incoming(phase)
         else:
-            psi = _turned(fit.psi, step[:, 0, ...], xp)
+            psi = turned(fit.psi, step[:, 0, ...], xp)
         trial = self._at(psi, coefficients, fit.frames, phase)
         better = some & (trial.cost < fit.cost)
         fit.take(better, trial, xp)
         return better, promised, xp.sqrt(xp.sum(step * step, axis=(1, 2, 3)) / model.pupil.n_points)
 
-    def _gradient(self, fit: _Fit, change: NDArray) -> NDArray:
+    def _gradient(self, fit: Fit, change: NDArray) -> NDArray:
         """Half the gradient of the cost for changes of the field (k, c, 2, ny, nx): (k, c, ny, nx)."""
         weights, difference = self._exact.noise.weights(fit.light), fit.light - fit.frames
         weighted = difference if weights is None else weights * difference
         back = self.settings.model(Kind.of(fit.psi)).adjoint(fit.waves * weighted[:, :, np.newaxis, ...])
         return 2 * parts_sum(change * back[:, np.newaxis, ...])
 
-    def _tangents(self, fit: _Fit) -> NDArray:
+    def _tangents(self, fit: Fit) -> NDArray:
         """Change of the field per unit of the unknowns, (k, c, 2 n_wavelengths, ny, nx)."""
         model = self.settings.model(Kind.of(fit.psi))
         return tangents(fit.psi, model.stop, self._exact.unknown_amplitude, model.kind.xp, model.channels.ratios)
 
-    def _reflect(self, fit: _Fit) -> None:
+    def _reflect(self, fit: Fit) -> None:
         """Try to leave local minima of single points, where frame sets have converged.
 
         The intensity of a point depends on the angle between its field psi and the reference wave r of a mask. Its
@@ -539,7 +527,7 @@ class MaximumLikelihood(Reconstructor):
         part.n_reflections = part.n_reflections + 1
         fit.put(some, part)
 
-    def _best_points(self, fit: _Fit, gain: NDArray) -> tuple[NDArray, None, NDArray, NDArray | None]:
+    def _best_points(self, fit: Fit, gain: NDArray) -> tuple[NDArray, None, NDArray, NDArray | None]:
         """Arguments of `_at` for the field in which points take another phase that is more likely by `gain`."""
         xp, noise, window = Kind.of(fit.psi).xp, self._exact.noise, self.sensor.window
         frames = fit.frames[(..., *window)]
@@ -553,18 +541,18 @@ class MaximumLikelihood(Reconstructor):
             least = xp.where(better, terms, least)
         return psi, None, fit.frames, phase
 
-    def _other_points(self, fit: _Fit, references: NDArray) -> Iterator[tuple[NDArray, NDArray | None]]:
+    def _other_points(self, fit: Fit, references: NDArray) -> Iterator[tuple[NDArray, NDArray | None]]:
         """Fields whose points may be more likely than those of a fit, and their phases in a band of light."""
         if fit.phase is None:
             for mask in range(self.sensor.n_masks):
-                yield _reflected(fit.psi, references[:, mask, ...]), None
+                yield reflected(fit.psi, references[:, mask, ...]), None
             return
         model = self.settings.model(Kind.of(fit.psi))
         for turn in (2 * np.pi, -2 * np.pi):
             phase = fit.phase + turn
             yield model.incoming(phase), phase
 
-    def _modes_step(self, hessian: _Hessian, gradient: NDArray, coefficients: NDArray) -> tuple[NDArray, NDArray]:
+    def _modes_step(self, hessian: Hessian, gradient: NDArray, coefficients: NDArray) -> tuple[NDArray, NDArray]:
         """Step of the coefficients, (k, m), and the fall of the cost that it promises, (k,)."""
         kind = Kind.of(gradient)
         xp, modes = kind.xp, kind.array(self._exact.modes)
@@ -574,7 +562,7 @@ class MaximumLikelihood(Reconstructor):
         step = -xp.linalg.solve(hessian.inverse, slope[..., np.newaxis])[..., 0]
         return step, xp.vecdot(step, hessian.damping[:, 0, ...] * step - slope)
 
-    def _phase(self, fit: _Fit) -> NDArray:
+    def _phase(self, fit: Fit) -> NDArray:
         """Phase of fits, (k, ny, nx)."""
         if fit.coefficients is not None:
             return self._of_modes(fit.coefficients)
@@ -592,7 +580,7 @@ class MaximumLikelihood(Reconstructor):
             return len(self._exact.modes)
         return (1 + self._exact.unknown_amplitude) * self.sensor.pupil.n_points - 1  # no frame shows the piston
 
-    def _chi2(self, fit: _Fit) -> NDArray:
+    def _chi2(self, fit: Fit) -> NDArray:
         """Reduced chi-square, (k,)."""
         xp = Kind.of(fit.light).xp
         if self._exact.noise.photons is None:
@@ -601,7 +589,7 @@ class MaximumLikelihood(Reconstructor):
         freedom = expected - self._n_unknowns()
         return xp.where(freedom > 0, misfit, np.nan) / freedom
 
-    def _explained(self, fit: _Fit) -> NDArray[np.bool_]:
+    def _explained(self, fit: Fit) -> NDArray[np.bool_]:
         """Whether the noise explains the misfit, (k,)."""
         xp = Kind.of(fit.light).xp
         if self._exact.noise.photons is None:
@@ -610,7 +598,7 @@ class MaximumLikelihood(Reconstructor):
         freedom = xp.clip(expected - self._n_unknowns(), 0, None)
         return misfit <= freedom + _SIGMAS * xp.sqrt(variance)
 
-    def _noise_variance(self, fit: _Fit) -> NDArray:
+    def _noise_variance(self, fit: Fit) -> NDArray:
         """Variance by which the inverse of the information is multiplied, (k,): 1 with a number of photons."""
         if self._exact.noise.photons is not None:
             return 1 + 0 * fit.cost
@@ -630,138 +618,6 @@ class MaximumLikelihood(Reconstructor):
             )
         except ValueError:  # such as the same mask twice, which still determines a phase as one mask does
             return None
-
-
-@dataclass
-class _Fit:
-    """State of the fits of k frame sets."""
-
-    frames: NDArray[np.floating]  # (k, n_masks, ny', nx'), measured
-    psi: NDArray[np.floating]  # (k, 2 n_wavelengths, ny, nx), field in the pupil
-    waves: NDArray[np.floating]  # (k, n_masks, 2 n_wavelengths, ny', nx'), its fields on the detector
-    light: NDArray[np.floating]  # (k, n_masks, ny', nx'), their intensity
-    cost: NDArray[np.floating]  # (k,), twice the negative logarithm of the likelihood and of the prior
-    coefficients: NDArray[np.floating] | None = None  # (k, m), of the modes
-    phase: NDArray[np.floating] | None = None  # (k, ny, nx), in a band of light: not wrapped
-    damping: Any = None  # (k,), relative to the mean of the diagonal of the information
-    growth: Any = None  # (k,), of the damping after a step that raises the cost
-    n_iterations: Any = None  # (k,)
-    converged: Any = None  # (k,)
-    n_starts: Any = None  # (k,)
-    n_reflections: Any = None  # (k,)
-    history: NDArray[np.floating] | None = None  # (k, n_iterations + 1, ny, nx)
-
-    def at(self, which: NDArray) -> _Fit:
-        """Return the fits of some frame sets, by their places or by flags."""
-        return _Fit(**{name: array[which] for name, array in self._arrays()})
-
-    def take(self, where: NDArray[np.bool_], other: _Fit, xp: Any) -> None:
-        """Replace the arrays by those that other fits of the same frame sets have, where flags (k,) are True."""
-        for name, array in other._arrays():
-            if not xp.all(where):
-                flags = xp.reshape(where, (-1, *(1,) * (array.ndim - 1)))
-                array = xp.where(flags, array, getattr(self, name))
-            setattr(self, name, array)
-
-    def put(self, which: NDArray[np.bool_], part: _Fit) -> None:
-        """Write the fits of some frame sets to their places."""
-        for name, array in part._arrays():
-            whole = getattr(self, name)
-            whole = Kind.of(whole).xp.asarray(whole, copy=True)
-            whole[which] = array
-            setattr(self, name, whole)
-
-    @classmethod
-    def joined(cls, fits: list[_Fit], xp: Any) -> _Fit:
-        """Return the fits of several batches as those of one."""
-        if len(fits) == 1:
-            return fits[0]
-        return cls(**{name: xp.concat([getattr(fit, name) for fit in fits]) for name, _ in fits[0]._arrays()})
-
-    def _arrays(self) -> list[tuple[str, Any]]:
-        return [(name, array) for name, array in vars(self).items() if array is not None]
-
-
-class _Slopes(NamedTuple):
-    """Fit of modes to a phase that is known up to multiples of 2 pi: their differences between neighbours fit."""
-
-    pairs_y: NDArray[np.bool_]  # (ny - 1, nx), whether a point and the next one along y are both inside
-    pairs_x: NDArray[np.bool_]  # (ny, nx - 1)
-    inverse: NDArray[np.float64]  # (m, n_pairs), from differences to coefficients
-
-    @classmethod
-    def of(cls, inside: NDArray[np.bool_], modes: NDArray[np.float64]) -> _Slopes:
-        pairs_y, pairs_x = inside[1:] & inside[:-1], inside[:, 1:] & inside[:, :-1]
-        slopes = np.concatenate([np.diff(modes, axis=1)[:, pairs_y], np.diff(modes, axis=2)[:, pairs_x]], axis=1)
-        return cls(pairs_y, pairs_x, np.linalg.pinv(slopes.T, rcond=1e-10))
-
-    def fit(self, phase: NDArray, kind: Kind) -> NDArray:
-        """Coefficients of phases: (k, ny, nx) to (k, m)."""
-        xp, k = kind.xp, phase.shape[0]
-        along_y, along_x = phase[:, 1:, :] - phase[:, :-1, :], phase[:, :, 1:] - phase[:, :, :-1]
-        slopes = xp.concat([
-            xp.reshape(slope, (k, -1))[:, kind.flags(pairs.ravel())]
-            for slope, pairs in ((along_y, self.pairs_y), (along_x, self.pairs_x))
-        ], axis=1)  # fmt: skip
-        return xp.atan2(xp.sin(slopes), xp.cos(slopes)) @ kind.array(self.inverse).T
-
-
-class _Hessian(NamedTuple):
-    """Damped information of k frame sets."""
-
-    scale: NDArray  # (k,), mean over the pupil of the information about the phase
-    damping: NDArray  # (k, 1, 1), added to the diagonal
-    inverse: Inverse | NDArray  # for points; for modes the damped matrices themselves, (k, m, m)
-
-
-def _points_step(hessian: _Hessian, gradient: NDArray) -> tuple[NDArray, NDArray]:
-    """Step at every point, (k, c, ny, nx), and the fall of the cost that it promises, (k,)."""
-    xp = Kind.of(gradient).xp
-    slopes = [gradient[:, c, ...] for c in range(gradient.shape[1])]
-    step = -xp.stack(hessian.inverse @ slopes, axis=1)
-    promised = hessian.damping[..., np.newaxis] * step - gradient
-    return step, xp.sum(step * promised, axis=(1, 2, 3))
-
-
-def _linear_field(frames: NDArray, psi: NDArray, model: Propagator) -> NDArray:
-    """Field that explains the frames best if the reference waves are those of another field, (k, 2, ny, nx).
-
-    With reference waves r_k the frames I_k = P + 2 Re(conj(r_k) psi) + |r_k|^2 are linear in P = |psi|^2 and psi
-    (`eq-linear-field`). Three different masks or more determine both.
-    """
-    xp, light = model.kind.xp, frames[(..., *model.window)]
-    waves = model.reference(psi)
-    rows = xp.stack([1 + 0 * light, 2 * waves[:, :, 0, ...], 2 * waves[:, :, 1, ...]], axis=1)
-    rows = xp.permute_dims(rows, (0, 3, 4, 1, 2))  # (k, ny, nx, 3, n_masks)
-    right = xp.permute_dims(light - square(waves), (0, 2, 3, 1))[..., np.newaxis]
-    normal = rows @ xp.matrix_transpose(rows) + _RIDGE * model.kind.array(np.eye(3))
-    solved = xp.linalg.solve(normal, rows @ right)[..., 0]
-    modulus = xp.sqrt(xp.clip(solved[..., 0], 0, None))
-    return split(xp.atan2(solved[..., 2], solved[..., 1]), modulus) * model.stop
-
-
-def _reflected(psi: NDArray, reference: NDArray) -> NDArray:
-    """Field (k, 2, ny, nx) reflected at the direction of another, r^2 conj(psi) / |r|^2."""
-    xp = Kind.of(psi).xp
-    real, imag = reference[:, 0, ...], reference[:, 1, ...]
-    power = real * real + imag * imag + _NOTHING
-    cos, sin = (real * real - imag * imag) / power, 2 * real * imag / power
-    return xp.stack(
-        [cos * psi[:, 0, ...] + sin * psi[:, 1, ...], sin * psi[:, 0, ...] - cos * psi[:, 1, ...]], axis=1
-    )
-
-
-def _turned(psi: NDArray, by: NDArray, xp: Any) -> NDArray:
-    """Field (k, 2, ny, nx) turned by about a phase (k, ny, nx), for small ones exactly by it.
-
-    The factor (1 + i x / 2) / (1 - i x / 2) has modulus 1 and the argument 2 arctan(x / 2) = x - x^3 / 12 + ... It
-    costs less than exp(i x), and shortens steps that are too long for the quadratic model.
-    """
-    real, imag = psi[:, 0, ...], psi[:, 1, ...]
-    half = 0.5 * by
-    sin = by / (1 + half * half)
-    cos = 1 - half * sin
-    return xp.stack([cos * real - sin * imag, sin * real + cos * imag], axis=1)
 
 
 def _precision(prior: ArrayLike | None, modes: NDArray | None, noise: Noise) -> NDArray[np.float64] | None:

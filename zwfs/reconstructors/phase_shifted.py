@@ -61,8 +61,8 @@ class PhaseShifted(FixedPoint):
     Raises
     ------
     ValueError
-        If the sensor has fewer than two masks, or if for a flat wavefront the determinant of equation (10)
-        vanishes everywhere: masks that are the same to a phase shift of 0 mod 2 pi, or the pair (0, pi).
+        If for a flat wavefront the determinant of equation (10) vanishes everywhere: masks that are the same to a
+        phase shift of 0 mod 2 pi, or the pair (0, pi).
 
     References
     ----------
@@ -266,20 +266,11 @@ class _SharedWave:
 
     The linear system of every point then is the same, and its solution is psi conj(B) = |B|^2 + signal, with a
     signal that the frames give once and for all (`eq-shared-wave`).
-
-    Attributes
-    ----------
-    core : ndarray of complex, shape (q, r)
-        Turns coefficients of the field into those of B.
-    weights : ndarray, shape (2, n_masks)
-        Of the intensities in the real and imaginary part of the signal.
-    darkest : float
-        |B|^2 at and below which the system counts as singular.
     """
 
-    core: NDArray[np.complex128]
-    weights: NDArray[np.float64]
-    darkest: float
+    core: NDArray[np.complex128]  # (q, r), from coefficients of the field to those of B
+    weights: NDArray[np.float64]  # (2, n_masks), of the intensities in both parts of the signal
+    darkest: float  # |B|^2 at and below which the system counts as singular
 
     @classmethod
     def of(cls, cores: NDArray[np.complex128]) -> _SharedWave | None:

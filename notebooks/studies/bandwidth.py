@@ -1,0 +1,198 @@
+"""Cost of a wide band: reconstructors that ignore the bandwidth, and one that knows it. Not in the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
+from numpy.typing import ArrayLike, NDArray
+
+from studies.kit import sweeps
+from studies.kit.parameters import parameter_limits
+from studies.kit.results import rounded
+from studies.kit.style import LOOKS
+from studies.kit.tables import Table
+from zwfs.bounds import cramer_rao
+from zwfs.metrics import reconstruction_error
+from zwfs.polychromatic import PolychromaticSensor
+from zwfs.reconstructors import MaximumLikelihood, PhaseShifted
+from zwfs.sensor import ZernikeSensor
+
+LIMITS = parameter_limits(
+    "n_modes diameter phase_shift inputs n_screens exponent",
+    n_pixels=(16, 200),
+    bandwidths=[(0.0, 1.0)],
+    photons=(1.0, 1e9),
+)
+
+SHIFTED, IGNORED, KNOWN = "PhaseShifted, ignored", "MaximumLikelihood, ignored", "MaximumLikelihood, known"
+"""Ways to reconstruct frames of a band: method, and whether it knows the bandwidth."""
+WAYS = {SHIFTED: "PhaseShifted", IGNORED: "MaximumLikelihood", KNOWN: "MaximumLikelihood"}
+"""Method of each way."""
+IGNORANT = SHIFTED, IGNORED
+
+_WAVELENGTHS = 9  # of the simulated light
+_KNOWN_WAVELENGTHS = 3  # of the reconstructor that knows the band: fewer, since it has no exact model of the light
+_TOLERANCE = 1e-4  # of the sensor of the bound, which it changes by less than 1e-3
+
+
+@dataclass(frozen=True)
+class BandCurves:
+    """Errors against the bandwidth, radian rms over all screens."""
+
+    bandwidths: NDArray[np.float64]  # (n,), full width over central wavelength
+    error: dict[str, NDArray[np.float64]]  # (n,) of each way, with photon noise
+    bias: dict[str, NDArray[np.float64]]  # (n,) of the ways that ignore the bandwidth, without noise
+    bound: NDArray[np.float64]  # (n,)
+    photons: float  # of each point and frame
+
+    def at(self, bandwidth: float) -> int:
+        """Place of the bandwidth that is nearest."""
+        return int(np.argmin(np.abs(self.bandwidths - bandwidth)))
+
+    def equal_photons(self, way: str) -> NDArray[np.float64]:
+        """Photons of each point and frame for which the bias of a way is as large as the bound, (n,)."""
+        bias = np.maximum(self.bias[way], np.finfo(float).tiny)
+        return self.photons * (self.bound / bias) ** 2
+
+
+def band_curves(
+    sensor: ZernikeSensor,
+    screens: NDArray,
+    bandwidths: ArrayLike,
+    photons: float,
+    *,
+    chromatic: bool = False,
+    seed: int = 0,
+) -> BandCurves:
+    """Reconstruct frames of a flat spectrum, with and without photon noise."""
+    widths = np.asarray(bandwidths, float)
+    shared = sensor, screens, photons, chromatic, seed
+    errors, biases, bounds = zip(*sweeps.run(_band_point, widths.tolist(), *shared, name="bandwidth"), strict=True)
+    return BandCurves(
+        widths,
+        {way: np.array([error[way] for error in errors]) for way in WAYS},
+        {way: np.array([bias[way] for bias in biases]) for way in IGNORANT},
+        np.array(bounds),
+        photons,
+    )
+
+
+def _band_point(
+    bandwidth: float, sensor: ZernikeSensor, screens: NDArray, photons: float, chromatic: bool, seed: int
+) -> tuple[dict[str, float], dict[str, float], float]:
+    """Errors with and without noise, and the bound, at one bandwidth."""
+    light = PolychromaticSensor.flat_band(sensor, bandwidth, _WAVELENGTHS, chromatic=chromatic)
+    known = PolychromaticSensor.flat_band(sensor, bandwidth, _KNOWN_WAVELENGTHS, chromatic=chromatic)
+    methods = {
+        SHIFTED: PhaseShifted(sensor, n_iterations=100, accelerate=True),
+        IGNORED: MaximumLikelihood(sensor, photons=photons, n_starts=1),
+        KNOWN: MaximumLikelihood(known, photons=photons, n_starts=1),
+    }
+
+    def errors(ways: tuple[str, ...], frames: NDArray) -> dict[str, float]:
+        return {way: _rms(reconstruction_error(sensor.pupil, methods[way](frames).phase, screens)) for way in ways}
+
+    clean = light.measure(screens)
+    noisy = np.random.default_rng(seed).poisson(photons * clean) / photons
+    rough = PolychromaticSensor.flat_band(
+        sensor.with_tolerance(_TOLERANCE), bandwidth, _KNOWN_WAVELENGTHS, chromatic=chromatic
+    )
+    bound = _rms(sensor.pupil.gather(cramer_rao(rough, screens, photons=photons)))
+    return errors(tuple(WAYS), noisy), errors(IGNORANT, clean), bound
+
+
+def _rms(values: NDArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+CaseCurves = Mapping[tuple[float, bool], BandCurves]  # of each input, radian rms, and chromatic or not
+_LINES = {"ignored": ("-", None), "known": ("--", "white")}  # and faces of the markers
+TABLED = 0.05, 0.10, 0.25
+"""Bandwidths in the table and in the text."""
+
+
+def draw_band_errors(curves: CaseCurves) -> Figure:
+    """Error of each way over the bound: one panel for each input and kind of phase shift."""
+    n_columns = len({chromatic for _, chromatic in curves})
+    n_rows = len(curves) // n_columns
+    figure, panels = plt.subplots(
+        n_rows, n_columns, figsize=(7, 1.2 + 2.5 * n_rows), sharex=True, sharey=True, squeeze=False
+    )
+    for axes, ((rms, chromatic), one) in zip(panels.flat, curves.items(), strict=True):
+        axes.axhline(1, color="#999999", lw=5, solid_capstyle="round", label="bound in the band", zorder=0)
+        for name, method in WAYS.items():
+            look, way = LOOKS[method], name.rpartition(" ")[2]
+            line, face = _LINES[way]
+            axes.plot(
+                100 * one.bandwidths, one.error[name] / one.bound, label=f"{look.name}, bandwidth {way}",
+                color=look.color, marker=look.marker, linestyle=line, markerfacecolor=face, ms=6,
+            )  # fmt: skip
+        axes.set_title(f"{rms:g} rad rms, {_kind(chromatic)} shifts", fontsize=10)
+        axes.set(yscale="log")
+    panels[0, 0].yaxis.set_major_locator(FixedLocator([1, 1.5, 2, 3, 5, 10]))
+    panels[0, 0].yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    panels[0, 0].yaxis.set_minor_formatter(NullFormatter())
+    for axes in panels[-1]:
+        axes.set_xlabel("bandwidth (%)")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("error / bound")
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def _kind(chromatic: bool) -> str:
+    return "chromatic" if chromatic else "achromatic"
+
+
+def band_columns(curves: CaseCurves) -> dict[str, NDArray]:
+    """Columns of the errors and the bound."""
+    columns = {}
+    for (rms, chromatic), one in curves.items():
+        kind = f"{rms:g} rad rms, {_kind(chromatic)}"
+        columns["bandwidth"] = one.bandwidths
+        columns[f"{kind}: bound (rad rms)"] = one.bound
+        columns |= {f"{kind}: {way}: error (rad rms)": one.error[way] for way in WAYS}
+        columns |= {f"{kind}: {way}: error without noise (rad rms)": bias for way, bias in one.bias.items()}
+    return columns
+
+
+def costs_table(curves: CaseCurves) -> Table:
+    """Error without noise of the reconstructors that ignore the bandwidth, over the input."""
+    short = {SHIFTED: "phase-shifted", IGNORED: "max. lik."}
+    header = ["input, shifts", *(f"{short[way]}, {width:.0%}" for way in IGNORANT for width in TABLED)]
+    rows = [
+        [
+            f"{rms:g} rad, {_kind(chromatic)}",
+            *(f"{one.bias[way][one.at(width)] / rms:.2%}" for way in IGNORANT for width in TABLED),
+        ]
+        for (rms, chromatic), one in curves.items()
+    ]
+    return Table(header, rows)
+
+
+def numbers(curves: CaseCurves) -> dict[str, float | str]:
+    """Return errors over the bound, errors without noise over the input, and photons at which both are equal."""
+    short = {SHIFTED: "shifted", IGNORED: "ignored", KNOWN: "known"}
+    inputs = sorted({rms for rms, _ in curves})
+    found: dict[str, float] = {}
+    for (rms, chromatic), one in curves.items():
+        for width in TABLED:
+            place, case = one.at(width), f"{inputs.index(rms)}_{_kind(chromatic)}_{100 * width:.0f}"
+            found |= {f"{short[way]}_{case}": one.error[way][place] / one.bound[place] for way in WAYS}
+            found |= {f"share_{short[way]}_{case}": one.bias[way][place] / rms for way in IGNORANT}
+            found |= {f"photons_{short[way]}_{case}": one.equal_photons(way)[place] for way in IGNORANT}
+    for width in TABLED:
+        shares = [one.bias[SHIFTED][one.at(width)] / rms for (rms, _), one in curves.items()]
+        found |= {f"least_{100 * width:.0f}": min(shares), f"most_{100 * width:.0f}": max(shares)}
+    bounds = np.array([one.bound / one.bound[one.at(0)] for one in curves.values()])
+    found |= {
+        "known_most": max((one.error[KNOWN] / one.bound).max() for one in curves.values()),
+        "bound_least": bounds.min(),
+        "bound_most": bounds.max(),
+    }
+    return rounded(found, ".3g")

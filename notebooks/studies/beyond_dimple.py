@@ -1,0 +1,301 @@
+"""Diameters of the dimple, beyond the paper: its iteration, accelerated or not, and maximum likelihood.
+
+A screen is recovered if the error of its phase is at most a threshold, 5 % of the input. Errors count modulo 2 pi.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from studies.beyond_range import (
+    ACCELERATED,
+    LIKELY,
+    PLAIN,
+    RecoveryCurves,
+    compared_methods,
+    method_line,
+    method_look,
+)
+from studies.fig04_dimple_diameter import DARK_RING, DiameterCurves, diameter_curves, iteration_spectrum
+from studies.kit import sweeps
+from studies.kit.curves import crossing
+from studies.kit.methods import MASKS, opposite_dimples
+from studies.kit.parameters import parameter_limits
+from studies.kit.results import rounded
+from studies.kit.style import LOOKS, OTHER_STYLES
+from studies.kit.tables import Table
+from zwfs.bounds import cramer_rao
+from zwfs.pupil import Pupil
+
+LIMITS = parameter_limits(
+    "n_pixels phase_shift inputs n_screens exponent n_iterations threshold",
+    n_modes=(3, 1000),  # tip, tilt and at least one other mode
+    step=(0.05, 2.0),
+    diameter_min=(0.1, 1.0),
+    diameter_max=(3.5, 8.0),
+    step_fine=(0.01, 0.3),
+    n_screens_few=(1, 100),
+)
+USUAL, LARGE = 1.06, 3.0  # diameters of the paper and of a dimple beyond its limit, lambda/D
+_TILTS = 2  # the first modes: Noll 2 and 3
+
+
+def dimple_curves(
+    pupil: Pupil, phase_shift: float, n_iterations: int, diameters: ArrayLike, screens: NDArray
+) -> DiameterCurves:
+    """Errors of the compared methods for pairs of dimples of opposite phase shifts; see `diameter_curves`."""
+
+    def make(diameter: float) -> dict[str, Any]:
+        return compared_methods(opposite_dimples(pupil, diameter, phase_shift), n_iterations)
+
+    return diameter_curves(make, diameters, screens)
+
+
+@dataclass(frozen=True)
+class DimpleLimits:
+    """Convergence of the paper's iteration, and information in the frames, against the diameter of the dimple.
+
+    The first wavefront is flat, the others are the screens. Bounds are divided by that of an ideal sensor.
+    """
+
+    diameters: NDArray[np.floating]  # (n_diameters,), lambda/D
+    factor: NDArray[np.float64]  # (n_diameters, 1 + n_screens), of an error in one iteration
+    bound: NDArray[np.float64]  # (n_diameters, 1 + n_screens, n_modes)
+
+    @property
+    def tilt(self) -> NDArray[np.float64]:
+        """Bound of a tilt, rms of the two, shape (n_diameters, 1 + n_screens)."""
+        return _rms(self.bound[..., :_TILTS])
+
+    @property
+    def others(self) -> NDArray[np.float64]:
+        """Bound of a mode other than tilt, rms over these modes, shape (n_diameters, 1 + n_screens)."""
+        return _rms(self.bound[..., _TILTS:])
+
+    @property
+    def total(self) -> NDArray[np.float64]:
+        """Bound of a mode, rms over all modes, shape (n_diameters, 1 + n_screens)."""
+        return _rms(self.bound)
+
+
+def dimple_limits(
+    pupil: Pupil, modes: NDArray, phase_shift: float, diameters: ArrayLike, screens: NDArray
+) -> DimpleLimits:
+    """Return the factor of the iteration and the bounds of the modes, at each diameter and at the dark ring."""
+    diameters = np.union1d(diameters, DARK_RING)
+    phases = np.concatenate([np.zeros((1, *pupil.shape)), screens])
+    shared = pupil, modes, phase_shift, phases
+    rows = sweeps.run(_limits_point, diameters.tolist(), *shared, name="dimple_limits")
+    return DimpleLimits(diameters, *map(np.array, zip(*rows, strict=True)))
+
+
+def _limits_point(
+    diameter: float, pupil: Pupil, modes: NDArray, phase_shift: float, phases: NDArray
+) -> tuple[list[float], NDArray]:
+    """One diameter of `dimple_limits`: factor, (k,), and bounds, (k, n_modes), around each phase."""
+    sensor = opposite_dimples(pupil, diameter, phase_shift)
+    factor = [float(np.abs(iteration_spectrum(pupil, diameter, phase)[0])) for phase in phases]
+    photons = 1e4  # per point and frame; the ratio does not depend on it
+    ideal = 1 / (2 * np.sqrt(sensor.n_masks * photons * pupil.n_points))
+    return factor, cramer_rao(sensor, phases, photons=photons, modes=modes) / ideal
+
+
+def _rms(values: NDArray) -> NDArray[np.float64]:
+    """Rms over the last axis."""
+    return np.sqrt(np.mean(values**2, axis=-1))
+
+
+_FLOOR = 1e-7  # of a drawn error: below it digits are rounding errors
+_INK = "#555555"
+_INSTRUMENTS = {"OZIRIIS": "center", "Keck": "left"}  # alignment of the name over the diameters of its masks
+
+
+def draw_dimple_recovery(curves: Mapping[float, DiameterCurves], threshold: float) -> Figure:
+    """Share of recovered screens, and mean error, against the diameter of the dimple."""
+    figure, panels = plt.subplots(2, len(curves), figsize=(7, 6), sharex=True, sharey="row", squeeze=False)
+    for (share, error), (rms, curve) in zip(panels.T, curves.items(), strict=True):
+        for name in curve.errors:
+            line = method_line(name)
+            share.plot(curve.diameters, 100 * curve.recovered(name, threshold), **line)
+            error.semilogy(curve.diameters, np.maximum(curve.mean(name), _FLOOR), **line)
+        limit = threshold * rms
+        error.axhline(limit, color=_INK, lw=1)
+        error.text(0.52, limit * 1.3, f"{threshold:.0%} of the input", color=_INK, fontsize=9)
+        share.set_title(f"input {rms:g} rad rms\n", fontsize=10)
+        error.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=curve.diameters[[0, -1]], ylim=(_FLOOR / 2, 4))
+        for axes in (share, error):
+            _mark_instruments(axes)
+        above = {"transform": share.get_xaxis_transform(), "va": "bottom", "fontsize": 9, "color": _INK}
+        for instrument, side in _INSTRUMENTS.items():
+            share.text(np.mean(_span(instrument)), 1.02, instrument, ha=side, **above)
+    panels[0, 0].set(ylabel="screens recovered (%)", ylim=(-4, 104))
+    panels[1, 0].set_ylabel("mean error (rad rms)")
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def draw_dimple_limits(limits: DimpleLimits, rms: float) -> Figure:
+    """Factor of one iteration, and bound of the modes, against the diameter of the dimple."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7, 4))
+    flat, color = OTHER_STYLES[1]["color"], LOOKS[PLAIN].color
+    screens = limits.factor[:, 1:]
+    left.plot(limits.diameters, limits.factor[:, 0], color=flat, ls="--", label="flat wavefront")
+    left.plot(limits.diameters, screens.mean(axis=1), color=color, label=f"{rms:g} rad rms")
+    left.fill_between(limits.diameters, screens.min(axis=1), screens.max(axis=1), color=color, alpha=0.25, lw=0)
+    left.axhline(1, color=_INK, lw=1)
+    left.text(0.52, 1.015, "diverges above", color=_INK, fontsize=9)
+    left.set(ylabel="error after / before an iteration", ylim=(0, 1.2))
+    for values, name, style in ((limits.tilt, "tilt", 0), (limits.others, "others", 2)):
+        color = OTHER_STYLES[style]["color"]
+        right.semilogy(limits.diameters, values[:, 0], color=color, ls="--", lw=1.2, label=f"{name}, flat")
+        right.semilogy(
+            limits.diameters, _rms(values[:, 1:]), color=color, lw=1.8, label=f"{name}, {rms:g} rad rms"
+        )
+    right.set(ylabel="bound / that of an ideal sensor", ylim=(0.9, 3e4))  # room for the legend
+    for axes in (left, right):
+        axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
+        axes.text(
+            DARK_RING, 1.01, "dark ring", color=_INK, fontsize=9, ha="center", va="bottom",
+            transform=axes.get_xaxis_transform(),
+        )  # fmt: skip
+        axes.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=limits.diameters[[0, -1]])
+        axes.legend(loc="lower right" if axes is left else "upper left", fontsize=9, frameon=axes is left)
+    return figure
+
+
+def _span(instrument: str) -> tuple[float, float]:
+    """Smallest and largest diameter of the masks of an instrument, lambda/D."""
+    diameters = [masks[0].diameter for name, masks in MASKS.items() if name.startswith(instrument)]
+    return min(diameters), max(diameters)
+
+
+def _mark_instruments(axes: Axes) -> None:
+    """Mark the diameters of the masks in instruments."""
+    for instrument in _INSTRUMENTS:
+        low, high = _span(instrument)
+        axes.axvspan(low - 0.01, high + 0.01, color="#d0d0d0", lw=0, zorder=0.4)
+
+
+def recovery_columns(curves: Mapping[float, DiameterCurves], threshold: float) -> dict[str, NDArray]:
+    """Columns of the figure: share of recovered screens and mean error of each method, for each input."""
+    columns = {}
+    for rms, curve in curves.items():
+        columns["diameter (lambda/D)"] = curve.diameters
+        for name in curve.errors:
+            columns[f"{name}, {rms:g} rad rms: share recovered"] = curve.recovered(name, threshold)
+            columns[f"{name}, {rms:g} rad rms: mean error (rad rms)"] = curve.mean(name)
+    return columns
+
+
+def limits_columns(limits: DimpleLimits) -> dict[str, NDArray]:
+    """Columns of the figure on the reasons."""
+    columns = {"diameter (lambda/D)": limits.diameters}
+    for index in range(limits.factor.shape[1]):
+        wavefront = f"screen {index}" if index else "flat wavefront"
+        columns[f"factor, {wavefront}"] = limits.factor[:, index]
+        columns[f"bound of tilt / ideal, {wavefront}"] = limits.tilt[:, index]
+        columns[f"bound of other modes / ideal, {wavefront}"] = limits.others[:, index]
+        columns[f"bound of all modes / ideal, {wavefront}"] = limits.total[:, index]
+    return columns
+
+
+def failing_table(curves: Mapping[float, DiameterCurves], threshold: float) -> Table:
+    """Failing point of each method, for each input."""
+    exceeded = f"mean error exceeds {100 * threshold:g} % from (λ/D)"
+    return Table(
+        ["input (rad rms)", "method", "recovers every screen up to (λ/D)", exceeded],
+        [
+            [
+                f"{rms:g}",
+                method_look(name).name,
+                _complete_up_to(curve, name, threshold),
+                _fails_above(curve, name, threshold),
+            ]
+            for rms, curve in curves.items()
+            for name in curve.errors
+        ],
+    )
+
+
+def _complete_up_to(curve: DiameterCurves, name: str, threshold: float) -> str:
+    """Largest diameter up to which a method recovers every screen."""
+    lost = np.flatnonzero(curve.recovered(name, threshold) < 1)
+    if not lost.size:
+        return f"{curve.diameters[-1]:g}, the largest"
+    return f"{curve.diameters[lost[0] - 1]:g}" if lost[0] else "none"
+
+
+def _fails_above(curve: DiameterCurves, name: str, threshold: float) -> str:
+    """Diameter at which the mean error exceeds the threshold."""
+    passed = curve.exceeds(name, threshold * curve.rms[0])
+    return f"{passed:.3g}" if passed < np.inf else "never"
+
+
+def instruments_table(curves: Mapping[str, RecoveryCurves], threshold: float) -> Table:
+    """Number of screens that each method recovers on the masks of instruments."""
+    names = list(next(iter(curves.values())).errors)
+    rows = []
+    for mask, curve in curves.items():
+        n_screens = curve.n_starts.shape[1]
+        shares = np.transpose([curve.recovered(name, threshold) for name in names])
+        for rms, row in zip(curve.rms, shares, strict=True):
+            counts = (f"{round(n_screens * share)} of {n_screens}" for share in row)
+            rows.append([f"{mask}, {MASKS[mask][0].diameter:g} λ/D", f"{rms:g}", *counts])
+    return Table(["mask", "input (rad rms)", *(method_look(name).name for name in names)], rows)
+
+
+def numbers(
+    curves: Mapping[float, DiameterCurves],
+    limits: DimpleLimits,
+    masks: Mapping[str, RecoveryCurves],
+    threshold: float,
+    settings: Mapping[str, float],
+) -> dict[str, float | str]:
+    """Return the settings and the numbers of the text, with the failing points at the first input."""
+    first = next(iter(curves.values()))
+    usual, large, ring = (_nearest(limits.diameters, diameter) for diameter in (USUAL, LARGE, DARK_RING))
+    # Rms over the screens, without the flat wavefront, of each diameter.
+    tilt, others, total = (_rms(values[:, 1:]) for values in (limits.tilt, limits.others, limits.total))
+    flat, *aberrated = (crossing(limits.diameters, row, 1.0) for row in limits.factor.T)
+    plain, likely = (
+        np.concatenate([curve.recovered(name, threshold) for curve in masks.values()]) for name in (PLAIN, LIKELY)
+    )
+    found = dict(settings) | {
+        "n_screens": first.errors[LIKELY].shape[1],
+        "first_input": first.rms[0],
+        "last_input": list(curves)[-1],
+        "largest": first.diameters[-1],
+        "smallest": first.diameters[0],
+        "plain_fails": _fails_above(first, PLAIN, threshold),
+        "accelerated_fails": _fails_above(first, ACCELERATED, threshold),
+        "likely_share": min(curve.recovered(LIKELY, threshold).min() for curve in curves.values()),
+        "factor_flat": flat,
+        "factor_screens_least": min(aberrated),
+        "factor_screens_most": max(aberrated),
+        "tilt_flat_ring": limits.tilt[ring, 0],
+        "others_flat_ring": limits.others[ring, 0],
+        "tilt_screens_most": tilt.max(),
+        "tilt_usual": tilt[usual],
+        "others_usual": others[usual],
+        "others_large": others[large],
+        "total_usual": total[usual],
+        "total_large": total[large],
+        "recovered_large": first.recovered(PLAIN, threshold)[_nearest(first.diameters, LARGE)],
+        "masks_plain_least": plain.min(),
+        "masks_plain_most": plain.max(),
+        "masks_likely_least": likely.min(),
+        "masks_likely_most": likely.max(),
+    }
+    return rounded(found, ".4g")
+
+
+def _nearest(diameters: NDArray, diameter: float) -> int:
+    return int(np.argmin(np.abs(diameters - diameter)))

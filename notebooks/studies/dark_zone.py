@@ -1,0 +1,245 @@
+"""Photons that hold a drift of picometres, as in the maintenance of a dark zone. Not in the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import cycle
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+from studies.kit.parameters import parameter_limits
+from studies.kit.results import rounded
+from studies.kit.style import OTHER_STYLES
+from studies.kit.tables import Table
+from zwfs.detector import Detector
+from zwfs.loop import Mirror, close_loop, hold_drift
+from zwfs.reconstructors import MaximumLikelihood
+from zwfs.sensor import ZernikeSensor
+
+LIMITS = parameter_limits(
+    "n_modes diameter phase_shift",
+    n_pixels=(16, 100),
+    diameter_best=(0.1, 8.0),
+    phase_shift_best=(0.01, 3.13),
+    drift=(0.001, 1000.0),
+    wavelength=(100.0, 20000.0),
+    photons=[(1e4, 1e16)],
+    photons_gain=[(1e4, 1e16)],
+    gains=[(0.01, 1.5)],
+    n_cycles=(4, 10000),
+    n_screens=(1, 1000),
+)
+
+IDEAL = "ideal sensor"
+"""Name of a sensor that measures each mode of unit rms with an error of 1 / (2 sqrt(photons)) radian."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Random walk of a wavefront, and the loop that holds it."""
+
+    modes: NDArray[np.floating]  # (n_modes, ny, nx), unit rms
+    rms: float  # of the step in each cycle, all modes together, pm
+    wavelength: float  # nm
+    n_cycles: int = 80  # of a simulated loop; the last half counts
+    n_screens: int = 6
+    seed: int = 0
+
+    @property
+    def scale(self) -> float:
+        """Wavefront per phase, pm / radian."""
+        return 1e3 * self.wavelength / (2 * np.pi)
+
+
+@dataclass(frozen=True)
+class DriftCurves:
+    """Residuals of simulated loops, and the errors that limit them."""
+
+    drift: Drift
+    errors: dict[str, NDArray[np.float64]]  # (n_modes,) of each sensor and of the ideal one, for one photon, pm
+    photons: Sequence[float]  # (n,), in a cycle
+    held: dict[str, NDArray[np.float64]]  # (n,) of each sensor, with the best gain, pm rms
+    gains: Sequence[float]  # (k,)
+    by_gain: dict[float, NDArray[np.float64]]  # (k,) of each number of photons, with the last sensor, pm rms
+
+
+def errors_of_one_photon(sensors: Mapping[str, ZernikeSensor], drift: Drift) -> dict[str, NDArray[np.float64]]:
+    """Cramer-Rao bound of each mode for one photon, pm rms: of each sensor by its name, and of an ideal one."""
+    bounds = {
+        name: hold_drift(sensor, drift.modes, drift=0, gain=1.0, photons=1.0, wavelength=drift.wavelength).noise
+        for name, sensor in sensors.items()
+    }
+    return bounds | {IDEAL: np.full(len(drift.modes), drift.scale / 2)}
+
+
+def kalman_limit(errors: ArrayLike, drift: Drift, photons: ArrayLike) -> NDArray[np.float64]:
+    """Smallest residual of any linear filter on a random walk, pm rms: the shape of `photons`."""
+    step = drift.rms**2 / len(drift.modes)
+    variance = np.square(errors) / np.asarray(photons, float)[..., np.newaxis]
+    return np.sqrt(np.sum(step + np.sqrt(step**2 + 4 * step * variance), axis=-1) / 2)
+
+
+def integrator_residual(errors: ArrayLike, drift: Drift, photons: float, gains: ArrayLike) -> NDArray[np.float64]:
+    """Residual of an integrator with one gain for all modes, pm rms: the shape of `gains`."""
+    gains = np.asarray(gains, float)
+    step, noise = drift.rms**2, np.sum(np.square(errors)) / photons
+    return np.sqrt((gains * noise + step / gains) / (2 - gains))
+
+
+def best_gain(errors: ArrayLike, drift: Drift, photons: float) -> float:
+    """Gain of the smallest `integrator_residual`: g^2 noise^2 = (1 - g) step^2."""
+    step, noise = drift.rms, np.sqrt(np.sum(np.square(errors)) / photons)
+    return float(2 * step / (step + np.hypot(step, 2 * noise)))
+
+
+def photons_to_hold(errors: ArrayLike, drift: Drift, residual: float) -> float:
+    """Photons per cycle for which `kalman_limit` is a residual (pm rms) above the rms of the drift."""
+    root = brentq(lambda decades: kalman_limit(errors, drift, 10**decades) - residual, -3, 30)
+    return float(10**root)
+
+
+def simulate(sensor: ZernikeSensor, drift: Drift, photons: float, gains: Iterable[float]) -> NDArray[np.float64]:
+    """Residual of simulated loops with photon noise, pm rms, for each gain."""
+    n, pupil = len(drift.modes), sensor.pupil
+    rng = np.random.default_rng(drift.seed)
+    steps = rng.standard_normal((drift.n_cycles, drift.n_screens, n)) * drift.rms / drift.scale / np.sqrt(n)
+    walks = np.tensordot(np.cumsum(steps, axis=0), drift.modes, 1)
+    camera, mirror = Detector(pupil, photons / sensor.n_masks), Mirror(pupil, drift.modes)
+    likely = MaximumLikelihood(sensor, drift.modes, photons=camera.photons_per_pixel, n_starts=1)
+    found = []
+    for gain in gains:
+        record = close_loop(sensor, mirror, likely, walks, gain=gain, camera=camera, seed=drift.seed)
+        found.append(drift.scale * np.sqrt(np.mean(record.settled(drift.n_cycles // 2) ** 2)))
+    return np.array(found)
+
+
+def hold(sensor: ZernikeSensor, drift: Drift, photons: Iterable[float], errors: ArrayLike) -> NDArray[np.float64]:
+    """Residual of simulated loops with the best gain, pm rms, for each number of photons."""
+    return np.array([simulate(sensor, drift, one, [best_gain(errors, drift, one)])[0] for one in photons])
+
+
+def drift_curves(
+    sensors: Mapping[str, ZernikeSensor],
+    drift: Drift,
+    photons: Sequence[float],
+    photons_gain: Sequence[float],
+    gains: Sequence[float],
+) -> DriftCurves:
+    """Simulate loops with the best gain for several numbers of photons, and with several gains for others."""
+    errors, (*_, last) = errors_of_one_photon(sensors, drift), sensors.values()
+    held = {name: hold(sensor, drift, photons, errors[name]) for name, sensor in sensors.items()}
+    by_gain = {light: simulate(last, drift, light, gains) for light in photons_gain}
+    return DriftCurves(drift, errors, photons, held, gains, by_gain)
+
+
+_SIZE = 6  # of markers, points; the first sensor has large open ones, as others lie on them
+_LIGHTS = (("#333333", "s"), ("#888888", "D"))  # grays and markers of the photons, as colours stand for sensors
+
+
+def draw_held_drift(curves: DriftCurves) -> Figure:
+    """Residual against the photons of a cycle for several sensors, and against the gain of the loop."""
+    drift, errors, photons, gains = curves.drift, curves.errors, curves.photons, curves.gains
+    held = curves.held
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7, 3.8), sharey=True)
+    many = np.geomspace(min(photons) / 2, 2 * max(photons), 100)
+    styles = {
+        name: style | {"markersize": size, "markerfacecolor": "none" if size > _SIZE else style["color"]}
+        for name, style, size in zip(held, OTHER_STYLES, (2 * _SIZE, *[_SIZE] * len(held)), strict=False)
+    }
+    left.axhline(drift.rms, color="#999999", lw=1)
+    left.plot(many, kalman_limit(errors[IDEAL], drift, many), color="#777777", ls=":", label=IDEAL)
+    for name, style in styles.items():
+        left.plot(many, kalman_limit(errors[name], drift, many), **style | {"marker": ""})
+        left.plot(photons, held[name], **style | {"linestyle": ""})
+        left.plot([], [], **style, label=name)
+    left.set(xscale="log", yscale="log", xlabel="photons per cycle", ylabel="residual (pm rms)")
+    *_, last = held
+    if len(held) > 1:
+        level = 1.5 * drift.rms
+        more, less = (np.interp(-level, -kalman_limit(errors[name], drift, many), many) for name in [*held][-2:])
+        _mark_factor(left, less, more, level)
+    left.text(many[0], 0.95 * drift.rms, "step of the drift", va="top")
+    dense = np.linspace(min(gains) / 1.3, 1.05 * max(gains), 100)
+    for (light, simulated), (gray, marker) in zip(curves.by_gain.items(), cycle(_LIGHTS), strict=False):
+        right.plot(dense, integrator_residual(errors[last], drift, light, dense), color=gray)
+        right.plot(gains, simulated, marker, color=gray, label=f"$10^{{{np.log10(light):.2g}}}$ photons")
+        right.axhline(kalman_limit(errors[last], drift, light), color=gray, lw=0.8, ls=":")
+    right.set_xlabel("gain of the integrator")
+    right.set_title(f"against the gain, {last}", fontsize=10)
+    left.set_title("against the photons, best gain", fontsize=10)
+    left.yaxis.set_major_locator(FixedLocator([2, 5, 10, 20, 50, 100, 200]))
+    left.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    left.yaxis.set_minor_formatter(NullFormatter())
+    right.legend(loc="upper center", fontsize=9)
+    left.set_ylim(bottom=0.7 * drift.rms)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def _mark_factor(axes: Axes, less: float, more: float, level: float) -> None:
+    """Arrow between two numbers of photons that give the same residual, and their ratio."""
+    arrow = {"arrowstyle": "<->", "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", (less, level), (more, level), arrowprops=arrow)
+    text = f"{more / less:.2f} times the photons"
+    axes.annotate(text, (more, level), (3, 3), textcoords="offset points", fontsize=9)
+
+
+def drift_columns(curves: DriftCurves) -> dict[str, NDArray]:
+    """Columns of the simulated residuals and their limits."""
+    columns = {"photons per cycle": np.array(curves.photons)}
+    for name, errors in curves.errors.items():
+        columns[f"{name}: limit (pm rms)"] = kalman_limit(errors, curves.drift, curves.photons)
+        if name in curves.held:
+            columns[f"{name}: simulated (pm rms)"] = curves.held[name]
+    return columns
+
+
+def photons_table(curves: DriftCurves) -> Table:
+    """Photons per cycle that hold the drift at several residuals."""
+    drift = curves.drift
+    targets = [factor * drift.rms for factor in (1.2, 1.5, 2.0, 3.0)]
+    rows = [
+        [name, *(f"{photons_to_hold(errors, drift, target):.2g}" for target in targets)]
+        for name, errors in curves.errors.items()
+    ]
+    return Table(["sensor", *(f"{target:g} pm" for target in targets)], rows)
+
+
+def numbers(curves: DriftCurves) -> dict[str, float | str]:
+    """Return photons, residuals and gains; sensors are numbered in their order."""
+    drift, gains, by_gain = curves.drift, curves.gains, curves.by_gain
+    *errors, ideal = curves.errors.values()
+    best, target = errors[-1], 1.5 * drift.rms
+    photons = [photons_to_hold(one, drift, target) for one in errors]
+    photons_ideal = photons_to_hold(ideal, drift, target)
+    found: dict[str, float] = {"drift": drift.rms, "target": target, "n_modes": len(drift.modes)}
+    for index, (one, needed) in enumerate(zip(errors, photons, strict=True)):
+        found |= {f"photons_{index}": needed, f"gain_{index}": best_gain(one, drift, needed)}
+    ratios = [
+        held / kalman_limit(one, drift, curves.photons)
+        for held, one in zip(curves.held.values(), errors, strict=True)
+    ]
+    least, most = min(by_gain), max(by_gain)
+    found |= {
+        "photons_ideal": photons_ideal,
+        "saved": 100 * (1 - photons[-1] / photons[1]),
+        "above_ideal": 100 * (photons[-1] / photons_ideal - 1),
+        "pair_over_classic": photons[1] / photons[0],
+        "agreement_least": np.min(ratios),
+        "agreement_most": np.max(ratios),
+        "light_gain": least,
+        "most_light": most,
+        "best_gain": best_gain(best, drift, least),
+        "highest_gain": max(gains),
+        "too_fast": by_gain[least][np.argmax(gains)] / kalman_limit(best, drift, least),
+        "too_slow": by_gain[most][np.argmin(gains)] / kalman_limit(best, drift, most),
+        "lowest_gain": min(gains),
+    }
+    return rounded(found, ".3g")

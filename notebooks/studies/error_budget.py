@@ -1,0 +1,138 @@
+"""The error budget of the bench: the effect of each of its errors alone, and of leakage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from studies.kit import sweeps
+from studies.kit.bench import BenchCurves, bench_curves, bench_reconstructors, check_bench
+from studies.kit.parameters import bench_fields, parameter_limits
+from studies.kit.results import rounded
+from studies.kit.style import LOOKS
+from studies.kit.tables import Table
+from zwfs.bench import Bench, BenchModel
+
+LIMITS = parameter_limits(
+    "inputs n_screens n_iterations",
+    n_pixels=(32, 1024),
+    leakages=[(0.0, 0.49), ...],
+    bench=bench_fields("n_pixels"),
+)
+CHECK_TOGETHER = check_bench
+
+NAME = "PhaseShifted"  # the reconstructor of the page
+Curves = Mapping[str, BenchCurves]  # by the error that is switched on
+
+
+def error_budget(
+    benches: Mapping[Any, Bench],
+    names: Sequence[str],
+    rms: ArrayLike,
+    n_screens: int,
+    *,
+    n_iterations: int = 25,
+    seed: int = 0,
+) -> dict[Any, BenchCurves]:
+    """Curves of benches that differ in their errors, each with its model and reconstructors."""
+    shared = list(names), np.asarray(rms, dtype=float), n_screens, n_iterations, seed
+    curves = sweeps.run(_bench_case, benches.values(), *shared, name="error_budget")
+    return dict(zip(benches, curves, strict=True))
+
+
+def _bench_case(
+    bench: Bench, names: Sequence[str], rms: NDArray, n_screens: int, n_iterations: int, seed: int
+) -> BenchCurves:
+    """Model one bench, build its reconstructors, and return their curves."""
+    model = BenchModel.from_images(bench, seed)
+    methods = bench_reconstructors(bench, model, n_iterations=n_iterations, seed=seed)
+    return bench_curves(bench, model, {name: methods[name] for name in names}, rms, n_screens, seed=seed)
+
+
+def effects(budget: Curves, name: str = NAME) -> tuple[NDArray, NDArray, NDArray]:
+    """Offset, and gain and error at the first input after 0, of each case."""
+    curves = budget.values()
+    return (
+        np.array([one.mean(name)[0] for one in curves]),
+        np.array([one.gain(name)[1] for one in curves]),
+        np.array([one.mean(name)[1] for one in curves]),
+    )
+
+
+def draw_budget(budget: Curves, name: str) -> Figure:
+    """Effect of each error alone: offset at a flat command, gain and error at the first other input."""
+    figure, panels = plt.subplots(1, 3, figsize=(7, 3.6), sharey=True)
+    rows = np.arange(len(budget))[::-1]
+    value = next(iter(budget.values())).rms[1]
+    offsets, gains, errors = effects(budget, name)
+    for axes, label, values in zip(
+        panels,
+        (
+            "error at a flat\ncommand (rad rms)",
+            f"change of the gain at\n{value:g} rad rms (%)",
+            f"error at {value:g} rad\nrms (rad rms)",
+        ),
+        (offsets, 100 * (gains - 1), errors),
+        strict=True,
+    ):
+        axes.barh(rows, values, color=LOOKS[name].color, height=0.65)
+        axes.axvline(0, color="#555555", lw=1)
+        axes.set(xlabel=label)
+        axes.grid(axis="y", visible=False)
+    panels[0].set_yticks(rows, [_words(error) for error in budget])
+    return figure
+
+
+def effect_columns(budget: Curves) -> dict[str, NDArray | list[str]]:
+    """Offset, and gain and error at the first input after 0."""
+    offsets, gains, errors = effects(budget)
+    value = next(iter(budget.values())).rms[1]
+    return {
+        "error": [_words(error) for error in budget],
+        "offset (rad rms)": offsets,
+        f"gain at {value} rad rms": gains,
+        f"error at {value} rad rms (rad rms)": errors,
+    }
+
+
+def effect_table(budget: Curves) -> Table:
+    """Offset, gains and errors with each error of the bench alone."""
+    rows = [
+        [_words(error), f"{offset:.1g}" if (offset := curves.mean(NAME)[0]) > 1e-6 else "0", *_cells(curves)]
+        for error, curves in budget.items()
+    ]
+    return Table(["error switched on", "offset (rad rms)", *_header(budget)], rows)
+
+
+def leakage_table(swept: Mapping[float, BenchCurves]) -> Table:
+    """Gains and errors with nothing but leakage."""
+    return Table(["leakage", *_header(swept)], [[f"{value:.0%}", *_cells(one)] for value, one in swept.items()])
+
+
+def _header(some: Mapping[Any, BenchCurves]) -> list[str]:
+    inputs = next((one.rms[one.rms > 0] for one in some.values()), ())
+    return [f"{quantity} at {value:g}" for quantity in ("gain", "error") for value in inputs]
+
+
+def _cells(curves: BenchCurves) -> list[str]:
+    used = curves.rms > 0
+    errors = (f"{value:.2g}" if value > 1e-6 else "0" for value in curves.mean(NAME)[used])
+    return [*(f"{value:.3f}" for value in curves.gain(NAME)[used]), *errors]
+
+
+def _words(error: str) -> str:
+    return error.replace("_", " ")
+
+
+def numbers(budget: Curves, swept: Mapping[float, BenchCurves]) -> dict[str, float | str]:
+    """Numbers for the text: offset and gain of some errors, and the gain with 10 % leakage."""
+    offsets, gains, _ = (dict(zip(budget, values, strict=True)) for values in effects(budget))
+    found: dict[str, Any] = {}
+    for case in ("leakage", "focus_difference", "static", "all"):
+        found |= {f"offset_{case}": offsets[case], f"gain_{case}": gains[case]}
+    return rounded(found | {"gain_leakage_10": swept[0.1].gain(NAME)[0] if 0.1 in swept else np.nan})

@@ -1,0 +1,409 @@
+"""Figure 3, section 4.1 of the paper: errors of the reconstructors on random screens, their causes and cost."""
+
+from __future__ import annotations
+
+import cProfile
+import pstats
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import LinearSegmentedColormap, to_rgba
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from studies.kit import sweeps
+from studies.kit.curves import ErrorCurves, screens_at
+from studies.kit.parameters import SETUP, parameter_limits
+from studies.kit.results import rounded
+from studies.kit.setups import NOISELESS, Noise, Screens, check_setup
+from studies.kit.style import LOOKS, looks_of
+from studies.kit.tables import Table, small
+from zwfs.metrics import reconstruction_error, strehl
+from zwfs.reconstructors import GerchbergSaxton, PhaseShifted
+from zwfs.sensor import ZernikeSensor
+
+LIMITS = parameter_limits(
+    "n_pixels n_modes diameter phase_shift rms_max n_rms rms_fine n_screens exponent n_iterations extent "
+    "threshold",
+    rms_beyond=[(0.0, 4.0), ...],
+    extents=[(1.0, 8.0)],
+    **SETUP,
+)
+CHECK_TOGETHER = check_setup
+
+_PASSES = ("split_expand", "split_adjoint")  # functions that pass through the low-rank model of the sensor
+
+
+@dataclass(frozen=True)
+class LinearityCurves(ErrorCurves):
+    """Errors of several reconstructors against the input, and properties of the screens."""
+
+    converged: dict[str, NDArray[np.bool_]]  # (n_rms, n_screens) by name
+    wrapped: NDArray[np.float64]  # (n_rms, n_screens), share of the points beyond +-pi
+    folded: NDArray[np.float64]  # (n_rms, n_screens), share of the points below -pi/4
+    strehl: NDArray[np.float64]  # (n_rms, n_screens)
+
+
+def linearity_curves(
+    reconstructors: Mapping[str, Any],
+    modes: NDArray | Screens,
+    rms: ArrayLike,
+    n_screens: int,
+    *,
+    exponent: float = -2.0,
+    seed: int = 0,
+    noise: Noise = NOISELESS,
+) -> LinearityCurves:
+    """Error of reconstructors on random screens of growing rms (radian): the experiment of section 4.1."""
+    rms = np.asarray(rms, float)
+    shared = dict(reconstructors), modes, n_screens, exponent, seed, noise
+    points = sweeps.run(_linearity_point, enumerate(rms.tolist()), *shared, name="linearity_curves")
+    errors, converged, *light = zip(*points, strict=True)
+    return LinearityCurves(
+        rms,
+        {name: np.array([point[name] for point in errors]) for name in reconstructors},
+        {name: np.array([point[name] for point in converged]) for name in reconstructors},
+        *map(np.array, light),
+    )
+
+
+def _linearity_point(
+    point: tuple[int, float],
+    reconstructors: Mapping[str, Any],
+    modes: NDArray | Screens,
+    n_screens: int,
+    exponent: float,
+    seed: int,
+    noise: Noise,
+) -> tuple[dict[str, NDArray], dict[str, NDArray], NDArray, NDArray, NDArray]:
+    """One input of the linearity curves: errors, converged, wrapped, folded and Strehl, (n_screens,) each."""
+    task, rms = point
+    screens = screens_at(modes, rms, n_screens, seed, task, exponent)
+    pupil = next(iter(reconstructors.values())).sensor.pupil
+    phase = pupil.gather(screens)
+    errors, converged = {}, {}
+    for name, reconstructor in reconstructors.items():
+        drawn = np.random.SeedSequence(seed, spawn_key=(task, 0))
+        estimate = reconstructor(noise(reconstructor.sensor, screens, drawn))
+        errors[name] = reconstruction_error(pupil, estimate.phase, screens)
+        converged[name] = estimate.converged
+    wrapped, folded = np.mean(np.abs(phase) > np.pi, axis=-1), np.mean(phase < -np.pi / 4, axis=-1)
+    return errors, converged, wrapped, folded, strehl(pupil, screens)
+
+
+def saxton_by_width(
+    reconstructors: Mapping[str, Any],
+    modes: NDArray | Screens,
+    extents: Sequence[float],
+    n_screens: int,
+    **settings: Any,
+) -> tuple[dict[str, GerchbergSaxton], LinearityCurves]:
+    """Error of variants of Gerchberg-Saxton on detectors of several widths (D), and of the linear method."""
+    original = reconstructors["GerchbergSaxton"]
+    sensor, n_iterations = original.sensor, original.settings.n_iterations
+    chosen = [(extent, "zero", n_iterations) for extent in extents]
+    chosen += [(min(extents), "model", n) for n in (n_iterations, 8 * n_iterations)]
+    variants = {
+        f"{extent:g} D, {unmeasured}, {n}": GerchbergSaxton(
+            ZernikeSensor(sensor.pupil, *sensor.masks, extent=extent), n_iterations=n, unmeasured=unmeasured
+        )
+        for extent, unmeasured, n in chosen
+    }
+    methods, inputs = {"Linear": reconstructors["Linear"], **variants}, [0.1, 0.2, 0.3, 0.5, 0.8]
+    return variants, linearity_curves(methods, modes, inputs, n_screens, **settings)
+
+
+def light_lost(sensor: ZernikeSensor) -> float:
+    """Fraction of the light of a flat wavefront that misses the detector behind the first mask."""
+    return 1 - float(sensor.measure(np.zeros(sensor.pupil.shape))[0].sum()) / sensor.pupil.n_points
+
+
+def count_work(reconstructors: Mapping[str, Any], phase: NDArray) -> tuple[dict[str, int], set[str]]:
+    """Passes of each reconstructor through the model of the sensor, and the Fourier functions that it calls."""
+    passes, fourier = {}, set()
+    for name, reconstructor in reconstructors.items():
+        frames = reconstructor.sensor.measure(phase)
+        reconstructor(frames)  # the first call also builds what later calls use again
+        profile = cProfile.Profile()
+        profile.runcall(reconstructor, frames)
+        calls = pstats.Stats(profile).stats  # type: ignore[attr-defined]
+        places = {place: f"{place[0]}:{place[2]}" for place in calls}
+        fourier |= {text for text in places.values() if "fft" in text}
+        passes[name] = sum(calls[place][1] for place in places if place[2] in _PASSES)
+    return passes, fourier
+
+
+def run_out(reconstructor: PhaseShifted, phase: NDArray) -> float:
+    """Error (radian rms) of 200 phase-shifted iterations without a stopping rule, for one wavefront in radian."""
+    sensor = reconstructor.sensor
+    estimate = PhaseShifted(sensor, n_iterations=200, tolerance=0)(sensor.measure(phase))
+    return float(reconstruction_error(sensor.pupil, estimate.phase, phase))
+
+
+# Look, title, dashes and markers of the variants of Gerchberg-Saxton, by what they do where nothing is measured.
+_UNMEASURED = {
+    "zero": ("GerchbergSaxton", "zero where not measured", ("-", "-.", "--", ":"), "^<v>"),
+    "model": ("GerchbergSaxtonModel", "modelled field kept, {:g} D", ("-", "--"), "x+"),
+}
+
+
+def draw_linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], rms_max: float) -> Figure:
+    """Figure 3: mean error and its standard deviation against the input, and their ratio on a logarithmic axis."""
+    figure, (plain, ratio) = plt.subplots(1, 2, figsize=(7, 4.6))
+    drawn = curves.rms <= rms_max
+    bright = curves.rms > 0
+    rms = curves.rms[drawn]
+    limits = {name: curves.dynamic_range(name, threshold) for name in names}
+    for name, look in looks_of(names):
+        mean, std = curves.mean(name), curves.std(name)[drawn]
+        line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
+        limit = limits[name]
+        reach = f": {limit:.2g} rad" if 0 < limit <= curves.rms[-1] else ""
+        plain.plot(rms, mean[drawn], label=look.label + reach, **line)
+        low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
+        plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
+        ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], **line)
+        if 0 < limit <= curves.rms[-1]:
+            ratio.plot(limit, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
+    plain.plot(rms, threshold * rms, color="#555555", lw=1)
+    plain.annotate(
+        f"{threshold:.0%}", (rms[-1], threshold * rms[-1]), (4, 0), textcoords="offset points", color="#555555",
+        fontsize=9, va="center",
+    )  # fmt: skip
+    ratio.axhline(threshold, color="#555555", lw=1)
+    end = ratio.get_yaxis_transform()  # the right end of the line, which no curve crosses
+    ratio.text(
+        1.02, threshold, f"{threshold:.0%}\nof the\ninput", transform=end, color="#555555", fontsize=9, va="center"
+    )
+    plain.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
+    ratio.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
+    return figure
+
+
+def draw_saxton_widths(
+    variants: Mapping[str, GerchbergSaxton], curves: LinearityCurves, threshold: float
+) -> Figure:
+    """Mean error over the input of Gerchberg-Saxton on detectors of several widths, and of the linear method."""
+    figure, panels = plt.subplots(1, 2, figsize=(7, 4.2), sharex=True)
+    for axes, (kind, (family, title, *lines)) in zip(panels, _UNMEASURED.items(), strict=True):
+        drawn = {name: method for name, method in variants.items() if method.unmeasured == kind}
+        colors = _shades(LOOKS[family].color, len(drawn))
+        for (name, method), color, line, marker in zip(drawn.items(), colors, *map(cycle, lines), strict=False):
+            ratio = curves.mean(name) / curves.rms
+            axes.semilogy(curves.rms, ratio, color=color, linestyle=line, marker=marker)
+            text, place = _variant_label(method)
+            axes.annotate(text, (curves.rms[0], ratio[0]), textcoords="offset points", fontsize=9, **place)
+        [linear] = axes.plot(curves.rms, curves.mean("Linear") / curves.rms, **LOOKS["Linear"].style)
+        axes.axhline(threshold, color="#555555", lw=1)
+        axes.set(xlabel="input phase (rad rms)", xlim=(0, None))
+        axes.set_title(title.format(method.sensor.extent), fontsize=10)
+    zero, model = panels
+    zero.set(ylabel="error / input", ylim=(threshold / 2, None))
+    style: dict[str, Any] = {"color": "#555555", "fontsize": 9, "ha": "right", "va": "top"}
+    line = f"{threshold:.0%} of the input"
+    zero.text(0.99, 0.9 * threshold, line, transform=zero.get_yaxis_transform(), **style)
+    model.set_ylim(bottom=model.get_ylim()[0] / 4)  # room for the labels
+    figure.legend([linear], ["linear"], loc="outside lower center", fontsize=9)
+    return figure
+
+
+def _variant_label(method: GerchbergSaxton) -> tuple[str, dict[str, Any]]:
+    """What distinguishes a variant from the others in its panel, and where to write it at the first point."""
+    if method.unmeasured == "zero":
+        return f"{method.sensor.extent:g} D", {"xytext": (-7, 0), "ha": "right", "va": "center"}
+    return f"{method.settings.n_iterations} iterations", {"xytext": (6, -11), "va": "top"}
+
+
+def _shades(color: str, count: int) -> list[tuple[float, ...]]:
+    """Return shades of a colour, from dark to light."""
+    ends = LinearSegmentedColormap.from_list("shades", ["black", color, "white"])
+    return [ends(level) for level in np.linspace(0.3, 0.65, count)] if count != 1 else [to_rgba(color)]
+
+
+def width_columns(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurves) -> dict[str, Any]:
+    """Columns of the mean errors of Gerchberg-Saxton on each detector, and of the linear method."""
+    names = {
+        name: f"{method.sensor.extent:g} D, {method.unmeasured}, {method.settings.n_iterations} iterations"
+        for name, method in variants.items()
+    } | {"Linear": "linear"}
+    return {"input (rad rms)": curves.rms} | {
+        f"{title}: mean error (rad rms)": curves.mean(name) for name, title in names.items()
+    }
+
+
+# The methods with one image, and Gerchberg-Saxton: no candidates for a long range.
+_SHORT_RANGE = ("Linear", "Arcsine", "GerchbergSaxton", "GerchbergSaxtonModel")
+
+
+def _indices(curves: LinearityCurves, values: Sequence[float]) -> dict[float, int]:
+    """Index of each of these inputs that the curves have."""
+    return {value: int(np.flatnonzero(curves.rms == value)[0]) for value in values if value in curves.rms}
+
+
+def _place(curves: LinearityCurves, name: str, threshold: float) -> str:
+    """Input at which a curve exceeds the threshold, in words."""
+    limit = curves.dynamic_range(name, threshold)
+    if limit == 0:
+        return "from the start"
+    return f"{limit:.2g}" if limit < np.inf else f"beyond {curves.rms[-1]:g}"
+
+
+def ranges_table(curves: LinearityCurves, threshold: float) -> Table:
+    """Limit of each reconstructor, and its error at some inputs."""
+    at = _indices(curves, (0.1, 0.3, 0.5, 0.8, 1.0, 1.3))
+    return Table(
+        ["reconstructor", f"exceeds {threshold:.0%} above (rad rms)", *(f"error at {value:g}" for value in at)],
+        [
+            [
+                LOOKS[name].name,
+                _place(curves, name, threshold),
+                *(small(curves.mean(name)[index]) for index in at.values()),
+            ]
+            for name in curves.errors
+        ],
+    )
+
+
+def one_image_table(curves: LinearityCurves) -> Table:
+    """Errors of the methods that use one image, and the points that an arcsine folds back."""
+    return Table(
+        ["input (rad rms)", "error / input, linear", "error / input, arcsine", "points below −π/4"],
+        [
+            [
+                value,
+                *(f"{curves.mean(name)[index] / value:.1%}" for name in ("Linear", "Arcsine")),
+                f"{curves.folded[index].mean():.2%}",
+            ]
+            for value, index in _indices(curves, (0.1, 0.2, 0.3, 0.4, 0.5)).items()
+        ],
+    )
+
+
+def two_images_table(curves: LinearityCurves, threshold: float) -> Table:
+    """Screens that the methods with two images recover, with the wraps and the Strehl ratio of the screens."""
+    names = ["PhaseShifted", *(name for name in curves.errors if name not in (*_SHORT_RANGE, "PhaseShifted"))]
+    return Table(
+        ["input (rad rms)", *(LOOKS[name].name for name in names), "points beyond ±π", "Strehl"],
+        [
+            [
+                float(value),
+                *(f"{curves.recovered(name, threshold)[index]:.0%}" for name in names),
+                f"{curves.wrapped[index].mean():.2%}",
+                f"{curves.strehl[index].mean():.2f}",
+            ]
+            for index, value in enumerate(curves.rms)
+            if value >= 0.5
+        ],
+    )
+
+
+def saxton_table(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurves) -> Table:
+    """Errors of Gerchberg-Saxton on each detector, next to those of the linear method, relative to the input."""
+    shares = {name: [f"{ratio:.1%}" for ratio in curves.mean(name) / curves.rms] for name in curves.errors}
+    return Table(
+        [
+            "detector (D)",
+            "unmeasured field",
+            "iterations",
+            "light lost",
+            *(f"{value:g} rad" for value in curves.rms),
+        ],
+        [
+            [
+                f"{method.sensor.extent:g}",
+                method.unmeasured,
+                method.settings.n_iterations,
+                f"{light_lost(method.sensor):.0%}",
+                *shares[name],
+            ]
+            for name, method in variants.items()
+        ]
+        + [["1 (linear)", "–", 1, "–", *shares["Linear"]]],
+    )
+
+
+def work_table(passes: Mapping[str, int]) -> Table:
+    """Passes through the model of the sensor, see `count_work`."""
+    return Table(
+        ["reconstructor", "passes through the model"], [[LOOKS[name].name, n] for name, n in passes.items()]
+    )
+
+
+def _better_from(curves: LinearityCurves, name: str) -> float:
+    """Smallest input from which on a method has a smaller error than the linear one."""
+    worse = curves.rms[curves.mean(name) >= curves.mean("Linear")]
+    return float(curves.rms[curves.rms > worse.max(initial=0)].min(initial=np.inf))
+
+
+def numbers(
+    curves: LinearityCurves,
+    threshold: float,
+    methods: Mapping[str, Any],
+    variants: Mapping[str, GerchbergSaxton],
+    by_width: LinearityCurves,
+    passes: Mapping[str, int],
+    fourier: set[str],
+    run_out: float,
+) -> dict[str, float | str]:
+    """Numbers of the text and of the claims of section 4.1."""
+    rms, mean = curves.rms, {name: curves.mean(name) for name in curves.errors}
+    limits = {name: curves.dynamic_range(name, threshold) for name in curves.errors}
+    gain = limits["PhaseShifted"] / limits["Linear"] if limits["Linear"] else np.inf
+    if limits["Linear"] == np.inf:
+        gain = np.nan  # unknown: no input is past the range of the linear one
+    *zeros, _, repaired = variants
+    widest = max(zeros, key=lambda name: variants[name].sensor.extent)
+    usual, wide = methods["GerchbergSaxton"].sensor, variants[widest].sensor
+    tenth, half, one = (int(np.argmin(np.abs(rms - value))) for value in (0.1, 0.5, 1.0))
+    offset, offset_widest = mean["GerchbergSaxton"][tenth], by_width.mean(widest)[0]
+    alike = rms[np.maximum(mean["PhaseShifted"], mean["GradientDescent"]) < 1e-6].max(initial=0)
+    low = (rms > 0) & (rms <= 0.3)
+    with_wraps = np.mean(curves.wrapped > 0, axis=1)
+    recovered = {name: curves.recovered(name, threshold)[one] for name in curves.errors}
+    found = {
+        "linear_limit": limits["Linear"],
+        "arcsine_limit": limits["Arcsine"],
+        "descent_limit": limits["GradientDescent"],
+        "saxton_limit": limits["GerchbergSaxton"],
+        "shifted_limit": limits["PhaseShifted"],
+        "gain": gain,
+        "gain_arcsine": limits["PhaseShifted"] / limits["Arcsine"] if limits["Arcsine"] else np.inf,
+        "arcsine_over_linear": np.max(mean["Arcsine"][low] / mean["Linear"][low], initial=0),
+        "arcsine_ratio_at_05": mean["Arcsine"][half] / rms[half],
+        "alike_up_to": alike,
+        "modes_recovered_at_1": recovered["GradientDescent"],
+        "points_recovered_at_1": recovered["GradientDescentPoints"],
+        "recovered_at_1": recovered["PhaseShifted"],
+        "strehl_at_1": curves.strehl[one].mean(),
+        "strehl_at_limit": np.interp(limits["PhaseShifted"], rms, curves.strehl.mean(axis=1)),
+        "wrapped_screens_at_05": with_wraps[half],
+        "wrapped_screens_at_1": with_wraps[one],
+        "wrap_onset": rms[with_wraps >= 0.5].min(initial=np.inf),
+        "saxton_extent": usual.extent,
+        "saxton_iterations": methods["GerchbergSaxton"].settings.n_iterations,
+        "saxton_error": offset,
+        "saxton_error_at_05": mean["GerchbergSaxton"][half],
+        "light_lost": light_lost(usual),
+        "saxton_widest_extent": wide.extent,
+        "saxton_widest_error": offset_widest,
+        "saxton_widest_beats_linear": _better_from(by_width, widest),
+        "light_lost_widest": light_lost(wide),
+        "saxton_model_error": by_width.mean(repaired)[0],
+        "saxton_model_limit": limits["GerchbergSaxtonModel"],
+        "saxton_model_limit_longer": by_width.dynamic_range(repaired, threshold),
+        "saxton_model_iterations_longer": variants[repaired].settings.n_iterations,
+        "started_limit": limits["GradientDescentStarted"],
+        "started_recovered_at_1": recovered["GradientDescentStarted"],
+        "started_error_at_1": mean["GradientDescentStarted"][one],
+        "shifted_passes": passes["PhaseShifted"],
+        "descent_passes": passes["GradientDescent"],
+        "fourier_functions": len(fourier),
+        "rank": methods["PhaseShifted"].sensor.rank,
+    }
+    # All digits of a rounding error but its power of ten depend on the machine.
+    return rounded(found) | rounded({"run_out": 10 ** np.ceil(np.log10(run_out))}, ".0e")

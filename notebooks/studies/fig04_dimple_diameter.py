@@ -1,0 +1,531 @@
+"""Figure 4, section 4.2 of the paper: errors against the diameter of the dimple, and why the iteration diverges.
+
+Everything rests on one identity. With beta the part of the field psi that passes through the dimple and
+c_k = exp(i theta_k) - 1, the frame of mask k is |psi|^2 + 2 Re(conj(c_k) W) with
+
+    W = conj(beta) (psi - beta),
+
+because |c_k|^2 = -2 Re(c_k). Two frames of an allowed pair are equivalent to the complex map W, whatever the pair.
+A step of the phase-shifted iteration therefore solves conj(beta) (psi' - beta) = W for psi', with the beta of the
+estimate before, and keeps its phase: the phase shifts drop out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from studies.kit import sweeps
+from studies.kit.curves import ErrorCurves, crossing
+from studies.kit.methods import opposite_dimples, own_reconstructors, paper_reconstructors
+from studies.kit.parameters import SETUP, parameter_limits
+from studies.kit.results import rounded
+from studies.kit.setups import NOISELESS, Noise, check_setup
+from studies.kit.style import LOOKS, OTHER_STYLES, looks_of
+from studies.kit.tables import Table, small
+from zwfs.masks import Dimple
+from zwfs.metrics import reconstruction_error, wrapped_residual
+from zwfs.pupil import Pupil
+from zwfs.reconstructors import PhaseShifted
+from zwfs.sensor import ZernikeSensor
+
+LIMITS = parameter_limits(
+    "n_pixels phase_shift n_screens exponent n_iterations extent threshold",
+    n_modes=(149, 1000),
+    rms=(0.01, 4.0),
+    more_iterations=[(1, 10000)],
+    step=(0.05, 2.0),
+    diameter_max=(3.5, 8.0),
+    step_fine=(0.01, 0.3),
+    n_screens_few=(1, 1000),
+    claimed=(0.1, 8.0),
+    **SETUP,
+)
+CHECK_TOGETHER = check_setup
+
+DARK_RING = 2 * 1.2196698912665045
+"""Diameter of the first dark ring of the Airy pattern, lambda/D: twice the first zero of J1(pi r)."""
+TABLED = (1.06, 1.5, 2.0, 2.2, 2.4, 2.6, 3.0, 3.5)
+"""Diameters of the table on the causes of Figure 4, lambda/D."""
+FEW = (0.5, 1.0, 1.06, 1.5, 1.6, 1.75, 2.0, 2.2, 2.4, 2.6, 3.0, 3.5, 4.0)
+"""Diameters at which the costly methods are compared, lambda/D."""
+ITERATION = "PhaseShifted"
+USUAL = 1.06
+"""Diameter of the paper's other figures, lambda/D."""
+SHORT = {
+    "Linear": "linear",
+    "Arcsine": "arcsine",
+    "GerchbergSaxton": "saxton",
+    "GradientDescent": "descent",
+    "GradientDescentPoints": "descent_points",
+}
+"""Names of the methods in the numbers for the text."""
+_MODES = {"tilt": 0, "defocus": 2, "high order (Noll 150)": 148}  # by their place among the modes
+_TOLERANCE = 1e-12  # of the low-rank factors, as the spectrum is to be exact where the iteration is
+
+
+@dataclass(frozen=True)
+class DiameterCurves(ErrorCurves):
+    """Errors of several reconstructors against the diameter of the dimple, on screens of one rms."""
+
+    diameters: NDArray[np.floating]  # (n_diameters,), lambda/D
+
+    def at(self, name: str, diameter: float) -> float:
+        """Mean error at the sampled diameter (lambda/D) that is nearest to `diameter`, radian rms."""
+        return float(self.mean(name)[np.argmin(np.abs(self.diameters - diameter))])
+
+    def exceeds(self, name: str, limit: float, start: float = 0.0) -> float:
+        """Diameter, from `start` on, at which the mean error exceeds `limit` (radian rms); see `crossing`."""
+        used = self.diameters >= start - 1e-9
+        return crossing(self.diameters[used], self.mean(name)[used], limit)
+
+
+def diameter_curves(
+    make: Callable[[float], Mapping[str, Any]],
+    diameters: ArrayLike,
+    screens: NDArray,
+    *,
+    noise: Noise = NOISELESS,
+    seed: int = 0,
+) -> DiameterCurves:
+    """Errors of the reconstructors that `make` returns for each diameter (lambda/D), on the same screens."""
+    diameters = np.asarray(diameters, float)
+    points = sweeps.run(_diameter_point, diameters.tolist(), make, screens, noise, seed, name="diameter_curves")
+    rms, errors = zip(*points, strict=True)
+    return DiameterCurves(
+        np.array(rms), {name: np.array([point[name] for point in errors]) for name in errors[0]}, diameters
+    )
+
+
+def _diameter_point(
+    diameter: float, make: Callable[[float], Mapping[str, Any]], screens: NDArray, noise: Noise, seed: int
+) -> tuple[float, dict[str, NDArray[np.floating]]]:
+    """One diameter of the curves: rms of the screens, and errors on each of them, (n_screens,)."""
+    errors = {}
+    for name, reconstructor in make(diameter).items():
+        sensor = reconstructor.sensor
+        estimate = reconstructor(noise(sensor, screens, seed))
+        errors[name] = reconstruction_error(sensor.pupil, estimate.phase, screens)
+    return float(np.mean(sensor.pupil.rms(screens))), errors
+
+
+def sampled_diameters(step: float, diameter_max: float, step_fine: float) -> NDArray[np.float64]:
+    """Diameters of Figure 4 (lambda/D): every `step`, every `step_fine` from 2 to 2.6, and those of the table."""
+    coarse = np.arange(step, diameter_max + step / 2, step)
+    fine = np.arange(2.0, 2.6 + step_fine / 2, step_fine)
+    return np.unique(np.round([*coarse, *fine, *TABLED], 9))
+
+
+def iteration_curves(
+    pupil: Pupil, phase_shift: float, n_iterations: int, diameters: ArrayLike, screens: NDArray, **noise: Any
+) -> DiameterCurves:
+    """Errors of the phase-shifted iteration, without an early stop; `noise` and `seed` as in `diameter_curves`."""
+
+    def make(diameter: float) -> dict[str, Any]:
+        sensor = opposite_dimples(pupil, diameter, phase_shift)
+        return {ITERATION: PhaseShifted(sensor, n_iterations=n_iterations, tolerance=0.0)}
+
+    return diameter_curves(make, diameters, screens, **noise)
+
+
+def other_curves(
+    pupil: Pupil,
+    modes: NDArray,
+    phase_shift: float,
+    screens: NDArray,
+    *,
+    own: Sequence[str] = (),
+    noise: Noise = NOISELESS,
+    seed: int = 0,
+    **settings: Any,
+) -> DiameterCurves:
+    """Errors of the other methods, at few diameters."""
+
+    def make(diameter: float) -> dict[str, Any]:
+        methods = paper_reconstructors(pupil, modes, diameter, phase_shift, **settings)
+        methods |= own_reconstructors(own, methods, modes)
+        del methods[ITERATION]
+        return methods
+
+    return diameter_curves(make, FEW, screens, noise=noise, seed=seed)
+
+
+class DimpleLight:
+    """The part of a field that passes through a dimple (lambda/D), beta, at the points of the pupil.
+
+    It is beta = expand(project(field) @ core): a few coefficients lie between the two planes.
+    """
+
+    def __init__(self, pupil: Pupil, diameter: float) -> None:
+        # For a phase shift of pi the reference wave is -2 beta.
+        factors = ZernikeSensor(pupil, Dimple(diameter, np.pi), tolerance=_TOLERANCE).factors
+        self.core = factors.core[0].T.real / -2
+        self._pupil, self._factors = pupil, factors
+
+    def __call__(self, field: NDArray) -> NDArray[np.complex128]:
+        """Beta of complex fields at the points of the pupil, (k, n_points) to (k, n_points)."""
+        return self.expand(self.project(field) @ self.core)
+
+    def project(self, field: NDArray) -> NDArray[np.complex128]:
+        """Coefficients of fields, (k, n_points) to (k, rank)."""
+        return self._factors.pupil.project(self._pupil.scatter(np.asarray(field, complex), fill=0))
+
+    def expand(self, coefficients: NDArray) -> NDArray:
+        """Fields of coefficients behind the dimple, (k, rank) to (k, n_points)."""
+        return self._pupil.gather(self._factors.detector.expand(coefficients))
+
+
+def iteration_spectrum(pupil: Pupil, diameter: float, phase: NDArray | None = None) -> NDArray[np.complex128]:
+    """Eigenvalues of the linearised phase-shifted step, piston left out."""
+    light, psi, beta = _linearised(pupil, diameter, phase)
+    # A step maps an error to the few coefficients of the change of beta, and these to the next error. Its
+    # eigenvalues other than 0 are those of the two maps in the opposite order: a small matrix.
+    unit = light.expand(light.core)
+    # The map is linear over the real numbers only: real and imaginary parts of the coefficients count separately.
+    errors = _error_after(psi, beta, np.concatenate([unit, 1j * unit]))
+    coefficients = light.project(1j * psi * errors)
+    values = np.linalg.eigvals(np.concatenate([coefficients.real, coefficients.imag], axis=1))
+    # A piston returns unchanged: its eigenvalue is exactly 1, and no frame shows a piston.
+    values = np.delete(values, np.argmin(np.abs(values - 1)))
+    return values[np.argsort(-np.abs(values), kind="stable")]
+
+
+def measured_factor(
+    pupil: Pupil, diameter: float, phase: NDArray, away: NDArray, n_iterations: int = 400
+) -> float:
+    """Factor by which an iteration of `PhaseShifted` multiplies a small error, observed."""
+    size = float(pupil.rms(away))
+    sensor = ZernikeSensor(pupil, *(Dimple(diameter, theta) for theta in (np.pi / 2, -np.pi / 2)), tolerance=1e-13)
+    method = PhaseShifted(sensor, n_iterations=1)
+    frames, error, factors = sensor.measure(phase), away, []
+    for _ in range(n_iterations):
+        error = wrapped_residual(pupil, method(frames, start=phase + error).phase, phase)
+        error = np.where(pupil.inside, error, 0)
+        factors.append(float(pupil.rms(error)) / size)
+        error /= factors[-1]
+    return float(np.exp(np.mean(np.log(factors[n_iterations // 2 :]))))
+
+
+def mode_sensitivity(
+    pupil: Pupil,
+    diameter: float,
+    modes: NDArray,
+    phase_shifts: tuple[float, ...] = (np.pi / 2, -np.pi / 2),
+    phase: NDArray | None = None,
+) -> NDArray[np.float64]:
+    """Sensitivity of the frames to each mode, the change of the reference wave included."""
+    light, psi, beta = _linearised(pupil, diameter, phase)
+    direct = 1j * psi * pupil.gather(modes)
+    through = light(direct)
+    power = np.zeros(len(direct))
+    for theta in phase_shifts:
+        strength = np.exp(1j * theta) - 1
+        out = psi + strength * beta
+        power += np.mean((2 * np.real(out.conj() * (direct + strength * through))) ** 2, axis=-1)
+    return np.sqrt(power)
+
+
+@dataclass(frozen=True)
+class Contraction:
+    """Factor by which an iteration multiplies a small error, and sensitivity to modes, against the diameter."""
+
+    diameters: NDArray[np.floating]  # (n_diameters,), lambda/D
+    flat: NDArray[np.float64]  # (n_diameters,), factor around a flat wavefront
+    aberrated: NDArray[np.float64]  # (n_diameters, n_screens), factor around each screen
+    observed: dict[float, float]  # factor on the first screen, by diameter
+    sensitivity: dict[str, NDArray[np.float64]]  # (n_diameters,) by mode, 1/rad
+
+    def index(self, diameter: float) -> int:
+        """Index of the sampled diameter that is nearest to `diameter` (lambda/D)."""
+        return int(np.argmin(np.abs(self.diameters - diameter)))
+
+
+def contraction(
+    pupil: Pupil, modes: NDArray, diameters: ArrayLike, screens: NDArray, away: NDArray
+) -> Contraction:
+    """Return the causes of Figure 4: the linearised iteration and the sensitivity, at each diameter."""
+    diameters = np.unique(np.append(diameters, DARK_RING))
+    chosen = modes[list(_MODES.values())]
+    observed = {diameter: measured_factor(pupil, diameter, screens[0], away) for diameter in TABLED}
+
+    def factor(diameter: float, phase: NDArray | None = None) -> float:
+        return float(np.abs(iteration_spectrum(pupil, diameter, phase)[0]))
+
+    sensitivity = np.array([mode_sensitivity(pupil, diameter, chosen) for diameter in diameters]).T
+    return Contraction(
+        diameters,
+        np.array([factor(diameter) for diameter in diameters]),
+        np.array([[factor(diameter, screen) for screen in screens] for diameter in diameters]),
+        observed,
+        dict(zip(_MODES, sensitivity, strict=True)),
+    )
+
+
+_light = lru_cache(maxsize=64)(DimpleLight)  # one for all wavefronts
+
+
+def _linearised(pupil: Pupil, diameter: float, phase: NDArray | None) -> tuple[DimpleLight, NDArray, NDArray]:
+    """Light in the dimple, and the field and its beta at the points of the pupil, (n_points,) each."""
+    psi = pupil.gather(pupil.field(np.zeros(pupil.shape) if phase is None else phase))
+    light = _light(pupil, float(diameter))
+    return light, psi, light(psi[np.newaxis])[0]
+
+
+def _error_after(psi: NDArray, beta: NDArray, change: NDArray) -> NDArray[np.float64]:
+    """Error of the phase after a step that uses beta + change in place of beta."""
+    relative = change / beta
+    return relative.imag - 2 * relative.real * np.imag(beta.conj() * psi) / np.abs(psi) ** 2
+
+
+def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float, claimed: float) -> Figure:
+    """Figure 4: mean error and its standard deviation against the diameter of the dimple, on two kinds of axes."""
+    figure, (plain, log) = plt.subplots(1, 2, figsize=(7, 4))
+    name, floor = ITERATION, 1e-7
+    look = LOOKS[name]
+    (number, curve), *others = curves.items()
+    mean, std = curve.mean(name), curve.std(name)
+    for axes, bottom in ((plain, 0), (log, floor)):
+        low, high = (np.maximum(mean + sign * std, bottom) for sign in (-1, 1))
+        axes.plot(curve.diameters, mean, color=look.color, marker=look.marker, ms=4, label=f"{number} iterations")
+        axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0)
+        _diameters(axes, curve.diameters[-1], claimed)
+        axes.set_ylabel("error (rad rms)")
+    for (number, other), style in zip(others, OTHER_STYLES[1:], strict=False):
+        log.plot(other.diameters, other.mean(name), ms=4, label=f"{number} iterations", **style)
+    limit = threshold * curve.rms[0]
+    log.axhline(limit, color="#555555", lw=1)
+    start, end = 0.64 * claimed, 1.4 * claimed
+    log.text(1.01 * start, limit * 1.3, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
+    plain.set_ylim(0, None)
+    log.set(yscale="log", xlim=(start, end), ylim=(floor, 60))  # room for the legend
+    log.legend(loc="upper left", fontsize=9, handlelength=1.6)
+    return figure
+
+
+def draw_diameter_methods(curves: Mapping[str, DiameterCurves], threshold: float, claimed: float) -> Figure:
+    """Mean error of several methods against the diameter of the dimple."""
+    figure, axes = plt.subplots(figsize=(7, 5))
+    floor = 1e-7
+    for name, look in looks_of(curves):
+        curve = curves[name]
+        mean = np.maximum(curve.mean(name), floor)
+        axes.semilogy(curve.diameters, mean, markersize=4.5, label=look.label, **look.style)
+    limit = threshold * curve.rms[0]
+    axes.axhline(limit, color="#555555", lw=1)
+    axes.text(0.05, limit * 1.2, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
+    _diameters(axes, max(curve.diameters[-1] for curve in curves.values()), claimed)
+    axes.set(ylabel="mean error (rad rms)", ylim=(floor / 2, 4))
+    figure.legend(loc="outside lower center", ncols=2)
+    return figure
+
+
+def draw_diameter_reasons(reasons: Contraction, claimed: float) -> Figure:
+    """Factor of one iteration, and sensitivity to single modes, against the diameter of the dimple."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7, 4))
+    color, diameters, aberrated = LOOKS[ITERATION].color, reasons.diameters, reasons.aberrated
+    flat_color, ring_color, *_ = (style["color"] for style in OTHER_STYLES)
+    left.plot(diameters, reasons.flat, color=flat_color, lw=2, ls="--", zorder=3, label="flat wavefront")
+    low, high = aberrated.min(axis=1), aberrated.max(axis=1)
+    left.fill_between(diameters, low, high, color=color, alpha=0.3, lw=0, label="screens, range")
+    left.plot(diameters, aberrated[:, 0], color=color, lw=1.5, label="first screen")
+    observed = list(reasons.observed), list(reasons.observed.values())
+    left.plot(*observed, "o", mfc="none", mec=ring_color, label="observed")
+    left.axhline(1, color="#555555", lw=1)
+    left.text(0.05, 1.015, "diverges above", color="#555555", fontsize=9)
+    left.set(ylabel="error after / before an iteration", ylim=(0, 1.2))
+    left.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
+    for (name, values), style in zip(reasons.sensitivity.items(), OTHER_STYLES, strict=False):
+        right.plot(diameters, values, lw=1.8, label=name, **style | {"marker": "none"})
+    right.set(ylabel="sensitivity (1/rad)", ylim=(0, 3.5))  # room for the legend on phones
+    right.legend(loc="upper left", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
+    for axes in (left, right):
+        _diameters(axes, diameters[-1], claimed)
+    return figure
+
+
+def _diameters(axes: Axes, end: float, claimed: float) -> None:
+    """Axis of the diameter, with the one of the paper and that of the dark ring."""
+    axes.axvline(claimed, color="#555555", lw=1.2, ls="--", zorder=0.5)
+    axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
+    above: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "va": "bottom", "fontsize": 9}
+    axes.text(claimed, 1.005, f"paper: {claimed:g} ", ha="right", color="#555555", **above)
+    axes.text(DARK_RING, 1.005, " dark ring", ha="left", color="#555555", **above)
+    axes.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=(0, end))
+
+
+def iteration_columns(curves: Mapping[int, DiameterCurves]) -> dict[str, NDArray]:
+    """Columns of the figure of the paper, by the number of iterations; NaN where a curve was not computed."""
+    diameters = next(iter(curves.values())).diameters
+    columns = {"diameter (lambda/D)": diameters}
+    for n, curve in curves.items():
+        computed = np.isin(diameters, curve.diameters)
+        both = {"mean error": curve.mean(ITERATION), "standard deviation": curve.std(ITERATION)}
+        for quantity, values in both.items():
+            column = columns[f"{n} iterations: {quantity} (rad rms)"] = np.full(diameters.size, np.nan)
+            column[computed] = values
+    return columns
+
+
+def reason_columns(reasons: Contraction) -> dict[str, NDArray]:
+    """Columns of the figure on the causes."""
+    return {
+        "diameter (lambda/D)": reasons.diameters,
+        "factor, flat wavefront": reasons.flat,
+        **{f"factor, screen {i}": row for i, row in enumerate(reasons.aberrated.T, start=1)},
+        **{f"sensitivity, {name} (1/rad)": row for name, row in reasons.sensitivity.items()},
+    }
+
+
+def method_columns(curves: Mapping[str, DiameterCurves]) -> dict[str, Sequence[float]]:
+    """Columns of the comparison of the methods."""
+    return {
+        "diameter (lambda/D)": FEW,
+        **{f"{name}, mean error (rad rms)": [curve.at(name, d) for d in FEW] for name, curve in curves.items()},
+    }
+
+
+def limits_table(curves: Mapping[int, DiameterCurves], threshold: float) -> Table:
+    """Diameters at which the error exceeds 1e-3 rad and the threshold, by the number of iterations."""
+    return Table(
+        ["iterations", "passes 10⁻³ rad at (λ/D)", f"passes {100 * threshold:g} % at (λ/D)"],
+        [
+            [n, *(curve.exceeds(ITERATION, limit) for limit in (1e-3, threshold * curve.rms[0]))]
+            for n, curve in curves.items()
+        ],
+    )
+
+
+def factors_table(reasons: Contraction, curve: DiameterCurves, n_iterations: int) -> Table:
+    """Factor of one iteration and sensitivity to tilt at some diameters, with the error of the iteration."""
+    rows = []
+    for diameter, observed in reasons.observed.items():
+        at = reasons.index(diameter)
+        values = reasons.flat[at], reasons.aberrated[at, 0], observed, reasons.sensitivity["tilt"][at]
+        rows.append([diameter, *map(float, values), small(curve.at(ITERATION, diameter))])
+    return Table(
+        [
+            "diameter (λ/D)",
+            "factor, flat",
+            "factor, first screen",
+            "observed on it",
+            "tilt sensitivity (1/rad)",
+            f"mean error after {n_iterations} (rad rms)",
+        ],
+        rows,
+    )
+
+
+def _ends(reasons: Contraction) -> tuple[float, list[float]]:
+    """Diameters at which the factor exceeds 1: for a flat wavefront, and for each screen."""
+    return (
+        crossing(reasons.diameters, reasons.flat, 1.0),
+        [crossing(reasons.diameters, row, 1.0) for row in reasons.aberrated.T],
+    )
+
+
+def ends_table(reasons: Contraction) -> Table:
+    """Diameters at which the factor exceeds 1."""
+    flat, screens = _ends(reasons)
+    return Table(
+        ["the factor passes 1 at", "λ/D"],
+        [
+            ["dark ring, theory", DARK_RING],
+            ["flat wavefront", flat],
+            ["screens, least", min(screens)],
+            ["screens, most", max(screens)],
+        ],
+        digits=4,
+    )
+
+
+def _start(curve: DiameterCurves, name: str, threshold: float) -> str:
+    """Diameter, from the usual one on, at which the error exceeds the threshold, in words."""
+    limit = threshold * curve.rms[0]
+    if curve.at(name, USUAL) > limit:
+        return "at all diameters"
+    return _place(curve.exceeds(name, limit, start=USUAL))
+
+
+def _doubled(curve: DiameterCurves, name: str) -> str:
+    """Diameter at which the error exceeds twice that at the usual one, in words."""
+    error = curve.at(name, USUAL)
+    return "–" if error < 1e-6 else _place(curve.exceeds(name, 2 * error, start=USUAL))
+
+
+def _place(diameter: float) -> str:
+    return f"{diameter:.3g}" if diameter < np.inf else "never"
+
+
+def methods_table(curves: Mapping[str, DiameterCurves], threshold: float) -> Table:
+    """Errors of the methods at some diameters, and the diameters at which they rise."""
+    return Table(
+        [
+            "method",
+            "error at 1.06",
+            "at 2",
+            "at 2.6",
+            "at 3.5 (λ/D)",
+            f"passes {100 * threshold:g} % at (λ/D)",
+            "twice that at 1.06 from (λ/D)",
+        ],
+        [
+            [
+                LOOKS[name].name,
+                *(small(curve.at(name, diameter)) for diameter in (USUAL, 2.0, 2.6, 3.5)),
+                _start(curve, name, threshold),
+                _doubled(curve, name),
+            ]
+            for name, curve in curves.items()
+        ],
+    )
+
+
+def numbers(
+    by_iterations: Mapping[int, DiameterCurves],
+    reasons: Contraction,
+    by_method: Mapping[str, DiameterCurves],
+    threshold: float,
+) -> dict[str, float | str]:
+    """Numbers of the text and of the claims of section 4.2 on the diameter."""
+    paper, longest = by_method[ITERATION], list(by_iterations.values())[-1]
+    limit = threshold * paper.rms[0]
+    flat, screens = _ends(reasons)
+    tilt = reasons.sensitivity["tilt"]
+    usual, at_22, at_3 = map(reasons.index, (USUAL, 2.2, 3.0))
+    ratios = {name: curve.at(name, 2.6) / curve.at(name, 2.0) for name, curve in by_method.items()}
+    lost = _start(by_method["GradientDescent"], "GradientDescent", threshold)
+    found: dict[str, Any] = {
+        "iterations": next(iter(by_iterations)),
+        "diameter_5_percent": paper.exceeds(ITERATION, limit),
+        "diameter_1e3": paper.exceeds(ITERATION, 1e-3),
+        "diameter_5_percent_400": longest.exceeds(ITERATION, limit),
+        "diameter_1e3_400": longest.exceeds(ITERATION, 1e-3),
+        "error_at_20": paper.at(ITERATION, 2.0),
+        "error_at_22": paper.at(ITERATION, 2.2),
+        "error_at_26": paper.at(ITERATION, 2.6),
+        "claim16_ratio": ratios[ITERATION],
+        "contraction_at_106": reasons.flat[usual],
+        "contraction_at_22": reasons.flat[at_22],
+        "contraction_crosses_1": flat,
+        "contraction_crosses_1_screens_least": min(screens),
+        "contraction_crosses_1_screens_most": max(screens),
+        "contraction_observed_difference": max(
+            abs(observed / reasons.aberrated[reasons.index(diameter), 0] - 1)
+            for diameter, observed in reasons.observed.items()
+        ),
+        "dark_ring": DARK_RING,
+        "tilt_at_22": tilt[at_22] / tilt[usual],
+        "tilt_at_dark_ring": tilt.min() / tilt[usual],
+        "tilt_at_3": tilt[at_3] / tilt[usual],
+        **{f"claim17_{short}_ratio": ratios[name] for name, short in SHORT.items()},
+        "descent_passes": f"at {lost} λ/D" if lost[0].isdigit() else lost,
+    }
+    return rounded(found, ".4g")

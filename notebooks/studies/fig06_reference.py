@@ -1,0 +1,66 @@
+"""Figure 6: the images of a flat command, and the errors of the bench."""
+
+from __future__ import annotations
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from studies.kit.bench import ARMS, check_bench, middle_rows
+from studies.kit.parameters import bench_fields, parameter_limits
+from studies.kit.results import rounded
+from studies.kit.style import show_intensity
+from studies.kit.tables import Table
+from zwfs.bench import Bench, BenchModel
+
+LIMITS = parameter_limits(n_pixels=(32, 1024), bench=bench_fields("n_pixels"))
+CHECK_TOGETHER = check_bench
+
+UNITS = {
+    "leakage": "of the light",
+    "focus_difference": "D²/λ",
+    "misregistration": "pixels",
+    "blur": "pixels rms",
+    "flux_imbalance": "of the mean flux",
+    "dimple_error": "of the diameter",
+    "static": "rad rms",
+    "quilting": "rad rms",
+    "photons": "photons in an image",
+    "read_noise": "electrons rms",
+    "background": "electrons in a pixel",
+}
+
+
+def draw_reference_intensities(frames: NDArray, clear_frames: NDArray) -> Figure:
+    """Figure 6: the two images of a flat command, mask in, and the clear frames, (2, ny, nx) each."""
+    figure, panels = plt.subplots(1, 4, figsize=(7, 3.1))
+    for pair, images, label in ((panels[:2], frames, "mask in"), (panels[2:], clear_frames, "mask out")):
+        top = np.quantile(images, 0.9995)
+        for axes, image, arm in zip(pair, images, ARMS, strict=True):
+            shown = show_intensity(axes, image, top)
+            axes.set_title(f"{label},\nimage {arm}", fontsize=10)
+        figure.colorbar(shown, ax=pair, label="intensity", location="bottom", shrink=0.7, aspect=30)
+    return figure
+
+
+def frame_columns(frames: NDArray, clear_frames: NDArray) -> dict[str, NDArray]:
+    """Middle rows of the images of Figure 6."""
+    return middle_rows({"mask in": frames, "mask out": clear_frames})
+
+
+def error_table(bench: Bench) -> Table:
+    """Size of each error of the bench."""
+    rows = [[name, float(getattr(bench, name)), unit] for name, unit in UNITS.items()]
+    return Table(["error", "value", "unit"], rows)
+
+
+def numbers(model: BenchModel, frames: NDArray) -> dict[str, float | str]:
+    """Numbers for the text: the usable segments, and the share of the light that lies outside of them."""
+    on_segments = frames[..., *model.shifted.window][0, model.segments > 0]
+    return rounded(
+        {
+            "usable_segments": len(model.numbers),
+            "light_outside": 1 - on_segments.sum() / frames[0].sum(),
+        }
+    )

@@ -1,0 +1,117 @@
+"""Figure 9: errors on the bench against the input, and the inputs up to which each reconstructor can be used."""
+
+from __future__ import annotations
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from studies.kit.bench import BenchCurves, check_bench
+from studies.kit.parameters import bench_fields, parameter_limits
+from studies.kit.results import rounded
+from studies.kit.style import LOOKS
+from studies.kit.tables import Table
+
+LIMITS = parameter_limits(
+    "rms_max n_rms rms_fine n_screens exponent n_iterations",
+    n_pixels=(32, 1024),
+    extent=(1.0, 4.0),
+    poke=(0.001, 1.5),
+    bench=bench_fields("n_pixels", "extent"),
+)
+CHECK_TOGETHER = check_bench
+
+SHORT = {
+    "linear": "Linear",
+    "arcsine": "Arcsine",
+    "shifted": "PhaseShifted",
+    "saxton": "GerchbergSaxton",
+    "descent": "GradientDescent",
+}
+"""Reconstructors by their names in the text."""
+SHOWN = (0.0, 0.1, 0.3, 0.5, 0.8, 1.0)  # inputs of the table of errors, rad rms
+
+
+def reach(curves: BenchCurves, name: str, ratio: float = 0.25) -> float:
+    """Largest input whose mean error is at most `ratio` times the input, rad rms; 0 if there is none."""
+    good = (curves.rms > 0) & (curves.mean(name) <= ratio * curves.rms)
+    return float(curves.rms[good].max(initial=0.0))
+
+
+def draw_bench_linearity(curves: BenchCurves) -> Figure:
+    """Figure 9: error of the segments against the input, and the gain, estimated over commanded pistons."""
+    figure, (plain, gain) = plt.subplots(1, 2, figsize=(7, 4.4))
+    for name in curves.residuals:
+        look, mean, std = LOOKS[name], curves.mean(name), curves.std(name)
+        plain.plot(curves.rms, mean, markersize=4, label=look.label, **look.style)
+        low, high = np.maximum(mean - std, 0), mean + std
+        plain.fill_between(curves.rms, low, high, color=look.color, alpha=0.15, lw=0)
+        gain.plot(curves.rms, curves.gain(name), markersize=4, **look.style)
+    gain.axhline(1, color="#555555", lw=1)
+    plain.set(xlabel="input (rad rms over the segments)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
+    gain.set(xlabel="input (rad rms over the segments)", ylabel="gain: estimated / commanded piston")
+    gain.set(xlim=(0, None), ylim=(0, 1.5))
+    figure.legend(loc="outside lower center", ncols=3, fontsize=9)
+    return figure
+
+
+def curve_columns(curves: BenchCurves) -> dict[str, NDArray]:
+    """Mean error, standard deviation and gain of each reconstructor."""
+    names = curves.residuals
+    return {
+        "input (rad rms)": curves.rms,
+        **{f"{name}, mean error (rad rms)": curves.mean(name) for name in names},
+        **{f"{name}, standard deviation (rad rms)": curves.std(name) for name in names},
+        **{f"{name}, gain": curves.gain(name) for name in names},
+    }
+
+
+def error_table(curves: BenchCurves) -> Table:
+    """Mean errors at some inputs."""
+    shown = [index for index, value in enumerate(curves.rms) if value in SHOWN]
+    header = ["reconstructor", *(f"error at {curves.rms[index]:g}" for index in shown)]
+    rows = [
+        [LOOKS[name].name, *(f"{curves.mean(name)[index]:.2g}" for index in shown)] for name in curves.residuals
+    ]
+    return Table(header, rows)
+
+
+def reach_table(curves: BenchCurves) -> Table:
+    """Error at a flat command, reach and gain of each reconstructor."""
+    smallest = np.flatnonzero(curves.rms > 0)[0]
+    header = [
+        "reconstructor",
+        "error at a flat command (rad rms)",
+        "largest input with an error below 25 % (rad rms)",
+        "gain at the smallest input",
+    ]
+    rows = [
+        [
+            LOOKS[name].name,
+            f"{curves.mean(name)[0]:.2g}",
+            reach(curves, name) or "none",
+            float(curves.gain(name)[smallest]),
+        ]
+        for name in curves.residuals
+    ]
+    return Table(header, rows)
+
+
+def numbers(curves: BenchCurves) -> dict[str, float | str]:
+    """Numbers for the text: offset and reach of the reconstructors, and how they compare."""
+    mean = {short: curves.mean(name) for short, name in SHORT.items()}
+    large = curves.rms >= 0.3
+    alike = mean["arcsine"][large] / mean["linear"][large]
+    at_01 = next(iter(mean["shifted"][curves.rms == 0.1]), np.nan)
+    return rounded(
+        {
+            **{f"offset_{short}": mean[short][0] for short in ("shifted", "linear", "saxton")},
+            "arcsine_over_linear": round(np.median(alike), 3) if alike.size else np.nan,
+            **{f"reach_{short}": reach(curves, name) for short, name in SHORT.items()},
+            "shifted_worst": mean["shifted"].max(),
+            "largest_input": curves.rms.max(),
+            "shifted_share_at_01": at_01 / 0.1,
+            "saxton_worse_up_to": curves.rms[mean["saxton"] > mean["linear"]].max(initial=0.0),
+        }
+    )

@@ -1,0 +1,361 @@
+"""Section 2 of the paper: its equations as printed, tested on simulated waves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import cycle, product
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from studies.kit.parameters import parameter_limits
+from studies.kit.results import rounded
+from studies.kit.style import OTHER_STYLES
+from studies.kit.tables import Table
+from zwfs.masks import Dimple, Mask
+from zwfs.metrics import reconstruction_error, strehl
+from zwfs.pupil import Pupil
+from zwfs.reconstructors import PhaseShifted
+from zwfs.sensor import ZernikeSensor
+
+LIMITS = parameter_limits(
+    "n_pixels n_modes diameter rms inputs n_screens",
+    patch_diameter=(0.1, 8.0),
+    n_shifts=(4, 96),
+    largest_phase=(0.1, 3.14),
+    resolution=(1e-15, 0.001),
+)
+
+BEST, LITERAL = "amplitude × √S", "intensity × √S"
+POWERS = {BEST: 0.5, LITERAL: 0.25, "not scaled": 0.0}
+"""Powers of the Strehl ratio S by which the common approximation may scale the amplitude of the reference wave."""
+QUOTED = {0.1: "01", 0.3: "03", 0.5: "05"}
+"""Inputs whose errors the text shows (rad rms), and the ends of the names of these numbers."""
+
+
+def two_waves(incoming: NDArray, reference: NDArray) -> NDArray[np.floating]:
+    """Right-hand side of equation (5): intensity of two interfering waves."""
+    i_in, i_ref = np.abs(incoming) ** 2, np.abs(reference) ** 2
+    return i_ref + i_in + 2 * np.sqrt(i_ref * i_in) * np.cos(np.angle(incoming) - np.angle(reference))
+
+
+def fourier_waves(pupil: Pupil, mask: Mask, field: NDArray, padding: int = 8) -> tuple[NDArray, NDArray, NDArray]:
+    """Equations (1) and (4) word by word, by Fourier transforms of a padded pupil."""
+    n = round(padding * pupil.n_pixels)
+    incoming = np.zeros((n, n), complex)
+    incoming[: pupil.shape[0], : pupil.shape[1]] = np.where(pupil.inside, field, 0)
+    u = np.fft.fftfreq(n, 1 / pupil.n_pixels)
+    v = u[:, np.newaxis]
+    patch = np.hypot(u, v) <= mask.diameter / 2
+    transmission = np.where(patch, mask.transmission(u + 0 * v, v + 0 * u), 1)
+    spectrum = np.fft.fft2(incoming)
+    return np.fft.ifft2(spectrum * transmission), incoming, np.fft.ifft2(spectrum * (transmission - 1))
+
+
+def direct_reference_wave(pupil: Pupil, mask: Mask, field: NDArray, n_samples: int = 24) -> NDArray[np.complex128]:
+    """Equation (4) as a sum over the patch, node by node: exact for a smooth patch, and slow."""
+    light = np.where(pupil.inside, field, 0) / pupil.n_pixels**2
+    nodes, weights = np.polynomial.legendre.leggauss(n_samples)
+    radius = (nodes + 1) * mask.diameter / 4
+    angles = np.arange(2 * n_samples) * np.pi / n_samples
+    u, v = np.outer(radius, np.cos(angles)).ravel(), np.outer(radius, np.sin(angles)).ravel()
+    area = np.outer(weights * radius * mask.diameter / 4, np.full(angles.size, np.pi / n_samples)).ravel()
+    waves_x, waves_y = np.exp(2j * np.pi * np.outer(u, pupil.x)), np.exp(2j * np.pi * np.outer(v, pupil.y))
+    spectrum = np.einsum("ky,yx,kx->k", waves_y.conj(), light, waves_x.conj(), optimize=True)
+    return (waves_y.T * (area * (mask.transmission(u, v) - 1) * spectrum)) @ waves_x
+
+
+def two_wave_errors(pupil: Pupil, mask: Mask, field: NDArray) -> tuple[float, float]:
+    """Largest error of equation (5), and largest difference of the low-rank model from `direct_reference_wave`."""
+    outgoing, incoming, reference = fourier_waves(pupil, mask, field)
+    intensity_error = np.abs(outgoing) ** 2 - two_waves(incoming, reference)
+    low_rank = ZernikeSensor(pupil, mask, tolerance=1e-14).reference_wave(field)[0]
+    model_error = low_rank - direct_reference_wave(pupil, mask, field)
+    return float(np.abs(intensity_error).max()), float(np.abs(model_error).max())
+
+
+def arccosine_phase(frame: NDArray, amplitude: NDArray, reference: NDArray) -> NDArray[np.floating]:
+    """Equation (6): phase from one frame and its reference wave."""
+    return np.angle(reference) - np.arccos(np.clip(_cosine(frame, amplitude, reference), -1, 1))
+
+
+def matrix_determinant(first: NDArray, second: NDArray) -> NDArray[np.floating]:
+    """Determinant of the matrix M of equation (9), from its elements."""
+    a, b = np.angle(first), np.angle(second)
+    return np.cos(a) * np.sin(b) - np.sin(a) * np.cos(b)
+
+
+def pair_phase(frames: NDArray, amplitude: NDArray, references: NDArray) -> NDArray[np.floating]:
+    """Equation (9): phase from two frames and their reference waves."""
+    c = _cosine(frames, amplitude, references)
+    a, b = np.moveaxis(np.angle(references), -2, 0)
+    determinant = matrix_determinant(references[..., 0, :], references[..., 1, :])
+    cosine = (np.sin(b) * c[..., 0, :] - np.sin(a) * c[..., 1, :]) / determinant
+    sine = (np.cos(a) * c[..., 1, :] - np.cos(b) * c[..., 0, :]) / determinant
+    return np.arctan2(sine, cosine)
+
+
+def _cosine(frame: NDArray, amplitude: NDArray, reference: NDArray) -> NDArray[np.floating]:
+    """Cosine of the phase between two waves, as equations (6) and (9) take it from the intensity."""
+    amplitude, reference = np.abs(amplitude), np.abs(reference)
+    return (frame - reference**2 - amplitude**2) / (2 * reference * amplitude)
+
+
+@dataclass(frozen=True)
+class ApproximationErrors:
+    """Errors of an approximate reference wave; means over the screens."""
+
+    phase: float  # of the wave, radian rms
+    amplitude: float  # of the wave, relative
+    wave: float  # but for a constant phase, relative
+    one_image: float  # of one step of reconstruction, radian rms
+    two_images: float  # of the same with two images
+
+
+def approximation_errors(sensor: ZernikeSensor, screens: NDArray, power: float = 0.5) -> ApproximationErrors:
+    """Test the common approximation: the wave of a flat wavefront, scaled with a power of the Strehl ratio S."""
+    pupil = sensor.pupil
+    amplitude = pupil.gather(pupil.amplitude)
+    frames = pupil.gather(sensor.measure(screens))
+    field = pupil.field(screens)
+    true = pupil.gather(sensor.reference_wave(field))
+    flat = pupil.gather(sensor.reference_wave(pupil.amplitude))
+    guess = strehl(pupil, screens)[:, np.newaxis, np.newaxis] ** power * flat
+    first, first_guess = true[:, 0], guess[:, 0]
+
+    def phase_error(phase: NDArray, truth: NDArray) -> float:
+        return float(reconstruction_error(pupil, pupil.scatter(phase), truth).mean())
+
+    def relative(gap: NDArray) -> float:
+        return float(np.mean(np.linalg.norm(gap, axis=-1) / np.linalg.norm(first, axis=-1)))
+
+    overlap = np.mean(first * first_guess.conj(), axis=-1, keepdims=True)
+    return ApproximationErrors(
+        phase=phase_error(np.angle(first_guess), pupil.scatter(np.angle(first))),
+        amplitude=relative(np.abs(first_guess) - np.abs(first)),
+        wave=relative(first_guess * overlap / np.abs(overlap) - first),
+        one_image=phase_error(arccosine_phase(frames[:, 0], amplitude, first_guess), screens),
+        two_images=phase_error(pair_phase(frames, amplitude, guess), screens),
+    )
+
+
+def approximation_curves(
+    sensor: ZernikeSensor, screens: NDArray, inputs: Sequence[float]
+) -> dict[str, list[ApproximationErrors]]:
+    """Errors of the common approximation with each of `POWERS`, for screens of 1 rad rms scaled to each input."""
+    return {
+        name: [approximation_errors(sensor, value * screens, power) for value in inputs]
+        for name, power in POWERS.items()
+    }
+
+
+@dataclass(frozen=True)
+class DimplePairs:
+    """Determinants of all pairs of phase shifts on a grid round the circle; means over the pupil."""
+
+    shifts: NDArray[np.float64]  # (n_pairs, 2), radian
+    difference: NDArray[np.float64]  # (n_pairs,), second less first, 0 to 2 pi
+    determinant: NDArray[np.float64]  # (n_pairs,), modulus, equation (10)
+    strength: NDArray[np.float64]  # (n_pairs,), modulus with the strength of both waves
+    off_by_pi: float  # share of the points where the waves differ by pi more than half of the difference
+    sine_error: float  # largest error of the determinant as a sine
+    half_error: float  # largest error of half of the difference, modulo pi
+
+
+def dimple_pairs(pupil: Pupil, diameter: float, n_shifts: int, field: NDArray) -> DimplePairs:
+    """Take the determinant of every pair of dimples of `n_shifts` phase shifts, at every point of the pupil."""
+    shifts = 2 * np.pi * np.arange(n_shifts) / n_shifts - np.pi
+    shifts = shifts[np.abs(shifts) > 1e-9]
+    sensor = ZernikeSensor(pupil, *(Dimple(diameter, theta) for theta in shifts))
+    waves = pupil.gather(sensor.reference_wave(field))
+    beta = waves[0] / (np.exp(1j * shifts[0]) - 1)
+    pairs = list(product(range(len(shifts)), repeat=2))
+    size, strength, off_by_pi, sine_error, half_error = np.empty((5, len(pairs)))
+    for index, (a, b) in enumerate(pairs):
+        determinant = matrix_determinant(waves[a], waves[b])
+        between = np.angle(waves[b]) - np.angle(waves[a])
+        beyond_half = between - (shifts[b] - shifts[a]) / 2
+        size[index] = np.abs(determinant).mean()
+        strength[index] = np.abs((waves[a].conj() * waves[b]).imag / np.abs(beta) ** 2).mean()
+        off_by_pi[index] = np.mean(np.cos(beyond_half) < 0)
+        sine_error[index] = np.abs(determinant - np.sin(between)).max()
+        half_error[index] = np.abs(np.sin(beyond_half)).max()
+    both = shifts[pairs]
+    difference = (both[:, 1] - both[:, 0]) % (2 * np.pi)
+    return DimplePairs(
+        both, difference, size, strength, float(off_by_pi.mean()), float(sine_error.max()), float(half_error.max())
+    )
+
+
+def true_wave_errors(sensor: ZernikeSensor, screens: NDArray) -> dict[str, NDArray[np.float64]]:
+    """Absolute errors of the phase at each point, from two frames and from one, with the true reference waves."""
+    pupil = sensor.pupil
+    amplitude, truth = pupil.gather(pupil.amplitude), pupil.gather(screens)
+    frames = sensor.measure(screens)
+    inside, waves = pupil.gather(frames), pupil.gather(sensor.reference_wave(pupil.field(screens)))
+    one_step = PhaseShifted(sensor, n_iterations=1)(frames, start=screens)
+    phases = {
+        "two images, equation (9)": pair_phase(inside, amplitude, waves),
+        "two images, one iteration": pupil.gather(one_step.phase),
+        "one image, equation (6)": arccosine_phase(inside[:, 0], amplitude, waves[:, 0]),
+    }
+    return {name: np.abs(np.angle(np.exp(1j * (phase - truth)))) for name, phase in phases.items()}
+
+
+Curves = Mapping[str, Sequence[float]]
+Errors = Mapping[str, Sequence[ApproximationErrors]]
+
+_FIFTH: dict[str, Any] = {"color": "#777777", "marker": "s", "linestyle": (0, (4, 1))}
+
+
+def approximation_panels(inputs: Sequence[float], errors: Errors) -> tuple[Curves, Curves]:
+    """Errors of the reference wave by what is drawn, and errors of one step with it over the input."""
+
+    def over_input(values: list[float]) -> list[float]:
+        return [value / rms for value, rms in zip(values, inputs, strict=True)]
+
+    wave = {"phase (rad rms)": [one.phase for one in errors[BEST]]}
+    wave |= {name: [one.amplitude for one in errors[name]] for name in (BEST, LITERAL)}
+    steps = {name: over_input([one.two_images for one in some]) for name, some in errors.items()}
+    steps[f"{BEST}, one image"] = over_input([one.one_image for one in errors[BEST]])
+    return wave, steps
+
+
+def draw_approximation(rms: Sequence[float], wave: Curves, steps: Curves) -> Figure:
+    """Error of approximate reference waves against the input, and of one step of reconstruction with each."""
+    figure, panels = plt.subplots(1, 2, figsize=(7.2, 4.0))
+    styles = dict(zip(dict.fromkeys([*steps, *wave]), cycle((*OTHER_STYLES, _FIFTH)), strict=False))
+    for axes, curves in zip(panels, (wave, steps), strict=True):
+        for label, values in curves.items():
+            axes.plot(rms, values, markersize=4.5, label=label, **styles[label])
+        top = max(max(values) for values in curves.values())
+        axes.set(xlabel="input phase (rad rms)", xlim=(0, None), ylim=(0, 1.4 * top))  # room for the legend
+        axes.legend(fontsize=8)
+    panels[0].set_ylabel("error of the reference wave")
+    panels[1].set_ylabel("error of the phase / input")
+    return figure
+
+
+# Pairs of phase shifts to point out, where the grid has them, rad.
+_NAMED = {
+    "±π/2": (-np.pi / 2, np.pi / 2),
+    "±2π/3": (-2 * np.pi / 3, 2 * np.pi / 3),
+    "π/12 and −11π/12": (np.pi / 12, -11 * np.pi / 12),
+}
+
+
+def draw_diversity(pairs: DimplePairs) -> Figure:
+    """Determinant of equation (10) and the one weighted with both reference waves, for many pairs of masks."""
+    matches = {label: np.isclose(pairs.shifts, pair).all(axis=1) for label, pair in _NAMED.items()}
+    named = {label: int(match.argmax()) for label, match in matches.items() if match.any()}
+    figure, panels = plt.subplots(1, 2, figsize=(7.2, 3.8), sharex=True)
+    for axes, values in zip(panels, (pairs.determinant, pairs.strength), strict=True):
+        axes.plot(pairs.difference, values, ".", color="#56B4E9", ms=4)
+        for (label, index), style in zip(named.items(), OTHER_STYLES, strict=False):
+            point = pairs.difference[index], values[index]
+            axes.plot(*point, label=label, markersize=8, **style | {"linestyle": "none"})
+        axes.set(xlabel=r"difference $\theta_b-\theta_a$ (rad)", ylim=(0, None))
+        axes.set_xticks(np.pi / 2 * np.arange(5), ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"])
+    panels[0].set_ylabel(r"$|\det M|$")
+    panels[1].set_ylabel("weighted determinant")
+    if named:
+        panels[0].legend(fontsize=9, loc="lower center")  # below the arch, where no pair is
+    return figure
+
+
+def approximation_columns(inputs: Sequence[float], wave: Curves, steps: Curves) -> dict[str, Sequence[float]]:
+    """Columns of the curves of both panels."""
+    return (
+        {"input (rad rms)": inputs}
+        | {f"reference wave: {name}": values for name, values in wave.items()}
+        | {f"phase over input: {name}": values for name, values in steps.items()}
+    )
+
+
+def diversity_columns(pairs: DimplePairs) -> dict[str, NDArray]:
+    """Columns of the determinants of all pairs."""
+    return {
+        "theta_a (rad)": pairs.shifts[:, 0],
+        "theta_b (rad)": pairs.shifts[:, 1],
+        "|det M|": pairs.determinant,
+        "determinant with the waves' strength": pairs.strength,
+    }
+
+
+def quoted_table(columns: Mapping[str, Sequence[float]]) -> Table:
+    """Errors at the quoted inputs."""
+    (_, inputs), *curves = columns.items()
+    shown = [inputs.index(value) for value in QUOTED]
+    header = ["", *(f"at {value:g} rad rms" for value in QUOTED)]
+    return Table(header, [[name, *(float(values[i]) for i in shown)] for name, values in curves], digits=2)
+
+
+def two_wave_table(errors: Mapping[str, tuple[float, float]], resolution: float) -> Table:
+    """Largest errors for each mask."""
+    rows = [[name, *(_text(value, resolution) for value in pair)] for name, pair in errors.items()]
+    return Table(["mask", "two-wave formula, largest error", "model, largest error"], rows)
+
+
+def true_wave_table(errors: Mapping[str, NDArray], resolution: float) -> Table:
+    """Largest and rms errors of phases from the true reference waves."""
+    rows = [
+        [name, _text(values, resolution), _text(np.sqrt(np.mean(values**2)), resolution)]
+        for name, values in errors.items()
+    ]
+    return Table(["phase from", "largest error (rad)", "error (rad rms)"], rows)
+
+
+def numbers(
+    wave_errors: Mapping[str, tuple[float, float]],
+    inputs: Sequence[float],
+    approximate: Errors,
+    pairs: DimplePairs,
+    true_wave: Mapping[str, NDArray],
+    largest_phase: float,
+    resolution: float,
+) -> dict[str, float | str]:
+    """Numbers that the claims of section 2 rest on."""
+    best_pair = int(np.argmax(pairs.determinant.round(9)))
+    two_images, one_step, one_image = true_wave.values()
+    errors: dict[str, ArrayLike] = {
+        "dimple_two_wave_error": wave_errors["dimple"][0],
+        "patch_two_wave_error": wave_errors["patch"][0],
+        "patch_model_error": wave_errors["patch"][1],
+        "determinant_error": pairs.sine_error,
+        "half_difference_error": pairs.half_error,
+        "diversity_at_0": pairs.determinant[pairs.difference < 1e-9],
+        "true_wave_error": two_images,
+        "one_step_error": one_step,
+    }
+    found = {name: _at_least(error, resolution) for name, error in errors.items()} | {
+        "pairs_off_by_pi": pairs.off_by_pi,
+        "largest_diversity": pairs.determinant[best_pair],
+        "best_difference": pairs.difference[best_pair],
+        "largest_phase": largest_phase,
+        "one_image_error": np.sqrt(np.mean(one_image**2)),
+    }
+    for value, ending in QUOTED.items():
+        right, literal = (approximate[name][inputs.index(value)] for name in (BEST, LITERAL))
+        found |= {
+            f"wave_error_{ending}": right.wave,
+            f"wave_phase_error_{ending}": right.phase,
+            f"wave_amplitude_error_{ending}": right.amplitude,
+            f"step_error_{ending}": right.two_images,
+            f"literal_amplitude_error_{ending}": literal.amplitude,
+            f"literal_step_error_{ending}": literal.two_images,
+        }
+    return rounded(found, ".5g")
+
+
+def _at_least(errors: ArrayLike, resolution: float) -> float:
+    """Largest error, or the resolution, below which errors are rounding."""
+    return max(float(np.max(errors)), resolution)
+
+
+def _text(errors: ArrayLike, resolution: float) -> str:
+    error = _at_least(errors, resolution)
+    return f"<{error:.0e}" if error <= resolution else f"{error:.2g}"

@@ -1,0 +1,1 @@
+"""Set-ups, styles, parameters, results and sweeps that the studies share."""

@@ -1,0 +1,123 @@
+"""The simulated bench in an experiment: random commands of the segments, and the errors of their estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from studies.kit import sweeps
+from studies.kit.curves import ErrorCurves
+from studies.kit.parameters import within
+from zwfs import Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
+from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
+
+ARMS = ("1 (+θ)", "2 (−θ)")  # of the bench, for labels
+
+# Smallest singular value of the interaction matrix that is inverted, over the largest. No sensor sees the piston
+# of all segments together: its singular value is the noise of the calibration, and is left out.
+_CONDITIONING = 0.1
+
+
+def check_bench(bench: Mapping[str, Any], **others: Any) -> None:
+    """Refuse fields of the bench that contradict each other, or the pixels and extent of a notebook."""
+    own = {name: others[name] for name in ("n_pixels", "extent") if name in others}
+    with within("bench", bench):
+        Bench(**own, **bench)
+
+
+@dataclass(frozen=True)
+class BenchCurves(ErrorCurves):
+    """Errors of several reconstructors on random segment commands."""
+
+    errors: dict[str, NDArray[np.float64]] = field(init=False)  # (n_rms, n_screens) each, rad rms
+    commanded: NDArray[np.float64]  # (n_rms, n_screens, n_segments), rad
+    residuals: dict[str, NDArray[np.float64]]  # the same shape each, rad
+
+    def __post_init__(self) -> None:
+        errors = {name: np.sqrt(np.mean(values**2, axis=-1)) for name, values in self.residuals.items()}
+        object.__setattr__(self, "errors", errors)
+
+    def gain(self, name: str) -> NDArray[np.float64]:
+        """Slope of the measured pistons against the commanded ones, (n_rms,); below 1 they are underestimated."""
+        residuals = self.residuals[name]
+        if np.any(self.rms == 0):
+            residuals = residuals - residuals[self.rms == 0].mean(axis=(0, 1))
+        power = np.sum(self.commanded**2, axis=(1, 2))
+        slope = np.sum(self.commanded * residuals, axis=(1, 2))
+        return 1 + np.divide(slope, power, out=np.full_like(power, np.nan), where=power > 0)
+
+
+def bench_reconstructors(
+    bench: Bench, model: BenchModel, *, n_iterations: int = 25, poke: float = 0.1, seed: int = 0
+) -> dict[str, Any]:
+    """Return the paper's reconstructors for the model of a bench; the linear one is calibrated on the bench."""
+    rng = np.random.default_rng(seed)
+    pokes = poke * np.eye(bench.n_segments)
+    flat, pushed, pulled = (
+        model.normalise(bench.frames(command, rng))[..., :1, :, :] for command in (None, pokes, -pokes)
+    )
+    recorded = flat, pushed, pulled
+    return {
+        "Linear": Linear(model.classic, model.modes, poke=poke, conditioning=_CONDITIONING, calibration=recorded),
+        "Arcsine": Arcsine(model.classic, n_iterations=n_iterations),
+        "GerchbergSaxton": GerchbergSaxton(model.shifted, n_iterations=n_iterations),
+        "GradientDescent": GradientDescent(model.shifted, model.modes, n_iterations=n_iterations),
+        "PhaseShifted": PhaseShifted(model.shifted, n_iterations=n_iterations),
+    }
+
+
+def find_pistons(reconstructor: Any, model: BenchModel, frames: NDArray) -> NDArray[np.float64]:
+    """Estimate the pistons of normalised frames of the bench, (..., 2, ny', nx') to (..., n_segments)."""
+    n_images = reconstructor.sensor.n_masks
+    return model.pistons(reconstructor(frames[..., :n_images, :, :]).phase)
+
+
+def bench_curves(
+    bench: Bench,
+    model: BenchModel,
+    reconstructors: Mapping[str, Any],
+    rms: ArrayLike,
+    n_screens: int,
+    *,
+    exponent: float = -2.0,
+    seed: int = 0,
+) -> BenchCurves:
+    """Errors of reconstructors on random segment commands of growing rms: the experiment of section 5.2."""
+    rms = np.asarray(rms, dtype=float)
+    shared = bench, model, dict(reconstructors), n_screens, exponent, seed
+    points = sweeps.run(_bench_point, enumerate(rms.tolist()), *shared, name="bench_curves")
+    commanded, residuals = zip(*points, strict=True)
+    return BenchCurves(
+        rms, np.array(commanded), {name: np.array([point[name] for point in residuals]) for name in reconstructors}
+    )
+
+
+def _bench_point(
+    point: tuple[int, float],
+    bench: Bench,
+    model: BenchModel,
+    reconstructors: Mapping[str, Any],
+    n_screens: int,
+    exponent: float,
+    seed: int,
+) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+    """One input of the bench curves: what is commanded, and the residuals, (n_screens, n_segments) each."""
+    task, rms = point
+    screens, noise = np.random.SeedSequence(seed, spawn_key=(task,)).spawn(2)
+    commanded = segment_screens(bench, rms, n_screens, exponent, screens)
+    frames = model.normalise(bench.frames(commanded, noise))
+    return commanded, {
+        name: segment_residual(find_pistons(reconstructor, model, frames), commanded)
+        for name, reconstructor in reconstructors.items()
+    }
+
+
+def middle_rows(pairs: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """Return columns for `publish`: the middle row of both images of each named pair, (2, ny, nx)."""
+    _, ny, nx = next(iter(pairs.values())).shape
+    rows = {f"{name}, image {i + 1}": pair[i, ny // 2] for name, pair in pairs.items() for i in range(2)}
+    return {"column (pixel)": np.arange(nx)} | rows

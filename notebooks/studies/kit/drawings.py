@@ -1,0 +1,211 @@
+"""Drawings of optical layouts with computed pictures in their planes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.image import AxesImage
+from matplotlib.layout_engine import PlaceHolderLayoutEngine
+from matplotlib.patches import Ellipse, FancyArrowPatch, Polygon, Rectangle
+from numpy.typing import NDArray
+
+from studies.kit.style import PHASE_MAP
+from zwfs.masks import Mask, focal_field
+from zwfs.pupil import Pupil
+
+_MASK_SAMPLES = 161
+_BEAM, _RAY, _GLASS, _EDGE = "#f8e8c8", "#a8742a", "#cfe3f2", "#33658a"
+METAL, RETARDER = "#444444", "#7a5195"
+Point = tuple[float, float]  # inches
+Profile = list[tuple[float, float]]  # distance along a beam and half of its width, inches
+
+
+@dataclass(frozen=True)
+class Polarisation:
+    """How one of the two polarisations is drawn: colour, and dashes for those who do not see it."""
+
+    color: str
+    line: str | tuple[float, tuple[float, ...]]
+
+
+# Red and indigo, close to the ends of the phase map for +theta and -theta. They are far from the colours of the
+# methods, and colour-blind readers can distinguish them.
+PLUS, MINUS = Polarisation("#B2182B", "-"), Polarisation("#313695", (0, (4, 2)))
+
+
+class Scene:
+    """Figure without visible axes: positions in inches from its lower left corner, text of `size` points."""
+
+    def __init__(self, width: float, height: float, size: float = 9) -> None:
+        # Not "none": after it, a figure that is saved twice gets the layout engine of the style.
+        self.figure = plt.figure(figsize=(width, height), layout=PlaceHolderLayoutEngine(True, True))
+        self.width, self.height, self.size = width, height, size
+        self.axes = self.figure.add_axes((0, 0, 1, 1))
+        self.axes.set(xlim=(0, width), ylim=(0, height))
+        self.axes.set_axis_off()
+
+    def _part(self, left: float, bottom: float, width: float, height: float) -> Axes:
+        return self.figure.add_axes(
+            (left / self.width, bottom / self.height, width / self.width, height / self.height)
+        )
+
+    def picture(
+        self,
+        x: float,
+        y: float,
+        size: float,
+        image: NDArray,
+        colors: str,
+        low: float,
+        high: float,
+        edge: str | None = "black",
+    ) -> AxesImage:
+        """Picture centred on (x, y), its first row at the bottom, with a frame unless `edge` is None."""
+        axes = self._part(x - size / 2, y - size / 2, size, size)
+        axes.set(xticks=[], yticks=[])
+        axes.grid(False)
+        axes.spines[:].set(
+            visible=edge is not None, color=edge or "none", linewidth=0.8 if edge == "black" else 1.6
+        )
+        return axes.imshow(image, cmap=colors, vmin=low, vmax=high, origin="lower", interpolation="none")
+
+    def scale(
+        self, shown: AxesImage, box: tuple[float, float, float, float], name: str = "", ticks: int = 4
+    ) -> None:
+        """Colour scale of a picture in a box (left, bottom, width, height), along its longer side."""
+        axes = self._part(*box)
+        flat = box[2] > box[3]
+        bar = self.figure.colorbar(shown, cax=axes, orientation="horizontal" if flat else "vertical")
+        bar.set_label(name, fontsize=self.size - 1)
+        axes.tick_params(labelsize=self.size - 1, length=2, pad=1)
+        axes.locator_params(nbins=ticks)
+
+    def label(
+        self, x: float, y: float, text: str, size: float | None = None, ha: str = "center", **style: Any
+    ) -> None:
+        """Text, centred on x unless said otherwise, in points; the size is that of the scene if None."""
+        self.axes.text(x, y, text, ha=ha, fontsize=size or self.size, **style)
+
+    def beam(self, profile: Profile, origin: Point, angle: float = 0.0) -> None:
+        """Beam of light: (distance along the axis, half of the width) at its corners."""
+        low, high = _turned(profile, origin, angle)
+        self.axes.add_patch(Polygon([*low, *high[::-1]], closed=True, fc=_BEAM, ec="none"))
+
+    def edges(self, profile: Profile, origin: Point) -> None:
+        """Edges of a beam that holds both polarisations, in both of their colours."""
+        for look in (PLUS, MINUS):
+            for side in _turned(profile, origin, 0.0):
+                self.axes.plot(*np.transpose(side), color=look.color, ls=look.line, lw=1.2)
+
+    def axis(self, start: Point, end: Point) -> None:
+        """Optical axis."""
+        self.axes.plot(*np.transpose([start, end]), color="#888888", lw=0.7, ls=(0, (8, 3, 2, 3)))
+
+    def arrows(self, start: float, end: float, y: float, apart: float) -> None:
+        """Two arrows along the light."""
+        for height in (y - apart, y + apart):
+            self.axes.add_patch(
+                FancyArrowPatch((start, height), (end, height), arrowstyle="-|>", mutation_scale=9, color=_RAY)
+            )
+
+    def lens(self, x: float, y: float, height: float, angle: float = 0.0) -> None:
+        """Lens; `angle` (radian) is that of the light."""
+        width = min(0.22, 0.13 * height)
+        self.axes.add_patch(Ellipse((x, y), width, height, angle=np.degrees(angle), fc=_GLASS, ec=_EDGE, lw=1.2))
+
+    def plate(self, x: float, y: float, width: float, height: float, color: str, edge: str = "none") -> None:
+        """Plate across the light."""
+        self.axes.add_patch(Rectangle((x - width / 2, y - height / 2), width, height, fc=color, ec=edge, zorder=3))
+
+    def corner(self, *points: Point) -> None:
+        """Light in front of a mirror that folds the beam."""
+        self.axes.add_patch(Polygon(points, closed=True, fc=_BEAM, ec=_BEAM, lw=0.5))
+
+    def stop(self, x: float, y: float, half: float, reach: float) -> None:
+        """Two blades that leave an opening of twice `half`."""
+        for sign in (-1, 1):
+            self.plate(x, y + sign * (half + reach) / 2, 0.06, reach - half, METAL)
+
+    def wollaston(self, x: float, y: float, width: float, height: float) -> None:
+        """Wollaston prism: two wedges of crystal with their axes crossed."""
+        left, right, low, high = x - width / 2, x + width / 2, y - height / 2, y + height / 2
+        for corners, color in (
+            ([(left, low), (right, low), (left, high)], _GLASS),
+            ([(right, low), (right, high), (left, high)], "#a9cbe4"),
+        ):
+            self.axes.add_patch(Polygon(corners, closed=True, fc=color, ec=_EDGE, lw=1.1, zorder=3))
+
+    def split_beam(self, start: Point, end: float, half: float, apart: float) -> None:
+        """Beams of the two polarisations from a Wollaston prism to their images `apart` from the axis."""
+        x, y = start
+        for look, sign in ((PLUS, 1), (MINUS, -1)):
+            low, high = ([(x, y + edge), (end, y + sign * apart + edge)] for edge in (-half, half))
+            self.axes.add_patch(Polygon([*low, *high[::-1]], closed=True, fc=look.color, ec="none", alpha=0.13))
+            for side in (low, high):
+                self.axes.plot(*np.transpose(side), color=look.color, ls=look.line, lw=1.2)
+
+    def detector(self, x: float, y: float, height: float) -> None:
+        """Detector, from the side."""
+        self.plate(x + 0.04, y, 0.08, height, METAL)
+
+    def key(self, x: float, y: float, look: Polarisation, text: str) -> None:
+        """Line of a polarisation, and what it means."""
+        self.axes.plot([x, x + 0.4], [y + 0.05, y + 0.05], color=look.color, ls=look.line, lw=1.6)
+        self.label(x + 0.47, y, text, ha="left")
+
+    def callout(self, *points: Point) -> None:
+        """Thin line from an element to its picture."""
+        self.axes.plot(*np.transpose(points), color="#888888", lw=0.8, zorder=1)
+
+
+def _turned(profile: Profile, origin: Point, angle: float) -> tuple[list[Point], list[Point]]:
+    """Lower and upper edge of a beam along a direction (radian)."""
+    along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    start = np.asarray(origin)
+
+    def edge(sign: int) -> list[Point]:
+        return [(x, y) for x, y in (start + s * along + sign * half * across for s, half in profile)]
+
+    return edge(-1), edge(1)
+
+
+def mask_picture(
+    scene: Scene, x: float, y: float, size: float, mask: Mask, halo: NDArray, reach: float, look: Polarisation
+) -> None:
+    """Phase map of a mask, in the colours of phase, over the image of the source, in faint grey."""
+    axes = scene.picture(x, y, size, halo, "Greys", -4, 3, edge=look.color).axes
+    u = np.linspace(-reach, reach, _MASK_SAMPLES)
+    inside = np.hypot(u, u[:, np.newaxis]) <= mask.diameter / 2
+    phase = np.where(inside, np.angle(mask.transmission(*np.meshgrid(u, u))), np.nan)
+    # Same sampling as the image below it: one pixel of the map is one of the picture.
+    axes.imshow(phase, cmap=PHASE_MAP, vmin=-np.pi, vmax=np.pi, origin="lower", interpolation="none")
+
+
+def focal_light(pupil: Pupil, field: NDArray, reach: float) -> NDArray:
+    """Decadic logarithm of the intensity in the focal plane, relative to its peak, to `reach` (lambda/D)."""
+    axis = np.linspace(-reach, reach, _MASK_SAMPLES)
+    focus = np.abs(focal_field(pupil, field, axis, axis)) ** 2
+    with np.errstate(divide="ignore"):
+        return np.log10(focus / focus.max())
+
+
+def shift_label(mask: Mask, *, plus: bool = False) -> str:
+    """Phase shift at the centre of a mask, with a + if asked for."""
+    axis = np.zeros(1)
+    angle = np.angle(mask.transmission(axis, axis)).item()
+    text = _in_pi(angle)
+    return f"$+${text}" if plus and angle > 0 else text
+
+
+def _in_pi(angle: float) -> str:
+    """Angle as a multiple of pi where it is a simple one."""
+    for parts in (1, 2, 3, 4, 6):
+        times = angle / np.pi * parts
+        if abs(times - round(times)) < 1e-9 and round(times):
+            top = {1: "", -1: "-"}.get(round(times), str(round(times)))
+            return f"${top}\\pi$" if parts == 1 else f"${top}\\pi/{parts}$"
+    return f"{angle:.3g}"

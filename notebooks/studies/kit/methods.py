@@ -1,0 +1,141 @@
+"""Reconstructors of the figures: those of the paper, repaired variants, and those of a reader."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zwfs.masks import Dimple
+from zwfs.pupil import Pupil
+from zwfs.reconstructors import (
+    RECONSTRUCTORS,
+    Arcsine,
+    GerchbergSaxton,
+    GradientDescent,
+    Linear,
+    PhaseShifted,
+    Reconstruction,
+)
+from zwfs.reconstructors.base import load
+from zwfs.sensor import ZernikeSensor
+
+PAPER = ("Linear", "Arcsine", "GerchbergSaxton", "GradientDescent", "GradientDescentPoints", "PhaseShifted")
+REPAIRED = ("GerchbergSaxtonModel", "GradientDescentStarted")
+OWN_CHAPTER = ("MaximumLikelihood",)  # reconstructors of the package that Figures 3 and 4 leave to other chapters
+
+
+def paper_reconstructors(
+    pupil: Pupil,
+    modes: NDArray,
+    diameter: float,
+    phase_shift: float,
+    *,
+    extent: float = 2.0,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Return the paper's reconstructors by name, each for the sensor that it needs."""
+    plus, minus = Dimple(diameter, phase_shift), Dimple(diameter, -phase_shift)
+    classic, shifted = ZernikeSensor(pupil, plus), ZernikeSensor(pupil, plus, minus)
+    wide = ZernikeSensor(pupil, plus, minus, extent=extent)
+    methods = (
+        Linear(classic, modes),
+        Arcsine(classic, **settings),
+        GerchbergSaxton(wide, **settings),
+        GradientDescent(shifted, modes, **settings),
+        GradientDescent(shifted, **settings),
+        PhaseShifted(shifted, **settings),
+    )
+    return dict(zip(PAPER, methods, strict=True))
+
+
+@dataclass(frozen=True)
+class _Started:
+    """Reconstructor that starts from the phase of a different one for the same frames."""
+
+    first: Any
+    then: Any
+
+    @property
+    def sensor(self) -> ZernikeSensor:
+        """Sensor of both reconstructors."""
+        return self.then.sensor
+
+    def __call__(self, frames: ArrayLike) -> Reconstruction:
+        """Reconstruct the phase of each frame set."""
+        return self.then(frames, start=self.first(frames).phase)
+
+
+def repaired_reconstructors(reconstructors: Mapping[str, Any]) -> dict[str, Any]:
+    """Return variants of `paper_reconstructors`, with their settings, that avoid a failure of the originals."""
+    shifted, original = reconstructors["PhaseShifted"].sensor, reconstructors["GerchbergSaxton"].settings
+    steps = {"n_iterations": original.n_iterations, "tolerance": original.tolerance}
+    start = PhaseShifted(shifted, n_iterations=5)
+    methods = (
+        GerchbergSaxton(shifted, **steps, unmeasured="model"),
+        _Started(start, reconstructors["GradientDescent"]),
+    )
+    return dict(zip(REPAIRED, methods, strict=True))
+
+
+def own_reconstructors(paths: Sequence[str], reconstructors: Mapping[str, Any], modes: NDArray) -> dict[str, Any]:
+    """Return the reconstructors that a reader names or adds to the package, for sensors of the paper's."""
+    added = {method.__name__: method for method in RECONSTRUCTORS}
+    for name in (*PAPER, *OWN_CHAPTER):
+        added.pop(name, None)
+    one, two = (reconstructors[name].sensor for name in ("Arcsine", "PhaseShifted"))
+    offered = {"modes": modes, "n_iterations": reconstructors["PhaseShifted"].settings.n_iterations}
+    return {
+        name: method(two if _accepts_two_masks(method) else one, **_asked(method, offered))
+        for name, method in (added | _own_classes(paths)).items()
+    }
+
+
+def _accepts_two_masks(method: Any) -> bool:
+    """Whether a class accepts a sensor with two masks; its `n_masks` is a number, or (fewest, most)."""
+    n_masks = getattr(method, "n_masks", 2)
+    fewest, most = n_masks if isinstance(n_masks, tuple) else (n_masks, n_masks)
+    return fewest <= 2 <= most
+
+
+def _asked(method: Any, offered: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the offered settings that the constructor of a class asks for by name."""
+    return {name: value for name, value in offered.items() if name in inspect.signature(method).parameters}
+
+
+def _own_classes(paths: Sequence[str]) -> dict[str, Any]:
+    """Return a reader's classes by their names, which differ from those of the paper's reconstructors."""
+    package = {f"zwfs:{method.__name__}": method for method in RECONSTRUCTORS}
+    own: dict[str, Any] = {}
+    for path in paths:
+        method = package.get(path) or load(path)
+        taken = (*PAPER, *REPAIRED, *own)
+        if method.__name__ in taken:
+            raise ValueError(f"path = {path!r}: expected a name other than {', '.join(taken)}")
+        own[method.__name__] = method
+    return own
+
+
+def check_own(paths: Sequence[str]) -> None:
+    """Refuse paths that `own_reconstructors` would refuse, before any work."""
+    _own_classes(paths)
+
+
+MASKS = {
+    "Keck": (Dimple(2.4, 0.30 * np.pi), Dimple(2.4, -0.68 * np.pi)),
+    "OZIRIIS, on the sky": (Dimple(1.96, 0.33 * np.pi), Dimple(1.96, -0.74 * np.pi)),
+    "OZIRIIS, in the laboratory": (Dimple(2.14, 0.33 * np.pi), Dimple(2.14, -0.74 * np.pi)),
+}
+"""Pairs of dimples in instruments.
+
+Keck's are those of Salama et al. 2024, OZIRIIS's those of its telemetry software (Motte 2026).
+"""
+
+
+def opposite_dimples(pupil: Pupil, diameter: float, phase_shift: float) -> ZernikeSensor:
+    """Return the sensor with two dimples of one diameter (lambda/D) and opposite phase shifts (radian)."""
+    return ZernikeSensor(pupil, Dimple(diameter, phase_shift), Dimple(diameter, -phase_shift))

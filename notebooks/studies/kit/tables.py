@@ -1,0 +1,41 @@
+"""Tables of results that notebooks show: few digits, the same on every machine."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under a header; a notebook shows it as a table."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    digits: int = 3
+
+    def __repr__(self) -> str:
+        return f"Table of {len(self.rows)} rows: {', '.join(self.header)}"
+
+    def _repr_markdown_(self) -> str:
+        lines = [list(map(self._text, self.header)), ["---"] * len(self.header)]
+        lines += [[self._text(cell) for cell in row] for row in self.rows]
+        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+    def _text(self, cell: Any) -> str:
+        if isinstance(cell, bool):
+            return "yes" if cell else "no"
+        return f"{cell:.{self.digits}g}" if isinstance(cell, float) else plain(str(cell))
+
+
+def small(value: float) -> str:
+    """Return a number with two significant digits, or a bound below which digits are rounding errors."""
+    return "<10⁻⁶" if value < 1e-6 else f"{value:.2g}"
+
+
+def plain(text: str) -> str:
+    """Return Markdown that shows a text as it is: one line, in which nothing is a link, a command or HTML."""
+    line = "".join(character if character.isprintable() else repr(character)[1:-1] for character in text)
+    return re.sub(r"([\\`*_{}\[\]<>$|#&~])", r"\\\1", line)

@@ -1,0 +1,324 @@
+"""Your own frames: the phase of a pair of camera frames, its verdict, and how it was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from astropy.io import fits
+from matplotlib.axes import Axes
+from matplotlib.colorbar import Colorbar
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from studies.kit.bench import middle_rows
+from studies.kit.parameters import parameter_limits
+from studies.kit.results import rounded
+from studies.kit.style import show_intensity, show_phase
+from studies.kit.tables import Table
+from zwfs import opd_to_phase, phase_to_opd
+from zwfs.frames import CameraNoise
+from zwfs.frames.files import CameraFile
+from zwfs.frames.pipeline import MeasuredPhase, Measurement, Step, model
+from zwfs.frames.registration import Image
+from zwfs.frames.verdict import Verdict
+
+_FITTED = "registration", "scale", "background", "diameter", "leakage", "unmasked", "pupil_background"
+LIMITS = parameter_limits(
+    "n_iterations rms",
+    frame_files=[str, ...],
+    pupil_files=[str, ...],
+    dark_files=[str, ...],
+    bad_pixel_files=[str, ...],
+    wavelength=(0.0, 1e5),
+    diameter=(0.0, 8.0),
+    phase_shifts=[(-6.2832, 6.2832), ...],
+    pupil_centers=[[(0.0, 1e5)], ...],
+    pupil_diameter=(0.0, 1e5),
+    exposure_ratio=(1e-6, 1e6),
+    saturation=(0.0, 1e12),
+    gain=(0.0, 1e6),
+    read_noise=(0.0, 1e6),
+    fitted=[_FITTED, ...],
+    accept_fits=bool,
+    output=str,
+    overwrite=bool,
+    n_bad=(0, 2000),
+)
+
+SHOWN = ("BUNIT", "WAVELEN", "PUPDIAM", "DIMPLE", "ROTATE", "MAGNIF", "NBAD")  # keywords of the phase map
+_BAD = "#FF00FF"  # not in the colour maps, and far from the colours of the methods
+
+
+def header_noise(source: CameraFile, gain: float, read_noise: float) -> CameraNoise | None:
+    """Noise of the camera by these values, or by EGAIN and RDNOISE of the header; None without a gain."""
+    gain = gain or (source.keyword("EGAIN") if "EGAIN" in source.header else 0.0)
+    read_noise = read_noise or (source.keyword("RDNOISE") if "RDNOISE" in source.header else 0.0)
+    return CameraNoise(gain, read_noise) if gain else None
+
+
+def draw_explained(result: MeasuredPhase) -> Figure:
+    """Measured frames, modelled frames and their difference, all on one scale; bad pixels are marked."""
+    figure, panels = plt.subplots(2, 3, figsize=(9, 5.6))
+    top = np.quantile(result.measured[..., *result.measurement.window][:, result.measurement.good], 0.999)
+    for row, (measured, modelled, bad) in enumerate(
+        zip(result.measured, result.modelled, result.measurement.bad, strict=True)
+    ):
+        shown = show_intensity(panels[row, 0], measured, top)
+        show_intensity(panels[row, 1], modelled, top)
+        difference = show_phase(panels[row, 2], np.where(bad, np.nan, measured - modelled), top / 2)
+        for axes in panels[row, ::2]:
+            axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=1.2)
+        panels[row, 0].set_ylabel(f"image {row + 1}: rms misfit {result.residual[row]:.3f}")
+    for axes, title in zip(panels[0], ("measured", "modelled", "measured − modelled"), strict=True):
+        axes.set_title(title, fontsize=10)
+    figure.colorbar(shown, ax=panels[:, :2], label="intensity", location="bottom", shrink=0.6, aspect=40)
+    figure.colorbar(
+        difference, ax=panels[:, 2], label="intensity", location="bottom", extend="both", shrink=0.9, aspect=20
+    )
+    return figure
+
+
+def draw_phase_map(result: MeasuredPhase, wavelength: float, sigma: NDArray | None = None) -> Figure:
+    """Phase in radian, with a second scale in nm, and its error bar; bad points are marked."""
+    n_panels = 1 if sigma is None else 2
+    figure, panels = plt.subplots(1, n_panels, figsize=(4.7 * n_panels, 4.6), squeeze=False)
+    axes = panels[0, 0]
+    # Single points at gaps may be off by a turn: they do not set the scale.
+    shown = show_phase(axes, result.phase, np.nanquantile(np.abs(result.phase), 0.99))
+    axes.set_title("phase", fontsize=10)
+    bad = result.measurement.pupil.inside & ~result.measurement.good
+    if bad.any():
+        axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=2, label=f"{bad.sum()} bad points")
+        figure.legend(loc="outside lower left", fontsize=9)
+    _two_scales(figure.colorbar(shown, ax=axes, location="bottom", aspect=30, extend="both"), wavelength)
+    if sigma is not None:
+        shown = show_intensity(panels[0, 1], sigma, 2 * np.nanmedian(sigma))
+        panels[0, 1].set_title("error bar: photon and read noise", fontsize=10)
+        bar = figure.colorbar(shown, ax=panels[0, 1], location="bottom", aspect=30, extend="max")
+        _two_scales(bar, wavelength)
+    return figure
+
+
+def _two_scales(bar: Colorbar, wavelength: float) -> None:
+    """Label a colour bar in radian below and in nm above."""
+    bar.set_label("rad")
+    bar.locator = MaxNLocator(4)
+    nm = bar.ax.secondary_xaxis(
+        "top",
+        functions=(partial(phase_to_opd, wavelength=wavelength), partial(opd_to_phase, wavelength=wavelength)),
+    )
+    nm.set_xlabel("nm of wavefront")
+    nm.xaxis.set_major_locator(MaxNLocator(4))
+
+
+def draw_gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> Figure:
+    """Score on unseen data with its control, misfit, and error where the truth is known, step by step."""
+    figure, panels = plt.subplots(1, 2 + (errors is not None), figsize=(9, 3.8), sharey=True)
+    rows = np.arange(len(work))[::-1]
+    # Markers for the images: colours would stand for methods.
+    for label, color, values in (
+        ("score", "#333333", [step.predicted for step in work]),
+        ("control", "#999999", [step.control for step in work]),
+    ):
+        for index, (points, marker) in enumerate(zip(np.transpose(values), "os", strict=True), start=1):
+            face = color if index == 1 else "none"
+            panels[0].plot(
+                points, rows + 0.3 * (1.5 - index), ls="-", lw=0.6, color=color, marker=marker, ms=5, mfc=face,
+                label=f"{label}, frame {index}",
+            )  # fmt: skip
+    panels[0].set(xlabel="correlation of frames 1 and 2\nwith their prediction")
+    panels[1].plot([step.result.misfit for step in work], rows, color="#444444", marker="o", ms=5)
+    panels[1].set(xlabel="rms misfit\nover contrast")
+    if errors is not None:
+        panels[2].plot(errors, rows, color="#444444", marker="o", ms=5)
+        panels[2].set(xlabel="error of the segments\n(rad rms)")
+    for axes in panels[1:]:
+        axes.margins(x=0.15)
+        axes.set_xlim(left=0)
+    panels[0].set_yticks(rows, [step.name for step in work])
+    figure.legend(loc="outside upper center", ncols=2, fontsize=9)
+    return figure
+
+
+def draw_signs(measurement: Measurement, height: float = 0.4) -> Figure:
+    """Sketch of the signs: a mirror that is pulled back, its phase, and the change of the two images."""
+    sensor, (ny, nx) = model(measurement), measurement.pupil.shape
+    y, x = np.mgrid[:ny, :nx]
+    apart = np.hypot(x - 0.64 * nx, y - 0.62 * ny) / measurement.registered.diameter
+    poke = np.where(sensor.pupil.inside, height * np.exp(-((apart / 0.1) ** 2)), 0)
+    change = (sensor.measure(poke) - sensor.measure(np.zeros_like(poke)))[(..., *sensor.window)]
+    figure, panels = plt.subplots(1, 4, figsize=(10, 3.2), width_ratios=(1.1, 1, 1, 1))
+    _pulled_mirror(panels[0])
+    maps = [(poke, height, "phase of the poke\nabove 0 (red)")]
+    for image, shift in zip(change, measurement.optics.phase_shifts, strict=True):
+        word = "brighter (red)" if image.sum(where=apart < 0.1) > 0 else "darker (blue)"
+        maps.append((image, np.abs(change).max(), f"image of phase shift {shift / np.pi:+.2g} π\n{word}"))
+    for axes, (values, limit, title) in zip(panels[1:], maps, strict=True):
+        show_phase(axes, np.where(sensor.pupil.inside, values, np.nan), limit)
+        axes.set_title(title, fontsize=10)
+    panels[1].set_xlabel("x: columns, to the right", fontsize=9)
+    panels[1].set_ylabel("y: rows, upwards", fontsize=9)
+    return figure
+
+
+def _pulled_mirror(axes: Axes) -> None:
+    """Side view: a pit in a mirror delays the reflected wavefront by twice its depth."""
+    y = np.linspace(-1, 1, 200)
+    pit = np.exp(-((y / 0.25) ** 2))
+    axes.fill_betweenx(y, 1 + 0.15 * pit, 1.5, color="#bbbbbb")
+    axes.plot(1 + 0.15 * pit, y, color="#444444", lw=2)
+    axes.plot(0.35 + 0.3 * pit, y, color="#444444", lw=1.2)
+    arrow = {"arrowstyle": "->", "color": "#444444"}
+    axes.annotate("", (0.9, 0.8), (0.5, 0.8), arrowprops=arrow)
+    axes.text(0.0, 0.86, "light", fontsize=9)
+    axes.annotate("", (0.0, -0.8), (0.3, -0.8), arrowprops=arrow)
+    axes.annotate("", (1.15, 0.0), (1.0, 0.0), arrowprops={"arrowstyle": "<->", "color": "#444444"})
+    axes.text(1.2, -0.05, "h", fontsize=10)
+    axes.text(0.0, -1.12, "reflected wavefront, late by 2 h", fontsize=9)
+    axes.set(xlim=(0, 1.5), ylim=(-1.2, 1.05), xticks=[], yticks=[])
+    axes.set_title("mirror pulled back by h:\nOPD = +2 h, phase above 0", fontsize=10)
+    axes.grid(False)
+    axes.spines[:].set_visible(False)
+
+
+def frame_columns(result: MeasuredPhase) -> dict[str, NDArray]:
+    """Middle rows of the frames."""
+    return middle_rows({"measured": result.measured, "modelled": result.modelled})
+
+
+def phase_columns(result: MeasuredPhase, verdict: Verdict, wavelength: float) -> dict[str, NDArray]:
+    """Phase and its error bar on the middle row."""
+    middle = result.phase.shape[0] // 2
+    row = result.phase[middle]
+    return {
+        "column (pixel)": np.arange(row.size),
+        "phase on the middle row (rad)": row,
+        "the same (nm)": phase_to_opd(row, wavelength),
+        "error bar (rad)": np.full(row.shape, np.nan) if verdict.sigma is None else verdict.sigma[middle],
+    }
+
+
+def step_columns(work: Sequence[Step], errors: Sequence[float] | None) -> dict[str, Any]:
+    """Scores of each step."""
+    columns: dict[str, Any] = {"step": [step.name for step in work]}
+    columns |= {f"score, image {i + 1}": [step.predicted[i] for step in work] for i in range(2)}
+    columns |= {f"control, image {i + 1}": [step.control[i] for step in work] for i in range(2)}
+    columns |= {"misfit over contrast": [step.result.misfit for step in work]}
+    return columns | {"error of the segments (rad rms)": errors or np.nan}
+
+
+def sign_columns(measurement: Measurement) -> dict[str, NDArray]:
+    """Phase shifts of the images."""
+    return {"image": np.array([1, 2]), "phase shift (rad)": np.array(measurement.optics.phase_shifts)}
+
+
+def verdict_table(verdict: Verdict) -> Table:
+    """Findings in words."""
+    return Table(["question", "answer"], [[topic, sentence] for topic, sentence in verdict.findings.items()])
+
+
+def result_table(result: MeasuredPhase) -> Table:
+    """Places of the pupils, counts, and agreement of the frames."""
+    measurement, registered = result.measurement, result.measurement.registered
+    placement = registered.placement
+    pupils = [f"{one.row:.2f}, {one.column:.2f}, {one.diameter:.2f}" for one in registered.pupils]
+    return Table(
+        ["quantity", "value"],
+        [
+            ["first pupil: row, column, diameter (pixels)", pupils[0]],
+            ["second pupil: row, column, diameter (pixels)", pupils[1]],
+            [
+                "shift of the second image (rows, columns; pixels)",
+                _with_error(placement.shift, placement.sigma[:2], 3),
+            ],
+            ["its rotation, x to y (degrees)", _with_error([placement.rotation], placement.sigma[2:3], 3)],
+            ["its magnification", _with_error([placement.magnification], placement.sigma[3:], 5)],
+            ["background of the clear frames (counts)", _pair(measurement.background[2:], 1)],
+            ["counts that make an intensity of 1", _pair(measurement.counts, 0)],
+            ["light of image 1 over 2, frames", f"{measurement.flux_ratio[0]:.3f}"],
+            ["the same, clear frames", f"{measurement.flux_ratio[1]:.3f}"],
+            ["points of the pupil", measurement.pupil.n_points],
+            ["of these, bad", measurement.n_bad],
+            ["points without a unique solution", result.n_unsolved],
+            ["correlation of the frames with their fit (too optimistic)", _pair(result.correlation, 3)],
+            ["rms difference of the frames (mean = 1)", _pair(result.residual, 3)],
+            ["excess light around the pupil (mean = 1)", f"{result.excess_light:.3f}"],
+        ],
+    )
+
+
+def step_table(work: Sequence[Step], errors: Sequence[float] | None) -> Table:
+    """Scores of each step, and the fitted optics."""
+    rows = []
+    for index, step in enumerate(work):
+        optics = step.result.measurement.optics
+        rows.append(
+            [
+                step.name,
+                _pair(step.predicted, 2),
+                _pair(step.control, 2),
+                f"{step.result.misfit:.3f}",
+                f"{optics.scale:.2f}",
+                f"{optics.diameter:.2f}",
+                f"{optics.leakage:.2f}",
+                f"{errors[index]:.3f}" if errors else "unknown",
+            ]
+        )
+    scores = ["score", "control", "misfit over contrast"]
+    return Table(["step", *scores, "scale", "dimple", "leakage", "error (rad rms)"], rows)
+
+
+def image_table(frames: Sequence[Image], clear_frames: Sequence[Image]) -> Table:
+    """Size, brightest good pixel and number of bad pixels of each image."""
+    rows = [
+        [one.name, *one.counts.shape, f"{one.counts[~one.bad].max():.5g}", int(one.bad.sum())]
+        for one in (*frames, *clear_frames)
+    ]
+    return Table(["image", "rows", "columns", "brightest good pixel", "bad pixels"], rows)
+
+
+def header_table(path: str) -> Table:
+    """Some keywords of the phase map."""
+    header = fits.getheader(path)
+    return Table(["keyword", "value"], [[key, header[key]] for key in SHOWN], digits=5)
+
+
+def _with_error(values: Sequence[float] | NDArray, errors: NDArray, digits: int) -> str:
+    """Values with their standard errors; a value without one was not determined."""
+    pairs = zip(values, errors, strict=True)
+    return ", ".join(
+        f"{value:.{digits}f} ± {error:.{digits}f}"
+        if np.isfinite(error)
+        else f"{value:.{digits}f} (not determined)"
+        for value, error in pairs
+    )
+
+
+def _pair(values: Sequence[float] | NDArray, digits: int) -> str:
+    """Values with a number of digits."""
+    return ", ".join(f"{value:.{digits}f}" for value in values)
+
+
+def numbers(
+    chosen: MeasuredPhase, verdict: Verdict, work: Sequence[Step], errors: Sequence[float] | None
+) -> dict[str, float | str]:
+    """Numbers for the text: scores, misfits, and errors of the chosen result and of the last step."""
+    known = errors or [np.nan] * len(work)
+    return rounded(
+        {
+            "score": verdict.score.min(),
+            "control": verdict.control.max(),
+            "inner": verdict.inner,
+            "edge": verdict.edge,
+            "misfit": chosen.misfit,
+            "misfit_last": work[-1].result.misfit,
+            "sigma": np.nan if verdict.sigma is None else np.nanmedian(verdict.sigma),
+            "error": known[[step.result for step in work].index(chosen)],
+            "error_last": known[-1],
+        }
+    )

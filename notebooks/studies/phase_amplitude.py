@@ -1,0 +1,326 @@
+"""Phase and amplitude from two masks and a clear frame, and the cost of a wrong amplitude. Not in the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+from studies.kit import sweeps
+from studies.kit.curves import screens_at
+from studies.kit.parameters import parameter_limits
+from studies.kit.results import rounded
+from studies.kit.style import LOOKS, show_intensity, show_phase
+from studies.kit.tables import Table
+from zwfs.bounds import cramer_rao
+from zwfs.detector import Detector
+from zwfs.metrics import reconstruction_error, wrapped_residual
+from zwfs.modes import power_law_screens
+from zwfs.pupil import Pupil
+from zwfs.reconstructors import LikelihoodReconstruction, MaximumLikelihood, PhaseShifted, Reconstruction
+from zwfs.sensor import ZernikeSensor
+
+LIMITS = parameter_limits(
+    "n_modes diameter phase_shift rms n_screens exponent",
+    n_pixels=(16, 200),
+    variations=[(0.0, 0.4)],  # dips cannot vary much more
+    shown=(0.0, 0.4),
+    photons=(1.0, 1e9),
+)
+
+KINDS = ("scintillation", "dips")
+"""Kinds of amplitude maps, see `amplitude_maps`."""
+_SPOTS, _WIDTH = 12, 0.05  # dips of one map, and their standard deviation, D
+
+
+class Way(NamedTuple):
+    """Method, by the name of its class, and its amplitude: "ignored" (uniform), "measured" or "estimated"."""
+
+    method: str
+    amplitude: str
+
+
+WAYS = {
+    f"{method}, {amplitude}": Way(method, amplitude)
+    for method, amplitude in (
+        ("PhaseShifted", "ignored"),
+        ("MaximumLikelihood", "ignored"),
+        ("PhaseShifted", "measured"),
+        ("MaximumLikelihood", "measured"),
+        ("MaximumLikelihood", "estimated"),
+    )
+}
+"""Ways to reconstruct a phase from two masks and a clear frame, by name."""
+ESTIMATED = "MaximumLikelihood, estimated"
+
+
+@dataclass(frozen=True)
+class AmplitudeCurves:
+    """Errors of the ways of `WAYS` against the variation of the amplitude, next to the bound."""
+
+    variations: NDArray[np.floating]  # (n,), rms over mean
+    errors: dict[str, NDArray[np.float64]]  # (n, n_screens) of each way, radian rms
+    consistent: dict[str, NDArray[np.bool_]]  # (n, n_screens) of each way of maximum likelihood
+    bound: NDArray[np.float64]  # (n,), radian rms
+
+    def error(self, way: str) -> NDArray[np.float64]:
+        """Error of a way, rms over the screens, shape (n,), radian rms."""
+        return np.sqrt(np.mean(self.errors[way] ** 2, axis=1))
+
+    def at(self, variation: float) -> int:
+        """Place of the sampled variation that is nearest to `variation`."""
+        return int(np.argmin(np.abs(self.variations - variation)))
+
+
+def amplitude_maps(
+    pupil: Pupil,
+    modes: ArrayLike,
+    kind: str,
+    variation: float,
+    n_maps: int,
+    *,
+    exponent: float = -2.0,
+    seed: int = 0,
+) -> NDArray[np.float64]:
+    """Random maps of an amplitude whose mean square over the pupil is 1."""
+    rng = np.random.default_rng([seed, KINDS.index(kind)])
+    if kind == "scintillation":
+        logarithms = pupil.gather(power_law_screens(modes, 1.0, n_maps, exponent, rng))
+    else:
+        centers = pupil.points[rng.integers(pupil.n_points, size=(n_maps, _SPOTS))]
+        squares = np.sum((pupil.points[:, np.newaxis] - centers[:, np.newaxis]) ** 2, axis=-1)
+        logarithms = -np.sum(np.exp(-squares / (2 * _WIDTH**2)), axis=-1)
+    return pupil.scatter(np.array([_varied(one, variation) for one in logarithms]), fill=0)
+
+
+def _varied(logarithm: NDArray, variation: float) -> NDArray[np.float64]:
+    """Amplitude of a variation and a mean square of 1 whose logarithm is a multiple of a map, plus a constant."""
+    logarithm = (logarithm - logarithm.max()) / logarithm.std()
+
+    def amplitude(scale: float) -> NDArray:
+        values = np.exp(scale * logarithm)
+        return values / np.sqrt(np.mean(values**2))
+
+    def excess(scale: float) -> float:  # increases with the scale
+        values = amplitude(scale)
+        return float(values.std() / values.mean()) - variation
+
+    return amplitude(brentq(excess, 0, 20)) if variation else amplitude(0)
+
+
+def amplitude_curves(
+    sensor: ZernikeSensor,
+    modes: NDArray,
+    variations: ArrayLike,
+    rms: float,
+    n_screens: int,
+    photons: float,
+    *,
+    exponent: float = -2.0,
+    seed: int = 0,
+) -> dict[str, AmplitudeCurves]:
+    """Error of the phase against the variation of the amplitude, for each way and kind of amplitude."""
+    variations = np.asarray(variations, float)
+    shared = sensor, modes, rms, n_screens, photons, exponent, seed
+    cells = list(product(KINDS, enumerate(variations.tolist())))
+    points = dict(zip(cells, sweeps.run(_point, cells, *shared, name="amplitude_curves"), strict=True))
+    curves = {}
+    for kind in KINDS:
+        errors, consistent, bound = zip(*(point for (of, _), point in points.items() if of == kind), strict=True)
+        curves[kind] = AmplitudeCurves(variations, _by_way(errors), _by_way(consistent), np.array(bound))
+    return curves
+
+
+def _by_way(points: Sequence[dict[str, NDArray]]) -> dict[str, NDArray]:
+    """Arrays of each way, (n, n_screens), from those of each variation, (n_screens,)."""
+    return {way: np.array([point[way] for point in points]) for way in points[0]}
+
+
+def _point(
+    cell: tuple[str, tuple[int, float]],
+    sensor: ZernikeSensor,
+    modes: NDArray,
+    rms: float,
+    n_screens: int,
+    photons: float,
+    exponent: float,
+    seed: int,
+) -> tuple[dict[str, NDArray], dict[str, NDArray], float]:
+    """One kind and variation: errors and consistent, (n_screens,) each, by way, and the bound."""
+    kind, (place, variation) = cell
+    phases = screens_at(modes, rms, n_screens, seed, 0, exponent)
+    amplitudes = amplitude_maps(sensor.pupil, modes, kind, variation, n_screens, exponent=exponent, seed=seed)
+    noise = np.random.SeedSequence(seed, spawn_key=(KINDS.index(kind), place))
+    frames = noisy_frames(sensor, phases, amplitudes, photons, noise)
+    errors, consistent = {}, {}
+    for way in WAYS:
+        results = reconstruct(way, sensor, frames, photons)
+        errors[way] = reconstruction_error(sensor.pupil, np.concatenate([one.phase for one in results]), phases)
+        known = [one.consistent for one in results if isinstance(one, LikelihoodReconstruction)]
+        if known:
+            consistent[way] = np.concatenate(known)
+    per_frame = photons / sensor.n_masks
+    bounds = [
+        cramer_rao(sensor, phase, photons=per_frame, amplitude=amplitude, amplitude_known=False)
+        for phase, amplitude in zip(phases, amplitudes, strict=True)
+    ]
+    return errors, consistent, float(np.sqrt(np.nanmean(np.square(bounds))))
+
+
+def noisy_frames(
+    sensor: ZernikeSensor, phases: ArrayLike, amplitudes: ArrayLike, photons: float, seed: Any = 0
+) -> NDArray[np.float64]:
+    """Frames with photon noise; the photons per point of the pupil are divided equally between the frames."""
+    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points / sensor.n_masks)
+    return camera.normalise(camera.expose(sensor.measure(phases, amplitudes), seed))
+
+
+def reconstruct(way: str, sensor: ZernikeSensor, frames: NDArray, photons: float) -> list[Reconstruction]:
+    """Reconstruct frame sets (k, n_masks, ny, nx) in a way of `WAYS`; `photons` as for `noisy_frames`."""
+    method, source = WAYS[way]
+    per_frame = photons / sensor.n_masks
+    if source == "estimated":
+        return [MaximumLikelihood(sensor, photons=per_frame, amplitude="unknown")(frames)]
+    pair = ZernikeSensor(sensor.pupil, *sensor.masks[:-1], extent=sensor.extent, tolerance=sensor.tolerance)
+    batches: list[tuple[NDArray | None, NDArray]] = [(None, frames)]
+    if source == "measured":
+        batches = [(np.sqrt(one[-1][sensor.window]), one[np.newaxis]) for one in frames]
+    if method == "PhaseShifted":
+        return [PhaseShifted(pair, amplitude=amplitude)(some[:, :-1]) for amplitude, some in batches]
+    return [
+        MaximumLikelihood(pair, photons=per_frame, amplitude=amplitude, n_starts=1)(some[:, :-1])
+        for amplitude, some in batches
+    ]
+
+
+_LINES = {"ignored": ":", "measured": "--", "estimated": "-"}
+
+
+def draw_amplitude_errors(curves: Mapping[str, AmplitudeCurves]) -> Figure:
+    """Error of each way and the bound against the variation of the amplitude, one panel for each kind."""
+    figure, panels = plt.subplots(1, len(curves), figsize=(7, 5), sharey=True, squeeze=False)
+    for axes, (kind, one) in zip(panels[0], curves.items(), strict=True):
+        percent = 100 * one.variations
+        axes.semilogy(percent, one.bound, color="#999999", lw=5, solid_capstyle="round", label="bound", zorder=0)
+        for name, way in WAYS.items():
+            look = LOOKS[way.method]
+            style = {"color": look.color, "marker": look.marker, "linestyle": _LINES[way.amplitude], "ms": 6}
+            style["markerfacecolor"] = "white" if way.amplitude == "measured" else look.color
+            axes.plot(percent, one.error(name), label=f"{look.name}, amplitude {way.amplitude}", **style)
+        axes.set_title(kind, fontsize=10)
+        axes.set(xlabel="variation of the amplitude (%)", xlim=(0, None))
+    panels[0, 0].set_ylabel("phase error (rad rms)")
+    panels[0, 0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    panels[0, 0].yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    panels[0, 0].yaxis.set_minor_formatter(NullFormatter())
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=1)
+    return figure
+
+
+def draw_phase_and_amplitude(
+    pupil: Pupil, phase: NDArray, amplitude: NDArray, estimate: LikelihoodReconstruction
+) -> Figure:
+    """True and estimated phase and amplitude of one frame set, and their differences."""
+    figure, panels = plt.subplots(2, 3, figsize=(7, 5), layout="constrained")
+    outside = np.where(pupil.inside, 0.0, np.nan)
+    residual = wrapped_residual(pupil, estimate.phase, phase)
+    phases = phase + outside, phase + residual, residual
+    amplitudes = amplitude + outside, estimate.amplitude, estimate.amplitude - amplitude
+    titles = "true", "estimated", "difference"
+    limit, small = (max(float(np.nanmax(np.abs(one))) for one in some) for some in (phases[:2], phases[2:]))
+    for axes, image, title in zip(panels[0], phases, titles, strict=True):
+        shown = show_phase(axes, image, small if title == "difference" else limit)
+        axes.set_title(f"phase,\n{title}", fontsize=10)
+        figure.colorbar(shown, ax=axes, label="rad", shrink=0.85)
+    largest = float(np.nanmax(amplitudes[0]))
+    for axes, image, title in zip(panels[1], amplitudes, titles, strict=True):
+        if title == "difference":
+            shown = show_phase(axes, image, float(np.nanmax(np.abs(image))))
+        else:
+            shown = show_intensity(axes, image, largest)
+        axes.set_title(f"amplitude,\n{title}", fontsize=10)
+        figure.colorbar(shown, ax=axes, shrink=0.85)
+    return figure
+
+
+def amplitude_columns(curves: Mapping[str, AmplitudeCurves]) -> dict[str, NDArray]:
+    """Columns of the errors and the bound."""
+    columns = {}
+    for kind, one in curves.items():
+        columns["variation of the amplitude"] = one.variations
+        columns[f"{kind}: bound (rad rms)"] = one.bound
+        columns |= {f"{kind}: {way}: error (rad rms)": one.error(way) for way in WAYS}
+    return columns
+
+
+def map_columns(
+    pupil: Pupil, phase: NDArray, amplitude: NDArray, estimate: LikelihoodReconstruction
+) -> dict[str, NDArray]:
+    """Columns of the maps, one row for each point of the pupil."""
+    columns = {"x (D)": pupil.points[:, 0], "y (D)": pupil.points[:, 1]}
+    columns |= {"phase (rad)": pupil.gather(phase), "amplitude": pupil.gather(amplitude)}
+    for name, (error, sigma) in _errors(pupil, phase, amplitude, estimate).items():
+        columns |= {f"error of the {name}": error, f"standard error of the {name}": sigma}
+    return columns
+
+
+def _errors(
+    pupil: Pupil, phase: NDArray, amplitude: NDArray, estimate: LikelihoodReconstruction
+) -> dict[str, tuple[NDArray, NDArray]]:
+    """Error and standard error of each point, by quantity."""
+    maps = {
+        "phase": (wrapped_residual(pupil, estimate.phase, phase), estimate.sigma),
+        "amplitude": (np.asarray(estimate.amplitude) - amplitude, np.asarray(estimate.sigma_amplitude)),
+    }
+    return {name: (pupil.gather(error), pupil.gather(sigma)) for name, (error, sigma) in maps.items()}
+
+
+TABLED = 0.05, 0.2
+"""Variations of the amplitude in the table and in the text."""
+
+
+def costs_table(curves: Mapping[str, AmplitudeCurves]) -> Table:
+    """Return the error over the bound, and the share of consistent frame sets, of each way."""
+    places = [(one, one.at(value), f"{kind}, {value:.0%}") for kind, one in curves.items() for value in TABLED]
+    rows = []
+    for name, way in WAYS.items():
+        ratios = [f"{one.error(name)[place] / one.bound[place]:.2f}" for one, place, _ in places]
+        known = [one.consistent[name][place] for one, place, _ in places if name in one.consistent]
+        consistent = f"{np.mean(known):.0%}" if known else "not tested"
+        rows.append([LOOKS[way.method].name, way.amplitude, *ratios, consistent])
+    return Table(["method", "amplitude", *(title for _, _, title in places), "consistent"], rows)
+
+
+def numbers(
+    curves: Mapping[str, AmplitudeCurves],
+    example: tuple[Pupil, NDArray, NDArray, LikelihoodReconstruction],
+    settings: Mapping[str, float],
+) -> dict[str, float | str]:
+    """Return the settings, ratios to the bound, shares of consistent frame sets, and errors of the example."""
+    short = {"PhaseShifted": "shifted", "MaximumLikelihood": "likely"}
+    found = dict(settings)
+    for kind, one in curves.items():
+        for name, way in WAYS.items():
+            ratio = one.error(name) / one.bound
+            for value in (0, *TABLED):
+                found[f"{short[way.method]}_{way.amplitude}_{kind}_{100 * value:.0f}"] = ratio[one.at(value)]
+    best = np.concatenate([one.error(ESTIMATED) / one.bound for one in curves.values()])
+    found |= {"estimated_lowest": best.min(), "estimated_highest": best.max()}
+    for name in next(iter(curves.values())).consistent:
+        uniform, *varied = (
+            np.mean([one.consistent[name][one.at(value)] for one in curves.values()]) for value in (0, *TABLED)
+        )
+        amplitude = WAYS[name].amplitude
+        found |= {f"consistent_{amplitude}_0": uniform, f"consistent_{amplitude}": np.mean(varied)}
+    for name, (error, sigma) in _errors(*example).items():
+        found |= {f"example_{name}": np.sqrt(np.mean(error**2)), f"within_{name}": np.mean(np.abs(error) < sigma)}
+    found["example_chi2"] = float(example[-1].chi2)
+    return rounded(found, ".4g")

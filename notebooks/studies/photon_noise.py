@@ -1,0 +1,269 @@
+"""Photon noise of the reconstructors next to the Cramer-Rao bound, and a check of error bars. Not in the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import erf
+
+from studies.kit import sweeps
+from studies.kit.curves import screens_at
+from studies.kit.parameters import parameter_limits
+from studies.kit.results import rounded
+from studies.kit.style import LOOKS, OTHER_STYLES
+from studies.kit.tables import Table
+from zwfs.bounds import cramer_rao
+from zwfs.detector import Detector
+from zwfs.metrics import reconstruction_error, wrapped_residual
+from zwfs.reconstructors import LikelihoodReconstruction, MaximumLikelihood
+from zwfs.sensor import ZernikeSensor
+
+LIMITS = parameter_limits(
+    "n_modes diameter phase_shift inputs n_screens exponent n_iterations extent",
+    n_pixels=(16, 200),
+    diameter_wide=(0.1, 8.0),
+    photons=[(1.0, 1e9)],
+    photons_bars=(10.0, 1e9),
+    wrong=[(0.01, 100.0)],
+)
+
+SIGMAS = np.arange(0.25, 3.01, 0.25)
+"""Widths of the error bars whose share of the points is counted, in standard errors."""
+EXPECTED = erf(SIGMAS / np.sqrt(2))
+"""Share of the points within `SIGMAS`, for Gaussian errors and true standard errors."""
+
+
+@dataclass(frozen=True)
+class PhotonCurves:
+    """Errors of reconstructors on noisy frames, next to the bound."""
+
+    rms: NDArray[np.floating]  # (n_rms,), input, radian rms
+    photons: NDArray[np.floating]  # (n_photons,), per point of the pupil, all frames
+    errors: dict[str, NDArray[np.float64]]  # (n_rms, n_photons, n_screens), radian rms
+    bound: NDArray[np.float64]  # (n_rms, n_photons), rms over points and screens, radian
+    within: NDArray[np.float64]  # (n_rms, n_photons), share of the points within one standard error
+
+    def error(self, name: str) -> NDArray[np.float64]:
+        """Error of a reconstructor, rms over the screens, shape (n_rms, n_photons), radian rms."""
+        return np.sqrt(np.mean(self.errors[name] ** 2, axis=-1))
+
+    def ratio(self, name: str) -> NDArray[np.float64]:
+        """`error` over the bound, shape (n_rms, n_photons)."""
+        return self.error(name) / self.bound
+
+
+def photon_curves(
+    sensor: ZernikeSensor,
+    reconstructors: Mapping[str, Any],
+    modes: NDArray,
+    rms: ArrayLike,
+    photons: ArrayLike,
+    n_screens: int,
+    *,
+    exponent: float = -2.0,
+    seed: int = 0,
+) -> PhotonCurves:
+    """Error of reconstructors against the number of photons, and the bound."""
+    rms, photons = np.asarray(rms, float), np.asarray(photons, float)
+    shared = sensor, dict(reconstructors), modes, n_screens, exponent, seed
+    cells = product(enumerate(rms.tolist()), enumerate(photons.tolist()))
+    points = sweeps.run(_photon_point, cells, *shared, name="photon_curves")
+    errors, bound, within = zip(*points, strict=True)
+    shape = rms.size, photons.size
+    return PhotonCurves(
+        rms,
+        photons,
+        {name: np.reshape([one[name] for one in errors], (*shape, n_screens)) for name in errors[0]},
+        np.reshape(bound, shape),
+        np.reshape(within, shape),
+    )
+
+
+def _photon_point(
+    cell: tuple[tuple[int, float], tuple[int, float]],
+    sensor: ZernikeSensor,
+    reconstructors: dict[str, Any],
+    modes: NDArray,
+    n_screens: int,
+    exponent: float,
+    seed: int,
+) -> tuple[dict[str, NDArray], float, float]:
+    """One input and number of photons: errors (n_screens,) by name, bound, and share within one sigma."""
+    (task, rms), (place, photons) = cell
+    screens = screens_at(modes, rms, n_screens, seed, task, exponent)
+    likely = MaximumLikelihood(sensor, photons=photons / sensor.n_masks)
+    errors = {}
+    for name, method in (reconstructors | {"MaximumLikelihood": likely}).items():
+        noise = np.random.SeedSequence(seed, spawn_key=(task, place))
+        estimate = method(_noisy(method.sensor, screens, photons, noise))
+        errors[name] = reconstruction_error(sensor.pupil, estimate.phase, screens)
+    within = np.mean(_in_sigmas(sensor, estimate, screens) < 1)
+    bound = cramer_rao(sensor, screens, photons=photons / sensor.n_masks)
+    return errors, float(np.sqrt(np.mean(sensor.pupil.gather(bound) ** 2))), float(within)
+
+
+class ErrorBars(NamedTuple):
+    """Standard errors of `MaximumLikelihood`, compared with the errors."""
+
+    assumed: float  # photons that the method assumes, over the right number
+    within: NDArray[np.float64]  # share of the points within each of `SIGMAS`
+    chi2: float  # reduced, mean over the screens
+    consistent: float  # share of the screens
+
+
+def error_bars(
+    sensor: ZernikeSensor,
+    modes: NDArray,
+    rms: Sequence[float],
+    photons: float,
+    assumed: Sequence[float],
+    n_screens: int,
+    *,
+    exponent: float = -2.0,
+    seed: int = 0,
+) -> list[ErrorBars]:
+    """Count the points within the error bars of `MaximumLikelihood`, with right and wrong numbers of photons."""
+    inputs = enumerate(rms)
+    screens = np.concatenate([screens_at(modes, value, n_screens, seed, task, exponent) for task, value in inputs])
+    frames = _noisy(sensor, screens, photons, seed)
+    rows = []
+    for factor in assumed:
+        method = MaximumLikelihood(sensor, photons=factor * photons / sensor.n_masks, n_starts=1)
+        estimate = method(frames)
+        error = _in_sigmas(sensor, estimate, screens)
+        within = np.mean(error[..., np.newaxis] < SIGMAS, axis=(0, 1))
+        rows.append(ErrorBars(factor, within, float(estimate.chi2.mean()), float(estimate.consistent.mean())))
+    return rows
+
+
+def _noisy(sensor: ZernikeSensor, screens: NDArray, photons: float, seed: Any) -> NDArray[np.float64]:
+    """Frames with photon noise; the photons per point of the pupil are divided between the masks."""
+    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points / sensor.n_masks)
+    return camera.normalise(camera.expose(sensor.measure(screens), seed))
+
+
+def _in_sigmas(
+    sensor: ZernikeSensor, estimate: LikelihoodReconstruction, screens: NDArray
+) -> NDArray[np.floating]:
+    """Error of each point over its standard error, (n_screens, n_points)."""
+    residual = wrapped_residual(sensor.pupil, estimate.phase, screens)
+    return sensor.pupil.gather(np.abs(residual) / estimate.sigma)
+
+
+def draw_photon_noise(curves: PhotonCurves) -> Figure:
+    """Error of each method and the bound against the number of photons, and their ratio; one column per input."""
+    size = curves.rms.size
+    figure, panels = plt.subplots(2, size, figsize=(7, 6.4), sharex=True, sharey="row", squeeze=False)
+    for column, (errors, ratios) in enumerate(panels.T):
+        bound = curves.bound[column]
+        errors.loglog(
+            curves.photons, bound, color="#999999", lw=5, solid_capstyle="round", label="bound", zorder=0
+        )
+        ratios.axhline(1, color="#999999", lw=5, zorder=0)
+        for name in sorted(curves.errors, key=list(LOOKS).index):
+            look = LOOKS[name]
+            errors.plot(curves.photons, curves.error(name)[column], ms=5, label=look.label, **look.style)
+            ratios.plot(curves.photons, curves.ratio(name)[column], ms=5, **look.style)
+        errors.set_title(f"input {curves.rms[column]:g} rad rms", fontsize=10)
+        ratios.set(xlabel="photons per point", xscale="log", ylim=(0.9, 1.6))
+    panels[0, 0].set_ylabel("error (rad rms)")
+    panels[1, 0].set_ylabel("error / bound")
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    return figure
+
+
+def draw_error_bars(rows: Sequence[ErrorBars]) -> Figure:
+    """Share of the points within a number of standard errors, next to that of Gaussian errors."""
+    figure, axes = plt.subplots(figsize=(6.5, 4))
+    axes.plot(SIGMAS, EXPECTED, color="#999999", lw=5, label="Gaussian errors", zorder=0)
+    wrong = iter(OTHER_STYLES)
+    for row in rows:
+        right = row.assumed == 1
+        style = LOOKS["MaximumLikelihood"].style if right else next(wrong)
+        label = "right number of photons" if right else f"{row.assumed:g} times the photons assumed"
+        axes.plot(SIGMAS, row.within, ms=6, label=label, **style)
+    axes.axvline(1, color="#555555", lw=1, zorder=0.5)
+    axes.set(xlabel="width of the error bar (standard errors)", ylabel="share of the points", ylim=(0, 1.02))
+    axes.set_xlim(0, SIGMAS[-1] + 0.1)
+    axes.legend(loc="lower right")
+    return figure
+
+
+TABLED = "MaximumLikelihood", "PhaseShifted"
+
+
+def photon_noise_columns(curves: PhotonCurves) -> dict[str, NDArray]:
+    """Columns of the errors and the bound."""
+    size = curves.rms.size, curves.photons.size
+    grid = {
+        "input (rad rms)": np.repeat(curves.rms, size[1]),
+        "photons per point": np.tile(curves.photons, size[0]),
+        "bound: error (rad rms)": curves.bound.ravel(),
+    }
+    return grid | {f"{name}: error (rad rms)": curves.error(name).ravel() for name in curves.errors}
+
+
+def error_bars_columns(rows: Sequence[ErrorBars]) -> dict[str, NDArray]:
+    """Columns of the shares of the points within error bars."""
+    shares = {f"share, {row.assumed:g} times the photons assumed": row.within for row in rows}
+    return {"standard errors": SIGMAS, "share, Gaussian errors": EXPECTED} | shares
+
+
+def ratio_table(curves: Mapping[float, PhotonCurves]) -> Table:
+    """Error over the bound of two methods, by the diameter of the dimples."""
+    photons = next(iter(curves.values())).photons
+    return Table(
+        ["dimple, input", *(f"{value:g}" for value in photons)],
+        [
+            [f"{diameter:g} λ/D, {rms:g} rad rms", *cells]
+            for diameter, one in curves.items()
+            for rms, cells in zip(one.rms, _cells(*map(one.ratio, TABLED)), strict=True)
+        ],
+    )
+
+
+def _cells(first: NDArray, second: NDArray) -> list[list[str]]:
+    """Pairs of numbers, on one line each."""
+    rows = zip(first, second, strict=True)
+    return [[f"{a:.2f}/{b:.2f}" for a, b in zip(*row, strict=True)] for row in rows]
+
+
+def numbers(curves: PhotonCurves, rows: Sequence[ErrorBars]) -> dict[str, float | str]:
+    """Numbers of the text: errors (radian), ratios and shares."""
+    bright = curves.photons >= min(100, curves.photons.max())
+    half, one = (int(np.argmin(np.abs(curves.rms - value))) for value in (0.5, 1.0))
+    likely, shifted = (curves.ratio(name)[:, bright] for name in TABLED)
+    right = next((row for row in rows if row.assumed == 1), rows[0])
+    wrong = max(rows, key=lambda row: row.assumed)
+    low = min(rows, key=lambda row: row.assumed)
+    place = int(np.argmin(np.abs(SIGMAS - 1)))
+    return rounded(
+        {
+            "likely_excess": np.max(likely) - 1,
+            "shifted_ratio": shifted[half].mean(),
+            "shifted_photons": np.mean(shifted[half] ** 2) - 1,
+            "arcsine_floor": curves.error("Arcsine")[half, -1],
+            "saxton_floor": curves.error("GerchbergSaxton")[half, -1],
+            "saxton_model_floor": curves.error("GerchbergSaxtonModel")[half, -1],
+            "bound_at_100": curves.bound[half, int(np.argmin(np.abs(curves.photons - 100)))],
+            "bound_growth": (curves.bound[one] / curves.bound[0]).mean(),
+            "within_low": curves.within[:, bright].min(),
+            "within_high": curves.within[:, bright].max(),
+            "within_right": right.within[place],
+            "within_wrong": wrong.within[place],
+            "within_modest": low.within[place],
+            "chi2_wrong": wrong.chi2,
+            "chi2_modest": low.chi2,
+            "consistent_right": right.consistent,
+            "consistent_wrong": wrong.consistent,
+            "consistent_modest": low.consistent,
+        }
+    )

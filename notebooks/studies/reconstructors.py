@@ -1,0 +1,156 @@
+"""Convergence of the reconstructors: error after each iteration, one screen, accuracy of the model."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from studies.kit.curves import screens_at
+from studies.kit.parameters import parameter_limits
+from studies.kit.style import ALONE, LOOKS, looks_of, show_phase
+from studies.kit.tables import Table, small
+from zwfs.metrics import reconstruction_error, wrapped_residual
+from zwfs.pupil import Pupil
+from zwfs.reconstructors import Reconstruction
+from zwfs.sensor import ZernikeSensor
+
+LIMITS = parameter_limits("n_pixels n_modes diameter phase_shift inputs n_screens exponent n_iterations extent")
+
+
+def iteration_errors(
+    reconstructor: Any, modes: NDArray, rms: float, n_screens: int, *, exponent: float = -2.0, seed: int = 0
+) -> NDArray[np.float64]:
+    """Error of a reconstructor on random screens of an rms, (n_screens, n_iterations + 1), radian rms."""
+    sensor = reconstructor.sensor
+    screens = screens_at(modes, rms, n_screens, seed, 0, exponent)
+    errors = np.empty((n_screens, reconstructor.settings.n_iterations + 1))
+    # One screen at a time: the history of all of them would take much memory.
+    for index, screen in enumerate(screens):
+        history = reconstructor(sensor.measure(screen), history=True).history
+        errors[index] = reconstruction_error(sensor.pupil, history, screen)
+    return errors
+
+
+def model_accuracy(sensor: ZernikeSensor, phase: NDArray, tolerances: Sequence[float]) -> NDArray[np.float64]:
+    """Tolerance, rank of the low-rank model of a sensor, and relative error of the reference wave, in rows."""
+    field = sensor.pupil.field(phase)
+    exact = ZernikeSensor(sensor.pupil, *sensor.masks, tolerance=1e-14).reference_wave(field)
+    rows = []
+    for tolerance in tolerances:
+        model = ZernikeSensor(sensor.pupil, *sensor.masks, tolerance=tolerance)
+        error = np.abs(model.reference_wave(field) - exact).max() / np.abs(exact).max()
+        rows.append((tolerance, model.rank, error))
+    return np.array(rows)
+
+
+def draw_convergence(errors: Mapping[str, Mapping[float, NDArray]]) -> Figure:
+    """Error against iteration, one panel for each input."""
+    inputs = list(next(iter(errors.values())))
+    figure, panels = plt.subplots(1, len(inputs), figsize=(7.2, 4.2), sharey=True, squeeze=False)
+    for axes, value in zip(panels[0], inputs, strict=True):
+        for name, look in looks_of(errors):
+            middle, low, high = (np.quantile(errors[name][value], q, axis=0) for q in (0.5, 0.1, 0.9))
+            if middle.size == 2:
+                axes.axhline(middle[1], color=look.color, linestyle=look.line, label=look.label)
+                continue
+            steps = np.arange(middle.size)
+            axes.semilogy(
+                steps, middle, color=look.color, linestyle=look.line, marker=look.marker, ms=3.5, label=look.label
+            )
+            axes.fill_between(steps, low, high, color=look.color, alpha=0.15, lw=0)
+        axes.set(xlabel="iteration", title=f"input {value:g} rad")
+        axes.xaxis.get_major_locator().set_params(integer=True)
+    panels[0, 0].set_ylabel("error (rad rms)")
+    panels[0, 0].set_ylim(3e-8, 2)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9)
+    return figure
+
+
+def draw_estimates(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) -> Figure:
+    """One screen, the phase (radian) that each method estimates, and the residual, on a scale four times finer."""
+    truth = np.where(pupil.inside, truth, np.nan)
+    limit = np.nanmax(np.abs(truth))
+    figure, panels = plt.subplots(2, len(phases) + 1, figsize=(7.2, 4.6))
+    image = show_phase(panels[0, 0], truth, limit)
+    panels[0, 0].set_title("input", fontsize=9)
+    panels[0, 0].set_gid(ALONE)
+    panels[1, 0].remove()
+    panels[1, 1].set_ylabel("residual")
+    for column, (name, look) in enumerate(looks_of(phases), start=1):
+        residual = wrapped_residual(pupil, phases[name], truth)
+        show_phase(panels[0, column], phases[name], limit)
+        shown = show_phase(panels[1, column], residual, limit / 4)
+        short, rms = textwrap.fill(look.name, 10), np.sqrt(np.nanmean(residual**2))
+        panels[0, column].set_title(short, fontsize=9)
+        panels[1, column].set_title(f"{short}\n{_short(rms)} rad", fontsize=9)
+    below: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 40}
+    figure.colorbar(image, ax=panels[0], label="phase (rad)", **below)
+    figure.colorbar(shown, ax=list(panels[1, 1:]), label="residual (rad)", extend="both", **below)
+    return figure
+
+
+def _short(value: float) -> str:
+    """Two digits, or a bound where the digits would be those of rounding errors."""
+    return f"{value:.2g}" if value >= 1e-6 else "< $10^{-6}$"
+
+
+def convergence_columns(errors: Mapping[str, Mapping[float, NDArray]]) -> dict[str, NDArray]:
+    """Columns of the errors after each iteration: median and middle 80 % of the screens."""
+    n_steps = max(error.shape[1] for by_input in errors.values() for error in by_input.values())
+    columns = {"iteration": np.arange(n_steps)}
+    for name, by_input in errors.items():
+        for value, error in by_input.items():
+            for level in (0.1, 0.5, 0.9):
+                curve = np.quantile(error, level, axis=0)
+                # A method without iterations: before and after.
+                curve = curve[-1] if curve.size == 2 else curve
+                columns[f"{name} at {value:g} rad: quantile {level:g} (rad rms)"] = curve
+    return columns
+
+
+def cut_columns(pupil: Pupil, screen: NDArray, phases: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """Columns of the estimates and the residuals along the middle of the pupil."""
+    row = pupil.shape[0] // 2
+    return {
+        "x at the middle of the pupil (D)": pupil.x,
+        "input (rad)": np.where(pupil.inside, screen, np.nan)[row],
+        **{f"{name} (rad)": phase[row] for name, phase in phases.items()},
+        **{
+            f"{name}, residual (rad)": wrapped_residual(pupil, phase, screen)[row]
+            for name, phase in phases.items()
+        },
+    }
+
+
+def results_table(pupil: Pupil, screen: NDArray, found: Mapping[str, Reconstruction]) -> Table:
+    """Result that each method reports, and its error."""
+    return Table(
+        ["reconstructor", "iterations", "mismatch of the frames (rms)", "error (rad rms)"],
+        [
+            [
+                LOOKS[name].name,
+                int(result.n_iterations),
+                small(float(result.residual)),
+                small(float(reconstruction_error(pupil, result.phase, screen))),
+            ]
+            for name, result in found.items()
+        ],
+    )
+
+
+def accuracy_table(rows: NDArray) -> Table:
+    """Rank and error of the low-rank model, see `model_accuracy`."""
+    return Table(
+        ["tolerance", "rank", "error of the reference wave, below"],
+        [
+            [f"{tolerance:.0e}", int(rank), f"{10.0 ** np.ceil(np.log10(error)):.0e}"]
+            for tolerance, rank, error in rows
+        ],
+    )

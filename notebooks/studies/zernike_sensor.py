@@ -1,0 +1,231 @@
+"""One pixel of a phase-shifted sensor: the phases that explain each of its intensities. Not in the paper."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from IPython.display import HTML
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike, NDArray
+
+from studies.kit.parameters import USUAL
+from studies.kit.results import rounded
+from studies.kit.style import LOOKS, dashed_circle, show_intensity, show_phase
+from zwfs.masks import focal_field
+from zwfs.metrics import reconstruction_error, strehl, wrapped_residual
+from zwfs.pupil import Pupil
+from zwfs.sensor import ZernikeSensor
+
+LIMITS = {name: USUAL[name] for name in ("n_pixels", "diameter", "phase_shift")} | {"height": (0.1, 3.0)}
+
+CENTRE = 0.22  # distance of the bump and of the pit from the middle of the pupil, D
+
+
+@dataclass(frozen=True)
+class Pixel:
+    """One pixel inside the pupil, and what each mask shows of it."""
+
+    row: int
+    column: int
+    phase: float  # radian
+    waves: NDArray[np.complex128]  # (n_masks,), reference waves over the amplitude of the pixel
+
+    def intensities(self, phase: ArrayLike) -> NDArray[np.floating]:
+        """Intensity behind each mask, equation (5), if the pixel had another phase."""
+        field = np.exp(1j * np.asarray(phase))
+        return np.abs(np.add.outer(self.waves, field)) ** 2
+
+    @property
+    def mirrored(self) -> NDArray[np.floating]:
+        """Other phase in (-pi, pi] with the same intensity, for each mask; `eq-reflection` of the book."""
+        return np.angle(np.exp(1j * (2 * np.angle(self.waves) - self.phase)))
+
+
+def bump_and_pit(pupil: Pupil, height: float, width: float = 0.1) -> NDArray[np.floating]:
+    """Return a phase with a Gaussian bump on the left and a pit of the same depth on the right."""
+
+    def bell(distance: NDArray) -> NDArray:
+        return np.exp(-(distance**2) / (2 * width**2))
+
+    return height * np.outer(bell(pupil.y), bell(pupil.x + CENTRE) - bell(pupil.x - CENTRE))
+
+
+def lowest_pixel(sensor: ZernikeSensor, phase: NDArray) -> Pixel:
+    """Return the pixel of the lowest phase inside the pupil."""
+    pupil = sensor.pupil
+    waves = sensor.reference_wave(pupil.field(phase))[(..., *sensor.window)]
+    inside = np.where(pupil.inside, phase, np.inf)
+    row, column = map(int, np.unravel_index(np.argmin(inside), inside.shape))
+    return Pixel(row, column, float(phase[row, column]), waves[:, row, column] / pupil.amplitude[row, column])
+
+
+IMAGES = ("1", "#B2182B", "-"), ("2", "#313695", "--")
+"""Name, colour and line of the images of both masks, as in Figure 2."""
+_WIDTH = 6.8  # inches: names of 10 points are then as large as the prose
+_REACH = 3.0  # of the picture of the focal plane, lambda/D
+_GREY = "#777777"
+
+
+def draw_sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Figure:
+    """Phase in the pupil, focal plane with the first mask, its reference wave and its image."""
+    pupil = sensor.pupil
+    field = pupil.field(phase)
+    wave = np.abs(sensor.reference_wave(field)[0]) ** 2
+    image = sensor.measure(phase)[0]
+    axis = np.linspace(-_REACH, _REACH, 121)
+    focus = np.abs(focal_field(pupil, field, axis, axis)) ** 2
+
+    figure, panels = plt.subplots(1, 4, figsize=(_WIDTH, 2.75))
+    inside = np.where(pupil.inside, phase, np.nan)
+    shown = (
+        show_phase(panels[0], inside, np.nanmax(np.abs(inside))),
+        show_intensity(panels[1], focus, 1.0),
+        show_intensity(panels[2], wave, wave.max()),
+        show_intensity(panels[3], image, image.max()),
+    )
+    shown[1].set(cmap="magma", norm="log", clim=(1e-3, 1), extent=(-_REACH, _REACH, -_REACH, _REACH))
+    dashed_circle(panels[1], (0, 0), sensor.masks[0].diameter / 2)
+    titles = "1. pupil:\nphase", "2. focus:\ndimple (dashed)", "3. reference\nwave", "4. camera:\nimage"
+    units = "rad", "intensity", "intensity", "intensity"
+    for axes, picture, title, unit in zip(panels, shown, titles, units, strict=True):
+        axes.set_title(title, fontsize=10)
+        bar = figure.colorbar(picture, ax=axes, location="bottom", label=unit, aspect=12, pad=0.03)
+        if axes is panels[1]:
+            bar.set_ticks([1e-2, 1e-1])  # none at the ends, next to those of other panels
+        if axes is panels[2]:
+            bar.locator = MaxNLocator(2)
+    for axes in (panels[0], panels[3]):
+        axes.plot(pixel.column, pixel.row, "+", color="black" if axes is panels[0] else "white", ms=9, mew=1.5)
+    return figure
+
+
+def draw_pixel_phasors(pixel: Pixel) -> Figure:
+    """Waves of one pixel as arrows in the complex plane, for both masks, and both intensities by its phase."""
+    figure, panels = plt.subplot_mosaic(
+        [["1", "2"], ["curves", "curves"]], figsize=(_WIDTH, 6.4), height_ratios=(5, 4)
+    )
+    curves = panels["curves"]
+    angles = np.linspace(-np.pi, np.pi, 361)
+    for k, (name, color, line) in enumerate(IMAGES):
+        _phasors(panels[name], pixel, k)
+        level = pixel.intensities(pixel.phase)[k]
+        curves.plot(angles, pixel.intensities(angles)[k], color=color, ls=line, lw=2)
+        curves.axhline(level, color=color, ls=line, lw=0.8)
+        curves.plot(pixel.mirrored[k], level, "o", color=color, mfc="white", mew=2, ms=9, zorder=4)
+        top = int(np.argmax(pixel.intensities(angles)[k]))
+        curves.text(angles[top], 3.05, f"image {name}", ha="center", color=color)
+    curves.plot([pixel.phase] * 2, pixel.intensities(pixel.phase), "o", color="black", ms=9, zorder=5)
+    curves.axvline(pixel.phase, color=_GREY, lw=0.8, ls=":")
+    curves.set(xlabel="phase of the pixel (rad)", ylabel="intensity", xlim=(-np.pi, np.pi), ylim=(0, 3.4))
+    return figure
+
+
+def _phasors(axes: Axes, pixel: Pixel, k: int) -> None:
+    """Reference wave and wave of the pixel, tip to tail, for both phases with the same intensity."""
+    name, color, _ = IMAGES[k]
+    wave, intensity = pixel.waves[k], pixel.intensities(pixel.phase)[k]
+    axes.add_patch(Circle((wave.real, wave.imag), 1, fill=False, ec=_GREY, ls=":", lw=1.5))
+    axes.add_patch(Circle((0, 0), np.sqrt(intensity), fill=False, ec=color, lw=1.5))
+    _arrow(axes, 0, wave, color=_GREY)
+    style: dict[str, Any] = {"color": _GREY, "fontsize": 9, "ha": "right", "va": "center"}
+    axes.text(wave.real + 0.04, 0.1 * wave.imag + 0.12, "reference\nwave", **style)
+    axes.plot(0, 0, "+", color="black", ms=8)
+    for phase, line, shade in ((pixel.phase, "-", "black"), (pixel.mirrored[k], "--", color)):
+        turn = np.exp(1j * phase)
+        _arrow(axes, wave, wave + turn, color=shade, ls=line)
+        point, label = wave + turn, wave + 1.18 * turn
+        axes.plot(point.real, point.imag, "o", color=shade, mfc="white" if line == "--" else shade, mew=2, ms=8)
+        side = "left" if turn.real > 0.5 else "right" if turn.real < -0.5 else "center"
+        height = "top" if turn.imag < -0.5 else "bottom" if turn.imag > 0.5 else "center"
+        text = f"{phase:+.2f} rad".replace("-", "−")
+        axes.text(label.real, label.imag, text, color=shade, ha=side, va=height)
+    axes.set(title=f"image {name}: intensity {intensity:.2f}", xlim=(-2.3, 1.7), ylim=(-2, 1.6), aspect="equal")
+    axes.set_axis_off()
+
+
+def _arrow(axes: Axes, start: complex, end: complex, **style: Any) -> None:
+    """Arrow in the complex plane."""
+    start, end = complex(start), complex(end)
+    shape = {"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0, "mutation_scale": 14, "lw": 2}
+    axes.annotate("", (end.real, end.imag), (start.real, start.imag), arrowprops=shape | style)
+
+
+def draw_one_or_two_images(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) -> Figure:
+    """True phase (radian), and the phases that methods reconstruct, with their errors."""
+    truth = np.where(pupil.inside, truth, np.nan)
+    limit = np.nanmax(np.abs(truth))
+    figure, panels = plt.subplots(1, 1 + len(phases), figsize=(_WIDTH, 2.7))
+    shown = show_phase(panels[0], truth, limit)
+    panels[0].set_title("true phase\n", fontsize=10)
+    for axes, (name, phase) in zip(panels[1:], phases.items(), strict=True):
+        residual = wrapped_residual(pupil, phase, truth)
+        show_phase(axes, truth + residual, limit)
+        error = float(np.sqrt(np.nanmean(residual**2)))
+        images = LOOKS[name].sees.replace("pupils", "images").replace("pupil", "image")
+        axes.set_title(f"from {images}:\n{_error(error)}", fontsize=10)
+    figure.colorbar(shown, ax=panels, label="phase (rad)", aspect=15)
+    return figure
+
+
+def _error(value: float) -> str:
+    return f"error {value:.2f} rad rms" if value >= 5e-3 else "no error"
+
+
+def sensor_steps_columns(pupil: Pupil, phase: NDArray, frames: NDArray, pixel: Pixel) -> dict[str, NDArray]:
+    """Columns along the row of the pixel."""
+    return {
+        "x (D)": pupil.x,
+        "phase (rad)": np.where(pupil.inside, phase, np.nan)[pixel.row],
+        "image 1": frames[0, pixel.row],
+        "image 2": frames[1, pixel.row],
+    }
+
+
+def pixel_phasors_columns(pixel: Pixel) -> dict[str, NDArray]:
+    """Columns of both intensities against the phase of the pixel."""
+    phases = np.linspace(-np.pi, np.pi, 361)
+    first, second = pixel.intensities(phases)
+    return {"phase of the pixel (rad)": phases, "image 1": first, "image 2": second}
+
+
+def one_or_two_images_columns(
+    pupil: Pupil, truth: NDArray, one: NDArray, two: NDArray, pixel: Pixel
+) -> dict[str, NDArray]:
+    """Columns of the reconstructed phases along the row of the pixel."""
+    return {
+        "x (D)": pupil.x,
+        "true phase (rad)": np.where(pupil.inside, truth, np.nan)[pixel.row],
+        "phase from one image (rad)": one[pixel.row],
+        "phase from two images (rad)": two[pixel.row],
+    }
+
+
+def numbers(pupil: Pupil, truth: NDArray, one: NDArray, pixel: Pixel) -> dict[str, float | str]:
+    """Phases that explain the pixel (radian), and the error of the phase from one image."""
+    return rounded(
+        {
+            "pixel_phase": pixel.phase,
+            "mirrored_a": pixel.mirrored[0],
+            "mirrored_b": pixel.mirrored[1],
+            "one_at_pixel": one[pixel.row, pixel.column],
+            "one_error": float(reconstruction_error(pupil, one, truth)),
+            "fold": np.angle(-np.exp(1j * np.angle(pixel.waves[0]))),
+            "strehl": float(strehl(pupil, truth)),
+        }
+    )
+
+
+def explorer(pixel: Pixel) -> HTML:
+    """Place of the interactive phasors, with the computed reference waves; book/_static/phasor.js draws them."""
+    waves = json.dumps([[round(wave.real, 4), round(wave.imag, 4)] for wave in pixel.waves.tolist()])
+    return HTML(
+        f'<div id="phasor" class="d-print-none" data-waves="{waves}" data-phase="{pixel.phase:.2f}" hidden></div>'
+    )

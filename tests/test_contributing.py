@@ -1,0 +1,141 @@
+"""The examples of CONTRIBUTING, added to copies of the repository: a figure and a reconstructor."""
+
+import csv
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+import nbformat
+import numpy as np
+import pytest
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+
+import zwfs
+from book._tools.book import BookError, check_contents
+from book._tools.project import Project
+
+from .conftest import ROOT, new_reconstructor
+
+FOLDERS = ("book", "environment", "notebooks", "tests", "zwfs")
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """A copy of the repository, without results."""
+    for name in FOLDERS:
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "*.png"))
+    for file in (*ROOT.glob("*.toml"), *ROOT.glob("*.yml"), ROOT / "CITATION.cff", ROOT / "CONTRIBUTING.md"):
+        shutil.copy(file, tmp_path)
+    return Project(tmp_path)
+
+
+def run(project, *command):
+    """Run Python in a copy, with the modules of the copy."""
+    path = os.pathsep.join(str(project.root / name) for name in ("", "notebooks", "book/_ext"))
+    done = subprocess.run(
+        [sys.executable, *command],
+        cwd=project.root,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
+    return done.stdout
+
+
+def block(introduction, language="python"):
+    """Return the first code of CONTRIBUTING after some words."""
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    return re.search(rf"{introduction}.*?^```{language}\n(.*?)^```", text, re.M | re.S)[1]
+
+
+def cells(text):
+    """Cells of a notebook that is written with ``# %%``."""
+    for cell in re.split(r"^# %%", text, flags=re.M)[1:]:
+        head, source = cell.split("\n", 1)
+        source = source.strip("\n")
+        if "[markdown]" in head:
+            yield new_markdown_cell(re.sub("^# ?", "", source, flags=re.M))
+        else:
+            tags = json.loads(head.partition("tags=")[2] or "[]")
+            yield new_code_cell(source, metadata={"tags": tags})
+
+
+@pytest.mark.slow
+def test_a_new_figure_is_a_study_a_notebook_and_a_line(copy):
+    study, written = block("The study, `notebooks/studies/strehl_loss.py`"), block("The notebook, ")
+    (copy.notebooks / "studies" / "strehl_loss.py").write_text(study)
+    nbformat.write(new_notebook(cells=[*cells(written)]), copy.source("strehl_loss"))
+    with pytest.raises(BookError, match=r"strehl_loss\.ipynb is not listed"):
+        check_contents(copy)
+    contents = copy.root / "_toc.yml"
+    line, place = block("The line in `_toc.yml`", "yaml"), "      - file: notebooks/fig04_dimple_diameter\n"
+    contents.write_text(contents.read_text().replace(place, place + line))
+    check_contents(copy)
+    run(copy, "-m", "book._tools", "rerun", "strehl_loss", "-p", "n_screens=2", "--output", "result")
+    result = copy.root / "result"
+    table = list(csv.DictReader((result / "strehl_loss.csv").read_text().splitlines()))
+    lowest = float(table[-1]["Strehl ratio"])
+    assert lowest == pytest.approx(np.exp(-1), abs=0.1)
+    assert (result / "strehl_loss.png").exists()
+    assert f"At the largest input it is {lowest:.2f}" in re.sub(
+        "<[^>]*>", "", (result / "strehl_loss.html").read_text()
+    )
+    for folder in ("notebooks/studies", "notebooks/strehl_loss.ipynb"):
+        run(copy, "-m", "ruff", "check", folder)
+        run(copy, "-m", "ruff", "format", "--check", folder)
+
+
+@pytest.mark.slow
+def test_a_new_reconstructor_is_a_file_and_an_entry(copy):
+    """It is in Figure 3, on the API page, and passes all tests of reconstructors."""
+    path, code = new_reconstructor()
+    (copy.root / path).write_text(code)
+    with (copy.root / "zwfs/reconstructors/__init__.py").open("a") as package:
+        package.write("\nfrom zwfs.reconstructors.wirtinger_flow import WirtingerFlow\n")
+        package.write("RECONSTRUCTORS = tuple(dict.fromkeys((*RECONSTRUCTORS, WirtingerFlow)))\n")
+    run(copy, "-c", FIGURE_3)
+    tested = [f"tests/test_{name}.py" for name in ("reconstructors", "bad_input", "figures")]
+    passed = run(
+        copy, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-k", "WirtingerFlow or look", *tested
+    )
+    assert int(re.search(r"(\d+) passed", passed)[1]) > 50
+    run(copy, "-m", "ruff", "check", path)
+    run(copy, "-m", "ruff", "format", "--check", path)
+
+
+FIGURE_3 = """
+import api, numpy as np, zwfs
+from studies.fig03_dynamic_range import draw_linearity, linearity_curves
+from studies.kit.methods import own_reconstructors, paper_reconstructors
+from studies.kit.style import LOOKS
+from zwfs.reconstructors import RECONSTRUCTORS
+from zwfs.reconstructors.wirtinger_flow import WirtingerFlow
+pupil = zwfs.Pupil.circular(40)
+modes = zwfs.zernike_basis(pupil, 30)
+methods = paper_reconstructors(pupil, modes, 1.06, np.pi / 2, n_iterations=30)
+methods |= own_reconstructors([], methods, modes)
+assert type(methods["WirtingerFlow"]) is WirtingerFlow and methods["WirtingerFlow"].settings.n_iterations == 30
+assert own_reconstructors(["zwfs:WirtingerFlow"], methods, modes).keys() == {"WirtingerFlow"}
+curves = linearity_curves(methods, modes, [0.3], 2)
+assert curves.mean("WirtingerFlow")[0] < 0.01
+draw_linearity(curves, 0.05, list(methods), 0.3)
+assert WirtingerFlow in RECONSTRUCTORS and WirtingerFlow.__module__ in api.modules()
+assert LOOKS["WirtingerFlow"].label == "wirtinger flow"
+"""
+
+
+@pytest.mark.parametrize("rms", [0.1, 0.5, 1.0])
+def test_the_iterative_example_converges_to_the_phase(tmp_path, monkeypatch, shifted, pupil, screens, rms):
+    (tmp_path / "wirtinger_flow.py").write_text(new_reconstructor()[1])
+    monkeypatch.syspath_prepend(tmp_path)
+    method = zwfs.reconstructors.base.load("wirtinger_flow:WirtingerFlow")(
+        shifted, n_iterations=400, tolerance=1e-8
+    )
+    phase = screens(rms)
+    found = method(shifted.measure(phase))
+    assert found.converged.all()
+    assert zwfs.reconstruction_error(pupil, found.phase, phase).max() < 1e-6

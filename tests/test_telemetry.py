@@ -16,6 +16,7 @@ import tracemalloc
 import warnings
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -737,22 +738,48 @@ def command(*arguments, cwd, **options):
     )
 
 
-def test_command_calibrates_and_reconstructs_with_all_of_its_options(folder, bench, capsys):
-    np.save("bad.npy", np.zeros(bench.flat.shape))
-    files = "--frames frame.fits --pupils pupils.fits --dark dark.fits --bad-pixels bad.npy"
-    places = "--no-registration --pupil-centers 27.5 27.5 27.5 83.5 --pupil-diameter 40 --exposure 1"
-    optics = "--diameter 1.06 --phase-shifts 1.5708 -1.5708 --fit scale --iterations 20 --tolerance 0.01"
-    assert main(["calibrate", "new.npz", *f"{files} {places} {optics} --saturation 60000".split()]) == 0
-    options = "--modes 5 --phases --photons 1e4 --read-noise 3 --keywords EXPTIME --workers 1 --strict"
-    arguments = f"reconstruct cube.fits --calibration new.npz -o phase.fits --largest-residual 0.5 {options}"
-    assert main(arguments.split()) == 0
-    assert "12 frames, 0 flagged" in capsys.readouterr().out
+# Options of the command that exclude no other, with other values than their defaults.
+RECONSTRUCT = [
+    "--modes 5", "--modes 5 --phases", "--photons 1e4", "--photons 1e4 --read-noise 3", "--keywords EXPTIME BUNIT",
+    "--saturation 60000", "--largest-residual 0.5", "--workers 1", "--restart", "--overwrite", "--strict",
+    "--quiet",
+]  # fmt: skip
+CALIBRATE = [
+    "--dark dark.fits", "--bad-pixels bad.npy", "--diameter 1.1", "--phase-shifts 1.5 -1.5", "--no-registration",
+    "--pupil-centers 27.5 27.5 27.5 83.5 --pupil-diameter 40", "--exposure 1.1", "--saturation 60000",
+    "--fit registration", "--iterations 10", "--tolerance 0.01",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("pair", list(combinations(RECONSTRUCT, 2)), ids=" ".join)
+def test_every_pair_of_options_reconstructs(folder, bench, pair):
+    fits.PrimaryHDU(bench.frames[:2], fits.Header(OPTICS | {"EXPTIME": 0.01})).writeto("two.fits")
+    options = " ".join(pair)
+    files = ["two.fits", "--calibration", "bench.npz", "--output", "phase.fits"]
+    assert main(["reconstruct", *files, *options.split()]) == 0
     with fits.open("phase.fits") as units:
         units.verify("exception")
         table = units["FRAMES"].data
-        assert units[0].data.shape[0] == units["SIGMA"].data.shape[0] == 12
-        assert {"COEFFS", "SIGCOEFF", "SIGMA", "EXPTIME"} <= set(table.names)
-        assert all(np.isfinite(table[name]).all() for name in ("COEFFS", "SIGCOEFF", "SIGMA"))
+        modes, photons = "--modes" in options, "--photons" in options
+        phases = not modes or "--phases" in options
+        assert (units[0].data is not None) == phases
+        assert ("SIGMA" in units) == ("SIGMA" in table.names) == (phases and photons)
+        assert ("SIGCOEFF" in table.names) == (modes and photons)
+        assert ("COEFFS" in table.names) == modes
+        assert ("EXPTIME" in table.names) == ("--keywords" in options)
+        for name in {"SIGMA", "SIGCOEFF", "COEFFS"} & set(table.names):
+            assert np.isfinite(table[name]).all()
+        if phases and photons:
+            rms_sigma = np.sqrt(np.nanmean(units["SIGMA"].data ** 2, axis=(1, 2)))
+            np.testing.assert_allclose(table["SIGMA"], rms_sigma, rtol=1e-5)
+
+
+@pytest.mark.parametrize("pair", list(combinations(CALIBRATE, 2)), ids=" ".join)
+def test_every_pair_of_options_calibrates(folder, bench, pair):
+    np.save("bad.npy", np.zeros(bench.flat.shape))
+    files = ["--frames", "frame.fits", "--pupils", "pupils.fits"]
+    assert main(["calibrate", "new.npz", *files, *" ".join(pair).split()]) == 0
+    assert np.isfinite(Calibration.load("new.npz")(bench.frames[:1]).flux).all()
 
 
 def test_exit_code_says_how_the_command_ended(folder, capsys):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind, per_kind, read_only
+from zwfs._arrays import Kind, added, any_array, holds, per_kind, read_only
 from zwfs._lowrank import Factors, Operator
 from zwfs.pupil import Pupil
 
@@ -121,9 +121,7 @@ class Propagator:
 
     def propagate(self, psi: NDArray) -> NDArray:
         """Fields on the detector: (k, 2, ny, nx) to (k, n_masks, 2, ny', nx')."""
-        out = self.operator.split_reference(psi)
-        out[(..., *self.window)] += psi[:, np.newaxis, ...]
-        return out
+        return added(self.operator.split_reference(psi), psi[:, np.newaxis, ...], self.window)
 
     def adjoint(self, waves: NDArray) -> NDArray:
         """Adjoint of `propagate`: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
@@ -173,7 +171,7 @@ def amplitude_maps(
     maps, batch = pupil_maps("amplitude", amplitude, sensor)
     _check.non_negative("amplitude", maps)
     xp = Kind.of(maps).xp
-    if not xp.all(xp.any(maps > 0, axis=(-2, -1))):
+    if not holds(xp.all(xp.any(maps > 0, axis=(-2, -1)))):
         raise ValueError("amplitude is 0 everywhere in the pupil: expected some light")
     with np.errstate(over="ignore"):
         maps = _check.in_kind("amplitude", maps, kind)
@@ -194,11 +192,8 @@ def amplitude_map(amplitude: ArrayLike | None, sensor: Optics) -> NDArray[np.flo
 
 def split(phase: NDArray, amplitude: NDArray) -> NDArray:
     """Field amplitude * exp(i phase): (k, ny, nx) to (k, 2, ny, nx)."""
-    kind = Kind.of(phase)
-    out = kind.xp.empty((phase.shape[0], 2, *phase.shape[1:]), dtype=kind.dtype, device=kind.device)
-    out[:, 0, ...] = kind.xp.cos(phase) * amplitude
-    out[:, 1, ...] = kind.xp.sin(phase) * amplitude
-    return out
+    xp = any_array(phase)[1]
+    return xp.stack([xp.cos(phase) * amplitude, xp.sin(phase) * amplitude], axis=1)
 
 
 def square(waves: NDArray) -> NDArray:

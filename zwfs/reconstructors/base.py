@@ -285,6 +285,8 @@ class Reconstructor(Immutable, ABC):
         self, frames: ArrayLike, start: ArrayLike | None
     ) -> tuple[NDArray[np.floating], tuple[int, ...], NDArray[np.floating] | None]:
         """Check the arguments of a call and return them as `solve` expects them, with the batch of the frames."""
+        _check.no_gradient("frames", frames)
+        _check.no_gradient("start", start)
         if not self.any_library:
             frames = _check.real_array("frames", frames)
         frames, batch = check_frames(self.sensor, frames, light=self._light)

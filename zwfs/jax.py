@@ -63,7 +63,9 @@ def measure(sensor: ZernikeSensor | PolychromaticSensor) -> Callable[..., Any]:
     try:
         import jax
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("zwfs.jax.measure needs JAX: expected it installed, as by pip install jax") from error
+        raise ModuleNotFoundError(
+            "zwfs.jax.measure needs JAX: expected it installed, as by pip install jax"
+        ) from error
     if not jax.config.jax_enable_x64:
         warnings.warn(
             "jax_enable_x64 is off, so JAX computes frames in float32, with a relative error of about 1e-6: expected "

@@ -29,7 +29,7 @@ def sensor(request, rough_pupil):
 
 @pytest.fixture
 def problem(sensor):
-    """Phases, (3, ny, nx) with NaN outside the pupil, weights of their frames, and the gradient of the weighted sum."""
+    """Phases with NaN outside the pupil, weights of their frames, and the gradient of the weighted sum."""
     rng = np.random.default_rng(3)
     phase = np.where(sensor.pupil.inside, rng.normal(size=(3, *sensor.pupil.shape)), np.nan)
     weights = rng.normal(size=(3, sensor.n_masks, *sensor.detector_shape))

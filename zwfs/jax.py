@@ -1,7 +1,7 @@
 """The sensors in JAX: frames that can be differentiated, compiled and vectorised.
 
-Arrays of PyTorch need no such module: `loss.backward()` passes through `Sensor.measure`. `import zwfs.jax` does not
-need JAX; `measure` does.
+Arrays of PyTorch need no such module: `loss.backward()` passes through `Sensor.measure`. JAX is imported by the
+first call of `measure`.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ def measure(sensor: ZernikeSensor | PolychromaticSensor) -> Callable[..., Any]:
         raise ModuleNotFoundError(
             "zwfs.jax.measure needs JAX: expected it installed, as by pip install jax"
         ) from error
-    if not jax.config.jax_enable_x64:
+    if not jax.config.read("jax_enable_x64"):
         warnings.warn(
-            "jax_enable_x64 is off, so JAX computes frames in float32, with a relative error of about 1e-6: expected "
+            "jax_enable_x64 is off, so JAX computes frames in float32, with an error of about 1e-6: expected "
             'jax.config.update("jax_enable_x64", True) for float64',
             UserWarning,
             stacklevel=2,
@@ -91,7 +91,7 @@ def measure(sensor: ZernikeSensor | PolychromaticSensor) -> Callable[..., Any]:
             warn_of_degrees(pupil_maps("phase", np.asarray(maps), sensor)[0], sensor.pupil, stacklevel=3)
         with jax.ensure_compile_time_eval():  # the sensor keeps the model, which must not belong to a trace
             model = propagator(sensor, Kind(xp, np.dtype(maps.dtype), None))
-        strength = model.amplitude
+        strength: Any = model.amplitude
         if amplitude is not None:
             strength = array("amplitude", amplitude).astype(maps.dtype)
             if not isinstance(strength, jax.core.Tracer):
@@ -99,7 +99,7 @@ def measure(sensor: ZernikeSensor | PolychromaticSensor) -> Callable[..., Any]:
             _check.broadcast(phase=maps, amplitude=strength)
             strength = xp.where(model.inside, strength, 0)
         maps, strength = xp.broadcast_arrays(xp.where(model.inside, maps, 0), strength)
-        flat = (xp.reshape(one, (-1, *shape)) for one in (maps, strength))
+        flat: Any = [xp.reshape(one, (-1, *shape)) for one in (maps, strength)]
         result = square(model.propagate(model.incoming(*flat)))
         return xp.reshape(result, (*maps.shape[:-2], *result.shape[1:]))
 

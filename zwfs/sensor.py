@@ -6,7 +6,6 @@ import warnings
 from abc import abstractmethod
 from functools import cached_property
 from math import prod, sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -237,7 +236,8 @@ class ZernikeSensor(Sensor):
     """A Zernike wavefront sensor with any number of masks.
 
     Fields and phases may be arrays of NumPy or of any library that follows the Python array API and lets arrays be
-    changed in place, such as PyTorch and CuPy; results are of the same library and on the same device.
+    changed in place, such as PyTorch and CuPy; results are of the same library and on the same device. Gradients of
+    PyTorch pass through all methods; `zwfs.jax` is the way for JAX.
 
     One mask makes the classic sensor, two make the phase-shifted one. Detector pixels are as large as pupil
     pixels and stand at the same places, so the detector of an extent of 1 D is the grid of the pupil.

@@ -323,7 +323,7 @@ def _warn_of_quadrature(index: int, mask: Mask, error: float, tolerance: float) 
         "of its quadrature: name circles at which it jumps in `breaks`, or raise `n_samples` (now "
         f"{mask.n_samples})",
         UserWarning,
-        stacklevel=5,  # the caller of the sensor, beyond the end of its constructor
+        stacklevel=6,  # the caller of the sensor, beyond the end of its constructor
     )
 
 

@@ -1,6 +1,7 @@
 """The model that sensors and reconstructors compute with: split fields of one kind of arrays.
 
-`propagator` returns the model of a sensor. `pupil_maps` and `amplitude_maps` check input; nothing else here does.
+`propagator` returns the model of a sensor. `pupil_maps`, `amplitude_maps` and `warn_of_degrees` check input;
+nothing else here does.
 
 A split field has shape (..., 2, ny, nx): the real part, then the imaginary part. It is 0 outside the pupil. A
 phasor is exp(i phase) as a split field. `k` is the number of frame sets in a batch.
@@ -12,9 +13,10 @@ the weight of a wavelength is a factor of its field, so an intensity is the sum 
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from functools import reduce
-from math import prod
+from math import prod, sqrt
 from operator import add
 from typing import Any, NamedTuple, Protocol
 
@@ -26,6 +28,7 @@ from zwfs._arrays import Kind, added, any_array, holds, per_kind, read_only
 from zwfs._lowrank import Factors, Operator
 from zwfs.pupil import Pupil
 
+_DEGREES = 20.0  # radian rms; no phase map reaches it, the same map in degrees soon does
 _RANGE = 1e30  # of the light in the pupil, and of its inverse: its square is a number in single precision, too
 _VANISHING = 1e-30  # modulus, or its square, of a field that counts as 0
 
@@ -188,6 +191,20 @@ def amplitude_map(amplitude: ArrayLike | None, sensor: Optics) -> NDArray[np.flo
     if not 1 / _RANGE < light < _RANGE:
         raise ValueError(f"amplitude: its squares add up to {light:.3g}: expected {1 / _RANGE:g} to {_RANGE:g}")
     return maps[0]
+
+
+def warn_of_degrees(phase: NDArray, pupil: Pupil, stacklevel: int) -> None:
+    """Warn if the rms of a phase, (k, ny, nx) with 0 outside the pupil, is too large for one in radian."""
+    xp, axes = any_array(phase)[1], (-2, -1)
+    mean = xp.sum(phase, axis=axes) / pupil.n_points
+    squares = xp.max(xp.sum(phase * phase, axis=axes) / pupil.n_points - mean * mean)
+    if not holds(squares <= _DEGREES**2):
+        warnings.warn(
+            f"phase has an rms of {sqrt(squares):.4g}: expected radian, less than {_DEGREES:g} rms; is it in "
+            "degrees?",
+            UserWarning,
+            stacklevel=stacklevel,
+        )
 
 
 def split(phase: NDArray, amplitude: NDArray) -> NDArray:

@@ -14,9 +14,9 @@ import numpy as np
 
 from zwfs import _check
 from zwfs._arrays import Kind
-from zwfs._propagator import amplitude_maps, propagator, pupil_maps, square
+from zwfs._propagator import amplitude_maps, propagator, pupil_maps, square, warn_of_degrees
 from zwfs.polychromatic import PolychromaticSensor
-from zwfs.sensor import ZernikeSensor, warn_of_degrees
+from zwfs.sensor import ZernikeSensor
 
 
 def measure(sensor: ZernikeSensor | PolychromaticSensor) -> Callable[..., Any]:

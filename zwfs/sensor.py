@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import abstractmethod
 from functools import cached_property
-from math import prod, sqrt
+from math import prod
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Immutable, Kind, any_array, holds, per_kind
+from zwfs._arrays import Immutable, Kind, per_kind
 from zwfs._lowrank import Factors, Operator, factorise
 from zwfs._propagator import (
     ONE_WAVELENGTH,
@@ -23,11 +22,11 @@ from zwfs._propagator import (
     propagator,
     pupil_maps,
     square,
+    warn_of_degrees,
 )
 from zwfs.masks import Dimple, Mask
 from zwfs.pupil import Pupil
 
-_DEGREES = 20.0  # radian rms; no phase map reaches it, the same map in degrees soon does
 _MOST_PIXELS = 2**14  # across the detector: a frame of them takes 2 GiB
 
 
@@ -236,8 +235,8 @@ class ZernikeSensor(Sensor):
     """A Zernike wavefront sensor with any number of masks.
 
     Fields and phases may be arrays of NumPy or of any library that follows the Python array API and lets arrays be
-    changed in place, such as PyTorch and CuPy; results are of the same library and on the same device. Gradients of
-    PyTorch pass through all methods; `zwfs.jax` is the way for JAX.
+    changed in place, such as PyTorch and CuPy; results are of the same library and on the same device. Gradients
+    of PyTorch pass through all methods. JAX needs the function `zwfs.jax.measure`.
 
     One mask makes the classic sensor, two make the phase-shifted one. Detector pixels are as large as pupil
     pixels and stand at the same places, so the detector of an extent of 1 D is the grid of the pupil.
@@ -384,17 +383,3 @@ def _margin(extent: float, pupil: Pupil) -> int:
             f"{_MOST_PIXELS} are possible"
         )
     return round((extent - 1) * pupil.n_pixels / 2)
-
-
-def warn_of_degrees(phase: NDArray, pupil: Pupil, stacklevel: int) -> None:
-    """Warn if the rms of a phase, (k, ny, nx) with 0 outside the pupil, is too large for one in radian."""
-    xp, axes = any_array(phase)[1], (-2, -1)
-    mean = xp.sum(phase, axis=axes) / pupil.n_points
-    squares = xp.max(xp.sum(phase * phase, axis=axes) / pupil.n_points - mean * mean)
-    if not holds(squares <= _DEGREES**2):
-        warnings.warn(
-            f"phase has an rms of {sqrt(squares):.4g}: expected radian, less than {_DEGREES:g} rms; is it in "
-            "degrees?",
-            UserWarning,
-            stacklevel=stacklevel,
-        )

@@ -69,11 +69,7 @@ def files(name: str, figure: str, links: dict[str, str]) -> str:
         origin = of_paper
     elif number:
         origin += f", goes with {of_paper}"
-    offered = {
-        "PNG": figure + ".png",
-        "PDF": figure + ".pdf",
-        "data (CSV)": figure + ".csv",
-    }
+    offered = {"PNG": f"{figure}.png", "PDF": f"{figure}.pdf", "data (CSV)": f"{figure}.csv"}
     shown = [f"{{download}}`{text} <{links[file]}>`" for text, file in offered.items() if file in links]
     archive = f'<a class="download" href="../{DOWNLOADS}/{name}.zip" download>notebook with its code (ZIP)</a>'
     return " · ".join([origin, archive, *shown])

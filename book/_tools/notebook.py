@@ -1,6 +1,7 @@
 """Normal form of notebooks: two runs of the same notebook give the same bytes."""
 
 import copy
+import json
 import re
 from pathlib import Path
 
@@ -52,3 +53,11 @@ def _without_date(output: NotebookNode) -> NotebookNode:
 def to_bytes(notebook: NotebookNode) -> bytes:
     """Return a notebook as it is stored: sorted keys, one newline at the end."""
     return (nbformat.writes(notebook).rstrip("\n") + "\n").encode()
+
+
+def glued_texts(path: Path) -> dict[str, str]:
+    """Return what a notebook glues, as text by name."""
+    cells = json.loads(path.read_text("utf-8"))["cells"]
+    outputs = (output for cell in cells for output in cell.get("outputs", ()))
+    named = ((output.get("metadata", {}).get("scrapbook", {}).get("name"), output) for output in outputs)
+    return {name: "".join(next(iter(output["data"].values()))) for name, output in named if name}

@@ -171,13 +171,12 @@ def _given(asked: argparse.Namespace) -> dict[str, Any]:
 def _text(file: Path) -> str:
     """Return the content of a file of parameters."""
     try:
-        if not stat.S_ISREG(file.stat().st_mode):
+        about = file.stat()
+        if not stat.S_ISREG(about.st_mode):
             raise ParameterError(f"-f {file}: expected a regular file")
-        with file.open("rb") as stream:
-            content = stream.read(declared.LONGEST + 1)
-        if len(content) > declared.LONGEST:
+        if about.st_size > declared.LONGEST:
             raise ParameterError(f"-f {file}: expected at most {declared.LONGEST} bytes")
-        return content.decode()
+        return file.read_text("utf-8")
     except OSError as error:
         raise ParameterError(f"-f {file}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -360,5 +359,5 @@ def make(
 
 def command(name: str, changed: dict[str, Any]) -> str:
     """Return the command that repeats a run, from the root of a clone."""
-    values = [shlex.quote(f"{key}={json.dumps(value)}") for key, value in changed.items()]
+    values = [shlex.quote(f"{key}={json.dumps(value, ensure_ascii=False)}") for key, value in changed.items()]
     return " ".join([COMMAND, name, *(f"-p {value}" for value in values)])

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from zwfs._system import write_file
 
 from .execute import Run, execute
-from .notebook import read, to_bytes
+from .notebook import glued_texts, to_bytes
 from .project import Project
 from .record import digest_result, key, read_record, versions
 from .scratch import scratch_folder, swap
@@ -94,20 +94,10 @@ def _show(project: Project, name: str, folder: Path) -> None:
 def moved_numbers(project: Project) -> dict[str, list[str]]:
     """Return the glued numbers that differ between committed and executed notebooks, by committed file."""
     return {
-        committed.relative_to(project.root).as_posix(): differences(_glued(committed), _glued(fresh))
+        committed.relative_to(project.root).as_posix(): differences(*map(glued_texts, (committed, fresh)))
         for committed in project.sources()
         if (fresh := project.executed / committed.name).exists()
     }
-
-
-def _glued(path: Path) -> dict[str, str]:
-    """Return what a notebook glues, as text by name."""
-    found = {}
-    for cell in read(path).cells:
-        for output in cell.get("outputs", ()):
-            if name := output.get("metadata", {}).get("scrapbook", {}).get("name"):
-                found[name] = next((text for kind, text in output.data.items() if kind.endswith("text/plain")), "")
-    return found
 
 
 def differences(before: dict[str, str], after: dict[str, str]) -> list[str]:

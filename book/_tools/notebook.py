@@ -61,3 +61,14 @@ def glued_texts(path: Path) -> dict[str, str]:
     outputs = (output for cell in cells for output in cell.get("outputs", ()))
     named = ((output.get("metadata", {}).get("scrapbook", {}).get("name"), output) for output in outputs)
     return {name: "".join(next(iter(output["data"].values()))) for name, output in named if name}
+
+
+def title(notebook: NotebookNode) -> str:
+    """Return the title of a notebook."""
+    return notebook.cells[title_cell(notebook)].source.splitlines()[0].lstrip("# ")
+
+
+def title_cell(notebook: NotebookNode) -> int:
+    """Return the index of the cell that begins with the title."""
+    cells = enumerate(notebook.cells)
+    return next((i for i, cell in cells if cell.cell_type == "markdown" and cell.source.startswith("# ")), 0)

@@ -1,6 +1,5 @@
 """Check of a release, and of every supported Python: the package as a stranger would install it."""
 
-import json
 import os
 import re
 import shutil
@@ -10,6 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from .notebook import read
 from .project import Project, ToolError
 from .scratch import scratch_folder, swap
 
@@ -137,12 +137,7 @@ def test(project: Project, python: Path, scratch: Path, files: list[str], *optio
 
 def check_imports(project: Project, wheel: Path, folder: Path) -> None:
     """Install the wheel with the extra of the notebooks, and import what they and their studies do."""
-    cells = [
-        "".join(cell["source"])
-        for source in project.sources()
-        for cell in json.loads(source.read_text("utf-8"))["cells"]
-        if cell["cell_type"] == "code"
-    ]
+    cells = [c.source for source in project.sources() for c in read(source).cells if c.cell_type == "code"]
     python = environment(project, folder, f"zwfs[notebooks] @ {wheel.as_uri()}")
     modules = {name for cell in cells for name in re.findall(r"(?m)^(?:from|import) ([\w.]+)", cell)}
     modules |= {f"studies.{file.stem}" for file in project.studies.glob("[!_]*.py")}

@@ -71,7 +71,8 @@ def files(name: str, figure: str, links: dict[str, str]) -> str:
         origin += f", goes with {of_paper}"
     offered = {"PNG": f"{figure}.png", "PDF": f"{figure}.pdf", "data (CSV)": f"{figure}.csv"}
     shown = [f"{{download}}`{text} <{links[file]}>`" for text, file in offered.items() if file in links]
-    archive = f'<a class="download" href="../{DOWNLOADS}/{name}.zip" download>notebook with its code (ZIP)</a>'
+    address = f"../{DOWNLOADS}/{name}.zip"
+    archive = f'<a class="reference download" href="{address}" download>notebook with its code (ZIP)</a>'
     return " · ".join([origin, archive, *shown])
 
 

@@ -259,13 +259,15 @@ def test_weak_waves_of_different_size_are_solved(pupil, screens, dtype):
 def test_a_result_belongs_to_the_caller(make, method, screens):
     reconstruct, sensor = make(method)
     frames = sensor.measure(screens(0.3, 2))
-    expected, found = (reconstruct(frames, history=True) for _ in range(2))
+    found = reconstruct(frames, history=True)
     names = ("phase", "n_iterations", "converged", "n_unsolved", "history", "frames", "residual")
+    expected = {name: getattr(found, name).copy() for name in names}
     for name in names:
         getattr(found, name)[...] = 0
     again = reconstruct(frames, history=True)
+    frames[...] = 0  # as a camera does that writes the next frame to the same place
     for name in names:
-        np.testing.assert_array_equal(getattr(again, name), getattr(expected, name))
+        np.testing.assert_array_equal(getattr(again, name), expected[name])
 
 
 def test_descent_that_starts_at_the_solution_has_converged(shifted, modes, screens):

@@ -150,6 +150,8 @@ def test_jacobian_is_the_derivative_of_the_frames(any_sensor, phases):
     plus, minus = (any_sensor.measure(phases + sign * step * change) for sign in (1, -1))
     expected = (plus - minus) / (2 * step)
     np.testing.assert_allclose(any_sensor.jacobian(phases, change), expected, atol=1e-8)
+    with pytest.raises(ValueError, match="change has shape"):
+        any_sensor.jacobian(phases, change[0])
 
 
 def test_adjoint_of_the_jacobian_has_the_same_products(any_sensor, phases):

@@ -385,6 +385,8 @@ def test_cost_is_half_the_mean_square_of_the_mismatch(pupil, shifted, screens):
     expected = np.mean((shifted.measure(truth) - shifted.measure(guess)) ** 2) / 2
     cost, _ = GradientDescent(shifted).cost(pupil.gather(guess), shifted.measure(truth)[np.newaxis])
     assert cost == pytest.approx(expected, rel=1e-12)
+    with pytest.raises(ValueError, match=r"frames has a batch of \(2,\)"):
+        GradientDescent(shifted).cost(pupil.gather(guess), shifted.measure([truth, guess]))
 
 
 def test_descent_never_climbs(pupil, shifted, screens):
@@ -683,14 +685,12 @@ def test_masks_without_diversity_are_refused(pupil, phases):
 
 
 @every
-@pytest.mark.parametrize("scale", [30.0, 4e3])
-def test_raw_counts_are_warned_of(make, method, screens, scale):
+def test_raw_counts_are_warned_of(make, method, screens):
     reconstruct, sensor = make(method)
     counts = sensor.measure(screens(0.3))
-    counts[1] *= scale
+    counts[1] *= 30
     mean = counts[1][:, sensor.pupil.inside].mean(axis=-1).max()
-    message = f"frames: the mean inside the pupil reaches {mean:.4g}: expected at most about 1, .*raw counts"
-    with pytest.warns(UserWarning, match=message) as caught:
+    with pytest.warns(UserWarning, match=f"frames: the mean inside the pupil reaches {mean:.4g}: ") as caught:
         reconstruct(counts)
     assert caught[0].filename == __file__
 

@@ -12,15 +12,13 @@ from zwfs import (
 )
 from zwfs.bench.model import Bench, BenchModel, segment_residual, segment_screens
 
-N = 68  # half the camera: 11 pixels of margin
-SMALL = {"n_pixels": N, "gap": 0.02, "stop": 0.8}
+from .conftest import SMALL
+from .conftest import ideal_bench as ideal
+
+N = SMALL["n_pixels"]
 EXTENT = 180 / 136
 MARGIN = 11
 LAYOUT = Pupil.hexagonal(N, 3, 0.02, (21,), 0.8)
-
-
-def ideal(**changes):
-    return Bench.ideal(**{**SMALL, **changes})
 
 
 def design(bench, diameter=1.06):
@@ -36,16 +34,6 @@ def inner(images):
 def phase_of(bench):
     """Phase that a bench adds to the flat command, as a perfect sensor would see it: NaN outside."""
     return PhaseShifted(design(bench), n_iterations=50, tolerance=1e-10)(bench.frames()).phase
-
-
-@pytest.fixture(scope="module")
-def perfect():
-    return ideal()
-
-
-@pytest.fixture(scope="module")
-def model(perfect):
-    return BenchModel.from_images(perfect)
 
 
 @pytest.fixture(scope="module")

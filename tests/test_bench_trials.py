@@ -6,24 +6,11 @@ from studies.kit.bench import BenchCurves, bench_curves, bench_reconstructors, f
 from zwfs import Linear, PhaseShifted
 from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 
-N = 68
-SMALL = {"n_pixels": N, "gap": 0.02, "stop": 0.8}
+from .conftest import SMALL
+from .conftest import ideal_bench as ideal
+
 RMS = (0, 0.05, 0.5)
 NAMES = ("Linear", "Arcsine", "GerchbergSaxton", "GradientDescent", "PhaseShifted")
-
-
-def ideal(**changes):
-    return Bench.ideal(**{**SMALL, **changes})
-
-
-@pytest.fixture(scope="module")
-def perfect():
-    return ideal()
-
-
-@pytest.fixture(scope="module")
-def model(perfect):
-    return BenchModel.from_images(perfect)
 
 
 @pytest.fixture(scope="module")

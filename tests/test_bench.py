@@ -2,14 +2,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from zwfs import (
-    Dimple,
-    PhaseShifted,
-    Pupil,
-    ZernikeSensor,
-    power_law_screens,
-    zernike_basis,
-)
+from zwfs import Dimple, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, zernike_basis
 from zwfs.bench.model import Bench, BenchModel, segment_residual, segment_screens
 
 from .conftest import SMALL

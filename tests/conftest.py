@@ -2,6 +2,8 @@ import inspect
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -62,6 +64,16 @@ def heed_signals():
     """Restore in a child the signals that a shell in the background (SIGINT) and nohup (SIGHUP) ignore."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
+
+
+def start_tool(root, *arguments, **streams):
+    """Start a command of the book on another project."""
+    code = (
+        "import pathlib, sys; from book._tools.__main__ import main; from book._tools.project import Project;"
+        f"sys.exit(main(sys.argv[1:], Project(pathlib.Path({str(root)!r}))))"
+    )
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.Popen(command, cwd=ROOT, preexec_fn=heed_signals, **streams)
 
 
 def wait_until(condition, seconds):

@@ -50,16 +50,6 @@ def book_pages():
     return {file: Page(file) for file in sorted(HTML.rglob("*.html")) if "_static" not in file.parts}
 
 
-def test_pages_load_nothing_from_the_network(book_pages):
-    remote = {
-        f"{file.relative_to(HTML)} loads {address}"
-        for file, page in book_pages.items()
-        for address in page.loads
-        if urlsplit(address).netloc or urlsplit(address).scheme not in ("", "data")
-    }
-    assert not remote
-
-
 def test_links_inside_the_book_resolve(book_pages):
     broken = []
     for file, page in book_pages.items():

@@ -169,6 +169,14 @@ def test_background_and_flux_are_measured(recorded):
     assert measurement.counts[0] * measurement.pupil.n_points == pytest.approx(COUNTS * pupil.n_points, rel=0.02)
 
 
+def test_a_longer_exposure_of_the_frames_changes_no_intensity(recorded):
+    _, masked, bare = recorded
+    once = reduce_frames(register_frames([image(masked)], [image(bare)]), Optics())
+    thrice = reduce_frames(register_frames([image(3 * masked)], [image(bare)], exposure=3.0), Optics())
+    np.testing.assert_allclose(thrice.background, once.background * [3, 3, 1, 1], rtol=1e-12)
+    np.testing.assert_allclose(thrice.intensity, once.intensity, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("balance", [False, True])
 def test_balance_gives_both_frames_the_same_light_in_the_pupil(recorded, balance):
     _, masked, bare = recorded

@@ -135,7 +135,7 @@ def assert_same_phase(pupil, found, expected, tolerance=1e-5):
 
 
 @pytest.mark.parametrize(("rms", "seed", "diameter", "shifts", "iterations"), SETTINGS)
-def test_sensor_agrees_with_zwfs(compute, pupil, modes, rms, seed, diameter, shifts, iterations):
+def test_sensor_and_reconstructors_agree_with_zwfs(compute, pupil, modes, rms, seed, diameter, shifts, iterations):
     made = compute(rms, seed, diameter, shifts, iterations)
     phase = screen_of(modes, rms, seed)
     np.testing.assert_allclose(made["phase"], phase, atol=1e-5)
@@ -144,12 +144,6 @@ def test_sensor_agrees_with_zwfs(compute, pupil, modes, rms, seed, diameter, shi
     axis = 4 * (2 * np.arange(48) - 47) / 48
     focal = np.abs(focal_field(pupil, np.exp(1j * phase), axis, axis)) ** 2
     np.testing.assert_allclose(np.reshape(made["focal"], focal.shape), focal, atol=1e-5)
-
-
-@pytest.mark.parametrize(("rms", "seed", "diameter", "shifts", "iterations"), SETTINGS)
-def test_reconstructors_agree_with_zwfs(compute, pupil, modes, rms, seed, diameter, shifts, iterations):
-    made = compute(rms, seed, diameter, shifts, iterations)
-    phase = screen_of(modes, rms, seed)
     one, both = sensor_of(pupil, diameter, shifts[:1]), sensor_of(pupil, diameter, shifts)
     histories = {"linear": zwfs.Linear(one, modes, poke=1e-4)(one.measure(phase)).phase[np.newaxis]}
     for name, method, sensor in (("arcsine", zwfs.Arcsine, one), ("shifted", zwfs.PhaseShifted, both)):
@@ -196,6 +190,7 @@ def test_maximum_likelihood_agrees_with_zwfs(compute, pupil, rms, seed, diameter
         (2.0, 7, 1.06, (0.5, -0.5), None, 7),
         (0.5, 3, 1.06, (0.5, -0.5), 1e4, 11),  # pixels without a photon, steps that raise the cost
         (1.2, 9, 1.3, (0.4, -0.8), 1e5, 12),
+        (1.5, 1, 2.0, (0.65, -0.65), 1e6, 28),  # points that are reflected: compared at the end only
     ],
 )
 def test_steps_of_maximum_likelihood_are_those_of_zwfs(
@@ -203,24 +198,16 @@ def test_steps_of_maximum_likelihood_are_those_of_zwfs(
 ):
     noise = {} if photons is None else {"photons": photons}
     made = compute(rms, seed, diameter, shifts, 2 + steps, likelihood=True, **noise)
-    history = likelihood_from_two_iterations(pupil, made, diameter, shifts, photons, steps).history
-    errors = zwfs.reconstruction_error(pupil, history, screen_of(modes, rms, seed))
-    np.testing.assert_allclose(made["likelihood"]["errors"][2:], errors, rtol=1e-3)
-
-
-def likelihood_from_two_iterations(pupil, made, diameter, shifts, photons, steps):
-    """Result of zwfs on the images of the page, from the phase from which the page starts."""
+    # From the phase from which the page starts.
     sensor = sensor_of(pupil, diameter, shifts)
     start = zwfs.PhaseShifted(sensor, n_iterations=2, tolerance=0.0)(made["frames"]).phase
     per_pixel = None if photons is None else photons / pupil.n_points
     method = zwfs.MaximumLikelihood(sensor, photons=per_pixel, n_starts=1, n_iterations=steps)
-    return method(made["frames"], np.where(pupil.inside, start, 0), history=True)
-
-
-def test_points_are_reflected_as_by_zwfs(compute, pupil):
-    made = compute(1.5, 1, 2.0, (0.65, -0.65), 30, likelihood=True, photons=1e6)
-    result = likelihood_from_two_iterations(pupil, made, 2.0, (0.65, -0.65), 1e6, 28)
+    result = method(made["frames"], np.where(pupil.inside, start, 0), history=True)
     assert zwfs.reconstruction_error(pupil, made["likelihood"]["phase"], result.phase) < 1e-3
+    if steps < 28:
+        errors = zwfs.reconstruction_error(pupil, result.history, screen_of(modes, rms, seed))
+        np.testing.assert_allclose(made["likelihood"]["errors"][2:], errors, rtol=1e-3)
 
 
 def test_noise_has_the_statistics_of_photons(compute, pupil):
@@ -326,10 +313,6 @@ def test_contours_and_the_best_design_are_those_of_the_map(fresh, name):
     assert [float(value) for value in place[:2]] == pytest.approx([column + 0.5, costs.shape[1] - row - 0.5])
 
 
-def verdicts(page):
-    return [page.inner_text(f"#live-verdict-{place}")[0] for place in range(3)]
-
-
 def wait_for_address(page, *parts):
     for part in parts:
         page.wait_for_function("part => location.hash.includes(part)", arg=part)
@@ -338,15 +321,15 @@ def wait_for_address(page, *parts):
 @pytest.mark.parametrize(
     ("preset", "expected", "named"),
     [
-        ("The paper", ["✗", "✗", "✓"], "phase-shifted"),
-        ("SEAL", ["✗", "✗", "✓"], "phase-shifted"),
-        ("Keck", ["✗", "✗", "✓"], "maximum likelihood"),
-        ("OZIRIIS", ["✗", "✗", "✓"], "maximum likelihood"),
-        ("All-round", ["✗", "✗", "✓"], "maximum likelihood"),
-        ("Dimple too large", ["✗", "✗", "✗"], "phase-shifted"),
-        ("Out of range", ["✗", "✗", "✗"], "phase-shifted"),
-        ("The same with maximum likelihood", ["✗", "✗", "✓"], "maximum likelihood"),
-        ("A small input", ["✗", "✓", "✓"], "phase-shifted"),
+        ("The paper", "✗✗✓", "phase-shifted"),
+        ("SEAL", "✗✗✓", "phase-shifted"),
+        ("Keck", "✗✗✓", "maximum likelihood"),
+        ("OZIRIIS", "✗✗✓", "maximum likelihood"),
+        ("All-round", "✗✗✓", "maximum likelihood"),
+        ("Dimple too large", "✗✗✗", "phase-shifted"),
+        ("Out of range", "✗✗✗", "phase-shifted"),
+        ("The same with maximum likelihood", "✗✗✓", "maximum likelihood"),
+        ("A small input", "✗✓✓", "phase-shifted"),
     ],
 )
 def test_presets_and_buttons_set_the_sensor_up(fresh, preset, expected, named):
@@ -355,7 +338,7 @@ def test_presets_and_buttons_set_the_sensor_up(fresh, preset, expected, named):
         fresh.click("#live-play")
         fresh.evaluate("window.zwfsLive.page.set({ iterations: '30' })")
     wait_for_drawing(fresh)
-    assert verdicts(fresh) == expected
+    assert [fresh.inner_text(f"#live-verdict-{place}")[0] for place in range(3)] == [*expected]
     assert fresh.inner_text("#live-name-2") == named
 
 
@@ -424,18 +407,6 @@ def test_photons_between_the_designs_of_the_map_are_those_of_the_bound(fresh, mo
     [cost] = photon_costs(pupil, [paper], {"screens": screens})["screens"]
     fresh.check("input[value='1 rad rms']")
     fresh.wait_for_function(f"document.getElementById('live-design').textContent.includes(' {cost:.2f} times')")
-
-
-@pytest.mark.parametrize("width", [1280, 390])
-def test_axe_finds_no_fault(browser, file, width):
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
-    page = browser.new_page(viewport={"width": width, "height": 844})
-    page.goto(file.as_uri())
-    rules = {"resultTypes": ["violations"], "runOnly": ["wcag2a", "wcag2aa"]}
-    found = axe.run(page, options=rules).response["violations"]
-    assert [(fault["id"], fault["nodes"][0]["html"]) for fault in found if fault["id"] != "document-title"] == []
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    page.close()
 
 
 def test_page_says_nothing_and_asks_for_nothing_else(page):

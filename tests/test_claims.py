@@ -19,20 +19,15 @@ def judged():
     return claims.findings(NOTEBOOKS)
 
 
-@pytest.mark.parametrize("number", range(1, 22))
-def test_verdict_is_the_recorded_one(judged, number):
-    found = judged[CLAIMS[number]]
-    assert found.verdict == VERDICTS[str(number)], found.measured
-
-
 def test_every_claim_is_there_once():
     assert [claim.number for claim in claims.CLAIMS] == list(range(1, 22))
     assert list(VERDICTS) == [str(number) for number in CLAIMS]
 
 
 @pytest.mark.parametrize("number", range(1, 22))
-def test_every_other_verdict_is_explained(judged, number):
+def test_verdict_is_the_recorded_one_and_any_but_holds_and_fails_is_explained(judged, number):
     found = judged[CLAIMS[number]]
+    assert found.verdict == VERDICTS[str(number)], found.measured
     assert found.remark or found.verdict in (HOLDS, FAILS)
     assert found.measured or found.verdict == UNTESTED
 

@@ -434,29 +434,21 @@ def test_phase_file_replaces_no_source_and_nothing_but_a_phase_map(tmp_path, rec
     _, masked, bare = recorded
     registered = register_frames([image(masked)], [image(bare)])
     found = recover_phase(reduce_frames(registered, Optics()))
+    np.save(tmp_path / "größe.npy", masked)
     monkeypatch.chdir(tmp_path)
-    np.save("größe.npy", masked)
-    raw, target = (tmp_path / "größe.npy").read_bytes(), tmp_path / "a.fits"
-    source = camera.read("größe.npy")
-    os.link("größe.npy", "hard.npy")
+    source, raw, target = camera.read("größe.npy"), Path("größe.npy").read_bytes(), tmp_path / "a.fits"
     (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir("elsewhere")
-    for name in ("../größe.npy", "../hard.npy"):
-        with pytest.raises(ValueError, match=r"output = .* is the input"):
-            camera.write_phase(name, found, 635.0, [source], overwrite=True)
+    monkeypatch.chdir("elsewhere")  # the name of the source is that in its folder
+    with pytest.raises(ValueError, match=r"output = .* is the input"):
+        camera.write_phase("../größe.npy", found, 635.0, [source], overwrite=True)
     target.write_text("precious")
     with pytest.raises(ValueError, match=r"output = .*a\.fits' exists and is not a phase map"):
         camera.write_phase(target, found, 635.0, [source])
     assert target.read_text() == "precious"
-    assert (tmp_path / "größe.npy").read_bytes() == (tmp_path / "hard.npy").read_bytes() == raw
+    assert (tmp_path / "größe.npy").read_bytes() == raw
     camera.write_phase(target, found, 635.0, [source], overwrite=True)
     assert fits.getheader(target)["FILE1"] == r"gr\xf6\xdfe.npy"
-    (tmp_path / "link.fits").symlink_to("a.fits")
-    camera.write_phase(tmp_path / "link.fits", found, 500.0)
-    assert (tmp_path / "link.fits").is_symlink()
-    assert fits.getheader(target)["WAVELEN"] == 500
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "a.fits", "elsewhere", "größe.npy", "hard.npy", "link.fits"]  # fmt: skip
+    assert {path.name for path in tmp_path.iterdir()} == {"a.fits", "elsewhere", "größe.npy"}
 
 
 # The real bench
@@ -496,10 +488,7 @@ def test_seal_frames_are_explained(seal_work):
     # One frame predicts the other one far better than the outlines alone let it.
     assert np.all(seal_work[-1].predicted > seal_work[0].predicted + 0.05)
     assert np.all(seal_work[-1].predicted > seal_work[-1].control + 0.25)
-
-
-@pytest.mark.slow
-def test_seal_images_hold_uneven_light_and_do_not_show_a_rotation(seal_work):
+    # Their light is uneven, and they do not show a rotation.
     measurement = seal_work[-1].result.measurement
     assert measurement.flux_ratio == pytest.approx((1.22, 1.02), abs=0.01)
     assert np.isnan(measurement.registered.placement.sigma[2:]).all()

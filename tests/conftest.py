@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import nbformat
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -76,6 +77,21 @@ def start_tool(root, *arguments, **streams):
     return subprocess.Popen(command, cwd=ROOT, preexec_fn=heed_signals, **streams)
 
 
+def glued(path, **values):
+    """Write a notebook that has glued these values, and printed something."""
+    outputs = [
+        nbformat.v4.new_output(
+            "display_data",
+            {"application/papermill.record/text/plain": repr(value)},
+            metadata={"scrapbook": {"name": name}},
+        )
+        for name, value in values.items()
+    ]
+    cell = nbformat.v4.new_code_cell("", outputs=[*outputs, nbformat.v4.new_output("stream", text="")])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), path)
+
+
 def wait_until(condition, seconds):
     end = time.monotonic() + seconds
     while not condition():
@@ -139,6 +155,15 @@ def complex_field():
         return rng.normal(size=(*batch, *pupil.shape)) + 1j * rng.normal(size=(*batch, *pupil.shape))
 
     return make
+
+
+def watch(page):
+    """Everything that a page of the browser says, and every address that it asks for."""
+    said, asked = [], []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    return said, asked
 
 
 @pytest.fixture(scope="module")

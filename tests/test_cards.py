@@ -12,8 +12,6 @@ from book._ext import cards
 from book._tools.project import Project
 
 ROOT = Path(__file__).parent.parent
-HTML = ROOT / "_build" / "html"
-NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 @pytest.fixture

@@ -14,6 +14,8 @@ from studies.design import Design, photon_costs
 from studies.kit.curves import screens_at
 from zwfs.masks import focal_field
 
+from .conftest import watch
+
 ROOT = Path(__file__).parent.parent
 STATIC = ROOT / "book" / "_static"
 SOURCE = (ROOT / "book" / "live.md").read_text("utf-8")
@@ -61,10 +63,7 @@ def file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def page(browser, file):
     page = browser.new_page(viewport={"width": 1000, "height": 800})
-    page.said, page.asked = [], []
-    page.on("console", lambda message: page.said.append(message.text))
-    page.on("pageerror", lambda error: page.said.append(str(error)))
-    page.on("request", lambda request: page.asked.append(request.url))
+    page.said, page.asked = watch(page)
     page.goto(file.as_uri())
     return page
 

@@ -10,6 +10,8 @@ import pytest
 
 from studies.zernike_sensor import Pixel, bump_and_pit, explorer, lowest_pixel
 
+from .conftest import watch
+
 ROOT = Path(__file__).parent.parent
 STATIC = ROOT / "book" / "_static"
 
@@ -50,9 +52,7 @@ def page(browser, pixel, tmp_path):
     box = explorer(pixel).data
     (tmp_path / "page.html").write_text(f"<!doctype html><html lang='en'>{head}<body>{box}</body></html>", "utf-8")
     page = browser.new_page(viewport={"width": 390, "height": 800})
-    page.said = []
-    page.on("console", lambda message: page.said.append(message.text))
-    page.on("pageerror", lambda error: page.said.append(str(error)))
+    page.said, _ = watch(page)
     page.goto((tmp_path / "page.html").as_uri())
     yield page
     page.close()

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import nbformat
 import pytest
-from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 from book._tools import book, notebook, record, run, scratch
 from book._tools.__main__ import main
 from book._tools.execute import NotebookError
 from book._tools.project import Project
-from tests.conftest import alive, start_tool, wait_until
+from tests.conftest import alive, glued, start_tool, wait_until
 from zwfs._system import write_file
 
 ROOT = Path(__file__).parent.parent
@@ -122,29 +122,15 @@ def test_refreshed_notebooks_are_current(ran, monkeypatch):
     assert run_all(ran)[0] == []
 
 
-def glued(path, **values):
-    """A notebook that has glued these values."""
-    outputs = [
-        new_output(
-            "display_data",
-            {"application/papermill.record/text/plain": value},
-            metadata={"scrapbook": {"name": name}},
-        )
-        for name, value in values.items()
-    ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    nbformat.write(new_notebook(cells=[new_code_cell("", outputs=outputs)]), path)
-
-
 def test_numbers_that_moved_are_listed_with_their_change(project):
-    glued(project.source("first"), limit="0.50", word="'low'", same="3", gone="1", zero="0")
-    glued(project.executed / "first.ipynb", limit="0.51", word="'high'", same="3", zero="1")
-    glued(project.source("second"), limit="0.5")
-    glued(project.executed / "second.ipynb", limit="0.5")
+    glued(project.source("first"), limit=0.5, word="low", same=3, gone=1, zero=0)
+    glued(project.executed / "first.ipynb", limit=0.51, word="high", same=3, zero=1)
+    glued(project.source("second"), limit=0.5)
+    glued(project.executed / "second.ipynb", limit=0.5)
     assert run.moved_numbers(project) == {
         "notebooks/first.ipynb": [
             "gone: 1 -> none",
-            "limit: 0.50 -> 0.51 (+2 %)",
+            "limit: 0.5 -> 0.51 (+2 %)",
             "word: 'low' -> 'high'",
             "zero: 0 -> 1",
         ],

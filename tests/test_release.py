@@ -3,7 +3,6 @@
 import os
 import re
 import subprocess
-import sys
 
 import pytest
 import yaml
@@ -52,15 +51,6 @@ def test_unit_tests_are_those_of_the_package_and_an_unknown_python_is_refused():
     assert "tests/test_book.py" not in tests
     with pytest.raises(release.ReleaseError, match=r"2\.7: expected one of 3\.11, 3\.12, 3\.13, lowest"):
         release.pythons(PROJECT, ["2.7"])
-
-
-def test_python_that_cannot_be_fetched_is_skipped_with_a_reason(tmp_path, monkeypatch, capsys):
-    for name in ("HOME", "PATH", "PYENV_ROOT", "UV_PYTHON_INSTALL_DIR"):
-        monkeypatch.setenv(name, str(tmp_path))
-    monkeypatch.setenv("UV_OFFLINE", "1")
-    version = next(one for one in ("3.12", "3.13") if not one.endswith(f".{sys.version_info.minor}"))
-    release.pythons(PROJECT, [version])
-    assert f"Python {version}: not tested, because" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ["ci.yml", "release.yml"])

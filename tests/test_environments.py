@@ -191,9 +191,8 @@ def make(folder, *arguments, **variables):
     """Run make, and return its status and what it says."""
     environment = os.environ | {"PYTHONPATH": str(folder.parent)} | variables
     command = ["make", *arguments, f"PYTHON={folder.parent / 'python'}"]
-    done = subprocess.run(
-        command, cwd=folder, env=environment, start_new_session=True, capture_output=True, text=True
-    )
+    run = {"cwd": folder, "env": environment, "start_new_session": True, "capture_output": True, "text": True}
+    done = subprocess.run(command, **run)
     return done.returncode, done.stdout
 
 

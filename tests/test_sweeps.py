@@ -123,10 +123,8 @@ def test_blas_has_one_thread_in_every_task():
         "        print(n_threads(0), *sweeps.run(n_threads, range(4), name='threads'))"
     )
     limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2")
-    ended = subprocess.run(
-        [sys.executable, "-c", script], cwd=NOTEBOOKS, env=os.environ | limits, capture_output=True, text=True
-    )
-    assert ended.stdout.splitlines() == ["2 1 1 1 1"] * 2, ended.stderr
+    run = {"cwd": NOTEBOOKS, "env": os.environ | limits, "check": True, "stdout": subprocess.PIPE, "text": True}
+    assert subprocess.run([sys.executable, "-c", script], **run).stdout.splitlines() == ["2 1 1 1 1"] * 2
 
 
 def process_after(seconds, *_):

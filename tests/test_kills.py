@@ -15,7 +15,7 @@ from .conftest import ROOT, heed_signals, wait_until
 
 NOT_COPIED = shutil.ignore_patterns(".*", "_build", "build", "__pycache__", "*.egg-info")
 PAGES = ["notebooks/fig02_vector_sensor", "book/glossary"]
-LARGE = [f"book._ext.{name}" for name in ("claims", "explore", "live", "performance")]  # need other pages
+LARGE = [f"book._ext.{name}" for name in ("claims", "live", "performance")]  # need other pages
 
 
 @pytest.fixture
@@ -38,11 +38,9 @@ def small_book(tmp_path):
 
 def start(root):
     command = [sys.executable, "-m", "book._tools", "book"]
-    environment = os.environ | {"PYTHONPATH": str(root)}
+    place = {"cwd": root, "env": os.environ | {"PYTHONPATH": str(root)}, "start_new_session": True}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen(
-        command, cwd=root, env=environment, start_new_session=True, preexec_fn=heed_signals, **pipes
-    )
+    return subprocess.Popen(command, preexec_fn=heed_signals, **place, **pipes)
 
 
 def build(root):

@@ -7,8 +7,8 @@ import zwfs
 from studies.beyond_dimple import dimple_curves, dimple_limits
 from studies.beyond_range import RecoveryCurves, Verdicts, compared_methods, recovery_curves
 from studies.fig04_dimple_diameter import DARK_RING, iteration_spectrum
-from studies.kit.curves import screens_at
 from studies.kit.methods import opposite_dimples
+from studies.kit.setups import screens_at
 
 
 @pytest.fixture(scope="module")
@@ -80,14 +80,6 @@ def test_frames_of_a_flat_wavefront_lose_tilt_where_the_eigenvalue_is_one_not_wh
     assert limits.tilt[large, 0] < 30  # diverging, not blind
     assert limits.tilt[ring, 1] < 30  # not blind around an aberrated wavefront
     assert np.all(limits.bound >= 1)  # no sensor is better than the ideal one
-
-
-def test_bounds_are_rms_values_of_those_of_the_modes(pupil, modes):
-    limits = dimple_limits(pupil, modes, np.pi / 2, [2.0], np.zeros((1, *pupil.shape)))
-    np.testing.assert_allclose(limits.factor[:, 0], limits.factor[:, 1])
-    n_modes = len(modes)
-    squares = 2 * limits.tilt**2 + (n_modes - 2) * limits.others**2
-    np.testing.assert_allclose(limits.total**2, squares / n_modes)
 
 
 def test_diameters_are_compared_for_the_same_pair_of_shifts(pupil, modes):

@@ -16,9 +16,10 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, screens_at
+from studies.kit.curves import ErrorCurves
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
+from studies.kit.setups import screens_at
 from studies.kit.style import LOOKS, OTHER_STYLES, Look
 from studies.kit.tables import Table
 from zwfs.metrics import reconstruction_error

@@ -17,7 +17,7 @@ from zwfs._likelihood import Estimator, Noise, require_information, require_one_
 from zwfs._propagator import Propagator, angle, parts_sum, split, square
 from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.polychromatic import PolychromaticSensor
-from zwfs.reconstructors._fit import Fit, Hessian, Slopes, linear_field, points_step, reflected, turned
+from zwfs.reconstructors._fit import Fit, Hessian, Unwrapping, linear_field, points_step, reflected, turned
 from zwfs.reconstructors.arcsine import Arcsine
 from zwfs.reconstructors.base import FixedPoint, Reconstruction, Reconstructor, Solution, pieces
 from zwfs.reconstructors.phase_shifted import PhaseShifted
@@ -245,12 +245,16 @@ class MaximumLikelihood(Reconstructor):
             Estimator(Response.of(one), noise, unknown, basis, precision) for one in (sensor, rough)
         )
         self._first = self._first_method()
-        self._slopes = None if basis is None else Slopes.of(pupil.inside, basis)
+        self._unwrapping = None if basis is None else Unwrapping.of(pupil.inside, basis)
+        self._points = None if basis is None else MaximumLikelihood(
+            sensor, photons=photons, read_noise=read_noise, amplitude=known, n_iterations=n_iterations,
+            tolerance=tolerance, n_starts=n_starts, seed=seed,
+        )  # fmt: skip
         self._smooth: NDArray[np.float64] | None = None
         if basis is None and isinstance(sensor, PolychromaticSensor):
             smooth = zernike_basis(pupil, min(_UNWRAPPED_MODES, pupil.n_points - 1))
             self._smooth = read_only(np.where(pupil.inside, smooth, 0))
-            self._slopes = Slopes.of(pupil.inside, self._smooth)
+            self._unwrapping = Unwrapping.of(pupil.inside, self._smooth)
         n_low = min(_KICK_MODES, pupil.n_points - 1)
         self._kicks: NDArray[np.float64] = np.zeros((0, *pupil.shape))
         if n_starts > 1 and n_low:
@@ -315,7 +319,7 @@ class MaximumLikelihood(Reconstructor):
     def _search(self, frames: NDArray, start: NDArray | None, history: bool) -> Fit:
         """Fit from start after start, until every frame set is explained or the starts are used up."""
         xp = Kind.of(frames).xp
-        fit = self._descend(frames, self._rough_phase(frames, None) if start is None else start, history)
+        fit = self._descend(frames, self._first_phase(frames) if start is None else start, history)
         if fit.history is not None and start is not None:
             fit.history[:, 0, ...] = start  # as it was given: modes may not represent it
         for attempt in range(1, self.n_starts):
@@ -330,6 +334,21 @@ class MaximumLikelihood(Reconstructor):
             fit.put(poor, best)
         return fit
 
+    def _first_phase(self, frames: NDArray) -> NDArray:
+        """Phase of the first start, (k, ny, nx): with modes, their fit to the most likely phase of every point."""
+        if self._points is None or self._unwrapping is None:
+            return self._rough_phase(frames, None)
+        fit = self._points._search(frames, None, False)
+        sigma = self._points._sigma(fit)
+        return self._of_modes(self._unwrapping.fit(self._points._phase(fit), Kind.of(frames), sigma))
+
+    def _sigma(self, fit: Fit) -> NDArray:
+        """Standard error of the phase of every point, (k, ny, nx)."""
+        xp = Kind.of(fit.psi).xp
+        singles = (slice(i, i + 1) for i in range(fit.psi.shape[0]))  # one at a time, for the memory
+        variance = [self._exact.variance(fit.psi[i, ...], fit.waves[i, ...])[0][:, 0, ...] for i in singles]
+        return xp.sqrt(xp.concat(variance) * self._noise_variance(fit)[:, np.newaxis, np.newaxis])
+
     def _rough_phase(self, frames: NDArray, start: NDArray | None) -> NDArray:
         """Phase after the first iterations, (k, ny, nx)."""
         if self._first is None:
@@ -339,11 +358,11 @@ class MaximumLikelihood(Reconstructor):
 
     def _unwrapped(self, phase: NDArray) -> NDArray:
         """Phase (k, ny, nx) with the multiples of 2 pi that bring it nearest to a smooth one, in a band."""
-        if self._smooth is None or self._slopes is None:
+        if self._smooth is None or self._unwrapping is None:
             return phase
         kind = Kind.of(phase)
         flat = kind.xp.reshape(kind.array(self._smooth), (self._smooth.shape[0], -1))
-        smooth = kind.xp.reshape(self._slopes.fit(phase, kind) @ flat, phase.shape)
+        smooth = kind.xp.reshape(self._unwrapping.fit(phase, kind) @ flat, phase.shape)
         return phase - 2 * np.pi * kind.xp.round((phase - smooth) / (2 * np.pi))
 
     def _other_start(self, attempt: int, fit: Fit) -> NDArray:
@@ -382,8 +401,8 @@ class MaximumLikelihood(Reconstructor):
         """Return the fit at a starting phase, (k, ny, nx)."""
         kind, k = Kind.of(frames), frames.shape[0]
         model, coefficients = self.settings.model(kind), None
-        if self._exact.modes is not None and self._slopes is not None:
-            coefficients = self._slopes.fit(start, kind)
+        if self._exact.modes is not None and self._unwrapping is not None:
+            coefficients = self._unwrapping.fit(start, kind)
             start = self._of_modes(coefficients)
         psi = model.incoming(start)
         for _ in range(_LINEAR_ITERATIONS if self._exact.unknown_amplitude else 0):

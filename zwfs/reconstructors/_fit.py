@@ -14,7 +14,7 @@ from zwfs._propagator import Propagator, split, square
 
 _NOTHING = 1e-300  # keeps quotients finite
 _RIDGE = 1e-6  # of the normal equations at points whose reference waves vanish
-_NEAR = 1.0  # radian, largest distance from a sum of modes of a phase that needs no multiples of 2 pi
+_NEAR = 1.0  # radian, largest distance of a point from a fit without wrong multiples of 2 pi
 _SURE, _OUTLIER = 0.7, 3.5  # radian and sigmas: largest error of a prediction at which a point joins a fit
 _VAGUE = 1.0  # radian, error of a phase that says nothing
 _LEAST_ERROR = 0.05  # radian, of a phase
@@ -87,8 +87,9 @@ class Unwrapping(NamedTuple):
     pairs: tuple[NDArray[np.bool_], NDArray[np.bool_]]  # whether a point and the next along y, or x, are inside
     basis: NDArray[np.float64]  # (n_points, m + 1), modes of a mean square slope of 1 / m, and a piston
     turn: NDArray[np.float64]  # (m, m), from their coefficients to those of the modes
-    modes: NDArray[np.float64]  # (m + 1, n_points), the modes and a piston
-    inverse: NDArray[np.float64]  # (n_points, m + 1), pseudo-inverse of these
+    modes: NDArray[np.float64]  # (m, n_points)
+    inverse: NDArray[np.float64]  # (n_points, m), least squares on the modes and a piston
+    from_slopes: NDArray[np.float64]  # (n_pairs, m), least squares on differences of neighbours
 
     @classmethod
     def of(cls, inside: NDArray[np.bool_], modes: NDArray[np.float64]) -> Unwrapping:
@@ -98,38 +99,58 @@ class Unwrapping(NamedTuple):
         turn = vectors / np.sqrt(np.maximum(values, _LEAST_SLOPE * values[-1] + _NOTHING))
         flat, piston = modes[:, inside], np.ones((1, np.count_nonzero(inside)))
         basis = np.concatenate([turn.T @ flat, _ANY_PISTON * piston])
-        both = np.concatenate([flat, piston])
+        inverse = np.linalg.pinv(np.concatenate([flat, piston]), rcond=1e-10)[:, :-1]
         places = np.argwhere(inside)
         radius = np.linalg.norm(places - places.mean(axis=0), axis=1) / max(inside.shape)
-        return cls(inside, radius, pairs, basis.T.copy(), turn, both, np.linalg.pinv(both, rcond=1e-10))
+        return cls(inside, radius, pairs, basis.T.copy(), turn, flat, inverse, np.linalg.pinv(slopes, rcond=1e-10))
 
     def fit(self, phase: NDArray, kind: Kind, sigma: NDArray | None = None) -> NDArray:
-        """Coefficients of phases, (k, ny, nx), with standard errors sigma, 0 if left out: (k, m)."""
+        """Coefficients of phases, (k, ny, nx), with standard errors sigma, 0 if left out: (k, m).
+
+        Three fits follow each other until all points are near one: least squares on the phase as it is, least
+        squares on wrapped differences, and the fit that grows. If none is near, as where the modes cannot
+        represent the phase, the best one counts.
+        """
         xp, k, inside = kind.xp, phase.shape[0], kind.flags(self.inside.ravel())
         points = xp.reshape(phase, (k, -1))[:, inside]
         errors = 0 * points if sigma is None else xp.reshape(sigma, (k, -1))[:, inside]
-        direct = points @ kind.array(self.inverse)
-        apart = xp.max(xp.abs(points - direct @ kind.array(self.modes)), axis=1)
-        rows = [
-            self._grown(points[i, ...], errors[i, ...], self._square_slope(phase[i, ...], kind), kind)
-            if apart[i] > _NEAR else direct[i, :-1]
-            for i in range(k)
-        ]  # fmt: skip
+        slopes = self._wrapped_slopes(phase, kind)
+        direct, sloped = points @ kind.array(self.inverse), slopes @ kind.array(self.from_slopes)
+        rows = []
+        for i in range(k):
+            one = points[i, ...], errors[i, ...]
+            best, (near, match) = direct[i, ...], self._quality(direct[i, ...], *one, kind)
+            for grow in (False, True):
+                if near:
+                    break
+                other = self._grown(*one, slopes[i, ...], kind) if grow else sloped[i, ...]
+                near, matched = self._quality(other, *one, kind)
+                if matched > match:
+                    best, match = other, matched
+            rows.append(best)
         return xp.stack(rows)
 
-    def _square_slope(self, phase: NDArray, kind: Kind) -> float:
-        """Mean square difference of neighbours."""
-        along = phase[1:, :] - phase[:-1, :], phase[:, 1:] - phase[:, :-1]
-        squares = [
-            kind.xp.sum(wrapped(one, kind.xp)[kind.flags(pairs)] ** 2)
-            for one, pairs in zip(along, self.pairs, strict=True)
-        ]
-        return float(sum(squares)) / max(sum(map(np.count_nonzero, self.pairs)), 1)
+    def _wrapped_slopes(self, phase: NDArray, kind: Kind) -> NDArray:
+        """Differences of neighbours, (k, n_pairs), in (-pi, pi]."""
+        along = phase[:, 1:, :] - phase[:, :-1, :], phase[:, :, 1:] - phase[:, :, :-1]
+        flat = (kind.xp.reshape(one, (phase.shape[0], -1)) for one in along)
+        some = [one[:, kind.flags(pairs.ravel())] for one, pairs in zip(flat, self.pairs, strict=True)]
+        return wrapped(kind.xp.concat(some, axis=1), kind.xp)
 
-    def _grown(self, phase: NDArray, sigma: NDArray, square_slope: float, kind: Kind) -> NDArray:
+    def _quality(self, coefficients: NDArray, phase: NDArray, sigma: NDArray, kind: Kind) -> tuple[bool, float]:
+        """Whether all points are near the fit, but for multiples of 2 pi and a piston, and how many agree."""
+        xp, rest = kind.xp, phase - coefficients @ kind.array(self.modes)
+        weights = 1 / (sigma**2 + _LEAST_ERROR**2)
+        real, imag = xp.vecdot(weights, xp.cos(rest)), xp.vecdot(weights, xp.sin(rest))
+        apart = xp.abs(wrapped(rest - xp.atan2(imag, real), xp))
+        return float(xp.max(apart)) < _NEAR, float(xp.hypot(real, imag))
+
+    def _grown(self, phase: NDArray, sigma: NDArray, slopes: NDArray, kind: Kind) -> NDArray:
         """Coefficients, (m,), of one phase, (n_points,)."""
         xp = kind.xp
-        prior = _STEEPER * square_slope + _LEAST_ERROR**2  # variance of a coefficient of the basis
+        prior = (
+            _STEEPER * float(xp.sum(slopes**2)) / max(slopes.shape[0], 1) + _LEAST_ERROR**2
+        )  # variance of a coefficient of the basis
         some = sigma <= max(_VAGUE, float(xp.min(sigma)))
         basis, rest, noise = kind.array(self.basis)[some], phase[some], sigma[some] ** 2 + _LEAST_ERROR**2
         fewest = 1 + rest.shape[0] // _MOST_ROUNDS

@@ -30,7 +30,6 @@ _LEAST_CUT = 0.1  # of the damping after a good step
 _KICK, _SHIFT = 1.0, 0.5  # radian rms, random phases of the other starts
 _KICK_MODES = 20
 _UNWRAPPED_MODES = 40  # of the smooth part of a phase that is known up to multiples of 2 pi
-_RESIDUAL = 1e-5  # rms, in units of the mean intensity, up to which frames without a noise model are explained
 _GROWTH = 2.0  # of the damping after a first step that raises the cost
 _NOTHING = 1e-300  # keeps quotients finite
 _NEGLIGIBLE = 1e-3  # of the mean standard error: a smaller step is the last one
@@ -38,7 +37,6 @@ _REFLECTIONS = 3  # largest number of times that points of one start are reflect
 _GAIN = 0.01  # of twice the logarithm of the likelihood, from which on a reflection counts
 _GAIN_TURN = 10.0  # the same, from which on a point is turned by 2 pi: a smooth phase is more probable
 _LINEAR_ITERATIONS = 5  # of the start of an unknown amplitude
-_SIGMAS = 5.0  # excess of the misfit, in its standard deviations, up to which noise explains it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,11 +52,8 @@ class LikelihoodReconstruction(Reconstruction):
     chi2 : ndarray, shape (...)
         Reduced chi-square: about 1 where the model explains the frames. NaN without a number of photons, and where
         the frames have no more information than there are unknowns, as for one mask.
-    consistent : ndarray of bool, shape (...)
-        Whether the fit converged and its phase explains the frames to within the noise: their misfit exceeds its
-        expectation by less than 5 standard deviations. Without a number of photons, the rms residual of the
-        frames, over the detector, is at most 1e-5 of the mean intensity instead. For one mask many phases explain
-        a frame.
+    explained : ndarray of bool, shape (...)
+        Whether the noise explains the misfit of the frames on the whole detector, see `consistent`.
     n_starts : ndarray of int, shape (...)
         Number of starts that were tried.
     estimator : Estimator
@@ -68,10 +63,19 @@ class LikelihoodReconstruction(Reconstruction):
     amplitude: NDArray[np.floating] | None
     coefficients: NDArray[np.floating] | None
     chi2: NDArray[np.floating]
-    consistent: NDArray[np.bool_]
+    explained: NDArray[np.bool_]
     n_starts: NDArray[np.int64]
     noise_variance: NDArray[np.floating]
     estimator: Estimator
+
+    @property
+    def consistent(self) -> NDArray[np.bool_]:
+        """Whether the fit converged and explains the frames, shape (...): `Reconstruction.explains` for its noise.
+
+        The expected misfit is that of frames to which so many unknowns were fitted, and all pixels of the detector
+        count. For one mask many phases explain a frame.
+        """
+        return self.converged & self.explained
 
     @property
     def sigma(self) -> NDArray[np.floating]:
@@ -93,27 +97,13 @@ class LikelihoodReconstruction(Reconstruction):
         return self._errors[1]
 
     @cached_property
-    def residual(self) -> NDArray[np.floating]:
-        """Mismatch of the frames, see `Reconstruction`."""
-        kind = Kind.of(self.frames)
-        model, xp = self.settings.model(kind), kind.xp
-        light = xp.reshape(self.frames, (-1, *self.frames.shape[-3:]))
-        waves = model.propagate(self._field(model))[(..., *model.window)]
-        difference = (square(waves) - light) * model.stop
-        squares = xp.sum(difference * difference, axis=(1, 2, 3))
-        residual = xp.sqrt(squares / (light.shape[1] * model.pupil.n_points))
-        return xp.reshape(residual, self.converged.shape)
-
-    @cached_property
     def _errors(self) -> tuple[NDArray[np.floating], NDArray[np.floating] | None]:
         kind = Kind.of(self.phase)
         double = kind._replace(dtype=kind.xp.float64)
         model, xp = self.settings.model(double), kind.xp
-        field = xp.astype(self._field(self.settings.model(kind)), xp.float64)
         batch = tuple(self.converged.shape)
         points, coefficients = [], []
-        for index in range(field.shape[0]):  # one at a time: the memory does not grow with the batch
-            psi = field[index : index + 1, ...]
+        for psi in self._fields(model):  # one at a time: the memory does not grow with the batch
             of_points, of_modes = self.estimator.variance(psi, model.propagate(psi))
             points.append(of_points)
             coefficients.append(of_modes)
@@ -125,13 +115,14 @@ class LikelihoodReconstruction(Reconstruction):
         of_modes = xp.astype(xp.sqrt(xp.concat(coefficients) * scale), kind.dtype)
         return sigma, xp.reshape(of_modes, (*batch, of_modes.shape[1]))
 
-    def _field(self, model: Propagator) -> NDArray[np.floating]:
-        """Estimated field, split, one batch axis."""
-        xp, shape = model.kind.xp, (-1, *model.pupil.shape)
-        phase = xp.reshape(xp.where(model.inside, self.phase, model.kind.array(0.0)), shape)
+    def _fields(self, model: Propagator) -> Iterator[NDArray[np.floating]]:
+        """Estimated field of each frame set, split, (1, 2 n_wavelengths, ny, nx)."""
         if self.amplitude is None:
-            return model.incoming(phase)
-        return split(phase, xp.reshape(xp.where(model.inside, self.amplitude, model.kind.array(0.0)), shape))
+            yield from super()._fields(model)
+            return
+        maps = (self._singles(one, model) for one in (self.phase, self.amplitude))
+        for phase, amplitude in zip(*maps, strict=True):
+            yield split(phase, amplitude)
 
 
 class MaximumLikelihood(Reconstructor):
@@ -289,7 +280,7 @@ class MaximumLikelihood(Reconstructor):
             amplitude=amplitude,
             coefficients=coefficients,
             chi2=shaped(self._chi2(fit)),
-            consistent=shaped(fit.converged & self._explained(fit)),
+            explained=shaped(self._explained(fit)),
             n_starts=shaped(fit.n_starts),
             noise_variance=shaped(self._noise_variance(fit)),
             estimator=self._exact,
@@ -610,12 +601,7 @@ class MaximumLikelihood(Reconstructor):
 
     def _explained(self, fit: Fit) -> NDArray[np.bool_]:
         """Whether the noise explains the misfit, (k,)."""
-        xp = Kind.of(fit.light).xp
-        if self._exact.noise.photons is None:
-            return fit.cost <= _RESIDUAL**2 * prod(fit.frames.shape[1:])
-        misfit, expected, variance = self._exact.noise.misfit(fit.light, fit.frames)
-        freedom = xp.clip(expected - self._n_unknowns(), 0, None)
-        return misfit <= freedom + _SIGMAS * xp.sqrt(variance)
+        return self._exact.noise.explains(fit.light, fit.frames, self._n_unknowns())
 
     def _noise_variance(self, fit: Fit) -> NDArray:
         """Variance by which the inverse of the information is multiplied, (k,): 1 with a number of photons."""

@@ -213,15 +213,16 @@ def test_modes_are_at_least_as_good_as_points(rms, photons):
     assert reconstruction_error(pupil, again.phase, result.phase).max() < 1e-4
 
 
-def test_modes_across_the_gaps_of_a_pupil():
+def test_modes_on_pupils_with_gaps_and_corners():
     y, x = np.mgrid[:48, :48] - 23.5
     parts = (np.hypot(x, y) < 24) & (np.hypot(x, y) > 6) & (np.abs(x) > 1) & (np.abs(y) > 1)
-    pupil = zwfs.Pupil.from_amplitude(parts.astype(float))
-    basis, sensor = zernike_basis(pupil, 60), pair(pupil, 1.06, 0.5, -0.5)
-    truth = zwfs.power_law_screens(basis, 2.0, 4, exponent=-2, seed=42)
-    result = MaximumLikelihood(sensor, basis, n_starts=1)(sensor.measure(truth))
-    assert result.consistent.all()
-    assert reconstruction_error(pupil, result.phase, truth).max() < 1e-5
+    quadrants, hexagon = zwfs.Pupil.from_amplitude(parts.astype(float)), zwfs.Pupil.hexagonal(48)
+    for pupil, n_modes, rms, seed in ((quadrants, 60, 2.0, 42), (hexagon, 100, 1.0, 25)):
+        basis, sensor = zernike_basis(pupil, n_modes), pair(pupil, 1.06, 0.5, -0.5)
+        truth = zwfs.power_law_screens(basis, rms, 4, exponent=-2, seed=seed)
+        result = MaximumLikelihood(sensor, basis, n_starts=1)(sensor.measure(truth))
+        assert result.consistent.all()
+        assert reconstruction_error(pupil, result.phase, truth).max() < 1e-5
 
 
 def test_a_prior_helps_faint_frames_and_does_not_bias_bright_ones(pupil):

@@ -14,7 +14,7 @@ from zwfs._propagator import Propagator, split, square
 
 _NOTHING = 1e-300  # keeps quotients finite
 _RIDGE = 1e-6  # of the normal equations at points whose reference waves vanish
-_NEAR = 1.0  # radian, largest distance of a point from a fit without wrong multiples of 2 pi
+_NEAR, _NEAR_SIGMAS = 1.0, 5.0  # radian and sigmas: largest distance from a fit without wrong multiples of 2 pi
 _SURE, _OUTLIER = 0.7, 3.5  # radian and sigmas: largest error of a prediction at which a point joins a fit
 _VAGUE = 1.0  # radian, error of a phase that says nothing
 _LEAST_ERROR = 0.05  # radian, of a phase
@@ -143,7 +143,8 @@ class Unwrapping(NamedTuple):
         weights = 1 / (sigma**2 + _LEAST_ERROR**2)
         real, imag = xp.vecdot(weights, xp.cos(rest)), xp.vecdot(weights, xp.sin(rest))
         apart = xp.abs(wrapped(rest - xp.atan2(imag, real), xp))
-        return float(xp.max(apart)) < _NEAR, float(xp.hypot(real, imag))
+        near = float(xp.max(apart)) < _NEAR and float(xp.max(apart**2 * weights)) < _NEAR_SIGMAS**2
+        return near, float(xp.hypot(real, imag))
 
     def _grown(self, phase: NDArray, sigma: NDArray, slopes: NDArray, kind: Kind) -> NDArray:
         """Coefficients, (m,), of one phase, (n_points,)."""

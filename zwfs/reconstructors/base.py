@@ -117,6 +117,15 @@ class Reconstruction:
             for frames without noise.
         read_noise : float, electrons rms / pixel
             That of the frames, with the noise of a background that was subtracted.
+
+        Returns
+        -------
+        ndarray of bool, shape (...)
+
+        Raises
+        ------
+        ValueError
+            If there is read noise without a number of photons.
         """
         noise, kind = Noise.checked(photons, read_noise), Kind.of(self.frames)
         double = kind._replace(dtype=kind.xp.float64)

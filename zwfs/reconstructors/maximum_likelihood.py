@@ -130,9 +130,10 @@ class MaximumLikelihood(Reconstructor):
 
     Levenberg-Marquardt steps on the phase of every point of the pupil. The Hessian is the Fisher information: a
     diagonal plus a matrix of low rank, which Woodbury's identity inverts (`eq-woodbury`). The first start is two
-    accelerated iterations of `PhaseShifted`, or of `Arcsine` for one mask. Where a solution does not explain the
-    frames, other starts follow: in turn, the best solution so far plus a random phase of 1 rad rms, made of the 20
-    lowest Zernike modes, and two iterations that begin at half such a phase. The most likely solution counts.
+    accelerated iterations of `PhaseShifted`, or of `Arcsine` for one mask. With modes, it is their fit to the most
+    likely phase of every point (`eq-unwrap`). Where a solution does not explain the frames, other starts follow:
+    in turn, the best solution so far plus a random phase of 1 rad rms, made of the 20 lowest Zernike modes, and
+    two iterations that begin at half such a phase. The most likely solution counts.
 
     Some directions are invisible or nearly so. No frame shows the piston: each step keeps it, and `sigma` is that
     of the phase without piston. A dimple near 2.44 lambda/D hardly shows small tilts. A single mask hardly shows
@@ -181,7 +182,7 @@ class MaximumLikelihood(Reconstructor):
     References
     ----------
     Levenberg 1944; Marquardt 1963; Paxman, Schulz & Fienup 1992; Nielsen 1999; `eq-likelihood` to
-    `eq-linear-field` of the book.
+    `eq-unwrap` of the book.
 
     Examples
     --------

@@ -238,10 +238,13 @@ class MaximumLikelihood(Reconstructor):
         )
         self._first = self._first_method()
         self._unwrapping = None if basis is None else Unwrapping.of(pupil.inside, basis)
-        self._points = None if basis is None else MaximumLikelihood(
-            sensor, photons=photons, read_noise=read_noise, amplitude=known, n_iterations=n_iterations,
-            tolerance=tolerance, n_starts=n_starts, seed=seed,
-        )  # fmt: skip
+        self._points = (
+            None
+            if basis is None
+            else MaximumLikelihood(
+                sensor, photons=photons, read_noise=read_noise, amplitude=known, n_starts=n_starts, seed=seed
+            )
+        )  # the start does not depend on how the fit of the modes stops
         self._smooth: NDArray[np.float64] | None = None
         if basis is None and isinstance(sensor, PolychromaticSensor):
             smooth = zernike_basis(pupil, min(_UNWRAPPED_MODES, pupil.n_points - 1))

@@ -147,11 +147,12 @@ class AlteredSensor:
 
     def __init__(self, sensor: ZernikeSensor, *, keep_wave: bool = False, keep_signs: bool = False) -> None:
         self.sensor, self.keep_wave, self.keep_signs = sensor, keep_wave, keep_signs
-        self._theta = sensor.masks[0].phase
+        dimple: Any = sensor.masks[0]
+        self._theta = dimple.phase
         self._flat = np.abs(self.wave(np.zeros(sensor.pupil.shape)))
         self.reversed: list[NDArray] = []  # of each measurement: share of reversed points, (n_screens,)
 
-    def wave(self, phase: NDArray) -> NDArray[np.complex128]:
+    def wave(self, phase: NDArray) -> NDArray[np.complexfloating]:
         """Reference wave, (..., ny, nx)."""
         return self.sensor.reference_wave(self.sensor.pupil.field(phase))[..., 0, :, :]
 
@@ -207,7 +208,7 @@ class Divergence:
 
 
 def linear_loops(
-    linear: Linear, modes: NDArray, flow: FrozenFlow, n_steps: int, *, gain: float, delay: int, **settings: Any
+    linear: Any, modes: NDArray, flow: FrozenFlow, n_steps: int, *, gain: float, delay: int, **settings: Any
 ) -> Divergence:
     """Close linear loops with the sensor and with altered ones, without noise."""
     plants = {name: AlteredSensor(linear.sensor, **keywords) for name, keywords in PLANTS.items()}
@@ -373,7 +374,7 @@ def linear_columns(found: Divergence) -> dict[str, NDArray]:
 
 def tuned_columns(trials: Sequence[TunedLoops]) -> dict[str, Sequence[float]]:
     """Columns of the figure: gain, residual and closed loops of each method, for each input and star."""
-    columns = {
+    columns: dict[str, Sequence[float]] = {
         "start (rad rms)": [one.start for one in trials],
         "photons per point": [one.photons for one in trials],
     }

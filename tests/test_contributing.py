@@ -16,6 +16,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 import zwfs
 from book._tools.book import BookError, check_contents
 from book._tools.project import Project
+from book._tools.run import manifest
 
 from .conftest import ROOT, new_reconstructor
 
@@ -75,6 +76,8 @@ def test_a_new_figure_is_a_study_a_notebook_and_a_line(copy):
     line, place = block("The line in `_toc.yml`", "yaml"), "      - file: notebooks/fig04_dimple_diameter\n"
     contents.write_text(contents.read_text().replace(place, place + line))
     check_contents(copy)
+    # `make figures` lists it for checkers.
+    assert b"- file: notebooks/strehl_loss.ipynb\n  comment: How fast does the Strehl" in manifest(copy)
     run(copy, "-m", "book._tools", "rerun", "strehl_loss", "-p", "n_screens=2", "--output", "result")
     result = copy.root / "result"
     table = list(csv.DictReader((result / "strehl_loss.csv").read_text().splitlines()))

@@ -51,7 +51,7 @@ def draw(request, classic, shifted, phase, bench, pistons, frames):
     calls = {
         "sensor_layout": lambda: draw_sensor_layout(classic, phase),
         "vector_sensor": lambda: draw_vector_sensor(shifted, phase),
-        "bench_layout": lambda: draw_bench_layout(bench, pistons, frames),
+        "bench_layout": lambda: draw_bench_layout(bench, pistons, frames, 635.0),
     }
     return calls[request.param]
 
@@ -152,8 +152,9 @@ def test_polarisations_differ_by_dashes_too(shifted, phase):
     assert min(styles["-"], styles["--"]) >= 8
 
 
-def test_bench_layout_shows_the_camera(bench, pistons, frames):
-    figure = draw_bench_layout(bench, pistons, frames)
+def test_bench_layout_shows_the_camera_and_the_wavelength(bench, pistons, frames):
+    figure = draw_bench_layout(bench, pistons, frames, 850.0)
+    assert "850 nm" in [text.get_text() for text in figure.axes[0].texts]
     for frame in frames:
         assert holds(figure, frame) == 1
     flat = Bench.ideal(n_pixels=60, quilting=bench.quilting).frames()[0]
@@ -161,7 +162,7 @@ def test_bench_layout_shows_the_camera(bench, pistons, frames):
 
 
 def test_bench_layout_shows_the_segments(bench, pistons, frames):
-    figure = draw_bench_layout(bench, pistons, frames)
+    figure = draw_bench_layout(bench, pistons, frames, 635.0)
     commanded = np.where(bench.segments > 0, bench.commanded_phase(pistons), np.nan)
     assert holds(figure, commanded) == 1
     pupil = zwfs.Pupil.from_segments(bench.segments)
@@ -174,7 +175,7 @@ def test_bench_layout_shows_the_segments(bench, pistons, frames):
 
 
 def test_bench_layout_of_flat_segments(bench, frames):
-    figure = draw_bench_layout(bench, np.zeros(bench.n_segments), frames)
+    figure = draw_bench_layout(bench, np.zeros(bench.n_segments), frames, 635.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         saved(figure)

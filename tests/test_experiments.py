@@ -10,8 +10,8 @@ import pytest
 from joblib import parallel_config
 
 from studies.fig03_dynamic_range import count_work, light_lost, linearity_curves, saxton_by_width
-from studies.kit.curves import screens_at
 from studies.kit.methods import own_reconstructors, paper_reconstructors, repaired_reconstructors
+from studies.kit.setups import screens_at
 from studies.reconstructors import iteration_errors, model_accuracy
 from zwfs import (
     RECONSTRUCTORS,

@@ -126,7 +126,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         ),
         "draw_sensor_layout": ((classic, phase), ()),
         "draw_vector_sensor": ((shifted, phase), ()),
-        "draw_bench_layout": ((bench, commands, bench.frames(commands, seed=1)), ()),
+        "draw_bench_layout": ((bench, commands, bench.frames(commands, seed=1), 635.0), ()),
         "draw_steps": ((pupil, phase, frames, dict.fromkeys([*two, "Arcsine"], phase)), ()),
         "draw_linearity": ((curves, 0.05, two, 0.4), two),
         "draw_saxton_widths": (

@@ -15,7 +15,7 @@ from .conftest import ROOT, heed_signals, wait_until
 
 NOT_COPIED = shutil.ignore_patterns(".*", "_build", "build", "__pycache__", "*.egg-info")
 PAGES = ["notebooks/fig02_vector_sensor", "book/glossary"]
-LARGE = [f"book._ext.{name}" for name in ("claims", "explore", "live", "performance")]  # need other pages
+LARGE = [f"book._ext.{name}" for name in ("claims", "live", "performance")]  # need other pages
 
 
 @pytest.fixture

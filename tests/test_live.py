@@ -11,7 +11,7 @@ from scipy.interpolate import RegularGridInterpolator
 import zwfs
 from book._ext import live
 from studies.design import Design, photon_costs
-from studies.kit.curves import screens_at
+from studies.kit.setups import screens_at
 from zwfs.masks import focal_field
 
 ROOT = Path(__file__).parent.parent

@@ -3,8 +3,8 @@ import pytest
 
 import zwfs
 from studies.design import CLASSIC, PUBLISHED, Design, DesignMap, design_map, photon_costs, uneven
-from studies.kit.curves import screens_at
 from studies.kit.methods import paper_reconstructors
+from studies.kit.setups import screens_at
 from studies.photon_noise import EXPECTED, SIGMAS, error_bars, photon_curves
 
 PHOTONS = [100.0, 1e4]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import nbformat
 import pytest
+import yaml
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from book._tools import book, notebook, record, run, scratch
@@ -69,7 +70,7 @@ def template(tmp_path_factory):
     write(project, "third", publish("numbers.csv", "1"))
     (project.root / "environment").mkdir()
     (project.root / "environment" / "requirements.lock").write_text("numpy==2\n")
-    shutil.copy(ROOT / "CITATION.cff", project.root)
+    (project.root / "codecheck.yml").write_text("manifest:\n- file: notebooks/zero.ipynb\ncertificate: 2026-001\n")
     run_all(project)
     return project
 
@@ -118,7 +119,10 @@ def test_refreshed_notebooks_are_current(ran, monkeypatch):
     picture = ran.executed / "third.files" / "third.png"
     write_file(picture, b"a picture")
     files = [f"notebooks/{name}.ipynb" for name in ("first", "second", "third")]
-    assert run.refresh(ran) == [*files, "book/_static/front.png"]
+    assert run.refresh(ran) == [*files, "book/_static/front.png", "codecheck.yml"]
+    check = yaml.safe_load((ran.root / "codecheck.yml").read_text())
+    assert [one["file"] for one in check["manifest"]] == [*files, "book/_static/front.png"]
+    assert check["certificate"] == "2026-001"
     assert (ran.root / "book" / "_static" / "front.png").read_bytes() == b"a picture"
     assert run.refresh(ran) == []
     picture.unlink()

@@ -7,8 +7,8 @@ import zwfs
 from studies.beyond_dimple import dimple_curves, dimple_limits
 from studies.beyond_range import RecoveryCurves, Verdicts, compared_methods, recovery_curves
 from studies.fig04_dimple_diameter import DARK_RING, iteration_spectrum
-from studies.kit.curves import screens_at
 from studies.kit.methods import opposite_dimples
+from studies.kit.setups import screens_at
 
 
 @pytest.fixture(scope="module")

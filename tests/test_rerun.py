@@ -5,6 +5,7 @@ import json
 import os
 import pty
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -229,6 +230,12 @@ def test_pipes_are_not_waited_for(project):
 
 def test_names_of_folders_hold_bytes_that_every_disk_takes():
     assert len(rerun.folder_name("fig", {"name": "\U0001d54f" * 99}).encode()) < 255
+
+
+def test_the_recorded_command_gives_the_same_parameters():
+    given = {"files": ["\U0001d54f.fits", "a 'b' \"c\""], "n": 3}
+    options = shlex.split(rerun.command("fig", given).removeprefix(f"{rerun.COMMAND} fig"))
+    assert declared.assignments([text for text in options if text != "-p"]) == given
 
 
 def test_files_that_parameters_name_count_by_what_is_in_them(project, tmp_path):

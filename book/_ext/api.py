@@ -53,10 +53,8 @@ def section(name: str) -> list[str]:
     module = importlib.import_module(name)
     directives = []
     for own in own_names(module):
-        if inspect.isclass(vars(module)[own]):
-            directives += [f".. autoclass:: {path(module, own)}", "   :members:", ""]
-        else:
-            directives += [f".. autofunction:: {path(module, own)}", ""]
+        kind, *options = ("class", "   :members:") if inspect.isclass(vars(module)[own]) else ("function",)
+        directives += [f".. auto{kind}:: {path(module, own)}", *options, ""]
     for own, text in constants(module).items():
         directives += [f".. py:data:: {own}", f"   :module: {name}", "", f"   {text}", ""]
     return [f"### `{name}`", "", "```{eval-rst}", f".. automodule:: {name}", "", *directives, "```", ""]

@@ -15,7 +15,6 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 from sphinx.application import Sphinx
 
-from book._ext.explore import button
 from book._ext.finish import VARIANTS
 from book._ext.reading import CARD, put_in_order
 from book._tools import record
@@ -55,8 +54,7 @@ def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions
         cells.append(cell)
         for figure in published(cell.source) if cell.cell_type == "code" else []:
             cell.metadata.setdefault("mystnb", {}).setdefault("figure", {})["classes"] = VARIANTS + figure
-            explored = button(figure) if f"{figure}.csv" in links else []
-            text = "\n".join(["::::{div} run-card", files(name, figure, links), *explored, *fold, "::::"])
+            text = "\n".join(["::::{div} run-card", files(name, figure, links), *fold, "::::"])
             cells.append(new_markdown_cell(text, id=f"{CARD}{figure}"[:64]))
             fold = []
     notebook.cells = cells
@@ -71,13 +69,10 @@ def files(name: str, figure: str, links: dict[str, str]) -> str:
         origin = of_paper
     elif number:
         origin += f", goes with {of_paper}"
-    offered = {
-        "PNG": figure + ".png",
-        "PDF": figure + ".pdf",
-        "data (CSV)": figure + ".csv",
-    }
+    offered = {"PNG": f"{figure}.png", "PDF": f"{figure}.pdf", "data (CSV)": f"{figure}.csv"}
     shown = [f"{{download}}`{text} <{links[file]}>`" for text, file in offered.items() if file in links]
-    archive = f'<a class="download" href="../{DOWNLOADS}/{name}.zip" download>notebook with its code (ZIP)</a>'
+    address = f"../{DOWNLOADS}/{name}.zip"
+    archive = f'<a class="reference download" href="{address}" download>notebook with its code (ZIP)</a>'
     return " · ".join([origin, archive, *shown])
 
 

@@ -1,6 +1,5 @@
 """The paper's claims, each judged by a rule from the numbers of a notebook, and their table."""
 
-import json
 import math
 import re
 from collections import Counter
@@ -8,11 +7,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import yaml
 from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.errors import ExtensionError
+
+from book._tools.notebook import glued_texts
 
 HOLDS, REMARK, FAILS, UNTESTED = "holds", "holds with a remark", "does not hold", "not to be tested here"
 # The signs differ in shape, for readers who do not see the colours.
@@ -37,60 +39,27 @@ class ClaimError(ExtensionError):
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a rule.
+    """Result of a rule."""
 
-    Parameters
-    ----------
-    verdict : str
-        One of `HOLDS`, `REMARK`, `FAILS` and `UNTESTED`.
-    measured : str
-        The measured values in words.
-    remark : str
-        The condition under which the claim holds, or the reason why it does not.
-    """
-
-    verdict: str
-    measured: str = ""
-    remark: str = ""
+    verdict: str  # one of `HOLDS`, `REMARK`, `FAILS` and `UNTESTED`
+    measured: str = ""  # the measured values in words
+    remark: str = ""  # the condition under which the claim holds, or the reason why it does not
 
 
-class Numbers(dict[str, float]):
-    """Numbers that a notebook glued, as attributes; a missing one is a `ClaimError`."""
-
-    def __getattr__(self, name: str) -> float:
-        """Return a number by its name."""
-        try:
-            return self[name]
-        except KeyError:
-            raise ClaimError(f"the claim needs {name}: the notebook does not glue it") from None
-
-
+Numbers = SimpleNamespace  # that a notebook glued
 Rule = Callable[[Numbers], Finding]
 RULES: dict[int, Rule] = {}
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of the paper, and its rule.
-
-    Parameters
-    ----------
-    number : int
-    section : str
-        The section of the paper.
-    statement : str
-        The statement, in our words.
-    rule : callable
-        Takes the `Numbers` of the notebook, and returns a `Finding`.
-    source : str
-        The notebook that measures it, and the heading to link to: ``notebook#its-words``.
-    """
+    """A statement of the paper, in our words, and its rule."""
 
     number: int
-    section: str
+    section: str  # of the paper
     statement: str
     rule: Rule
-    source: str = ""
+    source: str = ""  # the notebook that measures it, and the heading to link to: ``notebook#its-words``
 
     @property
     def notebook(self) -> str:
@@ -476,38 +445,25 @@ def below(error: float) -> str:
     return f"at most {text}" if error <= ROUNDING else text
 
 
-def glued(notebook: Path) -> Numbers:
-    """Return the numbers that an executed notebook glued, by name.
-
-    Raises
-    ------
-    ClaimError
-        If the notebook does not exist.
-    """
+def glued(notebook: Path) -> dict[str, float]:
+    """Return the numbers that an executed notebook glued, by name."""
     if not notebook.exists():
         raise ClaimError(f"{notebook.parent.name}/{notebook.name} does not exist")
-    numbers = Numbers()
-    for cell in json.loads(notebook.read_text("utf-8"))["cells"]:
-        for output in cell.get("outputs", []):
-            if name := output.get("metadata", {}).get("scrapbook", {}).get("name"):
-                # Only numbers can judge; a glued string appears on the notebook's own page.
-                with suppress(ValueError):
-                    numbers[name] = float("".join(next(iter(output["data"].values()))))
+    numbers = {}
+    for name, text in glued_texts(notebook).items():
+        # Only numbers can judge; a glued string appears on the notebook's own page.
+        with suppress(ValueError):
+            numbers[name] = float(text)
     return numbers
 
 
 def judge(claim: Claim, numbers: dict[str, float]) -> Finding:
-    """Judge a claim by the numbers of its notebook, see `glued`.
-
-    Raises
-    ------
-    ClaimError
-        If the rule needs another number.
-    """
+    """Judge a claim by the numbers of its notebook, see `glued`."""
     try:
-        return claim.rule(Numbers(numbers))
-    except ClaimError as error:
-        raise ClaimError(f"claim {claim.number}, {claim.notebook}: {error}") from None
+        return claim.rule(Numbers(**numbers))
+    except AttributeError as error:
+        needed = f"the claim needs {error.name}: the notebook does not glue it"
+        raise ClaimError(f"claim {claim.number}, {claim.notebook}: {needed}") from None
 
 
 def findings(folder: Path) -> dict[Claim, Finding]:

@@ -49,22 +49,14 @@ CHANGES = {  # of the scripts of the search
 }
 
 
-def add_address(app: Sphinx, config: Config) -> None:
-    """Add what needs the address of the project: buttons, links to the published book, ``{{ address.install }}``.
-
-    Without an address the book has none of them.
-    """
-    public = setting(Path(app.srcdir))
+def add_substitutions(app: Sphinx, config: Config) -> None:
+    """Add what the address of the project brings, and ``{{ pdf_link }}``: empty if the book gets no PDF."""
+    public, name = setting(Path(app.srcdir)), os.environ.get(PDF)
+    link = f'<p class="d-print-none"><a href="../{name}">The whole book as one PDF</a>, to print or to keep.</p>'
     config.html_baseurl = public.book
     config.html_theme_options = config.html_theme_options | public.theme()
-    config.myst_substitutions = config.myst_substitutions | {"address": public.texts()}
-
-
-def add_substitutions(app: Sphinx, config: Config) -> None:
-    """Define ``{{ pdf_link }}``: empty if the book gets no PDF."""
-    name = os.environ.get(PDF)
-    link = f'<p class="d-print-none"><a href="../{name}">The whole book as one PDF</a>, to print or to keep.</p>'
-    config.myst_substitutions = config.myst_substitutions | {"pdf_link": link if name else ""}
+    added = {"address": public.texts(), "pdf_link": link if name else ""}
+    config.myst_substitutions = config.myst_substitutions | added
 
 
 def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: nodes.document) -> None:
@@ -239,7 +231,6 @@ def draw_card(card: Path, logo: Path, figure: Path, title: str) -> None:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Finish each page, and their folder at the end."""
-    app.connect("config-inited", add_address)
     app.connect("config-inited", add_substitutions)
     app.connect("html-page-context", finish_page)
     # Before the extension that would write another index.html.

@@ -38,16 +38,9 @@ class LinkTerms(SphinxTransform):
         while missing and (found := pattern(missing).search(text)):
             term = missing.pop(found[1].lower())
             yield nodes.Text(text[: found.start()])
-            yield pending_xref(
-                "",
-                nodes.inline("", found[0], classes=["xref", "std", "std-term"]),
-                refdomain="std",
-                reftype="term",
-                reftarget=term,
-                refexplicit=True,
-                refwarn=True,
-                refdoc=self.env.docname,
-            )
+            shown = nodes.inline("", found[0], classes=["xref", "std", "std-term"])
+            about = {"refdomain": "std", "reftype": "term", "reftarget": term, "refdoc": self.env.docname}
+            yield pending_xref("", shown, refexplicit=True, refwarn=True, **about)
             text = text[found.end() :]
         yield nodes.Text(text)
 

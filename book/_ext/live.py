@@ -60,15 +60,6 @@ def dimples(pupil: zwfs.Pupil) -> tuple[NDArray, NDArray, NDArray]:
     A dark dimple blocks its light: its reference wave is minus that light. Its core is real and symmetric. The
     functions of an axis are even or odd, so products of them belong to one of four classes: 2 (odd in y) + (odd in
     x). A core couples functions of one class only.
-
-    Returns
-    -------
-    diameters : ndarray, shape (n,), lambda/D
-        Chebyshev points.
-    functions : ndarray, shape (a, n_pixels)
-        Even and odd ones in turn.
-    cores : ndarray, shape (n, 4, b, b)
-        For each class, between products of a function of y and one of x.
     """
     low, high = DIAMETERS
     angles = np.pi * (np.arange(N_DIAMETERS) + 0.5) / N_DIAMETERS
@@ -81,6 +72,7 @@ def dimples(pupil: zwfs.Pupil) -> tuple[NDArray, NDArray, NDArray]:
     cores = cores.reshape(-1, a, a, a, a)
     blocks = [cores[:, y::2, x::2, y::2, x::2] for y in (0, 1) for x in (0, 1)]
     size = (a // 2) ** 2
+    # (n,) in lambda/D, Chebyshev points; (a, n_pixels), even and odd in turn; (n, 4, b, b), b products in y and x.
     return diameters, functions, np.stack([block.reshape(-1, size, size) for block in blocks], axis=1)
 
 
@@ -111,18 +103,9 @@ def designs() -> dict[str, Any]:
 
 
 def contours(diameters: NDArray, shifts: NDArray, costs: NDArray) -> dict[str, Any]:
-    """Return the contours of a map as paths by their colours, and their labels; units are cells of the map.
+    """Return the contours of costs (a, b) as paths by their colours, and their labels; units are cells of the map.
 
-    Parameters
-    ----------
-    diameters : ndarray, shape (a,), lambda/D
-    shifts : ndarray, shape (b,), units of pi
-    costs : ndarray, shape (a, b)
-
-    Returns
-    -------
-    dict
-        "paths": path by colour. "labels": list of text, color, ground, and place from the left and from the top.
+    The diameters (a,) are in lambda/D, the shifts (b,) in units of pi.
     """
     cells = np.arange(diameters.size) + 0.5, shifts.size - np.arange(shifts.size) - 0.5
     lines = Figure().subplots().contour(*cells, costs.T, list(COST_LINES)).allsegs

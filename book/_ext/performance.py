@@ -107,20 +107,18 @@ def tables(speed: dict[str, Any]) -> dict[str, str]:
 
 def rates(speed: dict[str, Any]) -> str:
     """Return a table of reconstructions per second, one frame pair at a time."""
-    rows = [
-        [
-            f"{row['n_pixels']} pixels, {row['n_iterations']} iterations"
-            + (", accelerated" if row["accelerate"] else ""),
-            f"{row['rate']:.0f}",
-            power(row["median error"]),
-            power(row["largest error"]),
-        ]
+    chosen = [
+        row
         for row in speed["real time"]
         if row["dtype"] == "float32" and (row["accelerate"] or row["n_pixels"] == 100)
     ]
-    for row in speed["closed loop"]:
-        setting = f"{row['n_pixels']} pixels, 1 iteration that starts from the previous phase"
-        rows.append([setting, f"{row['rate']:.0f}", power(row["median error"]), ""])
+    settings = [f"{row['n_iterations']} iterations{', accelerated' * row['accelerate']}" for row in chosen]
+    settings += ["1 iteration that starts from the previous phase"] * len(speed["closed loop"])
+    rows = [
+        [f"{row['n_pixels']} pixels, {setting}", f"{row['rate']:.0f}"]
+        + [power(row[error]) if error in row else "" for error in ("median error", "largest error")]
+        for row, setting in zip(chosen + speed["closed loop"], settings, strict=True)
+    ]
     return table(["setting", "rate (1/s)", "median error (rad)", "largest error (rad)"], rows)
 
 

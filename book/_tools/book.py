@@ -6,12 +6,10 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
-import yaml
+from sphinx_external_toc.parsing import MalformedError, parse_toc_yaml
 
 from zwfs._system import write_file
 
@@ -64,24 +62,17 @@ def figures(project: Project) -> None:
 
 def check_contents(project: Project) -> None:
     """Check that _toc.yml lists every page and notebook, and nothing else: Sphinx would omit a page silently."""
-    contents = yaml.safe_load((project.root / "_toc.yml").read_text("utf-8"))
-    listed = {name.removesuffix(".md").removesuffix(".ipynb") for name in _entries(contents)}
+    try:
+        contents = parse_toc_yaml(project.root / "_toc.yml")
+    except MalformedError as error:
+        raise BookError(f"the book was not built: _toc.yml: {error}") from None
+    listed = {name.removesuffix(".md").removesuffix(".ipynb") for name in contents}
     pages = [*sorted((project.root / "book").glob("[!_]*.md")), *project.sources()]
     known = {page.relative_to(project.root).with_suffix("").as_posix(): page.suffix for page in pages}
     wrong = [f"{name}{known[name]} is not listed in _toc.yml" for name in known if name not in listed]
     wrong += [f"_toc.yml lists {name}, which does not exist" for name in sorted(listed - known.keys())]
     if wrong:
         raise BookError("\n".join(["the book was not built:", *wrong]))
-
-
-def _entries(contents: dict[str, Any]) -> Iterator[str]:
-    """Return the pages that a table of contents names, at any depth."""
-    for key, value in contents.items():
-        if key in ("root", "file"):
-            yield value
-        elif isinstance(value, list):
-            for entry in value:
-                yield from _entries(entry)
 
 
 def build(project: Project, chromium: str | None = None) -> bool:

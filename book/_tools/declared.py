@@ -200,13 +200,6 @@ def _typed(value: Any, limits: Any) -> Any:
 class _Constructor(SafeConstructor):
     """Constructor that reads dates as strings: no parameter is a date."""
 
-    def construct_scalar(self, node: Any) -> Any:
-        """Return a scalar; JSON writes two surrogates for one character."""
-        value = super().construct_scalar(node)
-        if isinstance(value, str):
-            return value.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
-        return value
-
 
 _Constructor.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
 

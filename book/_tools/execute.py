@@ -26,13 +26,8 @@ from .project import Project, ToolError, repair
 from .record import key
 
 # One thread for each kernel: the numbers do not depend on how many notebooks run at the same time.
-ENVIRONMENT = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "VECLIB_MAXIMUM_THREADS": "1",
-    "PYTHONHASHSEED": "0",
-}
+LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+ENVIRONMENT = dict.fromkeys(LIBRARIES, "1") | {"PYTHONHASHSEED": "0"}
 CORES = "LOKY_MAX_CPU_COUNT"  # the number of cores for the sweeps of a notebook, see `studies.kit.sweeps`
 
 PERIOD = 0.2  # of the progress bar, second

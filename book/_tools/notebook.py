@@ -1,6 +1,7 @@
 """Normal form of notebooks: two runs of the same notebook give the same bytes."""
 
 import copy
+import json
 import re
 from pathlib import Path
 
@@ -52,3 +53,22 @@ def _without_date(output: NotebookNode) -> NotebookNode:
 def to_bytes(notebook: NotebookNode) -> bytes:
     """Return a notebook as it is stored: sorted keys, one newline at the end."""
     return (nbformat.writes(notebook).rstrip("\n") + "\n").encode()
+
+
+def glued_texts(path: Path) -> dict[str, str]:
+    """Return what a notebook glues, as text by name."""
+    cells = json.loads(path.read_text("utf-8"))["cells"]
+    outputs = (output for cell in cells for output in cell.get("outputs", ()))
+    named = ((output.get("metadata", {}).get("scrapbook", {}).get("name"), output) for output in outputs)
+    return {name: "".join(next(iter(output["data"].values()))) for name, output in named if name}
+
+
+def title(notebook: NotebookNode) -> str:
+    """Return the title of a notebook."""
+    return notebook.cells[title_cell(notebook)].source.splitlines()[0].lstrip("# ")
+
+
+def title_cell(notebook: NotebookNode) -> int:
+    """Return the index of the cell that begins with the title."""
+    cells = enumerate(notebook.cells)
+    return next((i for i, cell in cells if cell.cell_type == "markdown" and cell.source.startswith("# ")), 0)

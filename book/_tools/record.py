@@ -37,27 +37,21 @@ def key(project: Project, name: str, parameters: dict[str, Any]) -> str:
     inputs = [*project.depends_on(name), project.lock]
     files = {str(file.relative_to(project.root)): file for file in inputs if file.exists()}
     files |= {f"runner {file.name}": file for file in RUNNER}
-    files |= {f"parameter {file}": file for file in _named_files(project.notebooks, _texts(parameters))}
+    files |= {f"parameter {file}": file for file in _named_files(project.notebooks, parameters)}
     content = [[cell.cell_type, cell.source, cell.metadata] for cell in cells]
     own = [list(sys.version_info[:2]), parameters, content]
     return digest([json.dumps(own, sort_keys=True).encode(), digest_files(files).encode()])
 
 
-def _texts(value: Any) -> Iterator[str]:
-    """Return the texts in parameters."""
+def _named_files(folder: Path, value: Any) -> Iterator[Path]:
+    """Return the files that strings in parameters name: their contents count as much as their names."""
     if isinstance(value, str):
-        yield value
+        with suppress(OSError, ValueError):  # not the name of a file
+            if (folder / value).is_file():
+                yield folder / value
     elif isinstance(value, dict | list | tuple):
         for one in value.values() if isinstance(value, dict) else value:
-            yield from _texts(one)
-
-
-def _named_files(folder: Path, texts: Iterable[str]) -> Iterator[Path]:
-    """Return the files that texts name: their contents count as much as their names."""
-    for text in texts:
-        with suppress(OSError, ValueError):  # not the name of a file
-            if (folder / text).is_file():
-                yield folder / text
+            yield from _named_files(folder, one)
 
 
 def digest_result(executed: bytes, files: list[Path]) -> str:

@@ -1,6 +1,5 @@
 """Check of a release, and of every supported Python: the package as a stranger would install it."""
 
-import json
 import os
 import re
 import shutil
@@ -10,6 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from .notebook import read
 from .project import Project, ToolError
 from .scratch import scratch_folder, swap
 
@@ -43,14 +43,13 @@ def pythons(project: Project, asked: list[str]) -> None:
     for name in asked or [*known, "lowest"]:
         if name not in (*known, "lowest"):
             raise ReleaseError(f"{name}: expected one of {', '.join(known)}, lowest")
-        lowest = ["--resolution", "lowest-direct"] if name == "lowest" else []
+        lowest = name == "lowest"
         if (found := interpreter(known[0] if lowest else name)) is None:
             print(f"Python {name}: not tested, because it is not installed and uv cannot fetch it here")
             continue
         with scratch_folder(project.build, "releasing-") as scratch:
             wheel, _ = build(project, about(project)["version"], scratch / "dist")
-            options = ["--python", found, *lowest]
-            python = environment(project, scratch / "env", f"zwfs[test] @ {wheel.as_uri()}", *options)
+            python = environment(project, scratch / "env", f"zwfs[test] @ {wheel.as_uri()}", found, lowest)
             test(project, python, scratch, [f"tests/test_{name}.py" for name in CORE], "--doctest-modules")
         print(f"Python {name}: passed")
 
@@ -96,14 +95,14 @@ def build(project: Project, version: str, folder: Path) -> tuple[Path, Path]:
     return wheel, source
 
 
-def environment(project: Project, folder: Path, requirement: str, *options: str) -> Path:
-    """Install a requirement into an empty environment, with the locked versions unless a resolution is named."""
-    version = options[options.index("--python") + 1] if "--python" in options else sys.executable
-    rest = options[2:] if "--python" in options else options
+def environment(
+    project: Project, folder: Path, requirement: str, version: str = sys.executable, lowest: bool = False
+) -> Path:
+    """Install a requirement into an empty environment, with the locked or the oldest versions."""
     call(project, UV, "venv", "--quiet", "--python", version, folder)
-    constraints = [] if rest else ["--constraint", pins(project, folder)]
+    chosen = ["--resolution", "lowest-direct"] if lowest else ["--constraint", pins(project, folder)]
     python = folder / "bin" / "python"
-    call(project, UV, "pip", "install", "--quiet", "--python", python, *map(str, constraints), *rest, requirement)
+    call(project, UV, "pip", "install", "--quiet", "--python", python, *chosen, requirement)
     return python
 
 
@@ -138,12 +137,7 @@ def test(project: Project, python: Path, scratch: Path, files: list[str], *optio
 
 def check_imports(project: Project, wheel: Path, folder: Path) -> None:
     """Install the wheel with the extra of the notebooks, and import what they and their studies do."""
-    cells = [
-        "".join(cell["source"])
-        for source in project.sources()
-        for cell in json.loads(source.read_text("utf-8"))["cells"]
-        if cell["cell_type"] == "code"
-    ]
+    cells = [c.source for source in project.sources() for c in read(source).cells if c.cell_type == "code"]
     python = environment(project, folder, f"zwfs[notebooks] @ {wheel.as_uri()}")
     modules = {name for cell in cells for name in re.findall(r"(?m)^(?:from|import) ([\w.]+)", cell)}
     modules |= {f"studies.{file.stem}" for file in project.studies.glob("[!_]*.py")}

@@ -23,7 +23,7 @@ from studies.kit.tables import plain
 
 from . import declared, record
 from .declared import Parameter, ParameterError
-from .notebook import normalise, read, to_bytes
+from .notebook import normalise, read, title, title_cell, to_bytes
 from .project import Project
 from .scratch import scratch_folder, swap
 
@@ -58,17 +58,16 @@ def parse(arguments: list[str]) -> argparse.Namespace:
             raise ParameterError(f"{argument}: expected UTF-8")
     layout = argparse.RawDescriptionHelpFormatter
     parser = Parser("rerun", description=__doc__, epilog=EXAMPLES, formatter_class=layout)
-    parser.add_argument("figure", nargs="?", help="number of a figure, or name of a notebook")
-    parser.add_argument("-p", metavar="NAME=VALUE", action="append", default=[], help="a parameter, in YAML")
-    file_help = "YAML file of parameters; -p overrides it"
-    parser.add_argument("-f", metavar="FILE", type=Path, action="append", default=[], help=file_help)
-    parser.add_argument("--list", action="store_true", help="list parameters, and run nothing")
-    parser.add_argument("--force", action="store_true", help="run even if the result exists")
-    parser.add_argument("--output", metavar="DIR", type=Path, help="folder for the results")
-    parser.add_argument("--jobs", metavar="N", type=int, help="largest number of processes of a sweep")
-    cluster_help = "address of a Dask scheduler for the sweeps, as in tcp://host:8786"
-    parser.add_argument("--cluster", metavar="ADDRESS", help=cluster_help)
-    parser.add_argument("--line", metavar="TEXT", help="all arguments in one string, quoted as for a shell")
+    add = parser.add_argument
+    add("figure", nargs="?", help="number of a figure, or name of a notebook")
+    add("-p", metavar="NAME=VALUE", action="append", default=[], help="a parameter, in YAML")
+    add("-f", metavar="FILE", type=Path, action="append", default=[], help="YAML file of parameters; -p overrides")
+    add("--list", action="store_true", help="list parameters, and run nothing")
+    add("--force", action="store_true", help="run even if the result exists")
+    add("--output", metavar="DIR", type=Path, help="folder for the results")
+    add("--jobs", metavar="N", type=int, help="largest number of processes of a sweep")
+    add("--cluster", metavar="ADDRESS", help="Dask scheduler for the sweeps, as in tcp://host:8786")
+    add("--line", metavar="TEXT", help="all arguments in one string, quoted as for a shell")
     asked = parser.parse_args(arguments)
     if asked.line is None:
         return asked
@@ -171,13 +170,12 @@ def _given(asked: argparse.Namespace) -> dict[str, Any]:
 def _text(file: Path) -> str:
     """Return the content of a file of parameters."""
     try:
-        if not stat.S_ISREG(file.stat().st_mode):
+        about = file.stat()
+        if not stat.S_ISREG(about.st_mode):
             raise ParameterError(f"-f {file}: expected a regular file")
-        with file.open("rb") as stream:
-            content = stream.read(declared.LONGEST + 1)
-        if len(content) > declared.LONGEST:
+        if about.st_size > declared.LONGEST:
             raise ParameterError(f"-f {file}: expected at most {declared.LONGEST} bytes")
-        return content.decode()
+        return file.read_text("utf-8")
     except OSError as error:
         raise ParameterError(f"-f {file}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -206,18 +204,8 @@ def _check_classes(paths: list[str]) -> None:
 
 def titles(project: Project) -> str:
     """List the notebooks: number, name, title."""
-    lines = []
-    for path in project.sources():
-        notebook = read(path)
-        title = notebook.cells[_title_cell(notebook)].source.splitlines()[0].lstrip("# ")
-        lines.append([_number(path.stem), path.stem, title])
+    lines = [[_number(path.stem), path.stem, title(read(path))] for path in project.sources()]
     return table(["figure", "notebook", "title"], sorted(lines, key=lambda line: (not line[0], line[1])))
-
-
-def _title_cell(notebook: NotebookNode) -> int:
-    """Return the index of the cell that begins with the title."""
-    cells = enumerate(notebook.cells)
-    return next((i for i, cell in cells if cell.cell_type == "markdown" and cell.source.startswith("# ")), 0)
 
 
 def description(project: Project, name: str) -> str:
@@ -328,7 +316,7 @@ def make(
         execute([run], lambda _: None)
         notebook = run.notebook
         if changed:
-            notebook.cells.insert(_title_cell(notebook) + 1, notice(changed, known))
+            notebook.cells.insert(title_cell(notebook) + 1, notice(changed, known))
         notebook = normalise(notebook)
         shutil.copytree(run.folder, new)
         (new / f"{name}.ipynb").write_bytes(to_bytes(notebook))
@@ -360,5 +348,5 @@ def make(
 
 def command(name: str, changed: dict[str, Any]) -> str:
     """Return the command that repeats a run, from the root of a clone."""
-    values = [shlex.quote(f"{key}={json.dumps(value)}") for key, value in changed.items()]
+    values = [shlex.quote(f"{key}={json.dumps(value, ensure_ascii=False)}") for key, value in changed.items()]
     return " ".join([COMMAND, name, *(f"-p {value}" for value in values)])

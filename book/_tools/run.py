@@ -2,23 +2,26 @@
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+import yaml
 from tqdm import tqdm
 
 from zwfs._system import write_file
 
 from .execute import Run, execute
-from .notebook import read, to_bytes
+from .notebook import glued_texts, read, title, to_bytes
 from .project import Project
 from .record import digest_result, key, read_record, versions
 from .scratch import scratch_folder, swap
 
 KEPT = 4  # results of each notebook
-FRONT_FIGURE = "at_a_glance"  # shown in the README and on the front page, as book/_static/front.png
+FRONT_FIGURE, FRONT = "at_a_glance", "book/_static/front.png"  # shown in the README and on the front page
+MANIFEST = "codecheck.yml"
 
 
 def run(project: Project, say: Callable[[str], None] = tqdm.write) -> list[str]:
@@ -94,20 +97,10 @@ def _show(project: Project, name: str, folder: Path) -> None:
 def moved_numbers(project: Project) -> dict[str, list[str]]:
     """Return the glued numbers that differ between committed and executed notebooks, by committed file."""
     return {
-        committed.relative_to(project.root).as_posix(): differences(_glued(committed), _glued(fresh))
+        committed.relative_to(project.root).as_posix(): differences(*map(glued_texts, (committed, fresh)))
         for committed in project.sources()
         if (fresh := project.executed / committed.name).exists()
     }
-
-
-def _glued(path: Path) -> dict[str, str]:
-    """Return what a notebook glues, as text by name."""
-    found = {}
-    for cell in read(path).cells:
-        for output in cell.get("outputs", ()):
-            if name := output.get("metadata", {}).get("scrapbook", {}).get("name"):
-                found[name] = next((text for kind, text in output.data.items() if kind.endswith("text/plain")), "")
-    return found
 
 
 def differences(before: dict[str, str], after: dict[str, str]) -> list[str]:
@@ -124,15 +117,23 @@ def differences(before: dict[str, str], after: dict[str, str]) -> list[str]:
 
 
 def refresh(project: Project) -> list[str]:
-    """Replace the committed notebooks and the front figure by the executed ones; return the names that changed."""
-    files = {committed: project.executed / committed.name for committed in project.sources()}
+    """Replace notebooks, front figure and manifest by those of the last run; return the names that changed."""
+    new = {source: (project.executed / source.name).read_bytes() for source in project.sources()}
     picture = project.executed / f"{FRONT_FIGURE}.files" / f"{FRONT_FIGURE}.png"
     if picture.exists():
-        files[project.root / "book" / "_static" / "front.png"] = picture
-    changed = []
-    for committed, fresh in files.items():
-        content = fresh.read_bytes()
-        if not committed.exists() or content != committed.read_bytes():
-            write_file(committed, content)
-            changed.append(committed.relative_to(project.root).as_posix())
-    return changed
+        new[project.root / FRONT] = picture.read_bytes()
+    new[project.root / MANIFEST] = manifest(project)
+    changed = {file: content for file, content in new.items() if not file.exists() or file.read_bytes() != content}
+    for file, content in changed.items():
+        write_file(file, content)
+    return [file.relative_to(project.root).as_posix() for file in changed]
+
+
+def manifest(project: Project) -> bytes:
+    """Return codecheck.yml with the list of the notebooks and the front figure; the rest of it stays."""
+    titles = {source.relative_to(project.root).as_posix(): title(read(source)) for source in project.sources()}
+    titles[FRONT] = "Figure of the front page and of the README"
+    entries = [{"file": name, "comment": comment} for name, comment in titles.items()]
+    listed = yaml.safe_dump({"manifest": entries}, sort_keys=False, allow_unicode=True, width=1000)
+    text = (project.root / MANIFEST).read_text("utf-8")
+    return re.sub(r"(?m)^manifest:.*\n(?:[- ].*\n)*", lambda _: listed, text).encode()

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from studies.fig04_dimple_diameter import iteration_spectrum
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, screens_at
+from studies.kit.curves import ErrorCurves
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
-from studies.kit.setups import Noise
+from studies.kit.setups import Noise, screens_at
 from studies.kit.style import LOOKS, OTHER_STYLES, Look
 from studies.kit.tables import Table, small
 from zwfs.bounds import cramer_rao
@@ -342,6 +342,7 @@ def _causes_point(
 
 
 _INK = "#555555"
+_BOUND: dict[str, Any] = {"color": _INK, "lw": 8, "alpha": 0.3, "solid_capstyle": "round", "zorder": 1.5}
 _FLOOR = 1e-7  # of a drawn error: below it digits are rounding errors
 
 
@@ -368,7 +369,10 @@ def _input_axes(axes: Axes, threshold: float, bottom: float) -> None:
     axes.set(xscale="log", yscale="log", xlabel="input (rad rms)", ylim=(bottom, 4))
     ends = np.array(axes.get_xlim())
     axes.plot(ends, threshold * ends, color=_INK, lw=1, ls=":", zorder=0.5)
-    axes.text(ends[0] * 1.08, threshold * ends[0] * 1.25, f"{threshold:.0%} of the input", color=_INK, fontsize=9)
+    axes.annotate(
+        f"{threshold:.0%}", (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points", color=_INK,
+        fontsize=9, va="center",
+    )  # fmt: skip
     axes.set_xlim(ends)
     ticks = [tick for tick in (0.05, 0.1, 0.2, 0.5, 1, 2, 4) if ends[0] <= tick <= ends[1]]
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -387,7 +391,7 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
     line = method_line(LIKELY) | {"label": "_"}
     for curve in noisy:
         light.plot(curve.rms, curve.median(LIKELY), **line)
-        light.plot(curve.rms, curve.bound[LIKELY], color=_INK, lw=1, label="_")
+        light.plot(curve.rms, curve.bound[LIKELY], label="_", **_BOUND)
         light.annotate(
             f"{curve.photons:,.0f}".replace(",", " "), (curve.rms[0], curve.bound[LIKELY][0]), (0, 8),
             textcoords="offset points", fontsize=9,
@@ -403,7 +407,7 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
     for axes in (methods, light):
         _input_axes(axes, threshold, bottom)
     handles, labels = methods.get_legend_handles_labels()
-    [bound] = light.plot([], [], color=_INK, lw=1)
+    [bound] = light.plot([], [], **_BOUND)
     figure.legend(
         [*handles, bound], [*labels, "Cramér-Rao bound"], loc="outside lower center", ncols=2, fontsize=9
     )
@@ -549,13 +553,13 @@ def numbers(
     for rms, place in at.items():
         result[f"few_likely_{rms}"] = few.median(LIKELY)[place]
         result[f"shown_likely_{rms}"] = chosen.median(LIKELY)[place]
-    for name, (kind, curve) in zip(
+    short = "amplitude", "offset", "diameter", "shift", "area"
+    for name, curve in zip(short, model.values(), strict=True):
         ("amplitude", "offset", "diameter", "shift", "area"), model.items(), strict=True
     ):
         for rms in (0.5, 1.0):
             place = int(np.argmin(np.abs(curve.rms - rms)))
             result[f"{name}_{rms:g}".replace(".", "")] = np.median(curve.errors[LIKELY][place])
-        result[f"{name}_name"] = kind
     return rounded(result, ".3g")
 
 

@@ -16,10 +16,10 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, screens_at
+from studies.kit.curves import ErrorCurves
 from studies.kit.parameters import SETUP, parameter_limits
 from studies.kit.results import rounded
-from studies.kit.setups import NOISELESS, Noise, Screens, check_setup
+from studies.kit.setups import NOISELESS, Noise, Screens, check_setup, screens_at
 from studies.kit.style import LOOKS, looks_of
 from studies.kit.tables import Table, small
 from zwfs.metrics import reconstruction_error, strehl

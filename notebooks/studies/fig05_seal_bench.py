@@ -22,8 +22,8 @@ LIMITS = parameter_limits("rms exponent", wavelength=(100.0, 20000.0), bench=ben
 CHECK_TOGETHER = check_bench
 
 
-def draw_bench_layout(bench: Bench, pistons: NDArray, frames: NDArray) -> Figure:
-    """Figure 5: simplified layout of the SEAL bench, folded at its two deformable mirrors."""
+def draw_bench_layout(bench: Bench, pistons: NDArray, frames: NDArray, wavelength: float) -> Figure:
+    """Figure 5: simplified layout of the SEAL bench, folded at its two deformable mirrors; wavelength in nm."""
     phase = np.where(bench.segments > 0, bench.commanded_phase(pistons), np.nan)
     scene = Scene(9, 7.05)
     top, bottom, corner, f, f_last, half = 6.2, 1.2, 8.25, 1.5, 1.75, 0.27
@@ -47,7 +47,7 @@ def draw_bench_layout(bench: Bench, pistons: NDArray, frames: NDArray) -> Figure
     for y, side in ((top, -1), (bottom, 1)):
         inner = y + side * half
         scene.corner((corner - half, y - half), (corner - half, y + half), (corner + half, inner))
-    _source(scene, 0.75, top)
+    _source(scene, 0.75, top, wavelength)
     scene.stop(stop, top, half, 0.5)
     scene.label(stop, top + 0.58, "pupil stop")
     scene.arrows(2.55, 3.05, top, 0.13)
@@ -107,12 +107,12 @@ def _bench_pictures(scene: Scene, bench: Bench, phase: NDArray, frames: NDArray)
         scene.key(0.35, y, look, text)
 
 
-def _source(scene: Scene, x: float, y: float) -> None:
+def _source(scene: Scene, x: float, y: float, wavelength: float) -> None:
     """Source of light, a point."""
     scene.axes.add_patch(Rectangle((x - 0.58, y - 0.16), 0.54, 0.32, fc=METAL, ec="none"))
     scene.axes.add_patch(Circle((x, y), 0.04, fc="#c1121f", ec="none", zorder=4))
     scene.label(x - 0.31, y, "source", color="white", va="center")
-    scene.label(x - 0.58, y + 0.27, "635 nm", ha="left")
+    scene.label(x - 0.58, y + 0.27, f"{wavelength:g} nm", ha="left")
 
 
 def _segmented_mirror(scene: Scene, center: Point, tilt: float, bench: Bench, pistons: NDArray) -> None:

@@ -30,7 +30,6 @@ SHORT = {
     "descent": "GradientDescent",
 }
 """Reconstructors by their names in the text."""
-SHOWN = (0.0, 0.1, 0.3, 0.5, 0.8, 1.0)  # inputs of the table of errors, rad rms
 
 
 def reach(curves: BenchCurves, name: str, ratio: float = 0.25) -> float:
@@ -65,16 +64,6 @@ def curve_columns(curves: BenchCurves) -> dict[str, NDArray]:
         **{f"{name}, standard deviation (rad rms)": curves.std(name) for name in names},
         **{f"{name}, gain": curves.gain(name) for name in names},
     }
-
-
-def error_table(curves: BenchCurves) -> Table:
-    """Mean errors at some inputs."""
-    shown = [index for index, value in enumerate(curves.rms) if value in SHOWN]
-    header = ["reconstructor", *(f"error at {curves.rms[index]:g}" for index in shown)]
-    rows = [
-        [LOOKS[name].name, *(f"{curves.mean(name)[index]:.2g}" for index in shown)] for name in curves.residuals
-    ]
-    return Table(header, rows)
 
 
 def reach_table(curves: BenchCurves) -> Table:

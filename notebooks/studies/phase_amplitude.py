@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from studies.kit import sweeps
-from studies.kit.curves import screens_at
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
+from studies.kit.setups import screens_at
 from studies.kit.style import LOOKS, show_intensity, show_phase
 from studies.kit.tables import Table
 from zwfs.bounds import cramer_rao

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf
 
 from studies.kit import sweeps
-from studies.kit.curves import screens_at
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
+from studies.kit.setups import screens_at
 from studies.kit.style import LOOKS, OTHER_STYLES
 from studies.kit.tables import Table
 from zwfs.bounds import cramer_rao

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies.kit.curves import screens_at
 from studies.kit.parameters import parameter_limits
+from studies.kit.setups import screens_at
 from studies.kit.style import ALONE, LOOKS, looks_of, show_phase
 from studies.kit.tables import Table, small
 from zwfs.metrics import reconstruction_error, wrapped_residual

@@ -11,7 +11,7 @@ from time import perf_counter
 
 import numpy as np
 
-from studies.kit.curves import screens_at
+from studies.kit.setups import screens_at
 from zwfs import Dimple, PhaseShifted, Pupil, ZernikeSensor, reconstruction_error, zernike_basis
 
 REPEATS = 3

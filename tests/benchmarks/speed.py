@@ -14,7 +14,7 @@ from time import perf_counter, thread_time
 
 import numpy as np
 
-from studies.kit.curves import screens_at
+from studies.kit.setups import screens_at
 from zwfs import (
     Arcsine,
     Dimple,

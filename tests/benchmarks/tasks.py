@@ -20,8 +20,8 @@ from studies.fig03_dynamic_range import linearity_curves
 from studies.fig04_dimple_diameter import iteration_curves
 from studies.kit import sweeps
 from studies.kit.bench import bench_curves, bench_reconstructors
-from studies.kit.curves import screens_at
 from studies.kit.methods import paper_reconstructors
+from studies.kit.setups import screens_at
 from studies.phase_shift_pairs import pair_maps
 from zwfs.bench.model import Bench, BenchModel
 

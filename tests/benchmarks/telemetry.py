@@ -13,7 +13,7 @@ from time import perf_counter, process_time, thread_time
 
 import numpy as np
 
-from studies.kit.curves import screens_at
+from studies.kit.setups import screens_at
 from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
 from zwfs.frames import Calibration, reconstruct
 from zwfs.frames._fits import fits_module

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ FIRST_BYTES = b"SIMPLE  ="
 # Types of the numbers of an image, by BITPIX, and the cards that give them a meaning, with their defaults.
 TYPES = {bits: np.dtype(kind) for bits, kind in
          {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}.items()}  # fmt: skip
+KEYWORD = re.compile("[A-Z0-9_ -]*")  # of the standard, with the blanks of the convention HIERARCH
 SCALING = {"BSCALE": 1, "BZERO": 0, "BLANK": None}
 
 
@@ -25,6 +28,21 @@ def fits_module() -> ModuleType:
     except ImportError:
         raise ImportError("FITS files need astropy: pip install astropy; NPY files do not") from None
     return fits
+
+
+def open_fits(content: BinaryIO, **options: Any) -> Any:
+    """Open a FITS file for reading, see `astropy.io.fits.open`; return its units."""
+    return fits_module().open(content, memmap=False, **options)
+
+
+def header_cards(header: Any) -> dict[str, Any]:
+    """Values of a FITS header by keyword; cards that do not follow the standard are left out."""
+    values: dict[str, Any] = {}
+    for card in header.cards:
+        with suppress(fits_module().VerifyError):
+            if KEYWORD.fullmatch(card.keyword):
+                values.setdefault(card.keyword, card.value)
+    return values
 
 
 def fits_content(*units: tuple[NDArray, str, Sequence[tuple[str, Any, str]]]) -> bytes:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs.frames._fits import SCALING, TYPES, fits_module, full_scale
-from zwfs.frames.files import _GZIP, _NPY, FileError, _broken, _content, _header_cards, _npy_header
+from zwfs.frames._fits import SCALING, TYPES, fits_module, full_scale, header_cards, open_fits
+from zwfs.frames.files import _GZIP, _NPY, FileError, _broken, _content, _npy_header
 
 _MOST_UNPACKED = 2**29  # bytes of a gzip file, which is unpacked in memory
 
@@ -258,13 +258,13 @@ def _fits_units(stream: BinaryIO, name: str) -> tuple[list[_Image], dict[str, An
     fits = fits_module()
     found: list[_Image] = []
     header: dict[str, Any] = {}
-    with _broken(f"{name}: a broken FITS file"), fits.open(stream, memmap=False, lazy_load_hdus=False) as units:
+    with _broken(f"{name}: a broken FITS file"), open_fits(stream, lazy_load_hdus=False) as units:
         for index, unit in enumerate(units):
             if isinstance(unit, fits.CompImageHDU):
                 raise FileError(f"{name}: extension {index} is compressed: expected plain images; use funpack")
             if not unit.is_image or not unit.shape:
                 continue
-            cards = _header_cards(unit.header)
+            cards = header_cards(unit.header)
             scale, zero, blank = (cards.get(key, plain) for key, plain in SCALING.items())
             numbers = {
                 "scale": _check.number("BSCALE", scale),
@@ -274,7 +274,7 @@ def _fits_units(stream: BinaryIO, name: str) -> tuple[list[_Image], dict[str, An
             if blank is not None and cards["BITPIX"] > 0:
                 numbers["blank"] = _check.integer("BLANK", blank, -(2**63))
             label = f"{name}[{index}]" if len(units) > 1 else name
-            header = header or _header_cards(units[0].header) | cards
+            header = header or header_cards(units[0].header) | cards
             offset = unit.fileinfo()["datLoc"]
             found.append((label, tuple(unit.shape), TYPES[cards["BITPIX"]], offset, numbers))
     if not found:

@@ -10,13 +10,11 @@ import hashlib
 import io
 import math
 import os
-import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -24,7 +22,17 @@ from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs._system import is_there, path_of, paths_of, write_file
-from zwfs.frames._fits import FIRST_BYTES, SCALING, TYPES, fits_content, fits_module, full_scale, has_card
+from zwfs.frames._fits import (
+    FIRST_BYTES,
+    SCALING,
+    TYPES,
+    fits_content,
+    fits_module,
+    full_scale,
+    has_card,
+    header_cards,
+    open_fits,
+)
 from zwfs.frames._part import scratch_of
 from zwfs.frames.pipeline import MeasuredPhase, Optics
 from zwfs.frames.registration import Image, nearest_good
@@ -33,7 +41,6 @@ _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do 
 _GZIP, _NPY = b"\x1f\x8b", b"\x93NUMPY"  # first bytes of a file
 # Header card of a phase map: no other file is replaced.
 _PHASE_CARD = b"CREATOR = 'zwfs "
-_KEYWORD = re.compile("[A-Z0-9_ -]*")  # of the standard, with the blanks of the convention HIERARCH
 _LONGEST = 240  # bytes of a file name; a partial file has a few more, and most file systems allow 255
 
 
@@ -172,9 +179,9 @@ def read(path: str | Path, *, max_bytes: int = 2**29, max_images: int = 2) -> Ca
             data, header = _read_npy(content, name, limits), dict[str, Any]()
             highest = full_scale(data.dtype)
     else:
-        fits = fits_module()
+        fits_module()  # without astropy this fails, and not the file
         with _broken(f"{name}: a broken FITS file"):
-            data, header, highest = _read_fits(fits, content, name, limits)
+            data, header, highest = _read_fits(content, name, limits)
     if data.dtype.kind not in "biuf":
         raise TypeError(f"{name}: its numbers are {data.dtype}: expected real ones")
     with np.errstate(over="ignore", invalid="ignore"):  # wider floats become infinite: bad pixels
@@ -507,12 +514,10 @@ def _read_npy(content: io.BytesIO, name: str, limits: tuple[int, int]) -> NDArra
     return data.reshape(shape, order="F" if columns_first else "C")
 
 
-def _read_fits(
-    fits: ModuleType, content: io.BytesIO, name: str, limits: tuple[int, int]
-) -> tuple[NDArray, dict[str, Any], float]:
+def _read_fits(content: io.BytesIO, name: str, limits: tuple[int, int]) -> tuple[NDArray, dict[str, Any], float]:
     # Odd header cards are no reason to refuse a file; missing or altered pixels are.
     warnings.filterwarnings("error", message=".*truncated.*|Datasum verification failed.*")
-    with fits.open(content, memmap=False, checksum=True) as units:
+    with open_fits(content, checksum=True) as units:
         images = [unit for unit in units if unit.is_image and unit.shape]
         if not images:
             raise FileError(f"{name}: a FITS file without an image")
@@ -520,7 +525,7 @@ def _read_fits(
         if len(images) > 2 or shapes[0] != shapes[-1] or (len(images) == 2 and len(shapes[0]) != 2):
             raise FileError(f"{name}: images of shapes {shapes}: expected one, or two of the same (ny, nx)")
         _accept(name, shapes[0] if len(images) == 1 else (2, *shapes[0]), limits)
-        cards = _header_cards(units[0].header) | _header_cards(images[0].header)
+        cards = header_cards(units[0].header) | header_cards(images[0].header)
         pixels, scales = zip(*map(_pixels, images), strict=True)
         return pixels[0] if len(images) == 1 else np.stack(pixels), cards, min(scales)
 
@@ -534,16 +539,6 @@ def _pixels(unit: Any) -> tuple[NDArray, float]:
     if blank is not None and data.dtype.kind == "u":  # astropy overlooks BLANK in unsigned numbers
         data = np.where(data == blank + zero, np.nan, data)
     return data, full_scale(TYPES[unit.header["BITPIX"]], scale, zero)
-
-
-def _header_cards(header: Any) -> dict[str, Any]:
-    """Values of a FITS header by keyword; cards that do not follow the standard are left out."""
-    values: dict[str, Any] = {}
-    for card in header.cards:
-        with suppress(fits_module().VerifyError):
-            if _KEYWORD.fullmatch(card.keyword):
-                values.setdefault(card.keyword, card.value)
-    return values
 
 
 def _usable(counts: NDArray) -> NDArray[np.bool_]:

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from studies.kit.setups import Screens
 from zwfs.metrics import dynamic_range
-from zwfs.modes import power_law_screens
 
 
 @dataclass(frozen=True)
@@ -55,13 +53,3 @@ def crossing(x: ArrayLike, y: ArrayLike, limit: float) -> float:
         return float(x[0])
     low, high = np.log(y[last - 1 : last + 1])
     return float(x[last - 1] + (np.log(limit) - low) / (high - low) * (x[last] - x[last - 1]))
-
-
-def screens_at(
-    modes: NDArray | Screens, rms: float, n_screens: int, seed: int, task: int, exponent: float = -2.0
-) -> NDArray[np.floating]:
-    """Screens of one task of an experiment: they depend on the seed and the task's number, not on the order."""
-    sequence = np.random.SeedSequence(seed, spawn_key=(task,))
-    if isinstance(modes, Screens):
-        return modes(rms, n_screens, sequence)
-    return power_law_screens(modes, rms, n_screens, exponent, sequence)

@@ -174,6 +174,16 @@ def make_screens(
     return Screens(pupil, modes, frequencies, kind, exponent, scale, recorded)
 
 
+def screens_at(
+    modes: NDArray | Screens, rms: float, n_screens: int, seed: int, task: int, exponent: float = -2.0
+) -> NDArray[np.floating]:
+    """Screens of one task of an experiment: they depend on the seed and the task's number, not on the order."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(task,))
+    if isinstance(modes, Screens):
+        return modes(rms, n_screens, sequence)
+    return power_law_screens(modes, rms, n_screens, exponent, sequence)
+
+
 def check_setup(
     n_pixels: int,
     n_modes: int,

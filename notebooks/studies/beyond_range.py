@@ -555,8 +555,6 @@ def numbers(
         result[f"shown_likely_{rms}"] = chosen.median(LIKELY)[place]
     short = "amplitude", "offset", "diameter", "shift", "area"
     for name, curve in zip(short, model.values(), strict=True):
-        ("amplitude", "offset", "diameter", "shift", "area"), model.items(), strict=True
-    ):
         for rms in (0.5, 1.0):
             place = int(np.argmin(np.abs(curve.rms - rms)))
             result[f"{name}_{rms:g}".replace(".", "")] = np.median(curve.errors[LIKELY][place])

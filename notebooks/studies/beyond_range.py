@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from studies.fig04_dimple_diameter import iteration_spectrum
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves
+from studies.kit.curves import ErrorCurves, crossing
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
 from studies.kit.setups import Noise, screens_at
@@ -49,6 +49,7 @@ PLAIN, ACCELERATED, LIKELY, MODES = (
     "PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood", "MaximumLikelihoodModes",
 )  # fmt: skip
 """Names of the compared methods."""
+PIXEL_ERROR = 0.01  # rad rms, from which the text calls the size of the pixels important
 _WITHOUT_NOISE = 0.0  # photons
 
 
@@ -379,6 +380,11 @@ def _input_axes(axes: Axes, threshold: float, bottom: float) -> None:
     axes.set_xticks([], minor=True)
 
 
+def _spaced(number: float) -> str:
+    """Whole number with spaces between thousands."""
+    return f"{number:,.0f}".replace(",", " ")
+
+
 def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) -> Figure:
     """Median error against the input: all methods for one number of photons, and one method for all."""
     figure, (methods, light) = plt.subplots(1, 2, figsize=(7, 4.6), sharey=True)
@@ -386,14 +392,14 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
     chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
     for name in chosen.errors:
         methods.plot(chosen.rms, chosen.median(name), **method_line(name))
-    methods.set_title(f"{chosen.photons:,.0f} photons per point".replace(",", " "), fontsize=10)
+    methods.set_title(f"{_spaced(chosen.photons)} photons per point", fontsize=10)
     methods.set_ylabel("median error (rad rms)")
     line = method_line(LIKELY) | {"label": "_"}
     for curve in noisy:
         light.plot(curve.rms, curve.median(LIKELY), **line)
         light.plot(curve.rms, curve.bound[LIKELY], label="_", **_BOUND)
         light.annotate(
-            f"{curve.photons:,.0f}".replace(",", " "), (curve.rms[0], curve.bound[LIKELY][0]), (0, 8),
+            _spaced(curve.photons), (curve.rms[0], curve.bound[LIKELY][0]), (0, 8),
             textcoords="offset points", fontsize=9,
         )  # fmt: skip
     light.set_title("maximum likelihood, by photons per point", fontsize=10)
@@ -423,7 +429,7 @@ def draw_model_errors(curves: Mapping[str, ErrorCurves], noise: NoiseCurves, thr
             axes.plot(curve.rms, np.median(curve.errors[name], axis=1), label=kind, ms=5, **style)
         axes.fill_between(
             noise.rms, noise.median(name), 1e-9, color="#999999", alpha=0.3, lw=0, zorder=0.4,
-            label=f"photon noise, {noise.photons:,.0f} per point".replace(",", " "),
+            label=f"below the photon noise of {_spaced(noise.photons)} per point",
         )  # fmt: skip
         axes.set_title(method_look(name).name, fontsize=10)
         rms = next(iter(curves.values())).rms
@@ -532,6 +538,7 @@ def numbers(
     two = int(np.argmin(np.abs(found.curves.rms - 2.0)))
     right = noiseless.errors[LIKELY] <= threshold * noiseless.rms[:, np.newaxis]
     usual = (chosen.rms >= 0.1) & (chosen.rms <= 2)
+    *_, area = model.values()
     result = dict(settings) | {
         "exact_up_to": noiseless.complete_up_to(LIKELY, threshold),
         "n_noiseless": right.size,
@@ -546,7 +553,8 @@ def numbers(
         "plain_half_sigma": accuracy,
         "contracting_at_2": np.mean(found.factor[two] < 1),
         "example_rms": found.example_rms,
-        "pixels_matter": _crossing_input(model, chosen),
+        "pixels_matter": crossing(area.rms, np.median(area.errors[LIKELY], axis=1), PIXEL_ERROR),
+        "pixel_error": PIXEL_ERROR,
     }
     for name, method in (("plain", PLAIN), ("dimmed", DIMMED), ("accelerated", ACCELERATED)):
         result[f"{name}_at_2"] = found.curves.recovered(method, threshold)[two]
@@ -559,11 +567,3 @@ def numbers(
             place = int(np.argmin(np.abs(curve.rms - rms)))
             result[f"{name}_{rms:g}".replace(".", "")] = np.median(curve.errors[LIKELY][place])
     return rounded(result, ".3g")
-
-
-def _crossing_input(model: Mapping[str, ErrorCurves], noise: NoiseCurves) -> float:
-    """Smallest input at which the size of the pixels costs as much as the photon noise, radian rms."""
-    *_, area = model.values()
-    error = np.median(area.errors[LIKELY], axis=1)
-    above = area.rms[error >= np.interp(area.rms, noise.rms, noise.median(LIKELY))]
-    return float(above.min(initial=np.inf))

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import settings
 
 import zwfs
+from zwfs.bench import Bench, BenchModel
 
 ROOT = Path(__file__).parent.parent
 
@@ -102,6 +103,23 @@ def classic(pupil):
 @pytest.fixture(scope="session")
 def shifted(pupil):
     return zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
+
+
+SMALL = {"n_pixels": 68, "gap": 0.02, "stop": 0.8}  # of a bench: half its camera, 11 pixels of margin
+
+
+def ideal_bench(**changes):
+    return Bench.ideal(**{**SMALL, **changes})
+
+
+@pytest.fixture(scope="session")
+def perfect():
+    return ideal_bench()
+
+
+@pytest.fixture(scope="session")
+def model(perfect):
+    return BenchModel.from_images(perfect)
 
 
 @pytest.fixture(scope="session")

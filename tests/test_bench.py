@@ -2,28 +2,16 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from studies.kit.bench import find_pistons
-from zwfs import (
-    Arcsine,
-    Dimple,
-    GradientDescent,
-    PhaseShifted,
-    Pupil,
-    ZernikeSensor,
-    power_law_screens,
-    zernike_basis,
-)
+from zwfs import Dimple, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, zernike_basis
 from zwfs.bench.model import Bench, BenchModel, segment_residual, segment_screens
 
-N = 68  # half the camera: 11 pixels of margin
-SMALL = {"n_pixels": N, "gap": 0.02, "stop": 0.8}
+from .conftest import SMALL
+from .conftest import ideal_bench as ideal
+
+N = SMALL["n_pixels"]
 EXTENT = 180 / 136
 MARGIN = 11
 LAYOUT = Pupil.hexagonal(N, 3, 0.02, (21,), 0.8)
-
-
-def ideal(**changes):
-    return Bench.ideal(**{**SMALL, **changes})
 
 
 def design(bench, diameter=1.06):
@@ -39,16 +27,6 @@ def inner(images):
 def phase_of(bench):
     """Phase that a bench adds to the flat command, as a perfect sensor would see it: NaN outside."""
     return PhaseShifted(design(bench), n_iterations=50, tolerance=1e-10)(bench.frames()).phase
-
-
-@pytest.fixture(scope="module")
-def perfect():
-    return ideal()
-
-
-@pytest.fixture(scope="module")
-def model(perfect):
-    return BenchModel.from_images(perfect)
 
 
 @pytest.fixture(scope="module")
@@ -90,17 +68,6 @@ def test_blur_widens_the_images_and_loses_no_light(perfect):
         (light, width), (same, wider) = moments(sharp), moments(blurred)
         assert same == pytest.approx(light)
         np.testing.assert_allclose(wider - width, 1.5**2, rtol=0.01)
-
-
-def test_blur_mixes_neighbours_only():
-    lit = {"n_rings": 1, "stop": None, "missing": (1, 2, 3, 4, 5, 7)}  # the first rows alone: the last are dark
-    sharp, blurred = (ideal(**lit, extent=2.0, blur=blur).frames() for blur in (0.0, 1.5))
-    reach = (1, 19, 19)  # 6 standard deviations on either side
-    highest, lowest = ndimage.maximum_filter(sharp, reach), ndimage.minimum_filter(sharp, reach)
-    assert highest[:, 0].max() > 5 * highest[:, -1].max()
-    assert np.all(blurred <= highest * (1 + 1e-9))
-    edge = (slice(None), slice(9, -9), slice(9, -9))  # light from beyond the camera reaches the rest
-    assert np.all(blurred[edge] >= lowest[edge] * (1 - 1e-9))
 
 
 def test_errors_are_named_and_0_on_an_ideal_bench(perfect):
@@ -169,17 +136,6 @@ def test_frames_do_not_depend_on_the_width_of_the_camera(relay, extent, commands
     np.testing.assert_allclose(centre, inner(ideal(**relay).frames(commands)), rtol=0, atol=1e-9)
 
 
-def test_reconstructors_find_the_commands_on_an_ideal_bench(perfect, model, commands):
-    frames = model.normalise(perfect.frames(commands))
-    exact = PhaseShifted(model.shifted, tolerance=1e-9), GradientDescent(model.shifted, model.modes)
-    for reconstruct, tolerance in zip(exact, (1e-5, 1e-4), strict=True):
-        found = find_pistons(reconstruct, model, frames)
-        np.testing.assert_allclose(segment_residual(found, commands), 0, atol=tolerance)
-    small = 0.1 * commands
-    found = find_pistons(Arcsine(model.classic), model, model.normalise(perfect.frames(small)))
-    np.testing.assert_allclose(segment_residual(found, small), 0, atol=1e-5)
-
-
 # Each error alone
 
 
@@ -191,15 +147,6 @@ def test_leakage_mixes_the_images_by_that_fraction(perfect, commands, leakage):
     np.testing.assert_allclose(bench.frames(commands), mixed, rtol=0, atol=1e-13)
     np.testing.assert_allclose(bench.clear_frames(), perfect.clear_frames(), rtol=0, atol=1e-13)
     assert np.abs(plus - minus).max() > 0.5
-
-
-@pytest.mark.parametrize("leakage", [0.03, 0.1])
-def test_leakage_makes_the_phase_too_small(perfect, model, commands, leakage):
-    # What is left of the difference of the images, which is the sine of the phase, is 1 - 2 leakage.
-    small = 0.05 * commands
-    found = find_pistons(PhaseShifted(model.shifted), model, ideal(leakage=leakage).frames(small))
-    gain = np.sum((small + segment_residual(found, small)) * small) / np.sum(small**2)
-    assert gain == pytest.approx(1 - 2 * leakage, abs=0.005)
 
 
 @pytest.mark.parametrize("imbalance", [-0.3, 0.05])
@@ -270,33 +217,34 @@ def test_focus_difference_is_free_space_to_either_side(perfect, commands, distan
     assert unlike > 50 * distance
 
 
-@pytest.mark.parametrize(("distance", "astigmatism"), [(3e-4, 0), (1e-3, 0), (3e-4, 2e-4)])
-def test_focus_difference_turns_a_phase_grating_into_opposite_contrasts(distance, astigmatism):
+def talbot_contrasts(q, f, **planes):
+    """Contrast along x and y of a phase grating of amplitude q and frequency f in each clear frame, (2, 2)."""
+    open_pupil = {"n_rings": 0, "missing": (), "illumination": 0} | planes
+    graved, plain = (ideal(**open_pupil, quilting=value).clear_frames() for value in (q, 0))
+    x, y = np.meshgrid(LAYOUT.x, LAYOUT.x)
+    centre = np.hypot(x, y) < 0.25
+    waves = np.stack([np.cos(2 * np.pi * f * x), np.cos(2 * np.pi * f * y), np.ones_like(x)])[:, centre]
+    return np.linalg.lstsq(waves.T, inner(graved - plain)[:, centre].T)[0][:2].T
+
+
+@pytest.mark.parametrize(
+    ("planes", "along"),  # along x and y, for each image
+    [
+        ({"focus_difference": 3e-4}, [[1.5e-4] * 2, [-1.5e-4] * 2]),
+        ({"focus_difference": 1e-3}, [[5e-4] * 2, [-5e-4] * 2]),
+        ({"focus_difference": 3e-4, "astigmatism": 2e-4}, [[2.5e-4, 0.5e-4], [-2.5e-4, -0.5e-4]]),
+        ({"focus": (2e-4, -1e-4, 4e-4, -3e-4)}, [[4e-4] * 2, [-3e-4] * 2]),
+    ],
+)
+def test_defocus_turns_a_phase_grating_into_contrasts(planes, along):
     # Talbot: exp(i q cos(2 pi f x)) becomes 1 + 2 q sin(pi z f^2) cos(2 pi f x) in intensity, for a small q.
     q, f = 0.01, 22
-    open_pupil = {"n_rings": 0, "missing": (), "illumination": 0, "focus_difference": distance}
-    open_pupil["astigmatism"] = astigmatism
-    graved, plain = (ideal(**open_pupil, quilting=value).clear_frames() for value in (q, 0))
-    x, y = np.meshgrid(LAYOUT.x, LAYOUT.x)
-    centre = np.hypot(x, y) < 0.25
-    waves = np.stack([np.cos(2 * np.pi * f * x), np.cos(2 * np.pi * f * y), np.ones_like(x)])[:, centre]
-    for arm, sign in enumerate((1, -1)):
-        found = np.linalg.lstsq(waves.T, inner(graved - plain)[arm][centre])[0]
-        along = distance + np.array([astigmatism, -astigmatism])  # x and y
-        expected = 2 * q * np.sin(sign * np.pi * along / 2 * f**2)
-        np.testing.assert_allclose(found[:2], expected, rtol=0.05)
+    expected = 2 * q * np.sin(np.pi * np.array(along) * f**2)
+    np.testing.assert_allclose(talbot_contrasts(q, f, **planes), expected, rtol=0.05)
 
 
-def test_each_image_has_its_own_plane_and_quilting_shows_off_mask(perfect, commands):
-    q, f, planes = 0.01, 22, (2e-4, -1e-4, 4e-4, -3e-4)
-    open_pupil = {"n_rings": 0, "missing": (), "illumination": 0, "focus": planes}
-    graved, plain = (ideal(**open_pupil, quilting=value).clear_frames() for value in (q, 0))
-    x, y = np.meshgrid(LAYOUT.x, LAYOUT.x)
-    centre = np.hypot(x, y) < 0.25
-    waves = np.stack([np.cos(2 * np.pi * f * x), np.cos(2 * np.pi * f * y), np.ones_like(x)])[:, centre]
-    for image, plane in zip(inner(graved - plain), planes[2:], strict=True):
-        found = np.linalg.lstsq(waves.T, image[centre])[0]
-        np.testing.assert_allclose(found[:2], 2 * q * np.sin(np.pi * plane * f**2), rtol=0.05)
+def test_each_image_has_its_own_plane(commands):
+    planes = (2e-4, -1e-4, 4e-4, -3e-4)
     one, other = ideal(focus=planes), ideal(focus=(planes[0], planes[0], 0, 0))
     np.testing.assert_allclose(one.frames(commands[0])[0], other.frames(commands[0])[0], rtol=0, atol=1e-12)
     halves = ideal(focus=(2e-4, -2e-4, 2e-4, -2e-4)), ideal(focus_difference=4e-4)
@@ -323,10 +271,6 @@ def test_light_that_no_mask_shifts_interferes_if_it_is_polarised(perfect, comman
 def test_focus_difference_loses_no_light(distance):
     images = ideal(extent=4, focus_difference=distance).clear_frames()
     np.testing.assert_allclose(images.sum(axis=(1, 2)), np.count_nonzero(LAYOUT.inside), rtol=1e-7)
-    # A narrower camera sees the same light.
-    narrow = ideal(focus_difference=distance).clear_frames()
-    cut = 3 * N // 2 - MARGIN
-    np.testing.assert_allclose(narrow, images[:, cut:-cut, cut:-cut], rtol=0, atol=1e-12)
 
 
 def test_a_flat_wavefront_looks_the_same_on_either_side_of_focus(perfect):
@@ -436,17 +380,6 @@ def test_commands_are_in_the_order_of_the_numbers(perfect):
     expected = 0.3 * (LAYOUT.segments == 5) - 0.2 * (LAYOUT.segments == 22)
     np.testing.assert_array_equal(phase, expected)
     np.testing.assert_array_equal(perfect.frames(0 * pistons), perfect.frames())
-
-
-def test_commands_in_batches_of_any_depth(perfect):
-    pistons = np.random.default_rng(0).normal(size=(2, 3, 36))
-    frames = perfect.frames(pistons)
-    assert frames.shape == (2, 3, 2, N + 2 * MARGIN, N + 2 * MARGIN)
-    np.testing.assert_allclose(frames[1, 2], perfect.frames(pistons[1, 2]), atol=1e-13)
-    phase = perfect.commanded_phase(pistons)
-    for index, number in enumerate(perfect.numbers):
-        assert (phase[..., LAYOUT.segments == number] == pistons[..., index, np.newaxis]).all()
-    assert not phase[..., LAYOUT.segments == 0].any()
 
 
 # What the bench hands out
@@ -577,86 +510,37 @@ def test_segment_screens_are_averaged_power_law_screens(perfect):
 
 
 @pytest.mark.parametrize(
-    ("changes", "error", "message"),
+    "change",
     [
-        ({"leakage": -0.1}, ValueError, r"leakage = -0\.1: expected .*\[0, 0\.5\]"),
-        ({"leakage": 0.6}, ValueError, r"leakage = 0\.6: expected .*\[0, 0\.5\]"),
-        ({"flux_imbalance": -1.5}, ValueError, r"flux_imbalance = -1\.5: expected .*\(-1, 1\)"),
-        ({"flux_imbalance": 1}, ValueError, r"flux_imbalance = 1: expected .*\(-1, 1\)"),
-        ({"photons": -1}, ValueError, r"photons = -1: expected .*\[0, inf"),
-        (
-            {"photons": 0},
-            ValueError,
-            "photons = 0 with read_noise = 30 and background = 60000: expected 0 for both",
-        ),
-        ({"read_noise": -1}, ValueError, "read_noise = -1"),
-        ({"background": -1}, ValueError, "background = -1"),
-        ({"static": -0.1}, ValueError, r"static = -0\.1"),
-        ({"focus_difference": -1e-4}, ValueError, r"focus_difference = -0\.0001: expected .*\[0, 0\.01\]"),
-        ({"focus_difference": 1}, ValueError, "focus_difference = 1"),
-        ({"misregistration": -1}, ValueError, r"misregistration = -1: expected .*\[0, 10\]"),
-        ({"dimple_error": -1}, ValueError, r"dimple_error = -1: expected .*\[-0\.9, 10\]"),
-        ({"illumination": 2}, ValueError, r"illumination = 2: expected .*\[0, 2\)"),
-        ({"n_rings": -1}, ValueError, "n_rings = -1"),
-        ({"gap": 0.5}, ValueError, r"gap = 0\.5"),
-        ({"stop": 0}, ValueError, r"stop = 0: expected .*, 1\]"),
-        ({"missing": (38,)}, ValueError, r"missing = \[38\]: .* from 1 to 37"),
-        ({"seed": -1}, ValueError, "seed = -1: expected at least 0"),
-        ({"diameter": -1}, ValueError, r"diameter = -1: expected"),
-        ({"extent": 0.5}, ValueError, r"extent = 0\.5: expected .*\[1, 10"),
+        {"leakage": 0.6}, {"flux_imbalance": 1}, {"photons": -1}, {"photons": 0}, {"read_noise": -1},
+        {"background": -1}, {"static": -0.1}, {"focus_difference": 1}, {"misregistration": -1},
+        {"dimple_error": -1}, {"illumination": 2}, {"n_rings": -1}, {"gap": 0.5}, {"stop": 0}, {"missing": (38,)},
+        {"seed": -1}, {"diameter": -1}, {"extent": 0.5},
     ],
-)
-def test_bad_parameters_are_named(changes, error, message):
-    with pytest.raises(error, match=message):
-        Bench(**{**SMALL, **changes})
+)  # fmt: skip
+def test_bad_parameters_are_named(change):
+    with pytest.raises(ValueError, match=rf"^{next(iter(change))} = .*: .*expected"):
+        Bench(**{**SMALL, **change})
 
 
 @pytest.mark.parametrize(
-    ("call", "error", "message"),
+    ("call", "message"),
     [
-        (lambda m, b: m.pistons(np.full((N, N), np.nan)), ValueError, "phase is NaN all over a segment"),
-        (lambda m, b: segment_residual([0.0, 1], [0.0, 1, 2]), ValueError, "found and commanded have shapes"),
-        (lambda m, b: segment_screens(b, -1, 2), ValueError, r"rms = -1: expected .*\[0, inf"),
-        (lambda m, b: segment_screens(b, 1, 0), ValueError, "n_screens = 0: expected at least 1"),
+        (lambda m, b: m.pistons(np.full((N, N), np.nan)), "phase is NaN all over a segment"),
+        (lambda m, b: segment_residual([0.0, 1], [0.0, 1, 2]), "found and commanded have shapes"),
+        (lambda m, b: segment_screens(b, -1, 2), "rms = -1"),
+        (lambda m, b: segment_screens(b, 1, 0), "n_screens = 0"),
     ],
-)  # fmt: skip
-def test_bad_input_is_named(perfect, model, call, error, message):
-    with pytest.raises(error, match=message):
+)
+def test_bad_input_is_named(perfect, model, call, message):
+    with pytest.raises(ValueError, match=message):
         call(model, perfect)
 
 
 # The pupil of a bench
 
 
-def test_pupil_from_segments():
-    segments = np.array([[0, 1, 1], [2, 2, 0], [0, 3, 3]])
-    amplitude = np.array([[9, 1, 2], [3, 4, -9], [9, 5, 6.0]])
-    pupil = Pupil.from_segments(segments, amplitude)
-    np.testing.assert_array_equal(pupil.segments, segments)
-    np.testing.assert_array_equal(pupil.inside, segments > 0)
-    inside = pupil.amplitude[pupil.inside]
-    np.testing.assert_allclose(inside / inside[0], [1, 2, 3, 4, 5, 6])
-    assert np.mean(inside**2) == pytest.approx(1)
-    assert pupil.n_pixels == 3
-    segments[0, 1] = 0  # the pupil keeps its own copy
-    assert pupil.segments[0, 1] == 1
-
-
 def test_pupil_from_the_segments_of_another_is_that_pupil():
     again = Pupil.from_segments(LAYOUT.segments)
     np.testing.assert_array_equal(again.amplitude, LAYOUT.amplitude)
     assert (again.n_pixels, again.center) == (LAYOUT.n_pixels, LAYOUT.center)
-
-
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
-    [
-        (lambda: Pupil.from_segments(np.ones((3, 3))), TypeError, "segments is .*float64: expected a map of int"),
-        (lambda: Pupil.from_segments(np.eye(3, dtype=int), 0.0), ValueError, "amplitude reaches down to 0"),
-        (lambda: Pupil.from_segments(np.eye(3, dtype=int), -np.ones((3, 3))), ValueError, "reaches down to -1"),
-        (lambda: Pupil.from_segments(-np.eye(3, dtype=int)), ValueError, "segments reaches down to -1"),
-    ],
-)  # fmt: skip
-def test_bad_segments_are_named(make, error, message):
-    with pytest.raises(error, match=message):
-        make()

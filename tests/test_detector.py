@@ -96,17 +96,18 @@ def test_error_of_a_reconstruction_falls_with_the_root_of_the_photons(pupil, shi
 
 
 @pytest.mark.parametrize(
-    ("make", "error", "message"),
+    ("make", "message"),
     [
-        (lambda p: Detector(p, 0), ValueError, r"photons = 0: .*\[1e-12, "),
-        (lambda p: Detector(p, 1, read_noise=-1), ValueError, "read_noise = -1"),
-        (lambda p: Detector(p, 1, full_well=0), ValueError, "full_well = 0"),
-        (lambda p: Detector(p, 1, gain=-2), ValueError, "gain = -2"),
-        (lambda p: Detector(p, 1).expose([1, -1]), ValueError, "frames reaches down to -1"),
+        (lambda p: Detector(p, 0), "photons = 0"),
+        (lambda p: Detector(p, 1, read_noise=-1), "read_noise = -1"),
+        (lambda p: Detector(p, 1, full_well=0), "full_well = 0"),
+        (lambda p: Detector(p, 1, gain=-2), "gain = -2"),
+        (lambda p: Detector(p, 1).expose([1, -1]), "frames reaches down to -1"),
+        (lambda p: Detector(p, 1e25).expose([1.0]), "frames reach .* electrons"),
     ],
 )
-def test_bad_input_is_named(make, error, message):
-    with pytest.raises(error, match=message):
+def test_bad_input_is_named(make, message):
+    with pytest.raises(ValueError, match=message):
         make(Pupil.circular(8))
 
 
@@ -114,8 +115,3 @@ def test_a_single_pixel_may_be_exposed():
     counts = Detector(Pupil.circular(8), 1e6).expose(1.0, seed=1)
     assert counts.shape == ()
     assert counts == Detector(Pupil.circular(8), 1e6).expose([1.0], seed=1)[0]
-
-
-def test_more_photons_than_can_be_counted_are_refused():
-    with pytest.raises(ValueError, match=r"frames reach .* electrons"):
-        Detector(Pupil.circular(8), 1e25).expose([1.0], seed=1)

@@ -99,44 +99,32 @@ def drawn_methods(curves, pupil, classic, shifted):
     measurement = Measurement(recording, Optics(), frames, pupil, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0))
     found = MeasuredPhase(phase, frames, 0.9 * frames, measurement, True, 0)
     varied = AmplitudeCurves(three, dict.fromkeys(phase_amplitude.WAYS, np.full((3, 2), 0.1)), {}, three)
+    drift, pair, falling = Drift(np.ones((6, 2, 2)), 10.0, 500.0), np.ones(6), np.array([20.0, 10.0])
     held = DriftCurves(
-        Drift(np.ones((6, 2, 2)), 10.0, 500.0),
-        {"pair": np.ones(6), IDEAL: np.ones(6)},
-        [1e2, 1e4],
-        {"pair": np.array([20.0, 10.0])},
-        [0.1, 0.5],
-        {1e3: np.array([30.0, 20.0])},
+        drift, {"pair": pair, IDEAL: pair}, [1e2, 1e4], {"pair": falling}, [0.1, 0.5], {1e3: falling}
     )
+    sliced = Grid({"x": np.arange(2), "screen": np.zeros(2), "error": np.ones(2)}, ("x",))
+    widths = replace(curves, errors={"narrow": curves.errors["Linear"]} | curves.errors)
+    faint = PhotonCurves(three, three, dict.fromkeys(LOOKS, np.ones((3, 3, 2))), np.eye(3) + 1, np.eye(3))
+    designs = DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5})
+    step = Step("outlines", found, np.ones(2), np.zeros(2))
     banded = BandCurves(three, dict.fromkeys(bandwidth.WAYS, three), {}, three, 1.0)
     triple = zwfs.ZernikeSensor(pupil, *shifted.masks, zwfs.Dimple(1, 0))
-    both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(
-        triple.measure(pupil.scatter(pupil.gather(phase), 0))
-    )
+    both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(triple.measure(phase))
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
     ways = dict.fromkeys(calibration.WAYS, 0.1 * commands)
     example = Example(commands, Shot(frames, frames), dict.fromkeys(calibration.WAYS, 0.9 * frames), ways)
-    calibrated = BenchCurves(
-        np.array([0.5]), commands[None, None], {name: one[None, None] for name, one in ways.items()}
-    )
+    residuals = {name: one[None, None] for name, one in ways.items()}
+    calibrated = BenchCurves(np.array([0.5]), commands[None, None], residuals)
     return {
-        "draw_slice": (
-            (Grid({"x": np.arange(2), "screen": np.zeros(2), "error": np.ones(2)}, ("x",)), "error", "x"),
-            (),
-        ),
+        "draw_slice": ((sliced, "error", "x"), ()),
         "draw_sensor_layout": ((classic, phase), ()),
         "draw_vector_sensor": ((shifted, phase), ()),
         "draw_bench_layout": ((bench, commands, bench.frames(commands, seed=1), 635.0), ()),
         "draw_steps": ((pupil, phase, frames, dict.fromkeys([*two, "Arcsine"], phase)), ()),
         "draw_linearity": ((curves, 0.05, two, 0.4), two),
-        "draw_saxton_widths": (
-            (
-                {"narrow": saxton},
-                replace(curves, errors={"narrow": curves.errors["Linear"]} | curves.errors),
-                0.05,
-            ),
-            ["Linear", "GerchbergSaxton"],
-        ),
+        "draw_saxton_widths": (({"narrow": saxton}, widths, 0.05), ["Linear", "GerchbergSaxton"]),
         "draw_convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in LOOKS},), LOOKS),
         "draw_estimates": ((pupil, phase, dict.fromkeys(two, phase)), ()),
         "draw_sensor_steps": ((shifted, phase, lowest_pixel(shifted, phase)), ()),
@@ -153,15 +141,9 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_range_starts": (({1.06: recovered, 2.0: recovered},), ()),
         "draw_pairs": ((PairMaps(three, *np.full((5, 3, 3), 1.0)),), ()),
         "draw_pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
-        "draw_photon_noise": (
-            (PhotonCurves(three, three, dict.fromkeys(LOOKS, np.ones((3, 3, 2))), np.eye(3) + 1, np.eye(3)),),
-            LOOKS,
-        ),
+        "draw_photon_noise": ((faint,), LOOKS),
         "draw_error_bars": (([ErrorBars(k, EXPECTED, k, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
-        "draw_design_maps": (
-            (DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5}), PUBLISHED, {"flat": three}),
-            (),
-        ),
+        "draw_design_maps": ((designs, PUBLISHED, {"flat": three}), ()),
         "draw_band_errors": (({(0.1, False): banded, (0.1, True): banded},), [*shifted_only, "MaximumLikelihood"]),
         "draw_held_drift": ((held,), ()),
         "draw_amplitude_errors": (({"dips": varied},), [*shifted_only, "MaximumLikelihood"]),
@@ -175,16 +157,10 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_calibration_frames": ((example,), ()),
         "draw_explained": ((found,), ()),
         "draw_phase_map": ((found, 635.0), ()),
-        "draw_gains": (
-            ([Step("outlines", found, np.ones(2), np.zeros(2))] * 2, [0.1, 0.2]),
-            (),
-        ),
+        "draw_gains": (([step] * 2, [0.1, 0.2]), ()),
         "draw_signs": ((measurement,), ()),
         "draw_loop_runs": (({4.0: dict.fromkeys(two, loop)},), two),
-        "draw_capture": (
-            (three, [dict.fromkeys(two, loop)] * 3),
-            two,
-        ),
+        "draw_capture": ((three, [dict.fromkeys(two, loop)] * 3), two),
     }
 
 

@@ -195,52 +195,37 @@ def test_noise_is_that_of_the_bound(sensor, modes):
     np.testing.assert_allclose(held.noise, bound * 500e3 / (2 * np.pi))
 
 
+OTHER = Pupil.circular(16)
+
+
 @pytest.mark.parametrize(
-    ("change", "kind", "message"),
+    ("change", "message"),
     [
-        ({"plant": 1}, TypeError, "plant is a int"),
-        ({"mirror": 1}, TypeError, "mirror is a int: expected a Mirror"),
-        ({"reconstructor": 1}, TypeError, "reconstructor is a int"),
-        ({"gain": 2.0}, ValueError, "gain = 2"),
-        ({"leak": 1.0}, ValueError, "leak = 1"),
-        ({"delay": 0}, ValueError, "delay = 0"),
-        ({"stroke": 0.0}, ValueError, "stroke = 0"),
-        ({"camera": 1}, TypeError, "camera is a int"),
-        ({"disturbance": []}, ValueError, "disturbance is empty"),
-        ({"disturbance": [np.zeros((3, 3))]}, ValueError, "disturbance.0. has shape"),
-        ({"disturbance": [np.zeros((20, 20)), np.zeros((2, 20, 20))]}, ValueError, "disturbance.1. has shape"),
+        ({"mirror": 1}, "mirror is a int"),
+        ({"mirror": Mirror(OTHER, zernike_basis(OTHER, 3))}, "mirror has Pupil"),
+        ({"gain": 2.0}, "gain = 2"),
+        ({"leak": 1.0}, "leak = 1"),
+        ({"delay": 0}, "delay = 0"),
+        ({"stroke": 0.0}, "stroke = 0"),
+        ({"disturbance": []}, "disturbance is empty"),
+        ({"disturbance": [np.zeros((20, 20)), np.zeros((2, 20, 20))]}, "disturbance.1. has shape"),
     ],
 )
-def test_bad_input_is_refused(mirror, sensor, shifted, change, kind, message):
-    arguments = {
-        "plant": sensor,
-        "mirror": mirror,
-        "reconstructor": shifted,
-        "disturbance": np.zeros((2, 20, 20)),
-    } | change
-    with pytest.raises(kind, match=message):
-        close_loop(**arguments)
+def test_bad_input_is_refused(mirror, sensor, shifted, change, message):
+    arguments = {"mirror": mirror, "disturbance": np.zeros((2, 20, 20))} | change
+    with pytest.raises((TypeError, ValueError), match=message):
+        close_loop(sensor, reconstructor=shifted, **arguments)
 
 
 def test_bad_drifts_are_refused(sensor, modes):
-    with pytest.raises(ValueError, match="gain = None: expected a gain"):
-        hold_drift(sensor, modes, drift=0, photons=1e9, wavelength=635.0)
-    with pytest.raises(TypeError, match="sensor is a int"):
-        hold_drift(1, modes, drift=1, photons=1e9, wavelength=635.0)
     for change in (
         {"modes": 0 * modes},
         {"modes": 2 * modes},
         {"drift": 1e155},
+        {"drift": 1e-100},
         {"speed": 1e155},
         {"gain": 1e-300},
+        {"gain": None, "drift": 0},
     ):
         with pytest.raises(ValueError, match=next(iter(change))):
             hold_drift(sensor, **{"modes": modes, "drift": 1.0, "photons": 1e9, "wavelength": 635.0} | change)
-    with pytest.raises(ValueError, match="drift = 1e-100: expected more or a gain"):
-        hold_drift(sensor, modes, drift=1e-100, photons=1e9, wavelength=635.0)
-
-
-def test_a_mirror_on_another_pupil_is_refused(sensor, shifted):
-    other = Pupil.circular(16)
-    with pytest.raises(ValueError, match="mirror has Pupil"):
-        close_loop(sensor, Mirror(other, zernike_basis(other, 3)), shifted, np.zeros((2, 20, 20)))

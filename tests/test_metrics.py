@@ -70,22 +70,21 @@ def test_dynamic_range_without_a_crossing():
 
 
 @pytest.mark.parametrize(
-    ("call", "error", "message"),
+    ("call", "message"),
     [
-        (lambda p: dynamic_range([1, 2], [0]), ValueError, r"rms and error have shapes \(2,\) and \(1,\)"),
         (
             lambda p: reconstruction_error(p, np.zeros((2, *p.shape)), np.zeros((3, *p.shape))),
-            ValueError,
-            "estimate and truth have shapes .*: expected ones that broadcast",
+            "estimate and truth",
         ),
-        (lambda p: dynamic_range([], []), ValueError, "with n at least 1"),
-        (lambda p: dynamic_range([2, 1], [0, 0]), ValueError, "rms = .*expected increasing"),
-        (lambda p: dynamic_range([0.0], [0]), ValueError, "rms = .*above 0"),
-        (lambda p: dynamic_range([-1, 1], [0, 0]), ValueError, "rms reaches down to -1"),
-        (lambda p: dynamic_range([1, 2], [-1, -2]), ValueError, "error reaches down to -2"),
-        (lambda p: dynamic_range([1, 2], [0, 0], 0), ValueError, "threshold = 0"),
+        (lambda p: dynamic_range([1, 2], [0]), "rms and error have shapes"),
+        (lambda p: dynamic_range([], []), "with n at least 1"),
+        (lambda p: dynamic_range([2, 1], [0, 0]), "rms = .*expected increasing"),
+        (lambda p: dynamic_range([0.0], [0]), "rms = .*above 0"),
+        (lambda p: dynamic_range([-1, 1], [0, 0]), "rms reaches down to -1"),
+        (lambda p: dynamic_range([1, 2], [-1, -2]), "error reaches down to -2"),
+        (lambda p: dynamic_range([1, 2], [0, 0], 0), "threshold = 0"),
     ],
 )
-def test_bad_input_is_named(pupil, call, error, message):
-    with pytest.raises(error, match=message):
+def test_bad_input_is_named(pupil, call, message):
+    with pytest.raises(ValueError, match=message):
         call(pupil)

@@ -38,10 +38,6 @@ def test_photons_do_not_reduce_a_systematic_error(curves):
     assert curves.error("MaximumLikelihood")[1, 1] < 0.2 * arcsine[1]
 
 
-def test_the_bound_falls_with_the_root_of_the_photons(curves):
-    np.testing.assert_allclose(curves.bound[:, 0] / curves.bound[:, 1], 10, rtol=1e-9)
-
-
 def test_68_percent_are_within_one_sigma(curves):
     np.testing.assert_allclose(curves.within, EXPECTED[ONE], atol=0.03)
 

@@ -21,7 +21,7 @@ from zwfs import (
     zernike_basis,
 )
 
-from .reference import HcipySensor, exact_frame
+from .reference import HcipySensor
 
 WAVELENGTHS, WEIGHTS, REFERENCE = [600.0, 640.0, 700.0], [1.0, 3.0, 2.0], 650.0
 
@@ -69,22 +69,9 @@ def test_frames_are_the_sum_over_the_wavelengths(band, phases):
     np.testing.assert_allclose(band.measure(phases), explicit(band, phases), atol=1e-9)
     amplitude = band.pupil.inside * (1 + 0.2 * band.pupil.x)
     np.testing.assert_allclose(band.measure(phases, amplitude), explicit(band, phases, amplitude), atol=1e-9)
-
-
-def test_frames_are_the_sum_on_a_wide_detector(sensor, phases):
-    wide = ZernikeSensor(sensor.pupil, *sensor.masks, extent=1.5)
-    band = PolychromaticSensor(wide, WAVELENGTHS, WEIGHTS, reference_wavelength=REFERENCE)
-    np.testing.assert_allclose(band.measure(phases), explicit(band, phases), atol=1e-9)
-
-
-def test_frames_are_those_of_the_exact_kernel(band, phases):
-    total = 0
-    for wavelength, weight in zip(band.wavelengths, band.weights, strict=True):
-        ratio = REFERENCE / wavelength
-        mask = Dimple(1.06 * ratio, np.pi / 2 * (ratio if band.chromatic else 1))
-        total = total + weight * exact_frame(band.pupil, mask, ratio * phases[0])
-    inside = band.pupil.inside
-    np.testing.assert_allclose(band.measure(phases[0])[0][inside], total[inside], atol=1e-8)
+    larger = ZernikeSensor(band.pupil, *band.masks, extent=1.5)
+    wide = PolychromaticSensor(larger, WAVELENGTHS, WEIGHTS, reference_wavelength=REFERENCE)
+    np.testing.assert_allclose(wide.measure(phases), explicit(wide, phases), atol=1e-9)
 
 
 def test_frames_agree_with_hcipy():
@@ -160,10 +147,11 @@ def any_sensor(sensor, band, request):
 
 def test_jacobian_is_the_derivative_of_the_frames(any_sensor, phases):
     change, step = np.random.default_rng(1).standard_normal(phases.shape), 1e-5
-    expected = (any_sensor.measure(phases + step * change) - any_sensor.measure(phases - step * change)) / (
-        2 * step
-    )
+    plus, minus = (any_sensor.measure(phases + sign * step * change) for sign in (1, -1))
+    expected = (plus - minus) / (2 * step)
     np.testing.assert_allclose(any_sensor.jacobian(phases, change), expected, atol=1e-8)
+    with pytest.raises(ValueError, match="change has shape"):
+        any_sensor.jacobian(phases, change[0])
 
 
 def test_adjoint_of_the_jacobian_has_the_same_products(any_sensor, phases):
@@ -173,17 +161,6 @@ def test_adjoint_of_the_jacobian_has_the_same_products(any_sensor, phases):
     left = np.vdot(any_sensor.jacobian(phases, change), frames)
     right = np.vdot(change, any_sensor.jacobian_adjoint(phases, frames))
     assert left == pytest.approx(right, rel=1e-12)
-
-
-def test_jacobian_refuses_maps_of_another_batch(any_sensor, phases):
-    with pytest.raises(ValueError, match="change has shape"):
-        any_sensor.jacobian(phases, phases[0])
-    frames = np.ones((2, 24, 24))
-    with pytest.raises(ValueError, match=r"frames has shape \(2, 24, 23\)"):
-        any_sensor.jacobian_adjoint(phases[0], frames[..., :23])
-    frames[0, 0, 0] = np.nan
-    with pytest.raises(ValueError, match="frames holds 1 NaN"):
-        any_sensor.jacobian_adjoint(phases[0], frames)
 
 
 def test_the_bound_is_that_of_the_dense_information(band, phases):
@@ -261,9 +238,7 @@ def test_gradient_of_the_descent(band, phases):
 
 @pytest.mark.parametrize("method", [PhaseShifted, Arcsine, GerchbergSaxton])
 def test_methods_of_one_wavelength_refuse_a_band(band, method):
-    with pytest.raises(
-        TypeError, match=f"expected a ZernikeSensor for {method.__name__}, such as sensor.reference"
-    ):
+    with pytest.raises(TypeError, match=f"expected a ZernikeSensor for {method.__name__}"):
         method(band)
 
 
@@ -276,40 +251,21 @@ def test_an_unknown_amplitude_needs_one_wavelength(sensor):
         cramer_rao(band, np.zeros(sensor.pupil.shape), photons=100, amplitude_known=False)
 
 
-def test_a_band_cannot_be_changed_and_survives_a_pickle(band, phases):
-    with pytest.raises(AttributeError):
-        band.chromatic = True
-    with pytest.raises(ValueError, match="read-only"):
-        band.weights[0] = 1
-    copy = pickle.loads(pickle.dumps(band))
-    assert np.array_equal(copy.measure(phases), band.measure(phases))
-    assert "3 wavelengths from 600 to 700" in repr(band)
+def test_a_band_survives_a_pickle(band, phases):
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(band)).measure(phases), band.measure(phases))
 
 
 @pytest.mark.parametrize(
-    ("arguments", "options", "message"),
+    ("arguments", "message"),
     [
-        (([],), {}, "wavelengths has shape"),
-        (([600.0, -1.0],), {}, "wavelengths = "),
-        (([100.0, 600.0],), {}, "within a factor of 4"),
-        ((np.ones(65),), {}, "wavelengths has 65 values"),
-        (([600.0], [1.0, 2.0]), {}, "weights has shape"),
-        (([600.0, 700.0], [1.0, -2.0]), {}, "weights reaches down to -2"),
-        (([600.0, 700.0], [0.0, 0.0]), {}, "weights is 0"),
-        (([600.0],), {"reference_wavelength": 0.0}, "reference_wavelength = 0.0"),
+        (([600.0, -1.0],), "wavelengths = "),
+        (([100.0, 600.0],), "within a factor of 4"),
+        ((np.ones(65),), "wavelengths has 65 values"),
+        (([600.0], [1.0, 2.0]), "weights has shape"),
+        (([600.0, 700.0], [1.0, -2.0]), "weights reaches down to -2"),
+        (([600.0, 700.0], [0.0, 0.0]), "weights is 0"),
     ],
 )
-def test_bad_input_is_refused(sensor, arguments, options, message):
+def test_bad_input_is_refused(sensor, arguments, message):
     with pytest.raises(ValueError, match=message):
-        PolychromaticSensor(sensor, *arguments, **options)
-
-
-def test_bad_bands_are_refused(sensor, pupil):
-    with pytest.raises(ValueError, match="bandwidth = 1"):
-        PolychromaticSensor.flat_band(sensor, 1.5)
-    with pytest.raises(ValueError, match="n_wavelengths = 0"):
-        PolychromaticSensor.flat_band(sensor, 0.1, 0)
-    with pytest.raises(TypeError, match="sensor is a Pupil: expected a ZernikeSensor"):
-        PolychromaticSensor(pupil, [600.0])
-    with pytest.raises(TypeError, match="chromatic = 1"):
-        PolychromaticSensor(sensor, [600.0], chromatic=1)
+        PolychromaticSensor(sensor, *arguments)

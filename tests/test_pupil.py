@@ -3,12 +3,6 @@ import pytest
 
 from zwfs import Pupil
 
-CORNER = 3 * np.sqrt(3) / 2  # area of a hexagon of circumradius 1
-
-
-def test_points_of_the_paper_grid():
-    assert Pupil.circular(100).n_points == 7860
-
 
 @pytest.mark.parametrize("n", [7, 8])
 def test_coordinates_are_pixel_centres_in_diameters(n):
@@ -18,6 +12,9 @@ def test_coordinates_are_pixel_centres_in_diameters(n):
     np.testing.assert_allclose(pupil.y, centres, atol=1e-15)
     rows, columns = np.nonzero(pupil.inside)
     np.testing.assert_array_equal(pupil.points, np.stack([pupil.x[columns], pupil.y[rows]], axis=-1))
+    moved = Pupil.from_amplitude(np.ones((4, 6)), n_pixels=5.5, center=(1, 2.5))
+    np.testing.assert_allclose(moved.y, (np.arange(4) - 1) / 5.5)
+    np.testing.assert_allclose(moved.x, (np.arange(6) - 2.5) / 5.5)
 
 
 @pytest.mark.parametrize("n", [16, 25, 100])
@@ -35,16 +32,13 @@ def test_disc_holds_the_centres_within_half_a_diameter(n):
         Pupil.circular(30, 0.3, [(0.4, 0.05)]),
         Pupil.hexagonal(60, gap=0.01),
         Pupil.from_amplitude(np.random.default_rng(0).uniform(size=(9, 12))),
+        Pupil.from_segments(np.arange(9).reshape(3, 3), np.arange(1.0, 10).reshape(3, 3)),
     ],
 )
 def test_mean_square_amplitude_is_1_inside_and_0_outside(pupil):
     assert np.mean(pupil.amplitude[pupil.inside] ** 2) == pytest.approx(1, abs=1e-12)
     assert not pupil.amplitude[~pupil.inside].any()
     assert pupil.n_points == np.count_nonzero(pupil.inside)
-
-
-def test_obscuration_takes_its_share_of_the_area():
-    assert Pupil.circular(200, 0.4).n_points / Pupil.circular(200).n_points == pytest.approx(1 - 0.4**2, rel=2e-3)
 
 
 def test_spider_is_dark_on_its_side_only():
@@ -59,7 +53,7 @@ def test_three_rings_are_37_segments_of_equal_area():
     numbers, areas = np.unique(pupil.segments[pupil.inside], return_counts=True)
     np.testing.assert_array_equal(numbers, np.arange(1, 38))
     pitch = 0.5 / np.sqrt(9 + 3 + 1 / 3)
-    expected = CORNER * ((pitch - 0.004) / np.sqrt(3)) ** 2 * 300**2
+    expected = 3 * np.sqrt(3) / 2 * ((pitch - 0.004) / np.sqrt(3)) ** 2 * 300**2
     np.testing.assert_allclose(areas, expected, rtol=0.03)
     assert areas.mean() == pytest.approx(expected, rel=3e-3)
 
@@ -112,21 +106,6 @@ def test_amplitude_image_keeps_its_relative_values():
     assert pupil.center == (0.5, 1.0)
 
 
-def test_amplitude_image_with_its_own_axis_and_diameter():
-    pupil = Pupil.from_amplitude(np.ones((4, 6)), n_pixels=5.5, center=(1, 2.5))
-    np.testing.assert_allclose(pupil.y, (np.arange(4) - 1) / 5.5)
-    np.testing.assert_allclose(pupil.x, (np.arange(6) - 2.5) / 5.5)
-
-
-def test_scatter_undoes_gather():
-    pupil = Pupil.circular(12, 0.3)
-    maps = np.random.default_rng(0).normal(size=(2, 3, *pupil.shape)).astype(np.float32)
-    again = pupil.scatter(pupil.gather(maps))
-    assert again.dtype == np.float32
-    np.testing.assert_array_equal(again[..., pupil.inside], maps[..., pupil.inside])
-    assert np.isnan(again[..., ~pupil.inside]).all()
-
-
 def test_field_has_the_amplitude_and_the_phase_and_is_dark_outside():
     pupil = Pupil.from_amplitude(np.pad(np.arange(1.0, 10).reshape(3, 3), 2))
     phase = np.linspace(-3, 3, 2 * 49).reshape(2, 7, 7)
@@ -152,6 +131,8 @@ def test_gather_and_scatter_keep_the_dtype(dtype):
     again = pupil.scatter(values, fill=0)
     assert again.dtype == dtype
     np.testing.assert_array_equal(again, np.where(pupil.inside, maps, 0))
+    if maps.dtype.kind == "f":
+        np.testing.assert_array_equal(pupil.scatter(values), np.where(pupil.inside, maps, np.nan))
 
 
 def test_points_on_the_edge_of_the_obscuration_are_inside():
@@ -175,60 +156,44 @@ def test_pupil_is_a_copy_of_its_arrays():
         assert pupil.segments.all()
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
-    [
-        (lambda: Pupil.circular(1), ValueError, r"n_pixels = 1: expected an integer in \[2, "),
-        (lambda: Pupil.circular(10, 1.0), ValueError, r"central_obscuration = 1\.0: .*\[0, 1\)"),
-        (lambda: Pupil.circular(10, spiders=[(0, -1)]), ValueError, r"spiders\[0\] width = -1"),
-        (lambda: Pupil.hexagonal(50, n_rings=-1), ValueError, "n_rings = -1"),
-        (lambda: Pupil.hexagonal(50, gap=1), ValueError, "gap = 1"),
-        (lambda: Pupil.hexagonal(50, missing=[38]), ValueError, r"missing = \[38\]: .* from 1 to 37"),
-        (lambda: Pupil.hexagonal(50, stop=1.5), ValueError, r"stop = 1\.5: .*, 1\]"),
-        (
-            lambda: Pupil.from_amplitude([[1, -0.5]]),
-            ValueError,
-            "image reaches down to -0.5: expected no negative",
-        ),
-        (lambda: Pupil.from_amplitude(np.ones((2, 2)), threshold=1), ValueError, "threshold = 1"),
-        (lambda: Pupil.from_amplitude(np.ones((2, 2)), n_pixels=0), ValueError, "n_pixels = 0"),
-    ],
-)
-def test_bad_input_is_named(make, error, message):
-    with pytest.raises(error, match=message):
-        make()
-
-
 ONES, WHOLE = np.ones((4, 4)), np.ones((4, 4), int)
-MASKED = np.ma.masked_array(WHOLE, np.eye(4, dtype=bool))
 POINTS = np.ones(Pupil.circular(4).n_points)
+REFUSED = {
+    "n_pixels = 1:": lambda: Pupil.circular(1),
+    "n_pixels = 1000000": lambda: Pupil.circular(10**6),
+    "n_pixels = 0.5": lambda: Pupil.from_amplitude(ONES, 0.5),
+    r"n_pixels = 1e\+300": lambda: Pupil.from_amplitude(ONES, 1e300),
+    "central_obscuration = 1": lambda: Pupil.circular(10, 1.0),
+    "central_obscuration": lambda: Pupil.circular(6, 0.99),
+    r"spiders\[0\] width = -1": lambda: Pupil.circular(10, spiders=[(0, -1)]),
+    r"spiders\[0\] angle = 90.0: .*degrees": lambda: Pupil.circular(8, spiders=[(90, 0.1)]),
+    "n_rings = -1": lambda: Pupil.hexagonal(50, n_rings=-1),
+    "n_rings = 26: .*n_pixels = 50": lambda: Pupil.hexagonal(50, n_rings=26),
+    "gap = 1": lambda: Pupil.hexagonal(50, gap=1),
+    r"missing = \[38\]": lambda: Pupil.hexagonal(50, missing=[38]),
+    "missing": lambda: Pupil.hexagonal(50, n_rings=0, missing=[1]),
+    "stop = 1.5": lambda: Pupil.hexagonal(50, stop=1.5),
+    "stop = 1e-310": lambda: Pupil.hexagonal(50, stop=1e-310),
+    "image reaches down to -0.5": lambda: Pupil.from_amplitude([[1, -0.5]]),
+    "image": lambda: Pupil.from_amplitude(0 * ONES),
+    "threshold = 1": lambda: Pupil.from_amplitude(np.ones((2, 2)), threshold=1),
+    r"center = \(1, .*1000 D": lambda: Pupil.from_amplitude(ONES, center=(1, 1e6)),
+    "segments": lambda: Pupil.from_segments(0 * WHOLE),
+    "segments reaches down to -1": lambda: Pupil.from_segments(-WHOLE),
+    "segments reaches": lambda: Pupil.from_segments(np.full((4, 4), 2**63, np.uint64)),
+    "segments is": lambda: Pupil.from_segments(ONES),
+    "amplitude reaches down to 0": lambda: Pupil.from_segments(WHOLE, 0.0),
+    "amplitude": lambda: Pupil(0 * ONES, 4, WHOLE, (1, 1)),
+    "segments has shape": lambda: Pupil(ONES, 4, WHOLE[:3], (1, 1)),
+    "segments differs .* at 16 points": lambda: Pupil(ONES, 4, 0 * WHOLE, (1, 1)),
+    "fill = nan": lambda: Pupil.circular(4).scatter(POINTS.astype(int)),
+    "fill = 256": lambda: Pupil.circular(4).scatter(POINTS.astype(np.uint8), 256),
+    r"fill = 1e\+300": lambda: Pupil.circular(4).scatter(POINTS.astype(np.float32), 1e300),
+    "phase reaches a modulus": lambda: Pupil.circular(4).rms(1e200 * ONES),
+}
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
-    [
-        (lambda: Pupil.circular(10**6), ValueError, "n_pixels = 1000000"),
-        (lambda: Pupil.circular(8, spiders=[(90, 0.1)]), ValueError, r"spiders\[0\] angle = 90\.0: .*degrees"),
-        (lambda: Pupil.circular(6, 0.99), ValueError, "central_obscuration"),
-        (lambda: Pupil.hexagonal(50, n_rings=26), ValueError, "n_rings = 26: .*n_pixels = 50"),
-        (lambda: Pupil.hexagonal(50, stop=1e-310), ValueError, "stop = 1e-310"),
-        (lambda: Pupil.hexagonal(50, n_rings=0, missing=[1]), ValueError, "missing"),
-        (lambda: Pupil.from_amplitude(0 * ONES), ValueError, "image"),
-        (lambda: Pupil.from_amplitude(ONES, 0.5), ValueError, r"n_pixels = 0\.5"),
-        (lambda: Pupil.from_amplitude(ONES, 1e300), ValueError, r"n_pixels = 1e\+300"),
-        (lambda: Pupil.from_amplitude(ONES, center=(1, 1e6)), ValueError, r"center = \(1, .*1000 D"),
-        (lambda: Pupil.from_segments(0 * WHOLE), ValueError, "segments"),
-        (lambda: Pupil.from_segments(np.full((4, 4), 2**63, np.uint64)), ValueError, "segments reaches"),
-        (lambda: Pupil(0 * ONES, 4, WHOLE, (1, 1)), ValueError, "amplitude"),
-        (lambda: Pupil(ONES, 4, WHOLE[:3], (1, 1)), ValueError, r"segments has shape \(3, 4\)"),
-        (lambda: Pupil(ONES, 4, 0 * WHOLE, (1, 1)), ValueError, "segments differs .* at 16 points"),
-        (lambda: Pupil(ONES, 4, ONES, (1, 1)), TypeError, "segments is 2-dimensional float64"),
-        (lambda: Pupil.circular(4).scatter(POINTS.astype(int)), TypeError, "fill = nan: expected an integer"),
-        (lambda: Pupil.circular(4).scatter(POINTS.astype(np.uint8), 256), ValueError, "fill = 256"),
-        (lambda: Pupil.circular(4).scatter(POINTS.astype(np.float32), 1e300), ValueError, r"fill = 1e\+300"),
-        (lambda: Pupil.circular(4).rms(1e200 * ONES), ValueError, r"phase reaches a modulus of 1e\+200"),
-    ],
-)
-def test_hostile_input_is_named(make, error, message):
-    with pytest.raises(error, match=message):
-        make()
+@pytest.mark.parametrize("message", REFUSED)
+def test_bad_input_is_named(message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        REFUSED[message]()

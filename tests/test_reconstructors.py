@@ -6,7 +6,6 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-import scipy.optimize
 
 import zwfs
 from zwfs import (
@@ -20,7 +19,7 @@ from zwfs import (
     ZernikeSensor,
     reconstruction_error,
 )
-from zwfs.reconstructors.base import ClosedForm, FixedPoint, Reconstructor, load
+from zwfs.reconstructors.base import ClosedForm, FixedPoint, Reconstructor
 
 every = pytest.mark.parametrize("method", RECONSTRUCTORS)
 iterative = pytest.mark.parametrize("method", [method for method in RECONSTRUCTORS if method.iterative])
@@ -95,7 +94,9 @@ def test_most_of_a_small_phase_comes_back(sensor_of, pupil, modes, screens, meth
     assert errors(build(method, sensor, modes), sensor, screens(0.01)).max() < 0.5 * 0.01
 
 
-@pytest.mark.parametrize("phases", [(np.pi / 2, -np.pi / 2), (np.pi / 2, np.pi), (0.3, -2.0), (1.5, -1.5, 2.5)])
+@pytest.mark.parametrize(
+    "phases", [(np.pi / 2, -np.pi / 2), (np.pi / 2, np.pi), (0.3, -2.0), (1.5, -1.5, 2.5), (0.0, 1.5, -1.5)]
+)
 def test_phase_shifted_is_exact_at_08_rad(pupil, screens, phases):
     sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in phases))
     assert errors(PhaseShifted(sensor, n_iterations=60), sensor, screens(0.8)).max() < 1e-6
@@ -139,17 +140,6 @@ def test_more_than_two_masks_are_combined_by_least_squares(pupil, screens):
         wave = waves[:, *point]
         real, imag = np.linalg.lstsq(2 * np.stack([wave.real, wave.imag], axis=1), right[:, *point])[0]
         assert found[point] == pytest.approx(np.arctan2(imag, real), abs=1e-9)
-
-
-def test_phase_shifted_on_an_uneven_pupil(rough_pupil):
-    phase = zwfs.power_law_screens(zwfs.zernike_basis(rough_pupil, 30), 0.5, 3, seed=1)
-    sensor = pair(rough_pupil, np.pi / 2, -np.pi / 2)
-    assert errors(PhaseShifted(sensor), sensor, phase).max() < 1e-6
-
-
-def test_masks_of_different_size_work_together(pupil, screens):
-    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.8, -np.pi / 2, 0.8))
-    assert errors(PhaseShifted(sensor, n_iterations=60), sensor, screens(0.5)).max() < 1e-6
 
 
 @pytest.mark.parametrize("diameters", [(1.06, 1.06), (1.06, 1.0600001)])
@@ -235,13 +225,6 @@ def test_arcsine_is_mirrored_with_the_dimple(classic, pupil, screens):
     np.testing.assert_allclose(minus, -plus, atol=1e-8)
 
 
-def test_arcsine_counts_cosines_beyond_1(classic, pupil):
-    frames = classic.measure(np.zeros(pupil.shape))
-    frames[0, 20, 18:22] += 50
-    frames[0, 0, :3] += 50  # outside the pupil
-    assert Arcsine(classic, n_iterations=1)(frames).n_unsolved == 4
-
-
 def test_arcsine_leaves_dark_points_as_they_were(classic, pupil, screens):
     amplitude = pupil.amplitude.copy()
     amplitude[20, 10:20] = 0
@@ -255,6 +238,7 @@ def test_arcsine_leaves_dark_points_as_they_were(classic, pupil, screens):
 def test_unsolved_points_are_those_of_each_frame(classic, pupil, screens):
     frames = classic.measure(screens(0.3, 3) * np.array([0, 1e-3, 1])[:, np.newaxis, np.newaxis])
     frames[0, 0, 20, 18:22] += 50
+    frames[0, 0, 0, :3] += 50  # outside the pupil
     frames[2, 0, 20, 18:24] += 50
     found = Arcsine(classic, tolerance=1e-2)(frames)
     assert found.n_iterations.tolist() == [2, 1, 3]  # some leave early
@@ -272,36 +256,18 @@ def test_weak_waves_of_different_size_are_solved(pupil, screens, dtype):
 
 
 @every
-@pytest.mark.parametrize("pickled", [False, True])
-def test_what_a_reconstructor_was_made_from_cannot_change(make, method, pickled):
-    reconstruct, sensor = make(method)
-    if pickled:
-        reconstruct = pickle.loads(pickle.dumps(reconstruct))
-    public = [name for name in dir(method) if isinstance(getattr(method, name), property)]
-    values = {name: getattr(reconstruct, name) for name in public if not callable(getattr(reconstruct, name))}
-    assert "settings" in values
-    for name, value in values.items():
-        with pytest.raises(AttributeError):
-            setattr(reconstruct, name, value)
-        if isinstance(value, np.ndarray):
-            assert not value.flags.writeable, name
-    with pytest.raises(AttributeError):
-        reconstruct.settings.tolerance = 0.5
-    with pytest.raises(ValueError, match="read-only"):
-        reconstruct.settings.amplitude[:] = 0.5
-    assert not np.shares_memory(reconstruct.settings.amplitude, sensor.pupil.amplitude)
-
-
-@every
 def test_a_result_belongs_to_the_caller(make, method, screens):
     reconstruct, sensor = make(method)
     frames = sensor.measure(screens(0.3, 2))
-    expected, found = (reconstruct(frames, history=True) for _ in range(2))
-    for name in ("phase", "n_iterations", "converged", "n_unsolved", "history", "frames", "residual"):
+    found = reconstruct(frames, history=True)
+    names = ("phase", "n_iterations", "converged", "n_unsolved", "history", "frames", "residual")
+    expected = {name: getattr(found, name).copy() for name in names}
+    for name in names:
         getattr(found, name)[...] = 0
     again = reconstruct(frames, history=True)
-    for name in ("phase", "n_iterations", "converged", "n_unsolved", "history", "frames", "residual"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(expected, name))
+    frames[...] = 0  # as a camera does that writes the next frame to the same place
+    for name in names:
+        np.testing.assert_array_equal(getattr(again, name), expected[name])
 
 
 def test_descent_that_starts_at_the_solution_has_converged(shifted, modes, screens):
@@ -309,38 +275,6 @@ def test_descent_that_starts_at_the_solution_has_converged(shifted, modes, scree
     found = GradientDescent(shifted, modes)(shifted.measure(phase), start=phase)
     assert found.converged
     np.testing.assert_allclose(found.residual, 0, atol=1e-12)
-
-
-def test_descent_keeps_the_points_that_are_accepted(shifted, modes, screens, monkeypatch):
-    """An optimiser may look elsewhere after the point that it accepts."""
-    frames = shifted.measure(screens(0.5, 1)[0])
-    expected = GradientDescent(shifted, modes)(frames, history=True)
-    minimize = scipy.optimize.minimize
-
-    def restless(value, x, *, callback, **options):
-        def follow(intermediate_result):
-            value(intermediate_result.x + 1.0)
-            callback(intermediate_result=intermediate_result)
-
-        return minimize(value, x, callback=follow, **options)
-
-    monkeypatch.setattr(scipy.optimize, "minimize", restless)
-    found = GradientDescent(shifted, modes)(frames, history=True)
-    np.testing.assert_array_equal(found.history, expected.history)
-    np.testing.assert_array_equal(found.converged, expected.converged)
-
-
-def test_cost_is_checked(shifted, pupil):
-    descent, frames = GradientDescent(shifted), shifted.measure(np.zeros(pupil.shape))
-    phase = np.full(pupil.n_points, 0.3)
-    whole = np.ones(frames.shape, int)
-    assert descent.cost(phase, whole)[0] == descent.cost(phase, whole.astype(float))[0]
-    with pytest.raises(ValueError, match=r"phase has shape \(3,\): expected \(1264,\), the points of the pupil"):
-        descent.cost(phase[:3], frames)
-    with pytest.raises(ValueError, match=r"frames has a batch of \(2,\): expected one set of frames"):
-        descent.cost(phase, np.stack([frames, frames]))
-    with pytest.raises(ValueError, match="phase holds 1 NaN"):
-        descent.cost(np.where(np.arange(phase.size) == 3, np.nan, phase), frames)
 
 
 @pytest.mark.parametrize("n_masks", [1, 2])
@@ -375,9 +309,6 @@ def test_conditioning_drops_what_the_sensor_does_not_see(pupil, modes, shifted, 
     assert 0 < few.n_inverted < len(modes)
     strength = np.linalg.svd(few.interaction_matrix, compute_uv=False)
     assert few.n_inverted == np.count_nonzero(strength > 0.9 * strength[0])
-
-
-def test_linear_refuses_modes_that_no_mask_shows(pupil, shifted):
     with pytest.raises(ValueError, match="modes"):
         Linear(shifted, pupil.inside[np.newaxis].astype(float))
 
@@ -449,17 +380,13 @@ def test_kept_model_is_exact_on_a_detector_as_wide_as_the_pupil(pupil, shifted, 
     assert errors(zero, shifted, screens(rms)).min() > rms  # it diverges
 
 
-@pytest.mark.parametrize("unmeasured", ["zeros", None, 0])
-def test_gerchberg_saxton_refuses_another_field_where_nothing_is_measured(shifted, unmeasured):
-    with pytest.raises(ValueError, match=r"unmeasured = .*: expected one of \['zero', 'model'\]"):
-        GerchbergSaxton(shifted, unmeasured=unmeasured)
-
-
 def test_cost_is_half_the_mean_square_of_the_mismatch(pupil, shifted, screens):
     truth, guess = screens(0.4, 2)
     expected = np.mean((shifted.measure(truth) - shifted.measure(guess)) ** 2) / 2
     cost, _ = GradientDescent(shifted).cost(pupil.gather(guess), shifted.measure(truth)[np.newaxis])
     assert cost == pytest.approx(expected, rel=1e-12)
+    with pytest.raises(ValueError, match=r"frames has a batch of \(2,\)"):
+        GradientDescent(shifted).cost(pupil.gather(guess), shifted.measure([truth, guess]))
 
 
 def test_descent_never_climbs(pupil, shifted, screens):
@@ -520,14 +447,6 @@ def test_many_frames_at_once_equal_few(make, method, screens):
 
 
 @every
-def test_phase_is_nan_outside_and_finite_inside(make, method, screens, pupil):
-    reconstruct, sensor = make(method)
-    found = reconstruct(sensor.measure(screens(0.3)), history=True)
-    for maps in (found.phase, found.history):
-        np.testing.assert_array_equal(np.isfinite(maps), np.broadcast_to(pupil.inside, maps.shape))
-
-
-@every
 def test_single_precision_in_single_precision_out(make, method, screens, pupil):
     reconstruct, sensor = make(method, **steps(method, n_iterations=8, tolerance=0))
     frames = sensor.measure(screens(0.3))
@@ -572,6 +491,7 @@ def test_history_leads_from_the_start_to_the_result(make, method, pupil, screens
     if issubclass(method, ClosedForm | FixedPoint | GradientDescent):  # others may start from a better guess
         assert pupil.rms(found.history[:, 0]).max() < 1e-6
     np.testing.assert_array_equal(found.history[:, -1], found.phase)
+    np.testing.assert_array_equal(np.isfinite(found.history), np.broadcast_to(pupil.inside, found.history.shape))
     assert reconstruct(frames).history is None
 
 
@@ -586,14 +506,7 @@ def test_history_holds_the_results_of_shorter_runs(make, method, screens):
         shorter = make(method, n_iterations=n, tolerance=0)[0](frames)
         np.testing.assert_allclose(history[:, n], shorter.phase, atol=1e-9)
         np.testing.assert_array_equal(shorter.n_iterations, n)
-
-
-@iterative
-def test_history_begins_with_the_start_of_any_piston(make, method, pupil, screens):
-    reconstruct, sensor = make(method, n_iterations=2)
-    start = np.where(pupil.inside, 4.0 + screens(0.1, 1)[0], np.nan)
-    found = reconstruct(sensor.measure(screens(0.1, 2)), start, history=True)
-    assert reconstruction_error(pupil, found.history[0, 0], start) < 1e-6
+        assert not shorter.converged.any()
 
 
 @iterative
@@ -612,18 +525,10 @@ def test_tolerance_stops_early(make, method, screens, pupil):
 
 
 @iterative
-def test_not_converged_is_said(make, method, screens):
-    reconstruct, sensor = make(method, n_iterations=2, tolerance=1e-9)
-    found = reconstruct(sensor.measure(screens(0.6)))
-    assert not found.converged.any()
-    np.testing.assert_array_equal(found.n_iterations, 2)
-
-
-@iterative
 def test_start_is_where_it_starts(make, method, screens, pupil):
     one_start = {"n_starts": 1} if takes(method, "n_starts") else {}
     reconstruct, sensor = make(method, n_iterations=3, tolerance=0, **one_start)
-    phase = screens(0.4)
+    phase = np.where(pupil.inside, 4.0 + screens(0.4), np.nan)
     frames = sensor.measure(phase)
     each = reconstruct(frames, start=phase, history=True)
     assert reconstruction_error(pupil, each.history[:, 0], phase).max() < 1e-6
@@ -772,37 +677,20 @@ def test_points_of_no_amplitude_do_no_harm(pupil, shifted, screens):
 # Bad input.
 
 
-@pytest.mark.parametrize(
-    "phases",
-    [
-        (0.0, np.pi),
-        (np.pi / 2, np.pi / 2),
-        (-0.4, 2 * np.pi - 0.4),
-        (-np.pi, np.pi),
-        (2 * np.pi, np.pi),
-        (0, 0, 0),
-    ],
-)
+@pytest.mark.parametrize("phases", [(0.0, np.pi), (-0.4, 2 * np.pi - 0.4), (-np.pi, np.pi), (0, 0, 0)])
 def test_masks_without_diversity_are_refused(pupil, phases):
     sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in phases))
-    with pytest.raises(ValueError, match=r"determinant .*equation \(10\) is 0.*expected .*2 pi"):
+    with pytest.raises(ValueError, match="determinant"):
         PhaseShifted(sensor)
 
 
-def test_a_useless_mask_among_three_is_accepted(pupil, screens):
-    sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in (0.0, np.pi / 2, -np.pi / 2)))
-    assert errors(PhaseShifted(sensor), sensor, screens(0.3)).max() < 1e-6
-
-
 @every
-@pytest.mark.parametrize("scale", [30.0, 4e3])
-def test_raw_counts_are_warned_of(make, method, screens, scale):
+def test_raw_counts_are_warned_of(make, method, screens):
     reconstruct, sensor = make(method)
     counts = sensor.measure(screens(0.3))
-    counts[1] *= scale
+    counts[1] *= 30
     mean = counts[1][:, sensor.pupil.inside].mean(axis=-1).max()
-    message = f"frames: the mean inside the pupil reaches {mean:.4g}: expected at most about 1, .*raw counts"
-    with pytest.warns(UserWarning, match=message) as caught:
+    with pytest.warns(UserWarning, match=f"frames: the mean inside the pupil reaches {mean:.4g}: ") as caught:
         reconstruct(counts)
     assert caught[0].filename == __file__
 
@@ -837,14 +725,6 @@ def test_frames_may_come_in_the_unit_of_their_calibration(shifted, modes, screen
     np.testing.assert_allclose(found.phase, Linear(shifted, modes)(frames / 1e4).phase, atol=1e-9)
 
 
-@iterative
-def test_any_change_is_within_a_huge_tolerance(make, method, screens):
-    reconstruct, sensor = make(method, tolerance=1e200)
-    found = reconstruct(sensor.measure(screens(0.3)))
-    assert found.converged.all()
-    assert np.all(found.n_iterations == 1)
-
-
 @every
 def test_number_of_masks_is_checked(pupil, modes, method):
     fewest, most = method.n_masks
@@ -868,107 +748,33 @@ def test_a_method_without_iteration_refuses_a_start(make, method, screens):
         reconstruct(frames, screens(0.1))
 
 
-def test_a_method_is_loaded_by_its_path(tmp_path, monkeypatch):
-    assert load("zwfs.reconstructors.linear:Linear") is Linear
-    (tmp_path / "mine.py").write_text("class Mine:\n    def __call__(self, frames): ...\n\nclass Other: ...\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    assert load("mine:Mine").__module__ == "mine"
-    for path in ("mine", "mine:", "mine:Mine()", "mine:Nobody", "mine:Other", "nowhere:Mine", "./mine:Mine"):
-        with pytest.raises(ValueError, match=r"path = .*: expected"):
-            load(path)
-    with pytest.raises(TypeError, match="path = 3: expected a string"):
-        load(3)
-
-
-@every
-@pytest.mark.parametrize(
-    ("spoil", "error", "message"),
-    [
-        (lambda f: np.concatenate([f, f]), ValueError, r"frames has shape .*: expected \(\.\.\., [12], 40, 40\)"),
-        (lambda f: f[:, 1:], ValueError, "frames has shape"),
-        (lambda f: f[np.newaxis][:0], ValueError, r"frames has shape .*: expected at least one frame"),
-        (lambda f: 0 * f, ValueError, "frames: .* hold no light: expected some flux"),
-        (lambda f: -f, ValueError, "frames: .* hold no light: expected some flux"),
-        (lambda f: f - np.where(np.arange(40) == 20, np.inf, 0), ValueError, "frames holds .* NaN or infinite"),
-    ],
-)
-def test_bad_frames_are_named(make, method, pupil, spoil, error, message):
-    reconstruct, sensor = make(method)
-    frames = sensor.measure(np.zeros(pupil.shape))
-    with pytest.raises(error, match=message):
-        reconstruct(spoil(frames))
-
-
 @iterative
-@pytest.mark.parametrize(
-    ("start", "error", "message"),
-    [
-        (np.zeros((3, 3)), ValueError, r"start has shape \(3, 3\): expected \(\.\.\., 40, 40\)"),
-        (
-            np.zeros((2, 40, 40)),
-            ValueError,
-            r"start has shape \(2, 40, 40\): expected \(40, 40\) or \(3, 40, 40\)",
-        ),
-    ],
-)
-def test_bad_start_is_named(make, method, screens, start, error, message):
+@pytest.mark.parametrize("shape", [(3, 3), (2, 40, 40)])
+def test_a_start_of_another_shape_is_refused(make, method, screens, shape):
     reconstruct, sensor = make(method)
-    with pytest.raises(error, match=message):
-        reconstruct(sensor.measure(screens(0.1)), start=start)
+    with pytest.raises(ValueError, match="start has shape"):
+        reconstruct(sensor.measure(screens(0.1)), start=np.zeros(shape))
 
 
-OPTIONS = [
-    ({"n_iterations": 0}, ValueError, r"n_iterations = 0: expected an integer in \[1, "),
-    ({"tolerance": -1e-6}, ValueError, r"tolerance = -1e-06: .*\[0, inf"),
-    ({"amplitude": np.ones((2, 40, 40))}, ValueError, r"amplitude has shape \(2, 40, 40\): expected \(40, 40\)"),
-    ({"amplitude": -np.ones((40, 40))}, ValueError, "amplitude reaches down to -1"),
-    ({"amplitude": np.zeros((40, 40))}, ValueError, "amplitude is 0 everywhere in the pupil"),
-    ({"poke": 0}, ValueError, r"poke = 0: .*\[1e-10, 3\.14"),
-    ({"poke": 1e308}, ValueError, r"poke = 1e\+308: .*\[1e-10, 3\.14"),
-    (
-        {"reference": np.full((40, 40), 1e100)},
-        ValueError,
-        "modes: .* none of them around the reference",
-    ),
-    (
-        {"amplitude": np.full((40, 40), 1e100)},
-        ValueError,
-        r"amplitude: its squares add up to .*e\+203: expected",
-    ),
-    (
-        {"amplitude": np.full((40, 40), 1e-200)},
-        ValueError,
-        "amplitude: its squares add up to 0: expected",
-    ),
-    ({"conditioning": 1.0}, ValueError, r"conditioning = 1\.0: .*\[0, 1\)"),
-    ({"reference": np.zeros((2, 40, 40))}, ValueError, r"reference has shape \(2, 40, 40\): expected \(40, 40\)$"),
-    ({"modes": np.ones((1265, 40, 40))}, ValueError, "modes: 1265 of them, expected at most the 1264 points"),
-]
-
-
-@pytest.mark.parametrize(
-    ("method", "options", "error", "message"),
-    [
-        (method, *case)
-        for method in RECONSTRUCTORS
-        for case in OPTIONS
-        if all(takes(method, name) for name in case[0])
-    ],
-)
-def test_bad_options_are_named(sensor_of, modes, method, options, error, message):
-    if takes(method, "modes"):
-        options = {"modes": modes} | options
-    with pytest.raises(error, match=message):
-        method(sensor_of(method), **options)
+OPTIONS = {
+    "amplitude: its squares add up": {"amplitude": np.full((40, 40), 1e100)},
+    "amplitude: its squares add up to 0": {"amplitude": np.full((40, 40), 1e-200)},
+    "amplitude has shape": {"amplitude": np.ones((2, 40, 40))},
+    "amplitude is 0 everywhere in the pupil": {"amplitude": np.zeros((40, 40))},
+    "conditioning = 1": {"conditioning": 1.0},
+    "modes: .* none of them around the reference": {"reference": np.full((40, 40), 1e100)},
+    "modes: 1265 of them, expected at most the 1264 points": {"modes": np.ones((1265, 40, 40))},
+    "reference has shape": {"reference": np.zeros((2, 40, 40))},
+    "tolerance = -1e-06": {"tolerance": -1e-6},
+}
 
 
 @every
-def test_reconstructors_and_results_print_as_one_line(make, method, screens):
-    reconstruct, sensor = make(method)
-    assert reconstruct.sensor is sensor
-    assert repr(reconstruct).startswith(f"{method.__name__}({sensor!r}, ")
-    result = reconstruct(sensor.measure(screens(0.0)))
-    assert repr(result) == f"Reconstruction(phase {result.phase.shape}, {result.converged.sum()} of 3 converged)"
+def test_bad_options_are_named(sensor_of, modes, method):
+    for message, options in OPTIONS.items():
+        if all(takes(method, name) for name in options):
+            with pytest.raises(ValueError, match=message):
+                build(method, sensor_of(method), **{"modes": modes} | options)
 
 
 def test_every_reconstructor_is_listed():

@@ -135,14 +135,6 @@ def test_frames_of_a_flat_wavefront_lose_tilt_where_the_eigenvalue_is_one_not_wh
     assert np.all(limits.bound >= 1)  # no sensor is better than the ideal one
 
 
-def test_bounds_are_rms_values_of_those_of_the_modes(pupil, modes):
-    limits = dimple_limits(pupil, modes, np.pi / 2, [2.0], np.zeros((1, *pupil.shape)))
-    np.testing.assert_allclose(limits.factor[:, 0], limits.factor[:, 1])
-    n_modes = len(modes)
-    squares = 2 * limits.tilt**2 + (n_modes - 2) * limits.others**2
-    np.testing.assert_allclose(limits.total**2, squares / n_modes)
-
-
 def test_only_maximum_likelihood_recovers_screens_beyond_the_dark_ring(pupil, modes):
     screens = screens_at(modes, 0.5, 4, seed=3, task=0)
     curves = dimple_curves(pupil, np.pi / 2, 25, [1.06, 3.0], screens)

@@ -8,16 +8,10 @@ import numpy as np
 import pytest
 
 import zwfs
-from zwfs import Detector, Dimple, Patch, Pupil, ZernikeSensor, _lowrank, zernike_basis
+from zwfs import Detector, Dimple, Patch, Pupil, ZernikeSensor, zernike_basis
 
 from .conftest import needs_modes
 from .reference import exact_reference
-
-TILT = (1.7, -0.6)  # radian per lambda/D
-
-
-def tilted(u, v):
-    return np.exp(1j * (TILT[0] * u + TILT[1] * v))
 
 
 def ramp(u, v):
@@ -34,20 +28,14 @@ MASKS = {
 
 @pytest.mark.parametrize("extent", [1, 2])
 @pytest.mark.parametrize("diameter", [0.5, 1.06, 2.2, 5])
-def test_dimple_has_the_airy_kernel(complex_field, diameter, extent):
-    pupil, dimple = Pupil.circular(64), Dimple(diameter, 0.7, 0.8)
-    sensor = ZernikeSensor(pupil, dimple, extent=extent, tolerance=1e-14)
-    for field in (pupil.amplitude, complex_field(pupil)):
-        exact = exact_reference(pupil, dimple, field, margin=32 * (extent - 1))
-        np.testing.assert_allclose(sensor.reference_wave(field)[0], exact, rtol=0, atol=1e-12)
-
-
-def test_dimple_has_the_airy_kernel_on_an_uneven_pupil(rough_pupil, complex_field):
-    dimple = Dimple(1.06, np.pi / 2)
-    sensor = ZernikeSensor(rough_pupil, dimple, tolerance=1e-14)
-    field = complex_field(rough_pupil)
-    exact = exact_reference(rough_pupil, dimple, field)
-    np.testing.assert_allclose(sensor.reference_wave(field)[0], exact, rtol=0, atol=1e-12)
+def test_dimple_has_the_airy_kernel(complex_field, rough_pupil, diameter, extent):
+    dimple = Dimple(diameter, 0.7, 0.8)
+    for pupil in (Pupil.circular(64), rough_pupil):
+        sensor = ZernikeSensor(pupil, dimple, extent=extent, tolerance=1e-14)
+        margin = sensor.window[0].start
+        for field in (pupil.amplitude, complex_field(pupil)):
+            exact = exact_reference(pupil, dimple, field, margin=margin)
+            np.testing.assert_allclose(sensor.reference_wave(field)[0], exact, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("masks", MASKS.values(), ids=MASKS)
@@ -76,18 +64,6 @@ def test_a_dozen_numbers_carry_the_reference_wave():
     assert one.rank == two.rank <= 40  # the phase of a dimple costs nothing
 
 
-def test_patch_with_a_ramp_of_phase_moves_the_kernel(complex_field):
-    pupil, diameter, margin = Pupil.circular(32), 2.2, 16
-    sensor = ZernikeSensor(pupil, Patch(diameter, tilted), extent=2, tolerance=1e-14)
-    field = complex_field(pupil)
-    # The ramp moves the kernel of the opening by a / (2 pi); the mask's change is that less the opening itself.
-    moved, centred = (
-        exact_reference(pupil, Dimple(diameter, np.pi), field, margin, shift) / -2
-        for shift in (np.divide(TILT, 2 * np.pi), (0, 0))
-    )
-    np.testing.assert_allclose(sensor.reference_wave(field)[0], moved - centred, rtol=0, atol=1e-12)
-
-
 def test_patch_equals_a_direct_fourier_sum_on_a_fine_grid(complex_field):
     pupil = Pupil.circular(16)
     # A Gaussian spot that is over within the patch, so that a plain sum over a Cartesian grid converges.
@@ -103,14 +79,6 @@ def test_patch_equals_a_direct_fourier_sum_on_a_fine_grid(complex_field):
     focal = to_v @ field @ to_u.T / 16**2
     summed = to_v.conj().T @ (change(u, u[:, np.newaxis]) * focal) @ to_u.conj() * 0.01**2
     np.testing.assert_allclose(sensor.reference_wave(field)[0], summed, rtol=0, atol=1e-12)
-
-
-def test_annular_patch_is_the_difference_of_two_dimples(pupil, complex_field):
-    ring = Patch(2.0, lambda u, v: np.where(np.hypot(u, v) < 0.5, 1, np.exp(0.9j)), breaks=[1.0])
-    waves = ZernikeSensor(pupil, ring, Dimple(2.0, 0.9), Dimple(1.0, 0.9), tolerance=1e-14).reference_wave(
-        complex_field(pupil)
-    )
-    np.testing.assert_allclose(waves[0], waves[1] - waves[2], rtol=0, atol=1e-12)
 
 
 def test_patch_of_several_rings_is_a_sum_of_airy_kernels(complex_field):
@@ -174,7 +142,7 @@ def test_no_patch_that_is_exact_draws_a_warning(tolerance):
         return np.where(np.hypot(u, v) < 0.5, 1j, np.where(np.hypot(u, v) < 0.8, 0, np.exp(0.1j * u)))
 
     masks = (
-        Patch(1.5, ramp), Patch(0.1, ramp), Patch(2, tilted), Patch(2.0, rings, breaks=[1.0, 1.6]),
+        Patch(1.5, ramp), Patch(0.1, ramp), Patch(2.0, rings, breaks=[1.0, 1.6]),
         Patch(1, lambda u, v: 1), Patch(1, lambda u, v: 1 - 1e-9 * u**2),
     )  # fmt: skip
     with warnings.catch_warnings():
@@ -220,20 +188,20 @@ def test_any_mask_of_the_protocol(pupil, complex_field):
 
 
 @pytest.mark.parametrize(
-    ("attributes", "error", "message"),
+    ("attribute", "value"),
     [
-        ({"breaks": 1.0}, TypeError, r"masks\[0\]\.breaks = 1\.0"),
-        ({"breaks": (3.0,)}, ValueError, r"masks\[0\]\.breaks = 3\.0"),
-        ({"diameter": np.nan}, ValueError, r"masks\[0\]\.diameter = nan"),
-        ({"n_samples": 1.5}, TypeError, r"masks\[0\]\.n_samples = 1\.5"),
-        ({"transmission": lambda u, v: np.nan * u}, ValueError, r"transmission of masks\[0\] holds"),
-        ({"transmission": lambda u, v: 1}, ValueError, r"transmission of masks\[0\] has shape \(\)"),
+        ("breaks", 1.0),
+        ("breaks", (3.0,)),
+        ("diameter", np.nan),
+        ("n_samples", 1.5),
+        ("transmission", lambda u, v: np.nan * u),
+        ("transmission", lambda u, v: 1),
     ],
 )
-def test_bad_masks_of_the_protocol_are_named(pupil, attributes, error, message):
+def test_bad_masks_of_the_protocol_are_named(pupil, attribute, value):
     mask = Ring()
-    vars(mask).update(attributes)
-    with pytest.raises(error, match=message):
+    setattr(mask, attribute, value)
+    with pytest.raises((TypeError, ValueError), match=rf"masks\[0\]\.{attribute}|{attribute} of masks\[0\]"):
         ZernikeSensor(pupil, mask)
 
 
@@ -288,8 +256,10 @@ def test_no_public_object_can_be_changed(rough_pupil, again):
     before = sensor.measure(phase), detector.expose(sensor.measure(phase), seed=1)
     band = again(zwfs.PolychromaticSensor(sensor, [600.0, 650.0]))
     mirror = again(zwfs.Mirror(rough_pupil, phase[np.newaxis]))
+    classic, modes = ZernikeSensor(rough_pupil, sensor.masks[0]), zernike_basis(rough_pupil, 3)
     methods = [
-        again(kind(sensor)) for kind in zwfs.RECONSTRUCTORS if kind.n_masks[1] > 1 and not needs_modes(kind)
+        again(kind(sensor if kind.n_masks[1] > 1 else classic, *([modes] if needs_modes(kind) else [])))
+        for kind in zwfs.RECONSTRUCTORS
     ]
     for thing in (sensor.pupil, sensor, *sensor.masks, sensor.factors, detector, band, mirror, *methods):
         assert_frozen(thing, type(thing).__name__)
@@ -300,22 +270,9 @@ def test_no_public_object_can_be_changed(rough_pupil, again):
 
 def test_objects_that_hold_arrays_compare_by_identity(shifted, pupil):
     other = ZernikeSensor(pupil, *shifted.masks)
-    pairs = (
-        (shifted.factors, other.factors),
-        (shifted.factors.pupil, other.factors.pupil),
-        (shifted, other),
-    )
-    for mine, others in pairs:
+    for mine, others in ((shifted.factors, other.factors), (shifted, other)):
         assert mine == mine
-        assert mine != others
         assert len({mine, others}) == 2
-
-
-def test_pieces_of_the_quadrature_add_up(pupil, complex_field, monkeypatch):
-    field, masks = complex_field(pupil), (Dimple(1.06, 1.5), Patch(2.0, ramp))
-    waves = ZernikeSensor(pupil, *masks).reference_wave(field)
-    monkeypatch.setattr(_lowrank, "_NODES", 50)
-    np.testing.assert_allclose(ZernikeSensor(pupil, *masks).reference_wave(field), waves, atol=1e-9)
 
 
 def test_masks_do_not_disturb_each_other(pupil, complex_field):
@@ -371,20 +328,6 @@ def test_reference_phase_of_a_flat_wavefront(pupil, phase):
     np.testing.assert_allclose(np.angle(wave), phase / 2 + np.sign(phase) * np.pi / 2, atol=1e-10)
 
 
-def test_positive_phase_delays_the_centre_and_not_the_rest():
-    # exp(+i theta) on axis: for a small positive bump and +pi/2 the frame gets brighter there.
-    pupil = Pupil.circular(40)
-    bump = np.zeros(pupil.shape)
-    bump[20, 20] = 0.01
-    plus, minus = (
-        ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
-        .measure([0 * bump, bump])
-        .swapaxes(0, 1)
-    )
-    assert (plus[1] - plus[0])[20, 20] > 0.005
-    assert (minus[1] - minus[0])[20, 20] < -0.005
-
-
 def test_axes_are_not_mixed_up():
     # An odd phase along x seen through a mask that differs from left to right: mirrored only together.
     pupil = Pupil.circular(24)
@@ -398,7 +341,7 @@ def test_axes_are_not_mixed_up():
     assert np.abs(left[0] - right[0]).max() > 0.01
 
 
-def test_piston_is_invisible(pupil, shifted, screens):
+def test_piston_is_invisible(shifted, screens):
     phase = screens(0.5)
     np.testing.assert_allclose(shifted.measure(phase + 1.234), shifted.measure(phase), rtol=0, atol=1e-13)
 
@@ -438,41 +381,16 @@ def test_wide_detector_shows_the_same_pupil(pupil, screens):
     np.testing.assert_allclose(frames[(..., *wide.window)], narrow, atol=1e-11)
 
 
-def test_batches_of_any_depth(shifted, screens, complex_field, pupil):
-    phase = screens(0.5, 6)
-    frames = shifted.measure(phase)
-    assert shifted.measure(phase[0]).shape == (2, 40, 40)
-    np.testing.assert_allclose(shifted.measure(phase[0]), frames[0], atol=1e-14)
-    np.testing.assert_allclose(shifted.measure(phase.reshape(1, 3, 2, 40, 40))[0, 1, 1], frames[3], atol=1e-14)
-    field = complex_field(pupil, 3, 2)
-    waves = shifted.propagate(field)
-    np.testing.assert_allclose(waves[2, 1], shifted.propagate(field[2, 1]), atol=1e-13)
-    back = shifted.adjoint(waves)
-    assert back.shape == field.shape
-    np.testing.assert_allclose(back[1, 0], shifted.adjoint(waves[1, 0]), atol=1e-13)
-
-
-def test_an_empty_batch_is_refused(shifted):
-    with pytest.raises(ValueError, match=r"phase has shape \(0, 40, 40\): expected at least one map"):
-        shifted.measure(np.empty((0, 40, 40)))
-    with pytest.raises(ValueError, match=r"field has shape \(0, 40, 40\): expected at least one field"):
-        shifted.propagate(np.empty((0, 40, 40)))
-
-
 def test_amplitudes_in_a_batch(shifted, screens, pupil):
     phase = screens(0.5, 4).reshape(2, 2, *pupil.shape)
     amplitude = np.random.default_rng(0).uniform(0.5, 1.5, phase.shape)
-    frames = shifted.measure(phase, amplitude)
-    np.testing.assert_allclose(frames[1, 0], shifted.measure(phase[1, 0], amplitude[1, 0]), atol=1e-13)
-    np.testing.assert_allclose(
-        shifted.measure(phase[0, 0], amplitude)[0, 1], shifted.measure(phase[0, 0], amplitude[0, 1]), atol=1e-13
+    both, one_phase, one_row = (
+        shifted.measure(*some) for some in ((phase, amplitude), (phase[0, 0], amplitude), (phase, amplitude[0]))
     )
-    np.testing.assert_allclose(
-        shifted.measure(phase, amplitude[0])[1, 1], shifted.measure(phase[1, 1], amplitude[0, 1])
-    )
-    np.testing.assert_allclose(
-        frames[0, 0], np.abs(shifted.propagate(amplitude[0, 0] * np.exp(1j * phase[0, 0]))) ** 2
-    )
+    for i, j in np.ndindex(2, 2):
+        for frames, turned, a in ((both, phase[i, j], i), (one_phase, phase[0, 0], i), (one_row, phase[i, j], 0)):
+            expected = np.abs(shifted.propagate(amplitude[a, j] * np.exp(1j * turned))) ** 2
+            np.testing.assert_allclose(frames[i, j], expected, atol=1e-12)
 
 
 def test_amplitude_is_that_of_the_pupil_unless_given(rough_pupil):
@@ -485,7 +403,9 @@ def test_amplitude_is_that_of_the_pupil_unless_given(rough_pupil):
 def test_single_precision_in_single_precision_out(shifted, screens, pupil):
     phase = screens(0.5)
     single = shifted.measure(phase.astype(np.float32))
-    assert single.dtype == np.float32
+    swapped = shifted.measure(phase.astype(">f4"))
+    assert single.dtype == swapped.dtype == np.float32
+    np.testing.assert_array_equal(swapped, single)
     np.testing.assert_allclose(single, shifted.measure(phase), atol=1e-5)
     field = np.exp(1j * phase)
     for function in (shifted.propagate, shifted.reference_wave):
@@ -493,21 +413,6 @@ def test_single_precision_in_single_precision_out(shifted, screens, pupil):
         assert waves.dtype == np.complex64
         np.testing.assert_allclose(waves, function(field), atol=1e-5)
     assert shifted.adjoint(waves).dtype == np.complex64
-
-
-def test_bytes_in_another_order_keep_their_precision(shifted, screens):
-    phase = screens(0.3).astype(">f4")
-    frames = shifted.measure(phase)
-    assert frames.dtype == np.float32
-    np.testing.assert_array_equal(frames, shifted.measure(phase.astype(np.float32)))
-    assert shifted.propagate(np.exp(1j * phase).astype(">c8")).dtype == np.complex64
-
-
-def test_fields_in_another_order_of_memory(shifted, complex_field, pupil):
-    field = complex_field(pupil, 2)
-    waves = shifted.propagate(field)
-    np.testing.assert_allclose(shifted.propagate(np.asfortranarray(field)), waves, atol=1e-12)
-    np.testing.assert_allclose(shifted.adjoint(np.asfortranarray(waves)), shifted.adjoint(waves), atol=1e-12)
 
 
 def test_what_lies_outside_the_pupil_does_not_matter(shifted, screens, pupil):
@@ -537,33 +442,27 @@ def test_phase_in_degrees_draws_a_warning(shifted, screens):
         shifted.measure(screens(19.0) + 1000)  # piston does not count
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda s: ZernikeSensor(s.pupil), ValueError, "masks is empty: expected at least one"),
-        (lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), extent=0.9), ValueError, r"extent = 0\.9: .*\[1, inf"),
-        (lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), tolerance=0), ValueError, "tolerance = 0"),
-        (lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), tolerance=1.0), ValueError, r"tolerance = 1\.0"),
-        (lambda s: ZernikeSensor(s.pupil, Patch(1, lambda u, v: 2.0)), ValueError, "reaches a modulus of 2"),
-        (lambda s: s.measure(np.zeros((40, 40)), -np.ones((40, 40))), ValueError, "amplitude reaches down to -1"),
-        (lambda s: s.measure(np.zeros((40, 40)), np.zeros((40, 40))), ValueError, "amplitude is 0 everywhere"),
-        (lambda s: s.measure(np.zeros((2, 40, 40)), np.ones((3, 40, 40))), ValueError, "amplitude"),
-        (lambda s: s.adjoint(np.ones((1, 40, 40))), ValueError, r"field has shape \(1, 40, 40\): .* 2, 40"),
-        (lambda s: s.measure(np.full((40, 40), 1e200)), ValueError, r"phase reaches a modulus of 1e\+200"),
-        (lambda s: s.measure(np.zeros((40, 40)), np.full((40, 40), 1e200)), ValueError, "amplitude reaches"),
-        (
-            lambda s: s.measure(np.zeros((40, 40), np.float32), np.full((40, 40), 1e30)),
-            ValueError,
-            "amplitude reaches a modulus of 1e",
-        ),
-        (lambda s: s.propagate(np.full((40, 40), 1e308)), ValueError, "field reaches a modulus"),
-        (lambda s: s.adjoint(np.full((2, 40, 40), 1e308)), ValueError, "field reaches a modulus"),
-        (lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), extent=1e6), ValueError, r"extent = 1e\+06"),
-    ],
-)  # fmt: skip
-def test_bad_input_is_named(shifted, call, error, message):
-    with pytest.raises(error, match=message):
-        call(shifted)
+FLAT = np.zeros((40, 40))
+REFUSED = {
+    "masks is empty": lambda s: ZernikeSensor(s.pupil),
+    "extent = 0.9": lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), extent=0.9),
+    "tolerance = 0": lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), tolerance=0),
+    "tolerance = 1": lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), tolerance=1.0),
+    "reaches a modulus of 2": lambda s: ZernikeSensor(s.pupil, Patch(1, lambda u, v: 2.0)),
+    "amplitude reaches down to -1": lambda s: s.measure(FLAT, FLAT - 1),
+    "amplitude is 0 everywhere": lambda s: s.measure(FLAT, FLAT),
+    "amplitude reaches a modulus of 1e": lambda s: s.measure(FLAT.astype(np.float32), FLAT + 1e30),
+    "phase and amplitude have shapes": lambda s: s.measure(np.zeros((2, 40, 40)), np.ones((3, 40, 40))),
+    "phase reaches a modulus": lambda s: s.measure(FLAT + 1e200),
+    "phase has shape": lambda s: s.measure(np.empty((0, 40, 40))),
+    "field has shape": lambda s: s.propagate(np.empty((0, 40, 40))),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_bad_input_is_named(shifted, message):
+    with pytest.raises(ValueError, match=message):
+        REFUSED[message](shifted)
 
 
 def test_pupil_of_a_single_row_is_a_pupil():

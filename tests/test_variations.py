@@ -5,28 +5,15 @@ from scipy.special import j1, jn_zeros
 import zwfs
 from studies.fig04_dimple_diameter import (
     DARK_RING,
-    TABLED,
     DimpleLight,
     contraction,
     diameter_curves,
-    iteration_curves,
     iteration_spectrum,
     measured_factor,
     mode_sensitivity,
-    other_curves,
-    sampled_diameters,
 )
 from studies.kit.curves import crossing
-from studies.kit.style import LOOKS
-from studies.phase_shift_pairs import (
-    DRAWN,
-    close_pairs,
-    compare_noise,
-    drawn_noise,
-    noise_of_pairs,
-    pair_maps,
-    phase_noise,
-)
+from studies.phase_shift_pairs import close_pairs, drawn_noise, pair_maps, phase_noise
 
 HALF = np.pi / 2
 
@@ -172,26 +159,6 @@ def test_noise_is_that_of_noisy_frames(pupil, screens, shifts):
     assert error < 0.01 * noise
 
 
-def test_noise_of_pairs_is_that_of_each_sensor(small):
-    screens = zwfs.power_law_screens(zwfs.zernike_basis(small, 10), 0.3, 2, seed=1)
-    noise = noise_of_pairs(small, 1.06, [1.0, HALF], {"flat": np.zeros((1, 16, 16)), "screens": screens})
-    assert list(noise) == ["photon noise, flat", "photon noise, screens", "read noise, flat"]
-    sensor = pair(small, 1.06)
-    expected = [phase_noise(sensor, screen).photon for screen in screens]
-    np.testing.assert_allclose(noise["photon noise, screens"][1], np.sqrt(np.mean(np.square(expected))))
-    np.testing.assert_allclose(
-        noise["read noise, flat"][1], np.sqrt(np.mean(phase_noise(sensor, np.zeros((16, 16))).read ** 2))
-    )
-
-
-def test_drawn_noise_is_compared_with_the_prediction(small):
-    rows = compare_noise(small, 1.06, {"flat": np.zeros((1, 16, 16))}, 1e6, 30, seed=2)
-    assert [(row.theta_a, row.theta_b) for row in rows] == list(DRAWN)
-    assert {row.name for row in rows} == {"photon noise, flat"}
-    for row in rows:
-        assert row.drawn == pytest.approx(row.expected, abs=5 * row.error + 0.1 * row.expected)
-
-
 def test_noise_grows_as_the_inverse_of_the_gap(small):
     screens = zwfs.power_law_screens(zwfs.zernike_basis(small, 10), 0.3, 1, seed=1)
     gaps, errors, noise = close_pairs(small, 1.06, [1e-2, 1e-3], screens).T
@@ -230,22 +197,6 @@ def test_diameter_curves(pupil, screens):
     assert curves.at("it", 1.95) == curves.mean("it")[1]
     assert 2.0 < curves.exceeds("it", 0.025) < 2.5
     assert curves.exceeds("it", 0.025, start=2.2) == 2.5
-
-
-def test_iteration_does_not_stop_early_and_the_other_methods_are_the_papers(small):
-    modes = zwfs.zernike_basis(small, 10)
-    screens = zwfs.power_law_screens(modes, 0.3, 1, seed=1)
-    curves = [iteration_curves(small, HALF, n, [1.0, 2.0], screens) for n in (5, 10)]
-    assert curves[1].at("PhaseShifted", 2.0) < curves[0].at("PhaseShifted", 2.0)
-    others = other_curves(small, modes, HALF, screens, n_iterations=3)
-    assert "PhaseShifted" not in others.errors
-    assert {"Linear", "Arcsine", "GerchbergSaxton", "GradientDescent"} <= set(others.errors) <= {*LOOKS}
-
-
-def test_diameters_are_finer_near_the_dark_ring():
-    diameters = sampled_diameters(0.5, 3.0, 0.1)
-    assert {*TABLED, 0.5, 3.0, 2.3} <= set(diameters)
-    assert np.diff(diameters[(diameters >= 2) & (diameters <= 2.6)]).max() == pytest.approx(0.1)
 
 
 def test_contraction_is_that_of_the_spectrum_and_the_iteration(small):

@@ -105,17 +105,21 @@ def closed_loop(n_pixels, seconds):
     return {"n_pixels": n_pixels, "time": time, "rate": 1 / time, "median error": float(np.median(errors[10:]))}
 
 
-def breakdown(n_pixels, seconds):
-    """Time of each part of one accelerated step, and of what comes before and after all steps."""
+def accelerated(n_pixels):
+    """Method at the settings for real time, frames of a screen, and what the method keeps for such frames."""
     sensor = ZernikeSensor(Pupil.circular(n_pixels), *DIMPLES)
     screen = screens_at(zernike_basis(sensor.pupil, 200), 0.8, 1, 2024, 7)[0]
     frames = sensor.measure(screen).astype(np.float32)
-    method = PhaseShifted(sensor, **REAL_TIME)
-    kind = Kind.of(frames)
-    constants = method.constants(kind)
+    method, kind = PhaseShifted(sensor, **REAL_TIME), Kind.of(frames)
+    return method, frames, kind, method.constants(kind)
+
+
+def breakdown(n_pixels, seconds):
+    """Time of each part of one accelerated step, and of what comes before and after all steps."""
+    method, frames, kind, constants = accelerated(n_pixels)
     model, core, acceleration = constants.model, constants.core, constants.acceleration
     operator, phasor = model.operator, model.flat
-    flat, batch = base.check_frames(sensor, frames)
+    flat, batch = base.check_frames(method.sensor, frames)
     state = method.begin(flat, None, constants)
     projected = operator.split_project(phasor)
     coefficients = projected @ core
@@ -124,7 +128,7 @@ def breakdown(n_pixels, seconds):
     found = method(frames)
     one = np.zeros(1, int)
     parts = {
-        "check of the frames": lambda: base.check_frames(sensor, frames),
+        "check of the frames": lambda: base.check_frames(method.sensor, frames),
         "signal and dimming": lambda: method.begin(flat, None, constants),
         "step: projection": lambda: operator.split_project(phasor) @ core,
         "step: extrapolation": lambda: acceleration.next(projected, replace(state), np),
@@ -140,12 +144,7 @@ def breakdown(n_pixels, seconds):
 
 def limit(n_pixels, seconds):
     """Time of an accelerated call, and of what no such call can do without: products, passes, arctangent."""
-    sensor = ZernikeSensor(Pupil.circular(n_pixels), *DIMPLES)
-    screen = screens_at(zernike_basis(sensor.pupil, 200), 0.8, 1, 2024, 7)[0]
-    frames = sensor.measure(screen).astype(np.float32)
-    method = PhaseShifted(sensor, **REAL_TIME)
-    kind = Kind.of(frames)
-    constants = method.constants(kind)
+    method, frames, _, constants = accelerated(n_pixels)
     operator = constants.model.operator
     phasor = np.ones((1, 2, *frames.shape[1:]), frames.dtype)
     coefficients = operator.split_project(phasor) @ constants.core

@@ -2,9 +2,12 @@ import inspect
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
+import nbformat
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -20,6 +23,11 @@ def new_reconstructor():
     text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
     path = r"`(zwfs/reconstructors/(?!__init__)\w+\.py)`"
     return re.search(rf"{path}.*?^```python\n(.*?)^```", text, re.M | re.S).groups()
+
+
+def code_of(page, language="python"):
+    """Blocks of code of a page of the book."""
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / "book" / page).read_text("utf-8"), re.S)
 
 
 def needs_modes(method):
@@ -58,6 +66,31 @@ def heed_signals():
     """Restore in a child the signals that a shell in the background (SIGINT) and nohup (SIGHUP) ignore."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
+
+
+def start_tool(root, *arguments, **streams):
+    """Start a command of the book on another project."""
+    code = (
+        "import pathlib, sys; from book._tools.__main__ import main; from book._tools.project import Project;"
+        f"sys.exit(main(sys.argv[1:], Project(pathlib.Path({str(root)!r}))))"
+    )
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.Popen(command, cwd=ROOT, preexec_fn=heed_signals, **streams)
+
+
+def glued(path, **values):
+    """Write a notebook that has glued these values, and printed something."""
+    outputs = [
+        nbformat.v4.new_output(
+            "display_data",
+            {"application/papermill.record/text/plain": repr(value)},
+            metadata={"scrapbook": {"name": name}},
+        )
+        for name, value in values.items()
+    ]
+    cell = nbformat.v4.new_code_cell("", outputs=[*outputs, nbformat.v4.new_output("stream", text="")])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), path)
 
 
 def wait_until(condition, seconds):
@@ -140,6 +173,15 @@ def complex_field():
         return rng.normal(size=(*batch, *pupil.shape)) + 1j * rng.normal(size=(*batch, *pupil.shape))
 
     return make
+
+
+def watch(page):
+    """Everything that a page of the browser says, and every address that it asks for."""
+    said, asked = [], []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    return said, asked
 
 
 @pytest.fixture(scope="module")

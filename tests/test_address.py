@@ -38,13 +38,7 @@ def content(root):
 @pytest.fixture
 def copy(tmp_path):
     (tmp_path / "notebooks").mkdir()
-    for name in (
-        "README.md",
-        "CITATION.cff",
-        "pyproject.toml",
-        "notebooks/identities.ipynb",
-        "notebooks/design.ipynb",
-    ):
+    for name in ("README.md", "CITATION.cff", "pyproject.toml", "notebooks/identities.ipynb"):
         shutil.copyfile(ROOT / name, tmp_path / name)
     return tmp_path
 
@@ -104,10 +98,7 @@ def test_a_cell_of_a_notebook_fetches_the_repository_on_colab_and_does_nothing_e
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        (
-            'repository = "https://github.com/zwfs.git"',
-            "repository = 'https://github.com/zwfs.git': expected https:",
-        ),
+        ('repository = "https://github.com/zwfs.git"', "repository = 'https://github.com/zwfs.git': expected"),
         ('repository = "https://github.com/a/b/"', "expected https://github.com/OWNER/NAME, or an empty string"),
         ('book = "https://example.org"', "expected https://SITE/ with a slash at its end"),
         ('doi = "https://doi.org/10.1/a"', "expected 10.NUMBER/NAME"),

@@ -1,11 +1,12 @@
 """The built book in a real browser, opened from the file system, as wide as a screen and as a phone."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import pytest
+
+from .conftest import watch
 
 ROOT = Path(__file__).parent.parent
 HTML = ROOT / "_build" / "html"
@@ -34,15 +35,6 @@ def address(name):
     return (HTML / name).as_uri()
 
 
-def watch(page):
-    """Everything that a page says, and everything that it asks of others than the file system."""
-    said, asked = [], []
-    page.on("console", lambda message: said.append(message.text))
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("request", lambda request: asked.append(request.url))
-    return said, asked
-
-
 def outside(asked):
     return [url for url in asked if not url.startswith(("file:", "data:", "blob:"))]
 
@@ -62,23 +54,15 @@ def window(request, browser):
     context.close()
 
 
-@dataclass(frozen=True)
-class Opened:
-    """A page, and what it said, asked and moved while it was loaded."""
-
-    page: Any
-    said: list[str]
-    asked: list[str]
-    moved: float
-
-
 @pytest.fixture(scope="module", params=PAGES)
 def opened(request, window):
+    """A page, and what it said, asked and moved while it was loaded."""
     page = window.new_page()
     said, asked = watch(page)
     page.goto(address(request.param))
     settle(page)
-    loaded = Opened(page, list(said), list(asked), page.evaluate("window.moved"))
+    moved = page.evaluate("window.moved")
+    loaded = SimpleNamespace(page=page, said=list(said), asked=list(asked), moved=moved)
     # What is folded is looked at too, and nothing while it changes its colour.
     page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
     page.add_style_tag(content="* { animation: none !important; transition: none !important }")

@@ -21,18 +21,6 @@ from zwfs.frames import files as camera
 FRAME = np.arange(600, dtype=np.int64).reshape(20, 30) % 250
 
 
-@pytest.mark.parametrize("dtype", [">i2", "<i2", ">u2", "u1", ">i4", ">f4", "<f8", ">f8"])
-def test_every_type_of_number_reads_the_same(tmp_path, dtype):
-    np.save(tmp_path / "a.npy", FRAME.astype(dtype))
-    fits.PrimaryHDU(FRAME.astype(dtype)).writeto(tmp_path / "a.fits")
-    for name in ("a.npy", "a.fits"):
-        file = camera.read(tmp_path / name)
-        assert file.images.dtype == np.float64
-        assert file.images.dtype.isnative
-        np.testing.assert_array_equal(file.images, FRAME[np.newaxis])
-        assert file.sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
-
-
 def test_unsigned_numbers_of_an_extension_are_read_with_their_full_scale(tmp_path):
     unit = fits.ImageHDU((FRAME + 40_000).astype(np.uint16), fits.Header({"WAVELEN": 633.0}))
     fits.HDUList([fits.PrimaryHDU(), unit]).writeto(tmp_path / "a.fits")
@@ -41,16 +29,11 @@ def test_unsigned_numbers_of_an_extension_are_read_with_their_full_scale(tmp_pat
     assert (file.full_scale, file.keyword("WAVELEN")) == (65535, 633)
 
 
-def test_two_images_in_two_extensions_are_both_read(tmp_path):
-    both = [fits.PrimaryHDU(), fits.ImageHDU(FRAME), fits.ImageHDU(FRAME + 1)]
-    fits.HDUList(both).writeto(tmp_path / "a.fits")
-    np.testing.assert_array_equal(camera.read(tmp_path / "a.fits").images, [FRAME, FRAME + 1])
-    for others in ([FRAME, FRAME], [FRAME[1:]]):
-        fits.HDUList([fits.PrimaryHDU(FRAME), *map(fits.ImageHDU, others)]).writeto(
-            tmp_path / "b.fits", overwrite=True
-        )
-        with pytest.raises(camera.FileError, match=r"b\.fits: images of shapes"):
-            camera.read(tmp_path / "b.fits")
+@pytest.mark.parametrize("others", [[FRAME, FRAME], [FRAME[1:]]])
+def test_three_images_or_two_shapes_are_refused(tmp_path, others):
+    fits.HDUList([fits.PrimaryHDU(FRAME), *map(fits.ImageHDU, others)]).writeto(tmp_path / "b.fits")
+    with pytest.raises(camera.FileError, match=r"b\.fits: images of shapes"):
+        camera.read(tmp_path / "b.fits")
 
 
 def test_compressed_files_are_read(tmp_path):
@@ -81,12 +64,8 @@ def column(name):
 
 NO_IMAGES = [
     (b"not a picture", "its first bytes are those of neither a FITS nor an NPY file"),
-    (b"SIMPLE  = nonsense", "a "),
-    (lambda: fits_bytes(fits.PrimaryHDU(FRAME))[:4000], "a broken FITS file"),
-    (lambda: npy_bytes(FRAME)[:300], "a broken NPY file"),
     (lambda: npy_bytes(np.array([{}], dtype=object)), "a broken NPY file"),
     (lambda: npy_bytes(FRAME + 1j), "its numbers are complex128"),
-    (lambda: gzip.compress(fits_bytes(fits.PrimaryHDU(FRAME)))[:200], "a broken gzip file"),
     (lambda: fits_bytes(fits.PrimaryHDU(), column("x")), "a FITS file without an image"),
     (lambda: fits_bytes(fits.PrimaryHDU(np.zeros((5, 20, 30)))), r"its shape is \(5, 20, 30\)"),
 ]
@@ -250,9 +229,11 @@ def test_notebook_refuses_such_an_output_before_any_work(folder, monkeypatch, na
 
 def test_bench_files_replace_only_those_of_a_bench(tmp_path):
     bench = Bench(n_pixels=40, gap=0.02)
-    before = [path.read_bytes() for path in write_bench(tmp_path, bench, seed=1).values()]
-    after = [path.read_bytes() for path in write_bench(tmp_path, bench, seed=2).values()]
-    assert before != after
+    before, after, again = (
+        [path.read_bytes() for path in write_bench(tmp_path, bench, n_bad=10, seed=seed).values()]
+        for seed in (1, 2, 2)
+    )
+    assert before != after == again
     fits.PrimaryHDU(FRAME).writeto(tmp_path / "dark.fits", overwrite=True)
     raw = (tmp_path / "dark.fits").read_bytes()
     with pytest.raises(ValueError, match=r"folder = .* holds a dark\.fits that the simulated bench did not write"):

@@ -36,13 +36,8 @@ def copy(tmp_path):
 def run(project, *command):
     """Run Python in a copy, with the modules of the copy."""
     path = os.pathsep.join(str(project.root / name) for name in ("", "notebooks", "book/_ext"))
-    done = subprocess.run(
-        [sys.executable, *command],
-        cwd=project.root,
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-    )
+    place = {"cwd": project.root, "env": os.environ | {"PYTHONPATH": path}}
+    done = subprocess.run([sys.executable, *command], **place, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
     return done.stdout
 
@@ -84,9 +79,8 @@ def test_a_new_figure_is_a_study_a_notebook_and_a_line(copy):
     lowest = float(table[-1]["Strehl ratio"])
     assert lowest == pytest.approx(np.exp(-1), abs=0.1)
     assert (result / "strehl_loss.png").exists()
-    assert f"At the largest input it is {lowest:.2f}" in re.sub(
-        "<[^>]*>", "", (result / "strehl_loss.html").read_text()
-    )
+    text = re.sub("<[^>]*>", "", (result / "strehl_loss.html").read_text())
+    assert f"At the largest input it is {lowest:.2f}" in text
     for folder in ("notebooks/studies", "notebooks/strehl_loss.ipynb"):
         run(copy, "-m", "ruff", "check", folder)
         run(copy, "-m", "ruff", "format", "--check", folder)
@@ -102,8 +96,8 @@ def test_a_new_reconstructor_is_a_file_and_an_entry(copy):
         package.write("RECONSTRUCTORS = tuple(dict.fromkeys((*RECONSTRUCTORS, WirtingerFlow)))\n")
     run(copy, "-c", FIGURE_3)
     tested = [f"tests/test_{name}.py" for name in ("reconstructors", "bad_input", "figures", "sensor")]
-    chosen = ["-k", "WirtingerFlow or look or can_be_changed", *tested]
-    passed = run(copy, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *chosen)
+    options = "-q", "-n", "0", "-p", "no:cacheprovider", "-k", "WirtingerFlow or look or can_be_changed"
+    passed = run(copy, "-m", "pytest", *options, *tested)
     assert int(re.search(r"(\d+) passed", passed)[1]) > 35
     run(copy, "-m", "ruff", "check", path)
     run(copy, "-m", "ruff", "format", "--check", path)
@@ -134,9 +128,8 @@ assert LOOKS["WirtingerFlow"].label == "wirtinger flow"
 def test_the_iterative_example_converges_to_the_phase(tmp_path, monkeypatch, shifted, pupil, screens, rms):
     (tmp_path / "wirtinger_flow.py").write_text(new_reconstructor()[1])
     monkeypatch.syspath_prepend(tmp_path)
-    method = zwfs.reconstructors.base.load("wirtinger_flow:WirtingerFlow")(
-        shifted, n_iterations=400, tolerance=1e-8
-    )
+    wirtinger_flow = zwfs.reconstructors.base.load("wirtinger_flow:WirtingerFlow")
+    method = wirtinger_flow(shifted, n_iterations=400, tolerance=1e-8)
     phase = screens(rms)
     found = method(shifted.measure(phase))
     assert found.converged.all()

@@ -14,7 +14,6 @@ from zwfs.frames import files as camera
 from zwfs.frames.pipeline import Optics, fit, predict_other, recover_phase, reduce_frames, steps
 from zwfs.frames.registration import (
     Image,
-    correlations,
     find_pupils,
     register,
     register_frames,
@@ -95,16 +94,6 @@ def test_register_refuses_a_shift_out_of_reach():
     inside = np.hypot(*(np.mgrid[:100, :100] - 49.5)) < 35
     with pytest.raises(ValueError, match="the end of the search"):
         register(np.roll(reference, 9, axis=0), reference, inside)
-
-
-def test_correlation_of_each_row_is_that_row_alone():
-    rng = np.random.default_rng(2)
-    first = rng.normal([[0], [100], [-7]], 1, (3, 50))
-    second = first[:, ::-1] + 0.5 * first + np.array([[3], [-50], [1000]])
-    expected = [np.corrcoef(*pair)[0, 1] for pair in zip(first, second, strict=True)]
-    np.testing.assert_allclose(correlations(first, second), expected, rtol=1e-10)
-    second[1] = 4
-    np.testing.assert_allclose(correlations(first, second), [expected[0], 0, expected[2]], rtol=1e-10)
 
 
 @pytest.mark.parametrize("illumination", [0.0, 0.5])
@@ -311,12 +300,17 @@ def test_order_without_a_poke_is_refused(screen):
 # Bad frames
 
 
-def test_frames_without_a_pupil_are_refused(recorded):
+def test_frames_without_two_equal_pupils_are_refused(recorded):
     _, masked, bare = recorded
     with pytest.raises(ValueError, match=r"empty\.fits: every pixel is 0: expected light"):
         register_frames([image(masked)], [image(np.zeros_like(bare), "empty.fits")])
     with pytest.raises(ValueError, match="bright regions as large as a pupil: expected 2"):
         register_frames([image(masked)], [image(np.hsplit(bare, 2)[0])])
+
+    left, right = np.hsplit(bare, 2)
+    small = ndimage.zoom(right, 0.9, order=1)
+    with pytest.raises(ValueError, match=r"the two pupils are 61\.\d and 6\d\.\d pixels wide"):
+        register_frames([image(left), image(right)], [image(left, "left"), image(small, "right")])
 
 
 @pytest.mark.parametrize(
@@ -327,16 +321,6 @@ def test_cut_pupil_is_refused(recorded, cut, side):
     _, masked, bare = recorded
     with pytest.raises(ValueError, match=f"is cut off at the {side}"):
         register_frames([image(masked[cut])], [image(bare[cut])])
-
-
-def test_pupils_of_different_size_are_refused(recorded):
-    _, _, bare = recorded
-    left, right = np.hsplit(bare, 2)
-    small = ndimage.zoom(right, 0.9, order=1)
-    with pytest.raises(
-        ValueError, match=r"the two pupils are 61\.\d and 6\d\.\d pixels wide: expected the same size"
-    ):
-        register_frames([image(left), image(right)], [image(left, "left"), image(small, "right")])
 
 
 def test_too_many_masked_points_are_refused(recorded):
@@ -354,7 +338,6 @@ def test_too_many_masked_points_are_refused(recorded):
         ({"pupil_centers": [[45, 45], [45, 137]]}, "pupil_centers without a pupil_diameter"),
         ({"pupil_centers": [[10, 45], [45, 137]], "pupil_diameter": 68}, "is cut off at the top"),
         ({"pupil_diameter": 7.9}, "pupil_diameter = 7.9"),
-        ({"pupil_diameter": np.nan}, "pupil_diameter = nan"),
         ({"pupil_diameter": 400}, "is cut off at the"),
         ({"exposure": 0}, "exposure = 0"),
     ],
@@ -365,17 +348,12 @@ def test_settings_out_of_range(recorded, settings, message):
         register_frames([image(masked)], [image(bare)], **settings)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"diameter": 0}, "diameter = 0"),
-        ({"phase_shifts": (1.5, 1.5 + 2 * np.pi)}, "expected two that differ by other than 0 mod 2 pi"),
-        ({"phase_shifts": (0.0, 1.0)}, "none of them 0"),
-        ({"leakage": 0.5}, "leakage = 0.5"),
-    ],
-)
-def test_optics_out_of_range(wrong, message):
-    with pytest.raises(ValueError, match=message):
+WRONG = [{"diameter": 0}, {"phase_shifts": (1.5, 1.5 + 2 * np.pi)}, {"phase_shifts": (0.0, 1.0)}, {"leakage": 0.5}]
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_optics_out_of_range(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
         Optics(**wrong)
 
 
@@ -389,20 +367,13 @@ def test_unknown_fit_is_refused_before_any_work(recorded, names):
 # The simulated bench
 
 
-SMALL = {"n_pixels": D, "gap": 0.02, "stop": 0.8}
-
-
-def bench_images(folder, bench, pistons, **settings):
-    files = {name: camera.read(path) for name, path in
-             write_bench(folder, bench, pistons, **settings).items()}  # fmt: skip
-    shared = [files["dark"]], [files["bad_pixels"]]
-    return files, camera.images([files["frame"]], *shared), camera.images([files["pupils"]], *shared)
-
-
 def test_bench_writes_what_the_pipeline_reads(tmp_path):
-    bench = Bench(**SMALL)
+    bench = Bench(n_pixels=D, gap=0.02, stop=0.8)
     commanded = segment_screens(bench, 0.3, 1, seed=2)[0]
-    files, frames, clear_frames = bench_images(tmp_path, bench, commanded, n_bad=40, seed=1)
+    written = write_bench(tmp_path, bench, commanded, n_bad=40, seed=1)
+    files = {name: camera.read(path) for name, path in written.items()}
+    shared = [files["dark"]], [files["bad_pixels"]]
+    frames, clear_frames = (camera.images([files[name]], *shared) for name in ("frame", "pupils"))
     assert files["frame"].keyword("WAVELEN") == 635
     assert files["frame"].keyword("DIMPLE") == 1.06
     assert fits.getheader(tmp_path / "frame.fits")["BITPIX"] == 16
@@ -416,16 +387,6 @@ def test_bench_writes_what_the_pipeline_reads(tmp_path):
     known = PhaseShifted(model.shifted)(model.normalise(bench.frames(commanded, 1))).phase
     # As good as one who knows where the pupils stand.
     assert error < segment_residual(model.pistons(known), commanded).std() + 0.03 < 0.18
-
-
-def test_bench_files_are_the_same_byte_for_byte(tmp_path):
-    bench = Bench(**SMALL)
-    contents = []
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        paths = write_bench(tmp_path / name, bench, n_bad=10, seed=4)
-        contents.append([path.read_bytes() for path in paths.values()])
-    assert contents[0] == contents[1]
 
 
 def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
@@ -450,7 +411,6 @@ def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
         assert header["CORR1"] == pytest.approx(found.correlation[0])
         assert (header["FILE1"], header["SHA1"], header["DATE-OBS"]) == ("frame.fits", "ab" * 32, "2023-05-01")
         assert header["CREATOR"].startswith("zwfs ")
-        assert not {"DATE", "CHECKSUM"} & set(header)
     with pytest.raises(ValueError, match="wavelength = 0"):
         camera.write_phase(tmp_path / "c.fits", found, 0)
     assert not (tmp_path / "c.fits").exists()
@@ -460,29 +420,21 @@ def test_phase_file_replaces_no_source_and_nothing_but_a_phase_map(tmp_path, rec
     _, masked, bare = recorded
     registered = register_frames([image(masked)], [image(bare)])
     found = recover_phase(reduce_frames(registered, Optics()))
+    np.save(tmp_path / "größe.npy", masked)
     monkeypatch.chdir(tmp_path)
-    np.save("größe.npy", masked)
-    raw, target = (tmp_path / "größe.npy").read_bytes(), tmp_path / "a.fits"
-    source = camera.read("größe.npy")
-    os.link("größe.npy", "hard.npy")
+    source, raw, target = camera.read("größe.npy"), Path("größe.npy").read_bytes(), tmp_path / "a.fits"
     (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir("elsewhere")
-    for name in ("../größe.npy", "../hard.npy"):
-        with pytest.raises(ValueError, match=r"output = .* is the input"):
-            camera.write_phase(name, found, 635.0, [source], overwrite=True)
+    monkeypatch.chdir("elsewhere")  # the name of the source is that in its folder
+    with pytest.raises(ValueError, match=r"output = .* is the input"):
+        camera.write_phase("../größe.npy", found, 635.0, [source], overwrite=True)
     target.write_text("precious")
     with pytest.raises(ValueError, match=r"output = .*a\.fits' exists and is not a phase map"):
         camera.write_phase(target, found, 635.0, [source])
     assert target.read_text() == "precious"
-    assert (tmp_path / "größe.npy").read_bytes() == (tmp_path / "hard.npy").read_bytes() == raw
+    assert (tmp_path / "größe.npy").read_bytes() == raw
     camera.write_phase(target, found, 635.0, [source], overwrite=True)
     assert fits.getheader(target)["FILE1"] == r"gr\xf6\xdfe.npy"
-    (tmp_path / "link.fits").symlink_to("a.fits")
-    camera.write_phase(tmp_path / "link.fits", found, 500.0)
-    assert (tmp_path / "link.fits").is_symlink()
-    assert fits.getheader(target)["WAVELEN"] == 500
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "a.fits", "elsewhere", "größe.npy", "hard.npy", "link.fits"]  # fmt: skip
+    assert {path.name for path in tmp_path.iterdir()} == {"a.fits", "elsewhere", "größe.npy"}
 
 
 # The real bench
@@ -522,10 +474,7 @@ def test_seal_frames_are_explained(seal_work):
     # One frame predicts the other one far better than the outlines alone let it.
     assert np.all(seal_work[-1].predicted > seal_work[0].predicted + 0.05)
     assert np.all(seal_work[-1].predicted > seal_work[-1].control + 0.25)
-
-
-@pytest.mark.slow
-def test_seal_images_hold_uneven_light_and_do_not_show_a_rotation(seal_work):
+    # Their light is uneven, and they do not show a rotation.
     measurement = seal_work[-1].result.measurement
     assert measurement.flux_ratio == pytest.approx((1.22, 1.02), abs=0.01)
     assert np.isnan(measurement.registered.placement.sigma[2:]).all()

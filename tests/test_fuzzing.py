@@ -280,32 +280,26 @@ def test_damaged_calibration_is_whole_or_refused_by_name(folder, calibration, da
 
 
 words = st.sampled_from(["0", "-1", "1", "nan", "1e999", "1.5", "9" * 30, "high", "", "EXPTIME", "frame.fits"])
-CALIBRATE = ["--dark", "--bad-pixels", "--diameter", "--phase-shifts", "--pupil-centers", "--pupil-diameter",
-             "--exposure", "--saturation", "--fit", "--iterations", "--tolerance"]  # fmt: skip
-RECONSTRUCT = ["--second", "--modes", "--photons", "--read-noise", "--keywords", "--saturation", "--workers",
-               "--largest-residual"]  # fmt: skip
+OPTIONS = {
+    "calibrate": "dark bad-pixels diameter phase-shifts pupil-centers pupil-diameter exposure saturation fit "
+    "iterations tolerance",
+    "reconstruct": "second modes photons read-noise keywords saturation workers largest-residual",
+}
 
 
 @examples
-@given(st.lists(st.tuples(st.sampled_from(RECONSTRUCT), st.lists(words, max_size=2)), max_size=2))
-def test_options_of_telemetry_are_used_or_refused(folder, bench, options):
-    given_options = [one for name, values in options for one in (name, *values)]
-    output = folder / "options.fits"
-    files = [bench["frame"], "--calibration", folder / "bench.npz", "-o", output]
-    code, messages = run(["reconstruct", *files, *given_options])
+@given(st.sampled_from([*OPTIONS]), st.data())
+def test_options_are_used_or_refused(folder, bench, tool, data):
+    known = st.sampled_from(OPTIONS[tool].split())
+    options = data.draw(st.lists(st.tuples(known, st.lists(words, max_size=4)), max_size=2))
+    output = folder / "options.npz"
+    if tool == "calibrate":
+        files = [output, "--frames", bench["frame"], "--pupils", bench["pupils"]]
+    else:
+        files = [bench["frame"], "--calibration", folder / "bench.npz", "-o", output]
+    code, messages = run([tool, *files, *(one for name, values in options for one in (f"--{name}", *values))])
     if code:
-        named = (name.lstrip("-").replace("-", "_") for name, _ in options)
-        check_refusal(code, messages, *named, *words.elements)
+        named = (name.strip("s").replace("-", "_") for name, _ in options)
+        check_refusal(code, messages, *named, *filter(None, words.elements), "fitted", "pixels wide")
     else:
         output.unlink()
-
-
-@examples
-@given(st.sampled_from(CALIBRATE), st.lists(words, max_size=4))
-@example("--dark", [""])
-def test_options_of_a_calibration_are_used_or_refused(folder, bench, name, values):
-    files = ["--frames", bench["frame"], "--pupils", bench["pupils"]]
-    code, messages = run(["calibrate", folder / "options.npz", *files, name, *values])
-    if code:
-        named = name.strip("-s").replace("-", "_"), *filter(None, values), "fitted", "pixels wide"
-        check_refusal(code, messages, *named)

@@ -257,9 +257,6 @@ def test_one_image_is_predicted_from_the_others(single):
     assert score.correlation[1] > upside_down + 0.2
 
 
-# Bad input
-
-
 # Real frames
 
 

@@ -38,11 +38,9 @@ def small_book(tmp_path):
 
 def start(root):
     command = [sys.executable, "-m", "book._tools", "book"]
-    environment = os.environ | {"PYTHONPATH": str(root)}
+    place = {"cwd": root, "env": os.environ | {"PYTHONPATH": str(root)}, "start_new_session": True}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen(
-        command, cwd=root, env=environment, start_new_session=True, preexec_fn=heed_signals, **pipes
-    )
+    return subprocess.Popen(command, preexec_fn=heed_signals, **place, **pipes)
 
 
 def build(root):

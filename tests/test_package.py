@@ -1,13 +1,10 @@
 """The package as a whole: what `import zwfs` imports, which names it has, and what type checkers learn of them."""
 
-import importlib
-import inspect
 import pkgutil
 import shutil
 import subprocess
 import sys
 import zipfile
-from functools import cached_property
 
 import pytest
 
@@ -73,40 +70,3 @@ def test_the_wheel_says_that_the_package_has_types(tmp_path):
     sources = (file for file in (ROOT / "zwfs").rglob("*") if file.suffix in (".py", ".typed"))
     assert held == {file.relative_to(ROOT).as_posix() for file in sources}
     assert "zwfs/py.typed" in held
-
-
-def functions(thing):
-    """The function itself, or the public methods and properties of a class and what it does when it is called."""
-    if inspect.isfunction(thing):
-        yield thing
-        return
-    for name, member in vars(thing).items():
-        if name.startswith("_") and name not in ("__init__", "__call__"):
-            continue
-        member = getattr(member, "__func__", member)  # of a class method
-        member = member.fget if isinstance(member, property) else member
-        member = member.func if isinstance(member, cached_property) else member
-        if inspect.isfunction(member) and member.__module__.startswith("zwfs"):
-            yield member
-
-
-def unannotated(function):
-    signature = inspect.signature(function)
-    hints = {name: parameter.annotation for name, parameter in signature.parameters.items()}
-    hints["return"] = signature.return_annotation
-    missing = {name for name, hint in hints.items() if hint is inspect.Signature.empty}
-    return sorted(missing - {"self", "cls"})
-
-
-@pytest.mark.parametrize("name", ["zwfs", *PUBLIC])
-def test_public_functions_are_annotated(name):
-    module = importlib.import_module(name)
-    own = [
-        thing
-        for key, thing in vars(module).items()
-        if not key.startswith("_")
-        and (key in getattr(module, "__all__", ()) or getattr(thing, "__module__", None) == name)
-    ]
-    things = [thing for thing in own if inspect.isclass(thing) or inspect.isfunction(thing)]
-    missing = {f.__qualname__: unannotated(f) for thing in things for f in functions(thing)}
-    assert {name: names for name, names in missing.items() if names} == {}

@@ -17,18 +17,11 @@ NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 @pytest.mark.parametrize(
     ("value", "limits"),
     [
-        (1, (1, 5)),
-        (5, (1, 5)),
         (np.int64(3), (1, 5)),
-        (0.0, (0.0, 4.0)),
         (4, (0.0, 4.0)),
-        (-2, (-6, 0.0)),
         ([0.1, 2], [(0.0, 4.0)]),
-        ([], [(0.0, 4.0), ...]),
         ((1, 2), [(1, 2)]),
-        ("low", ("low", "high")),
         (["low", "high"], [("low", "high")]),
-        ("any", str),
         ([], [str, ...]),
         (False, bool),
         ([[1.0, 2.0], [3, 4]], [[(0.0, 9.0)], ...]),
@@ -41,19 +34,12 @@ def test_values_within_limits_pass(value, limits):
 @pytest.mark.parametrize(
     ("value", "limits", "error", "message"),
     [
-        (0, (1, 5), ValueError, r"x = 0: expected an integer in \[1, 5\]"),
         (6, (1, 5), ValueError, r"x = 6: expected an integer in \[1, 5\]"),
         (3.0, (1, 5), TypeError, "x = 3.0: expected an integer, as in 3"),
-        (3.5, (1, 5), TypeError, "x = 3.5: expected an integer$"),
         (True, (0, 5), TypeError, "x = True: expected an integer"),
         ("3", (1, 5), TypeError, "x = '3': expected an integer"),
-        (None, (1, 5), TypeError, "x = None: expected an integer"),
-        (4.1, (0.0, 4.0), ValueError, r"x = 4.1: expected a finite number in \[0, 4\]"),
         (math.nan, (0.0, 4.0), ValueError, "x = nan: expected a finite number"),
         (math.inf, (0.0, math.inf), ValueError, "x = inf: expected a finite number"),
-        (True, (0.0, 4.0), TypeError, "x = True: expected a real number"),
-        ("1", (0.0, 4.0), TypeError, "x = '1': expected a real number"),
-        ([1.0], (0.0, 4.0), TypeError, r"x = \[1.0\]: expected a real number"),
         (1.0, [(0.0, 4.0)], TypeError, "x = 1.0: expected a list"),
         ("12", [(0, 4)], TypeError, "x = '12': expected a list"),
         ([], [(0.0, 4.0)], ValueError, r"x = \[\]: expected at least one value"),
@@ -72,18 +58,12 @@ def test_values_beyond_limits_are_refused(value, limits, error, message):
         check_parameters({"x": value}, x=limits)
 
 
-def test_limits_without_a_value_are_refused():
-    with pytest.raises(ValueError, match="y has limits but no value"):
-        check_parameters({"x": 1}, x=(0, 1), y=(0, 1))
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_every_parameter_of_a_notebook_has_a_meaning_and_limits(path):
     notebook = read(path)
     known = declared.parameters(notebook)
     assert known
-    assert [name for name, one in known.items() if not one.meaning] == []
-    assert [name for name, one in known.items() if one.limits is None] == []
+    assert [name for name, one in known.items() if not one.meaning or one.limits is None] == []
     # No limits for what is no parameter, and defaults within them.
     assert set(declared.study_of(notebook).LIMITS) == set(known)
     assert declared.accept({name: one.default for name, one in known.items()}, known) == {}
@@ -105,12 +85,7 @@ def with_default(written):
 
 @pytest.mark.parametrize(
     ("written", "value"),
-    [
-        ("np.pi", np.pi),
-        ("-np.pi / 2", -np.pi / 2),
-        ("0.3 * np.pi", 0.3 * np.pi),
-        ("[np.pi / 2, 1]", [np.pi / 2, 1]),
-    ],
+    [("-np.pi / 2", -np.pi / 2), ("0.3 * np.pi", 0.3 * np.pi), ("[np.pi / 2, 1]", [np.pi / 2, 1])],
 )
 def test_defaults_may_be_fractions_of_pi(written, value):
     assert declared.parameters(with_default(written))["angle"].default == value

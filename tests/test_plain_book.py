@@ -50,15 +50,12 @@ def test_claims_have_their_verdicts(plain_book):
     assert "The 21 claims" in read(plain_book / "book" / "index.html").article.get_text()
 
 
-def test_every_figure_of_the_paper_has_a_card_with_its_notebook(plain_book):
+def test_figures_have_cards_with_their_notebooks_and_the_address_leads_to_the_front_page(plain_book):
     for page in (plain_book / "notebooks").glob("fig*.html"):
         cards = read(page).select(".run-card")
         assert cards, page.name
         for link in (link for card in cards for link in card.select("a.download")):
             assert (page.parent / link["href"]).resolve().is_file()
-
-
-def test_pages_have_mathematics_and_the_address_leads_to_the_front_page(plain_book):
     assert (plain_book / "_static" / "mathjax" / "tex-chtml-full.js").is_file()
     assert 'url=book/index.html"' in (plain_book / "index.html").read_text("utf-8")
 
@@ -100,10 +97,8 @@ def launches(file):
 
 def test_book_without_an_address_promises_none(plain_book):
     for file in plain_book.glob("**/*.html"):
-        assert not launches(file), file.name
-        assert not [link for link in links(file) if re.search("executablebooks|/issues/new|/blob/", link)], (
-            file.name
-        )
+        public = [link for link in links(file) if re.search("executablebooks|/issues/new|/blob/", link)]
+        assert not launches(file) | {*public}, file.name
         assert not read(file).select("link[rel=canonical], meta[property='og:url'], meta[property='og:image']")
     assert "pip install .\n" in read(plain_book / "book" / "index.html").article.get_text()
     assert "git clone" not in read(plain_book / "book" / "checking.html").article.get_text()
@@ -154,13 +149,6 @@ def test_every_public_function_and_class_is_on_the_page_once(api_page):
                 package = module.__name__.split(".")[:-1]
                 places = [f"{'.'.join(package[:depth])}.{name}" for depth in range(1, len(package) + 1)]
                 assert sum(listed.count(place) for place in {*places, f"{module.__name__}.{name}"}) == 1, name
-
-
-def test_modules_are_sections_of_their_group(api_page):
-    group = api_page.find("section", id="reconstructors")
-    modules = [heading.get_text().rstrip("#") for heading in group.select("h3")]
-    assert "zwfs.reconstructors.phase_shifted" in modules
-    assert not [name for name in modules if "._" in name or not name.startswith("zwfs.reconstructors")]
 
 
 def test_docstrings_link_names_and_equations(api_page):

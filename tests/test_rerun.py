@@ -25,7 +25,7 @@ from book._tools.declared import ParameterError
 from book._tools.execute import NotebookError
 from book._tools.notebook import read
 from book._tools.project import REPAIR, Project
-from tests.conftest import alive, heed_signals, wait_until
+from tests.conftest import alive, heed_signals, start_tool, wait_until, watch
 
 ROOT = Path(__file__).parent.parent
 
@@ -129,37 +129,21 @@ def refused(project, *arguments):
         (["3"], "no notebook makes Figure 3: expected one of 1, 2"),
         (["fig01_smal"], "unknown notebook 'fig01_smal': did you mean 'fig01_small'?"),
         (["1", "-p", "wdth=2"], "unknown parameter 'wdth': did you mean 'width'?"),
-        (["1", "-p", "zzz=2"], "unknown parameter 'zzz': expected one of n, width, steps, seed"),
-        (["1", "-p", "n=1e0"], "n = 1.0: expected an integer, as in 1"),
-        (["1", "-p", "n="], "n = None: expected an integer"),
-        (["1", "-p", "width=.nan"], "width = nan: expected a finite number in [0, 4]"),
         (["1", "-p", "steps=[1, 10]"], "steps[1] = 10: expected an integer in [0, 9]"),
-        (["1", "-p", "steps=1"], "steps = 1: expected a list"),
         (["1", "-p", "steps=[1,"], "-p steps=[1,: expected the node content"),
         (["1", "-p", "n"], "-p n: expected name=value"),
         (["1", "-p", "n=1", "-p", "n=2"], "-p n=2: 'n' is given twice"),
-        (["1", "-p", "n =5"], "unknown parameter 'n ': did you mean 'n'?"),
-        (["1", "-p", "n=*a"], "aliases (*)"),
-        (["1", "-p", 'n=!!int "5"'], "tags (!)"),
         (["1", "-p", f"n={'1' * 5000}"], "Exceeds the limit"),
         (["1", "-p", f"n={'[' * 9000}"], "at most 8 deep"),
-        (["1", "-p", f"n={'[1],' * 9000}"], "expected at most 16384"),
-        (["1", "-p", f"n={'x' * 9000}"], ": expected an integer"),
         (["1", "-p", "n=\x1b[31m"], "special characters are not allowed"),
-        (["1", "-p", "n=2020-01-01"], "n = '2020-01-01': expected an integer"),
-        (["1", "-p", "n=\udcff"], "expected UTF-8"),
         (["-p", "n=1"], "name a figure"),
         (["1", "-f", "nowhere.yaml"], "-f nowhere.yaml: No such file"),
         (["1", "--output", "no/such/folder"], "is not a folder"),
-        (["1", "--unknown"], "unrecognized arguments: --unknown"),
         (["1", "-f", "/dev/zero"], "-f /dev/zero: expected a regular file"),
-        (["1", "-f", "."], "-f .: expected a regular file"),
-        (["1", "-f", "a" * 300], "File name too long"),
+        (["1", "-f", "a.yaml", "-f", "b.yaml"], "-f a.yaml -f b.yaml: expected one file"),
         (["1", "--jobs", "0"], "--jobs 0: expected at least 1"),
-        (["1", "--jobs", "two"], "argument --jobs: invalid int value: 'two'"),
         (["1", "--cluster", "nowhere"], "--cluster nowhere: expected an address, as in tcp://host:8786"),
         (["--line=1 -p n=10"], "n = 10: expected an integer in [1, 9]"),
-        (["--line=1 -p 'n=10"], "No closing quotation"),
         (["--line=1", "--list"], "--line replaces all other arguments"),
     ],
 )
@@ -172,16 +156,11 @@ def test_bad_requests_are_refused_before_anything_runs(project, arguments, messa
     [
         ("n: [1\n", "mine.yaml, line 2: "),
         ("- n\n- 2\n", "expected a mapping of names to values"),
-        ("", "expected a mapping of names to values"),
-        ("1: 2", "expected a mapping of names to values"),
         ("width: 1\n\nn: 2\nn: 3\n", 'mine.yaml, line 4: found duplicate key "n"'),
         ("n: !!python/object/apply:os.getpid []", "tags (!)"),
-        ("n: 20", "n = 20: expected an integer in [1, 9]"),
         ("n: 1\n---\nn: 2", "expected a single document"),
         ("n: &a [1]\nsteps: [*a, *a]\n", "mine.yaml, line 2: tags (!) and aliases (*) are not allowed"),
         ("".join(f"name{i}: 1\n" for i in range(60_000)), "expected at most 16384 bytes"),
-        ("".join(f"a{i}: 1\n" for i in range(1500)), "unknown parameter 'a0'"),
-        ("".join(f"{' ' * i}a:\n" for i in range(150)), "at most 8 deep"),
     ],
 )
 def test_bad_files_are_refused(project, text, message):
@@ -192,22 +171,11 @@ def test_bad_files_are_refused(project, text, message):
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [
-        ("1e-3", 1e-3),
-        ("1e3", 1000.0),
-        ("010", 10),
-        ("yes", "yes"),
-        ("1:30", "1:30"),
-        ("2020-01-01", "2020-01-01"),
-        ("'*.fits'", "*.fits"),
-        ("-.5", -0.5),
-        ("~", None),
-    ],
+    [("1e-3", 1e-3), ("1e3", 1000.0), ("010", 10), ("yes", "yes"), ("2020-01-01", "2020-01-01"), ("-.5", -0.5)],
 )
 def test_values_are_read_as_people_mean_them(text, value):
     found = declared.load(text, "here")
-    assert found == value
-    assert type(found) is type(value)
+    assert (found, type(found)) == (value, type(value))
 
 
 def test_command_line_wins_over_the_file(project, monkeypatch):
@@ -217,19 +185,6 @@ def test_command_line_wins_over_the_file(project, monkeypatch):
     rerun.rerun(project, ["fig01_small", "-f", str(project.root / "mine.yaml"), "-p", "n=6"])
     rerun.rerun(project, ["fig01", "-p", "width=1.5", "-p", "steps=[]"])
     assert made == [{"n": 6, "width": 2.0}, {"steps": []}]
-
-
-def test_one_file_of_parameters_is_taken(project):
-    assert "-f a.yaml -f b.yaml: expected one file" in refused(project, "1", "-f", "a.yaml", "-f", "b.yaml")
-
-
-def test_pipes_are_not_waited_for(project):
-    os.mkfifo(project.root / "pipe")
-    assert "expected a regular file" in refused(project, "1", "-f", str(project.root / "pipe"))
-
-
-def test_names_of_folders_hold_bytes_that_every_disk_takes():
-    assert len(rerun.folder_name("fig", {"name": "\U0001d54f" * 99}).encode()) < 255
 
 
 def test_the_recorded_command_gives_the_same_parameters():
@@ -292,6 +247,7 @@ def test_names_of_folders_tell_parameters_and_differ():
     assert rerun.folder_name("fig", one) != rerun.folder_name("fig", two)
     long = {"words": [f"../{index} $x" for index in range(99)]}
     assert re.fullmatch(r"[\w.=,+-]{1,90}", rerun.folder_name("fig", long))
+    assert len(rerun.folder_name("fig", {"name": "\U0001d54f" * 99}).encode()) < 255
 
 
 def test_folder_holds_all_that_was_made(ran):
@@ -323,16 +279,6 @@ def test_page_has_everything_in_it(ran):
     assert "check_parameters" not in plain
 
 
-def test_page_opens_without_network_and_complaint(ran, browser):
-    page, complaints = opened(browser, result(ran) / "fig01_small.html")
-    page.wait_for_selector("mjx-container svg")
-    widths = page.evaluate("[...document.images].map(image => image.naturalWidth)")
-    page.close()
-    assert complaints == []
-    assert widths
-    assert all(widths)
-
-
 def test_second_run_is_served_unless_something_changed(ran, monkeypatch, capsys):
     made = []
     monkeypatch.setattr(rerun, "make", lambda *arguments: made.append(arguments[2]) or 1.0)
@@ -358,28 +304,11 @@ def test_folders_of_others_are_not_overwritten(ran):
         rerun.rerun(ran, ["1", "-p", "width=3", "--force"])
 
 
-def test_failure_is_named_and_leaves_nothing(ran):
-    before = {file: file.read_bytes() for file in result(ran).iterdir()}
-    write(ran, "fig01_small", new_code_cell("light = 0\nraise ValueError('no light')"))
-    with pytest.raises(NotebookError) as caught:
-        rerun.rerun(ran, ["1", "-p", "width=3"])
-    assert "notebooks/fig01_small.ipynb failed in cell 6 of 6" in str(caught.value)
-    assert "the cell begins: light = 0" in str(caught.value)
-    assert "width = 3.0" in str(caught.value)
-    assert {file: file.read_bytes() for file in result(ran).iterdir()} == before
-    assert os.listdir(ran.build) == ["rerun"]
-
-
 def run_command(project, *arguments):
     """Start the command on a project in a terminal of its own."""
-    code = (
-        "import pathlib, sys; from book._tools.__main__ import main; from book._tools.project import Project;"
-        f"sys.exit(main(['rerun', *sys.argv[1:]], Project(pathlib.Path({str(project.root)!r}))))"
-    )
     ours, theirs = pty.openpty()
     termios.tcsetwinsize(ours, (24, 120))
-    command = [sys.executable, "-c", code, *arguments]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=theirs, stderr=theirs, preexec_fn=heed_signals)
+    process = start_tool(project.root, "rerun", *arguments, stdout=theirs, stderr=theirs)
     os.close(theirs)
     return process, ours
 
@@ -439,21 +368,13 @@ def test_a_killed_rerun_leaves_no_kernel_and_the_next_one_removes_its_pieces(pro
 
 def test_interruption_while_the_program_is_loaded_needs_no_traceback():
     command = [sys.executable, "-X", "importtime", "-m", "book._tools", "rerun", "--list"]
-    process = subprocess.Popen(
-        command,
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=heed_signals,
-    )
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True, preexec_fn=heed_signals)
     while "argparse" not in process.stderr.readline():  # one of the first, and NumPy is still to come
         assert process.poll() is None
     process.send_signal(signal.SIGINT)
-    said, errors = process.communicate(timeout=20)
+    errors = process.communicate(timeout=20)[1].splitlines()
+    assert [line for line in errors if not line.startswith("import time:")] == ["interrupted"]
     assert process.returncode == 1
-    assert [line for line in errors.splitlines() if not line.startswith("import time:")] == ["interrupted"]
-    assert said == ""
 
 
 def test_command_line_ends_with_2_and_one_line(capsys):
@@ -515,103 +436,69 @@ HOSTILE = {
     "code": "`` ` ` <b>bold</b> | $x$ {math}`y` *z* &lt;",
     "end": "</code></td></table></style><svg onload=document.title=666>",
 }
+# Shown in a table, and as if a notebook escaped nothing.
 SHOWN = """from studies.kit.tables import Table
+from IPython.display import Markdown, display
+for name in names:
+    if "include" not in name:  # a page may include files
+        display(Markdown(name))
 Table(["name", *names], [[name, *[""] * len(names)] for name in names])"""
-# As if a notebook escaped nothing.
-UNESCAPED = "from IPython.display import Markdown, display\nfor name in names:\n    display(Markdown(name))"
 
 
-def hostile_page(tmp_path, source):
-    """Make a page of hostile names, and return it and the names."""
-    project = make_project(tmp_path / "project")
-    secret = tmp_path / "secret.txt"
+def test_hostile_names_are_shown_as_they_are_and_the_page_runs_and_embeds_nothing_foreign(project, browser):
+    secret = project.root / "secret.txt"
     secret.write_text("the password")
     names = [name.replace("../../../SECRET", "../" * 20 + str(secret)[1:]) for name in HOSTILE.values()]
     limits = "from studies.kit.parameters import check_parameters\ncheck_parameters(globals(), names=[str, ...])"
-    write(project, "fig02_works", new_code_cell(source), defaults="names = []  # of files", limits=limits)
+    write(project, "fig02_works", new_code_cell(SHOWN), defaults="names = []  # of files", limits=limits)
     rerun.rerun(project, ["2", "-p", f"names={json.dumps(names)}"])
-    return result(project) / "fig02_works.html", names
-
-
-def opened(browser, file):
-    """Open a page, and return it with what it loaded and complained of."""
-    requests, complaints, page = [], [], browser.new_page()
-    page.on("request", lambda request: requests.append(request.url))
-    page.on("console", lambda message: complaints.append(message.text))
-    page.on("pageerror", lambda error: complaints.append(str(error)))
+    file = result(project) / "fig02_works.html"
+    page = browser.new_page()
+    _, asked = watch(page)  # the browser complains of what it does not run
     page.goto(file.as_uri())
     page.wait_for_load_state("networkidle")
-    assert [url for url in requests if not url.startswith("data:")] == [file.as_uri()]
-    return page, complaints
-
-
-def test_hostile_names_are_shown_as_they_are(tmp_path, browser):
-    file, names = hostile_page(tmp_path, SHOWN)
-    page, complaints = opened(browser, file)
-    assert complaints == []
+    page.wait_for_selector("mjx-container svg")
+    page.wait_for_timeout(200)
+    assert [url for url in asked if not url.startswith("data:")] == [file.as_uri()]
     assert page.title() == "Title of fig02_works"
     cells = page.locator(".cell_output td:first-child").all_inner_texts()
-    assert cells == [name.replace("\n", r"\n") for name in names]
+    assert cells[-len(names) :] == [name.replace("\n", r"\n") for name in names]
     told = page.locator("main > section > table td:nth-child(2), blockquote ~ table td:nth-child(2)").first
     assert json.loads(told.inner_text()) == names
-    assert page.locator("img, iframe, h1 ~ h1, a[href^=javascript]").count() == 0
-    page.close()
-    secret = (tmp_path / "secret.txt").read_bytes()
-    assert base64.b64encode(secret).decode() not in file.read_text()
-    assert secret.decode() not in file.read_text()
-
-
-def test_page_runs_and_embeds_nothing_foreign_even_if_a_notebook_escapes_nothing(tmp_path, browser):
-    file, _ = hostile_page(tmp_path, UNESCAPED)
-    page, _ = opened(browser, file)  # the browser complains of what it does not run
-    page.wait_for_timeout(200)
-    assert page.title() == "Title of fig02_works"
     assert page.locator("iframe, main script, a[href^=javascript], img:not([src^='data:'])").count() == 0
+    assert page.locator("td img, td iframe, td a").count() == 0
     page.close()
-    assert base64.b64encode(b"the password").decode() not in file.read_text()
+    text = file.read_text()
+    assert "the password" not in text
+    assert base64.b64encode(b"the password").decode() not in text
 
 
 @pytest.mark.slow
-def test_real_figure_with_a_nested_parameter(tmp_path):
-    target = tmp_path / "figure"
-    bench = {"n_rings": 2, "missing": [], "leakage": 0.1}
-    arguments = ["6", "-p", "n_pixels=40", "-p", f"bench={json.dumps(bench)}", "--output", str(target)]
-    rerun.rerun(Project(ROOT), arguments)
-    assert json.loads((target / rerun.RECORD).read_text())["changed"]["bench"] == bench
-    assert "n_rings" in (target / "fig06_reference.html").read_text()
-
-
-@pytest.mark.slow
-def test_real_figure_with_other_parameters(tmp_path):
-    target = tmp_path / "figure"
-    project = Project(ROOT)
-    rerun.rerun(project, ["1", "-p", "rms=0.3", "-p", "n_pixels=40", "--output", str(target)])
-    assert {f"fig01_sensor_layout.{kind}" for kind in ("html", "ipynb", "png", "pdf", "csv")} < set(
-        os.listdir(target)
-    )
-    assert len((target / "fig01_sensor_layout.csv").read_text().splitlines()) == 41
-    plain = re.sub(
-        r"<script>.*?</script>|<[^>]*>", "", (target / "fig01_sensor_layout.html").read_text(), flags=re.S
-    )
+def test_real_figure_has_its_files_and_the_numbers_of_equations(tmp_path):
+    rerun.rerun(Project(ROOT), ["1", "-p", "rms=0.3", "-p", "n_pixels=40", "--output", str(tmp_path / "figure")])
+    files = {file.suffix: file for file in (tmp_path / "figure").glob("fig01_sensor_layout.*")}
+    assert {".html", ".ipynb", ".png", ".pdf", ".csv"} <= set(files)
+    assert len(files[".csv"].read_text().splitlines()) == 41
+    plain = re.sub(r"<script>.*?</script>|<[^>]*>", "", files[".html"].read_text(), flags=re.S)
     assert "Figure 1 of the paper. Top" in plain
     assert re.search(r"interfering\s+waves \(\d+\)", plain), "equations have the numbers of the book"
 
 
-FEW = ["n_pixels=16", "n_screens=1"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("figure", "parameters"),
+    "words",
     [
         # Neither the inputs that the text quotes, nor the pairs of phase shifts that the figure points out.
-        ("identities", ["inputs=[4.0]", "n_modes=1", "n_shifts=5"]),
+        "identities inputs=[4.0] n_modes=1 n_shifts=5 n_pixels=16 n_screens=1",
         # Every method fails at every diameter.
-        ("4", ["n_screens_few=1", "rms=4", "n_iterations=1", "more_iterations=[1]", "step=2", "step_fine=0.3"]),
+        "4 rms=4 n_iterations=1 more_iterations=[1] step=2 step_fine=0.3 n_pixels=16 n_screens=1 n_screens_few=1",
+        # A nested parameter.
+        '6 n_pixels=40 bench={"n_rings":2,"missing":[],"leakage":0.1}',
     ],
 )
-def test_pages_of_unusual_parameters_have_no_gaps(tmp_path, capsys, figure, parameters):
-    values = [text for value in FEW + parameters for text in ("-p", value)]
+def test_pages_of_unusual_parameters_have_no_gaps(tmp_path, capsys, words):
+    figure, *parameters = words.split()
+    values = [text for value in parameters for text in ("-p", value)]
     rerun.rerun(Project(ROOT), [figure, *values, "--output", str(tmp_path / "figure")])
     assert capsys.readouterr().err == ""
 
@@ -722,6 +609,8 @@ def test_incomplete_notebooks_are_not_stored(project, capsys):
     assert main(["rerun", "2", "-p", "reconstructors=[leaves_kernels:Own]"], project) == 1
     assert "failed in cell 6 of 7" in capsys.readouterr().err
     assert len(os.listdir(project.build / "rerun")) == 1
+    before = {file: file.read_bytes() for file in result(project).iterdir()}
     write(project, "fig02_works", new_code_cell("import sys\nsys.exit()"))  # its last cell
     assert main(["rerun", "2", "--force"], project) == 1
     assert "RuntimeError: the cell ended Python" in capsys.readouterr().err
+    assert {file: file.read_bytes() for file in result(project).iterdir()} == before

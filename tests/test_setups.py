@@ -14,7 +14,7 @@ from book._tools.notebook import read
 from book._tools.project import Project
 from studies.fig03_dynamic_range import linearity_curves
 from studies.kit.parameters import Fields, check_parameters
-from studies.kit.setups import BASES, PUPILS, SCREENS, Noise, make_pupil, make_screens, screens_at
+from studies.kit.setups import BASES, PUPILS, SCREENS, Noise, make_pupil, make_screens
 from tests.test_camera import NO_IMAGES
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
 from zwfs.bench.model import Bench

@@ -3,7 +3,6 @@
 import csv
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +10,11 @@ from astropy.io import fits
 
 from studies.identities import direct_reference_wave
 
+from .conftest import ROOT, code_of
 from .vectors import make, packages
 
-ROOT = Path(__file__).parent.parent
 CASES = {case.name: case for case in make.cases()}
 AGREEMENT = {row.pop("case"): row for row in csv.DictReader(packages.AGREEMENT.open(encoding="utf-8"))}
-PAGE = (ROOT / "book" / "vectors.md").read_text("utf-8")
 
 
 @pytest.fixture(params=CASES, scope="module")
@@ -115,11 +113,7 @@ def test_packages_agree_as_the_book_states(case, package):
         assert error == pytest.approx(float(stated), rel=0.06)
 
 
-def python_blocks():
-    return re.findall(r"(?m)^```python\n(.*?)^```", PAGE, re.S)
-
-
-@pytest.mark.parametrize("code", python_blocks())
+@pytest.mark.parametrize("code", code_of("vectors.md"))
 def test_code_of_the_page_prints_what_the_page_says(code, capsys, monkeypatch):
     monkeypatch.chdir(ROOT)
     exec(compile(code, "book/vectors.md", "exec"), {})

@@ -423,9 +423,9 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
 def draw_model_errors(curves: Mapping[str, ErrorCurves], noise: NoiseCurves, threshold: float) -> Figure:
     """Median error against the input for frames that the model does not describe, for two methods."""
     figure, panels = plt.subplots(1, 2, figsize=(7, 4.6), sharey=True)
-    styles = [*OTHER_STYLES, {"color": LOOKS["Arcsine"].color, "marker": "s", "linestyle": "-"}]
+    styles = [*OTHER_STYLES, {"color": _INK, "marker": "s", "linestyle": "-"}]
     for axes, name in zip(panels, (ACCELERATED, LIKELY), strict=True):
-        for (kind, curve), style in zip(curves.items(), styles, strict=True):
+        for (kind, curve), style in zip(curves.items(), styles, strict=False):
             axes.plot(curve.rms, np.median(curve.errors[name], axis=1), label=kind, ms=5, **style)
         axes.fill_between(
             noise.rms, noise.median(name), 1e-9, color="#999999", alpha=0.3, lw=0, zorder=0.4,

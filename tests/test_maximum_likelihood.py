@@ -8,8 +8,10 @@ from zwfs import (
     Dimple,
     MaximumLikelihood,
     Patch,
+    Pupil,
     ZernikeSensor,
     cramer_rao,
+    power_law_screens,
     reconstruction_error,
     wrapped_residual,
     zernike_basis,
@@ -183,10 +185,10 @@ def test_modes_and_their_errors(pupil, modes):
 @pytest.mark.parametrize(("rms", "photons"), [(1.0, 1e3), (1.5, 1e4), (2.0, 1e5), (3.0, 1e5), (3.0, None)])
 def test_modes_are_at_least_as_good_as_points(rms, photons):
     """At the rim of these screens neighbours differ by more than pi."""
-    pupil = zwfs.Pupil.circular(48)
+    pupil = Pupil.circular(48)
     basis = zernike_basis(pupil, 120)
     sensor = pair(pupil, 1.06, 0.5, -0.5)
-    truth = zwfs.power_law_screens(basis, rms, 5, exponent=-2, seed=41)
+    truth = power_law_screens(basis, rms, 5, exponent=-2, seed=41)
     frames = sensor.measure(truth)
     if photons is not None:
         camera = Detector(pupil, photons * pupil.n_points)
@@ -208,10 +210,10 @@ def test_modes_are_at_least_as_good_as_points(rms, photons):
 def test_modes_on_pupils_with_gaps_and_corners():
     y, x = np.mgrid[:48, :48] - 23.5
     parts = (np.hypot(x, y) < 24) & (np.hypot(x, y) > 6) & (np.abs(x) > 1) & (np.abs(y) > 1)
-    quadrants, hexagon = zwfs.Pupil.from_amplitude(parts.astype(float)), zwfs.Pupil.hexagonal(48)
+    quadrants, hexagon = Pupil.from_amplitude(parts.astype(float)), Pupil.hexagonal(48)
     for pupil, n_modes, rms, seed in ((quadrants, 60, 2.0, 42), (hexagon, 100, 1.0, 25)):
         basis, sensor = zernike_basis(pupil, n_modes), pair(pupil, 1.06, 0.5, -0.5)
-        truth = zwfs.power_law_screens(basis, rms, 4, exponent=-2, seed=seed)
+        truth = power_law_screens(basis, rms, 4, exponent=-2, seed=seed)
         result = MaximumLikelihood(sensor, basis, n_starts=1)(sensor.measure(truth))
         assert result.consistent.all()
         assert reconstruction_error(pupil, result.phase, truth).max() < 1e-5

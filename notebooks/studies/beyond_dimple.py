@@ -19,14 +19,13 @@ from studies.beyond_range import (
     ACCELERATED,
     LIKELY,
     PLAIN,
-    RecoveryCurves,
     compared_methods,
     method_line,
     method_look,
 )
 from studies.fig04_dimple_diameter import DARK_RING, DiameterCurves, diameter_curves, iteration_spectrum
 from studies.kit import sweeps
-from studies.kit.curves import crossing
+from studies.kit.curves import ErrorCurves, crossing
 from studies.kit.methods import MASKS, opposite_dimples
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
@@ -239,12 +238,12 @@ def _fails_above(curve: DiameterCurves, name: str, threshold: float) -> str:
     return f"{passed:.3g}" if passed < np.inf else "never"
 
 
-def instruments_table(curves: Mapping[str, RecoveryCurves], threshold: float) -> Table:
+def instruments_table(curves: Mapping[str, ErrorCurves], threshold: float) -> Table:
     """Number of screens that each method recovers on the masks of instruments."""
     names = list(next(iter(curves.values())).errors)
     rows = []
     for mask, curve in curves.items():
-        n_screens = curve.n_starts.shape[1]
+        n_screens = curve.errors[names[0]].shape[1]
         shares = np.transpose([curve.recovered(name, threshold) for name in names])
         for rms, row in zip(curve.rms, shares, strict=True):
             counts = (f"{round(n_screens * share)} of {n_screens}" for share in row)
@@ -255,7 +254,7 @@ def instruments_table(curves: Mapping[str, RecoveryCurves], threshold: float) ->
 def numbers(
     curves: Mapping[float, DiameterCurves],
     limits: DimpleLimits,
-    masks: Mapping[str, RecoveryCurves],
+    masks: Mapping[str, ErrorCurves],
     threshold: float,
     settings: Mapping[str, float],
 ) -> dict[str, float | str]:

@@ -516,7 +516,7 @@ def test_tolerance_stops_early(make, method, screens, pupil):
     loose = make(method, n_iterations=500, tolerance=1e-3)[0](frames, history=True)
     tight = make(method, n_iterations=500, tolerance=1e-8)[0](frames)
     assert loose.converged.all()
-    assert np.all(loose.n_iterations < tight.n_iterations)
+    assert np.all((loose.n_iterations < tight.n_iterations) | (tight.n_iterations == 1))
     for history, n in zip(loose.history, loose.n_iterations, strict=True):
         change = pupil.gather(np.diff(history, axis=0))
         size = np.sqrt(np.mean(change**2, axis=1))

@@ -208,9 +208,9 @@ def test_maximum_likelihood_agrees_with_zwfs(compute, pupil, rms, seed, diameter
 @pytest.mark.parametrize(
     ("rms", "seed", "diameter", "shifts", "photons", "steps"),
     [
-        (2.0, 7, 1.06, (0.5, -0.5), None, 7),
-        (0.5, 3, 1.06, (0.5, -0.5), 3.0, 11),  # pixels without a photon, steps that raise the cost
-        (1.2, 9, 1.3, (0.4, -0.8), 30.0, 12),
+        (2.0, 7, 1.06, (0.5, -0.5), None, 2),
+        (0.5, 3, 1.06, (0.5, -0.5), 3.0, 8),  # pixels without a photon, steps that raise the cost
+        (1.2, 9, 1.3, (0.4, -0.8), 30.0, 9),
         (1.5, 1, 2.0, (0.65, -0.65), 310.0, 28),  # points that are reflected: compared at the end only
     ],
 )
@@ -221,13 +221,13 @@ def test_steps_of_maximum_likelihood_are_those_of_zwfs(
     made = compute(rms, seed, diameter, shifts, 2 + steps, likelihood=True, **noise)
     # From the phase from which the page starts.
     sensor = sensor_of(pupil, diameter, shifts)
-    start = zwfs.PhaseShifted(sensor, n_iterations=2, tolerance=0.0)(made["frames"]).phase
+    start = compute(rms, seed, diameter, shifts, 2, likelihood=True, **noise)["likelihood"]["phase"]
     method = zwfs.MaximumLikelihood(sensor, photons=photons, n_starts=1, n_iterations=steps)
     result = method(made["frames"], np.where(pupil.inside, start, 0), history=True)
     assert zwfs.reconstruction_error(pupil, made["likelihood"]["phase"], result.phase) < 1e-3
     if steps < 28:
         errors = zwfs.reconstruction_error(pupil, result.history, screen_of(modes, rms, seed))
-        np.testing.assert_allclose(made["likelihood"]["errors"][2:], errors, rtol=1e-3)
+        np.testing.assert_allclose(made["likelihood"]["errors"][2:], errors, rtol=1e-3, atol=3e-5)
 
 
 def test_noise_has_the_statistics_of_photons(compute, pupil):

@@ -246,6 +246,8 @@
     return { estimate, step: () => solvePoints(estimate, lightOf(estimate), frames, steps) };
   }
 
+  const accelerated = (problem) => phaseShifted(problem, extrapolated(problem));
+
   function angle(y, x) {
     if (x <= 0 || Math.abs(y) > SMALL * x) return Math.atan2(y, x);
     const t = y / x;
@@ -319,7 +321,7 @@
      linear, arcsine, shifted, accelerated, likelihood
                    estimate (field), residual (estimate less input on the circle, without piston, radian) and errors
                    (rms of the residual at the start and after each iteration, radian); null without a solution */
-  live.compute = ({ rms, seed, diameter, shifts, photons, iterations, accelerated, likelihood }) => {
+  live.compute = ({ rms, seed, diameter, shifts, photons, iterations, ...set }) => {
     const { phase, truth, strehl, focal } = wavefront(seed, rms);
     const model = dimple(diameter);
     const steps = shifts.map(live.step);
@@ -332,10 +334,10 @@
       linear: follow(linear(problem), truth, 0),
       arcsine: follow(arcsine(problem), truth, iterations),
       shifted: follow(phaseShifted(problem), truth, iterations),
-      accelerated: accelerated ? follow(phaseShifted(problem, extrapolated(problem)), truth, iterations) : null,
-      likelihood: likelihood ? follow(live.maximise(problem), truth, iterations) : null,
+      accelerated: set.accelerated ? follow(accelerated(problem), truth, iterations) : null,
+      likelihood: set.likelihood ? follow(live.maximise(problem), truth, iterations) : null,
     };
   };
 
-  Object.assign(live, { phaseShifted, compare });
+  Object.assign(live, { accelerated, compare });
 })();

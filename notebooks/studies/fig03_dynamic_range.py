@@ -129,7 +129,8 @@ def error_limits(
 
         return refined_limit(ratios, limits[name].value, threshold, width=0.15)
 
-    return limits | {name: refined(name) for name in REFINED if 0 < limits[name].value < np.inf}
+    finite = [name for name, limit in limits.items() if 0 < limit.value < np.inf]
+    return limits | {name: refined(name) for name in finite if name in REFINED}
 
 
 def saxton_by_width(

@@ -90,7 +90,7 @@ def refined_limit(
     for _ in range(4):
         x = middle * np.linspace(1 - width, 1 + width, 5)
         limit = fitted_limit(x, ratios(x), threshold, seed)
-        if x[0] < limit.value < x[-1]:
+        if abs(limit.value / middle - 1) < 0.99 * width:
             return limit
         middle = limit.value
     return Limit(start)

@@ -168,7 +168,7 @@ def arcsine(n: Numbers) -> Finding:
     """'about 0.3' is 0.2 to 0.4 rad rms."""
     measured = (
         f"up to 0.3 rad rms the error of the arcsine is at most {n.arcsine_over_linear:.0%} of the linear one. "
-        f"It exceeds 5 % of the input above about {n.arcsine_limit:.1f} rad rms, and is "
+        f"It exceeds 5 % of the input above about {n.arcsine_limit:.2f} rad rms, and is "
         f"{n.arcsine_ratio_at_05:.0%} of it at 0.5"
     )
     worse = "It does not beat the linear reconstructor everywhere below 0.3 rad rms."
@@ -193,9 +193,9 @@ def dynamic_range(n: Numbers) -> Finding:
     never = [f"{name} never stays within 5 %" for name, gain in gains.items() if not gain]
     repaired = (
         "If it keeps the modelled field where nothing is measured, Gerchberg-Saxton reaches "
-        f"{n.saxton_model_limit:.1f} (about {n.saxton_model_limit / n.linear_limit:.0f} times)"
+        f"{n.saxton_model_limit:.2f} (about {n.saxton_model_limit / n.linear_limit:.0f} times)"
     )
-    linear = f"largest inputs with an error within 5 %, in rad rms: linear about {n.linear_limit:.2f}"
+    linear = f"largest inputs with an error within 5 %, in rad rms: linear about {n.linear_limit:.3f}"
     measured = ". ".join([", ".join([linear, *reached]), *never, repaired])
     return first(
         measured,

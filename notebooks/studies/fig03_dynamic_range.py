@@ -201,7 +201,7 @@ def draw_linearity(
         mean, std = curves.mean(name), curves.std(name)[drawn]
         line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
         found = 0 < limits[name].value < np.inf
-        reach = f": {limits[name]} rad" if found else ""
+        reach = f": {limits[name].value:.2g} rad" if found else ""
         plain.plot(rms, mean[drawn], label=look.label + reach, **line)
         low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
         plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)

@@ -51,9 +51,9 @@ class Limit(NamedTuple):
     error: float = np.nan
 
     def __str__(self) -> str:
-        if not np.isfinite(self.error):
+        if not self.error > 0:  # NaN, or 0 from a single screen
             return f"about {self.value:.2g}"
-        digits = max(0, -int(np.floor(np.log10(max(self.error, 1e-6)))))  # one digit of the error
+        digits = max(0, -int(f"{self.error:.0e}"[-3:]))  # one digit of the error
         return f"{self.value:.{digits}f} ± {self.error:.{digits}f}"
 
     def over(self, other: Limit) -> Limit:

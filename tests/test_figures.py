@@ -26,7 +26,7 @@ from studies.fig04_dimple_diameter import Contraction, DiameterCurves
 from studies.identities import dimple_pairs
 from studies.kit import grids
 from studies.kit.bench import BenchCurves
-from studies.kit.curves import ErrorCurves
+from studies.kit.curves import ErrorCurves, Limit
 from studies.kit.grids import Grid
 from studies.kit.style import ALONE, DARK_PHASE_MAP, LOOKS, OTHER_STYLES, show_phase, use_style
 from studies.kit.variants import dark_color, variants
@@ -131,7 +131,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_vector_sensor": ((shifted, phase), ()),
         "draw_bench_layout": ((bench, commands, bench.frames(commands, seed=1), 635.0), ()),
         "draw_steps": ((pupil, phase, frames, dict.fromkeys([*two, "Arcsine"], phase)), ()),
-        "draw_linearity": ((curves, 0.05, two, 0.4), two),
+        "draw_linearity": ((curves, dict.fromkeys(two, Limit(0.2, 0.01)), 0.05, two, 0.4), two),
         "draw_saxton_widths": (({"narrow": saxton}, widths, 0.05), ["Linear", "GerchbergSaxton"]),
         "draw_convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in LOOKS},), LOOKS),
         "draw_estimates": ((pupil, phase, dict.fromkeys(two, phase)), ()),
@@ -328,13 +328,15 @@ def test_colours_that_share_a_figure_differ_for_every_reader(vision):
 
 
 def test_linearity_draws_the_means_and_marks_where_they_leave(curves):
-    figure = draw_linearity(curves, 0.05, ["Linear", "PhaseShifted"], rms_max=0.2)
+    limits = {"Linear": Limit(0.0612, 0.003), "PhaseShifted": Limit(np.inf)}
+    figure = draw_linearity(curves, limits, 0.05, ["Linear", "PhaseShifted"], rms_max=0.2)
     plain, ratio = figure.axes
     look = LOOKS["Linear"]
     np.testing.assert_allclose(drawn(plain, look).get_ydata(), curves.mean("Linear")[:3])
     np.testing.assert_allclose(drawn(ratio, look).get_ydata(), curves.mean("Linear")[1:] / curves.rms[1:])
     marks = [line.get_xdata()[0] for line in ratio.lines if len(line.get_xdata()) == 1]
-    assert marks == [pytest.approx(curves.dynamic_range("Linear", 0.05))]
+    assert marks == [0.0612]
+    assert "0.061 rad" in figure.legends[0].get_texts()[0].get_text()
 
 
 def test_methods_of_a_reader_get_looks_of_their_own(monkeypatch):

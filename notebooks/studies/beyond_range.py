@@ -53,12 +53,14 @@ PIXEL_ERROR = 0.01  # rad rms, from which the text calls the size of the pixels 
 _WITHOUT_NOISE = 0.0  # photons
 
 
-def compared_methods(sensor: ZernikeSensor, n_iterations: int, photons: float = 0.0) -> dict[str, Any]:
+def compared_methods(
+    sensor: ZernikeSensor, n_iterations: int, photons: float = 0.0, n_starts: int = 8
+) -> dict[str, Any]:
     """Return the paper's iteration, its accelerated form, and maximum likelihood, by name."""
     return {
         PLAIN: PhaseShifted(sensor, n_iterations=n_iterations),
         ACCELERATED: PhaseShifted(sensor, n_iterations=n_iterations, accelerate=True),
-        LIKELY: MaximumLikelihood(sensor, photons=photons or None),
+        LIKELY: MaximumLikelihood(sensor, photons=photons or None, n_starts=n_starts),
     }
 
 
@@ -69,7 +71,7 @@ def all_methods(sensor: ZernikeSensor, modes: NDArray, n_iterations: int, photon
         "Linear": Linear(single, modes),
         "Arcsine": Arcsine(single, n_iterations=n_iterations),
         **compared_methods(sensor, n_iterations, photons),
-        MODES: MaximumLikelihood(sensor, modes, photons=photons or None),
+        MODES: MaximumLikelihood(sensor, modes, photons=photons or None, n_starts=1),
     }
 
 
@@ -230,7 +232,7 @@ def _model_point(
     camera = FineCamera(sensor, modes, errors.n_subpixels)
     fine = np.where(camera.pupil.inside, screens_at(camera.modes, rms, n_screens, seed, task, exponent), 0)
     screens = camera.mean(fine)
-    methods = compared_methods(sensor, n_iterations)
+    methods = compared_methods(sensor, n_iterations, n_starts=1)  # no phase explains the frames
     return {
         (kind, name): reconstruction_error(sensor.pupil, methods[name](frames).phase, screens)
         for kind, frames in wrong_frames(sensor, errors, camera, fine, screens, seed).items()
@@ -365,15 +367,16 @@ def method_line(name: str) -> dict[str, Any]:
     return style | {"ms": 5, "lw": 1.6, "mfc": "#ffffff" if name == ACCELERATED else look.color}
 
 
-def _input_axes(axes: Axes, threshold: float, bottom: float) -> None:
+def _input_axes(axes: Axes, threshold: float, bottom: float, *, named: bool = True) -> None:
     """Logarithmic axes of the error against the input, with the line of recovered screens."""
     axes.set(xscale="log", yscale="log", xlabel="input (rad rms)", ylim=(bottom, 4))
     ends = np.array(axes.get_xlim())
     axes.plot(ends, threshold * ends, color=_INK, lw=1, ls=":", zorder=0.5)
-    axes.annotate(
-        f"{threshold:.0%}", (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points", color=_INK,
-        fontsize=9, va="center",
-    )  # fmt: skip
+    if named:
+        axes.annotate(
+            f"{threshold:.0%}", (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points", color=_INK,
+            fontsize=9, va="center",
+        )  # fmt: skip
     axes.set_xlim(ends)
     ticks = [tick for tick in (0.05, 0.1, 0.2, 0.5, 1, 2, 4) if ends[0] <= tick <= ends[1]]
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -399,8 +402,8 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
         light.plot(curve.rms, curve.median(LIKELY), **line)
         light.plot(curve.rms, curve.bound[LIKELY], label="_", **_BOUND)
         light.annotate(
-            _spaced(curve.photons), (curve.rms[0], curve.bound[LIKELY][0]), (0, 8),
-            textcoords="offset points", fontsize=9,
+            _spaced(curve.photons), (curve.rms[-1], curve.median(LIKELY)[-1]), (7, 0),
+            textcoords="offset points", fontsize=9, va="center",
         )  # fmt: skip
     light.set_title("maximum likelihood, by photons per point", fontsize=10)
     exact = noiseless.complete_up_to(LIKELY, threshold)
@@ -411,7 +414,7 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
             transform=light.transAxes,
         )  # fmt: skip
     for axes in (methods, light):
-        _input_axes(axes, threshold, bottom)
+        _input_axes(axes, threshold, bottom, named=axes is methods)
     handles, labels = methods.get_legend_handles_labels()
     [bound] = light.plot([], [], **_BOUND)
     figure.legend(

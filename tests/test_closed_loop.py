@@ -1,7 +1,16 @@
 import numpy as np
 import pytest
 
-from studies.closed_loop import FrozenFlow, follow_flow
+from studies.closed_loop import (
+    AlteredSensor,
+    FrozenFlow,
+    TunedLoops,
+    best_methods,
+    follow_flow,
+    linear_loops,
+    loop_growth,
+    tuned_loops,
+)
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
 
 PLUS, MINUS = Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2)
@@ -101,3 +110,99 @@ def test_the_power_falls_with_the_exponent(exponent):
     slope = np.polyfit(np.log(frequency[used]), np.log(power[used]), 1)[0]
     assert slope == pytest.approx(exponent, abs=0.1)
     assert power[frequency > 4.01].max() < 1e-20 * power.max()
+
+
+WIND = {"speed": 2.5, "cutoff": 3.0, "exponent": -2.0}
+LOOP = {"delay": 2, "stroke": 4.0}
+
+
+@pytest.fixture(scope="module")
+def small():
+    pupil = Pupil.circular(24)
+    return pupil, zernike_basis(pupil, 80), (ZernikeSensor(pupil, PLUS), ZernikeSensor(pupil, PLUS, MINUS))
+
+
+def test_an_unaltered_sensor_measures_the_same_and_counts_falling_intensities(small):
+    pupil, _, (sensor, _) = small
+    phase, step = FrozenFlow(pupil, 1.0, 3, seed=1)(0.0), 1e-6
+    plant = AlteredSensor(sensor)
+    np.testing.assert_allclose(pupil.gather(plant.measure(phase)), pupil.gather(sensor.measure(phase)), atol=1e-12)
+    wave = sensor.reference_wave(pupil.field(phase))[:, 0]
+    above, below = (np.abs(pupil.field(phase + change) + wave) ** 2 for change in (step, -step))
+    falls = pupil.gather(above - below) < 0
+    np.testing.assert_allclose(plant.reversed[0], falls.mean(axis=-1), atol=1 / pupil.n_points)
+    assert plant.reversed[0].min() > 0.05
+
+
+def test_altered_sensors_keep_what_they_promise(small):
+    pupil, _, (sensor, _) = small
+    phase = FrozenFlow(pupil, 1.2, 3, seed=1)(0.0)
+    rising = AlteredSensor(sensor, keep_signs=True)
+    below, above = (pupil.gather(rising.measure(phase + change * pupil.inside)) for change in (0.0, 1e-6))
+    assert np.all(above > below - 1e-12)  # a common piston turns the wave as well: nothing changes
+    kept, flat = AlteredSensor(sensor, keep_wave=True), np.zeros((1, *pupil.shape))
+    np.testing.assert_allclose(kept.measure(flat)[:, :, pupil.inside], sensor.measure(flat)[:, :, pupil.inside])
+    mean = [pupil.gather(one.measure(phase)).mean() - 1 for one in (kept, AlteredSensor(sensor))]
+    assert abs(mean[0] - mean[1]) > 0.01
+
+
+@pytest.mark.parametrize(("gain", "delay", "expected"), [(0.4, 1, 0.6), (0.4, 2, 0.4**0.5), (1.5, 2, 1.5**0.5)])
+def test_around_a_flat_wavefront_the_growth_is_that_of_the_integrator(small, gain, delay, expected):
+    pupil, modes, (sensor, _) = small
+    flat = np.zeros((1, *pupil.shape))
+    assert loop_growth(Linear(sensor, modes), modes, flat, gain, delay)[0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_the_growth_is_that_of_a_small_change_in_the_loop(small):
+    pupil, modes, (sensor, _) = small
+    linear, base, gain = Linear(sensor, modes), FrozenFlow(pupil, 0.9, 1, **WIND, seed=5)(0.0)[0], 0.4
+    estimate = {sign: linear(sensor.measure(base + sign * 1e-5 * modes)).phase for sign in (1, -1)}
+    response = pupil.gather((estimate[1] - estimate[-1]) / 2e-5) @ np.linalg.pinv(pupil.gather(modes))
+    change, growth = np.random.default_rng(1).standard_normal(len(modes)), []
+    for _ in range(400):
+        new = change - gain * change @ response
+        growth.append(np.linalg.norm(new) / np.linalg.norm(change))
+        change = new / np.linalg.norm(new)
+    found = loop_growth(linear, modes, base[np.newaxis], gain, 1)[0]
+    assert found == pytest.approx(np.exp(np.mean(np.log(growth[200:]))), rel=0.01)
+    assert found > 1
+
+
+def test_signs_not_the_wave_decide_which_loops_diverge_on_unseen_screens(small):
+    _, modes, (sensor, _) = small
+    flow = FrozenFlow(sensor.pupil, 0.8, 30, **WIND, seed=99)
+    found = linear_loops(Linear(sensor, modes), modes, flow, 40, gain=0.4, **LOOP)
+    closed = {name: run.closed().sum() for name, run in found.runs.items()}
+    assert closed["the sensor"] < 25
+    assert abs(closed["reference wave kept"] - closed["the sensor"]) <= 3
+    assert closed["signs kept"] == 30
+    assert found.ranking(found.growth) > 0.85
+    assert found.ranking(-found.wave) < 0.65
+
+
+@pytest.mark.parametrize("photons", [2.0, 200.0])
+def test_two_images_win_far_from_flat_and_cost_nothing_near_it(small, photons):
+    _, modes, sensors = small
+    trials = [
+        tuned_loops(sensors, modes, start, photons, [0.2], 8, 35, wind=WIND, seed=7, **LOOP)
+        for start in (0.3, 1.0)
+    ]
+    near, far = best_methods(trials)
+    assert 0.9 < near.ratio < 1.1
+    assert far.best == far.two
+    assert far.high < 0.7
+    assert np.median(trials[1].settled["LinearTwo"]) < 0.25
+    assert far.loops.closed("LinearTwo") > far.loops.closed("Linear")
+
+
+def test_the_best_method_is_chosen_on_other_screens_and_only_beyond_the_errors():
+    residual = np.geomspace(0.1, 0.2, 9)
+    noise = np.exp(0.05 * np.random.default_rng(1).standard_normal(9))
+    for factor, expected in ((2.0, "Linear"), (0.5, "PhaseShifted"), (1.0, None)):
+        settled = {"Linear": residual, "Arcsine": residual / 9}
+        settled |= dict.fromkeys(("LinearTwo", "PhaseShifted", "MaximumLikelihood"), factor * residual * noise)
+        chosen = {"Linear": 0.1, "Arcsine": 0.2, "LinearTwo": 0.2, "PhaseShifted": 0.1, "MaximumLikelihood": 0.2}
+        row = best_methods([TunedLoops(0.8, 2.0, {}, chosen, settled)])[0]
+        assert row.best == expected
+        assert row.ratio == pytest.approx(factor, rel=0.05)
+        assert row.low < factor < row.high

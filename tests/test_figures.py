@@ -18,7 +18,7 @@ from studies.bandwidth import BandCurves
 from studies.beyond_dimple import DimpleLimits
 from studies.beyond_range import RecoveryCurves
 from studies.calibration import Example, Shot
-from studies.closed_loop import LoopRun
+from studies.closed_loop import PLANTS, Divergence, LoopRun, TunedLoops
 from studies.dark_zone import IDEAL, Drift, DriftCurves
 from studies.design import PUBLISHED, DesignMap
 from studies.fig03_dynamic_range import draw_linearity, linearity_curves
@@ -91,7 +91,9 @@ def drawn_methods(curves, pupil, classic, shifted):
     trials = DiameterCurves(np.full(3, 0.5), dict.fromkeys(compared, np.full((3, 3), 0.1)), three)
     limits = DimpleLimits(three, np.full((3, 2), 0.5), np.full((3, 2, 4), 2.0))
     recovered = RecoveryCurves(three, trials.errors, np.ones((3, 3), bool), np.ones((3, 3), int))
-    loop = LoopRun(three, *np.full((3, 2, 3), 0.1))
+    loop = LoopRun(three, *np.full((2, 2, 3), 0.1))
+    in_loops = ["Linear", "LinearTwo", "PhaseShifted", "MaximumLikelihood"]
+    tuned = TunedLoops(0.5, 2.0, {}, {}, dict.fromkeys(in_loops, three))
     saxton = zwfs.GerchbergSaxton(shifted)
     bad = np.zeros(frames.shape, bool)
     bad[:, 10, 10] = True
@@ -159,8 +161,8 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_phase_map": ((found, 635.0), ()),
         "draw_gains": (([step] * 2, [0.1, 0.2]), ()),
         "draw_signs": ((measurement,), ()),
-        "draw_loop_runs": (({4.0: dict.fromkeys(two, loop)},), two),
-        "draw_capture": ((three, [dict.fromkeys(two, loop)] * 3), two),
+        "draw_linear_loops": ((Divergence(dict.fromkeys(PLANTS, loop), three, three, three),), ["Linear"]),
+        "draw_tuned_loops": (([tuned],), [name for name in in_loops if name != "LinearTwo"]),
     }
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from studies.kit.parameters import parameter_limits
@@ -18,23 +19,34 @@ from studies.kit.tables import Table
 from zwfs.detector import Detector
 from zwfs.loop import Mirror, close_loop
 from zwfs.pupil import Pupil
+from zwfs.reconstructors import Arcsine, Linear, MaximumLikelihood, PhaseShifted
+from zwfs.sensor import ZernikeSensor
 
 LIMITS = parameter_limits(
-    "n_modes diameter phase_shift n_screens exponent n_iterations",
+    "n_modes diameter phase_shift n_screens exponent rms",
     n_pixels=(16, 200),
-    rms=(0.01, 4.0),
+    n_screens_linear=(1, 1000),
     speed=(0.0, 100.0),
     cutoff=(1.0, 16.0),  # a pupil of the fewest pixels shows no higher frequency
     rate=(1.0, 1e5),
-    n_steps=(3, 100000),
+    n_steps=(6, 100000),
     gain=(0.01, 1.99),
+    gains=[(0.01, 1.99)],
     delay=(1, 10),
     stroke=(0.1, 100.0),
-    magnitudes=[(-5.0, 20.0)],
+    photons=[(0.01, 1e9)],
     photons_zero=(1.0, 1e12),
     inputs=[(0.01, 4.0)],
-    n_steps_capture=(3, 100000),
 )
+
+ONE_IMAGE = "Linear", "Arcsine"
+TWO_IMAGES = "LinearTwo", "PhaseShifted", "MaximumLikelihood"
+PLANTS = {
+    "the sensor": {},
+    "reference wave kept": {"keep_wave": True},
+    "signs kept": {"keep_signs": True},
+}
+"""Keywords of `AlteredSensor`, for each panel of the figure."""
 
 _BOX = 3.0  # D; the screens repeat after this length
 
@@ -93,25 +105,14 @@ class LoopRun:
     times: NDArray[np.float64]  # (n_steps,), second
     open_loop: NDArray[np.float64]  # (n_screens, n_steps), radian rms
     residual: NDArray[np.float64]  # (n_screens, n_steps), radian rms
-    strehl: NDArray[np.float64]  # (n_screens, n_steps)
-
-    @property
-    def last_third(self) -> slice:
-        """Last third of the steps, in which a loop counts as settled."""
-        return slice(self.times.size - max(1, self.times.size // 3), None)
 
     def settled(self) -> NDArray[np.float64]:
         """Rms of the residual over the last third of the steps, shape (n_screens,), radian rms."""
-        return np.sqrt(np.mean(self.residual[:, self.last_third] ** 2, axis=1))
+        return np.sqrt(np.mean(self.residual[:, -max(1, self.times.size // 3) :] ** 2, axis=1))
 
     def closed(self) -> NDArray[np.bool_]:
         """Whether each loop settled below half of the error at its start, shape (n_screens,)."""
         return self.settled() < self.open_loop[:, 0] / 2
-
-    def held(self) -> float:
-        """Median residual (radian rms) at which the closed loops settled, NaN if none closed."""
-        settled = self.settled()[self.closed()]
-        return float(np.median(settled)) if settled.size else np.nan
 
 
 def follow_flow(
@@ -120,132 +121,309 @@ def follow_flow(
     flow: FrozenFlow,
     n_steps: int,
     *,
+    plant: Any = None,
     rate: float = 1000.0,
     photons: float | None = None,
     **settings: Any,
 ) -> LoopRun:
     """Correct drifting screens with a Zernike sensor and a mirror of modes; `settings` are those of `close_loop`.
 
-    `photons` are those of a step; there is no noise if they are left out.
+    `photons` are those of a step, divided among the images; there is no noise if they are left out.
     """
     sensor = reconstructor.sensor
     camera = None if photons is None else Detector(sensor.pupil, photons / sensor.n_masks)
     times = np.arange(n_steps) / rate
     mirror = Mirror(sensor.pupil, modes)
-    record = close_loop(sensor, mirror, reconstructor, map(flow, times), camera=camera, **settings)
-    return LoopRun(times, record.open_loop, record.residual, record.strehl)
+    record = close_loop(plant or sensor, mirror, reconstructor, map(flow, times), camera=camera, **settings)
+    return LoopRun(times, record.open_loop, record.residual)
 
 
-def compare_loops(
-    reconstructors: Mapping[str, Any], modes: NDArray, flow: FrozenFlow, n_steps: int, **settings: Any
-) -> dict[str, LoopRun]:
-    """Close the loop with each of several reconstructors, on the same screens; see `follow_flow`."""
-    return {name: follow_flow(one, modes, flow, n_steps, **settings) for name, one in reconstructors.items()}
+class AlteredSensor:
+    """Sensor with one dimple whose reference wave keeps its strength, or whose response keeps its sign.
+
+    The intensity of a point rises with sin(a), where a + theta / 2 is its phase relative to the reference wave.
+    Its response is reversed where cos(a) < 0. To keep the sign, a stays within a quarter of a turn.
+    """
+
+    def __init__(self, sensor: ZernikeSensor, *, keep_wave: bool = False, keep_signs: bool = False) -> None:
+        self.sensor, self.keep_wave, self.keep_signs = sensor, keep_wave, keep_signs
+        self._theta = sensor.masks[0].phase
+        self._flat = np.abs(self.wave(np.zeros(sensor.pupil.shape)))
+        self.reversed: list[NDArray] = []  # of each measurement: share of reversed points, (n_screens,)
+
+    def wave(self, phase: NDArray) -> NDArray[np.complex128]:
+        """Reference wave, (..., ny, nx)."""
+        return self.sensor.reference_wave(self.sensor.pupil.field(phase))[..., 0, :, :]
+
+    def measure(self, phase: NDArray) -> NDArray[np.float64]:
+        """Frames of phases, (k, 1, ny, nx)."""
+        pupil, wave = self.sensor.pupil, self.wave(phase)
+        zero = np.angle(wave * np.exp(-0.5j * (self._theta + np.pi)))  # phase of the wave but for its mask
+        angle = phase - zero - self._theta / 2
+        self.reversed.append(np.mean(np.cos(pupil.gather(angle)) < 0, axis=-1))
+        if self.keep_wave:
+            wave = wave * (self._flat / np.maximum(np.abs(wave), 1e-12))
+        if self.keep_signs:
+            phase = np.clip(angle, -np.pi / 2, np.pi / 2) + zero + self._theta / 2
+        return (np.abs(pupil.field(phase) + wave) ** 2 * pupil.inside)[:, np.newaxis]
 
 
-StarRuns = Mapping[float, Mapping[str, LoopRun]]  # for each magnitude and method
-CaptureRuns = Sequence[Mapping[str, LoopRun]]  # for each error at the start, and for each method
+def loop_growth(
+    reconstructor: Any, modes: NDArray, phase: NDArray, gain: float, delay: int
+) -> NDArray[np.float64]:
+    """Largest factor per step by which a small change of the residual grows around each phase, (k, ny, nx).
+
+    The change of the commands is x' = x - g R J(phase) x. After a delay of d steps an eigenvalue m of R J gives
+    the factors z^d - z^(d-1) + g m = 0. R is an affine reconstructor, J the derivative of the frames.
+    """
+    sensor, mirror = reconstructor.sensor, Mirror(reconstructor.sensor.pupil, modes)
+    growth = []
+    for one in phase:
+        frames = sensor.measure(one)
+        pushed = frames + sensor.jacobian(np.broadcast_to(one, modes.shape), modes)
+        response = np.nan_to_num(reconstructor(pushed).phase - reconstructor(frames).phase)
+        factors = np.zeros((len(modes), delay + 1), complex)
+        factors[:, 0] = 1
+        factors[:, 1] -= 1
+        factors[:, -1] += gain * np.linalg.eigvals(mirror.fit(response))
+        growth.append(max(np.abs(np.roots(some)).max() for some in factors))
+    return np.array(growth)
 
 
-def draw_loop_runs(runs: StarRuns) -> Figure:
-    """Residual against time: a column for each star, a row for each method, and a line for each screen."""
-    n_rows = len(next(iter(runs.values())))
-    figure, panels = plt.subplots(
-        n_rows, len(runs), figsize=(7, 0.8 + 2.1 * n_rows), sharex=True, sharey=True, squeeze=False
+@dataclass(frozen=True)
+class Divergence:
+    """Linear loops with the sensor and with altered ones, and what the first frame shows of their end."""
+
+    runs: Mapping[str, LoopRun]  # for each of PLANTS
+    reversed: NDArray[np.float64]  # (n_screens, n_steps), share of the points, with the sensor
+    growth: NDArray[np.float64]  # (n_screens,), at the start
+    wave: NDArray[np.float64]  # (n_screens,), mean strength of the reference wave at the start; flat: 1
+
+    def ranking(self, values: NDArray) -> float:
+        """Return how probably a loop that diverges has a higher value than one that closes: 0.5 by chance."""
+        closed = self.runs["the sensor"].closed()
+        difference = values[~closed, np.newaxis] - values[closed]
+        return float(np.mean((difference > 0) + 0.5 * (difference == 0))) if difference.size else np.nan
+
+
+def linear_loops(
+    linear: Linear, modes: NDArray, flow: FrozenFlow, n_steps: int, *, gain: float, delay: int, **settings: Any
+) -> Divergence:
+    """Close linear loops with the sensor and with altered ones, without noise."""
+    plants = {name: AlteredSensor(linear.sensor, **keywords) for name, keywords in PLANTS.items()}
+    runs = {
+        name: follow_flow(linear, modes, flow, n_steps, plant=plant, gain=gain, delay=delay, **settings)
+        for name, plant in plants.items()
+    }
+    sensor, start = plants["the sensor"], flow(0.0)
+    waves = np.abs(linear.sensor.pupil.gather(np.stack([*sensor.wave(start), sensor.wave(0 * start[0])])))
+    strength = waves.mean(axis=-1)
+    growth = loop_growth(linear, modes, start, gain=gain, delay=delay)
+    return Divergence(runs, np.stack(sensor.reversed, axis=1), growth, strength[:-1] / strength[-1])
+
+
+def loop_methods(sensors: Sequence[ZernikeSensor], modes: NDArray, photons: float) -> dict[str, Any]:
+    """Return reconstructors for one and two images (`sensors`); `photons` per point are those of all images."""
+    one, two = sensors
+    methods = (
+        Linear(one, modes),
+        Arcsine(one, n_iterations=5, tolerance=0),
+        Linear(two, modes),
+        PhaseShifted(two, n_iterations=3, tolerance=0, accelerate=True),
+        MaximumLikelihood(two, photons=photons / 2, n_iterations=3, n_starts=1),
     )
-    for column, (magnitude, methods) in zip(panels.T, runs.items(), strict=True):
-        column[0].set_title(f"magnitude {magnitude:g}", fontsize=10)
-        column[-1].set_xlabel("time (ms)")
-        for axes, (name, run) in zip(column, methods.items(), strict=True):
-            time = 1e3 * run.times
-            axes.semilogy(time, run.residual.T, lw=1, color=LOOKS[name].color)
-            axes.semilogy(time, np.median(run.open_loop, axis=0), color="#777777", lw=1.5, ls="--")
-            axes.set_xlim(0, time[-1])
-    for axes, name in zip(panels[:, 0], methods, strict=True):
-        axes.set_ylabel(f"{LOOKS[name].name}\nresidual (rad rms)")
-    place = 0.97 * time[-1], 1.25 * run.open_loop.mean()
-    panels[-1, 0].text(*place, "no correction", ha="right", va="bottom", color="#777777")
+    return dict(zip((*ONE_IMAGE, *TWO_IMAGES), methods, strict=True))
+
+
+@dataclass(frozen=True)
+class TunedLoops:
+    """Loops of all methods for one input and one star, each with its best gain."""
+
+    start: float  # wavefront error at the start, radian rms
+    photons: float  # per point and step, all images together
+    gains: Mapping[str, float]
+    chosen: Mapping[str, float]  # residual with that gain on the screens that chose it, radian rms
+    settled: Mapping[str, NDArray]  # (n_screens,) residual on new screens, radian rms
+
+    def closed(self, method: str) -> int:
+        """Return how many loops settle below half of the error at the start."""
+        return int(np.count_nonzero(self.settled[method] < self.start / 2))
+
+
+def typical(settled: NDArray) -> float:
+    """Geometric mean of residuals, which counts loops that diverged without ignoring the others."""
+    return float(np.exp(np.mean(np.log(settled))))
+
+
+def tuned_loops(
+    sensors: Sequence[ZernikeSensor],
+    modes: NDArray,
+    start: float,
+    photons: float,
+    gains: Sequence[float],
+    n_screens: int,
+    n_steps: int,
+    *,
+    wind: Mapping[str, float],
+    seed: int,
+    **settings: Any,
+) -> TunedLoops:
+    """Choose the gain of each method on half as many screens, and evaluate it on new screens and noise."""
+    pupil = sensors[0].pupil
+    first, then = map(int, np.random.SeedSequence(seed).generate_state(2))
+    few = FrozenFlow(pupil, start, max(1, n_screens // 2), **wind, seed=first)
+    many = FrozenFlow(pupil, start, n_screens, **wind, seed=then)
+    settings |= {"photons": photons * pupil.n_points}
+
+    def settle(name: str, flow: FrozenFlow, gain: float, noise: int) -> NDArray:
+        return follow_flow(made[name], modes, flow, n_steps, gain=gain, seed=noise, **settings).settled()
+
+    made = loop_methods(sensors, modes, photons)
+    scores = {name: {gain: typical(settle(name, few, gain, first)) for gain in gains} for name in made}
+    best = {name: min(tried, key=lambda gain: tried[gain]) for name, tried in scores.items()}
+    settled = {name: settle(name, many, gain, then) for name, gain in best.items()}
+    chosen = {name: tried[best[name]] for name, tried in scores.items()}
+    return TunedLoops(start, photons, best, chosen, settled)
+
+
+@dataclass(frozen=True)
+class BestMethods:
+    """Best method with one and with two images, for one input and one star."""
+
+    loops: TunedLoops
+    one: str
+    two: str
+    ratio: float  # residual with two images over that with one, geometric mean over the screens
+    low: float  # the ratio less and plus twice its standard error
+    high: float
+
+    @property
+    def best(self) -> str | None:
+        """Best method, None if the two differ by less than twice the standard error."""
+        return self.two if self.high < 1 else self.one if self.low > 1 else None
+
+
+def best_methods(trials: Iterable[TunedLoops]) -> list[BestMethods]:
+    """Compare the best method with one image to that with two, screen by screen.
+
+    The screens that chose the gains also choose the methods.
+    """
+    rows = []
+    for loops in trials:
+        chosen = loops.chosen
+        one, two = (min(names, key=lambda name: chosen[name]) for names in (ONE_IMAGE, TWO_IMAGES))
+        logs = np.log(loops.settled[two] / loops.settled[one])
+        error = logs.std(ddof=1) / np.sqrt(logs.size) if logs.size > 1 else np.inf
+        low, middle, high = np.exp([logs.mean() - 2 * error, logs.mean(), logs.mean() + 2 * error])
+        rows.append(BestMethods(loops, one, two, float(middle), float(low), float(high)))
+    return rows
+
+
+_NAMES = {"Linear": "linear, one image", "LinearTwo": "linear, two images"}
+
+
+def method_name(method: str) -> str:
+    """Name of a method for readers, with the number of its images."""
+    look = LOOKS[method]
+    return _NAMES.get(method, f"{look.name}, {'one image' if method in ONE_IMAGE else 'two images'}")
+
+
+def draw_linear_loops(found: Divergence) -> Figure:
+    """Residual of linear loops against time: a panel for the sensor and each altered one, a line for a screen."""
+    figure, panels = plt.subplots(1, len(found.runs), figsize=(7, 3), sharex=True, sharey=True, squeeze=False)
+    for axes, (name, run) in zip(panels[0], found.runs.items(), strict=True):
+        closed = run.closed()
+        axes.semilogy(1e3 * run.times, run.residual[closed].T, lw=1, color="#999999")
+        axes.semilogy(1e3 * run.times, run.residual[~closed].T, lw=1, color=LOOKS["Linear"].color)
+        axes.set_title(f"{name}:\n{closed.sum()} of {closed.size} close", fontsize=10)
+        axes.set(xlabel="time (ms)", xlim=(0, 1e3 * run.times[-1]))
+    panels[0, 0].set_ylabel("residual (rad rms)")
     return figure
 
 
-def draw_capture(inputs: Sequence[float], runs: CaptureRuns) -> Figure:
-    """Fraction of the loops that close, and the residual of these, against the wavefront error at the start."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(7, 3.8))
-    for name in runs[0]:
-        look = LOOKS[name]
-        closed = [100 * np.mean(methods[name].closed()) for methods in runs]
-        left.plot(inputs, closed, label=look.label, **look.style)
-        right.semilogy(inputs, [methods[name].held() for methods in runs], label=look.label, **look.style)
-        points = [(start, value) for start, one in zip(inputs, runs, strict=True) for value in one[name].settled()]
-        right.plot(*np.transpose(points), ".", color=look.color, ms=4, alpha=0.5)
-    right.plot(inputs, inputs, color="#777777", lw=1, label="as at the start")
-    left.set(xlabel="error at the start (rad rms)", ylabel="loops that close (%)", ylim=(-3, 103))
-    right.set(xlabel="error at the start (rad rms)", ylabel="settled residual (rad rms)")
-    figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
+    """Residual against the error at the start: a panel for each star, a curve for each method at its best gain."""
+    stars = sorted({one.photons for one in trials})
+    figure, panels = plt.subplots(1, len(stars), figsize=(7, 3.8), sharex=True, sharey=True, squeeze=False)
+    for axes, photons in zip(panels[0], stars, strict=True):
+        some = sorted((one for one in trials if one.photons == photons), key=lambda one: one.start)
+        for name in some[0].settled:
+            style = LOOKS["Linear" if name == "LinearTwo" else name].style
+            if name == "LinearTwo":
+                style |= {"markerfacecolor": "white", "linestyle": "--"}
+            residual = [typical(one.settled[name]) for one in some]
+            axes.semilogy([one.start for one in some], residual, label=method_name(name), **style)
+        axes.set_title(f"{photons:g} photons per point", fontsize=10)
+        axes.set(xlabel="error at the start (rad rms)", xticks=[one.start for one in some])
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("")
+    panels[0, 0].set_ylabel("residual (rad rms)")
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
 
-def star_columns(runs: StarRuns) -> dict[str, NDArray]:
-    """Columns of the figure: the median residual for each star and method."""
-    columns = {}
-    for magnitude, methods in runs.items():
-        for name, run in methods.items():
-            columns["time (s)"] = run.times
-            columns[f"{name}, magnitude {magnitude:g}: median (rad rms)"] = np.median(run.residual, axis=0)
+def linear_columns(found: Divergence) -> dict[str, NDArray]:
+    """Columns of the figure: the residual of each loop, and the share of points with a reversed response."""
+    columns = {"time (s)": found.runs["the sensor"].times}
+    for name, run in found.runs.items():
+        columns |= {f"{name}, screen {k}: residual (rad rms)": one for k, one in enumerate(run.residual)}
+    return columns | {f"screen {k}: reversed points": one for k, one in enumerate(found.reversed)}
+
+
+def tuned_columns(trials: Sequence[TunedLoops]) -> dict[str, Sequence[float]]:
+    """Columns of the figure: gain, residual and closed loops of each method, for each input and star."""
+    columns = {
+        "start (rad rms)": [one.start for one in trials],
+        "photons per point": [one.photons for one in trials],
+    }
+    for name in trials[0].settled:
+        columns[f"{name}: gain"] = [one.gains[name] for one in trials]
+        columns[f"{name}: residual (rad rms)"] = [typical(one.settled[name]) for one in trials]
+        columns[f"{name}: loops that close"] = [float(one.closed(name)) for one in trials]
     return columns
 
 
-def capture_columns(inputs: Sequence[float], runs: CaptureRuns) -> dict[str, Sequence[float]]:
-    """Columns of the figure: the fraction of loops that close, and their residual, for each start."""
-    columns = {"start (rad rms)": inputs}
-    for name in runs[0]:
-        columns[f"{name}: loops that close"] = [float(np.mean(one[name].closed())) for one in runs]
-        columns[f"{name}: median residual of these (rad rms)"] = [one[name].held() for one in runs]
-    return columns
-
-
-def stars_table(runs: StarRuns, photons: Mapping[float, float]) -> Table:
-    """Return how many loops close, and the residual and the Strehl ratio of these, for each star and method."""
-    return Table(
-        [
-            "magnitude",
-            "photons per step",
-            "reconstructor",
-            "loops that close",
-            "their residual (rad rms)",
-            "their Strehl ratio",
-        ],
-        [
-            [
-                f"{magnitude:g}",
-                f"{photons[magnitude]:.2g}",
-                LOOKS[name].name,
-                f"{np.count_nonzero(run.closed())} of {len(run.residual)}",
-                f"{run.held():.2g}",
-                f"{np.median(run.strehl[run.closed(), run.last_third]):.2f}" if run.closed().any() else "–",
-            ]
-            for magnitude, methods in runs.items()
-            for name, run in methods.items()
-        ],
+def best_table(rows: Sequence[BestMethods]) -> Table:
+    """Return the best method for each input and star, and what the second image gains."""
+    header = (
+        "start (rad rms)",
+        "photons per point",
+        "best method",
+        "residual: two images / one",
+        "loops that close",
     )
+    cells = []
+    for row in rows:
+        loops, best = row.loops, method_name(row.best) if row.best else "one or two images"
+        closed = f"{loops.closed(row.two)} and {loops.closed(row.one)} of {loops.settled[row.one].size}"
+        ratio = f"{row.ratio:.2f} ({row.low:.2f} to {row.high:.2f})"
+        cells.append([f"{loops.start:g}", f"{loops.photons:g}", best, ratio, closed])
+    return Table(header, cells)
 
 
 def numbers(
-    stars: StarRuns, lag: LoopRun, inputs: Sequence[float], runs: CaptureRuns, settings: Mapping[str, float]
+    found: Divergence, rows: Sequence[BestMethods], settings: Mapping[str, float]
 ) -> dict[str, float | str]:
-    """Return settings, share and residual of the loops that close, and the error up to which all close.
-
-    `lag` is the loop without noise.
-    """
-    found = dict(settings) | {"faintest": max(stars), "n_screens": len(lag.residual), "lag": lag.held()}
-    bright, faint = stars[min(stars)], stars[max(stars)]
-    for name in bright:
-        found |= {
-            f"closed_{name}": max(int(one[name].closed().sum()) for one in stars.values()),
-            f"bright_{name}": bright[name].held(),
-            f"faint_{name}": faint[name].held(),
+    """Return the loops that close, what ranks them, and what the second image gains."""
+    names = dict(zip(("sensor", "wave", "signs"), PLANTS, strict=True))
+    closed, run = {key: found.runs[name].closed() for key, name in names.items()}, found.runs["the sensor"]
+    residual = [{name: typical(one) for name, one in row.loops.settled.items()} for row in rows]
+    lost, starts = run.residual[~closed["sensor"]], {row.loops.start for row in rows}
+    unequal = [row.loops.start for row in rows if row.best is not None]
+    others = [row.loops.start for row in rows if row.best != row.two]
+    return rounded(
+        dict(settings)
+        | {f"closed_{key}": np.count_nonzero(one) for key, one in closed.items()}
+        | {
+            "n_loops": len(run.residual),
+            "rank_growth": found.ranking(found.growth),
+            "rank_wave": found.ranking(-found.wave),
+            "reversed_start": found.reversed[:, 0].mean(),
+            "lowest_lost": np.median(lost.min(axis=1)) if lost.size else np.nan,
+            "equal_to": max((start for start in starts if start < min(unequal, default=np.inf)), default=np.nan),
+            "two_from": min((start for start in starts if start > max(others, default=0)), default=np.nan),
+            "linear_two_excess": max(one["LinearTwo"] / min(one.values()) for one in residual) - 1,
+            "iteration_excess": max(one["PhaseShifted"] / one["LinearTwo"] for one in residual) - 1,
         }
-    for name in runs[0]:
-        closing = [value for value, one in zip(inputs, runs, strict=True) if one[name].closed().all()]
-        found[f"all_close_{name}"] = max(closing, default=0.0)
-    return rounded(found)
+    )

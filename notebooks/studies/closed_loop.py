@@ -147,11 +147,12 @@ class AlteredSensor:
 
     def __init__(self, sensor: ZernikeSensor, *, keep_wave: bool = False, keep_signs: bool = False) -> None:
         self.sensor, self.keep_wave, self.keep_signs = sensor, keep_wave, keep_signs
-        self._theta = sensor.masks[0].phase
+        dimple: Any = sensor.masks[0]
+        self._theta = dimple.phase
         self._flat = np.abs(self.wave(np.zeros(sensor.pupil.shape)))
         self.reversed: list[NDArray] = []  # of each measurement: share of reversed points, (n_screens,)
 
-    def wave(self, phase: NDArray) -> NDArray[np.complex128]:
+    def wave(self, phase: NDArray) -> NDArray[np.complexfloating]:
         """Reference wave, (..., ny, nx)."""
         return self.sensor.reference_wave(self.sensor.pupil.field(phase))[..., 0, :, :]
 
@@ -207,7 +208,7 @@ class Divergence:
 
 
 def linear_loops(
-    linear: Linear, modes: NDArray, flow: FrozenFlow, n_steps: int, *, gain: float, delay: int, **settings: Any
+    linear: Any, modes: NDArray, flow: FrozenFlow, n_steps: int, *, gain: float, delay: int, **settings: Any
 ) -> Divergence:
     """Close linear loops with the sensor and with altered ones, without noise."""
     plants = {name: AlteredSensor(linear.sensor, **keywords) for name, keywords in PLANTS.items()}
@@ -373,7 +374,7 @@ def linear_columns(found: Divergence) -> dict[str, NDArray]:
 
 def tuned_columns(trials: Sequence[TunedLoops]) -> dict[str, Sequence[float]]:
     """Columns of the figure: gain, residual and closed loops of each method, for each input and star."""
-    columns = {
+    columns: dict[str, Sequence[float]] = {
         "start (rad rms)": [one.start for one in trials],
         "photons per point": [one.photons for one in trials],
     }
@@ -409,7 +410,8 @@ def numbers(
     names = dict(zip(("sensor", "wave", "signs"), PLANTS, strict=True))
     closed, run = {key: found.runs[name].closed() for key, name in names.items()}, found.runs["the sensor"]
     residual = [{name: typical(one) for name, one in row.loops.settled.items()} for row in rows]
-    lost, starts = run.residual[~closed["sensor"]], {row.loops.start for row in rows}
+    lost, starts = ~closed["sensor"], {row.loops.start for row in rows}
+    turning = run.residual[lost].argmin(axis=1)  # step at which a loop that diverges begins to grow
     unequal = [row.loops.start for row in rows if row.best is not None]
     others = [row.loops.start for row in rows if row.best != row.two]
     return rounded(
@@ -419,8 +421,10 @@ def numbers(
             "n_loops": len(run.residual),
             "rank_growth": found.ranking(found.growth),
             "rank_wave": found.ranking(-found.wave),
-            "reversed_start": found.reversed[:, 0].mean(),
-            "lowest_lost": np.median(lost.min(axis=1)) if lost.size else np.nan,
+            "reversed_closed": found.reversed[~lost, 0].mean() if not lost.all() else np.nan,
+            "reversed_lost": found.reversed[lost, 0].mean() if lost.any() else np.nan,
+            "reversed_later": found.reversed[lost, turning].mean() if lost.any() else np.nan,
+            "lowest_lost": np.median(run.residual[lost, turning]) if lost.any() else np.nan,
             "equal_to": max((start for start in starts if start < min(unequal, default=np.inf)), default=np.nan),
             "two_from": min((start for start in starts if start > max(others, default=0)), default=np.nan),
             "linear_two_excess": max(one["LinearTwo"] / min(one.values()) for one in residual) - 1,

@@ -33,6 +33,7 @@ LIMITS = parameter_limits(
     photons_loop=(0.01, 1e9),
     photons_loop_faint=(0.01, 1e9),
     n_screens=(2, 1000),
+    n_screens_perfect=(2, 1000),
     n_screens_loop=(2, 1000),
     photons_calibration=(100.0, 1e9),
     n_commands=(2, 50),
@@ -53,6 +54,14 @@ TWO_IMAGES = {
 }
 """Methods, the simplest first, and their names in the table."""
 UNCORRECTED = "PhaseShifted with the offset of its flat"
+
+CHAPTERS = (
+    Link("a calibrated model", "calibration.ipynb"),
+    Link("photon noise", "photon_noise.ipynb"),
+    Link("Figure 9", "fig09_bench_linearity.ipynb"),
+)
+"""Chapters that explain the rows without a loop."""
+_ALIKE = 1.05  # ratio of errors up to which the simpler one of two methods is named
 
 
 class Situation(NamedTuple):
@@ -102,18 +111,21 @@ def shots(taken: CalibrationFrames, photons: float, command: NDArray, seed: np.r
 
 
 def open_loop_errors(
-    benches: Mapping[str, Known], situations: Sequence[Situation], n_screens: int, n_iterations: int, seed: int
+    benches: Mapping[str, Known],
+    situations: Sequence[Situation],
+    n_screens: Mapping[str, int],
+    n_iterations: int,
+    seed: int,
 ) -> dict[str, list[dict[str, NDArray[np.float64]]]]:
     """Errors of all methods on each bench in each situation, (n_screens,) by name, rad rms over the segments."""
-    tasks = [
-        (name, row, screen) for name in benches for row in range(len(situations)) for screen in range(n_screens)
-    ]
+    rows = range(len(situations))
+    tasks = [(name, row, screen) for name in benches for row in rows for screen in range(n_screens[name])]
     errors = iter(sweeps.run(_errors, tasks, benches, situations, n_iterations, seed, name="open_loop_errors"))
     found: dict[str, list[dict[str, NDArray[np.float64]]]] = {}
     for name in benches:
         found[name] = []
         for _ in situations:
-            some = [next(errors) for _ in range(n_screens)]
+            some = [next(errors) for _ in range(n_screens[name])]
             found[name].append({method: np.array([one[method] for one in some]) for method in some[0]})
     return found
 
@@ -235,10 +247,10 @@ def ratio_of(first: NDArray, second: NDArray) -> tuple[float, float, float]:
 
 
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
-    """Name of the first method whose error is not larger than that of the best one by more than the scatter."""
+    """Name of the first method that agrees with the best one within the scatter, or within `_ALIKE`."""
     known = [name for name in names if name in errors]
     best = min(known, key=lambda name: typical(errors[name]))
-    return next(name for name in known if name == best or ratio_of(errors[name], errors[best])[1] <= 1)
+    return next(name for name in known if name == best or ratio_of(errors[name], errors[best])[1] <= _ALIKE)
 
 
 def open_cell(errors: Mapping[str, NDArray]) -> Cell:
@@ -273,8 +285,8 @@ def open_rows(situations: Sequence[Situation], errors: Mapping[str, Sequence[Map
         perfect, real = errors["perfect"][index], errors["real"][index]
         design = {name: values for name, values in real.items() if name != "Fitted"}
         cells = {"perfect": open_cell(perfect), "calibrated": open_cell(real), "design": open_cell(design)}
-        text = f"open loop, {rms:g} rad rms, {_light(photons, 2 * photons)}"
-        rows.append(Row(f"open_{index + 1}", text, cells, Link("a calibrated model", "calibration.ipynb")))
+        text = f"open loop, {rms:g} rad rms; {_light(photons)}"
+        rows.append(Row(f"open_{index + 1}", text, cells, CHAPTERS[index]))
     return rows
 
 
@@ -283,19 +295,18 @@ def loop_rows(found: Iterable[BestMethods]) -> list[Row]:
     rows = []
     for index, one in enumerate(found):
         cells = {"perfect": loop_cell(one), "calibrated": None, "design": None}
-        loops = one.loops
-        text = f"closed loop from {loops.start:g} rad rms, {_light(loops.photons / 2, loops.photons)} per step"
+        text = f"closed loop from {one.loops.start:g} rad rms; {_light(one.loops.photons / 2)} per step"
         rows.append(Row(f"closed_{index + 1}", text, cells, Link("closed loop", "closed_loop.ipynb")))
     return rows
 
 
-def _light(photons: float, total: float) -> str:
-    return f"{photons:g} photons per point and image ({total:g} in all)"
+def _light(photons: float) -> str:
+    return f"{photons:g} ({2 * photons:g})"
 
 
 def decision_table(rows: Iterable[Row]) -> Table:
     """Best method of each situation."""
-    header = ["situation", *COLUMNS.values(), "chapter"]
+    header = ["situation; photons per point and image (both images)", *COLUMNS.values(), "explained in"]
     cells = [[_cell_text(row.cells[name]) for name in COLUMNS] for row in rows]
     return Table(header, [[row.text, *some, row.chapter] for row, some in zip(rows, cells, strict=True)])
 
@@ -307,7 +318,7 @@ def _cell_text(cell: Cell | None) -> str:
 def numbers(
     rows: Sequence[Row], errors: Mapping[str, Sequence[Mapping[str, NDArray]]], loops: Sequence[BestMethods]
 ) -> dict[str, float | str]:
-    """Each cell in words, its error (rad rms), and the ratio of errors, two images over one; where two images lose."""
+    """Each cell in words, its error (rad rms), and the error with two images over that with one; and extremes."""
     found: dict[str, float | str] = {}
     for row in rows:
         found[f"{row.key}_situation"] = row.text
@@ -315,10 +326,18 @@ def numbers(
             found[f"{row.key}_{name}"] = _cell_text(cell)
             if cell is not None:
                 found |= {f"{row.key}_{name}_error": cell.error, f"{row.key}_{name}_ratio": cell.ratio}
+    gains = [1 / cell.ratio for row in rows[:2] for cell in row.cells.values() if cell]
     small, faint = errors["real"][-1], loops[-1]
     settled = faint.loops.settled
-    offset = ratio_of(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])
-    iterated = ratio_of(settled["PhaseShifted"], settled[faint.one])
-    for name, value in (("offset", offset), ("iterated", iterated)):
-        found |= {f"{name}_ratio": value[0], f"{name}_ratio_low": value[1], f"{name}_ratio_high": value[2]}
-    return rounded(found, ".3g")
+    return rounded(
+        found
+        | {
+            "gain_least": min(gains),
+            "gain_most": max(gains),
+            "loop_gain_least": min(1 / one.ratio for one in loops[:2]),
+            "loop_gain_most": max(1 / one.ratio for one in loops[:2]),
+            "offset_ratio": ratio_of(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
+            "likelihood_ratio": ratio_of(settled["MaximumLikelihood"], settled[faint.one])[0],
+        },
+        ".3g",
+    )

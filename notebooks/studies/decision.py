@@ -24,21 +24,14 @@ LIMITS = parameter_limits(
     "n_iterations",
     n_pixels=(32, 136),
     extent=(1.1, 2.0),
-    rms=(0.01, 2.0),
-    rms_small=(0.01, 2.0),
-    photons=(10.0, 1e9),
-    photons_faint=(10.0, 1e9),
-    rms_loop=(0.01, 4.0),
-    rms_loop_small=(0.01, 4.0),
-    photons_loop=(0.01, 1e9),
-    photons_loop_faint=(0.01, 1e9),
-    n_screens=(2, 1000),
-    n_screens_perfect=(2, 1000),
-    n_screens_loop=(2, 1000),
     photons_calibration=(100.0, 1e9),
     n_commands=(2, 50),
     rms_commands=(0.05, 2.0),
     poke=(0.001, 1.5),
+    **dict.fromkeys(("rms", "rms_small", "rms_loop", "rms_loop_small"), (0.01, 4.0)),
+    **dict.fromkeys(("photons", "photons_faint"), (10.0, 1e9)),
+    **dict.fromkeys(("photons_loop", "photons_loop_faint"), (0.01, 1e9)),
+    **dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop"), (2, 1000)),
 )
 
 COLUMNS = {"perfect": "no errors", "calibrated": "calibrated", "design": "only the design known"}
@@ -121,13 +114,11 @@ def open_loop_errors(
     rows = range(len(situations))
     tasks = [(name, row, screen) for name in benches for row in rows for screen in range(n_screens[name])]
     errors = iter(sweeps.run(_errors, tasks, benches, situations, n_iterations, seed, name="open_loop_errors"))
-    found: dict[str, list[dict[str, NDArray[np.float64]]]] = {}
-    for name in benches:
-        found[name] = []
-        for _ in situations:
-            some = [next(errors) for _ in range(n_screens[name])]
-            found[name].append({method: np.array([one[method] for one in some]) for method in some[0]})
-    return found
+    some = {name: [[next(errors) for _ in range(n_screens[name])] for _ in rows] for name in benches}
+    return {
+        name: [{method: np.array([one[method] for one in row]) for method in row[0]} for row in found]
+        for name, found in some.items()
+    }
 
 
 def _errors(

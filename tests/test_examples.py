@@ -63,3 +63,16 @@ def test_example_of_the_readme_runs(capsys):
     printed = capsys.readouterr().out
     assert printed.startswith("(20, 100, 100) [ True")
     assert "False" not in printed
+
+
+def test_example_of_gradients_fits_the_phase(capsys):
+    jax = pytest.importorskip("jax", reason="JAX is not installed")
+    page = (ROOT / "book" / "your_reconstructor.md").read_text("utf-8")
+    (code,) = (block for block in re.findall(r"(?m)^```python\n(.*?)^```", page, re.S) if "zwfs.jax" in block)
+    (stated,) = re.findall("falls to (.) × 10⁻⁸ rad", page)
+    before = jax.config.jax_enable_x64
+    try:
+        exec(compile(code, "your_reconstructor.md", "exec"), {})
+    finally:
+        jax.config.update("jax_enable_x64", before)
+    assert float(capsys.readouterr().out) == pytest.approx(int(stated) * 1e-8, rel=0.25)

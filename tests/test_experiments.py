@@ -186,7 +186,7 @@ class Transforming(PhaseShifted):
 @pytest.mark.slow
 def test_the_reconstructor_on_the_page_stands_next_to_the_five(tmp_path):
     page = (ROOT / "book" / "your_reconstructor.md").read_text("utf-8")
-    [code] = re.findall(r"```python\n(.*?)```", page, re.S)
+    [code, _] = re.findall(r"```python\n(.*?)```", page, re.S)
     assert len([line for line in code.splitlines() if line.strip()]) <= 30
     (tmp_path / "flat_reference.py").write_text(code)
     run = [sys.executable, "flat_reference.py"]

@@ -16,7 +16,7 @@ import zwfs
 from studies import bandwidth, calibration, phase_amplitude, zernike_sensor
 from studies.bandwidth import BandCurves
 from studies.beyond_dimple import DimpleLimits
-from studies.beyond_range import RecoveryCurves
+from studies.beyond_range import DIMMED, SECANT, Causes, NoiseCurves
 from studies.calibration import Example, Shot
 from studies.closed_loop import PLANTS, Divergence, LoopRun, TunedLoops
 from studies.dark_zone import IDEAL, Drift, DriftCurves
@@ -26,6 +26,7 @@ from studies.fig04_dimple_diameter import Contraction, DiameterCurves
 from studies.identities import dimple_pairs
 from studies.kit import grids
 from studies.kit.bench import BenchCurves
+from studies.kit.curves import ErrorCurves, Limit
 from studies.kit.grids import Grid
 from studies.kit.style import ALONE, DARK_PHASE_MAP, LOOKS, OTHER_STYLES, show_phase, use_style
 from studies.kit.variants import dark_color, variants
@@ -90,7 +91,12 @@ def drawn_methods(curves, pupil, classic, shifted):
     compared = ["PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood"]
     trials = DiameterCurves(np.full(3, 0.5), dict.fromkeys(compared, np.full((3, 3), 0.1)), three)
     limits = DimpleLimits(three, np.full((3, 2), 0.5), np.full((3, 2, 4), 2.0))
-    recovered = RecoveryCurves(three, trials.errors, np.ones((3, 3), bool), np.ones((3, 3), int))
+    both_kinds = trials.errors | {"MaximumLikelihoodModes": np.full((3, 3), 0.1)}
+    bounds = dict.fromkeys(["MaximumLikelihood", "MaximumLikelihoodModes"], three)
+    ranges = [NoiseCurves(three, both_kinds, n, bounds, np.ones((3, 3), bool)) for n in (0.0, 1e4)]
+    variants_of_it = ["PhaseShifted", "PhaseShiftedAccelerated", DIMMED, SECANT]
+    ingredients = ErrorCurves(three, dict.fromkeys(variants_of_it, np.full((3, 3), 0.1)))
+    limited = Causes(ingredients, np.ones((3, 3)), dict.fromkeys(variants_of_it, three), 1.0)
     loop = LoopRun(three, *np.full((2, 2, 3), 0.1))
     in_loops = ["Linear", "LinearTwo", "PhaseShifted", "MaximumLikelihood"]
     tuned = TunedLoops(0.5, 2.0, {}, {}, dict.fromkeys(in_loops, three))
@@ -125,7 +131,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_vector_sensor": ((shifted, phase), ()),
         "draw_bench_layout": ((bench, commands, bench.frames(commands, seed=1), 635.0), ()),
         "draw_steps": ((pupil, phase, frames, dict.fromkeys([*two, "Arcsine"], phase)), ()),
-        "draw_linearity": ((curves, 0.05, two, 0.4), two),
+        "draw_linearity": ((curves, dict.fromkeys(two, Limit(0.2, 0.01)), 0.05, two, 0.4), two),
         "draw_saxton_widths": (({"narrow": saxton}, widths, 0.05), ["Linear", "GerchbergSaxton"]),
         "draw_convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in LOOKS},), LOOKS),
         "draw_estimates": ((pupil, phase, dict.fromkeys(two, phase)), ()),
@@ -139,8 +145,9 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_diameter_reasons": ((reasons, 2.2), shifted_only),
         "draw_dimple_recovery": (({0.5: trials, 1.0: trials}, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
         "draw_dimple_limits": ((limits, 0.5), shifted_only),
-        "draw_range_recovery": (({1.06: recovered}, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
-        "draw_range_starts": (({1.06: recovered, 2.0: recovered},), ()),
+        "draw_range": ((ranges, 1e4, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
+        "draw_model_errors": (({"dimple": trials}, ranges[1], 0.05), ()),
+        "draw_causes": ((limited, 0.05), shifted_only),
         "draw_pairs": ((PairMaps(three, *np.full((5, 3, 3), 1.0)),), ()),
         "draw_pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
         "draw_photon_noise": ((faint,), LOOKS),
@@ -321,13 +328,15 @@ def test_colours_that_share_a_figure_differ_for_every_reader(vision):
 
 
 def test_linearity_draws_the_means_and_marks_where_they_leave(curves):
-    figure = draw_linearity(curves, 0.05, ["Linear", "PhaseShifted"], rms_max=0.2)
+    limits = {"Linear": Limit(0.0612, 0.003), "PhaseShifted": Limit(np.inf)}
+    figure = draw_linearity(curves, limits, 0.05, ["Linear", "PhaseShifted"], rms_max=0.2)
     plain, ratio = figure.axes
     look = LOOKS["Linear"]
     np.testing.assert_allclose(drawn(plain, look).get_ydata(), curves.mean("Linear")[:3])
     np.testing.assert_allclose(drawn(ratio, look).get_ydata(), curves.mean("Linear")[1:] / curves.rms[1:])
     marks = [line.get_xdata()[0] for line in ratio.lines if len(line.get_xdata()) == 1]
-    assert marks == [pytest.approx(curves.dynamic_range("Linear", 0.05))]
+    assert marks == [0.0612]
+    assert "0.061 rad" in figure.legends[0].get_texts()[0].get_text()
 
 
 def test_methods_of_a_reader_get_looks_of_their_own(monkeypatch):

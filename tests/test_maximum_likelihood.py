@@ -8,8 +8,10 @@ from zwfs import (
     Dimple,
     MaximumLikelihood,
     Patch,
+    Pupil,
     ZernikeSensor,
     cramer_rao,
+    power_law_screens,
     reconstruction_error,
     wrapped_residual,
     zernike_basis,
@@ -178,6 +180,43 @@ def test_modes_and_their_errors(pupil, modes):
     assert np.std(pull) == pytest.approx(1, abs=0.1)
     points = wrapped_residual(pupil, noisy.phase, truth)
     assert np.sqrt(np.nanmean(points**2)) == pytest.approx(np.sqrt(np.nanmean(noisy.sigma**2)), rel=0.15)
+
+
+@pytest.mark.parametrize(("rms", "photons"), [(1.0, 1e3), (1.5, 1e4), (2.0, 1e5), (3.0, 1e5), (3.0, None)])
+def test_modes_are_at_least_as_good_as_points(rms, photons):
+    """At the rim of these screens neighbours differ by more than pi."""
+    pupil = Pupil.circular(48)
+    basis = zernike_basis(pupil, 120)
+    sensor = pair(pupil, 1.06, 0.5, -0.5)
+    truth = power_law_screens(basis, rms, 5, exponent=-2, seed=41)
+    frames = sensor.measure(truth)
+    if photons is not None:
+        camera = Detector(pupil, photons * pupil.n_points)
+        frames = camera.normalise(camera.expose(frames, 8))
+    points, fitted = (MaximumLikelihood(sensor, some, photons=photons) for some in (None, basis))
+    result = fitted(frames)
+    error = reconstruction_error(pupil, result.phase, truth)
+    assert result.consistent.all()
+    assert np.all(error <= reconstruction_error(pupil, points(frames).phase, truth) + 1e-5)
+    if photons is not None and rms <= 2:
+        bound = np.linalg.norm(cramer_rao(sensor, truth, photons=photons, modes=basis), axis=-1)
+        assert np.sqrt(np.mean((error / bound) ** 2)) < 1.1
+    # A given start may be wrapped, too.
+    start = np.angle(np.exp(1j * np.where(pupil.inside, truth, 0)))
+    again = MaximumLikelihood(sensor, basis, photons=photons, n_starts=1)(frames, start)
+    assert reconstruction_error(pupil, again.phase, result.phase).max() < 1e-4
+
+
+def test_modes_on_pupils_with_gaps_and_corners():
+    y, x = np.mgrid[:48, :48] - 23.5
+    parts = (np.hypot(x, y) < 24) & (np.hypot(x, y) > 6) & (np.abs(x) > 1) & (np.abs(y) > 1)
+    quadrants, hexagon = Pupil.from_amplitude(parts.astype(float)), Pupil.hexagonal(48)
+    for pupil, n_modes, rms, seed in ((quadrants, 60, 2.0, 42), (hexagon, 100, 1.0, 25)):
+        basis, sensor = zernike_basis(pupil, n_modes), pair(pupil, 1.06, 0.5, -0.5)
+        truth = power_law_screens(basis, rms, 4, exponent=-2, seed=seed)
+        result = MaximumLikelihood(sensor, basis, n_starts=1)(sensor.measure(truth))
+        assert result.consistent.all()
+        assert reconstruction_error(pupil, result.phase, truth).max() < 1e-5
 
 
 def test_a_prior_helps_faint_frames_and_does_not_bias_bright_ones(pupil):

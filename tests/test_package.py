@@ -24,7 +24,7 @@ def run(*command, folder=ROOT):
 
 
 def test_import_is_light():
-    late = {"astropy", "cloudpickle", "distributed", "joblib", "matplotlib", "threadpoolctl"}
+    late = {"astropy", "cloudpickle", "distributed", "jax", "joblib", "matplotlib", "threadpoolctl"}
     late |= {"scipy.optimize", "zwfs.frames"}
     done = run("-c", f"import sys, zwfs; print({late} & set(sys.modules), zwfs.__version__ > '0')")
     assert done.stdout == "set() True\n", done.stderr

@@ -11,7 +11,7 @@ MODES = zwfs.zernike_basis(PUPIL, 30)
 PAIR = [zwfs.Dimple(1.06, sign * np.pi / 2) for sign in (1, -1)]
 SENSOR = zwfs.ZernikeSensor(PUPIL, *PAIR, zwfs.Dimple(1, 0))
 IGNORED, MEASURED, ESTIMATED = (f"MaximumLikelihood, {word}" for word in ("ignored", "measured", "estimated"))
-PHOTONS = 3000.0
+PHOTONS = 1000.0
 
 
 @pytest.fixture(scope="module")

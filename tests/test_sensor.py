@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy.special import j0
 
 import zwfs
 from zwfs import Detector, Dimple, Patch, Pupil, ZernikeSensor, zernike_basis
@@ -294,6 +295,37 @@ def test_detector_sees_incoming_field_plus_reference_wave(pupil, complex_field, 
     assert not rest.any()
 
 
+@pytest.mark.parametrize("diameter", [0.3, 1.06, 4.0])
+def test_diameter_derivative_is_an_integral_around_the_rim(pupil, screens, diameter):
+    sensor = ZernikeSensor(pupil, Dimple(diameter, 0.7, 0.8), tolerance=1e-14)
+    phase = screens(0.8, 1)[0]
+    inside, field = pupil.inside, pupil.amplitude * np.exp(1j * phase)
+    rows, columns = np.indices(pupil.shape) / pupil.n_pixels
+    r = np.hypot(rows[..., np.newaxis] - rows[inside], columns[..., np.newaxis] - columns[inside])
+    kernel = (0.8 * np.exp(0.7j) - 1) * np.pi * diameter / 2 * j0(np.pi * diameter * r) / pupil.n_pixels**2
+    expected = 2 * np.real(sensor.propagate(field)[0].conj() * (kernel @ field[inside]))
+    np.testing.assert_allclose(sensor.diameter_derivative(phase)[0], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("chromatic", [None, False, True])
+def test_diameter_derivative_agrees_with_differences(rough_pupil, chromatic):
+    phase = np.random.default_rng(4).normal(size=(2, *rough_pupil.shape))
+
+    def wider(by):
+        masks = Dimple(1.06 + by, np.pi / 2), Dimple(2 + by, -1.0, 0.7)
+        sensor = ZernikeSensor(rough_pupil, *masks, extent=1.2, tolerance=1e-14)
+        band = zwfs.PolychromaticSensor(sensor, [600, 650, 720], [1, 2, 1], chromatic=bool(chromatic))
+        return sensor if chromatic is None else band
+
+    def difference(step):
+        return (wider(step).measure(phase) - wider(-step).measure(phase)) / (2 * step)
+
+    found, coarse, fine = wider(0.0).diameter_derivative(phase), difference(0.02), difference(0.01)
+    error, halved = (np.abs(one - found).max() for one in (coarse, fine))
+    assert error / halved == pytest.approx(4, rel=0.02)  # the error of central differences
+    np.testing.assert_allclose((4 * fine - coarse) / 3, found, rtol=0, atol=1e-4 * error)  # Richardson
+
+
 def test_two_wave_interference(pupil, screens):
     sensor = ZernikeSensor(pupil, *MASKS["patch"])
     phase = screens(0.9)
@@ -463,6 +495,11 @@ REFUSED = {
 def test_bad_input_is_named(shifted, message):
     with pytest.raises(ValueError, match=message):
         REFUSED[message](shifted)
+
+
+def test_diameter_derivative_needs_dimples(pupil):
+    with pytest.raises(TypeError, match=r"masks\[1\] is a Patch: expected a Dimple"):
+        ZernikeSensor(pupil, Dimple(1, 1), Patch(1, ramp)).diameter_derivative(FLAT)
 
 
 def test_pupil_of_a_single_row_is_a_pupil():

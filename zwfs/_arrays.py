@@ -6,6 +6,7 @@ its constants for each kind, see `per_kind`. `Immutable` is the base of objects 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import cached_property, wraps
 from typing import Any, NamedTuple, NoReturn, TypeVar
@@ -49,6 +50,8 @@ class Kind(NamedTuple):
         """Real numbers as an array of this kind; no other library shares the memory of an array of NumPy."""
         if self.xp is not np and isinstance(values, np.ndarray):
             values = values.copy()
+        if self.xp is not np and hasattr(values, "requires_grad"):  # asarray of PyTorch would warn of a gradient
+            return values.to(dtype=self.dtype, device=self.device)
         return self.xp.asarray(values, dtype=self.dtype, device=self.device)
 
     def flags(self, values: NDArray[np.bool_]) -> Any:
@@ -97,6 +100,30 @@ def any_array(value: Any) -> tuple[Any, Any]:
     if not array.dtype.isnative:  # as in FITS files
         array = array.astype(array.dtype.newbyteorder("="))
     return array, np
+
+
+def is_jax(array: Any) -> bool:
+    """Whether an array belongs to JAX, in or outside of its transformations."""
+    jax = sys.modules.get("jax")
+    return jax is not None and isinstance(array, jax.Array)
+
+
+def holds(test: Any) -> bool:
+    """Whether a test of an array holds; True inside `torch.vmap`, where values cannot be tested."""
+    try:
+        return bool(test)
+    except RuntimeError as error:
+        if "vmap" not in str(error):
+            raise
+        return True
+
+
+def added(array: Any, values: Any, where: tuple[slice, ...]) -> Any:
+    """Add values to a part of an array, whose memory is reused if its library can change it."""
+    if is_jax(array):
+        return array.at[(..., *where)].add(values)
+    array[(..., *where)] += values
+    return array
 
 
 def read_only(array: Any) -> Any:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zwfs._arrays import Kind, any_array, read_only
+from zwfs._arrays import Kind, any_array, holds, is_jax, read_only
 
 _STRONGEST = 1e15  # value of a mode, and of its inverse: squares summed over a pupil fit in single precision
 LARGEST = 1e38  # number in a map: the square of its sum is far from the range of a float
@@ -158,7 +158,7 @@ def integer_array(name: str, value: Any) -> NDArray[np.integer]:
 
 def real_any(name: str, value: Any) -> NDArray:
     """Return `value` as a float32 or float64 array; those of a library of the array API stay there."""
-    array, xp = _made(name, value, any_array)
+    array, xp = _of_any_library(name, value)
     if array.dtype in (xp.float32, xp.float64):
         return array
     if xp.isdtype(array.dtype, "complex floating"):
@@ -175,7 +175,7 @@ def complex_array(name: str, value: Any) -> NDArray:
 
 def complex_any(name: str, value: Any) -> NDArray:
     """Return `value` as a complex64 or complex128 array; those of a library of the array API stay there."""
-    array, xp = _made(name, value, any_array)
+    array, xp = _of_any_library(name, value)
     if array.dtype in (xp.complex64, xp.complex128):
         return array
     if xp.isdtype(array.dtype, "complex floating"):
@@ -220,6 +220,29 @@ def flag_map(name: str, value: Any, shape: tuple[int, ...], *, some: bool = Fals
     return array
 
 
+def no_gradient(name: str, value: Any) -> None:
+    """Refuse an array through which a gradient is to pass."""
+    if is_jax(value):
+        raise TypeError(
+            f"{name} is an array of JAX: expected np.asarray({name}), outside of jax.jit, jax.grad and jax.vmap, "
+            "because a reconstructor has no gradient"
+        )
+    if getattr(value, "requires_grad", False):
+        raise TypeError(
+            f"{name} requires a gradient: expected {name}.detach(), because a reconstructor has no gradient"
+        )
+
+
+def _of_any_library(name: str, value: Any) -> tuple[Any, Any]:
+    """Return an array and its namespace; those of JAX, which cannot be changed in place, are refused."""
+    if is_jax(value):
+        raise TypeError(
+            f"{name} is an array of JAX: expected np.asarray({name}); zwfs.jax.measure(sensor) returns the frames "
+            "in JAX, with gradients"
+        )
+    return _made(name, value, any_array)
+
+
 def _made(name: str, value: Any, make: Callable[[Any], Any]) -> Any:
     """Make an array of `value`, which must hold nothing that it would lose: masked values, or a unit."""
     if np.ma.is_masked(value):
@@ -234,8 +257,9 @@ def _made(name: str, value: Any, make: Callable[[Any], Any]) -> Any:
     try:
         return make(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        reason = str(error).partition("\n")[0]
         raise TypeError(
-            f"{name} is a {type(value).__name__} that cannot become an array here ({error})"
+            f"{name} is a {type(value).__name__} that cannot become an array here ({reason})"
         ) from error
 
 
@@ -305,7 +329,7 @@ def finite(name: str, array: Any, where: str = "") -> None:
     xp = any_array(array)[1]
     # A sum is finite only if all its terms are, and costs a tenth of the full test.
     with np.errstate(over="ignore", invalid="ignore"):
-        if xp.isfinite(xp.sum(array)):
+        if holds(xp.isfinite(xp.sum(array))):
             return
     bad = math.prod(array.shape) - int(xp.count_nonzero(xp.isfinite(array)))
     if bad:
@@ -314,9 +338,9 @@ def finite(name: str, array: Any, where: str = "") -> None:
 
 def non_negative(name: str, array: Any) -> None:
     """Require that no number of `array` is below 0."""
-    lowest = float(any_array(array)[1].min(array)) if 0 not in array.shape else 0.0
-    if lowest < 0:
-        raise ValueError(f"{name} reaches down to {lowest:.6g}: expected no negative values")
+    lowest = any_array(array)[1].min(array) if 0 not in array.shape else np.zeros(())
+    if not holds(~(lowest < 0)):
+        raise ValueError(f"{name} reaches down to {float(lowest):.6g}: expected no negative values")
 
 
 def radian(name: str, value: Any) -> float:
@@ -347,7 +371,7 @@ def moderate(name: str, array: Any, where: str = "") -> None:
     xp = any_array(array)[1]
     flat = xp.reshape(array, (-1,))
     with np.errstate(over="ignore", invalid="ignore"):
-        if xp.isfinite(xp.vecdot(flat, flat)):
+        if holds(xp.isfinite(flat @ flat)):
             return
     finite(name, array, where)
     largest = float(xp.max(xp.abs(array)))

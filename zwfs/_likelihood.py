@@ -16,6 +16,8 @@ from zwfs.sensor import Sensor
 
 _DARK = 1e-12  # electrons: a modelled pixel that is darker counts as this bright
 _DISTINCT = 1e-6  # difference of two masks, relative to the strongest response, from which on they are different
+_SIGMAS = 5.0  # excess of the misfit, in its standard deviations, up to which noise explains it
+_RESIDUAL = 1e-5  # rms, in units of the mean intensity, up to which frames without noise are explained
 _SINGULAR = 1e-14  # eigenvalue of the information about modes, relative to the largest, that counts as 0
 
 
@@ -88,6 +90,19 @@ class Noise:
         terms = difference * difference * scale, expected, (2 * expected + scale) * expected
         misfit, mean, variance = (xp.sum(term, axis=axes) for term in terms)
         return misfit, mean, variance
+
+    def explains(self, light: NDArray, frames: NDArray, n_unknowns: int = 0) -> NDArray[np.bool_]:
+        """Whether noise explains the misfit of frames after a fit of so many unknowns: (k, ...) to (k,).
+
+        Without a number of photons, the difference must be within rounding.
+        """
+        xp, axes = Kind.of(light).xp, tuple(range(1, light.ndim))
+        if self.photons is None:
+            difference = light - frames
+            return xp.mean(difference * difference, axis=axes) <= _RESIDUAL**2
+        misfit, expected, variance = self.misfit(light, frames)
+        freedom = xp.clip(expected - n_unknowns, 0, None)
+        return misfit <= freedom + _SIGMAS * xp.sqrt(variance)
 
 
 def tangents(

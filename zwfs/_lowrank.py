@@ -214,6 +214,8 @@ def factorise(
     detector_axes: tuple[NDArray, NDArray],
     pixel_area: float,
     tolerance: float,
+    *,
+    rim: bool = False,
 ) -> Factors:
     """Factors of the reference-wave operators of several masks, with functions common to all of them.
 
@@ -227,6 +229,8 @@ def factorise(
         Coordinates y of the rows and x of the columns.
     pixel_area : float, D^2
     tolerance : float
+    rim : bool
+        Factors of the derivatives with respect to the diameters instead; the masks are dimples (`eq-rim`).
 
     Returns
     -------
@@ -250,7 +254,7 @@ def factorise(
     to_detector = from_pupil if same else along(detector_axes)
 
     def core_of(index: int, refinement: float = 1.0) -> NDArray[np.complex128]:
-        u, v, weights = _quadrature(masks[index], reach, tolerance, refinement)
+        u, v, weights = (_rim if rim else _quadrature)(masks[index], reach, tolerance, refinement)
         change = pixel_area * weights * (_transmission(index, masks[index], u, v) - 1)
         total: Any = 0
         for some in (slice(first, first + _NODES) for first in range(0, u.size, _NODES)):
@@ -319,7 +323,7 @@ def _warn_of_quadrature(index: int, mask: Mask, error: float, tolerance: float) 
         "of its quadrature: name circles at which it jumps in `breaks`, or raise `n_samples` (now "
         f"{mask.n_samples})",
         UserWarning,
-        stacklevel=5,  # the caller of the sensor, beyond the end of its constructor
+        stacklevel=6,  # the caller of the sensor, beyond the end of its constructor
     )
 
 
@@ -354,6 +358,14 @@ def _quadrature(
     angle = 2 * np.pi * np.arange(n_angles) / n_angles
     u, v = np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))
     return u.ravel(), v.ravel(), np.repeat(ring * 2 * np.pi / n_angles, n_angles)
+
+
+def _rim(mask: Mask, reach: float, tolerance: float, refinement: float) -> tuple[NDArray, NDArray, NDArray]:
+    """Equispaced nodes u, v on the rim of a patch; the sum is the derivative of its integral by the diameter."""
+    radius = mask.diameter / 2
+    n_angles = _bandwidth(2 * np.pi * radius * reach, tolerance)
+    angle = 2 * np.pi * np.arange(n_angles) / n_angles
+    return radius * np.cos(angle), radius * np.sin(angle), np.full(n_angles, np.pi * radius / n_angles)
 
 
 def _bandwidth(argument: float, tolerance: float) -> int:

@@ -1,6 +1,7 @@
 """The model that sensors and reconstructors compute with: split fields of one kind of arrays.
 
-`propagator` returns the model of a sensor. `pupil_maps` and `amplitude_maps` check input; nothing else here does.
+`propagator` returns the model of a sensor. `pupil_maps`, `amplitude_maps` and `warn_of_degrees` check input;
+nothing else here does.
 
 A split field has shape (..., 2, ny, nx): the real part, then the imaginary part. It is 0 outside the pupil. A
 phasor is exp(i phase) as a split field. `k` is the number of frame sets in a batch.
@@ -12,9 +13,10 @@ the weight of a wavelength is a factor of its field, so an intensity is the sum 
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from functools import reduce
-from math import prod
+from math import prod, sqrt
 from operator import add
 from typing import Any, NamedTuple, Protocol
 
@@ -22,10 +24,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Kind, per_kind, read_only
+from zwfs._arrays import Kind, added, any_array, holds, per_kind, read_only
 from zwfs._lowrank import Factors, Operator
 from zwfs.pupil import Pupil
 
+_DEGREES = 20.0  # radian rms; no phase map reaches it, the same map in degrees soon does
 _RANGE = 1e30  # of the light in the pupil, and of its inverse: its square is a number in single precision, too
 _VANISHING = 1e-30  # modulus, or its square, of a field that counts as 0
 
@@ -121,9 +124,7 @@ class Propagator:
 
     def propagate(self, psi: NDArray) -> NDArray:
         """Fields on the detector: (k, 2, ny, nx) to (k, n_masks, 2, ny', nx')."""
-        out = self.operator.split_reference(psi)
-        out[(..., *self.window)] += psi[:, np.newaxis, ...]
-        return out
+        return added(self.operator.split_reference(psi), psi[:, np.newaxis, ...], self.window)
 
     def adjoint(self, waves: NDArray) -> NDArray:
         """Adjoint of `propagate`: (k, n_masks, 2, ny', nx') to (k, 2, ny, nx)."""
@@ -173,7 +174,7 @@ def amplitude_maps(
     maps, batch = pupil_maps("amplitude", amplitude, sensor)
     _check.non_negative("amplitude", maps)
     xp = Kind.of(maps).xp
-    if not xp.all(xp.any(maps > 0, axis=(-2, -1))):
+    if not holds(xp.all(xp.any(maps > 0, axis=(-2, -1)))):
         raise ValueError("amplitude is 0 everywhere in the pupil: expected some light")
     with np.errstate(over="ignore"):
         maps = _check.in_kind("amplitude", maps, kind)
@@ -192,13 +193,24 @@ def amplitude_map(amplitude: ArrayLike | None, sensor: Optics) -> NDArray[np.flo
     return maps[0]
 
 
+def warn_of_degrees(phase: NDArray, pupil: Pupil, stacklevel: int) -> None:
+    """Warn if the rms of a phase, (k, ny, nx) with 0 outside the pupil, is too large for one in radian."""
+    xp, axes = any_array(phase)[1], (-2, -1)
+    mean = xp.sum(phase, axis=axes) / pupil.n_points
+    squares = xp.max(xp.sum(phase * phase, axis=axes) / pupil.n_points - mean * mean)
+    if not holds(squares <= _DEGREES**2):
+        warnings.warn(
+            f"phase has an rms of {sqrt(squares):.4g}: expected radian, less than {_DEGREES:g} rms; is it in "
+            "degrees?",
+            UserWarning,
+            stacklevel=stacklevel,
+        )
+
+
 def split(phase: NDArray, amplitude: NDArray) -> NDArray:
     """Field amplitude * exp(i phase): (k, ny, nx) to (k, 2, ny, nx)."""
-    kind = Kind.of(phase)
-    out = kind.xp.empty((phase.shape[0], 2, *phase.shape[1:]), dtype=kind.dtype, device=kind.device)
-    out[:, 0, ...] = kind.xp.cos(phase) * amplitude
-    out[:, 1, ...] = kind.xp.sin(phase) * amplitude
-    return out
+    xp = any_array(phase)[1]
+    return xp.stack([xp.cos(phase) * amplitude, xp.sin(phase) * amplitude], axis=1)
 
 
 def square(waves: NDArray) -> NDArray:

@@ -107,10 +107,7 @@ class PolychromaticSensor(Sensor):
             sensor.tolerance,
             Channels(ratios, tuple(self.weights.tolist())),
         )
-        masks = [_at(mask, ratio, self.chromatic) for mask in sensor.masks for ratio in ratios]
-        factors = factorise(masks, *self._axes(), sensor.pupil.n_pixels**-2.0, sensor.tolerance)
-        core = factors.core.reshape(self.n_masks, len(ratios), *factors.core.shape[1:])
-        self.factors = Factors(factors.pupil, factors.detector, core)
+        self.factors = self._factorise()
 
     @classmethod
     def flat_band(
@@ -150,6 +147,15 @@ class PolychromaticSensor(Sensor):
             f"PolychromaticSensor({self.reference!r}, {self.wavelengths.size} wavelengths from {low:g} to "
             f"{high:g}, {shifts})"
         )
+
+    def _factorise(self, *, rim: bool = False) -> Factors:
+        ratios = self.channels.ratios
+        masks = [_at(mask, ratio, self.chromatic) for mask in self.masks for ratio in ratios]
+        factors = factorise(masks, *self._axes(), self.pupil.n_pixels**-2.0, self.tolerance, rim=rim)
+        core = factors.core.reshape(self.n_masks, len(ratios), *factors.core.shape[1:])
+        if rim:  # the diameter at each wavelength is that at the reference wavelength times the ratio
+            core = core * np.array(ratios)[:, np.newaxis, np.newaxis]
+        return Factors(factors.pupil, factors.detector, core)
 
     def with_tolerance(self, tolerance: float) -> PolychromaticSensor:
         """Return the same sensor with another error of the reference wave."""

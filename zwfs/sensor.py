@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
-from math import prod, sqrt
-from typing import Any
+from abc import abstractmethod
+from functools import cached_property
+from math import prod
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Immutable, Kind
-from zwfs._lowrank import Factors, factorise
+from zwfs._arrays import Immutable, Kind, per_kind
+from zwfs._lowrank import Factors, Operator, factorise
 from zwfs._propagator import (
     ONE_WAVELENGTH,
     Channels,
@@ -22,11 +22,11 @@ from zwfs._propagator import (
     propagator,
     pupil_maps,
     square,
+    warn_of_degrees,
 )
-from zwfs.masks import Mask
+from zwfs.masks import Dimple, Mask
 from zwfs.pupil import Pupil
 
-_DEGREES = 20.0  # radian rms; no phase map reaches it, the same map in degrees soon does
 _MOST_PIXELS = 2**14  # across the detector: a frame of them takes 2 GiB
 
 
@@ -106,13 +106,7 @@ class Sensor(Immutable):
         """
         maps, batch = pupil_maps("phase", phase, self)
         kind = Kind.of(maps)
-        rms = self._largest_rms(maps, kind.xp)
-        if rms > _DEGREES:
-            warnings.warn(
-                f"phase has an rms of {rms:.4g}: expected radian, less than {_DEGREES:g} rms; is it in degrees?",
-                UserWarning,
-                stacklevel=2,
-            )
+        warn_of_degrees(maps, self.pupil, stacklevel=3)
         strength, strength_batch = amplitude_maps(amplitude, self, kind)
         if strength_batch:
             xp, shape = kind.xp, self.pupil.shape
@@ -125,7 +119,7 @@ class Sensor(Immutable):
         return kind.xp.reshape(frames, (*batch, self.n_masks, *self.detector_shape))
 
     def jacobian(self, phase: ArrayLike, change: ArrayLike) -> NDArray[np.floating]:
-        """Change of the frames per change of the phase: the derivative of `measure` at a phase, times a change.
+        """Change of the frames per change of the phase: the derivative of the frames at a phase, times a change.
 
         Parameters
         ----------
@@ -180,6 +174,50 @@ class Sensor(Immutable):
         gradient = 2 * parts_sum(along_phase(psi, self.channels.ratios, kind.xp) * back)
         return kind.xp.reshape(gradient, (*batch, *self.pupil.shape))
 
+    def diameter_derivative(self, phase: ArrayLike) -> NDArray[np.floating]:
+        """Change of the frames per change of the diameters of the dimples.
+
+        The derivative is analytical, and as accurate as the frames: the rim of a dimple is the only place at which
+        its transmission changes with the diameter, so the change of its reference wave is an integral around the
+        rim. The frame of a mask depends on the diameter of that mask only.
+
+        Parameters
+        ----------
+        phase : array_like, shape (..., ny, nx), radian
+
+        Returns
+        -------
+        ndarray, shape (..., n_masks, ny_detector, nx_detector), 1 / (lambda/D)
+
+        Raises
+        ------
+        TypeError
+            If a mask is not a `Dimple`.
+
+        References
+        ----------
+        `eq-rim` of the book.
+        """
+        for index, mask in enumerate(self.masks):
+            _check.instance(f"masks[{index}]", mask, Dimple)
+        maps, batch = pupil_maps("phase", phase, self)
+        model, psi, waves = self._waves(maps)
+        result = 2 * parts_sum(waves * self._rim(model.kind).split_reference(psi))
+        return model.kind.xp.reshape(result, (*batch, *result.shape[1:]))
+
+    @abstractmethod
+    def _factorise(self, *, rim: bool = False) -> Factors:
+        """Factors of the reference waves, or of their derivatives with respect to the diameters of the dimples."""
+
+    @cached_property
+    def _rim_factors(self) -> Factors:
+        return self._factorise(rim=True)
+
+    @per_kind
+    def _rim(self, kind: Kind) -> Operator:
+        """Operator to the derivatives of the reference waves with respect to the diameters of the dimples."""
+        return Operator(self._rim_factors, self.window, kind)
+
     def _waves(self, maps: NDArray) -> tuple[Propagator, NDArray, NDArray]:
         """Model, and the fields of checked phases in the pupil and on the detector."""
         model = propagator(self, Kind.of(maps))
@@ -192,18 +230,13 @@ class Sensor(Immutable):
         y, x = (axis[0] + (np.arange(axis.size + 2 * m) - m) / pupil.n_pixels for axis in (pupil.y, pupil.x))
         return (pupil.y, pupil.x), (y, x)
 
-    def _largest_rms(self, phase: NDArray, xp: Any) -> float:
-        """Largest rms of phases that are 0 outside the pupil, (k, ny, nx), piston removed."""
-        axes, n_points = (-2, -1), self.pupil.n_points
-        mean = xp.sum(phase, axis=axes) / n_points
-        return sqrt(max(float(xp.max(xp.sum(phase * phase, axis=axes) / n_points - mean * mean)), 0.0))
-
 
 class ZernikeSensor(Sensor):
     """A Zernike wavefront sensor with any number of masks.
 
     Fields and phases may be arrays of NumPy or of any library that follows the Python array API and lets arrays be
-    changed in place, such as PyTorch and CuPy; results are of the same library and on the same device.
+    changed in place, such as PyTorch and CuPy; results are of the same library and on the same device. Gradients
+    of PyTorch pass through all methods. JAX needs the function `zwfs.jax.measure`.
 
     One mask makes the classic sensor, two make the phase-shifted one. Detector pixels are as large as pupil
     pixels and stand at the same places, so the detector of an extent of 1 D is the grid of the pupil.
@@ -250,11 +283,14 @@ class ZernikeSensor(Sensor):
         if not masks:
             raise ValueError("masks is empty: expected at least one mask, such as Dimple(1.06, np.pi / 2)")
         super().__init__(pupil, masks, extent, tolerance, ONE_WAVELENGTH)
-        self.factors = factorise(masks, *self._axes(), pupil.n_pixels**-2.0, self.tolerance)
+        self.factors = self._factorise()
 
     def __repr__(self) -> str:
         masks = ", ".join(map(repr, self.masks))
         return f"ZernikeSensor({self.pupil.n_points} points, {masks}, extent={self.extent:g}, rank={self.rank})"
+
+    def _factorise(self, *, rim: bool = False) -> Factors:
+        return factorise(self.masks, *self._axes(), self.pupil.n_pixels**-2.0, self.tolerance, rim=rim)
 
     def with_tolerance(self, tolerance: float) -> ZernikeSensor:
         """Return the same sensor with another error of the reference wave."""

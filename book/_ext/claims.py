@@ -168,8 +168,8 @@ def arcsine(n: Numbers) -> Finding:
     """'about 0.3' is 0.2 to 0.4 rad rms."""
     measured = (
         f"up to 0.3 rad rms the error of the arcsine is at most {n.arcsine_over_linear:.0%} of the linear one. "
-        f"It exceeds 5 % of the input above {n.arcsine_limit:.2f} rad rms, and is {n.arcsine_ratio_at_05:.0%} of "
-        "it at 0.5"
+        f"It exceeds 5 % of the input above about {n.arcsine_limit:.2f} rad rms, and is "
+        f"{n.arcsine_ratio_at_05:.0%} of it at 0.5"
     )
     worse = "It does not beat the linear reconstructor everywhere below 0.3 rad rms."
     return first(
@@ -189,13 +189,13 @@ def dynamic_range(n: Numbers) -> Finding:
     }
     gains = {name: limit / n.linear_limit for name, limit in limits.items()}
     short = [name for name, gain in gains.items() if gain <= 10]
-    reached = [f"{name} {limits[name]:.1f} ({gain:.0f} times as large)" for name, gain in gains.items() if gain]
+    reached = [f"{name} {limits[name]:.1f} (about {gain:.0f} times)" for name, gain in gains.items() if gain]
     never = [f"{name} never stays within 5 %" for name, gain in gains.items() if not gain]
     repaired = (
         "If it keeps the modelled field where nothing is measured, Gerchberg-Saxton reaches "
-        f"{n.saxton_model_limit:.2f} ({n.saxton_model_limit / n.linear_limit:.0f} times)"
+        f"{n.saxton_model_limit:.2f} (about {n.saxton_model_limit / n.linear_limit:.0f} times)"
     )
-    linear = f"largest inputs with an error within 5 %, in rad rms: linear {n.linear_limit:.3f}"
+    linear = f"largest inputs with an error within 5 %, in rad rms: linear about {n.linear_limit:.3f}"
     measured = ". ".join([", ".join([linear, *reached]), *never, repaired])
     return first(
         measured,
@@ -270,7 +270,8 @@ def reach(n: Numbers) -> Finding:
     """'about 1' is 0.8 to 1.2 rad rms."""
     measured = (
         f"{n.recovered_at_1:.0%} of the screens are recovered at 1 rad rms (Strehl ratio {n.strehl_at_1:.2f}). "
-        f"The mean error exceeds 5 % above {n.shifted_limit:.1f} rad rms (Strehl ratio {n.strehl_at_limit:.2f})"
+        f"The mean error exceeds 5 % above about {n.shifted_limit:.1f} rad rms (Strehl ratio about "
+        f"{n.strehl_at_limit:.1f})"
     )
     return first(
         measured,
@@ -278,7 +279,8 @@ def reach(n: Numbers) -> Finding:
         (
             n.shifted_limit > 1.2,
             REMARK,
-            "On our screens the range ends at a larger input, where the reference wave has little light.",
+            "On our screens the iteration fails at a larger input. Its flat start causes this limit, not the weak "
+            "wave: [maximum likelihood](../notebooks/beyond_range.ipynb) recovers larger inputs.",
         ),
     )
 
@@ -335,14 +337,14 @@ def best_pair(n: Numbers) -> Finding:
 def diameter(n: Numbers) -> Finding:
     """'about 2.2' is 2.0 to 2.4, 'drastically' more than ten times."""
     measured = (
-        f"the mean error exceeds 5 % of the input above {n.diameter_5_percent:.2f} $\\lambda/D$. It grows by a "
-        f"factor of about {round(n.error_at_26 / n.error_at_20, -2):.0f} from 2.0 to 2.6 $\\lambda/D$"
+        f"the mean error exceeds 5 % of the input above about {n.diameter_5_percent:.1f} $\\lambda/D$. It grows "
+        f"by a factor of about {round(n.error_at_26 / n.error_at_20, -2):.0f} from 2.0 to 2.6 $\\lambda/D$"
     )
     drastic = n.error_at_26 > 10 * n.error_at_20 and 2.0 <= n.diameter_5_percent <= 2.4
     slow = (
-        f"With 400 iterations the error exceeds 5 % only above {n.diameter_5_percent_400:.2f}. Around a flat "
-        f"wavefront the iteration converges slowly up to {n.contraction_crosses_1:.2f} $\\lambda/D$ and diverges "
-        "above."
+        f"With 400 iterations the error exceeds 5 % only above about {n.diameter_5_percent_400:.1f}. Around a "
+        f"flat wavefront the iteration converges slowly up to {n.contraction_crosses_1:.2f} $\\lambda/D$ and "
+        "diverges above."
     )
     return first(
         measured,

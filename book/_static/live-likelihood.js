@@ -5,7 +5,7 @@
 (() => {
   const live = window.zwfsLive;
   const { inside, nInside, nQuarter, map, field, mirrored, project, expand, through, behind, intensity } = live;
-  const FIRST_ITERATIONS = 2; // of the phase-shifted method
+  const FIRST_ITERATIONS = 2; // of the accelerated iteration
   const COARSE = 1e-3; // weakest function of the dimple in the Hessian, relative to the strongest
   const DAMPING = 1e-3; // of the first step, relative to the mean of the information's diagonal
   const LEAST_CUT = 0.1; // of the damping after a good step
@@ -216,7 +216,7 @@
     if (problem.steps.every(([c, s]) => c * c + s * s < 1e-18)) return null;
     const strongest = functions.list[0].pivot;
     const coarse = live.grouped(functions.list.filter(({ pivot }) => pivot > COARSE * strongest));
-    const first = live.phaseShifted(problem);
+    const first = live.accelerated(problem);
     const method = { estimate: first?.estimate ?? live.phasors(map()), converged: false };
     const nPixels = 2 * all.length;
     let [iteration, damping, growth, reflections, fit] = [0, DAMPING, GROWTH, 0, null];

@@ -66,6 +66,7 @@
       const step = errors.length === 1 ? Number(find("iterations").max) : 1;
       const points = ends.map((value, i) => `${i * step},${1 - Math.log10(Math.max(value, SMALLEST))}`);
       find(`line-${name}`).setAttribute("points", points.join(" "));
+      document.querySelector(`.live-legend .live-${name}`).hidden = !method;
     }
   }
 
@@ -77,5 +78,5 @@
     }
   }
 
-  window.zwfsLive.draw = { SMALLEST, scientific, error, phase, difference, image, focal, curves, bars };
+  window.zwfsLive.draw = { SMALLEST, error, phase, difference, image, focal, curves, bars };
 })();

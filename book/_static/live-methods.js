@@ -3,11 +3,14 @@
 
 (() => {
   const live = window.zwfsLive;
-  const { inside, nInside, modes, map, mirrored, dots, accumulate, expand, through, phasors } = live;
+  const { inside, nInside, nQuarter, modes, map, mirrored, dots, accumulate } = live;
+  const { project, expand, through, phasors } = live;
   const PARALLEL = 1e-6; // as in zwfs.PhaseShifted: sine below which two reference waves count as parallel,
   const DARK = 1e-9; // and amplitude below which one counts as absent
   const IN_LINE = 1e-6; // as in zwfs.Arcsine
   const CONDITIONING = 1e-3; // as in zwfs.Linear: smallest singular value that is inverted, relative to the largest
+  const DIMMEST = 0.01; // as in the accelerated zwfs.PhaseShifted: least light that images miss, relative to flat ones,
+  const MOST = 0.5; // and largest remainder of a small tilt
   const SMALL = 0.1; // tangents below it have their angle by a series
 
   // Solve L L^T x = b, with L in the lower half of rows.
@@ -90,6 +93,24 @@
     };
   }
 
+  // What the accelerated iteration needs to know of a dimple: the remainder of a small tilt after a plain iteration, and
+  // inner products of light. A field is known by its real and imaginary coefficients, its projections on the functions W.
+  // Their inner product is that of zwfs, of the parts of the fields in the span of W: that of the Gram matrix's inverse.
+  function accelerationFor(functions, flat) {
+    const tilt = map();
+    for (const k of inside) tilt[k] = (live.places[k] % live.size) - (live.size - 1) / 2;
+    const left = expand(project(tilt, functions), functions);
+    const share = (term) => inside.reduce((sum, k) => sum + tilt[k] * term(k), 0);
+    const remainder = share((k) => left[k] / flat[0][k]) / share((k) => tilt[k]);
+    const gram = functions.list.map((_, i) => {
+      const one = functions.list.map((_, j) => Number(i === j));
+      return project(expand(one, functions, nQuarter), functions, nQuarter);
+    });
+    const factor = cholesky(gram);
+    const inner = (a, b) => a.reduce((sum, part, p) => sum + dot(part, solve(factor, b[p])), 0);
+    return { inner, relaxation: 1 / (1 - Math.min(Math.max(remainder, 0), MOST)) };
+  }
+
   // Methods are { estimate, step }: the estimate is a field of modulus 1, which a step replaces.
   function linear({ flat, frames, steps, solveLinear }) {
     const sine = steps[0][1];
@@ -109,10 +130,9 @@
       const [x, y] = [c * flat[0][k], s * flat[0][k]];
       side[k] = -y >= -IN_LINE * Math.hypot(x, y) ? 1 : -1;
     }
-    let light = flat;
+    const lightOf = plainly({ functions, flat });
     const step = () => {
-      const [x, y] = light ?? through(functions, estimate, nInside);
-      light = null;
+      const [x, y] = lightOf(estimate);
       for (const k of inside) {
         const rx = c * x[k] - s * y[k];
         const ry = c * y[k] + s * x[k];
@@ -160,16 +180,73 @@
     return unsolved;
   }
 
-  function phaseShifted({ functions, flat, frames, steps }) {
+  // Light through the dimple in each step of an iteration: that of a flat wavefront, then that of the estimate.
+  function plainly({ functions, flat }) {
+    let light = flat;
+    return (estimate) => {
+      const now = light ?? through(functions, estimate, nInside);
+      light = null;
+      return now;
+    };
+  }
+
+  // The same for the accelerated iteration: dimmed in the first two steps (eq-dimming), then the secant (eq-secant).
+  function extrapolated({ functions, flat, frames, steps, acceleration: { inner, relaxation } }) {
+    const strength = steps.reduce((sum, [c, s]) => sum + c * c + s * s, 0);
+    const lightOf = (coefficients) => coefficients.map((part) => expand(part, functions));
+    const add = (a, factor, b) => a.map((part, p) => part.map((value, i) => value + factor * b[p][i]));
+
+    // Light that the reference waves of coefficients take out of the pupil (eq-lost).
+    function taken(coefficients, [x, y] = lightOf(coefficients)) {
+      const total = coefficients.reduce((sum, part) => sum + dot(part, part), 0);
+      return strength * inside.reduce((rest, k) => rest - x[k] * x[k] - y[k] * y[k], total);
+    }
+
+    let tried = phasors(map()).map((part) => project(part, functions));
+    const most = taken(tried, flat);
+    const seen = frames.reduce((sum, frame) => inside.reduce((rest, k) => rest + 1 - frame[k], sum), 0);
+    const missing = Math.min(Math.max(seen, DIMMEST * most), most);
+    const dimmed = (coefficients) => {
+      const factor = Math.sqrt(missing / Math.max(taken(coefficients), DIMMEST * missing));
+      return coefficients.map((part) => part.map((value) => factor * value));
+    };
+
+    let [before, change] = [null, null];
+    function secant(x, f) {
+      let next = add(x, relaxation, f);
+      if (before) {
+        const turn = add(f, -1, change);
+        const share = inner(turn, f) / (inner(turn, turn) || 1);
+        next = add(next, -share, add(add(x, -1, before), relaxation, turn));
+      }
+      [before, change] = [x, f];
+      return next;
+    }
+
+    let step = 0;
+    return (estimate) => {
+      const own = estimate.map((part) => project(part, functions));
+      if (step === 0) tried = dimmed(tried);
+      else if (step === 1) tried = dimmed(add(tried, relaxation, add(own, -1, tried)));
+      else {
+        const across = [own[1], own[0].map((value) => -value)];
+        const piston = Math.atan2(inner(tried, across), inner(tried, own));
+        const cosine = own.map((part) => part.map((value) => Math.cos(piston) * value));
+        tried = secant(tried, add(add(cosine, Math.sin(piston), across), -1, tried));
+      }
+      step++;
+      return lightOf(tried);
+    };
+  }
+
+  function phaseShifted(problem, lightOf = plainly(problem)) {
+    const { flat, frames, steps } = problem;
     const estimate = phasors(map());
     if (solvePoints(phasors(map()), flat, frames, steps) === inside.length) return null;
-    let light = flat;
-    const step = () => {
-      solvePoints(estimate, light ?? through(functions, estimate, nInside), frames, steps);
-      light = null;
-    };
-    return { estimate, step };
+    return { estimate, step: () => solvePoints(estimate, lightOf(estimate), frames, steps) };
   }
+
+  const accelerated = (problem) => phaseShifted(problem, extrapolated(problem));
 
   function angle(y, x) {
     if (x <= 0 || Math.abs(y) > SMALL * x) return Math.atan2(y, x);
@@ -228,37 +305,39 @@
     if (kept.diameter !== diameter) {
       const functions = live.dimple(diameter);
       const flat = through(functions, phasors(map()));
-      Object.assign(kept, { diameter, dimple: { functions, flat, solveLinear: linearFor(functions) } });
+      const prepared = { solveLinear: linearFor(functions), acceleration: accelerationFor(functions, flat) };
+      Object.assign(kept, { diameter, dimple: { functions, flat, ...prepared } });
     }
     return kept.dimple;
   }
 
-  /* settings: rms (radian), seed (1 to nSeeds), diameter (lambda/D), shifts (two, radian), photons (in each image;
-     Infinity: no noise), iterations, likelihood (whether to maximise it). Maps are those of live-model.js:
+  /* settings: rms (radian), seed (1 to nSeeds), diameter (lambda/D), shifts (two, radian), photons (that an
+     intensity of 1 puts into a pixel of each image; Infinity: no noise), iterations, accelerated and likelihood (whether
+     to compute them). Maps are those of live-model.js:
      phase         input, radian
      strehl        of the input
      focal         intensity in the focal plane, rows
      frames        both images, 1 = mean intensity of the pupil with the mask out
-     linear, arcsine, shifted, likelihood
+     linear, arcsine, shifted, accelerated, likelihood
                    estimate (field), residual (estimate less input on the circle, without piston, radian) and errors
                    (rms of the residual at the start and after each iteration, radian); null without a solution */
-  live.compute = ({ rms, seed, diameter, shifts, photons, iterations, likelihood }) => {
+  live.compute = ({ rms, seed, diameter, shifts, photons, iterations, ...set }) => {
     const { phase, truth, strehl, focal } = wavefront(seed, rms);
-    const { functions, flat, solveLinear } = dimple(diameter);
+    const model = dimple(diameter);
     const steps = shifts.map(live.step);
-    const perPixel = photons / inside.length;
-    const light = through(functions, truth);
+    const light = through(model.functions, truth);
     const clean = steps.map((change) => live.intensity(live.behind(truth, light, change)));
-    const frames = live.expose(clean, perPixel, seed);
-    const problem = { functions, flat, solveLinear, frames, steps, perPixel };
+    const frames = live.expose(clean, photons, seed);
+    const problem = { ...model, frames, steps, perPixel: photons };
     return {
       ...{ phase, strehl, focal, frames },
       linear: follow(linear(problem), truth, 0),
       arcsine: follow(arcsine(problem), truth, iterations),
       shifted: follow(phaseShifted(problem), truth, iterations),
-      likelihood: likelihood ? follow(live.maximise(problem), truth, iterations) : null,
+      accelerated: set.accelerated ? follow(accelerated(problem), truth, iterations) : null,
+      likelihood: set.likelihood ? follow(live.maximise(problem), truth, iterations) : null,
     };
   };
 
-  Object.assign(live, { phaseShifted, compare });
+  Object.assign(live, { accelerated, compare });
 })();

@@ -258,7 +258,7 @@ window.zwfsLive = (() => {
     return count;
   }
 
-  // Images with photon noise; perPixel is the number of photons that an intensity of 1 puts into a pixel.
+  // Images with photon noise; perPixel is the number of photons that an intensity of 1 puts into a pixel of each.
   function expose(frames, perPixel, seed) {
     if (perPixel === Infinity) return frames;
     const random = generator(seed);

@@ -18,14 +18,14 @@
   const signed = (number, digits) => `${number < 0 ? "−" : "+"}${Math.abs(number).toFixed(digits)}`;
 
   // What is written above a slider, and what a screen reader says.
-  const photons = () => (value("photons") > 9 ? Infinity : 10 ** value("photons"));
+  const photons = () => (value("per-point") < find("per-point").max ? 10 ** value("per-point") : Infinity);
   const captions = {
     rms: (v) => [`${v.toFixed(2)} rad`],
     seed: (v) => [`${v}`],
     diameter: (v) => [`${v.toFixed(2)} λ/D`, `${v.toFixed(2)} lambda over D`],
     "shift-a": (v) => [`${signed(v, 2)} π`, `${v.toFixed(2)} pi`],
     "shift-b": (v) => [`${signed(v, 2)} π`, `${v.toFixed(2)} pi`],
-    photons: () => (photons() === Infinity ? ["no noise"] : [draw.scientific(photons())]),
+    "per-point": () => (photons() === Infinity ? ["no noise"] : [`${Number(photons().toPrecision(2))}`]),
     iterations: (v) => [`${v}`],
   };
 
@@ -52,7 +52,11 @@
     ask();
   }
 
-  const parse = (text) => Object.fromEntries(new URLSearchParams(text));
+  // The slider `photons` of old addresses counted those of all points: the logarithm is less by 3.5, to 2 %.
+  function parse(text) {
+    const { photons: old, ...state } = Object.fromEntries(new URLSearchParams(text));
+    return old ? { "per-point": String(old - 3.5), ...state } : state;
+  }
 
   function toAddress() {
     const changed = inputs.filter((input) => read(input) !== standard(input));
@@ -85,11 +89,13 @@
     shifts: [value("shift-a") * Math.PI, value("shift-b") * Math.PI],
     photons: photons(),
     iterations: value("iterations"),
+    accelerated: find("accelerated").checked,
     likelihood: find("likelihood").checked,
   });
 
-  function columns(made, { likelihood }) {
-    const last = likelihood ? ["likelihood", "maximum likelihood"] : ["shifted", "phase-shifted"];
+  function columns(made, { accelerated, likelihood }) {
+    const iteration = accelerated ? ["accelerated", "accelerated"] : ["shifted", "phase-shifted"];
+    const last = likelihood ? ["likelihood", "maximum likelihood"] : iteration;
     return [["linear", "linear"], ["arcsine", "arcsine"], last].map(([key, name]) => ({ key, name, made: made[key] }));
   }
 
@@ -130,8 +136,8 @@
       find(`name-${place}`).textContent = name;
       find(`error-name-${place}`).textContent = name;
     });
-    document.querySelector(".live-legend .live-likelihood").hidden = !made.likelihood;
-    draw.curves({ linear: made.linear, arcsine: made.arcsine, shifted: made.shifted, likelihood: made.likelihood });
+    const { linear, arcsine, shifted, accelerated, likelihood } = made;
+    draw.curves({ linear, arcsine, shifted, accelerated, likelihood });
     find("says").textContent = sentence(made, set);
     listeners.forEach((listener) => listener(set, made));
   }

@@ -48,14 +48,14 @@ class BandCurves:
     error: dict[str, NDArray[np.float64]]  # (n,) of each way, with photon noise
     bias: dict[str, NDArray[np.float64]]  # (n,) of the ways that ignore the bandwidth, without noise
     bound: NDArray[np.float64]  # (n,)
-    photons: float  # of each point and frame
+    photons: float  # per point and image
 
     def at(self, bandwidth: float) -> int:
         """Place of the bandwidth that is nearest."""
         return int(np.argmin(np.abs(self.bandwidths - bandwidth)))
 
     def equal_photons(self, way: str) -> NDArray[np.float64]:
-        """Photons of each point and frame for which the bias of a way is as large as the bound, (n,)."""
+        """Photons per point and image for which the bias of a way is as large as the bound, (n,)."""
         bias = np.maximum(self.bias[way], np.finfo(float).tiny)
         return self.photons * (self.bound / bias) ** 2
 

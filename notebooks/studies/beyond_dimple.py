@@ -5,7 +5,7 @@ A screen is recovered if the error of its phase is at most a threshold, 5 % of t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,14 +19,19 @@ from studies.beyond_range import (
     ACCELERATED,
     LIKELY,
     PLAIN,
-    RecoveryCurves,
     compared_methods,
     method_line,
     method_look,
 )
-from studies.fig04_dimple_diameter import DARK_RING, DiameterCurves, diameter_curves, iteration_spectrum
+from studies.fig04_dimple_diameter import (
+    DARK_RING,
+    DiameterCurves,
+    diameter_curves,
+    diameter_limit,
+    iteration_spectrum,
+)
 from studies.kit import sweeps
-from studies.kit.curves import crossing
+from studies.kit.curves import ErrorCurves, Limit, crossing
 from studies.kit.methods import MASKS, opposite_dimples
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
@@ -49,14 +54,34 @@ _TILTS = 2  # the first modes: Noll 2 and 3
 
 
 def dimple_curves(
-    pupil: Pupil, phase_shift: float, n_iterations: int, diameters: ArrayLike, screens: NDArray
+    pupil: Pupil,
+    phase_shift: float,
+    n_iterations: int,
+    diameters: ArrayLike,
+    screens: NDArray,
+    names: Sequence[str] = (PLAIN, ACCELERATED, LIKELY),
 ) -> DiameterCurves:
     """Errors of the compared methods for pairs of dimples of opposite phase shifts; see `diameter_curves`."""
 
     def make(diameter: float) -> dict[str, Any]:
-        return compared_methods(opposite_dimples(pupil, diameter, phase_shift), n_iterations)
+        methods = compared_methods(opposite_dimples(pupil, diameter, phase_shift), n_iterations)
+        return {name: methods[name] for name in names}
 
     return diameter_curves(make, diameters, screens)
+
+
+def failing_limits(
+    curve: DiameterCurves, pupil: Pupil, phase_shift: float, n_iterations: int, screens: NDArray, threshold: float
+) -> dict[str, Limit]:
+    """Diameter at which the mean error of each iteration exceeds the threshold, from other screens."""
+
+    def limit(name: str) -> Limit:
+        def make(diameters: NDArray) -> DiameterCurves:
+            return dimple_curves(pupil, phase_shift, n_iterations, diameters, screens, [name])
+
+        return diameter_limit(curve, name, make, threshold)
+
+    return {name: limit(name) for name in (PLAIN, ACCELERATED)}
 
 
 @dataclass(frozen=True)
@@ -209,7 +234,7 @@ def limits_columns(limits: DimpleLimits) -> dict[str, NDArray]:
 
 def failing_table(curves: Mapping[float, DiameterCurves], threshold: float) -> Table:
     """Failing point of each method, for each input."""
-    exceeded = f"mean error exceeds {100 * threshold:g} % from (λ/D)"
+    exceeded = f"mean error exceeds {100 * threshold:g} % from about (λ/D)"
     return Table(
         ["input (rad rms)", "method", "recovers every screen up to (λ/D)", exceeded],
         [
@@ -236,15 +261,15 @@ def _complete_up_to(curve: DiameterCurves, name: str, threshold: float) -> str:
 def _fails_above(curve: DiameterCurves, name: str, threshold: float) -> str:
     """Diameter at which the mean error exceeds the threshold."""
     passed = curve.exceeds(name, threshold * curve.rms[0])
-    return f"{passed:.3g}" if passed < np.inf else "never"
+    return f"{passed:.2g}" if passed < np.inf else "never"
 
 
-def instruments_table(curves: Mapping[str, RecoveryCurves], threshold: float) -> Table:
+def instruments_table(curves: Mapping[str, ErrorCurves], threshold: float) -> Table:
     """Number of screens that each method recovers on the masks of instruments."""
     names = list(next(iter(curves.values())).errors)
     rows = []
     for mask, curve in curves.items():
-        n_screens = curve.n_starts.shape[1]
+        n_screens = curve.errors[names[0]].shape[1]
         shares = np.transpose([curve.recovered(name, threshold) for name in names])
         for rms, row in zip(curve.rms, shares, strict=True):
             counts = (f"{round(n_screens * share)} of {n_screens}" for share in row)
@@ -255,7 +280,8 @@ def instruments_table(curves: Mapping[str, RecoveryCurves], threshold: float) ->
 def numbers(
     curves: Mapping[float, DiameterCurves],
     limits: DimpleLimits,
-    masks: Mapping[str, RecoveryCurves],
+    masks: Mapping[str, ErrorCurves],
+    fails: Mapping[str, Limit],
     threshold: float,
     settings: Mapping[str, float],
 ) -> dict[str, float | str]:
@@ -274,8 +300,10 @@ def numbers(
         "last_input": list(curves)[-1],
         "largest": first.diameters[-1],
         "smallest": first.diameters[0],
-        "plain_fails": _fails_above(first, PLAIN, threshold),
-        "accelerated_fails": _fails_above(first, ACCELERATED, threshold),
+        "plain_fails": fails[PLAIN].value,
+        "plain_fails_error": fails[PLAIN].error,
+        "accelerated_fails": fails[ACCELERATED].value,
+        "accelerated_fails_error": fails[ACCELERATED].error,
         "likely_share": min(curve.recovered(LIKELY, threshold).min() for curve in curves.values()),
         "factor_flat": flat,
         "factor_screens_least": min(aberrated),

@@ -1,62 +1,89 @@
-"""Screens that are recovered, beyond the paper: by its iteration, accelerated or not, and by maximum likelihood.
+"""Range of two images, beyond the paper: errors against the input, with photon noise and with errors of the model.
 
-A screen is recovered if the error of its phase is at most a threshold, 5 % of the input. Errors count modulo 2 pi.
+Errors are radian rms over the pupil, without piston and modulo 2 pi.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import cycle
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from studies.fig04_dimple_diameter import iteration_spectrum
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves
+from studies.kit.curves import ErrorCurves, crossing
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
-from studies.kit.setups import screens_at
+from studies.kit.setups import Noise, screens_at
 from studies.kit.style import LOOKS, OTHER_STYLES, Look
-from studies.kit.tables import Table
+from studies.kit.tables import Table, small
+from zwfs.bounds import cramer_rao
+from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error
-from zwfs.reconstructors import MaximumLikelihood, PhaseShifted
+from zwfs.modes import power_law_screens, zernike_basis
+from zwfs.pupil import Pupil
+from zwfs.reconstructors import Arcsine, Linear, MaximumLikelihood, PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
 LIMITS = parameter_limits(
-    "n_pixels n_modes phase_shift inputs n_screens exponent n_iterations threshold", diameters=[(0.1, 8.0)]
+    "n_pixels n_modes diameter phase_shift n_screens exponent n_iterations threshold",
+    inputs=[(0.01, 4.0)],
+    inputs_noiseless=[(0.01, 12.0), ...],
+    inputs_limit=[(0.1, 4.0)],
+    photons=[(1.0, 1e12)],
+    diameter_error=(-0.5, 0.5),
+    shift_error=(-0.5, 0.5),
+    image_shift=(0.0, 5.0),
+    amplitude_error=(0.0, 0.3),
+    n_subpixels=(2, 8),
+    n_screens_model=(1, 1000),
+    n_screens_limit=(10, 10000),
 )
-PLAIN, ACCELERATED, LIKELY = "PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood"
+PLAIN, ACCELERATED, LIKELY, MODES = (
+    "PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood", "MaximumLikelihoodModes",
+)  # fmt: skip
 """Names of the compared methods."""
+PIXEL_ERROR = 0.01  # rad rms, from which the text calls the size of the pixels important
+_WITHOUT_NOISE = 0.0  # photons
 
 
-def compared_methods(sensor: ZernikeSensor, n_iterations: int) -> dict[str, Any]:
+def compared_methods(sensor: ZernikeSensor, n_iterations: int, photons: float = 0.0) -> dict[str, Any]:
     """Return the paper's iteration, its accelerated form, and maximum likelihood, by name."""
     return {
         PLAIN: PhaseShifted(sensor, n_iterations=n_iterations),
         ACCELERATED: PhaseShifted(sensor, n_iterations=n_iterations, accelerate=True),
-        LIKELY: MaximumLikelihood(sensor),
+        LIKELY: MaximumLikelihood(sensor, photons=photons or None),
     }
 
 
-class Verdicts(NamedTuple):
-    """Numbers of screens by what maximum likelihood says about its phase, and by whether the phase is right."""
-
-    consistent_right: int
-    consistent_wrong: int
-    inconsistent_right: int
-    inconsistent_wrong: int
+def all_methods(sensor: ZernikeSensor, modes: NDArray, n_iterations: int, photons: float) -> dict[str, Any]:
+    """Return `compared_methods`, maximum likelihood on modes, and the methods with one image, by name."""
+    single = ZernikeSensor(sensor.pupil, sensor.masks[0])
+    return {
+        "Linear": Linear(single, modes),
+        "Arcsine": Arcsine(single, n_iterations=n_iterations),
+        **compared_methods(sensor, n_iterations, photons),
+        MODES: MaximumLikelihood(sensor, modes, photons=photons or None),
+    }
 
 
 @dataclass(frozen=True)
-class RecoveryCurves(ErrorCurves):
-    """Errors of the compared methods against the input, and what maximum likelihood reports."""
+class NoiseCurves(ErrorCurves):
+    """Errors against the input for one number of photons, the bounds, and whether a solution is consistent."""
 
-    consistent: NDArray[np.bool_]  # (n_rms, n_screens)
-    n_starts: NDArray[np.integer]  # (n_rms, n_screens)
+    photons: float  # per point and image; 0 without noise
+    bound: dict[str, NDArray[np.float64]]  # (n_rms,) by name: LIKELY for points, MODES for modes; radian rms
+    consistent: NDArray[np.bool_]  # (n_rms, n_screens), of maximum likelihood
+
+    def median(self, name: str) -> NDArray[np.float64]:
+        """Median error over the screens, shape (n_rms,), radian rms."""
+        return np.median(self.errors[name], axis=1)
 
     def complete_up_to(self, name: str, threshold: float) -> float:
         """Largest input up to which a method recovers every screen, radian rms; 0 if there is none."""
@@ -64,64 +91,268 @@ class RecoveryCurves(ErrorCurves):
         complete = self.rms[: lost[0]] if lost.size else self.rms
         return float(complete[-1]) if complete.size else 0.0
 
-    def verdicts(self, threshold: float = 0.05) -> Verdicts:
-        """Count the screens by the verdict of maximum likelihood and by the truth."""
-        right = self.errors[LIKELY] <= threshold * self.rms[:, np.newaxis]
-        return Verdicts(*(
-            int(np.count_nonzero((self.consistent == said) & (right == truth)))
-            for said in (True, False)
-            for truth in (True, False)
-        ))  # fmt: skip
 
-
-def recovery_curves(
-    sensors: Mapping[Any, ZernikeSensor],
+def noise_curves(
+    sensor: ZernikeSensor,
     modes: NDArray,
-    rms: ArrayLike,
+    photons: Sequence[float],
+    inputs: Sequence[float],
+    inputs_noiseless: Sequence[float],
     n_screens: int,
-    *,
-    n_iterations: int = 25,
-    exponent: float = -2.0,
-    seed: int = 0,
-) -> dict[Any, RecoveryCurves]:
-    """Errors of the compared methods on random screens of growing rms, for each of several sensors."""
-    rms = np.asarray(rms)
+    **settings: Any,
+) -> list[NoiseCurves]:
+    """Errors of all methods for each number of photons, and without noise at more inputs."""
+    levels = [_WITHOUT_NOISE, *sorted(photons)]
+    rms = {level: [*inputs, *([] if level else inputs_noiseless)] for level in levels}
     # The largest inputs take longest: they begin first, so that all cores end at about the same time.
-    points = [(name, task) for task in reversed(range(rms.size)) for name in sensors]
-    shared = dict(sensors), modes, rms.tolist(), n_screens, n_iterations, exponent, seed
-    found = dict(zip(points, sweeps.run(_recovery_point, points, *shared, name="recovery_curves"), strict=True))
-    curves = {}
-    for name in sensors:
-        errors, *reports = zip(*(found[name, task] for task in range(rms.size)), strict=True)
-        by_method = {method: np.array([point[method] for point in errors]) for method in errors[0]}
-        curves[name] = RecoveryCurves(rms, by_method, *map(np.array, reports))
+    points = [(level, task) for level in levels for task in reversed(range(len(rms[level])))]
+    tasks = [(level, task, rms[level][task]) for level, task in points]
+    found = sweeps.run(_noise_point, tasks, sensor, modes, n_screens, *_ordered(settings), name="noise_curves")
+    by_point = dict(zip(points, found, strict=True))
+    curves = []
+    for level in levels:
+        errors, bounds, consistent = zip(*(by_point[level, task] for task in range(len(rms[level]))), strict=True)
+        curves.append(
+            NoiseCurves(
+                np.array(rms[level]),
+                {name: np.array([point[name] for point in errors]) for name in errors[0]},
+                level,
+                {name: np.array([point[name] for point in bounds]) for name in bounds[0]},
+                np.array(consistent),
+            )
+        )
     return curves
 
 
-def _recovery_point(
-    point: tuple[Any, int],
-    sensors: Mapping[Any, ZernikeSensor],
+def _ordered(settings: Mapping[str, Any]) -> tuple[int, float, int]:
+    return settings["n_iterations"], settings["exponent"], settings["seed"]
+
+
+def _noise_point(
+    point: tuple[float, int, float],
+    sensor: ZernikeSensor,
     modes: NDArray,
-    rms: list[float],
     n_screens: int,
     n_iterations: int,
     exponent: float,
     seed: int,
-) -> tuple[dict[str, NDArray], NDArray, NDArray]:
-    """One sensor and input of `recovery_curves`: errors, consistent and number of starts, (n_screens,) each."""
-    name, task = point
-    sensor = sensors[name]
-    screens = screens_at(modes, rms[task], n_screens, seed, task, exponent)
-    frames = sensor.measure(screens)
-    found = {method: one(frames) for method, one in compared_methods(sensor, n_iterations).items()}
-    errors = {method: reconstruction_error(sensor.pupil, one.phase, screens) for method, one in found.items()}
-    return errors, found[LIKELY].consistent, found[LIKELY].n_starts
+) -> tuple[dict[str, NDArray], dict[str, float], NDArray]:
+    """One number of photons and input: errors, (n_screens,), bounds, and consistent, (n_screens,)."""
+    photons, task, rms = point
+    screens = screens_at(modes, rms, n_screens, seed, task, exponent)
+    noise = Noise(sensor.n_masks * photons)  # the light of all images goes to one where a method uses one
+    errors, consistent = {}, np.zeros(n_screens, bool)
+    for name, method in all_methods(sensor, modes, n_iterations, photons).items():
+        result = method(noise(method.sensor, screens, np.random.SeedSequence(seed, spawn_key=(task, 0))))
+        errors[name] = reconstruction_error(sensor.pupil, result.phase, screens)
+        consistent = result.consistent if name == LIKELY else consistent
+    if not photons:
+        return errors, {}, consistent
+    points = sensor.pupil.gather(cramer_rao(sensor, screens, photons=photons))
+    coefficients = cramer_rao(sensor, screens, photons=photons, modes=modes)
+    bounds = {
+        LIKELY: float(np.median(np.sqrt(np.mean(points**2, axis=-1)))),
+        MODES: float(np.median(np.sqrt(np.sum(coefficients**2, axis=-1)))),  # modes of unit rms
+    }
+    return errors, bounds, consistent
+
+
+@dataclass(frozen=True)
+class ModelErrors:
+    """How a camera differs from the model of the reconstructors."""
+
+    diameter: float  # of the dimples, relative
+    shift: float  # phase shift of the first dimple, relative
+    image_shift: float  # of the second image along x, pixels
+    amplitude: float  # rms over the pupil, relative
+    n_subpixels: int  # along each side of a pixel
+
+
+class FineCamera:
+    """Camera whose pixels average n x n samples of a finer model of the pupil."""
+
+    def __init__(self, sensor: ZernikeSensor, modes: NDArray, n: int) -> None:
+        amplitude = np.kron(sensor.pupil.amplitude, np.ones((n, n)))
+        self.pupil = Pupil.from_amplitude(amplitude, n_pixels=n * sensor.pupil.n_pixels)
+        self._sensor, self._n = ZernikeSensor(self.pupil, *sensor.masks), n
+        # The corners of whole pixels reach beyond the unit circle of the modes: a wider circle holds them.
+        wider = Pupil.from_amplitude(amplitude, n_pixels=(1 + 2 / sensor.pupil.n_pixels) * self.pupil.n_pixels)
+        self.modes = zernike_basis(wider, len(modes))
+
+    def mean(self, values: NDArray) -> NDArray:
+        """Mean of fine values over each pixel."""
+        *batch, height, width = values.shape
+        return values.reshape(*batch, height // self._n, self._n, width // self._n, self._n).mean(axis=(-3, -1))
+
+    def frames(self, screens: NDArray, image_shift: float = 0.0) -> NDArray:
+        """Frames of fine screens, the second image displaced along x (pixels)."""
+        fine = self._sensor.measure(screens)
+        whole, part = divmod(image_shift * self._n, 1)
+        moved = np.roll(fine[:, 1], -int(whole), axis=-1)
+        fine[:, 1] = (1 - part) * moved + part * np.roll(moved, -1, axis=-1)
+        return self.mean(fine)
+
+
+def model_curves(
+    sensor: ZernikeSensor,
+    modes: NDArray,
+    errors: ModelErrors,
+    inputs: Sequence[float],
+    n_screens: int,
+    *,
+    n_iterations: int,
+    exponent: float,
+    seed: int,
+) -> dict[str, ErrorCurves]:
+    """Errors of the two best methods on noiseless frames that their model does not describe, by its error."""
+    tasks = list(enumerate(inputs))[::-1]
+    shared = sensor, modes, errors, n_screens, n_iterations, exponent, seed
+    found = sweeps.run(_model_point, tasks, *shared, name="model_curves")[::-1]
+    names = (ACCELERATED, LIKELY)
+    return {
+        kind: ErrorCurves(np.array(inputs), {name: np.array([one[kind, name] for one in found]) for name in names})
+        for kind in dict.fromkeys(kind for kind, _ in found[0])
+    }
+
+
+def _model_point(
+    point: tuple[int, float],
+    sensor: ZernikeSensor,
+    modes: NDArray,
+    errors: ModelErrors,
+    n_screens: int,
+    n_iterations: int,
+    exponent: float,
+    seed: int,
+) -> dict[tuple[str, str], NDArray]:
+    """Errors of one input, (n_screens,) by the error of the model and the method."""
+    task, rms = point
+    camera = FineCamera(sensor, modes, errors.n_subpixels)
+    fine = np.where(camera.pupil.inside, screens_at(camera.modes, rms, n_screens, seed, task, exponent), 0)
+    screens = camera.mean(fine)
+    methods = compared_methods(sensor, n_iterations)
+    return {
+        (kind, name): reconstruction_error(sensor.pupil, methods[name](frames).phase, screens)
+        for kind, frames in wrong_frames(sensor, errors, camera, fine, screens, seed).items()
+        for name in (ACCELERATED, LIKELY)
+    }
+
+
+def wrong_frames(
+    sensor: ZernikeSensor, errors: ModelErrors, camera: FineCamera, fine: NDArray, screens: NDArray, seed: int
+) -> dict[str, NDArray]:
+    """Noiseless frames of screens, given on the fine and on the camera's grid, by the error of the model."""
+    pupil, (first, second) = sensor.pupil, sensor.masks
+    wider = (Dimple((1 + errors.diameter) * mask.diameter, mask.phase) for mask in (first, second))
+    shifted = Dimple(first.diameter, (1 + errors.shift) * first.phase)
+    uneven = 0 * pupil.amplitude
+    if errors.amplitude:
+        uneven = power_law_screens(zernike_basis(pupil, 60), errors.amplitude, 1, -2.0, seed)[0]
+    amplitude = pupil.amplitude * (1 + np.where(pupil.inside, uneven, 0))
+    return {
+        f"amplitude wrong by {errors.amplitude:.0%} rms": sensor.measure(screens, amplitude),
+        f"second image {errors.image_shift:g} pixel off": camera.frames(fine, errors.image_shift),
+        f"dimples {errors.diameter:.0%} larger": ZernikeSensor(pupil, *wider).measure(screens),
+        f"one phase shift {errors.shift:.0%} off": ZernikeSensor(pupil, shifted, second).measure(screens),
+        "pixels are areas, model exact": camera.frames(fine),
+    }
+
+
+DIMMED, SECANT = "plain, dimmed start", "secant, flat start"
+"""Variants of the iteration that have one of the two ingredients of the acceleration."""
+
+
+@dataclass(frozen=True)
+class Causes:
+    """Noiseless screens around the limit of the plain iteration, and what limits it."""
+
+    curves: ErrorCurves  # of PLAIN, DIMMED, SECANT, ACCELERATED
+    factor: NDArray[np.float64]  # (n_rms, n_screens), of a small error in one plain iteration near the truth
+    example: dict[str, NDArray[np.float64]]  # error after each iteration, (n_iterations + 1,) by name
+    example_rms: float
+
+    def half(self, name: str, threshold: float) -> tuple[float, float]:
+        """Input at which a method recovers half of the screens, and its standard error, radian rms."""
+        share, rms = self.curves.recovered(name, threshold), self.curves.rms
+        below = np.flatnonzero(share < 0.5)
+        if not below.size or below[0] == 0:
+            return (0.0 if below.size else np.inf), 0.0
+        low, high = below[0] - 1, below[0]
+        slope = (share[low] - share[high]) / (rms[high] - rms[low])
+        n_screens = self.curves.errors[name].shape[1]
+        return float(rms[low] + (share[low] - 0.5) / slope), float(0.5 / np.sqrt(n_screens) / slope)
+
+
+def causes(
+    sensor: ZernikeSensor,
+    modes: NDArray,
+    inputs: Sequence[float],
+    n_screens: int,
+    threshold: float,
+    **settings: Any,
+) -> Causes:
+    """Separate the two ingredients of the acceleration on noiseless frames."""
+    shared = sensor, modes, n_screens, *_ordered(settings)
+    found = sweeps.run(_causes_point, list(enumerate(inputs)), *shared, name="causes")
+    errors, factor = zip(*found, strict=True)
+    rms = np.array(inputs)
+    curves = ErrorCurves(rms, {name: np.array([one[name] for one in errors]) for name in errors[0]})
+    # An example that only the acceleration recovers, and whose iteration contracts near the truth.
+    lost = curves.errors[PLAIN] > threshold * rms[:, np.newaxis]
+    kept = curves.errors[ACCELERATED] <= threshold * rms[:, np.newaxis]
+    places = np.argwhere(lost & kept & (np.array(factor) < 1))
+    task, index = places[len(places) // 2] if len(places) else (len(rms) - 1, 0)
+    screen = screens_at(modes, rms[task], n_screens, settings["seed"], int(task), settings["exponent"])[[index]]
+    n_iterations = settings["n_iterations"]
+    example = {
+        name: reconstruction_error(sensor.pupil, result.history[0], screen[0])
+        for name, result in _variants(sensor, sensor.measure(screen), n_iterations, history=True).items()
+    }
+    return Causes(curves, np.array(factor), example, float(rms[task]))
+
+
+def _variants(sensor: ZernikeSensor, frames: NDArray, n_iterations: int, **options: Any) -> dict[str, Any]:
+    """Results of the iteration with none, either and both of the ingredients of the acceleration."""
+    plain, accelerated, _ = compared_methods(sensor, n_iterations).values()
+    one_step = PhaseShifted(sensor, n_iterations=1, tolerance=0.0, accelerate=True)
+    dimmed = np.where(sensor.pupil.inside, one_step(frames).phase, 0)
+    return {
+        PLAIN: plain(frames, **options),
+        SECANT: accelerated(frames, start=0 * dimmed, **options),
+        DIMMED: plain(frames, start=dimmed, **options),
+        ACCELERATED: accelerated(frames, **options),
+    }
+
+
+def _causes_point(
+    point: tuple[int, float],
+    sensor: ZernikeSensor,
+    modes: NDArray,
+    n_screens: int,
+    n_iterations: int,
+    exponent: float,
+    seed: int,
+) -> tuple[dict[str, NDArray], list[float]]:
+    """Errors, (n_screens,) by variant, and contraction factors, (n_screens,), of one input."""
+    task, rms = point
+    screens, pupil = screens_at(modes, rms, n_screens, seed, task, exponent), sensor.pupil
+    results = _variants(sensor, sensor.measure(screens), n_iterations)
+    errors = {name: reconstruction_error(pupil, result.phase, screens) for name, result in results.items()}
+    diameter = sensor.masks[0].diameter
+    return errors, [float(np.abs(iteration_spectrum(pupil, diameter, one)[0])) for one in screens]
+
+
+_INK = "#555555"
+_BOUND: dict[str, Any] = {"color": _INK, "lw": 8, "alpha": 0.3, "solid_capstyle": "round", "zorder": 1.5}
+_FLOOR = 1e-7  # of a drawn error: below it digits are rounding errors
 
 
 def method_look(name: str) -> Look:
-    """Look of a compared method: the accelerated iteration has the colour of the plain one."""
+    """Look of a compared method: variants of a method have its colour."""
     if name == ACCELERATED:
         return replace(LOOKS[PLAIN], name="phase-shifted, accelerated", line="-")
+    if name == MODES:
+        return replace(LOOKS[LIKELY], name="maximum likelihood on modes", line="--", marker="o")
     return LOOKS[name]
 
 
@@ -134,86 +365,205 @@ def method_line(name: str) -> dict[str, Any]:
     return style | {"ms": 5, "lw": 1.6, "mfc": "#ffffff" if name == ACCELERATED else look.color}
 
 
-def draw_range_recovery(curves: Mapping[float, RecoveryCurves], threshold: float) -> Figure:
-    """Share of recovered screens against the input, one panel for each dimple."""
-    figure, panels = plt.subplots(1, len(curves), figsize=(7, 3.6), sharey=True, squeeze=False)
-    for axes, (diameter, curve) in zip(panels[0], curves.items(), strict=True):
-        for name in curve.errors:
-            axes.plot(curve.rms, 100 * curve.recovered(name, threshold), **method_line(name))
-        axes.set_title(rf"{diameter:g} $\lambda/D$", fontsize=10)
-        axes.set(xlabel="input (rad rms)", xlim=(0, None))
-    panels[0, 0].set(ylabel="screens recovered (%)", ylim=(-4, 104))
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    return figure
+def _input_axes(axes: Axes, threshold: float, bottom: float) -> None:
+    """Logarithmic axes of the error against the input, with the line of recovered screens."""
+    axes.set(xscale="log", yscale="log", xlabel="input (rad rms)", ylim=(bottom, 4))
+    ends = np.array(axes.get_xlim())
+    axes.plot(ends, threshold * ends, color=_INK, lw=1, ls=":", zorder=0.5)
+    axes.annotate(
+        f"{threshold:.0%}", (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points", color=_INK,
+        fontsize=9, va="center",
+    )  # fmt: skip
+    axes.set_xlim(ends)
+    ticks = [tick for tick in (0.05, 0.1, 0.2, 0.5, 1, 2, 4) if ends[0] <= tick <= ends[1]]
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_xticks([], minor=True)
 
 
-def draw_range_starts(curves: Mapping[float, RecoveryCurves]) -> Figure:
-    """Mean number of starts of maximum likelihood against the input, one line for each dimple."""
-    figure, axes = plt.subplots(figsize=(7, 3.4))
-    for (diameter, curve), style in zip(curves.items(), cycle(OTHER_STYLES), strict=False):
-        axes.plot(curve.rms, curve.n_starts.mean(axis=1), label=rf"{diameter:g} $\lambda/D$", **style)
-    axes.set(xlabel="input (rad rms)", ylabel="starts per screen, mean", xlim=(0, None), ylim=(0, None))
-    axes.legend(fontsize=9)
-    return figure
+def _spaced(number: float) -> str:
+    """Whole number with spaces between thousands."""
+    return f"{number:,.0f}".replace(",", " ")
 
 
-def range_columns(curves: Mapping[float, RecoveryCurves], threshold: float) -> dict[str, NDArray]:
-    """Columns of the figures: share of recovered screens of each method, and mean number of starts."""
-    columns = {}
-    for diameter, curve in curves.items():
-        columns["input (rad rms)"] = curve.rms
-        for name in curve.errors:
-            columns[f"{name}, {diameter:g} lambda/D: share recovered"] = curve.recovered(name, threshold)
-        columns[f"{diameter:g} lambda/D: starts, mean"] = curve.n_starts.mean(axis=1)
-    return columns
-
-
-def range_table(curves: Mapping[float, RecoveryCurves], threshold: float) -> Table:
-    """Largest input up to which each method recovers every screen, for each dimple."""
-    names = next(iter(curves.values())).errors
-    return Table(
-        ["every screen up to (rad rms)", *(f"{diameter:g} λ/D" for diameter in curves)],
-        [
-            [method_look(name).name, *(f"{curve.complete_up_to(name, threshold):g}" for curve in curves.values())]
-            for name in names
-        ],
+def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) -> Figure:
+    """Median error against the input: all methods for one number of photons, and one method for all."""
+    figure, (methods, light) = plt.subplots(1, 2, figsize=(7, 4.6), sharey=True)
+    noiseless, *noisy = curves
+    chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
+    for name in chosen.errors:
+        methods.plot(chosen.rms, chosen.median(name), **method_line(name))
+    methods.set_title(f"{_spaced(chosen.photons)} photons per point", fontsize=10)
+    methods.set_ylabel("median error (rad rms)")
+    line = method_line(LIKELY) | {"label": "_"}
+    for curve in noisy:
+        light.plot(curve.rms, curve.median(LIKELY), **line)
+        light.plot(curve.rms, curve.bound[LIKELY], label="_", **_BOUND)
+        light.annotate(
+            _spaced(curve.photons), (curve.rms[0], curve.bound[LIKELY][0]), (0, 8),
+            textcoords="offset points", fontsize=9,
+        )  # fmt: skip
+    light.set_title("maximum likelihood, by photons per point", fontsize=10)
+    exact = noiseless.complete_up_to(LIKELY, threshold)
+    bottom = noisy[-1].median(MODES).min() / 3
+    if exact:
+        light.text(
+            0.98, 0.02, f"no noise: exact up to {exact:g} rad rms", ha="right", fontsize=9, color=_INK,
+            transform=light.transAxes,
+        )  # fmt: skip
+    for axes in (methods, light):
+        _input_axes(axes, threshold, bottom)
+    handles, labels = methods.get_legend_handles_labels()
+    [bound] = light.plot([], [], **_BOUND)
+    figure.legend(
+        [*handles, bound], [*labels, "Cramér-Rao bound"], loc="outside lower center", ncols=2, fontsize=9
     )
+    return figure
 
 
-def verdicts_table(curves: Mapping[float, RecoveryCurves], threshold: float) -> Table:
-    """Numbers of screens by what maximum likelihood says and by the truth."""
-    rows = [[f"{diameter:g}", *curve.verdicts(threshold)] for diameter, curve in curves.items()]
-    names = (name.replace("_", " and ") for name in Verdicts._fields)
-    return Table(["diameter (λ/D)", *names], [*rows, ["all", *_all_verdicts(curves, threshold)]])
+def draw_model_errors(curves: Mapping[str, ErrorCurves], noise: NoiseCurves, threshold: float) -> Figure:
+    """Median error against the input for frames that the model does not describe, for two methods."""
+    figure, panels = plt.subplots(1, 2, figsize=(7, 4.6), sharey=True)
+    styles = [*OTHER_STYLES, {"color": _INK, "marker": "s", "linestyle": "-"}]
+    for axes, name in zip(panels, (ACCELERATED, LIKELY), strict=True):
+        for (kind, curve), style in zip(curves.items(), styles, strict=False):
+            axes.plot(curve.rms, np.median(curve.errors[name], axis=1), label=kind, ms=5, **style)
+        axes.fill_between(
+            noise.rms, noise.median(name), 1e-9, color="#999999", alpha=0.3, lw=0, zorder=0.4,
+            label=f"below the photon noise of {_spaced(noise.photons)} per point",
+        )  # fmt: skip
+        axes.set_title(method_look(name).name, fontsize=10)
+        rms = next(iter(curves.values())).rms
+        axes.set_xlim(rms[0] / 1.1, rms[-1] * 1.1)
+        _input_axes(axes, threshold, 5e-4)
+    panels[0].set_ylabel("median error (rad rms)")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9)
+    return figure
 
 
-def _all_verdicts(curves: Mapping[float, RecoveryCurves], threshold: float) -> Verdicts:
-    return Verdicts(*map(sum, zip(*(curve.verdicts(threshold) for curve in curves.values()), strict=True)))
+_CAUSES = {
+    PLAIN: ("plain: flat start", ":", "v"),
+    SECANT: ("secant steps, flat start", "--", "x"),
+    DIMMED: ("plain steps, dimmed start", "-.", "^"),
+    ACCELERATED: ("accelerated: both", "-", "o"),
+}
+
+
+def draw_causes(found: Causes, threshold: float) -> Figure:
+    """Share of recovered screens for the ingredients of the acceleration, and one screen that they decide."""
+    figure, (share, example) = plt.subplots(1, 2, figsize=(7, 4.4))
+    color = LOOKS[PLAIN].color
+    contracts = 100 * np.mean(found.factor < 1, axis=1)
+    [line] = share.plot(found.curves.rms, contracts, color=_INK, lw=4, alpha=0.4)
+    handles, labels = [line], ["contracts near the solution"]
+    for name, (label, dashes, marker) in _CAUSES.items():
+        tone = color if name in (PLAIN, ACCELERATED) else OTHER_STYLES[1 if name == SECANT else 2]["color"]
+        style: dict[str, Any] = {"color": tone, "ls": dashes, "marker": marker, "ms": 5, "mfc": "#ffffff"}
+        handles += share.plot(found.curves.rms, 100 * found.curves.recovered(name, threshold), **style)
+        labels.append(label)
+        example.semilogy(np.maximum(found.example[name], _FLOOR), **style)
+    share.set(xlabel="input (rad rms)", ylabel="screens (%)", ylim=(-4, 104))
+    example.axhline(threshold * found.example_rms, color=_INK, lw=1, ls=":")
+    example.set(xlabel="iterations", ylabel="error (rad rms)", ylim=(_FLOOR / 2, 5))
+    example.set_title(f"one screen of {found.example_rms:g} rad rms", fontsize=10)
+    share.set_title("screens recovered", fontsize=10)
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9)
+    return figure
+
+
+def range_columns(curves: Sequence[NoiseCurves]) -> dict[str, NDArray]:
+    """Columns of the first figure: median and largest error of each method, and the bounds."""
+    columns: dict[str, list[Any]] = {"photons per point": [], "input (rad rms)": []}
+    for curve in curves:
+        n_rms = curve.rms.size
+        columns["photons per point"] += [curve.photons] * n_rms
+        columns["input (rad rms)"] += list(curve.rms)
+        for name in curve.errors:
+            for kind, values in (("median", curve.median(name)), ("largest", curve.errors[name].max(axis=1))):
+                columns.setdefault(f"{name}: {kind} error (rad rms)", []).extend(np.maximum(values, _FLOOR))
+        for name in (LIKELY, MODES):
+            bound = curve.bound.get(name, np.zeros(n_rms))
+            columns.setdefault(f"{name}: bound (rad rms)", []).extend(bound)
+    return {name: np.array(values) for name, values in columns.items()}
+
+
+def model_columns(curves: Mapping[str, ErrorCurves]) -> dict[str, NDArray]:
+    """Columns of the second figure: median error of each method, for each error of the model."""
+    columns = {"input (rad rms)": next(iter(curves.values())).rms}
+    return columns | {
+        f"{name}, {kind}: median error (rad rms)": np.median(values, axis=1)
+        for kind, curve in curves.items()
+        for name, values in curve.errors.items()
+    }
+
+
+def causes_columns(found: Causes, threshold: float) -> dict[str, NDArray]:
+    """Columns of the third figure: shares of the screens."""
+    shares = {
+        f"{label}: share recovered": found.curves.recovered(name, threshold)
+        for name, (label, *_) in _CAUSES.items()
+    }
+    columns = {
+        "input (rad rms)": found.curves.rms,
+        "share with a contraction factor below 1": np.mean(found.factor < 1, axis=1),
+    }
+    return columns | shares
+
+
+def error_table(curves: Sequence[NoiseCurves]) -> Table:
+    """Median error of maximum likelihood on points and on modes, for each number of photons."""
+    noisy = curves[1:]
+    at = [place for place, rms in enumerate(noisy[0].rms) if rms in (0.1, 0.5, 1.0, 2.0, 3.0)]
+    rows = [
+        [f"{curve.photons:.0f}", words, *(small(curve.median(name)[place]) for place in at)]
+        for curve in noisy
+        for name, words in ((LIKELY, "points"), (MODES, "modes"))
+    ]
+    return Table(["photons per point", "estimated", *(f"{noisy[0].rms[place]:g} rad" for place in at)], rows)
 
 
 def numbers(
-    curves: Mapping[float, RecoveryCurves], threshold: float, settings: Mapping[str, float]
+    curves: Sequence[NoiseCurves],
+    model: Mapping[str, ErrorCurves],
+    found: Causes,
+    shown: float,
+    threshold: float,
+    settings: Mapping[str, float],
 ) -> dict[str, float | str]:
-    """Return the settings and the numbers of the text, with the limits of the first, second and third dimple."""
-    verdicts = _all_verdicts(curves, threshold)
-    n_starts = np.concatenate([curve.n_starts.ravel() for curve in curves.values()])
-    first = next(iter(curves.values()))
-    found = dict(settings) | {
-        "largest": first.rms[-1],
-        "n_screens": first.n_starts.shape[1],
-        "n_all": sum(verdicts),
-        "n_right": verdicts.consistent_right + verdicts.inconsistent_right,
-        "n_wrong": verdicts.consistent_wrong + verdicts.inconsistent_wrong,
-        "false_alarms": verdicts.inconsistent_right,
-        "false_trust": verdicts.consistent_wrong,
-        "once": np.mean(n_starts == 1),
-        "starts_most": n_starts.max(),
+    """Return the settings and the numbers of the text."""
+    noiseless, *noisy = curves
+    chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
+    few = min(noisy, key=lambda curve: abs(np.log(curve.photons / 1e3)))
+    at = {name: int(np.argmin(np.abs(chosen.rms - rms))) for name, rms in (("1", 1.0), ("3", 3.0))}
+    plain, accuracy = found.half(PLAIN, threshold)
+    two = int(np.argmin(np.abs(found.curves.rms - 2.0)))
+    right = noiseless.errors[LIKELY] <= threshold * noiseless.rms[:, np.newaxis]
+    usual = (chosen.rms >= 0.1) & (chosen.rms <= 2)
+    *_, area = model.values()
+    result = dict(settings) | {
+        "exact_up_to": noiseless.complete_up_to(LIKELY, threshold),
+        "n_noiseless": right.size,
+        "n_right": np.count_nonzero(right),
+        "false_trust": np.count_nonzero(noiseless.consistent & ~right),
+        "false_alarms": np.count_nonzero(~noiseless.consistent & right),
+        "few_photons": few.photons,
+        "shown_photons": chosen.photons,
+        "modes_gain": np.median(chosen.median(LIKELY)[usual] / chosen.median(MODES)[usual]),
+        "modes_excess": np.max(chosen.median(MODES)[usual] / chosen.bound[MODES][usual]) - 1,
+        "plain_half": plain,
+        "plain_half_sigma": accuracy,
+        "contracting_at_2": np.mean(found.factor[two] < 1),
+        "example_rms": found.example_rms,
+        "pixels_matter": crossing(area.rms, np.median(area.errors[LIKELY], axis=1), PIXEL_ERROR),
+        "pixel_error": PIXEL_ERROR,
     }
-    for place, (diameter, curve) in zip(("first", "second", "third"), curves.items(), strict=False):
-        found |= {
-            f"{place}_diameter": diameter,
-            f"{place}_plain": curve.complete_up_to(PLAIN, threshold),
-            f"{place}_likely": curve.complete_up_to(LIKELY, threshold),
-            f"{place}_end": curve.recovered(LIKELY, threshold)[-1],
-        }
-    return rounded(found, ".4g")
+    for name, method in (("plain", PLAIN), ("dimmed", DIMMED), ("accelerated", ACCELERATED)):
+        result[f"{name}_at_2"] = found.curves.recovered(method, threshold)[two]
+    for rms, place in at.items():
+        result[f"few_likely_{rms}"] = few.median(LIKELY)[place]
+        result[f"shown_likely_{rms}"] = chosen.median(LIKELY)[place]
+    short = "amplitude", "offset", "diameter", "shift", "area"
+    for name, curve in zip(short, model.values(), strict=True):
+        for rms in (0.5, 1.0):
+            place = int(np.argmin(np.abs(curve.rms - rms)))
+            result[f"{name}_{rms:g}".replace(".", "")] = np.median(curve.errors[LIKELY][place])
+    return rounded(result, ".3g")

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves
+from studies.kit.curves import ErrorCurves, Limit, refined_limit
 from studies.kit.parameters import SETUP, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.setups import NOISELESS, Noise, Screens, check_setup, screens_at
@@ -57,11 +57,15 @@ def linearity_curves(
     exponent: float = -2.0,
     seed: int = 0,
     noise: Noise = NOISELESS,
+    first_task: int = 0,
 ) -> LinearityCurves:
-    """Error of reconstructors on random screens of growing rms (radian): the experiment of section 4.1."""
+    """Error of reconstructors on random screens of growing rms (radian): the experiment of section 4.1.
+
+    Each input has a task number from `first_task` on; screens and noise depend on this number and on the seed.
+    """
     rms = np.asarray(rms, float)
     shared = dict(reconstructors), modes, n_screens, exponent, seed, noise
-    points = sweeps.run(_linearity_point, enumerate(rms.tolist()), *shared, name="linearity_curves")
+    points = sweeps.run(_linearity_point, enumerate(rms.tolist(), first_task), *shared, name="linearity_curves")
     errors, converged, *light = zip(*points, strict=True)
     return LinearityCurves(
         rms,
@@ -93,6 +97,40 @@ def _linearity_point(
         converged[name] = estimate.converged
     wrapped, folded = np.mean(np.abs(phase) > np.pi, axis=-1), np.mean(phase < -np.pi / 4, axis=-1)
     return errors, converged, wrapped, folded, strehl(pupil, screens)
+
+
+# Methods whose limits are refined, with the screens of each input close to the limit, over those of the curves.
+REFINED = {
+    "Linear": 10,
+    "Arcsine": 10,
+    "PhaseShifted": 10,
+    "GerchbergSaxtonModel": 2,
+    "GradientDescent": 1,
+    "GradientDescentStarted": 1,
+}
+
+
+def error_limits(
+    reconstructors: Mapping[str, Any],
+    modes: NDArray | Screens,
+    curves: LinearityCurves,
+    threshold: float,
+    **settings: Any,
+) -> dict[str, Limit]:
+    """Input at which each mean error exceeds `threshold` times the input; that of `REFINED` from other screens."""
+    limits = {name: Limit(curves.dynamic_range(name, threshold)) for name in curves.errors}
+
+    def refined(name: str) -> Limit:
+        method, n_screens = {name: reconstructors[name]}, REFINED[name] * curves.strehl.shape[1]
+
+        def ratios(rms: NDArray) -> NDArray:
+            tried = linearity_curves(method, modes, rms, n_screens, first_task=1000, **settings)
+            return tried.errors[name] / rms[:, np.newaxis]
+
+        return refined_limit(ratios, limits[name].value, threshold, width=0.15)
+
+    finite = [name for name, limit in limits.items() if 0 < limit.value < np.inf]
+    return limits | {name: refined(name) for name in finite if name in REFINED}
 
 
 def saxton_by_width(
@@ -151,24 +189,25 @@ _UNMEASURED = {
 }
 
 
-def draw_linearity(curves: LinearityCurves, threshold: float, names: Sequence[str], rms_max: float) -> Figure:
+def draw_linearity(
+    curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float, names: Sequence[str], rms_max: float
+) -> Figure:
     """Figure 3: mean error and its standard deviation against the input, and their ratio on a logarithmic axis."""
     figure, (plain, ratio) = plt.subplots(1, 2, figsize=(7, 4.6))
     drawn = curves.rms <= rms_max
     bright = curves.rms > 0
     rms = curves.rms[drawn]
-    limits = {name: curves.dynamic_range(name, threshold) for name in names}
     for name, look in looks_of(names):
         mean, std = curves.mean(name), curves.std(name)[drawn]
         line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
-        limit = limits[name]
-        reach = f": {limit:.2g} rad" if 0 < limit <= curves.rms[-1] else ""
+        found = 0 < limits[name].value < np.inf
+        reach = f": {limits[name].value:.2g} rad" if found else ""
         plain.plot(rms, mean[drawn], label=look.label + reach, **line)
         low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
         plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
         ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], **line)
-        if 0 < limit <= curves.rms[-1]:
-            ratio.plot(limit, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
+        if found:
+            ratio.plot(limits[name].value, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
     plain.plot(rms, threshold * rms, color="#555555", lw=1)
     plain.annotate(
         f"{threshold:.0%}", (rms[-1], threshold * rms[-1]), (4, 0), textcoords="offset points", color="#555555",
@@ -245,15 +284,14 @@ def _indices(curves: LinearityCurves, values: Sequence[float]) -> dict[float, in
     return {value: int(np.flatnonzero(curves.rms == value)[0]) for value in values if value in curves.rms}
 
 
-def _place(curves: LinearityCurves, name: str, threshold: float) -> str:
+def _place(curves: LinearityCurves, limit: Limit) -> str:
     """Input at which a curve exceeds the threshold, in words."""
-    limit = curves.dynamic_range(name, threshold)
-    if limit == 0:
+    if limit.value == 0:
         return "from the start"
-    return f"{limit:.2g}" if limit < np.inf else f"beyond {curves.rms[-1]:g}"
+    return str(limit) if limit.value < np.inf else f"beyond {curves.rms[-1]:g}"
 
 
-def ranges_table(curves: LinearityCurves, threshold: float) -> Table:
+def ranges_table(curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float) -> Table:
     """Limit of each reconstructor, and its error at some inputs."""
     at = _indices(curves, (0.1, 0.3, 0.5, 0.8, 1.0, 1.3))
     return Table(
@@ -261,7 +299,7 @@ def ranges_table(curves: LinearityCurves, threshold: float) -> Table:
         [
             [
                 LOOKS[name].name,
-                _place(curves, name, threshold),
+                _place(curves, limits[name]),
                 *(small(curves.mean(name)[index]) for index in at.values()),
             ]
             for name in curves.errors
@@ -340,8 +378,19 @@ def _better_from(curves: LinearityCurves, name: str) -> float:
     return float(curves.rms[curves.rms > worse.max(initial=0)].min(initial=np.inf))
 
 
+_SHORT = {
+    "Linear": "linear",
+    "Arcsine": "arcsine",
+    "PhaseShifted": "shifted",
+    "GerchbergSaxtonModel": "saxton_model",
+    "GradientDescent": "descent",
+    "GradientDescentStarted": "started",
+}
+
+
 def numbers(
     curves: LinearityCurves,
+    limits: Mapping[str, Limit],
     threshold: float,
     methods: Mapping[str, Any],
     variants: Mapping[str, GerchbergSaxton],
@@ -352,10 +401,7 @@ def numbers(
 ) -> dict[str, float | str]:
     """Numbers of the text and of the claims of section 4.1."""
     rms, mean = curves.rms, {name: curves.mean(name) for name in curves.errors}
-    limits = {name: curves.dynamic_range(name, threshold) for name in curves.errors}
-    gain = limits["PhaseShifted"] / limits["Linear"] if limits["Linear"] else np.inf
-    if limits["Linear"] == np.inf:
-        gain = np.nan  # unknown: no input is past the range of the linear one
+    gain = limits["PhaseShifted"].over(limits["Linear"])
     *zeros, _, repaired = variants
     widest = max(zeros, key=lambda name: variants[name].sensor.extent)
     usual, wide = methods["GerchbergSaxton"].sensor, variants[widest].sensor
@@ -366,13 +412,10 @@ def numbers(
     with_wraps = np.mean(curves.wrapped > 0, axis=1)
     recovered = {name: curves.recovered(name, threshold)[one] for name in curves.errors}
     found = {
-        "linear_limit": limits["Linear"],
-        "arcsine_limit": limits["Arcsine"],
-        "descent_limit": limits["GradientDescent"],
-        "saxton_limit": limits["GerchbergSaxton"],
-        "shifted_limit": limits["PhaseShifted"],
-        "gain": gain,
-        "gain_arcsine": limits["PhaseShifted"] / limits["Arcsine"] if limits["Arcsine"] else np.inf,
+        "saxton_limit": limits["GerchbergSaxton"].value,
+        "gain": gain.value,
+        "gain_error": gain.error,
+        "gain_arcsine": limits["PhaseShifted"].over(limits["Arcsine"]).value,
         "arcsine_over_linear": np.max(mean["Arcsine"][low] / mean["Linear"][low], initial=0),
         "arcsine_ratio_at_05": mean["Arcsine"][half] / rms[half],
         "alike_up_to": alike,
@@ -380,7 +423,7 @@ def numbers(
         "points_recovered_at_1": recovered["GradientDescentPoints"],
         "recovered_at_1": recovered["PhaseShifted"],
         "strehl_at_1": curves.strehl[one].mean(),
-        "strehl_at_limit": np.interp(limits["PhaseShifted"], rms, curves.strehl.mean(axis=1)),
+        "strehl_at_limit": np.interp(limits["PhaseShifted"].value, rms, curves.strehl.mean(axis=1)),
         "wrapped_screens_at_05": with_wraps[half],
         "wrapped_screens_at_1": with_wraps[one],
         "wrap_onset": rms[with_wraps >= 0.5].min(initial=np.inf),
@@ -394,10 +437,8 @@ def numbers(
         "saxton_widest_beats_linear": _better_from(by_width, widest),
         "light_lost_widest": light_lost(wide),
         "saxton_model_error": by_width.mean(repaired)[0],
-        "saxton_model_limit": limits["GerchbergSaxtonModel"],
         "saxton_model_limit_longer": by_width.dynamic_range(repaired, threshold),
         "saxton_model_iterations_longer": variants[repaired].settings.n_iterations,
-        "started_limit": limits["GradientDescentStarted"],
         "started_recovered_at_1": recovered["GradientDescentStarted"],
         "started_error_at_1": mean["GradientDescentStarted"][one],
         "shifted_passes": passes["PhaseShifted"],
@@ -405,5 +446,7 @@ def numbers(
         "fourier_functions": len(fourier),
         "rank": methods["PhaseShifted"].sensor.rank,
     }
+    for name, short in _SHORT.items():
+        found |= {f"{short}_limit": limits[name].value, f"{short}_limit_error": limits[name].error}
     # All digits of a rounding error but its power of ten depend on the machine.
     return rounded(found) | rounded({"run_out": 10 ** np.ceil(np.log10(run_out))}, ".0e")

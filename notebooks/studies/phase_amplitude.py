@@ -167,9 +167,8 @@ def _point(
         known = [one.consistent for one in results if isinstance(one, LikelihoodReconstruction)]
         if known:
             consistent[way] = np.concatenate(known)
-    per_frame = photons / sensor.n_masks
     bounds = [
-        cramer_rao(sensor, phase, photons=per_frame, amplitude=amplitude, amplitude_known=False)
+        cramer_rao(sensor, phase, photons=photons, amplitude=amplitude, amplitude_known=False)
         for phase, amplitude in zip(phases, amplitudes, strict=True)
     ]
     return errors, consistent, float(np.sqrt(np.nanmean(np.square(bounds))))
@@ -178,17 +177,16 @@ def _point(
 def noisy_frames(
     sensor: ZernikeSensor, phases: ArrayLike, amplitudes: ArrayLike, photons: float, seed: Any = 0
 ) -> NDArray[np.float64]:
-    """Frames with photon noise; the photons per point of the pupil are divided equally between the frames."""
-    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points / sensor.n_masks)
+    """Frames with photon noise, for a number of photons per point and image."""
+    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points)
     return camera.normalise(camera.expose(sensor.measure(phases, amplitudes), seed))
 
 
 def reconstruct(way: str, sensor: ZernikeSensor, frames: NDArray, photons: float) -> list[Reconstruction]:
     """Reconstruct frame sets (k, n_masks, ny, nx) in a way of `WAYS`; `photons` as for `noisy_frames`."""
     method, source = WAYS[way]
-    per_frame = photons / sensor.n_masks
     if source == "estimated":
-        return [MaximumLikelihood(sensor, photons=per_frame, amplitude="unknown")(frames)]
+        return [MaximumLikelihood(sensor, photons=photons, amplitude="unknown")(frames)]
     pair = ZernikeSensor(sensor.pupil, *sensor.masks[:-1], extent=sensor.extent, tolerance=sensor.tolerance)
     batches: list[tuple[NDArray | None, NDArray]] = [(None, frames)]
     if source == "measured":
@@ -196,7 +194,7 @@ def reconstruct(way: str, sensor: ZernikeSensor, frames: NDArray, photons: float
     if method == "PhaseShifted":
         return [PhaseShifted(pair, amplitude=amplitude)(some[:, :-1]) for amplitude, some in batches]
     return [
-        MaximumLikelihood(pair, photons=per_frame, amplitude=amplitude, n_starts=1)(some[:, :-1])
+        MaximumLikelihood(pair, photons=photons, amplitude=amplitude, n_starts=1)(some[:, :-1])
         for amplitude, some in batches
     ]
 

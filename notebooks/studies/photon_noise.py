@@ -45,7 +45,7 @@ class PhotonCurves:
     """Errors of reconstructors on noisy frames, next to the bound."""
 
     rms: NDArray[np.floating]  # (n_rms,), input, radian rms
-    photons: NDArray[np.floating]  # (n_photons,), per point of the pupil, all frames
+    photons: NDArray[np.floating]  # (n_photons,), per point and image of the sensor with the bound
     errors: dict[str, NDArray[np.float64]]  # (n_rms, n_photons, n_screens), radian rms
     bound: NDArray[np.float64]  # (n_rms, n_photons), rms over points and screens, radian
     within: NDArray[np.float64]  # (n_rms, n_photons), share of the points within one standard error
@@ -70,7 +70,10 @@ def photon_curves(
     exponent: float = -2.0,
     seed: int = 0,
 ) -> PhotonCurves:
-    """Error of reconstructors against the number of photons, and the bound."""
+    """Error of reconstructors against the photons per point and image of a sensor, and its bound.
+
+    Other sensors get the same light in all their images together.
+    """
     rms, photons = np.asarray(rms, float), np.asarray(photons, float)
     shared = sensor, dict(reconstructors), modes, n_screens, exponent, seed
     cells = product(enumerate(rms.tolist()), enumerate(photons.tolist()))
@@ -98,14 +101,15 @@ def _photon_point(
     """One input and number of photons: errors (n_screens,) by name, bound, and share within one sigma."""
     (task, rms), (place, photons) = cell
     screens = screens_at(modes, rms, n_screens, seed, task, exponent)
-    likely = MaximumLikelihood(sensor, photons=photons / sensor.n_masks)
+    likely = MaximumLikelihood(sensor, photons=photons)
     errors = {}
     for name, method in (reconstructors | {"MaximumLikelihood": likely}).items():
         noise = np.random.SeedSequence(seed, spawn_key=(task, place))
-        estimate = method(_noisy(method.sensor, screens, photons, noise))
+        share = photons * sensor.n_masks / method.sensor.n_masks
+        estimate = method(_noisy(method.sensor, screens, share, noise))
         errors[name] = reconstruction_error(sensor.pupil, estimate.phase, screens)
     within = np.mean(_in_sigmas(sensor, estimate, screens) < 1)
-    bound = cramer_rao(sensor, screens, photons=photons / sensor.n_masks)
+    bound = cramer_rao(sensor, screens, photons=photons)
     return errors, float(np.sqrt(np.mean(sensor.pupil.gather(bound) ** 2))), float(within)
 
 
@@ -135,7 +139,7 @@ def error_bars(
     frames = _noisy(sensor, screens, photons, seed)
     rows = []
     for factor in assumed:
-        method = MaximumLikelihood(sensor, photons=factor * photons / sensor.n_masks, n_starts=1)
+        method = MaximumLikelihood(sensor, photons=factor * photons, n_starts=1)
         estimate = method(frames)
         error = _in_sigmas(sensor, estimate, screens)
         within = np.mean(error[..., np.newaxis] < SIGMAS, axis=(0, 1))
@@ -144,8 +148,8 @@ def error_bars(
 
 
 def _noisy(sensor: ZernikeSensor, screens: NDArray, photons: float, seed: Any) -> NDArray[np.float64]:
-    """Frames with photon noise; the photons per point of the pupil are divided between the masks."""
-    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points / sensor.n_masks)
+    """Frames with photon noise, for a number of photons per point and image."""
+    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points)
     return camera.normalise(camera.expose(sensor.measure(screens), seed))
 
 
@@ -172,7 +176,7 @@ def draw_photon_noise(curves: PhotonCurves) -> Figure:
             errors.plot(curves.photons, curves.error(name)[column], ms=5, label=look.label, **look.style)
             ratios.plot(curves.photons, curves.ratio(name)[column], ms=5, **look.style)
         errors.set_title(f"input {curves.rms[column]:g} rad rms", fontsize=10)
-        ratios.set(xlabel="photons per point", xscale="log", ylim=(0.9, 1.6))
+        ratios.set(xlabel="photons per point and image", xscale="log", ylim=(0.9, 1.6))
     panels[0, 0].set_ylabel("error (rad rms)")
     panels[1, 0].set_ylabel("error / bound")
     handles, labels = panels[0, 0].get_legend_handles_labels()
@@ -205,7 +209,7 @@ def photon_noise_columns(curves: PhotonCurves) -> dict[str, NDArray]:
     size = curves.rms.size, curves.photons.size
     grid = {
         "input (rad rms)": np.repeat(curves.rms, size[1]),
-        "photons per point": np.tile(curves.photons, size[0]),
+        "photons per point and image": np.tile(curves.photons, size[0]),
         "bound: error (rad rms)": curves.bound.ravel(),
     }
     return grid | {f"{name}: error (rad rms)": curves.error(name).ravel() for name in curves.errors}

@@ -25,7 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Immutable, Kind, per_kind, read_only
-from zwfs._propagator import Propagator, amplitude_map, angle, propagator, pupil_maps, split, unit
+from zwfs._likelihood import Noise
+from zwfs._propagator import Propagator, amplitude_map, angle, propagator, pupil_maps, split, square, unit
 from zwfs.polychromatic import PolychromaticSensor
 from zwfs.sensor import Sensor, ZernikeSensor
 
@@ -50,7 +51,8 @@ class Reconstruction:
         Iterations used; 1 without iteration.
     converged : ndarray of bool, shape (...)
         Whether the last iteration changed the phase by no more than the tolerance. A `FixedPoint` with a tolerance
-        of 0 makes no such test and reports False. A `ClosedForm` always reports True.
+        of 0 makes no such test and reports False. A `ClosedForm` always reports True. The phase may be wrong all
+        the same: see `explains`.
     n_unsolved : ndarray of int, shape (...)
         Points whose equation had no (unique) solution in the last iteration: singular ones, which kept the value
         of the iteration before, or cosines beyond +-1.
@@ -83,11 +85,81 @@ class Reconstruction:
         from the phase; the unit is the mean intensity of the pupil.
         """
         kind = Kind.of(self.frames)
+        parts = [(light - frames) ** 2 for light, frames in self._compared(kind)]
+        squares = kind.xp.concat([kind.xp.mean(part, axis=(1, 2)) for part in parts])
+        return self._shaped(kind.xp.sqrt(squares))
+
+    @property
+    def consistent(self) -> NDArray[np.bool_]:
+        """Whether the phase explains frames without noise, shape (...): `explains` without a number of photons.
+
+        The result of `MaximumLikelihood` has its noise, and compares the frames with that.
+        """
+        return self.explains()
+
+    def explains(self, *, photons: float | None = None, read_noise: float = 0.0) -> NDArray[np.bool_]:
+        """Return whether the method converged and its phase explains the frames, shape (...).
+
+        `converged` only says that the phase stopped to change. Here the frames that it gives are compared with
+        those measured, at the points of the pupil: their misfit must exceed that of noise by less than 5 standard
+        deviations. Without a number of photons the rms residual must be at most 1e-5 of the mean intensity, which
+        is far above rounding in single precision. Where the tolerance is 0 no iteration tests whether it has
+        converged, and only the frames count.
+
+        The frames cannot reject all that is wrong. The phase of every point follows part of the noise, and an
+        error of the frames of up to 0.7 standard deviations of a pixel passes. With 50 photons per point this is
+        10 %, more than most errors of the model cause. For one mask many phases explain a frame.
+
+        Parameters
+        ----------
+        photons : float, optional
+            Photons that an intensity of 1 puts into a pixel of each frame, `Detector.photons_per_pixel`. Left out
+            for frames without noise.
+        read_noise : float, electrons rms / pixel
+            That of the frames, with the noise of a background that was subtracted.
+
+        Returns
+        -------
+        ndarray of bool, shape (...)
+
+        Raises
+        ------
+        ValueError
+            If there is read noise without a number of photons.
+        """
+        noise, kind = Noise.checked(photons, read_noise), Kind.of(self.frames)
+        double = kind._replace(dtype=kind.xp.float64)
+        fine = kind.xp.concat([noise.explains(*pair) for pair in self._compared(double)])
+        stopped = self.converged if self.settings.tolerance else self.converged | True
+        return self._shaped(fine) & stopped
+
+    def _compared(self, kind: Kind) -> Iterator[tuple[NDArray[np.floating], NDArray[np.floating]]]:
+        """Modelled and measured frames at the points of the pupil, (1, n_masks, n_points) for each frame set."""
         model, xp = self.settings.model(kind), kind.xp
-        phase = xp.reshape(xp.where(model.inside, self.phase, kind.array(0.0)), (-1, *model.pupil.shape))
-        residual = self.settings.residual(phase, xp.reshape(self.frames, (-1, *self.frames.shape[-3:])))
+        inside = kind.flags(model.pupil.inside.ravel())
+        frames = xp.reshape(xp.astype(self.frames, kind.dtype), (-1, *self.frames.shape[-3:]))
+        for index, psi in enumerate(self._fields(model)):
+            light = square(model.reference(psi) + psi[:, np.newaxis, ...])
+            pair = (xp.reshape(one, (*one.shape[:2], -1)) for one in (light, frames[index : index + 1, ...]))
+            modelled, measured = (one[:, :, inside] for one in pair)
+            yield modelled, measured
+
+    def _fields(self, model: Propagator) -> Iterator[NDArray[np.floating]]:
+        """Estimated field of each frame set, split, (1, 2 n_wavelengths, ny, nx)."""
+        for phase in self._singles(self.phase, model):
+            yield model.incoming(phase)
+
+    def _singles(self, maps: NDArray[np.floating], model: Propagator) -> Iterator[NDArray[np.floating]]:
+        """Each map of a result, (1, ny, nx), 0 outside the pupil."""
+        xp, zero = model.kind.xp, model.kind.array(0.0)
+        maps = xp.reshape(maps, (-1, *model.pupil.shape))
+        for index in range(maps.shape[0]):
+            yield xp.where(model.inside, xp.astype(maps[index : index + 1, ...], model.kind.dtype), zero)
+
+    def _shaped(self, values: NDArray) -> NDArray:
+        """Values of all frame sets, (k,), in the shape of their batch."""
         batch = self.phase.shape[:-2]
-        return xp.reshape(residual, batch) if batch else residual[0]
+        return Kind.of(self.phase).xp.reshape(values, batch) if batch else values[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,6 +357,8 @@ class Reconstructor(Immutable, ABC):
         self, frames: ArrayLike, start: ArrayLike | None
     ) -> tuple[NDArray[np.floating], tuple[int, ...], NDArray[np.floating] | None]:
         """Check the arguments of a call and return them as `solve` expects them, with the batch of the frames."""
+        _check.no_gradient("frames", frames)
+        _check.no_gradient("start", start)
         if not self.any_library:
             frames = _check.real_array("frames", frames)
         frames, batch = check_frames(self.sensor, frames, light=self._light)

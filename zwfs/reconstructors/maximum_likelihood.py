@@ -17,7 +17,7 @@ from zwfs._likelihood import Estimator, Noise, require_information, require_one_
 from zwfs._propagator import Propagator, angle, parts_sum, split, square
 from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.polychromatic import PolychromaticSensor
-from zwfs.reconstructors._fit import Fit, Hessian, Slopes, linear_field, points_step, reflected, turned
+from zwfs.reconstructors._fit import Fit, Hessian, Unwrapping, linear_field, points_step, reflected, turned
 from zwfs.reconstructors.arcsine import Arcsine
 from zwfs.reconstructors.base import FixedPoint, Reconstruction, Reconstructor, Solution, pieces
 from zwfs.reconstructors.phase_shifted import PhaseShifted
@@ -30,7 +30,6 @@ _LEAST_CUT = 0.1  # of the damping after a good step
 _KICK, _SHIFT = 1.0, 0.5  # radian rms, random phases of the other starts
 _KICK_MODES = 20
 _UNWRAPPED_MODES = 40  # of the smooth part of a phase that is known up to multiples of 2 pi
-_RESIDUAL = 1e-5  # rms, in units of the mean intensity, up to which frames without a noise model are explained
 _GROWTH = 2.0  # of the damping after a first step that raises the cost
 _NOTHING = 1e-300  # keeps quotients finite
 _NEGLIGIBLE = 1e-3  # of the mean standard error: a smaller step is the last one
@@ -38,7 +37,6 @@ _REFLECTIONS = 3  # largest number of times that points of one start are reflect
 _GAIN = 0.01  # of twice the logarithm of the likelihood, from which on a reflection counts
 _GAIN_TURN = 10.0  # the same, from which on a point is turned by 2 pi: a smooth phase is more probable
 _LINEAR_ITERATIONS = 5  # of the start of an unknown amplitude
-_SIGMAS = 5.0  # excess of the misfit, in its standard deviations, up to which noise explains it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,11 +52,8 @@ class LikelihoodReconstruction(Reconstruction):
     chi2 : ndarray, shape (...)
         Reduced chi-square: about 1 where the model explains the frames. NaN without a number of photons, and where
         the frames have no more information than there are unknowns, as for one mask.
-    consistent : ndarray of bool, shape (...)
-        Whether the fit converged and its phase explains the frames to within the noise: their misfit exceeds its
-        expectation by less than 5 standard deviations. Without a number of photons, the rms residual of the
-        frames, over the detector, is at most 1e-5 of the mean intensity instead. For one mask many phases explain
-        a frame.
+    explained : ndarray of bool, shape (...)
+        Whether the noise explains the misfit of the frames on the whole detector, see `consistent`.
     n_starts : ndarray of int, shape (...)
         Number of starts that were tried.
     estimator : Estimator
@@ -68,10 +63,19 @@ class LikelihoodReconstruction(Reconstruction):
     amplitude: NDArray[np.floating] | None
     coefficients: NDArray[np.floating] | None
     chi2: NDArray[np.floating]
-    consistent: NDArray[np.bool_]
+    explained: NDArray[np.bool_]
     n_starts: NDArray[np.int64]
     noise_variance: NDArray[np.floating]
     estimator: Estimator
+
+    @property
+    def consistent(self) -> NDArray[np.bool_]:
+        """Whether the fit converged and explains the frames, shape (...): `Reconstruction.explains` for its noise.
+
+        The expected misfit is that of frames to which so many unknowns were fitted, and all pixels of the detector
+        count. For one mask many phases explain a frame.
+        """
+        return self.converged & self.explained
 
     @property
     def sigma(self) -> NDArray[np.floating]:
@@ -93,27 +97,13 @@ class LikelihoodReconstruction(Reconstruction):
         return self._errors[1]
 
     @cached_property
-    def residual(self) -> NDArray[np.floating]:
-        """Mismatch of the frames, see `Reconstruction`."""
-        kind = Kind.of(self.frames)
-        model, xp = self.settings.model(kind), kind.xp
-        light = xp.reshape(self.frames, (-1, *self.frames.shape[-3:]))
-        waves = model.propagate(self._field(model))[(..., *model.window)]
-        difference = (square(waves) - light) * model.stop
-        squares = xp.sum(difference * difference, axis=(1, 2, 3))
-        residual = xp.sqrt(squares / (light.shape[1] * model.pupil.n_points))
-        return xp.reshape(residual, self.converged.shape)
-
-    @cached_property
     def _errors(self) -> tuple[NDArray[np.floating], NDArray[np.floating] | None]:
         kind = Kind.of(self.phase)
         double = kind._replace(dtype=kind.xp.float64)
         model, xp = self.settings.model(double), kind.xp
-        field = xp.astype(self._field(self.settings.model(kind)), xp.float64)
         batch = tuple(self.converged.shape)
         points, coefficients = [], []
-        for index in range(field.shape[0]):  # one at a time: the memory does not grow with the batch
-            psi = field[index : index + 1, ...]
+        for psi in self._fields(model):  # one at a time: the memory does not grow with the batch
             of_points, of_modes = self.estimator.variance(psi, model.propagate(psi))
             points.append(of_points)
             coefficients.append(of_modes)
@@ -125,13 +115,14 @@ class LikelihoodReconstruction(Reconstruction):
         of_modes = xp.astype(xp.sqrt(xp.concat(coefficients) * scale), kind.dtype)
         return sigma, xp.reshape(of_modes, (*batch, of_modes.shape[1]))
 
-    def _field(self, model: Propagator) -> NDArray[np.floating]:
-        """Estimated field, split, one batch axis."""
-        xp, shape = model.kind.xp, (-1, *model.pupil.shape)
-        phase = xp.reshape(xp.where(model.inside, self.phase, model.kind.array(0.0)), shape)
+    def _fields(self, model: Propagator) -> Iterator[NDArray[np.floating]]:
+        """Estimated field of each frame set, split, (1, 2 n_wavelengths, ny, nx)."""
         if self.amplitude is None:
-            return model.incoming(phase)
-        return split(phase, xp.reshape(xp.where(model.inside, self.amplitude, model.kind.array(0.0)), shape))
+            yield from super()._fields(model)
+            return
+        maps = (self._singles(one, model) for one in (self.phase, self.amplitude))
+        for phase, amplitude in zip(*maps, strict=True):
+            yield split(phase, amplitude)
 
 
 class MaximumLikelihood(Reconstructor):
@@ -139,9 +130,10 @@ class MaximumLikelihood(Reconstructor):
 
     Levenberg-Marquardt steps on the phase of every point of the pupil. The Hessian is the Fisher information: a
     diagonal plus a matrix of low rank, which Woodbury's identity inverts (`eq-woodbury`). The first start is two
-    accelerated iterations of `PhaseShifted`, or of `Arcsine` for one mask. Where a solution does not explain the
-    frames, other starts follow: in turn, the best solution so far plus a random phase of 1 rad rms, made of the 20
-    lowest Zernike modes, and two iterations that begin at half such a phase. The most likely solution counts.
+    accelerated iterations of `PhaseShifted`, or of `Arcsine` for one mask. With modes, it is their fit to the most
+    likely phase of every point (`eq-unwrap`). Where a solution does not explain the frames, other starts follow:
+    in turn, the best solution so far plus a random phase of 1 rad rms, made of the 20 lowest Zernike modes, and
+    two iterations that begin at half such a phase. The most likely solution counts.
 
     Some directions are invisible or nearly so. No frame shows the piston: each step keeps it, and `sigma` is that
     of the phase without piston. A dimple near 2.44 lambda/D hardly shows small tilts. A single mask hardly shows
@@ -190,7 +182,7 @@ class MaximumLikelihood(Reconstructor):
     References
     ----------
     Levenberg 1944; Marquardt 1963; Paxman, Schulz & Fienup 1992; Nielsen 1999; `eq-likelihood` to
-    `eq-linear-field` of the book.
+    `eq-unwrap` of the book.
 
     Examples
     --------
@@ -245,12 +237,19 @@ class MaximumLikelihood(Reconstructor):
             Estimator(Response.of(one), noise, unknown, basis, precision) for one in (sensor, rough)
         )
         self._first = self._first_method()
-        self._slopes = None if basis is None else Slopes.of(pupil.inside, basis)
+        self._unwrapping = None if basis is None else Unwrapping.of(pupil.inside, basis)
+        self._points = (
+            None
+            if basis is None
+            else MaximumLikelihood(
+                sensor, photons=photons, read_noise=read_noise, amplitude=known, n_starts=n_starts, seed=seed
+            )
+        )  # the start does not depend on how the fit of the modes stops
         self._smooth: NDArray[np.float64] | None = None
         if basis is None and isinstance(sensor, PolychromaticSensor):
             smooth = zernike_basis(pupil, min(_UNWRAPPED_MODES, pupil.n_points - 1))
             self._smooth = read_only(np.where(pupil.inside, smooth, 0))
-            self._slopes = Slopes.of(pupil.inside, self._smooth)
+            self._unwrapping = Unwrapping.of(pupil.inside, self._smooth)
         n_low = min(_KICK_MODES, pupil.n_points - 1)
         self._kicks: NDArray[np.float64] = np.zeros((0, *pupil.shape))
         if n_starts > 1 and n_low:
@@ -285,7 +284,7 @@ class MaximumLikelihood(Reconstructor):
             amplitude=amplitude,
             coefficients=coefficients,
             chi2=shaped(self._chi2(fit)),
-            consistent=shaped(fit.converged & self._explained(fit)),
+            explained=shaped(self._explained(fit)),
             n_starts=shaped(fit.n_starts),
             noise_variance=shaped(self._noise_variance(fit)),
             estimator=self._exact,
@@ -315,7 +314,7 @@ class MaximumLikelihood(Reconstructor):
     def _search(self, frames: NDArray, start: NDArray | None, history: bool) -> Fit:
         """Fit from start after start, until every frame set is explained or the starts are used up."""
         xp = Kind.of(frames).xp
-        fit = self._descend(frames, self._rough_phase(frames, None) if start is None else start, history)
+        fit = self._descend(frames, self._first_phase(frames) if start is None else start, history)
         if fit.history is not None and start is not None:
             fit.history[:, 0, ...] = start  # as it was given: modes may not represent it
         for attempt in range(1, self.n_starts):
@@ -330,6 +329,21 @@ class MaximumLikelihood(Reconstructor):
             fit.put(poor, best)
         return fit
 
+    def _first_phase(self, frames: NDArray) -> NDArray:
+        """Phase of the first start, (k, ny, nx): with modes, their fit to the most likely phase of every point."""
+        if self._points is None or self._unwrapping is None:
+            return self._rough_phase(frames, None)
+        fit = self._points._search(frames, None, False)
+        sigma = self._points._sigma(fit)
+        return self._of_modes(self._unwrapping.fit(self._points._phase(fit), Kind.of(frames), sigma))
+
+    def _sigma(self, fit: Fit) -> NDArray:
+        """Standard error of the phase of every point, (k, ny, nx)."""
+        xp = Kind.of(fit.psi).xp
+        singles = (slice(i, i + 1) for i in range(fit.psi.shape[0]))  # one at a time, for the memory
+        variance = [self._exact.variance(fit.psi[i, ...], fit.waves[i, ...])[0][:, 0, ...] for i in singles]
+        return xp.sqrt(xp.concat(variance) * self._noise_variance(fit)[:, np.newaxis, np.newaxis])
+
     def _rough_phase(self, frames: NDArray, start: NDArray | None) -> NDArray:
         """Phase after the first iterations, (k, ny, nx)."""
         if self._first is None:
@@ -339,11 +353,11 @@ class MaximumLikelihood(Reconstructor):
 
     def _unwrapped(self, phase: NDArray) -> NDArray:
         """Phase (k, ny, nx) with the multiples of 2 pi that bring it nearest to a smooth one, in a band."""
-        if self._smooth is None or self._slopes is None:
+        if self._smooth is None or self._unwrapping is None:
             return phase
         kind = Kind.of(phase)
         flat = kind.xp.reshape(kind.array(self._smooth), (self._smooth.shape[0], -1))
-        smooth = kind.xp.reshape(self._slopes.fit(phase, kind) @ flat, phase.shape)
+        smooth = kind.xp.reshape(self._unwrapping.fit(phase, kind) @ flat, phase.shape)
         return phase - 2 * np.pi * kind.xp.round((phase - smooth) / (2 * np.pi))
 
     def _other_start(self, attempt: int, fit: Fit) -> NDArray:
@@ -382,8 +396,8 @@ class MaximumLikelihood(Reconstructor):
         """Return the fit at a starting phase, (k, ny, nx)."""
         kind, k = Kind.of(frames), frames.shape[0]
         model, coefficients = self.settings.model(kind), None
-        if self._exact.modes is not None and self._slopes is not None:
-            coefficients = self._slopes.fit(start, kind)
+        if self._exact.modes is not None and self._unwrapping is not None:
+            coefficients = self._unwrapping.fit(start, kind)
             start = self._of_modes(coefficients)
         psi = model.incoming(start)
         for _ in range(_LINEAR_ITERATIONS if self._exact.unknown_amplitude else 0):
@@ -591,12 +605,7 @@ class MaximumLikelihood(Reconstructor):
 
     def _explained(self, fit: Fit) -> NDArray[np.bool_]:
         """Whether the noise explains the misfit, (k,)."""
-        xp = Kind.of(fit.light).xp
-        if self._exact.noise.photons is None:
-            return fit.cost <= _RESIDUAL**2 * prod(fit.frames.shape[1:])
-        misfit, expected, variance = self._exact.noise.misfit(fit.light, fit.frames)
-        freedom = xp.clip(expected - self._n_unknowns(), 0, None)
-        return misfit <= freedom + _SIGMAS * xp.sqrt(variance)
+        return self._exact.noise.explains(fit.light, fit.frames, self._n_unknowns())
 
     def _noise_variance(self, fit: Fit) -> NDArray:
         """Variance by which the inverse of the information is multiplied, (k,): 1 with a number of photons."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,6 +42,58 @@ class ErrorCurves:
             columns[f"{name}: mean error (rad rms)"] = self.mean(name)
             columns[f"{name}: standard deviation (rad rms)"] = self.std(name)
         return columns
+
+
+class Limit(NamedTuple):
+    """Input or diameter at which a mean error exceeds a threshold, and its standard error (NaN: not known)."""
+
+    value: float
+    error: float = np.nan
+
+    def __str__(self) -> str:
+        if not self.error > 0:  # NaN, or 0 from a single screen
+            return f"about {self.value:.2g}"
+        digits = max(0, -int(f"{self.error:.0e}"[-3:]))  # one digit of the error
+        return f"{self.value:.{digits}f} ± {self.error:.{digits}f}"
+
+    def over(self, other: Limit) -> Limit:
+        """Ratio to an independent limit; NaN if that is not known."""
+        if not 0 < other.value < np.inf:
+            return Limit(np.nan)
+        ratio = self.value / other.value
+        return Limit(ratio, float(np.hypot(self.error, ratio * other.error) / other.value))
+
+
+def fitted_limit(x: ArrayLike, ratio: NDArray, threshold: float, seed: Any = 0, n_draws: int = 1000) -> Limit:
+    """Limit at which the mean over the screens of a ratio, (n, n_screens), rises through a threshold.
+
+    A cubic is fitted to the square root of the mean: if few screens fail, its noise is the same at all inputs.
+    The standard error is that of draws of the screens with replacement.
+    """
+    x, n_screens = np.asarray(x, float), ratio.shape[1]
+    shares = np.random.default_rng(seed).multinomial(n_screens, np.full(n_screens, 1 / n_screens), n_draws)
+    means = np.column_stack([ratio.mean(axis=1), ratio @ shares.T / n_screens])
+    middle, half = (x[-1] + x[0]) / 2, (x[-1] - x[0]) / 2
+    cubics = np.polyfit((x - middle) / half, np.sqrt(means), 3)
+    steps = np.linspace(-1, 1, 2001)
+    below = np.vander(steps, 4) @ cubics <= np.sqrt(threshold)
+    # The first step above the threshold; an end of the inputs if there is none, or nothing else.
+    places = middle + half * steps[np.where(below.all(axis=0), -1, np.argmin(below, axis=0))]
+    return Limit(float(places[0]), float(places[1:].std()))
+
+
+def refined_limit(
+    ratios: Callable[[NDArray], NDArray], start: float, threshold: float, *, width: float, seed: Any = 0
+) -> Limit:
+    """Limit near `start`, from `ratios` of error to input, (5, n_screens), at five places close to it."""
+    middle = start
+    for _ in range(4):
+        x = middle * np.linspace(1 - width, 1 + width, 5)
+        limit = fitted_limit(x, ratios(x), threshold, seed)
+        if abs(limit.value / middle - 1) < 0.99 * width:
+            return limit
+        middle = limit.value
+    return Limit(start)
 
 
 def crossing(x: ArrayLike, y: ArrayLike, limit: float) -> float:

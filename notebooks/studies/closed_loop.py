@@ -325,8 +325,9 @@ _NAMES = {"Linear": "linear, one image", "LinearTwo": "linear, two images"}
 
 def method_name(method: str) -> str:
     """Name of a method for readers, with the number of its images."""
-    look = LOOKS[method]
-    return _NAMES.get(method, f"{look.name}, {'one image' if method in ONE_IMAGE else 'two images'}")
+    if method in _NAMES:  # `LOOKS` would add a look for a name that it does not know
+        return _NAMES[method]
+    return f"{LOOKS[method].name}, {'one image' if method in ONE_IMAGE else 'two images'}"
 
 
 def draw_linear_loops(found: Divergence) -> Figure:

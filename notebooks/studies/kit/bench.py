@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from studies.kit import sweeps
 from studies.kit.curves import ErrorCurves
 from studies.kit.parameters import within
-from zwfs import Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted
+from zwfs import Arcsine, GerchbergSaxton, GradientDescent, Linear, PhaseShifted, ZernikeSensor
 from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 
 ARMS = ("1 (+θ)", "2 (−θ)")  # of the bench, for labels
@@ -51,18 +51,27 @@ class BenchCurves(ErrorCurves):
         return 1 + np.divide(slope, power, out=np.full_like(power, np.nan), where=power > 0)
 
 
+def poked_frames(bench: Bench, model: BenchModel, poke: float, seed: int) -> list[NDArray[np.float64]]:
+    """Normalised frames of the flat command, and of each segment pushed and pulled."""
+    rng = np.random.default_rng(seed)
+    pokes = poke * np.eye(bench.n_segments)
+    return [model.normalise(bench.frames(command, rng)) for command in (None, pokes, -pokes)]
+
+
+def poked_linear(sensor: ZernikeSensor, model: BenchModel, poked: Sequence[NDArray], poke: float) -> Linear:
+    """Return the linear reconstructor whose interaction matrix was recorded on the bench, for one image or two."""
+    flat, pushed, pulled = (frames[..., : sensor.n_masks, :, :] for frames in poked)
+    recorded = flat, pushed, pulled
+    return Linear(sensor, model.modes, poke=poke, conditioning=_CONDITIONING, calibration=recorded)
+
+
 def bench_reconstructors(
     bench: Bench, model: BenchModel, *, n_iterations: int = 25, poke: float = 0.1, seed: int = 0
 ) -> dict[str, Any]:
     """Return the paper's reconstructors for the model of a bench; the linear one is calibrated on the bench."""
-    rng = np.random.default_rng(seed)
-    pokes = poke * np.eye(bench.n_segments)
-    flat, pushed, pulled = (
-        model.normalise(bench.frames(command, rng))[..., :1, :, :] for command in (None, pokes, -pokes)
-    )
-    recorded = flat, pushed, pulled
+    poked = poked_frames(bench, model, poke, seed)
     return {
-        "Linear": Linear(model.classic, model.modes, poke=poke, conditioning=_CONDITIONING, calibration=recorded),
+        "Linear": poked_linear(model.classic, model, poked, poke),
         "Arcsine": Arcsine(model.classic, n_iterations=n_iterations),
         "GerchbergSaxton": GerchbergSaxton(model.shifted, n_iterations=n_iterations),
         "GradientDescent": GradientDescent(model.shifted, model.modes, n_iterations=n_iterations),

@@ -5,7 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
+
+
+class Link(NamedTuple):
+    """A cell that links to a page; in the book, the output needs the format `myst`."""
+
+    text: str
+    page: str  # relative to the notebook
 
 
 @dataclass(frozen=True)
@@ -25,6 +32,8 @@ class Table:
         return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
     def _text(self, cell: Any) -> str:
+        if isinstance(cell, Link):
+            return f"[{plain(cell.text)}]({cell.page})"
         if isinstance(cell, bool):
             return "yes" if cell else "no"
         return f"{cell:.{self.digits}g}" if isinstance(cell, float) else plain(str(cell))

@@ -1,0 +1,334 @@
+"""The method that measures best: one image or two, much light or little, the bench known or only its design."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from studies.calibration import CalibrationFrames, Shot, dimmed, take_calibration_frames
+from studies.closed_loop import BestMethods, TunedLoops, best_methods, method_name, tuned_loops, typical
+from studies.kit import sweeps
+from studies.kit.bench import poked_frames, poked_linear
+from studies.kit.parameters import parameter_limits
+from studies.kit.results import rounded
+from studies.kit.tables import Link, Table
+from zwfs import Arcsine, Dimple, MaximumLikelihood, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
+from zwfs.bench import Bench, BenchModel, segment_pistons, segment_residual, segment_screens
+from zwfs.frames import FittedSensor, fit_bench
+
+LIMITS = parameter_limits(
+    "n_iterations",
+    n_pixels=(32, 136),
+    extent=(1.1, 2.0),
+    photons_calibration=(100.0, 1e9),
+    n_commands=(2, 50),
+    rms_commands=(0.05, 2.0),
+    poke=(0.001, 1.5),
+    **dict.fromkeys(("rms", "rms_small", "rms_loop", "rms_loop_small"), (0.01, 4.0)),
+    **dict.fromkeys(("photons", "photons_faint"), (10.0, 1e9)),
+    **dict.fromkeys(("photons_loop", "photons_loop_faint"), (0.01, 1e9)),
+    **dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop"), (2, 1000)),
+)
+
+COLUMNS = {"perfect": "no errors", "calibrated": "calibrated", "design": "only the design known"}
+"""What is known of the bench, and the headers of the table."""
+ONE_IMAGE = {"Linear": "linear", "Arcsine": "arcsine", "LikelihoodOne": "maximum likelihood on modes"}
+TWO_IMAGES = {
+    "LinearTwo": "linear",
+    "PhaseShifted": "phase-shifted",
+    "Accelerated": "phase-shifted, accelerated",
+    "MaximumLikelihood": "maximum likelihood",
+    "LikelihoodModes": "maximum likelihood on modes",
+    "Fitted": "fitted model",
+}
+"""Methods, the simplest first, and their names in the table."""
+UNCORRECTED = "PhaseShifted with the offset of its flat"
+
+CHAPTERS = (
+    Link("a calibrated model", "calibration.ipynb"),
+    Link("photon noise", "photon_noise.ipynb"),
+    Link("Figure 9", "fig09_bench_linearity.ipynb"),
+)
+"""Chapters that explain the rows without a loop."""
+_ALIKE = 1.05  # ratio of errors up to which the simpler one of two methods is named
+
+
+class Situation(NamedTuple):
+    """A row of the table."""
+
+    rms: float  # of the segments, or of the wavefront at the start of a loop, rad
+    photons: float  # per point and image of two, in a loop of each step; one image gets the light of both
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A bench, and what was recorded and modelled on it before the measurements."""
+
+    taken: CalibrationFrames
+    model: BenchModel
+    poked: Sequence[NDArray]
+    poke: float
+    fitted: FittedSensor | None = None
+
+
+def know_bench(bench: Bench, n_commands: int, rms: float, poke: float, *, seed: int, fitted: bool) -> Known:
+    """Record frames of known commands on a bench, and fit a model of the optics to them if `fitted`."""
+    taken = take_calibration_frames(bench, n_commands, rms, seed)
+    model = BenchModel.from_images(bench, seed)
+    known = Known(taken, model, poked_frames(bench, model, poke, seed), poke)
+    if not fitted:
+        return known
+    commanded = bench.commanded_phase(taken.commands)
+    settings: dict[str, Any] = {"n_inner": 30, "tolerance": 5e-4, "errors": False}
+    fit = fit_bench(taken.frames, taken.clear, commanded, n_pixels=bench.n_pixels, noise=taken.noise, **settings)
+    return replace(known, fitted=FittedSensor(fit, n_steps=2))
+
+
+def shots(taken: CalibrationFrames, photons: float, command: NDArray, seed: np.random.SeedSequence) -> list[Shot]:
+    """Take frames of one image and of two, in units of the calibration's light.
+
+    `photons` are those per point and image of two; one image gets those of both. On its own the first image would
+    be brighter than the mean of the two by the imbalance of the bench.
+    """
+    bench, found = taken.bench, []
+    alone = 2 * photons / (1 + bench.flux_imbalance)
+    for light, n_images, noise in zip((alone, photons), (1, 2), seed.spawn(2), strict=True):
+        share = light * np.count_nonzero(bench.segments) / bench.photons
+        shot = replace(taken, bench=dimmed(bench, light), dark=share * taken.dark).shot(command, noise)
+        found.append(Shot(*(one[:n_images] / share for one in shot)))
+    return found
+
+
+def open_loop_errors(
+    benches: Mapping[str, Known],
+    situations: Sequence[Situation],
+    n_screens: Mapping[str, int],
+    n_iterations: int,
+    seed: int,
+) -> dict[str, list[dict[str, NDArray[np.float64]]]]:
+    """Errors of all methods on each bench in each situation, (n_screens,) by name, rad rms over the segments."""
+    rows = range(len(situations))
+    tasks = [(name, row, screen) for name in benches for row in rows for screen in range(n_screens[name])]
+    errors = iter(sweeps.run(_errors, tasks, benches, situations, n_iterations, seed, name="open_loop_errors"))
+    some = {name: [[next(errors) for _ in range(n_screens[name])] for _ in rows] for name in benches}
+    return {
+        name: [{method: np.array([one[method] for one in row]) for method in row[0]} for row in found]
+        for name, found in some.items()
+    }
+
+
+def _errors(
+    task: tuple[str, int, int],
+    benches: Mapping[str, Known],
+    situations: Sequence[Situation],
+    n_iterations: int,
+    seed: int,
+) -> dict[str, float]:
+    """Errors of all methods on one screen; each method subtracts what it finds for the flat command."""
+    name, row, screen = task
+    known, (rms, photons) = benches[name], situations[row]
+    draws, noise = np.random.SeedSequence(seed, spawn_key=(row, screen)).spawn(2)
+    taken, model, bench = known.taken, known.model, known.taken.bench
+    [command] = segment_screens(bench, rms, 1, seed=draws)
+    alone, pair = shots(taken, photons, command, noise)
+
+    def error(phase: NDArray, flat: NDArray | float) -> float:
+        found = segment_pistons(phase, bench.segments, bench.numbers) - flat
+        return float(np.sqrt(np.mean(segment_residual(found, command) ** 2)))
+
+    found = {}
+    for method, reconstruct in _methods(known, photons, n_iterations).items():
+        n_images = reconstruct.sensor.n_masks
+        counts = np.stack([taken.frames[0, :n_images], (alone if n_images == 1 else pair).counts])
+        flat, phase = reconstruct(counts / model.scale[:n_images]).phase
+        found[method] = error(phase, model.pistons(flat))
+        if method == "PhaseShifted":
+            found[UNCORRECTED] = error(phase, 0.0)
+    if known.fitted:
+        found["Fitted"] = error(known.fitted(*pair), model.pistons(known.fitted.flat))
+    return found
+
+
+def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
+    """Return the methods that know the design of the mask, the clear frames, and the response to pokes."""
+    one, two, modes = known.model.classic, known.model.shifted, known.model.modes
+    share = photons * np.count_nonzero(known.taken.bench.segments) / known.taken.bench.photons
+    noise = np.sqrt(share) * known.taken.noise  # of a pixel without light, as in `shots`
+    single: dict[str, Any] = {"photons": 2 * photons, "read_noise": np.sqrt(2) * noise}
+    double: dict[str, Any] = {"photons": photons, "read_noise": noise}
+    return {
+        "Linear": poked_linear(one, known.model, known.poked, known.poke),
+        "Arcsine": Arcsine(one, n_iterations=n_iterations),
+        "LikelihoodOne": MaximumLikelihood(one, modes, **single),
+        "LinearTwo": poked_linear(two, known.model, known.poked, known.poke),
+        "PhaseShifted": PhaseShifted(two, n_iterations=n_iterations),
+        "Accelerated": PhaseShifted(two, n_iterations=n_iterations, accelerate=True),
+        # Of two images, the first start explains the frames or no start does.
+        "MaximumLikelihood": MaximumLikelihood(two, n_starts=1, **double),
+        "LikelihoodModes": MaximumLikelihood(two, modes, n_starts=1, **double),
+    }
+
+
+def closed_loops(situations: Sequence[Situation], n_screens: int, seed: int) -> list[BestMethods]:
+    """Close loops with each method at its best gain, with the settings of the chapter on closed loops."""
+    return best_methods(sweeps.run(_closed_loop, situations, n_screens, seed, name="closed_loops"))
+
+
+def _closed_loop(situation: Situation, n_screens: int, seed: int) -> TunedLoops:
+    """All methods in one situation."""
+    pupil = Pupil.circular(24)
+    masks = Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2)
+    return tuned_loops(
+        (ZernikeSensor(pupil, masks[0]), ZernikeSensor(pupil, *masks)),
+        zernike_basis(pupil, 80),
+        situation.rms,
+        2 * situation.photons,
+        gains=(0.1, 0.2, 0.4),
+        n_screens=n_screens,
+        n_steps=40,
+        wind={"speed": 2.5, "cutoff": 3.0, "exponent": -2.0},
+        seed=seed,
+        rate=1000.0,
+        delay=2,
+        stroke=4.0,
+    )
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Best method with one image and with two, and how they compare."""
+
+    one: str
+    two: str
+    typical: tuple[float, float]  # errors with one and two images, geometric mean over the screens, rad rms
+    ratio: float  # error with two images over that with one
+    low: float  # the ratio less and plus twice its standard error
+    high: float
+
+    @property
+    def images(self) -> int | None:
+        """Number of images that wins, None if the two differ by less than twice the standard error."""
+        return 2 if self.high < 1 else 1 if self.low > 1 else None
+
+    @property
+    def error(self) -> float:
+        """Error of the winner, or the smaller one of two that do not differ."""
+        return min(self.typical) if self.images is None else self.typical[self.images - 1]
+
+    @property
+    def text(self) -> str:
+        """Cell of the table."""
+        if self.images is None:
+            return f"no difference: {self.error:.2g}"
+        factor = max(self.ratio, 1 / self.ratio)
+        count, method = ("one image", self.one) if self.images == 1 else ("two images", self.two)
+        return f"{count}, {method}: {self.error:.2g}, {factor:.2g} times smaller"
+
+
+def ratio_of(first: NDArray, second: NDArray) -> tuple[float, float, float]:
+    """Ratio of two errors, screen by screen: geometric mean, and this less and plus twice its standard error."""
+    logs = np.log(first / second)
+    error = 2 * logs.std(ddof=1) / np.sqrt(logs.size)
+    middle, low, high = np.exp(logs.mean() + error * np.array([0, -1, 1]))
+    return float(middle), float(low), float(high)
+
+
+def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
+    """Name of the first method that agrees with the best one within the scatter, or within `_ALIKE`."""
+    known = [name for name in names if name in errors]
+    best = min(known, key=lambda name: typical(errors[name]))
+    return next(name for name in known if name == best or ratio_of(errors[name], errors[best])[1] <= _ALIKE)
+
+
+def open_cell(errors: Mapping[str, NDArray]) -> Cell:
+    """Compare the methods without a loop."""
+    one, two = simplest(errors, ONE_IMAGE), simplest(errors, TWO_IMAGES)
+    both = typical(errors[one]), typical(errors[two])
+    return Cell(ONE_IMAGE[one], TWO_IMAGES[two], both, *ratio_of(errors[two], errors[one]))
+
+
+def loop_cell(found: BestMethods) -> Cell:
+    """Result of the study of closed loops."""
+    settled = found.loops.settled
+    one, two = (method_name(name).partition(",")[0] for name in (found.one, found.two))
+    both = typical(settled[found.one]), typical(settled[found.two])
+    return Cell(one, two, both, found.ratio, found.low, found.high)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table; a cell that was not studied is None."""
+
+    key: str
+    text: str
+    cells: Mapping[str, Cell | None]
+    chapter: Link
+
+
+def open_rows(situations: Sequence[Situation], errors: Mapping[str, Sequence[Mapping[str, NDArray]]]) -> list[Row]:
+    """Rows without a loop; on the calibrated bench, the methods that know its design compete as well."""
+    rows = []
+    for index, (rms, photons) in enumerate(situations):
+        perfect, real = errors["perfect"][index], errors["real"][index]
+        design = {name: values for name, values in real.items() if name != "Fitted"}
+        cells = {"perfect": open_cell(perfect), "calibrated": open_cell(real), "design": open_cell(design)}
+        text = f"open loop, {rms:g} rad rms; {_light(photons)}"
+        rows.append(Row(f"open_{index + 1}", text, cells, CHAPTERS[index]))
+    return rows
+
+
+def loop_rows(found: Iterable[BestMethods]) -> list[Row]:
+    """Rows of closed loops."""
+    rows = []
+    for index, one in enumerate(found):
+        cells = {"perfect": loop_cell(one), "calibrated": None, "design": None}
+        text = f"closed loop from {one.loops.start:g} rad rms; {_light(one.loops.photons / 2)} per step"
+        rows.append(Row(f"closed_{index + 1}", text, cells, Link("closed loop", "closed_loop.ipynb")))
+    return rows
+
+
+def _light(photons: float) -> str:
+    return f"{photons:g} ({2 * photons:g})"
+
+
+def decision_table(rows: Iterable[Row]) -> Table:
+    """Best method of each situation."""
+    header = ["situation; photons per point and image (both images)", *COLUMNS.values(), "explained in"]
+    cells = [[_cell_text(row.cells[name]) for name in COLUMNS] for row in rows]
+    return Table(header, [[row.text, *some, row.chapter] for row, some in zip(rows, cells, strict=True)])
+
+
+def _cell_text(cell: Cell | None) -> str:
+    return "not studied" if cell is None else cell.text
+
+
+def numbers(
+    rows: Sequence[Row], errors: Mapping[str, Sequence[Mapping[str, NDArray]]], loops: Sequence[BestMethods]
+) -> dict[str, float | str]:
+    """Each cell in words, its error (rad rms), and the error with two images over that with one; and extremes."""
+    found: dict[str, float | str] = {}
+    for row in rows:
+        found[f"{row.key}_situation"] = row.text
+        for name, cell in row.cells.items():
+            found[f"{row.key}_{name}"] = _cell_text(cell)
+            if cell is not None:
+                found |= {f"{row.key}_{name}_error": cell.error, f"{row.key}_{name}_ratio": cell.ratio}
+    gains = [1 / cell.ratio for row in rows[:2] for cell in row.cells.values() if cell]
+    small, faint = errors["real"][-1], loops[-1]
+    settled = faint.loops.settled
+    return rounded(
+        found
+        | {
+            "gain_least": min(gains),
+            "gain_most": max(gains),
+            "loop_gain_least": min(1 / one.ratio for one in loops[:2]),
+            "loop_gain_most": max(1 / one.ratio for one in loops[:2]),
+            "offset_ratio": ratio_of(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
+            "likelihood_ratio": ratio_of(settled["MaximumLikelihood"], settled[faint.one])[0],
+        },
+        ".3g",
+    )

@@ -1,0 +1,99 @@
+"""The table of the best methods: what decides a cell, and whether the comparison is fair."""
+
+import numpy as np
+import pytest
+
+from studies.calibration import dimmed
+from studies.closed_loop import BestMethods, TunedLoops
+from studies.decision import (
+    Situation,
+    decision_table,
+    know_bench,
+    loop_rows,
+    open_cell,
+    open_loop_errors,
+    open_rows,
+    shots,
+)
+from zwfs.bench import Bench
+
+SITUATIONS = [Situation(0.5, 1e4), Situation(0.5, 100.0), Situation(0.1, 1e4)]
+
+
+@pytest.fixture(scope="module")
+def known():
+    bench = dimmed(Bench.ideal(n_pixels=40, extent=1.3, photons=1e10), 1e5)
+    return know_bench(bench, 2, 0.6, 0.1, seed=5, fitted=False)
+
+
+@pytest.fixture
+def errors():
+    rng = np.random.default_rng(1)
+    scatter = {name: rng.uniform(0.9, 1.1, 8) for name in ("Linear", "Arcsine", "PhaseShifted", "Accelerated")}
+    sizes = {"Linear": 0.2, "Arcsine": 0.1, "PhaseShifted": 0.02, "Accelerated": 0.03}
+    return {name: sizes[name] * scatter[name] for name in sizes}
+
+
+def test_a_method_that_becomes_worse_loses_its_cell(errors):
+    cell = open_cell(errors)
+    assert (cell.images, cell.one, cell.two) == (2, "arcsine", "phase-shifted")
+    assert cell.error == pytest.approx(0.02, rel=0.1)
+    assert cell.ratio == pytest.approx(0.2, rel=0.1)
+    worse = open_cell(errors | {"PhaseShifted": 3 * errors["PhaseShifted"]})
+    assert (worse.images, worse.two) == (2, "phase-shifted, accelerated")
+    lost = open_cell(worse_by(10, errors))
+    assert (lost.images, lost.one) == (1, "arcsine")
+    assert lost.error == pytest.approx(0.1, rel=0.1)
+    assert lost.ratio == pytest.approx(10 * cell.ratio, rel=0.2)
+
+
+def worse_by(factor, errors):
+    return errors | {name: factor * errors[name] for name in ("PhaseShifted", "Accelerated")}
+
+
+def test_methods_that_agree_within_the_scatter_are_called_alike(errors):
+    cell = open_cell(errors | {"PhaseShifted": errors["Arcsine"][::-1]})
+    assert cell.images == 2  # by the accelerated iteration
+    tied = open_cell(worse_by(1e3, errors) | {"PhaseShifted": errors["Arcsine"][::-1]})
+    assert tied.images is None
+    assert tied.text.startswith("no difference")
+
+
+def test_the_simpler_of_two_methods_that_agree_is_named(errors):
+    cell = open_cell(errors | {"Accelerated": 0.99 * errors["PhaseShifted"]})
+    assert cell.two == "phase-shifted"
+
+
+def test_one_image_gets_the_light_that_two_share():
+    bench = dimmed(Bench.ideal(n_pixels=40, extent=1.6, photons=1e10, flux_imbalance=0.2), 1e6)
+    taken = know_bench(bench, 2, 0.6, 0.1, seed=5, fitted=False).taken
+    for photons in (50.0, 1e4):
+        one, two = shots(taken, photons, np.zeros(bench.n_segments), np.random.SeedSequence(2))
+        # With photon noise alone, sigma^2 is the mean count, so this counts the photons in any unit.
+        light = [np.sum(shot.counts) ** 2 / np.sum(shot.sigma**2) for shot in (one, two)]
+        share = np.divide(light, 2 * photons * np.count_nonzero(bench.segments))
+        assert (one.counts.shape[0], two.counts.shape[0]) == (1, 2)
+        np.testing.assert_allclose(share[0], share[1], rtol=0.01)
+        assert 0.85 < share[0] < 1  # the masks send some of the light past the camera
+
+
+def test_winners_on_a_bench_without_errors_do_not_depend_on_the_screens(known):
+    errors = open_loop_errors({"perfect": known}, SITUATIONS, {"perfect": 12}, 25, seed=7)["perfect"]
+    cells = [open_cell(one) for one in errors]
+    assert [cell.images for cell in cells] == [2, 2, None]
+    assert all(cell.two == "phase-shifted" for cell in cells[:2])
+
+
+def test_the_table_has_a_cell_for_each_situation_and_says_what_was_not_studied(errors):
+    fitted = errors | {"Fitted": 0.01 * errors["PhaseShifted"]}
+    rows = open_rows(SITUATIONS, {"perfect": [errors] * 3, "real": [fitted] * 3})
+    assert [row.cells["calibrated"].two for row in rows] == ["fitted model"] * 3
+    assert [row.cells["design"].two for row in rows] == ["phase-shifted"] * 3
+    settled = {"Linear": np.full(4, 0.4), "LinearTwo": np.full(4, 0.1)}
+    loops = TunedLoops(1.0, 2.0, {}, {name: values.mean() for name, values in settled.items()}, settled)
+    [row] = loop_rows([BestMethods(loops, "Linear", "LinearTwo", 0.25, 0.2, 0.3)])
+    assert row.cells["perfect"].text == "two images, linear: 0.1, 4 times smaller"
+    assert row.text == "closed loop from 1 rad rms; 1 (2) per step"
+    lines = decision_table([*rows, row])._repr_markdown_().splitlines()
+    assert len(lines) == 6
+    assert lines[-1].endswith("not studied | not studied | [closed loop](closed_loop.ipynb) |")

@@ -130,6 +130,14 @@ class Unwrapping(NamedTuple):
             rows.append(best)
         return xp.stack(rows)
 
+    def direct(self, phase: NDArray, kind: Kind) -> tuple[NDArray, NDArray[np.bool_]]:
+        """Least squares on phases as they are, (k, m), and whether all points are near it, (k,)."""
+        points = kind.xp.reshape(phase, (phase.shape[0], -1))[:, kind.flags(self.inside.ravel())]
+        coefficients = points @ kind.array(self.inverse)
+        error = 0 * points[0, ...] + _NEAR / _NEAR_SIGMAS
+        near = [self._quality(coefficients[i, ...], points[i, ...], error, kind)[0] for i in range(phase.shape[0])]
+        return coefficients, kind.flags(np.array(near))
+
     def _wrapped_slopes(self, phase: NDArray, kind: Kind) -> NDArray:
         """Differences of neighbours, (k, n_pairs), in (-pi, pi]."""
         along = phase[:, 1:, :] - phase[:, :-1, :], phase[:, :, 1:] - phase[:, :, :-1]

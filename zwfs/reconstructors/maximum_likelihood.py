@@ -313,10 +313,17 @@ class MaximumLikelihood(Reconstructor):
 
     def _search(self, frames: NDArray, start: NDArray | None, history: bool) -> Fit:
         """Fit from start after start, until every frame set is explained or the starts are used up."""
-        xp = Kind.of(frames).xp
-        fit = self._descend(frames, self._first_phase(frames) if start is None else start, history)
+        kind = Kind.of(frames)
+        xp = kind.xp
+        first, quick = (start, None) if start is not None else self._first_phase(frames, kind)
+        fit = self._descend(frames, first, history)
         if fit.history is not None and start is not None:
             fit.history[:, 0, ...] = start  # as it was given: modes may not represent it
+        if quick is not None and xp.any(poor := quick & ~self._explained(fit)):
+            best = fit.at(poor)
+            other = self._descend(best.frames, self._phase_of_points(best.frames, kind), history)
+            best.take(other.cost < best.cost, other, xp)
+            fit.put(poor, best)
         for attempt in range(1, self.n_starts):
             poor = ~self._explained(fit)
             if not xp.any(poor):
@@ -329,13 +336,27 @@ class MaximumLikelihood(Reconstructor):
             fit.put(poor, best)
         return fit
 
-    def _first_phase(self, frames: NDArray) -> NDArray:
-        """Phase of the first start, (k, ny, nx): with modes, their fit to the most likely phase of every point."""
-        if self._points is None or self._unwrapping is None:
-            return self._rough_phase(frames, None)
+    def _first_phase(self, frames: NDArray, kind: Kind) -> tuple[NDArray, NDArray[np.bool_] | None]:
+        """Phase of the first start, (k, ny, nx), and with modes, where it is a fit to the first iterations, (k,).
+
+        Where every point of the first iterations is near the fit, none is a multiple of 2 pi off.
+        """
+        rough = self._rough_phase(frames, None)
+        if self._unwrapping is None or self._exact.modes is None:
+            return rough, None
+        coefficients, near = self._unwrapping.direct(rough, kind)
+        start = self._of_modes(coefficients)
+        if not kind.xp.all(near):
+            start[~near] = self._phase_of_points(frames[~near], kind)
+        return start, near
+
+    def _phase_of_points(self, frames: NDArray, kind: Kind) -> NDArray:
+        """Fit of the modes to the most likely phase of every point, (k, ny, nx)."""
+        assert self._points is not None
+        assert self._unwrapping is not None
         fit = self._points._search(frames, None, False)
         sigma = self._points._sigma(fit)
-        return self._of_modes(self._unwrapping.fit(self._points._phase(fit), Kind.of(frames), sigma))
+        return self._of_modes(self._unwrapping.fit(self._points._phase(fit), kind, sigma))
 
     def _sigma(self, fit: Fit) -> NDArray:
         """Standard error of the phase of every point, (k, ny, nx)."""

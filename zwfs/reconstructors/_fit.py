@@ -115,7 +115,7 @@ class Unwrapping(NamedTuple):
         points = xp.reshape(phase, (k, -1))[:, inside]
         errors = 0 * points if sigma is None else xp.reshape(sigma, (k, -1))[:, inside]
         slopes = self._wrapped_slopes(phase, kind)
-        direct, sloped = points @ kind.array(self.inverse), slopes @ kind.array(self.from_slopes)
+        direct, sloped = points @ kind.array(self.inverse), self.sloped(phase, kind)
         rows = []
         for i in range(k):
             one = points[i, ...], errors[i, ...]
@@ -137,6 +137,10 @@ class Unwrapping(NamedTuple):
         error = 0 * points[0, ...] + _NEAR / _NEAR_SIGMAS
         near = [self._quality(coefficients[i, ...], points[i, ...], error, kind)[0] for i in range(phase.shape[0])]
         return coefficients, kind.flags(np.array(near))
+
+    def sloped(self, phase: NDArray, kind: Kind) -> NDArray:
+        """Least squares on wrapped differences of neighbours, (k, m)."""
+        return self._wrapped_slopes(phase, kind) @ kind.array(self.from_slopes)
 
     def _wrapped_slopes(self, phase: NDArray, kind: Kind) -> NDArray:
         """Differences of neighbours, (k, n_pairs), in (-pi, pi]."""

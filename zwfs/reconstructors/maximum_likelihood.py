@@ -378,7 +378,7 @@ class MaximumLikelihood(Reconstructor):
             return phase
         kind = Kind.of(phase)
         flat = kind.xp.reshape(kind.array(self._smooth), (self._smooth.shape[0], -1))
-        smooth = kind.xp.reshape(self._unwrapping.fit(phase, kind) @ flat, phase.shape)
+        smooth = kind.xp.reshape(self._unwrapping.sloped(phase, kind) @ flat, phase.shape)
         return phase - 2 * np.pi * kind.xp.round((phase - smooth) / (2 * np.pi))
 
     def _other_start(self, attempt: int, fit: Fit) -> NDArray:

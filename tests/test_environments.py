@@ -73,7 +73,8 @@ def test_every_supported_python_is_tested_and_environments_have_the_newest():
     *others, newest = supported()
     assert f"Python {', '.join(others)} or {newest}" in read("README.md")
     assert found(r"(?m)^  - python=(\S+)$", "environment/environment.yml") == {newest}
-    assert found(r"(?m)^FROM python:(\d+\.\d+)-slim", "environment/Dockerfile") == {newest}
+    pinned = r"(?m)^FROM python:(\d+\.\d+)\.\d+-slim-bookworm@sha256:[0-9a-f]{64}$"
+    assert found(pinned, "environment/Dockerfile") == {newest}
     assert found(r"^python-(\d+\.\d+)\s*$", ".binder/runtime.txt") == {newest}
 
 

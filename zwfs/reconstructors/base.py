@@ -91,7 +91,7 @@ class Reconstruction:
 
     @property
     def consistent(self) -> NDArray[np.bool_]:
-        """Whether the phase explains frames without noise, shape (...): `explains` without a number of photons.
+        """Whether the phase explains frames without noise, shape (...), see `explains`.
 
         The result of `MaximumLikelihood` has its noise, and compares the frames with that.
         """

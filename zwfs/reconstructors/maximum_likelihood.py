@@ -70,10 +70,10 @@ class LikelihoodReconstruction(Reconstruction):
 
     @property
     def consistent(self) -> NDArray[np.bool_]:
-        """Whether the fit converged and explains the frames, shape (...): `Reconstruction.explains` for its noise.
+        """Whether the fit converged and explains the frames to within its noise, shape (...).
 
-        The expected misfit is that of frames to which so many unknowns were fitted, and all pixels of the detector
-        count. For one mask many phases explain a frame.
+        See `Reconstruction.explains`. The expected misfit is that of frames to which so many unknowns were fitted,
+        and all pixels of the detector count. For one mask many phases explain a frame.
         """
         return self.converged & self.explained
 

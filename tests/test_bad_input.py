@@ -133,6 +133,7 @@ def valid() -> dict:
         "Detector": zwfs.Detector(pupil, 1e5, gain=1.0, full_well=1e4),
         "Mirror": mirror,
         "LoopRecord": zwfs.close_loop(shifted, mirror, method, phase[np.newaxis]),
+        "Reconstruction": method(shifted.measure(phase)),
         **methods,
     }
     return {"arguments": arguments, "instances": instances}

@@ -37,6 +37,7 @@ LIMITS = parameter_limits(
     inputs_noiseless=[(0.01, 12.0), ...],
     inputs_limit=[(0.1, 4.0)],
     photons=[(1.0, 1e12)],
+    photons_shown=(1.0, 1e12),
     diameter_error=(-0.5, 0.5),
     shift_error=(-0.5, 0.5),
     image_shift=(0.0, 5.0),

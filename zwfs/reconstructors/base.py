@@ -136,12 +136,12 @@ class Reconstruction:
     def _compared(self, kind: Kind) -> Iterator[tuple[NDArray[np.floating], NDArray[np.floating]]]:
         """Modelled and measured frames at the points of the pupil, (1, n_masks, n_points) for each frame set."""
         model, xp = self.settings.model(kind), kind.xp
-        inside = kind.flags(model.pupil.inside.ravel())
+        inside = kind.integers(np.flatnonzero(model.pupil.inside))
         frames = xp.reshape(xp.astype(self.frames, kind.dtype), (-1, *self.frames.shape[-3:]))
         for index, psi in enumerate(self._fields(model)):
             light = square(model.reference(psi) + psi[:, np.newaxis, ...])
             pair = (xp.reshape(one, (*one.shape[:2], -1)) for one in (light, frames[index : index + 1, ...]))
-            modelled, measured = (one[:, :, inside] for one in pair)
+            modelled, measured = (xp.take(one, inside, axis=2) for one in pair)
             yield modelled, measured
 
     def _fields(self, model: Propagator) -> Iterator[NDArray[np.floating]]:

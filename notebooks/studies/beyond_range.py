@@ -245,7 +245,8 @@ def wrong_frames(
     sensor: ZernikeSensor, errors: ModelErrors, camera: FineCamera, fine: NDArray, screens: NDArray, seed: int
 ) -> dict[str, NDArray]:
     """Noiseless frames of screens, given on the fine and on the camera's grid, by the error of the model."""
-    pupil, (first, second) = sensor.pupil, sensor.masks
+    pupil = sensor.pupil
+    first, second = (mask for mask in sensor.masks if isinstance(mask, Dimple))
     wider = (Dimple((1 + errors.diameter) * mask.diameter, mask.phase) for mask in (first, second))
     shifted = Dimple(first.diameter, (1 + errors.shift) * first.phase)
     uneven = 0 * pupil.amplitude
@@ -271,7 +272,7 @@ class Causes:
 
     curves: ErrorCurves  # of PLAIN, DIMMED, SECANT, ACCELERATED
     factor: NDArray[np.float64]  # (n_rms, n_screens), of a small error in one plain iteration near the truth
-    example: dict[str, NDArray[np.float64]]  # error after each iteration, (n_iterations + 1,) by name
+    example: dict[str, NDArray[np.floating]]  # error after each iteration, (n_iterations + 1,) by name
     example_rms: float
 
     def half(self, name: str, threshold: float) -> tuple[float, float]:
@@ -378,7 +379,7 @@ def _input_axes(axes: Axes, threshold: float, bottom: float, *, named: bool = Tr
             f"{threshold:.0%}", (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points", color=_INK,
             fontsize=9, va="center",
         )  # fmt: skip
-    axes.set_xlim(ends)
+    axes.set_xlim(*ends)
     ticks = [tick for tick in (0.05, 0.1, 0.2, 0.5, 1, 2, 4) if ends[0] <= tick <= ends[1]]
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.set_xticks([], minor=True)
@@ -567,7 +568,7 @@ def numbers(
         result[f"shown_likely_{rms}"] = chosen.median(LIKELY)[place]
     short = "amplitude", "offset", "diameter", "shift", "area"
     for name, curve in zip(short, model.values(), strict=True):
-        for rms in (0.5, 1.0):
-            place = int(np.argmin(np.abs(curve.rms - rms)))
-            result[f"{name}_{rms:g}".replace(".", "")] = np.median(curve.errors[LIKELY][place])
+        for value in (0.5, 1.0):
+            place = int(np.argmin(np.abs(curve.rms - value)))
+            result[f"{name}_{value:g}".replace(".", "")] = np.median(curve.errors[LIKELY][place])
     return rounded(result, ".3g")

@@ -36,7 +36,7 @@ def needs_modes(method):
     return modes is not None and modes.default is inspect.Parameter.empty
 
 
-# A busy machine is no failure: neither a slow example nor a slow draw.
+# On a busy machine examples are slow; this is not a failure.
 BUSY = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("zwfs", derandomize=True, max_examples=25, **BUSY)
 settings.register_profile("fuzz", max_examples=1000, print_blob=True, **BUSY)

@@ -14,6 +14,7 @@ from studies.beyond_range import (
     SECANT,
     FineCamera,
     ModelErrors,
+    Trials,
     causes,
     compared_methods,
     model_curves,
@@ -39,11 +40,11 @@ def sensor(pupil):
     return opposite_dimples(pupil, 1.06, np.pi / 2)
 
 
-TRIALS = {"n_iterations": 25, "exponent": -2.0, "seed": 3}
+TRIALS = Trials(n_iterations=25, exponent=-2.0, seed=3)
 
 
 def test_photons_set_the_error_and_the_plain_iteration_has_a_range(sensor, modes):
-    noiseless, few, many = noise_curves(sensor, modes, [1e5, 1e3], [0.5, 3.0], [8.0], 8, **TRIALS)
+    noiseless, few, many = noise_curves(sensor, modes, [1e5, 1e3], [0.5, 3.0], [8.0], 8, TRIALS)
     assert (few.photons, many.photons) == (1e3, 1e5)
     assert noiseless.complete_up_to(LIKELY, 0.05) == 8.0
     assert noiseless.complete_up_to(PLAIN, 0.05) == 0.5
@@ -59,8 +60,8 @@ def test_photons_set_the_error_and_the_plain_iteration_has_a_range(sensor, modes
 
 
 def test_each_error_of_the_model_costs_and_a_right_model_does_not(sensor, modes):
-    wrong = model_curves(sensor, modes, ModelErrors(0.02, 0.03, 0.2, 0.05, 3), [0.5], 3, **TRIALS)
-    right = model_curves(sensor, modes, ModelErrors(0.0, 0.0, 0.0, 0.0, 3), [0.5], 3, **TRIALS)
+    wrong = model_curves(sensor, modes, ModelErrors(0.02, 0.03, 0.2, 0.05, 3), [0.5], 3, TRIALS)
+    right = model_curves(sensor, modes, ModelErrors(0.0, 0.0, 0.0, 0.0, 3), [0.5], 3, TRIALS)
     amplitude, offset, diameter, shift, area = (np.median(one.errors[LIKELY]) for one in wrong.values())
     assert amplitude > offset > diameter > shift > area > 0
     for kind, (curve, control) in enumerate(zip(wrong.values(), right.values(), strict=True)):
@@ -84,7 +85,7 @@ def test_camera_pixels_are_means_and_a_whole_pixel_of_displacement_is_one(sensor
 
 
 def test_the_start_and_the_contraction_limit_the_iteration(sensor, modes, pupil):
-    found = causes(sensor, modes, [0.5, 2.2, 2.6], 16, 0.05, **TRIALS)
+    found = causes(sensor, modes, [0.5, 2.2, 2.6], 16, 0.05, TRIALS)
     share = {name: found.curves.recovered(name) for name in found.curves.errors}
     assert all(values[0] == 1 for values in share.values())
     assert np.all(share[PLAIN][1:] < 0.5)
@@ -96,7 +97,7 @@ def test_the_start_and_the_contraction_limit_the_iteration(sensor, modes, pupil)
     assert accuracy > 0
     assert found.half(ACCELERATED, 0.05)[0] == np.inf
     # The factor decides whether the plain iteration returns to the truth from nearby.
-    screens = screens_at(modes, 2.6, 16, TRIALS["seed"], 2)
+    screens = screens_at(modes, 2.6, 16, TRIALS.seed, 2)
     near = screens + screens_at(modes, 1e-4, 16, 9, 0)
     plain = zwfs.PhaseShifted(sensor, n_iterations=300, tolerance=0)
     stays = zwfs.reconstruction_error(pupil, plain(sensor.measure(screens), start=near).phase, screens) < 1e-4

@@ -54,6 +54,19 @@ PIXEL_ERROR = 0.01  # rad rms, from which the text calls the size of the pixels 
 _WITHOUT_NOISE = 0.0  # photons
 
 
+@dataclass(frozen=True)
+class Trials:
+    """Settings that all experiments of the chapter share."""
+
+    n_iterations: int
+    exponent: float
+    seed: int
+
+    def screens(self, modes: NDArray, rms: float, n_screens: int, task: int) -> NDArray[np.floating]:
+        """Screens of one task, see `screens_at`."""
+        return screens_at(modes, rms, n_screens, self.seed, task, self.exponent)
+
+
 def compared_methods(
     sensor: ZernikeSensor, n_iterations: int, photons: float = 0.0, n_starts: int = 8
 ) -> dict[str, Any]:
@@ -102,7 +115,7 @@ def noise_curves(
     inputs: Sequence[float],
     inputs_noiseless: Sequence[float],
     n_screens: int,
-    **settings: Any,
+    trials: Trials,
 ) -> list[NoiseCurves]:
     """Errors of all methods for each number of photons, and without noise at more inputs."""
     levels = [_WITHOUT_NOISE, *sorted(photons)]
@@ -110,7 +123,7 @@ def noise_curves(
     # The largest inputs take longest: they begin first, so that all cores end at about the same time.
     points = [(level, task) for level in levels for task in reversed(range(len(rms[level])))]
     tasks = [(level, task, rms[level][task]) for level, task in points]
-    found = sweeps.run(_noise_point, tasks, sensor, modes, n_screens, *_ordered(settings), name="noise_curves")
+    found = sweeps.run(_noise_point, tasks, sensor, modes, n_screens, trials, name="noise_curves")
     by_point = dict(zip(points, found, strict=True))
     curves = []
     for level in levels:
@@ -127,26 +140,20 @@ def noise_curves(
     return curves
 
 
-def _ordered(settings: Mapping[str, Any]) -> tuple[int, float, int]:
-    return settings["n_iterations"], settings["exponent"], settings["seed"]
-
-
 def _noise_point(
     point: tuple[float, int, float],
     sensor: ZernikeSensor,
     modes: NDArray,
     n_screens: int,
-    n_iterations: int,
-    exponent: float,
-    seed: int,
+    trials: Trials,
 ) -> tuple[dict[str, NDArray], dict[str, float], NDArray]:
     """One number of photons and input: errors, (n_screens,), bounds, and consistent, (n_screens,)."""
     photons, task, rms = point
-    screens = screens_at(modes, rms, n_screens, seed, task, exponent)
+    screens = trials.screens(modes, rms, n_screens, task)
     noise = Noise(sensor.n_masks * photons)  # the light of all images goes to one where a method uses one
     errors, consistent = {}, np.zeros(n_screens, bool)
-    for name, method in all_methods(sensor, modes, n_iterations, photons).items():
-        result = method(noise(method.sensor, screens, np.random.SeedSequence(seed, spawn_key=(task, 0))))
+    for name, method in all_methods(sensor, modes, trials.n_iterations, photons).items():
+        result = method(noise(method.sensor, screens, np.random.SeedSequence(trials.seed, spawn_key=(task, 0))))
         errors[name] = reconstruction_error(sensor.pupil, result.phase, screens)
         consistent = result.consistent if name == LIKELY else consistent
     if not photons:
@@ -202,14 +209,11 @@ def model_curves(
     errors: ModelErrors,
     inputs: Sequence[float],
     n_screens: int,
-    *,
-    n_iterations: int,
-    exponent: float,
-    seed: int,
+    trials: Trials,
 ) -> dict[str, ErrorCurves]:
     """Errors of the two best methods on noiseless frames that their model does not describe, by its error."""
     tasks = list(enumerate(inputs))[::-1]
-    shared = sensor, modes, errors, n_screens, n_iterations, exponent, seed
+    shared = sensor, modes, errors, n_screens, trials
     found = sweeps.run(_model_point, tasks, *shared, name="model_curves")[::-1]
     names = (ACCELERATED, LIKELY)
     return {
@@ -224,19 +228,17 @@ def _model_point(
     modes: NDArray,
     errors: ModelErrors,
     n_screens: int,
-    n_iterations: int,
-    exponent: float,
-    seed: int,
+    trials: Trials,
 ) -> dict[tuple[str, str], NDArray]:
     """Errors of one input, (n_screens,) by the error of the model and the method."""
     task, rms = point
     camera = FineCamera(sensor, modes, errors.n_subpixels)
-    fine = np.where(camera.pupil.inside, screens_at(camera.modes, rms, n_screens, seed, task, exponent), 0)
+    fine = np.where(camera.pupil.inside, trials.screens(camera.modes, rms, n_screens, task), 0)
     screens = camera.mean(fine)
-    methods = compared_methods(sensor, n_iterations, n_starts=1)  # no phase explains the frames
+    methods = compared_methods(sensor, trials.n_iterations, n_starts=1)  # no phase explains the frames
     return {
         (kind, name): reconstruction_error(sensor.pupil, methods[name](frames).phase, screens)
-        for kind, frames in wrong_frames(sensor, errors, camera, fine, screens, seed).items()
+        for kind, frames in wrong_frames(sensor, errors, camera, fine, screens, trials.seed).items()
         for name in (ACCELERATED, LIKELY)
     }
 
@@ -293,10 +295,10 @@ def causes(
     inputs: Sequence[float],
     n_screens: int,
     threshold: float,
-    **settings: Any,
+    trials: Trials,
 ) -> Causes:
     """Separate the two ingredients of the acceleration on noiseless frames."""
-    shared = sensor, modes, n_screens, *_ordered(settings)
+    shared = sensor, modes, n_screens, trials
     found = sweeps.run(_causes_point, list(enumerate(inputs)), *shared, name="causes")
     errors, factor = zip(*found, strict=True)
     rms = np.array(inputs)
@@ -306,11 +308,10 @@ def causes(
     kept = curves.errors[ACCELERATED] <= threshold * rms[:, np.newaxis]
     places = np.argwhere(lost & kept & (np.array(factor) < 1))
     task, index = places[len(places) // 2] if len(places) else (len(rms) - 1, 0)
-    screen = screens_at(modes, rms[task], n_screens, settings["seed"], int(task), settings["exponent"])[[index]]
-    n_iterations = settings["n_iterations"]
+    screen = trials.screens(modes, rms[task], n_screens, int(task))[[index]]
     example = {
         name: reconstruction_error(sensor.pupil, result.history[0], screen[0])
-        for name, result in _variants(sensor, sensor.measure(screen), n_iterations, history=True).items()
+        for name, result in _variants(sensor, sensor.measure(screen), trials.n_iterations, history=True).items()
     }
     return Causes(curves, np.array(factor), example, float(rms[task]))
 
@@ -333,14 +334,12 @@ def _causes_point(
     sensor: ZernikeSensor,
     modes: NDArray,
     n_screens: int,
-    n_iterations: int,
-    exponent: float,
-    seed: int,
+    trials: Trials,
 ) -> tuple[dict[str, NDArray], list[float]]:
     """Errors, (n_screens,) by variant, and contraction factors, (n_screens,), of one input."""
     task, rms = point
-    screens, pupil = screens_at(modes, rms, n_screens, seed, task, exponent), sensor.pupil
-    results = _variants(sensor, sensor.measure(screens), n_iterations)
+    screens, pupil = trials.screens(modes, rms, n_screens, task), sensor.pupil
+    results = _variants(sensor, sensor.measure(screens), trials.n_iterations)
     errors = {name: reconstruction_error(pupil, result.phase, screens) for name, result in results.items()}
     diameter = sensor.masks[0].diameter
     return errors, [float(np.abs(iteration_spectrum(pupil, diameter, one)[0])) for one in screens]

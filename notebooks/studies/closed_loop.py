@@ -128,7 +128,7 @@ def follow_flow(
 ) -> LoopRun:
     """Correct drifting screens with a Zernike sensor and a mirror of modes; `settings` are those of `close_loop`.
 
-    `photons` are those of a step, divided among the images; there is no noise if they are left out.
+    `photons` are detected in each step, and the images share them. Without `photons` the frames have no noise.
     """
     sensor = reconstructor.sensor
     camera = None if photons is None else Detector(sensor.pupil, photons / sensor.n_masks)

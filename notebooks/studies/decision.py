@@ -261,7 +261,7 @@ def loop_cell(found: BestMethods) -> Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table; a cell that was not studied is None."""
+    """A row of the table; None marks a cell that was not studied."""
 
     key: str
     text: str

@@ -161,9 +161,8 @@ class Unwrapping(NamedTuple):
     def _grown(self, phase: NDArray, sigma: NDArray, slopes: NDArray, kind: Kind) -> NDArray:
         """Coefficients, (m,), of one phase, (n_points,)."""
         xp = kind.xp
-        prior = (
-            _STEEPER * float(xp.sum(slopes**2)) / max(slopes.shape[0], 1) + _LEAST_ERROR**2
-        )  # variance of a coefficient of the basis
+        steepness = float(xp.sum(slopes**2)) / max(slopes.shape[0], 1)
+        prior = _STEEPER * steepness + _LEAST_ERROR**2  # variance of a coefficient of the basis
         some = sigma <= max(_VAGUE, float(xp.min(sigma)))
         basis, rest, noise = kind.array(self.basis)[some], phase[some], sigma[some] ** 2 + _LEAST_ERROR**2
         fewest = 1 + rest.shape[0] // _MOST_ROUNDS

@@ -77,7 +77,7 @@ def fitted_limit(x: ArrayLike, ratio: NDArray, threshold: float, seed: Any = 0, 
     cubics = np.polyfit((x - middle) / half, np.sqrt(means), 3)
     steps = np.linspace(-1, 1, 2001)
     below = np.vander(steps, 4) @ cubics <= np.sqrt(threshold)
-    # The first step above the threshold; an end of the inputs if there is none, or nothing else.
+    # The first step above the threshold; the last input if all are below, and the first if all are above.
     places = middle + half * steps[np.where(below.all(axis=0), -1, np.argmin(below, axis=0))]
     return Limit(float(places[0]), float(places[1:].std()))
 

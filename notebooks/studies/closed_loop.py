@@ -256,6 +256,14 @@ def typical(settled: NDArray) -> float:
     return float(np.exp(np.mean(np.log(settled))))
 
 
+def paired_ratio(first: NDArray, second: NDArray) -> tuple[float, float, float]:
+    """Ratio of two errors, screen by screen: geometric mean, and this less and plus twice its standard error."""
+    logs = np.log(first / second)
+    error = 2 * logs.std(ddof=1) / np.sqrt(logs.size) if logs.size > 1 else np.inf
+    middle, low, high = np.exp([logs.mean(), logs.mean() - error, logs.mean() + error])
+    return float(middle), float(low), float(high)
+
+
 def tuned_loops(
     sensors: Sequence[ZernikeSensor],
     modes: NDArray,
@@ -313,10 +321,7 @@ def best_methods(trials: Iterable[TunedLoops]) -> list[BestMethods]:
     for loops in trials:
         chosen = loops.chosen
         one, two = (min(names, key=lambda name: chosen[name]) for names in (ONE_IMAGE, TWO_IMAGES))
-        logs = np.log(loops.settled[two] / loops.settled[one])
-        error = logs.std(ddof=1) / np.sqrt(logs.size) if logs.size > 1 else np.inf
-        low, middle, high = np.exp([logs.mean() - 2 * error, logs.mean(), logs.mean() + 2 * error])
-        rows.append(BestMethods(loops, one, two, float(middle), float(low), float(high)))
+        rows.append(BestMethods(loops, one, two, *paired_ratio(loops.settled[two], loops.settled[one])))
     return rows
 
 

@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies.calibration import CalibrationFrames, Shot, dimmed, take_calibration_frames
-from studies.closed_loop import BestMethods, TunedLoops, best_methods, method_name, tuned_loops, typical
+from studies.closed_loop import (
+    BestMethods,
+    TunedLoops,
+    best_methods,
+    method_name,
+    paired_ratio,
+    tuned_loops,
+    typical,
+)
 from studies.kit import sweeps
 from studies.kit.bench import poked_frames, poked_linear
 from studies.kit.parameters import parameter_limits
@@ -229,26 +237,18 @@ class Cell:
         return f"{count}, {method}: {self.error:.2g}, {factor:.2g} times smaller"
 
 
-def ratio_of(first: NDArray, second: NDArray) -> tuple[float, float, float]:
-    """Ratio of two errors, screen by screen: geometric mean, and this less and plus twice its standard error."""
-    logs = np.log(first / second)
-    error = 2 * logs.std(ddof=1) / np.sqrt(logs.size)
-    middle, low, high = np.exp(logs.mean() + error * np.array([0, -1, 1]))
-    return float(middle), float(low), float(high)
-
-
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
     """Name of the first method that agrees with the best one within the scatter, or within `_ALIKE`."""
     known = [name for name in names if name in errors]
     best = min(known, key=lambda name: typical(errors[name]))
-    return next(name for name in known if name == best or ratio_of(errors[name], errors[best])[1] <= _ALIKE)
+    return next(name for name in known if name == best or paired_ratio(errors[name], errors[best])[1] <= _ALIKE)
 
 
 def open_cell(errors: Mapping[str, NDArray]) -> Cell:
     """Compare the methods without a loop."""
     one, two = simplest(errors, ONE_IMAGE), simplest(errors, TWO_IMAGES)
     both = typical(errors[one]), typical(errors[two])
-    return Cell(ONE_IMAGE[one], TWO_IMAGES[two], both, *ratio_of(errors[two], errors[one]))
+    return Cell(ONE_IMAGE[one], TWO_IMAGES[two], both, *paired_ratio(errors[two], errors[one]))
 
 
 def loop_cell(found: BestMethods) -> Cell:
@@ -327,8 +327,8 @@ def numbers(
             "gain_most": max(gains),
             "loop_gain_least": min(1 / one.ratio for one in loops[:2]),
             "loop_gain_most": max(1 / one.ratio for one in loops[:2]),
-            "offset_ratio": ratio_of(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
-            "likelihood_ratio": ratio_of(settled["MaximumLikelihood"], settled[faint.one])[0],
+            "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
+            "likelihood_ratio": paired_ratio(settled["MaximumLikelihood"], settled[faint.one])[0],
         },
         ".3g",
     )

@@ -18,7 +18,7 @@ import bs4
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 
-from studies.kit.results import published
+from studies.kit.results import SCREENS, published
 
 from .notebook import to_bytes
 from .project import Project
@@ -91,7 +91,8 @@ def _with_downloads(notebook: NotebookNode, files: list[Path]) -> NotebookNode:
     for cell in notebook.cells:
         result.cells.append(cell)
         for figure in published(cell.source) if cell.cell_type == "code" else []:
-            links = (f"{{download}}`{file.name} <downloads/{file.name}>`" for file in files if file.stem == figure)
+            own = [file.name for file in files if file.stem in (figure, figure + SCREENS)]
+            links = (f"{{download}}`{file} <downloads/{file}>`" for file in own)
             result.cells.append(new_markdown_cell("Download: " + " · ".join(links), id=f"files-{figure}"[:64]))
     return result
 

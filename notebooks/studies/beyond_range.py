@@ -19,7 +19,7 @@ from studies.fig04_dimple_diameter import iteration_spectrum
 from studies.kit import sweeps
 from studies.kit.curves import ErrorCurves, crossing
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded
+from studies.kit.results import rounded, stacked
 from studies.kit.setups import Noise, screens_at
 from studies.kit.style import LOOKS, OTHER_STYLES, Look
 from studies.kit.tables import Table, small
@@ -511,6 +511,11 @@ def causes_columns(found: Causes, threshold: float) -> dict[str, NDArray]:
         "share with a contraction factor below 1": np.mean(found.factor < 1, axis=1),
     }
     return columns | shares
+
+
+def range_screens(curves: Sequence[NoiseCurves]) -> dict[str, NDArray]:
+    """Columns with a row for each screen of the first figure."""
+    return stacked("photons per point", {curve.photons: curve.screens() for curve in curves})
 
 
 def error_table(curves: Sequence[NoiseCurves]) -> Table:

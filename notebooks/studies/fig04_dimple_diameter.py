@@ -27,7 +27,7 @@ from studies.kit import sweeps
 from studies.kit.curves import ErrorCurves, Limit, crossing, refined_limit
 from studies.kit.methods import opposite_dimples, own_reconstructors, paper_reconstructors
 from studies.kit.parameters import SETUP, parameter_limits
-from studies.kit.results import rounded
+from studies.kit.results import rounded, screen_columns
 from studies.kit.setups import NOISELESS, Noise, check_setup
 from studies.kit.style import LOOKS, OTHER_STYLES, looks_of
 from studies.kit.tables import Table, small
@@ -86,6 +86,10 @@ class DiameterCurves(ErrorCurves):
         """Diameter, from `start` on, at which the mean error exceeds `limit` (radian rms); see `crossing`."""
         used = self.diameters >= start - 1e-9
         return crossing(self.diameters[used], self.mean(name)[used], limit)
+
+    def screens(self) -> dict[str, NDArray]:
+        """Diameter and errors of every single screen, as columns for `publish`."""
+        return screen_columns({"diameter (lambda/D)": self.diameters}, self._named_errors())
 
 
 def diameter_curves(

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from studies.kit.results import screen_columns
 from zwfs.metrics import dynamic_range
 
 
@@ -42,6 +43,13 @@ class ErrorCurves:
             columns[f"{name}: mean error (rad rms)"] = self.mean(name)
             columns[f"{name}: standard deviation (rad rms)"] = self.std(name)
         return columns
+
+    def screens(self) -> dict[str, NDArray]:
+        """Input and errors of every single screen, as columns for `publish`."""
+        return screen_columns({"input (rad rms)": self.rms}, self._named_errors())
+
+    def _named_errors(self) -> dict[str, NDArray[np.float64]]:
+        return {f"{name}: error (rad rms)": errors for name, errors in self.errors.items()}
 
 
 class Limit(NamedTuple):

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from studies.fig04_dimple_diameter import iteration_spectrum
 from studies.kit import sweeps
 from studies.kit.curves import ErrorCurves, crossing
-from studies.kit.parameters import parameter_limits
+from studies.kit.parameters import SETUP, Fields, parameter_limits
 from studies.kit.results import rounded, stacked
-from studies.kit.setups import Noise, screens_at
+from studies.kit.setups import SCREENS, Noise, Screens, screens_at
 from studies.kit.style import LOOKS, OTHER_STYLES, Look
 from studies.kit.tables import Table, small
 from zwfs.bounds import cramer_rao
@@ -45,6 +45,7 @@ LIMITS = parameter_limits(
     n_subpixels=(2, 8),
     n_screens_model=(1, 1000),
     n_screens_limit=(10, 10000),
+    screens=Fields(SETUP["screens"].of, kinds={kind: SETUP["screens"].kinds[kind] for kind in SCREENS[:3]}),
 )
 PLAIN, ACCELERATED, LIKELY, MODES = (
     "PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood", "MaximumLikelihoodModes",
@@ -59,12 +60,14 @@ class Trials:
     """Settings that all experiments of the chapter share."""
 
     n_iterations: int
-    exponent: float
+    source: Screens
     seed: int
 
-    def screens(self, modes: NDArray, rms: float, n_screens: int, task: int) -> NDArray[np.floating]:
-        """Screens of one task, see `screens_at`."""
-        return screens_at(modes, rms, n_screens, self.seed, task, self.exponent)
+    def screens(
+        self, pupil: Pupil, modes: NDArray, rms: float, n_screens: int, task: int
+    ) -> NDArray[np.floating]:
+        """Screens of one task on a pupil with these modes, see `screens_at`."""
+        return screens_at(replace(self.source, pupil=pupil, modes=modes), rms, n_screens, self.seed, task)
 
 
 def compared_methods(
@@ -119,7 +122,7 @@ def noise_curves(
 ) -> list[NoiseCurves]:
     """Errors of all methods for each number of photons, and without noise at more inputs."""
     levels = [_WITHOUT_NOISE, *sorted(photons)]
-    rms = {level: [*inputs, *([] if level else inputs_noiseless)] for level in levels}
+    rms = {level: sorted({*inputs, *([] if level else inputs_noiseless)}) for level in levels}
     # The largest inputs take longest: they begin first, so that all cores end at about the same time.
     points = [(level, task) for level in levels for task in reversed(range(len(rms[level])))]
     tasks = [(level, task, rms[level][task]) for level, task in points]
@@ -149,7 +152,7 @@ def _noise_point(
 ) -> tuple[dict[str, NDArray], dict[str, float], NDArray]:
     """One number of photons and input: errors, (n_screens,), bounds, and consistent, (n_screens,)."""
     photons, task, rms = point
-    screens = trials.screens(modes, rms, n_screens, task)
+    screens = trials.screens(sensor.pupil, modes, rms, n_screens, task)
     noise = Noise(sensor.n_masks * photons)  # the light of all images goes to one where a method uses one
     errors, consistent = {}, np.zeros(n_screens, bool)
     for name, method in all_methods(sensor, modes, trials.n_iterations, photons).items():
@@ -233,7 +236,7 @@ def _model_point(
     """Errors of one input, (n_screens,) by the error of the model and the method."""
     task, rms = point
     camera = FineCamera(sensor, modes, errors.n_subpixels)
-    fine = np.where(camera.pupil.inside, trials.screens(camera.modes, rms, n_screens, task), 0)
+    fine = np.where(camera.pupil.inside, trials.screens(camera.pupil, camera.modes, rms, n_screens, task), 0)
     screens = camera.mean(fine)
     methods = compared_methods(sensor, trials.n_iterations, n_starts=1)  # no phase explains the frames
     return {
@@ -308,7 +311,7 @@ def causes(
     kept = curves.errors[ACCELERATED] <= threshold * rms[:, np.newaxis]
     places = np.argwhere(lost & kept & (np.array(factor) < 1))
     task, index = places[len(places) // 2] if len(places) else (len(rms) - 1, 0)
-    screen = trials.screens(modes, rms[task], n_screens, int(task))[[index]]
+    screen = trials.screens(sensor.pupil, modes, rms[task], n_screens, int(task))[[index]]
     example = {
         name: reconstruction_error(sensor.pupil, result.history[0], screen[0])
         for name, result in _variants(sensor, sensor.measure(screen), trials.n_iterations, history=True).items()
@@ -338,7 +341,8 @@ def _causes_point(
 ) -> tuple[dict[str, NDArray], list[float]]:
     """Errors, (n_screens,) by variant, and contraction factors, (n_screens,), of one input."""
     task, rms = point
-    screens, pupil = trials.screens(modes, rms, n_screens, task), sensor.pupil
+    pupil = sensor.pupil
+    screens = trials.screens(pupil, modes, rms, n_screens, task)
     results = _variants(sensor, sensor.measure(screens), trials.n_iterations)
     errors = {name: reconstruction_error(pupil, result.phase, screens) for name, result in results.items()}
     diameter = sensor.masks[0].diameter
@@ -379,7 +383,7 @@ def _input_axes(axes: Axes, threshold: float, bottom: float, *, named: bool = Tr
             fontsize=9, va="center",
         )  # fmt: skip
     axes.set_xlim(*ends)
-    ticks = [tick for tick in (0.05, 0.1, 0.2, 0.5, 1, 2, 4) if ends[0] <= tick <= ends[1]]
+    ticks = [tick for tick in (0.05, 0.1, 0.2, 0.5, 1, 2, 4, 10) if ends[0] <= tick <= ends[1]]
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.set_xticks([], minor=True)
 

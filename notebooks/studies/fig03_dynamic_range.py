@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from studies.kit import sweeps
 from studies.kit.curves import ErrorCurves, Limit, refined_limit
 from studies.kit.parameters import SETUP, parameter_limits
-from studies.kit.results import rounded
+from studies.kit.results import rounded, screen_columns
 from studies.kit.setups import NOISELESS, Noise, Screens, check_setup, screens_at
 from studies.kit.style import LOOKS, looks_of
 from studies.kit.tables import Table, small
@@ -46,6 +46,12 @@ class LinearityCurves(ErrorCurves):
     wrapped: NDArray[np.float64]  # (n_rms, n_screens), share of the points beyond +-pi
     folded: NDArray[np.float64]  # (n_rms, n_screens), share of the points below -pi/4
     strehl: NDArray[np.float64]  # (n_rms, n_screens)
+    size: NDArray[np.float64]  # (n_rms, n_screens), rms of each screen, radian
+
+    def screens(self) -> dict[str, NDArray]:
+        """Input, rms, Strehl ratio and errors of every single screen, as columns for `publish`."""
+        own = {"rms of the screen (rad)": self.size, "Strehl ratio": self.strehl}
+        return screen_columns({"input (rad rms)": self.rms}, own | self._named_errors())
 
 
 def linearity_curves(
@@ -61,7 +67,7 @@ def linearity_curves(
 ) -> LinearityCurves:
     """Error of reconstructors on random screens of growing rms (radian): the experiment of section 4.1.
 
-    Each input has a task number from `first_task` on; screens and noise depend on this number and on the seed.
+    With `d_over_r0` of the screens, an input is the root mean square over all screens of turbulence. Each input has a task number from `first_task` on; screens and noise depend on this number and on the seed.
     """
     rms = np.asarray(rms, float)
     shared = dict(reconstructors), modes, n_screens, exponent, seed, noise
@@ -83,8 +89,8 @@ def _linearity_point(
     exponent: float,
     seed: int,
     noise: Noise,
-) -> tuple[dict[str, NDArray], dict[str, NDArray], NDArray, NDArray, NDArray]:
-    """One input of the linearity curves: errors, converged, wrapped, folded and Strehl, (n_screens,) each."""
+) -> tuple[dict[str, NDArray], dict[str, NDArray], NDArray, NDArray, NDArray, NDArray]:
+    """One input of the linearity curves: errors, converged, wrapped, folded, Strehl and rms, (n_screens,) each."""
     task, rms = point
     screens = screens_at(modes, rms, n_screens, seed, task, exponent)
     pupil = next(iter(reconstructors.values())).sensor.pupil
@@ -96,7 +102,7 @@ def _linearity_point(
         errors[name] = reconstruction_error(pupil, estimate.phase, screens)
         converged[name] = estimate.converged
     wrapped, folded = np.mean(np.abs(phase) > np.pi, axis=-1), np.mean(phase < -np.pi / 4, axis=-1)
-    return errors, converged, wrapped, folded, strehl(pupil, screens)
+    return errors, converged, wrapped, folded, strehl(pupil, screens), pupil.rms(screens)
 
 
 # Methods whose limits are refined, with the screens of each input close to the limit, over those of the curves.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from studies.fig04_dimple_diameter import iteration_spectrum
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, crossing
+from studies.kit.curves import ErrorCurves, Limit, crossing, percent, reach_text
 from studies.kit.parameters import SETUP, Fields, parameter_limits
 from studies.kit.results import rounded, stacked
 from studies.kit.setups import SCREENS, Noise, Screens, screens_at
@@ -63,9 +63,7 @@ class Trials:
     source: Screens
     seed: int
 
-    def screens(
-        self, pupil: Pupil, modes: NDArray, rms: float, n_screens: int, task: int
-    ) -> NDArray[np.floating]:
+    def screens(self, pupil: Pupil, modes: NDArray, rms: float, n_screens: int, task: int) -> NDArray[np.floating]:
         """Screens of one task on a pupil with these modes, see `screens_at`."""
         return screens_at(replace(self.source, pupil=pupil, modes=modes), rms, n_screens, self.seed, task)
 
@@ -379,8 +377,8 @@ def _input_axes(axes: Axes, threshold: float, bottom: float, *, named: bool = Tr
     axes.plot(ends, threshold * ends, color=_INK, lw=1, ls=":", zorder=0.5)
     if named:
         axes.annotate(
-            f"{threshold:.0%}", (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points", color=_INK,
-            fontsize=9, va="center",
+            f"{100 * threshold:g}%", (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points",
+            color=_INK, fontsize=9, va="center",
         )  # fmt: skip
     axes.set_xlim(*ends)
     ticks = [tick for tick in (0.05, 0.1, 0.2, 0.5, 1, 2, 4, 10) if ends[0] <= tick <= ends[1]]
@@ -534,6 +532,26 @@ def error_table(curves: Sequence[NoiseCurves]) -> Table:
     return Table(["photons per point", "estimated", *(f"{noisy[0].rms[place]:g} rad" for place in at)], rows)
 
 
+def _exact_text(noiseless: NoiseCurves, threshold: float) -> str:
+    """Inputs up to which maximum likelihood recovers every screen without noise, in words."""
+    exact = noiseless.complete_up_to(LIKELY, threshold)
+    n_screens = noiseless.errors[LIKELY][noiseless.rms <= exact].size
+    if not exact:
+        return f"loses screens already at {noiseless.rms[0]:.2g} rad rms"
+    return f"recovers all {n_screens} simulated screens of up to {exact:.2g} rad rms"
+
+
+def _half_text(found: Causes, threshold: float) -> str:
+    """Input at which the plain iteration recovers half of the screens, in words."""
+    half, error = found.half(PLAIN, threshold)
+    rms = found.curves.rms
+    if 0 < half < np.inf:
+        return f"recovers only half of the screens at {Limit(half, error)} rad rms"
+    if half:
+        return f"recovers at least half of the screens up to {rms[-1]:.2g} rad rms"
+    return f"recovers less than half of the screens at {rms[0]:.2g} rad rms"
+
+
 def numbers(
     curves: Sequence[NoiseCurves],
     model: Mapping[str, ErrorCurves],
@@ -551,7 +569,9 @@ def numbers(
     two = int(np.argmin(np.abs(found.curves.rms - 2.0)))
     right = noiseless.errors[LIKELY] <= threshold * noiseless.rms[:, np.newaxis]
     usual = (chosen.rms >= 0.1) & (chosen.rms <= 2)
+    usual |= not usual.any()
     *_, area = model.values()
+    pixels = np.median(area.errors[LIKELY], axis=1)
     result = dict(settings) | {
         "exact_up_to": noiseless.complete_up_to(LIKELY, threshold),
         "n_noiseless": right.size,
@@ -561,13 +581,22 @@ def numbers(
         "few_photons": few.photons,
         "shown_photons": chosen.photons,
         "modes_gain": np.median(chosen.median(LIKELY)[usual] / chosen.median(MODES)[usual]),
-        "modes_excess": np.max(chosen.median(MODES)[usual] / chosen.bound[MODES][usual]) - 1,
+        "modes_over": np.max(chosen.median(MODES)[usual] / chosen.bound[MODES][usual]),
+        "modes_from": chosen.rms[usual][0],
+        "modes_to": chosen.rms[usual][-1],
         "plain_half": plain,
         "plain_half_sigma": accuracy,
         "contracting_at_2": np.mean(found.factor[two] < 1),
         "example_rms": found.example_rms,
-        "pixels_matter": crossing(area.rms, np.median(area.errors[LIKELY], axis=1), PIXEL_ERROR),
-        "pixel_error": PIXEL_ERROR,
+        "exact_text": _exact_text(noiseless, threshold),
+        "half_text": _half_text(found, threshold),
+        "pixels_text": reach_text(
+            area.rms, pixels, PIXEL_ERROR, Limit(crossing(area.rms, pixels, PIXEL_ERROR)), f"{PIXEL_ERROR:g} rad"
+        ),
+        "threshold_text": percent(threshold),
+        "model_input": area.rms[np.argmin(np.abs(area.rms - 1.0))],
+        "input_2": found.curves.rms[two],
+        **{f"input_{name}": chosen.rms[place] for name, place in at.items()},
     }
     for name, method in (("plain", PLAIN), ("dimmed", DIMMED), ("accelerated", ACCELERATED)):
         result[f"{name}_at_2"] = found.curves.recovered(method, threshold)[two]

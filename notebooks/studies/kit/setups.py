@@ -149,7 +149,7 @@ class Screens:
         return {"D/r0": self.d_over_r0_of(rms)} if self.d_over_r0 else {}
 
     def mark(self, figure: Figure) -> Figure:
-        """Add an axis of D/r0 to the panels of a figure that have the input as their axis, if the screens have one."""
+        """Add an axis of D/r0 to the panels of a figure against the input, if the screens have one."""
         panels = [axes for axes in figure.axes if axes.get_xlabel().startswith("input")] if self.d_over_r0 else []
         for axes in panels:
             axes.secondary_xaxis("top", functions=(self.d_over_r0_of, self.rms_of)).set_xlabel("$D/r_0$")
@@ -211,8 +211,8 @@ def make_screens(
     file : str
         FITS or NPY file of screens (n, ny, nx) in radian; the seed chooses among them.
     d_over_r0 : float
-        Strength D/r0 of the turbulence at the largest input, which replaces that in rad rms; 0 keeps the latter. An
-        input is then the root mean square over all screens, and single screens scatter around it.
+        Strength D/r0 of the turbulence at the largest input, which replaces that in rad rms; 0 keeps the latter.
+        An input is then the root mean square over all screens, and single screens scatter around it.
 
     Raises
     ------

@@ -118,7 +118,7 @@ assert type(methods["WirtingerFlow"]) is WirtingerFlow and methods["WirtingerFlo
 assert own_reconstructors(["zwfs:WirtingerFlow"], methods, modes).keys() == {"WirtingerFlow"}
 curves = linearity_curves(methods, modes, [0.3], 2)
 assert curves.mean("WirtingerFlow")[0] < 0.01
-draw_linearity(curves, error_limits(methods, modes, curves, 0.05), 0.05, list(methods), 0.3)
+draw_linearity(curves, error_limits(methods, modes, curves, 0.05), 0.05, 0.3)
 assert WirtingerFlow in RECONSTRUCTORS and WirtingerFlow.__module__ in api.modules()
 assert LOOKS["WirtingerFlow"].label == "wirtinger flow"
 """

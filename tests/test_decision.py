@@ -90,7 +90,7 @@ def test_the_table_has_a_cell_for_each_situation_and_says_what_was_not_studied(e
     assert [row.cells["calibrated"].two for row in rows] == ["fitted model"] * 3
     assert [row.cells["design"].two for row in rows] == ["phase-shifted"] * 3
     settled = {"Linear": np.full(4, 0.4), "LinearTwo": np.full(4, 0.1)}
-    loops = TunedLoops(1.0, 2.0, {}, {name: values.mean() for name, values in settled.items()}, settled)
+    loops = TunedLoops(1.0, 1.0, {}, {name: values.mean() for name, values in settled.items()}, settled)
     [row] = loop_rows([BestMethods(loops, "Linear", "LinearTwo", 0.25, 0.2, 0.3)])
     assert row.cells["perfect"].text == "two images, linear: 0.1, 4 times smaller"
     assert row.text == "closed loop from 1 rad rms; 1 (2) per step"

@@ -139,7 +139,7 @@ def test_noise_of_the_symmetric_pair_on_a_flat_wavefront(pupil):
     for theta in (HALF, 2.3):
         noise = phase_noise(pair(pupil, 1.06, theta, -theta), flat)
         intensity = 1 - 2 * b * (1 - b) * (1 - np.cos(theta))
-        expected = np.sqrt(intensity) / (2 * b * np.sin(theta))
+        expected = np.sqrt(intensity / 2) / (2 * b * np.sin(theta))
         np.testing.assert_allclose(noise.photon, expected, rtol=1e-8)
         np.testing.assert_allclose(noise.bound, expected, rtol=1e-8)
         np.testing.assert_allclose(noise.read, 1 / (np.sqrt(8) * b * np.sin(theta)), rtol=1e-8)

@@ -151,7 +151,7 @@ def _noise_point(
     """One number of photons and input: errors, (n_screens,), bounds, and consistent, (n_screens,)."""
     photons, task, rms = point
     screens = trials.screens(sensor.pupil, modes, rms, n_screens, task)
-    noise = Noise(sensor.n_masks * photons)  # the light of all images goes to one where a method uses one
+    noise = Noise(photons)
     errors, consistent = {}, np.zeros(n_screens, bool)
     for name, method in all_methods(sensor, modes, trials.n_iterations, photons).items():
         result = method(noise(method.sensor, screens, np.random.SeedSequence(trials.seed, spawn_key=(task, 0))))
@@ -398,7 +398,7 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
     chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
     for name in chosen.errors:
         methods.plot(chosen.rms, chosen.median(name), **method_line(name))
-    methods.set_title(f"{_spaced(chosen.photons)} photons per point", fontsize=10)
+    methods.set_title(f"{_spaced(chosen.photons)} photons per point and image", fontsize=10)
     methods.set_ylabel("median error (rad rms)")
     line = method_line(LIKELY) | {"label": "_"}
     for curve in noisy:
@@ -408,7 +408,7 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
             _spaced(curve.photons), (curve.rms[-1], curve.median(LIKELY)[-1]), (7, 0),
             textcoords="offset points", fontsize=9, va="center",
         )  # fmt: skip
-    light.set_title("maximum likelihood, by photons per point", fontsize=10)
+    light.set_title("maximum likelihood, by photons per point and image", fontsize=10)
     exact = noiseless.complete_up_to(LIKELY, threshold)
     bottom = noisy[-1].median(MODES).min() / 3
     if exact:
@@ -435,7 +435,7 @@ def draw_model_errors(curves: Mapping[str, ErrorCurves], noise: NoiseCurves, thr
             axes.plot(curve.rms, np.median(curve.errors[name], axis=1), label=kind, ms=5, **style)
         axes.fill_between(
             noise.rms, noise.median(name), 1e-9, color="#999999", alpha=0.3, lw=0, zorder=0.4,
-            label=f"below the photon noise of {_spaced(noise.photons)} per point",
+            label=f"below the photon noise of {_spaced(noise.photons)} per point and image",
         )  # fmt: skip
         axes.set_title(method_look(name).name, fontsize=10)
         rms = next(iter(curves.values())).rms
@@ -478,10 +478,10 @@ def draw_causes(found: Causes, threshold: float) -> Figure:
 
 def range_columns(curves: Sequence[NoiseCurves]) -> dict[str, NDArray]:
     """Columns of the first figure: median and largest error of each method, and the bounds."""
-    columns: dict[str, list[Any]] = {"photons per point": [], "input (rad rms)": []}
+    columns: dict[str, list[Any]] = {"photons per point and image": [], "input (rad rms)": []}
     for curve in curves:
         n_rms = curve.rms.size
-        columns["photons per point"] += [curve.photons] * n_rms
+        columns["photons per point and image"] += [curve.photons] * n_rms
         columns["input (rad rms)"] += list(curve.rms)
         for name in curve.errors:
             for kind, values in (("median", curve.median(name)), ("largest", curve.errors[name].max(axis=1))):
@@ -529,7 +529,9 @@ def error_table(curves: Sequence[NoiseCurves]) -> Table:
         for curve in noisy
         for name, words in ((LIKELY, "points"), (MODES, "modes"))
     ]
-    return Table(["photons per point", "estimated", *(f"{noisy[0].rms[place]:g} rad" for place in at)], rows)
+    return Table(
+        ["photons per point and image", "estimated", *(f"{noisy[0].rms[place]:g} rad" for place in at)], rows
+    )
 
 
 def _exact_text(noiseless: NoiseCurves, threshold: float) -> str:

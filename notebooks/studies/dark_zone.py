@@ -229,6 +229,7 @@ def numbers(curves: DriftCurves) -> dict[str, float | str]:
     least, most = min(by_gain), max(by_gain)
     found |= {
         "photons_ideal": photons_ideal,
+        "per_point": 1e9 / 2 / np.count_nonzero(np.any(drift.modes, axis=0)),
         "saved": 100 * (1 - photons[-1] / photons[1]),
         "above_ideal": 100 * (photons[-1] / photons_ideal - 1),
         "pair_over_classic": photons[1] / photons[0],

@@ -194,7 +194,7 @@ def _closed_loop(situation: Situation, n_screens: int, seed: int) -> TunedLoops:
         (ZernikeSensor(pupil, masks[0]), ZernikeSensor(pupil, *masks)),
         zernike_basis(pupil, 80),
         situation.rms,
-        2 * situation.photons,
+        situation.photons,
         gains=(0.1, 0.2, 0.4),
         n_screens=n_screens,
         n_steps=40,
@@ -286,7 +286,7 @@ def loop_rows(found: Iterable[BestMethods]) -> list[Row]:
     rows = []
     for index, one in enumerate(found):
         cells = {"perfect": loop_cell(one), "calibrated": None, "design": None}
-        text = f"closed loop from {one.loops.start:g} rad rms; {_light(one.loops.photons / 2)} per step"
+        text = f"closed loop from {one.loops.start:g} rad rms; {_light(one.loops.photons)} per step"
         rows.append(Row(f"closed_{index + 1}", text, cells, Link("closed loop", "closed_loop.ipynb")))
     return rows
 

@@ -106,6 +106,27 @@ def _linearity_point(
     return errors, converged, wrapped, folded, strehl(pupil, screens), pupil.rms(screens)
 
 
+_VARIANTS = ("GradientDescentPoints", "GradientDescentStarted")
+
+
+def pop_variants(reconstructors: dict[str, Any]) -> dict[str, Any]:
+    """Remove the variants of gradient descent that are evaluated at one input only, and return them."""
+    return {name: reconstructors.pop(name) for name in _VARIANTS}
+
+
+def curves_at(
+    rms: float,
+    reconstructors: Mapping[str, Any],
+    modes: NDArray | Screens,
+    curves: LinearityCurves,
+    **settings: Any,
+) -> LinearityCurves:
+    """Errors of further reconstructors on the screens of `curves` whose input is nearest to `rms`."""
+    place = int(np.argmin(np.abs(curves.rms - rms)))
+    n_screens = curves.strehl.shape[1]
+    return linearity_curves(reconstructors, modes, curves.rms[[place]], n_screens, first_task=place, **settings)
+
+
 # Methods whose limits are refined, with the screens of each input close to the limit, over those of the curves.
 REFINED = {
     "Linear": 10,
@@ -113,7 +134,6 @@ REFINED = {
     "PhaseShifted": 10,
     "GerchbergSaxtonModel": 2,
     "GradientDescent": 1,
-    "GradientDescentStarted": 1,
 }
 
 
@@ -197,14 +217,14 @@ _UNMEASURED = {
 
 
 def draw_linearity(
-    curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float, names: Sequence[str], rms_max: float
+    curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float, rms_max: float
 ) -> Figure:
     """Figure 3: mean error and its standard deviation against the input, and their ratio on a logarithmic axis."""
     figure, (plain, ratio) = plt.subplots(1, 2, figsize=(7, 4.6))
     drawn = curves.rms <= rms_max
     bright = curves.rms > 0
     rms = curves.rms[drawn]
-    for name, look in looks_of(names):
+    for name, look in looks_of(curves.errors):
         mean, std = curves.mean(name), curves.std(name)[drawn]
         line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
         found = 0 < limits[name].value < np.inf
@@ -431,12 +451,12 @@ _SHORT = {
     "PhaseShifted": "shifted",
     "GerchbergSaxtonModel": "saxton_model",
     "GradientDescent": "descent",
-    "GradientDescentStarted": "started",
 }
 
 
 def numbers(
     curves: LinearityCurves,
+    descents: LinearityCurves,
     limits: Mapping[str, Limit],
     threshold: float,
     methods: Mapping[str, Any],
@@ -458,6 +478,7 @@ def numbers(
     low = (rms > 0) & (rms <= 0.3)
     with_wraps = np.mean(curves.wrapped > 0, axis=1)
     recovered = {name: curves.recovered(name, threshold)[one] for name in curves.errors}
+    recovered |= {name: descents.recovered(name, threshold)[0] for name in descents.errors}
     found: dict[str, Any] = {
         "saxton_limit": limits["GerchbergSaxton"].value,
         "gain": gain.value,
@@ -487,7 +508,7 @@ def numbers(
         "saxton_model_limit_longer": by_width.dynamic_range(repaired, threshold),
         "saxton_model_iterations_longer": variants[repaired].settings.n_iterations,
         "started_recovered_at_1": recovered["GradientDescentStarted"],
-        "started_error_at_1": mean["GradientDescentStarted"][one],
+        "started_error_at_1": descents.mean("GradientDescentStarted")[0],
         "shifted_passes": passes["PhaseShifted"],
         "descent_passes": passes["GradientDescent"],
         "fourier_functions": len(fourier),

@@ -331,7 +331,8 @@ class Noise:
     Parameters
     ----------
     photons : float, photons
-        Photons per point of the pupil, all frames together; 0 for frames without noise.
+        Photons per point of the pupil and image of two; any other number of images shares the light of these two.
+        0 for frames without noise.
     read_noise : float, electrons
         Read noise of a pixel, rms.
 
@@ -346,7 +347,7 @@ class Noise:
     >>> from studies.kit.setups import Noise
     >>> pupil = zwfs.Pupil.circular(32)
     >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
-    >>> Noise(photons=1000)(sensor, np.zeros(pupil.shape), seed=1).shape
+    >>> Noise(photons=500)(sensor, np.zeros(pupil.shape), seed=1).shape
     (1, 32, 32)
     """
 
@@ -358,12 +359,12 @@ class Noise:
             raise ValueError(f"noise.read_noise = {self.read_noise:g} with photons = 0: expected photons above 0")
 
     def __call__(self, sensor: ZernikeSensor, phase: NDArray, seed: Any) -> NDArray[np.floating]:
-        """Return the normalised frames of phases, with the light divided between the masks."""
+        """Return the normalised frames of phases, with the light of two images divided between the masks."""
         frames = sensor.measure(phase)
         if not self.photons:
             return frames
         pupil = sensor.pupil
-        camera = Detector(pupil, self.photons * pupil.n_points / sensor.n_masks, read_noise=self.read_noise)
+        camera = Detector(pupil, 2 * self.photons * pupil.n_points / sensor.n_masks, read_noise=self.read_noise)
         return camera.normalise(camera.expose(frames, seed))
 
 

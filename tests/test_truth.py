@@ -349,7 +349,7 @@ CASES = {
         {},
         {"rms_max": 4.0},
         {"rms_max": 0.05},
-        {"bench": {"photons": 1e5}},
+        {"bench": {"photons": 1e7}},
         {"bench": {"static": 0.0}},
         {"bench": {"n_rings": 1, "missing": []}},
         {"n_iterations": 1},
@@ -358,19 +358,19 @@ CASES = {
         {"extent": 1.0},
     ),
     "fig08_segments": (
-        BENCH, {}, {"rms": 0.0}, {"rms": 4.0}, {"bench": {"photons": 1e5}}, {"bench": {"static": 3.0}},
+        BENCH, {}, {"rms": 0.0}, {"rms": 4.0}, {"bench": {"photons": 1e7}}, {"bench": {"static": 3.0}},
         {"bench": {"n_rings": 1, "missing": []}}, {"n_iterations": 1}, {"bench": {"blur": 20.0}},
         {"bench": {"diameter": 8.0}}, {"exponent": 0.0},
     ),
     "fig07_frames": (
-        BENCH, {}, {"rms": 0.0}, {"rms": 4.0}, {"bench": {"photons": 1e5}}, {"bench": {"static": 3.0}},
+        BENCH, {}, {"rms": 0.0}, {"rms": 4.0}, {"bench": {"photons": 1e7}}, {"bench": {"static": 3.0}},
         {"bench": {"n_rings": 1, "missing": []}}, {"n_iterations": 1}, {"bench": {"blur": 20.0}},
         {"bench": {"diameter": 8.0}}, {"exponent": 0.0},
     ),
     "error_budget": (
         BENCH | {"n_screens": 1, "n_iterations": 2, "inputs": [0.3], "leakages": [0.1]},
         {}, {"inputs": [0.001]}, {"inputs": [4.0]}, {"leakages": []}, {"leakages": [0.49]},
-        {"bench": {"static": 0.0}}, {"bench": {"photons": 1e5}}, {"bench": {"n_rings": 1, "missing": []}},
+        {"bench": {"static": 0.0}}, {"bench": {"photons": 1e7}}, {"bench": {"n_rings": 1, "missing": []}},
         {"n_iterations": 1}, {"bench": {"blur": 20.0}},
     ),
     "decision": (

@@ -58,6 +58,7 @@ def test_figures_have_cards_with_their_notebooks_and_the_address_leads_to_the_fr
             assert (page.parent / link["href"]).resolve().is_file()
     assert (plain_book / "_static" / "mathjax" / "tex-chtml-full.js").is_file()
     assert 'url=book/index.html"' in (plain_book / "index.html").read_text("utf-8")
+    assert 'url=claims.html"' in (plain_book / "book" / "differences.html").read_text("utf-8")
 
 
 def test_equations_are_numbered_through_the_book_and_those_of_the_paper_as_there(plain_book):

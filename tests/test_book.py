@@ -139,8 +139,7 @@ def test_signatures_are_python():
 
 def chapters(pdf):
     """The bookmarks of the chapters, as (title, number of the page from 0)."""
-    nested = [entry for entry in pdf.outline if isinstance(entry, list)]
-    found = [entry for part in nested for entry in part if not isinstance(entry, list)]
+    found = [entry for entry in pdf.outline if not isinstance(entry, list)]
     return [(entry.title, pdf.get_destination_page_number(entry)) for entry in found]
 
 

@@ -10,7 +10,7 @@ from sphinx.application import Sphinx
 from sphinx.transforms import SphinxTransform
 
 GLOSSARY = "book/glossary"
-WITHOUT = {GLOSSARY, "book/api", "book/bibliography", "book/index", "book/notation"}
+WITHOUT = {GLOSSARY, "book/bibliography", "book/index", "book/notation"}
 TERM = re.compile(r"^(\w.*)\n  \S", re.MULTILINE)
 PROSE = (nodes.paragraph, nodes.emphasis, nodes.strong, nodes.list_item)
 
@@ -22,7 +22,7 @@ class LinkTerms(SphinxTransform):
 
     def apply(self) -> None:
         """Split the texts that use a term."""
-        if self.env.docname in WITHOUT:
+        if self.env.docname in WITHOUT or self.env.docname.startswith("book/api"):
             return
         source = Path(self.env.doc2path(GLOSSARY))
         self.env.note_dependency(str(source))

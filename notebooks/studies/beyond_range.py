@@ -408,7 +408,7 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
             _spaced(curve.photons), (curve.rms[-1], curve.median(LIKELY)[-1]), (7, 0),
             textcoords="offset points", fontsize=9, va="center",
         )  # fmt: skip
-    light.set_title("maximum likelihood, by photons per point and image", fontsize=10)
+    light.set_title("maximum likelihood, by photons", fontsize=10)
     exact = noiseless.complete_up_to(LIKELY, threshold)
     bottom = noisy[-1].median(MODES).min() / 3
     if exact:
@@ -582,7 +582,7 @@ def numbers(
         "false_alarms": np.count_nonzero(~noiseless.consistent & right),
         "few_photons": few.photons,
         "shown_photons": chosen.photons,
-        "modes_gain": np.median(chosen.median(LIKELY)[usual] / chosen.median(MODES)[usual]),
+        "modes_share": np.median(chosen.median(MODES)[usual] / chosen.median(LIKELY)[usual]),
         "modes_over": np.max(chosen.median(MODES)[usual] / chosen.bound[MODES][usual]),
         "modes_from": chosen.rms[usual][0],
         "modes_to": chosen.rms[usual][-1],

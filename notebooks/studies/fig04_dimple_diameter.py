@@ -335,12 +335,13 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
     mean, std = curve.mean(name), curve.std(name)
     for axes, bottom in ((plain, 0), (log, floor)):
         low, high = (np.maximum(mean + sign * std, bottom) for sign in (-1, 1))
-        axes.plot(curve.diameters, mean, color=look.color, marker=look.marker, ms=4, label=f"{number} iterations")
+        drawn = np.maximum(mean, bottom)
+        axes.plot(curve.diameters, drawn, color=look.color, marker=look.marker, ms=4, label=f"{number} iterations")
         axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0)
         _diameters(axes, curve.diameters[-1], claimed)
         axes.set_ylabel("error (rad rms)")
     for (number, other), style in zip(others, OTHER_STYLES[1:], strict=False):
-        log.plot(other.diameters, other.mean(name), ms=4, label=f"{number} iterations", **style)
+        log.plot(other.diameters, np.maximum(other.mean(name), floor), ms=4, label=f"{number} iterations", **style)
     limit = threshold * curve.rms[0]
     log.axhline(limit, color="#555555", lw=1)
     end = min(1.4 * claimed, curve.diameters[-1])

@@ -107,7 +107,8 @@ def _check_fields(name: str, values: Any, fields: Fields) -> None:
 _CUT = {"obstruction": (0.0, 0.9), "vanes": [[(-6.2832, 6.2832)], ...]}
 _RINGS = _CUT | {"n_rings": (1, 50), "gap": (0.0, 0.1), "missing": [(1, 10000), ...], "stop": (0.1, 1.0)}
 _BASIS = {"basis": ("zernike", "fourier", "hexagonal", "kl")}
-SETUP = {
+_STRENGTH = {"d_over_r0": (0.0, 20.0)}
+SETUP: dict[str, Any] = {
     "pupil": Fields(
         "studies.kit.setups.make_pupil",
         kinds={
@@ -125,8 +126,8 @@ SETUP = {
         _BASIS,
         {
             "power_law": {},
-            "kolmogorov": {},
-            "von_karman": {"outer_scale": (0.2, 1e5)},
+            "kolmogorov": _STRENGTH,
+            "von_karman": {"outer_scale": (0.2, 1e5)} | _STRENGTH,
             "segments": {},
             "file": {"file": str},
         },

@@ -82,7 +82,9 @@ def test_pages_tell_what_they_are_about(book_pages):
     assert 60 < len(seen["index.html"]) <= 250
     assert seen["index.html"] == seen["book/index.html"]
     assert seen["book/conclusions.html"] == seen["book/claims.html"]
-    forwards = {file.relative_to(HTML).as_posix() for file, soup in book_pages.items() if soup.select("[http-equiv]")}
+    forwards = {
+        file.relative_to(HTML).as_posix() for file, soup in book_pages.items() if soup.select("[http-equiv]")
+    }
     described = [text for name, text in seen.items() if name.partition("/")[1] and name not in forwards]
     assert len(set(described)) == len(described)
     assert not [text for text in described if not text or "\\" in text]

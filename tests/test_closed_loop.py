@@ -180,7 +180,7 @@ def test_signs_not_the_wave_decide_which_loops_diverge_on_unseen_screens(small):
     assert found.ranking(-found.wave) < 0.65
 
 
-@pytest.mark.parametrize("photons", [1.0, 100.0])
+@pytest.mark.parametrize("photons", [1.0, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_two_images_win_far_from_flat_and_cost_nothing_near_it(small, photons):
     _, modes, sensors = small
     trials = [

@@ -18,6 +18,7 @@ from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.util.fileutil import copy_asset_file
 
+from book._ext.glossary import GLOSSARY, define
 from book._ext.performance import PICTURES
 from book._tools.address import setting
 from book._tools.project import PDF
@@ -76,6 +77,7 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
         image.parent.wrap(body.new_tag("div", **{"class": "wide-figure"}))
     for figure in body.select(f"figure[class*={VARIANTS}]"):
         add_variants(app, figure)
+    define(body, Path(app.srcdir, f"{GLOSSARY}.md"))
     for entry in body.select("[role=doc-biblioentry]"):
         entry["role"] = "listitem"  # the role of Sphinx is deprecated: a list has items
     if body.find(id="phasor"):

@@ -20,7 +20,7 @@ from book._ext.reading import CARD, put_in_order
 from book._tools import record
 from book._tools.declared import assigned
 from book._tools.project import EXECUTED, Project
-from studies.kit.results import SCREENS, published
+from studies.kit.results import published
 
 DOWNLOADS = "_downloads"  # folder of the pages
 
@@ -69,8 +69,7 @@ def files(name: str, figure: str, links: dict[str, str]) -> str:
         origin = of_paper
     elif number:
         origin += f", goes with {of_paper}"
-    offered = {kind.upper(): f"{figure}.{kind}" for kind in ("png", "svg", "pdf")}
-    offered |= {"data (CSV)": f"{figure}.csv", "single screens (CSV)": f"{figure}{SCREENS}.csv"}
+    offered = {"PNG": f"{figure}.png", "PDF": f"{figure}.pdf", "data (CSV)": f"{figure}.csv"}
     shown = [f"{{download}}`{text} <{links[file]}>`" for text, file in offered.items() if file in links]
     address = f"../{DOWNLOADS}/{name}.zip"
     archive = f'<a class="reference download" href="{address}" download>notebook with its code (ZIP)</a>'

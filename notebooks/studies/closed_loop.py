@@ -404,8 +404,7 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
     for row in rows:
         loops, best = row.loops, method_name(row.best) if row.best else "one or two images"
         closed = f"{loops.closed(row.two)} and {loops.closed(row.one)} of {loops.settled[row.one].size}"
-        span = f"{row.low:.2f} to {row.high:.2f}" if row.high < np.inf else "one loop"
-        ratio = f"{row.ratio:.2f} ({span})"
+        ratio = f"{row.ratio:.2f} ({row.low:.2f} to {row.high:.2f})"
         cells.append([f"{loops.start:g}", f"{loops.photons:g}", best, ratio, closed])
     return Table(header, cells)
 

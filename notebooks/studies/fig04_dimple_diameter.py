@@ -24,10 +24,10 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, crossing, percent, reach_text, refined_limit
+from studies.kit.curves import ErrorCurves, Limit, crossing, refined_limit
 from studies.kit.methods import opposite_dimples, own_reconstructors, paper_reconstructors
 from studies.kit.parameters import SETUP, parameter_limits
-from studies.kit.results import rounded, screen_columns
+from studies.kit.results import rounded
 from studies.kit.setups import NOISELESS, Noise, check_setup
 from studies.kit.style import LOOKS, OTHER_STYLES, looks_of
 from studies.kit.tables import Table, small
@@ -43,7 +43,7 @@ LIMITS = parameter_limits(
     rms=(0.01, 4.0),
     more_iterations=[(1, 10000)],
     step=(0.05, 2.0),
-    diameter_max=(1.0, 8.0),
+    diameter_max=(3.5, 8.0),
     step_fine=(0.01, 0.3),
     n_screens_few=(1, 1000),
     claimed=(0.1, 8.0),
@@ -79,18 +79,13 @@ class DiameterCurves(ErrorCurves):
     diameters: NDArray[np.floating]  # (n_diameters,), lambda/D
 
     def at(self, name: str, diameter: float) -> float:
-        """Mean error at a sampled diameter (lambda/D), radian rms; NaN if it was not sampled."""
-        found = self.mean(name)[np.abs(self.diameters - diameter) < 1e-9]
-        return float(found[0]) if found.size else np.nan
+        """Mean error at the sampled diameter (lambda/D) that is nearest to `diameter`, radian rms."""
+        return float(self.mean(name)[np.argmin(np.abs(self.diameters - diameter))])
 
     def exceeds(self, name: str, limit: float, start: float = 0.0) -> float:
         """Diameter, from `start` on, at which the mean error exceeds `limit` (radian rms); see `crossing`."""
         used = self.diameters >= start - 1e-9
         return crossing(self.diameters[used], self.mean(name)[used], limit)
-
-    def screens(self) -> dict[str, NDArray]:
-        """Diameter and errors of every single screen, as columns for `publish`."""
-        return screen_columns({"diameter (lambda/D)": self.diameters}, self._named_errors())
 
 
 def diameter_curves(
@@ -123,22 +118,10 @@ def _diameter_point(
 
 
 def sampled_diameters(step: float, diameter_max: float, step_fine: float) -> NDArray[np.float64]:
-    """Diameters of Figure 4 (lambda/D): every `step`, every `step_fine` from 2 to 2.6, those tabled, the end."""
-    coarse = np.arange(step, diameter_max, step)
+    """Diameters of Figure 4 (lambda/D): every `step`, every `step_fine` from 2 to 2.6, and those of the table."""
+    coarse = np.arange(step, diameter_max + step / 2, step)
     fine = np.arange(2.0, 2.6 + step_fine / 2, step_fine)
-    return _up_to(diameter_max, [*coarse, *fine, *TABLED])
-
-
-def near_limit(diameters: NDArray, low: float = 1.5, high: float = 2.5) -> NDArray[np.float64]:
-    """Diameters for more iterations, which only lead farther away beyond 2.5 lambda/D; all if none is near."""
-    near = diameters[(diameters >= low) & (diameters <= high)]
-    return near if near.size else diameters
-
-
-def _up_to(end: float, diameters: ArrayLike) -> NDArray[np.float64]:
-    """Diameters below an end, and the end."""
-    listed = np.unique(np.round([*np.ravel(diameters), end], 9))
-    return listed[listed <= end + 1e-9]
+    return np.unique(np.round([*coarse, *fine, *TABLED], 9))
 
 
 def iteration_curves(
@@ -174,13 +157,12 @@ def other_curves(
     phase_shift: float,
     screens: NDArray,
     *,
-    diameter_max: float = FEW[-1],
     own: Sequence[str] = (),
     noise: Noise = NOISELESS,
     seed: int = 0,
     **settings: Any,
 ) -> DiameterCurves:
-    """Errors of the other methods, at few diameters up to the largest one."""
+    """Errors of the other methods, at few diameters."""
 
     def make(diameter: float) -> dict[str, Any]:
         methods = paper_reconstructors(pupil, modes, diameter, phase_shift, **settings)
@@ -188,8 +170,7 @@ def other_curves(
         del methods[ITERATION]
         return methods
 
-    few = _up_to(diameter_max, [*FEW, *np.arange(5.0, diameter_max)])
-    return diameter_curves(make, few, screens, noise=noise, seed=seed)
+    return diameter_curves(make, FEW, screens, noise=noise, seed=seed)
 
 
 class DimpleLight:
@@ -281,21 +262,14 @@ class Contraction:
         """Index of the sampled diameter that is nearest to `diameter` (lambda/D)."""
         return int(np.argmin(np.abs(self.diameters - diameter)))
 
-    def at(self, values: NDArray, diameter: float) -> float:
-        """One of some values at the sampled diameters (lambda/D); NaN at one that was not sampled."""
-        place = self.index(diameter)
-        return float(values[place]) if abs(self.diameters[place] - diameter) < 1e-9 else np.nan
-
 
 def contraction(
     pupil: Pupil, modes: NDArray, diameters: ArrayLike, screens: NDArray, away: NDArray
 ) -> Contraction:
     """Return the causes of Figure 4: the linearised iteration and the sensitivity, at each diameter."""
-    end = np.max(diameters)
-    diameters = np.unique([*np.ravel(diameters), *([DARK_RING] if end > DARK_RING else [])])
+    diameters = np.unique(np.append(diameters, DARK_RING))
     chosen = modes[list(_MODES.values())]
-    tabled = [diameter for diameter in TABLED if diameter <= end] or [float(end)]
-    observed = {diameter: measured_factor(pupil, diameter, screens[0], away) for diameter in tabled}
+    observed = {diameter: measured_factor(pupil, diameter, screens[0], away) for diameter in TABLED}
 
     def factor(diameter: float, phase: NDArray | None = None) -> float:
         return float(np.abs(iteration_spectrum(pupil, diameter, phase)[0]))
@@ -343,9 +317,8 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
         log.plot(other.diameters, other.mean(name), ms=4, label=f"{number} iterations", **style)
     limit = threshold * curve.rms[0]
     log.axhline(limit, color="#555555", lw=1)
-    end = min(1.4 * claimed, curve.diameters[-1])
-    start = min(0.64 * claimed, end / 2)
-    log.text(1.01 * start, limit * 1.3, f"{100 * threshold:g}% of the input", color="#555555", fontsize=9)
+    start, end = 0.64 * claimed, 1.4 * claimed
+    log.text(1.01 * start, limit * 1.3, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
     plain.set_ylim(0, None)
     log.set(yscale="log", xlim=(start, end), ylim=(floor, 60))  # room for the legend
     log.legend(loc="upper left", fontsize=9, handlelength=1.6)
@@ -362,7 +335,7 @@ def draw_diameter_methods(curves: Mapping[str, DiameterCurves], threshold: float
         axes.semilogy(curve.diameters, mean, markersize=4.5, label=look.label, **look.style)
     limit = threshold * curve.rms[0]
     axes.axhline(limit, color="#555555", lw=1)
-    axes.text(0.05, limit * 1.2, f"{100 * threshold:g}% of the input", color="#555555", fontsize=9)
+    axes.text(0.05, limit * 1.2, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
     _diameters(axes, max(curve.diameters[-1] for curve in curves.values()), claimed)
     axes.set(ylabel="mean error (rad rms)", ylim=(floor / 2, 4))
     figure.legend(loc="outside lower center", ncols=2)
@@ -395,13 +368,11 @@ def draw_diameter_reasons(reasons: Contraction, claimed: float) -> Figure:
 
 def _diameters(axes: Axes, end: float, claimed: float) -> None:
     """Axis of the diameter, with the one of the paper and that of the dark ring."""
+    axes.axvline(claimed, color="#555555", lw=1.2, ls="--", zorder=0.5)
+    axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
     above: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "va": "bottom", "fontsize": 9}
-    if claimed < end:
-        axes.axvline(claimed, color="#555555", lw=1.2, ls="--", zorder=0.5)
-        axes.text(claimed, 1.005, f"paper: {claimed:g} ", ha="right", color="#555555", **above)
-    if end > DARK_RING:
-        axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
-        axes.text(DARK_RING, 1.005, " dark ring", ha="left", color="#555555", **above)
+    axes.text(claimed, 1.005, f"paper: {claimed:g} ", ha="right", color="#555555", **above)
+    axes.text(DARK_RING, 1.005, " dark ring", ha="left", color="#555555", **above)
     axes.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=(0, end))
 
 
@@ -428,12 +399,11 @@ def reason_columns(reasons: Contraction) -> dict[str, NDArray]:
     }
 
 
-def method_columns(curves: Mapping[str, DiameterCurves]) -> dict[str, ArrayLike]:
+def method_columns(curves: Mapping[str, DiameterCurves]) -> dict[str, Sequence[float]]:
     """Columns of the comparison of the methods."""
-    few = min((curve.diameters for curve in curves.values()), key=len)
     return {
-        "diameter (lambda/D)": few,
-        **{f"{name}, mean error (rad rms)": [curve.at(name, d) for d in few] for name, curve in curves.items()},
+        "diameter (lambda/D)": FEW,
+        **{f"{name}, mean error (rad rms)": [curve.at(name, d) for d in FEW] for name, curve in curves.items()},
     }
 
 
@@ -442,9 +412,10 @@ def limits_table(curves: Mapping[int, DiameterCurves], threshold: float) -> Tabl
     return Table(
         ["iterations", "passes 10⁻³ rad at about (λ/D)", f"passes {100 * threshold:g} % at about (λ/D)"],
         [
-            [n, *(_place(curve, ITERATION, limit) for limit in (1e-3, threshold * curve.rms[0]))]
+            [n, *(curve.exceeds(ITERATION, limit) for limit in (1e-3, threshold * curve.rms[0]))]
             for n, curve in curves.items()
         ],
+        digits=2,
     )
 
 
@@ -479,51 +450,34 @@ def _ends(reasons: Contraction) -> tuple[float, list[float]]:
 def ends_table(reasons: Contraction) -> Table:
     """Diameters at which the factor exceeds 1."""
     flat, screens = _ends(reasons)
-    found = {"flat wavefront": flat, "screens, least": min(screens), "screens, most": max(screens)}
     return Table(
         ["the factor passes 1 at", "λ/D"],
         [
-            ["dark ring, theory", f"{DARK_RING:.4g}"],
-            *([name, _diameter_text(diameter, reasons.diameters[-1], ".4g")] for name, diameter in found.items()),
+            ["dark ring, theory", DARK_RING],
+            ["flat wavefront", flat],
+            ["screens, least", min(screens)],
+            ["screens, most", max(screens)],
         ],
+        digits=4,
     )
 
 
 def _start(curve: DiameterCurves, name: str, threshold: float) -> str:
     """Diameter, from the usual one on, at which the error exceeds the threshold, in words."""
     limit = threshold * curve.rms[0]
-    if curve.at(name, _usual(curve)) > limit:
+    if curve.at(name, USUAL) > limit:
         return "at all diameters"
-    return _place(curve, name, limit, _usual(curve))
+    return _place(curve.exceeds(name, limit, start=USUAL))
 
 
 def _doubled(curve: DiameterCurves, name: str) -> str:
     """Diameter at which the error exceeds twice that at the usual one, in words."""
-    error = curve.at(name, _usual(curve))
-    return "–" if error < 1e-6 else _place(curve, name, 2 * error, _usual(curve))
+    error = curve.at(name, USUAL)
+    return "–" if error < 1e-6 else _place(curve.exceeds(name, 2 * error, start=USUAL))
 
 
-def _usual(curve: DiameterCurves) -> float:
-    """Diameter of the paper's other figures, or the largest one if that is smaller (lambda/D)."""
-    return min(USUAL, float(curve.diameters[-1]))
-
-
-def _place(curve: DiameterCurves, name: str, limit: float, start: float = 0.0) -> str:
-    """Diameter, from `start` on, at which an error exceeds a limit (radian rms), in words."""
-    return _diameter_text(curve.exceeds(name, limit, start), curve.diameters[-1])
-
-
-def _diameter_text(diameter: float, end: float, form: str = ".2g") -> str:
-    return f"{diameter:{form}}" if diameter < np.inf else f"not up to {end:g}"
-
-
-def _reach(
-    curve: DiameterCurves, name: str, allowed: float, words: str, limit: Limit | None = None, start: float = 0.0
-) -> str:
-    """Diameters, from `start` on, at which an error stays within what is allowed (radian rms), in words."""
-    used = curve.diameters >= start - 1e-9
-    limit = limit or Limit(curve.exceeds(name, allowed, start))
-    return reach_text(curve.diameters[used], curve.mean(name)[used], allowed, limit, words, "λ/D")
+def _place(diameter: float) -> str:
+    return f"{diameter:.2g}" if diameter < np.inf else "never"
 
 
 def methods_table(curves: Mapping[str, DiameterCurves], threshold: float) -> Table:
@@ -561,23 +515,22 @@ def numbers(
     paper, longest = by_method[ITERATION], list(by_iterations.values())[-1]
     flat, screens = _ends(reasons)
     tilt = reasons.sensitivity["tilt"]
-    usual, end = reasons.at(tilt, _usual(paper)), paper.diameters[-1]
+    usual, at_22, at_3 = map(reasons.index, (USUAL, 2.2, 3.0))
     ratios = {name: curve.at(name, 2.6) / curve.at(name, 2.0) for name, curve in by_method.items()}
-    of_input, allowed = f"{percent(threshold)} of the input", threshold * paper.rms[0]
-    descent = by_method["GradientDescent"]
+    lost = _start(by_method["GradientDescent"], "GradientDescent", threshold)
     found: dict[str, Any] = {
         "iterations": next(iter(by_iterations)),
         "diameter_5_percent": limit.value,
         "diameter_5_percent_error": limit.error,
         "diameter_1e3": paper.exceeds(ITERATION, 1e-3),
-        "diameter_5_percent_400": longest.exceeds(ITERATION, allowed),
+        "diameter_5_percent_400": longest.exceeds(ITERATION, threshold * paper.rms[0]),
         "diameter_1e3_400": longest.exceeds(ITERATION, 1e-3),
         "error_at_20": paper.at(ITERATION, 2.0),
         "error_at_22": paper.at(ITERATION, 2.2),
         "error_at_26": paper.at(ITERATION, 2.6),
         "claim16_ratio": ratios[ITERATION],
-        "contraction_at_106": reasons.at(reasons.flat, USUAL),
-        "contraction_at_22": reasons.at(reasons.flat, 2.2),
+        "contraction_at_106": reasons.flat[usual],
+        "contraction_at_22": reasons.flat[at_22],
         "contraction_crosses_1": flat,
         "contraction_crosses_1_screens_least": min(screens),
         "contraction_crosses_1_screens_most": max(screens),
@@ -586,15 +539,10 @@ def numbers(
             for diameter, observed in reasons.observed.items()
         ),
         "dark_ring": DARK_RING,
-        "tilt_at_22": reasons.at(tilt, 2.2) / usual,
-        "tilt_at_dark_ring": tilt.min() / usual if end > DARK_RING else np.nan,
-        "tilt_at_3": reasons.at(tilt, 3.0) / usual,
+        "tilt_at_22": tilt[at_22] / tilt[usual],
+        "tilt_at_dark_ring": tilt.min() / tilt[usual],
+        "tilt_at_3": tilt[at_3] / tilt[usual],
         **{f"claim17_{short}_ratio": ratios[name] for name, short in SHORT.items()},
-        "rms": paper.rms[0],
-        "longest": list(by_iterations)[-1],
-        "reach": _reach(paper, ITERATION, allowed, of_input, limit),
-        "reach_1e3": _reach(paper, ITERATION, 1e-3, "10⁻³ rad"),
-        "reach_longest": _reach(longest, ITERATION, allowed, of_input),
-        "descent_reach": _reach(descent, "GradientDescent", allowed, of_input, start=_usual(descent)),
+        "descent_passes": f"at about {lost} λ/D" if lost[0].isdigit() else lost,
     }
     return rounded(found, ".4g")

@@ -15,7 +15,7 @@ from scipy.special import erf
 
 from studies.kit import sweeps
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded, screen_columns
+from studies.kit.results import rounded
 from studies.kit.setups import screens_at
 from studies.kit.style import LOOKS, OTHER_STYLES
 from studies.kit.tables import Table
@@ -57,11 +57,6 @@ class PhotonCurves:
     def ratio(self, name: str) -> NDArray[np.float64]:
         """`error` over the bound, shape (n_rms, n_photons)."""
         return self.error(name) / self.bound
-
-    def screens(self) -> dict[str, NDArray]:
-        """Input, photons and errors of every single screen, as columns for `publish`."""
-        axes = {"input (rad rms)": self.rms, "photons per point": self.photons}
-        return screen_columns(axes, {f"{name}: error (rad rms)": errors for name, errors in self.errors.items()})
 
 
 def photon_curves(

@@ -107,8 +107,7 @@ def _check_fields(name: str, values: Any, fields: Fields) -> None:
 _CUT = {"obstruction": (0.0, 0.9), "vanes": [[(-6.2832, 6.2832)], ...]}
 _RINGS = _CUT | {"n_rings": (1, 50), "gap": (0.0, 0.1), "missing": [(1, 10000), ...], "stop": (0.1, 1.0)}
 _BASIS = {"basis": ("zernike", "fourier", "hexagonal", "kl")}
-_STRENGTH = {"d_over_r0": (0.0, 20.0)}
-SETUP: dict[str, Any] = {
+SETUP = {
     "pupil": Fields(
         "studies.kit.setups.make_pupil",
         kinds={
@@ -126,8 +125,8 @@ SETUP: dict[str, Any] = {
         _BASIS,
         {
             "power_law": {},
-            "kolmogorov": _STRENGTH,
-            "von_karman": {"outer_scale": (0.2, 1e5)} | _STRENGTH,
+            "kolmogorov": {},
+            "von_karman": {"outer_scale": (0.2, 1e5)},
             "segments": {},
             "file": {"file": str},
         },

@@ -19,7 +19,7 @@ from studies.fig04_dimple_diameter import iteration_spectrum
 from studies.kit import sweeps
 from studies.kit.curves import ErrorCurves, Limit, crossing, percent, reach_text
 from studies.kit.parameters import SETUP, Fields, parameter_limits
-from studies.kit.results import rounded, stacked
+from studies.kit.results import rounded
 from studies.kit.setups import SCREENS, Noise, Screens, screens_at
 from studies.kit.style import LOOKS, OTHER_STYLES, Look
 from studies.kit.tables import Table, small
@@ -142,11 +142,7 @@ def noise_curves(
 
 
 def _noise_point(
-    point: tuple[float, int, float],
-    sensor: ZernikeSensor,
-    modes: NDArray,
-    n_screens: int,
-    trials: Trials,
+    point: tuple[float, int, float], sensor: ZernikeSensor, modes: NDArray, n_screens: int, trials: Trials
 ) -> tuple[dict[str, NDArray], dict[str, float], NDArray]:
     """One number of photons and input: errors, (n_screens,), bounds, and consistent, (n_screens,)."""
     photons, task, rms = point
@@ -331,11 +327,7 @@ def _variants(sensor: ZernikeSensor, frames: NDArray, n_iterations: int, **optio
 
 
 def _causes_point(
-    point: tuple[int, float],
-    sensor: ZernikeSensor,
-    modes: NDArray,
-    n_screens: int,
-    trials: Trials,
+    point: tuple[int, float], sensor: ZernikeSensor, modes: NDArray, n_screens: int, trials: Trials
 ) -> tuple[dict[str, NDArray], list[float]]:
     """Errors, (n_screens,) by variant, and contraction factors, (n_screens,), of one input."""
     task, rms = point
@@ -515,11 +507,6 @@ def causes_columns(found: Causes, threshold: float) -> dict[str, NDArray]:
     return columns | shares
 
 
-def range_screens(curves: Sequence[NoiseCurves]) -> dict[str, NDArray]:
-    """Columns with a row for each screen of the first figure."""
-    return stacked("photons per point", {curve.photons: curve.screens() for curve in curves})
-
-
 def error_table(curves: Sequence[NoiseCurves]) -> Table:
     """Median error of maximum likelihood on points and on modes, for each number of photons."""
     noisy = curves[1:]
@@ -567,7 +554,7 @@ def numbers(
     chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
     few = min(noisy, key=lambda curve: abs(np.log(curve.photons / 1e3)))
     at = {name: int(np.argmin(np.abs(chosen.rms - rms))) for name, rms in (("1", 1.0), ("3", 3.0))}
-    plain, accuracy = found.half(PLAIN, threshold)
+    plain, _ = found.half(PLAIN, threshold)
     two = int(np.argmin(np.abs(found.curves.rms - 2.0)))
     right = noiseless.errors[LIKELY] <= threshold * noiseless.rms[:, np.newaxis]
     usual = (chosen.rms >= 0.1) & (chosen.rms <= 2)
@@ -587,9 +574,7 @@ def numbers(
         "modes_from": chosen.rms[usual][0],
         "modes_to": chosen.rms[usual][-1],
         "plain_half": plain,
-        "plain_half_sigma": accuracy,
         "contracting_at_2": np.mean(found.factor[two] < 1),
-        "example_rms": found.example_rms,
         "exact_text": _exact_text(noiseless, threshold),
         "half_text": _half_text(found, threshold),
         "pixels_text": reach_text(

@@ -383,7 +383,9 @@ CASES = {
 }  # fmt: skip
 COSTLY = {name for name in CASES if name not in ("zernike_sensor", "at_a_glance", "identities", "design")}
 SETS = [
-    pytest.param(name, base | odd, marks=[pytest.mark.slow] if name in COSTLY and place else [])
+    pytest.param(
+        name, base | odd, marks=[pytest.mark.slow] if name == "decision" or (name in COSTLY and place) else []
+    )
     for name, (base, *odds) in CASES.items()
     for place, odd in enumerate(odds)
 ]

@@ -64,7 +64,7 @@ def define(body: BeautifulSoup, glossary: Path) -> None:
     """Give each link to a term its definition, which shows on hover and on focus."""
     known = {f"term-{nodes.make_id(term)}": text for term, text in definitions(glossary).items()}
     for link in body.select("a:has(> .std-term)"):
-        if text := known.get(link["href"].partition("#")[2].lower()):
+        if text := known.get(str(link["href"]).partition("#")[2].lower()):
             link["data-definition"] = link["aria-description"] = text
 
 

@@ -61,7 +61,8 @@ function zwfsWorker() {
       postMessage({ id, value: await calls[call](given) });
     } catch (error) {
       const lines = String(error.message ?? error).trim().split("\n");
-      postMessage({ id, error: lines[lines.length - 1] }); // of a traceback, the error itself
+      const said = lines.findLast((line) => /^[\w.]+: /.test(line)) ?? lines[lines.length - 1];
+      postMessage({ id, error: said }); // of a traceback, the error itself
     }
   };
 }

@@ -379,7 +379,7 @@
         await python.start();
         said.textContent = "Running …";
         const shown = await python.call("example", { source: edit.hidden ? text : edit.value });
-        said.textContent = written(shown.text) + (shown.error ?? "") || "Done. The code prints nothing.";
+        said.textContent = shown.text + (shown.error ?? "") || "Done. The code prints nothing.";
         said.classList.toggle("run-error", Boolean(shown.error));
       } catch (error) {
         said.textContent = error instanceof Stopped ? "Stopped." : error.message;

@@ -46,6 +46,13 @@ LIMITS = parameter_limits(
     n_screens_model=(1, 1000),
     n_screens_limit=(10, 10000),
 )
+QUICK = {
+    "n_pixels": 40,
+    "inputs": [0.1, 0.5, 1.0, 2.0],
+    "photons": [1e2, 1e4],
+    "n_screens": 2,
+    "n_screens_limit": 5,
+}
 PLAIN, ACCELERATED, LIKELY, MODES = (
     "PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood", "MaximumLikelihoodModes",
 )  # fmt: skip

@@ -28,11 +28,10 @@ from sphinx.application import Sphinx
 
 from book._tools import declared
 from book._tools.declared import Parameter
-from book._tools.project import Project
+from book._tools.project import PYODIDE, Project
 from studies.kit.parameters import Fields
 from studies.kit.results import published
 
-FOLDER = "ZWFS_PYODIDE"  # environment variable that names a Pyodide to copy into the book
 COPY = "_static/pyodide"
 DATA = "_static/run"
 KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the version that this book uses
@@ -87,6 +86,7 @@ def described(notebook: NotebookNode, name: str) -> dict[str, Any]:
             for figure in (published(cell.source) if cell.cell_type == "code" else [])
         },
         "skipped": SKIPPED,
+        "extra": ["astropy"] if any("zwfs.frames" in cell.source for cell in cells) else [],
         "notebook": {"cells": cells, "metadata": notebook.metadata, "nbformat": 4, "nbformat_minor": 5},
     }
 
@@ -228,9 +228,9 @@ def write_script(file: Path, name: str, value: Any) -> None:
 
 def place(app: Sphinx) -> str:
     """Return the address of Pyodide; copy a folder into the book if the environment names one."""
-    if folder := os.environ.get(FOLDER):
-        target = Path(app.outdir, COPY)
-        shutil.rmtree(target, ignore_errors=True)
+    target = Path(app.outdir, COPY)
+    shutil.rmtree(target, ignore_errors=True)  # of an earlier build
+    if folder := os.environ.get(PYODIDE):
         shutil.copytree(folder, target, copy_function=shutil.copyfile)
         return f"{COPY}/"
     return str(app.config.pyodide)

@@ -5,10 +5,11 @@
 // eslint-disable-next-line no-unused-vars
 function zwfsWorker() {
   let python, driver;
+  let needed = true; // whether Python cannot do without the files that are loaded now
 
   // Every file is checked by the browser while it is fetched: the core against our list, packages against the lock
   // of Pyodide, which is on our list. Nothing without a digest is fetched.
-  function fetchChecked(digests) {
+  function fetchChecked(digests, refuse) {
     const fetchAny = self.fetch;
     self.fetch = async (address, options = {}) => {
       const url = String(address.url ?? address);
@@ -23,13 +24,20 @@ function zwfsWorker() {
       } catch {
         // The browser does not say which of the two it was.
       }
-      throw new Error(`Python was not loaded: ${name}: ${problem}`);
+      const error = new Error(`Python was not loaded: ${name}: ${problem}`);
+      if (needed) refuse(error); // Pyodide waits for some files for ever
+      throw error;
     };
   }
 
-  // Load Pyodide, its packages, and the files of this book.
-  async function load({ place, digests, packages, files }) {
-    fetchChecked(digests);
+  const load = (given) =>
+    new Promise((done, refuse) => {
+      fetchChecked(given.digests, refuse);
+      start(given).then(done, refuse);
+    });
+
+  // Start Pyodide with its packages and the files of this book.
+  async function start({ place, packages, extra, files }) {
     for (const name of ["pyodide.js", "pyodide.asm.js"]) {
       const script = URL.createObjectURL(await (await fetch(place + name)).blob());
       importScripts(script);
@@ -39,6 +47,8 @@ function zwfsWorker() {
     python = await loadPyodide({ indexURL: place, stdout: () => {}, stderr: () => {} });
     await python.loadPackage(packages, { messageCallback: () => {}, errorCallback: (text) => (failed = text) });
     if (packages.some((name) => !(name in python.loadedPackages))) throw new Error(failed);
+    needed = false; // a notebook says itself what it misses of these
+    await python.loadPackage(extra, { messageCallback: () => {}, errorCallback: () => {} });
     const bytes = Uint8Array.from(atob(files), (letter) => letter.charCodeAt(0));
     python.unpackArchive(bytes, "zip", { extractDir: python.runPython("import site; site.getsitepackages()[0]") });
     driver = python.pyimport("driver");

@@ -37,7 +37,8 @@
       this.worker.onmessage = ({ data }) => this.hear(data);
       try {
         const { digests, packages } = settings;
-        this.versions = await this.call("load", { place, digests, packages, files: window.zwfsFiles });
+        const extra = notebook?.extra ?? [];
+        this.versions = await this.call("load", { place, digests, packages, extra, files: window.zwfsFiles });
       } catch (error) {
         this.stop(error);
         throw error;

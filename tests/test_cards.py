@@ -46,6 +46,11 @@ def test_a_card_says_how_a_figure_was_made(carded):
     assert "CSV" not in cells[2].source, "there is no such file"
 
 
+def test_a_page_of_tables_has_a_form_too(carded):
+    [_, card] = carded("decision", "rms = 0.5")
+    assert 'class="run-form"' in card.source
+
+
 def test_the_commit_is_that_of_this_folder_alone(tmp_path):
     def git(*command):
         names = ("-c", "user.name=Nobody", "-c", "user.email=nobody@example.org")

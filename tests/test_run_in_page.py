@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import threading
+from contextlib import contextmanager
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -83,15 +84,21 @@ def columns(text):
     return made
 
 
-@pytest.fixture(scope="module")
-def book():
-    """The built book on a server of this computer."""
+@contextmanager
+def serving():
+    """Serve the built book on this computer, and return its address."""
     handler = functools.partial(SimpleHTTPRequestHandler, directory=HTML)
     handler.func.log_message = lambda *_: None
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}/"
         server.shutdown()
+
+
+@pytest.fixture(scope="module")
+def book():
+    with serving() as address:
+        yield address
 
 
 class Page:

@@ -58,6 +58,10 @@ def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions
             made = ["", f"Commit: {commit}. Versions: {versions}."] if first else []
             text = ["::::{div} run-card", files(name, figure, links), *made, "", run.form(figure, first), "::::"]
             cells.append(new_markdown_cell("\n".join(text), id=f"{CARD}{figure}"[:64]))
+    if not any(cell.id.startswith(CARD) for cell in cells):  # the page shows tables only
+        place = next((number for number, cell in enumerate(cells, 1) if cell.get("outputs")), len(cells))
+        text = ["::::{div} run-card", files(name, "", links), "", run.form("", True), "::::"]
+        cells.insert(place, new_markdown_cell("\n".join(text), id=f"{CARD}{name}"[:64]))
     notebook.cells = cells
 
 

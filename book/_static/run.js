@@ -203,7 +203,7 @@
       this.count += 1;
       this.later = [];
       this.values = this.form.changed;
-      await this.go(notebook.figures[figure]);
+      await this.go(notebook.figures[figure] ?? Infinity);
     }
 
     // Run the cells up to one, and show what they give.

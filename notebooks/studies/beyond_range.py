@@ -51,7 +51,7 @@ QUICK = {
     "inputs": [0.1, 0.5, 1.0, 2.0],
     "photons": [1e2, 1e4],
     "n_screens": 2,
-    "n_screens_limit": 5,
+    "n_screens_limit": 10,
 }
 PLAIN, ACCELERATED, LIKELY, MODES = (
     "PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood", "MaximumLikelihoodModes",

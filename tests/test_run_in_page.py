@@ -245,7 +245,7 @@ def test_a_run_can_be_stopped_and_repeated_and_its_address_shared(figure4):
     page = figure4.page
     page.get_by_role("button", name="Values of the book").click()
     figure4.fill(**SMALL, seed=7)
-    address = page.url
+    address = page.evaluate("location.href")
     page.click(".run-details button[type=submit]")
     page.wait_for_function("document.querySelector('.run-details [role=status]').textContent.startsWith('Cell')")
     page.get_by_role("button", name="Stop").click()
@@ -263,10 +263,11 @@ def test_a_run_can_be_stopped_and_repeated_and_its_address_shared(figure4):
 
 def test_ten_runs_leave_no_memory_behind_and_an_example_runs_in_the_same_python(figure4):
     page = figure4.page
-    small = SMALL | {"n_pixels": 24, "n_screens": 1, "n_screens_few": 1}
-    figure4.fill(**small)
+    coarse = {"step": 2, "step_fine": 0.3, "diameter_max": 3.5, "more_iterations": [10], "n_iterations": 5}
+    figure4.fill(n_pixels=24, n_screens=1, n_screens_few=1, **coarse)
     sizes = []
-    page.get_by_role("button", name="Edit").first.click()
+    page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+    page.locator(".run-example button", has_text="Edit").first.click()
     edited = page.locator("textarea").first
     edited.fill("import pyodide_js\nprint(10**10, pyodide_js._module.HEAPU8.length)")
     for _ in range(10):

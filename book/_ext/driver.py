@@ -30,6 +30,23 @@ def prepare(tell: Callable[[str, int, int], None]) -> None:
         _provide("IPython.display", HTML=lambda text: SimpleNamespace(_repr_html_=lambda: text))
     vars(import_module("studies.kit.sweeps"))["_report_progress"] = tell
     vars(import_module("studies.kit.results"))["publish"] = _keep
+    _repair_svd()
+
+
+def _repair_svd() -> None:
+    """Replace `numpy.linalg.svd` where it gives NaN: NumPy 2.0.2 of Pyodide does so for some wide matrices."""
+    import numpy as np
+    from scipy import linalg
+
+    given = np.linalg.svd
+
+    def svd(a: Any, *args: Any, **named: Any) -> Any:
+        found = given(a, *args, **named)
+        values = found if isinstance(found, np.ndarray) else found[1]
+        damaged = np.ndim(a) == 2 and not np.isfinite(values).all() and np.isfinite(a).all()
+        return linalg.svd(a, *args, **named) if damaged else found
+
+    vars(np.linalg)["svd"] = svd
 
 
 def _keep(figure: Any, name: str, columns: Any) -> None:

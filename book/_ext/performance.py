@@ -38,7 +38,11 @@ def add_substitutions(app: Sphinx, config: Config) -> None:
     for row in kept["peers"]:
         tasks.setdefault(row["task"], []).append(row)
     compared = {task: peers(task, rows) for task, rows in tasks.items()}
-    added = tables(kept["speed"]) | {"peers": compared, "machine": kept["machine"], "pages": pages(kept["pages"])}
+    added = tables(kept["speed"]) | {
+        "peers": compared,
+        "machine": kept["machine"],
+        "pages": pages(kept.get("pages", [])),
+    }
     config.myst_substitutions = config.myst_substitutions | {"performance": added}
     with plt.rc_context():
         use_style()

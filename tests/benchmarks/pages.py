@@ -48,10 +48,10 @@ def main(names):
         for name in names or known:
             if row := measure(browser, book, name):
                 rows[name] = rounded(row)
-                print(f"{name:28}{row['python']:7.1f} s{row['figure']:7.1f} s")
-    kept["pages"] = [rows[name] for name in sorted(rows)]
-    kept["sha256"] = fingerprint(kept)
-    write_file(KEPT, (json.dumps(kept, indent=1, ensure_ascii=False) + "\n").encode())
+                print(f"{name:28}{row['python']:7.1f} s{row['figure']:7.1f} s", flush=True)
+                kept["pages"] = [rows[one] for one in sorted(rows)]
+                kept["sha256"] = fingerprint(kept)
+                write_file(KEPT, (json.dumps(kept, indent=1, ensure_ascii=False) + "\n").encode())
 
 
 if __name__ == "__main__":

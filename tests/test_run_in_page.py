@@ -192,13 +192,14 @@ def assert_equal_columns(found, expected, tolerance=1e-9):
     ("name", "figure", "values", "tolerance"),
     [
         # An iteration that fails is chaotic: it takes another path after rounding.
-        ("fig03_dynamic_range", "fig03_dynamic_range", {"n_pixels": 40, "rms_max": 0.4, "n_rms": 3, "rms_fine": [],
-         "rms_beyond": [], "n_screens": 2}, 1e-6),
+        ("fig03_dynamic_range", "fig03_dynamic_range", {"n_pixels": 32, "n_modes": 50, "rms_max": 0.3, "n_rms": 2,
+         "rms_fine": [], "rms_beyond": [], "n_screens": 1, "noise": {"photons": 1e10}}, 1e-6),
         ("fig09_bench_linearity", "fig09_bench_linearity", {"n_pixels": 40, "rms_max": 0.4, "n_rms": 2,
          "n_screens": 1}, 1e-6),
         ("fig01_sensor_layout", "fig01_sensor_layout", {"n_pixels": 40, "rms": 0.8}, 1e-9),
-        ("dark_zone", "dark_zone", {"photons": [1e10], "photons_gain": [1e10], "gains": [0.4], "n_cycles": 20,
-         "n_screens": 1}, 1e-6),
+        ("beyond_range", "beyond_range", {"n_pixels": 32, "n_modes": 50, "inputs": [0.1, 0.5], "n_screens": 1,
+         "inputs_noiseless": [], "photons": [1e4, 1e10], "n_screens_limit": 10, "inputs_limit": [0.5, 0.8],
+         "photons_shown": 1e4}, 1e-6),
     ],
 )  # fmt: skip
 def test_figures_of_the_page_are_those_of_this_python(opened, name, figure, values, tolerance):

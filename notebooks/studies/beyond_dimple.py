@@ -49,6 +49,7 @@ LIMITS = parameter_limits(
     step_fine=(0.01, 0.3),
     n_screens_few=(1, 100),
 )
+QUICK = {"n_pixels": 40, "n_screens": 3, "step": 0.5, "step_fine": 0.3}
 USUAL, LARGE = 1.06, 3.0  # diameters of the paper and of a dimple beyond its limit, lambda/D
 _TILTS = 2  # the first modes: Noll 2 and 3
 

@@ -47,6 +47,13 @@ LIMITS = parameter_limits(
     n_screens_limit=(10, 10000),
     screens=Fields(SETUP["screens"].of, kinds={kind: SETUP["screens"].kinds[kind] for kind in SCREENS[:3]}),
 )
+QUICK = {
+    "n_pixels": 40,
+    "inputs": [0.1, 0.5, 1.0, 2.0],
+    "photons": [1e2, 1e4],
+    "n_screens": 2,
+    "n_screens_limit": 10,
+}
 PLAIN, ACCELERATED, LIKELY, MODES = (
     "PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood", "MaximumLikelihoodModes",
 )  # fmt: skip

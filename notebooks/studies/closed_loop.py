@@ -38,6 +38,7 @@ LIMITS = parameter_limits(
     photons_zero=(1.0, 1e12),
     inputs=[(0.01, 4.0)],
 )
+QUICK = {"inputs": [0.7], "n_screens": 3, "n_screens_linear": 4}
 
 ONE_IMAGE = "Linear", "Arcsine"
 TWO_IMAGES = "LinearTwo", "PhaseShifted", "MaximumLikelihood"

@@ -36,6 +36,7 @@ LIMITS = parameter_limits(
     n_cycles=(4, 10000),
     n_screens=(1, 1000),
 )
+QUICK = {"photons": [1e8, 1e10], "photons_gain": [1e8], "gains": [0.1, 0.4, 1.0], "n_cycles": 40, "n_screens": 2}
 
 IDEAL = "ideal sensor"
 """Name of a sensor that measures each mode of unit rms with an error of 1 / (2 sqrt(photons)) radian."""

@@ -34,6 +34,7 @@ LIMITS = parameter_limits(
     **SETUP,
 )
 CHECK_TOGETHER = check_setup
+QUICK = {"n_pixels": 64, "n_rms": 6, "rms_fine": [0.05], "rms_beyond": [1.6, 2.0], "n_screens": 4}
 
 _PASSES = ("split_expand", "split_adjoint")  # functions that pass through the low-rank model of the sensor
 

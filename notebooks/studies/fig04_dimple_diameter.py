@@ -50,6 +50,7 @@ LIMITS = parameter_limits(
     **SETUP,
 )
 CHECK_TOGETHER = check_setup
+QUICK = {"n_pixels": 64, "n_screens": 4, "step": 0.5, "step_fine": 0.2, "n_screens_few": 2}
 
 DARK_RING = 2 * 1.2196698912665045
 """Diameter of the first dark ring of the Airy pattern, lambda/D: twice the first zero of J1(pi r)."""

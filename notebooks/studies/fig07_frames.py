@@ -19,6 +19,7 @@ from zwfs.bench import BenchModel
 
 LIMITS = parameter_limits("rms exponent n_iterations", n_pixels=(32, 1024), bench=bench_fields("n_pixels"))
 CHECK_TOGETHER = check_bench
+QUICK = {"n_pixels": 68}
 
 
 def correlations(model: BenchModel, measured: NDArray, modelled: NDArray) -> list[float]:

@@ -22,6 +22,7 @@ LIMITS = parameter_limits(
     bench=bench_fields("n_pixels", "extent"),
 )
 CHECK_TOGETHER = check_bench
+QUICK = {"n_pixels": 68, "n_rms": 5, "n_screens": 2}
 
 SHORT = {
     "linear": "Linear",

@@ -32,6 +32,7 @@ LIMITS = parameter_limits(
     photons=(1.0, 1e12),
     n_draws=(2, 10000),
 )
+QUICK = {"n_pixels": 32, "n_quarter": 5, "n_screens": 1}
 
 HALF = np.pi / 2
 DRAWN = (

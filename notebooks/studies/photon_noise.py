@@ -33,6 +33,7 @@ LIMITS = parameter_limits(
     photons_bars=(10.0, 1e9),
     wrong=[(0.01, 100.0)],
 )
+QUICK = {"photons": [10.0, 1e3, 1e5], "n_screens": 2}
 
 SIGMAS = np.arange(0.25, 3.01, 0.25)
 """Widths of the error bars whose share of the points is counted, in standard errors."""

@@ -104,6 +104,22 @@ def _check_fields(name: str, values: Any, fields: Fields) -> None:
         _check_value(f"{name}.{key}", value, known[key])
 
 
+def typed(value: Any, limits: Any) -> Any:
+    """Return a checked value, with floats in place of integers where the limits are floats."""
+    if isinstance(limits, Fields):
+        return {name: typed(one, limits.every()[name]) for name, one in value.items()}
+    if isinstance(value, list):
+        return [typed(item, limits[0]) for item in value]
+    return float(value) if isinstance(example(limits), float) else value
+
+
+def example(limits: Any) -> Any:
+    """Return a value of the type that single values within some limits have: a float if one limit is a float."""
+    if isinstance(limits, type):
+        return limits()
+    return next((one for one in limits or () if isinstance(one, float)), limits[0] if limits else None)
+
+
 _CUT = {"obstruction": (0.0, 0.9), "vanes": [[(-6.2832, 6.2832)], ...]}
 _RINGS = _CUT | {"n_rings": (1, 50), "gap": (0.0, 0.1), "missing": [(1, 10000), ...], "stop": (0.1, 1.0)}
 _BASIS = {"basis": ("zernike", "fourier", "hexagonal", "kl")}

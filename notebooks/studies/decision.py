@@ -42,6 +42,8 @@ LIMITS = parameter_limits(
     **dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop"), (2, 1000)),
 )
 
+QUICK = {"n_pixels": 32, "n_commands": 2, "n_screens": 2, "n_screens_perfect": 2, "n_screens_loop": 2}
+
 COLUMNS = {"perfect": "no errors", "calibrated": "calibrated", "design": "only the design known"}
 """What is known of the bench, and the headers of the table."""
 ONE_IMAGE = {"Linear": "linear", "Arcsine": "arcsine", "LikelihoodOne": "maximum likelihood on modes"}

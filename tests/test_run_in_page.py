@@ -289,7 +289,7 @@ def test_the_example_of_the_front_page_gives_the_numbers_of_this_python(opened):
     page.get_by_role("button", name="Run", exact=True).click()
     page.wait_for_function("/\\d\\s*$/.test(document.querySelector('.run-said').textContent)")
     expected = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    *lines, number = page.locator(".run-said").inner_text().split("\n")
+    *lines, number = page.locator(".run-said").inner_text().strip().split("\n")
     *said, value = expected.strip().split("\n")
     assert lines == said
     assert float(number) == pytest.approx(float(value), rel=1e-9)

@@ -199,7 +199,8 @@ def finish_files(app: Sphinx, exception: Exception | None) -> None:
             script.write_text(text, "utf-8")
     forward(html, "index", app.config.root_doc)
     for old, new in app.config.moved_pages.items():
-        forward(html, old, new)
+        if new in app.env.found_docs:  # not so in a part of the book
+            forward(html, old, new)
 
 
 def forward(html: Path, old: str, new: str) -> None:

@@ -317,14 +317,15 @@ def best_pair(n: Numbers) -> Finding:
     """Best means that no other pair has less noise by more than 2 %."""
     gains = {
         "photon noise on a flat wavefront": 1 - n.best_noise / n.noise_at_half_pi,
-        "photon noise at 0.5 rad rms": 1 - n.best_noise_aberrated / n.noise_at_half_pi_aberrated,
+        "photon noise of the iteration at 0.5 rad rms": 1 - n.best_noise_aberrated / n.noise_at_half_pi_aberrated,
+        "the information bound there": 1 - n.best_noise_bound / n.noise_at_half_pi_bound,
         "read noise": 1 - n.best_noise_read / n.noise_at_half_pi_read,
     }
     listed = ", by ".join(f"{gain:.0%} for {name}" for name, gain in gains.items())
     better = [name for name, gain in gains.items() if gain > 0.02]
     remark = (
         "The claim holds where the noise does not depend on the light. With photon noise, a flat wavefront and "
-        f"dimples of 1.06 $\\lambda/D$, $\\pm{abs(n.best_theta_a) / math.pi:.1f}\\pi$ is better."
+        f"dimples of 1.06 $\\lambda/D$, $\\pm{n.best_pi:.1f}\\pi$ is better."
     )
     return first(
         f"compared with $\\pm\\pi/2$, the best pair of the map has less noise by {listed}",

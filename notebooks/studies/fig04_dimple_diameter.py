@@ -367,26 +367,30 @@ def draw_diameter_methods(curves: Mapping[str, DiameterCurves], threshold: float
 
 
 def draw_diameter_reasons(reasons: Contraction, claimed: float) -> Figure:
-    """Factor of one iteration, and sensitivity to single modes, against the diameter of the dimple."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(7, 4))
+    """Factor of one iteration above the sensitivity to single modes, on one axis of the diameter."""
+    figure, (top, bottom) = plt.subplots(2, 1, figsize=(7, 6), sharex=True, height_ratios=(1, 0.8))
     color, diameters, aberrated = LOOKS[ITERATION].color, reasons.diameters, reasons.aberrated
     flat_color, ring_color, *_ = (style["color"] for style in OTHER_STYLES)
-    left.plot(diameters, reasons.flat, color=flat_color, lw=2, ls="--", zorder=3, label="flat wavefront")
+    top.plot(diameters, reasons.flat, color=flat_color, lw=2, ls="--", zorder=3, label="flat wavefront")
     low, high = aberrated.min(axis=1), aberrated.max(axis=1)
-    left.fill_between(diameters, low, high, color=color, alpha=0.3, lw=0, label="screens, range")
-    left.plot(diameters, aberrated[:, 0], color=color, lw=1.5, label="first screen")
+    top.fill_between(diameters, low, high, color=color, alpha=0.3, lw=0, label="screens, range")
+    top.plot(diameters, aberrated[:, 0], color=color, lw=1.5, label="first screen")
     observed = list(reasons.observed), list(reasons.observed.values())
-    left.plot(*observed, "o", mfc="none", mec=ring_color, label="observed")
-    left.axhline(1, color="#555555", lw=1)
-    left.text(0.05, 1.015, "diverges above", color="#555555", fontsize=9)
-    left.set(ylabel="error after / before an iteration", ylim=(0, 1.2))
-    left.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
+    top.plot(*observed, "o", mfc="none", mec=ring_color, label="observed")
+    top.axhline(1, color="#555555", lw=1)
+    top.text(0.05, 1.015, "diverges above", color="#555555", fontsize=9)
+    top.set(ylabel="error after / before", ylim=(0, 1.2))
+    top.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
     for (name, values), style in zip(reasons.sensitivity.items(), OTHER_STYLES, strict=False):
-        right.plot(diameters, values, lw=1.8, label=name, **style | {"marker": "none"})
-    right.set(ylabel="sensitivity (1/rad)", ylim=(0, 3.5))  # room for the legend on phones
-    right.legend(loc="upper left", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
-    for axes in (left, right):
+        bottom.plot(diameters, values, lw=1.8, label=name, **style | {"marker": "none"})
+    bottom.set(ylabel="sensitivity (1/rad)", ylim=(0, 3.2))  # room for the legend on phones
+    bottom.legend(loc="upper left", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
+    for axes in (top, bottom):
         _diameters(axes, diameters[-1], claimed)
+    if diameters[-1] > DARK_RING:
+        top.plot(DARK_RING, 1, "o", ms=14, mfc="none", mec="#000000", mew=1.5, zorder=4)
+        bottom.plot(DARK_RING, 0, "o", ms=14, mfc="none", mec="#000000", mew=1.5, zorder=4, clip_on=False)
+    top.set_xlabel("")
     return figure
 
 

@@ -181,9 +181,7 @@ def dimple_pairs(pupil: Pupil, diameter: float, n_shifts: int, field: NDArray) -
         sine_error[index] = np.abs(determinant - np.sin(between)).max()
         half_error[index] = np.abs(np.sin(beyond_half)).max()
     difference = np.array([shifts[b] - shifts[a] for a, b in pairs]) % (2 * np.pi)
-    return DimplePairs(
-        difference, size, float(off_by_pi.mean()), float(sine_error.max()), float(half_error.max())
-    )
+    return DimplePairs(difference, size, float(off_by_pi.mean()), float(sine_error.max()), float(half_error.max()))
 
 
 def true_wave_errors(sensor: ZernikeSensor, screens: NDArray) -> dict[str, NDArray[np.float64]]:

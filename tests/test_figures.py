@@ -23,7 +23,6 @@ from studies.dark_zone import IDEAL, Drift, DriftCurves
 from studies.design import PUBLISHED, DesignMap
 from studies.fig03_dynamic_range import draw_linearity, linearity_curves
 from studies.fig04_dimple_diameter import Contraction, DiameterCurves
-from studies.identities import dimple_pairs
 from studies.kit import grids
 from studies.kit.bench import BenchCurves
 from studies.kit.curves import ErrorCurves, Limit
@@ -139,7 +138,6 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_pixel_phasors": ((lowest_pixel(shifted, phase),), ()),
         "draw_one_or_two_images": ((pupil, phase, dict.fromkeys(two, phase)), ()),
         "draw_approximation": ((three, lines, lines), ()),
-        "draw_diversity": ((dimple_pairs(pupil, 1.06, 24, pupil.field(0 * phase)),), ()),
         "draw_dimple_diameter": (({25: trial, 100: trial}, 0.05, 2.2), shifted_only),
         "draw_diameter_methods": ((dict.fromkeys(LOOKS, trial), 0.05, 2.2), LOOKS),
         "draw_diameter_reasons": ((reasons, 2.2), shifted_only),

@@ -28,27 +28,27 @@ def draw_sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:
     frame = np.abs(sensor.propagate(field)[0]) ** 2
     inside = np.where(pupil.inside, 1, np.nan)
 
-    scene = Scene(9, 4.7, size=10.5)
-    y, half = 3.0, 0.8 * 0.98
+    scene = Scene(9, 6.1)
+    y, half = 3.9, 0.98
     scene.beam([(0.1, half), (2.82, half), (4.5, 0), (6.18, half), (8.9, half)], origin=(0, y))
     scene.axis((0.1, y), (8.9, y))
     for x in (2.82, 6.18):
-        scene.lens(x, y, 1.95)
-        scene.label(x, y - 1.2, "lens")
-    scene.arrows(2.05, 2.6, y, 0.4)
+        scene.lens(x, y, 2.4)
+        scene.label(x, y - 1.5, "lens")
+    scene.arrows(2.28, 2.66, y, 0.4)
 
     limit = np.nanmax(np.abs(phase * inside))
-    _plane(scene, 1.15, "pupil plane", r"phase of $\psi_{in}$ (rad)", PHASE_MAP, phase * inside, -limit, limit)
+    _plane(scene, 1.25, "pupil plane", r"phase of $\psi_{in}$ (rad)", PHASE_MAP, phase * inside, -limit, limit)
     light = focal_light(pupil, field, 4)
     focal = _plane(scene, 4.5, "focal plane", r"$|\hat\psi_{in}|^2$ (log$_{10}$)", FOCUS_MAP, light, -4, 0)
     # The axis runs from -4 to 4 lambda/D over 161 samples.
     dashed_circle(focal, (80, 80), mask.diameter / 2 * 20)
-    label = f"mask: {mask.diameter:g} $\\lambda/D$, {shift_label(mask)} rad"
-    focal.text(80, 146, label, color="white", ha="center", fontsize=9)
-    focal.plot([80, 80], [80 + mask.diameter * 10, 142], color="white", lw=0.8)
-    focal.plot([20, 60], [12, 12], color="white", lw=1.5)
-    focal.text(40, 17, r"2 $\lambda/D$", color="white", ha="center", fontsize=9.5)
-    _plane(scene, 7.85, "detector plane", r"intensity $I_{out}$", INTENSITY_MAP, frame, 0, frame.max())
+    label = f"{mask.diameter:g} $\\lambda/D$, {shift_label(mask)} rad"
+    focal.text(80, 142, label, color="white", ha="center", fontsize=scene.size)
+    focal.plot([80, 80], [80 + mask.diameter * 10, 138], color="white", lw=0.8)
+    focal.plot([20, 60], [10, 10], color="white", lw=1.5)
+    focal.text(40, 16, r"2 $\lambda/D$", color="white", ha="center", fontsize=scene.size)
+    _plane(scene, 7.75, "detector plane", r"intensity $I_{out}$", INTENSITY_MAP, frame, 0, frame.max())
 
     interference = 2 * np.abs(pupil.amplitude * wave) * np.cos(np.angle(field * wave.conj()))
     terms = (
@@ -57,11 +57,11 @@ def draw_sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:
         (r"$I_{ref}$", "+", np.abs(wave) ** 2, INTENSITY_MAP, 0),
         (r"$2\sqrt{I_{in}I_{ref}}\,\cos(\phi_{in}-\phi_{ref})$", "", interference, PHASE_MAP, -frame.max()),
     )
-    for x, (title, sign, image, colors, low) in zip((1.15, 3.1, 5.05, 7.0), terms, strict=True):
-        term = scene.picture(x, 0.91, 1.1, image, colors, low, frame.max(), edge=None)
-        scene.label(x, 0.1, title, size=10)
-        scene.label(x + 0.97, 0.9, sign, size=15, va="center")
-    scene.scale(term, (7.75, 0.36, 0.08, 1.1), "intensity", ticks=5)
+    for x, (title, sign, image, colors, low) in zip((1.25, 3.15, 5.05, 6.95), terms, strict=True):
+        term = scene.picture(x, 1.1, 1.3, image, colors, low, frame.max(), edge=None)
+        scene.label(x, 0.12, title)
+        scene.label(x + 0.95, 1.1, sign, size=20, va="center")
+    scene.scale(term, (7.75, 0.45, 0.08, 1.3), "intensity", ticks=5)
     return scene.figure
 
 
@@ -69,10 +69,10 @@ def _plane(
     scene: Scene, x: float, title: str, scale: str, colors: str, image: NDArray, low: float, high: float
 ) -> Axes:
     """Picture of a plane on the optical axis of Figure 1, its name above and its colour scale below."""
-    shown = scene.picture(x, 3.0, 1.6, image, colors, low, high)
-    scene.label(x, 4.38, title, size=11, weight="bold")
-    scene.scale(shown, (x - 0.6, 2.02, 1.2, 0.07))
-    scene.label(x, 4.0, scale)
+    shown = scene.picture(x, 3.9, 2.0, image, colors, low, high)
+    scene.label(x, 5.78, title, weight="bold")
+    scene.scale(shown, (x - 0.75, 2.7, 1.5, 0.08))
+    scene.label(x, 5.2, scale)
     return shown.axes
 
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, Polygon
 from numpy.typing import NDArray
 
-from studies.kit.drawings import MINUS, PLUS, RETARDER, Scene, focal_light, mask_picture, shift_label
+from studies.kit.drawings import METAL, MINUS, PLUS, RETARDER, Scene, focal_light, mask_picture, shift_label
 from studies.kit.parameters import parameter_limits
 from studies.kit.style import INTENSITY_MAP, PHASE_MAP
 from studies.kit.tables import Table
@@ -21,18 +21,18 @@ LIMITS = parameter_limits("n_pixels diameter phase_shift rms")
 
 # Title and text of a drawing, by whether its mask is of liquid crystal.
 _KINDS = {
-    True: ("Liquid crystal", "geometric phase, of opposite sign for\nthe two circular polarisations"),
-    False: ("Metasurface", "structures below the wavelength, for\nthe two linear polarisations directly"),
+    True: ("Liquid crystal", "opposite phases for the\ntwo circular polarisations"),
+    False: ("Metasurface", "opposite phases for the\ntwo linear polarisations"),
 }
 
 
 def draw_vector_sensor(sensor: ZernikeSensor, phase: NDArray) -> Figure:
     """Figure 2: a vector mask of liquid crystal and one of a metasurface, with the fields computed for `phase`."""
-    scene = Scene(9, 7.25, size=10.5)
-    for y, liquid in ((5.5, True), (2.05, False)):
+    scene = Scene(9, 8.05)
+    for y, liquid in ((6.2, True), (2.55, False)):
         _vector_row(scene, y, sensor, phase, liquid=liquid)
-    scene.axes.plot([0.2, 8.8], [3.86, 3.86], color="#cccccc", lw=0.8)
-    _legend(scene, 0.16)
+    scene.axes.plot([0.2, 8.8], [4.43, 4.43], color="#cccccc", lw=0.8)
+    _legend(scene)
     return scene.figure
 
 
@@ -41,7 +41,7 @@ def _vector_row(scene: Scene, y: float, sensor: ZernikeSensor, phase: NDArray, *
     pupil_x, first, focus, second, prism, detector, images = 0.8, 2.3, 3.9, 5.5, 6.05, 7.25, 8.2
     half, apart = 0.5, 0.62
     title, text = _KINDS[liquid]
-    scene.label(0.2, y + 1.42, title, size=12, weight="bold", ha="left")
+    scene.label(0.2, y + 1.42, title, size=16, weight="bold", ha="left")
     scene.label(0.2, y + 1.34, text, ha="left", va="top", color="#444444")
 
     scene.beam([(0.1, half), (first, half), (focus, 0), (second, half), (prism, half)], origin=(0, y))
@@ -51,7 +51,8 @@ def _vector_row(scene: Scene, y: float, sensor: ZernikeSensor, phase: NDArray, *
     scene.arrows(1.52, 2.0, y, 0.25)
     for x in (first, second):
         scene.lens(x, y, 1.3)
-        scene.label(x, y - 0.84, "lens")
+    scene.label(first, y - 0.9, "lens")
+    scene.label(second, y + 0.72, "lens")
 
     pupil = sensor.pupil
     inside = np.where(pupil.inside, phase, np.nan)
@@ -59,7 +60,7 @@ def _vector_row(scene: Scene, y: float, sensor: ZernikeSensor, phase: NDArray, *
     shown = scene.picture(pupil_x, y, 1.05, inside, PHASE_MAP, -limit, limit)
     scene.label(pupil_x, y + 0.6, r"pupil: $\phi_{in}$ (rad)")
     scene.scale(shown, (pupil_x - 0.45, y - 0.66, 0.9, 0.06))
-    scene.label(pupil_x, y - 1.1, "unpolarised light")
+    scene.label(0.12, y - 1.2, "unpolarised light", ha="left")
 
     halo = focal_light(pupil, pupil.field(phase), 2.2)
     frames = sensor.measure(phase)
@@ -79,20 +80,20 @@ def _vector_row(scene: Scene, y: float, sensor: ZernikeSensor, phase: NDArray, *
         else:
             _symbol(scene, 4.85, y + sign * 0.52, linear, look.color)
         _symbol(scene, 6.65, y + sign * 1.08, linear, look.color)
-        center = y + sign * apart
+        center = y + sign * (apart + 0.05)
         shown = scene.picture(images, center, 1.02, frames[index], INTENSITY_MAP, 0, frames.max(), edge=look.color)
-        scene.label(images - 0.24, center + sign * 0.64, f"image {index + 1}", va="center", color=look.color)
-    scene.scale(shown, (images + 0.15, y - 1.25, 0.35, 0.06), ticks=2)
+        scene.label(images - 0.36, center + sign * 0.64, f"image {index + 1}", va="center", color=look.color)
+    scene.scale(shown, (images + 0.15, y - 1.31, 0.38, 0.06), ticks=2)
 
     scene.plate(focus, y, 0.07, 0.34, RETARDER)
     scene.label(focus - 0.13, y - 0.09, "mask", ha="right", va="top")
     if liquid:
         scene.plate(4.88, y, 0.1, 0.9, "#d9c7e8", edge=RETARDER)
-        scene.label(4.84, y - 0.76, "quarter-\nwave plate", va="top")
+        scene.label(4.93, y - 0.76, "quarter-\nwave plate", va="top")
     scene.wollaston(prism, y, 0.3, 1.25)
     scene.label(prism + 0.02, y - 0.7, "Wollaston\nprism", va="top")
     scene.detector(detector, y, 2.3)
-    scene.label(detector - 0.05, y - 1.32, "detector")
+    scene.label(detector - 0.3, y - 1.42, "detector")
     _focus_marks(scene, detector, y, half, apart)
 
 
@@ -116,19 +117,18 @@ def _symbol(scene: Scene, x: float, y: float, kind: str, color: str) -> None:
     axes.add_patch(Polygon(np.array(head) + np.array([x, y]), closed=True, fc=color, ec="none"))
 
 
-def _legend(scene: Scene, y: float) -> None:
-    """Key to the lines and signs."""
-    for x, look, text in ((0.25, PLUS, r"sees phase $+\theta$"), (1.95, MINUS, r"sees phase $-\theta$")):
-        scene.key(x, y, look, text)
-    gray = "#444444"
-    for x, kind, text in (
-        (3.7, "left", ""),
-        (4.02, "right", "circular"),
-        (5.05, "along", "linear, in the drawing"),
-        (7.0, "across", "linear, perpendicular"),
+def _legend(scene: Scene) -> None:
+    """Key to the lines and signs, in two rows."""
+    for x, look, text in ((0.25, PLUS, r"sees phase $+\theta$"), (2.75, MINUS, r"sees phase $-\theta$")):
+        scene.key(x, 0.5, look, text)
+    for x, y, kind, text in (
+        (5.3, 0.5, "left", ""),
+        (5.62, 0.5, "right", "circular"),
+        (0.45, 0.12, "along", "linear, in the drawing"),
+        (3.2, 0.12, "across", "linear, perpendicular"),
     ):
-        _symbol(scene, x, y + 0.05, kind, gray)
-        scene.label(x + 0.18, y, text, ha="left")
+        _symbol(scene, x, y + 0.07, kind, METAL)
+        scene.label(x + 0.27, y, text, ha="left")
 
 
 def _focus_marks(scene: Scene, x: float, y: float, half: float, apart: float) -> None:

@@ -25,8 +25,8 @@ CHECK_TOGETHER = check_bench
 def draw_bench_layout(bench: Bench, pistons: NDArray, frames: NDArray, wavelength: float) -> Figure:
     """Figure 5: simplified layout of the SEAL bench, folded at its two deformable mirrors; wavelength in nm."""
     phase = np.where(bench.segments > 0, bench.commanded_phase(pistons), np.nan)
-    scene = Scene(9, 7.05)
-    top, bottom, corner, f, f_last, half = 6.2, 1.2, 8.25, 1.5, 1.75, 0.27
+    scene = Scene(9, 8.2)
+    top, bottom, corner, f, f_last, half = 7.3, 1.3, 8.25, 1.5, 1.75, 0.27
     stop, focus, camera = corner - 4 * f, corner - 2 * f_last, corner - 4 * f_last
 
     # Each leg takes a pupil to the next one, two lenses and four focal lengths on.
@@ -65,13 +65,13 @@ def draw_bench_layout(bench: Bench, pistons: NDArray, frames: NDArray, wavelengt
     for x in (focus + f_last, focus - f_last):
         scene.lens(x, bottom, 0.9)
     scene.plate(focus, bottom, 0.07, 0.3, RETARDER)
-    scene.label(focus, bottom - 0.4, "vector-Zernike\nmask", va="top")
+    scene.label(focus, bottom - 0.4, "vector\nmask", va="top")
     scene.plate(focus - 0.75, bottom, 0.09, 0.6, "#d9c7e8", edge=RETARDER)
-    scene.label(focus - 0.9, bottom - 0.4, "quarter-\nwave plate", va="top")
+    scene.label(focus - 1.0, bottom - 0.4, "quarter-\nwave plate", va="top")
     scene.wollaston(prism, bottom, 0.24, 0.85)
     scene.label(prism, bottom - 0.5, "Wollaston\nprism", va="top")
     scene.detector(camera - 0.08, bottom, 1.5)
-    scene.callout((camera - 0.04, bottom + 0.75), (camera - 0.04, bottom + 1.2))
+    scene.callout((camera - 0.04, bottom + 0.75), (camera - 0.04, 3.6))
     scene.label(camera - 0.2, bottom, "camera", ha="right", va="center")
     _bench_pictures(scene, bench, phase, frames)
     return scene.figure
@@ -81,38 +81,38 @@ def _bench_pictures(scene: Scene, bench: Bench, phase: NDArray, frames: NDArray)
     """Computed pictures of Figure 5, next to their elements."""
     pupil = Pupil.from_segments(bench.segments)
     limit = np.nanmax(np.abs(phase))
-    left, right, upper, lower, size = 4.75, 6.7, 4.8, 2.87, 1.35
-    scene.callout((8.0, 5.95), (right + size / 2, upper + size / 2))
+    left, right, upper, lower, size = 4.75, 6.7, 5.75, 3.3, 1.45
+    scene.callout((8.0, 7.05), (right + size / 2, upper + size / 2))
     scene.picture(left, upper, size, pupil.amplitude**2, "gray", 0, pupil.amplitude.max() ** 2)
-    scene.label(left, upper + 0.73, "segments in the stop")
+    scene.label(left, upper + 0.8, "segments in stop")
     shown = scene.picture(right, upper, size, phase, PHASE_MAP, -limit, limit)
-    scene.label(right, upper + 0.73, "pistons (rad)")
-    scene.scale(shown, (right - 0.55, upper - 0.77, 1.1, 0.06))
+    scene.label(right, upper + 0.8, "pistons (rad)")
+    scene.scale(shown, (right - 0.7, upper - 0.83, 1.4, 0.06), ticks=2)
 
-    scene.callout((8.0, 1.45), (right + size / 2, lower - size / 2))
+    scene.callout((8.0, 1.55), (right + size / 2, lower - size / 2))
     none: dict[str, Any] = dict.fromkeys((*bench.errors(), "photons", "read_noise", "background"), 0)
     quilted = replace(bench, **none | {"quilting": bench.quilting}).frames()[0]
     scene.picture(right, lower, size, quilted, INTENSITY_MAP, 0, quilted.max())
-    scene.label(right, lower + 0.73, "quilting in a flat frame")
+    scene.label(right, lower + 0.8, "quilting")
     mask = Dimple(bench.diameter, bench.phase)
     halo = focal_light(pupil, pupil.field(phase), 4)
-    scene.callout((left, 1.2), (left, lower))
+    scene.callout((left, 1.3), (left, lower))
     mask_picture(scene, left, lower, size, mask, halo, 4, PLUS)
-    scene.label(left, lower + 0.73, f"focus, dimple of {shift_label(mask, plus=True)}")
+    scene.label(left, lower + 0.8, f"dimple: {shift_label(mask, plus=True)}")
 
     for frame, x, look, number in zip(frames, (1.2, 3.05), (PLUS, MINUS), (1, 2), strict=True):
-        scene.picture(x, 3.27, 1.72, frame, INTENSITY_MAP, 0, frames.max(), edge=look.color)
-        scene.label(x, 4.2, f"image {number}", color=look.color, size=10)
-    for y, look, text in ((5.12, PLUS, r"sees phase $+\theta$"), (4.82, MINUS, r"sees phase $-\theta$")):
+        scene.picture(x, 3.6, 1.72, frame, INTENSITY_MAP, 0, frames.max(), edge=look.color)
+        scene.label(x, 4.53, f"image {number}", color=look.color)
+    for y, look, text in ((5.95, PLUS, r"sees phase $+\theta$"), (5.55, MINUS, r"sees phase $-\theta$")):
         scene.key(0.35, y, look, text)
 
 
 def _source(scene: Scene, x: float, y: float, wavelength: float) -> None:
     """Source of light, a point."""
-    scene.axes.add_patch(Rectangle((x - 0.58, y - 0.16), 0.54, 0.32, fc=METAL, ec="none"))
+    scene.axes.add_patch(Rectangle((x - 0.73, y - 0.18), 0.7, 0.36, fc=METAL, ec="none"))
     scene.axes.add_patch(Circle((x, y), 0.04, fc="#c1121f", ec="none", zorder=4))
-    scene.label(x - 0.31, y, "source", color="white", va="center")
-    scene.label(x - 0.58, y + 0.27, f"{wavelength:g} nm", ha="left")
+    scene.label(x - 0.38, y - 0.01, "source", color="white", va="center")
+    scene.label(x - 0.73, y + 0.27, f"{wavelength:g} nm", ha="left")
 
 
 def _segmented_mirror(scene: Scene, center: Point, tilt: float, bench: Bench, pistons: NDArray) -> None:

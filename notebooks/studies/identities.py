@@ -157,10 +157,8 @@ def approximation_curves(
 class DimplePairs:
     """Determinants of all pairs of phase shifts on a grid round the circle; means over the pupil."""
 
-    shifts: NDArray[np.float64]  # (n_pairs, 2), radian
     difference: NDArray[np.float64]  # (n_pairs,), second less first, 0 to 2 pi
     determinant: NDArray[np.float64]  # (n_pairs,), modulus, equation (10)
-    strength: NDArray[np.float64]  # (n_pairs,), modulus with the strength of both waves
     off_by_pi: float  # share of the points where the waves differ by pi more than half of the difference
     sine_error: float  # largest error of the determinant as a sine
     half_error: float  # largest error of half of the difference, modulo pi
@@ -172,23 +170,18 @@ def dimple_pairs(pupil: Pupil, diameter: float, n_shifts: int, field: NDArray) -
     shifts = shifts[np.abs(shifts) > 1e-9]
     sensor = ZernikeSensor(pupil, *(Dimple(diameter, theta) for theta in shifts))
     waves = pupil.gather(sensor.reference_wave(field))
-    beta = waves[0] / (np.exp(1j * shifts[0]) - 1)
     pairs = list(product(range(len(shifts)), repeat=2))
-    size, strength, off_by_pi, sine_error, half_error = np.empty((5, len(pairs)))
+    size, off_by_pi, sine_error, half_error = np.empty((4, len(pairs)))
     for index, (a, b) in enumerate(pairs):
         determinant = matrix_determinant(waves[a], waves[b])
         between = np.angle(waves[b]) - np.angle(waves[a])
         beyond_half = between - (shifts[b] - shifts[a]) / 2
         size[index] = np.abs(determinant).mean()
-        strength[index] = np.abs((waves[a].conj() * waves[b]).imag / np.abs(beta) ** 2).mean()
         off_by_pi[index] = np.mean(np.cos(beyond_half) < 0)
         sine_error[index] = np.abs(determinant - np.sin(between)).max()
         half_error[index] = np.abs(np.sin(beyond_half)).max()
-    both = shifts[pairs]
-    difference = (both[:, 1] - both[:, 0]) % (2 * np.pi)
-    return DimplePairs(
-        both, difference, size, strength, float(off_by_pi.mean()), float(sine_error.max()), float(half_error.max())
-    )
+    difference = np.array([shifts[b] - shifts[a] for a, b in pairs]) % (2 * np.pi)
+    return DimplePairs(difference, size, float(off_by_pi.mean()), float(sine_error.max()), float(half_error.max()))
 
 
 def true_wave_errors(sensor: ZernikeSensor, screens: NDArray) -> dict[str, NDArray[np.float64]]:
@@ -240,33 +233,6 @@ def draw_approximation(rms: Sequence[float], wave: Curves, steps: Curves) -> Fig
     return figure
 
 
-# Pairs of phase shifts to point out, where the grid has them, rad.
-_NAMED = {
-    "±π/2": (-np.pi / 2, np.pi / 2),
-    "±2π/3": (-2 * np.pi / 3, 2 * np.pi / 3),
-    "π/12 and −11π/12": (np.pi / 12, -11 * np.pi / 12),
-}
-
-
-def draw_diversity(pairs: DimplePairs) -> Figure:
-    """Determinant of equation (10) and the one weighted with both reference waves, for many pairs of masks."""
-    matches = {label: np.isclose(pairs.shifts, pair).all(axis=1) for label, pair in _NAMED.items()}
-    named = {label: int(match.argmax()) for label, match in matches.items() if match.any()}
-    figure, panels = plt.subplots(1, 2, figsize=(7.2, 3.8), sharex=True)
-    for axes, values in zip(panels, (pairs.determinant, pairs.strength), strict=True):
-        axes.plot(pairs.difference, values, ".", color="#56B4E9", ms=4)
-        for (label, index), style in zip(named.items(), OTHER_STYLES, strict=False):
-            point = pairs.difference[index], values[index]
-            axes.plot(*point, label=label, markersize=8, **style | {"linestyle": "none"})
-        axes.set(xlabel=r"difference $\theta_b-\theta_a$ (rad)", ylim=(0, None))
-        axes.set_xticks(np.pi / 2 * np.arange(5), ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"])
-    panels[0].set_ylabel(r"$|\det M|$")
-    panels[1].set_ylabel("weighted determinant")
-    if named:
-        panels[0].legend(fontsize=9, loc="lower center")  # below the arch, where no pair is
-    return figure
-
-
 def approximation_columns(inputs: Sequence[float], wave: Curves, steps: Curves) -> dict[str, Sequence[float]]:
     """Columns of the curves of both panels."""
     return (
@@ -274,39 +240,6 @@ def approximation_columns(inputs: Sequence[float], wave: Curves, steps: Curves) 
         | {f"reference wave: {name}": values for name, values in wave.items()}
         | {f"phase over input: {name}": values for name, values in steps.items()}
     )
-
-
-def diversity_columns(pairs: DimplePairs) -> dict[str, NDArray]:
-    """Columns of the determinants of all pairs."""
-    return {
-        "theta_a (rad)": pairs.shifts[:, 0],
-        "theta_b (rad)": pairs.shifts[:, 1],
-        "|det M|": pairs.determinant,
-        "determinant with the waves' strength": pairs.strength,
-    }
-
-
-def quoted_table(columns: Mapping[str, Sequence[float]]) -> Table:
-    """Errors at the quoted inputs."""
-    (_, inputs), *curves = columns.items()
-    shown = [inputs.index(value) for value in QUOTED]
-    header = ["", *(f"at {value:g} rad rms" for value in QUOTED)]
-    return Table(header, [[name, *(float(values[i]) for i in shown)] for name, values in curves], digits=2)
-
-
-def two_wave_table(errors: Mapping[str, tuple[float, float]], resolution: float) -> Table:
-    """Largest errors for each mask."""
-    rows = [[name, *(_text(value, resolution) for value in pair)] for name, pair in errors.items()]
-    return Table(["mask", "two-wave formula, largest error", "model, largest error"], rows)
-
-
-def true_wave_table(errors: Mapping[str, NDArray], resolution: float) -> Table:
-    """Largest and rms errors of phases from the true reference waves."""
-    rows = [
-        [name, _text(values, resolution), _text(np.sqrt(np.mean(values**2)), resolution)]
-        for name, values in errors.items()
-    ]
-    return Table(["phase from", "largest error (rad)", "error (rad rms)"], rows)
 
 
 def numbers(
@@ -339,16 +272,27 @@ def numbers(
         "one_image_error": np.sqrt(np.mean(one_image**2)),
     }
     for value, ending in QUOTED.items():
-        right, literal = (approximate[name][inputs.index(value)] for name in (BEST, LITERAL))
-        found |= {
-            f"wave_error_{ending}": right.wave,
-            f"wave_phase_error_{ending}": right.phase,
-            f"wave_amplitude_error_{ending}": right.amplitude,
-            f"step_error_{ending}": right.two_images,
-            f"literal_amplitude_error_{ending}": literal.amplitude,
-            f"literal_step_error_{ending}": literal.two_images,
-        }
+        one = approximate[BEST][inputs.index(value)]
+        found |= {f"wave_error_{ending}": one.wave, f"step_error_{ending}": one.two_images}
+    for name, short in ((BEST, "wave"), (LITERAL, "literal")):
+        found[f"{short}_amplitude_error_05"] = approximate[name][inputs.index(0.5)].amplitude
     return rounded(found, ".5g")
+
+
+def identities_table(found: Mapping[str, float | str], resolution: float) -> Table:
+    """Largest error of each identity, from `numbers`."""
+    titles = {
+        "dimple_two_wave_error": "(5): two waves interfere, behind a dimple",
+        "patch_two_wave_error": "(5), behind a patch of uneven phase and amplitude",
+        "patch_model_error": "low-rank model of the reference wave of this patch",
+        "determinant_error": "(10): the determinant is the sine of the difference of the reference phases",
+        "half_difference_error": "this difference is half of that of the phase shifts, modulo π (rad)",
+        "diversity_at_0": "determinant of equal phase shifts",
+        "true_wave_error": "(9): phase from two images and their true reference waves (rad)",
+        "one_step_error": "the same by one iteration from the true phase (rad)",
+    }
+    rows = [[title, _text(float(found[name]), resolution)] for name, title in titles.items()]
+    return Table(["equation of the paper", "largest error"], rows)
 
 
 def _at_least(errors: ArrayLike, resolution: float) -> float:

@@ -162,7 +162,7 @@ class PairMaps:
         np.float64
     ]  # (n, n), photon noise of a flat wavefront, radian for one photon per point and image
     aberrated: NDArray[np.float64]  # (n, n), photon noise of the screens
-    bound: NDArray[np.float64]  # (n, n), bound of the photon noise of a flat wavefront
+    bound: NDArray[np.float64]  # (n, n), bound of the photon noise of the screens
     read: NDArray[np.float64]  # (n, n), read noise of a flat wavefront
 
     @property
@@ -218,8 +218,9 @@ def _pair(
         return (np.nan,) * 5
     error = reconstruction_error(sensor.pupil, method(sensor.measure(screens)).phase, screens).mean()
     flat = phase_noise(sensor, np.zeros(sensor.pupil.shape))
-    aberrated = np.array([phase_noise(sensor, screen).photon for screen in screens])
-    return error, _rms(flat.photon), _rms(aberrated), _rms(flat.bound), _rms(flat.read)
+    aberrated = [phase_noise(sensor, screen) for screen in screens]
+    photon, bound = (_rms(np.array([getattr(one, name) for one in aberrated])) for name in ("photon", "bound"))
+    return error, _rms(flat.photon), photon, bound, _rms(flat.read)
 
 
 def _rms(values: NDArray) -> float:
@@ -352,7 +353,7 @@ def best_table(maps: PairMaps, rms: float) -> Table:
         "flat": "photon noise, flat wavefront",
         "aberrated": f"photon noise, {rms:g} rad rms",
         "read": "read noise, flat wavefront",
-        "bound": "bound, photon noise, flat wavefront",
+        "bound": f"bound, photon noise, {rms:g} rad rms",
     }
     rows = []
     for name, title in titles.items():
@@ -366,34 +367,29 @@ def _pi(angle: float) -> str:
     return f"{angle / np.pi:.3g}π".replace("-", "−")
 
 
-def numbers(
-    maps: PairMaps, angles: NDArray, noise: Mapping[str, NDArray], rows: Sequence[DrawnNoise]
-) -> dict[str, float | str]:
+def numbers(maps: PairMaps, rows: Sequence[DrawnNoise]) -> dict[str, float | str]:
     """Numbers of the claims of section 4.2 on pairs."""
     found = {
-        "n_pairs": maps.error.size,
         "n_singular": maps.singular.sum(),
         "n_allowed": (~maps.singular).sum(),
         "singular_as_expected": np.array_equal(maps.singular, maps.forbidden),
         "zero_works": maps.zero_works,
         "error_max_allowed_pairs": np.nanmax(maps.error),
     }
-    for name, suffix in (("flat", ""), ("aberrated", "_aberrated"), ("read", "_read")):
-        theta_a, theta_b, value = maps.best(name)
+    for name, suffix in (("flat", ""), ("aberrated", "_aberrated"), ("bound", "_bound"), ("read", "_read")):
+        theta_a, _, value = maps.best(name)
         found |= {
-            f"best_theta_a{suffix}": theta_a,
-            f"best_theta_b{suffix}": theta_b,
             f"best_noise{suffix}": value,
             f"noise_at_half_pi{suffix}": maps.at(name, HALF, -HALF),
             f"best_pi{suffix}": abs(theta_a) / np.pi,
         }
-    moved = maps.at("aberrated", found["best_theta_a"], found["best_theta_b"])
+    moved = maps.at("aberrated", *maps.best("flat")[:2])
     found |= {
         "gain_flat": 1 - found["best_noise"] / found["noise_at_half_pi"],
         "photons_saved_flat": 1 - (found["best_noise"] / found["noise_at_half_pi"]) ** 2,
         "gain_aberrated": 1 - found["best_noise_aberrated"] / found["noise_at_half_pi_aberrated"],
+        "gain_bound": 1 - found["best_noise_bound"] / found["noise_at_half_pi_bound"],
         "gain_moved": 1 - moved / found["noise_at_half_pi_aberrated"],
-        "cut_best_theta_flat": angles[np.argmin(noise["photon noise, flat wavefront"])],
         "drawn_difference": max(abs(row.drawn / row.expected - 1) for row in rows),
     }
     return rounded(found, ".4g")

@@ -20,6 +20,8 @@ from zwfs.pupil import Pupil
 _MASK_SAMPLES = 161
 _BEAM, _RAY, _GLASS, _EDGE = "#f8e8c8", "#a8742a", "#cfe3f2", "#33658a"
 METAL, RETARDER = "#444444", "#7a5195"
+LETTERS = 14.2
+"""Size of the letters of a drawing 9 inches wide, points: on a page they are as large as its prose."""
 Point = tuple[float, float]  # inches
 Profile = list[tuple[float, float]]  # distance along a beam and half of its width, inches
 
@@ -40,7 +42,7 @@ PLUS, MINUS = Polarisation("#B2182B", "-"), Polarisation("#313695", (0, (4, 2)))
 class Scene:
     """Figure without visible axes: positions in inches from its lower left corner, text of `size` points."""
 
-    def __init__(self, width: float, height: float, size: float = 9) -> None:
+    def __init__(self, width: float, height: float, size: float = LETTERS) -> None:
         # Not "none": after it, a figure that is saved twice gets the layout engine of the style.
         self.figure = plt.figure(figsize=(width, height), layout=PlaceHolderLayoutEngine(True, True))
         self.width, self.height, self.size = width, height, size
@@ -80,8 +82,8 @@ class Scene:
         axes = self._part(*box)
         flat = box[2] > box[3]
         bar = self.figure.colorbar(shown, cax=axes, orientation="horizontal" if flat else "vertical")
-        bar.set_label(name, fontsize=self.size - 1)
-        axes.tick_params(labelsize=self.size - 1, length=2, pad=1)
+        bar.set_label(name, fontsize=self.size)
+        axes.tick_params(labelsize=self.size, length=2, pad=1)
         axes.locator_params(nbins=ticks)
 
     def label(

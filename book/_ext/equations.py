@@ -28,10 +28,10 @@ class LinkCode(SphinxTransform):
         root = Path(self.app.srcdir)
         for equation in list(self.document.findall(nodes.math_block)):
             if paths := implementations(root).get(equation.get("label", "")):
-                line = nodes.paragraph("", "In code: ", classes=["equation-code"])
+                line = nodes.paragraph("", "Code: ", classes=["equation-code"])
                 line += joined([self.link(path) for path in paths])
                 files = dict.fromkeys(file for path in paths for file in tests(root, path))
-                line += nodes.Text(". Tests: " if files else "")
+                line += nodes.Text(" · " if files else "")
                 line += joined([self.test(file) for file in files])
                 equation.parent.insert(equation.parent.index(equation) + 1, line)
 

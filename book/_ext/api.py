@@ -25,6 +25,7 @@ KINDS = ("class", "data", "exception", "function")
 # The pages with the equations of the paper, in its order.
 PAPER = ("sensor.md", "phase_shifted.md", "methods.md")
 
+BACK = re.compile(r'<a class="viewcode-back".*?</a>')
 NUMBERED = re.compile(r"(?<=Chambouleyron)[^;]*?equations?\s[^;.\n]*")
 
 logger = logging.getLogger(__name__)
@@ -173,6 +174,12 @@ def link_name(
     return None if target.startswith(f"{PACKAGE}.") else contnode
 
 
+def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, Any], document: Any) -> None:
+    """Drop the links of sources to entries: they name the module of a definition, entries a shorter path."""
+    if page.startswith("_modules/"):
+        context["body"] = BACK.sub("", context["body"])
+
+
 def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
     """Warn of public modules that are missing on the API pages."""
     if PAGE in env.found_docs and (missing := set(modules()) - set(env.domains["py"].modules)):
@@ -185,5 +192,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", list_properties, priority=300)
     app.connect("autodoc-process-docstring", link_equations, priority=400)
     app.connect("missing-reference", link_name)
+    app.connect("html-page-context", drop_links_back)
     app.connect("env-check-consistency", check_complete)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -144,7 +144,8 @@ def test_every_public_function_and_class_is_on_the_pages_once(api_pages):
     assert {f"zwfs.{name}" for name in zwfs.__all__ if callable(getattr(zwfs, name))} <= set(listed)
     for module in public_modules():
         for name, thing in vars(module).items():
-            if not (inspect.isclass(thing) or inspect.isfunction(thing)) or name.startswith("_"):
+            hidden = not hasattr(module, "__path__") and name not in getattr(module, "__all__", vars(module))
+            if not (inspect.isclass(thing) or inspect.isfunction(thing)) or name.startswith("_") or hidden:
                 continue
             if thing.__module__ == module.__name__:
                 package = module.__name__.split(".")[:-1]

@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs.pupil import Pupil
 
+__all__ = ["dynamic_range", "reconstruction_error", "strehl", "wrapped_residual"]
+
 
 def wrapped_residual(pupil: Pupil, estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.floating]:
     """Difference of two phases, on the circle and without piston.

@@ -4,9 +4,9 @@ import importlib
 import inspect
 import pkgutil
 import re
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
 from docutils import nodes
@@ -25,6 +25,7 @@ KINDS = ("class", "data", "exception", "function")
 # The pages with the equations of the paper, in its order.
 PAPER = ("sensor.md", "phase_shifted.md", "methods.md")
 
+BACK = re.compile(r'<a class="viewcode-back".*?</a>')
 NUMBERED = re.compile(r"(?<=Chambouleyron)[^;]*?equations?\s[^;.\n]*")
 
 logger = logging.getLogger(__name__)
@@ -53,7 +54,10 @@ def section(name: str) -> list[str]:
     module = importlib.import_module(name)
     directives = []
     for own in own_names(module):
-        kind, *options = ("class", "   :members:") if inspect.isclass(vars(module)[own]) else ("function",)
+        thing = vars(module)[own]
+        kind = "class" if inspect.isclass(thing) else "function"
+        listed = methods(thing) if inspect.isclass(thing) else []
+        options = [f"   :members: {', '.join(listed)}"] if listed else []
         directives += [f".. auto{kind}:: {path(module, own)}", *options, ""]
     for own, text in constants(module).items():
         directives += [f".. py:data:: {own}", f"   :module: {name}", "", f"   {text}", ""]
@@ -65,18 +69,48 @@ def modules() -> list[str]:
     """Return the names of the public modules of the package, in order."""
     package = importlib.import_module(PACKAGE)
     found = (module.name for module in pkgutil.walk_packages(package.__path__, f"{PACKAGE}."))
-    return sorted(name for name in found if not any(part.startswith("_") for part in name.split(".")))
+    named = (name for name in found if not any(part.startswith("_") for part in name.split(".")))
+    # A module with an empty list of public names is a part of the package.
+    return sorted(name for name in named if getattr(importlib.import_module(name), "__all__", True))
 
 
 def own_names(module: ModuleType) -> list[str]:
-    """Return the public functions and classes that a module defines, in the order of its source."""
+    """Return the public functions and classes that a module defines: those of ``__all__``, if it has one."""
+    package = hasattr(module, "__path__")
+    public = vars(module) if package else getattr(module, "__all__", vars(module))
     return [
         name
         for name, thing in vars(module).items()
         if (inspect.isclass(thing) or inspect.isfunction(thing))
         and thing.__module__ == module.__name__
+        and name in public
         and not name.startswith("_")
     ]
+
+
+def methods(thing: type) -> list[str]:
+    """Return the methods that have entries of their own: public ones that repeat no method of a class above."""
+    return [
+        name
+        for name, value in vars(thing).items()
+        if isinstance(value, FunctionType | classmethod | staticmethod)
+        and not (name.startswith("_") or any(hasattr(base, name) for base in thing.__bases__))
+    ]
+
+
+def list_properties(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Append the properties of a class and their summaries to its docstring."""
+    found = {key: value for key, value in vars(thing).items() if is_property(value)} if what == "class" else {}
+    if found := {key: value for key, value in found.items() if not key.startswith("_")}:
+        lines += ["", "Properties", "----------"]
+        for key, value in found.items():
+            summary = (inspect.getdoc(value) or "").partition("\n\n")[0]
+            lines += [key, f"    {' '.join(summary.split())}"]
+
+
+def is_property(value: Any) -> bool:
+    """Return whether a member of a class is computed when it is read."""
+    return isinstance(value, property | cached_property)
 
 
 def constants(module: ModuleType) -> dict[str, str]:
@@ -140,6 +174,12 @@ def link_name(
     return None if target.startswith(f"{PACKAGE}.") else contnode
 
 
+def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, Any], document: Any) -> None:
+    """Drop the links of sources to entries: they name the module of a definition, entries a shorter path."""
+    if page.startswith("_modules/"):
+        context["body"] = BACK.sub("", context["body"])
+
+
 def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
     """Warn of public modules that are missing on the API pages."""
     if PAGE in env.found_docs and (missing := set(modules()) - set(env.domains["py"].modules)):
@@ -149,7 +189,9 @@ def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
 def setup(app: Sphinx) -> dict[str, bool]:
     """Add the directive and the links."""
     app.add_directive("modules", Modules)
+    app.connect("autodoc-process-docstring", list_properties, priority=300)
     app.connect("autodoc-process-docstring", link_equations, priority=400)
     app.connect("missing-reference", link_name)
+    app.connect("html-page-context", drop_links_back)
     app.connect("env-check-consistency", check_complete)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

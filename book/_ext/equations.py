@@ -28,10 +28,10 @@ class LinkCode(SphinxTransform):
         root = Path(self.app.srcdir)
         for equation in list(self.document.findall(nodes.math_block)):
             if paths := implementations(root).get(equation.get("label", "")):
-                line = nodes.paragraph("", "In code: ", classes=["equation-code"])
+                line = nodes.paragraph("", "Code: ", classes=["equation-code"])
                 line += joined([self.link(path) for path in paths])
                 files = dict.fromkeys(file for path in paths for file in tests(root, path))
-                line += nodes.Text(". Tests: " if files else "")
+                line += nodes.Text(" · " if files else "")
                 line += joined([self.test(file) for file in files])
                 equation.parent.insert(equation.parent.index(equation) + 1, line)
 
@@ -39,9 +39,9 @@ class LinkCode(SphinxTransform):
         """Return the name of a file of tests, with a link if the repository has an address."""
         options = self.config.html_theme_options
         if not options["repository_url"]:
-            return nodes.Text(file)
+            return nodes.literal("", file)
         source = f"{options['repository_url']}/blob/{options['repository_branch']}/tests"
-        return nodes.reference("", file, refuri=f"{source}/{file}")
+        return nodes.reference("", "", nodes.literal("", file), refuri=f"{source}/{file}")
 
     def link(self, path: str) -> nodes.Node:
         """Return a link to a name on the API page."""
@@ -76,10 +76,11 @@ def docstrings() -> Iterator[tuple[str, str]]:
         for own in api.own_names(module):
             thing, path = vars(module)[own], api.path(module, own)
             yield path, inspect.getdoc(thing) or ""
+            listed = api.methods(thing) if inspect.isclass(thing) else []
             for member in vars(thing) if inspect.isclass(thing) else ():
                 value = getattr(thing, member)
                 if not (member.startswith("_") or inspect.isclass(value)):
-                    yield f"{path}.{member}", inspect.getdoc(value) or ""
+                    yield f"{path}.{member}" if member in listed else path, inspect.getdoc(value) or ""
 
 
 @cache

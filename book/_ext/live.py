@@ -3,6 +3,8 @@
 import base64
 import csv
 import json
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,11 @@ from matplotlib.colors import LogNorm, to_hex
 from matplotlib.figure import Figure
 from matplotlib.pyplot import get_cmap
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 from sphinx.application import Sphinx
 
 import zwfs
-from studies.design import COST_LINES, PUBLISHED, label_places
+from studies.design import PUBLISHED
 from studies.kit.style import DARK_PHASE_MAP, INTENSITY_MAP, PHASE_MAP
 
 DATA = "_static/live-data.js"
@@ -30,6 +33,9 @@ TOLERANCE = 1e-7  # of the reference waves, which are stored in single precision
 COST_MAP = "cividis_r"
 MOST = 10  # photon cost at the end of its scale
 MAP_SIZE = 2.9, 2.4  # of the map of designs on a phone, inch
+NEAREST = 0.11  # of a label of a contour to anything else, inch
+COST_LINES = dict.fromkeys((1.25, 1.5, 2), "#222222") | dict.fromkeys((3, 5, 10), "#ffffff")
+"""Photon costs at which a line is drawn, and its colour, which differs from that of the map."""
 
 
 def script() -> str:
@@ -128,6 +134,30 @@ def contours(diameters: NDArray, shifts: NDArray, costs: NDArray) -> dict[str, A
         for level, place in places.items()
     ]
     return {"paths": paths, "labels": labels}
+
+
+def label_places(
+    paths: Mapping[float, Sequence[NDArray]], marks: NDArray, extent: Sequence[float], size: Sequence[float]
+) -> dict[float, NDArray]:
+    """Choose a place for the label of each contour: far from other contours, marks, labels and the frame."""
+    left, right, low, high = extent
+    scale = np.divide(size, (right - left, high - low))
+    frame = _dense(np.array([(left, low), (right, low), (right, high), (left, high), (left, low)]))
+    points = {level: np.concatenate([np.empty((0, 2)), *parts]) for level, parts in paths.items()}
+    places: dict[float, NDArray] = {}
+    for level, own in points.items():
+        others = [other for key, other in points.items() if key != level]
+        taken = np.concatenate([frame, marks, *others, *(place[np.newaxis] for place in places.values())])
+        distances = cdist(own * scale, taken * scale).min(axis=1)
+        if distances.size and distances.max() > NEAREST:
+            places[level] = own[distances.argmax()]
+    return places
+
+
+def _dense(corners: NDArray) -> NDArray:
+    """Points on a line with these corners."""
+    steps = np.linspace(0, 1, 25)[:, np.newaxis]
+    return np.concatenate([corners[:1], *(a + steps * (b - a) for a, b in pairwise(corners))])
 
 
 def _ground(cost: float) -> str:

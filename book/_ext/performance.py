@@ -103,7 +103,6 @@ def tables(speed: dict[str, Any]) -> dict[str, str]:
         ),
         "loop": table(["reconstructor", "time of a step (ms)"], loop),
         "limit": table(["part", "time (μs)", "share"], limit),
-        "growth": growth(speed),
         "telemetry": telemetry(speed["telemetry"]),
         **latency(speed["latency"]),
     }
@@ -172,19 +171,6 @@ def telemetry(measured: dict[str, Any]) -> str:
         f"{one['residual']:.2f} ms for the residual. The memory grew by {measured['memory'] / 1e6:.0f} MB. "
         f"Standard errors of all points take {sigma:.0f} times as long as the phase, those of 50 modes "
         f"{of_modes:.0f} times.\n"
-    )
-
-
-def growth(speed: dict[str, Any]) -> str:
-    """Return sentences on the set-up and on the growth of time with the number of pixels."""
-    made, slope = speed["set-up"], speed["slope"]
-    complete = made["1000 pixels, pupil and reconstructor included"]
-    return (
-        f"From 128 pixels across, the time grows with the number of pixels with an exponent of "
-        f"{slope['slope from 128 on']:.2f}. Over all sizes the exponent is {slope['slope']:.2f}: the fixed cost "
-        f"of a call dominates for small pupils. The set-up of a sensor takes {1e3 * made['100 pixels']:.0f} ms at "
-        f"100 pixels across and {made['1000 pixels']:.2f} s at 1000. With its pupil and a reconstructor, the "
-        f"set-up at 1000 pixels takes {complete:.1f} s and {made['peak memory'] / 1e6:.0f} MB of memory.\n"
     )
 
 

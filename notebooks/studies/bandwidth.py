@@ -178,15 +178,12 @@ def costs_table(curves: CaseCurves) -> Table:
 
 def numbers(curves: CaseCurves) -> dict[str, float | str]:
     """Return errors over the bound, errors without noise over the input, and photons at which both are equal."""
-    short = {SHIFTED: "shifted", IGNORED: "ignored", KNOWN: "known"}
     inputs = sorted({rms for rms, _ in curves})
     found: dict[str, float] = {}
     for (rms, chromatic), one in curves.items():
         for width in TABLED:
             place, case = one.at(width), f"{inputs.index(rms)}_{_kind(chromatic)}_{100 * width:.0f}"
-            found |= {f"{short[way]}_{case}": one.error[way][place] / one.bound[place] for way in WAYS}
-            found |= {f"share_{short[way]}_{case}": one.bias[way][place] / rms for way in IGNORANT}
-            found |= {f"photons_{short[way]}_{case}": one.equal_photons(way)[place] for way in IGNORANT}
+            found[f"photons_shifted_{case}"] = one.equal_photons(SHIFTED)[place]
     for width in TABLED:
         shares = [one.bias[SHIFTED][one.at(width)] / rms for (rms, _), one in curves.items()]
         found |= {f"least_{100 * width:.0f}": min(shares), f"most_{100 * width:.0f}": max(shares)}

@@ -301,15 +301,10 @@ def numbers(
         np.concatenate([curve.recovered(name, threshold) for curve in masks.values()]) for name in (PLAIN, LIKELY)
     )
     found = dict(settings) | {
-        "n_screens": first.errors[LIKELY].shape[1],
         "first_input": first.rms[0],
         "last_input": list(curves)[-1],
         "largest": first.diameters[-1],
         "smallest": first.diameters[0],
-        "plain_fails": fails[PLAIN].value,
-        "plain_fails_error": fails[PLAIN].error,
-        "accelerated_fails": fails[ACCELERATED].value,
-        "accelerated_fails_error": fails[ACCELERATED].error,
         "likely_share": min(curve.recovered(LIKELY, threshold).min() for curve in curves.values()),
         "factor_flat": flat,
         "factor_screens_least": min(aberrated),
@@ -317,7 +312,6 @@ def numbers(
         "tilt_flat_ring": limits.tilt[ring, 0],
         "others_flat_ring": limits.others[ring, 0],
         "tilt_screens_most": tilt.max(),
-        "tilt_usual": tilt[usual],
         "others_usual": others[usual],
         "others_large": others[large],
         "total_usual": total[usual],
@@ -326,7 +320,6 @@ def numbers(
         "masks_plain_least": plain.min(),
         "masks_plain_most": plain.max(),
         "masks_likely_least": likely.min(),
-        "masks_likely_most": likely.max(),
     }
     allowed, words = threshold * first.rms[0], f"{percent(threshold)} of the input"
     for name, short in ((PLAIN, "plain"), (ACCELERATED, "accelerated")):

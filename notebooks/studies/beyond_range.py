@@ -599,7 +599,5 @@ def numbers(
         result[f"shown_likely_{rms}"] = chosen.median(LIKELY)[place]
     short = "amplitude", "offset", "diameter", "shift", "area"
     for name, curve in zip(short, model.values(), strict=True):
-        for value in (0.5, 1.0):
-            place = int(np.argmin(np.abs(curve.rms - value)))
-            result[f"{name}_{value:g}".replace(".", "")] = np.median(curve.errors[LIKELY][place])
+        result[f"{name}_1"] = np.median(curve.errors[LIKELY][np.argmin(np.abs(curve.rms - 1.0))])
     return rounded(result, ".3g")

@@ -322,8 +322,8 @@ def numbers(
         "largest_deviation": max(abs(one.deviation) for one in parameters),
     }
     for name in WAYS:
-        short, mean = "less_flat" if name == "design, less flat" else name, curves.mean(name)
-        found |= {f"{short}_error": mean[place], f"{short}_largest": mean.max()}
+        short = "less_flat" if name == "design, less flat" else name
+        found[f"{short}_error"] = curves.mean(name)[place]
     found["improvement"] = found["less_flat_error"] / found["calibrated_error"]
     counts, sigma = example.measured
     lit = np.pad(bench.segments > 0, (counts.shape[-1] - bench.n_pixels) // 2)

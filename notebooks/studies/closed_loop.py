@@ -419,7 +419,6 @@ def numbers(
     closed, run = {key: found.runs[name].closed() for key, name in names.items()}, found.runs["the sensor"]
     residual = [{name: typical(one) for name, one in row.loops.settled.items()} for row in rows]
     lost, starts = ~closed["sensor"], {row.loops.start for row in rows}
-    turning = run.residual[lost].argmin(axis=1)  # step at which a loop that diverges begins to grow
     unequal = [row.loops.start for row in rows if row.best is not None]
     others = [row.loops.start for row in rows if row.best != row.two]
     return rounded(
@@ -431,8 +430,6 @@ def numbers(
             "rank_wave": found.ranking(-found.wave),
             "reversed_closed": found.reversed[~lost, 0].mean() if not lost.all() else np.nan,
             "reversed_lost": found.reversed[lost, 0].mean() if lost.any() else np.nan,
-            "reversed_later": found.reversed[lost, turning].mean() if lost.any() else np.nan,
-            "lowest_lost": np.median(run.residual[lost, turning]) if lost.any() else np.nan,
             "equal_to": max((start for start in starts if start < min(unequal, default=np.inf)), default=np.nan),
             "two_from": min((start for start in starts if start > max(others, default=0)), default=np.nan),
             "linear_two_excess": max(one["LinearTwo"] / min(one.values()) for one in residual) - 1,

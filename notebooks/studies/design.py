@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
+from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
+from matplotlib.ticker import FormatStrFormatter
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.distance import cdist
 
 from studies.kit import sweeps
 from studies.kit.methods import MASKS
@@ -129,93 +124,43 @@ def _costs(pupil: Pupil, design: Design, screens: Mapping[str, NDArray]) -> dict
     return {name: 4 * float(np.mean(part**2)) for name, part in zip(screens, np.split(bounds, ends), strict=True)}
 
 
-COST_LINES = dict.fromkeys((1.25, 1.5, 2), "#222222") | dict.fromkeys((3, 5, 10), "#ffffff")
-"""Photon costs at which a line is drawn, and its colour, which differs from that of the map."""
-_NEAREST = 0.11  # of a label to anything else, inch
-_OUTLINE = withStroke(linewidth=3, foreground="#ffffff")  # of the marks, on dark colours of the map
-_MARKS = ("o", "s", "D", "*", "P", "X")
+LEVELS = [1, 1.25, 1.5, 2, 3, 5, 10]
+"""Photon costs at which the colour of a map changes."""
 
 
 def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[str, NDArray]) -> Figure:
-    """Photon cost against diameter and phase shift, one panel for each kind of wavefront."""
-    figure, panels = plt.subplots(1, len(maps.costs), figsize=(7, 4.4), sharey=True, squeeze=False)
+    """Photon cost against diameter and phase shift, one panel for each kind of wavefront.
+
+    Designs whose phase shifts are of equal size are marked with their cost.
+    """
+    figure, panels = plt.subplots(1, len(maps.costs), figsize=(7, 3.8), sharey=True, squeeze=False)
     x, y = maps.diameters, maps.angles / np.pi
     half = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
     extent = x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1]
-    contours: list[dict[float, list[NDArray]]] = []
+    colors = {"cmap": "cividis_r", "norm": BoundaryNorm(LEVELS, 256, extend="max")}
     for axes, (name, grid) in zip(panels[0], maps.costs.items(), strict=True):
         axes.grid(False)
-        shown = axes.imshow(
-            grid.T, cmap="cividis_r", norm=LogNorm(1, 10), extent=extent, aspect="auto", interpolation="bilinear"
-        )
-        lines = axes.contour(x, y, grid.T, list(COST_LINES), colors=list(COST_LINES.values()), linewidths=0.8)
-        contours.append(dict(zip(COST_LINES, lines.allsegs, strict=True)))
-        marked = zip((*designs, maps.best(name)), (*costs[name], grid.min()), _MARKS, strict=False)
-        for design, cost, mark in marked:
-            low, high = sorted(abs(theta) / np.pi for theta in design[2:])
-            if high > low + 1e-9:
-                axes.plot([design.diameter] * 2, [low, high], color="#ffffff", lw=4)
-                axes.plot([design.diameter] * 2, [low, high], color="#000000", lw=1.5)
-            label = "best of each map" if design.name.startswith("best") else design.name
-            size = {"*": 15}.get(mark, 8)
-            axes.plot(
-                design.diameter, (low + high) / 2, mark, mfc=shown.to_rgba(cost), mec="#000000", mew=1.2, ms=size,
-                label=label, ls="none", clip_on=False, zorder=5, path_effects=[_OUTLINE],
-            )  # fmt: skip
+        shown = axes.imshow(grid.T, extent=extent, aspect="auto", interpolation="bilinear", **colors)
+        for design, cost in zip(designs, costs[name], strict=True):
+            if np.isclose(design.theta_a, -design.theta_b):
+                place = design.diameter, design.theta_a / np.pi
+                axes.plot(*place, "o", mfc="#ffffff", mec="#000000", ms=8)
+                axes.annotate(f"{design.name}: {cost:.1f}", place, (8, 0), textcoords="offset points", **_LABEL)
         axes.set(xlim=extent[:2], ylim=extent[2:], xlabel="diameter (λ/D)")
         axes.set_title(name, fontsize=10)
         axes.yaxis.set_major_formatter(FormatStrFormatter("±%gπ"))
     panels[0, 0].set_ylabel("phase shifts (rad)")
-    bar = figure.colorbar(
-        shown, ax=list(panels[0]), label="photons / photons of an ideal sensor", extend="max", aspect=25
-    )
-    bar.ax.yaxis.set_major_locator(FixedLocator([1, 2, 3, 5, 10]))
-    bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-    bar.ax.yaxis.set_minor_formatter(NullFormatter())
-    marks, labels = panels[0, 0].get_legend_handles_labels()
-    handles: list[Any] = [copy(mark) for mark in marks]
-    for handle in handles:  # a mark has another colour in each panel
-        handle.set_markerfacecolor("#ffffff")
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, handletextpad=0.2, columnspacing=1)
-    figure.draw_without_rendering()  # which decides the size of the panels
-    for axes, paths in zip(panels[0], contours, strict=True):
-        _label_contours(axes, paths, extent)
+    label = "photons / photons of an ideal sensor"
+    figure.colorbar(shown, ax=list(panels[0]), label=label, format="%g", aspect=25)
     return figure
 
 
-def _label_contours(axes: Axes, paths: Mapping[float, Sequence[NDArray]], extent: Sequence[float]) -> None:
-    """Write the cost of each contour on it, on the colour that the map has there."""
-    marks = np.concatenate([_dense(np.asarray(line.get_xydata())) for line in axes.lines])
-    shown: Any = axes.images[0]
-    size = axes.get_window_extent().size / shown.figure.dpi
-    for cost, (across, up) in label_places(paths, marks, extent, size).items():
-        patch = {"facecolor": shown.to_rgba(cost), "edgecolor": "none", "boxstyle": "square,pad=0.1"}
-        style: dict[str, Any] = {"color": COST_LINES[cost], "fontsize": 9, "bbox": patch}
-        axes.text(across, up, f"{cost:g}", ha="center", va="center", **style)
-
-
-def label_places(
-    paths: Mapping[float, Sequence[NDArray]], marks: NDArray, extent: Sequence[float], size: Sequence[float]
-) -> dict[float, NDArray]:
-    """Choose a place for the label of each contour: far from other contours, marks, labels and the frame."""
-    left, right, low, high = extent
-    scale = np.divide(size, (right - left, high - low))
-    frame = _dense(np.array([(left, low), (right, low), (right, high), (left, high), (left, low)]))
-    points = {level: np.concatenate([np.empty((0, 2)), *parts]) for level, parts in paths.items()}
-    places: dict[float, NDArray] = {}
-    for level, own in points.items():
-        others = [other for key, other in points.items() if key != level]
-        taken = np.concatenate([frame, marks, *others, *(place[np.newaxis] for place in places.values())])
-        distances = cdist(own * scale, taken * scale).min(axis=1)
-        if distances.size and distances.max() > _NEAREST:
-            places[level] = own[distances.argmax()]
-    return places
-
-
-def _dense(corners: NDArray) -> NDArray:
-    """Points on a line with these corners."""
-    steps = np.linspace(0, 1, 25)[:, np.newaxis]
-    return np.concatenate([corners[:1], *(a + steps * (b - a) for a, b in pairwise(corners))])
+_LABEL: dict[str, Any] = {
+    "va": "center",
+    "fontsize": 9,
+    "bbox": {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0.15"},
+}
+"""Style of the labels of designs."""
 
 
 def design_maps_columns(maps: DesignMap) -> dict[str, NDArray]:

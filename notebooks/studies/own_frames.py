@@ -314,8 +314,6 @@ def numbers(
         {
             "score": verdict.score.min(),
             "control": verdict.control.max(),
-            "inner": verdict.inner,
-            "edge": verdict.edge,
             "misfit": chosen.misfit,
             "misfit_last": work[-1].result.misfit,
             "sigma": np.nan if verdict.sigma is None else np.nanmedian(verdict.sigma),

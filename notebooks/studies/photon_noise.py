@@ -61,7 +61,7 @@ class PhotonCurves:
 
     def screens(self) -> dict[str, NDArray]:
         """Input, photons and errors of every single screen, as columns for `publish`."""
-        axes = {"input (rad rms)": self.rms, "photons per point": self.photons}
+        axes = {"input (rad rms)": self.rms, "photons per point and image": self.photons}
         return screen_columns(axes, {f"{name}: error (rad rms)": errors for name, errors in self.errors.items()})
 
 
@@ -168,23 +168,17 @@ def _in_sigmas(
 
 
 def draw_photon_noise(curves: PhotonCurves) -> Figure:
-    """Error of each method and the bound against the number of photons, and their ratio; one column per input."""
+    """Error of each method over the bound, against the number of photons; one panel for each input."""
     size = curves.rms.size
-    figure, panels = plt.subplots(2, size, figsize=(7, 6.4), sharex=True, sharey="row", squeeze=False)
-    for column, (errors, ratios) in enumerate(panels.T):
-        bound = curves.bound[column]
-        errors.loglog(
-            curves.photons, bound, color="#999999", lw=5, solid_capstyle="round", label="bound", zorder=0
-        )
-        ratios.axhline(1, color="#999999", lw=5, zorder=0)
+    figure, panels = plt.subplots(1, size, figsize=(7, 3.6), sharex=True, sharey=True, squeeze=False)
+    for place, axes in enumerate(panels[0]):
+        axes.axhline(1, color="#999999", lw=5, label="bound", zorder=0)
         for name in sorted(curves.errors, key=list(LOOKS).index):
             look = LOOKS[name]
-            errors.plot(curves.photons, curves.error(name)[column], ms=5, label=look.label, **look.style)
-            ratios.plot(curves.photons, curves.ratio(name)[column], ms=5, **look.style)
-        errors.set_title(f"input {curves.rms[column]:g} rad rms", fontsize=10)
-        ratios.set(xlabel="photons per point and image", xscale="log", ylim=(0.9, 1.6))
-    panels[0, 0].set_ylabel("error (rad rms)")
-    panels[1, 0].set_ylabel("error / bound")
+            axes.loglog(curves.photons, curves.ratio(name)[place], ms=5, label=look.label, **look.style)
+        axes.set_title(f"input {curves.rms[place]:g} rad rms", fontsize=10)
+        axes.set_xlabel("photons per point\nand image")
+    panels[0, 0].set_ylabel("error / bound")
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
     return figure
@@ -262,7 +256,6 @@ def numbers(curves: PhotonCurves, rows: Sequence[ErrorBars]) -> dict[str, float 
             "shifted_photons": np.mean(shifted[half] ** 2) - 1,
             "arcsine_floor": curves.error("Arcsine")[half, -1],
             "saxton_floor": curves.error("GerchbergSaxton")[half, -1],
-            "saxton_model_floor": curves.error("GerchbergSaxtonModel")[half, -1],
             "bound_at_100": curves.bound[half, int(np.argmin(np.abs(curves.photons - 100)))],
             "bound_growth": (curves.bound[one] / curves.bound[0]).mean(),
             "within_low": curves.within[:, bright].min(),

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from zwfs._arrays import read_only
 from zwfs._lowrank import _bandwidth, gauss_legendre
 
+__all__: list[str] = []  # a part of the package, not for its users
+
 _ROUNDING = 1e-13
 
 

@@ -21,6 +21,8 @@ from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
+__all__ = ["FittedSensor", "fit_bench"]
+
 _RELAY = "focus", "astigmatism", "astigmatism_45"
 _FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
 _ROUNDS = 4  # of a fit for small changes of the phase, which must not change the amplitude

@@ -31,6 +31,8 @@ from zwfs.frames.optics_model import (
 )
 from zwfs.frames.registration import correlations
 
+__all__ = ["JointFit", "fit_jointly"]
+
 _FLAT: Any = None
 _BINS = 24  # of spatial frequency, for the preconditioner
 _ROUGHLY, _WELL = 0.1, 0.03  # relative errors of a step, and of the solutions that make the covariance

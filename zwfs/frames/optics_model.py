@@ -26,6 +26,8 @@ from zwfs import _check
 from zwfs._lowrank import _axis_functions, _quadrature, _spectra
 from zwfs.masks import Dimple
 
+__all__: list[str] = []  # a part of the package, not for its users
+
 _ALL: Any = None
 _TOLERANCE = 1e-6  # of the reference wave
 

@@ -18,6 +18,8 @@ from scipy import ndimage, optimize
 
 from zwfs import _check
 
+__all__ = ["Placement", "RegisteredFrames", "register_frames"]
+
 _Item = TypeVar("_Item")
 
 _REACH = 6  # pixels by which an image may be off its neighbour before sub-pixel registration

@@ -25,6 +25,8 @@ from zwfs.frames.pipeline import (
 )
 from zwfs.frames.registration import Placement, RegisteredFrames, nearest_good
 
+__all__ = ["CameraNoise", "ImageOrder", "Verdict", "judge", "order_of_images"]
+
 _NEAR = 2  # pixels from a gap, vane or edge that count as near it
 _LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
 _EXPLAINED = 1.25  # misfit over the noise up to which noise explains the frames

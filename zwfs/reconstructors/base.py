@@ -30,6 +30,8 @@ from zwfs._propagator import Propagator, amplitude_map, angle, propagator, pupil
 from zwfs.polychromatic import PolychromaticSensor
 from zwfs.sensor import Sensor, ZernikeSensor
 
+__all__ = ["ClosedForm", "Estimate", "FixedPoint", "Reconstruction", "Reconstructor", "State", "load"]
+
 # Detector pixels handled together: on the processor few enough for its fast memory, enough to vectorise.
 _CHUNK, _CHUNK_ELSEWHERE = 80_000, 40_000_000
 _BRIGHT = 10.0  # mean of a frame inside the pupil, relative to no mask: masks never exceed 1, raw counts soon do

@@ -22,7 +22,7 @@ from studies.kit.tables import Table
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 SMALL = {"n_pixels": 24, "n_screens": 1, "n_modes": 15, "n_iterations": 3}
-# A number that is no number, or a limit of zero: all that a reader must never see.
+# NaN, infinity or a limit of zero: no page may show them.
 NONSENSE = re.compile(r"(?<![\w.])-?(inf|nan)(?!\w)|\b(inf|nan) ?%|\b0\.0+ ?(±|rad\b|λ)", re.IGNORECASE)
 
 

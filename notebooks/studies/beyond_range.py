@@ -376,7 +376,7 @@ def _input_axes(axes: Axes, threshold: float, bottom: float, *, named: bool = Tr
     axes.plot(ends, threshold * ends, color=_INK, lw=1, ls=":", zorder=0.5)
     if named:
         axes.annotate(
-            f"{100 * threshold:g}%", (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points",
+            percent(threshold), (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points",
             color=_INK, fontsize=9, va="center",
         )  # fmt: skip
     axes.set_xlim(*ends)

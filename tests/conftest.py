@@ -38,7 +38,7 @@ def needs_modes(method):
 
 # On a busy machine examples are slow; this is not a failure.
 BUSY = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
-settings.register_profile("zwfs", derandomize=True, max_examples=25, **BUSY)
+settings.register_profile("zwfs", derandomize=True, max_examples=15, **BUSY)
 settings.register_profile("fuzz", max_examples=1000, print_blob=True, **BUSY)
 settings.load_profile("zwfs")
 

@@ -45,7 +45,7 @@ def dense_bound(sensor, phase, photons, read_noise=0.0, modes=None, amplitude=No
 
 
 @given(sensors(), seeds, st.floats(0, 1.5), st.floats(1, 1e5), st.sampled_from([0.0, 0.5, 20.0]))
-@settings(max_examples=10)  # a dense matrix takes long
+@settings(max_examples=6)  # a dense matrix takes long
 def test_bound_is_that_of_a_dense_matrix(sensor, seed, rms, photons, read_noise):
     phase = rms * np.random.default_rng(seed).normal(size=sensor.pupil.shape)
     expected, condition = dense_bound(sensor, phase, photons, read_noise)

@@ -13,7 +13,6 @@ from .conftest import needs_modes
 
 PAIR = Dimple(1.06, np.pi / 2), Dimple(1.5, -np.pi / 2)
 SENSORS = {
-    "two masks": lambda pupil: ZernikeSensor(pupil, *PAIR),
     "wide detector": lambda pupil: ZernikeSensor(pupil, *PAIR, extent=1.3),
     "three wavelengths": lambda pupil: PolychromaticSensor(ZernikeSensor(pupil, *PAIR), [600.0, 650.0, 720.0]),
 }

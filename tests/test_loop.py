@@ -157,7 +157,7 @@ def test_the_mirror_keeps_its_figure_where_one_of_two_frames_is_dark(mirror, mod
 def test_read_noise_does_not_lower_the_gain_of_the_loop(mirror, modes, sensor):
     camera = Detector(sensor.pupil, 20 * sensor.pupil.n_points, read_noise=10.0)
     likely = MaximumLikelihood(sensor, modes, photons=20, read_noise=10.0, n_starts=1)
-    still = np.broadcast_to(0.2 * modes[4], (2, 200, *sensor.pupil.shape))
+    still = np.broadcast_to(0.2 * modes[4], (2, 80, *sensor.pupil.shape))
     record = close_loop(sensor, mirror, likely, still, gain=0.5, camera=camera, seed=1)
     assert record.commands[:, 1, 4].mean() == pytest.approx(0.1, rel=0.03)
 

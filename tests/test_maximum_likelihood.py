@@ -86,11 +86,11 @@ def test_read_noise_is_weighed(pupil, screens):
     assert error == pytest.approx(np.sqrt(np.nanmean(bound**2)), rel=0.05)
 
 
-@pytest.mark.parametrize(("photons", "read_noise"), [(20, 10.0), (5, 1.0)])
-def test_negative_pixels_bias_nothing(pupil, modes, photons, read_noise):
-    """Electrons plus variance of the read noise are negative in 3 % of the pixels at 5 photons, in few at 20."""
+def test_negative_pixels_bias_nothing(pupil, modes):
+    """Electrons plus the variance of the read noise are negative in 3 % of the pixels."""
+    photons, read_noise = 5, 1.0
     sensor, basis = pair(pupil, 1.06, 0.5, -0.5), modes[:20]
-    true = np.random.default_rng(3).normal(0, 0.05, (100, 20))
+    true = np.random.default_rng(3).normal(0, 0.05, (50, 20))
     camera = Detector(pupil, photons * pupil.n_points, read_noise=read_noise)
     frames = sensor.measure(np.tensordot(true, np.where(pupil.inside, basis, 0), 1))
     frames = camera.normalise(camera.expose(frames, 1))
@@ -142,7 +142,7 @@ def test_a_misfit_of_more_than_5_standard_deviations_is_not_consistent(pupil, mo
 def test_faint_photon_noise_is_consistent(pupil, modes):
     """Squares of Poisson numbers spread more than those of a Gaussian: at 0.1 photons by a factor of 2.4."""
     sensor = pair(pupil, 1.06, 0.5, -0.5)
-    frames = exposed(pupil, sensor.measure(np.zeros(pupil.shape)), 0.1, 300)
+    frames = exposed(pupil, sensor.measure(np.zeros(pupil.shape)), 0.1, 100)
     result = MaximumLikelihood(sensor, modes[:2], photons=0.1, n_starts=1)(frames)
     assert result.consistent.all()
     assert np.mean(result.chi2) == pytest.approx(1, abs=0.03)

@@ -339,7 +339,7 @@ def test_modelled_field_is_kept_beyond_the_detector_and_in_the_mask(pupil, scree
     """Compare with a detector that catches all light, and a second one behind the light that a mask absorbs."""
     truth, guess = screens(0.8, 2)
     wide, absorbing = (
-        ZernikeSensor(pupil, *masks, extent=6, tolerance=1e-8) for masks in ((SMOOTH, DARK), (ABSORBED,))
+        ZernikeSensor(pupil, *masks, extent=4, tolerance=1e-8) for masks in ((SMOOTH, DARK), (ABSORBED,))
     )
     near = ZernikeSensor(pupil, SMOOTH, DARK, extent=1.5)
     frames, field = near.measure(truth), pupil.field(guess)
@@ -350,10 +350,10 @@ def test_modelled_field_is_kept_beyond_the_detector_and_in_the_mask(pupil, scree
     waves[..., middle, middle] = np.sqrt(frames) * some / np.abs(some)
     expected = np.angle(wide.adjoint(waves) + absorbing.adjoint(absorbed) - absorbed[0][absorbing.window])
     once = GerchbergSaxton(near, n_iterations=1, tolerance=0, unmeasured="model")
-    for dtype, accuracy in ((np.float64, 1e-6), (np.float32, 1e-5)):
+    for dtype in (np.float64, np.float32):
         found = once(frames.astype(dtype), start=guess).phase
         assert found.dtype == dtype
-        np.testing.assert_allclose(pupil.gather(found), pupil.gather(expected), atol=accuracy)
+        np.testing.assert_allclose(pupil.gather(found), pupil.gather(expected), atol=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -547,7 +547,7 @@ def test_start_is_where_it_starts(make, method, screens, pupil):
 def test_a_camera_whose_dark_is_subtracted_is_accepted(make, method, screens, modes, pupil):
     reconstruct, sensor = make(method)
     camera = zwfs.Detector(pupil, 100 * pupil.n_points, read_noise=60.0, background=30.0)
-    truth = screens(0.2, 20)
+    truth = screens(0.2, 8)
     frames = camera.normalise(camera.expose(sensor.measure(truth), 1))
     assert np.mean(frames < 0) > 0.1
     assert np.mean(frames[..., pupil.inside] < 0) > 0.01
@@ -697,13 +697,12 @@ def test_raw_counts_are_warned_of(make, method, screens):
 
 
 @every
-@pytest.mark.parametrize("extent", [1.0, 2.0])
-@pytest.mark.parametrize("dimple", [Dimple(1.06, np.pi / 2), Dimple(1.06, np.pi), Dimple(2.5, 1.0, 0.3)])
+@pytest.mark.parametrize(("dimple", "extent"), [(Dimple(1.06, np.pi), 1.0), (Dimple(2.5, 1.0, 0.3), 1.6)])
 def test_no_frame_of_a_mask_is_taken_for_raw_counts(pupil, modes, screens, method, extent, dimple):
     sensor = ZernikeSensor(pupil, dimple, *[Dimple(1.06, -2.0)] * (method.n_masks[1] > 1), extent=extent)
     once = {"n_starts": 1} if takes(method, "n_starts") else {}
     reconstruct = build(method, sensor, modes, **steps(method, n_iterations=1), **once)
-    phase = np.concatenate([screens(0.0, 1), screens(0.5), screens(3.0)])
+    phase = np.concatenate([screens(0.0, 1), screens(0.5, 1), screens(3.0)])
     rng = np.random.default_rng(0)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="frames: ")  # a method may warn of other things

@@ -16,6 +16,14 @@ matplotlib.use("agg")
 
 
 @pytest.fixture
+def plain():
+    """A figure that takes little time to draw."""
+    figure = plt.figure(figsize=(1, 1))
+    yield figure
+    plt.close(figure)
+
+
+@pytest.fixture
 def figure():
     """Two panels with a colour bar: their constrained layout changes each time it is computed."""
     figure, axes = plt.subplots(2, 2, layout="constrained", figsize=(4, 3))
@@ -59,22 +67,22 @@ def test_files_are_the_same_from_run_to_run(figure, tmp_path, monkeypatch):
     assert plt.imread(tmp_path / "first" / "plot.png").shape[:2] == (600, 800)  # 200 dots per inch
 
 
-def test_letters_of_a_pdf_are_truetype_as_journals_ask(figure, tmp_path, monkeypatch):
-    figure.axes[0].set_title(r"$\lambda/D$ and words")
-    published(tmp_path / "files", monkeypatch, figure)
+def test_letters_of_a_pdf_are_truetype_as_journals_ask(plain, tmp_path, monkeypatch):
+    plain.text(0, 0, r"$\lambda/D$ and words")
+    published(tmp_path / "files", monkeypatch, plain)
     resources = PdfReader(tmp_path / "files" / "plot.pdf").pages[0]["/Resources"]
     kinds = {kind.get_object()["/Subtype"] for kind in resources["/Font"].values()}
     assert kinds
     assert "/Type3" not in kinds
 
 
-def test_single_screens_are_written_with_a_row_each(figure, tmp_path, monkeypatch):
+def test_single_screens_are_written_with_a_row_each(plain, tmp_path, monkeypatch):
     errors = np.arange(12.0).reshape(2, 2, 3)
     tables = {
         n: screen_columns({"input": [0.1, 0.2], "photons": [1, 10]}, {"error": factor * errors})
         for n, factor in (("a", 1), ("b", 2))
     }
-    made = published(tmp_path / "files", monkeypatch, figure, screens=stacked("case", tables))
+    made = published(tmp_path / "files", monkeypatch, plain, screens=stacked("case", tables))
     header, *rows = csv.reader(made["plot_screens.csv"].decode().splitlines())
     assert header == ["case", "input", "photons", "screen", "error"]
     assert len(rows) == 24
@@ -83,15 +91,15 @@ def test_single_screens_are_written_with_a_row_each(figure, tmp_path, monkeypatc
         assert float(error) == {"a": 1, "b": 2}[case] * errors[place]
 
 
-def test_a_file_is_replaced_and_not_written_through_a_link(figure, tmp_path, monkeypatch):
+def test_a_file_is_replaced_and_not_written_through_a_link(plain, tmp_path, monkeypatch):
     folder = tmp_path / "new" / "folder"
     monkeypatch.setenv(FOLDER, str(folder))
-    publish(figure, "plot", {"x (D)": [1.0]})
+    publish(plain, "plot", {"x (D)": [1.0]})
     (tmp_path / "raw").write_bytes(b"raw")
     (folder / "plot.csv").unlink()
     (folder / "plot.csv").symlink_to(tmp_path / "raw")
     names = sorted(file.name for file in folder.iterdir())
-    publish(figure, "plot", {"x (D)": [2.0]})
+    publish(plain, "plot", {"x (D)": [2.0]})
     assert (tmp_path / "raw").read_bytes() == b"raw"
     assert (folder / "plot.csv").read_text() == "x (D)\n2\n"
     assert sorted(file.name for file in folder.iterdir()) == names
@@ -106,10 +114,10 @@ def test_figure_without_layout_keeps_its_place(tmp_path, monkeypatch, recwarn):
     assert not recwarn.list
 
 
-def test_columns_are_written_in_order_with_nine_digits(figure, tmp_path, monkeypatch):
+def test_columns_are_written_in_order_with_nine_digits(plain, tmp_path, monkeypatch):
     columns = {"x, y (rad)": np.array([np.pi, np.nan]), "n": np.array([1, 2]), "d (lambda/D)": 1.06}
     columns |= {"method": "linear", "single": np.float32([0.5, 1e-30])}
-    published(tmp_path / "files", monkeypatch, figure, columns=columns)
+    published(tmp_path / "files", monkeypatch, plain, columns=columns)
     rows = list(csv.reader((tmp_path / "files" / "plot.csv").read_text().splitlines()))
     assert rows == [
         list(columns),
@@ -126,10 +134,10 @@ def test_columns_are_written_in_order_with_nine_digits(figure, tmp_path, monkeyp
         ("plot", {"x": [1, 2], "y": [1]}, "differ in length: 'x': 2, 'y': 1"),
     ],
 )
-def test_bad_arguments_are_refused(figure, monkeypatch, name, columns, message):
+def test_bad_arguments_are_refused(plain, monkeypatch, name, columns, message):
     monkeypatch.delenv(FOLDER, raising=False)
     with pytest.raises(ValueError, match=message):
-        publish(figure, name, columns)
+        publish(plain, name, columns)
 
 
 def test_rounded_numbers_are_glued_as_they_are_and_strings_stay(monkeypatch):

@@ -307,15 +307,14 @@ def test_diameter_derivative_is_an_integral_around_the_rim(pupil, screens, diame
     np.testing.assert_allclose(sensor.diameter_derivative(phase)[0], expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("chromatic", [None, False, True])
+@pytest.mark.parametrize("chromatic", [False, True])
 def test_diameter_derivative_agrees_with_differences(rough_pupil, chromatic):
     phase = np.random.default_rng(4).normal(size=(2, *rough_pupil.shape))
 
     def wider(by):
         masks = Dimple(1.06 + by, np.pi / 2), Dimple(2 + by, -1.0, 0.7)
         sensor = ZernikeSensor(rough_pupil, *masks, extent=1.2, tolerance=1e-14)
-        band = zwfs.PolychromaticSensor(sensor, [600, 650, 720], [1, 2, 1], chromatic=bool(chromatic))
-        return sensor if chromatic is None else band
+        return zwfs.PolychromaticSensor(sensor, [600, 720], [1, 2], chromatic=chromatic)
 
     def difference(step):
         return (wider(step).measure(phase) - wider(-step).measure(phase)) / (2 * step)

@@ -16,13 +16,13 @@ from joblib import parallel_config
 from book._tools.declared import accept, accept_together, parameters
 from book._tools.notebook import without_gaps
 from book._tools.page import leave_out
+from studies.kit import results
 from studies.kit.curves import Limit, reach_text
-from studies.kit.results import FOLDER
 from studies.kit.tables import Table
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 SMALL = {"n_pixels": 24, "n_screens": 1, "n_modes": 15, "n_iterations": 3}
-# A number that is no number, or a limit of zero: all that a reader must never see.
+# NaN, infinity or a limit of zero: no page may show them.
 NONSENSE = re.compile(r"(?<![\w.])-?(inf|nan)(?!\w)|\b(inf|nan) ?%|\b0\.0+ ?(±|rad\b|λ)", re.IGNORECASE)
 
 
@@ -37,7 +37,8 @@ def run(name, given, monkeypatch):
     stub = ModuleType("myst_nb")
     stub.glue = lambda name, value, display: glued.update({name: value})
     monkeypatch.setitem(sys.modules, "myst_nb", stub)
-    monkeypatch.delenv(FOLDER, raising=False)
+    monkeypatch.delenv(results.FOLDER, raising=False)
+    monkeypatch.setattr(results, "picture_bytes", lambda figure, kind: b"")  # drawing takes half of the time
     shown, space = [], {"__name__": "notebook"}
     with parallel_config(backend="sequential"), plt.rc_context():
         for cell in notebook.cells:
@@ -218,13 +219,9 @@ CASES = {
         {"n_pixels": 16, "n_modes": 3, "n_screens": 1, "n_angles": 2, "step": 0.5},
         {"inputs": [4.0]},
         {"inputs": [0.001]},
-        {"inputs": [0.1, 0.2, 0.3]},
         {"diameter_max": 2.0, "step": 1.0},
         {"diameter_max": 8.0},
         {"added": 1.0},
-        {"added": -1.0},
-        {"added": 0.0},
-        {"exponent": 0.0},
         {"n_angles": 3, "inputs": [1.0, 1.0]},
     ),
     "phase_shift_pairs": (
@@ -294,14 +291,10 @@ CASES = {
     ),
     "identities": (
         {"n_pixels": 24, "n_modes": 15, "n_screens": 1, "n_shifts": 4, "inputs": [0.1]},
-        {"inputs": [4.0]},
         {"inputs": [0.001]},
         {"rms": 0.0},
-        {"rms": 4.0},
         {"diameter": 0.1},
         {"diameter": 8.0},
-        {"patch_diameter": 0.1},
-        {"n_shifts": 5},
         {"largest_phase": 0.1},
         {"resolution": 0.001},
     ),
@@ -313,23 +306,16 @@ CASES = {
         {"diameter": 8.0},
         {"phase_shift": 0.01},
         {"phase_shift": 3.13},
-        {"n_pixels": 16},
-        {"height": 3.0, "diameter": 4.0},
-        {"height": 2.0, "phase_shift": 3.0},
-        {"n_pixels": 17},
     ),
     "at_a_glance": (
         {"n_pixels": 24, "n_modes": 15},
         {"rms": 4.0},
         {"rms": 0.0},
-        {"rms": 0.01},
         {"diameter": 0.1},
         {"diameter": 8.0},
         {"phase_shift": 0.01},
         {"phase_shift": 3.13},
         {"n_iterations": 1},
-        {"n_modes": 1},
-        {"exponent": 0.0},
     ),
     "reconstructors": (
         SMALL | {"inputs": [0.5]},

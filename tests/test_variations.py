@@ -214,7 +214,7 @@ def test_contraction_is_that_of_the_spectrum_and_the_iteration(small):
     assert reasons.sensitivity["tilt"][2] < 0.1 * reasons.sensitivity["tilt"][0]
 
 
-@pytest.mark.parametrize("end", [1.0, 1.7, 2.3, 4.0, 8.0])
+@pytest.mark.parametrize("end", [1.0, 2.3, 8.0])
 def test_all_diameters_of_figure_4_end_at_the_largest(small, end):
     modes = zwfs.zernike_basis(small, 149)
     screens = zwfs.power_law_screens(modes[:20], 0.4, 1, seed=1)

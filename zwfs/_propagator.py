@@ -215,7 +215,8 @@ def split(phase: NDArray, amplitude: NDArray) -> NDArray:
 
 def square(waves: NDArray) -> NDArray:
     """Squared modulus, summed over the wavelengths: (..., 2 n_wavelengths, ny, nx) to (..., ny, nx)."""
-    return parts_sum(waves * waves)
+    parts = (waves[..., part, :, :] for part in range(waves.shape[-3]))
+    return reduce(add, (part * part for part in parts))
 
 
 def parts_sum(products: NDArray) -> NDArray:

@@ -29,7 +29,7 @@ def prepare(tell: Callable[[str, int, int], None]) -> None:
     if not find_spec("IPython"):
         _provide("IPython", get_ipython=lambda: None)
         _provide("IPython.display", HTML=lambda text: SimpleNamespace(_repr_html_=lambda: text))
-    vars(import_module("studies.kit.sweeps"))["_report_progress"] = tell
+    vars(import_module("studies.kit.sweeps"))["report_progress"] = tell
     vars(import_module("studies.kit.results"))["publish"] = _keep
     _repair_svd()
 
@@ -152,7 +152,7 @@ def kinds(name: str) -> list[str]:
     figure, _, screens = figures[name]
     narrow = ["narrow.png", "narrow-dark.png"] if any(axes.get_subplotspec() for axes in figure.axes) else []
     tables = ["csv"] if screens is None else ["csv", "screens.csv"]
-    return [*tables, *import_module("studies.kit.results")._METADATA, "dark.png", *narrow]
+    return [*tables, *import_module("studies.kit.results").METADATA, "dark.png", *narrow]
 
 
 def draw(name: str, kind: str) -> bytes:
@@ -160,9 +160,9 @@ def draw(name: str, kind: str) -> bytes:
     results = import_module("studies.kit.results")
     figure, columns, screens = figures[name]
     if kind in ("csv", "screens.csv"):
-        return results._csv(columns if kind == "csv" else screens)
+        return results.csv_bytes(columns if kind == "csv" else screens)
     if "." not in kind:
-        return results._picture(figure, kind)
+        return results.picture_bytes(figure, kind)
     if name not in variants:
         variants[name] = import_module("studies.kit.variants").variants(figure)
-    return results._picture(variants[name][kind.removesuffix(".png")], "png")
+    return results.picture_bytes(variants[name][kind.removesuffix(".png")], "png")

@@ -107,9 +107,8 @@ def _digest(project: Project, printed: bool) -> str:
         executed = project.executed / notebook.name
         files += [executed, executed.with_suffix(".json"), *project.published(notebook.stem)]
     named = {file.relative_to(root).as_posix(): file for file in files if file.is_file()}
-    about = json.dumps(
-        [sys.version_info[:2], printed, os.environ.get(PYODIDE), commit(root)]
-    )  # the pages name the commit
+    # The pages name the commit.
+    about = json.dumps([sys.version_info[:2], printed, os.environ.get(PYODIDE), commit(root)])
     return digest([digest_files(named).encode(), about.encode()])
 
 

@@ -154,7 +154,7 @@ def draw_dimple_recovery(curves: Mapping[float, DiameterCurves], threshold: floa
             error.semilogy(curve.diameters, np.maximum(curve.mean(name), _FLOOR), **line)
         limit = threshold * rms
         error.axhline(limit, color=_INK, lw=1)
-        error.text(0.52, limit * 1.3, f"{100 * threshold:g}% of the input", color=_INK, fontsize=9)
+        error.text(0.52, limit * 1.3, f"{percent(threshold)} of the input", color=_INK, fontsize=9)
         share.set_title(f"input {rms:g} rad rms\n", fontsize=10)
         error.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=curve.diameters[[0, -1]], ylim=(_FLOOR / 2, 4))
         for axes in (share, error):
@@ -240,7 +240,7 @@ def limits_columns(limits: DimpleLimits) -> dict[str, NDArray]:
 
 def failing_table(curves: Mapping[float, DiameterCurves], threshold: float) -> Table:
     """Failing point of each method, for each input."""
-    exceeded = f"mean error exceeds {100 * threshold:g} % from about (λ/D)"
+    exceeded = f"mean error exceeds {percent(threshold)} from about (λ/D)"
     return Table(
         ["input (rad rms)", "method", "recovers every screen up to (λ/D)", exceeded],
         [

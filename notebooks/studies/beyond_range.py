@@ -131,7 +131,8 @@ def noise_curves(
     # The largest inputs take longest: they begin first, so that all cores end at about the same time.
     points = [(level, task) for level in levels for task in reversed(range(len(rms[level])))]
     tasks = [(level, task, rms[level][task]) for level, task in points]
-    found = sweeps.run(_noise_point, tasks, sensor, modes, n_screens, trials, name="noise_curves")
+    methods = {level: all_methods(sensor, modes, trials.n_iterations, level) for level in levels}
+    found = sweeps.run(_noise_point, tasks, methods, modes, n_screens, trials, name="noise_curves")
     by_point = dict(zip(points, found, strict=True))
     curves = []
     for level in levels:
@@ -149,14 +150,19 @@ def noise_curves(
 
 
 def _noise_point(
-    point: tuple[float, int, float], sensor: ZernikeSensor, modes: NDArray, n_screens: int, trials: Trials
+    point: tuple[float, int, float],
+    methods: Mapping[float, Mapping[str, Any]],
+    modes: NDArray,
+    n_screens: int,
+    trials: Trials,
 ) -> tuple[dict[str, NDArray], dict[str, float], NDArray]:
     """One number of photons and input: errors, (n_screens,), bounds, and consistent, (n_screens,)."""
     photons, task, rms = point
+    sensor = methods[photons][LIKELY].sensor
     screens = trials.screens(sensor.pupil, modes, rms, n_screens, task)
     noise = Noise(photons)
     errors, consistent = {}, np.zeros(n_screens, bool)
-    for name, method in all_methods(sensor, modes, trials.n_iterations, photons).items():
+    for name, method in methods[photons].items():
         result = method(noise(method.sensor, screens, np.random.SeedSequence(trials.seed, spawn_key=(task, 0))))
         errors[name] = reconstruction_error(sensor.pupil, result.phase, screens)
         consistent = result.consistent if name == LIKELY else consistent
@@ -376,7 +382,7 @@ def _input_axes(axes: Axes, threshold: float, bottom: float, *, named: bool = Tr
     axes.plot(ends, threshold * ends, color=_INK, lw=1, ls=":", zorder=0.5)
     if named:
         axes.annotate(
-            f"{100 * threshold:g}%", (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points",
+            percent(threshold), (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points",
             color=_INK, fontsize=9, va="center",
         )  # fmt: skip
     axes.set_xlim(*ends)

@@ -238,7 +238,7 @@ def draw_linearity(
             ratio.plot(limits[name].value, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
     plain.plot(rms, threshold * rms, color="#555555", lw=1)
     plain.annotate(
-        f"{100 * threshold:g}%", (rms[-1], threshold * rms[-1]), (4, 0), textcoords="offset points",
+        percent(threshold), (rms[-1], threshold * rms[-1]), (4, 0), textcoords="offset points",
         color="#555555", fontsize=9, va="center",
     )  # fmt: skip
     ratio.axhline(threshold, color="#555555", lw=1)
@@ -246,7 +246,7 @@ def draw_linearity(
     ratio.text(
         1.02,
         threshold,
-        f"{100 * threshold:g}%\nof the\ninput",
+        f"{percent(threshold)}\nof the\ninput",
         transform=end,
         color="#555555",
         fontsize=9,
@@ -278,7 +278,7 @@ def draw_saxton_widths(
     zero, model = panels
     zero.set(ylabel="error / input", ylim=(threshold / 2, None))
     style: dict[str, Any] = {"color": "#555555", "fontsize": 9, "ha": "right", "va": "top"}
-    line = f"{100 * threshold:g}% of the input"
+    line = f"{percent(threshold)} of the input"
     zero.text(0.99, 0.9 * threshold, line, transform=zero.get_yaxis_transform(), **style)
     model.set_ylim(bottom=model.get_ylim()[0] / 4)  # room for the labels
     figure.legend([linear], ["linear"], loc="outside lower center", fontsize=9)
@@ -338,7 +338,7 @@ def ranges_table(curves: LinearityCurves, limits: Mapping[str, Limit], threshold
     return Table(
         [
             "reconstructor",
-            f"exceeds {100 * threshold:g}% above (rad rms)",
+            f"exceeds {percent(threshold)} above (rad rms)",
             *(f"error at {value:g}" for value in at),
         ],
         [

@@ -342,7 +342,7 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
     log.axhline(limit, color="#555555", lw=1)
     end = min(1.4 * claimed, curve.diameters[-1])
     start = min(0.64 * claimed, end / 2)
-    log.text(1.01 * start, limit * 1.3, f"{100 * threshold:g}% of the input", color="#555555", fontsize=9)
+    log.text(1.01 * start, limit * 1.3, f"{percent(threshold)} of the input", color="#555555", fontsize=9)
     plain.set_ylim(0, None)
     log.set(yscale="log", xlim=(start, end), ylim=(floor, 60))  # room for the legend
     log.legend(loc="upper left", fontsize=9, handlelength=1.6)
@@ -359,7 +359,7 @@ def draw_diameter_methods(curves: Mapping[str, DiameterCurves], threshold: float
         axes.semilogy(curve.diameters, mean, markersize=4.5, label=look.label, **look.style)
     limit = threshold * curve.rms[0]
     axes.axhline(limit, color="#555555", lw=1)
-    axes.text(0.05, limit * 1.2, f"{100 * threshold:g}% of the input", color="#555555", fontsize=9)
+    axes.text(0.05, limit * 1.2, f"{percent(threshold)} of the input", color="#555555", fontsize=9)
     _diameters(axes, max(curve.diameters[-1] for curve in curves.values()), claimed)
     axes.set(ylabel="mean error (rad rms)", ylim=(floor / 2, 4))
     figure.legend(loc="outside lower center", ncols=2)
@@ -441,7 +441,7 @@ def method_columns(curves: Mapping[str, DiameterCurves]) -> dict[str, ArrayLike]
 def limits_table(curves: Mapping[int, DiameterCurves], threshold: float) -> Table:
     """Diameters at which the error exceeds 1e-3 rad and the threshold, by the number of iterations."""
     return Table(
-        ["iterations", "passes 10⁻³ rad at about (λ/D)", f"passes {100 * threshold:g} % at about (λ/D)"],
+        ["iterations", "passes 10⁻³ rad at about (λ/D)", f"passes {percent(threshold)} at about (λ/D)"],
         [
             [n, *(_place(curve, ITERATION, limit) for limit in (1e-3, threshold * curve.rms[0]))]
             for n, curve in curves.items()
@@ -515,7 +515,7 @@ def methods_table(curves: Mapping[str, DiameterCurves], threshold: float) -> Tab
             "at 2",
             "at 2.6",
             "at 3.5 (λ/D)",
-            f"passes {100 * threshold:g} % at about (λ/D)",
+            f"passes {percent(threshold)} at about (λ/D)",
             "twice that at 1.06 from about (λ/D)",
         ],
         [

@@ -158,9 +158,7 @@ class PairMaps:
 
     angles: NDArray[np.float64]  # (n,), radian
     error: NDArray[np.float64]  # (n, n), without noise, radian rms
-    flat: NDArray[
-        np.float64
-    ]  # (n, n), photon noise of a flat wavefront, radian for one photon per point and image
+    flat: NDArray[np.float64]  # (n, n), noise of a flat wavefront, radian for one photon per point and image
     aberrated: NDArray[np.float64]  # (n, n), photon noise of the screens
     bound: NDArray[np.float64]  # (n, n), bound of the photon noise of the screens
     read: NDArray[np.float64]  # (n, n), read noise of a flat wavefront

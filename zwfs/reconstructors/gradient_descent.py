@@ -113,9 +113,13 @@ class GradientDescent(Reconstructor):
         config = self.settings
         n_points = config.sensor.pupil.n_points
         path = [start]
+        latest = np.array(np.nan), start  # the steps follow the last phase of which the cost was computed
 
         def phase(x: NDArray) -> NDArray:
-            return start + (x if self.modes is None else x @ self.modes)
+            nonlocal latest
+            if not np.array_equal(x, latest[0]):
+                latest = x.copy(), start + (x if self.modes is None else x @ self.modes)
+            return latest[1]
 
         def value(x: NDArray) -> tuple[float, NDArray]:
             cost, gradient = self._cost(phase(x), frames)

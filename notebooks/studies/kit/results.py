@@ -22,7 +22,7 @@ FOLDER = "ZWFS_RESULTS"  # environment variable that names the folder
 SCREENS = "_screens"  # after the name of a figure: the file with a row for each screen
 _DPI = 200
 # Without dates and versions the same figure is the same file.
-_METADATA: dict[str, dict[str, None]] = {
+METADATA: dict[str, dict[str, None]] = {
     "png": {"Software": None},
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
     "svg": {"Creator": None, "Date": None},
@@ -42,12 +42,12 @@ def publish(
     """Write a figure and its numbers, also of single screens, to the folder that ZWFS_RESULTS names."""
     if not re.fullmatch(r"[a-z0-9][a-z0-9_-]*", name):
         raise ValueError(f"name = {name!r}: expected lower-case letters, digits, - and _")
-    contents = {".csv": _csv(columns)} | ({} if screens is None else {f"{SCREENS}.csv": _csv(screens)})
+    contents = {".csv": csv_bytes(columns)} | ({} if screens is None else {f"{SCREENS}.csv": csv_bytes(screens)})
     folder = os.environ.get(FOLDER)
     if folder:
-        contents |= {f".{kind}.png": _picture(one, "png") for kind, one in variants(figure).items()}
-    for kind in _METADATA if folder else ("png",):  # the first one fixes the layout
-        contents[f".{kind}"] = _picture(figure, kind)
+        contents |= {f".{kind}.png": picture_bytes(one, "png") for kind, one in variants(figure).items()}
+    for kind in METADATA if folder else ("png",):  # the first one fixes the layout
+        contents[f".{kind}"] = picture_bytes(figure, kind)
     if folder:
         for end, content in contents.items():
             _write(Path(folder) / f"{name}{end}", content)
@@ -95,18 +95,18 @@ def published(source: str) -> list[str]:
     return [ast.literal_eval(call.args[1]) for call in named]
 
 
-def _picture(figure: Figure, kind: str) -> bytes:
+def picture_bytes(figure: Figure, kind: str) -> bytes:
     """Draw a figure in a format, with the layout of the first one."""
     stream = io.BytesIO()
     with rc_context(_RC):
-        figure.savefig(stream, format=kind, dpi=_DPI, metadata=_METADATA[kind])
+        figure.savefig(stream, format=kind, dpi=_DPI, metadata=METADATA[kind])
         if figure.get_layout_engine() is not None:
             # Constrained layout goes on moving the axes each time it runs.
             figure.set_layout_engine("none")
     return stream.getvalue()
 
 
-def _csv(columns: Mapping[str, ArrayLike]) -> bytes:
+def csv_bytes(columns: Mapping[str, ArrayLike]) -> bytes:
     """Columns as the bytes of a CSV file; a scalar stands in every row."""
     arrays = {header: np.asarray(column) for header, column in columns.items()}
     if len({array.shape for array in arrays.values()} - {()}) > 1:

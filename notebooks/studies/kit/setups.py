@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import fftconvolve
 
 from studies.kit.parameters import within
 from zwfs.detector import Detector
-from zwfs.frames.files import read
 from zwfs.modes import fourier_basis, mode_frequencies, noll_to_nm, power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
@@ -87,6 +85,8 @@ def make_pupil(n_pixels: int, kind: str = "circular", **changes: Any) -> Pupil:
 
 
 def _pupil_of_file(n_pixels: int, file: str = "") -> Pupil:
+    from zwfs.frames.files import read  # late: few notebooks need it, and it imports all of zwfs.frames
+
     found = read(file, max_images=1)
     (image,) = found.images
     if max(image.shape) != n_pixels:
@@ -176,9 +176,9 @@ def turbulent_rms(pupil: Pupil, outer_scale: float = inf) -> float:
 
     The mean is over all pairs of points, whose distances the autocorrelation of the pupil counts.
     """
-    inside = pupil.inside.astype(float)
-    pairs = fftconvolve(inside, inside[::-1, ::-1])
-    rows, columns = (np.arange(1 - n, n) / pupil.n_pixels for n in pupil.shape)
+    shape = [2 * n - 1 for n in pupil.shape]
+    pairs = np.fft.irfft2(np.abs(np.fft.rfft2(pupil.inside, shape)) ** 2, shape)
+    rows, columns = (np.fft.fftfreq(n, 1 / n) / pupil.n_pixels for n in shape)
     differences = structure_function(np.hypot(rows[:, np.newaxis], columns), 1.0, outer_scale)
     return float(np.sqrt(np.sum(pairs * differences) / (2 * pupil.n_points**2)))
 
@@ -289,6 +289,8 @@ def _modes(pupil: Pupil, n_modes: int, basis: str, outer_scale: float) -> tuple[
 
 def _screens_of_file(pupil: Pupil, file: str) -> NDArray:
     """Return the screens of a file, each of which can be scaled to an rms."""
+    from zwfs.frames.files import read
+
     found = read(file, max_bytes=_MAX_BYTES, max_images=_MAX_BYTES)
     if found.images.shape[1:] != pupil.shape:
         raise ValueError(

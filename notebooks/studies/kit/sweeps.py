@@ -65,12 +65,12 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
     store = _Store(name, (task, *shared))
     finished = {index: kept for index, value in enumerate(inputs) if (kept := store.load(value)) is not None}
     if finished:
-        _report_progress(name, len(finished), len(inputs))
+        report_progress(name, len(finished), len(inputs))
     waiting = [(index, value) for index, value in enumerate(inputs) if index not in finished]
     for index, *result in _results(waiting, (task, *shared), name):
         store.save(inputs[index], result)
         finished[index] = result
-        _report_progress(name, len(finished), len(inputs))
+        report_progress(name, len(finished), len(inputs))
     return [finished[index][0] for index in range(len(inputs))]
 
 
@@ -212,7 +212,7 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _report_progress(name: str, done: int, total: int) -> None:
+def report_progress(name: str, done: int, total: int) -> None:
     """Append a line to the progress file, if the environment names one."""
     if path := os.environ.get(PROGRESS):
         with open(path, "a") as file:

@@ -88,7 +88,7 @@ class Camera:
         oversampling: int,
         largest: float,
     ) -> None:
-        self.n, self.shape, self.n_pixels, self.f = n, shape, n_pixels, oversampling
+        self.n, self.shape, self.n_pixels, self.f, self.largest = n, shape, n_pixels, oversampling, largest
         self.exposures = tuple(exposures)
         self.n_arms = 1 + max(one.arm for one in exposures)
         f, inner = oversampling, n * oversampling

@@ -1,515 +1,200 @@
 """Model of a bench: optics from frames of a mirror in known states, and phases of other frames with them.
 
-`fit_bench` finds all unknowns of the model of `zwfs.frames.camera` at once. `FittedSensor` keeps what was fitted, and
-seeks only the phase of a pair of frames.
+`fit_bench` sets up the joint fit of `zwfs.frames.joint` for a camera behind two masks. `FittedSensor` keeps all
+that was fitted, and seeks only the phase of a pair of frames.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, NamedTuple
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
-from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft, ndimage, sparse
-from scipy.sparse.linalg import splu
 
 from zwfs import _check
-from zwfs.frames.camera import ARM, Camera, Exposure, names_of
-from zwfs.frames.camera_fit import Free, Light, LightMap, Minimum, PhaseMap, Point, Problem, covariance, fine_phase, minimise
-from zwfs.frames.joint import MapPrior
+from zwfs.frames.joint import JointFit, JointProblem, MapPrior, fit_jointly
+from zwfs.frames.optics_model import Arm, MaskPair, Parameter, Picture
 from zwfs.frames.registration import radius
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
-_PAD = 2  # pixels of the maps around the grid of the known phases
-_REACH = 3  # pixels over which a known phase is continued
+_RELAY = "focus", "astigmatism", "astigmatism_45"
 _FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
-_EXPLAINED = 1.2  # mean square of the residuals over the noise up to which a model explains the frames
-_PASSES = 3  # of the fit: each divides the light again, and weighs by the images of the one before
-_DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
-_EXPONENTS = (2.0, 3.0, 4.0, 5.0, 6.0)  # of the spectrum of a phase; held-out pixels choose
-_HELD_OUT = 0.06  # of the pixels
-_DRAWS = 12  # for the error bars of a phase
-
-
-class Estimate(NamedTuple):
-    """Value of a number of the bench.
-
-    Attributes
-    ----------
-    name : str
-    value : float
-    sigma : float
-        One standard deviation, with the maps and all other numbers free. It grows with the root of the misfit.
-    at_limit : bool
-        Whether the value is one of its limits, so that the error bar does not hold.
-    """
-
-    name: str
-    value: float
-    sigma: float
-    at_limit: bool
-
-
-@dataclass(frozen=True, eq=False)
-class BenchFit:
-    """Result of `fit_bench`.
-
-    Attributes
-    ----------
-    estimates : tuple of Estimate
-        Diameter (lambda/D), phase shifts (radian), leakage, blur (pixels rms), and for each arm focus (D^2 / lambda),
-        row and column (pixels), rotation (radian, from x to y), magnification, flux and background (counts). The
-        arms 0 and 1 are the frames behind the masks, 2 and 3 the clear frames, which share focus, rotation and
-        magnification with them.
-    covariance : ndarray, shape (n_estimates, n_estimates)
-    flat : ndarray, shape (n, n), radian
-        Phase of the optics without a command, mean over each pixel.
-    light : ndarray, shape (n, n)
-        Light of each pixel of the pupil, 1 = mean of the first clear frame.
-    misfit : ndarray, shape (2 + 2 n_states,)
-        Mean square of the residuals over the noise: of the clear frames, then of each pair.
-    noise : float, counts rms
-        Noise of a pixel without light, as given or as estimated.
-    converged : bool
-        Whether the next step promises to lower half the sum of squares by less than a part of 1.
-    remarks : tuple of str
-        What does not fit together, in words.
-    """
-
-    estimates: tuple[Estimate, ...]
-    covariance: NDArray[np.float64]
-    flat: NDArray[np.float64]
-    light: NDArray[np.float64]
-    misfit: NDArray[np.float64]
-    noise: float
-    converged: bool
-    remarks: tuple[str, ...]
-    _point: Point
-
-    @property
-    def consistent(self) -> bool:
-        """Whether the model explains all images within their noise."""
-        return bool(np.mean(self.misfit) < _EXPLAINED and not self.remarks)
-
-    @property
-    def sigma(self) -> NDArray[np.float64]:
-        """Error bars of the estimates, (n_estimates,)."""
-        return np.sqrt(np.diagonal(self.covariance))
-
-    def __getitem__(self, name: str) -> Estimate:
-        """Estimate of a name."""
-        for one in self.estimates:
-            if one.name == name:
-                return one
-        raise KeyError(f"{name!r}: expected one of {[one.name for one in self.estimates]}")
+_ROUNDS = 4  # of a fit for small changes of the phase, which must not change the amplitude
+_FEW = 3  # states in the first steps of a fit
+_WIDE = MapPrior(0.5, 1.0)
+_DARKEST = 1e-2  # of the mean intensity: where the amplitude starts in gaps and beyond the outline
 
 
 def fit_bench(
     frames: ArrayLike,
     clear_frames: ArrayLike,
-    phases: ArrayLike,
+    known: ArrayLike,
     *,
     n_pixels: float,
-    noise: float | None = None,
+    mask: MaskPair | None = None,
+    noise: float = 0.0,
     gain: float = 1.0,
-    diameter: float = 1.06,
-    phase_shifts: tuple[float, float] = (np.pi / 2, -np.pi / 2),
-    oversampling: int = 2,
-    n_steps: int = 10,
-) -> BenchFit:
+    phase_prior: MapPrior | None = None,
+    amplitude_prior: MapPrior | None = None,
+    **settings: Any,
+) -> JointFit:
     """Fit a model of the optics to frames of a mirror in known states, and to clear frames.
 
-    Maps of phase and light and all numbers are the unknowns of one least-squares problem. The place of the maps is
-    that of the known phases. The flux of the first clear frame is fixed: it defines the map of the light.
+    Each of the four images has its own focus, astigmatism, shift, flux and background. The plane and the place of
+    the maps are those of the known phases, so they need more than one state. The flux of the first clear frame is
+    fixed: it defines an amplitude of 1.
 
     Parameters
     ----------
-    frames : array_like, shape (n_states, 2, ny, nx) or (n_states, n_frames, 2, ny, nx), counts
-        Less the dark. NaN marks bad pixels. The mean of several frames is taken.
-    clear_frames : array_like, shape (2, ny, nx) or (n_frames, 2, ny, nx), counts
+    frames : array_like, shape (n_states, 2, ny, nx), counts
+        Less the dark.
+    clear_frames : array_like, shape (2, ny', nx'), counts
         Less the dark, with the mask out.
-    phases : array_like, shape (n_states, n, n), radian
-        Phases that the commands add, mean over each pixel, on a grid whose middle is that of the frames. NaN, or 0
-        in all states, marks what is unknown around the pupil; there the phases are continued.
+    known : array_like, shape (n_states, n, n), radian
+        Phases that the commands add, on the grid of the pupil.
     n_pixels : float, pixels
         Diameter D.
-    noise : float, counts rms, optional
-        Of a pixel of one frame without light: read noise, and that of the background and the dark. By default it
-        is estimated from the darkest pixels; the result names it.
+    mask : MaskPair, optional
+        Start of the masks; by default those of the paper, with diameter, phase shifts, leakage and blur free.
+    noise : float, counts rms
+        Of a pixel without light: read noise, and that of the background and the dark.
     gain : float, electrons / count
         For the photon noise.
-    diameter : float, lambda/D
-        Of the dimple, by design. The fit starts from the best of several diameters around it.
-    phase_shifts : (float, float), radian
-        Of the two images, by design. The fit also tries the reverse order, and a remark tells if it is right.
-    oversampling : int
-        Points of the model along a pixel.
-    n_steps : int
-        Largest number of steps of each of the passes.
+    phase_prior, amplitude_prior : MapPrior, optional
+        Of the maps; wide by default.
+    **settings
+        Of `fit_jointly`.
 
     Returns
     -------
-    BenchFit
+    JointFit
 
     Raises
     ------
     ValueError
-        If the shapes do not belong together, there are fewer than two states, or a clear frame holds no light.
+        If a clear frame holds no light.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
+    >>> from zwfs.frames.bench_fit import FittedSensor, fit_bench
+    >>> from zwfs.frames.joint import MapPrior
+    >>> from zwfs.frames.optics_model import MaskPair, Parameter
+    >>> pupil = Pupil.circular(12)
+    >>> sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=1.5)
+    >>> known = 0.4 * np.stack([0 * pupil.amplitude, zernike_basis(pupil, 3)[2]])
+    >>> clear = np.stack([np.pad(pupil.amplitude**2, 3)] * 2)
+    >>> settings = {"amplitude_prior": MapPrior(0.05), "n_steps": 2, "n_inner": 10, "errors": False}
+    >>> mask = MaskPair(diameter=Parameter.fitted(1.0))
+    >>> fit = fit_bench(sensor.measure(known), clear, known, n_pixels=12, mask=mask, noise=0.02, **settings)
+    >>> round(fit.mask.diameter, 2)
+    1.06
+    >>> phase = 0.3 * zernike_basis(pupil, 5)[0]
+    >>> error = FittedSensor(fit, n_steps=1)(sensor.measure(phase), 0.02) - phase
+    >>> bool(error[pupil.inside].std() < 0.01)
+    True
     """
-    data = _Recording.of(frames, clear_frames, phases, n_pixels, noise, gain)
+    frames, clear = _check.real_map("frames", frames, 4), _check.real_map("clear_frames", clear_frames, 3)
+    known = _check.real_map("known", known, 3)
+    for name, array in (("frames", frames[0]), ("clear_frames", clear)):
+        if len(array) != 2:
+            raise ValueError(f"{name} has {len(array)} images: expected 2")
+    if len(known) != len(frames) or known.shape[1] != known.shape[2]:
+        raise ValueError(f"known has shape {known.shape}: expected ({len(frames)}, n, n), a phase for each state")
+    if len(known) < 2:
+        raise ValueError(
+            "known holds 1 state: expected two or more, which fix the place and the plane of the maps"
+        )
+    noise, gain = _check.number("noise", noise, 0), _check.number("gain", gain, 0, open_low=True)
+    n = known.shape[-1]
+    stop = radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2
+    rows, columns = ((length - n) // 2 for length in clear.shape[1:])
+    if min(rows, columns) < 0:
+        raise ValueError(f"clear_frames has shape {clear.shape}: expected at least the {n} pixels of known")
+    inner = clear[:, rows : rows + n, columns : columns + n]
+    flux = inner[:, stop].mean(axis=1)
+    if np.any(flux <= 0):
+        raise ValueError(f"clear_frames hold {flux} counts on average in the pupil: expected light")
+
+    def picture(counts: NDArray, arm: int, side: int | None, phase: NDArray | None = None) -> Picture:
+        sigma = np.sqrt(np.maximum(counts, 0) / gain + noise**2 + 1e-12 * flux[0] ** 2)
+        return Picture(counts, arm, side, sigma, known=phase)
+
+    pictures = [picture(clear[side], 2 + side, None) for side in (0, 1)]
+    for pair, phase in zip(frames, known, strict=True):
+        pictures += [picture(pair[side], side, side, phase) for side in (0, 1)]
+    arms = [free_arm(flux[0]), free_arm(flux[1]), free_arm(flux[0], fixed_flux=True), free_arm(flux[1])]
+    lit = np.maximum((inner / flux[:, None, None]).mean(axis=0), _DARKEST)
+    problem = JointProblem(
+        pictures,
+        arms,
+        free_masks() if mask is None else mask,
+        np.sqrt(lit) * stop,
+        n_pixels,
+        phase_prior or _WIDE,
+        amplitude_prior or MapPrior(0.5, 0.0),
+    )
+    # Before the maps are about right, clear frames are explained by any focus: it waits. The first states suffice.
+    still = [replace(arm, **{name: replace(getattr(arm, name), free=False) for name in _RELAY}) for arm in arms]
+    rough = replace(problem, pictures=pictures[: 2 + 2 * _FEW])
+    quick = {**settings, "errors": False}
+    fit = fit_jointly(replace(rough, arms=still), **{**quick, "n_inner": 15, "tolerance": 0.02})
+    fit = fit_jointly(rough, start=fit, **{**quick, "n_inner": 20, "tolerance": 2e-3})
+    return fit_jointly(problem, start=fit, **settings)
+
+
+def free_arm(flux: float, *, fixed_flux: bool = False) -> Arm:
+    """Arm with focus, astigmatism, shift, flux and background free, rotation and magnification fixed.
+
+    Examples
+    --------
+    >>> from zwfs.frames.bench_fit import free_arm
+    >>> arm = free_arm(2000.0)
+    >>> arm.focus.free, arm.rotation.free, arm.flux.value
+    (True, False, 2000.0)
+    """
+    flux = _check.number("flux", float(flux), 0, open_low=True)
+    focus, shift = Parameter.fitted(0.0, -_FARTHEST, _FARTHEST), Parameter.fitted(0.0, -5.0, 5.0)
+    return Arm(
+        focus=focus,
+        astigmatism=focus,
+        astigmatism_45=focus,
+        row=shift,
+        column=shift,
+        flux=Parameter(flux, not fixed_flux, low=0.0),
+        background=Parameter.fitted(0.0),
+    )
+
+
+def free_masks(diameter: float = 1.06, first: float = np.pi / 2, second: float = -np.pi / 2) -> MaskPair:
+    """Masks with diameter, phase shifts, leakage and blur free; they start at the design.
+
+    Examples
+    --------
+    >>> from zwfs.frames.bench_fit import free_masks
+    >>> mask = free_masks(diameter=1.06)
+    >>> mask.diameter.free, mask.diameter.low, mask.diameter.high
+    (True, 0.53, 1.59)
+    """
     diameter = _check.number("diameter", diameter, 0, open_low=True)
-    shifts = _check.pair("phase_shifts", phase_shifts, _check.number)
-    oversampling, n_steps = _check.integer("oversampling", oversampling, 1, 8), _check.integer("n_steps", n_steps, 1)
-    start = _coarse(data, diameter, shifts)
-    problem = _problem(data, start, oversampling)
-    best = minimise(problem, _with_flat(problem, start.flat), n_steps, 25)
-    for _ in range(_PASSES - 1):
-        problem, x = _again(data, best)
-        best = minimise(problem, x, n_steps, 35)
-    return _result(data, best, start.reversed)
 
+    def shift(name: str, value: float) -> Parameter:
+        value = _check.radian(name, value)
+        low, high = (0.05, 2 * np.pi - 0.05) if value > 0 else (0.05 - 2 * np.pi, -0.05)
+        return Parameter.fitted(value, low, high)
 
-@dataclass(frozen=True, eq=False)
-class _Recording:
-    """Checked data: means of cubes, their bad pixels, and the noise of a mean."""
-
-    counts: list[NDArray[np.float64]]  # clear frames first, then each pair
-    good: list[NDArray[np.bool_]]
-    n_frames: list[int]
-    phases: NDArray[np.float64]  # (n_states, n + 2 pad, n + 2 pad), continued
-    n_pixels: float
-    noise: float
-    gain: float
-
-    @classmethod
-    def of(
-        cls, frames: ArrayLike, clear: ArrayLike, phases: ArrayLike, n_pixels: float, noise: float | None, gain: float
-    ) -> _Recording:
-        masked, m = _mean_of("frames", frames, 4)
-        clear, k = _mean_of("clear_frames", clear, 3)
-        phases = _check.real_array("phases", phases)
-        for name, array in (("frames", masked[0]), ("clear_frames", clear)):
-            if len(array) != 2:
-                raise ValueError(f"{name} has {len(array)} images: expected 2")
-        if masked.shape[2:] != clear.shape[1:]:
-            raise ValueError(f"clear_frames has shape {clear.shape}: expected (2, {masked.shape[2]}, {masked.shape[3]})")
-        if phases.ndim != 3 or len(phases) != len(masked) or phases.shape[1] != phases.shape[2]:
-            raise ValueError(f"phases has shape {phases.shape}: expected ({len(masked)}, n, n), one for each state")
-        if len(phases) < 2:
-            raise ValueError("phases holds 1 state: expected two or more, which fix the place and the plane of the maps")
-        n_pixels = _check.number("n_pixels", n_pixels, 1)
-        if any((length - phases.shape[1]) % 2 for length in clear.shape[1:]):
-            raise ValueError(
-                f"phases has shape {phases.shape} and frames {clear.shape[1:]}: expected even differences, so that "
-                "the pixels stand at the same places"
-            )
-        gain = _check.number("gain", gain, 0, open_low=True)
-        images = [*clear, *masked.reshape(-1, *masked.shape[2:])]
-        good = [np.isfinite(one) for one in images]
-        if noise is None:
-            noise = _dark_noise(images, n_pixels) * math.sqrt(m)
-        counts = [np.where(ok, one, 0) for one, ok in zip(images, good, strict=True)]
-        noise = _check.number("noise", noise, 0, open_low=True)
-        n_frames = [k, k] + [m] * (len(images) - 2)
-        return cls(counts, good, n_frames, _continued(phases), n_pixels, noise, gain)
-
-    @cached_property
-    def light(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Light of each pixel of the maps, 1 on average where it is lit, and the counts of 1 in each clear frame."""
-        n = self.phases.shape[-1]
-        inner = np.stack([centred(one, n) for one in self.counts[:2]])
-        mean = inner.mean(axis=0)
-        lit = mean > 0.5 * np.percentile(mean, 80)
-        flux = inner[:, lit].mean(axis=1)
-        if np.any(flux <= 0) or not np.all(np.isfinite(flux)):
-            raise ValueError(f"clear_frames hold {flux} counts on average in the pupil: expected light")
-        return np.maximum((inner / flux[:, None, None]).mean(axis=0), 0), flux
-
-    def weights(self, images: list[NDArray]) -> list[NDArray[np.float64]]:
-        """One over the noise of each pixel, for the images of a model."""
-        pairs = zip(images, self.good, self.n_frames, strict=True)
-        return [ok * np.sqrt(k / (np.maximum(image, 0) / self.gain + self.noise**2)) for image, ok, k in pairs]
-
-
-def _mean_of(name: str, images: ArrayLike, n_axes: int) -> tuple[NDArray[np.float64], int]:
-    """Mean over the frames of cubes, and their number; NaN where all are bad."""
-    array = _check.real_array(name, images)
-    if array.ndim not in (n_axes, n_axes + 1) or not array.size:
-        raise ValueError(f"{name} has shape {array.shape}: expected {n_axes} axes, or {n_axes + 1} with cubes")
-    if array.ndim == n_axes:
-        return array, 1
-    axis = array.ndim - 4
-    return array.mean(axis=axis), array.shape[axis]
-
-
-def _dark_noise(images: list[NDArray], n_pixels: float) -> float:
-    """Noise of the darkest pixels of the clear frames, from differences of neighbours."""
-    found = []
-    for image in images[:2]:
-        far = radius(image.shape, tuple((n - 1) / 2 for n in image.shape)) > 0.56 * n_pixels
-        step = (np.diff(image, axis=1) / math.sqrt(2))[far[:, 1:] & far[:, :-1]]
-        step = step[np.isfinite(step)]
-        if step.size < 50:
-            raise ValueError("noise = None: expected the noise of a pixel, because the frames hold too few dark pixels")
-        found.append(1.4826 * np.median(np.abs(step - np.median(step))))
-    return float(np.mean(found))
-
-
-def centred(image: NDArray, n: int) -> NDArray:
-    """The n middle rows and columns, with zeros where there are fewer."""
-    margin = max(0, *(n - length for length in image.shape)) // 2 + 1
-    whole = np.pad(image, margin)
-    first = [(length - n) // 2 for length in whole.shape]
-    return whole[first[0] : first[0] + n, first[1] : first[1] + n]
-
-
-def _continued(phases: NDArray) -> NDArray[np.float64]:
-    """Known phases on a wider grid, smoothly continued by a few pixels beyond where they are known."""
-    bad = ~np.isfinite(phases).all(axis=0) | (phases == 0).all(axis=0)
-    wide = np.pad(np.nan_to_num(phases), ((0, 0), (_PAD, _PAD), (_PAD, _PAD)))
-    regions, _ = ndimage.label(np.pad(bad, _PAD, constant_values=True))
-    unknown = regions == regions[0, 0]
-    if np.any(bad & unknown[_PAD:-_PAD, _PAD:-_PAD]):  # a pixel of the outline mixes the phase with zeros
-        unknown = ndimage.binary_dilation(unknown)
-    if unknown.all():
-        return wide
-    n = wide.shape[-1]
-    second = sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(n - 2, n))
-    first = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(n - 1, n))
-    same = sparse.eye_array(n)
-    parts = (sparse.kron(second, same), sparse.kron(same, second), math.sqrt(2) * sparse.kron(first, first))
-    bending = sum(one.T @ one for one in parts).tocsc()
-    flat, rows = wide.reshape(len(wide), -1).copy(), unknown.ravel()
-    right = -(bending[rows][:, ~rows] @ flat[:, ~rows].T)
-    flat[:, rows] = splu(bending[rows][:, rows].tocsc()).solve(right).T
-    far = ndimage.distance_transform_edt(unknown) > _REACH
-    near = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
-    return flat.reshape(wide.shape)[(slice(None), *near)]
-
-
-class _Start(NamedTuple):
-    """Best of the coarse grid."""
-
-    diameter: float
-    shifts: tuple[float, float]
-    flat: NDArray[np.float64]
-    reversed: bool
-
-
-def _coarse(data: _Recording, diameter: float, shifts: tuple[float, float]) -> _Start:
-    """Diameter and order that explain the frames best, with one flat for all states by the phase-shifted iteration."""
-    light, flux = data.light
-    n = len(light)
-    stop = radius((n, n), ((n - 1) / 2,) * 2) <= data.n_pixels / 2 + 1
-    pupil = Pupil.from_amplitude(np.sqrt(light) * stop, data.n_pixels, threshold=0.3)
-    inside = pupil.inside
-    scale = flux * np.mean(light[inside])
-    frames = np.stack([centred(one, n) for one in data.counts[2:]]).reshape(-1, 2, n, n) / scale[:, None, None]
-    best: tuple[float, _Start] | None = None
-    for order in (False, True):
-        pair = shifts[::-1] if order else shifts
-        for factor in _DIAMETERS:
-            sensor = ZernikeSensor(pupil, *(Dimple(factor * diameter, one) for one in pair), tolerance=1e-4)
-            found = PhaseShifted(sensor, n_iterations=15)(np.maximum(frames, 0)).phase
-            waves = np.where(inside, np.exp(1j * (np.nan_to_num(found) - data.phases)), 0)
-            for _ in range(3):  # each phase has its own piston
-                mean = waves.mean(axis=0)
-                waves = waves * np.exp(-1j * np.angle(np.sum(waves * mean.conj(), axis=(1, 2))))[:, None, None]
-            flat = np.angle(ndimage.gaussian_filter(waves.mean(axis=0), 1.0))
-            misfit = float(np.mean((sensor.measure(flat + data.phases) - frames)[..., inside] ** 2))
-            if best is None or misfit < best[0]:
-                best = misfit, _Start(factor * diameter, pair, np.where(inside, flat, 0), order)
-    assert best is not None
-    return best[1]
-
-
-def _free(data: _Recording, start: _Start) -> list[Free]:
-    """Numbers that are free, and where they start."""
-    _, flux = data.light
-    free = []
-    for side in (0, 1):
-        both = (side, side + 2)
-
-        def shared(name: str, *limits: float, arms: tuple[int, int] = both) -> Free:
-            return Free(f"arm {arms[0]} {name}", tuple((arm, name) for arm in arms), *limits)
-
-        free += [shared("focus", 0.0, -_FARTHEST, _FARTHEST), shared("rotation", 0.0, -0.3, 0.3, 0.05)]
-        free += [shared("magnification", 1.0, 0.7, 1.4, 0.05)]
-        for arm in both:
-            names = {"row": (0.0, -6.0, 6.0), "column": (0.0, -6.0, 6.0), "background": (0.0,), "flux": (flux[side], 0.0)}
-            free += [
-                Free(f"arm {arm} {name}", ((arm, name),), *limits)
-                for name, limits in names.items()
-                if (arm, name) != (2, "flux")
-            ]
-    limits = {
-        "diameter": (start.diameter, 0.4 * start.diameter, 1.8 * start.diameter),
-        "first": (start.shifts[0],),
-        "second": (start.shifts[1],),
-        "leakage": (0.01, 0.0, 0.45),
-        "blur": (0.5, 0.02, 5.0),
-    }
-    return free + [Free(name, ((None, name),), *values) for name, values in limits.items()]
-
-
-def _problem(data: _Recording, start: _Start, f: int) -> Problem:
-    """The first problem of a fit."""
-    light, flux = data.light
-    n, shape = len(light), data.counts[0].shape
-    exposures = [Exposure(2, None, 0), Exposure(3, None, 0)]
-    exposures += [Exposure(side, side, state) for state in range(len(data.phases)) for side in (0, 1)]
-    camera = Camera(n, shape, data.n_pixels, exposures, fine_phase(data.phases, f), f, 1.9 * start.diameter)
-    values = np.zeros(len(names_of(4)))
-    table = values[: 4 * len(ARM)].reshape(4, -1)
-    table[:, ARM.index("magnification")], table[:, ARM.index("flux")] = 1, np.tile(flux, 2)
-    division = Light.of(np.kron(light, np.ones((f, f))), light, f)
-    smooth = [ndimage.uniform_filter(one, 3) for one in data.counts]
-    free = _free(data, start)
-    phase_map = PhaseMap(n, f, MapPrior(0.5, 3.0), data.n_pixels)
-    lights = _light_maps(division, f * data.n_pixels)
-    zero = np.zeros((n * f, n * f))
-    return Problem(camera, data.counts, data.weights(smooth), division, zero, phase_map, lights, values, free)
-
-
-def _light_maps(light: Light, n_pixels: float) -> tuple[LightMap, ...]:
-    return (LightMap(light.support, MapPrior(0.2, 3.0, outer_scale=0.1), n_pixels),)
-
-
-def _white(phase_map: PhaseMap, means: NDArray) -> NDArray[np.float64]:
-    """White numbers of a phase, mean over each pixel."""
-    size, n = phase_map.size, phase_map.n
-    wide = np.pad(means, ((0, size - n),) * 2, "linear_ramp")
-    return fft.irfft2(fft.rfft2(wide) / phase_map.colour, s=wide.shape)
-
-
-def _with_flat(problem: Problem, flat: NDArray) -> NDArray[np.float64]:
-    x = problem.start
-    x[: problem.phase_map.size**2] = _white(problem.phase_map, flat).ravel()
-    return x
-
-
-def _again(data: _Recording, best: Minimum) -> tuple[Problem, NDArray]:
-    """The problem with light divided, and pixels weighed, by what was fitted."""
-    point, before = best.point, best.point.problem
-    f, n = before.camera.f, before.phase_map.n
-    light = Light.of(point.light, point.light.reshape(n, f, n, f).mean(axis=(1, 3)), f)
-    free = [
-        one if math.isfinite(one.sigma) else one._replace(value=float(point.values[places[0]]))
-        for one, places in zip(before.free, before.places, strict=True)
-    ]
-    problem = replace(
-        before,
-        light=light,
-        weights=data.weights(point.model.images),
-        light_maps=_light_maps(light, f * data.n_pixels),
-        values=point.values,
-        free=free,
+    return MaskPair(
+        diameter=Parameter.fitted(diameter, 0.5 * diameter, 1.5 * diameter),
+        first=shift("first", first),
+        second=shift("second", second),
+        leakage=Parameter.fitted(0.01, 0.0, 0.5),
+        blur=Parameter.fitted(0.5, 0.05, 5.0),
     )
-    x, n_phase = problem.start, before.phase_map.size**2
-    x[:n_phase], x[problem.n_white :] = point.x[:n_phase], point.x[before.n_white :]
-    return problem, x
-
-
-def _result(data: _Recording, best: Minimum, is_reversed: bool) -> BenchFit:
-    point = best.point
-    scale = max(1.0, float(np.mean(point.misfit)))
-    spread = covariance(point, 10) * scale
-    values = point.x[point.problem.n_white :]
-    sigma = np.sqrt(np.diagonal(spread)).tolist()
-    estimates = tuple(
-        Estimate(one.name, value, error, not one.low < value < one.high)
-        for one, value, error in zip(point.problem.free, values.tolist(), sigma, strict=True)
-    )
-    n, f = point.problem.phase_map.n, point.problem.camera.f
-    inner = (slice(_PAD, n - _PAD),) * 2
-    return BenchFit(
-        estimates,
-        spread,
-        point.problem.phase_map.means(point.problem.split(point.x)[0][0])[inner],
-        point.light.reshape(n, f, n, f).mean(axis=(1, 3))[inner],
-        point.misfit,
-        data.noise,
-        best.converged,
-        tuple(_remarks(data, point, estimates, is_reversed)),
-        point,
-    )
-
-
-def _remarks(data: _Recording, point: Point, estimates: tuple[Estimate, ...], is_reversed: bool) -> list[str]:
-    """What does not fit together, in words."""
-    out = []
-    if is_reversed:
-        out.append("The images are in reverse order: the first image has the second of the phase shifts given.")
-    out += [f"{one.name} stands at a limit of the fit." for one in estimates if one.at_limit]
-    states = point.misfit[2:].reshape(-1, 2).mean(axis=1)
-    typical = float(np.median(states))
-    for state, misfit in enumerate(states):
-        if misfit > max(2 * typical, _EXPLAINED):
-            out.append(f"State {state} has a misfit of {misfit:.3g}, the median is {typical:.3g}: its command or its frames are wrong.")
-    for one in estimates:
-        level = data.light[1][0]
-        if one.name.endswith("background") and abs(one.value) > max(5 * one.sigma, 3e-3 * level):
-            out.append(f"{one.name} is {one.value:.4g} counts: the dark does not belong to the frames.")
-    return out
-
-
-@dataclass(frozen=True, eq=False)
-class FittedPhase(NDArrayOperatorsMixin):
-    """Phase of a pair of frames; in arithmetic and for NumPy it is the array `phase`.
-
-    Attributes
-    ----------
-    phase : ndarray, shape (n, n), radian
-        Mean over each pixel, that of the optics included.
-    misfit : float
-        Mean square of the residuals over the noise.
-    consistent : bool
-        Whether the model explains the frames within their noise.
-    converged : bool
-    exponent : float
-        Of the spectrum of the prior, as chosen by held-out pixels.
-    """
-
-    phase: NDArray[np.float64]
-    misfit: float
-    consistent: bool
-    converged: bool
-    exponent: float
-    _point: Point
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
-        return np.array(self.phase, dtype=dtype, copy=True if copy is None else copy)
-
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **settings: Any) -> Any:
-        arrays = [one.phase if isinstance(one, FittedPhase) else one for one in inputs]
-        return getattr(ufunc, method)(*arrays, **settings)
-
-    def __getitem__(self, index: Any) -> Any:
-        return self.phase[index]
-
-    @cached_property
-    def sigma(self) -> NDArray[np.float64]:
-        """Error bar of each pixel, (n, n), radian: from draws of the noise and of the prior, and the misfit."""
-        point, rng = self._point, np.random.default_rng(0)  # the choice changes the error bars by some percent
-        problem, draws = point.problem, []
-        held = np.zeros(point.x.shape, bool)
-        for _ in range(_DRAWS):
-            noise = [rng.normal(size=one.shape) * (one > 0) for one in problem.weights]
-            right = point.back(noise) + rng.normal(size=point.x.shape)
-            white, _ = problem.split(point.solve(right, held, 60, 0.03))
-            draws.append(problem.phase_map.means(white[0])[_PAD:-_PAD, _PAD:-_PAD])
-        inner = point.light.reshape(problem.phase_map.n, problem.camera.f, problem.phase_map.n, -1).mean(axis=(1, 3))
-        lit = inner[_PAD:-_PAD, _PAD:-_PAD] > 0.3
-        left = np.stack([one - one[lit].mean() for one in draws])
-        variance = ndimage.gaussian_filter(np.mean(left**2, axis=0), 1.0)
-        return np.sqrt(variance * max(1.0, self.misfit))
 
 
 @dataclass(frozen=True, eq=False)
@@ -517,66 +202,56 @@ class FittedSensor:
     """A sensor whose optics are those of a fit: pairs of frames in, phases out.
 
     The phase-shifted iteration with the fitted mask and amplitude gives a start. Then the phase alone is fitted
-    with all of the model. Its prior is smooth to a degree that held-out pixels choose.
+    with all of the model: relay, blur, leakage.
 
     Parameters
     ----------
-    fit : BenchFit
+    fit : JointFit
+        Such as `fit_bench` returns: the arms 0 and 1 are those of the two masks.
+    prior : MapPrior
+        Of the phase, less that of the start.
     n_steps : int
-        Largest number of steps for a pair.
+        Of each of the four rounds of the fit of a pair, at most.
     """
 
-    fit: BenchFit
-    n_steps: int = 8
+    fit: JointFit
+    prior: MapPrior = _WIDE
+    n_steps: int = 4
 
     def __post_init__(self) -> None:
-        _check.instance("fit", self.fit, BenchFit)
+        _check.instance("fit", self.fit, JointFit)
+        _check.instance("prior", self.prior, MapPrior)
         _check.integer("n_steps", self.n_steps, 1)
 
     @property
     def flat(self) -> NDArray[np.float64]:
         """Phase of the optics at a flat command, (n, n)."""
-        return self.fit.flat
+        return self.fit.phase
 
-    def __call__(self, frames: ArrayLike, sigma: ArrayLike) -> FittedPhase:
+    def __call__(self, frames: ArrayLike, sigma: ArrayLike) -> NDArray[np.float64]:
         """Phase of one pair of frames.
 
         Parameters
         ----------
         frames : array_like, shape (2, ny, nx), counts
-            Less the dark. NaN marks bad pixels.
+            Less the dark.
         sigma : array_like, shape (2, ny, nx) or a number, counts rms
             Noise of the pixels.
 
         Returns
         -------
-        FittedPhase
+        ndarray, shape (n, n), radian
+            That of the optics included; 0 where no light comes through.
         """
-        counts = _check.real_array("frames", frames)
-        shape = (2, *self._fitted.camera.shape)
-        if counts.shape != shape:
-            raise ValueError(f"frames has shape {counts.shape}: expected {shape}")
-        sigma = np.broadcast_to(_check.real_array("sigma", sigma), shape)
-        if not np.all(sigma > 0):
-            raise ValueError(f"sigma reaches down to {sigma.min():.6g}: expected more than 0")
-        good = np.isfinite(counts)
-        counts, weights = np.where(good, counts, 0), good / sigma
-        start = self._start(counts)
-        held = np.random.default_rng(0).random(shape) < _HELD_OUT
-        lit = held & good & (counts > 0.1 * np.median(counts[counts > 0.5 * counts.max()]))
-        scores = {}
-        for exponent in _EXPONENTS:
-            seen = self._minimum(counts, weights * ~held, exponent, start, 3)
-            left = (np.array(seen.point.model.images) - counts) * weights
-            scores[exponent] = float(np.mean(left[lit] ** 2))
-            if scores[exponent] > 1.02 * min(scores.values()):
-                break
-        exponent = min(scores, key=lambda one: scores[one])
-        best = self._minimum(counts, weights, exponent, start, self.n_steps)
-        point = best.point
-        misfit = float(np.mean(point.misfit))
-        phase = point.problem.phase_map.means(point.problem.split(point.x)[0][0])[_PAD:-_PAD, _PAD:-_PAD]
-        return FittedPhase(phase, misfit, misfit < _EXPLAINED, best.converged, exponent, point)
+        frames = _check.real_map("frames", frames, 3)
+        if len(frames) != 2:
+            raise ValueError(f"frames has {len(frames)} images: expected 2")
+        sigma = np.broadcast_to(_check.real_array("sigma", sigma), frames.shape)
+        problem, phase = self._problem(frames, sigma), self._start(frames)
+        for _ in range(_ROUNDS):
+            problem = replace(problem, phase=phase)
+            phase = fit_jointly(problem, n_steps=self.n_steps, n_inner=30, errors=False).phase
+        return phase
 
     def frames(self, phase: ArrayLike) -> NDArray[np.float64]:
         """Frames that the model predicts for a phase.
@@ -592,80 +267,49 @@ class FittedSensor:
         """
         phase = _check.real_map("phase", phase, 2)
         _check.trailing_shape("phase", phase, self.flat.shape, "the grid of the pupil")
-        fine = fine_phase(np.pad(phase, _PAD, "edge"), self._fitted.camera.f)
-        point = self.fit._point
-        return np.stack(self._camera.at(self._light.maps(point.light, fine), point.values).images)
+        camera = next(picture.counts for picture in self.fit.problem.pictures if picture.mask is not None)
+        blank = np.zeros((2, *camera.shape))
+        problem = self._problem(blank, np.ones(blank.shape))
+        field = (problem.amplitude * np.exp(1j * phase)).astype(complex)
+        return np.stack(problem.forward.at(field, problem.values).images)
 
-    @property
-    def _fitted(self) -> Problem:
-        return self.fit._point.problem
+    def _problem(self, frames: NDArray, sigma: NDArray) -> JointProblem:
+        """The problem of the phase alone of a pair of frames."""
+        fit = self.fit
+        return JointProblem(
+            [Picture(frames[side], side, side, sigma[side]) for side in (0, 1)],
+            [_frozen(arm, values) for arm, values in zip(fit.problem.arms[:2], fit.arms[:2], strict=True)],
+            _frozen(fit.problem.mask, fit.mask),
+            np.maximum(fit.amplitude, 1e-6) * fit.problem.inside,
+            fit.problem.n_pixels,
+            self.prior,
+            MapPrior(1e-6),
+        )
 
-    @property
-    def _light(self) -> Light:
-        return replace(self._fitted.light, start=self.fit._point.light)
-
-    @cached_property
-    def _camera(self) -> Camera:
-        """The camera behind the two masks alone."""
-        of = self._fitted.camera
-        exposures = [Exposure(0, 0, 0), Exposure(1, 1, 0), Exposure(2, None, 0), Exposure(3, None, 0)]
-        camera = Camera(of.n, of.shape, of.n_pixels, exposures, np.zeros((1, of.n * of.f, of.n * of.f)), of.f, of.largest)
-        camera.exposures = camera.exposures[:2]
-        return camera
-
-    def _minimum(self, counts: NDArray, weights: NDArray, exponent: float, start: NDArray, n_steps: int) -> Minimum:
-        """Fit of the phase alone."""
-        of = self._fitted
-        inside = start[of.phase_map.n // 4 : -of.phase_map.n // 4]
-        phase_map = PhaseMap(of.phase_map.n, of.camera.f, MapPrior(max(0.1, 2 * float(inside.std())), exponent), of.camera.n_pixels)
-        values = self.fit._point.values
-        problem = Problem(self._camera, counts, weights, self._light, np.zeros(self._light.start.shape), phase_map, (), values)
-        return minimise(problem, _white(phase_map, start).ravel(), n_steps, 30)
-
-    def _start(self, counts: NDArray) -> NDArray[np.float64]:
-        """Phase of the phase-shifted iteration on images brought back to the pupil, unwrapped and continued."""
-        point, n, f = self.fit._point, self._fitted.phase_map.n, self._fitted.camera.f
-        light = np.maximum(point.light.reshape(n, f, n, f).mean(axis=(1, 3)), 0)
-        pupil = Pupil.from_amplitude(np.sqrt(light), self._fitted.camera.n_pixels, threshold=0.3)
-        power = np.mean(pupil.amplitude[pupil.inside] ** 2) / np.mean(light[pupil.inside])
-        masks = point.model.masks
-        y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2,) * 2, indexing="ij")
-        images = np.empty((2, n, n))
-        for side, arm in enumerate(point.model.arms[:2]):
-            cosine, sine = (arm["magnification"] * one(arm["rotation"]) for one in (math.cos, math.sin))
-            rows = cosine * y + sine * x + arm["row"] + (counts.shape[1] - 1) / 2
-            columns = cosine * x - sine * y + arm["column"] + (counts.shape[2] - 1) / 2
-            image = (counts[side] - arm["background"]) / arm["flux"] * power
-            images[side] = ndimage.map_coordinates(image, [rows, columns], order=3, mode="nearest")
-        leaked = min(masks["leakage"], 0.4)
-        images = ((1 - leaked) * images - leaked * images[::-1]) / (1 - 2 * leaked)
-        sensor = ZernikeSensor(pupil, *(Dimple(masks["diameter"], masks[name]) for name in ("first", "second")), tolerance=1e-5)
-        found = PhaseShifted(sensor, n_iterations=25, tolerance=1e-3)(np.maximum(images, 0)).phase
-        inside = ndimage.binary_erosion(pupil.inside) | (pupil.inside & (light > 0.8))
-        phase = unwrapped(np.nan_to_num(found), inside)
-        near = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
-        return phase[tuple(near)] - phase[inside].mean()
+    def _start(self, frames: NDArray) -> NDArray[np.float64]:
+        """Phase of the phase-shifted iteration, for which the light is unmixed and the images are shifted back."""
+        fit, mask = self.fit, self.fit.mask
+        pupil = Pupil.from_amplitude(np.maximum(fit.amplitude, 0), fit.problem.n_pixels, threshold=0.1)
+        sensor = ZernikeSensor(pupil, Dimple(mask.diameter, mask.first), Dimple(mask.diameter, mask.second))
+        n = len(fit.amplitude)
+        power = np.mean(fit.amplitude[pupil.inside] ** 2)
+        light = np.empty((2, n, n))
+        for side, arm in enumerate(fit.arms[:2]):
+            image = (frames[side] - arm.background) / (arm.flux * power)
+            rows, columns = ((length - n) // 2 for length in image.shape)
+            v, u = (np.fft.fftfreq(length) for length in image.shape)
+            ramp = np.exp(2j * np.pi * (v[:, None] * arm.row + u * arm.column))
+            light[side] = np.fft.ifft2(np.fft.fft2(image) * ramp).real[rows : rows + n, columns : columns + n]
+        leaked = min(mask.leakage, 0.4)  # half of the light cannot be unmixed
+        light = ((1 - leaked) * light - leaked * light[::-1]) / (1 - 2 * leaked)
+        phase = PhaseShifted(sensor, tolerance=1e-3)(np.maximum(light, 0)).phase
+        # Dim points hardly change the frames, so they keep the phase that explained the frames of the calibration.
+        waves = np.exp(1j * np.stack([np.where(np.isfinite(phase), phase, 0), self.flat]))
+        turns = np.mean(waves[:, pupil.inside], axis=1)[:, np.newaxis, np.newaxis]
+        measured, flat = np.angle(waves * turns.conj())
+        return np.where(pupil.inside, measured, flat)
 
 
-def unwrapped(phase: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Phase without jumps of 2 pi between neighbours inside, by least squares."""
-    number = np.full(inside.shape, -1)
-    number[inside] = np.arange(np.count_nonzero(inside))
-    rows, right = [], []
-    for axis in (0, 1):
-        first, second = (np.moveaxis(number, axis, 0)[cut] for cut in (slice(None, -1), slice(1, None)))
-        values = np.moveaxis(phase, axis, 0)
-        both = (first >= 0) & (second >= 0)
-        rows.append(np.stack([first[both], second[both]], axis=1))
-        right.append(np.angle(np.exp(1j * np.diff(values, axis=0)))[both])
-    pairs, step = np.concatenate(rows), np.concatenate(right)
-    k = np.arange(len(pairs))
-    size = (len(pairs), int(number.max()) + 1)
-    slope = sparse.csr_array((np.tile([-1.0, 1.0], len(pairs)), (np.repeat(k, 2), pairs.ravel())), size)
-    normal = (slope.T @ slope + 1e-9 * sparse.eye_array(size[1])).tocsc()
-    smooth = splu(normal).solve(slope.T @ step)
-    out = phase.copy()
-    difference = smooth - phase[inside]
-    difference -= np.median(difference)
-    out[inside] += 2 * np.pi * np.rint(difference / (2 * np.pi))
-    return out
+def _frozen(owner: Any, values: Any) -> Any:
+    """An `Arm` or `MaskPair` fixed at values."""
+    return replace(owner, **{one.name: Parameter(getattr(values, one.name)) for one in fields(owner)})

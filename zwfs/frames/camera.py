@@ -1,13 +1,14 @@
-"""Model of a camera behind two masks: from maps of light and phase to the counts of each pixel, and its derivatives.
+"""Model of a camera behind two masks: from maps of light and phase to the counts of each pixel, with derivatives.
 
-The field lives on f x f points per pixel of the camera. A point that is lit in part is two areas: the share s that is
-lit, with the field A exp(i phase), and the rest. Its intensity behind a mask with the reference wave r is
+The field lives on f x f points per pixel of the camera. A point that is lit in part is two areas: the share s that
+is lit, with the field A exp(i phase), and the rest. Its intensity behind a mask with the reference wave r is
 
     I = s |A exp(i phase) + r|^2 + (1 - s) |r|^2 = |m exp(i phase) + r|^2 + q,
 
-with the mean field m = s A and the light q = s A^2 - m^2 that does not interfere with r. The relay moves the fields
-to the plane that is conjugate to the camera. A Gaussian blur and the area of a pixel act on the intensity as products
-with its spectrum, and a spline takes it to the pixels, at the place that shift, rotation and magnification give.
+with the mean field m = s A and the light q = s A^2 - m^2 that does not interfere with r. The relay moves the
+fields to the plane that is conjugate to the camera. A Gaussian blur and the area of a pixel act on the intensity
+as products with its spectrum. A spline takes it to the pixels, at the place that shift, rotation and magnification
+give.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +107,9 @@ class Camera:
         self.relay = self.polynomials(frequency[None, :], frequency[:, None])
         half = fft.rfftfreq(size) * f
         self.squares = frequency[:, None] ** 2 + half**2
-        prefilter = [np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * one / f), _symbol()) for one in (frequency, half)]
+        prefilter = [
+            np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * one / f), _symbol()) for one in (frequency, half)
+        ]
         pixel = [np.sinc(one) / two for one, two in zip((frequency, half), prefilter, strict=True)]
         self.pixel = np.multiply.outer(*pixel)
 
@@ -187,11 +190,12 @@ def coefficients(masks: dict[str, float]) -> Coefficients:
     kept, leakage = 1 - masks["incoherent"], masks["leakage"]
     shares = np.array([[1 - leakage, leakage], [leakage, 1 - leakage]])
     mix, power = kept * shares, np.abs(strength) ** 2
-    slope = np.zeros((2, len(MASKS)), complex)  # of the strengths
+    slope: Any = np.zeros((2, len(MASKS)), complex)  # of the strengths
     place = MASKS.index
     slope[0, place("first")], slope[1, place("second")] = 1j * turn * factor
     slope[:, place("in_phase")], slope[:, place("quadrature")] = -strength * factor, -1j * strength * factor
-    first_slope, second_slope = mix @ slope, mix @ (2 * (strength.conj()[:, None] * slope).real)
+    first_slope: Any = mix @ slope
+    second_slope: Any = mix @ (2 * (strength.conj()[:, None] * slope).real)
     for name, change in (("leakage", kept * np.array([[-1, 1], [1, -1]])), ("incoherent", -shares)):
         first_slope[:, place(name)] += change @ strength
         second_slope[:, place(name)] += change @ power
@@ -403,7 +407,9 @@ class Linearised:
                 out.append(self._on_camera(one, change))
         return np.reshape(out, (len(wanted), *camera.shape))
 
-    def _by_relay(self, one: Exposure, part: _Part, source: tuple[NDArray, NDArray, NDArray], number: int) -> NDArray:
+    def _by_relay(
+        self, one: Exposure, part: _Part, source: tuple[NDArray, NDArray, NDArray], number: int
+    ) -> NDArray:
         """Derivative of an intensity by a number of the relay."""
         camera, transfer = self.camera, self._transfer[one.arm]
         spectrum = fft.fft2(source[0]) if transfer is None else transfer * source[1]

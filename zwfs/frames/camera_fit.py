@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import fft, linalg, ndimage
 from scipy.interpolate import BSpline
 
-from zwfs.frames.camera import ARM, MASKS, Camera, Linearised, Maps, names_of
+from zwfs.frames.camera import Camera, Linearised, Maps, names_of
 from zwfs.frames.joint import MapPrior
 
 _BINS = 24  # of spatial frequency, for the preconditioner
@@ -151,7 +151,9 @@ class Light:
         whole = (pixels > 0.9 * typical) & (typical > 0.5)
         full = ndimage.binary_erosion(whole)
         weight = ndimage.gaussian_filter(full.astype(float), 1.5)
-        near = np.where(weight > 1e-3, ndimage.gaussian_filter(pixels * full, 1.5) / np.maximum(weight, 1e-12), np.nan)
+        near = np.where(
+            weight > 1e-3, ndimage.gaussian_filter(pixels * full, 1.5) / np.maximum(weight, 1e-12), np.nan
+        )
         index = ndimage.distance_transform_edt(np.isnan(near), return_distances=False, return_indices=True)
         power = np.maximum(near[tuple(index)], 0.05)
         support = ndimage.binary_dilation(pixels > 0.1, iterations=2)
@@ -184,7 +186,6 @@ class Light:
         """Square root of the light, and its tangent where a fully lit point would be much too dark."""
         least = np.maximum(light, self._least)
         return np.sqrt(least) + (light - least) / (2 * np.sqrt(least))
-
 
     def sharpened(self, light: NDArray, oversampling: int, factor: int) -> Light:
         """The division on a grid that is finer by a factor, with an edge wherever light falls to darkness."""
@@ -245,10 +246,13 @@ class Problem:
     def places(self) -> list[list[int]]:
         """Places of each free number in the vector of all."""
         index = {name: place for place, name in enumerate(names_of(self.camera.n_arms))}
-        return [[index[name if arm is None else f"arm {arm} {name}"] for arm, name in one.places] for one in self.free]
+        return [
+            [index[name if arm is None else f"arm {arm} {name}"] for arm, name in one.places] for one in self.free
+        ]
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
+        """Limits of the free numbers, (n_free, 2)."""
         return np.array([(one.low, one.high) for one in self.free]).reshape(-1, 2)
 
     @cached_property
@@ -279,9 +283,12 @@ class Problem:
 
     def light_change(self, white: Sequence[NDArray]) -> NDArray[np.float64]:
         """Change of the light on the fine grid."""
-        return sum((of.fine(one) for one, of in zip(white[1:], self.light_maps, strict=True)), np.zeros(self.phase.shape))
+        return sum(
+            (of.fine(one) for one, of in zip(white[1:], self.light_maps, strict=True)), np.zeros(self.phase.shape)
+        )
 
     def all_values(self, free: NDArray) -> NDArray[np.float64]:
+        """All numbers, with those that are free."""
         values = self.values.copy()
         for places, value in zip(self.places, free.tolist(), strict=True):
             values[places] = value
@@ -328,7 +335,12 @@ class Point:
             which = [(number, names) for number, names in which if names]
             names = [names[0] for _, names in which]
             slopes = self.model.slopes(index, names) * self.problem.weights[index]
-            out.append((np.array([number for number, _ in which], int), slopes.reshape(len(names), self.problem.weights[index].size)))
+            out.append(
+                (
+                    np.array([number for number, _ in which], int),
+                    slopes.reshape(len(names), self.problem.weights[index].size),
+                )
+            )
         return out
 
     @cached_property
@@ -376,6 +388,7 @@ class Point:
 
     @cached_property
     def gradient(self) -> NDArray[np.float64]:
+        """Of the cost."""
         n = self.problem.n_white
         gradient = self.back(self.residuals)
         gradient[:n] += self.x[:n]
@@ -480,7 +493,9 @@ class Minimum:
     converged: bool
 
 
-def minimise(problem: Problem, x: NDArray | None = None, n_steps: int = 30, n_inner: int = 60, log: Any = None) -> Minimum:
+def minimise(
+    problem: Problem, x: NDArray | None = None, n_steps: int = 30, n_inner: int = 60, log: Any = None
+) -> Minimum:
     """Levenberg and Marquardt's method on all unknowns, until a step promises no more than a part of 1."""
     point = Point(problem, problem.start if x is None else x)
     damping, converged, step = 1e-2, False, 0
@@ -499,7 +514,7 @@ def minimise(problem: Problem, x: NDArray | None = None, n_steps: int = 30, n_in
             damping = max(4 * damping, 1e-3)
         converged = promised < _SETTLED and damping < 0.1
         if log:
-            log(f"  step {step}: cost {point.cost:.1f} gain {gain:.2f} promised {promised:.2f} damping {damping:.1g}")
+            log(f"step {step}: cost {point.cost:.1f} gain {gain:.2f} of {promised:.2f}, damping {damping:.1g}")
         if gain >= 0:
             point = trial
         damping = damping / 8 if damping > 1e-4 else 0.0

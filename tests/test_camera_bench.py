@@ -7,10 +7,10 @@ import pytest
 from scipy import ndimage
 
 from zwfs import Dimple, Pupil, ZernikeSensor
-from zwfs.frames.camera import Camera, Exposure, Maps
-from zwfs.frames.camera_bench import fit_bench
-from zwfs.frames.camera_fit import Light, fine_phase
-from zwfs.frames.camera_sensor import FittedSensor, unwrapped
+from zwfs.frames._camera.bench import fit_bench
+from zwfs.frames._camera.model import Camera, Exposure, Maps
+from zwfs.frames._camera.sensor import FittedSensor, unwrapped
+from zwfs.frames._camera.solve import Light, fine_phase
 
 from .hcipy_bench import BEFORE, CASES
 

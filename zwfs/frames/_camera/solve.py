@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from scipy import fft, linalg, ndimage
 from scipy.interpolate import BSpline
 
-from zwfs.frames.camera import Camera, Linearised, Maps, names_of
+from zwfs.frames._camera.model import Camera, Linearised, Maps, names_of
 from zwfs.frames.joint import MapPrior
 
 _BINS = 24  # of spatial frequency, for the preconditioner
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
+_LEAST = 1e-3  # damping
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
 _PIXEL_MEAN = np.array([230.0, 2 * 76.0, 2.0]) / 384  # of a cubic spline over a pixel, as a series of cosines
 
@@ -511,13 +512,15 @@ def minimise(
             gain = point.cost - trial.cost
             if gain >= 0 or promised < _SETTLED:
                 break
-            damping = max(4 * damping, 1e-3)
+            damping *= 8
         converged = promised < _SETTLED and damping < 0.1
         if log:
             log(f"step {step}: cost {point.cost:.1f} gain {gain:.2f} of {promised:.2f}, damping {damping:.1g}")
         if gain >= 0:
             point = trial
-        damping = damping / 8 if damping > 1e-4 else 0.0
+        share = gain / promised if promised > 0 else 1.0
+        damping *= 0.2 if share > 0.75 else 1.0 if share > 0.4 else 4.0
+        damping = max(damping, _LEAST)
     return Minimum(point, step, converged)
 
 

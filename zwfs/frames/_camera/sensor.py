@@ -14,10 +14,10 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from zwfs import _check
-from zwfs.frames.camera import Camera, Exposure
-from zwfs.frames.camera_bench import EXPLAINED, BenchFit, white_phase
-from zwfs.frames.camera_fit import Light, Minimum, PhaseMap, Point, Problem, fine_phase, minimise
-from zwfs.frames.camera_recording import PAD
+from zwfs.frames._camera.bench import EXPLAINED, BenchFit, white_phase
+from zwfs.frames._camera.model import Camera, Exposure
+from zwfs.frames._camera.recording import PAD
+from zwfs.frames._camera.solve import Light, Minimum, PhaseMap, Point, Problem, fine_phase, minimise
 from zwfs.frames.joint import MapPrior
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil

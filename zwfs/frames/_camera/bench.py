@@ -1,7 +1,7 @@
 """Optics of a bench from frames of a mirror in known states.
 
-`fit_bench` finds all unknowns of the model of `zwfs.frames.camera` at once. `zwfs.frames.camera_sensor` keeps what
-was fitted, and seeks only the phase of a pair of frames.
+`fit_bench` finds all unknowns of the model at once. `sensor` keeps what was fitted, and seeks only the phase of a
+pair of frames.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from zwfs import _check
-from zwfs.frames.camera import ARM, Camera, Exposure, names_of
-from zwfs.frames.camera_fit import (
+from zwfs.frames._camera.model import ARM, Camera, Exposure, names_of
+from zwfs.frames._camera.recording import PAD, Recording, centred
+from zwfs.frames._camera.solve import (
     Free,
     Light,
     LightMap,
@@ -28,7 +29,6 @@ from zwfs.frames.camera_fit import (
     fine_phase,
     minimise,
 )
-from zwfs.frames.camera_recording import PAD, Recording, centred
 from zwfs.frames.joint import MapPrior
 from zwfs.frames.registration import radius
 from zwfs.masks import Dimple

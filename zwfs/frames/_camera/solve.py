@@ -188,19 +188,6 @@ class Light:
         least = np.maximum(light, self._least)
         return np.sqrt(least) + (light - least) / (2 * np.sqrt(least))
 
-    def sharpened(self, light: NDArray, oversampling: int, factor: int) -> Light:
-        """The division on a grid that is finer by a factor, with an edge wherever light falls to darkness."""
-        share = _stretched(np.clip(light / self.amplitude**2, 0, 1), factor)
-        share = ndimage.gaussian_filter(share, 0.4 * oversampling * factor)
-        near = 2 * oversampling * factor + 1
-        cut = (ndimage.minimum_filter(share, near) < 0.2) & (ndimage.maximum_filter(share, near) > 0.8)
-        slope = 1.5 * oversampling * factor  # from dark to light within about one fine point
-        share = np.where(cut, np.clip(0.5 + slope * (share - 0.5), 0, 1), share)
-        amplitude = _stretched(self.amplitude, factor)
-        full, support = (np.kron(one, np.ones((factor, factor))) > 0 for one in (self.full, self.support))
-        start = np.where(full, _stretched(light, factor), amplitude**2 * share) * support
-        return Light(start, amplitude, full, support)
-
 
 def _stretched(pixels: NDArray, factor: int) -> NDArray[np.float64]:
     """A smooth map of pixels on a grid that is finer by a factor, linear between the pixels."""

@@ -89,7 +89,7 @@ def test_a_cell_of_a_notebook_fetches_the_repository_on_colab_and_does_nothing_e
     for source in Project(copy).sources():
         first, *others = (cell for cell in read(source).cells if cell.cell_type == "code")
         assert f"git clone -q --depth 1 {PUBLISHED.repository} " in first.source
-        assert first.metadata.tags == ["remove-cell"]
+        assert first.metadata.tags == ["remove-cell", "colab"]
         assert not first.outputs
         assert [cell.execution_count for cell in (first, *others)] == list(range(1, len(others) + 2))
         exec(TransformerManager().transform_cell(first.source), {})

@@ -40,10 +40,22 @@ def test_a_card_says_how_a_figure_was_made(carded):
         commit="`abc`",
     )
     assert [cell.cell_type for cell in cells] == ["code", "code", "markdown", "code"]
-    said = ["rms = 0.5  # input, rad rms\nseed = 3\n", "`abc`", "Python 3.12.1", "<../run/fig03_range.png>"]
-    said += ['href="../_downloads/fig03_range.zip"', 'make rerun FIGURE=fig03_range ARGS="-p seed=4"']
+    said = ["`abc`", "Python 3.12.1", "<../run/fig03_range.png>", 'href="../_downloads/fig03_range.zip"']
+    said += ['<div class="run-form" data-figure="fig03_range">']
     assert not [text for text in said if text not in cells[2].source]
     assert "CSV" not in cells[2].source, "there is no such file"
+
+
+def test_a_card_offers_the_files_that_exist_and_no_others():
+    names = ["one.png", "one.svg", "one_screens.csv", "two.csv"]
+    line = cards.files("some", "one", {name: f"../run/{name}" for name in names})
+    assert [name for name in names if f"<../run/{name}>" in line] == names[:3]
+    assert line.count("{download}") == 3
+
+
+def test_a_page_of_tables_has_a_form_too(carded):
+    [_, card] = carded("decision", "rms = 0.5")
+    assert 'class="run-form"' in card.source
 
 
 def test_the_commit_is_that_of_this_folder_alone(tmp_path):

@@ -69,7 +69,7 @@ def test_a_new_figure_is_a_study_a_notebook_and_a_line(copy):
         check_contents(copy)
     contents = copy.root / "_toc.yml"
     line, place = block("The line in `_toc.yml`", "yaml"), "      - file: notebooks/fig04_dimple_diameter\n"
-    contents.write_text(contents.read_text().replace(place, place + line))
+    contents.write_text(contents.read_text().replace(place, line + place))
     check_contents(copy)
     # `make figures` lists it for checkers.
     assert b"- file: notebooks/strehl_loss.ipynb\n  comment: How fast does the Strehl" in manifest(copy)
@@ -118,7 +118,7 @@ assert type(methods["WirtingerFlow"]) is WirtingerFlow and methods["WirtingerFlo
 assert own_reconstructors(["zwfs:WirtingerFlow"], methods, modes).keys() == {"WirtingerFlow"}
 curves = linearity_curves(methods, modes, [0.3], 2)
 assert curves.mean("WirtingerFlow")[0] < 0.01
-draw_linearity(curves, error_limits(methods, modes, curves, 0.05), 0.05, list(methods), 0.3)
+draw_linearity(curves, error_limits(methods, modes, curves, 0.05), 0.05, 0.3)
 assert WirtingerFlow in RECONSTRUCTORS and WirtingerFlow.__module__ in api.modules()
 assert LOOKS["WirtingerFlow"].label == "wirtinger flow"
 """

@@ -78,7 +78,7 @@ def test_one_image_gets_the_light_that_two_share():
 
 
 def test_winners_on_a_bench_without_errors_do_not_depend_on_the_screens(known):
-    errors = open_loop_errors({"perfect": known}, SITUATIONS, {"perfect": 12}, 25, seed=7)["perfect"]
+    errors = open_loop_errors({"perfect": known}, SITUATIONS, {"perfect": 8}, 25, seed=7)["perfect"]
     cells = [open_cell(one) for one in errors]
     assert [cell.images for cell in cells] == [2, 2, None]
     assert all(cell.two == "phase-shifted" for cell in cells[:2])
@@ -90,7 +90,7 @@ def test_the_table_has_a_cell_for_each_situation_and_says_what_was_not_studied(e
     assert [row.cells["calibrated"].two for row in rows] == ["fitted model"] * 3
     assert [row.cells["design"].two for row in rows] == ["phase-shifted"] * 3
     settled = {"Linear": np.full(4, 0.4), "LinearTwo": np.full(4, 0.1)}
-    loops = TunedLoops(1.0, 2.0, {}, {name: values.mean() for name, values in settled.items()}, settled)
+    loops = TunedLoops(1.0, 1.0, {}, {name: values.mean() for name, values in settled.items()}, settled)
     [row] = loop_rows([BestMethods(loops, "Linear", "LinearTwo", 0.25, 0.2, 0.3)])
     assert row.cells["perfect"].text == "two images, linear: 0.1, 4 times smaller"
     assert row.text == "closed loop from 1 rad rms; 1 (2) per step"

@@ -65,6 +65,13 @@ def test_example_of_the_readme_runs(capsys):
     assert "False" not in printed
 
 
+def test_example_of_the_front_page_prints_what_it_says(capsys):
+    page = (ROOT / "book" / "index.md").read_text("utf-8")
+    (code,), (printed,) = (re.findall(rf"(?m)^```{kind}\n(.*?)^```", page, re.S) for kind in ("python", "text"))
+    exec(compile(code, "index.md", "exec"), {})
+    assert capsys.readouterr().out == printed
+
+
 def test_example_of_gradients_fits_the_phase(capsys):
     jax = pytest.importorskip("jax", reason="JAX is not installed")
     page = (ROOT / "book" / "your_reconstructor.md").read_text("utf-8")

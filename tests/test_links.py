@@ -1,6 +1,7 @@
 """Links of the book: from equations to code and tests, and from the first use of a term to the glossary."""
 
 import pytest
+from bs4 import BeautifulSoup
 from docutils import nodes
 from docutils.utils import new_document
 
@@ -38,6 +39,18 @@ def test_terms_are_linked_at_their_first_use(text, terms):
         found.append(match[0])
         text = text[match.end() :]
     assert found == terms
+
+
+def test_links_carry_the_definition_of_their_term():
+    link = '<p><a href="glossary.html#{}"><span class="std-term">x</span></a></p>'
+    body = BeautifulSoup(
+        "".join(map(link.format, ("term-Cramer-Rao-bound", "term-dimple", "term-x"))), "html.parser"
+    )
+    glossary.define(body, ROOT / "book" / "glossary.md")
+    bound, dimple, unknown = body.find_all("a")
+    assert bound["data-definition"].startswith("The smallest error")
+    assert dimple["data-definition"].endswith("passes through it by the phase shift.")
+    assert "data-definition" not in unknown.attrs
 
 
 def test_titles_tables_and_code_stay_without_links():

@@ -17,12 +17,10 @@ FILES = {
     "_toc.yml": """
         format: jb-book
         root: book/index
-        parts:
-          - caption: The sensor
-            chapters:
-              - file: book/theory
-                sections:
-                  - file: notebooks/one""",
+        chapters:
+          - file: book/theory
+            sections:
+              - file: notebooks/one""",
     "_config.yml": "{title: A book, author: Some & others}",
     "pyproject.toml": "[project]\nversion = '1.2.3'\n[tool.zwfs]\nrepository = 'https://github.com/reader/sensor'",
 }

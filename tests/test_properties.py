@@ -90,7 +90,7 @@ def test_a_passive_mask_never_adds_light(sensor, batch, seed):
 
 # The wave of a dimple is 1 / diameter wide: smaller ones would need a wider detector.
 @given(pupils(), st.builds(Dimple, st.floats(1, 3), st.floats(-3, 3)), seeds)
-@settings(max_examples=8)  # a wide detector takes long
+@settings(max_examples=4)  # a wide detector takes long
 def test_a_phase_mask_loses_no_light_on_a_wide_detector(pupil, dimple, seed):
     field = white(pupil.shape, seed) * pupil.inside
     sensor = ZernikeSensor(pupil, dimple, extent=6.0, tolerance=1e-8)

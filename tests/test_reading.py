@@ -1,4 +1,4 @@
-"""The order of reading of a notebook's page: figures first, then the code that leads to them."""
+"""The order of reading of a notebook's page: figures first, then all code in one fold."""
 
 import nbformat
 import pytest
@@ -32,44 +32,28 @@ def reads():
     return read
 
 
-def test_figure_and_its_section_come_before_the_code(reads):
+def test_figures_and_text_come_first_and_all_code_is_in_one_fold_before_the_last_paragraph(reads):
     page = reads(
         new_markdown_cell("# Question"),
         code(PARAMETERS, "parameters"),
+        code("check()", "remove-cell"),
         code(SET_UP, "hide-input"),
         code("curves = compute()"),
         code(DRAW, "hide-input", output=True),
         new_markdown_cell("::: files", id="card-range"),
         new_markdown_cell("## Results"),
         code("report(curves)", "hide-input", output=True),
-        new_markdown_cell("## Method"),
+        new_markdown_cell("## Second"),
+        code("more = compute()"),
+        code("draw(more)", "hide-input", output=True),
+        new_markdown_cell("## Method\n\nText.\n\nNext: elsewhere."),
     )
-    fold = ("folded", f"{SET_UP}\n\n{DRAW}")
-    results = ["## Results", "output", "curves = compute()", fold, "## Method"]
-    assert page == ["# Question", "output", "::: files", *results]
-
-
-def test_each_figure_has_its_own_code(reads):
-    figures = [
-        cell
-        for name in ("first", "second")
-        for cell in (
-            code(f"{name} = compute()"),
-            code(f'publish(figure, "{name}", {{}})', "hide-input", output=True),
-            new_markdown_cell(f"What {name} shows."),
-        )
-    ]
-    page = reads(*figures)
-    first, second = (("folded", f'publish(figure, "{name}", {{}})') for name in ("first", "second"))
-    assert page[:5] == ["output", "What first shows.", "first = compute()", first, "output"]
-    assert page[5:] == ["What second shows.", "second = compute()", second]
-
-
-def test_no_code_but_the_parameters_is_lost(reads):
-    cells = [code(SET_UP, "hide-input"), code("x = 1"), code("record(x)", "hide-input", output=True)]
-    assert reads(*cells) == ["output", "x = 1", ("folded", SET_UP)]
-    assert reads(code(PARAMETERS, "parameters")) == []
+    first = ["# Question", "check()", "output", "::: files", "## Results", "output", "curves = compute()"]
+    sources = [PARAMETERS, SET_UP, "curves = compute()", DRAW, "report(curves)", "more = compute()", "draw(more)"]
+    fold = ("folded", "\n\n".join(sources))
+    assert page == [*first, "## Second", "output", "## Method\n\nText.", fold, "Next: elsewhere."]
 
 
 def test_a_cell_that_computes_and_prints_keeps_its_code(reads):
-    assert reads(code("table = compute()\ntable", output=True)) == ["table = compute()\ntable"]
+    source = "table = compute()\ntable"
+    assert reads(code(source, output=True)) == [source, ("folded", source)]

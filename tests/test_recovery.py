@@ -22,7 +22,7 @@ from studies.beyond_range import (
 )
 from studies.fig04_dimple_diameter import DARK_RING, iteration_spectrum
 from studies.kit.methods import opposite_dimples
-from studies.kit.setups import screens_at
+from studies.kit.setups import make_screens, screens_at
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def sensor(pupil):
     return opposite_dimples(pupil, 1.06, np.pi / 2)
 
 
-TRIALS = Trials(n_iterations=25, exponent=-2.0, seed=3)
+TRIALS = Trials(n_iterations=25, source=make_screens(zwfs.Pupil.circular(32), 40, -2.0), seed=3)
 
 
 def test_photons_set_the_error_and_the_plain_iteration_has_a_range(sensor, modes):

@@ -2,13 +2,15 @@ import csv
 import io
 import os
 import pickle
+import re
 
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from pypdf import PdfReader
 
-from studies.kit.results import FOLDER, glue_numbers, publish, rounded
+from studies.kit.results import FOLDER, glue_numbers, publish, rounded, screen_columns, stacked
 
 matplotlib.use("agg")
 
@@ -23,10 +25,10 @@ def figure():
     plt.close(figure)
 
 
-def published(folder, monkeypatch, figure, name="plot", columns=None):
+def published(folder, monkeypatch, figure, name="plot", columns=None, **screens):
     folder.mkdir()
     monkeypatch.setenv(FOLDER, str(folder))
-    publish(figure, name, columns or {"x (D)": [1.0, 2.0]})
+    publish(figure, name, columns or {"x (D)": [1.0, 2.0]}, **screens)
     return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
@@ -46,13 +48,39 @@ def test_nothing_is_written_without_a_folder_and_the_figure_looks_the_same(figur
 def test_files_are_the_same_from_run_to_run(figure, tmp_path, monkeypatch):
     twin = pickle.loads(pickle.dumps(figure))
     first = published(tmp_path / "first", monkeypatch, figure)
-    kinds = "csv", "dark.png", "narrow-dark.png", "narrow.png", "pdf", "png"
+    kinds = "csv", "dark.png", "narrow-dark.png", "narrow.png", "pdf", "png", "svg"
     assert sorted(first) == [f"plot.{kind}" for kind in kinds]
     assert published(tmp_path / "second", monkeypatch, twin) == first
     assert b"CreationDate" not in first["plot.pdf"]
     assert b"Software" not in first["plot.png"]
     assert first["plot.pdf"].startswith(b"%PDF")
+    assert b"<svg" in first["plot.svg"]
+    assert not re.search(rb"<dc:(date|creator)", first["plot.svg"])
     assert plt.imread(tmp_path / "first" / "plot.png").shape[:2] == (600, 800)  # 200 dots per inch
+
+
+def test_letters_of_a_pdf_are_truetype_as_journals_ask(figure, tmp_path, monkeypatch):
+    figure.axes[0].set_title(r"$\lambda/D$ and words")
+    published(tmp_path / "files", monkeypatch, figure)
+    resources = PdfReader(tmp_path / "files" / "plot.pdf").pages[0]["/Resources"]
+    kinds = {kind.get_object()["/Subtype"] for kind in resources["/Font"].values()}
+    assert kinds
+    assert "/Type3" not in kinds
+
+
+def test_single_screens_are_written_with_a_row_each(figure, tmp_path, monkeypatch):
+    errors = np.arange(12.0).reshape(2, 2, 3)
+    tables = {
+        n: screen_columns({"input": [0.1, 0.2], "photons": [1, 10]}, {"error": factor * errors})
+        for n, factor in (("a", 1), ("b", 2))
+    }
+    made = published(tmp_path / "files", monkeypatch, figure, screens=stacked("case", tables))
+    header, *rows = csv.reader(made["plot_screens.csv"].decode().splitlines())
+    assert header == ["case", "input", "photons", "screen", "error"]
+    assert len(rows) == 24
+    for case, rms, photons, screen, error in rows:
+        place = ["0.1", "0.2"].index(rms), ["1", "10"].index(photons), int(screen) - 1
+        assert float(error) == {"a": 1, "b": 2}[case] * errors[place]
 
 
 def test_a_file_is_replaced_and_not_written_through_a_link(figure, tmp_path, monkeypatch):

@@ -6,20 +6,23 @@ import time
 from importlib import import_module
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from book._tools import declared, rerun
 from book._tools.notebook import read
 from book._tools.project import Project
 from studies.fig03_dynamic_range import linearity_curves
 from studies.kit.parameters import Fields, check_parameters
-from studies.kit.setups import BASES, PUPILS, SCREENS, Noise, make_pupil, make_screens
+from studies.kit.results import FOLDER, publish
+from studies.kit.setups import BASES, PUPILS, SCREENS, Noise, make_pupil, make_screens, turbulent_rms
 from tests.test_camera import NO_IMAGES
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
 from zwfs.bench.model import Bench
 from zwfs.modes import mode_frequencies
-from zwfs.turbulence import karhunen_loeve_basis
+from zwfs.turbulence import karhunen_loeve_basis, structure_function, turbulent_screens
 
 FIGURE_3 = "fig03_dynamic_range"
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
@@ -62,6 +65,61 @@ def test_screens_of_every_kind_have_the_rms_and_the_seed_decides(kind, basis):
     assert not np.allclose(screens, source(0.4, 3, 2))
     if kind == "segments":
         assert len(np.unique(screens[0].round(12))) <= 38
+
+
+def test_the_mean_square_of_turbulence_is_that_of_the_structure_function():
+    """On a disc the distances have a known density, and Noll 1976 gives 1.0299 for the mean square."""
+
+    def integrand(s):  # of the distance in a disc of radius 1
+        density = 4 * s / np.pi * np.arccos(s / 2) - 2 * s**2 / np.pi * np.sqrt(1 - s**2 / 4)
+        return density * structure_function(s / 2) / 2
+
+    expected = quad(integrand, 0, 2)[0]
+    assert expected == pytest.approx(1.0299, rel=3e-3)
+    assert turbulent_rms(make_pupil(100)) ** 2 == pytest.approx(expected, rel=1e-3)
+    pupil = make_pupil(16, "vlt", obstruction=0.3)
+    apart = np.hypot(*(pupil.points[:, np.newaxis] - pupil.points).transpose(2, 0, 1))
+    for scale in (np.inf, 5.0):
+        pairs = np.mean(structure_function(apart, outer_scale=scale)) / 2
+        assert turbulent_rms(pupil, scale) ** 2 == pytest.approx(pairs, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["kolmogorov", "von_karman"])
+def test_screens_of_a_strength_scatter_as_turbulence_around_their_root_mean_square(kind):
+    pupil = make_pupil(24)
+    source = make_screens(pupil, 10, -2.0, kind=kind, d_over_r0=8.0)
+    largest = source.largest(1.0)
+    screens = source(largest, 1000, 1)
+    sizes = pupil.rms(screens)
+    assert np.sqrt(np.mean(sizes**2)) == pytest.approx(source.unit * 8.0 ** (5 / 6), rel=0.05)
+    assert sizes.std() > 0.2 * sizes.mean()
+    # The same turbulence as the package draws it, and half of its rms at half of the input.
+    r0 = turbulent_screens(pupil, 1 / 8, 1000, source.outer_scale, 1)
+    np.testing.assert_allclose(screens, r0, rtol=1e-3)
+    np.testing.assert_allclose(source(largest / 2, 2, 1), screens[:2] / 2, rtol=1e-12)
+    assert source.d_over_r0_of(largest) == pytest.approx(8.0, rel=1e-3)
+    assert source.inputs([0.1, 1.0, 40.0]) == [0.1, 1.0, largest]
+
+
+def test_without_a_strength_inputs_stay():
+    source = make_screens(make_pupil(24), 10, -2.0, kind="kolmogorov")
+    assert source.largest(1.3) == 1.3
+    assert source.inputs([0.1, 0.5]) == [0.1, 0.5]
+    assert source.columns([0.1, 0.5]) == {}
+
+
+def test_a_figure_of_a_strength_has_an_axis_and_a_column_of_it(tmp_path, monkeypatch):
+    source = make_screens(make_pupil(24), 10, -2.0, kind="kolmogorov", d_over_r0=5.0)
+    figure, (input_, other) = plt.subplots(1, 2)
+    input_.set(xlabel="input (rad rms)", xlim=(0, source.largest(1.0)))
+    other.set(xlabel="iterations")
+    monkeypatch.setenv(FOLDER, str(tmp_path))
+    rms = [0.0, 1.0]
+    publish(source.mark(figure), "plot", {"input": rms} | source.columns(rms))  # also narrow and dark
+    [axis] = [one for axes in figure.axes for one in axes.child_axes]
+    assert axis.get_xlim() == pytest.approx((0, 5), rel=1e-3)
+    assert (tmp_path / "plot.csv").read_text() == f"input,D/r0\n0,0\n1,{source.d_over_r0_of(1.0):.9g}\n"
+    plt.close(figure)
 
 
 def test_hexagonal_modes_are_orthonormal_on_the_pupil_and_zernike_modes_on_a_circle():
@@ -155,12 +213,13 @@ def test_endless_and_huge_files_are_not_read(tmp_path):
 def test_noise_is_that_of_the_photons():
     pupil = make_pupil(32)
     sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
-    phase, photons, read_noise = np.zeros((200, *pupil.shape)), 2000.0, 10.0
+    phase, photons, read_noise = np.zeros((200, *pupil.shape)), 1000.0, 10.0
     frames = pupil.gather(Noise(photons, read_noise)(sensor, phase, 1))
-    each = photons / 2
     mean = pupil.gather(sensor.measure(phase[0]))
-    assert np.mean(frames.var(axis=0) / (mean / each + (read_noise / each) ** 2)) == pytest.approx(1, abs=0.02)
-    faint = Noise(20.0, read_noise)(sensor, phase, 1)
+    assert np.mean(frames.var(axis=0) / (mean / photons + (read_noise / photons) ** 2)) == pytest.approx(
+        1, abs=0.02
+    )
+    faint = Noise(10.0, read_noise)(sensor, phase, 1)
     assert np.mean(faint - sensor.measure(phase[0])) == pytest.approx(0, abs=0.01)  # negative pixels are kept
     with pytest.raises(ValueError, match=r"noise.read_noise = 1 with photons = 0"):
         Noise(read_noise=1.0)
@@ -171,7 +230,7 @@ def test_noise_reaches_the_curves_and_sensors_share_it():
     source = make_screens(pupil, 8, -2.0)
     sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
     methods = {"one": PhaseShifted(sensor), "same": PhaseShifted(sensor), "linear": Linear(sensor, source.modes)}
-    noisy = linearity_curves(methods, source, [0.1, 0.2], 2, seed=1, noise=Noise(100.0))
+    noisy = linearity_curves(methods, source, [0.1, 0.2], 2, seed=1, noise=Noise(50.0))
     clean = linearity_curves(methods, source, [0.1, 0.2], 2, seed=1)
     assert (noisy.mean("one") > 10 * clean.mean("one")).all()
     np.testing.assert_array_equal(noisy.errors["one"], noisy.errors["same"])

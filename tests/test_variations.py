@@ -11,6 +11,9 @@ from studies.fig04_dimple_diameter import (
     iteration_spectrum,
     measured_factor,
     mode_sensitivity,
+    near_limit,
+    other_curves,
+    sampled_diameters,
 )
 from studies.kit.curves import crossing
 from studies.phase_shift_pairs import close_pairs, drawn_noise, pair_maps, phase_noise
@@ -136,7 +139,7 @@ def test_noise_of_the_symmetric_pair_on_a_flat_wavefront(pupil):
     for theta in (HALF, 2.3):
         noise = phase_noise(pair(pupil, 1.06, theta, -theta), flat)
         intensity = 1 - 2 * b * (1 - b) * (1 - np.cos(theta))
-        expected = np.sqrt(intensity) / (2 * b * np.sin(theta))
+        expected = np.sqrt(intensity / 2) / (2 * b * np.sin(theta))
         np.testing.assert_allclose(noise.photon, expected, rtol=1e-8)
         np.testing.assert_allclose(noise.bound, expected, rtol=1e-8)
         np.testing.assert_allclose(noise.read, 1 / (np.sqrt(8) * b * np.sin(theta)), rtol=1e-8)
@@ -194,7 +197,8 @@ def test_diameter_curves(pupil, screens):
     assert curves.errors["it"].shape == (3, 3)
     np.testing.assert_allclose(curves.rms, 0.5)
     assert np.all(np.diff(curves.mean("it")) > 0)
-    assert curves.at("it", 1.95) == curves.mean("it")[1]
+    assert curves.at("it", 2.0) == curves.mean("it")[1]
+    assert np.isnan(curves.at("it", 1.95))
     assert 2.0 < curves.exceeds("it", 0.025) < 2.5
     assert curves.exceeds("it", 0.025, start=2.2) == 2.5
 
@@ -202,12 +206,25 @@ def test_diameter_curves(pupil, screens):
 def test_contraction_is_that_of_the_spectrum_and_the_iteration(small):
     modes = zwfs.zernike_basis(small, 149)
     screens = zwfs.power_law_screens(modes[:20], 0.4, 1, seed=1)
-    reasons = contraction(small, modes, [1.06, 2.2], screens, 1e-4 * modes[1])
-    np.testing.assert_array_equal(reasons.diameters, [1.06, 2.2, DARK_RING])
+    reasons = contraction(small, modes, [1.06, 2.2, 2.6], screens, 1e-4 * modes[1])
+    np.testing.assert_array_equal(reasons.diameters, [1.06, 2.2, DARK_RING, 2.6])
     assert reasons.index(2.3) == 1
     assert reasons.flat[1] == abs(iteration_spectrum(small, 2.2)[0])
     assert reasons.observed[2.2] == pytest.approx(reasons.aberrated[1, 0], rel=0.01)
     assert reasons.sensitivity["tilt"][2] < 0.1 * reasons.sensitivity["tilt"][0]
+
+
+@pytest.mark.parametrize("end", [1.0, 1.7, 2.3, 4.0, 8.0])
+def test_all_diameters_of_figure_4_end_at_the_largest(small, end):
+    modes = zwfs.zernike_basis(small, 149)
+    screens = zwfs.power_law_screens(modes[:20], 0.4, 1, seed=1)
+    diameters = sampled_diameters(0.5, end, 0.3)
+    near = near_limit(diameters)
+    assert diameters[-1] == end >= near[-1]
+    reasons = contraction(small, modes, diameters[-2:], screens, 1e-4 * modes[1])
+    others = other_curves(small, modes[:6], np.pi / 2, screens, diameter_max=end, n_iterations=1)
+    assert reasons.diameters[-1] == others.diameters[-1] == end
+    assert max(reasons.observed) <= end
 
 
 def test_crossing_is_interpolated_on_the_logarithm():

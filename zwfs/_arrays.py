@@ -65,8 +65,8 @@ class Kind(NamedTuple):
         return self.xp.zeros(shape, dtype=self.dtype, device=self.device)
 
     def integers(self, values: Any) -> Any:
-        """Integers for use with arrays of this kind."""
-        return self.xp.asarray(values, dtype=self.xp.int64, device=self.device)
+        """Integers for use as indices of arrays of this kind; those of NumPy have 32 bits in a browser."""
+        return self.xp.asarray(values, dtype=getattr(self.xp, "intp", self.xp.int64), device=self.device)
 
 
 Owner = TypeVar("Owner")

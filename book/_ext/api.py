@@ -1,4 +1,4 @@
-"""The API page: a directive for the public names of modules, and links in docstrings."""
+"""The API pages: a directive for the public names of modules, and links in docstrings."""
 
 import importlib
 import inspect
@@ -37,7 +37,7 @@ class Modules(SphinxDirective):
     final_argument_whitespace = True
 
     def run(self) -> list[nodes.Node]:
-        """Parse a section for each module; MyST appends it to the section around the directive."""
+        """Parse a section for each module; MyST appends it to the page."""
         lines = []
         for name in self.arguments[0].split():
             package = name.removesuffix(".*")
@@ -57,7 +57,7 @@ def section(name: str) -> list[str]:
         directives += [f".. auto{kind}:: {path(module, own)}", *options, ""]
     for own, text in constants(module).items():
         directives += [f".. py:data:: {own}", f"   :module: {name}", "", f"   {text}", ""]
-    return [f"### `{name}`", "", "```{eval-rst}", f".. automodule:: {name}", "", *directives, "```", ""]
+    return [f"## `{name}`", "", "```{eval-rst}", f".. automodule:: {name}", "", *directives, "```", ""]
 
 
 @cache
@@ -141,7 +141,7 @@ def link_name(
 
 
 def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
-    """Warn of public modules that are missing on the API page."""
+    """Warn of public modules that are missing on the API pages."""
     if PAGE in env.found_docs and (missing := set(modules()) - set(env.domains["py"].modules)):
         logger.warning("no directive names %s", ", ".join(sorted(missing)), location=PAGE)
 

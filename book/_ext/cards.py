@@ -15,12 +15,12 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 from sphinx.application import Sphinx
 
+from book._ext import run
 from book._ext.finish import VARIANTS
 from book._ext.reading import CARD, put_in_order
 from book._tools import record
-from book._tools.declared import assigned
 from book._tools.project import EXECUTED, Project
-from studies.kit.results import published
+from studies.kit.results import SCREENS, published
 
 DOWNLOADS = "_downloads"  # folder of the pages
 
@@ -30,12 +30,13 @@ def read_notebook(app: Sphinx, document: str, text: list[str]) -> None:
     source = Path(app.env.doc2path(document))
     if source.suffix != ".ipynb":
         return
-    run = run_of(app, source)
-    app.env.note_dependency(os.path.relpath(run, app.srcdir))
-    notebook = nbformat.reads(run.read_text("utf-8"), as_version=4)
-    files = sorted(run.with_suffix(".files").glob("[!.]*"))
+    last = run_of(app, source)
+    app.env.note_dependency(os.path.relpath(last, app.srcdir))
+    notebook = nbformat.reads(last.read_text("utf-8"), as_version=4)
+    files = sorted(last.with_suffix(".files").glob("[!.]*"))
     links = {file.name: Path(os.path.relpath(file, source.parent)).as_posix() for file in files}
-    add_cards(notebook, source.stem, links, versions(run), commit(Path(app.srcdir)))
+    run.mark_cells(notebook)
+    add_cards(notebook, source.stem, links, versions(last), commit(Path(app.srcdir)))
     put_in_order(notebook)
     text[0] = nbformat.writes(notebook)
 
@@ -47,16 +48,20 @@ def run_of(app: Sphinx, source: Path) -> Path:
 
 
 def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions: str, commit: str) -> None:
-    """Add a card under each figure of an executed notebook, in place; the first one shows the parameters."""
+    """Add a card under each figure of an executed notebook, in place; the first one has the form of parameters."""
     cells = []
-    fold = ["", *parameters(notebook, name), "", f"Commit: {commit}. Versions: {versions}.", ":::"]
     for cell in notebook.cells:
         cells.append(cell)
         for figure in published(cell.source) if cell.cell_type == "code" else []:
             cell.metadata.setdefault("mystnb", {}).setdefault("figure", {})["classes"] = VARIANTS + figure
-            text = "\n".join(["::::{div} run-card", files(name, figure, links), *fold, "::::"])
-            cells.append(new_markdown_cell(text, id=f"{CARD}{figure}"[:64]))
-            fold = []
+            first = not any(one.id.startswith(CARD) for one in cells)
+            made = ["", f"Commit: {commit}. Versions: {versions}."] if first else []
+            text = ["::::{div} run-card", files(name, figure, links), *made, "", run.form(figure, first), "::::"]
+            cells.append(new_markdown_cell("\n".join(text), id=f"{CARD}{figure}"[:64]))
+    if not any(cell.id.startswith(CARD) for cell in cells):  # the page shows tables only
+        place = next((number for number, cell in enumerate(cells, 1) if cell.get("outputs")), len(cells))
+        text = ["::::{div} run-card", files(name, "", links), "", run.form("", True), "::::"]
+        cells.insert(place, new_markdown_cell("\n".join(text), id=f"{CARD}{name}"[:64]))
     notebook.cells = cells
 
 
@@ -69,30 +74,12 @@ def files(name: str, figure: str, links: dict[str, str]) -> str:
         origin = of_paper
     elif number:
         origin += f", goes with {of_paper}"
-    offered = {"PNG": f"{figure}.png", "PDF": f"{figure}.pdf", "data (CSV)": f"{figure}.csv"}
+    offered = {kind.upper(): f"{figure}.{kind}" for kind in ("png", "svg", "pdf")}
+    offered |= {"data (CSV)": f"{figure}.csv", "single screens (CSV)": f"{figure}{SCREENS}.csv"}
     shown = [f"{{download}}`{text} <{links[file]}>`" for text, file in offered.items() if file in links]
     address = f"../{DOWNLOADS}/{name}.zip"
     archive = f'<a class="reference download" href="{address}" download>notebook with its code (ZIP)</a>'
     return " · ".join([origin, archive, *shown])
-
-
-def parameters(notebook: NotebookNode, name: str) -> list[str]:
-    """Return the lines of the fold that shows the parameters of a notebook, and the command that changes one."""
-    code = next((c.source for c in notebook.cells if "parameters" in c.metadata.get("tags", ())), "")
-    numbers = {key: int(value) for key, (value, _) in assigned(notebook).items() if value.isnumeric()}
-    changed = f"seed={numbers['seed'] + 1}" if "seed" in numbers else "NAME=VALUE"
-    return [
-        ":::{dropdown} Parameters (click to change and re-run)",
-        "```python",
-        code,
-        "```",
-        "",
-        "To re-run the notebook from the root of a clone, with one parameter or more changed:",
-        "",
-        "```sh",
-        f'make rerun FIGURE={name} ARGS="-p {changed}"',
-        "```",
-    ]
 
 
 def versions(run: Path) -> str:

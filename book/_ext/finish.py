@@ -18,6 +18,7 @@ from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.util.fileutil import copy_asset_file
 
+from book._ext.glossary import GLOSSARY, define
 from book._ext.performance import PICTURES
 from book._tools.address import setting
 from book._tools.project import PDF
@@ -76,6 +77,7 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
         image.parent.wrap(body.new_tag("div", **{"class": "wide-figure"}))
     for figure in body.select(f"figure[class*={VARIANTS}]"):
         add_variants(app, figure)
+    define(body, Path(app.srcdir, f"{GLOSSARY}.md"))
     for entry in body.select("[role=doc-biblioentry]"):
         entry["role"] = "listitem"  # the role of Sphinx is deprecated: a list has items
     if body.find(id="phasor"):
@@ -195,16 +197,20 @@ def finish_files(app: Sphinx, exception: Exception | None) -> None:
             for old, new in CHANGES.items():
                 text = text.replace(old, new)
             script.write_text(text, "utf-8")
-    forward(html, f"{app.config.root_doc}.html")
+    forward(html, "index", app.config.root_doc)
+    for old, new in app.config.moved_pages.items():
+        if new in app.env.found_docs:  # not so in a part of the book
+            forward(html, old, new)
 
 
-def forward(html: Path, front: str) -> None:
-    """Write index.html, which describes the front page and forwards to it."""
-    head = BeautifulSoup((html / front).read_text("utf-8"), "html.parser").head
+def forward(html: Path, old: str, new: str) -> None:
+    """Write a page that describes a different page and forwards to it."""
+    head = BeautifulSoup((html / f"{new}.html").read_text("utf-8"), "html.parser").head
     kept = head.select("meta[property^='og:'], meta[name='description'], meta[name^='twitter:']")
-    described = "".join(str(tag).replace(f"/{front}", "/index.html") for tag in kept)
-    (html / "index.html").write_text(
-        FORWARD.format(title=head.title.string, address=front, tags=described), "utf-8"
+    described = "".join(str(tag).replace(f"/{new}.html", f"/{old}.html") for tag in kept)
+    address = os.path.relpath(f"{new}.html", os.path.dirname(old))
+    (html / f"{old}.html").write_text(
+        FORWARD.format(title=head.title.string, address=address, tags=described), "utf-8"
     )
 
 
@@ -231,6 +237,7 @@ def draw_card(card: Path, logo: Path, figure: Path, title: str) -> None:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Finish each page, and their folder at the end."""
+    app.add_config_value("moved_pages", {}, "html")  # old to new address of each page that merged into another
     app.connect("config-inited", add_substitutions)
     app.connect("html-page-context", finish_page)
     # Before the extension that would write another index.html.

@@ -1,17 +1,20 @@
-"""Links to the glossary: the first use of each of its terms on a page."""
+"""Links to the glossary: the first use of each of its terms on a page, with the definition."""
 
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
+from bs4 import BeautifulSoup
 from docutils import nodes
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.transforms import SphinxTransform
 
 GLOSSARY = "book/glossary"
-WITHOUT = {GLOSSARY, "book/api", "book/bibliography", "book/index", "book/notation"}
-TERM = re.compile(r"^(\w.*)\n  \S", re.MULTILINE)
+WITHOUT = {GLOSSARY, "book/bibliography", "book/index", "book/notation"}
+TERM = re.compile(r"^(\w.*)\n  (\S.*)", re.MULTILINE)
+ROLE = re.compile(r"\{\w+\}`([^`<]*?)(?: <[^`]*>)?`")
 PROSE = (nodes.paragraph, nodes.emphasis, nodes.strong, nodes.list_item)
 
 
@@ -22,7 +25,7 @@ class LinkTerms(SphinxTransform):
 
     def apply(self) -> None:
         """Split the texts that use a term."""
-        if self.env.docname in WITHOUT:
+        if self.env.docname in WITHOUT or self.env.docname.startswith("book/api"):
             return
         source = Path(self.env.doc2path(GLOSSARY))
         self.env.note_dependency(str(source))
@@ -47,7 +50,22 @@ class LinkTerms(SphinxTransform):
 
 def terms(glossary: Path) -> list[str]:
     """Return the terms that the page of the glossary defines."""
-    return TERM.findall(glossary.read_text("utf-8").partition("```{glossary}")[2])
+    return [*definitions(glossary)]
+
+
+@cache
+def definitions(glossary: Path) -> dict[str, str]:
+    """Return the definition of each term on the page of the glossary, as plain text."""
+    entries = TERM.findall(glossary.read_text("utf-8").partition("```{glossary}")[2])
+    return {term: ROLE.sub(r"\1", definition) for term, definition in entries}
+
+
+def define(body: BeautifulSoup, glossary: Path) -> None:
+    """Give each link to a term its definition, which shows on hover and on focus."""
+    known = {f"term-{nodes.make_id(term)}": text for term, text in definitions(glossary).items()}
+    for link in body.select("a:has(> .std-term)"):
+        if text := known.get(str(link["href"]).partition("#")[2].lower()):
+            link["data-definition"] = link["aria-description"] = text
 
 
 def pattern(missing: dict[str, str]) -> re.Pattern[str]:

@@ -38,7 +38,11 @@ def add_substitutions(app: Sphinx, config: Config) -> None:
     for row in kept["peers"]:
         tasks.setdefault(row["task"], []).append(row)
     compared = {task: peers(task, rows) for task, rows in tasks.items()}
-    added = tables(kept["speed"]) | {"peers": compared, "machine": kept["machine"]}
+    added = tables(kept["speed"]) | {
+        "peers": compared,
+        "machine": kept["machine"],
+        "pages": pages(kept.get("pages", [])),
+    }
     config.myst_substitutions = config.myst_substitutions | {"performance": added}
     with plt.rc_context():
         use_style()
@@ -103,6 +107,19 @@ def tables(speed: dict[str, Any]) -> dict[str, str]:
         "telemetry": telemetry(speed["telemetry"]),
         **latency(speed["latency"]),
     }
+
+
+def pages(rows: list[dict[str, Any]]) -> str:
+    """Return a table of the times of the pages, the shortest first."""
+    lines = [
+        [
+            f"{{doc}}`../notebooks/{row['page']}`",
+            "quick" if row["quick"] else "of the book",
+            f"{row['figure']:.0f}",
+        ]
+        for row in sorted(rows, key=lambda row: float(row["figure"]))
+    ]
+    return table(["page", "parameters", "time to the figure (s)"], lines)
 
 
 def rates(speed: dict[str, Any]) -> str:

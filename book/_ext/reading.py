@@ -1,4 +1,4 @@
-"""Order of reading: a page shows a figure and what it says, and then the code that leads to it.
+"""Order of reading: a page shows its figures and what they say; all of its code stands in one fold at the end.
 
 A notebook runs from its parameters to its figures. Everywhere but on its page of the book it keeps that order.
 """
@@ -6,49 +6,48 @@ A notebook runs from its parameters to its figures. Everywhere but on its page o
 import copy
 
 from nbformat import NotebookNode
-from nbformat.v4 import new_code_cell
+from nbformat.v4 import new_code_cell, new_markdown_cell
 
 from studies.kit.results import published
 
 CARD = "card-"  # with which the ids of the cards begin
-FOLD = "Set-up and drawing"
+FOLD = "Code of this page"
+NEXT = "\n\nNext:"  # begins the last paragraph of a page
 
 
 def put_in_order(notebook: NotebookNode) -> None:
-    """Move the code of each figure to the end of the section that follows the figure, in place.
+    """Move the code of a notebook into a fold before its last paragraph, in place.
 
-    The code that computes stays visible there; what sets up and draws is folded. The page omits two kinds of code:
-    the parameters, which the card of the first figure shows, and code that only prints a table.
+    The first cell that computes also stays visible, at the end of the section that follows the first figure.
     """
+    code = [cell for cell in notebook.cells if cell.cell_type == "code" and not tagged(cell, "remove-cell")]
+    computing = [cell for cell in code if not (cell.outputs or tagged(cell, "hide-input", "parameters"))][:1]
     cells: list[NotebookNode] = []
-    ahead: list[NotebookNode] = []  # code of the next figure
-    behind: list[NotebookNode] = []  # code of the last figure
-    described = False  # whether text followed the last figure
+    drawn = described = False  # whether the first figure, and text on it, are above
     for cell in notebook.cells:
-        tags = cell.metadata.get("tags", [])
         if cell.cell_type == "markdown":
             if described and cell.source.startswith("#"):
-                cells, behind = cells + arranged(behind), []
-            cells, described = [*cells, cell], described or not cell.id.startswith(CARD)
-        elif published(cell.source) and cell.outputs:
-            cells = [*cells, *arranged(behind), without_code(cell)]
-            ahead, behind, described = [], [*ahead, cell], False
-        elif cell.outputs or "remove-cell" in tags:
-            cells.append(without_code(cell) if "hide-input" in tags else cell)
-        elif "parameters" not in tags:
-            ahead.append(cell)
-    notebook.cells = cells + arranged(behind + ahead)
+                cells, computing = cells + computing, []
+            described = described or (drawn and not cell.id.startswith(CARD))
+            cells.append(cell)
+        elif cell.outputs or tagged(cell, "remove-cell"):
+            drawn = drawn or bool(published(cell.source))
+            cells.append(without_code(cell) if tagged(cell, "hide-input") else cell)
+    notebook.cells = [*cells, *computing, *([fold(code)] if code else [])]
+    if cells and cells[-1].cell_type == "markdown" and NEXT in cells[-1].source:
+        cells[-1].source, _, last = cells[-1].source.rpartition(NEXT)
+        notebook.cells.append(new_markdown_cell(NEXT.strip() + last, id="next"))
 
 
-def arranged(code: list[NotebookNode]) -> list[NotebookNode]:
-    """Return the cells that compute, and in one folded cell the source of the others."""
-    folded = [cell for cell in code if "hide-input" in cell.metadata.get("tags", [])]
-    if not folded:
-        return code
+def tagged(cell: NotebookNode, *tags: str) -> bool:
+    """Return whether a cell has one of these tags."""
+    return not set(tags).isdisjoint(cell.metadata.get("tags", []))
+
+
+def fold(code: list[NotebookNode]) -> NotebookNode:
+    """Return a folded cell with the source of others."""
     metadata = {"tags": ["hide-input"], "mystnb": {"code_prompt_show": FOLD, "code_prompt_hide": FOLD}}
-    source = "\n\n".join(cell.source for cell in folded)
-    fold = new_code_cell(source, metadata=metadata, id=f"code-{folded[-1].id}"[:64])
-    return [*(cell for cell in code if cell not in folded), fold]
+    return new_code_cell("\n\n".join(cell.source for cell in code), metadata=metadata, id="code")
 
 
 def without_code(cell: NotebookNode) -> NotebookNode:

@@ -27,3 +27,9 @@ for (const event of ["load", "resize"]) {
   addEventListener(event, fadeWideBoxes);
 }
 addEventListener("scroll", fadeWideBoxes, { capture: true, passive: true });
+
+// The arrows in the list of contents have no text: each gets the name of what it unfolds.
+addEventListener("DOMContentLoaded", () => {
+  for (const arrow of document.querySelectorAll(".bd-links summary"))
+    arrow.setAttribute("aria-label", `Pages of: ${arrow.closest("li").querySelector("a").textContent.trim()}`);
+});

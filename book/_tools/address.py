@@ -142,7 +142,7 @@ def with_cell(notebook: NotebookNode, source: str) -> NotebookNode:
     """Return a notebook with this cell for Colab after its title, or without one, numbered as a run would do."""
     notebook.cells = [cell for cell in notebook.cells if COLAB not in cell.source]
     if source:
-        notebook.cells.insert(1, new_code_cell(source, metadata={"tags": ["remove-cell"]}))
+        notebook.cells.insert(1, new_code_cell(source, metadata={"tags": ["remove-cell", "colab"]}))
     for number, cell in enumerate((cell for cell in notebook.cells if cell.cell_type == "code"), 1):
         for counted in (cell, *(output for output in cell.outputs if "execution_count" in output)):
             counted.execution_count = number

@@ -15,7 +15,7 @@ from zwfs._system import write_file
 
 from . import pdf as printing
 from .execute import TRACEBACK_LINES
-from .project import EXECUTED, PDF, Project, ToolError
+from .project import EXECUTED, PDF, PYODIDE, Project, ToolError
 from .record import commit, digest, digest_files
 from .run import moved_numbers, refresh, run
 from .scratch import scratch_folder, swap
@@ -107,7 +107,9 @@ def _digest(project: Project, printed: bool) -> str:
         executed = project.executed / notebook.name
         files += [executed, executed.with_suffix(".json"), *project.published(notebook.stem)]
     named = {file.relative_to(root).as_posix(): file for file in files if file.is_file()}
-    about = json.dumps([sys.version_info[:2], printed, commit(root)])  # the pages name the commit
+    about = json.dumps(
+        [sys.version_info[:2], printed, os.environ.get(PYODIDE), commit(root)]
+    )  # the pages name the commit
     return digest([digest_files(named).encode(), about.encode()])
 
 

@@ -17,7 +17,7 @@ from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event
 
-from studies.kit.parameters import Fields, check_parameters
+from studies.kit.parameters import Fields, check_parameters, example, typed
 
 from .project import ToolError, one_line
 
@@ -54,7 +54,7 @@ class Parameter:
         if isinstance(self.limits, Fields):
             return "mapping"
         depth, within = _unlisted(self.limits)
-        return "list of " * depth + type(_example(within)).__name__
+        return "list of " * depth + type(example(within)).__name__
 
     @property
     def allowed(self) -> str:
@@ -95,13 +95,6 @@ def _unlisted(limits: Any) -> tuple[int, Any]:
     while isinstance(limits, list):
         depth, limits = depth + 1, limits[0]
     return depth, limits
-
-
-def _example(limits: Any) -> Any:
-    """Return a value of the type that single values within some limits have: a float if one limit is a float."""
-    if isinstance(limits, type):
-        return limits()
-    return next((one for one in limits or () if isinstance(one, float)), limits[0] if limits else None)
 
 
 def parameters(notebook: NotebookNode) -> dict[str, Parameter]:
@@ -169,8 +162,8 @@ def accept(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]
     except (TypeError, ValueError) as error:
         raise ParameterError(str(error)) from None
     # In the order of the notebook: the order on the command line makes no difference.
-    typed = {name: _typed(given[name], one.limits) for name, one in known.items() if name in given}
-    return {name: value for name, value in typed.items() if value != known[name].default}
+    checked = {name: typed(given[name], one.limits) for name, one in known.items() if name in given}
+    return {name: value for name, value in checked.items() if value != known[name].default}
 
 
 def accept_together(notebook: NotebookNode, values: dict[str, Any]) -> None:
@@ -186,15 +179,6 @@ def nearest(name: str, known: Any) -> str:
     """Suggest the known name that is most like a given one, or list all known names."""
     similar = difflib.get_close_matches(str(name), known, n=1)
     return f"did you mean {similar[0]!r}?" if similar else f"expected one of {', '.join(known) or '(none)'}"
-
-
-def _typed(value: Any, limits: Any) -> Any:
-    """Return a checked value, with floats in place of integers where the limits are floats."""
-    if isinstance(limits, Fields):
-        return {name: _typed(one, limits.every()[name]) for name, one in value.items()}
-    if isinstance(value, list):
-        return [_typed(item, limits[0]) for item in value]
-    return float(value) if isinstance(_example(limits), float) else value
 
 
 class _Constructor(SafeConstructor):

@@ -18,7 +18,7 @@ import bs4
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 
-from studies.kit.results import published
+from studies.kit.results import SCREENS, published
 
 from .notebook import to_bytes
 from .project import Project
@@ -55,16 +55,18 @@ window.MathJax = {
 ACTIVE = ["script", "iframe", "object", "embed", "base", "meta", "link", "form"]
 
 
-def page(project: Project, name: str, notebook: NotebookNode, files: list[Path], scratch: Path) -> tuple[str, str]:
+def page(
+    project: Project, name: str, notebook: NotebookNode, files: list[Path], scratch: Path, *, changed: bool = False
+) -> tuple[str, str]:
     """Build the page of an executed notebook; return it and the warnings of Sphinx, a line each.
 
     Sphinx reads the whole book with its settings and writes this page: equations have the same numbers as in the
-    book. Links to other pages become plain text.
+    book. Links to other pages become plain text. With `changed`, text of the class `defaults` is left out.
     """
     source, output = scratch / "source", scratch / "html"
     _stage(project, name, notebook, files, source)
     warnings = _sphinx(source, output, f"notebooks/{name}.ipynb")
-    embedded = _embed(output, f"notebooks/{name}.html", {file.name for file in files})
+    embedded = _embed(output, f"notebooks/{name}.html", {file.name for file in files}, changed)
     marked = [line for line in warnings.splitlines() if f"notebooks/{name}.ipynb" in line]
     return embedded, "\n".join(line.replace(f"{source}/", "") for line in marked)
 
@@ -91,7 +93,8 @@ def _with_downloads(notebook: NotebookNode, files: list[Path]) -> NotebookNode:
     for cell in notebook.cells:
         result.cells.append(cell)
         for figure in published(cell.source) if cell.cell_type == "code" else []:
-            links = (f"{{download}}`{file.name} <downloads/{file.name}>`" for file in files if file.stem == figure)
+            own = [file.name for file in files if file.stem in (figure, figure + SCREENS)]
+            links = (f"{{download}}`{file} <downloads/{file}>`" for file in own)
             result.cells.append(new_markdown_cell("Download: " + " · ".join(links), id=f"files-{figure}"[:64]))
     return result
 
@@ -139,13 +142,15 @@ def _is_within(folder: Path, file: Path) -> bool:
     return Path(os.path.realpath(file)).is_relative_to(os.path.realpath(folder))
 
 
-def _embed(output: Path, document: str, published: set[str]) -> str:
+def _embed(output: Path, document: str, published: set[str], changed: bool) -> str:
     """Return a page that Sphinx wrote, with its pictures and styles in it, and without active elements."""
     file = output / document
     soup = bs4.BeautifulSoup(file.read_text("utf-8"), "html.parser")
     body = soup.find("div", class_="body")
     for element in body.find_all(ACTIVE):
         element.decompose()
+    if changed:
+        leave_out(body)
     for picture in body.find_all("img"):
         source = file.parent / unquote(picture.get("src", ""))
         if _is_within(output, source) and source.is_file():
@@ -169,6 +174,19 @@ def _embed(output: Path, document: str, published: set[str]) -> str:
         scripts="\n".join(f"<script>{script}</script>" for script in scripts),
         body="".join(map(str, body.contents)),
     )
+
+
+def leave_out(body: bs4.Tag) -> None:
+    """Remove what holds for the defaults only: marked text, what it leaves empty, and descriptions of figures."""
+    for element in body.select(".defaults"):
+        element.decompose()
+    for element in reversed(body.find_all(["p", "li", "ul", "ol", "section"])):
+        heading = element.find(re.compile("h[1-6]"), recursive=False)
+        said = element.get_text().strip().removeprefix(heading.get_text().strip() if heading else "")
+        if not said and not element.find(["img", "table", "input"]):
+            element.decompose()
+    for picture in body.select("img[alt]"):
+        picture["alt"] = "Figure of this run; the CSV file has its numbers."
 
 
 def _policy(scripts: list[str]) -> str:

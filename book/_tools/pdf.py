@@ -19,7 +19,7 @@ from bs4 import BeautifulSoup, Tag
 from playwright.sync_api import Browser, sync_playwright
 from pypdf import PdfReader, PdfWriter
 from pypdf.generic import DictionaryObject, NameObject, TextStringObject
-from sphinx_external_toc.api import SiteMap, TocTree
+from sphinx_external_toc.api import SiteMap
 from sphinx_external_toc.parsing import parse_toc_yaml
 
 from .address import setting
@@ -112,17 +112,14 @@ def _assemble(root: Path, book: Path) -> BeautifulSoup:
     version = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["project"]["version"]
     mathjax = _mathjax(_read(book, toc.root.docname), toc.root.docname)
     chapters = {name: chapter(_read(book, name), name, known) for name in toc}
-    chapters[toc.root.docname].select_one("h2").string = "Introduction"
+    chapters[toc.root.docname].h1.string = "Introduction"
     title, author = html.escape(config["title"]), html.escape(config["author"])
     contents, body = "", ""
-    for caption, names in parts(toc):
-        if caption:
-            contents += f'<p class="part">{html.escape(caption)}</p>'
-            body += f'<h1 class="part">{html.escape(caption)}</h1>'
-        for name in names:
-            heading = html.escape(chapters[name].select_one("h2").get_text())
-            contents += f'<p><a href="#{name}">{heading}</a><span class="page" data-name="{name}">000</span></p>'
-            body += str(chapters[name])
+    for name, depth in depths(toc).items():
+        heading = html.escape(chapters[name].h1.get_text())
+        link = f'<a href="#{name}">{heading}</a><span class="page" data-name="{name}">000</span>'
+        contents += f'<p class="depth-{depth}">{link}</p>'
+        body += str(chapters[name])
     sheets = "".join(f'<link rel="stylesheet" href="_static/{sheet}">' for sheet in STYLES)
     return BeautifulSoup(
         f"""<!DOCTYPE html>
@@ -139,13 +136,15 @@ def _read(book: Path, name: str) -> BeautifulSoup:
     return BeautifulSoup((book / f"{name}.html").read_text("utf-8"), "html.parser")
 
 
-def parts(toc: SiteMap) -> list[tuple[str | None, list[str]]]:
-    """List the parts of the book, each with its caption and its pages; the front page has no caption."""
+def depths(toc: SiteMap) -> dict[str, int]:
+    """Return how deep each page is nested, in the order of the book; 0 for the front page and the parts."""
 
-    def below(tree: TocTree) -> list[str]:
-        return [name for item in tree.items for name in (str(item), *chain(*map(below, toc[str(item)].subtrees)))]
+    def below(name: str, depth: int) -> Iterator[tuple[str, int]]:
+        yield name, depth
+        for item in chain(*(tree.items for tree in toc[name].subtrees)):
+            yield from below(str(item), depth + 1)
 
-    return [(None, [toc.root.docname]), *((tree.caption, below(tree)) for tree in toc.root.subtrees)]
+    return {name: max(depth - 1, 0) for name, depth in below(toc.root.docname, 0)}
 
 
 def _mathjax(page: BeautifulSoup, name: str) -> str:
@@ -167,9 +166,6 @@ def chapter(page: BeautifulSoup, name: str, known: set[str]) -> Tag:
             paragraph.decompose()
     for details in article.find_all("details"):
         details["open"] = ""
-    for level in range(5, 0, -1):
-        for heading in article.find_all(f"h{level}"):
-            heading.name = f"h{level + 1}"  # the parts are above the chapters
     for element in article.find_all(id=True):
         element["id"] = f"{name}--{element['id']}"
     for element in article.find_all(src=True):

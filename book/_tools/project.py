@@ -5,9 +5,9 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-# Environment variables for the extensions of the book: the folder of the executed notebooks from the root, and the
-# name of the PDF.
-EXECUTED, PDF = "ZWFS_EXECUTED", "ZWFS_PDF"
+# Environment variables for the extensions of the book: the folder of the executed notebooks from the root, the
+# name of the PDF, and a folder with Pyodide to copy into the book.
+EXECUTED, PDF, PYODIDE = "ZWFS_EXECUTED", "ZWFS_PDF", "ZWFS_PYODIDE"
 
 # Sets up the environment again, from new downloads: a damaged file may come from the cache.
 REPAIR = "rm -rf .venv && UV_NO_CACHE=1 make .venv/.ready"

@@ -23,7 +23,7 @@ from studies.kit.tables import plain
 
 from . import declared, record
 from .declared import Parameter, ParameterError
-from .notebook import normalise, read, title, title_cell, to_bytes
+from .notebook import normalise, read, title, title_cell, to_bytes, without_gaps
 from .project import Project
 from .scratch import scratch_folder, swap
 
@@ -277,8 +277,8 @@ def notice(changed: dict[str, Any], known: dict[str, Parameter]) -> NotebookNode
     ]
     text = [
         "> **The parameters of this page are not those of the book.**",
-        "> Pictures, tables and numbers show this run. The text was written for the defaults:",
-        "> its statements about the results may not hold here.",
+        "> Pictures, tables and numbers show this run. The page leaves out sentences that hold for the",
+        "> defaults only; in the notebook they are marked `{.defaults}`.",
         "",
         "| parameter | here | default | unit | meaning |",
         "| --- | --- | --- | --- | --- |",
@@ -317,10 +317,10 @@ def make(
         notebook = run.notebook
         if changed:
             notebook.cells.insert(title_cell(notebook) + 1, notice(changed, known))
-        notebook = normalise(notebook)
+        notebook = without_gaps(normalise(notebook))
         shutil.copytree(run.folder, new)
         (new / f"{name}.ipynb").write_bytes(to_bytes(notebook))
-        html, warnings = page.page(project, name, notebook, run.files, scratch / "page")
+        html, warnings = page.page(project, name, notebook, run.files, scratch / "page", changed=bool(changed))
         (new / f"{name}.html").write_text(html, "utf-8")
         parameters = {key: one.default for key, one in known.items()} | changed
         about = {

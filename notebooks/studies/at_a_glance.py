@@ -69,5 +69,7 @@ def numbers(pupil: Pupil, phase: NDArray, estimates: Mapping[str, NDArray]) -> d
     """Wavefront error and error of each method, radian rms."""
     rms = {"input": float(pupil.rms(phase))}
     rms |= {f"error_{name}": float(reconstruction_error(pupil, one, phase)) for name, one in estimates.items()}
+    shifted = rms["error_PhaseShifted"]
+    text = "below 10⁻⁶ rad rms" if shifted < 1e-6 else f"{shifted:.2g} rad rms"
     tiny = {name: value for name, value in rms.items() if value <= 0.01}  # their second digit is rounding
-    return rounded(rms, ".2g") | rounded(tiny, ".1g")
+    return rounded(rms, ".2g") | rounded(tiny, ".1g") | {"error_text": text}

@@ -28,6 +28,7 @@ LIMITS = parameter_limits(
     bandwidths=[(0.0, 1.0)],
     photons=(1.0, 1e9),
 )
+QUICK = {"n_screens": 1, "bandwidths": [0.0, 0.1, 0.25]}
 
 SHIFTED, IGNORED, KNOWN = "PhaseShifted, ignored", "MaximumLikelihood, ignored", "MaximumLikelihood, known"
 """Ways to reconstruct frames of a band: method, and whether it knows the bandwidth."""

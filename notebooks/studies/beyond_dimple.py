@@ -31,10 +31,10 @@ from studies.fig04_dimple_diameter import (
     iteration_spectrum,
 )
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, crossing
+from studies.kit.curves import ErrorCurves, Limit, crossing, percent, reach_text
 from studies.kit.methods import MASKS, opposite_dimples
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded
+from studies.kit.results import rounded, stacked
 from studies.kit.style import LOOKS, OTHER_STYLES
 from studies.kit.tables import Table
 from zwfs.bounds import cramer_rao
@@ -49,6 +49,7 @@ LIMITS = parameter_limits(
     step_fine=(0.01, 0.3),
     n_screens_few=(1, 100),
 )
+QUICK = {"n_pixels": 40, "n_screens": 3, "step": 0.5, "step_fine": 0.3}
 USUAL, LARGE = 1.06, 3.0  # diameters of the paper and of a dimple beyond its limit, lambda/D
 _TILTS = 2  # the first modes: Noll 2 and 3
 
@@ -153,7 +154,7 @@ def draw_dimple_recovery(curves: Mapping[float, DiameterCurves], threshold: floa
             error.semilogy(curve.diameters, np.maximum(curve.mean(name), _FLOOR), **line)
         limit = threshold * rms
         error.axhline(limit, color=_INK, lw=1)
-        error.text(0.52, limit * 1.3, f"{threshold:.0%} of the input", color=_INK, fontsize=9)
+        error.text(0.52, limit * 1.3, f"{100 * threshold:g}% of the input", color=_INK, fontsize=9)
         share.set_title(f"input {rms:g} rad rms\n", fontsize=10)
         error.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=curve.diameters[[0, -1]], ylim=(_FLOOR / 2, 4))
         for axes in (share, error):
@@ -218,6 +219,11 @@ def recovery_columns(curves: Mapping[float, DiameterCurves], threshold: float) -
             columns[f"{name}, {rms:g} rad rms: share recovered"] = curve.recovered(name, threshold)
             columns[f"{name}, {rms:g} rad rms: mean error (rad rms)"] = curve.mean(name)
     return columns
+
+
+def recovery_screens(curves: Mapping[float, DiameterCurves]) -> dict[str, NDArray]:
+    """Columns with a row for each screen of the first figure."""
+    return stacked("input (rad rms)", {rms: curve.screens() for rms, curve in curves.items()})
 
 
 def limits_columns(limits: DimpleLimits) -> dict[str, NDArray]:
@@ -322,6 +328,10 @@ def numbers(
         "masks_likely_least": likely.min(),
         "masks_likely_most": likely.max(),
     }
+    allowed, words = threshold * first.rms[0], f"{percent(threshold)} of the input"
+    for name, short in ((PLAIN, "plain"), (ACCELERATED, "accelerated")):
+        error = first.mean(name)
+        found[f"{short}_reach"] = reach_text(first.diameters, error, allowed, fails[name], words, "λ/D")
     return rounded(found, ".4g")
 
 

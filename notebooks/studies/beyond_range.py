@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from studies.fig04_dimple_diameter import iteration_spectrum
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, crossing
-from studies.kit.parameters import parameter_limits
+from studies.kit.curves import ErrorCurves, Limit, crossing, percent, reach_text
+from studies.kit.parameters import SETUP, Fields, parameter_limits
 from studies.kit.results import rounded
-from studies.kit.setups import Noise, screens_at
+from studies.kit.setups import SCREENS, Noise, Screens, screens_at
 from studies.kit.style import LOOKS, OTHER_STYLES, Look
 from studies.kit.tables import Table, small
 from zwfs.bounds import cramer_rao
@@ -45,7 +45,15 @@ LIMITS = parameter_limits(
     n_subpixels=(2, 8),
     n_screens_model=(1, 1000),
     n_screens_limit=(10, 10000),
+    screens=Fields(SETUP["screens"].of, kinds={kind: SETUP["screens"].kinds[kind] for kind in SCREENS[:3]}),
 )
+QUICK = {
+    "n_pixels": 40,
+    "inputs": [0.1, 0.5, 1.0, 2.0],
+    "photons": [1e2, 1e4],
+    "n_screens": 2,
+    "n_screens_limit": 10,
+}
 PLAIN, ACCELERATED, LIKELY, MODES = (
     "PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood", "MaximumLikelihoodModes",
 )  # fmt: skip
@@ -59,12 +67,12 @@ class Trials:
     """Settings that all experiments of the chapter share."""
 
     n_iterations: int
-    exponent: float
+    source: Screens
     seed: int
 
-    def screens(self, modes: NDArray, rms: float, n_screens: int, task: int) -> NDArray[np.floating]:
-        """Screens of one task, see `screens_at`."""
-        return screens_at(modes, rms, n_screens, self.seed, task, self.exponent)
+    def screens(self, pupil: Pupil, modes: NDArray, rms: float, n_screens: int, task: int) -> NDArray[np.floating]:
+        """Screens of one task on a pupil with these modes, see `screens_at`."""
+        return screens_at(replace(self.source, pupil=pupil, modes=modes), rms, n_screens, self.seed, task)
 
 
 def compared_methods(
@@ -119,7 +127,7 @@ def noise_curves(
 ) -> list[NoiseCurves]:
     """Errors of all methods for each number of photons, and without noise at more inputs."""
     levels = [_WITHOUT_NOISE, *sorted(photons)]
-    rms = {level: [*inputs, *([] if level else inputs_noiseless)] for level in levels}
+    rms = {level: sorted({*inputs, *([] if level else inputs_noiseless)}) for level in levels}
     # The largest inputs take longest: they begin first, so that all cores end at about the same time.
     points = [(level, task) for level in levels for task in reversed(range(len(rms[level])))]
     tasks = [(level, task, rms[level][task]) for level, task in points]
@@ -141,16 +149,12 @@ def noise_curves(
 
 
 def _noise_point(
-    point: tuple[float, int, float],
-    sensor: ZernikeSensor,
-    modes: NDArray,
-    n_screens: int,
-    trials: Trials,
+    point: tuple[float, int, float], sensor: ZernikeSensor, modes: NDArray, n_screens: int, trials: Trials
 ) -> tuple[dict[str, NDArray], dict[str, float], NDArray]:
     """One number of photons and input: errors, (n_screens,), bounds, and consistent, (n_screens,)."""
     photons, task, rms = point
-    screens = trials.screens(modes, rms, n_screens, task)
-    noise = Noise(sensor.n_masks * photons)  # the light of all images goes to one where a method uses one
+    screens = trials.screens(sensor.pupil, modes, rms, n_screens, task)
+    noise = Noise(photons)
     errors, consistent = {}, np.zeros(n_screens, bool)
     for name, method in all_methods(sensor, modes, trials.n_iterations, photons).items():
         result = method(noise(method.sensor, screens, np.random.SeedSequence(trials.seed, spawn_key=(task, 0))))
@@ -233,7 +237,7 @@ def _model_point(
     """Errors of one input, (n_screens,) by the error of the model and the method."""
     task, rms = point
     camera = FineCamera(sensor, modes, errors.n_subpixels)
-    fine = np.where(camera.pupil.inside, trials.screens(camera.modes, rms, n_screens, task), 0)
+    fine = np.where(camera.pupil.inside, trials.screens(camera.pupil, camera.modes, rms, n_screens, task), 0)
     screens = camera.mean(fine)
     methods = compared_methods(sensor, trials.n_iterations, n_starts=1)  # no phase explains the frames
     return {
@@ -308,7 +312,7 @@ def causes(
     kept = curves.errors[ACCELERATED] <= threshold * rms[:, np.newaxis]
     places = np.argwhere(lost & kept & (np.array(factor) < 1))
     task, index = places[len(places) // 2] if len(places) else (len(rms) - 1, 0)
-    screen = trials.screens(modes, rms[task], n_screens, int(task))[[index]]
+    screen = trials.screens(sensor.pupil, modes, rms[task], n_screens, int(task))[[index]]
     example = {
         name: reconstruction_error(sensor.pupil, result.history[0], screen[0])
         for name, result in _variants(sensor, sensor.measure(screen), trials.n_iterations, history=True).items()
@@ -330,15 +334,12 @@ def _variants(sensor: ZernikeSensor, frames: NDArray, n_iterations: int, **optio
 
 
 def _causes_point(
-    point: tuple[int, float],
-    sensor: ZernikeSensor,
-    modes: NDArray,
-    n_screens: int,
-    trials: Trials,
+    point: tuple[int, float], sensor: ZernikeSensor, modes: NDArray, n_screens: int, trials: Trials
 ) -> tuple[dict[str, NDArray], list[float]]:
     """Errors, (n_screens,) by variant, and contraction factors, (n_screens,), of one input."""
     task, rms = point
-    screens, pupil = trials.screens(modes, rms, n_screens, task), sensor.pupil
+    pupil = sensor.pupil
+    screens = trials.screens(pupil, modes, rms, n_screens, task)
     results = _variants(sensor, sensor.measure(screens), trials.n_iterations)
     errors = {name: reconstruction_error(pupil, result.phase, screens) for name, result in results.items()}
     diameter = sensor.masks[0].diameter
@@ -375,11 +376,11 @@ def _input_axes(axes: Axes, threshold: float, bottom: float, *, named: bool = Tr
     axes.plot(ends, threshold * ends, color=_INK, lw=1, ls=":", zorder=0.5)
     if named:
         axes.annotate(
-            f"{threshold:.0%}", (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points", color=_INK,
-            fontsize=9, va="center",
+            f"{100 * threshold:g}%", (ends[1], threshold * ends[1]), (3, 0), textcoords="offset points",
+            color=_INK, fontsize=9, va="center",
         )  # fmt: skip
     axes.set_xlim(*ends)
-    ticks = [tick for tick in (0.05, 0.1, 0.2, 0.5, 1, 2, 4) if ends[0] <= tick <= ends[1]]
+    ticks = [tick for tick in (0.05, 0.1, 0.2, 0.5, 1, 2, 4, 10) if ends[0] <= tick <= ends[1]]
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.set_xticks([], minor=True)
 
@@ -396,7 +397,7 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
     chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
     for name in chosen.errors:
         methods.plot(chosen.rms, chosen.median(name), **method_line(name))
-    methods.set_title(f"{_spaced(chosen.photons)} photons per point", fontsize=10)
+    methods.set_title(f"{_spaced(chosen.photons)} photons per point and image", fontsize=10)
     methods.set_ylabel("median error (rad rms)")
     line = method_line(LIKELY) | {"label": "_"}
     for curve in noisy:
@@ -406,7 +407,7 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
             _spaced(curve.photons), (curve.rms[-1], curve.median(LIKELY)[-1]), (7, 0),
             textcoords="offset points", fontsize=9, va="center",
         )  # fmt: skip
-    light.set_title("maximum likelihood, by photons per point", fontsize=10)
+    light.set_title("maximum likelihood, by photons", fontsize=10)
     exact = noiseless.complete_up_to(LIKELY, threshold)
     bottom = noisy[-1].median(MODES).min() / 3
     if exact:
@@ -433,7 +434,7 @@ def draw_model_errors(curves: Mapping[str, ErrorCurves], noise: NoiseCurves, thr
             axes.plot(curve.rms, np.median(curve.errors[name], axis=1), label=kind, ms=5, **style)
         axes.fill_between(
             noise.rms, noise.median(name), 1e-9, color="#999999", alpha=0.3, lw=0, zorder=0.4,
-            label=f"below the photon noise of {_spaced(noise.photons)} per point",
+            label=f"below the photon noise of {_spaced(noise.photons)} per point and image",
         )  # fmt: skip
         axes.set_title(method_look(name).name, fontsize=10)
         rms = next(iter(curves.values())).rms
@@ -476,10 +477,10 @@ def draw_causes(found: Causes, threshold: float) -> Figure:
 
 def range_columns(curves: Sequence[NoiseCurves]) -> dict[str, NDArray]:
     """Columns of the first figure: median and largest error of each method, and the bounds."""
-    columns: dict[str, list[Any]] = {"photons per point": [], "input (rad rms)": []}
+    columns: dict[str, list[Any]] = {"photons per point and image": [], "input (rad rms)": []}
     for curve in curves:
         n_rms = curve.rms.size
-        columns["photons per point"] += [curve.photons] * n_rms
+        columns["photons per point and image"] += [curve.photons] * n_rms
         columns["input (rad rms)"] += list(curve.rms)
         for name in curve.errors:
             for kind, values in (("median", curve.median(name)), ("largest", curve.errors[name].max(axis=1))):
@@ -522,7 +523,29 @@ def error_table(curves: Sequence[NoiseCurves]) -> Table:
         for curve in noisy
         for name, words in ((LIKELY, "points"), (MODES, "modes"))
     ]
-    return Table(["photons per point", "estimated", *(f"{noisy[0].rms[place]:g} rad" for place in at)], rows)
+    return Table(
+        ["photons per point and image", "estimated", *(f"{noisy[0].rms[place]:g} rad" for place in at)], rows
+    )
+
+
+def _exact_text(noiseless: NoiseCurves, threshold: float) -> str:
+    """Inputs up to which maximum likelihood recovers every screen without noise, in words."""
+    exact = noiseless.complete_up_to(LIKELY, threshold)
+    n_screens = noiseless.errors[LIKELY][noiseless.rms <= exact].size
+    if not exact:
+        return f"loses screens already at {noiseless.rms[0]:.2g} rad rms"
+    return f"recovers all {n_screens} simulated screens of up to {exact:.2g} rad rms"
+
+
+def _half_text(found: Causes, threshold: float) -> str:
+    """Input at which the plain iteration recovers half of the screens, in words."""
+    half, error = found.half(PLAIN, threshold)
+    rms = found.curves.rms
+    if 0 < half < np.inf:
+        return f"recovers only half of the screens at {Limit(half, error)} rad rms"
+    if half:
+        return f"recovers at least half of the screens up to {rms[-1]:.2g} rad rms"
+    return f"recovers less than half of the screens at {rms[0]:.2g} rad rms"
 
 
 def numbers(
@@ -538,11 +561,13 @@ def numbers(
     chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
     few = min(noisy, key=lambda curve: abs(np.log(curve.photons / 1e3)))
     at = {name: int(np.argmin(np.abs(chosen.rms - rms))) for name, rms in (("1", 1.0), ("3", 3.0))}
-    plain, accuracy = found.half(PLAIN, threshold)
+    plain, _ = found.half(PLAIN, threshold)
     two = int(np.argmin(np.abs(found.curves.rms - 2.0)))
     right = noiseless.errors[LIKELY] <= threshold * noiseless.rms[:, np.newaxis]
     usual = (chosen.rms >= 0.1) & (chosen.rms <= 2)
+    usual |= not usual.any()
     *_, area = model.values()
+    pixels = np.median(area.errors[LIKELY], axis=1)
     result = dict(settings) | {
         "exact_up_to": noiseless.complete_up_to(LIKELY, threshold),
         "n_noiseless": right.size,
@@ -551,14 +576,21 @@ def numbers(
         "false_alarms": np.count_nonzero(~noiseless.consistent & right),
         "few_photons": few.photons,
         "shown_photons": chosen.photons,
-        "modes_gain": np.median(chosen.median(LIKELY)[usual] / chosen.median(MODES)[usual]),
-        "modes_excess": np.max(chosen.median(MODES)[usual] / chosen.bound[MODES][usual]) - 1,
+        "modes_share": np.median(chosen.median(MODES)[usual] / chosen.median(LIKELY)[usual]),
+        "modes_over": np.max(chosen.median(MODES)[usual] / chosen.bound[MODES][usual]),
+        "modes_from": chosen.rms[usual][0],
+        "modes_to": chosen.rms[usual][-1],
         "plain_half": plain,
-        "plain_half_sigma": accuracy,
         "contracting_at_2": np.mean(found.factor[two] < 1),
-        "example_rms": found.example_rms,
-        "pixels_matter": crossing(area.rms, np.median(area.errors[LIKELY], axis=1), PIXEL_ERROR),
-        "pixel_error": PIXEL_ERROR,
+        "exact_text": _exact_text(noiseless, threshold),
+        "half_text": _half_text(found, threshold),
+        "pixels_text": reach_text(
+            area.rms, pixels, PIXEL_ERROR, Limit(crossing(area.rms, pixels, PIXEL_ERROR)), f"{PIXEL_ERROR:g} rad"
+        ),
+        "threshold_text": percent(threshold),
+        "model_input": area.rms[np.argmin(np.abs(area.rms - 1.0))],
+        "input_2": found.curves.rms[two],
+        **{f"input_{name}": chosen.rms[place] for name, place in at.items()},
     }
     for name, method in (("plain", PLAIN), ("dimmed", DIMMED), ("accelerated", ACCELERATED)):
         result[f"{name}_at_2"] = found.curves.recovered(method, threshold)[two]

@@ -31,6 +31,7 @@ LIMITS = parameter_limits(
     rms_commands=(0.05, 2.0),
     photons=(100.0, 1e9),
 )
+QUICK = {"n_pixels": 36, "n_commands": 2, "inputs": [0.8], "n_screens": 1}
 
 WAYS = {
     "design": "model of the design",

@@ -38,6 +38,7 @@ LIMITS = parameter_limits(
     photons_zero=(1.0, 1e12),
     inputs=[(0.01, 4.0)],
 )
+QUICK = {"inputs": [0.7], "n_screens": 3, "n_screens_linear": 4}
 
 ONE_IMAGE = "Linear", "Arcsine"
 TWO_IMAGES = "LinearTwo", "PhaseShifted", "MaximumLikelihood"
@@ -224,14 +225,14 @@ def linear_loops(
 
 
 def loop_methods(sensors: Sequence[ZernikeSensor], modes: NDArray, photons: float) -> dict[str, Any]:
-    """Return reconstructors for one and two images (`sensors`); `photons` per point are those of all images."""
+    """Return reconstructors for one and two images (`sensors`); `photons` are those per point and image of two."""
     one, two = sensors
     methods = (
         Linear(one, modes),
         Arcsine(one, n_iterations=5, tolerance=0),
         Linear(two, modes),
         PhaseShifted(two, n_iterations=3, tolerance=0, accelerate=True),
-        MaximumLikelihood(two, photons=photons / 2, n_iterations=3, n_starts=1),
+        MaximumLikelihood(two, photons=photons, n_iterations=3, n_starts=1),
     )
     return dict(zip((*ONE_IMAGE, *TWO_IMAGES), methods, strict=True))
 
@@ -241,7 +242,7 @@ class TunedLoops:
     """Loops of all methods for one input and one star, each with its best gain."""
 
     start: float  # wavefront error at the start, radian rms
-    photons: float  # per point and step, all images together
+    photons: float  # per point, step and image of two; one image gets the light of both
     gains: Mapping[str, float]
     chosen: Mapping[str, float]  # residual with that gain on the screens that chose it, radian rms
     settled: Mapping[str, NDArray]  # (n_screens,) residual on new screens, radian rms
@@ -282,7 +283,7 @@ def tuned_loops(
     first, then = map(int, np.random.SeedSequence(seed).generate_state(2))
     few = FrozenFlow(pupil, start, max(1, n_screens // 2), **wind, seed=first)
     many = FrozenFlow(pupil, start, n_screens, **wind, seed=then)
-    settings |= {"photons": photons * pupil.n_points}
+    settings |= {"photons": 2 * photons * pupil.n_points}
 
     def settle(name: str, flow: FrozenFlow, gain: float, noise: int) -> NDArray:
         return follow_flow(made[name], modes, flow, n_steps, gain=gain, seed=noise, **settings).settled()
@@ -360,7 +361,7 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
                 style |= {"markerfacecolor": "white", "linestyle": "--"}
             residual = [typical(one.settled[name]) for one in some]
             axes.semilogy([one.start for one in some], residual, label=method_name(name), **style)
-        axes.set_title(f"{photons:g} photons per point", fontsize=10)
+        axes.set_title(f"{photons:g} photons per point and image", fontsize=10)
         axes.set(xlabel="error at the start (rad rms)", xticks=[one.start for one in some])
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter("{x:g}")
@@ -382,7 +383,7 @@ def tuned_columns(trials: Sequence[TunedLoops]) -> dict[str, Sequence[float]]:
     """Columns of the figure: gain, residual and closed loops of each method, for each input and star."""
     columns: dict[str, Sequence[float]] = {
         "start (rad rms)": [one.start for one in trials],
-        "photons per point": [one.photons for one in trials],
+        "photons per point and image": [one.photons for one in trials],
     }
     for name in trials[0].settled:
         columns[f"{name}: gain"] = [one.gains[name] for one in trials]
@@ -395,16 +396,17 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
     """Return the best method for each input and star, and what the second image gains."""
     header = (
         "start (rad rms)",
-        "photons per point",
+        "photons per point and image",
         "best method",
         "residual: two images / one",
-        "loops that close",
+        "loops that close: two images, one",
     )
     cells = []
     for row in rows:
         loops, best = row.loops, method_name(row.best) if row.best else "one or two images"
         closed = f"{loops.closed(row.two)} and {loops.closed(row.one)} of {loops.settled[row.one].size}"
-        ratio = f"{row.ratio:.2f} ({row.low:.2f} to {row.high:.2f})"
+        span = f"{row.low:.2f} to {row.high:.2f}" if row.high < np.inf else "one loop"
+        ratio = f"{row.ratio:.2f} ({span})"
         cells.append([f"{loops.start:g}", f"{loops.photons:g}", best, ratio, closed])
     return Table(header, cells)
 

@@ -30,12 +30,13 @@ LIMITS = parameter_limits(
     phase_shift_best=(0.01, 3.13),
     drift=(0.001, 1000.0),
     wavelength=(100.0, 20000.0),
-    photons=[(1e4, 1e16)],
-    photons_gain=[(1e4, 1e16)],
+    photons=[(1e4, 1e14)],
+    photons_gain=[(1e4, 1e14)],
     gains=[(0.01, 1.5)],
     n_cycles=(4, 10000),
     n_screens=(1, 1000),
 )
+QUICK = {"photons": [1e8, 1e10], "photons_gain": [1e8], "gains": [0.1, 0.4, 1.0], "n_cycles": 40, "n_screens": 2}
 
 IDEAL = "ideal sensor"
 """Name of a sensor that measures each mode of unit rms with an error of 1 / (2 sqrt(photons)) radian."""
@@ -229,6 +230,7 @@ def numbers(curves: DriftCurves) -> dict[str, float | str]:
     least, most = min(by_gain), max(by_gain)
     found |= {
         "photons_ideal": photons_ideal,
+        "per_point": 1e9 / 2 / np.count_nonzero(np.any(drift.modes, axis=0)),
         "saved": 100 * (1 - photons[-1] / photons[1]),
         "above_ideal": 100 * (photons[-1] / photons_ideal - 1),
         "pair_over_classic": photons[1] / photons[0],

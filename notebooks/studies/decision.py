@@ -42,6 +42,8 @@ LIMITS = parameter_limits(
     **dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop"), (2, 1000)),
 )
 
+QUICK = {"n_pixels": 32, "n_commands": 2, "n_screens": 2, "n_screens_perfect": 2, "n_screens_loop": 2}
+
 COLUMNS = {"perfect": "no errors", "calibrated": "calibrated", "design": "only the design known"}
 """What is known of the bench, and the headers of the table."""
 ONE_IMAGE = {"Linear": "linear", "Arcsine": "arcsine", "LikelihoodOne": "maximum likelihood on modes"}
@@ -194,7 +196,7 @@ def _closed_loop(situation: Situation, n_screens: int, seed: int) -> TunedLoops:
         (ZernikeSensor(pupil, masks[0]), ZernikeSensor(pupil, *masks)),
         zernike_basis(pupil, 80),
         situation.rms,
-        2 * situation.photons,
+        situation.photons,
         gains=(0.1, 0.2, 0.4),
         n_screens=n_screens,
         n_steps=40,
@@ -286,7 +288,7 @@ def loop_rows(found: Iterable[BestMethods]) -> list[Row]:
     rows = []
     for index, one in enumerate(found):
         cells = {"perfect": loop_cell(one), "calibrated": None, "design": None}
-        text = f"closed loop from {one.loops.start:g} rad rms; {_light(one.loops.photons / 2)} per step"
+        text = f"closed loop from {one.loops.start:g} rad rms; {_light(one.loops.photons)} per step"
         rows.append(Row(f"closed_{index + 1}", text, cells, Link("closed loop", "closed_loop.ipynb")))
     return rows
 

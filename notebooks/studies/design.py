@@ -36,6 +36,7 @@ LIMITS = parameter_limits(
     n_angles=(2, 100),
     added=(-1.0, 1.0),
 )
+QUICK = {"n_pixels": 32, "n_screens": 2, "step": 0.4, "n_angles": 7}
 
 _TOLERANCE = 1e-4  # of the model of the sensor: changes the bound by less than 1e-3, and is several times faster
 

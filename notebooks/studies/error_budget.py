@@ -25,6 +25,7 @@ LIMITS = parameter_limits(
     bench=bench_fields("n_pixels"),
 )
 CHECK_TOGETHER = check_bench
+QUICK = {"n_pixels": 68, "inputs": [0.8], "n_screens": 1, "leakages": [0.0, 0.1, 0.3]}
 
 NAME = "PhaseShifted"  # the reconstructor of the page
 Curves = Mapping[str, BenchCurves]  # by the error that is switched on

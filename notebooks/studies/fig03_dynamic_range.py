@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, refined_limit
+from studies.kit.curves import ErrorCurves, Limit, percent, reach_text, refined_limit
 from studies.kit.parameters import SETUP, parameter_limits
-from studies.kit.results import rounded
+from studies.kit.results import rounded, screen_columns
 from studies.kit.setups import NOISELESS, Noise, Screens, check_setup, screens_at
 from studies.kit.style import LOOKS, looks_of
 from studies.kit.tables import Table, small
@@ -34,6 +34,7 @@ LIMITS = parameter_limits(
     **SETUP,
 )
 CHECK_TOGETHER = check_setup
+QUICK = {"n_pixels": 64, "n_rms": 6, "rms_fine": [0.05], "rms_beyond": [1.6, 2.0], "n_screens": 4}
 
 _PASSES = ("split_expand", "split_adjoint")  # functions that pass through the low-rank model of the sensor
 
@@ -46,6 +47,12 @@ class LinearityCurves(ErrorCurves):
     wrapped: NDArray[np.float64]  # (n_rms, n_screens), share of the points beyond +-pi
     folded: NDArray[np.float64]  # (n_rms, n_screens), share of the points below -pi/4
     strehl: NDArray[np.float64]  # (n_rms, n_screens)
+    size: NDArray[np.float64]  # (n_rms, n_screens), rms of each screen, radian
+
+    def screens(self) -> dict[str, NDArray]:
+        """Input, rms, Strehl ratio and errors of every single screen, as columns for `publish`."""
+        own = {"rms of the screen (rad)": self.size, "Strehl ratio": self.strehl}
+        return screen_columns({"input (rad rms)": self.rms}, own | self._named_errors())
 
 
 def linearity_curves(
@@ -61,7 +68,8 @@ def linearity_curves(
 ) -> LinearityCurves:
     """Error of reconstructors on random screens of growing rms (radian): the experiment of section 4.1.
 
-    Each input has a task number from `first_task` on; screens and noise depend on this number and on the seed.
+    With `d_over_r0` of the screens, an input is the root mean square over all screens of turbulence. Each input
+    has a task number from `first_task` on; screens and noise depend on this number and on the seed.
     """
     rms = np.asarray(rms, float)
     shared = dict(reconstructors), modes, n_screens, exponent, seed, noise
@@ -83,8 +91,8 @@ def _linearity_point(
     exponent: float,
     seed: int,
     noise: Noise,
-) -> tuple[dict[str, NDArray], dict[str, NDArray], NDArray, NDArray, NDArray]:
-    """One input of the linearity curves: errors, converged, wrapped, folded and Strehl, (n_screens,) each."""
+) -> tuple[dict[str, NDArray], dict[str, NDArray], NDArray, NDArray, NDArray, NDArray]:
+    """One input of the linearity curves: errors, converged, wrapped, folded, Strehl and rms, (n_screens,) each."""
     task, rms = point
     screens = screens_at(modes, rms, n_screens, seed, task, exponent)
     pupil = next(iter(reconstructors.values())).sensor.pupil
@@ -96,7 +104,28 @@ def _linearity_point(
         errors[name] = reconstruction_error(pupil, estimate.phase, screens)
         converged[name] = estimate.converged
     wrapped, folded = np.mean(np.abs(phase) > np.pi, axis=-1), np.mean(phase < -np.pi / 4, axis=-1)
-    return errors, converged, wrapped, folded, strehl(pupil, screens)
+    return errors, converged, wrapped, folded, strehl(pupil, screens), pupil.rms(screens)
+
+
+_VARIANTS = ("GradientDescentPoints", "GradientDescentStarted")
+
+
+def pop_variants(reconstructors: dict[str, Any]) -> dict[str, Any]:
+    """Remove the variants of gradient descent that are evaluated at one input only, and return them."""
+    return {name: reconstructors.pop(name) for name in _VARIANTS}
+
+
+def curves_at(
+    rms: float,
+    reconstructors: Mapping[str, Any],
+    modes: NDArray | Screens,
+    curves: LinearityCurves,
+    **settings: Any,
+) -> LinearityCurves:
+    """Errors of further reconstructors on the screens of `curves` whose input is nearest to `rms`."""
+    place = int(np.argmin(np.abs(curves.rms - rms)))
+    n_screens = curves.strehl.shape[1]
+    return linearity_curves(reconstructors, modes, curves.rms[[place]], n_screens, first_task=place, **settings)
 
 
 # Methods whose limits are refined, with the screens of each input close to the limit, over those of the curves.
@@ -106,7 +135,6 @@ REFINED = {
     "PhaseShifted": 10,
     "GerchbergSaxtonModel": 2,
     "GradientDescent": 1,
-    "GradientDescentStarted": 1,
 }
 
 
@@ -190,14 +218,14 @@ _UNMEASURED = {
 
 
 def draw_linearity(
-    curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float, names: Sequence[str], rms_max: float
+    curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float, rms_max: float
 ) -> Figure:
     """Figure 3: mean error and its standard deviation against the input, and their ratio on a logarithmic axis."""
     figure, (plain, ratio) = plt.subplots(1, 2, figsize=(7, 4.6))
     drawn = curves.rms <= rms_max
     bright = curves.rms > 0
     rms = curves.rms[drawn]
-    for name, look in looks_of(names):
+    for name, look in looks_of(curves.errors):
         mean, std = curves.mean(name), curves.std(name)[drawn]
         line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
         found = 0 < limits[name].value < np.inf
@@ -210,13 +238,19 @@ def draw_linearity(
             ratio.plot(limits[name].value, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
     plain.plot(rms, threshold * rms, color="#555555", lw=1)
     plain.annotate(
-        f"{threshold:.0%}", (rms[-1], threshold * rms[-1]), (4, 0), textcoords="offset points", color="#555555",
-        fontsize=9, va="center",
+        f"{100 * threshold:g}%", (rms[-1], threshold * rms[-1]), (4, 0), textcoords="offset points",
+        color="#555555", fontsize=9, va="center",
     )  # fmt: skip
     ratio.axhline(threshold, color="#555555", lw=1)
     end = ratio.get_yaxis_transform()  # the right end of the line, which no curve crosses
     ratio.text(
-        1.02, threshold, f"{threshold:.0%}\nof the\ninput", transform=end, color="#555555", fontsize=9, va="center"
+        1.02,
+        threshold,
+        f"{100 * threshold:g}%\nof the\ninput",
+        transform=end,
+        color="#555555",
+        fontsize=9,
+        va="center",
     )
     plain.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
     ratio.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
@@ -244,7 +278,7 @@ def draw_saxton_widths(
     zero, model = panels
     zero.set(ylabel="error / input", ylim=(threshold / 2, None))
     style: dict[str, Any] = {"color": "#555555", "fontsize": 9, "ha": "right", "va": "top"}
-    line = f"{threshold:.0%} of the input"
+    line = f"{100 * threshold:g}% of the input"
     zero.text(0.99, 0.9 * threshold, line, transform=zero.get_yaxis_transform(), **style)
     model.set_ylim(bottom=model.get_ylim()[0] / 4)  # room for the labels
     figure.legend([linear], ["linear"], loc="outside lower center", fontsize=9)
@@ -284,6 +318,13 @@ def _indices(curves: LinearityCurves, values: Sequence[float]) -> dict[float, in
     return {value: int(np.flatnonzero(curves.rms == value)[0]) for value in values if value in curves.rms}
 
 
+def _reach(curves: LinearityCurves, name: str, threshold: float, limit: Limit) -> str:
+    """Inputs above 0 at which an error stays within the threshold, in words."""
+    bright = curves.rms > 0
+    rms, error = curves.rms[bright], curves.mean(name)[bright]
+    return reach_text(rms, error, threshold * rms, limit, f"{percent(threshold)} of the input")
+
+
 def _place(curves: LinearityCurves, limit: Limit) -> str:
     """Input at which a curve exceeds the threshold, in words."""
     if limit.value == 0:
@@ -295,7 +336,11 @@ def ranges_table(curves: LinearityCurves, limits: Mapping[str, Limit], threshold
     """Limit of each reconstructor, and its error at some inputs."""
     at = _indices(curves, (0.1, 0.3, 0.5, 0.8, 1.0, 1.3))
     return Table(
-        ["reconstructor", f"exceeds {threshold:.0%} above (rad rms)", *(f"error at {value:g}" for value in at)],
+        [
+            "reconstructor",
+            f"exceeds {100 * threshold:g}% above (rad rms)",
+            *(f"error at {value:g}" for value in at),
+        ],
         [
             [
                 LOOKS[name].name,
@@ -378,18 +423,41 @@ def _better_from(curves: LinearityCurves, name: str) -> float:
     return float(curves.rms[curves.rms > worse.max(initial=0)].min(initial=np.inf))
 
 
+def _phrases(curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float) -> dict[str, str]:
+    """Sentences, and parts of them, that hold for any parameters: a limit need not exist."""
+    rms, gain = curves.rms, limits["PhaseShifted"].over(limits["Linear"])
+    both = np.maximum(curves.mean("PhaseShifted"), curves.mean("GradientDescent")) < 1e-6
+    alike = rms[both].max(initial=0)
+    onset = rms[np.mean(curves.wrapped > 0, axis=1) >= 0.5].min(initial=np.inf)
+    reaches = {
+        f"{short}_reach": _reach(curves, name, threshold, limits[name])
+        for name, short in (_SHORT | {"GerchbergSaxton": "saxton"}).items()
+    }
+    return reaches | {
+        "gain_text": f"The second limit is {gain} times the first."
+        if 0 < gain.value < np.inf
+        else "The two limits have no ratio, because not both exist.",
+        "alike_text": f"Up to {alike:.2g} rad rms its error is below 10⁻⁶ rad, like that of the iteration."
+        if alike
+        else "Its error and that of the iteration are not below 10⁻⁶ rad.",
+        "wrap_text": f"on at least half of the screens from {onset:.2g} rad rms on"
+        if onset < np.inf
+        else f"on less than half of the screens up to {rms[-1]:.2g} rad rms",
+    }
+
+
 _SHORT = {
     "Linear": "linear",
     "Arcsine": "arcsine",
     "PhaseShifted": "shifted",
     "GerchbergSaxtonModel": "saxton_model",
     "GradientDescent": "descent",
-    "GradientDescentStarted": "started",
 }
 
 
 def numbers(
     curves: LinearityCurves,
+    descents: LinearityCurves,
     limits: Mapping[str, Limit],
     threshold: float,
     methods: Mapping[str, Any],
@@ -411,7 +479,8 @@ def numbers(
     low = (rms > 0) & (rms <= 0.3)
     with_wraps = np.mean(curves.wrapped > 0, axis=1)
     recovered = {name: curves.recovered(name, threshold)[one] for name in curves.errors}
-    found = {
+    recovered |= {name: descents.recovered(name, threshold)[0] for name in descents.errors}
+    found: dict[str, Any] = {
         "saxton_limit": limits["GerchbergSaxton"].value,
         "gain": gain.value,
         "gain_error": gain.error,
@@ -440,7 +509,7 @@ def numbers(
         "saxton_model_limit_longer": by_width.dynamic_range(repaired, threshold),
         "saxton_model_iterations_longer": variants[repaired].settings.n_iterations,
         "started_recovered_at_1": recovered["GradientDescentStarted"],
-        "started_error_at_1": mean["GradientDescentStarted"][one],
+        "started_error_at_1": descents.mean("GradientDescentStarted")[0],
         "shifted_passes": passes["PhaseShifted"],
         "descent_passes": passes["GradientDescent"],
         "fourier_functions": len(fourier),
@@ -448,5 +517,18 @@ def numbers(
     }
     for name, short in _SHORT.items():
         found |= {f"{short}_limit": limits[name].value, f"{short}_limit_error": limits[name].error}
+    found |= _phrases(curves, limits, threshold)
+    better = found["saxton_widest_beats_linear"]
+    found |= {
+        "saxton_widest_reach": _reach(
+            by_width, widest, threshold, Limit(by_width.dynamic_range(widest, threshold))
+        ),
+        "saxton_model_reach_longer": _reach(
+            by_width, repaired, threshold, Limit(found["saxton_model_limit_longer"])
+        ),
+        "saxton_widest_text": f"From {better:.2g} rad rms on it is smaller than that of the linear method."
+        if better < np.inf
+        else "It is smaller than that of the linear method at no large input.",
+    }
     # All digits of a rounding error but its power of ten depend on the machine.
     return rounded(found) | rounded({"run_out": 10 ** np.ceil(np.log10(run_out))}, ".0e")

@@ -24,10 +24,10 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, crossing, refined_limit
+from studies.kit.curves import ErrorCurves, Limit, crossing, percent, reach_text, refined_limit
 from studies.kit.methods import opposite_dimples, own_reconstructors, paper_reconstructors
 from studies.kit.parameters import SETUP, parameter_limits
-from studies.kit.results import rounded
+from studies.kit.results import rounded, screen_columns
 from studies.kit.setups import NOISELESS, Noise, check_setup
 from studies.kit.style import LOOKS, OTHER_STYLES, looks_of
 from studies.kit.tables import Table, small
@@ -43,13 +43,14 @@ LIMITS = parameter_limits(
     rms=(0.01, 4.0),
     more_iterations=[(1, 10000)],
     step=(0.05, 2.0),
-    diameter_max=(3.5, 8.0),
+    diameter_max=(1.0, 8.0),
     step_fine=(0.01, 0.3),
     n_screens_few=(1, 1000),
     claimed=(0.1, 8.0),
     **SETUP,
 )
 CHECK_TOGETHER = check_setup
+QUICK = {"n_pixels": 64, "n_screens": 4, "step": 0.5, "step_fine": 0.2, "n_screens_few": 2}
 
 DARK_RING = 2 * 1.2196698912665045
 """Diameter of the first dark ring of the Airy pattern, lambda/D: twice the first zero of J1(pi r)."""
@@ -79,13 +80,18 @@ class DiameterCurves(ErrorCurves):
     diameters: NDArray[np.floating]  # (n_diameters,), lambda/D
 
     def at(self, name: str, diameter: float) -> float:
-        """Mean error at the sampled diameter (lambda/D) that is nearest to `diameter`, radian rms."""
-        return float(self.mean(name)[np.argmin(np.abs(self.diameters - diameter))])
+        """Mean error at a sampled diameter (lambda/D), radian rms; NaN if it was not sampled."""
+        found = self.mean(name)[np.abs(self.diameters - diameter) < 1e-9]
+        return float(found[0]) if found.size else np.nan
 
     def exceeds(self, name: str, limit: float, start: float = 0.0) -> float:
         """Diameter, from `start` on, at which the mean error exceeds `limit` (radian rms); see `crossing`."""
         used = self.diameters >= start - 1e-9
         return crossing(self.diameters[used], self.mean(name)[used], limit)
+
+    def screens(self) -> dict[str, NDArray]:
+        """Diameter and errors of every single screen, as columns for `publish`."""
+        return screen_columns({"diameter (lambda/D)": self.diameters}, self._named_errors())
 
 
 def diameter_curves(
@@ -118,10 +124,22 @@ def _diameter_point(
 
 
 def sampled_diameters(step: float, diameter_max: float, step_fine: float) -> NDArray[np.float64]:
-    """Diameters of Figure 4 (lambda/D): every `step`, every `step_fine` from 2 to 2.6, and those of the table."""
-    coarse = np.arange(step, diameter_max + step / 2, step)
+    """Diameters of Figure 4 (lambda/D): every `step`, every `step_fine` from 2 to 2.6, those tabled, the end."""
+    coarse = np.arange(step, diameter_max, step)
     fine = np.arange(2.0, 2.6 + step_fine / 2, step_fine)
-    return np.unique(np.round([*coarse, *fine, *TABLED], 9))
+    return _up_to(diameter_max, [*coarse, *fine, *TABLED])
+
+
+def near_limit(diameters: NDArray, low: float = 1.5, high: float = 2.5) -> NDArray[np.float64]:
+    """Diameters for more iterations, which only lead farther away beyond 2.5 lambda/D; all if none is near."""
+    near = diameters[(diameters >= low) & (diameters <= high)]
+    return near if near.size else diameters
+
+
+def _up_to(end: float, diameters: ArrayLike) -> NDArray[np.float64]:
+    """Diameters below an end, and the end."""
+    listed = np.unique(np.round([*np.ravel(diameters), end], 9))
+    return listed[listed <= end + 1e-9]
 
 
 def iteration_curves(
@@ -157,12 +175,13 @@ def other_curves(
     phase_shift: float,
     screens: NDArray,
     *,
+    diameter_max: float = FEW[-1],
     own: Sequence[str] = (),
     noise: Noise = NOISELESS,
     seed: int = 0,
     **settings: Any,
 ) -> DiameterCurves:
-    """Errors of the other methods, at few diameters."""
+    """Errors of the other methods, at few diameters up to the largest one."""
 
     def make(diameter: float) -> dict[str, Any]:
         methods = paper_reconstructors(pupil, modes, diameter, phase_shift, **settings)
@@ -170,7 +189,8 @@ def other_curves(
         del methods[ITERATION]
         return methods
 
-    return diameter_curves(make, FEW, screens, noise=noise, seed=seed)
+    few = _up_to(diameter_max, [*FEW, *np.arange(5.0, diameter_max)])
+    return diameter_curves(make, few, screens, noise=noise, seed=seed)
 
 
 class DimpleLight:
@@ -267,9 +287,11 @@ def contraction(
     pupil: Pupil, modes: NDArray, diameters: ArrayLike, screens: NDArray, away: NDArray
 ) -> Contraction:
     """Return the causes of Figure 4: the linearised iteration and the sensitivity, at each diameter."""
-    diameters = np.unique(np.append(diameters, DARK_RING))
+    end = np.max(diameters)
+    diameters = np.unique([*np.ravel(diameters), *([DARK_RING] if end > DARK_RING else [])])
     chosen = modes[list(_MODES.values())]
-    observed = {diameter: measured_factor(pupil, diameter, screens[0], away) for diameter in TABLED}
+    tabled = [diameter for diameter in TABLED if diameter <= end] or [float(end)]
+    observed = {diameter: measured_factor(pupil, diameter, screens[0], away) for diameter in tabled}
 
     def factor(diameter: float, phase: NDArray | None = None) -> float:
         return float(np.abs(iteration_spectrum(pupil, diameter, phase)[0]))
@@ -309,16 +331,18 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
     mean, std = curve.mean(name), curve.std(name)
     for axes, bottom in ((plain, 0), (log, floor)):
         low, high = (np.maximum(mean + sign * std, bottom) for sign in (-1, 1))
-        axes.plot(curve.diameters, mean, color=look.color, marker=look.marker, ms=4, label=f"{number} iterations")
+        drawn = np.maximum(mean, bottom)
+        axes.plot(curve.diameters, drawn, color=look.color, marker=look.marker, ms=4, label=f"{number} iterations")
         axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0)
         _diameters(axes, curve.diameters[-1], claimed)
         axes.set_ylabel("error (rad rms)")
     for (number, other), style in zip(others, OTHER_STYLES[1:], strict=False):
-        log.plot(other.diameters, other.mean(name), ms=4, label=f"{number} iterations", **style)
+        log.plot(other.diameters, np.maximum(other.mean(name), floor), ms=4, label=f"{number} iterations", **style)
     limit = threshold * curve.rms[0]
     log.axhline(limit, color="#555555", lw=1)
-    start, end = 0.64 * claimed, 1.4 * claimed
-    log.text(1.01 * start, limit * 1.3, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
+    end = min(1.4 * claimed, curve.diameters[-1])
+    start = min(0.64 * claimed, end / 2)
+    log.text(1.01 * start, limit * 1.3, f"{100 * threshold:g}% of the input", color="#555555", fontsize=9)
     plain.set_ylim(0, None)
     log.set(yscale="log", xlim=(start, end), ylim=(floor, 60))  # room for the legend
     log.legend(loc="upper left", fontsize=9, handlelength=1.6)
@@ -335,7 +359,7 @@ def draw_diameter_methods(curves: Mapping[str, DiameterCurves], threshold: float
         axes.semilogy(curve.diameters, mean, markersize=4.5, label=look.label, **look.style)
     limit = threshold * curve.rms[0]
     axes.axhline(limit, color="#555555", lw=1)
-    axes.text(0.05, limit * 1.2, f"{threshold:.0%} of the input", color="#555555", fontsize=9)
+    axes.text(0.05, limit * 1.2, f"{100 * threshold:g}% of the input", color="#555555", fontsize=9)
     _diameters(axes, max(curve.diameters[-1] for curve in curves.values()), claimed)
     axes.set(ylabel="mean error (rad rms)", ylim=(floor / 2, 4))
     figure.legend(loc="outside lower center", ncols=2)
@@ -368,11 +392,13 @@ def draw_diameter_reasons(reasons: Contraction, claimed: float) -> Figure:
 
 def _diameters(axes: Axes, end: float, claimed: float) -> None:
     """Axis of the diameter, with the one of the paper and that of the dark ring."""
-    axes.axvline(claimed, color="#555555", lw=1.2, ls="--", zorder=0.5)
-    axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
     above: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "va": "bottom", "fontsize": 9}
-    axes.text(claimed, 1.005, f"paper: {claimed:g} ", ha="right", color="#555555", **above)
-    axes.text(DARK_RING, 1.005, " dark ring", ha="left", color="#555555", **above)
+    if claimed < end:
+        axes.axvline(claimed, color="#555555", lw=1.2, ls="--", zorder=0.5)
+        axes.text(claimed, 1.005, f"paper: {claimed:g} ", ha="right", color="#555555", **above)
+    if end > DARK_RING:
+        axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
+        axes.text(DARK_RING, 1.005, " dark ring", ha="left", color="#555555", **above)
     axes.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=(0, end))
 
 
@@ -399,11 +425,12 @@ def reason_columns(reasons: Contraction) -> dict[str, NDArray]:
     }
 
 
-def method_columns(curves: Mapping[str, DiameterCurves]) -> dict[str, Sequence[float]]:
+def method_columns(curves: Mapping[str, DiameterCurves]) -> dict[str, ArrayLike]:
     """Columns of the comparison of the methods."""
+    few = min((curve.diameters for curve in curves.values()), key=len)
     return {
-        "diameter (lambda/D)": FEW,
-        **{f"{name}, mean error (rad rms)": [curve.at(name, d) for d in FEW] for name, curve in curves.items()},
+        "diameter (lambda/D)": few,
+        **{f"{name}, mean error (rad rms)": [curve.at(name, d) for d in few] for name, curve in curves.items()},
     }
 
 
@@ -412,10 +439,9 @@ def limits_table(curves: Mapping[int, DiameterCurves], threshold: float) -> Tabl
     return Table(
         ["iterations", "passes 10⁻³ rad at about (λ/D)", f"passes {100 * threshold:g} % at about (λ/D)"],
         [
-            [n, *(curve.exceeds(ITERATION, limit) for limit in (1e-3, threshold * curve.rms[0]))]
+            [n, *(_place(curve, ITERATION, limit) for limit in (1e-3, threshold * curve.rms[0]))]
             for n, curve in curves.items()
         ],
-        digits=2,
     )
 
 
@@ -450,34 +476,51 @@ def _ends(reasons: Contraction) -> tuple[float, list[float]]:
 def ends_table(reasons: Contraction) -> Table:
     """Diameters at which the factor exceeds 1."""
     flat, screens = _ends(reasons)
+    found = {"flat wavefront": flat, "screens, least": min(screens), "screens, most": max(screens)}
     return Table(
         ["the factor passes 1 at", "λ/D"],
         [
-            ["dark ring, theory", DARK_RING],
-            ["flat wavefront", flat],
-            ["screens, least", min(screens)],
-            ["screens, most", max(screens)],
+            ["dark ring, theory", f"{DARK_RING:.4g}"],
+            *([name, _diameter_text(diameter, reasons.diameters[-1], ".4g")] for name, diameter in found.items()),
         ],
-        digits=4,
     )
 
 
 def _start(curve: DiameterCurves, name: str, threshold: float) -> str:
     """Diameter, from the usual one on, at which the error exceeds the threshold, in words."""
     limit = threshold * curve.rms[0]
-    if curve.at(name, USUAL) > limit:
+    if curve.at(name, _usual(curve)) > limit:
         return "at all diameters"
-    return _place(curve.exceeds(name, limit, start=USUAL))
+    return _place(curve, name, limit, _usual(curve))
 
 
 def _doubled(curve: DiameterCurves, name: str) -> str:
     """Diameter at which the error exceeds twice that at the usual one, in words."""
-    error = curve.at(name, USUAL)
-    return "–" if error < 1e-6 else _place(curve.exceeds(name, 2 * error, start=USUAL))
+    error = curve.at(name, _usual(curve))
+    return "–" if error < 1e-6 else _place(curve, name, 2 * error, _usual(curve))
 
 
-def _place(diameter: float) -> str:
-    return f"{diameter:.2g}" if diameter < np.inf else "never"
+def _usual(curve: DiameterCurves) -> float:
+    """Diameter of the paper's other figures, or the largest one if that is smaller (lambda/D)."""
+    return min(USUAL, float(curve.diameters[-1]))
+
+
+def _place(curve: DiameterCurves, name: str, limit: float, start: float = 0.0) -> str:
+    """Diameter, from `start` on, at which an error exceeds a limit (radian rms), in words."""
+    return _diameter_text(curve.exceeds(name, limit, start), curve.diameters[-1])
+
+
+def _diameter_text(diameter: float, end: float, form: str = ".2g") -> str:
+    return f"{diameter:{form}}" if diameter < np.inf else f"not up to {end:g}"
+
+
+def _reach(
+    curve: DiameterCurves, name: str, allowed: float, words: str, limit: Limit | None = None, start: float = 0.0
+) -> str:
+    """Diameters, from `start` on, at which an error stays within what is allowed (radian rms), in words."""
+    used = curve.diameters >= start - 1e-9
+    limit = limit or Limit(curve.exceeds(name, allowed, start))
+    return reach_text(curve.diameters[used], curve.mean(name)[used], allowed, limit, words, "λ/D")
 
 
 def methods_table(curves: Mapping[str, DiameterCurves], threshold: float) -> Table:
@@ -514,35 +557,26 @@ def numbers(
     """Numbers of the text and of the claims of section 4.2 on the diameter."""
     paper, longest = by_method[ITERATION], list(by_iterations.values())[-1]
     flat, screens = _ends(reasons)
-    tilt = reasons.sensitivity["tilt"]
-    usual, at_22, at_3 = map(reasons.index, (USUAL, 2.2, 3.0))
     ratios = {name: curve.at(name, 2.6) / curve.at(name, 2.0) for name, curve in by_method.items()}
-    lost = _start(by_method["GradientDescent"], "GradientDescent", threshold)
+    of_input, allowed = f"{percent(threshold)} of the input", threshold * paper.rms[0]
+    descent = by_method["GradientDescent"]
     found: dict[str, Any] = {
         "iterations": next(iter(by_iterations)),
         "diameter_5_percent": limit.value,
         "diameter_5_percent_error": limit.error,
-        "diameter_1e3": paper.exceeds(ITERATION, 1e-3),
-        "diameter_5_percent_400": longest.exceeds(ITERATION, threshold * paper.rms[0]),
-        "diameter_1e3_400": longest.exceeds(ITERATION, 1e-3),
+        "diameter_5_percent_400": longest.exceeds(ITERATION, allowed),
         "error_at_20": paper.at(ITERATION, 2.0),
-        "error_at_22": paper.at(ITERATION, 2.2),
         "error_at_26": paper.at(ITERATION, 2.6),
         "claim16_ratio": ratios[ITERATION],
-        "contraction_at_106": reasons.flat[usual],
-        "contraction_at_22": reasons.flat[at_22],
         "contraction_crosses_1": flat,
         "contraction_crosses_1_screens_least": min(screens),
         "contraction_crosses_1_screens_most": max(screens),
-        "contraction_observed_difference": max(
-            abs(observed / reasons.aberrated[reasons.index(diameter), 0] - 1)
-            for diameter, observed in reasons.observed.items()
-        ),
         "dark_ring": DARK_RING,
-        "tilt_at_22": tilt[at_22] / tilt[usual],
-        "tilt_at_dark_ring": tilt.min() / tilt[usual],
-        "tilt_at_3": tilt[at_3] / tilt[usual],
         **{f"claim17_{short}_ratio": ratios[name] for name, short in SHORT.items()},
-        "descent_passes": f"at about {lost} λ/D" if lost[0].isdigit() else lost,
+        "longest": list(by_iterations)[-1],
+        "reach": _reach(paper, ITERATION, allowed, of_input, limit),
+        "reach_1e3": _reach(paper, ITERATION, 1e-3, "10⁻³ rad"),
+        "reach_longest": _reach(longest, ITERATION, allowed, of_input),
+        "descent_reach": _reach(descent, "GradientDescent", allowed, of_input, start=_usual(descent)),
     }
     return rounded(found, ".4g")

@@ -19,6 +19,7 @@ from zwfs.bench import BenchModel
 
 LIMITS = parameter_limits("rms exponent n_iterations", n_pixels=(32, 1024), bench=bench_fields("n_pixels"))
 CHECK_TOGETHER = check_bench
+QUICK = {"n_pixels": 68}
 
 
 def correlations(model: BenchModel, measured: NDArray, modelled: NDArray) -> list[float]:
@@ -77,4 +78,6 @@ def numbers(correlation: list[float], error: NDArray, commanded: NDArray) -> dic
     """Numbers for the text: the correlation of each image, and the error as a share of the commands."""
     first, second = correlation
     share = error.std() / commanded.std() if commanded.any() else np.nan
-    return rounded({"correlation_first": first, "correlation_second": second, "error_share": share})
+    text = f"{share:.0%} of the input" if commanded.any() else f"{error.std():.2g} rad rms at a flat command"
+    found = rounded({"correlation_first": first, "correlation_second": second, "error_share": share})
+    return found | {"error_text": text}

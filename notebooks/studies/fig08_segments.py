@@ -17,6 +17,7 @@ from zwfs.bench import Bench
 
 LIMITS = parameter_limits("rms exponent n_iterations", n_pixels=(32, 1024), bench=bench_fields("n_pixels"))
 CHECK_TOGETHER = check_bench
+QUICK = {"n_pixels": 68}
 
 
 def draw_segment_errors(bench: Bench, commanded: NDArray, errors: Mapping[str, NDArray]) -> Figure:

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from studies.kit.bench import BenchCurves, check_bench
+from studies.kit.curves import Limit, reach_text
 from studies.kit.parameters import bench_fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS
@@ -21,6 +22,7 @@ LIMITS = parameter_limits(
     bench=bench_fields("n_pixels", "extent"),
 )
 CHECK_TOGETHER = check_bench
+QUICK = {"n_pixels": 68, "n_rms": 5, "n_screens": 2}
 
 SHORT = {
     "linear": "Linear",
@@ -92,8 +94,22 @@ def numbers(curves: BenchCurves) -> dict[str, float | str]:
     mean = {short: curves.mean(name) for short, name in SHORT.items()}
     large = curves.rms >= 0.3
     alike = mean["arcsine"][large] / mean["linear"][large]
+    bright, worse = curves.rms > 0, curves.rms[mean["saxton"] > mean["linear"]].max(initial=0.0)
+    inputs, linear = curves.rms[bright], mean["linear"][bright]
     at_01 = next(iter(mean["shifted"][curves.rms == 0.1]), np.nan)
-    return rounded(
+    texts = {
+        "linear_reach": reach_text(
+            inputs, linear, 0.25 * inputs, Limit(reach(curves, "Linear")), "25 % of the input"
+        ),
+        "alike_text": f"From {curves.rms[large][0]:.2g} rad rms on, the median ratio of the arcsine's error to "
+        f"that of the linear method is {np.median(alike):.2f}."
+        if alike.size
+        else "No input is large enough for a comparison.",
+        "saxton_text": f"worse than the linear method up to {worse:.2g} rad rms"
+        if worse
+        else "at no input above 0 worse than the linear method",
+    }
+    return texts | rounded(
         {
             **{f"offset_{short}": mean[short][0] for short in ("shifted", "linear", "saxton")},
             "arcsine_over_linear": round(np.median(alike), 3) if alike.size else np.nan,
@@ -101,6 +117,6 @@ def numbers(curves: BenchCurves) -> dict[str, float | str]:
             "shifted_worst": mean["shifted"].max(),
             "largest_input": curves.rms.max(),
             "shifted_share_at_01": at_01 / 0.1,
-            "saxton_worse_up_to": curves.rms[mean["saxton"] > mean["linear"]].max(initial=0.0),
+            "saxton_worse_up_to": worse,
         }
     )

@@ -8,7 +8,6 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from astropy.io import fits
 from matplotlib.axes import Axes
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
@@ -284,6 +283,8 @@ def image_table(frames: Sequence[Image], clear_frames: Sequence[Image]) -> Table
 
 def header_table(path: str) -> Table:
     """Some keywords of the phase map."""
+    from astropy.io import fits  # not in the page, where only this table needs it
+
     header = fits.getheader(path)
     return Table(["keyword", "value"], [[key, header[key]] for key in SHOWN], digits=5)
 

@@ -35,6 +35,7 @@ LIMITS = parameter_limits(
     shown=(0.0, 0.4),
     photons=(1.0, 1e9),
 )
+QUICK = {"variations": [0.0, 0.1, 0.3], "n_screens": 2}
 
 KINDS = ("scintillation", "dips")
 """Kinds of amplitude maps, see `amplitude_maps`."""

@@ -32,6 +32,7 @@ LIMITS = parameter_limits(
     photons=(1.0, 1e12),
     n_draws=(2, 10000),
 )
+QUICK = {"n_pixels": 32, "n_quarter": 5, "n_screens": 1}
 
 HALF = np.pi / 2
 DRAWN = (
@@ -47,7 +48,7 @@ DRAWN = (
 class PhaseNoise:
     """Error of the phase at each point of the pupil, (n_points,), with the reference waves held fixed."""
 
-    photon: NDArray[np.float64]  # radian, for one photon per point, both frames together
+    photon: NDArray[np.float64]  # radian, for one photon per point and image
     bound: NDArray[np.float64]  # of Cramer and Rao, the same unit
     read: NDArray[np.float64]  # radian, for a read noise of 1, the intensity of the pupil
 
@@ -64,9 +65,9 @@ def phase_noise(sensor: ZernikeSensor, phase: NDArray) -> PhaseNoise:
         # d psi / d s_a = -2i r_b / D, d psi / d s_b = 2i r_a / D
         gain = 2j * np.stack([-waves[1], waves[0]]) / determinant
         answer = np.imag(psi.conj() * gain) / np.abs(psi) ** 2
-        photon = np.sqrt(2 * np.sum(answer**2 * intensity, axis=0))
+        photon = np.sqrt(np.sum(answer**2 * intensity, axis=0))
         read = np.sqrt(np.sum(answer**2, axis=0))
-        bound = 1 / np.sqrt(np.sum(slope**2 / intensity, axis=0) / 2)
+        bound = 1 / np.sqrt(np.sum(slope**2 / intensity, axis=0))
     return PhaseNoise(*(np.where(np.isnan(values), np.inf, values) for values in (photon, bound, read)))
 
 
@@ -143,7 +144,7 @@ def drawn_noise(
     sensor: ZernikeSensor, phase: NDArray, photons: float, n_draws: int, seed: int = 0
 ) -> tuple[float, float]:
     """Photon noise of the phase-shifted iteration on frames with drawn noise, and its standard error."""
-    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points / sensor.n_masks)
+    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points)
     frames = np.repeat(sensor.measure(phase)[np.newaxis], n_draws, axis=0)
     estimate = PhaseShifted(sensor)(camera.normalise(camera.expose(frames, seed)))
     power = photons * reconstruction_error(sensor.pupil, estimate.phase, phase) ** 2
@@ -157,7 +158,9 @@ class PairMaps:
 
     angles: NDArray[np.float64]  # (n,), radian
     error: NDArray[np.float64]  # (n, n), without noise, radian rms
-    flat: NDArray[np.float64]  # (n, n), photon noise of a flat wavefront, radian for one photon per point
+    flat: NDArray[
+        np.float64
+    ]  # (n, n), photon noise of a flat wavefront, radian for one photon per point and image
     aberrated: NDArray[np.float64]  # (n, n), photon noise of the screens
     bound: NDArray[np.float64]  # (n, n), bound of the photon noise of a flat wavefront
     read: NDArray[np.float64]  # (n, n), read noise of a flat wavefront

@@ -15,7 +15,7 @@ from scipy.special import erf
 
 from studies.kit import sweeps
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded
+from studies.kit.results import rounded, screen_columns
 from studies.kit.setups import screens_at
 from studies.kit.style import LOOKS, OTHER_STYLES
 from studies.kit.tables import Table
@@ -33,6 +33,7 @@ LIMITS = parameter_limits(
     photons_bars=(10.0, 1e9),
     wrong=[(0.01, 100.0)],
 )
+QUICK = {"photons": [10.0, 1e3, 1e5], "n_screens": 2}
 
 SIGMAS = np.arange(0.25, 3.01, 0.25)
 """Widths of the error bars whose share of the points is counted, in standard errors."""
@@ -57,6 +58,11 @@ class PhotonCurves:
     def ratio(self, name: str) -> NDArray[np.float64]:
         """`error` over the bound, shape (n_rms, n_photons)."""
         return self.error(name) / self.bound
+
+    def screens(self) -> dict[str, NDArray]:
+        """Input, photons and errors of every single screen, as columns for `publish`."""
+        axes = {"input (rad rms)": self.rms, "photons per point": self.photons}
+        return screen_columns(axes, {f"{name}: error (rad rms)": errors for name, errors in self.errors.items()})
 
 
 def photon_curves(

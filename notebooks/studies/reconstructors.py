@@ -21,6 +21,7 @@ from zwfs.reconstructors import Reconstruction
 from zwfs.sensor import ZernikeSensor
 
 LIMITS = parameter_limits("n_pixels n_modes diameter phase_shift inputs n_screens exponent n_iterations extent")
+QUICK = {"n_pixels": 64, "n_screens": 4}
 
 
 def iteration_errors(

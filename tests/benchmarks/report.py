@@ -60,6 +60,7 @@ def main(path):
         "machine": machine(measured["machine_info"]),
         "peers": peers(measured),
         "speed": rounded(speed.results(1.0)),
+        "pages": json.loads(KEPT.read_text("utf-8")).get("pages", []),  # see pages.py
     }
     kept["sha256"] = fingerprint(kept)
     write_file(KEPT, (json.dumps(kept, indent=1, ensure_ascii=False) + "\n").encode())

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from studies.kit.results import screen_columns
 from zwfs.metrics import dynamic_range
 
 
@@ -43,6 +44,13 @@ class ErrorCurves:
             columns[f"{name}: standard deviation (rad rms)"] = self.std(name)
         return columns
 
+    def screens(self) -> dict[str, NDArray]:
+        """Input and errors of every single screen, as columns for `publish`."""
+        return screen_columns({"input (rad rms)": self.rms}, self._named_errors())
+
+    def _named_errors(self) -> dict[str, NDArray[np.float64]]:
+        return {f"{name}: error (rad rms)": errors for name, errors in self.errors.items()}
+
 
 class Limit(NamedTuple):
     """Input or diameter at which a mean error exceeds a threshold, and its standard error (NaN: not known)."""
@@ -62,6 +70,32 @@ class Limit(NamedTuple):
             return Limit(np.nan)
         ratio = self.value / other.value
         return Limit(ratio, float(np.hypot(self.error, ratio * other.error) / other.value))
+
+
+def reach_text(
+    x: ArrayLike,
+    error: ArrayLike,
+    bound: ArrayLike,
+    limit: Limit,
+    words: str = "5 % of the input",
+    unit: str = "rad rms",
+) -> str:
+    """Where an error stays within a bound, in words that follow "the error" and hold for any curve."""
+    x, within = np.asarray(x, float), np.asarray(error) <= bound
+    if within.all():
+        return f"stays within {words} up to {x[-1]:.3g} {unit}"
+    if not within.any():
+        return f"exceeds {words} everywhere from {x[0]:.3g} to {x[-1]:.3g} {unit}"
+    if within[0]:
+        return f"exceeds {words} above {limit} {unit}"
+    low, high = x[within][[0, -1]]
+    span = f"at {low:.3g}" if low == high else f"from {low:.3g} to {high:.3g}"
+    return f"stays within {words} only {span} {unit}"
+
+
+def percent(share: float) -> str:
+    """Share as text without needless digits."""
+    return f"{100 * share:.3g} %"
 
 
 def fitted_limit(x: ArrayLike, ratio: NDArray, threshold: float, seed: Any = 0, n_draws: int = 1000) -> Limit:

@@ -104,10 +104,27 @@ def _check_fields(name: str, values: Any, fields: Fields) -> None:
         _check_value(f"{name}.{key}", value, known[key])
 
 
+def typed(value: Any, limits: Any) -> Any:
+    """Return a checked value, with floats in place of integers where the limits are floats."""
+    if isinstance(limits, Fields):
+        return {name: typed(one, limits.every()[name]) for name, one in value.items()}
+    if isinstance(value, list):
+        return [typed(item, limits[0]) for item in value]
+    return float(value) if isinstance(example(limits), float) else value
+
+
+def example(limits: Any) -> Any:
+    """Return a value of the type that single values within some limits have: a float if one limit is a float."""
+    if isinstance(limits, type):
+        return limits()
+    return next((one for one in limits or () if isinstance(one, float)), limits[0] if limits else None)
+
+
 _CUT = {"obstruction": (0.0, 0.9), "vanes": [[(-6.2832, 6.2832)], ...]}
 _RINGS = _CUT | {"n_rings": (1, 50), "gap": (0.0, 0.1), "missing": [(1, 10000), ...], "stop": (0.1, 1.0)}
 _BASIS = {"basis": ("zernike", "fourier", "hexagonal", "kl")}
-SETUP = {
+_STRENGTH = {"d_over_r0": (0.0, 20.0)}
+SETUP: dict[str, Any] = {
     "pupil": Fields(
         "studies.kit.setups.make_pupil",
         kinds={
@@ -125,8 +142,8 @@ SETUP = {
         _BASIS,
         {
             "power_law": {},
-            "kolmogorov": {},
-            "von_karman": {"outer_scale": (0.2, 1e5)},
+            "kolmogorov": _STRENGTH,
+            "von_karman": {"outer_scale": (0.2, 1e5)} | _STRENGTH,
             "segments": {},
             "file": {"file": str},
         },

@@ -14,29 +14,60 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from studies.kit.variants import variants
 
 FOLDER = "ZWFS_RESULTS"  # environment variable that names the folder
+SCREENS = "_screens"  # after the name of a figure: the file with a row for each screen
 _DPI = 200
 # Without dates and versions the same figure is the same file.
-_METADATA = {"png": {"Software": None}, "pdf": {"Creator": None, "Producer": None, "CreationDate": None}}
+_METADATA: dict[str, dict[str, None]] = {
+    "png": {"Software": None},
+    "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
+    "svg": {"Creator": None, "Date": None},
+}
+_RC: dict[Any, Any] = {
+    # After a save matplotlib asks these two for a layout, even if the figure was made without one.
+    "figure.constrained_layout.use": False,
+    "figure.autolayout": False,
+    "pdf.fonttype": 42,  # TrueType: journals refuse the default, Type 3
+    "svg.hashsalt": "zwfs",  # element ids are random unless salted
+}
 
 
-def publish(figure: Figure, name: str, columns: Mapping[str, ArrayLike]) -> None:
-    """Write a figure and its numbers to the folder that the environment variable ZWFS_RESULTS names."""
+def publish(
+    figure: Figure, name: str, columns: Mapping[str, ArrayLike], screens: Mapping[str, ArrayLike] | None = None
+) -> None:
+    """Write a figure and its numbers, also of single screens, to the folder that ZWFS_RESULTS names."""
     if not re.fullmatch(r"[a-z0-9][a-z0-9_-]*", name):
         raise ValueError(f"name = {name!r}: expected lower-case letters, digits, - and _")
-    contents = {"csv": _csv(columns)}
+    contents = {".csv": _csv(columns)} | ({} if screens is None else {f"{SCREENS}.csv": _csv(screens)})
     folder = os.environ.get(FOLDER)
     if folder:
-        contents |= {f"{kind}.png": _picture(one, "png") for kind, one in variants(figure).items()}
+        contents |= {f".{kind}.png": _picture(one, "png") for kind, one in variants(figure).items()}
     for kind in _METADATA if folder else ("png",):  # the first one fixes the layout
-        contents[kind] = _picture(figure, kind)
+        contents[f".{kind}"] = _picture(figure, kind)
     if folder:
-        for kind, content in contents.items():
-            _write(Path(folder) / f"{name}.{kind}", content)
+        for end, content in contents.items():
+            _write(Path(folder) / f"{name}{end}", content)
+
+
+def screen_columns(axes: Mapping[str, ArrayLike], values: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """Columns with a row for each screen, from values (n_1, ..., n_screens) along the named axes."""
+    *_, n_screens = next(iter(values.values())).shape
+    grid = np.meshgrid(*axes.values(), np.arange(1, n_screens + 1), indexing="ij")
+    named = zip((*axes, "screen"), grid, strict=True)
+    return {header: column.ravel() for header, column in (*named, *values.items())}
+
+
+def stacked(header: str, tables: Mapping[Any, Mapping[str, NDArray]]) -> dict[str, NDArray]:
+    """Columns of several tables below each other; the first column has the key of each row's table."""
+    columns = list(zip(*(table.values() for table in tables.values()), strict=True))
+    sizes = [len(column) for column in columns[0]]
+    names = next(iter(tables.values()))
+    keys = np.repeat(np.array(list(tables)), sizes)
+    return {header: keys} | {name: np.concatenate(parts) for name, parts in zip(names, columns, strict=True)}
 
 
 def glue_numbers(numbers: Mapping[str, float | str]) -> None:
@@ -67,8 +98,7 @@ def published(source: str) -> list[str]:
 def _picture(figure: Figure, kind: str) -> bytes:
     """Draw a figure in a format, with the layout of the first one."""
     stream = io.BytesIO()
-    # After a save matplotlib asks these settings for a layout, even if the figure was made without one.
-    with rc_context({"figure.constrained_layout.use": False, "figure.autolayout": False}):
+    with rc_context(_RC):
         figure.savefig(stream, format=kind, dpi=_DPI, metadata=_METADATA[kind])
         if figure.get_layout_engine() is not None:
             # Constrained layout goes on moving the axes each time it runs.

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+from scipy.signal import fftconvolve
 
 from studies.kit.parameters import within
 from zwfs.detector import Detector
@@ -16,7 +19,7 @@ from zwfs.frames.files import read
 from zwfs.modes import fourier_basis, mode_frequencies, noll_to_nm, power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
-from zwfs.turbulence import karhunen_loeve_basis, turbulent_screens
+from zwfs.turbulence import karhunen_loeve_basis, structure_function, turbulent_screens
 
 _CROSS = [[0.785, 0.005], [2.356, 0.005], [3.927, 0.005], [5.498, 0.005]]
 _MAX_BYTES = 2**31  # of a file of screens: 1000 of them on 512 pixels
@@ -94,7 +97,11 @@ def _pupil_of_file(n_pixels: int, file: str = "") -> Pupil:
 
 @dataclass(frozen=True)
 class Screens:
-    """Random screens of a kind, each scaled to an rms; made by `make_screens`."""
+    """Random screens of a kind, made by `make_screens`.
+
+    Each screen is scaled to the rms of the input. With `d_over_r0` the screens keep the scatter of turbulence: an
+    input is then the root mean square over all screens, and the largest input is that of this D/r0.
+    """
 
     pupil: Pupil
     modes: NDArray
@@ -103,14 +110,50 @@ class Screens:
     exponent: float
     outer_scale: float = inf
     recorded: NDArray | None = None
+    d_over_r0: float = 0.0  # of the largest input; 0: each screen is scaled
 
     def __call__(self, rms: float, n_screens: int, seed: Any) -> NDArray[np.floating]:
         """Return screens of an rms (radian), shape (n_screens, ny, nx), 0 outside the pupil."""
         if self.kind == "power_law":
             return power_law_screens(self.modes, rms, n_screens, self.exponent, seed, frequencies=self.frequencies)
+        if self.d_over_r0:
+            return self._shapes(n_screens, seed) * (rms / self.unit)
         values = self.pupil.gather(self._shapes(n_screens, seed))
         values = values - values.mean(axis=-1, keepdims=True)
         return self.pupil.scatter(values * (rms / values.std(axis=-1, keepdims=True)), fill=0.0)
+
+    @cached_property
+    def unit(self) -> float:
+        """Root mean square (radian) of turbulence with r0 = D on the pupil, 1.016 on a circle."""
+        return turbulent_rms(self.pupil, self.outer_scale)
+
+    def rms_of(self, d_over_r0: ArrayLike) -> NDArray[np.float64]:
+        """Root mean square (radian) of turbulence of some D/r0."""
+        return self.unit * np.asarray(d_over_r0, float) ** (5 / 6)
+
+    def d_over_r0_of(self, rms: ArrayLike) -> NDArray[np.float64]:
+        """D/r0 of turbulence of some root mean square (radian), which is not negative."""
+        return (np.maximum(rms, 0) / self.unit) ** (6 / 5)
+
+    def largest(self, rms: float) -> float:
+        """Return the largest input (radian rms): that of `d_over_r0`, or the given one without it."""
+        return float(f"{self.rms_of(self.d_over_r0):.4g}") if self.d_over_r0 else rms
+
+    def inputs(self, rms: Sequence[float]) -> list[float]:
+        """Return inputs of at most the largest one (radian rms), and with `d_over_r0` the largest itself."""
+        largest = self.largest(max(rms))
+        return sorted({*(one for one in rms if one < largest), largest})
+
+    def columns(self, rms: ArrayLike) -> dict[str, NDArray[np.float64]]:
+        """Return a column of the D/r0 of some inputs for `publish`, if the screens have one."""
+        return {"D/r0": self.d_over_r0_of(rms)} if self.d_over_r0 else {}
+
+    def mark(self, figure: Figure) -> Figure:
+        """Add an axis of D/r0 to the panels of a figure against the input, if the screens have one."""
+        panels = [axes for axes in figure.axes if axes.get_xlabel().startswith("input")] if self.d_over_r0 else []
+        for axes in panels:
+            axes.secondary_xaxis("top", functions=(self.d_over_r0_of, self.rms_of)).set_xlabel("$D/r_0$")
+        return figure
 
     def _shapes(self, n_screens: int, seed: Any) -> NDArray:
         """Screens before they are scaled."""
@@ -128,6 +171,18 @@ class Screens:
         return turbulent_screens(self.pupil, 1.0, n_screens, self.outer_scale, seed)
 
 
+def turbulent_rms(pupil: Pupil, outer_scale: float = inf) -> float:
+    """Root mean square (radian) of turbulence with r0 = D on a pupil, piston removed: half the mean of D(r).
+
+    The mean is over all pairs of points, whose distances the autocorrelation of the pupil counts.
+    """
+    inside = pupil.inside.astype(float)
+    pairs = fftconvolve(inside, inside[::-1, ::-1])
+    rows, columns = (np.arange(1 - n, n) / pupil.n_pixels for n in pupil.shape)
+    differences = structure_function(np.hypot(rows[:, np.newaxis], columns), 1.0, outer_scale)
+    return float(np.sqrt(np.sum(pairs * differences) / (2 * pupil.n_points**2)))
+
+
 def make_screens(
     pupil: Pupil,
     n_modes: int,
@@ -136,6 +191,7 @@ def make_screens(
     basis: str = "zernike",
     outer_scale: float = 10.0,
     file: str = "",
+    d_over_r0: float = 0.0,
 ) -> Screens:
     """Source of random screens of a kind.
 
@@ -147,13 +203,16 @@ def make_screens(
     exponent : float
         Exponent of the power spectral density of the kinds "power_law" and "segments".
     kind : str
-        Kind of the screens; each screen is scaled to the rms of the input.
+        Kind of the screens; without `d_over_r0` each screen is scaled to the rms of the input.
     basis : str
         Modes of power-law screens and of the modal reconstructors, see `BASES`.
     outer_scale : float, D
         Outer scale of von Karman's spectrum.
     file : str
         FITS or NPY file of screens (n, ny, nx) in radian; the seed chooses among them.
+    d_over_r0 : float
+        Strength D/r0 of the turbulence at the largest input, which replaces that in rad rms; 0 keeps the latter.
+        An input is then the root mean square over all screens, and single screens scatter around it.
 
     Raises
     ------
@@ -171,7 +230,7 @@ def make_screens(
     scale = outer_scale if kind == "von_karman" else inf
     modes, frequencies = _modes(pupil, n_modes, basis, scale)
     recorded = _screens_of_file(pupil, file) if kind == "file" else None
-    return Screens(pupil, modes, frequencies, kind, exponent, scale, recorded)
+    return Screens(pupil, modes, frequencies, kind, exponent, scale, recorded, d_over_r0)
 
 
 def screens_at(
@@ -272,7 +331,8 @@ class Noise:
     Parameters
     ----------
     photons : float, photons
-        Photons per point of the pupil, all frames together; 0 for frames without noise.
+        Photons per point of the pupil and image of two; any other number of images shares the light of these two.
+        0 for frames without noise.
     read_noise : float, electrons
         Read noise of a pixel, rms.
 
@@ -287,7 +347,7 @@ class Noise:
     >>> from studies.kit.setups import Noise
     >>> pupil = zwfs.Pupil.circular(32)
     >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
-    >>> Noise(photons=1000)(sensor, np.zeros(pupil.shape), seed=1).shape
+    >>> Noise(photons=500)(sensor, np.zeros(pupil.shape), seed=1).shape
     (1, 32, 32)
     """
 
@@ -299,12 +359,12 @@ class Noise:
             raise ValueError(f"noise.read_noise = {self.read_noise:g} with photons = 0: expected photons above 0")
 
     def __call__(self, sensor: ZernikeSensor, phase: NDArray, seed: Any) -> NDArray[np.floating]:
-        """Return the normalised frames of phases, with the light divided between the masks."""
+        """Return the normalised frames of phases, with the light of two images divided between the masks."""
         frames = sensor.measure(phase)
         if not self.photons:
             return frames
         pupil = sensor.pupil
-        camera = Detector(pupil, self.photons * pupil.n_points / sensor.n_masks, read_noise=self.read_noise)
+        camera = Detector(pupil, 2 * self.photons * pupil.n_points / sensor.n_masks, read_noise=self.read_noise)
         return camera.normalise(camera.expose(frames, seed))
 
 

@@ -5,7 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any, NamedTuple
+
+MISSING = "–"
+"""What stands for a number that does not exist."""
 
 
 class Link(NamedTuple):
@@ -36,11 +40,15 @@ class Table:
             return f"[{plain(cell.text)}]({cell.page})"
         if isinstance(cell, bool):
             return "yes" if cell else "no"
-        return f"{cell:.{self.digits}g}" if isinstance(cell, float) else plain(str(cell))
+        if isinstance(cell, float):
+            return f"{cell:.{self.digits}g}" if isfinite(cell) else MISSING
+        return plain(str(cell))
 
 
 def small(value: float) -> str:
     """Return a number with two significant digits, or a bound below which digits are rounding errors."""
+    if not isfinite(value):
+        return MISSING
     return "<10⁻⁶" if value < 1e-6 else f"{value:.2g}"
 
 

@@ -1,0 +1,256 @@
+"""Python in the pages: forms of the notebooks' parameters, and all files that a browser needs to run the code.
+
+Nothing is loaded before the reader asks. `book/_static/run.js` is the page's side, `driver.py` that of Python.
+"""
+
+import ast
+import base64
+import builtins
+import copy
+import io
+import json
+import os
+import re
+import shutil
+from hashlib import sha256
+from html import unescape
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
+
+import nbformat
+from docutils import nodes
+from myst_nb.ext.glue.domain import NbGlueDomain
+from myst_nb.ext.glue.roles import PasteTextRole
+from nbformat import NotebookNode
+from sphinx.application import Sphinx
+
+from book._tools import declared
+from book._tools.declared import Parameter
+from book._tools.project import PYODIDE, Project
+from studies.kit.parameters import Fields
+from studies.kit.results import published
+
+COPY = "_static/pyodide"
+DATA = "_static/run"
+KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the version that this book uses
+SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
+# Modules that Python in the page has; code that imports others cannot run there.
+MODULES = {"dataclasses", "math", "matplotlib", "numpy", "scipy", "studies", "types", "typing", "zwfs"}
+SKIPPED = "colab"  # tag of cells that the page leaves out
+POLICY = '<meta http-equiv="Content-Security-Policy" content="{}"/>'
+DATE = (2020, 1, 1, 0, 0, 0)
+
+
+class MarkedText(PasteTextRole):
+    """The role ``glue:text``; the number of the same page gets its name and its format as a class."""
+
+    def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
+        """Return the text, marked."""
+        made, messages = super().run()
+        for node in made:
+            if isinstance(node, nodes.inline):
+                node["classes"].append(f"glued:{self.text if ':' in self.text else f'{self.text}:s'}")
+        return made, messages
+
+
+def form(figure: str, first: bool) -> str:
+    """Return the place of the form, and of the button of every later figure, in HTML for a card."""
+    kind = "run-form" if first else "run-figure"
+    absent = "With JavaScript, this figure can be computed again here, with other parameters."
+    return f'<div class="{kind}" data-figure="{figure}"><noscript>{absent}</noscript></div>'
+
+
+def mark_cells(notebook: NotebookNode) -> None:
+    """Give each cell of code with an output its number as a tag, which is a class on the page, in place."""
+    for number, cell in enumerate(notebook.cells):
+        if cell.cell_type == "code":
+            cell.metadata.tags = [*cell.metadata.get("tags", []), f"run-{number}"]
+
+
+def described(notebook: NotebookNode, name: str) -> dict[str, Any]:
+    """Return what the page needs of a notebook, ready for JSON."""
+    study = declared.study_of(notebook)
+    cells = [copy.deepcopy(cell) for cell in notebook.cells]
+    for cell in cells:
+        if cell.cell_type == "code":
+            cell.outputs, cell.execution_count = [], None
+    return {
+        "name": name,
+        "parameters": {key: field(one) for key, one in declared.parameters(notebook).items()},
+        "quick": getattr(study, "QUICK", {}),
+        "figures": {
+            figure: number
+            for number, cell in enumerate(cells)
+            for figure in (published(cell.source) if cell.cell_type == "code" else [])
+        },
+        "skipped": SKIPPED,
+        "extra": ["astropy"] if any("zwfs.frames" in cell.source for cell in cells) else [],
+        "notebook": {"cells": cells, "metadata": notebook.metadata, "nbformat": 4, "nbformat_minor": 5},
+    }
+
+
+def field(parameter: Parameter) -> dict[str, Any]:
+    """Return a parameter for the form."""
+    return {
+        "meaning": parameter.meaning,
+        "unit": parameter.unit,
+        "default": parameter.default,
+        "limits": limits(parameter),
+    }
+
+
+def limits(parameter: Parameter) -> dict[str, Any]:
+    """Return the limits of a parameter for the form."""
+    match parameter.limits:
+        case Fields() as known:
+            fields = {name: field(one) for name, one in parameter.fields().items() if name != "kind"}
+            return {"kinds": {kind: list(of) for kind, of in known.kinds.items()}, "fields": fields}
+        case [each, *more] if isinstance(parameter.limits, list):
+            return {"list": limits(Parameter(None, "", "", each)), "empty": bool(more)}
+        case (str(), *_) as choices:
+            return {"choices": choices}
+        case (low, high):
+            return {"low": low, "high": high, "whole": isinstance(low, int) and isinstance(high, int)}
+    return {"yes": parameter.limits is bool}
+
+
+def mark_examples(app: Sphinx, tree: nodes.document) -> None:
+    """Mark the examples of a page that Python in the page can run."""
+    for block in tree.findall(nodes.literal_block):
+        if block.get("language") == "python" and runs_in_page(block.astext()):
+            block["classes"].append("runnable")
+
+
+def runs_in_page(code: str) -> bool:
+    """Return whether code is complete, uses `zwfs`, and imports only what Python in the page has."""
+    try:
+        tree = [*ast.walk(ast.parse(code))]
+    except SyntaxError:
+        return False
+    imports = [one.name for node in tree if isinstance(node, ast.Import) for one in node.names]
+    imports += [node.module or "." for node in tree if isinstance(node, ast.ImportFrom)]
+    given = {
+        one.asname or one.name.split(".")[0]
+        for node in tree
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for one in node.names
+    }
+    given |= {node.name for node in tree if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    given |= {node.arg for node in tree if isinstance(node, ast.arg)}
+    words = [node for node in tree if isinstance(node, ast.Name)]
+    given |= {node.id for node in words if isinstance(node.ctx, ast.Store)} | {*dir(builtins), "__name__"}
+    complete = {node.id for node in words} <= given
+    return complete and "zwfs" in given and {name.split(".")[0] for name in imports} <= MODULES
+
+
+def site(project: Project) -> bytes:
+    """Return a ZIP of the pure Python that the page needs; the same content gives the same bytes."""
+    files = {
+        f"zwfs/{file.relative_to(project.root / 'zwfs').as_posix()}": file.read_bytes()
+        for file in (project.root / "zwfs").rglob("*.py")
+    }
+    files |= {
+        file.relative_to(project.notebooks).as_posix(): file.read_bytes() for file in project.studies.rglob("*.py")
+    }
+    files["driver.py"] = Path(__file__).with_name("driver.py").read_bytes()
+    about = metadata.distribution("zwfs")
+    files[f"zwfs-{about.version}.dist-info/METADATA"] = f"Name: zwfs\nVersion: {about.version}\n".encode()
+    for file in metadata.files("array-api-compat") or ():
+        if file.suffix == ".py" or file.match("*.dist-info/METADATA") or file.match("*.dist-info/licenses/*"):
+            files[file.as_posix()] = file.read_binary()
+    stream = io.BytesIO()
+    with ZipFile(stream, "w", ZIP_DEFLATED) as archive:
+        for name in sorted(files):
+            one = ZipInfo(name, DATE)
+            one.compress_type = ZIP_DEFLATED
+            archive.writestr(one, files[name])
+    return stream.getvalue()
+
+
+def write(app: Sphinx, exception: Exception | None) -> None:
+    """Write the data of the notebooks, the files of Python, and where Pyodide is."""
+    if exception is not None or app.builder.name != "html":
+        return
+    project, folder = Project(Path(app.srcdir)), Path(app.outdir, DATA)
+    folder.mkdir(parents=True, exist_ok=True)
+    for source in project.sources():
+        notebook = nbformat.read(source, as_version=4)
+        write_script(folder / f"{source.stem}.js", "zwfsNotebook", described(notebook, source.stem))
+    write_script(folder / "files.js", "zwfsFiles", base64.b64encode(site(project)).decode())
+    known, where = json.loads(KNOWN.read_text("utf-8")), place(app)
+    write_script(folder / "settings.js", "zwfsPython", known | {"place": where})
+    add_policies(Path(app.outdir), where)
+
+
+def add_policies(html: Path, place: str) -> None:
+    """Put a content security policy into each page of the book."""
+    pages = [page for page in html.rglob("*.html") if not page.is_relative_to(html / "_static")]
+    # The search reads other pages, with their handlers.
+    found = (re.findall(r"\son[a-z]+=\"([^\"]*)\"", page.read_text("utf-8")) for page in pages)
+    handlers = {unescape(code) for of_page in found for code in of_page}
+    for page in pages:
+        add_policy(page, place, handlers)
+
+
+def add_policy(file: Path, place: str, handlers: set[str]) -> None:
+    """Put a content security policy into a page: its own files and inline scripts, and Python where it can run.
+
+    The loader of Pyodide evaluates code, and a worker made from a Blob inherits the policy of its page. MathJax
+    writes styles into the page.
+    """
+    html = re.sub(POLICY.format(".*?"), "", file.read_text("utf-8"))  # of an earlier build
+    inline = re.findall(r"<script(?![^>]*\ssrc=)[^>]*>(.*?)</script>", html, re.DOTALL)
+    digests = sorted({base64.b64encode(sha256(code.encode()).digest()).decode() for code in {*inline, *handlers}})
+    runs = "/run.js" in html
+    scripts = ["'self'", "'unsafe-hashes'", *(f"'sha256-{one}'" for one in digests)]
+    remote = [place] if runs and "://" in place else []
+    policy = {
+        "default-src": ["'none'"],
+        "script-src": [*scripts, *(["blob:", "'unsafe-eval'"] if runs else [])],
+        "worker-src": ["blob:"] if runs else ["'none'"],
+        "connect-src": ["'self'", *remote],
+        "style-src": ["'self'", "'unsafe-inline'"],
+        "img-src": ["'self'", "data:", "blob:"],
+        "font-src": ["'self'", "data:"],
+        "base-uri": ["'none'"],
+        "form-action": ["'self'"],
+    }
+    text = "; ".join(f"{name} {' '.join(allowed)}" for name, allowed in policy.items())
+    file.write_text(re.sub(r"(<head[^>]*>)", rf"\1{POLICY.format(text)}", html, count=1), "utf-8")
+
+
+def write_script(file: Path, name: str, value: Any) -> None:
+    """Write a script that defines data: browsers block pages from the file system from reading data files."""
+    file.write_text(f"window.{name} = {json.dumps(value, ensure_ascii=False)};\n", "utf-8")
+
+
+def place(app: Sphinx) -> str:
+    """Return the address of Pyodide; copy a folder into the book if the environment names one."""
+    target = Path(app.outdir, COPY)
+    shutil.rmtree(target, ignore_errors=True)  # of an earlier build
+    if folder := os.environ.get(PYODIDE):
+        shutil.copytree(folder, target, copy_function=shutil.copyfile)
+        return f"{COPY}/"
+    return str(app.config.pyodide)
+
+
+def add_scripts(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: nodes.document) -> None:
+    """Load the scripts on pages with code to run, and there alone."""
+    body = context.get("body", "")
+    if 'class="run-form"' in body or "runnable" in body:
+        app.add_css_file("run.css")
+        scripts = (f"run/{Path(page).name}.js", *SCRIPTS) if 'class="run-form"' in body else SCRIPTS
+        for script in scripts:
+            app.add_js_file(script, loading_method="defer")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Mark what can run, and write what it needs."""
+    app.add_config_value("pyodide", "", "html")
+    NbGlueDomain.roles["text"] = MarkedText()
+    app.connect("doctree-read", mark_examples)
+    app.connect("html-page-context", add_scripts)
+    app.connect("build-finished", write)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

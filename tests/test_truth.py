@@ -1,0 +1,399 @@
+"""Text of a run with other parameters: what holds only for the defaults is hidden, and no limit is infinite."""
+
+import ast
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import bs4
+import matplotlib.pyplot as plt
+import nbformat
+import numpy as np
+import pytest
+from joblib import parallel_config
+
+from book._tools.declared import accept, accept_together, parameters
+from book._tools.notebook import without_gaps
+from book._tools.page import leave_out
+from studies.kit.curves import Limit, reach_text
+from studies.kit.results import FOLDER
+from studies.kit.tables import Table
+
+NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
+SMALL = {"n_pixels": 24, "n_screens": 1, "n_modes": 15, "n_iterations": 3}
+# A number that is no number, or a limit of zero: all that a reader must never see.
+NONSENSE = re.compile(r"(?<![\w.])-?(inf|nan)(?!\w)|\b(inf|nan) ?%|\b0\.0+ ?(±|rad\b|λ)", re.IGNORECASE)
+
+
+def run(name, given, monkeypatch):
+    """Run the code cells of a notebook in this process; return the text that its page shows, and the tables."""
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    known = parameters(notebook)
+    monkeypatch.chdir(NOTEBOOKS)
+    changed = accept(given, known)
+    accept_together(notebook, {key: one.default for key, one in known.items()} | changed)
+    glued = {}
+    stub = ModuleType("myst_nb")
+    stub.glue = lambda name, value, display: glued.update({name: value})
+    monkeypatch.setitem(sys.modules, "myst_nb", stub)
+    monkeypatch.delenv(FOLDER, raising=False)
+    shown, space = [], {"__name__": "notebook"}
+    with parallel_config(backend="sequential"), plt.rc_context():
+        for cell in notebook.cells:
+            if cell.cell_type != "code":
+                continue
+            code = ast.parse(cell.source)
+            last = code.body.pop() if isinstance(code.body[-1], ast.Expr) else None
+            exec(compile(code, name, "exec"), space)
+            if last is not None:
+                shown.append(eval(compile(ast.Expression(last.value), name, "eval"), space))
+            if "parameters" in cell.metadata.get("tags", ()):
+                space |= changed
+            plt.close("all")
+    tables = [one._repr_markdown_() for one in shown if isinstance(one, Table)]
+    return visible(notebook, glued), tables
+
+
+def texts(notebook):
+    """Markdown and captions of a notebook."""
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            yield cell.source
+        yield cell.metadata.get("mystnb", {}).get("figure", {}).get("caption", "")
+
+
+def visible(notebook, glued):
+    """Text of the page of a run that has other parameters, with the values that it glued."""
+    text = re.sub(
+        r"^:::\{div\} defaults\n.*?^:::$", "", "\n".join(texts(notebook)), flags=re.MULTILINE | re.DOTALL
+    )
+    while (end := text.find("]{.defaults}")) >= 0:
+        start, depth = end, 1
+        while depth:
+            start -= 1
+            depth += {"]": 1, "[": -1}.get(text[start], 0)
+        text = text[:start] + text[end + len("]{.defaults}") :]
+
+    def value(match):
+        one = glued[match[1]]
+        return one if isinstance(one, str) else format(one, match[2] or "")
+
+    return re.sub(r"\{glue:text\}`(\w+)(?::([^`:]*))?`", value, text)
+
+
+PAGE = """<section><h1>Page</h1>
+<p>The error stays small<span class="defaults">, without noise and</span> with a perfect model.</p>
+<ul><li><p><span class="defaults">The peak is caused by slow screens.</span></p></li>
+<li><p>Screens are random.</p></li></ul>
+<section><h2>What differs</h2><div class="defaults"><p>Only here.</p></div></section>
+<section><h2>Picture</h2><figure><img alt="three curves" src="x.png"/>
+<figcaption><span class="defaults">It wins.</span> Error.</figcaption></figure></section></section>"""
+
+
+def test_a_page_of_other_parameters_leaves_out_what_holds_for_the_defaults_only():
+    body = bs4.BeautifulSoup(PAGE, "html.parser")
+    leave_out(body)
+    said = " ".join(body.get_text().split())
+    assert said == "Page The error stays small with a perfect model. Screens are random. Picture Error."
+    assert len(body.find_all("li")) == 1
+    assert body.img["alt"] != "three curves"
+
+
+def test_a_dash_stands_for_a_number_that_does_not_exist():
+    output = nbformat.v4.new_output(
+        "display_data", {"text/plain": "inf"}, metadata={"scrapbook": {"name": "limit"}}
+    )
+    known = nbformat.v4.new_output(
+        "display_data", {"text/plain": "2.5"}, metadata={"scrapbook": {"name": "limits"}}
+    )
+    code = nbformat.v4.new_code_cell(outputs=[output, known])
+    code.metadata["mystnb"] = {"figure": {"caption": "Up to {glue:text}`limit:.2f`."}}
+    text = nbformat.v4.new_markdown_cell(
+        "{glue:text}`limit:.2f` and {glue:text}`limit` and {glue:text}`limits:.1f`"
+    )
+    shown = without_gaps(nbformat.v4.new_notebook(cells=[text, code]))
+    assert shown.cells[0].source == "– and – and {glue:text}`limits:.1f`"
+    assert shown.cells[1].metadata.mystnb.figure.caption == "Up to –."
+    assert text.source.startswith("{glue")
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        ([0.0, 0.0, 0.0], "stays within 5 % of the input up to 2 rad rms"),
+        ([1.0, 1.0, 1.0], "exceeds 5 % of the input everywhere from 0.5 to 2 rad rms"),
+        ([0.0, 0.01, 1.0], "exceeds 5 % of the input above 1.50 ± 0.03 rad rms"),
+        ([1.0, 0.01, 0.01], "stays within 5 % of the input only from 1 to 2 rad rms"),
+        ([1.0, 0.01, 1.0], "stays within 5 % of the input only at 1 rad rms"),
+    ],
+)
+def test_where_an_error_stays_within_a_bound_is_said_in_words(error, text):
+    rms = np.array([0.5, 1.0, 2.0])
+    assert reach_text(rms, error, 0.05 * rms, Limit(1.5, 0.03)) == text
+
+
+BENCH = {"n_pixels": 32}
+FIGURE_4 = SMALL | {"n_modes": 149, "step": 0.5, "step_fine": 0.3, "more_iterations": [5], "n_screens_few": 1}
+RANGE = SMALL | {
+    "inputs": [0.1, 1.0], "inputs_noiseless": [2.0], "inputs_limit": [1.0, 2.0], "photons": [1e3],
+    "n_subpixels": 2, "n_screens_model": 1, "n_screens_limit": 10,
+}  # fmt: skip
+DIMPLE = SMALL | {"inputs": [0.5], "step": 2.0, "step_fine": 0.3, "diameter_max": 3.5, "n_screens_few": 1}
+DECISION = BENCH | {
+    "n_commands": 2, "n_screens": 2, "n_screens_perfect": 2, "n_screens_loop": 2, "n_iterations": 3,
+}  # fmt: skip
+LOOP = {
+    "n_pixels": 16, "n_modes": 6, "n_screens": 1, "n_screens_linear": 2, "n_steps": 8, "inputs": [0.4],
+    "photons": [10.0], "gains": [0.4],
+}  # fmt: skip
+ZONE = {"n_pixels": 16, "n_modes": 3, "n_cycles": 4, "n_screens": 1, "photons": [1e8], "photons_gain": [1e8]}
+CASES = {
+    "fig03_dynamic_range": (
+        SMALL | {"n_rms": 3, "rms_fine": [0.05], "rms_beyond": [1.5], "extents": [1.0, 2.0]},
+        {"noise": {"photons": 10.0}},
+        {"noise": {"photons": 1000.0, "read_noise": 5.0}, "n_screens": 2},
+        {"rms_max": 4.0, "rms_beyond": []},
+        {"rms_max": 0.05, "rms_beyond": [], "rms_fine": []},
+        {"screens": {"kind": "kolmogorov", "d_over_r0": 20.0}},
+        {"screens": {"kind": "von_karman", "outer_scale": 0.5}, "pupil": {"kind": "vlt"}},
+        {"pupil": {"kind": "hexagonal"}, "screens": {"kind": "segments"}, "n_pixels": 48},
+        {"threshold": 0.001, "n_iterations": 1},
+        {"threshold": 1.0},
+        {"diameter": 8.0, "phase_shift": 3.13, "extents": [1.0]},
+    ),
+    "fig04_dimple_diameter": (
+        FIGURE_4,
+        {"diameter_max": 1.0},
+        {"diameter_max": 1.0, "step": 2.0, "noise": {"photons": 10.0}},
+        {"diameter_max": 2.2, "rms": 2.0},
+        {"diameter_max": 8.0, "step": 2.0},
+        {"rms": 0.01, "threshold": 1.0, "diameter_max": 1.5},
+        {"threshold": 0.001, "diameter_max": 2.5, "noise": {"photons": 100.0}},
+        {"screens": {"kind": "kolmogorov", "d_over_r0": 2.0}, "diameter_max": 1.5},
+        {"pupil": {"kind": "vlt"}, "claimed": 8.0, "diameter_max": 2.0},
+        {"phase_shift": 0.01, "diameter_max": 1.2, "n_iterations": 1},
+        {"rms": 4.0, "more_iterations": [1], "diameter_max": 1.5},
+    ),
+    "beyond_range": (
+        RANGE,
+        {"inputs": [4.0], "n_iterations": 1},
+        {"inputs": [0.01], "inputs_noiseless": [], "inputs_limit": [0.1]},
+        {"screens": {"kind": "kolmogorov", "d_over_r0": 20.0}},
+        {"screens": {"kind": "von_karman", "outer_scale": 0.2, "d_over_r0": 0.1}},
+        {"photons": [1.0], "photons_shown": 1e12},
+        {"threshold": 0.001},
+        {"threshold": 1.0},
+        {"diameter_error": 0.0, "shift_error": 0.0, "image_shift": 0.0, "amplitude_error": 0.0},
+        {"diameter": 0.1},
+        {"inputs_limit": [4.0, 3.9], "phase_shift": 0.01},
+    ),
+    "beyond_dimple": (
+        DIMPLE,
+        {"inputs": [4.0]},
+        {"inputs": [0.001]},
+        {"threshold": 0.001, "n_iterations": 1},
+        {"threshold": 1.0},
+        {"diameter_max": 8.0},
+        {"phase_shift": 3.13},
+        {"phase_shift": 0.01},
+        {"n_modes": 3},
+        {"inputs": [0.2, 3.0], "n_iterations": 2},
+        {"diameter_min": 0.1, "exponent": 0.0},
+    ),
+    "photon_noise": (
+        SMALL | {"inputs": [0.5], "photons": [100.0], "wrong": [2.0, 0.5]},
+        {"photons": [1.0]},
+        {"photons": [1e9], "photons_bars": 1e9},
+        {"inputs": [4.0]},
+        {"inputs": [0.001, 0.002]},
+        {"wrong": [1.0]},
+        {"wrong": [100.0, 0.01]},
+        {"diameter": 0.1},
+        {"diameter_wide": 8.0},
+        {"phase_shift": 3.13},
+        {"n_modes": 1, "extent": 1.0},
+    ),
+    "design": (
+        {"n_pixels": 16, "n_modes": 3, "n_screens": 1, "n_angles": 2, "step": 0.5},
+        {"inputs": [4.0]},
+        {"inputs": [0.001]},
+        {"inputs": [0.1, 0.2, 0.3]},
+        {"diameter_max": 2.0, "step": 1.0},
+        {"diameter_max": 8.0},
+        {"added": 1.0},
+        {"added": -1.0},
+        {"added": 0.0},
+        {"exponent": 0.0},
+        {"n_angles": 3, "inputs": [1.0, 1.0]},
+    ),
+    "phase_shift_pairs": (
+        SMALL | {"n_quarter": 2, "n_draws": 2},
+        {"rms": 4.0},
+        {"rms": 0.0},
+        {"photons": 1.0},
+        {"photons": 1e12},
+        {"n_quarter": 1},
+        {"diameter": 0.1},
+        {"diameter": 8.0},
+        {"n_modes": 1},
+        {"n_iterations": 2},
+        {"exponent": 0.0},
+    ),
+    "phase_amplitude": (
+        {"n_pixels": 16, "n_modes": 3, "n_screens": 1, "variations": [0.0, 0.2]},
+        {"variations": [0.4]},
+        {"variations": [0.0]},
+        {"photons": 1.0},
+        {"photons": 1e9},
+        {"rms": 0.0},
+        {"rms": 4.0},
+        {"shown": 0.0},
+        {"diameter": 8.0},
+        {"phase_shift": 0.01},
+        {"n_modes": 1},
+    ),
+    "closed_loop": (
+        LOOP,
+        {"inputs": [4.0]},
+        {"inputs": [0.01], "photons": [1e9]},
+        {"photons": [0.01]},
+        {"rms": 0.0},
+        {"rms": 4.0, "gain": 1.99},
+        {"rms": 0.01},
+        {"delay": 10},
+        {"stroke": 0.1},
+        {"speed": 0.0},
+        {"photons_zero": 1.0},
+    ),
+    "dark_zone": (
+        ZONE,
+        {"drift": 1000.0},
+        {"drift": 0.001},
+        {"photons": [1e4]},
+        {"photons": [1e14]},
+        {"gains": [1.5]},
+        {"gains": [0.01]},
+        {"diameter": 8.0},
+        {"phase_shift": 3.13},
+        {"phase_shift_best": 0.01},
+        {"wavelength": 20000.0, "photons_gain": [1e4, 1e14]},
+    ),
+    "bandwidth": (
+        {"n_pixels": 16, "n_modes": 3, "n_screens": 1, "inputs": [0.5], "bandwidths": [0.0, 0.2]},
+        {"inputs": [4.0]},
+        {"inputs": [0.001]},
+        {"bandwidths": [0.0]},
+        {"bandwidths": [1.0]},
+        {"photons": 1.0},
+        {"photons": 1e9},
+        {"phase_shift": 0.01},
+        {"diameter": 8.0},
+        {"n_modes": 1},
+        {"inputs": [0.1, 0.2]},
+    ),
+    "identities": (
+        {"n_pixels": 24, "n_modes": 15, "n_screens": 1, "n_shifts": 4, "inputs": [0.1]},
+        {"inputs": [4.0]},
+        {"inputs": [0.001]},
+        {"rms": 0.0},
+        {"rms": 4.0},
+        {"diameter": 0.1},
+        {"diameter": 8.0},
+        {"patch_diameter": 0.1},
+        {"n_shifts": 5},
+        {"largest_phase": 0.1},
+        {"resolution": 0.001},
+    ),
+    "zernike_sensor": (
+        {"n_pixels": 24},
+        {"height": 3.0},
+        {"height": 0.1},
+        {"diameter": 0.1},
+        {"diameter": 8.0},
+        {"phase_shift": 0.01},
+        {"phase_shift": 3.13},
+        {"n_pixels": 16},
+        {"height": 3.0, "diameter": 4.0},
+        {"height": 2.0, "phase_shift": 3.0},
+        {"n_pixels": 17},
+    ),
+    "at_a_glance": (
+        {"n_pixels": 24, "n_modes": 15},
+        {"rms": 4.0},
+        {"rms": 0.0},
+        {"rms": 0.01},
+        {"diameter": 0.1},
+        {"diameter": 8.0},
+        {"phase_shift": 0.01},
+        {"phase_shift": 3.13},
+        {"n_iterations": 1},
+        {"n_modes": 1},
+        {"exponent": 0.0},
+    ),
+    "reconstructors": (
+        SMALL | {"inputs": [0.5]},
+        {"inputs": [4.0]},
+        {"inputs": [0.001]},
+        {"inputs": [0.1, 0.2]},
+        {"n_iterations": 1},
+        {"n_modes": 1},
+        {"diameter": 0.1},
+        {"diameter": 8.0},
+        {"phase_shift": 3.13},
+        {"extent": 1.0},
+        {"exponent": 0.0},
+    ),
+    "fig09_bench_linearity": (
+        BENCH | {"n_screens": 1, "n_rms": 2, "rms_fine": [], "n_iterations": 3},
+        {},
+        {"rms_max": 4.0},
+        {"rms_max": 0.05},
+        {"bench": {"photons": 1e7}},
+        {"bench": {"static": 0.0}},
+        {"bench": {"n_rings": 1, "missing": []}},
+        {"n_iterations": 1},
+        {"rms_fine": [0.1, 0.3], "poke": 1.5},
+        {"bench": {"leakage": 0.5}},
+        {"extent": 1.0},
+    ),
+    "fig08_segments": (
+        BENCH, {}, {"rms": 0.0}, {"rms": 4.0}, {"bench": {"photons": 1e7}}, {"bench": {"static": 3.0}},
+        {"bench": {"n_rings": 1, "missing": []}}, {"n_iterations": 1}, {"bench": {"blur": 20.0}},
+        {"bench": {"diameter": 8.0}}, {"exponent": 0.0},
+    ),
+    "fig07_frames": (
+        BENCH, {}, {"rms": 0.0}, {"rms": 4.0}, {"bench": {"photons": 1e7}}, {"bench": {"static": 3.0}},
+        {"bench": {"n_rings": 1, "missing": []}}, {"n_iterations": 1}, {"bench": {"blur": 20.0}},
+        {"bench": {"diameter": 8.0}}, {"exponent": 0.0},
+    ),
+    "error_budget": (
+        BENCH | {"n_screens": 1, "n_iterations": 2, "inputs": [0.3], "leakages": [0.1]},
+        {}, {"inputs": [0.001]}, {"inputs": [4.0]}, {"leakages": []}, {"leakages": [0.49]},
+        {"bench": {"static": 0.0}}, {"bench": {"photons": 1e7}}, {"bench": {"n_rings": 1, "missing": []}},
+        {"n_iterations": 1}, {"bench": {"blur": 20.0}},
+    ),
+    "decision": (
+        DECISION,
+        {}, {"rms": 0.01, "rms_small": 0.01}, {"rms": 4.0}, {"photons": 10.0, "photons_faint": 10.0},
+        {"rms_loop": 0.01, "rms_loop_small": 0.01}, {"rms_loop": 4.0, "rms_loop_small": 4.0},
+        {"photons_loop": 0.01, "photons_loop_faint": 0.01}, {"poke": 1.5}, {"extent": 2.0},
+        {"n_iterations": 1},
+    ),
+}  # fmt: skip
+COSTLY = {name for name in CASES if name not in ("zernike_sensor", "at_a_glance", "identities", "design")}
+SETS = [
+    pytest.param(
+        name, base | odd, marks=[pytest.mark.slow] if name == "decision" or (name in COSTLY and place) else []
+    )
+    for name, (base, *odds) in CASES.items()
+    for place, odd in enumerate(odds)
+]
+
+
+@pytest.mark.parametrize(("name", "given"), SETS)
+@pytest.mark.filterwarnings("ignore")  # of phases beyond what a sensor resolves
+def test_text_of_odd_parameters_names_no_limit_that_does_not_exist(name, given, monkeypatch):
+    text, tables = run(name, given, monkeypatch)
+    assert not NONSENSE.findall(text), text
+    assert not [table for table in tables if NONSENSE.search(table)]

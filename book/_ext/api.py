@@ -69,12 +69,12 @@ def modules() -> list[str]:
 
 
 def own_names(module: ModuleType) -> list[str]:
-    """Return the public functions and classes that a module defines, in the order of its source."""
+    """Return the public functions and classes that a module or a private part of a package defines, in order."""
     return [
         name
         for name, thing in vars(module).items()
         if (inspect.isclass(thing) or inspect.isfunction(thing))
-        and thing.__module__ == module.__name__
+        and (thing.__module__ == module.__name__ or thing.__module__.startswith(f"{module.__name__}._"))
         and not name.startswith("_")
     ]
 

@@ -50,8 +50,7 @@ class Optics:
     unmasked : float
         Fraction of the light that the mask does not shift, because its retardance is not half a wave. It is added
         as an intensity, which is right for unpolarised light. In linearly polarised light it interferes with the
-        shifted light, which changes the frames by some tenths of the mean intensity: `quadrature` of
-        `zwfs.frames.optics_model.MaskPair` describes that case.
+        shifted light, which changes the frames by some tenths of the mean intensity and is not modelled.
 
     Raises
     ------

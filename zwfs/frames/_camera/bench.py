@@ -16,6 +16,7 @@ from scipy import fft, ndimage
 
 from zwfs import _check
 from zwfs.frames._camera.model import ARM, Camera, Exposure, names_of
+from zwfs.frames._camera.prior import MapPrior
 from zwfs.frames._camera.recording import PAD, Recording, centred
 from zwfs.frames._camera.solve import (
     Free,
@@ -29,7 +30,6 @@ from zwfs.frames._camera.solve import (
     fine_phase,
     minimise,
 )
-from zwfs.frames.joint import MapPrior
 from zwfs.frames.registration import radius
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil

@@ -14,7 +14,7 @@ from scipy import fft, linalg, ndimage
 from scipy.interpolate import BSpline
 
 from zwfs.frames._camera.model import Camera, Linearised, Maps, names_of
-from zwfs.frames.joint import MapPrior
+from zwfs.frames._camera.prior import MapPrior
 
 _BINS = 24  # of spatial frequency, for the preconditioner
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones

@@ -83,7 +83,20 @@ def test_a_notebook_is_downloaded_with_all_that_it_imports_of_the_studies(tmp_pa
     shutil.unpack_archive(tmp_path / "one.zip", tmp_path / "unpacked")
     assert (tmp_path / "unpacked" / source.name).read_bytes() == source.read_bytes()
     assert not (tmp_path / "unpacked" / "studies" / "fig09_bench_linearity.py").exists()
+    assert not list((tmp_path / "unpacked").rglob("*.npz"))
     imports = "from studies import fig01_sensor_layout as s; from studies.kit import sweeps; print(s.__file__)"
     command = [sys.executable, "-c", imports]
     done = subprocess.run(command, cwd=tmp_path / "unpacked", capture_output=True, text=True, check=True)
     assert Path(done.stdout.strip()).is_relative_to(tmp_path)
+
+
+def test_the_data_of_a_study_come_with_its_notebook(tmp_path):
+    cards.write_archive(tmp_path / "one.zip", Project(ROOT), ROOT / "notebooks" / "calibration.ipynb")
+    shutil.unpack_archive(tmp_path / "one.zip", tmp_path / "unpacked")
+    command = [
+        sys.executable,
+        "-c",
+        "from studies.calibration import Recording; print(len(Recording.read().frames))",
+    ]
+    done = subprocess.run(command, cwd=tmp_path / "unpacked", capture_output=True, text=True, check=True)
+    assert done.stdout == "5\n"

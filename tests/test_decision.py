@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from studies.calibration import dimmed
 from studies.closed_loop import BestMethods, TunedLoops
 from studies.decision import (
     Situation,
+    calibrated_errors,
     decision_table,
+    dimmed,
     know_bench,
     loop_rows,
     open_cell,
@@ -22,8 +23,7 @@ SITUATIONS = [Situation(0.5, 1e4), Situation(0.5, 100.0), Situation(0.1, 1e4)]
 
 @pytest.fixture(scope="module")
 def known():
-    bench = dimmed(Bench.ideal(n_pixels=40, extent=1.3, photons=1e10), 1e5)
-    return know_bench(bench, 2, 0.6, 0.1, seed=5, fitted=False)
+    return know_bench(Bench.ideal(n_pixels=40, extent=1.3, photons=1e10), 1e5, 0.1, seed=5)
 
 
 @pytest.fixture
@@ -65,12 +65,11 @@ def test_the_simpler_of_two_methods_that_agree_is_named(errors):
 
 
 def test_one_image_gets_the_light_that_two_share():
-    bench = dimmed(Bench.ideal(n_pixels=40, extent=1.6, photons=1e10, flux_imbalance=0.2), 1e6)
-    taken = know_bench(bench, 2, 0.6, 0.1, seed=5, fitted=False).taken
+    bench = Bench.ideal(n_pixels=40, extent=1.6, photons=1e10, flux_imbalance=0.2)
+    known = know_bench(bench, 1e6, 0.1, seed=5)
     for photons in (50.0, 1e4):
-        one, two = shots(taken, photons, np.zeros(bench.n_segments), np.random.SeedSequence(2))
-        # With photon noise alone, sigma^2 is the mean count, so this counts the photons in any unit.
-        light = [np.sum(shot.counts) ** 2 / np.sum(shot.sigma**2) for shot in (one, two)]
+        one, two = shots(known, photons, np.zeros(bench.n_segments), np.random.SeedSequence(2))
+        light = [shot.counts.sum() for shot in (one, two)]
         share = np.divide(light, 2 * photons * np.count_nonzero(bench.segments))
         assert (one.counts.shape[0], two.counts.shape[0]) == (1, 2)
         np.testing.assert_allclose(share[0], share[1], rtol=0.01)
@@ -85,9 +84,11 @@ def test_winners_on_a_bench_without_errors_do_not_depend_on_the_screens(known):
 
 
 def test_the_table_has_a_cell_for_each_situation_and_says_what_was_not_studied(errors):
-    fitted = errors | {"Fitted": 0.01 * errors["PhaseShifted"]}
-    rows = open_rows(SITUATIONS, {"perfect": [errors] * 3, "real": [fitted] * 3})
-    assert [row.cells["calibrated"].two for row in rows] == ["fitted model"] * 3
+    rows = open_rows(SITUATIONS, {"perfect": [errors] * 3, "real": [errors] * 3}, [0.01, None, 0.02])
+    known = [row.cells["calibrated"] for row in rows]
+    assert known[1] is None
+    assert [one.error for one in known[::2]] == [0.01, 0.02]
+    assert known[0].text == "two images, fitted model: 0.01; one image not studied"
     assert [row.cells["design"].two for row in rows] == ["phase-shifted"] * 3
     settled = {"Linear": np.full(4, 0.4), "LinearTwo": np.full(4, 0.1)}
     loops = TunedLoops(1.0, 1.0, {}, {name: values.mean() for name, values in settled.items()}, settled)
@@ -97,3 +98,17 @@ def test_the_table_has_a_cell_for_each_situation_and_says_what_was_not_studied(e
     lines = decision_table([*rows, row])._repr_markdown_().splitlines()
     assert len(lines) == 6
     assert lines[-1].endswith("not studied | not studied | [closed loop](closed_loop.ipynb) |")
+
+
+def test_a_situation_that_was_not_recorded_on_the_calibrated_bench_has_no_error():
+    assert calibrated_errors([Situation(0.45, 1e4), Situation(0.5, 300.0)], 2) == [None, None]
+    assert calibrated_errors(SITUATIONS, 0) == [None] * 3
+
+
+def test_exposures_keep_the_share_of_the_background():
+    bench = Bench(n_pixels=40)
+    short = dimmed(bench, 1e4)
+    n_points = np.count_nonzero(bench.segments)
+    assert short.photons == pytest.approx(1e4 * n_points)
+    assert short.background / short.photons == pytest.approx(bench.background / bench.photons)
+    assert short.read_noise**2 / short.photons == pytest.approx(bench.read_noise**2 / bench.photons)

@@ -11,18 +11,8 @@ from .test_package import PUBLIC
 
 # Results that functions make, whose examples show them, and steps that the example of their package shows.
 SHOWN_BY_OTHERS = {
-    "zwfs.frames.bench_fit": {"FittedSensor"},
     "zwfs.frames.calibration": {"Calibration", "Phases"},
     "zwfs.frames.files": {"read_all", "write_phase"},
-    "zwfs.frames.joint": {
-        "FittedParameter",
-        "JointFit",
-        "JointProblem",
-        "Score",
-        "held_out_blocks",
-        "predict_image",
-    },
-    "zwfs.frames.optics_model": {"ArmValues", "Coefficients", "Linearised", "MaskValues"},
     "zwfs.frames.pipeline": {
         *("Measurement", "MeasuredPhase", "Step", "reduce_frames", "recover_phase", "model", "ideal_frames"),
         *("predict_other", "upside_down", "fit", "steps"),

@@ -13,11 +13,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb, to_rgba_array
 
 import zwfs
-from studies import bandwidth, calibration, phase_amplitude, zernike_sensor
+from studies import bandwidth, phase_amplitude, zernike_sensor
 from studies.bandwidth import BandCurves
 from studies.beyond_dimple import DimpleLimits
 from studies.beyond_range import DIMMED, SECANT, Causes, NoiseCurves
-from studies.calibration import Example, Shot
+from studies.calibration import Errors, Measured
 from studies.closed_loop import PLANTS, Divergence, LoopRun, TunedLoops
 from studies.dark_zone import IDEAL, Drift, DriftCurves
 from studies.design import PUBLISHED, DesignMap
@@ -120,10 +120,7 @@ def drawn_methods(curves, pupil, classic, shifted):
     both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(triple.measure(phase))
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
-    ways = dict.fromkeys(calibration.WAYS, 0.1 * commands)
-    example = Example(commands, Shot(frames, frames), dict.fromkeys(calibration.WAYS, 0.9 * frames), ways)
-    residuals = {name: one[None, None] for name, one in ways.items()}
-    calibrated = BenchCurves(np.array([0.5]), commands[None, None], residuals)
+    calibrated = Errors(three, [[Measured(0.2, 0.1, 0.1, 0.7, 1.0, True)]] * 3)
     return {
         "draw_slice": ((sliced, "error", "x"), ()),
         "draw_sensor_layout": ((classic, phase), ()),
@@ -160,8 +157,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),
         "draw_bench_linearity": ((bench_curves,), two),
         "draw_budget": ((dict.fromkeys(["none", "blur"], bench_curves), "PhaseShifted"), shifted_only),
-        "draw_calibration_errors": ((calibrated, example, bench.numbers), shifted_only),
-        "draw_calibration_frames": ((example,), ()),
+        "draw_calibration_errors": ((calibrated,), shifted_only),
         "draw_explained": ((found,), ()),
         "draw_phase_map": ((found, 635.0), ()),
         "draw_gains": (([step] * 2, [0.1, 0.2]), ()),

@@ -142,7 +142,7 @@ RANGE = SMALL | {
 }  # fmt: skip
 DIMPLE = SMALL | {"inputs": [0.5], "step": 2.0, "step_fine": 0.3, "diameter_max": 3.5, "n_screens_few": 1}
 DECISION = BENCH | {
-    "n_commands": 2, "n_screens": 2, "n_screens_perfect": 2, "n_screens_loop": 2, "n_iterations": 3,
+    "n_screens": 2, "n_screens_perfect": 2, "n_screens_loop": 2, "n_screens_calibrated": 0, "n_iterations": 3,
 }  # fmt: skip
 LOOP = {
     "n_pixels": 16, "n_modes": 6, "n_screens": 1, "n_screens_linear": 2, "n_steps": 8, "inputs": [0.4],
@@ -359,6 +359,7 @@ CASES = {
         {"bench": {"static": 0.0}}, {"bench": {"photons": 1e7}}, {"bench": {"n_rings": 1, "missing": []}},
         {"n_iterations": 1}, {"bench": {"blur": 20.0}},
     ),
+    "calibration": ({"n_commands": 1, "n_steps": 1, "oversampling": 1, "largest": 0.1}, {}),
     "decision": (
         DECISION,
         {}, {"rms": 0.01, "rms_small": 0.01}, {"rms": 4.0}, {"photons": 10.0, "photons_faint": 10.0},

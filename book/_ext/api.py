@@ -75,14 +75,14 @@ def modules() -> list[str]:
 
 
 def own_names(module: ModuleType) -> list[str]:
-    """Return the public functions and classes that a module defines: those of ``__all__``, if it has one."""
+    """Return the public names that a module or a private part of a package defines: those of ``__all__``, if any."""
     package = hasattr(module, "__path__")
     public = vars(module) if package else getattr(module, "__all__", vars(module))
     return [
         name
         for name, thing in vars(module).items()
         if (inspect.isclass(thing) or inspect.isfunction(thing))
-        and thing.__module__ == module.__name__
+        and (thing.__module__ == module.__name__ or thing.__module__.startswith(f"{module.__name__}._"))
         and name in public
         and not name.startswith("_")
     ]

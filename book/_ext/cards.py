@@ -109,7 +109,7 @@ def write_archives(app: Sphinx, exception: Exception | None) -> None:
 
 
 def write_archive(file: Path, project: Project, notebook: Path) -> None:
-    """Write a notebook and the studies that it imports to a ZIP; the same content gives the same bytes."""
+    """Write a notebook, the studies that it imports and their data to a ZIP, with the same bytes each time."""
     studies = sorted(one for one in project.depends_on(notebook.stem) if one.is_relative_to(project.studies))
     with ZipFile(file, "w", ZIP_DEFLATED) as archive:
         for path in (notebook, *studies):

@@ -146,14 +146,13 @@ def runs_in_page(code: str) -> bool:
 
 
 def site(project: Project) -> bytes:
-    """Return a ZIP of the pure Python that the page needs; the same content gives the same bytes."""
+    """Return a ZIP of the code and data that the page needs; the same content gives the same bytes."""
     files = {
         f"zwfs/{file.relative_to(project.root / 'zwfs').as_posix()}": file.read_bytes()
         for file in (project.root / "zwfs").rglob("*.py")
     }
-    files |= {
-        file.relative_to(project.notebooks).as_posix(): file.read_bytes() for file in project.studies.rglob("*.py")
-    }
+    studies = (file for file in project.modules() if file.is_relative_to(project.studies))
+    files |= {file.relative_to(project.notebooks).as_posix(): file.read_bytes() for file in studies}
     files["driver.py"] = Path(__file__).with_name("driver.py").read_bytes()
     about = metadata.distribution("zwfs")
     files[f"zwfs-{about.version}.dist-info/METADATA"] = f"Name: zwfs\nVersion: {about.version}\n".encode()

@@ -83,11 +83,12 @@ class Project:
         return self.root / "environment" / "requirements.lock"
 
     def modules(self) -> list[Path]:
-        """Return the files of the package and of the studies."""
-        return sorted(file for folder in ("zwfs", "notebooks") for file in (self.root / folder).rglob("*.py"))
+        """Return the files of the package and of the studies, with the data of a study."""
+        files = (file for folder in ("zwfs", "notebooks") for file in (self.root / folder).rglob("*.py"))
+        return sorted([*files, *self.studies.glob("*.npz")])
 
     def depends_on(self, name: str) -> set[Path]:
-        """Return the code that a notebook depends on: all files but the studies that it does not import."""
+        """Return what a notebook depends on: all files but those of the studies that it does not import."""
         studies = {file.stem: file for file in self.studies.glob("*.py")}
         found: set[str] = set()
         waiting = [self.source(name)]
@@ -96,4 +97,5 @@ class Project:
             new = {one for pair in IMPORTED.findall(text) for one in pair if one in studies} - found
             found |= new
             waiting += [studies[one] for one in new]
-        return {*self.modules()} - {studies[one] for one in studies.keys() - found - {"__init__"}}
+        unused = studies.keys() - found - {"__init__"}
+        return {file for file in self.modules() if file.parent != self.studies or file.stem not in unused}

@@ -1,334 +1,276 @@
-"""Calibration of the simulated bench: a fitted model of its optics, and the segments measured with it."""
+"""From pokes to phases: calibration with known commands, and unseen screens, on a bench that HCIPy simulates."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from studies.kit import sweeps
-from studies.kit.bench import ARMS, BenchCurves, middle_rows
-from studies.kit.parameters import parameter_limits
+from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
-from studies.kit.style import LOOKS, show_intensity, show_phase
+from studies.kit.style import LOOKS
 from studies.kit.tables import Table
-from zwfs import PhaseShifted
-from zwfs.bench import Bench, BenchModel, segment_pistons, segment_residual, segment_screens
-from zwfs.frames import FittedSensor, fit_bench
-from zwfs.frames.joint import JointFit
+from zwfs.frames import BenchFit, FittedSensor, fit_bench
+from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
+from zwfs.frames.registration import Image, register_frames
 
-LIMITS = parameter_limits(
-    "inputs n_screens n_iterations",
-    n_pixels=(32, 200),
-    extent=(1.1, 2.0),
-    n_commands=(2, 50),
-    rms_commands=(0.05, 2.0),
-    photons=(100.0, 1e9),
-)
-QUICK = {"n_pixels": 36, "n_commands": 2, "inputs": [0.8], "n_screens": 1}
-
-WAYS = {
-    "design": "model of the design",
-    "design, less flat": "model of the design, less its flat",
-    "calibrated": "calibrated model",
-    "shuffled": "control: calibrated with shuffled commands",
+LIMITS = {
+    "n_commands": (1, 4),
+    "n_steps": (1, 30),
+    "oversampling": (1, 4),
+    "largest": (0.1, 1.2),
+    "n_screens": (1, 2),
+    "n_iterations": USUAL["n_iterations"],
 }
-"""Ways to measure the segments, and their names in the figure."""
+QUICK = {"n_commands": 2, "n_steps": 2, "oversampling": 1, "largest": 0.3}
 
-_N_DARKS = 16  # averaged
-_FIT: dict[str, Any] = {"n_inner": 30, "tolerance": 5e-4}
-_CONTROL_STEPS = 4  # of a fit that cannot succeed
-
-
-class Shot(NamedTuple):
-    """One pair of frames, less the dark, photoelectrons."""
-
-    counts: NDArray[np.float64]  # (2, ny, nx)
-    sigma: NDArray[np.float64]  # noise of each pixel, rms
+_UNIT = 1e-4  # rad, of the phases in the file
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationFrames:
-    """Frames with which a bench is calibrated, less the dark, photoelectrons."""
+class Recording:
+    """Frames of a bench in known states and of screens that the calibration has not seen, less the dark.
 
-    bench: Bench
-    commands: NDArray[np.float64]  # (n_commands + 1, n_segments), rad; the first one is flat
-    frames: NDArray[np.float64]  # (n_commands + 1, 2, ny, nx)
-    clear: NDArray[np.float64]  # (2, ny, nx)
-    dark: NDArray[np.float64]  # (2, ny, nx)
+    `tests/calibration_frames.py` makes the file.
+    """
+
+    arrays: Mapping[str, NDArray]
+
+    @classmethod
+    def read(cls) -> Recording:
+        """Read the file next to this one."""
+        with np.load(Path(__file__).with_suffix(".npz")) as file:
+            return cls(dict(file))
+
+    @property
+    def frames(self) -> NDArray[np.float64]:
+        """Frames of the flat and of known commands, counts, (n_states, 2, ny, nx)."""
+        return self.arrays["frames"].astype(float)
+
+    @property
+    def clear_frames(self) -> NDArray[np.float64]:
+        """Frames with the mask out, counts, (2, ny, nx)."""
+        return self.arrays["clear_frames"].astype(float)
+
+    @property
+    def commands(self) -> NDArray[np.float64]:
+        """Known phases, mean over each pixel, radian, (n_states, n, n)."""
+        return self.arrays["commands"] * _UNIT
+
+    @property
+    def gain(self) -> float:
+        """Electrons per count."""
+        return float(self.arrays["gain"])
 
     @property
     def noise(self) -> float:
-        """Noise of a pixel without light, photoelectrons rms."""
-        return float(np.hypot(np.sqrt(self.bench.background), self.bench.read_noise))
+        """Noise of a pixel without light, counts rms."""
+        return self.noise_at(float(self.arrays["photons"]))
 
-    def shot(self, command: NDArray, seed: np.random.SeedSequence) -> Shot:
-        """Take frames of a different command."""
-        counts = self.bench.frames(command, seed) - self.dark
-        return Shot(counts, np.sqrt(np.maximum(counts, 0) + self.noise**2))
+    def noise_at(self, photons: float) -> float:
+        """The same for an exposure with other photons per pixel."""
+        share = photons / float(self.arrays["photons"])
+        return float(np.sqrt(self.arrays["read_noise"] ** 2 + share * self.arrays["background"]) / self.gain)
 
+    def unseen(self, rms: float, photons: float) -> list[int]:
+        """Numbers of the unseen screens with this error (rad rms) and light (photons per pixel)."""
+        same = (self.arrays["unseen_rms"] == rms) & (self.arrays["unseen_photons"] == photons)
+        return np.flatnonzero(same).tolist()
 
-def dimmed(bench: Bench, photons: float) -> Bench:
-    """Return the bench with other exposures: photons per pixel of the pupil, and background and noise to match."""
-    total = photons * np.count_nonzero(bench.segments)
-    share = total / bench.photons
-    background, read_noise = share * bench.background, np.sqrt(share) * bench.read_noise
-    return replace(bench, photons=total, background=background, read_noise=read_noise)
+    @cached_property
+    def photons(self) -> list[float]:
+        """Light of the unseen screens, photons per pixel, the brightest first."""
+        return sorted(set(self.arrays["unseen_photons"].tolist()), reverse=True)
 
+    def inputs(self, largest: float) -> NDArray[np.float64]:
+        """Errors of the bright unseen screens up to the largest, rad rms."""
+        bright = self.arrays["unseen_photons"] == self.photons[0]
+        found = np.unique(self.arrays["unseen_rms"][bright])
+        return found[found <= largest]
 
-def take_calibration_frames(bench: Bench, n_commands: int, rms: float, seed: int = 0) -> CalibrationFrames:
-    """Take frames of a flat and of random segment commands, clear frames and darks."""
-    draws, masked, clear, *darks = np.random.SeedSequence(seed).spawn(3 + _N_DARKS)
-    commands = rms * np.random.default_rng(draws).normal(size=(n_commands + 1, bench.n_segments))
-    commands[0] = 0
-    dark = np.mean([bench.dark(one) for one in darks], axis=0)
-    frames, clear_frames = bench.frames(commands, masked) - dark, bench.clear_frames(clear) - dark
-    return CalibrationFrames(bench, commands, frames, clear_frames, dark)
-
-
-def fit_models(taken: CalibrationFrames) -> dict[str, JointFit]:
-    """Fit the model of the optics to the frames, and for control to the frames with shuffled commands."""
-    names = "calibrated", "shuffled"
-    return dict(zip(names, sweeps.run(_fit_model, names, taken, name="fit_models"), strict=True))
-
-
-def _fit_model(name: str, taken: CalibrationFrames) -> JointFit:
-    """Fit one of the two models."""
-    bench, commands, settings = taken.bench, taken.commands, _FIT
-    if name == "shuffled":
-        commands, settings = np.roll(commands, 1, axis=0), {**_FIT, "errors": False, "n_steps": _CONTROL_STEPS}
-    known = bench.commanded_phase(commands)
-    return fit_bench(taken.frames, taken.clear, known, n_pixels=bench.n_pixels, noise=taken.noise, **settings)
+    def shot(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Frames of an unseen screen and their noise, in counts of an exposure as long as the calibration's."""
+        photons = float(self.arrays["unseen_photons"][number])
+        counts = self.arrays["unseen_frames"][number].astype(float)
+        sigma = np.sqrt(np.maximum(counts, 0) / self.gain + self.noise_at(photons) ** 2)
+        share = photons / float(self.arrays["photons"])
+        return counts / share, sigma / share
 
 
-class FittedParameter(NamedTuple):
-    """A parameter of the bench, put in and fitted."""
-
-    name: str
-    true: float
-    value: float
-    sigma: float
-
-    @property
-    def deviation(self) -> float:
-        """Error over its standard deviation."""
-        return (self.value - self.true) / self.sigma
-
-
-def fitted_parameters(bench: Bench, fit: JointFit) -> list[FittedParameter]:
-    """Parameters of the bench next to those of a fit."""
-    index = {one.name: number for number, one in enumerate(fit.estimates)}
-    values = np.array([one.value for one in fit.estimates])
-
-    def row(name: str, true: float, plus: str, minus: str | None = None) -> FittedParameter:
-        weights = np.zeros(len(values))
-        weights[index[plus]] = 1
-        if minus is not None:
-            weights[index[minus]] = -1
-        sigma = np.sqrt(weights @ fit.covariance @ weights)
-        return FittedParameter(name, true, float(weights @ values), float(sigma))
-
-    return [
-        row("diameter of the dimple (λ/D)", bench.diameter * (1 + bench.dimple_error), "diameter"),
-        row("phase shift of the first image (rad)", bench.phase, "first"),
-        row("phase shift of the second image (rad)", -bench.phase, "second"),
-        row("leakage", bench.leakage, "leakage"),
-        row("blur (pixels rms)", bench.blur, "blur"),
-        row("focus difference (D²/λ)", bench.focus_difference, "arm 0 focus", "arm 1 focus"),
-        row("distance of the images, rows (pixels)", bench.misregistration, "arm 0 row", "arm 1 row"),
-        row("distance of the images, columns (pixels)", bench.misregistration, "arm 0 column", "arm 1 column"),
-    ]
-
-
-@dataclass(frozen=True, eq=False)
-class Example:
-    """One screen: its frames, those that the models predict for the measured phases, and the errors."""
-
-    commanded: NDArray[np.float64]  # (n_segments,), rad
-    measured: Shot
-    modelled: dict[str, NDArray[np.float64]]  # (2, ny, nx) for each model, photoelectrons
-    residuals: dict[str, NDArray[np.float64]]  # (n_segments,) for each of `WAYS`, rad
-
-
-def measure_segments(
-    taken: CalibrationFrames,
-    fits: Mapping[str, JointFit],
-    rms: ArrayLike,
-    n_screens: int,
-    *,
-    n_iterations: int = 25,
-    seed: int = 0,
-) -> tuple[BenchCurves, list[list[Example]]]:
-    """Measure random segment commands, which no calibration has seen, with each of `WAYS`."""
-    rms, bench = np.asarray(rms, dtype=float), taken.bench
-    model = BenchModel.from_images(bench, seed)
-    design = _Design(model, PhaseShifted(model.shifted, n_iterations=n_iterations))
-    sensors = {name: FittedSensor(fit, n_steps=2) for name, fit in fits.items()}
-    flat, _ = design(taken.shot(np.zeros(bench.n_segments), np.random.SeedSequence(seed, spawn_key=(0,))))
-    models = {"design": design, **{name: _Fitted(sensor) for name, sensor in sensors.items()}}
-    flats = {"design": flat, **{name: sensor.flat for name, sensor in sensors.items()}}
-    tasks = [(row, column) for row in range(len(rms)) for column in range(n_screens)]
-    examples = sweeps.run(_measure, tasks, rms, seed, taken, models, flats, name="measure_segments")
-    rows = [examples[start : start + n_screens] for start in range(0, len(examples), n_screens)]
-    commanded = np.array([[one.commanded for one in row] for row in rows])
-    residuals = {
-        name: np.array([[one.residuals[name] for one in row] for row in rows]) for name in examples[0].residuals
-    }
-    return BenchCurves(rms, commanded, residuals), rows
-
-
-@dataclass(frozen=True, eq=False)
-class _Design:
-    """The phase-shifted iteration with the model of the design."""
-
-    model: BenchModel
-    reconstruct: PhaseShifted
-
-    def __call__(self, shot: Shot) -> tuple[NDArray, NDArray]:
-        """Phase of a frame set, and the frames that the model predicts for it."""
-        estimate = self.reconstruct(shot.counts / self.model.scale)
-        return estimate.phase, self.model.shifted.measure(estimate.phase) * self.model.scale
-
-
-@dataclass(frozen=True, eq=False)
-class _Fitted:
-    """A fitted model."""
-
-    sensor: FittedSensor
-
-    def __call__(self, shot: Shot) -> tuple[NDArray, NDArray]:
-        """Phase of a frame set, and the frames that the model predicts for it."""
-        phase = self.sensor(*shot)
-        return phase, self.sensor.frames(phase)
-
-
-def _measure(
-    task: tuple[int, int],
-    rms: NDArray,
-    seed: int,
-    taken: CalibrationFrames,
-    models: Mapping[str, _Design | _Fitted],
-    flats: Mapping[str, NDArray],
-) -> Example:
-    """Measure one screen with each model."""
-    bench = taken.bench
-    screen, noise = np.random.SeedSequence(seed, spawn_key=(1, *task)).spawn(2)
-    [command] = segment_screens(bench, rms[task[0]], 1, seed=screen)
-    shot = taken.shot(command, noise)
-    modelled, residuals = {}, {}
-    for name, find in models.items():
-        phase, modelled[name] = find(shot)
-        pistons, flat = (segment_pistons(one, bench.segments, bench.numbers) for one in (phase, flats[name]))
-        if name == "design":
-            residuals[name] = segment_residual(pistons, command)
-        residuals["design, less flat" if name == "design" else name] = segment_residual(pistons - flat, command)
-    return Example(command, shot, modelled, residuals)
-
-
-_LINES = {"design": ":", "design, less flat": "--", "calibrated": "-", "shuffled": "-."}
-
-
-def _style(name: str) -> dict[str, Any]:
-    """Keywords of a curve for `plot`; the model of the design has the colour of its reconstructor."""
-    look = LOOKS["PhaseShifted"]
-    color, marker = {"calibrated": ("#333333", "*"), "shuffled": ("#777777", "x")}.get(
-        name, (look.color, look.marker)
+def calibrate(taken: Recording, n_commands: int = 4, n_steps: int = 6, oversampling: int = 2) -> BenchFit:
+    """Fit the bench to the frames of the flat and of known commands."""
+    states = slice(n_commands + 1)
+    return fit_bench(
+        taken.frames[states],
+        taken.clear_frames,
+        taken.commands[states],
+        n_pixels=taken.commands.shape[-1],
+        noise=taken.noise,
+        gain=taken.gain,
+        n_steps=n_steps,
+        oversampling=oversampling,
     )
-    hollow = {"markerfacecolor": "none"} if name == "design, less flat" else {}
-    return {"color": color, "marker": marker, "linestyle": _LINES[name]} | hollow
 
 
-def draw_calibration_errors(curves: BenchCurves, example: Example, segments: NDArray) -> Figure:
-    """Error of the segments against the input, for each model, and the errors of one screen."""
-    figure, (linearity, points) = plt.subplots(1, 2, figsize=(7, 4.6))
-    for name, label in WAYS.items():
-        style = _style(name)
-        linearity.semilogy(curves.rms, curves.mean(name), ms=7, label=label, **style)
-        if name != "shuffled":
-            points.plot(segments, example.residuals[name], **{**style, "linestyle": ""}, ms=6)
-    linearity.set(xlabel="input (rad rms over the segments)", ylabel="error (rad rms)", xlim=(0, None))
-    linearity.yaxis.set_major_locator(LogLocator())
-    linearity.yaxis.set_minor_formatter(NullFormatter())
-    points.axhline(0, color="#555555", lw=1)
-    points.set(xlabel="segment number", ylabel="error of the piston (rad)")
-    figure.legend(*linearity.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9)
+class Measured(NamedTuple):
+    """Errors of an unseen screen over the pixels that are fully lit, rad rms, and what the calibrated fit says."""
+
+    plain: float
+    calibrated: float
+    sigma: float  # error bar that the fit states, rms over the same pixels
+    inside: float  # share of these pixels with an error below the error bar
+    misfit: float
+    consistent: bool
+
+
+def measure(taken: Recording, fit: BenchFit, numbers: Sequence[int], n_iterations: int = 25) -> list[Measured]:
+    """Measure unseen screens by the plain route with the values of the design, and with the fitted optics."""
+    return sweeps.run(_measure, numbers, taken, FittedSensor(fit), n_iterations, name="calibrated_errors")
+
+
+def _measure(number: int, taken: Recording, sensor: FittedSensor, n_iterations: int) -> Measured:
+    counts, sigma = taken.shot(number)
+    found, lit = sensor(counts, sigma), taken.arrays["lit"]
+    left = _error(found.phase, taken.arrays["unseen"][number] * _UNIT, lit)
+    bars = found.sigma[lit]
+    plain = _plain(counts, taken, number, n_iterations)
+    inside = float(np.mean(np.abs(left) < bars))
+    stated = float(np.sqrt(np.mean(bars**2)))
+    return Measured(float(plain.std()), float(left.std()), stated, inside, found.misfit, found.consistent)
+
+
+def _plain(counts: NDArray, taken: Recording, number: int, n_iterations: int) -> NDArray[np.float64]:
+    """Error of the phase-shifted iteration with the values of the design, on the pixels of the first image."""
+    frames, clear = (
+        [Image(one, np.zeros(one.shape, bool)) for one in pair] for pair in (counts, taken.clear_frames)
+    )
+    registered = register_frames(frames, clear)
+    phase = recover_phase(reduce_frames(registered, Optics()), n_iterations).phase
+    window = tuple(slice(first, first + registered.n_pixels) for first in registered.corner)
+    lit = taken.arrays["lit_on_camera"][window] & np.isfinite(phase)
+    return _error(phase, taken.arrays["unseen_on_camera"][number][window] * _UNIT, lit)
+
+
+def _error(phase: NDArray, truth: NDArray, lit: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Error without piston of the pixels that are fully lit."""
+    left = np.exp(1j * (phase - truth)[lit])
+    return np.angle(left * np.conj(left.mean()))
+
+
+def known_values(taken: Recording) -> dict[str, float]:
+    """Values of the bench by their names in a fit."""
+    bench = taken.arrays
+    values = {name: float(bench[name]) for name in ("diameter", "leakage", "blur")}
+    values |= {name: float(value) for name, value in zip(("first", "second"), bench["shifts"], strict=True)}
+    for arm in (0, 1):
+        values[f"arm {arm} focus"] = float(bench["focus"][arm])
+        values[f"arm {arm} row"], values[f"arm {arm} column"] = map(float, bench["offsets"][arm])
+    return values
+
+
+_TITLES = {
+    "diameter": "diameter of the dimple (λ/D)",
+    "first": "phase shift of the first image (rad)",
+    "second": "phase shift of the second image (rad)",
+    "leakage": "leakage",
+    "blur": "blur (pixels rms)",
+    "arm 0 focus": "focus of the first image (D²/λ)",
+    "arm 0 row": "row of the first image (pixels)",
+}
+
+
+def estimate_table(taken: Recording, fit: BenchFit) -> Table:
+    """Values of the bench, those fitted, and their differences in units of the error bar."""
+    true = known_values(taken)
+    rows = []
+    for name, title in _TITLES.items():
+        value, sigma = fit[name].value, fit[name].sigma
+        deviation = (value - true[name]) / sigma
+        rows.append([title, f"{true[name]:.5g}", f"{value:.4g}", f"{sigma:.1g}", f"{deviation:+.0f}"])
+    return Table(["parameter", "put in", "fitted", "error bar", "deviation (error bars)"], rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Errors against the input."""
+
+    rms: NDArray[np.float64]  # (n,) rad
+    measured: list[list[Measured]]  # for each input, one for each screen
+
+    def column(self, name: str) -> NDArray[np.float64]:
+        """Root mean square over the screens of an attribute, (n,)."""
+        values = np.array([[getattr(one, name) for one in row] for row in self.measured])
+        return np.sqrt(np.mean(values**2, axis=1))
+
+
+def measure_inputs(
+    taken: Recording, fit: BenchFit, largest: float, n_screens: int, n_iterations: int = 25
+) -> Errors:
+    """Measure the bright unseen screens up to an error."""
+    inputs = taken.inputs(largest)
+    numbers = [number for rms in inputs for number in taken.unseen(rms, taken.photons[0])[:n_screens]]
+    found = measure(taken, fit, numbers, n_iterations)
+    return Errors(inputs, [found[k : k + n_screens] for k in range(0, len(found), n_screens)])
+
+
+def draw_calibration_errors(errors: Errors) -> Figure:
+    """Error against the input, with the values of the design and calibrated, and the error bar that is stated."""
+    figure, axes = plt.subplots(figsize=(6, 4.2))
+    plain, found, stated = (errors.column(name) for name in ("plain", "calibrated", "sigma"))
+    axes.plot(errors.rms, plain, **LOOKS["PhaseShifted"].style, label="values of the design")
+    axes.plot(errors.rms, found, "*-", color="#333333", ms=9, label="calibrated")
+    axes.plot(errors.rms, stated, "o", color="#777777", mfc="none", ms=8, label="error bar, calibrated")
+    axes.set(xlabel="input (rad rms)", ylabel="error (rad rms)", yscale="log", xlim=(0, None))
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     return figure
 
 
-def draw_calibration_frames(example: Example) -> Figure:
-    """Measured frames of one screen, and their differences from the frames of each model in units of the noise."""
-    titles = {"design": "model of\nthe design", "shuffled": "control", "calibrated": "calibrated\nmodel"}
-    figure, panels = plt.subplots(2, 1 + len(titles), figsize=(7, 4.6))
-    counts, sigma = example.measured
-    misfits = {name: (counts - example.modelled[name]) / sigma for name in titles}
-    limits = {name: float(np.quantile(np.abs(misfits[name]), 0.99)) for name in ("design", "calibrated")}
-    for axes, image, arm in zip(panels[:, 0], counts / np.quantile(counts, 0.999), ARMS, strict=True):
-        light = show_intensity(axes, image, 1.0)
-        axes.set_ylabel(f"image {arm}")
-    shown = {}
-    for column, (name, title) in zip(panels[:, 1:].T, titles.items(), strict=True):
-        for axes, image in zip(column, misfits[name], strict=True):
-            shown[name] = show_phase(axes, image, limits.get(name, limits["design"]))
-        column[0].set_title(title, fontsize=10)
-    panels[0, 0].set_title("measured", fontsize=10)
-    bars: dict[str, Any] = {"location": "bottom", "shrink": 0.85}
-    figure.colorbar(light, ax=panels[:, 0], label="intensity", aspect=12, **bars)
-    misfit: dict[str, Any] = {"label": "misfit / noise", "extend": "both"} | bars
-    figure.colorbar(shown["design"], ax=panels[:, 1:3], aspect=25, **misfit)
-    figure.colorbar(shown["calibrated"], ax=panels[:, 3], aspect=12, **misfit)
-    return figure
-
-
-def error_columns(curves: BenchCurves) -> dict[str, NDArray]:
-    """Mean error of each of `WAYS`."""
+def error_columns(errors: Errors) -> dict[str, NDArray]:
+    """Errors, error bars and misfits."""
     return {
-        "input (rad rms)": curves.rms,
-        **{f"{label}: mean error (rad rms)": curves.mean(name) for name, label in WAYS.items()},
+        "input (rad rms)": errors.rms,
+        "plain route: error (rad rms)": errors.column("plain"),
+        "calibrated: error (rad rms)": errors.column("calibrated"),
+        "calibrated: error bar (rad rms)": errors.column("sigma"),
+        "calibrated: misfit": np.array([np.mean([one.misfit for one in row]) for row in errors.measured]),
     }
 
 
-def frame_columns(example: Example) -> dict[str, NDArray]:
-    """Middle rows of the measured and modelled images."""
-    return middle_rows({"measured": example.measured.counts, **example.modelled})
-
-
-def parameter_table(parameters: Sequence[FittedParameter]) -> Table:
-    """Parameters put in, those fitted, and their differences in units of the error bar."""
-    return Table(
-        ["parameter", "put in", "fitted", "error bar", "deviation (error bars)"],
-        [
-            [one.name, f"{one.true:.5g}", f"{one.value:.5g}", f"{one.sigma:.1g}", f"{one.deviation:+.1f}"]
-            for one in parameters
-        ],
+def numbers(taken: Recording, fit: BenchFit, errors: Errors) -> dict[str, float | str]:
+    """Numbers for the text: settings, verdict, errors and how well the error bars hold."""
+    true, plain, found = known_values(taken), errors.column("plain"), errors.column("calibrated")
+    every = [one for row in errors.measured for one in row]
+    place = int(np.argmin(np.abs(errors.rms - 0.8)))
+    return rounded(
+        {
+            "commands": len(fit.misfit) / 2 - 2,
+            "photons": float(taken.arrays["photons"]),
+            "misfit": float(np.mean(fit.misfit)),
+            "verdict": "consistent" if fit.consistent else "not consistent",
+            "remarks": " ".join(fit.remarks) or "none",
+            "largest_deviation": max(abs(fit[name].value - true[name]) / fit[name].sigma for name in true),
+            "diameter_error": 100 * abs(fit["diameter"].value / true["diameter"] - 1),
+            "shift_error": 100 * max(abs(fit[name].value / true[name] - 1) for name in ("first", "second")),
+            "leakage_error": 100 * abs(fit["leakage"].value - true["leakage"]),
+            "shown": errors.rms[place],
+            "plain_error": plain[place],
+            "calibrated_error": found[place],
+            "gain": plain[place] / found[place],
+            "gain_least": (plain / found).min(),
+            "gain_most": (plain / found).max(),
+            "calibrated_largest": found.max(),
+            "sigma": errors.column("sigma")[place],
+            "inside": 100 * float(np.mean([one.inside for one in every])),
+            "flagged": sum(not one.consistent for one in every),
+            "unseen": len(every),
+        },
+        ".3g",
     )
-
-
-def numbers(
-    taken: CalibrationFrames, parameters: Sequence[FittedParameter], curves: BenchCurves, example: Example
-) -> dict[str, float | str]:
-    """Numbers for the text: settings, errors at the input of the example, and agreement of its frames."""
-    bench = taken.bench
-    place = int(np.argmin(np.abs(curves.rms - example.commanded.std())))
-    found = {
-        "commands": len(taken.commands) - 1,
-        "shown": curves.rms[place],
-        "photons": bench.photons / np.count_nonzero(bench.segments),
-        "largest_deviation": max(abs(one.deviation) for one in parameters),
-    }
-    for name in WAYS:
-        short = "less_flat" if name == "design, less flat" else name
-        found[f"{short}_error"] = curves.mean(name)[place]
-    found["improvement"] = found["less_flat_error"] / found["calibrated_error"]
-    counts, sigma = example.measured
-    lit = np.pad(bench.segments > 0, (counts.shape[-1] - bench.n_pixels) // 2)
-    for name, frames in example.modelled.items():
-        found[f"{name}_misfit"] = np.sqrt(np.mean(((frames - counts) / sigma) ** 2))
-        pairs = zip(frames, counts, strict=True)
-        found[f"{name}_correlation"] = min(np.corrcoef(one[lit], other[lit])[0, 1] for one, other in pairs)
-    return rounded(found, ".4g")

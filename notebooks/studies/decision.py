@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from studies.calibration import CalibrationFrames, Shot, dimmed, take_calibration_frames
+from studies import calibration
 from studies.closed_loop import (
     BestMethods,
     TunedLoops,
@@ -26,23 +26,21 @@ from studies.kit.results import rounded
 from studies.kit.tables import Link, Table
 from zwfs import Arcsine, Dimple, MaximumLikelihood, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
 from zwfs.bench import Bench, BenchModel, segment_pistons, segment_residual, segment_screens
-from zwfs.frames import FittedSensor, fit_bench
 
 LIMITS = parameter_limits(
     "n_iterations",
     n_pixels=(32, 136),
     extent=(1.1, 2.0),
     photons_calibration=(100.0, 1e9),
-    n_commands=(2, 50),
-    rms_commands=(0.05, 2.0),
     poke=(0.001, 1.5),
     **dict.fromkeys(("rms", "rms_small", "rms_loop", "rms_loop_small"), (0.01, 4.0)),
     **dict.fromkeys(("photons", "photons_faint"), (10.0, 1e9)),
     **dict.fromkeys(("photons_loop", "photons_loop_faint"), (0.01, 1e9)),
     **dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop"), (2, 1000)),
+    n_screens_calibrated=(0, 2),
 )
 
-QUICK = {"n_pixels": 32, "n_commands": 2, "n_screens": 2, "n_screens_perfect": 2, "n_screens_loop": 2}
+QUICK = {"n_pixels": 32, "n_screens": 2, "n_screens_perfect": 2, "n_screens_loop": 2, "n_screens_calibrated": 0}
 
 COLUMNS = {"perfect": "no errors", "calibrated": "calibrated", "design": "only the design known"}
 """What is known of the bench, and the headers of the table."""
@@ -53,17 +51,17 @@ TWO_IMAGES = {
     "Accelerated": "phase-shifted, accelerated",
     "MaximumLikelihood": "maximum likelihood",
     "LikelihoodModes": "maximum likelihood on modes",
-    "Fitted": "fitted model",
 }
 """Methods, the simplest first, and their names in the table."""
 UNCORRECTED = "PhaseShifted with the offset of its flat"
 
 CHAPTERS = (
-    Link("a calibrated model", "calibration.ipynb"),
+    Link("from pokes to phases", "calibration.ipynb"),
     Link("photon noise", "photon_noise.ipynb"),
     Link("Figure 9", "fig09_bench_linearity.ipynb"),
 )
 """Chapters that explain the rows without a loop."""
+_N_DARKS = 16  # averaged
 _ALIKE = 1.05  # ratio of errors up to which the simpler one of two methods is named
 
 
@@ -74,42 +72,61 @@ class Situation(NamedTuple):
     photons: float  # per point and image of two, in a loop of each step; one image gets the light of both
 
 
+class Shot(NamedTuple):
+    """Frames less the dark, photoelectrons."""
+
+    counts: NDArray[np.float64]  # (n_images, ny, nx)
+    share: float  # light of the exposure over that of the calibration
+
+
 @dataclass(frozen=True, eq=False)
 class Known:
     """A bench, and what was recorded and modelled on it before the measurements."""
 
-    taken: CalibrationFrames
+    bench: Bench
+    dark: NDArray[np.float64]  # photoelectrons, (2, ny, nx)
+    flat: NDArray[np.float64]  # frames of the flat command less the dark, the same
     model: BenchModel
     poked: Sequence[NDArray]
     poke: float
-    fitted: FittedSensor | None = None
+
+    @property
+    def noise(self) -> float:
+        """Noise of a pixel without light, photoelectrons rms."""
+        return float(np.hypot(np.sqrt(self.bench.background), self.bench.read_noise))
 
 
-def know_bench(bench: Bench, n_commands: int, rms: float, poke: float, *, seed: int, fitted: bool) -> Known:
-    """Record frames of known commands on a bench, and fit a model of the optics to them if `fitted`."""
-    taken = take_calibration_frames(bench, n_commands, rms, seed)
+def know_bench(bench: Bench, photons: float, poke: float, *, seed: int) -> Known:
+    """Record what the methods know of a bench, with photons per pixel of the pupil in each frame."""
+    bench = dimmed(bench, photons)
+    masked, *darks = np.random.SeedSequence(seed).spawn(1 + _N_DARKS)
+    dark = np.mean([bench.dark(one) for one in darks], axis=0)
     model = BenchModel.from_images(bench, seed)
-    known = Known(taken, model, poked_frames(bench, model, poke, seed), poke)
-    if not fitted:
-        return known
-    commanded = bench.commanded_phase(taken.commands)
-    settings: dict[str, Any] = {"n_inner": 30, "tolerance": 5e-4, "errors": False}
-    fit = fit_bench(taken.frames, taken.clear, commanded, n_pixels=bench.n_pixels, noise=taken.noise, **settings)
-    return replace(known, fitted=FittedSensor(fit, n_steps=2))
+    return Known(
+        bench, dark, bench.frames(None, masked) - dark, model, poked_frames(bench, model, poke, seed), poke
+    )
 
 
-def shots(taken: CalibrationFrames, photons: float, command: NDArray, seed: np.random.SeedSequence) -> list[Shot]:
-    """Take frames of one image and of two, in units of the calibration's light.
+def dimmed(bench: Bench, photons: float) -> Bench:
+    """Return the bench with other exposures: photons per pixel of the pupil, and background and noise to match."""
+    total = photons * np.count_nonzero(bench.segments)
+    share = total / bench.photons
+    background, read_noise = share * bench.background, np.sqrt(share) * bench.read_noise
+    return replace(bench, photons=total, background=background, read_noise=read_noise)
+
+
+def shots(known: Known, photons: float, command: NDArray, seed: np.random.SeedSequence) -> list[Shot]:
+    """Take frames of one image and of two.
 
     `photons` are those per point and image of two; one image gets those of both. On its own the first image would
     be brighter than the mean of the two by the imbalance of the bench.
     """
-    bench, found = taken.bench, []
+    bench, found = known.bench, []
     alone = 2 * photons / (1 + bench.flux_imbalance)
     for light, n_images, noise in zip((alone, photons), (1, 2), seed.spawn(2), strict=True):
         share = light * np.count_nonzero(bench.segments) / bench.photons
-        shot = replace(taken, bench=dimmed(bench, light), dark=share * taken.dark).shot(command, noise)
-        found.append(Shot(*(one[:n_images] / share for one in shot)))
+        counts = dimmed(bench, light).frames(command, noise) - share * known.dark
+        found.append(Shot(counts[:n_images], share))
     return found
 
 
@@ -142,9 +159,9 @@ def _errors(
     name, row, screen = task
     known, (rms, photons) = benches[name], situations[row]
     draws, noise = np.random.SeedSequence(seed, spawn_key=(row, screen)).spawn(2)
-    taken, model, bench = known.taken, known.model, known.taken.bench
+    model, bench = known.model, known.bench
     [command] = segment_screens(bench, rms, 1, seed=draws)
-    alone, pair = shots(taken, photons, command, noise)
+    alone, pair = shots(known, photons, command, noise)
 
     def error(phase: NDArray, flat: NDArray | float) -> float:
         found = segment_pistons(phase, bench.segments, bench.numbers) - flat
@@ -153,21 +170,20 @@ def _errors(
     found = {}
     for method, reconstruct in _methods(known, photons, n_iterations).items():
         n_images = reconstruct.sensor.n_masks
-        counts = np.stack([taken.frames[0, :n_images], (alone if n_images == 1 else pair).counts])
+        shot = alone if n_images == 1 else pair
+        counts = np.stack([known.flat[:n_images], shot.counts / shot.share])
         flat, phase = reconstruct(counts / model.scale[:n_images]).phase
         found[method] = error(phase, model.pistons(flat))
         if method == "PhaseShifted":
             found[UNCORRECTED] = error(phase, 0.0)
-    if known.fitted:
-        found["Fitted"] = error(known.fitted(*pair), model.pistons(known.fitted.flat))
     return found
 
 
 def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
     """Return the methods that know the design of the mask, the clear frames, and the response to pokes."""
     one, two, modes = known.model.classic, known.model.shifted, known.model.modes
-    share = photons * np.count_nonzero(known.taken.bench.segments) / known.taken.bench.photons
-    noise = np.sqrt(share) * known.taken.noise  # of a pixel without light, as in `shots`
+    share = photons * np.count_nonzero(known.bench.segments) / known.bench.photons
+    noise = np.sqrt(share) * known.noise  # of a pixel without light, as in `shots`
     single: dict[str, Any] = {"photons": 2 * photons, "read_noise": np.sqrt(2) * noise}
     double: dict[str, Any] = {"photons": photons, "read_noise": noise}
     return {
@@ -181,6 +197,19 @@ def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
         "MaximumLikelihood": MaximumLikelihood(two, n_starts=1, **double),
         "LikelihoodModes": MaximumLikelihood(two, modes, n_starts=1, **double),
     }
+
+
+def calibrated_errors(situations: Sequence[Situation], n_screens: int) -> list[float | None]:
+    """Errors of a calibrated bench that HCIPy simulates, rad rms over the pixels; None if nothing was recorded."""
+    taken = calibration.Recording.read()
+    recorded = [taken.unseen(*one)[:n_screens] for one in situations]
+    some = [number for row in recorded for number in row]
+    errors = (
+        dict(zip(some, calibration.measure(taken, calibration.calibrate(taken), some), strict=True))
+        if some
+        else {}
+    )
+    return [typical(np.array([errors[one].calibrated for one in row])) if row else None for row in recorded]
 
 
 def closed_loops(situations: Sequence[Situation], n_screens: int, seed: int) -> list[BestMethods]:
@@ -239,6 +268,18 @@ class Cell:
         return f"{count}, {method}: {self.error:.2g}, {factor:.2g} times smaller"
 
 
+@dataclass(frozen=True)
+class Calibrated:
+    """Error of two images on a calibrated bench, rad rms."""
+
+    error: float
+
+    @property
+    def text(self) -> str:
+        """Cell of the table."""
+        return f"two images, fitted model: {self.error:.2g}; one image not studied"
+
+
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
     """Name of the first method that agrees with the best one within the scatter, or within `_ALIKE`."""
     known = [name for name in names if name in errors]
@@ -267,17 +308,24 @@ class Row:
 
     key: str
     text: str
-    cells: Mapping[str, Cell | None]
+    cells: Mapping[str, Cell | Calibrated | None]
     chapter: Link
 
 
-def open_rows(situations: Sequence[Situation], errors: Mapping[str, Sequence[Mapping[str, NDArray]]]) -> list[Row]:
-    """Rows without a loop; on the calibrated bench, the methods that know its design compete as well."""
+def open_rows(
+    situations: Sequence[Situation],
+    errors: Mapping[str, Sequence[Mapping[str, NDArray]]],
+    calibrated: Sequence[float | None],
+) -> list[Row]:
+    """Rows without a loop."""
     rows = []
     for index, (rms, photons) in enumerate(situations):
-        perfect, real = errors["perfect"][index], errors["real"][index]
-        design = {name: values for name, values in real.items() if name != "Fitted"}
-        cells = {"perfect": open_cell(perfect), "calibrated": open_cell(real), "design": open_cell(design)}
+        known = calibrated[index]
+        cells = {
+            "perfect": open_cell(errors["perfect"][index]),
+            "calibrated": None if known is None else Calibrated(known),
+            "design": open_cell(errors["real"][index]),
+        }
         text = f"open loop, {rms:g} rad rms; {_light(photons)}"
         rows.append(Row(f"open_{index + 1}", text, cells, CHAPTERS[index]))
     return rows
@@ -304,7 +352,7 @@ def decision_table(rows: Iterable[Row]) -> Table:
     return Table(header, [[row.text, *some, row.chapter] for row, some in zip(rows, cells, strict=True)])
 
 
-def _cell_text(cell: Cell | None) -> str:
+def _cell_text(cell: Cell | Calibrated | None) -> str:
     return "not studied" if cell is None else cell.text
 
 
@@ -318,8 +366,10 @@ def numbers(
         for name, cell in row.cells.items():
             found[f"{row.key}_{name}"] = _cell_text(cell)
             if cell is not None:
-                found |= {f"{row.key}_{name}_error": cell.error, f"{row.key}_{name}_ratio": cell.ratio}
-    gains = [1 / cell.ratio for row in rows[:2] for cell in row.cells.values() if cell]
+                found[f"{row.key}_{name}_error"] = cell.error
+            if isinstance(cell, Cell):
+                found[f"{row.key}_{name}_ratio"] = cell.ratio
+    gains = [1 / cell.ratio for row in rows[:2] for cell in row.cells.values() if isinstance(cell, Cell)]
     small, faint = errors["real"][-1], loops[-1]
     settled = faint.loops.settled
     return rounded(

@@ -3,8 +3,8 @@
 `files` reads and writes, `registration` locates the pupils, `pipeline` reconstructs a pair of frames, `verdict`
 judges the result and finds which image has which phase shift. `calibration` keeps the constants of a
 bench, and `telemetry` reconstructs files of any length with them. The command is `python -m zwfs.frames`.
-`joint` fits one model, `optics_model`, to all images of a recording; `bench_fit` takes a model of a bench from
-frames of a mirror in known states.
+`fit_bench` takes a model of a bench from frames of a mirror in known states. `FittedSensor` measures phases with
+that model, with error bars and a verdict.
 
 Examples
 --------
@@ -36,34 +36,24 @@ True
 >>> folder.cleanup()
 """
 
-from zwfs.frames import (
-    bench_fit,
-    calibration,
-    files,
-    joint,
-    optics_model,
-    pipeline,
-    registration,
-    telemetry,
-    verdict,
-)
-from zwfs.frames.bench_fit import FittedSensor, fit_bench
+from zwfs.frames import calibration, files, pipeline, registration, telemetry, verdict
+from zwfs.frames._camera import BenchFit, Estimate, FittedPhase, FittedSensor, fit_bench
 from zwfs.frames.calibration import Calibration, calibrate
 from zwfs.frames.telemetry import reconstruct
 from zwfs.frames.verdict import CameraNoise, judge, order_of_images
 
 __all__ = [
+    "BenchFit",
     "Calibration",
     "CameraNoise",
+    "Estimate",
+    "FittedPhase",
     "FittedSensor",
-    "bench_fit",
     "calibrate",
     "calibration",
     "files",
     "fit_bench",
-    "joint",
     "judge",
-    "optics_model",
     "order_of_images",
     "pipeline",
     "reconstruct",

@@ -25,8 +25,6 @@ from zwfs.reconstructors import Arcsine, PhaseShifted
 from zwfs.sensor import ZernikeSensor
 from zwfs.units import phase_to_opd
 
-__all__ = ["MeasuredPhase", "Measurement", "Optics", "Step", "fit", "recover_phase", "reduce_frames", "steps"]
-
 _MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
 
 
@@ -52,8 +50,7 @@ class Optics:
     unmasked : float
         Fraction of the light that the mask does not shift, because its retardance is not half a wave. It is added
         as an intensity, which is right for unpolarised light. In linearly polarised light it interferes with the
-        shifted light, which changes the frames by some tenths of the mean intensity: `quadrature` of
-        ``zwfs.frames.optics_model.MaskPair`` describes that case.
+        shifted light, which changes the frames by some tenths of the mean intensity and is not modelled.
 
     Raises
     ------

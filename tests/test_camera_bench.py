@@ -1,0 +1,157 @@
+"""Calibration with the model of the camera, on frames that HCIPy simulates, and the parts that it is made of."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from zwfs import Dimple, Pupil, ZernikeSensor
+from zwfs.frames._camera.bench import fit_bench
+from zwfs.frames._camera.model import Camera, Exposure, Maps
+from zwfs.frames._camera.sensor import FittedSensor, unwrapped
+from zwfs.frames._camera.solve import Light, fine_phase
+
+from .hcipy_bench import BEFORE, CASES
+
+FINE = 16
+
+
+def blocks(image, k):
+    return image.reshape(len(image) // k, k, -1, k).mean(axis=(1, 3))
+
+
+def test_fine_phase_has_the_means_of_the_pixels():
+    means = ndimage.gaussian_filter(np.random.default_rng(1).normal(size=(24, 24)), 0.8)
+    np.testing.assert_allclose(blocks(fine_phase(means, FINE), FINE), means, rtol=0, atol=2e-3)
+
+
+def test_fine_phase_of_a_parabola_is_its_value_and_not_its_mean():
+    y, x = np.mgrid[:40, :40] - 19.5
+    fine_y, fine_x = (np.mgrid[:80, :80] + 0.5) / 2 - 20
+    found = fine_phase(0.01 * (x**2 + x * y) + 0.01 / 12, 2)
+    inner = (slice(30, 50),) * 2
+    np.testing.assert_allclose(found[inner], 0.01 * (fine_x**2 + fine_x * fine_y)[inner], rtol=0, atol=1e-5)
+
+
+def test_unwrapped_phase_has_no_jump():
+    inside = Pupil.circular(40).inside
+    true = 60 * ndimage.gaussian_filter(np.random.default_rng(2).normal(size=(40, 40)), 5)
+    true[~inside] = 0
+    assert np.ptp(true[inside]) > 3 * np.pi
+    left = (unwrapped(np.angle(np.exp(1j * true)), inside) - true)[inside]
+    assert np.ptp(left) < 1e-9
+
+
+@pytest.fixture(scope="module")
+def partly_lit():
+    """Fine amplitude and phase of a disc that cuts pixels, and its image with a blur, (ny, nx)."""
+    n, k, blur = 24, 8, 0.5
+    y, x = (np.mgrid[: n * k, : n * k] + 0.5) / k - n / 2
+    amplitude = (np.hypot(y, x) < 9.7).astype(float)
+    phase = 0.5 * np.sin(x / 3 + 0.4) * np.cos(y / 4)
+    pupil = Pupil.from_amplitude(amplitude, 20 * k)
+    frame = np.mean(pupil.amplitude[pupil.inside] ** 2) * ZernikeSensor(pupil, Dimple(1.1, 1.5)).measure(phase)[0]
+    return amplitude, phase, blocks(ndimage.gaussian_filter(frame, blur * k, truncate=6), k), blur
+
+
+def modelled(partly_lit, f, areas):
+    amplitude, phase, _, blur = partly_lit
+    k = 8 // f
+    light, mean = blocks(amplitude**2, k), blocks(amplitude, k)
+    mean = mean if areas else np.sqrt(light)
+    camera = Camera(24, (24, 24), 20, [Exposure(0, 0, 0)], np.zeros((1, 24 * f, 24 * f)), f, 1.5)
+    values = np.array([0, 0, 0, 0, 0, 0, 1, 1, 0, 1.1, 1.5, -1.5, 0, 0, 0, 0, blur])
+    (image,) = camera.at(Maps(mean, light - mean**2, blocks(phase, k)), values).images
+    return image
+
+
+def test_two_areas_describe_a_pixel_that_is_lit_in_part(partly_lit):
+    """With one amplitude, the root of the mean light, the error is several times larger."""
+    middle = (slice(2, -2),) * 2  # the light of the reference wave beyond the frame is not simulated
+    errors = {
+        (f, areas): np.abs(modelled(partly_lit, f, areas) - partly_lit[2])[middle].max()
+        for f in (1, 2)
+        for areas in (True, False)
+    }
+    assert errors[2, True] < 0.01
+    assert errors[2, True] < errors[2, False] / 3
+    assert errors[1, True] < errors[1, False] / 1.5
+
+
+def test_light_of_a_pixel_that_is_lit_in_part_divides():
+    x = np.mgrid[:20, :20][1]
+    light = np.where(x < 12, 1.21, np.where(x == 12, 0.6 * 1.21, 0.0))
+    division = Light.of(light, light, 1)
+    maps = division.maps(light, 0 * light)
+    np.testing.assert_allclose(maps.mean[4:-4, 12], 0.6 * 1.1, rtol=1e-6)
+    np.testing.assert_allclose(maps.mean[4:-4, 5], 1.1, rtol=1e-6)
+    np.testing.assert_allclose(maps.rest[4:-4, 12], 0.6 * 1.21 - 0.66**2, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"phases": np.zeros((1, 24, 24)), "frames": np.ones((1, 2, 24, 24))}, "phases holds 1 state"),
+        ({"phases": np.zeros((3, 24, 24))}, "one for each state"),
+        ({"phases": np.zeros((2, 23, 23))}, "even differences"),
+        ({"clear_frames": np.ones((2, 20, 20))}, "clear_frames has shape"),
+        ({"clear_frames": np.zeros((2, 24, 24))}, "expected light"),
+        ({"noise": 0.0}, "noise = 0"),
+        ({"frames": np.ones((2, 3, 24, 24))}, "frames has 3 images"),
+    ],
+)
+def test_data_that_do_not_belong_together_are_refused(change, message):
+    data = {
+        "frames": np.ones((2, 2, 24, 24)),
+        "clear_frames": np.ones((2, 24, 24)),
+        "phases": np.zeros((2, 24, 24)),
+    }
+    with pytest.raises(ValueError, match=message):
+        fit_bench(**{**data, "n_pixels": 20, "noise": 1.0, **change})
+
+
+BENCH = replace(CASES["disc"], pixels=40, side=52)
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    frames, clear, phases = BENCH.recording()
+    return fit_bench(frames, clear, phases, n_pixels=BENCH.pixels, noise=BENCH.noise, n_steps=6)
+
+
+def test_calibration_of_a_foreign_bench_explains_its_frames(calibrated):
+    assert calibrated.misfit.mean() < 1.2
+    assert not calibrated.remarks
+    found = {one.name: one.value for one in calibrated.estimates}
+    assert found["diameter"] == pytest.approx(BENCH.diameter, rel=3e-3)
+    assert found["first"] == pytest.approx(BENCH.shifts[0], rel=3e-3)
+    assert found["second"] == pytest.approx(BENCH.shifts[1], rel=3e-3)
+    assert found["leakage"] == pytest.approx(BENCH.leakage, abs=3e-3)
+    assert found["blur"] == pytest.approx(BENCH.blur, abs=0.04)
+    for side in (0, 1):
+        assert found[f"arm {side} row"] == pytest.approx(BENCH.offsets[side][0], abs=0.02)
+        assert found[f"arm {side} column"] == pytest.approx(BENCH.offsets[side][1], abs=0.02)
+
+
+@pytest.mark.parametrize(("number", "rms"), [(0, 0.3), (1, 0.8)])
+def test_calibrated_phase_has_half_the_error_that_the_plain_route_had(calibrated, number, rms):
+    screen = BENCH.smooth(rms, seed=1)
+    counts = BENCH.counts(screen, (7, 1))
+    found = FittedSensor(calibrated)(counts, np.sqrt(np.maximum(counts, 0) + BENCH.noise**2))
+    assert BENCH.error(found, screen) < min(0.02, BEFORE["disc"]["plain"][number] / 2)
+    left = (found - BENCH.on_pupil(screen + BENCH.flat))[BENCH.fully_lit]
+    pull = (left - left.mean()) / found.sigma[BENCH.fully_lit]
+    assert 0.5 < pull.std() < 2
+
+
+@pytest.mark.slow
+def test_reverse_order_and_a_command_with_the_wrong_sign_are_reported():
+    frames, clear, phases = BENCH.recording()
+    settings = {"n_pixels": BENCH.pixels, "noise": BENCH.noise, "n_steps": 3}
+    flipped = fit_bench(frames[:, ::-1], clear[::-1], phases, **settings)
+    assert any("reverse order" in one for one in flipped.remarks)
+    phases[2] *= -1
+    wrong = fit_bench(frames, clear, phases, **settings)
+    assert any(one.startswith("State 2") for one in wrong.remarks)
+    assert not wrong.consistent

@@ -1,0 +1,80 @@
+"""The model of the camera: its limit, its derivatives and their adjoint."""
+
+import numpy as np
+import pytest
+
+from zwfs import Dimple, Pupil, ZernikeSensor
+from zwfs.frames._camera.model import Camera, Exposure, Maps, names_of
+
+N, F, SHAPE = 20, 2, (28, 28)
+EXPOSURES = [Exposure(0, 0, 0), Exposure(1, 1, 0), Exposure(2, None, 0), Exposure(0, 0, 1), Exposure(1, 1, 1)]
+VALUES = np.array(
+    [
+        *(3e-4, 1e-4, -2e-4, 0.3, -0.4, 0.01, 1.02, 10, 0.2),
+        *(-2e-4, -1e-4, 1e-4, -0.2, 0.6, 0.02, 1.01, 12, 0.1),
+        *(0, 0, 0, 0.1, 0.1, 0, 1, 9, 0.1),
+        *(1.1, 1.5, -1.4, 0.05, 0.1, 0.05, 0.1, 0.7),
+    ]
+)
+SCALE = np.array([*[1e-4] * 3, *[0.1] * 2, 0.01, 0.01, 1, 1] * 3 + [0.1] * 8)
+
+
+@pytest.fixture(scope="module")
+def camera():
+    commands = np.zeros((2, N * F, N * F))
+    commands[1] = 0.3 * np.random.default_rng(1).normal(size=commands[1].shape)
+    return Camera(N, SHAPE, N, EXPOSURES, commands, F, 1.5)
+
+
+@pytest.fixture(scope="module")
+def maps():
+    rng = np.random.default_rng(0)
+    inside = Pupil.circular(N * F).amplitude
+    mean = inside * (1 + 0.1 * rng.normal(size=inside.shape))
+    return Maps(mean, 0.1 * inside * rng.random(inside.shape), 0.4 * rng.normal(size=inside.shape))
+
+
+def test_images_without_errors_are_those_of_the_sensor():
+    pupil = Pupil.circular(N)
+    phase = 0.4 * np.random.default_rng(2).normal(size=(N, N))
+    still = Camera(N, SHAPE, N, EXPOSURES[:3], np.zeros((1, N, N)), 1, 1.5)
+    values = np.array([*[0, 0, 0, 0, 0, 0, 1, 1, 0] * 3, 1.06, np.pi / 2, -np.pi / 2, 0, 0, 0, 0, 0.0])
+    point = still.at(Maps(pupil.amplitude, np.zeros((N, N)), phase), values)
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=SHAPE[0] / N)
+    fine = [np.abs(part.field) ** 2 for part in point._parts[2:]]
+    margin = (still.size - SHAPE[0]) // 2
+    for part, expected in zip(point._parts, sensor.measure(phase), strict=False):
+        intensity = np.fft.irfft2(part.spectrum, s=(still.size,) * 2)
+        np.testing.assert_allclose(intensity[margin:-margin, margin:-margin], expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(fine[0].sum(), pupil.n_points, rtol=1e-12)
+
+
+@pytest.mark.parametrize("index", range(len(VALUES)))
+def test_derivatives_are_those_of_finite_differences(camera, maps, index):
+    name = names_of(3)[index]
+    step = np.zeros(VALUES.size)
+    step[index] = 1e-4 * SCALE[index]
+    point = camera.at(maps, VALUES)
+    up, down = (camera.at(maps, VALUES + sign * step).images for sign in (1, -1))
+    for number, exposure in enumerate(EXPOSURES):
+        own = not name.startswith("arm") or int(name.split()[1]) == exposure.arm
+        exact = point.slopes(number, [name.split()[-1]])[0] * step[index] if own else 0 * up[number]
+        error = np.abs((up[number] - down[number]) / 2 - exact).max()
+        assert error <= 1e-5 * max(np.abs(exact).max(), 1e-4)
+
+
+def test_change_of_the_maps_is_that_of_finite_differences_and_has_an_adjoint(camera, maps):
+    rng = np.random.default_rng(3)
+    change = rng.normal(size=(3, N * F, N * F))
+    point = camera.at(maps, VALUES)
+    up, down = (
+        camera.at(Maps(*(one + sign * 1e-6 * two for one, two in zip(maps, change, strict=True))), VALUES).images
+        for sign in (1, -1)
+    )
+    applied = point.apply(*change)
+    for high, low, exact in zip(up, down, applied, strict=True):
+        np.testing.assert_allclose((high - low) / 2e-6, exact, rtol=0, atol=1e-5 * np.abs(exact).max())
+    pixels = [rng.normal(size=SHAPE) for _ in EXPOSURES]
+    seen = sum(np.vdot(one, two) for one, two in zip(pixels, applied, strict=True))
+    back = sum(np.vdot(one, two) for one, two in zip(point.adjoint(pixels), change, strict=True))
+    assert back == pytest.approx(seen, rel=1e-10)

@@ -1,0 +1,358 @@
+"""Optics of a bench from frames of a mirror in known states.
+
+`fit_bench` finds all unknowns of the model at once. `sensor` keeps what was fitted, and seeks only the phase of a
+pair of frames.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft, ndimage
+
+from zwfs import _check
+from zwfs.frames._camera.model import ARM, Camera, Exposure, names_of
+from zwfs.frames._camera.prior import MapPrior
+from zwfs.frames._camera.recording import PAD, Recording, centred
+from zwfs.frames._camera.solve import (
+    Free,
+    Light,
+    LightMap,
+    Minimum,
+    PhaseMap,
+    Point,
+    Problem,
+    covariance,
+    fine_phase,
+    minimise,
+)
+from zwfs.frames.registration import radius
+from zwfs.masks import Dimple
+from zwfs.pupil import Pupil
+from zwfs.reconstructors import PhaseShifted
+from zwfs.sensor import ZernikeSensor
+
+EXPLAINED = 1.2
+"""Mean square of the residuals over the noise up to which a model explains the frames."""
+_FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
+_PASSES = 3  # of the fit: each divides the light again, and weighs by the images of the one before
+_DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
+
+
+class Estimate(NamedTuple):
+    """Value of a number of the bench.
+
+    Attributes
+    ----------
+    name : str
+    value : float
+    sigma : float
+        One standard deviation, with the maps and all other numbers free. It grows with the root of the misfit.
+    at_limit : bool
+        Whether the value is one of its limits, so that the error bar does not hold.
+    """
+
+    name: str
+    value: float
+    sigma: float
+    at_limit: bool
+
+
+@dataclass(frozen=True, eq=False)
+class BenchFit:
+    """Result of `fit_bench`.
+
+    Attributes
+    ----------
+    estimates : tuple of Estimate
+        Diameter (lambda/D), phase shifts (radian), leakage, blur (pixels rms), and for each arm focus
+        (D^2 / lambda), row and column (pixels), rotation (radian, from x to y), magnification, flux and background
+        (counts). The arms 0 and 1 are the frames behind the masks, 2 and 3 the clear frames, which share focus,
+        rotation and magnification with them.
+    covariance : ndarray, shape (n_estimates, n_estimates)
+    flat : ndarray, shape (n, n), radian
+        Phase of the optics without a command, mean over each pixel.
+    light : ndarray, shape (n, n)
+        Light of each pixel of the pupil, 1 = mean of the first clear frame.
+    misfit : ndarray, shape (2 + 2 n_states,)
+        Mean square of the residuals over the noise: of the clear frames, then of each pair.
+    noise : float, counts rms
+        Noise of a pixel without light, as given or as estimated.
+    converged : bool
+        Whether the next step promises to lower half the sum of squares by less than a part of 1.
+    remarks : tuple of str
+        What does not fit together, in words.
+    """
+
+    estimates: tuple[Estimate, ...]
+    covariance: NDArray[np.float64]
+    flat: NDArray[np.float64]
+    light: NDArray[np.float64]
+    misfit: NDArray[np.float64]
+    noise: float
+    converged: bool
+    remarks: tuple[str, ...]
+    point: Point
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the model explains all images within their noise."""
+        return bool(np.mean(self.misfit) < EXPLAINED and not self.remarks)
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """Error bars of the estimates, (n_estimates,)."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    def __getitem__(self, name: str) -> Estimate:
+        """Estimate of a name."""
+        for one in self.estimates:
+            if one.name == name:
+                return one
+        raise KeyError(f"{name!r}: expected one of {[one.name for one in self.estimates]}")
+
+
+def fit_bench(
+    frames: ArrayLike,
+    clear_frames: ArrayLike,
+    phases: ArrayLike,
+    *,
+    n_pixels: float,
+    noise: float | None = None,
+    gain: float = 1.0,
+    diameter: float = 1.06,
+    phase_shifts: tuple[float, float] = (np.pi / 2, -np.pi / 2),
+    oversampling: int = 2,
+    n_steps: int = 10,
+) -> BenchFit:
+    """Fit a model of the optics to frames of a mirror in known states, and to clear frames.
+
+    Maps of phase and light and all numbers are the unknowns of one least-squares problem. The place of the maps is
+    that of the known phases. The flux of the first clear frame is fixed: it defines the map of the light.
+
+    Parameters
+    ----------
+    frames : array_like, shape (n_states, 2, ny, nx) or (n_states, n_frames, 2, ny, nx), counts
+        Less the dark. NaN marks bad pixels. The mean of several frames is taken.
+    clear_frames : array_like, shape (2, ny, nx) or (n_frames, 2, ny, nx), counts
+        Less the dark, with the mask out.
+    phases : array_like, shape (n_states, n, n), radian
+        Phases that the commands add, mean over each pixel, on a grid whose middle is that of the frames. NaN, or 0
+        in all states, marks what is unknown around the pupil; there the phases are continued.
+    n_pixels : float, pixels
+        Diameter D.
+    noise : float, counts rms, optional
+        Of a pixel of one frame without light: read noise, and that of the background and the dark. By default it
+        is estimated from the darkest pixels; the result names it.
+    gain : float, electrons / count
+        For the photon noise.
+    diameter : float, lambda/D
+        Of the dimple, by design. The fit starts from the best of several diameters around it.
+    phase_shifts : (float, float), radian
+        Of the two images, by design. The fit also tries the reverse order, and a remark tells if it is right.
+    oversampling : int
+        Points of the model along a pixel.
+    n_steps : int
+        Largest number of steps of each of the passes.
+
+    Returns
+    -------
+    BenchFit
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not belong together, there are fewer than two states, or a clear frame holds no light.
+    """
+    data = Recording.of(frames, clear_frames, phases, n_pixels, noise, gain)
+    diameter = _check.number("diameter", diameter, 0, open_low=True)
+    shifts = _check.pair("phase_shifts", phase_shifts, _check.number)
+    oversampling, n_steps = (
+        _check.integer("oversampling", oversampling, 1, 8),
+        _check.integer("n_steps", n_steps, 1),
+    )
+    start = _coarse(data, diameter, shifts)
+    problem = _problem(data, start, oversampling)
+    best = minimise(problem, _with_flat(problem, start.flat), n_steps, 25)
+    for _ in range(_PASSES - 1):
+        problem, x = _again(data, best)
+        best = minimise(problem, x, n_steps, 35)
+    return _result(data, best, start.reversed)
+
+
+class _Start(NamedTuple):
+    """Best of the coarse grid."""
+
+    diameter: float
+    shifts: tuple[float, float]
+    flat: NDArray[np.float64]
+    reversed: bool
+
+
+def _coarse(data: Recording, diameter: float, shifts: tuple[float, float]) -> _Start:
+    """Diameter and order that explain the frames best, with one flat for all states."""
+    light, flux = data.light
+    n = len(light)
+    stop = radius((n, n), ((n - 1) / 2,) * 2) <= data.n_pixels / 2 + 1
+    pupil = Pupil.from_amplitude(np.sqrt(light) * stop, data.n_pixels, threshold=0.3)
+    inside = pupil.inside
+    scale = flux * np.mean(light[inside])
+    frames = np.stack([centred(one, n) for one in data.counts[2:]]).reshape(-1, 2, n, n) / scale[:, None, None]
+    best: tuple[float, _Start] | None = None
+    for order in (False, True):
+        pair = shifts[::-1] if order else shifts
+        for factor in _DIAMETERS:
+            sensor = ZernikeSensor(pupil, *(Dimple(factor * diameter, one) for one in pair), tolerance=1e-4)
+            found = PhaseShifted(sensor, n_iterations=15)(np.maximum(frames, 0)).phase
+            waves = np.where(inside, np.exp(1j * (np.nan_to_num(found) - data.phases)), 0)
+            for _ in range(3):  # each phase has its own piston
+                mean = waves.mean(axis=0)
+                waves = waves * np.exp(-1j * np.angle(np.sum(waves * mean.conj(), axis=(1, 2))))[:, None, None]
+            flat = np.angle(ndimage.gaussian_filter(waves.mean(axis=0), 1.0))
+            misfit = float(np.mean((sensor.measure(flat + data.phases) - frames)[..., inside] ** 2))
+            if best is None or misfit < best[0]:
+                best = misfit, _Start(factor * diameter, pair, np.where(inside, flat, 0), order)
+    assert best is not None
+    return best[1]
+
+
+def _free(data: Recording, start: _Start) -> list[Free]:
+    """Numbers that are free, and where they start."""
+    _, flux = data.light
+    free = []
+    for side in (0, 1):
+        both = (side, side + 2)
+
+        def shared(name: str, *limits: float, arms: tuple[int, int] = both) -> Free:
+            return Free(f"arm {arms[0]} {name}", tuple((arm, name) for arm in arms), *limits)
+
+        free += [shared("focus", 0.0, -_FARTHEST, _FARTHEST), shared("rotation", 0.0, -0.3, 0.3, 0.05)]
+        free += [shared("magnification", 1.0, 0.7, 1.4, 0.05)]
+        for arm in both:
+            names = {
+                "row": (0.0, -6.0, 6.0),
+                "column": (0.0, -6.0, 6.0),
+                "background": (0.0,),
+                "flux": (flux[side], 0.0),
+            }
+            free += [
+                Free(f"arm {arm} {name}", ((arm, name),), *limits)
+                for name, limits in names.items()
+                if (arm, name) != (2, "flux")
+            ]
+    limits = {
+        "diameter": (start.diameter, 0.4 * start.diameter, 1.8 * start.diameter),
+        "first": (start.shifts[0],),
+        "second": (start.shifts[1],),
+        "leakage": (0.01, 0.0, 0.45),
+        "blur": (0.5, 0.02, 5.0),
+    }
+    return free + [Free(name, ((None, name),), *values) for name, values in limits.items()]
+
+
+def _problem(data: Recording, start: _Start, f: int) -> Problem:
+    """The first problem of a fit."""
+    light, flux = data.light
+    n, shape = len(light), data.counts[0].shape
+    exposures = [Exposure(2, None, 0), Exposure(3, None, 0)]
+    exposures += [Exposure(side, side, state) for state in range(len(data.phases)) for side in (0, 1)]
+    camera = Camera(n, shape, data.n_pixels, exposures, fine_phase(data.phases, f), f, 1.9 * start.diameter)
+    values = np.zeros(len(names_of(4)))
+    table = values[: 4 * len(ARM)].reshape(4, -1)
+    table[:, ARM.index("magnification")], table[:, ARM.index("flux")] = 1, np.tile(flux, 2)
+    division = Light.of(np.kron(light, np.ones((f, f))), light, f)
+    smooth = [ndimage.uniform_filter(one, 3) for one in data.counts]
+    free = _free(data, start)
+    phase_map = PhaseMap(n, f, MapPrior(0.5, 3.0), data.n_pixels)
+    lights = _light_maps(division, f * data.n_pixels)
+    zero = np.zeros((n * f, n * f))
+    return Problem(camera, data.counts, data.weights(smooth), division, zero, phase_map, lights, values, free)
+
+
+def _light_maps(light: Light, n_pixels: float) -> tuple[LightMap, ...]:
+    return (LightMap(light.support, MapPrior(0.2, 3.0, outer_scale=0.1), n_pixels),)
+
+
+def white_phase(phase_map: PhaseMap, means: NDArray) -> NDArray[np.float64]:
+    """White numbers of a phase, mean over each pixel."""
+    size, n = phase_map.size, phase_map.n
+    wide = np.pad(means, ((0, size - n),) * 2, "linear_ramp")
+    return fft.irfft2(fft.rfft2(wide) / phase_map.colour, s=wide.shape)
+
+
+def _with_flat(problem: Problem, flat: NDArray) -> NDArray[np.float64]:
+    x = problem.start
+    x[: problem.phase_map.size**2] = white_phase(problem.phase_map, flat).ravel()
+    return x
+
+
+def _again(data: Recording, best: Minimum) -> tuple[Problem, NDArray]:
+    """The problem with light divided, and pixels weighed, by what was fitted."""
+    point, before = best.point, best.point.problem
+    f, n = before.camera.f, before.phase_map.n
+    light = Light.of(point.light, point.light.reshape(n, f, n, f).mean(axis=(1, 3)), f)
+    free = [
+        one if math.isfinite(one.sigma) else one._replace(value=float(point.values[places[0]]))
+        for one, places in zip(before.free, before.places, strict=True)
+    ]
+    problem = replace(
+        before,
+        light=light,
+        weights=data.weights(point.model.images),
+        light_maps=_light_maps(light, f * data.n_pixels),
+        values=point.values,
+        free=free,
+    )
+    x, n_phase = problem.start, before.phase_map.size**2
+    x[:n_phase], x[problem.n_white :] = point.x[:n_phase], point.x[before.n_white :]
+    return problem, x
+
+
+def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:
+    point = best.point
+    scale = max(1.0, float(np.mean(point.misfit)))
+    spread = covariance(point, 10) * scale
+    values = point.x[point.problem.n_white :]
+    sigma = np.sqrt(np.diagonal(spread)).tolist()
+    estimates = tuple(
+        Estimate(one.name, value, error, not one.low < value < one.high)
+        for one, value, error in zip(point.problem.free, values.tolist(), sigma, strict=True)
+    )
+    n, f = point.problem.phase_map.n, point.problem.camera.f
+    inner = (slice(PAD, n - PAD),) * 2
+    return BenchFit(
+        estimates,
+        spread,
+        point.problem.phase_map.means(point.problem.split(point.x)[0][0])[inner],
+        point.light.reshape(n, f, n, f).mean(axis=(1, 3))[inner],
+        point.misfit,
+        data.noise,
+        best.converged,
+        tuple(_remarks(data, point, estimates, is_reversed)),
+        point,
+    )
+
+
+def _remarks(data: Recording, point: Point, estimates: tuple[Estimate, ...], is_reversed: bool) -> list[str]:
+    """What does not fit together, in words."""
+    out = []
+    if is_reversed:
+        out.append("The images are in reverse order: the first image has the second of the phase shifts given.")
+    out += [f"{one.name} stands at a limit of the fit." for one in estimates if one.at_limit]
+    states = point.misfit[2:].reshape(-1, 2).mean(axis=1)
+    typical = float(np.median(states))
+    for state, misfit in enumerate(states):
+        if misfit > max(2 * typical, EXPLAINED):
+            out.append(
+                f"State {state} has a misfit of {misfit:.3g}, the median is {typical:.3g}: its command or its "
+                "frames are wrong."
+            )
+    for one in estimates:
+        level = data.light[1][0]
+        if one.name.endswith("background") and abs(one.value) > max(5 * one.sigma, 3e-3 * level):
+            out.append(f"{one.name} is {one.value:.4g} counts: the dark does not belong to the frames.")
+    return out

@@ -1,0 +1,425 @@
+"""Model of a camera behind two masks: from maps of light and phase to the counts of each pixel, with derivatives.
+
+The field lives on f x f points per pixel of the camera. A point that is lit in part is two areas: the share s that
+is lit, with the field A exp(i phase), and the rest. Its intensity behind a mask with the reference wave r is
+
+    I = s |A exp(i phase) + r|^2 + (1 - s) |r|^2 = |m exp(i phase) + r|^2 + q,
+
+with the mean field m = s A and the light q = s A^2 - m^2 that does not interfere with r. The relay moves the
+fields to the plane that is conjugate to the camera. A Gaussian blur and the area of a pixel act on the intensity
+as products with its spectrum. A spline takes it to the pixels, at the place that shift, rotation and magnification
+give.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, sparse
+from scipy.interpolate import BSpline
+
+from zwfs._lowrank import _axis_functions, _quadrature, _rim, _spectra
+from zwfs.masks import Dimple
+
+_TOLERANCE = 1e-6  # of the reference wave
+_DEGREE = 5  # of the spline that takes an image to the pixels
+_BORDER = 4  # pixels around a frame that are modelled: blurred light that crosses the edge comes back
+_RELAY = ("focus", "astigmatism", "astigmatism_45")
+_PLACE = ("row", "column", "rotation", "magnification")
+ARM = (*_RELAY, *_PLACE, "flux", "background")
+"""Numbers of an optical path: D^2 / lambda for the relay, pixels, pixels, radian and 1 for the place, counts."""
+MASKS = ("diameter", "first", "second", "leakage", "incoherent", "in_phase", "quadrature", "blur")
+"""Numbers that all images share: lambda/D, radian, radian, fractions of light and of amplitude, pixels rms."""
+
+
+class Exposure(NamedTuple):
+    """Which optical path, which mask (None for a clear frame) and which state of the mirror an image has."""
+
+    arm: int
+    mask: int | None
+    state: int
+
+
+class Maps(NamedTuple):
+    """Mean field and light that does not interfere, and the phase, on the fine grid of the pupil."""
+
+    mean: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    phase: NDArray[np.float64]
+
+
+def names_of(n_arms: int) -> list[str]:
+    """Names of all numbers in the order of the vector: each arm, then the masks."""
+    return [f"arm {arm} {name}" for arm in range(n_arms) for name in ARM] + list(MASKS)
+
+
+class Camera:
+    """Grids of the model and all that does not depend on its parameters.
+
+    Parameters
+    ----------
+    n : int, pixels
+        Rows and columns of the maps.
+    shape : (int, int), pixels
+        Of a frame, whose middle is that of the maps but for the shift of its arm.
+    n_pixels : float, pixels
+        Diameter D.
+    exposures : sequence of Exposure
+    commands : ndarray, shape (n_states, n * f, n * f), radian
+        Phases that the states add.
+    oversampling : int
+        Points f along a pixel.
+    largest : float, lambda/D
+        Largest diameter of the dimple.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        shape: tuple[int, int],
+        n_pixels: float,
+        exposures: Sequence[Exposure],
+        commands: NDArray,
+        oversampling: int,
+        largest: float,
+    ) -> None:
+        self.n, self.shape, self.n_pixels, self.f, self.largest = n, shape, n_pixels, oversampling, largest
+        self.exposures = tuple(exposures)
+        self.n_arms = 1 + max(one.arm for one in exposures)
+        f, inner = oversampling, n * oversampling
+        size = max(n, *shape) * f + 2 * _BORDER * f
+        while (size - inner) % 2 or fft.next_fast_len(size) != size:
+            size += 1
+        self.size = size
+        self.window = (slice((size - inner) // 2, (size + inner) // 2),) * 2
+        self.turns = np.exp(1j * commands)
+        axis = (np.arange(size) - (size - 1) / 2) / (n_pixels * f)
+        spread = math.sqrt(2) * (inner + size) / (n_pixels * f)
+        self.planes = tuple(_Plane(one, largest, spread) for one in (axis[self.window[0]], axis))
+        self._spread = spread
+        frequency = fft.fftfreq(size) * f  # cycles per pixel
+        self.relay = self.polynomials(frequency[None, :], frequency[:, None])
+        half = fft.rfftfreq(size) * f
+        self.squares = frequency[:, None] ** 2 + half**2
+        prefilter = [
+            np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * one / f), _symbol()) for one in (frequency, half)
+        ]
+        pixel = [np.sinc(one) / two for one, two in zip((frequency, half), prefilter, strict=True)]
+        self.pixel = np.multiply.outer(*pixel)
+
+    def polynomials(self, u: NDArray, v: NDArray) -> NDArray[np.float64]:
+        """Phases (3, ...) at frequencies in cycles per pixel that a unit of each parameter of the relay makes."""
+        scale = np.pi * self.n_pixels**2
+        return scale * np.stack(np.broadcast_arrays(u**2 + v**2, u**2 - v**2, 2 * u * v))
+
+    def cores(self, diameter: float, relay: NDArray) -> NDArray[np.complex128]:
+        """Operators (5, q, r) of the dimple's light: itself, and its derivatives by relay and diameter."""
+        dimple = Dimple(diameter, 0.0)
+        nodes = [make(dimple, self._spread, _TOLERANCE, 1.0) for make in (_quadrature, _rim)]
+        u, v = (np.concatenate(both) for both in zip(*(one[:2] for one in nodes), strict=True))
+        disc, rim = (np.zeros(u.size) for _ in range(2))
+        disc[: nodes[0][2].size], rim[nodes[0][2].size :] = nodes[0][2], nodes[1][2]
+        polynomials = self.polynomials(u / self.n_pixels, v / self.n_pixels)
+        factors = np.concatenate([[disc], -1j * polynomials * disc, [rim]])
+        factors = factors * np.exp(-1j * np.tensordot(relay, polynomials, 1)) / (self.n_pixels * self.f) ** 2
+        source, target = (plane.spectra(u, v) for plane in self.planes)
+        return (target.conj() * factors[:, np.newaxis, :]) @ source.T
+
+    def at(self, maps: Maps, values: NDArray) -> Linearised:
+        """Images and their derivatives at maps and parameters."""
+        return Linearised(self, maps, values)
+
+
+def _symbol() -> NDArray[np.float64]:
+    """Chebyshev coefficients of the sum of the central B-spline at whole numbers times cosines."""
+    spline = BSpline.basis_element(np.arange(_DEGREE + 2) - (_DEGREE + 1) / 2, extrapolate=False)
+    values = spline(np.arange(_DEGREE // 2 + 1))
+    return np.concatenate([values[:1], 2 * values[1:]])
+
+
+class _Plane:
+    """Few real functions on a square grid that hold all waves from a disc of the focal plane."""
+
+    def __init__(self, axis: NDArray, largest: float, spread: float) -> None:
+        self._axis = axis
+        self._along = _axis_functions(axis, largest / 2, _TOLERANCE)
+        u, v, _ = _quadrature(Dimple(largest, 0.0), spread, _TOLERANCE)
+        waves = _spectra(((self._along, axis),) * 2, u, v)
+        functions, strength, _ = np.linalg.svd(np.concatenate([waves.real, waves.imag], 1), full_matrices=False)
+        self._combine = functions[:, strength > _TOLERANCE * strength[0]]
+
+    def project(self, field: NDArray) -> NDArray:
+        """Coefficients of a field, (n, n) to (r,)."""
+        return (self._along @ field @ self._along.T).ravel() @ self._combine
+
+    def expand(self, coefficients: NDArray) -> NDArray:
+        """Field of coefficients: the adjoint of `project`."""
+        square = (self._combine @ coefficients).reshape((len(self._along),) * 2)
+        return self._along.T @ square @ self._along
+
+    def spectra(self, u: NDArray, v: NDArray) -> NDArray[np.complex128]:
+        """Fourier sums of all functions, (r, n_nodes)."""
+        return self._combine.T @ _spectra(((self._along, self._axis),) * 2, u, v)
+
+
+class Coefficients(NamedTuple):
+    """The numbers c_1 and c_2 of the two masks, (2,) each, and their derivatives by the masks' parameters."""
+
+    first: NDArray[np.complex128]
+    second: NDArray[np.float64]
+    first_slope: NDArray[np.complex128]  # (2, n_masks)
+    second_slope: NDArray[np.float64]
+
+
+def coefficients(masks: dict[str, float]) -> Coefficients:
+    """What the masks do to the light of the dimple: c_1 (amplitude) and c_2 (intensity).
+
+    A share q_j of the light carries psi + s_j b, with s_j = (exp(i theta_j) - 1) / (1 + in_phase + i quadrature):
+    (1 - incoherent) (1 - leakage) of this mask, (1 - incoherent) leakage of the other one, and incoherent with
+    s = 0. So c_1 = sum q_j s_j and c_2 = sum q_j |s_j|^2.
+    """
+    factor = 1 / (1 + masks["in_phase"] + 1j * masks["quadrature"])
+    turn = np.exp(1j * np.array([masks["first"], masks["second"]]))
+    strength = (turn - 1) * factor
+    kept, leakage = 1 - masks["incoherent"], masks["leakage"]
+    shares = np.array([[1 - leakage, leakage], [leakage, 1 - leakage]])
+    mix, power = kept * shares, np.abs(strength) ** 2
+    slope: Any = np.zeros((2, len(MASKS)), complex)  # of the strengths
+    place = MASKS.index
+    slope[0, place("first")], slope[1, place("second")] = 1j * turn * factor
+    slope[:, place("in_phase")], slope[:, place("quadrature")] = -strength * factor, -1j * strength * factor
+    first_slope: Any = mix @ slope
+    second_slope: Any = mix @ (2 * (strength.conj()[:, None] * slope).real)
+    for name, change in (("leakage", kept * np.array([[-1, 1], [1, -1]])), ("incoherent", -shares)):
+        first_slope[:, place(name)] += change @ strength
+        second_slope[:, place(name)] += change @ power
+    return Coefficients(mix @ strength, mix @ power, first_slope, second_slope)
+
+
+class _Spline:
+    """Spline through the fine grid, at the pixels of an image that is moved, turned and magnified."""
+
+    def __init__(self, camera: Camera, place: Sequence[float]) -> None:
+        row, column, rotation, magnification = place
+        self.shape, self.size, f = camera.shape, camera.size, camera.f
+        y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in camera.shape), indexing="ij")
+        y, x = y.ravel() - row, x.ravel() - column
+        cosine, sine = math.cos(rotation) / magnification, math.sin(rotation) / magnification
+        across, down = cosine * x + sine * y, cosine * y - sine * x
+        # Changes of (down, across), in pixels, with each number of the place.
+        self._moves = (
+            (-cosine, -sine),
+            (sine, -cosine),
+            (-across, down),
+            (-down / magnification, -across / magnification),
+        )
+        middle = (camera.size - 1) / 2
+        (rows, along_y, slope_y), (columns, along_x, slope_x) = (
+            _weights(one * f + middle, camera.size) for one in (down, across)
+        )
+        self._index = (rows[:, :, None] * camera.size + columns[:, None, :]).reshape(len(rows), -1)
+        self._starts = np.arange(len(rows) + 1) * self._index.shape[1]
+        self._pairs = (along_y, along_x), (f * slope_y, along_x), (along_y, f * slope_x)
+
+    def _of(self, pair: int) -> sparse.csr_array:
+        first, second = self._pairs[pair]
+        weights = (first[:, :, None] * second[:, None, :]).ravel()
+        return sparse.csr_array((weights, self._index.ravel(), self._starts), (self._index.shape[0], self.size**2))
+
+    @cached_property
+    def _matrix(self) -> sparse.csr_array:
+        return self._of(0)
+
+    @cached_property
+    def _gradient(self) -> tuple[sparse.csr_array, sparse.csr_array]:
+        return self._of(1), self._of(2)
+
+    def __call__(self, image: NDArray) -> NDArray:
+        return (self._matrix @ image.ravel()).reshape(self.shape)
+
+    def adjoint(self, pixels: NDArray) -> NDArray:
+        return (self._matrix.T @ pixels.ravel()).reshape(self.size, self.size)
+
+    def slopes(self, image: NDArray) -> NDArray:
+        """Derivatives by row, column, rotation and magnification, (4, ny, nx)."""
+        down, across = (one @ image.ravel() for one in self._gradient)
+        return np.stack([(down * dy + across * dx).reshape(self.shape) for dy, dx in self._moves])
+
+
+def _weights(places: NDArray, size: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Nodes, weights and slopes of the B-splines at each place, (n, degree + 1) each; periodic."""
+    spline = BSpline.basis_element(np.arange(_DEGREE + 2) - (_DEGREE + 1) / 2, extrapolate=False)
+    nodes = np.floor(places).astype(int)[:, None] + np.arange(-(_DEGREE // 2), _DEGREE // 2 + 2)
+    away = places[:, None] - nodes
+    return nodes % size, np.nan_to_num(spline(away)), np.nan_to_num(spline.derivative()(away))
+
+
+@dataclass(eq=False)
+class _Part:
+    """Steps of the model of one image that its derivative needs."""
+
+    field: NDArray[np.complex128]
+    light: NDArray[np.complex128]  # of the dimple
+    ahead: NDArray[np.complex128]  # half the derivative of the intensity by the field, conjugated
+    across: NDArray[np.complex128]  # the same by the light of the dimple
+    spectrum: NDArray[np.complex128]  # of the intensity
+    blurred: NDArray[np.float64]
+    seen: NDArray[np.float64]  # before flux and background
+
+
+class Linearised:
+    """Images at one point, their derivatives by the maps (`apply`, `adjoint`) and the parameters (`slopes`).
+
+    Attributes
+    ----------
+    images : list of ndarray, counts
+    """
+
+    def __init__(self, camera: Camera, maps: Maps, values: NDArray) -> None:
+        self.camera, self.maps = camera, maps
+        split = values[: -len(MASKS)].reshape(camera.n_arms, len(ARM))
+        self.arms = [dict(zip(ARM, row, strict=True)) for row in split.tolist()]
+        self.masks = dict(zip(MASKS, values[-len(MASKS) :].tolist(), strict=True))
+        self._coefficients = coefficients(self.masks)
+        self._relays = [np.array([arm[name] for name in _RELAY]) for arm in self.arms]
+        self._transfer = [
+            np.exp(-1j * np.tensordot(relay, camera.relay, 1)) if relay.any() else None for relay in self._relays
+        ]
+        self._blur = camera.pixel * np.exp(-2 * (np.pi * self.masks["blur"]) ** 2 * camera.squares)
+        self._splines = [_Spline(camera, [arm[name] for name in _PLACE]) for arm in self.arms]
+        masked = {one.arm for one in camera.exposures if one.mask is not None}
+        self._cores = {arm: camera.cores(self.masks["diameter"], self._relays[arm]) for arm in masked}
+        self._wave = np.exp(1j * maps.phase)
+        self._states = [self._source(maps.mean * self._wave * turn) for turn in camera.turns]
+        self._parts = [self._part(one) for one in camera.exposures]
+        self.images = [
+            self.arms[one.arm]["flux"] * part.seen + self.arms[one.arm]["background"]
+            for one, part in zip(camera.exposures, self._parts, strict=True)
+        ]
+
+    def _source(self, field: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Field on the whole grid, its spectrum, and its coefficients for the light of the dimple."""
+        whole = np.zeros((self.camera.size,) * 2, complex)
+        whole[self.camera.window] = field
+        moved = any(one is not None for one in self._transfer)
+        return whole, fft.fft2(whole) if moved else whole, self.camera.planes[0].project(field)
+
+    def _relayed(self, arm: int, source: tuple[NDArray, NDArray, NDArray]) -> NDArray[np.complex128]:
+        transfer = self._transfer[arm]
+        return source[0] if transfer is None else fft.ifft2(transfer * source[1])
+
+    def _part(self, one: Exposure) -> _Part:
+        camera, source = self.camera, self._states[one.state]
+        field = self._relayed(one.arm, source)
+        light = across = np.zeros(0, complex)
+        ahead, intensity = field, field.real**2 + field.imag**2
+        if one.mask is not None:
+            light = camera.planes[1].expand(self._cores[one.arm][0] @ source[2])
+            first, second = self._coefficients.first[one.mask], self._coefficients.second[one.mask]
+            ahead = field + first * light
+            across = np.conj(first) * field + second * light
+            intensity = (field.conj() * ahead + light.conj() * across).real
+        intensity[camera.window] += self.maps.rest
+        spectrum = fft.rfft2(intensity)
+        blurred = fft.irfft2(self._blur * spectrum, s=intensity.shape)
+        return _Part(field, light, ahead, across, spectrum, blurred, self._splines[one.arm](blurred))
+
+    def _on_camera(self, one: Exposure, intensity: NDArray) -> NDArray[np.float64]:
+        blurred = fft.irfft2(self._blur * fft.rfft2(intensity), s=intensity.shape)
+        return self.arms[one.arm]["flux"] * self._splines[one.arm](blurred)
+
+    def apply(self, mean: NDArray, rest: NDArray, phase: NDArray) -> list[NDArray[np.float64]]:
+        """Change of the images with a change of the maps."""
+        camera, changes = self.camera, []
+        change = (mean + 1j * self.maps.mean * phase) * self._wave
+        states = [self._source(change * turn) for turn in camera.turns]
+        for one, part in zip(camera.exposures, self._parts, strict=True):
+            intensity = _twice(part.ahead, self._relayed(one.arm, states[one.state]))
+            if one.mask is not None:
+                light = camera.planes[1].expand(self._cores[one.arm][0] @ states[one.state][2])
+                intensity += _twice(part.across, light)
+            intensity[camera.window] += rest
+            changes.append(self._on_camera(one, intensity))
+        return changes
+
+    def adjoint(self, pixels: Sequence[NDArray]) -> Maps:
+        """Adjoint of `apply`."""
+        camera = self.camera
+        spectra = [np.zeros((camera.size,) * 2, complex) for _ in self._states]
+        direct = [np.zeros((camera.size,) * 2, complex) for _ in self._states]
+        inputs = [np.zeros(source[2].shape, complex) for source in self._states]
+        rest = np.zeros(self.maps.rest.shape)
+        for one, part, weight in zip(camera.exposures, self._parts, pixels, strict=True):
+            back = self._splines[one.arm].adjoint(self.arms[one.arm]["flux"] * weight)
+            gain = fft.irfft2(self._blur * fft.rfft2(back), s=back.shape)
+            rest += gain[camera.window]
+            transfer = self._transfer[one.arm]
+            if transfer is None:
+                direct[one.state] += 2 * gain * part.ahead
+            else:
+                spectra[one.state] += transfer.conj() * fft.fft2(2 * gain * part.ahead)
+            if one.mask is not None:
+                core = self._cores[one.arm][0].conj().T
+                inputs[one.state] += core @ camera.planes[1].project(2 * gain * part.across)
+        moved = any(one is not None for one in self._transfer)
+        total = np.zeros(rest.shape, complex)
+        for whole, spectrum, light, turn in zip(direct, spectra, inputs, camera.turns, strict=True):
+            field = whole + fft.ifft2(spectrum) if moved else whole
+            total += turn.conj() * (field[camera.window] + camera.planes[0].expand(light))
+        total *= self._wave.conj()
+        return Maps(total.real, rest, self.maps.mean * total.imag)
+
+    def slopes(self, index: int, wanted: Sequence[str]) -> NDArray[np.float64]:
+        """Derivatives of one image by numbers of its arm or of the masks, (k, ny, nx)."""
+        camera, one, part = self.camera, self.camera.exposures[index], self._parts[index]
+        arm, source = self.arms[one.arm], self._states[one.state]
+        zero = np.zeros(camera.shape)
+        place = arm["flux"] * self._splines[one.arm].slopes(part.blurred) if set(wanted) & set(_PLACE) else None
+        out = []
+        for name in wanted:
+            if name in _PLACE and place is not None:
+                out.append(place[_PLACE.index(name)])
+            elif name == "flux":
+                out.append(part.seen)
+            elif name == "background":
+                out.append(zero + 1)
+            elif name == "blur":
+                slope = -4 * np.pi**2 * self.masks["blur"] * camera.squares * self._blur
+                image = fft.irfft2(slope * part.spectrum, s=part.blurred.shape)
+                out.append(arm["flux"] * self._splines[one.arm](image))
+            elif name in _RELAY:
+                out.append(self._on_camera(one, self._by_relay(one, part, source, _RELAY.index(name))))
+            elif one.mask is None:
+                out.append(zero)
+            elif name == "diameter":
+                light = camera.planes[1].expand(self._cores[one.arm][-1] @ source[2])
+                out.append(self._on_camera(one, _twice(part.across, light)))
+            else:
+                first = self._coefficients.first_slope[one.mask, MASKS.index(name)]
+                second = self._coefficients.second_slope[one.mask, MASKS.index(name)]
+                change = 2 * (first * part.field.conj() * part.light).real + second * np.abs(part.light) ** 2
+                out.append(self._on_camera(one, change))
+        return np.reshape(out, (len(wanted), *camera.shape))
+
+    def _by_relay(
+        self, one: Exposure, part: _Part, source: tuple[NDArray, NDArray, NDArray], number: int
+    ) -> NDArray:
+        """Derivative of an intensity by a number of the relay."""
+        camera, transfer = self.camera, self._transfer[one.arm]
+        spectrum = fft.fft2(source[0]) if transfer is None else transfer * source[1]
+        intensity = _twice(part.ahead, fft.ifft2(-1j * camera.relay[number] * spectrum))
+        if one.mask is not None:
+            light = camera.planes[1].expand(self._cores[one.arm][1 + number] @ source[2])
+            intensity += _twice(part.across, light)
+        return intensity
+
+
+def _twice(one: NDArray, other: NDArray) -> NDArray[np.float64]:
+    """2 Re(conj(one) other)."""
+    return 2 * (one.real * other.real + one.imag * other.imag)

@@ -1,0 +1,152 @@
+"""Checked frames of a mirror in known states, their noise, and the known phases on the grid of the model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
+
+from zwfs import _check
+from zwfs.frames.registration import radius
+
+PAD = 2
+"""Pixels of the maps around the grid of the known phases."""
+_REACH = 3  # pixels over which a known phase is continued
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Checked data: means of cubes, their bad pixels, and the noise of a mean."""
+
+    counts: list[NDArray[np.float64]]  # clear frames first, then each pair
+    good: list[NDArray[np.bool_]]
+    n_frames: list[int]
+    phases: NDArray[np.float64]  # (n_states, n + 2 pad, n + 2 pad), continued
+    n_pixels: float
+    noise: float
+    gain: float
+
+    @classmethod
+    def of(
+        cls,
+        frames: ArrayLike,
+        clear: ArrayLike,
+        phases: ArrayLike,
+        n_pixels: float,
+        noise: float | None,
+        gain: float,
+    ) -> Recording:
+        """Check data as `fit_bench` receives them."""
+        masked, m = _mean_of("frames", frames, 4)
+        clear, k = _mean_of("clear_frames", clear, 3)
+        phases = _check.real_array("phases", phases)
+        for name, array in (("frames", masked[0]), ("clear_frames", clear)):
+            if len(array) != 2:
+                raise ValueError(f"{name} has {len(array)} images: expected 2")
+        if masked.shape[2:] != clear.shape[1:]:
+            raise ValueError(
+                f"clear_frames has shape {clear.shape}: expected (2, {masked.shape[2]}, {masked.shape[3]})"
+            )
+        if phases.ndim != 3 or len(phases) != len(masked) or phases.shape[1] != phases.shape[2]:
+            raise ValueError(
+                f"phases has shape {phases.shape}: expected ({len(masked)}, n, n), one for each state"
+            )
+        if len(phases) < 2:
+            raise ValueError(
+                "phases holds 1 state: expected two or more, which fix the place and the plane of the maps"
+            )
+        n_pixels = _check.number("n_pixels", n_pixels, 1)
+        if any((length - phases.shape[1]) % 2 for length in clear.shape[1:]):
+            raise ValueError(
+                f"phases has shape {phases.shape} and frames {clear.shape[1:]}: expected even differences, so "
+                "that the pixels stand at the same places"
+            )
+        gain = _check.number("gain", gain, 0, open_low=True)
+        images = [*clear, *masked.reshape(-1, *masked.shape[2:])]
+        good = [np.isfinite(one) for one in images]
+        if noise is None:
+            noise = _dark_noise(images, n_pixels) * math.sqrt(m)
+        counts = [np.where(ok, one, 0) for one, ok in zip(images, good, strict=True)]
+        noise = _check.number("noise", noise, 0, open_low=True)
+        n_frames = [k, k] + [m] * (len(images) - 2)
+        return cls(counts, good, n_frames, _continued(phases), n_pixels, noise, gain)
+
+    @cached_property
+    def light(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Light of each pixel of the maps, 1 on average where lit, and the counts of 1 in each clear frame."""
+        n = self.phases.shape[-1]
+        inner = np.stack([centred(one, n) for one in self.counts[:2]])
+        mean = inner.mean(axis=0)
+        lit = mean >= 0.5 * np.percentile(mean, 80)
+        flux = inner[:, lit].mean(axis=1)
+        if np.any(flux <= 0):
+            raise ValueError(f"clear_frames hold {flux} counts on average in the pupil: expected light")
+        return np.maximum((inner / flux[:, None, None]).mean(axis=0), 0), flux
+
+    def weights(self, images: list[NDArray]) -> list[NDArray[np.float64]]:
+        """One over the noise of each pixel, for the images of a model."""
+        pairs = zip(images, self.good, self.n_frames, strict=True)
+        return [ok * np.sqrt(k / (np.maximum(image, 0) / self.gain + self.noise**2)) for image, ok, k in pairs]
+
+
+def _mean_of(name: str, images: ArrayLike, n_axes: int) -> tuple[NDArray[np.float64], int]:
+    """Mean over the frames of cubes, and their number; NaN where all are bad."""
+    array = _check.real_array(name, images)
+    if array.ndim not in (n_axes, n_axes + 1) or not array.size:
+        raise ValueError(f"{name} has shape {array.shape}: expected {n_axes} axes, or {n_axes + 1} with cubes")
+    if array.ndim == n_axes:
+        return array, 1
+    axis = array.ndim - 4
+    return array.mean(axis=axis), array.shape[axis]
+
+
+def _dark_noise(images: list[NDArray], n_pixels: float) -> float:
+    """Noise of the darkest pixels of the clear frames, from differences of neighbours."""
+    found = []
+    for image in images[:2]:
+        far = radius(image.shape, tuple((n - 1) / 2 for n in image.shape)) > 0.56 * n_pixels
+        step = (np.diff(image, axis=1) / math.sqrt(2))[far[:, 1:] & far[:, :-1]]
+        step = step[np.isfinite(step)]
+        if step.size < 50:
+            raise ValueError(
+                "noise = None: expected the noise of a pixel, because the frames hold too few dark pixels"
+            )
+        found.append(1.4826 * np.median(np.abs(step - np.median(step))))
+    return float(np.mean(found))
+
+
+def centred(image: NDArray, n: int) -> NDArray:
+    """The n middle rows and columns, with zeros where there are fewer."""
+    margin = max(0, *(n - length for length in image.shape)) // 2 + 1
+    whole = np.pad(image, margin)
+    first = [(length - n) // 2 for length in whole.shape]
+    return whole[first[0] : first[0] + n, first[1] : first[1] + n]
+
+
+def _continued(phases: NDArray) -> NDArray[np.float64]:
+    """Known phases on a wider grid, smoothly continued by a few pixels beyond where they are known."""
+    bad = ~np.isfinite(phases).all(axis=0) | (phases == 0).all(axis=0)
+    wide = np.pad(np.nan_to_num(phases), ((0, 0), (PAD, PAD), (PAD, PAD)))
+    regions, _ = ndimage.label(np.pad(bad, PAD, constant_values=True))
+    unknown = regions == regions[0, 0]
+    if np.any(bad & unknown[PAD:-PAD, PAD:-PAD]):  # a pixel of the outline mixes the phase with zeros
+        unknown = ndimage.binary_dilation(unknown)
+    if unknown.all():
+        return wide
+    n = wide.shape[-1]
+    second = sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(n - 2, n))
+    first = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(n - 1, n))
+    same = sparse.eye_array(n)
+    parts = (sparse.kron(second, same), sparse.kron(same, second), math.sqrt(2) * sparse.kron(first, first))
+    bending = sum(one.T @ one for one in parts).tocsc()
+    flat, rows = wide.reshape(len(wide), -1).copy(), unknown.ravel()
+    right = -(bending[rows][:, ~rows] @ flat[:, ~rows].T)
+    flat[:, rows] = splu(bending[rows][:, rows].tocsc()).solve(right).T
+    far = ndimage.distance_transform_edt(unknown) > _REACH
+    near = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
+    return flat.reshape(wide.shape)[(slice(None), *near)]

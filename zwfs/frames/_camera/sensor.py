@@ -1,0 +1,274 @@
+"""Phases of pairs of frames with the optics of a fit, their error bars and a verdict."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
+
+from zwfs import _check
+from zwfs.frames._camera.bench import EXPLAINED, BenchFit, white_phase
+from zwfs.frames._camera.model import Camera, Exposure
+from zwfs.frames._camera.prior import MapPrior
+from zwfs.frames._camera.recording import PAD
+from zwfs.frames._camera.solve import Light, Minimum, PhaseMap, Point, Problem, fine_phase, minimise
+from zwfs.masks import Dimple
+from zwfs.pupil import Pupil
+from zwfs.reconstructors import PhaseShifted
+from zwfs.sensor import ZernikeSensor
+
+_EXPONENTS = (2.0, 3.0, 4.0, 5.0)  # of the spectrum of a phase; held-out pixels choose
+_HELD_OUT = 0.1  # of the pixels
+_TIE = 0.03  # of priors that predict held-out pixels as well as this, the smoothest is taken
+_DRAWS = 12  # for the error bars of a phase
+
+
+@dataclass(frozen=True, eq=False)
+class FittedPhase(NDArrayOperatorsMixin):
+    """Phase of a pair of frames; in arithmetic and for NumPy it is the array `phase`.
+
+    Attributes
+    ----------
+    phase : ndarray, shape (n, n), radian
+        Mean over each pixel, that of the optics included.
+    misfit : float
+        Mean square of the residuals over the noise.
+    consistent : bool
+        Whether the model explains the frames within their noise.
+    converged : bool
+    exponent : float
+        Of the spectrum of the prior, as chosen by held-out pixels.
+    """
+
+    phase: NDArray[np.float64]
+    misfit: float
+    consistent: bool
+    converged: bool
+    exponent: float
+    _point: Point
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
+        return np.array(self.phase, dtype=dtype, copy=True if copy is None else copy)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **settings: Any) -> Any:
+        arrays = [one.phase if isinstance(one, FittedPhase) else one for one in inputs]
+        return getattr(ufunc, method)(*arrays, **settings)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.phase[index]
+
+    @cached_property
+    def sigma(self) -> NDArray[np.float64]:
+        """Error bar of each pixel, (n, n), radian: from draws of the noise and of the prior, and the misfit."""
+        point, rng = self._point, np.random.default_rng(0)  # the choice changes the error bars by some percent
+        problem, draws = point.problem, []
+        held = np.zeros(point.x.shape, bool)
+        for _ in range(_DRAWS):
+            noise = [rng.normal(size=one.shape) * (one > 0) for one in problem.weights]
+            right = point.back(noise) + rng.normal(size=point.x.shape)
+            white, _ = problem.split(point.solve(right, held, 60, 0.03))
+            draws.append(problem.phase_map.means(white[0])[PAD:-PAD, PAD:-PAD])
+        inner = point.light.reshape(problem.phase_map.n, problem.camera.f, problem.phase_map.n, -1).mean(
+            axis=(1, 3)
+        )
+        lit = inner[PAD:-PAD, PAD:-PAD] > 0.3
+        left = np.stack([one - one[lit].mean() for one in draws])
+        variance = ndimage.gaussian_filter(np.mean(left**2, axis=0), 1.0)
+        return np.sqrt(variance * max(1.0, self.misfit))
+
+
+@dataclass(frozen=True, eq=False)
+class FittedSensor:
+    """A sensor whose optics are those of a fit: pairs of frames in, phases out.
+
+    The phase-shifted iteration with the fitted mask and amplitude gives a start. Then the phase alone is fitted
+    with all of the model. Its prior is smooth to a degree that held-out pixels choose.
+
+    Parameters
+    ----------
+    fit : BenchFit
+    n_steps : int
+        Largest number of steps for a pair.
+    """
+
+    fit: BenchFit
+    n_steps: int = 8
+
+    def __post_init__(self) -> None:
+        _check.instance("fit", self.fit, BenchFit)
+        _check.integer("n_steps", self.n_steps, 1)
+
+    @property
+    def flat(self) -> NDArray[np.float64]:
+        """Phase of the optics at a flat command, (n, n)."""
+        return self.fit.flat
+
+    def __call__(self, frames: ArrayLike, sigma: ArrayLike) -> FittedPhase:
+        """Phase of one pair of frames.
+
+        Parameters
+        ----------
+        frames : array_like, shape (2, ny, nx), counts
+            Less the dark. NaN marks bad pixels.
+        sigma : array_like, shape (2, ny, nx) or a number, counts rms
+            Noise of the pixels.
+
+        Returns
+        -------
+        FittedPhase
+        """
+        counts = _check.real_array("frames", frames)
+        shape = (2, *self._fitted.camera.shape)
+        if counts.shape != shape:
+            raise ValueError(f"frames has shape {counts.shape}: expected {shape}")
+        sigma = np.broadcast_to(_check.real_array("sigma", sigma), shape)
+        if not np.all(sigma > 0):
+            raise ValueError(f"sigma reaches down to {sigma.min():.6g}: expected more than 0")
+        good = np.isfinite(counts)
+        counts, weights = np.where(good, counts, 0), good / sigma
+        held = np.random.default_rng(0).random(shape) < _HELD_OUT  # the choice hardly changes the prior
+        lit = held & good & (counts > 0.1 * np.median(counts[counts > 0.5 * counts.max()]))
+        best: tuple[float, float, NDArray] | None = None
+        for accelerate in (
+            False,
+            True,
+        ):  # the second is for phases from which the plain iteration does not converge
+            means, tried = self._start(counts, accelerate), list[tuple[float, float, NDArray]]()
+            for exponent in _EXPONENTS:
+                seen = self._minimum(counts, weights * ~held, exponent, means, 2 if tried else 3, 20).point
+                means = seen.problem.phase_map.means(seen.problem.split(seen.x)[0][0])
+                score = float(np.mean(((np.array(seen.model.images) - counts) * weights)[lit] ** 2))
+                tried.append((score, exponent, means))
+                if score > 1.1 * min(one[0] for one in tried):
+                    break
+            least = min(one[0] for one in tried)
+            smoothest = [one for one in tried if one[0] <= (1 + _TIE) * least][-1]
+            if best is None or least < best[0]:
+                best = least, smoothest[1], smoothest[2]
+            if least < 2 * EXPLAINED:
+                break
+        assert best is not None
+        _, exponent, means = best
+        end = self._minimum(counts, weights, exponent, means, self.n_steps, 30)
+        point = end.point
+        misfit = float(np.mean(point.misfit))
+        phase = point.problem.phase_map.means(point.problem.split(point.x)[0][0])[PAD:-PAD, PAD:-PAD]
+        return FittedPhase(phase, misfit, misfit < EXPLAINED, end.converged, exponent, point)
+
+    def frames(self, phase: ArrayLike) -> NDArray[np.float64]:
+        """Frames that the model predicts for a phase.
+
+        Parameters
+        ----------
+        phase : array_like, shape (n, n), radian
+            That of the optics included.
+
+        Returns
+        -------
+        ndarray, shape (2, ny, nx), counts
+        """
+        phase = _check.real_map("phase", phase, 2)
+        _check.trailing_shape("phase", phase, self.flat.shape, "the grid of the pupil")
+        fine = fine_phase(np.pad(phase, PAD, "edge"), self._fitted.camera.f)
+        point = self.fit.point
+        return np.stack(self._camera.at(self._light.maps(point.light, fine), point.values).images)
+
+    @property
+    def _fitted(self) -> Problem:
+        return self.fit.point.problem
+
+    @property
+    def _light(self) -> Light:
+        return replace(self._fitted.light, start=self.fit.point.light)
+
+    @cached_property
+    def _camera(self) -> Camera:
+        """The camera behind the two masks alone."""
+        of = self._fitted.camera
+        exposures = [Exposure(0, 0, 0), Exposure(1, 1, 0), Exposure(2, None, 0), Exposure(3, None, 0)]
+        camera = Camera(
+            of.n, of.shape, of.n_pixels, exposures, np.zeros((1, of.n * of.f, of.n * of.f)), of.f, of.largest
+        )
+        camera.exposures = camera.exposures[:2]
+        return camera
+
+    def _minimum(
+        self, counts: NDArray, weights: NDArray, exponent: float, start: NDArray, n_steps: int, n_inner: int
+    ) -> Minimum:
+        """Fit of the phase alone."""
+        of = self._fitted
+        inside = start[of.phase_map.n // 4 : -of.phase_map.n // 4]
+        phase_map = PhaseMap(
+            of.phase_map.n, of.camera.f, MapPrior(max(0.1, 2 * float(inside.std())), exponent), of.camera.n_pixels
+        )
+        values = self.fit.point.values
+        problem = Problem(
+            self._camera,
+            list(counts),
+            list(weights),
+            self._light,
+            np.zeros(self._light.start.shape),
+            phase_map,
+            (),
+            values,
+        )
+        return minimise(problem, white_phase(phase_map, start).ravel(), n_steps, n_inner)
+
+    def _start(self, counts: NDArray, accelerate: bool) -> NDArray[np.float64]:
+        """Phase of the phase-shifted iteration on images brought back to the pupil, unwrapped and continued."""
+        point, n, f = self.fit.point, self._fitted.phase_map.n, self._fitted.camera.f
+        light = np.maximum(point.light.reshape(n, f, n, f).mean(axis=(1, 3)), 0)
+        pupil = Pupil.from_amplitude(np.sqrt(light), self._fitted.camera.n_pixels, threshold=0.3)
+        power = np.mean(pupil.amplitude[pupil.inside] ** 2) / np.mean(light[pupil.inside])
+        masks = point.model.masks
+        y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2,) * 2, indexing="ij")
+        images = np.empty((2, n, n))
+        for side, arm in enumerate(point.model.arms[:2]):
+            cosine, sine = (arm["magnification"] * one(arm["rotation"]) for one in (math.cos, math.sin))
+            rows = cosine * y + sine * x + arm["row"] + (counts.shape[1] - 1) / 2
+            columns = cosine * x - sine * y + arm["column"] + (counts.shape[2] - 1) / 2
+            image = (counts[side] - arm["background"]) / arm["flux"] * power
+            images[side] = ndimage.map_coordinates(image, [rows, columns], order=3, mode="nearest")
+        leaked = min(masks["leakage"], 0.4)
+        images = ((1 - leaked) * images - leaked * images[::-1]) / (1 - 2 * leaked)
+        sensor = ZernikeSensor(
+            pupil, *(Dimple(masks["diameter"], masks[name]) for name in ("first", "second")), tolerance=1e-5
+        )
+        found = PhaseShifted(sensor, n_iterations=25, tolerance=1e-3, accelerate=accelerate)(
+            np.maximum(images, 0)
+        ).phase
+        inside = ndimage.binary_erosion(pupil.inside) | (pupil.inside & (light > 0.8))
+        phase = unwrapped(np.nan_to_num(found), inside)
+        near = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+        return phase[tuple(near)] - phase[inside].mean()
+
+
+def unwrapped(phase: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Phase without jumps of 2 pi between neighbours inside, by least squares."""
+    number = np.full(inside.shape, -1)
+    number[inside] = np.arange(np.count_nonzero(inside))
+    rows, right = [], []
+    for axis in (0, 1):
+        first, second = (np.moveaxis(number, axis, 0)[cut] for cut in (slice(None, -1), slice(1, None)))
+        values = np.moveaxis(phase, axis, 0)
+        both = (first >= 0) & (second >= 0)
+        rows.append(np.stack([first[both], second[both]], axis=1))
+        right.append(np.angle(np.exp(1j * np.diff(values, axis=0)))[both])
+    pairs, step = np.concatenate(rows), np.concatenate(right)
+    k = np.arange(len(pairs))
+    size = (len(pairs), int(number.max()) + 1)
+    slope = sparse.csr_array((np.tile([-1.0, 1.0], len(pairs)), (np.repeat(k, 2), pairs.ravel())), size)
+    normal = (slope.T @ slope + 1e-9 * sparse.eye_array(size[1])).tocsc()
+    smooth = splu(normal).solve(slope.T @ step)
+    out = phase.copy()
+    difference = smooth - phase[inside]
+    difference -= np.median(difference)
+    out[inside] += 2 * np.pi * np.rint(difference / (2 * np.pi))
+    return out

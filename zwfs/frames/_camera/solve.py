@@ -1,0 +1,533 @@
+"""Fit of the model of the camera: maps of light and phase, and all numbers, in one least-squares problem."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, linalg, ndimage
+from scipy.interpolate import BSpline
+
+from zwfs.frames._camera.model import Camera, Linearised, Maps, names_of
+from zwfs.frames._camera.prior import MapPrior
+
+_BINS = 24  # of spatial frequency, for the preconditioner
+_FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
+_LEAST = 1e-3  # damping
+_SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
+_PIXEL_MEAN = np.array([230.0, 2 * 76.0, 2.0]) / 384  # of a cubic spline over a pixel, as a series of cosines
+
+
+class Free(NamedTuple):
+    """A free number, which may stand at several places of the vector of all numbers."""
+
+    name: str
+    places: tuple[tuple[int | None, str], ...]  # (arm, or None for the masks; name)
+    value: float
+    low: float = -math.inf
+    high: float = math.inf
+    sigma: float = math.inf  # of its prior
+
+
+class PhaseMap:
+    """White numbers to the mean of a phase over each pixel, and to the phase on the fine grid, by a cubic spline.
+
+    Parameters
+    ----------
+    n : int, pixels
+    oversampling : int
+    prior : MapPrior
+    n_pixels : float, pixels
+        Diameter D.
+    """
+
+    def __init__(self, n: int, oversampling: int, prior: MapPrior, n_pixels: float) -> None:
+        self.n, self.size = n, fft.next_fast_len(round(1.2 * n), real=True)
+        self.colour = np.sqrt(prior.spectrum(self.size, n_pixels))
+        self._along = fine_spline(n, oversampling, self.size)
+        self._means = self.colour / _mean_symbol(self.size)
+
+    def means(self, white: NDArray) -> NDArray[np.float64]:
+        """Mean over each pixel, (n, n)."""
+        return fft.irfft2(self.colour * fft.rfft2(white), s=white.shape)[: self.n, : self.n]
+
+    def fine(self, white: NDArray) -> NDArray[np.float64]:
+        """Phase on the fine grid."""
+        return self._along @ fft.irfft2(self._means * fft.rfft2(white), s=white.shape) @ self._along.T
+
+    def adjoint(self, fine: NDArray) -> NDArray[np.float64]:
+        """Adjoint of `fine`."""
+        nodes = self._along.T @ fine @ self._along
+        return fft.irfft2(self._means * fft.rfft2(nodes), s=nodes.shape)
+
+
+class LightMap:
+    """White numbers to the change of the light on some points of the fine grid.
+
+    Parameters
+    ----------
+    where : ndarray of bool, shape (n * f, n * f)
+    prior : MapPrior
+    n_pixels : float
+        Diameter D on the fine grid.
+    """
+
+    def __init__(self, where: NDArray, prior: MapPrior, n_pixels: float) -> None:
+        self.where, self.n = where, len(where)
+        self.size = fft.next_fast_len(round(1.05 * self.n), real=True)
+        self.colour = np.sqrt(prior.spectrum(self.size, n_pixels))
+
+    def fine(self, white: NDArray) -> NDArray[np.float64]:
+        """Change of the light on the fine grid."""
+        return fft.irfft2(self.colour * fft.rfft2(white), s=white.shape)[: self.n, : self.n] * self.where
+
+    def adjoint(self, fine: NDArray) -> NDArray[np.float64]:
+        """Adjoint of `fine`."""
+        whole = np.zeros((self.size, self.size))
+        whole[: self.n, : self.n] = fine * self.where
+        return fft.irfft2(self.colour * fft.rfft2(whole), s=whole.shape)
+
+
+def _mean_symbol(size: int) -> NDArray[np.float64]:
+    full, half = (
+        np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * one), _PIXEL_MEAN)
+        for one in (fft.fftfreq(size), fft.rfftfreq(size))
+    )
+    return np.multiply.outer(full, half)
+
+
+def fine_spline(n: int, oversampling: int, size: int) -> NDArray[np.float64]:
+    """Cubic B-splines at nodes 0 to size - 1, periodic, at the fine points of n pixels, (n * f, size)."""
+    places = (np.arange(n * oversampling) + 0.5) / oversampling - 0.5
+    nodes = np.floor(places).astype(int)[:, None] + np.arange(-1, 3)
+    values = np.nan_to_num(BSpline.basis_element(np.arange(-2.0, 3.0), extrapolate=False)(places[:, None] - nodes))
+    matrix = np.zeros((len(places), size))
+    np.add.at(matrix, (np.arange(len(places))[:, None], nodes % size), values)
+    return matrix
+
+
+def fine_phase(means: NDArray, oversampling: int) -> NDArray[np.float64]:
+    """Phase on the fine grid by the cubic spline whose means over the pixels are given, (..., n, n)."""
+    n, margin = means.shape[-1], 12
+    padded = np.pad(means, [(0, 0)] * (means.ndim - 2) + [(margin, margin)] * 2, "reflect", reflect_type="odd")
+    # A period that is the map and its mirror image has no jump.
+    both = np.concatenate([padded, padded[..., ::-1]], -1)
+    both = np.concatenate([both, both[..., ::-1, :]], -2)
+    nodes = fft.irfft2(fft.rfft2(both) / _mean_symbol(both.shape[-1]), s=both.shape[-2:])
+    nodes = nodes[..., margin - 2 : margin + n + 2, margin - 2 : margin + n + 2]
+    along = fine_spline(n + 4, oversampling, n + 4)[2 * oversampling : -2 * oversampling]
+    return along @ nodes @ along.T
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Where light is, and how it divides into the two areas of a point.
+
+    Attributes
+    ----------
+    start : ndarray, shape (n * f, n * f)
+        Light of no change.
+    amplitude : ndarray, shape (n * f, n * f)
+        Amplitude A of the lit part.
+    full : ndarray of bool, shape (n * f, n * f)
+        Points that are fully lit.
+    support : ndarray of bool, shape (n * f, n * f)
+        Points that may have light.
+    """
+
+    start: NDArray[np.float64]
+    amplitude: NDArray[np.float64]
+    full: NDArray[np.bool_]
+    support: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, start: NDArray, pixels: NDArray, oversampling: int) -> Light:
+        """Divide a fine map of light; `pixels` is the light of each pixel, 1 on average where it is lit."""
+        typical = ndimage.percentile_filter(pixels, 60, 5)
+        whole = (pixels > 0.9 * typical) & (typical > 0.5)
+        full = ndimage.binary_erosion(whole)
+        weight = ndimage.gaussian_filter(full.astype(float), 1.5)
+        near = np.where(
+            weight > 1e-3, ndimage.gaussian_filter(pixels * full, 1.5) / np.maximum(weight, 1e-12), np.nan
+        )
+        index = ndimage.distance_transform_edt(np.isnan(near), return_distances=False, return_indices=True)
+        power = np.maximum(near[tuple(index)], 0.05)
+        support = ndimage.binary_dilation(pixels > 0.1, iterations=2)
+        flat = np.kron(full, np.ones((oversampling,) * 2)) > 0
+        inner = np.kron(support, np.ones((oversampling,) * 2)) > 0
+        return cls(start, np.sqrt(_stretched(power, oversampling)), flat, inner)
+
+    def changed(self, change: NDArray | float) -> NDArray[np.float64]:
+        """Light of a change, in units of that of a fully lit point."""
+        return self.support * (self.start + self.amplitude**2 * change)
+
+    def maps(self, light: NDArray, phase: NDArray) -> Maps:
+        """Maps of the model."""
+        mean = np.where(self.full, self._root(light), light / self.amplitude)
+        return Maps(mean, np.where(self.full, 0, light - mean**2), phase)
+
+    def slopes(self, light: NDArray) -> tuple[NDArray, NDArray]:
+        """Derivatives of mean field and rest by the change of the light."""
+        power = self.amplitude**2
+        slope = self.support * power
+        root = 0.5 / np.sqrt(np.maximum(light, self._least))
+        mean = np.where(self.full, root, 1 / self.amplitude)
+        return slope * mean, slope * np.where(self.full, 0, 1 - 2 * light / power)
+
+    @property
+    def _least(self) -> NDArray[np.float64]:
+        return 0.5 * self.amplitude**2
+
+    def _root(self, light: NDArray) -> NDArray[np.float64]:
+        """Square root of the light, and its tangent where a fully lit point would be much too dark."""
+        least = np.maximum(light, self._least)
+        return np.sqrt(least) + (light - least) / (2 * np.sqrt(least))
+
+
+def _stretched(pixels: NDArray, factor: int) -> NDArray[np.float64]:
+    """A smooth map of pixels on a grid that is finer by a factor, linear between the pixels."""
+    n = pixels.shape[-1]
+    places = np.clip((np.arange(n * factor) + 0.5) / factor - 0.5, 0, n - 1)
+    low = np.minimum(places.astype(int), n - 2)
+    along = np.zeros((len(places), n))
+    along[np.arange(len(places)), low] = 1 - (places - low)
+    along[np.arange(len(places)), low + 1] += places - low
+    return along @ pixels @ along.T
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Images, the model, and what is unknown.
+
+    Attributes
+    ----------
+    camera : Camera
+    counts, weights : list of ndarray
+        Images, and one over the noise of each pixel; 0 for bad pixels.
+    light : Light
+    phase : ndarray, shape (n * f, n * f), radian
+        Mean of the prior of the phase, on the fine grid.
+    phase_map : PhaseMap
+    light_maps : tuple of LightMap
+        None if the light is known.
+    values : ndarray
+        Of all numbers; those of `free` are where a fit starts.
+    free : sequence of Free
+    """
+
+    camera: Camera
+    counts: Sequence[NDArray[np.float64]]
+    weights: Sequence[NDArray[np.float64]]
+    light: Light
+    phase: NDArray[np.float64]
+    phase_map: PhaseMap
+    light_maps: tuple[LightMap, ...]
+    values: NDArray[np.float64]
+    free: Sequence[Free] = ()
+
+    @cached_property
+    def places(self) -> list[list[int]]:
+        """Places of each free number in the vector of all."""
+        index = {name: place for place, name in enumerate(names_of(self.camera.n_arms))}
+        return [
+            [index[name if arm is None else f"arm {arm} {name}"] for arm, name in one.places] for one in self.free
+        ]
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """Limits of the free numbers, (n_free, 2)."""
+        return np.array([(one.low, one.high) for one in self.free]).reshape(-1, 2)
+
+    @cached_property
+    def prior(self) -> tuple[NDArray, NDArray]:
+        """Means and inverse standard deviations of the priors of the free numbers."""
+        return np.array([one.value for one in self.free]), np.array([1 / one.sigma for one in self.free])
+
+    @property
+    def maps(self) -> tuple[PhaseMap | LightMap, ...]:
+        """All maps, that of the phase first."""
+        return (self.phase_map, *self.light_maps)
+
+    @cached_property
+    def n_white(self) -> int:
+        """Number of white unknowns."""
+        return sum(one.size**2 for one in self.maps)
+
+    @property
+    def start(self) -> NDArray[np.float64]:
+        """Where a fit starts."""
+        return np.concatenate([np.zeros(self.n_white), self.prior[0]])
+
+    def split(self, x: NDArray) -> tuple[list[NDArray], NDArray]:
+        """White maps and free numbers."""
+        ends = np.cumsum([one.size**2 for one in self.maps])
+        *white, free = np.split(x, ends)
+        return [one.reshape(of.size, -1) for one, of in zip(white, self.maps, strict=True)], free
+
+    def light_change(self, white: Sequence[NDArray]) -> NDArray[np.float64]:
+        """Change of the light on the fine grid."""
+        return sum(
+            (of.fine(one) for one, of in zip(white[1:], self.light_maps, strict=True)), np.zeros(self.phase.shape)
+        )
+
+    def all_values(self, free: NDArray) -> NDArray[np.float64]:
+        """All numbers, with those that are free."""
+        values = self.values.copy()
+        for places, value in zip(self.places, free.tolist(), strict=True):
+            values[places] = value
+        return values
+
+
+class Point:
+    """Model, residuals and cost at given unknowns, and Gauss and Newton's matrix there."""
+
+    def __init__(self, problem: Problem, x: NDArray) -> None:
+        self.problem, self.x = problem, x
+        white, free = problem.split(x)
+        self.light = problem.light.changed(problem.light_change(white))
+        self.phase = problem.phase + problem.phase_map.fine(white[0])
+        self.values = problem.all_values(free)
+        self.model: Linearised = problem.camera.at(problem.light.maps(self.light, self.phase), self.values)
+        self.residuals = [
+            weight * (image - counts)
+            for weight, image, counts in zip(problem.weights, self.model.images, problem.counts, strict=True)
+        ]
+        self.excess = (free - problem.prior[0]) * problem.prior[1]
+        parts = [*self.residuals, x[: problem.n_white], self.excess]
+        self.cost = sum(float(np.vdot(one, one)) for one in parts) / 2
+
+    @cached_property
+    def misfit(self) -> NDArray[np.float64]:
+        """Mean square of the residuals of each image."""
+        pairs = zip(self.residuals, self.problem.weights, strict=True)
+        return np.array([np.vdot(r, r) / max(1, np.count_nonzero(w)) for r, w in pairs])
+
+    @cached_property
+    def _light_slopes(self) -> tuple[NDArray, NDArray]:
+        return self.problem.light.slopes(self.light)
+
+    @cached_property
+    def columns(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
+        """Free numbers that change each image, and its changes over the noise with each, (k, n_pixels)."""
+        out = []
+        for index, one in enumerate(self.problem.camera.exposures):
+            which = [
+                (number, [name for arm, name in free.places if arm is None or arm == one.arm])
+                for number, free in enumerate(self.problem.free)
+            ]
+            which = [(number, names) for number, names in which if names]
+            names = [names[0] for _, names in which]
+            slopes = self.model.slopes(index, names) * self.problem.weights[index]
+            out.append(
+                (
+                    np.array([number for number, _ in which], int),
+                    slopes.reshape(len(names), self.problem.weights[index].size),
+                )
+            )
+        return out
+
+    @cached_property
+    def block(self) -> NDArray[np.float64]:
+        """Matrix of the free numbers."""
+        block = np.diag(self.problem.prior[1] ** 2 + 1e-300)
+        for which, slopes in self.columns:
+            block[np.ix_(which, which)] += slopes @ slopes.T
+        return block
+
+    def change(self, d: NDArray) -> list[NDArray[np.float64]]:
+        """Change of the residuals with the unknowns."""
+        problem = self.problem
+        white, free = problem.split(d)
+        light = problem.light_change(white)
+        mean, rest = (light * one for one in self._light_slopes)
+        images = self.model.apply(mean, rest, problem.phase_map.fine(white[0]))
+        changes = [weight * image for weight, image in zip(problem.weights, images, strict=True)]
+        if free.any():
+            for one, (which, slopes) in zip(changes, self.columns, strict=True):
+                one += (free[which] @ slopes).reshape(one.shape)
+        return changes
+
+    def back(self, residuals: Sequence[NDArray]) -> NDArray[np.float64]:
+        """Adjoint of `change`."""
+        problem = self.problem
+        maps = self.model.adjoint([w * r for w, r in zip(problem.weights, residuals, strict=True)])
+        mean, rest = self._light_slopes
+        light = maps.mean * mean + maps.rest * rest
+        parts = [problem.phase_map.adjoint(maps.phase).ravel()]
+        parts += [one.adjoint(light).ravel() for one in problem.light_maps]
+        free = np.zeros(len(problem.free))
+        if len(free):
+            for image, (which, slopes) in zip(residuals, self.columns, strict=True):
+                free[which] += slopes @ image.ravel()
+        return np.concatenate([*parts, free])
+
+    def product(self, d: NDArray) -> NDArray[np.float64]:
+        """Matrix times a vector."""
+        n = self.problem.n_white
+        out = self.back(self.change(d))
+        out[:n] += d[:n]
+        out[n:] += d[n:] * self.problem.prior[1] ** 2
+        return out
+
+    @cached_property
+    def gradient(self) -> NDArray[np.float64]:
+        """Of the cost."""
+        n = self.problem.n_white
+        gradient = self.back(self.residuals)
+        gradient[:n] += self.x[:n]
+        gradient[n:] += self.excess * self.problem.prior[1]
+        return gradient
+
+    @cached_property
+    def stuck(self) -> NDArray[np.bool_]:
+        """Numbers at a limit beyond which the cost would fall."""
+        n, bounds = self.problem.n_white, self.problem.bounds
+        stuck = np.zeros(self.x.shape, bool)
+        values, slope = self.x[n:], self.gradient[n:]
+        stuck[n:] = ((values <= bounds[:, 0]) & (slope > 0)) | ((values >= bounds[:, 1]) & (slope < 0))
+        return stuck
+
+    @cached_property
+    def _spectra(self) -> list[NDArray[np.float64]]:
+        """Approximate eigenvalues of the matrix for each map, by random vectors."""
+        rng = np.random.default_rng(0)  # the choice hardly changes the number of steps
+        problem, (mean, rest), zero = self.problem, self._light_slopes, np.zeros(self.phase.shape)
+        out = []
+        for number, one in enumerate(problem.maps):
+            where = (self.light > 0.3) if isinstance(one, PhaseMap) else one.where
+            probe = rng.choice([-1.0, 1.0], self.phase.shape) * where
+            change = (probe * mean, probe * rest, zero) if number else (zero, zero, probe)
+            images = self.model.apply(*change)
+            maps = self.model.adjoint([w**2 * image for w, image in zip(problem.weights, images, strict=True)])
+            answer = (maps.mean * mean + maps.rest * rest) * where if number else maps.phase
+            response = self._response(probe, answer, one)
+            white = [rng.normal(size=(of.size,) * 2) * (of is one) for of in problem.maps]
+            white[number] = fft.irfft2(fft.rfft2(white[number]) / np.sqrt(1 + response), s=white[number].shape)
+            d = np.concatenate([*(each.ravel() for each in white), np.zeros(len(problem.free))])
+            out.append(float(d @ self.product(d)) / one.size**2 * (1 + response))
+        return out
+
+    def _response(self, probe: NDArray, answer: NDArray, of: PhaseMap | LightMap) -> NDArray[np.float64]:
+        """Mean response of the images at each spatial frequency of a map."""
+        f = self.problem.camera.f
+        v, u = fft.fftfreq(len(probe))[:, None] * f, fft.rfftfreq(len(probe)) * f
+        edges = np.linspace(0, 0.5 * f, _BINS + 1)
+        bins = np.minimum(np.digitize(np.hypot(u, v), edges), _BINS).ravel() - 1
+        sent, got = fft.rfft2(np.stack([probe, answer]))
+        power = np.bincount(bins, (np.abs(sent) ** 2).ravel(), _BINS)
+        heard = np.bincount(bins, (sent.conj() * got).real.ravel(), _BINS)
+        curve = np.maximum(heard / power, _FAINTEST * (heard / power).max())
+        scale, gain = (1, f**2) if isinstance(of, PhaseMap) else (f, 1)
+        v, u = fft.fftfreq(of.size)[:, None] * scale, fft.rfftfreq(of.size) * scale
+        spectrum = np.exp(np.interp(np.hypot(u, v), (edges[1:] + edges[:-1]) / 2, np.log(curve)))
+        return gain * of.colour**2 * spectrum
+
+    def _filtered(self, d: NDArray, power: int) -> list[NDArray]:
+        white, _ = self.problem.split(d)
+        return [
+            fft.irfft2(fft.rfft2(one) * response**power, s=one.shape).ravel()
+            for one, response in zip(white, self._spectra, strict=True)
+        ]
+
+    def precondition(self, r: NDArray) -> NDArray[np.float64]:
+        """Approximate inverse of the matrix times a vector."""
+        free = r[self.problem.n_white :]
+        if free.size:
+            unit = np.sqrt(np.diagonal(self.block))
+            scaled = self.block / np.outer(unit, unit) + 1e-9 * np.eye(len(unit))
+            free = linalg.solve(scaled, free / unit, assume_a="pos") / unit
+        return np.concatenate([*self._filtered(r, -1), free])
+
+    def scale(self, d: NDArray) -> NDArray[np.float64]:
+        """Damping times a vector."""
+        free = np.diagonal(self.block) * d[self.problem.n_white :]
+        return np.concatenate([*self._filtered(d, 1), free])
+
+    def solve(
+        self, right: NDArray, held: NDArray[np.bool_], n_inner: int, tolerance: float, damping: float = 0.0
+    ) -> NDArray[np.float64]:
+        """Solution of the damped equations by conjugate gradients; what is held stays."""
+
+        def product(d: NDArray) -> NDArray:
+            return self.product(d) + damping * self.scale(d) if damping else self.product(d)
+
+        x, r = np.zeros_like(right), np.where(held, 0, right)
+        z = np.where(held, 0, self.precondition(r))
+        d, size = z, float(r @ z)
+        goal = tolerance**2 * size
+        for _ in range(n_inner):
+            if size <= goal or size <= 0:
+                break
+            along = np.where(held, 0, product(d))
+            step = size / float(d @ along)
+            x, r = x + step * d, r - step * along
+            z = np.where(held, 0, self.precondition(r))
+            before, size = size, float(r @ z)
+            d = z + size / before * d
+        return x
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where a fit ended."""
+
+    point: Point
+    n_steps: int
+    converged: bool
+
+
+def minimise(
+    problem: Problem, x: NDArray | None = None, n_steps: int = 30, n_inner: int = 60, log: Any = None
+) -> Minimum:
+    """Levenberg and Marquardt's method on all unknowns, until a step promises no more than a part of 1."""
+    point = Point(problem, problem.start if x is None else x)
+    damping, converged, step = 1e-2, False, 0
+    n, bounds = problem.n_white, problem.bounds
+    while step < n_steps and not converged:
+        step += 1
+        for _ in range(10):
+            change = point.solve(-point.gradient, point.stuck, n_inner, 0.03, damping)
+            target = point.x + change
+            target[n:] = np.clip(target[n:], bounds[:, 0], bounds[:, 1])
+            promised = -float(point.gradient @ change) / 2
+            trial = Point(problem, target)
+            gain = point.cost - trial.cost
+            if gain >= 0 or promised < _SETTLED:
+                break
+            damping *= 8
+        converged = promised < _SETTLED and damping < 0.1
+        if log:
+            log(f"step {step}: cost {point.cost:.1f} gain {gain:.2f} of {promised:.2f}, damping {damping:.1g}")
+        if gain >= 0:
+            point = trial
+        share = gain / promised if promised > 0 else 1.0
+        damping *= 0.2 if share > 0.75 else 1.0 if share > 0.4 else 4.0
+        damping = max(damping, _LEAST)
+    return Minimum(point, step, converged)
+
+
+def covariance(point: Point, n_inner: int = 15) -> NDArray[np.float64]:
+    """Covariance of the free numbers: the inverse of Schur's complement of the maps.
+
+    S = H_pp - 2 H_pm X + X^T H_mm X with an approximate X = H_mm^-1 H_mp: its error is of second order in that
+    of X.
+    """
+    n, n_all = point.problem.n_white, len(point.x)
+    free = np.arange(n_all) >= n
+    left, solved, products = [], [], []
+    for index in range(n, n_all):
+        right = point.product(np.eye(1, n_all, index)[0])
+        solution = point.solve(right, free, n_inner, 0.02)
+        left.append(right[:n])
+        solved.append(solution[:n])
+        products.append(point.product(solution)[:n])
+    cross = np.array(left) @ np.array(solved).T
+    schur = point.block - cross - cross.T + np.array(solved) @ np.array(products).T
+    unit = np.sqrt(np.diagonal(point.block))
+    schur = (schur + schur.T) / 2 / np.outer(unit, unit)
+    return linalg.pinvh(schur, rtol=1e-13) / np.outer(unit, unit)

@@ -75,7 +75,7 @@ def modules() -> list[str]:
 
 
 def own_names(module: ModuleType) -> list[str]:
-    """Return the public names that a module or a private part of a package defines: those of ``__all__``, if any."""
+    """Return the public names that a module, or a private part of a package, defines."""
     package = hasattr(module, "__path__")
     public = vars(module) if package else getattr(module, "__all__", vars(module))
     return [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -74,6 +75,7 @@ class CalibrationFrames:
         return Shot(counts, np.sqrt(np.maximum(counts, 0) + self.noise**2))
 
 
+@lru_cache(maxsize=16)  # a new bench computes its dimples anew
 def dimmed(bench: Bench, photons: float) -> Bench:
     """Return the bench with other exposures: photons per pixel of the pupil, and background and noise to match."""
     total = photons * np.count_nonzero(bench.segments)

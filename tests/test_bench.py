@@ -52,13 +52,6 @@ def test_layout_is_36_segments_six_across_with_one_missing_at_the_top_right():
     assert 5.4 < 136 / np.mean(pitches) < 6.5  # 24.9 pixels, as in the real frames
 
 
-def test_camera_sees_a_margin_around_the_pupil(perfect):
-    assert Bench.ideal().frames().shape == (2, 180, 180)
-    for images in (perfect.frames(), perfect.clear_frames(), perfect.dark()):
-        assert images.shape == (2, N + 2 * MARGIN, N + 2 * MARGIN)
-    assert perfect.segments.shape == (N, N)
-
-
 def test_blur_widens_the_images_and_loses_no_light(perfect):
     def moments(image):
         axes = np.indices(image.shape).reshape(2, -1)
@@ -68,17 +61,6 @@ def test_blur_widens_the_images_and_loses_no_light(perfect):
         (light, width), (same, wider) = moments(sharp), moments(blurred)
         assert same == pytest.approx(light)
         np.testing.assert_allclose(wider - width, 1.5**2, rtol=0.01)
-
-
-def test_errors_are_named_and_0_on_an_ideal_bench(perfect):
-    names = Bench.errors()
-    assert names == (
-        "leakage", "focus_difference", "misregistration", "blur", "flux_imbalance", "dimple_error", "static",
-        "quilting",
-    )  # fmt: skip
-    assert all(getattr(perfect, name) == 0 for name in (*names, "photons", "read_noise", "background"))
-    assert all(getattr(Bench(**SMALL), name) > 0 for name in names)
-    assert ideal(leakage=0.1).leakage == 0.1
 
 
 # Gaps below a pixel
@@ -267,18 +249,6 @@ def test_light_that_no_mask_shifts_interferes_if_it_is_polarised(perfect, comman
     assert np.abs(coherent - incoherent).max() > 0.3
 
 
-@pytest.mark.parametrize("distance", [1e-4, 1e-2])
-def test_focus_difference_loses_no_light(distance):
-    images = ideal(extent=4, focus_difference=distance).clear_frames()
-    np.testing.assert_allclose(images.sum(axis=(1, 2)), np.count_nonzero(LAYOUT.inside), rtol=1e-7)
-
-
-def test_a_flat_wavefront_looks_the_same_on_either_side_of_focus(perfect):
-    one, other = ideal(focus_difference=1e-3).clear_frames()
-    np.testing.assert_allclose(one, other, rtol=0, atol=1e-13)
-    assert np.abs(one - perfect.clear_frames()[0]).max() > 0.1
-
-
 def test_dimple_error_changes_the_dimple_only(perfect, commands):
     bench = ideal(dimple_error=0.25)
     np.testing.assert_array_equal(bench.clear_frames(), perfect.clear_frames())
@@ -431,14 +401,6 @@ def test_model_amplitude_is_close_to_the_truth_on_the_bench_as_it_is():
     deep = ndimage.binary_erosion(layout.inside, iterations=4)[layout.inside]
     assert ratio[deep].std() / ratio[deep].mean() < 0.04
     assert not found.inside[np.hypot(layout.x, layout.y[:, np.newaxis]) > 0.5].any()
-
-
-def test_model_follows_the_seed():
-    bench = Bench(**SMALL)
-    one, again, other = (BenchModel.from_images(bench, seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one.shifted.pupil.amplitude, again.shifted.pupil.amplitude)
-    np.testing.assert_array_equal(one.dark, again.dark)
-    assert np.mean(one.dark != other.dark) > 0.9
 
 
 def test_normalised_counts_are_1_on_average_in_the_pupil():

@@ -16,7 +16,6 @@ from studies.beyond_range import (
     ModelErrors,
     Trials,
     causes,
-    compared_methods,
     model_curves,
     noise_curves,
 )
@@ -142,12 +141,3 @@ def test_only_maximum_likelihood_recovers_screens_beyond_the_dark_ring(pupil, mo
     assert curves.recovered(LIKELY).tolist() == [1, 1]
     for name in (PLAIN, ACCELERATED):
         assert curves.recovered(name).tolist() == [1, 0]
-
-
-def test_diameters_are_compared_for_the_same_pair_of_shifts(pupil, modes):
-    screens = screens_at(modes, 0.5, 2, seed=3, task=0)
-    curves = dimple_curves(pupil, np.pi / 2, 25, [1.06, 3.0], screens)
-    sensor = opposite_dimples(pupil, 3.0, np.pi / 2)
-    phase = compared_methods(sensor, 25)["PhaseShifted"](sensor.measure(screens)).phase
-    np.testing.assert_allclose(curves.errors["PhaseShifted"][1], zwfs.reconstruction_error(pupil, phase, screens))
-    assert list(curves.errors) == ["PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood"]

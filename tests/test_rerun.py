@@ -230,26 +230,6 @@ def test_a_notebook_depends_on_its_studies_the_kit_and_all_of_the_package(projec
         assert (record.key(project, "fig01_small", {}) != before) == counts, name
 
 
-def test_lists_tell_titles_and_parameters(project, capsys):
-    rerun.rerun(project, [])
-    assert re.search(r"^1 +fig01_small +Title of fig01_small$", capsys.readouterr().out, re.MULTILINE)
-    rerun.rerun(project, ["1", "--list"])
-    told = capsys.readouterr().out
-    assert re.search(r"^n +int +2 +1 to 9 +pixels across$", told, re.MULTILINE)
-    assert re.search(r"^width +float +1.5 +0 to 4 +rad +of the slit$", told, re.MULTILINE)
-    assert re.search(r"^steps +list of int +\[1, 2\] +0 to 9 +tried, in turn$", told, re.MULTILINE)
-
-
-def test_names_of_folders_tell_parameters_and_differ():
-    one, two = ({"width": 2.0, "n": n} for n in (1, 2))
-    assert rerun.folder_name("fig", {}) == "fig-defaults"
-    assert rerun.folder_name("fig", one).startswith("fig-width=2.0-n=1-")
-    assert rerun.folder_name("fig", one) != rerun.folder_name("fig", two)
-    long = {"words": [f"../{index} $x" for index in range(99)]}
-    assert re.fullmatch(r"[\w.=,+-]{1,90}", rerun.folder_name("fig", long))
-    assert len(rerun.folder_name("fig", {"name": "\U0001d54f" * 99}).encode()) < 255
-
-
 def test_folder_holds_all_that_was_made(ran):
     folder = result(ran)
     about = json.loads((folder / "record.json").read_text())

@@ -253,8 +253,27 @@ def factorise(
     same = all(map(np.array_equal, pupil_axes, detector_axes))
     to_detector = from_pupil if same else along(detector_axes)
 
+    nodes = _rim if rim else _quadrature
+
+    @cache
+    def disc(diameter: float) -> NDArray[np.float64]:
+        """Core of a dimple that adds 1 to the transmission: half of the nodes, as opposite ones are conjugate."""
+        u, v, weights = nodes(Dimple(diameter, 0.0), reach, tolerance)
+        n_angles = u.size if rim else math.isqrt(2 * u.size)
+        half = np.flatnonzero(np.arange(u.size) % n_angles < n_angles // 2)
+        total: Any = 0
+        for some in (half[first : first + _NODES] for first in range(0, half.size, _NODES)):
+            spectra = _spectra(from_pupil, u[some], v[some])
+            seen = spectra if same else _spectra(to_detector, u[some], v[some])
+            strength = 2 * pixel_area * weights[some]
+            total = total + (seen.real * strength) @ spectra.real.T + (seen.imag * strength) @ spectra.imag.T
+        return total
+
     def core_of(index: int, refinement: float = 1.0) -> NDArray[np.complex128]:
-        u, v, weights = (_rim if rim else _quadrature)(masks[index], reach, tolerance, refinement)
+        if type(masks[index]) is Dimple:  # the same everywhere on the mask
+            change = _transmission(index, masks[index], np.zeros(1), np.zeros(1)) - 1
+            return change * disc(masks[index].diameter)
+        u, v, weights = nodes(masks[index], reach, tolerance, refinement)
         change = pixel_area * weights * (_transmission(index, masks[index], u, v) - 1)
         total: Any = 0
         for some in (slice(first, first + _NODES) for first in range(0, u.size, _NODES)):
@@ -360,7 +379,7 @@ def _quadrature(
     return u.ravel(), v.ravel(), np.repeat(ring * 2 * np.pi / n_angles, n_angles)
 
 
-def _rim(mask: Mask, reach: float, tolerance: float, refinement: float) -> tuple[NDArray, NDArray, NDArray]:
+def _rim(mask: Mask, reach: float, tolerance: float, refinement: float = 1.0) -> tuple[NDArray, NDArray, NDArray]:
     """Equispaced nodes u, v on the rim of a patch; the sum is the derivative of its integral by the diameter."""
     radius = mask.diameter / 2
     n_angles = _bandwidth(2 * np.pi * radius * reach, tolerance)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -179,6 +180,7 @@ def _errors(
     return found
 
 
+@lru_cache(maxsize=1)  # of a bench and a light, for all screens
 def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
     """Return the methods that know the design of the mask, the clear frames, and the response to pokes."""
     one, two, modes = known.model.classic, known.model.shifted, known.model.modes

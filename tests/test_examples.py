@@ -11,12 +11,14 @@ from .test_package import PUBLIC
 
 # Results that functions make, whose examples show them, and steps that the example of their package shows.
 SHOWN_BY_OTHERS = {
-    "zwfs.frames.calibration": {"Calibration", "Phases"},
+    "zwfs.frames.calibration": {"Calibration"},
+    "zwfs.frames.phases": {"Phases"},
     "zwfs.frames.files": {"read_all", "write_phase"},
     "zwfs.frames.pipeline": {
-        *("Measurement", "MeasuredPhase", "Step", "reduce_frames", "recover_phase", "model", "ideal_frames"),
-        *("predict_other", "upside_down", "fit", "steps"),
+        *("Measurement", "MeasuredPhase", "reduce_frames", "recover_phase", "model", "ideal_frames"),
+        *("predict_other", "upside_down"),
     },
+    "zwfs.frames.refine": {"Step", "fit", "steps"},
     "zwfs.frames.registration": {"Placement", "RegisteredFrames", "register_frames"},
     "zwfs.frames.telemetry": {"Summary"},
     "zwfs.frames.verdict": {"CameraNoise", "ImageOrder", "Verdict", "error_bar", "near_edges"},

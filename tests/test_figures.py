@@ -35,7 +35,8 @@ from studies.photon_noise import EXPECTED, ErrorBars, PhotonCurves
 from studies.reconstructors import draw_convergence
 from studies.zernike_sensor import lowest_pixel
 from zwfs.bench.model import Bench
-from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics, Step
+from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics
+from zwfs.frames.refine import Step
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,8 @@ from zwfs import Dimple, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, 
 from zwfs.bench import bench_error, write_bench
 from zwfs.bench.model import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.frames import files as camera
-from zwfs.frames.pipeline import Optics, fit, predict_other, recover_phase, reduce_frames, steps
+from zwfs.frames.pipeline import Optics, predict_other, recover_phase, reduce_frames
+from zwfs.frames.refine import fit, steps
 from zwfs.frames.registration import (
     Image,
     find_pupils,

@@ -28,8 +28,8 @@ from zwfs import Dimple, Pupil, ZernikeSensor, power_law_screens, zernike_basis
 from zwfs.frames import Calibration, calibrate, pipeline, reconstruct
 from zwfs.frames.__main__ import main
 from zwfs.frames._stack import Stack
-from zwfs.frames.calibration import Flag
 from zwfs.frames.files import FileError
+from zwfs.frames.phases import Flag
 from zwfs.frames.pipeline import Optics, reduce_frames
 from zwfs.frames.registration import Image, nearest_good, register_frames
 

@@ -22,7 +22,8 @@ from studies.kit.tables import Table
 from zwfs import opd_to_phase, phase_to_opd
 from zwfs.frames import CameraNoise
 from zwfs.frames.files import CameraFile
-from zwfs.frames.pipeline import MeasuredPhase, Measurement, Step, model
+from zwfs.frames.pipeline import MeasuredPhase, Measurement, model
+from zwfs.frames.refine import Step
 from zwfs.frames.registration import Image
 from zwfs.frames.verdict import Verdict
 

@@ -1,8 +1,9 @@
 """Camera files to phase.
 
-`files` reads and writes, `registration` locates the pupils, `pipeline` reconstructs a pair of frames, `verdict`
-judges the result and finds which image has which phase shift. `calibration` keeps the constants of a
-bench, and `telemetry` reconstructs files of any length with them. The command is `python -m zwfs.frames`.
+`files` reads and writes, `registration` locates the pupils, `pipeline` reconstructs a pair of frames, `refine`
+fits single parameters of the optics to it, and `verdict` judges the result and finds which image has which phase
+shift. `calibration` keeps the constants of a bench, and `telemetry` reconstructs files of any length with them, to
+`phases` with flags. The command is `python -m zwfs.frames`.
 `fit_bench` takes a model of a bench from frames of a mirror in known states. `FittedSensor` measures phases with
 that model, with error bars and a verdict.
 
@@ -13,7 +14,8 @@ From files of the simulated bench to a phase:
 >>> import tempfile
 >>> from zwfs.bench import Bench, write_bench
 >>> from zwfs.frames.files import read_all, write_phase
->>> from zwfs.frames.pipeline import Optics, fit, predict_other, recover_phase, reduce_frames, steps, upside_down
+>>> from zwfs.frames.pipeline import Optics, predict_other, recover_phase, reduce_frames, upside_down
+>>> from zwfs.frames.refine import fit, steps
 >>> from zwfs.frames.registration import register_frames
 >>> bench, folder = Bench(n_pixels=40), tempfile.TemporaryDirectory()
 >>> files = write_bench(folder.name, bench, seed=1)
@@ -36,7 +38,7 @@ True
 >>> folder.cleanup()
 """
 
-from zwfs.frames import calibration, files, pipeline, registration, telemetry, verdict
+from zwfs.frames import calibration, files, phases, pipeline, refine, registration, telemetry, verdict
 from zwfs.frames._camera import BenchFit, Estimate, FittedPhase, FittedSensor, fit_bench
 from zwfs.frames.calibration import Calibration, calibrate
 from zwfs.frames.telemetry import reconstruct
@@ -55,8 +57,10 @@ __all__ = [
     "fit_bench",
     "judge",
     "order_of_images",
+    "phases",
     "pipeline",
     "reconstruct",
+    "refine",
     "registration",
     "telemetry",
     "verdict",

@@ -13,110 +13,32 @@ import json
 import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from enum import IntFlag
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage, sparse
 
 from zwfs import _check
 from zwfs._arrays import Immutable, Kind, read_only
-from zwfs._information import Response
 from zwfs._likelihood import Estimator, Noise
 from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
+from zwfs.frames._grid import Grid, camera_places
 from zwfs.frames.files import FileError, _broken, read_all
-from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, _check_fit, fit, ideal_frames, reduce_frames
-from zwfs.frames.registration import _TOUCHED, Image, RegisteredFrames, nearest_good, register_frames
-from zwfs.masks import Dimple
+from zwfs.frames.phases import Flag, Phases
+from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames, reduce_frames
+from zwfs.frames.refine import _check_fit, fit
+from zwfs.frames.registration import register_frames
 from zwfs.metrics import without_piston
-from zwfs.pupil import Pupil
-from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
 FORMAT = 1  # of the file; another number is refused
 _NAME = "zwfs calibration"
-_FAR = 40  # pixels beyond the camera at which the edge of an image has no effect on the camera
-_REACH = 12  # pixels around the pupil that its splines need: farther ones weigh less than 2e-7
-_CUT = _REACH - 1  # of these, those without a coefficient of a spline in the pupil
-_NEGLIGIBLE = 1e-10  # of a weight: smaller ones only slow products down, much so if their products are subnormal
 _DIM = 0.1  # of the light of the calibration: a frame with less is lost
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
-
-
-class Flag(IntFlag):
-    """What is wrong with a frame; flags add up.
-
-    Attributes
-    ----------
-    LOST
-        The frame has less than a tenth of the light of the calibration, or more than a fifth of the pupil is bad.
-        Its phase is NaN.
-    BAD_PIXELS
-        Pixels are NaN, infinite or saturated that are good in the calibration.
-    SATURATED
-        Some of these are saturated.
-    INCONSISTENT
-        No phase explains the frame: its residual exceeds the limit of the call.
-    NOT_CONVERGED
-        The iteration used all its steps.
-
-    Examples
-    --------
-    >>> from zwfs.frames.calibration import Flag
-    >>> [flag.name for flag in Flag(6)]
-    ['BAD_PIXELS', 'SATURATED']
-    """
-
-    LOST = 1
-    BAD_PIXELS = 2
-    SATURATED = 4
-    INCONSISTENT = 8
-    NOT_CONVERGED = 16
-
-
 _LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED = (flag.value for flag in Flag)  # plain, and far quicker
-
-
-@dataclass(frozen=True, eq=False)
-class Phases:
-    """Phases of camera images; `...` is the batch of the exposures.
-
-    Attributes
-    ----------
-    phase : ndarray of float32, shape (..., ny, nx), radian
-        In (-pi, pi], NaN outside the pupil, at bad points, and everywhere if the frame is lost.
-    filled : ndarray of float32, shape (..., ny, nx), radian
-        The same with bad points filled with the phase of the nearest good one, and 0 outside the pupil.
-    flux : ndarray of float32, shape (...)
-        Light of the pupil relative to the calibration, mean of the two images.
-    n_bad, n_saturated : ndarray of int, shape (...)
-        Pixels of both images that are bad here and good in the calibration, and those of them that are saturated.
-    residual : ndarray of float32, shape (...)
-        Rms difference of measured and modelled frames in the pupil; 1 = mean of a clear frame.
-    n_iterations : ndarray of int, shape (...)
-    flags : ndarray of int, shape (...)
-        Sum of `Flag`; 0 is a good frame.
-    """
-
-    phase: NDArray[np.float32]
-    filled: NDArray[np.float32]
-    flux: NDArray[np.float32]
-    n_bad: NDArray[np.int64]
-    n_saturated: NDArray[np.int64]
-    residual: NDArray[np.float32]
-    n_iterations: NDArray[np.int64]
-    flags: NDArray[np.int64]
-
-    @classmethod
-    def joined(cls, parts: list[Phases], batch: tuple[int, ...]) -> Phases:
-        """Join parts of a batch, with one axis each, and return them in its shape."""
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        whole = (column[0] if len(column) == 1 else np.concatenate(column) for column in columns)
-        return cls(*(array.reshape((*batch, *array.shape[1:])) for array in whole))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -253,7 +175,7 @@ class Calibration(Immutable):
             raise ValueError(f"the frames have shapes {shape} and {images[-1].counts.shape}: expected the same")
         counts, _ = registered.frames_on_grid()
         unit, background = measurement.counts * registered.exposure, measurement.background[:2]
-        places, response = _places(registered)
+        places, response = camera_places(registered)
         inner = (..., *measurement.window)
         good = measurement.good
         weights, offset = _undoing(measurement)
@@ -484,8 +406,8 @@ class Calibration(Immutable):
         return stream.getvalue()
 
     @cached_property
-    def _work(self) -> _Work:
-        return _Work.of(self)
+    def _work(self) -> Grid:
+        return Grid.of(self)
 
     def _phases(self, counts: NDArray, start: NDArray | None, level: float, limit: float, judge: bool) -> Phases:
         """Phases of camera images, (k, n_images, ny_camera, nx_camera)."""
@@ -542,110 +464,6 @@ class Calibration(Immutable):
         return phase, n_iterations, converged, residual
 
 
-class _Work(NamedTuple):
-    """Constants of the calls of a calibration, in single precision, on a box of the camera around each pupil."""
-
-    reconstruct: PhaseShifted
-    response: Response
-    n_points: int
-    offset: NDArray[np.float32]
-    flat_frames: NDArray[np.float32]
-    boxes: list[tuple[int, Any, Any]]  # image, rows and columns
-    dark: NDArray[np.float32]  # (2, h, w), background included
-    bad: NDArray[np.bool_]  # (2, h, w)
-    watched: NDArray[np.bool_]  # (2, h, w), good pixels from which the pupil is made
-    repairs: list[tuple[NDArray, NDArray]]  # bad pixels of each box, and their nearest good ones
-    filters: tuple[NDArray[np.float32], NDArray[np.float32]]  # spline coefficients along rows and columns
-    splines: list[Any]  # sparse (ny nx, h' w'), cubic, 0 outside the pupil
-    touching: list[Any]  # sparse (ny nx, h w), linear
-    holes: tuple[NDArray, NDArray]  # bad points of the pupil, and their nearest good ones
-
-    @classmethod
-    def of(cls, calibration: Calibration) -> _Work:
-        pupil = Pupil.from_amplitude(calibration.amplitude, calibration.diameter, calibration.center)
-        masks = (Dimple(calibration.optics.diameter, shift) for shift in calibration.optics.phase_shifts)
-        sensor = ZernikeSensor(pupil, *masks, tolerance=1e-6)
-        settings: dict[str, Any] = {"n_iterations": calibration.n_iterations, "tolerance": calibration.tolerance}
-        places = calibration.places.reshape(2, 2, -1)
-        low = np.floor(places.min(axis=2)).astype(int) - _REACH
-        size = (np.floor(places.max(axis=2)).astype(int) + _REACH + 2 - low).max(axis=0)
-        boxes = []
-        for index, (row, column) in enumerate(low):
-            axes = zip((row, column), size, calibration.shape, strict=True)
-            boxes.append((min(index, calibration.n_images - 1), *(_span(*axis) for axis in axes)))
-        dark = np.stack([calibration.dark[i][rows][:, columns] for i, rows, columns in boxes])
-        bad = np.stack([calibration.bad[i][rows][:, columns] for i, rows, columns in boxes])
-        corners = places - low[:, :, np.newaxis]
-        touching = [_linear(corner, tuple(size)) for corner in corners]
-        inside = pupil.inside.ravel().astype(float)
-        reached = np.stack([one.T @ inside > 0 for one in touching]).reshape(bad.shape)
-        return cls(
-            PhaseShifted(sensor, accelerate=True, **settings),
-            Response.of(sensor),
-            pupil.n_points,
-            calibration.offset.astype(np.float32),
-            sensor.measure(np.zeros(pupil.shape)).astype(np.float32),
-            boxes,
-            dark + calibration.background[:, np.newaxis, np.newaxis].astype(np.float32),
-            bad,
-            reached & ~bad,
-            [_repair(one, ~one) for one in bad],
-            (_spline_filter(size[0]), _spline_filter(size[1])),
-            [_cubic(corner - _CUT, tuple(size - 2 * _CUT), pupil.inside.ravel()) for corner in corners],
-            touching,
-            _repair(pupil.inside & ~calibration.good, calibration.good),
-        )
-
-    def on_grid(self, counts: NDArray, level: float, good: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Counts on the grid, (k, 2, n), good points, (k, ny, nx), and bad and saturated pixels, (k,)."""
-        k = len(counts)
-        raw = np.empty((k, *self.dark.shape), np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):  # larger numbers become infinite: bad pixels
-            for index, (image, rows, columns) in enumerate(self.boxes):
-                raw[:, index] = counts[:, image][:, rows][:, :, columns]
-            odd = ~((raw < level) & (raw > -_check.LARGEST) | self.bad)
-            good = np.broadcast_to(good, (k, *good.shape))
-            n_bad = n_saturated = np.zeros(k, int)
-            strange = odd.any(axis=(1, 2, 3))
-            if strange.any():
-                spoiled = odd & self.watched
-                n_bad = np.count_nonzero(spoiled, axis=(1, 2, 3))
-                n_saturated = np.count_nonzero(spoiled & (raw >= level), axis=(1, 2, 3))
-                good = good & ~self._touched(spoiled)
-            raw -= self.dark
-        flat = raw.reshape(k, len(self.boxes), -1)
-        for index, (pixels, nearest) in enumerate(self.repairs):
-            flat[:, index, pixels] = flat[:, index, nearest]
-        for place in np.flatnonzero(strange):
-            for index, one in enumerate(odd[place]):
-                usable = ~(one | self.bad[index])
-                raw[place, index] = nearest_good(raw[place, index], usable) if usable.any() else 0
-        coefficients = self.filters[0] @ raw @ self.filters[1].T
-        values = np.stack(
-            [spline @ coefficients[:, index].reshape(k, -1).T for index, spline in enumerate(self.splines)]
-        )
-        return np.ascontiguousarray(values.transpose(2, 0, 1)), good, n_bad, n_saturated
-
-    def filled(self, phase: NDArray, good: NDArray) -> NDArray:
-        """Phases (k, ny, nx) with bad points replaced by the nearest good one."""
-        flat = phase.reshape(len(phase), -1)
-        inside = self.reconstruct.sensor.pupil.inside
-        flat[:, self.holes[0]] = flat[:, self.holes[1]]
-        n_static = np.count_nonzero(inside) - len(self.holes[0])
-        for index in np.flatnonzero(np.count_nonzero(good, axis=(1, 2)) < n_static):
-            if good[index].any():
-                phase[index] = np.where(inside, nearest_good(phase[index], good[index]), 0)
-        return phase
-
-    def _touched(self, spoiled: NDArray) -> NDArray[np.bool_]:
-        """Points with a bad pixel on one of their sides: (k, 2, h, w) to (k, ny, nx)."""
-        k, shape = len(spoiled), self.offset.shape[1:]
-        weights = sum(
-            one @ spoiled[:, index].reshape(k, -1).T.astype(np.float32) for index, one in enumerate(self.touching)
-        )
-        return (weights.T > _TOUCHED).reshape(k, *shape)
-
-
 def calibrate(
     frame_files: Sequence[str | Path],
     pupil_files: Sequence[str | Path],
@@ -674,7 +492,7 @@ def calibrate(
         Of the camera, see `zwfs.frames.files.images`. Without it the frames to come are compared with SATURATE of
         the header, or with the largest number of their type.
     fitted : sequence of str
-        Parameters that `zwfs.frames.pipeline.fit` fits to these frames.
+        Parameters that `zwfs.frames.refine.fit` fits to these frames.
     n_iterations : int
     tolerance : float, radian
     **settings
@@ -769,76 +587,3 @@ def _undoing(measurement: Measurement) -> tuple[NDArray[np.float64], NDArray[np.
 
     offset = undone(0, 0)
     return np.stack([(undone(*light) - offset)[:, 0, 0] for light in ((1, 0), (0, 1))], axis=1), offset
-
-
-def _places(registered: RegisteredFrames) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Row and column of each point of the grid on the two frames, (2, 2, ny, nx), and counts there of one count.
-
-    `RegisteredFrames` resamples images whose counts are the number of the row or of the column. They reach beyond
-    the camera, since splines bend ramps at the edge.
-    """
-    wide = [length + 2 * _FAR for length in registered.frames[0].counts.shape]
-    origins = registered.origins + np.array([[_FAR], [_FAR], [0], [0]])
-
-    def on_grid(counts: NDArray) -> NDArray[np.float64]:
-        image = Image(counts, np.zeros(counts.shape, bool))
-        return replace(registered, frames=(image, image), origins=origins).frames_on_grid()[0]
-
-    response = on_grid(np.ones(wide))
-    ramps = np.indices(wide).astype(float) - _FAR
-    return np.stack([on_grid(ramp) / response for ramp in ramps], axis=1), response.mean(axis=(1, 2))
-
-
-def _span(low: int, size: int, length: int) -> Any:
-    """Indices of an axis of the camera; beyond the edge it is repeated."""
-    if low >= 0 and low + size <= length:
-        return slice(low, low + size)
-    return np.clip(np.arange(low, low + size), 0, length - 1)
-
-
-def _repair(bad: NDArray[np.bool_], good: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
-    """Flat indices of bad pixels and of the nearest good ones."""
-    if not bad.any() or not good.any():
-        return np.zeros(0, int), np.zeros(0, int)
-    nearest = nearest_good(np.arange(bad.size, dtype=float).reshape(bad.shape), good).astype(int)
-    return np.flatnonzero(bad), nearest[bad]
-
-
-def _spline_filter(size: int) -> NDArray[np.float32]:
-    """Matrix from samples to the coefficients of a cubic spline near the pupil."""
-    matrix = ndimage.spline_filter1d(np.eye(size), 3, axis=0, mode="nearest")
-    matrix = np.where(np.abs(matrix) > _NEGLIGIBLE, matrix, 0).astype(np.float32)
-    return np.ascontiguousarray(matrix[_CUT:-_CUT])
-
-
-def _cubic(places: NDArray, size: tuple[int, int], inside: NDArray) -> Any:
-    """Sparse matrix from coefficients of cubic splines, (h w), to places (2, n); 0 to those not inside."""
-    base = np.floor(places)
-    t = places - base
-    u = 1 - t
-    weights = np.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / 6
-    return _interpolation(base.astype(int) - 1, weights * inside, size)
-
-
-def _linear(places: NDArray, size: tuple[int, int]) -> Any:
-    """Sparse matrix of linear interpolation, from pixels (h w) to places (2, n)."""
-    base = np.floor(places)
-    return _interpolation(base.astype(int), np.stack([1 - (places - base), places - base]), size)
-
-
-def _interpolation(first: NDArray, weights: NDArray, size: tuple[int, int]) -> Any:
-    """Sparse matrix with weights (m, 2, n) of the m rows and m columns from the first, (2, n)."""
-    m, _, n = weights.shape
-    values = weights[:, np.newaxis, 0] * weights[np.newaxis, :, 1]
-    values = np.where(np.abs(values) > _NEGLIGIBLE, values, 0)
-    steps = np.arange(m)
-    rows = first[0] + steps[:, np.newaxis, np.newaxis]
-    columns = first[1] + steps[np.newaxis, :, np.newaxis]
-    pixels = rows * size[1] + columns
-    points = np.broadcast_to(np.arange(n), pixels.shape)
-    shape = n, size[0] * size[1]
-    matrix = sparse.csr_array((values.ravel(), (points.ravel(), pixels.ravel())), shape=shape, dtype=np.float32)
-    matrix.eliminate_zeros()
-    # Half the bytes of each index: reading them takes much of the time of a product.
-    matrix.indices, matrix.indptr = matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32)
-    return matrix

@@ -1,24 +1,20 @@
 """Camera frames to phase: normalise, model the sensor from its own pupil, reconstruct, and judge.
 
 The images come from `zwfs.frames.files`, their places from `zwfs.frames.registration`. Uncertain properties of the
-sensor are parameters of `Optics`. `fit` seeks values that explain the frames better. They need not make the phase
-better: with two images for one unknown at each point, the iteration explains much of any pair of frames.
-`predict_other` is the stricter test.
+sensor are parameters of `Optics`, which `zwfs.frames.refine` fits. `predict_other` tests a phase on unseen data.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 
 from zwfs import _check
-from zwfs.frames.registration import Image, RegisteredFrames, correlations, nearest_good, radius, register_frames
+from zwfs.frames.registration import RegisteredFrames, correlations, nearest_good, radius
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
@@ -90,19 +86,6 @@ class Optics:
     def opposite(self) -> bool:
         """Whether the two phase shifts are +theta and -theta, modulo 2 pi."""
         return abs(np.exp(1j * sum(self.phase_shifts)) - 1) < 1e-9
-
-
-# Lowest and highest value, and a typical change, of each parameter of `fit`, and of a shift in pixels.
-_SHIFT_RANGE = (-3.0, 3.0, 0.3)
-_RANGES = {
-    "background": (-0.5, 0.9, 0.05),
-    "pupil_background": (-0.9, 0.9, 0.1),
-    "scale": (0.2, 5.0, 0.1),
-    "diameter": (0.3, 3.0, 0.05),
-    "leakage": (0.0, 0.45, 0.05),
-    "unmasked": (0.0, 0.9, 0.1),
-}
-_CHANGE = 0.1  # step of a derivative over the typical change: smaller steps amplify the jumps of single points
 
 
 @dataclass(frozen=True, eq=False)
@@ -436,90 +419,6 @@ def upside_down(measurement: Measurement) -> Measurement:
     return replace(measurement, **flipped)
 
 
-def fit(
-    registered: RegisteredFrames, optics: Optics, names: Sequence[str], n_iterations: int = 25, n_steps: int = 8
-) -> tuple[RegisteredFrames, Optics]:
-    """Seek parameters of the model, and the registration, for which the modelled frames agree best.
-
-    A least-squares search makes `MeasuredPhase.misfit` small. The light next to the pupil counts as much as that
-    in it: there no phase can hide an error of the model.
-
-    Parameters
-    ----------
-    registered : RegisteredFrames
-    optics : Optics
-        Start of the search.
-    names : sequence of str
-        Parameters of `Optics` other than the phase shifts; "registration" stands for the shifts of all images
-        but the first clear frame, six numbers.
-    n_iterations : int
-        As for `recover_phase`.
-    n_steps : int
-        Of the least-squares search, at most.
-
-    Returns
-    -------
-    RegisteredFrames, Optics
-
-    Raises
-    ------
-    ValueError
-        If a name is unknown or there twice, or `optics` begins out of the range of a
-        fit.
-    """
-    _check.instance("registered", registered, RegisteredFrames)
-    _check_fit("names", names, optics)
-    n_iterations = _check.integer("n_iterations", n_iterations, 1)
-    n_steps = _check.integer("n_steps", n_steps, 1)
-    if not names:
-        return registered, optics
-    # The unknowns are values of the optics, then a shift (rows, columns) of each of these images.
-    values = [name for name in names if name in _RANGES]
-    images = [0, 1, 3] if "registration" in names else []
-    n_shifts = 2 * len(images)
-    start = [*(getattr(optics, name) for name in values), *[0.0] * n_shifts]
-    low, high, step = np.transpose([*(_RANGES[name] for name in values), *[_SHIFT_RANGE] * n_shifts])
-    change = _CHANGE * step
-    margin = registered.margin  # the same in each trial, so that the number of residuals stays
-
-    def trial(unknowns: NDArray) -> tuple[RegisteredFrames, Optics]:
-        origins = registered.origins.copy()
-        origins[images] += unknowns[len(values) :].reshape(-1, 2)
-        changes: dict[str, Any] = dict(zip(values, unknowns.tolist(), strict=False))
-        return replace(registered, origins=origins), replace(optics, **changes)
-
-    def residuals(unknowns: NDArray) -> NDArray:
-        # Finite differences need a smooth function, so no trial may end an iteration earlier than its neighbours.
-        return recover_phase(_reduce(*trial(unknowns), margin), n_iterations, 1e-8).mismatch.ravel()
-
-    def jacobian(unknowns: NDArray) -> NDArray:
-        base = residuals(unknowns)
-        around = unknowns + np.diag(np.where(unknowns + change > high, -change, change))
-        slopes = [(residuals(one) - base) / (one - unknowns)[index] for index, one in enumerate(around)]
-        return np.transpose(slopes)
-
-    best = optimize.least_squares(residuals, start, jacobian, bounds=(low, high), x_scale=step, max_nfev=n_steps)
-    return trial(best.x)
-
-
-def _check_fit(argument: str, names: Any, optics: Any) -> None:
-    """Require names of different parameters that `fit` knows, and optics from which it can start."""
-    _check.instance("optics", optics, Optics)
-    known = (*_RANGES, "registration")
-    listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
-    if not listed or not all(isinstance(name, str) and name in known for name in names):
-        raise ValueError(f"{argument} = {_check.shown(names)}: expected a list with some of {list(known)}")
-    if len(set(names)) < len(names):
-        raise ValueError(f"{argument} = {_check.shown(names)}: expected each name once")
-    for name in set(names) & set(_RANGES):
-        low, high, _ = _RANGES[name]
-        if not low <= getattr(optics, name) <= high:
-            raise ValueError(
-                f"{argument} holds {name!r}, and {name} = {getattr(optics, name)}: "
-                f"expected a start in [{low:g}, {high:g}] for a fit"
-            )
-
-
 def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:
     """Counts around the pupils of the clear frames, for frames and clear frames, (4,); 0 where cut."""
     levels = []
@@ -556,78 +455,3 @@ def _unmix(frames: NDArray, measurement: Measurement) -> NDArray[np.float64]:
     pure[(..., *measurement.window)] -= optics.unmasked * measurement.pupil.amplitude**2
     pure /= 1 - optics.unmasked
     return ((1 - optics.leakage) * pure - optics.leakage * pure[::-1]) / (1 - 2 * optics.leakage)
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """Result of one of the `steps`.
-
-    Attributes
-    ----------
-    name : str
-    result : MeasuredPhase
-    predicted : ndarray, shape (2,)
-        Correlation of each frame with the prediction from the other one alone, see `predict_other`.
-    control : ndarray, shape (2,)
-        The same with the second frame upside down.
-    """
-
-    name: str
-    result: MeasuredPhase
-    predicted: NDArray[np.float64]
-    control: NDArray[np.float64]
-
-
-def steps(
-    frames: Sequence[Image],
-    clear_frames: Sequence[Image],
-    optics: Optics,
-    fitted: Sequence[str] = ("registration", "background", "scale"),
-    n_iterations: int = 25,
-    **settings: Any,
-) -> list[Step]:
-    """Reconstruct a pair of frames step by step, and judge each step.
-
-    Parameters
-    ----------
-    frames, clear_frames : sequence of one or two Images
-    optics : Optics
-    fitted : sequence of str
-        Parameters to fit, see `fit`: with each step one more, and all earlier ones again.
-    n_iterations : int
-        As for `recover_phase`.
-    **settings
-        Of `register_frames`: pupil_centers, pupil_diameter, exposure.
-
-    Returns
-    -------
-    list of Step
-        The last one holds the result.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `register_frames`, `reduce_frames` and `fit` do.
-    """
-    _check_fit("fitted", fitted, optics)
-    n_iterations = _check.integer("n_iterations", n_iterations, 1)
-    work = []
-
-    def add(name: str, registered: RegisteredFrames, optics: Optics) -> None:
-        measurement = reduce_frames(registered, optics)
-        scores = (predict_other(one, n_iterations) for one in (measurement, upside_down(measurement)))
-        work.append(Step(name, recover_phase(measurement, n_iterations), *scores))
-
-    switches: dict[str, Any] = dict.fromkeys(("subpixel", "background", "balance"), False)
-    add("outlines of the pupils", register_frames(frames, clear_frames, **settings, **switches), optics)
-    for switch, name in (
-        ("subpixel", "registration by content"),
-        ("background", "background around the pupils"),
-        ("balance", "balance of the flux"),
-    ):
-        switches[switch] = True
-        add(name, register_frames(frames, clear_frames, **settings, **switches), optics)
-    for number, name in enumerate(fitted, 1):
-        last = work[-1].result.measurement
-        add(f"fit of {name.replace('_', ' ')}", *fit(last.registered, last.optics, fitted[:number], n_iterations))
-    return work

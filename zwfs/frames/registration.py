@@ -14,9 +14,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, optimize
+from scipy import ndimage
 
 from zwfs import _check
+from zwfs.frames._outline import Details, not_cut, outline, threshold, turning
 
 __all__ = ["Placement", "RegisteredFrames", "register_frames"]
 
@@ -129,7 +130,7 @@ class Placement:
     @property
     def matrix(self) -> NDArray[np.float64]:
         """Rotation and magnification, for (row, column), shape (2, 2)."""
-        return _turned(self.rotation, self.magnification)
+        return turning(self.rotation, self.magnification)
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,7 +354,7 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
     smooth = ndimage.gaussian_filter(image.counts, 1.0)
     if np.ptp(smooth) <= 1e-9 * np.abs(smooth).max(initial=1e-300):
         raise ValueError(f"{image.name}: every pixel is {smooth.flat[0]:.6g}: expected light in a pupil")
-    level = _threshold(smooth)
+    level = threshold(smooth)
     bright = ndimage.binary_opening(smooth > level, iterations=2)
     # Gaps between segments, and vanes, divide a pupil.
     bright = ndimage.binary_closing(np.pad(bright, 8), iterations=6)[8:-8, 8:-8]
@@ -366,11 +367,11 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
             f"{image.name}: {count} bright regions as large as a pupil: expected {n_pupils}; "
             "give the positions, or look for stray light"
         )
-    circles = [_outline(smooth, labels == label, level) for label in largest]
+    circles = [Circle(*outline(smooth, labels == label, level)) for label in largest]
     if diameter is not None:
         circles = [replace(circle, diameter=diameter) for circle in circles]
     for circle in circles:
-        _not_cut(circle, image)
+        not_cut(circle, image)
     places = np.array([(circle.row, circle.column) for circle in circles])
     return tuple(circles[index] for index in np.argsort(places[:, np.argmax(np.ptp(places, axis=0))]))
 
@@ -431,8 +432,8 @@ def register(
     # Details of three times the width, at every third point, draw the search from farther away.
     thin = np.zeros_like(inside)
     thin[::3, ::3] = True
-    coarse = _Details.of(image, reference, inside & thin if np.any(inside & thin) else inside, 3 * blur)
-    details = _Details.of(image, reference, inside, blur)
+    coarse = Details.of(image, reference, inside & thin if np.any(inside & thin) else inside, 3 * blur)
+    details = Details.of(image, reference, inside, blur)
     stretch = (magnification - 1) * details.reach if turn else 0.0
     steps = range(-_REACH, _REACH + 1)
     moves = [(y, x, 0.0, stretch) for y in steps for x in steps]
@@ -451,77 +452,6 @@ def register(
     scale = np.array([1, 1, np.degrees(1 / details.reach), 1 / details.reach])
     rows, columns, rotation, stretch = best * scale
     return Placement(np.array([rows, columns]), float(rotation), float(1 + stretch), sigma * scale)
-
-
-@dataclass(frozen=True, eq=False)
-class _Details:
-    """Band-passed image and reference, and their difference after a move.
-
-    A move is (rows, columns, rotation, stretch), all in pixels; the last two at the edge of the points.
-    """
-
-    image: NDArray[np.float64]  # coefficients of splines
-    reference: NDArray[np.float64]
-    points: NDArray[np.float64]  # (2, n), from the middle
-    middle: NDArray[np.float64]
-    reach: float  # pixels from the middle to the farthest point
-    block: NDArray[np.int64]  # number of the block of pixels that a point belongs to
-
-    @classmethod
-    def of(cls, image: NDArray, reference: NDArray, inside: NDArray, blur: float) -> _Details:
-        bands = (
-            ndimage.gaussian_filter(one, blur) - ndimage.gaussian_filter(one, 4 * blur)
-            for one in (image, reference)
-        )
-        splines = [ndimage.spline_filter(band, order=3, mode="nearest") for band in bands]
-        places = np.argwhere(inside).T
-        middle = (np.array(inside.shape)[:, np.newaxis] - 1) / 2
-        points = places - middle
-        # Errors of neighbours go together: those of different blocks hardly do.
-        size = max(1, round(8 * blur))
-        block = np.unique(places[0] // size * inside.shape[1] + places[1] // size, return_inverse=True)[1]
-        return cls(splines[0], splines[1], points, middle, float(np.hypot(*points).max()), block)
-
-    def search(self, start: NDArray, free: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Best move and its standard errors, pixels; what is not free keeps its start."""
-
-        def move(values: NDArray) -> NDArray[np.float64]:
-            full = start.copy()
-            full[free] = values
-            return full
-
-        best = optimize.least_squares(
-            lambda values: self.difference(move(values)), start[free], x_scale=0.1, xtol=1e-5, ftol=1e-9, gtol=1e-9
-        )
-        sigma = np.full(4, np.nan)
-        sigma[free] = self._errors(best.jac, best.fun, free)
-        return move(best.x), sigma
-
-    def difference(self, move: Any) -> NDArray[np.float64]:
-        """Moved image less the reference, each of mean 0 and norm 1."""
-        return self._at(self.image, move) - self._at(self.reference, np.zeros(4))
-
-    def _at(self, spline: NDArray, move: Any) -> NDArray[np.float64]:
-        turned = _turned(np.degrees(move[2] / self.reach), 1 + move[3] / self.reach) @ self.points
-        places = self.middle + np.reshape(move[:2], (2, 1)) + turned
-        values = ndimage.map_coordinates(spline, places, order=3, mode="nearest", prefilter=False)
-        values -= values.mean()
-        return values / max(float(np.linalg.norm(values)), 1e-300)
-
-    def _errors(self, slopes: NDArray, difference: NDArray, free: NDArray) -> NDArray[np.float64]:
-        """Standard errors of the free values: the curvature, and the scatter of the gradient between blocks.
-
-        The curvature is the product of the slopes of image and reference. Their noise is independent, so that
-        noise alone makes no curvature.
-        """
-        moves = 0.1 * np.eye(4)[free]
-        other = [(self._at(self.reference, one) - self._at(self.reference, -one)) / 0.2 for one in moves]
-        curvature = slopes.T @ np.transpose(other)
-        curvature += 1e-9 * np.trace(slopes.T @ slopes) * np.eye(len(moves))
-        gradient = np.zeros((self.block.max() + 1, len(moves)))
-        np.add.at(gradient, self.block, slopes * difference[:, np.newaxis])
-        weight = np.linalg.pinv(curvature)
-        return np.sqrt(np.diag(weight @ (gradient.T @ gradient) @ weight.T))
 
 
 def nearest_good(image: NDArray, good: NDArray) -> NDArray:
@@ -574,82 +504,11 @@ def correlations(first: NDArray, second: NDArray) -> NDArray[np.float64]:
     return np.divide(np.sum(first * second, axis=1), scale, out=np.zeros(len(scale)), where=scale > 0)
 
 
-def _turned(rotation: float, magnification: float) -> NDArray[np.float64]:
-    """Matrix of a rotation (degrees) and a magnification, for (row, column)."""
-    sine, cosine = np.sin(np.radians(rotation)), np.cos(np.radians(rotation))
-    return magnification * np.array([[cosine, sine], [-sine, cosine]])
-
-
 def _check_images(name: str, images: Any) -> None:
     """Require a sequence of one or two Images."""
     _check.sequence(name, images, Image)
     if len(images) not in (1, 2):
         raise ValueError(f"{name} holds {len(images)} images: expected 1 or 2")
-
-
-def _threshold(image: NDArray) -> float:
-    """Otsu's level: it parts the pixels in two classes of the least variance."""
-    number, edges = np.histogram(image, 256)
-    middle = (edges[1:] + edges[:-1]) / 2
-    below, moment = np.cumsum(number), np.cumsum(number * middle)
-    above = below[-1] - below
-    between = (moment[-1] * below / below[-1] - moment) ** 2 / np.maximum(below * above, 1)
-    return float(middle[np.argmax(np.where(above > 0, between, 0))])
-
-
-def _outline(image: NDArray, region: NDArray, level: float) -> Circle:
-    """Circle through the edge of a pupil, to a fraction of a pixel.
-
-    The edge lies where rays from the centre cross half of their bright level for the last time. A region of bright
-    pixels gives the first centre and radius. Each pass then takes both from the circle through the edge points.
-    """
-    region = ndimage.binary_fill_holes(region)
-    row, column = ndimage.center_of_mass(region)
-    radius = np.sqrt(np.count_nonzero(region) / np.pi)
-    dark = np.median(image[image <= level])
-    angles = np.arange(720) * np.pi / 360
-    sine, cosine = np.sin(angles), np.cos(angles)
-    for _ in range(4):
-        # Not beyond 1.08 radii: the next pupil may begin close to this one.
-        reach = np.arange(0.7 * radius, 1.08 * radius, 0.05)
-        rays = np.array([row + np.outer(sine, reach), column + np.outer(cosine, reach)])
-        light = ndimage.map_coordinates(image, rays, order=1, mode="constant", cval=dark)
-        # The bright level belongs to the ray, because the pupil may be lit unevenly.
-        bright = np.median(light[:, reach < 0.93 * radius], axis=1, keepdims=True)
-        inside = light > (dark + bright) / 2
-        last = reach[inside.shape[1] - 1 - np.argmax(inside[:, ::-1], axis=1)]
-        edge = np.stack([row + last * sine, column + last * cosine], axis=1)
-        row, column, radius = _circle_through(edge[inside.any(axis=1)])
-    return Circle(float(row), float(column), float(2 * radius))
-
-
-def _circle_through(points: NDArray) -> tuple[float, float, float]:
-    """Least-squares circle (row, column, radius) through the points, without outliers."""
-    keep = np.ones(len(points), bool)
-    for _ in range(10):
-        some = points[keep]
-        a, b, c = np.linalg.lstsq(np.c_[2 * some, np.ones(len(some))], np.sum(some**2, axis=1), rcond=None)[0]
-        radius = np.sqrt(c + a**2 + b**2)
-        distance = np.hypot(points[:, 0] - a, points[:, 1] - b) - radius
-        distance -= np.median(distance)
-        keep = np.abs(distance) <= 3 * (1.5 * np.median(np.abs(distance)) + 0.05)
-    return a, b, radius
-
-
-def _not_cut(circle: Circle, image: Image) -> None:
-    """Refuse a pupil that reaches beyond the image."""
-    ends = {
-        "top": circle.row - circle.diameter / 2 + 0.5,
-        "left": circle.column - circle.diameter / 2 + 0.5,
-        "bottom": image.counts.shape[0] - 0.5 - circle.row - circle.diameter / 2,
-        "right": image.counts.shape[1] - 0.5 - circle.column - circle.diameter / 2,
-    }
-    side, room = min(ends.items(), key=lambda item: item[1])
-    if room < -2:
-        raise ValueError(
-            f"{image.name}: the pupil at row {circle.row:.1f}, column {circle.column:.1f}, {circle.diameter:.1f} "
-            f"pixels wide, is cut off at the {side} (row 0 is the top): expected all of it on the image"
-        )
 
 
 def _require_same_size(circles: tuple[Circle, Circle], images: tuple[Image, Image]) -> None:
@@ -680,7 +539,7 @@ def _locate(
     else:
         circles = tuple(Circle(row, column, diameter) for row, column in places.tolist())
         for circle, image in zip(circles, _pair(images), strict=True):
-            _not_cut(circle, image)
+            not_cut(circle, image)
     images = _pair(images)
     if images[0] is images[1]:
         return _pair([_extend(images[0], circles)]), _pair(circles)

@@ -22,8 +22,9 @@ from zwfs._system import one_thread, path_of, paths_of
 from zwfs.frames._fits import fits_module
 from zwfs.frames._part import Cards, Part, Unit, plan_of
 from zwfs.frames._stack import Stack
-from zwfs.frames.calibration import Calibration, Flag, Phases
+from zwfs.frames.calibration import Calibration
 from zwfs.frames.files import FileError, check_output
+from zwfs.frames.phases import Flag, Phases
 from zwfs.modes import zernike_basis
 
 _CHUNK = 2**24  # bytes of camera images that a thread handles at once

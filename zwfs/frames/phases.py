@@ -1,0 +1,78 @@
+"""Phases of many pairs of frames, and flags that say what is wrong with each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Flag(IntFlag):
+    """What is wrong with a frame; flags add up.
+
+    Attributes
+    ----------
+    LOST
+        The frame has less than a tenth of the light of the calibration, or more than a fifth of the pupil is bad.
+        Its phase is NaN.
+    BAD_PIXELS
+        Pixels are NaN, infinite or saturated that are good in the calibration.
+    SATURATED
+        Some of these are saturated.
+    INCONSISTENT
+        No phase explains the frame: its residual exceeds the limit of the call.
+    NOT_CONVERGED
+        The iteration used all its steps.
+
+    Examples
+    --------
+    >>> from zwfs.frames.phases import Flag
+    >>> [flag.name for flag in Flag(6)]
+    ['BAD_PIXELS', 'SATURATED']
+    """
+
+    LOST = 1
+    BAD_PIXELS = 2
+    SATURATED = 4
+    INCONSISTENT = 8
+    NOT_CONVERGED = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Phases:
+    """Phases of camera images; `...` is the batch of the exposures.
+
+    Attributes
+    ----------
+    phase : ndarray of float32, shape (..., ny, nx), radian
+        In (-pi, pi], NaN outside the pupil, at bad points, and everywhere if the frame is lost.
+    filled : ndarray of float32, shape (..., ny, nx), radian
+        The same with bad points filled with the phase of the nearest good one, and 0 outside the pupil.
+    flux : ndarray of float32, shape (...)
+        Light of the pupil relative to the calibration, mean of the two images.
+    n_bad, n_saturated : ndarray of int, shape (...)
+        Pixels of both images that are bad here and good in the calibration, and those of them that are saturated.
+    residual : ndarray of float32, shape (...)
+        Rms difference of measured and modelled frames in the pupil; 1 = mean of a clear frame.
+    n_iterations : ndarray of int, shape (...)
+    flags : ndarray of int, shape (...)
+        Sum of `Flag`; 0 is a good frame.
+    """
+
+    phase: NDArray[np.float32]
+    filled: NDArray[np.float32]
+    flux: NDArray[np.float32]
+    n_bad: NDArray[np.int64]
+    n_saturated: NDArray[np.int64]
+    residual: NDArray[np.float32]
+    n_iterations: NDArray[np.int64]
+    flags: NDArray[np.int64]
+
+    @classmethod
+    def joined(cls, parts: list[Phases], batch: tuple[int, ...]) -> Phases:
+        """Join parts of a batch, with one axis each, and return them in its shape."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        whole = (column[0] if len(column) == 1 else np.concatenate(column) for column in columns)
+        return cls(*(array.reshape((*batch, *array.shape[1:])) for array in whole))

@@ -482,13 +482,22 @@ class Minimum:
 
 
 def minimise(
-    problem: Problem, x: NDArray | None = None, n_steps: int = 30, n_inner: int = 60, log: Any = None
+    problem: Problem,
+    x: NDArray | None = None,
+    n_steps: int = 30,
+    n_inner: int = 60,
+    enough: float = 0.0,
+    log: Any = None,
 ) -> Minimum:
-    """Levenberg and Marquardt's method on all unknowns, until a step promises no more than a part of 1."""
+    """Levenberg and Marquardt's method on all unknowns, until a step promises no more than a part of 1.
+
+    It ends earlier when a step promises less than `enough` of the cost.
+    """
     point = Point(problem, problem.start if x is None else x)
     damping, converged, step = 1e-2, False, 0
     n, bounds = problem.n_white, problem.bounds
-    while step < n_steps and not converged:
+    promised = math.inf
+    while step < n_steps and not converged and promised > enough * point.cost:
         step += 1
         for _ in range(10):
             change = point.solve(-point.gradient, point.stuck, n_inner, 0.03, damping)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
-from zwfs.frames.registration import register_frames
+from zwfs.frames.registration import Image, register_frames
 from zwfs.frames.verdict import CameraNoise, judge, near_edges
 
 from . import foreign
+from .hcipy_bench import HcipyBench
 
 
 @pytest.fixture(scope="module", params=foreign.CASES)
@@ -80,3 +81,23 @@ def test_frames_that_do_not_belong_together_score_like_the_control():
     assert np.all(verdict.score < 0.3)
     assert verdict.explained is None
     assert verdict.sigma is None
+
+
+@pytest.mark.parametrize("aperture", ["LUVOIR", pytest.param("GMT", marks=pytest.mark.slow), "Keck"])
+def test_pupils_with_many_edges_are_measured_if_their_diameter_is_given(aperture):
+    """The circle through the outline of segments is up to a tenth smaller than D, which scales the dimple."""
+    bench = HcipyBench(aperture)
+    screen = bench.smooth(0.5, seed=1)
+    frames, clear_frames = (
+        [Image(one, np.zeros(one.shape, bool)) for one in bench.counts(phase, (7, 1), masked)]
+        for phase, masked in ((screen, True), (0 * screen, False))
+    )
+    registered = register_frames(frames, clear_frames, pupil_diameter=float(bench.pixels))
+    found = recover_phase(reduce_frames(registered, Optics())).phase
+    start = (bench.side - bench.pixels) // 2
+    first = [start - corner for corner in registered.corner]
+    window = tuple(slice(one, one + bench.pixels) for one in first)
+    lit = bench.fully_lit & np.isfinite(found[window])
+    left = np.exp(1j * (found[window] - bench.on_pupil(screen)))[lit]
+    assert np.count_nonzero(lit) > 0.98 * np.count_nonzero(bench.fully_lit)
+    assert np.angle(left * np.conj(left.mean())).std() < 0.02

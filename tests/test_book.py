@@ -105,7 +105,7 @@ def plain(text):
 
 
 def articles():
-    for file in sorted(HTML.glob("*/*.html")):
+    for file in sorted(HTML.glob("[!_]*/*.html")):  # without the sources
         if article := read(file).select_one("article"):
             yield article
 

@@ -461,7 +461,7 @@ def test_real_figure_has_its_files_and_the_numbers_of_equations(tmp_path):
     assert len(files[".csv"].read_text().splitlines()) == 41
     plain = re.sub(r"<script>.*?</script>|<[^>]*>", "", files[".html"].read_text(), flags=re.S)
     assert "Figure 1 of the paper. Top" in plain
-    assert re.search(r"interfering\s+waves \(\d+\)", plain), "equations have the numbers of the book"
+    assert re.search(r"two\s+waves \(\d+\)", plain), "equations have the numbers of the book"
 
 
 @pytest.mark.slow

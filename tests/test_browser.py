@@ -151,7 +151,7 @@ def test_search_finds_a_chapter_before_the_api(page):
     page.goto(f"{address('search.html')}?q=Gerchberg")
     results = page.locator("#search-results li a")
     results.first.wait_for()
-    page.wait_for_function("document.querySelector('.search-summary').textContent.includes('found')")
+    page.locator(".search-summary", has_text="found").wait_for()
     found = [link.get_attribute("href") for link in results.all()]
     api = ["book/api" in one for one in found]
     assert 0 < sum(api) < len(api)

@@ -75,8 +75,11 @@ def pattern(missing: dict[str, str]) -> re.Pattern[str]:
 
 
 def in_prose(text: nodes.Text) -> bool:
-    """Whether a text stands in a paragraph, and not in a link, in a table or in the text of another page."""
+    """Whether a text stands in a paragraph, and not in a link, a button, a table or the text of another page."""
     parent = text.parent
+    place = parent.index(text)
+    if place and isinstance(parent[place - 1], nodes.raw) and parent[place - 1].astext().startswith("<button"):
+        return False
     while isinstance(parent, PROSE):
         if isinstance(parent, nodes.paragraph):
             return not isinstance(parent.parent, nodes.entry)

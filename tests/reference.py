@@ -57,18 +57,6 @@ class HcipySensor:
         """Frames, shape (n_masks, ny, nx)."""
         return np.abs(self.propagate(self.pupil.amplitude * np.exp(1j * phase))) ** 2
 
-    def phase_shifted(self, frames, n_iterations):
-        """Section 3.1 with two dimples: equation (10) at every point, from a flat start."""
-        amplitude = self.pupil.amplitude
-        field = amplitude.astype(complex)
-        for _ in range(n_iterations):
-            a, b = self.propagate(field) - field
-            right_a, right_b = frames - np.abs([a, b]) ** 2 - amplitude**2
-            # The solution times the determinant, which is positive for the pair +-pi/2.
-            phasor = 1j * (right_b * a - right_a * b) * np.sign((np.conj(a) * b).imag)
-            field = amplitude * np.exp(1j * np.angle(phasor))
-        return np.angle(field)
-
 
 def prysm_propagation(n_pixels, mask, n_samples):
     """Function from a field, shape (n, n), to the field behind the mask, by the matrix transforms of prysm.

@@ -121,7 +121,7 @@ def valid() -> dict:
         "MaximumLikelihood.prior": np.eye(5),
         **{f"{name}.sensor": one.sensor for name, one in methods.items()},
         **{f"{name}.__call__.frames": one.sensor.measure(phase) for name, one in methods.items()},
-        **{f"{name}.__call__.start": None for name, one in methods.items() if not one.iterative},
+        **{f"{name}.__call__.start": 0.1 * phase if one.iterative else None for name, one in methods.items()},
     }  # fmt: skip
     instances = {
         "Pupil": pupil,
@@ -136,6 +136,9 @@ def valid() -> dict:
         "Reconstruction": method(shifted.measure(phase)),
         **methods,
     }
+    for value in arguments.values():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)  # who writes to an input raises
     return {"arguments": arguments, "instances": instances}
 
 

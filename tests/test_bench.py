@@ -320,11 +320,6 @@ def test_counts_scatter_as_those_of_a_camera(perfect):
     assert dark.var() == pytest.approx(background + read_noise**2, rel=0.05)
 
 
-def test_a_frame_holds_the_photons_that_it_should():
-    bench = ideal(photons=1e9, flux_imbalance=0.1)
-    np.testing.assert_allclose(bench.clear_frames(1).sum(axis=(1, 2)), [1.1e9, 0.9e9], rtol=3e-4)
-
-
 @pytest.mark.parametrize("shoot", [Bench.frames, Bench.clear_frames, Bench.dark])
 def test_noise_follows_the_seed(shoot):
     bench = Bench(**SMALL)
@@ -497,12 +492,3 @@ def test_bad_parameters_are_named(change):
 def test_bad_input_is_named(perfect, model, call, message):
     with pytest.raises(ValueError, match=message):
         call(model, perfect)
-
-
-# The pupil of a bench
-
-
-def test_pupil_from_the_segments_of_another_is_that_pupil():
-    again = Pupil.from_segments(LAYOUT.segments)
-    np.testing.assert_array_equal(again.amplitude, LAYOUT.amplitude)
-    assert (again.n_pixels, again.center) == (LAYOUT.n_pixels, LAYOUT.center)

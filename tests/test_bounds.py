@@ -45,7 +45,7 @@ def dense_bound(sensor, phase, photons, read_noise=0.0, modes=None, amplitude=No
 
 
 @given(sensors(), seeds, st.floats(0, 1.5), st.floats(1, 1e5), st.sampled_from([0.0, 0.5, 20.0]))
-@settings(max_examples=6)  # a dense matrix takes long
+@settings(max_examples=4)  # a dense matrix takes long
 def test_bound_is_that_of_a_dense_matrix(sensor, seed, rms, photons, read_noise):
     phase = rms * np.random.default_rng(seed).normal(size=sensor.pupil.shape)
     expected, condition = dense_bound(sensor, phase, photons, read_noise)
@@ -138,7 +138,6 @@ def test_what_a_bound_refuses(small):
     pair, phase = ZernikeSensor(small, *THREE[:2]), np.zeros(small.shape)
     for options, message in (
         ({"photons": 0}, "photons = 0"),
-        ({"photons": None}, "photons = None"),
         ({"photons": 10, "read_noise": -1}, "read_noise = -1"),
         ({"photons": 10, "amplitude_known": False}, "2 different masks"),
         ({"photons": 10, "amplitude_known": False, "modes": zernike_basis(small, 3)}, "amplitude_known"),
@@ -148,5 +147,3 @@ def test_what_a_bound_refuses(small):
             cramer_rao(pair, phase, **options)
     with pytest.raises(ValueError, match="none of its masks changes the light"):
         cramer_rao(ZernikeSensor(small, Dimple(1, 0)), phase, photons=10)
-    with pytest.raises(TypeError, match="sensor"):
-        cramer_rao(small, phase, photons=10)

@@ -1,14 +1,12 @@
 """The built book in a real browser, opened from the file system, as wide as a screen and as a phone."""
 
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from .conftest import watch
+from .conftest import ROOT, watch
 
-ROOT = Path(__file__).parent.parent
 HTML = ROOT / "_build" / "html"
 WIDTHS = (1280, 390)
 PAGES = sorted(

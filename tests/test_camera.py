@@ -1,13 +1,11 @@
 """Camera files: what is read, what is refused, and that no file is lost."""
 
 import gzip
-import hashlib
 import io
 import sys
 import tracemalloc
 from pathlib import Path
 
-import nbformat
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -34,16 +32,6 @@ def test_three_images_or_two_shapes_are_refused(tmp_path, others):
     fits.HDUList([fits.PrimaryHDU(FRAME), *map(fits.ImageHDU, others)]).writeto(tmp_path / "b.fits")
     with pytest.raises(camera.FileError, match=r"b\.fits: images of shapes"):
         camera.read(tmp_path / "b.fits")
-
-
-def test_compressed_files_are_read(tmp_path):
-    plain, packed = tmp_path / "plain.fits", tmp_path / "packed.fits.gz"
-    fits.PrimaryHDU(FRAME.astype(np.int16), fits.Header({"WAVELEN": 633.0})).writeto(plain)
-    packed.write_bytes(gzip.compress(plain.read_bytes()))
-    one, other = camera.read(plain), camera.read(packed)
-    np.testing.assert_array_equal(other.images, one.images)
-    assert other.keyword("WAVELEN") == 633
-    assert other.sha256 == hashlib.sha256(packed.read_bytes()).hexdigest()
 
 
 def fits_bytes(*units):
@@ -209,22 +197,6 @@ def test_output_that_would_lose_a_file_or_cannot_be_written(folder, name, messag
     with pytest.raises(ValueError, match=f"output = .*{message}|{message}"):
         camera.check_output(name)
     assert (folder / "notes.md").read_text() == "precious"
-
-
-@pytest.mark.parametrize("name", ["frame.fits", "sub/../frame.fits", "notes.md"])
-def test_notebook_refuses_such_an_output_before_any_work(folder, monkeypatch, name):
-    def work(*_, **__):
-        pytest.fail("a file was read before the output was checked")
-
-    notebook = Path(__file__).parents[1] / "notebooks" / "own_frames.ipynb"
-    sources = [cell.source for cell in nbformat.read(notebook, 4).cells if cell.cell_type == "code"]
-    defaults = next(index for index, source in enumerate(sources) if source.startswith("frame_files ="))
-    given = f"frame_files, pupil_files, output = ['frame.fits'], ['frame.fits'], {name!r}"
-    monkeypatch.setattr(camera, "read", work)
-    kept = {path: path.read_bytes() for path in folder.glob("*.*")}
-    with pytest.raises(ValueError, match="output = "):
-        exec("\n".join([sources[defaults], given, *sources[defaults + 1 :]]), {})
-    assert {path: path.read_bytes() for path in folder.glob("*.*")} == kept
 
 
 def test_bench_files_replace_only_those_of_a_bench(tmp_path):

@@ -75,28 +75,22 @@ def test_the_commit_is_that_of_this_folder_alone(tmp_path):
     assert cards.commit(tmp_path / "within") == "not known"
 
 
-def test_a_notebook_is_downloaded_with_all_that_it_imports_of_the_studies(tmp_path):
-    source = ROOT / "notebooks" / "fig01_sensor_layout.ipynb"
-    for name in ("one.zip", "two.zip"):
-        cards.write_archive(tmp_path / name, Project(ROOT), source)
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [
+        ("fig01_sensor_layout", "from studies import fig01_sensor_layout as s; from studies.kit import sweeps"),
+        ("calibration", "from studies import calibration as s; assert len(s.Recording.read().frames) == 5"),
+    ],
+)
+def test_a_notebook_is_downloaded_with_its_studies_and_their_data(tmp_path, name, code):
+    folder, source = tmp_path / "unpacked", ROOT / "notebooks" / f"{name}.ipynb"
+    for archive in ("one.zip", "two.zip"):
+        cards.write_archive(tmp_path / archive, Project(ROOT), source)
+    shutil.unpack_archive(tmp_path / "one.zip", folder)
     assert (tmp_path / "one.zip").read_bytes() == (tmp_path / "two.zip").read_bytes()
-    shutil.unpack_archive(tmp_path / "one.zip", tmp_path / "unpacked")
-    assert (tmp_path / "unpacked" / source.name).read_bytes() == source.read_bytes()
-    assert not (tmp_path / "unpacked" / "studies" / "fig09_bench_linearity.py").exists()
-    assert not list((tmp_path / "unpacked").rglob("*.npz"))
-    imports = "from studies import fig01_sensor_layout as s; from studies.kit import sweeps; print(s.__file__)"
-    command = [sys.executable, "-c", imports]
-    done = subprocess.run(command, cwd=tmp_path / "unpacked", capture_output=True, text=True, check=True)
+    assert (folder / source.name).read_bytes() == source.read_bytes()
+    assert not (folder / "studies" / "fig09_bench_linearity.py").exists()
+    assert bool(list(folder.rglob("*.npz"))) == (name == "calibration")
+    run = [sys.executable, "-c", f"{code}; print(s.__file__)"]
+    done = subprocess.run(run, cwd=folder, capture_output=True, text=True, check=True)
     assert Path(done.stdout.strip()).is_relative_to(tmp_path)
-
-
-def test_the_data_of_a_study_come_with_its_notebook(tmp_path):
-    cards.write_archive(tmp_path / "one.zip", Project(ROOT), ROOT / "notebooks" / "calibration.ipynb")
-    shutil.unpack_archive(tmp_path / "one.zip", tmp_path / "unpacked")
-    command = [
-        sys.executable,
-        "-c",
-        "from studies.calibration import Recording; print(len(Recording.read().frames))",
-    ]
-    done = subprocess.run(command, cwd=tmp_path / "unpacked", capture_output=True, text=True, check=True)
-    assert done.stdout == "5\n"

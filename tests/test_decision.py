@@ -3,17 +3,13 @@
 import numpy as np
 import pytest
 
-from studies.closed_loop import BestMethods, TunedLoops
 from studies.decision import (
     Situation,
     calibrated_errors,
-    decision_table,
     dimmed,
     know_bench,
-    loop_rows,
     open_cell,
     open_loop_errors,
-    open_rows,
     shots,
 )
 from zwfs.bench import Bench
@@ -81,23 +77,6 @@ def test_winners_on_a_bench_without_errors_do_not_depend_on_the_screens(known):
     cells = [open_cell(one) for one in errors]
     assert [cell.images for cell in cells] == [2, 2, None]
     assert all(cell.two == "phase-shifted" for cell in cells[:2])
-
-
-def test_the_table_has_a_cell_for_each_situation_and_says_what_was_not_studied(errors):
-    rows = open_rows(SITUATIONS, {"perfect": [errors] * 3, "real": [errors] * 3}, [0.01, None, 0.02])
-    known = [row.cells["calibrated"] for row in rows]
-    assert known[1] is None
-    assert [one.error for one in known[::2]] == [0.01, 0.02]
-    assert known[0].text == "two images, fitted model: 0.01; one image not studied"
-    assert [row.cells["design"].two for row in rows] == ["phase-shifted"] * 3
-    settled = {"Linear": np.full(4, 0.4), "LinearTwo": np.full(4, 0.1)}
-    loops = TunedLoops(1.0, 1.0, {}, {name: values.mean() for name, values in settled.items()}, settled)
-    [row] = loop_rows([BestMethods(loops, "Linear", "LinearTwo", 0.25, 0.2, 0.3)])
-    assert row.cells["perfect"].text == "two images, linear: 0.1, 4 times smaller"
-    assert row.text == "closed loop from 1 rad rms; 1 (2) per step"
-    lines = decision_table([*rows, row])._repr_markdown_().splitlines()
-    assert len(lines) == 6
-    assert lines[-1].endswith("not studied | not studied | [closed loop](closed_loop.ipynb) |")
 
 
 def test_a_situation_that_was_not_recorded_on_the_calibrated_bench_has_no_error():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from zwfs import Detector, Dimple, PhaseShifted, Pupil, ZernikeSensor, reconstruction_error
+from zwfs import Detector, Dimple, Pupil, ZernikeSensor
 
 N_FRAMES = 400
 
@@ -81,18 +81,6 @@ def test_seed_decides_the_noise(pupil, flat):
     np.testing.assert_array_equal(first, detector.expose(flat[:2], seed=np.random.default_rng(3)))
     assert np.any(first != detector.expose(flat[:2], seed=4))
     np.testing.assert_array_equal(state, np.random.get_state()[1])
-
-
-def test_error_of_a_reconstruction_falls_with_the_root_of_the_photons(pupil, shifted, screens):
-    phase = screens(0.3, 10)
-    errors = []
-    for photons in (1e6, 1e8):
-        detector = Detector(pupil, photons)
-        frames = detector.normalise(detector.expose(shifted.measure(phase), seed=5))
-        errors.append(reconstruction_error(pupil, PhaseShifted(shifted)(frames).phase, phase).mean())
-    assert errors[0] / errors[1] == pytest.approx(10, rel=0.1)
-    # One photon a pixel is worth about 1 / sqrt(2) rad of noise with two frames.
-    assert errors[0] == pytest.approx(np.sqrt(0.5 * pupil.n_points / 1e6), rel=0.5)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ from studies.identities import (
     arccosine_phase,
     direct_reference_wave,
     fourier_waves,
-    matrix_determinant,
     pair_phase,
     two_waves,
 )
@@ -30,13 +29,6 @@ def test_fourier_transforms_and_two_waves_agree(pupil, screens, patch, mask):
     assert np.abs(corner - exact).max() < 0.03 * np.abs(exact).max()
 
 
-def test_direct_sum_is_the_reference_wave(pupil, screens, patch):
-    field = pupil.amplitude * np.exp(1j * screens(0.5, 1)[0])
-    sensor = zwfs.ZernikeSensor(pupil, patch, tolerance=1e-14)
-    direct = direct_reference_wave(pupil, patch, field)
-    assert sensor.reference_wave(field)[0] == pytest.approx(direct, abs=1e-12)
-
-
 def test_equations_give_the_phase_back(shifted, screens):
     pupil = shifted.pupil
     phase = screens(0.2, 2)
@@ -48,13 +40,6 @@ def test_equations_give_the_phase_back(shifted, screens):
     safe = np.abs(truth) < 0.5
     found = arccosine_phase(frames[:, 0], amplitude, waves[:, 0])
     assert found[safe] == pytest.approx(truth[safe], abs=1e-6)
-
-
-def test_determinant_is_the_sine_of_the_difference():
-    angles = np.linspace(-3, 3, 13)
-    a, b = np.exp(1j * angles)[:, np.newaxis], 2 * np.exp(1j * angles)
-    expected = np.sin(angles - angles[:, np.newaxis])
-    assert matrix_determinant(a, b) == pytest.approx(expected, abs=1e-14)
 
 
 def test_approximation_is_right_to_second_order_in_amplitude_only(shifted, screens):

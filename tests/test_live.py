@@ -14,9 +14,8 @@ from studies.design import Design, photon_costs
 from studies.kit.setups import screens_at
 from zwfs.masks import focal_field
 
-from .conftest import watch
+from .conftest import ROOT, watch
 
-ROOT = Path(__file__).parent.parent
 STATIC = ROOT / "book" / "_static"
 SOURCE = (ROOT / "book" / "live.md").read_text("utf-8")
 MARKUP = "".join(re.findall(r"```\{raw\} html\n(.*?)```", SOURCE, re.DOTALL))

@@ -27,10 +27,6 @@ def test_unrelated_phases_differ_by_pi_over_root_3():
     assert reconstruction_error(pupil, *random).mean() == pytest.approx(np.pi / np.sqrt(3), rel=0.01)
 
 
-def test_estimate_and_truth_broadcast(pupil, screens):
-    assert reconstruction_error(pupil, np.zeros(pupil.shape), screens(0.2, 4)).shape == (4,)
-
-
 def test_residual_lies_on_the_circle(pupil):
     residual = wrapped_residual(pupil, np.linspace(-50, 50, 1600).reshape(40, 40), np.zeros(pupil.shape))
     inside = pupil.gather(residual)
@@ -72,19 +68,13 @@ def test_dynamic_range_without_a_crossing():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda p: reconstruction_error(p, np.zeros((2, *p.shape)), np.zeros((3, *p.shape))),
-            "estimate and truth",
-        ),
-        (lambda p: dynamic_range([1, 2], [0]), "rms and error have shapes"),
-        (lambda p: dynamic_range([], []), "with n at least 1"),
-        (lambda p: dynamic_range([2, 1], [0, 0]), "rms = .*expected increasing"),
-        (lambda p: dynamic_range([0.0], [0]), "rms = .*above 0"),
-        (lambda p: dynamic_range([-1, 1], [0, 0]), "rms reaches down to -1"),
-        (lambda p: dynamic_range([1, 2], [-1, -2]), "error reaches down to -2"),
-        (lambda p: dynamic_range([1, 2], [0, 0], 0), "threshold = 0"),
+        (lambda: dynamic_range([2, 1], [0, 0]), "rms = .*expected increasing"),
+        (lambda: dynamic_range([0.0], [0]), "rms = .*above 0"),
+        (lambda: dynamic_range([-1, 1], [0, 0]), "rms reaches down to -1"),
+        (lambda: dynamic_range([1, 2], [-1, -2]), "error reaches down to -2"),
+        (lambda: dynamic_range([1, 2], [0, 0], 0), "threshold = 0"),
     ],
 )
-def test_bad_input_is_named(pupil, call, message):
+def test_bad_input_is_named(call, message):
     with pytest.raises(ValueError, match=message):
-        call(pupil)
+        call()

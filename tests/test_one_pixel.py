@@ -3,16 +3,14 @@
 import json
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from studies.zernike_sensor import Pixel, bump_and_pit, explorer, lowest_pixel
 
-from .conftest import watch
+from .conftest import ROOT, watch
 
-ROOT = Path(__file__).parent.parent
 STATIC = ROOT / "book" / "_static"
 
 

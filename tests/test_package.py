@@ -1,6 +1,5 @@
 """The package as a whole: what `import zwfs` imports, which names it has, and what type checkers learn of them."""
 
-import pkgutil
 import shutil
 import subprocess
 import sys
@@ -11,12 +10,6 @@ import pytest
 import zwfs
 
 from .conftest import ROOT, new_reconstructor
-
-PUBLIC = [
-    module.name
-    for module in pkgutil.walk_packages(zwfs.__path__, "zwfs.")
-    if not any(part.startswith("_") for part in module.name.split("."))
-]
 
 
 def run(*command, folder=ROOT):

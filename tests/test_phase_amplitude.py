@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import zwfs
-from studies.phase_amplitude import KINDS, WAYS, amplitude_curves, amplitude_maps, noisy_frames, reconstruct
+from studies.phase_amplitude import KINDS, WAYS, amplitude_curves, amplitude_maps, reconstruct
 
 PUPIL = zwfs.Pupil.circular(24)
 MODES = zwfs.zernike_basis(PUPIL, 30)
@@ -62,18 +62,6 @@ def test_a_measured_amplitude_costs_little_but_spoils_the_verdict(curves, kind):
     assert not np.any(one.consistent[MEASURED])
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_without_noise_phase_and_amplitude_are_exact(kind):
-    phases = zwfs.power_law_screens(MODES, 0.5, 3, seed=4)
-    amplitudes = amplitude_maps(PUPIL, MODES, kind, 0.2, 3, seed=4)
-    frames = SENSOR.measure(phases, amplitudes)
-    result = zwfs.MaximumLikelihood(SENSOR, amplitude="unknown")(frames)
-    assert np.all(zwfs.reconstruction_error(PUPIL, result.phase, phases) < 1e-6)
-    assert PUPIL.gather(result.amplitude) == pytest.approx(PUPIL.gather(amplitudes), abs=1e-6)
-    ignored = zwfs.MaximumLikelihood(zwfs.ZernikeSensor(PUPIL, *PAIR), n_starts=1)(frames[:, :2])
-    assert not np.any(ignored.consistent)
-
-
 def test_the_error_of_an_ignored_amplitude_is_a_fixed_share_of_a_small_phase():
     # To first order an amplitude error d changes the phase by d sin(phi) / |beta|.
     amplitude = amplitude_maps(PUPIL, MODES, "dips", 0.02, 1, seed=5)[0]
@@ -85,23 +73,6 @@ def test_the_error_of_an_ignored_amplitude_is_a_fixed_share_of_a_small_phase():
         shares.append(zwfs.reconstruction_error(PUPIL, result.phase[0], rms * screen) / rms)
     assert shares[0] == pytest.approx(shares[1], rel=0.05)
     assert 0.5 < shares[0] / (2 * 0.02) < 2
-
-
-def test_two_frames_alone_do_not_determine_phase_and_amplitude():
-    with pytest.raises(ValueError, match="two frames allow two fields"):
-        zwfs.MaximumLikelihood(zwfs.ZernikeSensor(PUPIL, *PAIR), photons=1000, amplitude="unknown")
-
-
-def test_standard_errors_hold_for_phase_and_amplitude():
-    phases = zwfs.power_law_screens(MODES, 0.5, 6, seed=6)
-    amplitudes = amplitude_maps(PUPIL, MODES, "scintillation", 0.1, 6, seed=6)
-    frames = noisy_frames(SENSOR, phases, amplitudes, PHOTONS, 6)
-    [result] = reconstruct(ESTIMATED, SENSOR, frames, PHOTONS)
-    error = zwfs.metrics.wrapped_residual(PUPIL, result.phase, phases)
-    within = np.abs(PUPIL.gather(error / result.sigma)) < 1
-    within_amplitude = np.abs(PUPIL.gather((result.amplitude - amplitudes) / result.sigma_amplitude)) < 1
-    assert within.mean() == pytest.approx(0.683, abs=0.03)
-    assert within_amplitude.mean() == pytest.approx(0.683, abs=0.03)
 
 
 def test_curves_do_not_depend_on_the_other_variations(curves):

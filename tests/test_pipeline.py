@@ -3,24 +3,21 @@
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import nbformat
 import pytest
 import yaml
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
-from book._tools import book, notebook, record, run, scratch
+from book._tools import book, record, run, scratch
 from book._tools.__main__ import main
 from book._tools.execute import NotebookError
 from book._tools.project import Project
-from tests.conftest import alive, glued, start_tool, wait_until
+from tests.conftest import ROOT, glued
 from zwfs._system import write_file
 
-ROOT = Path(__file__).parent.parent
 ALL = {"first", "second", "third"}  # notebooks of the template
 
 
@@ -43,11 +40,6 @@ def run_all(project):
 
 def results(project):
     return {file.name: file.read_bytes() for file in sorted(project.executed.glob("*.ipynb"))}
-
-
-def printed(project, name):
-    cells = notebook.read(project.executed / f"{name}.ipynb").cells
-    return "".join(o.text for c in cells if c.cell_type == "code" for o in c.outputs if "text" in o)
 
 
 @pytest.fixture
@@ -175,39 +167,12 @@ def test_failure_is_named_and_leaves_earlier_results(ran):
     assert sorted(os.listdir(ran.build)) == ["kept", "notebooks"]
 
 
-def test_new_files_replace_the_old_ones(ran):
-    write(ran, "third", publish("others.csv", "2"))
-    run_all(ran)
-    assert [file.name for file in ran.published("third")] == ["others.csv"]
-    assert ran.published("first") == []
-
-
 @pytest.mark.slow
 def test_dead_kernel_is_named(project):
     write(project, "dies", "import os\nos._exit(3)")
     with pytest.raises(NotebookError, match=r"notebooks/dies.ipynb failed in cell 3 of 3"):
         run_all(project)
     assert results(project) == {}
-
-
-def start_sleeping_run(project):
-    """Start a run in a process, wait until the notebook sleeps, and return the process and the kernel's id."""
-    pid = project.notebooks / "pid"
-    note = f"import os, pathlib, time\npathlib.Path({str(pid)!r}).write_text(str(os.getpid()))"
-    write(project, "sleeps", note, "time.sleep(99)")
-    process = start_tool(project.root, "figures", stderr=subprocess.DEVNULL)
-    wait_until(lambda: pid.exists() and pid.read_text(), seconds=180)
-    return process, int(pid.read_text())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_interruption_leaves_no_kernel_and_no_pieces(project, number):
-    process, kernel = start_sleeping_run(project)
-    process.send_signal(number)
-    assert process.wait(20) != 0
-    assert list(project.build.iterdir()) == []
-    wait_until(lambda: not alive(kernel), seconds=20)
 
 
 def test_second_command_waits_for_the_first(tmp_path):

@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from .conftest import code_of, watch
+from .conftest import ROOT, code_of, watch
 
-ROOT = Path(__file__).parent.parent
 HTML = ROOT / "_build" / "html"
 PYODIDE = os.environ.get("ZWFS_PYODIDE", "")
 MINUTE = 60_000  # milliseconds

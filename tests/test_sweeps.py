@@ -21,19 +21,15 @@ import pytest
 import yaml
 from distributed import Client, LocalCluster
 
-from studies.error_budget import error_budget
 from studies.fig03_dynamic_range import linearity_curves
-from studies.fig04_dimple_diameter import iteration_curves
 from studies.kit import sweeps
 from studies.kit.bench import bench_curves, bench_reconstructors
 from studies.kit.grids import Recovery, grid
 from studies.kit.setups import make_screens
-from studies.phase_shift_pairs import pair_maps
-from tests.conftest import alive, code_of, heed_signals, wait_until
+from tests.conftest import ROOT, alive, code_of, heed_signals, wait_until
 from zwfs import Arcsine, Dimple, GradientDescent, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
 from zwfs.bench.model import Bench, BenchModel
 
-ROOT = Path(__file__).parent.parent
 NOTEBOOKS = ROOT / "notebooks"
 AS_THE_PAGE_SAYS = os.environ | {"PYTHONPATH": str(NOTEBOOKS)}
 
@@ -72,28 +68,12 @@ def figure_3(pupil, modes):
     return [curves.rms, *curves.errors.values(), *curves.converged.values(), curves.wrapped, curves.strehl]
 
 
-def figure_4(pupil, modes):
-    return list(iteration_curves(pupil, np.pi / 2, 25, [0.8, 1.06, 2.3], modes[:3]).errors.values())
-
-
 def figure_9(pupil, modes):
     bench = Bench(n_pixels=40)
     model = BenchModel.from_images(bench, 1)
     methods = bench_reconstructors(bench, model, n_iterations=2)
     curves = bench_curves(bench, model, methods, [0, 0.3, 0.6], 1, seed=1)
     return [curves.commanded, *curves.residuals.values()]
-
-
-def budget(pupil, modes):
-    found = error_budget(
-        Bench(n_pixels=40).single_errors(), ["PhaseShifted"], [0.0, 0.3], 1, n_iterations=2, seed=1
-    )
-    return [curves.residuals["PhaseShifted"] for curves in found.values()]
-
-
-def maps(pupil, modes):
-    found = pair_maps(pupil, 1.06, np.linspace(-np.pi, np.pi, 5), 0.3 * modes[:2])
-    return [found.error, found.flat, found.aberrated, found.bound, found.read]
 
 
 def recovery(pupil, modes):
@@ -467,7 +447,7 @@ def test_the_recipe_for_kubernetes_starts_a_cluster(foreign_cluster, monkeypatch
     assert os.getpid() not in found
 
 
-@pytest.mark.parametrize("experiment", [figure_3, figure_4, figure_9, budget, maps, recovery])
+@pytest.mark.parametrize("experiment", [figure_3, figure_9, recovery])
 def test_one_core_two_cores_and_a_cluster_agree_to_the_last_bit(
     experiment, pupil, modes, foreign_cluster, monkeypatch
 ):

@@ -17,10 +17,6 @@ def test_few_digits_are_shown_and_truths_in_words():
     assert "| 3.1 |" in Table(["a"], [[3.14159]], digits=2)._repr_markdown_()
 
 
-def test_plain_text_tells_no_address():
-    assert repr(Table(["a", "b"], [[1, 2]])) == "Table of 1 rows: a, b"
-
-
 def test_a_bar_does_not_end_the_cell():
     assert Table(["a"], [["|det M|"]])._repr_markdown_().endswith("| \\|det M\\| |")
 

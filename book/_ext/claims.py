@@ -185,7 +185,7 @@ def dynamic_range(n: Numbers) -> Finding:
     short = [name for name, gain in gains.items() if gain <= 10]
     reached = [f"{name} {limits[name]:.1f} (about {gain:.0f} times)" for name, gain in gains.items() if gain]
     never = [f"{name} never stays within 5 %" for name, gain in gains.items() if not gain]
-    repaired = f"with the modelled field it reaches {n.saxton_model_limit:.2f}"
+    repaired = f"Gerchberg-Saxton with the modelled field reaches {n.saxton_model_limit:.2f}"
     linear = f"limits in rad rms: linear {n.linear_limit:.3f}"
     measured = "; ".join([", ".join([linear, *reached]), *never, repaired])
     return first(

@@ -99,7 +99,7 @@ def telemetry(n=10_000, n_workers=2, n_pixels=90, **settings):
         assert found.n_flagged == 0
         return {
             "frames": n, "threads": n_workers, "n_pixels": n_pixels, "time": clock, "processor time": busy,
-            "memory": _peak() - before, "input": cube.stat().st_size, "output": output.stat().st_size,
+            "memory": _peak() - before, "output": output.stat().st_size,
             "parts": parts(calibration, frames),
         }  # fmt: skip
 

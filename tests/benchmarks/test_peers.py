@@ -5,13 +5,15 @@ import pytest
 from .peers import Field
 
 CONTESTANTS = list(Field().contestants())
+SLOW = [pytest.mark.slow]  # as many samples as no default has
+CASES = [pytest.param(one, marks=SLOW if "1024" in one.setting else []) for one in CONTESTANTS]
 
 # Largest error that is believed of a package with its own setting: a worse one means that it is used wrongly here.
 LARGEST = {"zwfs": 1e-9, "HCIPy": 5e-3, "HCIPy, vector": 5e-3, "prysm": 5e-3, "pyZELDA": 3e-2}
 
 
 @pytest.mark.filterwarnings("ignore::Warning")
-@pytest.mark.parametrize("contestant", CONTESTANTS, ids=lambda c: f"{c.task}: {c.name}")
+@pytest.mark.parametrize("contestant", CASES, ids=lambda c: f"{c.task}: {c.name}")
 def test_contestant(benchmark, contestant):
     benchmark.group = contestant.task
     contestant.run()  # bases are set up at the first call
@@ -20,7 +22,7 @@ def test_contestant(benchmark, contestant):
     benchmark.extra_info.update(
         package=contestant.package, setting=contestant.setting, default=contestant.default, error=error
     )
-    if contestant.default and contestant.task != "phase of one frame":
+    if contestant.default:
         assert error < LARGEST[contestant.package]
     assert error < 0.05
 

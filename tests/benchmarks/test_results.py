@@ -2,14 +2,14 @@
 
 import json
 
-from . import arrays, latency, speed, telemetry
+from . import latency, speed, telemetry
 from .report import KEPT, fingerprint
 
 
 def test_numbers_of_the_performance_page_are_those_that_were_measured():
     kept = json.loads(KEPT.read_text("utf-8"))
     assert kept["sha256"] == fingerprint(kept)
-    kept["speed"]["slope"]["slope"] += 0.01
+    kept["speed"]["slope"]["times"][0] += 0.01
     assert kept["sha256"] != fingerprint(kept)
 
 
@@ -31,15 +31,9 @@ def test_memory_stays_flat_as_batches_grow():
     assert many["memory"] < 1.2 * few["memory"] + 100_000
 
 
-def test_every_library_at_hand_finds_the_same():
-    found = list(arrays.rates(21, 40))
-    assert found[0][0] == "NumPy"
-    assert all(rate > 0 and error < 0.01 for _, rate, error in found)
-
-
 def test_causes_of_late_calls_are_shares_of_all_calls():
     row = latency.latency(40, 30)
-    assert row["p50"] <= row["p99"] <= row["p99.9"] <= row["largest"]
+    assert row["p50"] <= row["p99"] <= row["p99.9"]
     assert all(0 <= row[name] <= row["late"] <= 1 for name in row if name.startswith("late"))
 
 

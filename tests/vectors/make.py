@@ -23,20 +23,12 @@ STEP = 2.0**-16  # radian; phases are multiples, so that every machine and singl
 
 @dataclass(frozen=True)
 class Mask:
-    """Disc of the transmission amplitude * exp(i (phase + tilt * u)), 1 around it; u is horizontal.
+    """Disc of the transmission amplitude * exp(i (phase + tilt * u)), 1 around it; u is horizontal."""
 
-    Attributes
-    ----------
-    diameter : float, lambda/D
-    phase : float, radian
-    amplitude : float
-    tilt : float, radian per lambda/D
-    """
-
-    diameter: float = 1.06
-    phase: float = np.pi / 2
+    diameter: float = 1.06  # lambda/D
+    phase: float = np.pi / 2  # radian
     amplitude: float = 1.0
-    tilt: float = 0.0
+    tilt: float = 0.0  # radian per lambda/D
 
     def kernel(self, x, y):
         """Integral of (transmission - 1) * exp(2 pi i (u x + v y)) over the disc, x and y in D."""
@@ -46,25 +38,14 @@ class Mask:
 
 @dataclass(frozen=True)
 class Case:
-    """Input of a test vector.
-
-    Attributes
-    ----------
-    name, text : str
-    pupil : Pupil
-    phase : ndarray, shape (ny, nx), radian
-        0 outside the pupil.
-    masks : tuple of Mask
-    margin : int, pixels
-        By which the detector is wider than the pupil on each side.
-    """
+    """Input of a test vector."""
 
     name: str
     text: str
     pupil: Pupil
-    phase: np.ndarray
+    phase: np.ndarray  # (ny, nx), radian; 0 outside the pupil
     masks: tuple[Mask, ...]
-    margin: int = 0
+    margin: int = 0  # pixels by which the detector is wider than the pupil on each side
 
     def fields(self):
         """Field on the detector behind each mask, shape (n_masks, ny, nx)."""

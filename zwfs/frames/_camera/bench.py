@@ -155,7 +155,7 @@ def fit_bench(
     diameter : float, lambda/D
         Of the dimple, by design. The fit starts from the best of several diameters around it.
     phase_shifts : (float, float), radian
-        Of the two images, by design. The fit also tries the reverse order, and a remark tells if it is right.
+        Of the two images, by design. The fit tries both orders, and a remark reports a reversed one.
     oversampling : int
         Points of the model along a pixel.
     n_steps : int

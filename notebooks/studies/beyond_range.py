@@ -22,7 +22,6 @@ from studies.kit.parameters import SETUP, Fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.setups import SCREENS, Noise, Screens, screens_at
 from studies.kit.style import LOOKS, OTHER_STYLES, Look
-from studies.kit.tables import Table, small
 from zwfs.bounds import cramer_rao
 from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error
@@ -518,20 +517,6 @@ def causes_columns(found: Causes, threshold: float) -> dict[str, NDArray]:
         "share with a contraction factor below 1": np.mean(found.factor < 1, axis=1),
     }
     return columns | shares
-
-
-def error_table(curves: Sequence[NoiseCurves]) -> Table:
-    """Median error of maximum likelihood on points and on modes, for each number of photons."""
-    noisy = curves[1:]
-    at = [place for place, rms in enumerate(noisy[0].rms) if rms in (0.1, 0.5, 1.0, 2.0, 3.0)]
-    rows = [
-        [f"{curve.photons:.0f}", words, *(small(curve.median(name)[place]) for place in at)]
-        for curve in noisy
-        for name, words in ((LIKELY, "points"), (MODES, "modes"))
-    ]
-    return Table(
-        ["photons per point and image", "estimated", *(f"{noisy[0].rms[place]:g} rad" for place in at)], rows
-    )
 
 
 def _exact_text(noiseless: NoiseCurves, threshold: float) -> str:

@@ -204,14 +204,13 @@ def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
 def calibrated_errors(situations: Sequence[Situation], n_screens: int) -> list[float | None]:
     """Errors of a calibrated bench that HCIPy simulates, rad rms over the pixels; None if nothing was recorded."""
     taken = calibration.Recording.read()
-    recorded = [taken.unseen(*one)[:n_screens] for one in situations]
-    some = [number for row in recorded for number in row]
-    errors = (
-        dict(zip(some, calibration.measure(taken, calibration.calibrate(taken), some), strict=True))
-        if some
-        else {}
-    )
-    return [typical(np.array([errors[one].calibrated for one in row])) if row else None for row in recorded]
+    rows = [taken.unseen(*one)[:n_screens] for one in situations]
+    if not any(rows):
+        return [None] * len(rows)
+    fit = calibration.calibrate(taken)
+    found = iter(calibration.measure(taken, fit, [number for row in rows for number in row]))
+    errors = [np.array([next(found).calibrated for _ in row]) for row in rows]
+    return [typical(row) if row.size else None for row in errors]
 
 
 def closed_loops(situations: Sequence[Situation], n_screens: int, seed: int) -> list[BestMethods]:

@@ -26,20 +26,14 @@ PACKAGES = {
     "prysm": ("#117733", "^"),
     "pyZELDA": ("#888888", "s"),
 }
-PHASE = "error of the phase (rad rms)"
 INTENSITY = "largest error of the intensity"
-ERRORS = {"one propagation": "largest error of the field", "one frame": INTENSITY, "two frames": INTENSITY}
 
 
 def add_substitutions(app: Sphinx, config: Config) -> None:
     """Define the tables of the page, as in ``{{ performance.rates }}``, and draw its figures."""
     kept = json.loads(Path(app.srcdir, MEASURED).read_text("utf-8"))
-    tasks: dict[str, list[dict[str, Any]]] = {}
-    for row in kept["peers"]:
-        tasks.setdefault(row["task"], []).append(row)
-    compared = {task: peers(task, rows) for task, rows in tasks.items()}
     added = tables(kept["speed"]) | {
-        "peers": compared,
+        "peers": peers([row for row in kept["peers"] if row["task"] == "one frame"]),
         "machine": kept["machine"],
         "pages": pages(kept.get("pages", [])),
     }
@@ -47,7 +41,7 @@ def add_substitutions(app: Sphinx, config: Config) -> None:
     with plt.rc_context():
         use_style()
         figures = {
-            "peers": error_against_time(tasks["one frame"] + tasks["two frames"]),
+            "peers": error_against_time(kept["peers"]),
             "growth": time_against_pixels(kept["speed"]["slope"]),
         }
         for name, figure in figures.items():
@@ -65,7 +59,7 @@ def table(header: list[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
-def peers(task: str, rows: list[dict[str, Any]]) -> str:
+def peers(rows: list[dict[str, Any]]) -> str:
     """Return a table of each package with its default, and with its fastest accurate setting."""
     lines = []
     for package in dict.fromkeys(row["package"] for row in rows):
@@ -76,17 +70,12 @@ def peers(task: str, rows: list[dict[str, Any]]) -> str:
             if row["default"] or row is quickest:
                 setting = f"{package}, {row['setting']}{' (default)' if row['default'] else ''}"
                 lines.append([setting, f"{row['ratio']:.3g}", power(row["error"])])
-    return table(["package and setting", "time (zwfs\u00a0=\u00a01)", ERRORS.get(task, PHASE)], lines)
+    return table(["package and setting", "time (zwfs\u00a0=\u00a01)", INTENSITY], lines)
 
 
 def tables(speed: dict[str, Any]) -> dict[str, str]:
     """Return the tables and sentences on speed, by name."""
-    whole = speed["limit"]["the whole call"]
-    limit = [[name, f"{1e6 * t:.0f}", f"{t / whole:.0%}"] for name, t in speed["limit"].items()]
-    parts = [[name, f"{1e6 * t:.0f}"] for name, t in speed["breakdown"]["100"].items()]
-    methods, loop = (
-        [[name, f"{1e3 * t:.2g}"] for name, t in speed[key].items()] for key in ("others", "loop step")
-    )
+    methods = [[name, f"{1e3 * t:.2g}"] for name, t in speed["others"].items()]
     batches = [
         [str(row["n_frames"]), f"{1e3 * row['time per frame']:.2f}", f"{row['memory'] / 1e6:.1f}"]
         for row in speed["batches"]
@@ -94,15 +83,12 @@ def tables(speed: dict[str, Any]) -> dict[str, str]:
     memory = "memory without frames and results (MB)"
     return {
         "rates": rates(speed),
-        "parts": table(["part", "time (μs)"], parts),
         "batches": table(["frame pairs in a call", "time of each (ms)", memory], batches),
         "methods": table(["method", "time (ms)"], methods),
         "likelihood": table(
             ["task", "time, in propagations of HCIPy"],
             [[name.replace("lambda/D", "λ/D"), f"{ratio:.2g}"] for name, ratio in speed["likelihood"].items()],
         ),
-        "loop": table(["reconstructor", "time of a step (ms)"], loop),
-        "limit": table(["part", "time (μs)", "share"], limit),
         "telemetry": telemetry(speed["telemetry"]),
         **latency(speed["latency"]),
     }

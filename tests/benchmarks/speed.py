@@ -27,10 +27,6 @@ from zwfs import (
     reconstruction_error,
     zernike_basis,
 )
-from zwfs._arrays import Kind
-from zwfs._propagator import angle, unit
-from zwfs.metrics import without_piston
-from zwfs.reconstructors import base
 
 from ..reference import HcipySensor
 from . import latency, telemetry
@@ -101,95 +97,6 @@ def closed_loop(n_pixels, seconds):
         errors.append(float(reconstruction_error(pupil, phase, truth)))
     time = best(lambda: method(frames, phase), seconds)
     return {"n_pixels": n_pixels, "time": time, "rate": 1 / time, "median error": float(np.median(errors[10:]))}
-
-
-def accelerated(n_pixels):
-    """Method at the settings for real time, frames of a screen, and what the method keeps for such frames."""
-    sensor = ZernikeSensor(Pupil.circular(n_pixels), *DIMPLES)
-    screen = screens_at(zernike_basis(sensor.pupil, 200), 0.8, 1, 2024, 7)[0]
-    frames = sensor.measure(screen).astype(np.float32)
-    method, kind = PhaseShifted(sensor, **REAL_TIME), Kind.of(frames)
-    return method, frames, kind, method.constants(kind)
-
-
-def breakdown(n_pixels, seconds):
-    """Time of each part of one accelerated step, and of what comes before and after all steps."""
-    method, frames, kind, constants = accelerated(n_pixels)
-    model, core, acceleration = constants.model, constants.core, constants.acceleration
-    operator, phasor = model.operator, model.flat
-    flat, batch = base.check_frames(method.sensor, frames)
-    state = method.begin(flat, None, constants)
-    projected = operator.split_project(phasor)
-    coefficients = projected @ core
-    wave = operator.split_expand(coefficients, in_window=True)[:, 0]
-    field, _ = method._shared.solve(wave, state.measured, kind)
-    found = method(frames)
-    one = np.zeros(1, int)
-    parts = {
-        "check of the frames": lambda: base.check_frames(method.sensor, frames),
-        "signal and dimming": lambda: method.begin(flat, None, constants),
-        "step: projection": lambda: operator.split_project(phasor) @ core,
-        "step: extrapolation": lambda: acceleration.next(projected, replace(state), np),
-        "step: expansion": lambda: operator.split_expand(coefficients, in_window=True),
-        "step: linear system": lambda: method._shared.solve(wave, state.measured, kind),
-        "step: modulus": lambda: unit(field.copy(), model.stop, np),
-        "angle": lambda: angle(phasor, np),
-        "report": lambda: method.report(flat, batch, base.Solution(found.phase[np.newaxis], one, one, one)),
-        "whole call": lambda: method(frames),
-    }
-    return best_of_each(parts, seconds)
-
-
-def limit(n_pixels, seconds):
-    """Time of an accelerated call, and of what no such call can do without: products, passes, arctangent."""
-    method, frames, _, constants = accelerated(n_pixels)
-    operator = constants.model.operator
-    phasor = np.ones((1, 2, *frames.shape[1:]), frames.dtype)
-    coefficients = operator.split_project(phasor) @ constants.core
-    steps = REAL_TIME["n_iterations"]
-    signal, target = np.ones_like(phasor), np.empty_like(phasor)
-
-    def passes():
-        np.add(frames, frames, out=target[0])  # the signal
-        for _ in range(steps):
-            np.multiply(signal, phasor, out=target)  # the system: field and signal in, field out
-
-    parts = {
-        "the whole call": lambda: method(frames),
-        # The first step needs none: its wave is that of a flat wavefront.
-        "its products with the low-rank functions": lambda: [
-            (operator.split_project(phasor), operator.split_expand(coefficients, in_window=True))
-            for _ in range(steps - 1)
-        ],
-        "one pass over frames and, in each step, over signal and field": passes,
-        "the arctangent of the phase": lambda: angle(phasor, np),
-    }
-    times = best_of_each(parts, seconds)
-    return times | {"these three together": sum(times.values()) - times["the whole call"]}
-
-
-def loop_step(n_pixels, seconds):
-    """Time from frames to a new figure of the mirror, one screen, by reconstructor."""
-    pupil = Pupil.circular(n_pixels)
-    modes = zernike_basis(pupil, 200)
-    classic, shifted = ZernikeSensor(pupil, DIMPLES[0]), ZernikeSensor(pupil, *DIMPLES)
-    methods = {
-        "linear": Linear(classic, modes),
-        "phase-shifted, 5 iterations": PhaseShifted(shifted, n_iterations=5),
-        "phase-shifted, 2 iterations, accelerated": PhaseShifted(shifted, **REAL_TIME),
-    }
-    screen = screens_at(modes, 0.1, 1, 2024, 7)[0]
-    flat, steps = pupil.gather(modes), {}
-    fit = np.linalg.pinv(flat)
-    for name, method in methods.items():
-        frames = method.sensor.measure(screen).astype(np.float32)
-
-        def step(method=method, frames=frames):
-            found = without_piston(pupil.gather(method(frames).phase))
-            return 0.4 * (found @ fit) @ flat
-
-        steps[name] = step
-    return best_of_each(steps, seconds)
 
 
 def slope(seconds, sizes=(32, 64, 128, 256, 512, 1024)):
@@ -269,7 +176,6 @@ def results(seconds=2.0):
         "batches": batches(seconds),
         "real time": [row for n_pixels in (100, 40) for row in real_time(n_pixels, seconds)],
         "closed loop": [closed_loop(n_pixels, seconds) for n_pixels in (100, 40)],
-        "loop step": loop_step(40, seconds),
         "slope": slope(seconds),
         "others": others(seconds),
         "likelihood": likelihood(seconds),

@@ -137,8 +137,6 @@ def refused(project, *arguments):
         (["1", "--output", "no/such/folder"], "is not a folder"),
         (["1", "-f", "/dev/zero"], "-f /dev/zero: expected a regular file"),
         (["1", "-f", "a.yaml", "-f", "b.yaml"], "-f a.yaml -f b.yaml: expected one file"),
-        (["1", "--jobs", "0"], "--jobs 0: expected at least 1"),
-        (["1", "--cluster", "nowhere"], "--cluster nowhere: expected an address, as in tcp://host:8786"),
         (["--line=1 -p n=10"], "n = 10: expected an integer in [1, 9]"),
         (["--line=1", "--list"], "--line replaces all other arguments"),
     ],

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import joblib
 import papermill
 from nbformat import NotebookNode
 from papermill.clientwrap import PapermillNotebookClient
@@ -40,7 +41,7 @@ class NotebookError(ToolError):
 
 
 class Run:
-    """One execution of a notebook, which writes to the folder `scratch`; no result depends on `environment`."""
+    """One execution of a notebook, which writes to the folder `scratch`."""
 
     error: NotebookError | None = None
     key: str | None = None  # see `record.key`; None if the inputs changed during the run
@@ -50,15 +51,9 @@ class Run:
     _stopped = False
 
     def __init__(
-        self,
-        project: Project,
-        name: str,
-        scratch: Path,
-        parameters: dict[str, Any] | None = None,
-        environment: dict[str, str] | None = None,
+        self, project: Project, name: str, scratch: Path, parameters: dict[str, Any] | None = None
     ) -> None:
         self.project, self.name, self.parameters = project, name, parameters or {}
-        self._environment = environment or {}
         self.folder = scratch / f"{name}.files"
         self._target, self._log, self._progress = (
             scratch / f"{name}{end}" for end in (".ipynb", ".log", ".progress")
@@ -111,7 +106,7 @@ class Run:
             progress_bar=False,
             request_save_on_cell_execute=False,
             run=self,
-            environment=os.environ | ENVIRONMENT | own | self._environment,
+            environment=os.environ | ENVIRONMENT | own,
         )
 
     def start_kernel(self, client: PapermillNotebookClient, environment: dict[str, str]) -> None:
@@ -190,14 +185,13 @@ class Engine(NBClientEngine):
 papermill_engines.register("zwfs", Engine)
 
 
-def execute(runs: list[Run], finished: Callable[[Run], None], n_processes: int | None = None) -> None:
+def execute(runs: list[Run], finished: Callable[[Run], None]) -> None:
     """Execute notebooks in parallel, by default on all cores; `finished` takes each run at its end.
 
     The error of all that failed is raised after the end of the last one.
     """
-    available = os.cpu_count() or 1
-    n_processes = min(n_processes or available, len(runs))
-    cores = max(1, available // n_processes)
+    n_processes = min(joblib.cpu_count(), len(runs))
+    cores = max(1, joblib.cpu_count() // n_processes)
     with (
         tqdm(unit="cell", total=1, disable=None, leave=False, dynamic_ncols=True) as bar,
         ThreadPoolExecutor(n_processes) as pool,

@@ -18,7 +18,6 @@ from typing import Any, NoReturn
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 
-from studies.kit import sweeps
 from studies.kit.tables import plain
 
 from . import declared, record
@@ -39,7 +38,6 @@ EXAMPLES = """examples:
   rerun 3 --list                            list the parameters of Figure 3
   rerun 3 -p rms_max=2.0 -p n_screens=50    run it
   rerun phase_shift_pairs -f mine.yaml      with parameters from a file
-  rerun 3 --cluster tcp://host:8786         with the sweeps on a Dask cluster
 """
 
 
@@ -65,8 +63,6 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     add("--list", action="store_true", help="list parameters, and run nothing")
     add("--force", action="store_true", help="run even if the result exists")
     add("--output", metavar="DIR", type=Path, help="folder for the results")
-    add("--jobs", metavar="N", type=int, help="largest number of processes of a sweep")
-    add("--cluster", metavar="ADDRESS", help="Dask scheduler for the sweeps, as in tcp://host:8786")
     add("--line", metavar="TEXT", help="all arguments in one string, quoted as for a shell")
     asked = parser.parse_args(arguments)
     if asked.line is None:
@@ -101,41 +97,13 @@ def rerun(project: Project, arguments: list[str]) -> None:
         if classes := changed.get("reconstructors"):
             _check_classes(classes)
     folder = _folder(project, asked.output or project.build / "rerun" / folder_name(name, changed))
-    earlier, workers = read_result(folder, name), _workers(asked)
+    earlier = read_result(folder, name)
     if not asked.force and is_current(earlier, folder, record.key(project, name, changed)):
         print(f"{name}: unchanged, from {earlier['made']}")
     else:
-        print(f"{name}: {make(project, name, changed, known, folder, workers):.1f} s")
+        print(f"{name}: {make(project, name, changed, known, folder):.1f} s")
     page = folder / f"{name}.html"
     print(f"open {page.relative_to(Path.cwd()) if page.is_relative_to(Path.cwd()) else page}")
-
-
-def _workers(asked: argparse.Namespace) -> dict[str, str]:
-    """Return the environment that sends the sweeps of a notebook to the workers asked for."""
-    workers = {}
-    if asked.jobs is not None:
-        if asked.jobs < 1:
-            raise ParameterError(f"--jobs {asked.jobs}: expected at least 1")
-        workers["LOKY_MAX_CPU_COUNT"] = str(asked.jobs)
-    if asked.cluster is not None:
-        workers[sweeps.CLUSTER] = asked.cluster
-        _check_cluster(asked.cluster)
-    return workers
-
-
-def _check_cluster(address: str) -> None:
-    """Require a scheduler with workers."""
-    if not re.fullmatch(r"(tcp|tls|ucx|wss?)://\S+:\d+", address):
-        raise ParameterError(f"--cluster {address}: expected an address, as in tcp://host:8786")
-    from distributed import Client
-
-    try:
-        with Client(address, timeout=3, set_as_default=False) as client:
-            cores = sum(client.nthreads().values())
-    except (OSError, ValueError) as error:
-        raise ParameterError(f"--cluster {address}: no Dask scheduler answers ({error})") from None
-    if cores < 2:
-        raise ParameterError(f"--cluster {address} has {cores} cores: expected at least 2")
 
 
 def resolve(project: Project, figure: str) -> str:
@@ -291,17 +259,10 @@ def _code(value: Any) -> str:
     return "`" + json.dumps(value).replace("`", r"\u0060").replace("|", r"\u007c") + "`"
 
 
-def make(
-    project: Project,
-    name: str,
-    changed: dict[str, Any],
-    known: dict[str, Parameter],
-    folder: Path,
-    workers: dict[str, str] | None = None,
-) -> float:
+def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, Parameter], folder: Path) -> float:
     """Run a notebook, move all its results into a folder in one step, and return the seconds.
 
-    The folder is absent or holds an earlier result, which is replaced. `workers` are environment variables.
+    The folder is absent or holds an earlier result, which is replaced.
     """
     within = project.build if folder.is_relative_to(project.build) else folder.parent
     commit, changed_since = record.commit(project.root)
@@ -312,7 +273,7 @@ def make(
         from . import page
         from .execute import Run, execute
 
-        run, new = Run(project, name, scratch, changed, workers), scratch / "new"
+        run, new = Run(project, name, scratch, changed), scratch / "new"
         execute([run], lambda _: None)
         notebook = run.notebook
         if changed:

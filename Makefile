@@ -99,7 +99,7 @@ lock: $(BIN)/uv ## pin the newest allowed version of every dependency, or of one
 
 # Other files in _build belong to the user, above all the results of make rerun.
 clean: ## remove the results of these commands, except those of make rerun
-	rm -rf $(addprefix _build/,home html html.json jupyter_execute kept measured.json notebooks performance dist building-* running-* rerunning-* releasing-*)
+	rm -rf $(addprefix _build/,home html html.json jupyter_execute measured.json notebooks performance dist building-* running-* rerunning-* releasing-*)
 	rm -rf build $(VENV) *.egg-info .benchmarks .coverage* .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name _build -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 	@if [ -d _build ] && ! rmdir _build 2>/dev/null; then echo "kept: $$(echo _build/*)"; fi

@@ -236,7 +236,7 @@ def test_set_up_stops_at_a_damaged_file_and_says_how_to_repair_it(clone, tmp_pat
 
 
 def test_clean_keeps_what_belongs_to_the_user(clone):
-    results = "html/index.html", "notebooks/a.ipynb", "kept/a/1/a.json", "running-1/a"
+    results = "html/index.html", "notebooks/a.ipynb", "running-1/a"
     for name in (*results, "rerun/mine/record.json", "other/a"):
         (clone / "_build" / name).parent.mkdir(parents=True, exist_ok=True)
         (clone / "_build" / name).write_text("")

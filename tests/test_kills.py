@@ -76,7 +76,6 @@ def test_a_killed_build_leaves_the_earlier_book_and_the_next_one_gives_the_same_
     for phase in ("running-*", "building-*/*/html/*.html"):
         page.write_text(f"{text}\nIt has changed.\n", "utf-8")
         if phase == "running-*":
-            shutil.rmtree(small_book / "_build" / "kept")
             shutil.rmtree(small_book / "_build" / "notebooks")
         process = start(small_book)
         try:

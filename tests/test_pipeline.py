@@ -15,7 +15,7 @@ from book._tools import book, record, run, scratch
 from book._tools.__main__ import main
 from book._tools.execute import NotebookError
 from book._tools.project import Project
-from tests.conftest import ROOT, glued
+from tests.conftest import ROOT
 from zwfs._system import write_file
 
 ALL = {"first", "second", "third"}  # notebooks of the template
@@ -76,30 +76,18 @@ def ran(template, tmp_path):
 def test_two_runs_give_identical_bytes(ran):
     before = results(ran)
     shutil.rmtree(ran.executed)
-    shutil.rmtree(ran.kept)
     assert run_all(ran)[0]
     assert results(ran) == before
     assert len(before) == 3
 
 
-def test_undoing_a_change_runs_nothing(ran):
-    before, source = results(ran), ran.source("third").read_bytes()
-    published = ran.published("third")[0].read_bytes()
+def test_only_what_changed_runs_again(ran):
     for text in ("2", "3"):
         write(ran, "third", publish("numbers.csv", text))
         made, said = run_all(ran)
         assert (made, said[-1]) == (["third"], "notebooks: 1 run, 2 unchanged")
         assert ran.published("third")[0].read_text() == text
-    ran.source("third").write_bytes(source)
-    assert run_all(ran) == ([], ["notebooks: 0 run, 1 from earlier runs, 2 unchanged"])
-    assert results(ran) == before
-    assert ran.published("third")[0].read_bytes() == published
-    # A damaged result is replaced by the kept one; without a whole one the notebook runs.
     (ran.executed / "first.ipynb").write_text("half of a noteb")
-    assert run_all(ran)[0] == []
-    assert results(ran) == before
-    for file in (ran.executed / "first.ipynb", *ran.kept.glob("first/*/first.ipynb")):
-        file.write_text("half of a noteb")
     assert run_all(ran)[0] == ["first"]
 
 
@@ -116,22 +104,6 @@ def test_refreshed_notebooks_are_current(ran, monkeypatch):
     assert run.refresh(ran) == []
     picture.unlink()
     assert run_all(ran)[0] == []
-
-
-def test_numbers_that_moved_are_listed_with_their_change(project):
-    glued(project.source("first"), limit=0.5, word="low", same=3, gone=1, zero=0)
-    glued(project.executed / "first.ipynb", limit=0.51, word="high", same=3, zero=1)
-    glued(project.source("second"), limit=0.5)
-    glued(project.executed / "second.ipynb", limit=0.5)
-    assert run.moved_numbers(project) == {
-        "notebooks/first.ipynb": [
-            "gone: 1 -> none",
-            "limit: 0.5 -> 0.51 (+2 %)",
-            "word: 'low' -> 'high'",
-            "zero: 0 -> 1",
-        ],
-        "notebooks/second.ipynb": [],
-    }
 
 
 @pytest.mark.parametrize(
@@ -164,7 +136,7 @@ def test_failure_is_named_and_leaves_earlier_results(ran):
     assert message.endswith("ValueError: no light")
     assert results(ran) == before
     assert ran.published("first") == []
-    assert sorted(os.listdir(ran.build)) == ["kept", "notebooks"]
+    assert sorted(os.listdir(ran.build)) == ["notebooks"]
 
 
 @pytest.mark.slow
@@ -276,7 +248,7 @@ def test_book_is_built_once_and_after_each_change_and_a_failure_keeps_it(fake_bo
     with pytest.raises(book.BookError, match=r"book/index.md:3: WARNING: unknown document"):
         book.build(fake_book)
     assert (fake_book.build / "html" / "index.html").read_text() == before
-    assert sorted(os.listdir(fake_book.build)) == ["html", "kept", "notebooks"]
+    assert sorted(os.listdir(fake_book.build)) == ["html", "notebooks"]
     # The pages are built again even if the change is undone: they may lack a part.
     index.write_text(before)
     assert book.build(fake_book)

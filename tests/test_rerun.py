@@ -22,7 +22,7 @@ from book._tools import declared, record, rerun
 from book._tools.__main__ import main
 from book._tools.declared import ParameterError
 from book._tools.notebook import read
-from book._tools.project import REPAIR, Project
+from book._tools.project import Project
 from tests.conftest import ROOT, alive, heed_signals, start_tool, wait_until, watch
 
 DEFAULTS = (
@@ -488,19 +488,6 @@ def own_project(project):
     write(project, "fig02_works", *cells, defaults="reconstructors = []  # of a reader", limits=limits)
     for name, source in modules.items():
         (project.notebooks / f"{name}.py").write_text(source)
-
-
-def test_damaged_environment_names_its_repair_in_one_line(tmp_path):
-    (tmp_path / "yaml.py").write_text("def cut(")
-    code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); sys.prefix = {str(tmp_path)!r}\n"
-        "from book._tools.__main__ import main; sys.exit(main(['book']))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    [line] = done.stderr.splitlines()
-    assert done.returncode == 1
-    assert str(tmp_path / "yaml.py") in line
-    assert line.endswith(f": run {REPAIR}, then repeat the command")
 
 
 @pytest.mark.parametrize("content", ["[1]", "[]", '"x"', "3", "null", '{"files": [[1]]}', "{", '{"made_by": []}'])

@@ -9,7 +9,7 @@ if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is not signal.SIG_
     # The imports below take a second, and there is nothing to remove yet: Ctrl-C needs no traceback.
     signal.signal(signal.SIGINT, lambda *_: (os.write(2, b"interrupted\n"), os._exit(1)))
 
-from .project import Project, ToolError, one_line, repair
+from .project import Project, ToolError, one_line
 from .scratch import end_cleanly_on_signals, one_at_a_time, remove_abandoned
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,12 +57,6 @@ def main(arguments: list[str], project: Project | None = None) -> int:
     except ToolError as failure:
         print(f"{command}: {failure}", file=sys.stderr)
         return failure.status
-    except (SyntaxError, ImportError) as error:
-        file = getattr(error, "filename", None) or getattr(error, "path", None) or ""
-        if not repair(file):
-            raise
-        print(f"{command}: {file}: {one_line(str(error))}: {repair(file)}", file=sys.stderr)
-        return 1
     except OSError as error:  # a full disk, a locked folder, a name that is too long
         print(f"{command}: {one_line(str(error))}", file=sys.stderr)
         return 1

@@ -17,7 +17,7 @@ from . import pdf as printing
 from .execute import TRACEBACK_LINES
 from .project import EXECUTED, PDF, PYODIDE, Project, ToolError
 from .record import commit, digest, digest_files
-from .run import moved_numbers, refresh, run
+from .run import refresh, run
 from .scratch import scratch_folder, swap
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
@@ -53,11 +53,10 @@ def pdf(project: Project) -> None:
 
 
 def figures(project: Project) -> None:
-    """Replace the committed notebooks and the front figure by freshly run ones; print the numbers that moved."""
+    """Replace the committed notebooks and the front figure by freshly run ones."""
     run(project)
-    numbers = moved_numbers(project)
     for name in refresh(project):
-        print(f"{name} is new", *numbers.get(name, ()), sep="\n  ")
+        print(f"{name} is new")
 
 
 def check_contents(project: Project) -> None:

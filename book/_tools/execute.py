@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import time
 from collections.abc import Callable
@@ -23,7 +22,7 @@ from studies.kit import results, sweeps
 
 from . import declared
 from .notebook import read, to_bytes
-from .project import Project, ToolError, repair
+from .project import Project, ToolError
 from .record import key
 
 # One thread for each kernel: the numbers do not depend on how many notebooks run at the same time.
@@ -148,9 +147,7 @@ class Run:
         lines += [f"  parameters in force: {values or '(none)'}", ""]
         if isinstance(error, PapermillExecutionError):
             traceback = strip_color("\n".join(error.traceback)).splitlines()[-TRACEBACK_LINES:]
-            files = re.findall(r"^ *File (.*):\d+$", "\n".join(traceback), re.MULTILINE)
-            advice = [repair(files[-1])] if files and error.ename == "SyntaxError" else []
-            return "\n".join([*lines, *(traceback or [f"{error.ename}: {error.evalue}"]), *filter(None, advice)])
+            return "\n".join([*lines, *(traceback or [f"{error.ename}: {error.evalue}"])])
         log = self._log.read_text(errors="replace")[-LOG_CHARACTERS:] if self._log.exists() else ""
         return "\n".join([*lines, *log.splitlines(), f"{type(error).__name__}: {error}"])
 

@@ -1,16 +1,12 @@
 """Places of the files of a project."""
 
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 # Environment variables for the extensions of the book: the folder of the executed notebooks from the root, the
 # name of the PDF, and a folder with Pyodide to copy into the book.
 EXECUTED, PDF, PYODIDE = "ZWFS_EXECUTED", "ZWFS_PDF", "ZWFS_PYODIDE"
-
-# Sets up the environment again, from new downloads: a damaged file may come from the cache.
-REPAIR = "rm -rf .venv && UV_NO_CACHE=1 make .venv/.ready"
 
 # Names after "from studies import" or "from studies.", in code and in the JSON of a notebook.
 IMPORTED = re.compile(r"from studies(?:\.(\w+) import| import (\w+))")
@@ -26,12 +22,6 @@ def one_line(text: str) -> str:
     """Return a text for the terminal: on one line, without control characters, cut in the middle if it is long."""
     line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
     return line if len(line) <= 400 else f"{line[:250]} ... {line[-140:]}"
-
-
-def repair(file: str) -> str:
-    """Return the advice for a file that cannot be imported: empty unless it belongs to the environment."""
-    ours = file.startswith(f"{sys.prefix}/")
-    return f"the environment is damaged: run {REPAIR}, then repeat the command" if ours else ""
 
 
 @dataclass(frozen=True)
@@ -60,11 +50,6 @@ class Project:
         """Folder of the executed notebooks, each with its published files and its record."""
         return self.build / "notebooks"
 
-    @property
-    def kept(self) -> Path:
-        """Folder of the last results of each notebook, by key: NAME/KEY/ has the content of `executed`."""
-        return self.build / "kept"
-
     def source(self, name: str) -> Path:
         """Return the file of a committed notebook."""
         return self.notebooks / f"{name}.ipynb"
@@ -73,9 +58,9 @@ class Project:
         """Return the files of the committed notebooks, in order."""
         return sorted(self.notebooks.glob("*.ipynb"))
 
-    def published(self, name: str, folder: Path | None = None) -> list[Path]:
-        """Return the figures and tables of a result in a folder, by default that of the last run, in order."""
-        return sorted(((folder or self.executed) / f"{name}.files").glob("[!.]*"))
+    def published(self, name: str) -> list[Path]:
+        """Return the figures and tables of the last run of a notebook, in order."""
+        return sorted((self.executed / f"{name}.files").glob("[!.]*"))
 
     @property
     def lock(self) -> Path:

@@ -59,12 +59,12 @@ def digest_result(executed: bytes, files: list[Path]) -> str:
     return digest([executed, digest_files({file.name: file for file in files}).encode()])
 
 
-def read_record(project: Project, name: str, folder: Path | None = None) -> dict[str, Any]:
-    """Return the record of a result in a folder, by default that of the last run; empty if it is not whole."""
-    result = (folder or project.executed) / f"{name}.ipynb"
+def read_record(project: Project, name: str) -> dict[str, Any]:
+    """Return the record of the last run of a notebook; empty if its result is not whole."""
+    result = project.executed / f"{name}.ipynb"
     try:
         record = json.loads(result.with_suffix(".json").read_bytes())
-        content = digest_result(result.read_bytes(), project.published(name, folder))
+        content = digest_result(result.read_bytes(), project.published(name))
         return record if record["result"] == content and record["seconds"] >= 0 else {}
     except (OSError, ValueError, KeyError, TypeError):  # TypeError: it is JSON of another kind
         return {}

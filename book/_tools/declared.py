@@ -4,7 +4,6 @@ import difflib
 import inspect
 import math
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import import_module
 from pkgutil import resolve_name
@@ -13,9 +12,8 @@ from typing import Any
 
 from nbformat import NotebookNode
 from ruamel.yaml import YAML
-from ruamel.yaml.constructor import SafeConstructor
+from ruamel.yaml.composer import MaxDepthExceededError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event
 
 from studies.kit.parameters import Fields, check_parameters, example, typed
 
@@ -181,41 +179,22 @@ def nearest(name: str, known: Any) -> str:
     return f"did you mean {similar[0]!r}?" if similar else f"expected one of {', '.join(known) or '(none)'}"
 
 
-class _Constructor(SafeConstructor):
-    """Constructor that reads dates as strings: no parameter is a date."""
-
-
-_Constructor.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
-
-
 def load(text: str, origin: str) -> Any:
-    """Read plain YAML 1.2: numbers, strings, lists and mappings, without tags and aliases."""
+    """Read YAML 1.2: numbers, strings, lists and mappings."""
     if len(text) > LONGEST:
         raise ParameterError(f"{origin}: {len(text)} characters: expected at most {LONGEST}")
     yaml = YAML(typ="safe", pure=True)  # not the C parser: it reads YAML 1.1, in which yes is True and 010 is 8
-    yaml.Constructor = _Constructor
+    yaml.max_depth = DEEPEST
     try:
-        _check_plain(yaml.parse(text))
         return yaml.load(text)
+    except MaxDepthExceededError:
+        raise ParameterError(f"{origin}: expected lists and mappings at most {DEEPEST} deep") from None
     except MarkedYAMLError as error:
         where = f", line {error.problem_mark.line + 1}" if "\n" in text else ""
         context = f" ({error.context})" if error.context else ""
         raise ParameterError(f"{origin}{where}: {error.problem}{context}") from None
     except (YAMLError, ValueError) as error:  # an invalid character, or a number with too many digits
         raise ParameterError(f"{origin}: {error}") from None
-
-
-def _check_plain(events: Iterable[Event]) -> None:
-    """Refuse tags and aliases, and what is nested too deep."""
-    depth, problem = 0, ""
-    for event in events:
-        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-        if isinstance(event, AliasEvent) or getattr(event, "tag", None):
-            problem = "tags (!) and aliases (*) are not allowed; quote strings"
-        elif depth > DEEPEST:
-            problem = f"expected lists and mappings at most {DEEPEST} deep"
-        if problem:
-            raise MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
 
 
 def mapping(text: str, origin: str) -> dict[str, Any]:

@@ -3,9 +3,7 @@
 Nothing is loaded before the reader asks. `book/_static/run.js` is the page's side, `driver.py` that of Python.
 """
 
-import ast
 import base64
-import builtins
 import copy
 import io
 import json
@@ -36,8 +34,6 @@ COPY = "_static/pyodide"
 DATA = "_static/run"
 KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the version that this book uses
 SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
-# Modules that Python in the page has; code that imports others cannot run there.
-MODULES = {"dataclasses", "math", "matplotlib", "numpy", "scipy", "studies", "types", "typing", "zwfs"}
 SKIPPED = "colab"  # tag of cells that the page leaves out
 POLICY = '<meta http-equiv="Content-Security-Policy" content="{}"/>'
 DATE = (2020, 1, 1, 0, 0, 0)
@@ -114,35 +110,6 @@ def limits(parameter: Parameter) -> dict[str, Any]:
         case (low, high):
             return {"low": low, "high": high, "whole": isinstance(low, int) and isinstance(high, int)}
     return {"yes": parameter.limits is bool}
-
-
-def mark_examples(app: Sphinx, tree: nodes.document) -> None:
-    """Mark the examples of a page that Python in the page can run."""
-    for block in tree.findall(nodes.literal_block):
-        if block.get("language") == "python" and runs_in_page(block.astext()):
-            block["classes"].append("runnable")
-
-
-def runs_in_page(code: str) -> bool:
-    """Return whether code is complete, uses `zwfs`, and imports only what Python in the page has."""
-    try:
-        tree = [*ast.walk(ast.parse(code))]
-    except SyntaxError:
-        return False
-    imports = [one.name for node in tree if isinstance(node, ast.Import) for one in node.names]
-    imports += [node.module or "." for node in tree if isinstance(node, ast.ImportFrom)]
-    given = {
-        one.asname or one.name.split(".")[0]
-        for node in tree
-        if isinstance(node, ast.Import | ast.ImportFrom)
-        for one in node.names
-    }
-    given |= {node.name for node in tree if isinstance(node, ast.FunctionDef | ast.ClassDef)}
-    given |= {node.arg for node in tree if isinstance(node, ast.arg)}
-    words = [node for node in tree if isinstance(node, ast.Name)]
-    given |= {node.id for node in words if isinstance(node.ctx, ast.Store)} | {*dir(builtins), "__name__"}
-    complete = {node.id for node in words} <= given
-    return complete and "zwfs" in given and {name.split(".")[0] for name in imports} <= MODULES
 
 
 def site(project: Project) -> bytes:
@@ -249,7 +216,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Mark what can run, and write what it needs."""
     app.add_config_value("pyodide", "", "html")
     NbGlueDomain.roles["text"] = MarkedText()
-    app.connect("doctree-read", mark_examples)
     app.connect("html-page-context", add_scripts)
     app.connect("build-finished", write)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -8,7 +8,6 @@ import os
 import re
 from pathlib import Path
 from typing import Any
-from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import nbformat
 from nbformat import NotebookNode
@@ -105,18 +104,14 @@ def write_archives(app: Sphinx, exception: Exception | None) -> None:
     folder.mkdir(exist_ok=True)
     for source in project.sources():
         if source.relative_to(project.root).with_suffix("").as_posix() in app.env.found_docs:
-            write_archive(folder / f"{source.stem}.zip", project, run_of(app, source))
+            (folder / f"{source.stem}.zip").write_bytes(archive(project, run_of(app, source)))
 
 
-def write_archive(file: Path, project: Project, notebook: Path) -> None:
-    """Write a notebook, the studies that it imports and their data to a ZIP, with the same bytes each time."""
-    studies = sorted(one for one in project.depends_on(notebook.stem) if one.is_relative_to(project.studies))
-    with ZipFile(file, "w", ZIP_DEFLATED) as archive:
-        for path in (notebook, *studies):
-            name = path.name if path == notebook else path.relative_to(project.notebooks).as_posix()
-            about = ZipInfo(name)  # its date is a constant
-            about.compress_type, about.external_attr = ZIP_DEFLATED, 0o644 << 16
-            archive.writestr(about, path.read_bytes())
+def archive(project: Project, notebook: Path) -> bytes:
+    """Return a ZIP of a notebook, the studies that it imports and their data."""
+    studies = (one for one in project.depends_on(notebook.stem) if one.is_relative_to(project.studies))
+    files = {one.relative_to(project.notebooks).as_posix(): one.read_bytes() for one in studies}
+    return run.zipped(files | {notebook.name: notebook.read_bytes()})
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -76,21 +76,15 @@ def peers(rows: list[dict[str, Any]]) -> str:
 def tables(speed: dict[str, Any]) -> dict[str, str]:
     """Return the tables and sentences on speed, by name."""
     methods = [[name, f"{1e3 * t:.2g}"] for name, t in speed["others"].items()]
-    batches = [
-        [str(row["n_frames"]), f"{1e3 * row['time per frame']:.2f}", f"{row['memory'] / 1e6:.1f}"]
-        for row in speed["batches"]
-    ]
-    memory = "memory without frames and results (MB)"
     return {
         "rates": rates(speed),
-        "batches": table(["frame pairs in a call", "time of each (ms)", memory], batches),
         "methods": table(["method", "time (ms)"], methods),
         "likelihood": table(
             ["task", "time, in propagations of HCIPy"],
             [[name.replace("lambda/D", "λ/D"), f"{ratio:.2g}"] for name, ratio in speed["likelihood"].items()],
         ),
         "telemetry": telemetry(speed["telemetry"]),
-        **latency(speed["latency"]),
+        "latency": latency(speed["latency"]),
     }
 
 
@@ -124,25 +118,15 @@ def rates(speed: dict[str, Any]) -> str:
     return table(["setting", "rate (1/s)", "median error (rad)", "largest error (rad)"], rows)
 
 
-def latency(rows: list[dict[str, Any]]) -> dict[str, str]:
-    """Return a table of the times of single frames, and one of the causes of late calls."""
+def latency(rows: list[dict[str, Any]]) -> str:
+    """Return a table of the times of single frames."""
     settings = [f"{row['n_pixels']} pixels{'' if row['frozen'] else ', with garbage collector'}" for row in rows]
     quantiles = "p50", "p99", "p99.9"
     times = [
         [setting, *(f"{1e6 * row[name]:.0f}" for name in quantiles), f"{row['p99 / p50']:.2f}"]
         for setting, row in zip(settings, rows, strict=True)
     ]
-    causes = [name for name in rows[0] if name.startswith("late")]
-    late = [
-        [name.removeprefix("late, ") if name != "late" else "late, all", *(f"{row[name]:.2%}" for row in rows)]
-        for name in causes
-    ]
-    return {
-        "latency": table(
-            [f"{rows[0]['n_frames']} frames", *(f"{name} (μs)" for name in quantiles), "p99 / p50"], times
-        ),
-        "late": table(["share of the calls", *settings], late),
-    }
+    return table([f"{rows[0]['n_frames']} frames", *(f"{name} (μs)" for name in quantiles), "p99 / p50"], times)
 
 
 def telemetry(measured: dict[str, Any]) -> str:

@@ -36,7 +36,6 @@ KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the ver
 SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
 SKIPPED = "colab"  # tag of cells that the page leaves out
 POLICY = '<meta http-equiv="Content-Security-Policy" content="{}"/>'
-DATE = (2020, 1, 1, 0, 0, 0)
 
 
 class MarkedText(PasteTextRole):
@@ -113,7 +112,7 @@ def limits(parameter: Parameter) -> dict[str, Any]:
 
 
 def site(project: Project) -> bytes:
-    """Return a ZIP of the code and data that the page needs; the same content gives the same bytes."""
+    """Return a ZIP of the code and data that the page needs."""
     files = {
         f"zwfs/{file.relative_to(project.root / 'zwfs').as_posix()}": file.read_bytes()
         for file in (project.root / "zwfs").rglob("*.py")
@@ -126,12 +125,17 @@ def site(project: Project) -> bytes:
     for file in metadata.files("array-api-compat") or ():
         if file.suffix == ".py" or file.match("*.dist-info/METADATA") or file.match("*.dist-info/licenses/*"):
             files[file.as_posix()] = file.read_binary()
+    return zipped(files)
+
+
+def zipped(files: dict[str, bytes]) -> bytes:
+    """Return a ZIP of files by name; the same content gives the same bytes."""
     stream = io.BytesIO()
     with ZipFile(stream, "w", ZIP_DEFLATED) as archive:
         for name in sorted(files):
-            one = ZipInfo(name, DATE)
-            one.compress_type = ZIP_DEFLATED
-            archive.writestr(one, files[name])
+            about = ZipInfo(name)  # its date is a constant
+            about.compress_type, about.external_attr = ZIP_DEFLATED, 0o644 << 16
+            archive.writestr(about, files[name])
     return stream.getvalue()
 
 

@@ -173,7 +173,6 @@ def likelihood(seconds, n_pixels=100):
 def results(seconds=2.0):
     """All of the above: numbers, lists and dictionaries only."""
     return {
-        "batches": batches(seconds),
         "real time": [row for n_pixels in (100, 40) for row in real_time(n_pixels, seconds)],
         "closed loop": [closed_loop(n_pixels, seconds) for n_pixels in (100, 40)],
         "slope": slope(seconds),

@@ -1,4 +1,4 @@
-"""Links of the book: from equations to code, and from the first use of a term to the glossary."""
+"""Links of the book: from equations to code and tests, and from the first use of a term to the glossary."""
 
 import pytest
 from bs4 import BeautifulSoup
@@ -10,11 +10,15 @@ from book._ext import equations, glossary
 from .conftest import ROOT
 
 
-def test_equations_lead_to_the_code_that_cites_them():
+def test_equations_lead_to_the_code_that_cites_them_and_to_its_tests():
     found = equations.implementations(ROOT)
     assert found["eq-phase-shifted"] == ["zwfs.PhaseShifted"]
     assert found["eq-reference"] == ["zwfs.ZernikeSensor.reference_wave"], "the method, not its class"
     assert len(found) >= 25
+    assert equations.tests(ROOT, "zwfs.ZernikeSensor.adjoint") == ["test_sensor.py"]
+    assert equations.tests(ROOT, "zwfs.cramer_rao") == ["test_bounds.py"]
+    for paths in found.values():
+        assert all((ROOT / "tests" / file).is_file() for path in paths for file in equations.tests(ROOT, path))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Links from each equation to the code that implements it, from the citations in docstrings."""
+"""Links from each equation to the code that implements it and to its tests, from the citations in docstrings."""
 
 import importlib
 import inspect
@@ -30,7 +30,18 @@ class LinkCode(SphinxTransform):
             if paths := implementations(root).get(equation.get("label", "")):
                 line = nodes.paragraph("", "Code: ", classes=["equation-code"])
                 line += joined([self.link(path) for path in paths])
+                files = dict.fromkeys(file for path in paths for file in tests(root, path))
+                line += nodes.Text(" · " if files else "")
+                line += joined([self.test(file) for file in files])
                 equation.parent.insert(equation.parent.index(equation) + 1, line)
+
+    def test(self, file: str) -> nodes.Node:
+        """Return the name of a file of tests, with a link if the repository has an address."""
+        options = self.config.html_theme_options
+        if not options["repository_url"]:
+            return nodes.literal("", file)
+        source = f"{options['repository_url']}/blob/{options['repository_branch']}/tests"
+        return nodes.reference("", "", nodes.literal("", file), refuri=f"{source}/{file}")
 
     def link(self, path: str) -> nodes.Node:
         """Return a link to a name on the API page."""
@@ -70,6 +81,28 @@ def docstrings() -> Iterator[tuple[str, str]]:
                 value = getattr(thing, member)
                 if not (member.startswith("_") or inspect.isclass(value)):
                     yield f"{path}.{member}" if member in listed else path, inspect.getdoc(value) or ""
+
+
+@cache
+def tests(root: Path, path: str) -> list[str]:
+    """Return the file with the tests of a name: that of its module, else the one that uses the name most often."""
+    thing = nearest(path)
+    for part in reversed(thing.__module__.split(".")):
+        if (root / "tests" / f"test_{part}.py").exists():
+            return [f"test_{part}.py"]
+    word = re.compile(rf"\b{thing.__name__}\b")
+    files = sorted(set((root / "tests").glob("test_*.py")) - {root / "tests" / "test_bad_input.py"})
+    uses = {file.name: len(word.findall(file.read_text("utf-8"))) for file in files}
+    return [max(uses, key=uses.__getitem__)] if any(uses.values()) else []
+
+
+def nearest(path: str) -> type:
+    """Return the function or the class at a path; the class of a method."""
+    parts = path.split(".")
+    start = max(
+        depth for depth in range(1, len(parts)) if ".".join(parts[:depth]) in {api.PACKAGE, *api.modules()}
+    )
+    return getattr(importlib.import_module(".".join(parts[:start])), parts[start])
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

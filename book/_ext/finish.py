@@ -12,8 +12,6 @@ from urllib.parse import unquote
 
 from bs4 import BeautifulSoup, Tag
 from docutils import nodes
-from matplotlib.figure import Figure
-from matplotlib.image import imread
 from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.util.fileutil import copy_asset_file
@@ -25,9 +23,8 @@ from book._tools.project import PDF
 
 VARIANTS = "variants-"  # with which the class of a figure begins that may have dark and narrow variants
 PHONE = "(max-width: 600px)"
-CARD = "_static/social.png"
-CARD_SIZE = (1200, 630)  # pixels, as social networks expect
-CARD_ALT = "The logo and the title of the book above a wavefront, its two images, and three reconstructions."
+CARD = "_static/front.png"
+CARD_ALT = "A wavefront, its two images, and three reconstructions."
 LENGTH = 200  # characters of a description
 MATH = {"lambda": "λ", "theta": "θ", "pi": "π", "pm": "±"}
 TEX = re.compile(r"\\(?:[()]|([a-z]+))")
@@ -150,8 +147,6 @@ def tags(config: Config, page: str, body: BeautifulSoup, given: str) -> str:
         described |= {
             "og:url": f"{config.html_baseurl}{page}.html",
             "og:image": f"{config.html_baseurl}{CARD}",
-            "og:image:width": str(CARD_SIZE[0]),
-            "og:image:height": str(CARD_SIZE[1]),
             "og:image:alt": CARD_ALT,
             "twitter:card": "summary_large_image",
         }
@@ -184,13 +179,11 @@ def size(picture: Path) -> tuple[int, int]:
 
 
 def finish_files(app: Sphinx, exception: Exception | None) -> None:
-    """Add MathJax, the social card and the index page, and silence the scripts."""
+    """Add MathJax and the index page, and silence the scripts."""
     if exception is not None or app.builder.format != "html":
         return
-    html, sources = Path(app.outdir), Path(app.srcdir, "book", "_static")
+    html = Path(app.outdir)
     copy_mathjax(html / "_static" / "mathjax")
-    if app.config.html_baseurl:
-        draw_card(html / CARD, sources / "logo.png", sources / "front.png", app.config.html_title)
     for script in (html / "search.html", *sorted((html / "_static").rglob("*.js"))):
         if "mathjax" not in script.parts:
             text = CONSOLE.sub("void(", script.read_text("utf-8"))
@@ -221,18 +214,6 @@ def copy_mathjax(folder: Path) -> None:
         target = folder / file.relative_to(package)
         target.parent.mkdir(parents=True, exist_ok=True)
         copy_asset_file(file, target)
-
-
-def draw_card(card: Path, logo: Path, figure: Path, title: str) -> None:
-    """Draw the social card: logo and title above a figure."""
-    width, height = CARD_SIZE
-    drawing = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor="white")
-    for picture, (left, bottom, wide, high) in ((logo, (40, 500, 100, 100)), (figure, (40, 20, 1120, 450))):
-        box = (left / width, bottom / height, wide / width, high / height)
-        drawing.add_axes(box, frameon=False, xticks=[], yticks=[]).imshow(imread(picture), interpolation="lanczos")
-    lines = "\n".join(textwrap.wrap(title, 44))
-    drawing.text(165 / width, 550 / height, lines, size=29, weight="bold", color="#1f2d3d", va="center")
-    drawing.savefig(card, format="png", metadata={"Software": None})
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

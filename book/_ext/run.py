@@ -81,7 +81,8 @@ def described(notebook: NotebookNode, name: str) -> dict[str, Any]:
             for figure in (published(cell.source) if cell.cell_type == "code" else [])
         },
         "skipped": SKIPPED,
-        "extra": ["astropy"] if any("zwfs.frames" in cell.source for cell in cells) else [],
+        # Files in FITS need it, and no study imports it.
+        "extra": ["astropy"] if any(c.cell_type == "code" and "zwfs.frames" in c.source for c in cells) else [],
         "notebook": {"cells": cells, "metadata": notebook.metadata, "nbformat": 4, "nbformat_minor": 5},
     }
 

@@ -30,7 +30,7 @@ LIMITS = {
     "n_screens": (1, 2),
     "n_iterations": USUAL["n_iterations"],
 }
-QUICK = {"n_commands": 2, "n_steps": 2, "oversampling": 1, "largest": 0.3}
+QUICK = {"n_commands": 2, "n_steps": 2, "oversampling": 1, "largest": 0.3, "n_screens": 1}
 
 _UNIT = 1e-4  # rad, of the phases in the file
 

@@ -30,12 +30,11 @@ from zwfs.masks import Dimple
 _TOLERANCE = 1e-6  # of the reference wave
 _DEGREE = 5  # of the spline that takes an image to the pixels
 _BORDER = 4  # pixels around a frame that are modelled: blurred light that crosses the edge comes back
-_RELAY = ("focus", "astigmatism", "astigmatism_45")
 _PLACE = ("row", "column", "rotation", "magnification")
-ARM = (*_RELAY, *_PLACE, "flux", "background")
-"""Numbers of an optical path: D^2 / lambda for the relay, pixels, pixels, radian and 1 for the place, counts."""
-MASKS = ("diameter", "first", "second", "leakage", "incoherent", "in_phase", "quadrature", "blur")
-"""Numbers that all images share: lambda/D, radian, radian, fractions of light and of amplitude, pixels rms."""
+ARM = ("focus", *_PLACE, "flux", "background")
+"""Numbers of an optical path: D^2 / lambda for the focus, pixels, pixels, radian and 1 for the place, counts."""
+MASKS = ("diameter", "first", "second", "leakage", "blur")
+"""Numbers that all images share: lambda/D, radian, radian, fraction of light, pixels rms."""
 
 
 class Exposure(NamedTuple):
@@ -104,7 +103,7 @@ class Camera:
         self.planes = tuple(_Plane(one, largest, spread) for one in (axis[self.window[0]], axis))
         self._spread = spread
         frequency = fft.fftfreq(size) * f  # cycles per pixel
-        self.relay = self.polynomials(frequency[None, :], frequency[:, None])
+        self.defocus = self.defocus_at(frequency[None, :], frequency[:, None])
         half = fft.rfftfreq(size) * f
         self.squares = frequency[:, None] ** 2 + half**2
         prefilter = [
@@ -113,21 +112,20 @@ class Camera:
         pixel = [np.sinc(one) / two for one, two in zip((frequency, half), prefilter, strict=True)]
         self.pixel = np.multiply.outer(*pixel)
 
-    def polynomials(self, u: NDArray, v: NDArray) -> NDArray[np.float64]:
-        """Phases (3, ...) at frequencies in cycles per pixel that a unit of each parameter of the relay makes."""
-        scale = np.pi * self.n_pixels**2
-        return scale * np.stack(np.broadcast_arrays(u**2 + v**2, u**2 - v**2, 2 * u * v))
+    def defocus_at(self, u: NDArray, v: NDArray) -> NDArray[np.float64]:
+        """Phase at frequencies in cycles per pixel that a unit of focus makes."""
+        return np.pi * self.n_pixels**2 * (u**2 + v**2)
 
-    def cores(self, diameter: float, relay: NDArray) -> NDArray[np.complex128]:
-        """Operators (5, q, r) of the dimple's light: itself, and its derivatives by relay and diameter."""
+    def cores(self, diameter: float, focus: float) -> NDArray[np.complex128]:
+        """Operators (3, q, r) of the dimple's light: itself, and its derivatives by focus and diameter."""
         dimple = Dimple(diameter, 0.0)
         nodes = [make(dimple, self._spread, _TOLERANCE, 1.0) for make in (_quadrature, _rim)]
         u, v = (np.concatenate(both) for both in zip(*(one[:2] for one in nodes), strict=True))
         disc, rim = (np.zeros(u.size) for _ in range(2))
         disc[: nodes[0][2].size], rim[nodes[0][2].size :] = nodes[0][2], nodes[1][2]
-        polynomials = self.polynomials(u / self.n_pixels, v / self.n_pixels)
-        factors = np.concatenate([[disc], -1j * polynomials * disc, [rim]])
-        factors = factors * np.exp(-1j * np.tensordot(relay, polynomials, 1)) / (self.n_pixels * self.f) ** 2
+        defocus = self.defocus_at(u / self.n_pixels, v / self.n_pixels)
+        factors = np.stack([disc, -1j * defocus * disc, rim])
+        factors = factors * np.exp(-1j * focus * defocus) / (self.n_pixels * self.f) ** 2
         source, target = (plane.spectra(u, v) for plane in self.planes)
         return (target.conj() * factors[:, np.newaxis, :]) @ source.T
 
@@ -180,26 +178,22 @@ class Coefficients(NamedTuple):
 def coefficients(masks: dict[str, float]) -> Coefficients:
     """What the masks do to the light of the dimple: c_1 (amplitude) and c_2 (intensity).
 
-    A share q_j of the light carries psi + s_j b, with s_j = (exp(i theta_j) - 1) / (1 + in_phase + i quadrature):
-    (1 - incoherent) (1 - leakage) of this mask, (1 - incoherent) leakage of the other one, and incoherent with
-    s = 0. So c_1 = sum q_j s_j and c_2 = sum q_j |s_j|^2.
+    A share q_j of the light carries psi + s_j b, with s_j = exp(i theta_j) - 1: 1 - leakage of this mask, and
+    leakage of the other one. So c_1 = sum q_j s_j and c_2 = sum q_j |s_j|^2.
     """
-    factor = 1 / (1 + masks["in_phase"] + 1j * masks["quadrature"])
     turn = np.exp(1j * np.array([masks["first"], masks["second"]]))
-    strength = (turn - 1) * factor
-    kept, leakage = 1 - masks["incoherent"], masks["leakage"]
+    strength, leakage = turn - 1, masks["leakage"]
     shares = np.array([[1 - leakage, leakage], [leakage, 1 - leakage]])
-    mix, power = kept * shares, np.abs(strength) ** 2
+    power = np.abs(strength) ** 2
     slope: Any = np.zeros((2, len(MASKS)), complex)  # of the strengths
     place = MASKS.index
-    slope[0, place("first")], slope[1, place("second")] = 1j * turn * factor
-    slope[:, place("in_phase")], slope[:, place("quadrature")] = -strength * factor, -1j * strength * factor
-    first_slope: Any = mix @ slope
-    second_slope: Any = mix @ (2 * (strength.conj()[:, None] * slope).real)
-    for name, change in (("leakage", kept * np.array([[-1, 1], [1, -1]])), ("incoherent", -shares)):
-        first_slope[:, place(name)] += change @ strength
-        second_slope[:, place(name)] += change @ power
-    return Coefficients(mix @ strength, mix @ power, first_slope, second_slope)
+    slope[0, place("first")], slope[1, place("second")] = 1j * turn
+    first_slope: Any = shares @ slope
+    second_slope: Any = shares @ (2 * (strength.conj()[:, None] * slope).real)
+    change = np.array([[-1, 1], [1, -1]])
+    first_slope[:, place("leakage")] += change @ strength
+    second_slope[:, place("leakage")] += change @ power
+    return Coefficients(shares @ strength, shares @ power, first_slope, second_slope)
 
 
 class _Spline:
@@ -287,14 +281,13 @@ class Linearised:
         self.arms = [dict(zip(ARM, row, strict=True)) for row in split.tolist()]
         self.masks = dict(zip(MASKS, values[-len(MASKS) :].tolist(), strict=True))
         self._coefficients = coefficients(self.masks)
-        self._relays = [np.array([arm[name] for name in _RELAY]) for arm in self.arms]
         self._transfer = [
-            np.exp(-1j * np.tensordot(relay, camera.relay, 1)) if relay.any() else None for relay in self._relays
+            np.exp(-1j * arm["focus"] * camera.defocus) if arm["focus"] else None for arm in self.arms
         ]
         self._blur = camera.pixel * np.exp(-2 * (np.pi * self.masks["blur"]) ** 2 * camera.squares)
         self._splines = [_Spline(camera, [arm[name] for name in _PLACE]) for arm in self.arms]
         masked = {one.arm for one in camera.exposures if one.mask is not None}
-        self._cores = {arm: camera.cores(self.masks["diameter"], self._relays[arm]) for arm in masked}
+        self._cores = {arm: camera.cores(self.masks["diameter"], self.arms[arm]["focus"]) for arm in masked}
         self._wave = np.exp(1j * maps.phase)
         self._states = [self._source(maps.mean * self._wave * turn) for turn in camera.turns]
         self._parts = [self._part(one) for one in camera.exposures]
@@ -393,8 +386,8 @@ class Linearised:
                 slope = -4 * np.pi**2 * self.masks["blur"] * camera.squares * self._blur
                 image = fft.irfft2(slope * part.spectrum, s=part.blurred.shape)
                 out.append(arm["flux"] * self._splines[one.arm](image))
-            elif name in _RELAY:
-                out.append(self._on_camera(one, self._by_relay(one, part, source, _RELAY.index(name))))
+            elif name == "focus":
+                out.append(self._on_camera(one, self._by_focus(one, part, source)))
             elif one.mask is None:
                 out.append(zero)
             elif name == "diameter":
@@ -407,15 +400,13 @@ class Linearised:
                 out.append(self._on_camera(one, change))
         return np.reshape(out, (len(wanted), *camera.shape))
 
-    def _by_relay(
-        self, one: Exposure, part: _Part, source: tuple[NDArray, NDArray, NDArray], number: int
-    ) -> NDArray:
-        """Derivative of an intensity by a number of the relay."""
+    def _by_focus(self, one: Exposure, part: _Part, source: tuple[NDArray, NDArray, NDArray]) -> NDArray:
+        """Derivative of an intensity by the focus."""
         camera, transfer = self.camera, self._transfer[one.arm]
         spectrum = fft.fft2(source[0]) if transfer is None else transfer * source[1]
-        intensity = _twice(part.ahead, fft.ifft2(-1j * camera.relay[number] * spectrum))
+        intensity = _twice(part.ahead, fft.ifft2(-1j * camera.defocus * spectrum))
         if one.mask is not None:
-            light = camera.planes[1].expand(self._cores[one.arm][1 + number] @ source[2])
+            light = camera.planes[1].expand(self._cores[one.arm][1] @ source[2])
             intensity += _twice(part.across, light)
         return intensity
 

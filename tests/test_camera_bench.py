@@ -61,7 +61,7 @@ def modelled(partly_lit, f, areas):
     light, mean = blocks(amplitude**2, k), blocks(amplitude, k)
     mean = mean if areas else np.sqrt(light)
     camera = Camera(24, (24, 24), 20, [Exposure(0, 0, 0)], np.zeros((1, 24 * f, 24 * f)), f, 1.5)
-    values = np.array([0, 0, 0, 0, 0, 0, 1, 1, 0, 1.1, 1.5, -1.5, 0, 0, 0, 0, blur])
+    values = np.array([0, 0, 0, 0, 1, 1, 0, 1.1, 1.5, -1.5, 0, blur])
     (image,) = camera.at(Maps(mean, light - mean**2, blocks(phase, k)), values).images
     return image
 

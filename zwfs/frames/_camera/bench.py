@@ -297,9 +297,8 @@ def _with_flat(problem: Problem, flat: NDArray) -> NDArray[np.float64]:
 def _again(data: Recording, best: Minimum, missed: NDArray) -> tuple[Problem, NDArray]:
     """The problem with light divided, and pixels weighed, by what was fitted."""
     point, before = best.point, best.point.problem
-    f, n = before.camera.f, before.phase_map.n
-    weights = data.weights(point.model.images)
-    light = Light.of(point.light, point.light.reshape(n, f, n, f).mean(axis=(1, 3)), f)
+    f, weights = before.camera.f, data.weights(point.model.images)
+    light = Light.of(point.light, point.light_means, f)
     free = [
         one if math.isfinite(one.sigma) else one._replace(value=float(point.values[places[0]]))
         for one, places in zip(before.free, before.places, strict=True)
@@ -355,13 +354,11 @@ def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:
         Estimate(one.name, value, error, not one.low < value < one.high)
         for one, value, error in zip(point.problem.free, values.tolist(), sigma, strict=True)
     )
-    n, f = point.problem.phase_map.n, point.problem.camera.f
-    inner = (slice(PAD, n - PAD),) * 2
     return BenchFit(
         estimates,
         spread,
-        point.problem.phase_map.means(point.problem.split(point.x)[0][0])[inner],
-        point.light.reshape(n, f, n, f).mean(axis=(1, 3))[inner],
+        point.phase_means[PAD:-PAD, PAD:-PAD],
+        point.light_means[PAD:-PAD, PAD:-PAD],
         misfit,
         data.noise,
         best.converged,
@@ -384,8 +381,8 @@ def _remarks(data: Recording, misfit: NDArray, estimates: tuple[Estimate, ...], 
                 f"State {state} has a misfit of {misfit:.3g}, the median is {typical:.3g}: its command or its "
                 "frames are wrong."
             )
+    level = data.light[1][0]
     for one in estimates:
-        level = data.light[1][0]
         if one.name.endswith("background") and abs(one.value) > max(5 * one.sigma, 3e-3 * level):
             out.append(f"{one.name} is {one.value:.4g} counts: the dark does not belong to the frames.")
     return out

@@ -75,10 +75,7 @@ class FittedPhase(NDArrayOperatorsMixin):
             right = point.back(noise) + rng.normal(size=point.x.shape)
             white, _ = problem.split(point.solve(right, held, 60, 0.03))
             draws.append(problem.phase_map.means(white[0])[PAD:-PAD, PAD:-PAD])
-        inner = point.light.reshape(problem.phase_map.n, problem.camera.f, problem.phase_map.n, -1).mean(
-            axis=(1, 3)
-        )
-        lit = inner[PAD:-PAD, PAD:-PAD] > 0.3
+        lit = point.light_means[PAD:-PAD, PAD:-PAD] > 0.3
         left = np.stack([one - one[lit].mean() for one in draws])
         variance = ndimage.gaussian_filter(np.mean(left**2, axis=0), 1.0)
         return np.sqrt(variance * max(1.0, self.misfit))
@@ -136,14 +133,11 @@ class FittedSensor:
         held = np.random.default_rng(0).random(shape) < _HELD_OUT  # the choice hardly changes the prior
         lit = held & good & (counts > 0.1 * np.median(counts[counts > 0.5 * counts.max()]))
         best: tuple[float, float, NDArray] | None = None
-        for accelerate in (
-            False,
-            True,
-        ):  # the second is for phases from which the plain iteration does not converge
+        for accelerate in (False, True):  # the second where the plain iteration does not converge
             means, tried = self._start(counts, accelerate), list[tuple[float, float, NDArray]]()
             for exponent in _EXPONENTS:
                 seen = self._minimum(counts, weights * ~held, exponent, means, 2 if tried else 3, 20).point
-                means = seen.problem.phase_map.means(seen.problem.split(seen.x)[0][0])
+                means = seen.phase_means
                 score = float(np.mean(((np.array(seen.model.images) - counts) * weights)[lit] ** 2))
                 tried.append((score, exponent, means))
                 if score > 1.1 * min(one[0] for one in tried):
@@ -157,10 +151,8 @@ class FittedSensor:
         assert best is not None
         _, exponent, means = best
         end = self._minimum(counts, weights, exponent, means, self.n_steps, 30)
-        point = end.point
-        misfit = float(np.mean(point.misfit))
-        phase = point.problem.phase_map.means(point.problem.split(point.x)[0][0])[PAD:-PAD, PAD:-PAD]
-        return FittedPhase(phase, misfit, misfit < EXPLAINED, end.converged, exponent, point)
+        misfit, phase = float(np.mean(end.point.misfit)), end.point.phase_means[PAD:-PAD, PAD:-PAD]
+        return FittedPhase(phase, misfit, misfit < EXPLAINED, end.converged, exponent, end.point)
 
     def frames(self, phase: ArrayLike) -> NDArray[np.float64]:
         """Frames that the model predicts for a phase.
@@ -205,26 +197,17 @@ class FittedSensor:
         """Fit of the phase alone."""
         of = self._fitted
         inside = start[of.phase_map.n // 4 : -of.phase_map.n // 4]
-        phase_map = PhaseMap(
-            of.phase_map.n, of.camera.f, MapPrior(max(0.1, 2 * float(inside.std())), exponent), of.camera.n_pixels
-        )
-        values = self.fit.point.values
-        problem = Problem(
-            self._camera,
-            list(counts),
-            list(weights),
-            self._light,
-            np.zeros(self._light.start.shape),
-            phase_map,
-            (),
-            values,
-        )
+        prior = MapPrior(max(0.1, 2 * float(inside.std())), exponent)
+        phase_map = PhaseMap(of.phase_map.n, of.camera.f, prior, of.camera.n_pixels)
+        light, values = self._light, self.fit.point.values
+        zero = np.zeros(light.start.shape)
+        problem = Problem(self._camera, list(counts), list(weights), light, zero, phase_map, (), values)
         return minimise(problem, white_phase(phase_map, start).ravel(), n_steps, n_inner)
 
     def _start(self, counts: NDArray, accelerate: bool) -> NDArray[np.float64]:
         """Phase of the phase-shifted iteration on images brought back to the pupil, unwrapped and continued."""
-        point, n, f = self.fit.point, self._fitted.phase_map.n, self._fitted.camera.f
-        light = np.maximum(point.light.reshape(n, f, n, f).mean(axis=(1, 3)), 0)
+        point, n = self.fit.point, self._fitted.phase_map.n
+        light = np.maximum(point.light_means, 0)
         pupil = Pupil.from_amplitude(np.sqrt(light), self._fitted.camera.n_pixels, threshold=0.3)
         power = np.mean(pupil.amplitude[pupil.inside] ** 2) / np.mean(light[pupil.inside])
         masks = point.model.masks
@@ -238,12 +221,10 @@ class FittedSensor:
             images[side] = ndimage.map_coordinates(image, [rows, columns], order=3, mode="nearest")
         leaked = min(masks["leakage"], 0.4)
         images = ((1 - leaked) * images - leaked * images[::-1]) / (1 - 2 * leaked)
-        sensor = ZernikeSensor(
-            pupil, *(Dimple(masks["diameter"], masks[name]) for name in ("first", "second")), tolerance=1e-5
-        )
-        found = PhaseShifted(sensor, n_iterations=25, tolerance=1e-3, accelerate=accelerate)(
-            np.maximum(images, 0)
-        ).phase
+        dimples = (Dimple(masks["diameter"], masks[name]) for name in ("first", "second"))
+        sensor = ZernikeSensor(pupil, *dimples, tolerance=1e-5)
+        iterate = PhaseShifted(sensor, n_iterations=25, tolerance=1e-3, accelerate=accelerate)
+        found = iterate(np.maximum(images, 0)).phase
         inside = ndimage.binary_erosion(pupil.inside) | (pupil.inside & (light > 0.8))
         phase = unwrapped(np.nan_to_num(found), inside)
         near = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)

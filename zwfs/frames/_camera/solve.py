@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -301,6 +301,17 @@ class Point:
         parts = [*self.residuals, x[: problem.n_white], self.excess]
         self.cost = sum(float(np.vdot(one, one)) for one in parts) / 2
 
+    @property
+    def phase_means(self) -> NDArray[np.float64]:
+        """Phase, mean over each pixel."""
+        return self.problem.phase_map.means(self.problem.split(self.x)[0][0])
+
+    @property
+    def light_means(self) -> NDArray[np.float64]:
+        """Light, mean over each pixel."""
+        n, f = self.problem.phase_map.n, self.problem.camera.f
+        return self.light.reshape(n, f, n, f).mean(axis=(1, 3))
+
     @cached_property
     def misfit(self) -> NDArray[np.float64]:
         """Mean square of the residuals of each image."""
@@ -477,7 +488,6 @@ class Minimum:
     """Where a fit ended."""
 
     point: Point
-    n_steps: int
     converged: bool
 
 
@@ -487,18 +497,17 @@ def minimise(
     n_steps: int = 30,
     n_inner: int = 60,
     enough: float = 0.0,
-    log: Any = None,
 ) -> Minimum:
     """Levenberg and Marquardt's method on all unknowns, until a step promises no more than a part of 1.
 
     It ends earlier when a step promises less than `enough` of the cost.
     """
     point = Point(problem, problem.start if x is None else x)
-    damping, converged, step = 1e-2, False, 0
+    damping, converged, promised = 1e-2, False, math.inf
     n, bounds = problem.n_white, problem.bounds
-    promised = math.inf
-    while step < n_steps and not converged and promised > enough * point.cost:
-        step += 1
+    for _ in range(n_steps):
+        if converged or promised <= enough * point.cost:
+            break
         for _ in range(10):
             change = point.solve(-point.gradient, point.stuck, n_inner, 0.03, damping)
             target = point.x + change
@@ -510,14 +519,12 @@ def minimise(
                 break
             damping *= 8
         converged = promised < _SETTLED and damping < 0.1
-        if log:
-            log(f"step {step}: cost {point.cost:.1f} gain {gain:.2f} of {promised:.2f}, damping {damping:.1g}")
         if gain >= 0:
             point = trial
         share = gain / promised if promised > 0 else 1.0
         damping *= 0.2 if share > 0.75 else 1.0 if share > 0.4 else 4.0
         damping = max(damping, _LEAST)
-    return Minimum(point, step, converged)
+    return Minimum(point, converged)
 
 
 def covariance(point: Point, n_inner: int = 15) -> NDArray[np.float64]:

@@ -259,8 +259,7 @@ def factorise(
     def disc(diameter: float) -> NDArray[np.float64]:
         """Core of a dimple that adds 1 to the transmission: half of the nodes, as opposite ones are conjugate."""
         u, v, weights = nodes(Dimple(diameter, 0.0), reach, tolerance)
-        n_angles = u.size if rim else math.isqrt(2 * u.size)
-        half = np.flatnonzero(np.arange(u.size) % n_angles < n_angles // 2)
+        half = np.flatnonzero(np.cos(1) * u + np.sin(1) * v > 0)  # 1 rad from u: no node lies on the border
         total: Any = 0
         for some in (half[first : first + _NODES] for first in range(0, half.size, _NODES)):
             spectra = _spectra(from_pupil, u[some], v[some])

@@ -120,7 +120,7 @@ def test_refreshed_notebooks_are_current(ran, monkeypatch):
 )
 def test_what_changed_is_stale(ran, change, stale):
     change(ran)
-    keys = {name: record.key(ran, name, {}) for name in ALL}
+    keys = {name: record.key(ran, name) for name in ALL}
     assert {name for name in keys if record.read_record(ran, name).get("key") != keys[name]} == stale
 
 

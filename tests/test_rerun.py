@@ -186,21 +186,6 @@ def test_the_recorded_command_gives_the_same_parameters():
     assert declared.assignments([text for text in options if text != "-p"]) == given
 
 
-def test_files_that_parameters_name_count_by_what_is_in_them(project, tmp_path):
-    (project.notebooks / "beside.npy").write_bytes(b"one")
-    (tmp_path / "far.npy").write_bytes(b"one")
-    given = {
-        "files": ["beside.npy", str(tmp_path / "far.npy")],
-        "other": ["x" * 5000, "no\0file", "nowhere.npy", ""],
-    }
-    keys = [record.key(project, "fig01_small", given)]
-    for file in (project.notebooks / "beside.npy", tmp_path / "far.npy", project.notebooks / "nowhere.npy"):
-        file.write_bytes(b"two")
-        keys.append(record.key(project, "fig01_small", given))
-    assert len(set(keys)) == 4
-    assert record.key(project, "fig01_small", given) == keys[-1]
-
-
 def test_a_notebook_depends_on_its_studies_the_kit_and_all_of_the_package(project):
     (project.notebooks / "studies").unlink()
     write(project, "fig01_small", new_code_cell("from studies import fig01_small as study"))
@@ -217,10 +202,10 @@ def test_a_notebook_depends_on_its_studies_the_kit_and_all_of_the_package(projec
         (project.root / name).write_text("")
     (project.notebooks / "studies" / "fig01_small.py").write_text("from studies.shared import light\n")
     for name, counts in parts.items():
-        before = record.key(project, "fig01_small", {})
+        before = record.key(project, "fig01_small")
         with (project.root / name).open("a") as file:
             file.write("# changed\n")
-        assert (record.key(project, "fig01_small", {}) != before) == counts, name
+        assert (record.key(project, "fig01_small") != before) == counts, name
 
 
 def test_folder_holds_all_that_was_made(ran):
@@ -231,7 +216,6 @@ def test_folder_holds_all_that_was_made(ran):
     assert (folder / "numbers.csv").read_text() == "2,3.0"
     assert about["parameters"] == {"n": 2, "width": 3.0, "steps": [1, 2], "seed": 7}
     assert (about["changed"], about["seed"], about["commit"]) == ({"width": 3.0}, 7, None)
-    assert about["key"] == record.key(ran, "fig01_small", {"width": 3.0})
     assert {"Python", "NumPy", "SciPy", "Matplotlib", "zwfs"} <= set(about["versions"])
     assert set(about["files"]) == files
     assert os.listdir(ran.build) == ["rerun"]
@@ -252,29 +236,16 @@ def test_page_has_everything_in_it(ran):
     assert "check_parameters" not in plain
 
 
-def test_second_run_is_served_unless_something_changed(ran, monkeypatch, capsys):
-    made = []
-    monkeypatch.setattr(rerun, "make", lambda *arguments: made.append(arguments[2]) or 1.0)
-    rerun.rerun(ran, ["1", "-p", "width=3.0"])
-    assert made == []
-    assert "unchanged" in capsys.readouterr().out
-    rerun.rerun(ran, ["1", "-p", "width=3", "--force"])
-    rerun.rerun(ran, ["1", "-p", "width=2"])
-    (result(ran) / "numbers.csv").write_text("edited")
-    rerun.rerun(ran, ["1", "-p", "width=3"])
-    assert made == [{"width": 3.0}, {"width": 2.0}, {"width": 3.0}]
-
-
 def test_folders_of_others_are_not_overwritten(ran):
     (ran.root / "mine").mkdir()
     (ran.root / "mine" / "thesis.tex").write_text("x")
     with pytest.raises(ParameterError, match="holds no result of fig01_small"):
-        rerun.rerun(ran, ["1", "--force", "--output", str(ran.root / "mine")])
+        rerun.rerun(ran, ["1", "--output", str(ran.root / "mine")])
     with pytest.raises(ParameterError, match="holds no result of fig02_works"):
-        rerun.rerun(ran, ["2", "--force", "--output", str(result(ran))])
+        rerun.rerun(ran, ["2", "--output", str(result(ran))])
     (result(ran) / "notes.txt").write_text("x")
     with pytest.raises(ParameterError, match=r"notes.txt"):
-        rerun.rerun(ran, ["1", "-p", "width=3", "--force"])
+        rerun.rerun(ran, ["1", "-p", "width=3"])
 
 
 def run_command(project, *arguments):
@@ -507,6 +478,6 @@ def test_incomplete_notebooks_are_not_stored(project, capsys):
     assert len(os.listdir(project.build / "rerun")) == 1
     before = {file: file.read_bytes() for file in result(project).iterdir()}
     write(project, "fig02_works", new_code_cell("import sys\nsys.exit()"))  # its last cell
-    assert main(["rerun", "2", "--force"], project) == 1
+    assert main(["rerun", "2"], project) == 1
     assert "RuntimeError: the cell ended Python" in capsys.readouterr().err
     assert {file: file.read_bytes() for file in result(project).iterdir()} == before

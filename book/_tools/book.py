@@ -1,6 +1,5 @@
 """The book: run what changed, build it with Jupyter Book, and print it."""
 
-import errno
 import json
 import os
 import re
@@ -23,7 +22,6 @@ from .scratch import scratch_folder, swap
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 JUPYTER_BOOK = Path(sys.executable).with_name("jupyter-book")
 OPTIONS = ["-W", "-n", "--keep-going"]  # warnings are errors, and all of them are listed
-FULL = [os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)]
 NO_PDF = (
     "the PDF needs Chromium: install one, run .venv/bin/playwright install chromium, or name one in ZWFS_CHROMIUM"
 )
@@ -126,7 +124,5 @@ def _write_pages(project: Project, output: Path, environment: dict[str, str]) ->
         said = COLOUR.sub("", done.stdout).replace(f"{project.root}{os.sep}", "")
         lines = said.partition("\nThe above exception was the direct cause")[0].strip().splitlines()
         marked = [line for line in lines if "WARNING:" in line or "ERROR:" in line]
-        if full := [line for line in lines if any(reason in line for reason in FULL)]:
-            marked = full[-1:]  # Sphinx warns of every file that does not fit
         raise BookError("\n".join(["the book was not built:", *(marked or lines[-TRACEBACK_LINES:])]))
     return output / "_build" / "html"

@@ -74,7 +74,7 @@ class Run:
         """Run the notebook to its end, or set `error`."""
         begin = time.perf_counter()
         try:
-            made_from = key(self.project, self.name, self.parameters)
+            made_from = key(self.project, self.name)
             self.folder.mkdir()
             source = self._target.with_suffix(".source.ipynb")
             source.write_bytes(to_bytes(self._source))
@@ -88,7 +88,7 @@ class Run:
             if not _complete(self.notebook):
                 raise RuntimeError("the cell ended Python: expected all cells to run")
             # The result of a notebook that is edited during the run is not current.
-            self.key = made_from if key(self.project, self.name, self.parameters) == made_from else None
+            self.key = made_from if key(self.project, self.name) == made_from else None
         except Exception as error:
             self.error = NotebookError(self._describe(error))
         self.cell = len(self.cells)

@@ -17,7 +17,7 @@ from urllib.parse import unquote, urlsplit
 import yaml
 from bs4 import BeautifulSoup, Tag
 from playwright.sync_api import Browser, sync_playwright
-from pypdf import PdfReader, PdfWriter
+from pypdf import PdfWriter
 from pypdf.generic import DictionaryObject, NameObject, TextStringObject
 from sphinx_external_toc.api import SiteMap
 from sphinx_external_toc.parsing import parse_toc_yaml
@@ -47,13 +47,6 @@ FIT = """() => {
     element.style.zoom = 0.99 * (edge - box.left) / box.width;
   }
   return wide().map(element => element.outerHTML.slice(0, 200));
-}"""
-
-# Writes the first page of each chapter into the table of contents.
-NUMBER = """places => {
-  for (const entry of document.querySelectorAll("nav .page")) {
-    entry.textContent = places[entry.dataset.name] ?? "000";
-  }
 }"""
 
 PRINT = {
@@ -95,9 +88,7 @@ def print_book(root: Path, book: Path, chromium: str) -> bytes:
         paper.write_text(str(pages), "utf-8")
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-            # The numbers of pages come from a first print, with a table of contents of the same length.
-            places = _places(_print(browser, paper, {}))
-            printed = _print(browser, paper, places)
+            printed = _print(browser, paper)
             browser.close()
     finally:
         paper.unlink(missing_ok=True)
@@ -117,8 +108,7 @@ def _assemble(root: Path, book: Path) -> BeautifulSoup:
     contents, body = "", ""
     for name, depth in depths(toc).items():
         heading = html.escape(chapters[name].h1.get_text())
-        link = f'<a href="#{name}">{heading}</a><span class="page" data-name="{name}">000</span>'
-        contents += f'<p class="depth-{depth}">{link}</p>'
+        contents += f'<p class="depth-{depth}"><a href="#{name}">{heading}</a></p>'
         body += str(chapters[name])
     sheets = "".join(f'<link rel="stylesheet" href="_static/{sheet}">' for sheet in STYLES)
     return BeautifulSoup(
@@ -195,28 +185,14 @@ def _redirect(element: Tag, name: str, known: set[str]) -> None:
         element.unwrap()  # a file of the book, which does not come with the PDF
 
 
-def _print(browser: Browser, file: Path, places: dict[str, int]) -> bytes:
-    """Print a file with these numbers of pages in its table of contents.
-
-    Each print needs a new page: Chromium may break the second print of a page at other lines.
-    """
+def _print(browser: Browser, file: Path) -> bytes:
     page = browser.new_page(viewport={"width": 642, "height": 970})  # the text of a page, see the style
     page.emulate_media(media="print")
     page.goto(file.resolve().as_uri())
     page.evaluate("async () => { await window.MathJax?.startup?.promise; await document.fonts.ready }")
     if wide := page.evaluate(FIT):
         raise PrintError("\n".join(["the book was not printed: too wide for a page:", *wide]))
-    page.evaluate(NUMBER, places)
-    printed = page.pdf(**PRINT)
-    page.close()
-    return printed
-
-
-def _places(printed: bytes) -> dict[str, int]:
-    """Return the page, from 1, of each target of a link."""
-    reader = PdfReader(io.BytesIO(printed))
-    places = reader.named_destinations.items()
-    return {name.lstrip("/"): reader.get_destination_page_number(place) + 1 for name, place in places}
+    return page.pdf(**PRINT)
 
 
 def _finish(printed: bytes, pages: BeautifulSoup) -> bytes:

@@ -5,7 +5,7 @@ import json
 import platform
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -31,27 +31,15 @@ def digest_files(files: dict[str, Path]) -> str:
     return digest(part for name in sorted(files) for part in (name.encode(), files[name].read_bytes()))
 
 
-def key(project: Project, name: str, parameters: dict[str, Any]) -> str:
-    """Return a digest of everything that the result of a notebook depends on."""
+def key(project: Project, name: str) -> str:
+    """Return a digest of everything that the result of a notebook with its defaults depends on."""
     cells = notebook.read(project.source(name)).cells
     inputs = [*project.depends_on(name), project.lock]
     files = {str(file.relative_to(project.root)): file for file in inputs if file.exists()}
     files |= {f"runner {file.name}": file for file in RUNNER}
-    files |= {f"parameter {file}": file for file in _named_files(project.notebooks, parameters)}
     content = [[cell.cell_type, cell.source, cell.metadata] for cell in cells]
-    own = [list(sys.version_info[:2]), parameters, content]
+    own = [list(sys.version_info[:2]), content]
     return digest([json.dumps(own, sort_keys=True).encode(), digest_files(files).encode()])
-
-
-def _named_files(folder: Path, value: Any) -> Iterator[Path]:
-    """Return the files that strings in parameters name: their contents count as much as their names."""
-    if isinstance(value, str):
-        with suppress(OSError, ValueError):  # not the name of a file
-            if (folder / value).is_file():
-                yield folder / value
-    elif isinstance(value, dict | list | tuple):
-        for one in value.values() if isinstance(value, dict) else value:
-            yield from _named_files(folder, one)
 
 
 def digest_result(executed: bytes, files: list[Path]) -> str:

@@ -61,7 +61,6 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     add("-p", metavar="NAME=VALUE", action="append", default=[], help="a parameter, in YAML")
     add("-f", metavar="FILE", type=Path, action="append", default=[], help="YAML file of parameters; -p overrides")
     add("--list", action="store_true", help="list parameters, and run nothing")
-    add("--force", action="store_true", help="run even if the result exists")
     add("--output", metavar="DIR", type=Path, help="folder for the results")
     add("--line", metavar="TEXT", help="all arguments in one string, quoted as for a shell")
     asked = parser.parse_args(arguments)
@@ -79,7 +78,7 @@ def rerun(project: Project, arguments: list[str]) -> None:
     """Serve a command line; before a refusal nothing runs, and a notebook that fails leaves nothing."""
     asked = parse(arguments)
     if asked.figure in (None, "list"):
-        if asked.p or asked.f or asked.output or asked.force:
+        if asked.p or asked.f or asked.output:
             raise ParameterError("name a figure, as in: rerun 3 -p n_screens=50")
         print(titles(project))
         if asked.list:
@@ -97,11 +96,8 @@ def rerun(project: Project, arguments: list[str]) -> None:
         if classes := changed.get("reconstructors"):
             _check_classes(classes)
     folder = _folder(project, asked.output or project.build / "rerun" / folder_name(name, changed))
-    earlier = read_result(folder, name)
-    if not asked.force and is_current(earlier, folder, record.key(project, name, changed)):
-        print(f"{name}: unchanged, from {earlier['made']}")
-    else:
-        print(f"{name}: {make(project, name, changed, known, folder):.1f} s")
+    check_folder(folder, name)
+    print(f"{name}: {make(project, name, changed, known, folder):.1f} s")
     page = folder / f"{name}.html"
     print(f"open {page.relative_to(Path.cwd()) if page.is_relative_to(Path.cwd()) else page}")
 
@@ -204,10 +200,10 @@ def folder_name(name: str, changed: dict[str, Any]) -> str:
     return f"{name}-{readable}-{sha256(json.dumps(changed, sort_keys=True).encode()).hexdigest()[:8]}"
 
 
-def read_result(folder: Path, name: str) -> dict[str, Any]:
-    """Return the record of an earlier result, if there is one; refuse a folder with anything else."""
+def check_folder(folder: Path, name: str) -> None:
+    """Refuse a folder that holds anything but an earlier result of a notebook."""
     if not folder.exists():
-        return {}
+        return
     if not folder.is_dir():
         raise ParameterError(f"{folder} is not a folder")
     files = {file.name for file in folder.glob("[!.]*")}
@@ -220,20 +216,6 @@ def read_result(folder: Path, name: str) -> dict[str, Any]:
         raise ParameterError(f"{folder} holds no result of {name}: name another folder") from None
     if foreign:
         raise ParameterError(f"{folder} holds other files, such as {min(foreign)}: move them first")
-    return earlier
-
-
-def is_current(earlier: dict[str, Any], folder: Path, key: str) -> bool:
-    """Return whether an earlier result has the same inputs, and is unchanged."""
-    try:
-        return earlier.get("key") == key and earlier["files"] == digests(folder, earlier["files"])
-    except (OSError, KeyError, TypeError):
-        return False
-
-
-def digests(folder: Path, names: Any) -> dict[str, str]:
-    """Return the sha256 of files by name."""
-    return {name: sha256((folder / name).read_bytes()).hexdigest() for name in sorted(names)}
 
 
 def notice(changed: dict[str, Any], known: dict[str, Parameter]) -> NotebookNode:
@@ -295,10 +277,9 @@ def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, 
             "versions": record.versions(),
             "commit": commit,
             "changed_since": changed_since,
-            "key": run.key,
             "seconds": run.seconds,
+            "files": {file.name: sha256(file.read_bytes()).hexdigest() for file in sorted(new.iterdir())},
         }
-        about["files"] = digests(new, [file.name for file in new.iterdir()])
         (new / RECORD).write_text(json.dumps(about, indent=2) + "\n", "utf-8")
         folder.parent.mkdir(parents=True, exist_ok=True)
         swap(new, folder, scratch / "earlier")

@@ -24,7 +24,7 @@ def run(project: Project, say: Callable[[str], None] = tqdm.write) -> list[str]:
     """Run every notebook that has no result for its key, with its defaults, and return their names."""
     names = [path.stem for path in project.sources()]
     records = {name: read_record(project, name) for name in names}
-    stale = [name for name in names if records[name].get("key") != key(project, name, {})]
+    stale = [name for name in names if records[name].get("key") != key(project, name)]
     # The longest first, as measured in earlier runs: the others fill the gaps.
     stale.sort(key=lambda name: -records[name].get("seconds", float("inf")))
 

@@ -611,7 +611,7 @@ BAD = {
     ),
     "compressed": (
         lambda path, f: fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(f)]).writeto(path),
-        "extension 1 is compressed: expected plain images; use funpack",
+        "compressed: expected plain images; use funpack",
     ),
 }
 
@@ -634,7 +634,7 @@ def _cut(path, frames, kind):
 def test_bad_file_is_refused_by_name_before_any_work(folder, bench, kind):
     write, message = BAD[kind]
     write(folder / "bad.fits", bench.frames)
-    with pytest.raises(FileError, match=f"bad.fits: {message}"):
+    with pytest.raises(FileError, match=rf"bad.fits(\[\d\])?: {message}"):
         reconstruct(["cube.fits", "bad.fits"], "bench.npz", "phase.fits")
     assert not Path("phase.fits").exists()
     assert not list(folder.glob(".*"))

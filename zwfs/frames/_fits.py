@@ -1,24 +1,17 @@
-"""FITS files. The only module that imports astropy: `pip install astropy`."""
+"""Astropy, which only FITS files need: `pip install astropy`. And how to write them."""
 
 from __future__ import annotations
 
 import io
-import re
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 FIRST_BYTES = b"SIMPLE  ="
-# Types of the numbers of an image, by BITPIX, and the cards that give them a meaning, with their defaults.
-TYPES = {bits: np.dtype(kind) for bits, kind in
-         {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}.items()}  # fmt: skip
-KEYWORD = re.compile("[A-Z0-9_ -]*")  # of the standard, with the blanks of the convention HIERARCH
-SCALING = {"BSCALE": 1, "BZERO": 0, "BLANK": None}
 
 
 def fits_module() -> ModuleType:
@@ -28,21 +21,6 @@ def fits_module() -> ModuleType:
     except ImportError:
         raise ImportError("FITS files need astropy: pip install astropy; NPY files do not") from None
     return fits
-
-
-def open_fits(content: BinaryIO, **options: Any) -> Any:
-    """Open a FITS file for reading, see `astropy.io.fits.open`; return its units."""
-    return fits_module().open(content, memmap=False, **options)
-
-
-def header_cards(header: Any) -> dict[str, Any]:
-    """Values of a FITS header by keyword; cards that do not follow the standard are left out."""
-    values: dict[str, Any] = {}
-    for card in header.cards:
-        with suppress(fits_module().VerifyError):
-            if KEYWORD.fullmatch(card.keyword):
-                values.setdefault(card.keyword, card.value)
-    return values
 
 
 def fits_content(*units: tuple[NDArray, str, Sequence[tuple[str, Any, str]]]) -> bytes:
@@ -76,10 +54,3 @@ def card_value(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(f"{value:.9g}") if np.isfinite(value) else "NaN"
     return bool(value) if isinstance(value, np.bool_) else value
-
-
-def full_scale(dtype: np.dtype, scale: float = 1.0, zero: float = 0.0) -> float:
-    """Largest value that numbers of a type can stand for, each times `scale` plus `zero`; infinity for floats."""
-    if dtype.kind not in "iu":
-        return np.inf
-    return max(float(end) * scale + zero for end in (np.iinfo(dtype).min, np.iinfo(dtype).max))

@@ -25,8 +25,9 @@ from zwfs._arrays import Immutable, Kind, read_only
 from zwfs._likelihood import Estimator, Noise
 from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
+from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._grid import Grid, camera_places
-from zwfs.frames.files import FileError, _broken, read_all
+from zwfs.frames.files import read_all
 from zwfs.frames.phases import Flag, Phases
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames, reduce_frames
 from zwfs.frames.refine import _check_fit, fit
@@ -236,7 +237,7 @@ class Calibration(Immutable):
             raise FileNotFoundError(f"{path}: no such file: expected a calibration")
         if not _is_calibration(path):
             raise FileError(f"{path.name}: expected a calibration, which `calibrate` writes")
-        with _broken(f"{path.name}: a broken calibration"), np.load(path, allow_pickle=False) as file:
+        with broken(f"{path.name}: a broken calibration"), np.load(path, allow_pickle=False) as file:
             values: dict[str, Any] = json.loads(str(file["values"]))
             found = values.pop("format")
             if found == FORMAT:

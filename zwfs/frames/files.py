@@ -5,34 +5,21 @@ FITS files need astropy: `pip install astropy`.
 
 from __future__ import annotations
 
-import gzip
 import hashlib
-import io
 import math
 import os
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs._system import is_there, path_of, paths_of, write_file
-from zwfs.frames._fits import (
-    FIRST_BYTES,
-    SCALING,
-    TYPES,
-    fits_content,
-    fits_module,
-    full_scale,
-    has_card,
-    header_cards,
-    open_fits,
-)
+from zwfs.frames._blocks import FileError, blocks_in, unpacked
+from zwfs.frames._fits import fits_content, fits_module, has_card
 from zwfs.frames._part import scratch_of
 from zwfs.frames.pipeline import MeasuredPhase, Optics
 from zwfs.frames.registration import Image, nearest_good
@@ -40,21 +27,9 @@ from zwfs.frames.registration import Image, nearest_good
 __all__ = ["CameraFile", "FileError", "check_output", "images", "read", "read_all", "write_phase"]
 
 _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do that, saturation does
-_GZIP, _NPY = b"\x1f\x8b", b"\x93NUMPY"  # first bytes of a file
 # Header card of a phase map: no other file is replaced.
 _PHASE_CARD = b"CREATOR = 'zwfs "
 _LONGEST = 240  # bytes of a file name; a partial file has a few more, and most file systems allow 255
-
-
-class FileError(ValueError):
-    """A camera file is broken, too large, or holds no image; the message names the file.
-
-    Examples
-    --------
-    >>> from zwfs.frames.files import FileError
-    >>> issubclass(FileError, ValueError)
-    True
-    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,10 +124,8 @@ def read(path: str | Path, *, max_bytes: int = 2**29, max_images: int = 2) -> Ca
     ImportError
         If astropy is needed and missing.
     FileError
-        A ValueError: if the file is of another kind, broken, too large, holds no image, too many of them, or an
-        array that is neither (ny, nx) nor (n, ny, nx).
-    TypeError
-        If an argument is of the wrong type, or the numbers of the file are not real.
+        A ValueError: if the file is of another kind, broken, too large, compressed with fpack, holds no image, too
+        many of them, an array that is neither (ny, nx) nor (n, ny, nx), or numbers that are not real.
 
     Examples
     --------
@@ -173,22 +146,17 @@ def read(path: str | Path, *, max_bytes: int = 2**29, max_images: int = 2) -> Ca
         raise FileNotFoundError(f"{path}: no such file{where}")
     name = path.name
     with path.open("rb") as file:
-        content = _content(file, name, limits[0])
+        content = unpacked(file, name, limits[0])
         file.seek(0)
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    if content.getbuffer()[: len(_NPY)] == _NPY:
-        with _broken(f"{name}: a broken NPY file"):
-            data, header = _read_npy(content, name, limits), dict[str, Any]()
-            highest = full_scale(data.dtype)
-    else:
-        fits_module()  # without astropy this fails, and not the file
-        with _broken(f"{name}: a broken FITS file"):
-            data, header, highest = _read_fits(content, name, limits)
-    if data.dtype.kind not in "biuf":
-        raise TypeError(f"{name}: its numbers are {data.dtype}: expected real ones")
-    with np.errstate(over="ignore", invalid="ignore"):  # wider floats become infinite: bad pixels
-        images = data.astype(np.float64).reshape(-1, *data.shape[-2:])
-    return CameraFile(images, name, sha256, header, highest, path.resolve())
+    blocks, header = blocks_in(content, path, verify=True)
+    shapes = [block.full for block in blocks]
+    if len(blocks) > 2 or shapes[0] != shapes[-1] or (len(blocks) == 2 and len(shapes[0]) != 2):
+        raise FileError(f"{name}: images of shapes {shapes}: expected one, or two of the same (ny, nx)")
+    _accept(name, shapes[0] if len(blocks) == 1 else (2, *shapes[0]), limits)
+    images = [block.scaled(block.take(content, 0, block.n), np.float64)[:, 0] for block in blocks]
+    highest = min(block.full_scale for block in blocks)
+    return CameraFile(np.concatenate(images), name, sha256, header, highest, path.resolve())
 
 
 def read_all(
@@ -439,46 +407,6 @@ def write_phase(
     write_file(path, fits_content((phase.phase, "", cards), *units))
 
 
-@contextmanager
-def _broken(message: str) -> Iterator[None]:
-    """Turn whatever a parser raises on broken bytes into one error that names the file; warnings are ignored.
-
-    But astropy only warns of an extension whose header is cut off, and then leaves out its image.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            warnings.filterwarnings("error", message="Error validating header")
-            yield
-    except FileError:
-        raise
-    except Exception as error:  # astropy alone raises a dozen different ones
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise FileError(f"{message}: {reason}") from error
-
-
-def _content(file: BinaryIO, name: str, max_bytes: int) -> io.BytesIO:
-    """Bytes of a FITS or NPY file, unpacked; never much more than `max_bytes` are in memory."""
-    with _broken(f"{name}: it cannot be read"):
-        packed = file.read(len(_GZIP)) == _GZIP
-        file.seek(0)
-    size, content = os.fstat(file.fileno()).st_size, io.BytesIO()
-    with _broken(f"{name}: a broken gzip file" if packed else f"{name}: it cannot be read"):
-        stream = gzip.GzipFile(fileobj=file) if packed else file
-        while size <= max_bytes and (chunk := stream.read(2**20)):
-            if not content.tell() and not chunk.startswith((_NPY, FIRST_BYTES)):
-                break
-            size = max(size, content.tell() + len(chunk))
-            content.write(chunk)
-    if size > max_bytes:
-        unpacked = "unpacked, it is" if packed else "it is"
-        raise FileError(f"{name}: {unpacked} larger than {max_bytes} bytes: expected at most max_bytes")
-    if not content.tell():
-        raise FileError(f"{name}: its first bytes are those of neither a FITS nor an NPY file")
-    content.seek(0)
-    return content
-
-
 def _accept(name: str, shape: tuple[int, ...], limits: tuple[int, int]) -> None:
     """Refuse images of a shape that a header announces, before there is memory for them."""
     max_bytes, max_images = limits
@@ -490,57 +418,6 @@ def _accept(name: str, shape: tuple[int, ...], limits: tuple[int, int]) -> None:
             f"{name}: its shape is {shape}, {8 * math.prod(shape)} bytes as float64: "
             f"expected at most max_bytes = {max_bytes}"
         )
-
-
-def _npy_header(content: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, whether columns come first, and type of the numbers of an NPY file, which ends with its data."""
-    version = np.lib.format.read_magic(content)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
-        raise ValueError(f"version {version}: expected 1.0 or 2.0")
-    shape, columns_first, dtype = readers[version](content)
-    if dtype.hasobject:
-        raise ValueError("it holds objects of Python: expected numbers")
-    start = content.tell()
-    surplus = content.seek(0, os.SEEK_END) - start - math.prod(shape) * dtype.itemsize
-    content.seek(start)
-    if min(shape, default=0) > 0 and surplus > 0:
-        raise ValueError(f"{surplus} bytes follow the array of shape {shape}: expected none")
-    return shape, columns_first, dtype
-
-
-def _read_npy(content: io.BytesIO, name: str, limits: tuple[int, int]) -> NDArray:
-    shape, columns_first, dtype = _npy_header(content)
-    _accept(name, shape, limits)
-    data = np.frombuffer(content.read(math.prod(shape) * dtype.itemsize), dtype)
-    return data.reshape(shape, order="F" if columns_first else "C")
-
-
-def _read_fits(content: io.BytesIO, name: str, limits: tuple[int, int]) -> tuple[NDArray, dict[str, Any], float]:
-    # Odd header cards are no reason to refuse a file; missing or altered pixels are.
-    warnings.filterwarnings("error", message=".*truncated.*|Datasum verification failed.*")
-    with open_fits(content, checksum=True) as units:
-        images = [unit for unit in units if unit.is_image and unit.shape]
-        if not images:
-            raise FileError(f"{name}: a FITS file without an image")
-        shapes = [unit.shape for unit in images]
-        if len(images) > 2 or shapes[0] != shapes[-1] or (len(images) == 2 and len(shapes[0]) != 2):
-            raise FileError(f"{name}: images of shapes {shapes}: expected one, or two of the same (ny, nx)")
-        _accept(name, shapes[0] if len(images) == 1 else (2, *shapes[0]), limits)
-        cards = header_cards(units[0].header) | header_cards(images[0].header)
-        pixels, scales = zip(*map(_pixels, images), strict=True)
-        return pixels[0] if len(images) == 1 else np.stack(pixels), cards, min(scales)
-
-
-def _pixels(unit: Any) -> tuple[NDArray, float]:
-    """Numbers of an image, NaN where it has none, and the largest value that their type can stand for."""
-    scale, zero, blank = (unit.header.get(key, plain) for key, plain in SCALING.items())
-    data = unit.data
-    if unit.header["BITPIX"] < 0:
-        return data, np.inf
-    if blank is not None and data.dtype.kind == "u":  # astropy overlooks BLANK in unsigned numbers
-        data = np.where(data == blank + zero, np.nan, data)
-    return data, full_scale(TYPES[unit.header["BITPIX"]], scale, zero)
 
 
 def _usable(counts: NDArray) -> NDArray[np.bool_]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,19 +53,15 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(required=True, metavar="command")
-    shared: dict[str, Any] = {
-        "epilog": _EXIT_CODES,
-        "formatter_class": argparse.RawDescriptionHelpFormatter,
-    }
+    shared: dict[str, Any] = {"epilog": _EXIT_CODES, "formatter_class": argparse.RawDescriptionHelpFormatter}
+    files: dict[str, Any] = {"nargs": "+", "metavar": "FILE"}
     one = commands.add_parser("calibrate", help="make a calibration from frames and clear frames", **shared)
     one.set_defaults(run=_calibrate)
     one.add_argument("output", help="calibration to write, NPZ")
-    one.add_argument(
-        "--frames", nargs="+", required=True, metavar="FILE", help="a frame, or one file for each image"
-    )
-    one.add_argument("--pupils", nargs="+", required=True, metavar="FILE", help="clear frames, likewise")
-    one.add_argument("--dark", nargs="+", default=(), metavar="FILE", help="counts without light")
-    one.add_argument("--bad-pixels", nargs="+", default=(), metavar="FILE", help="maps, other than 0 where bad")
+    one.add_argument("--frames", dest="frame_files", required=True, help="a frame, or one for each image", **files)
+    one.add_argument("--pupils", dest="pupil_files", required=True, help="clear frames, likewise", **files)
+    one.add_argument("--dark", dest="dark_files", default=(), help="counts without light", **files)
+    one.add_argument("--bad-pixels", dest="bad_pixel_files", default=(), help="maps, not 0 where bad", **files)
     one.add_argument("--diameter", type=float, default=0.0, help="of the dimple in lambda/D; default: DIMPLE")
     one.add_argument(
         "--phase-shifts", type=float, nargs=2, default=(), metavar="RAD", help="default: THETA1, THETA2"
@@ -75,17 +71,15 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--no-registration", dest="subpixel", action="store_false", help="trust the outlines")
     one.add_argument("--exposure", type=float, default=1.0, help="of the frames over that of the clear frames")
     one.add_argument("--saturation", type=float, metavar="COUNTS", help="default: SATURATE, or the type's largest")
-    one.add_argument(
-        "--fit", nargs="+", default=(), metavar="NAME", help="parameters to fit, such as registration"
-    )
-    one.add_argument("--iterations", type=int, default=25, metavar="N", help="at most; default: 25")
+    one.add_argument("--fit", dest="fitted", nargs="+", default=(), metavar="NAME", help="parameter to fit")
+    one.add_argument("--iterations", dest="n_iterations", type=int, default=25, metavar="N", help="default: 25")
     one.add_argument("--tolerance", type=float, default=1e-3, metavar="RAD", help="that ends them; default: 1e-3")
     two = commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared)
     two.set_defaults(run=_reconstruct)
     two.add_argument("frames", nargs="+", help="FITS or NPY files with frames")
     two.add_argument("--calibration", required=True, metavar="FILE", help="that `calibrate` wrote")
     two.add_argument("--output", "-o", required=True, metavar="FILE", help="FITS file to write")
-    two.add_argument("--second", nargs="+", default=(), metavar="FILE", help="files with the second images")
+    two.add_argument("--second", dest="second_frames", default=(), help="of the second images", **files)
     two.add_argument("--modes", type=int, metavar="N", help="write coefficients of N Zernike modes, not phases")
     two.add_argument("--phases", action="store_true", default=None, help="write phases, too")
     two.add_argument("--photons", type=float, help="per pixel at an intensity of 1: write standard errors")
@@ -93,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     two.add_argument("--keywords", nargs="+", default=(), metavar="KEY", help="of the headers, for the table")
     two.add_argument("--saturation", type=float, metavar="COUNTS", help="default: that of the calibration")
     two.add_argument("--largest-residual", type=float, metavar="RMS", help="of a consistent frame")
-    two.add_argument("--workers", type=int, metavar="N", help="threads; default: one for each core")
+    two.add_argument("--workers", dest="n_workers", type=int, metavar="N", help="default: one for each core")
     two.add_argument("--restart", action="store_true", help="drop the part of an interrupted run")
     two.add_argument("--overwrite", action="store_true", help="replace any file")
     two.add_argument("--strict", action="store_true", help="exit with 3 if frames are flagged")
@@ -101,18 +95,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _calibrate(
-    output: str, frames: Sequence[str], pupils: Sequence[str], dark: Sequence[str], bad_pixels: Sequence[str],
-    diameter: float, phase_shifts: Sequence[float], pupil_centers: Sequence[float] | None,
-    pupil_diameter: float | None, subpixel: bool, exposure: float, saturation: float | None, fit: Sequence[str],
-    iterations: int, tolerance: float,
-) -> int:  # fmt: skip
+def _calibrate(output: str, pupil_centers: Sequence[float] | None, **settings: Any) -> int:
     centers = None if pupil_centers is None else [pupil_centers[:2], pupil_centers[2:]]
-    found = calibrate(
-        frames, pupils, dark, bad_pixels, diameter=diameter, phase_shifts=phase_shifts, saturation=saturation,
-        fitted=fit, n_iterations=iterations, tolerance=tolerance, pupil_centers=centers,
-        pupil_diameter=pupil_diameter, subpixel=subpixel, exposure=exposure,
-    )  # fmt: skip
+    found = calibrate(**settings, pupil_centers=centers)
     found.save(output)
     print(
         f"{output}: pupil {found.diameter:.2f} pixels wide, residual of the frames {found.residual:.3f}, "
@@ -121,29 +106,19 @@ def _calibrate(
     return 0
 
 
-def _reconstruct(
-    frames: Sequence[str], calibration: str, output: str, second: Sequence[str], workers: int | None, strict: bool,
-    quiet: bool, **settings: Any,
-) -> int:  # fmt: skip
-    bar = _bar() if sys.stderr.isatty() and not quiet else None
-    found = reconstruct(
-        frames, calibration, output, second_frames=second, n_workers=workers, progress=bar, **settings
-    )
+def _reconstruct(output: str, strict: bool, quiet: bool, **settings: Any) -> int:
+    bar = _bar if sys.stderr.isatty() and not quiet else None
+    found = reconstruct(output=output, progress=bar, **settings)
     if not quiet:
         flags = ", ".join(f"{n} {name.lower().replace('_', ' ')}" for name, n in found.counts.items() if n)
         print(f"{Path(output)}: {found.n_frames} frames, {found.n_flagged} flagged{f': {flags}' if flags else ''}")
     return 3 if strict and found.n_flagged else 0
 
 
-def _bar() -> Callable[[int, int], None]:
-    def show(done: int, total: int) -> None:
-        width = 40 * done // total
-        end = "\n" if done == total else ""
-        print(
-            f"\r[{'#' * width}{'.' * (40 - width)}] {done} of {total} frames", end=end, file=sys.stderr, flush=True
-        )
-
-    return show
+def _bar(done: int, total: int) -> None:
+    width = 40 * done // total
+    end = "\n" if done == total else ""
+    print(f"\r[{'#' * width}{'.' * (40 - width)}] {done} of {total} frames", end=end, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

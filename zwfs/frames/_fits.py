@@ -29,11 +29,16 @@ def fits_content(*units: tuple[NDArray, str, Sequence[tuple[str, Any, str]]]) ->
     made = fits.HDUList()
     for image, name, cards in units:
         made.append(fits.ImageHDU(image, name=name) if made else fits.PrimaryHDU(image))
-        for key, value, comment in cards:
-            made[-1].header[key] = (card_value(value), comment) if comment else card_value(value)
+        set_cards(made[-1].header, cards)
     stream = io.BytesIO()
     made.writeto(stream)
     return stream.getvalue()
+
+
+def set_cards(header: Any, cards: Sequence[tuple[str, Any, str]]) -> None:
+    """Put cards (keyword, value, comment) into a header."""
+    for key, value, comment in cards:
+        header[key] = (card_value(value), comment) if comment else card_value(value)
 
 
 def has_card(path: Path, card: bytes) -> bool:

@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zwfs.frames._fits import card_value, fits_module
+from zwfs.frames._fits import fits_module, set_cards
 
 _BLOCK = 2880  # bytes: all parts of a FITS file are multiples of it
 _LINE = 80  # bytes that no line of a journal exceeds
 _MARKER = "output"  # file of a scratch folder that holds the name of the output
-_FORMATS = {"i2": "I", "i4": "J", "i8": "K", "f4": "E", "f8": "D", "S": "A"}  # of the columns of a table
 
 Cards = Sequence[tuple[str, Any, str]]
 
@@ -71,33 +70,20 @@ class Unit:
 
     def header(self) -> bytes:
         """Return the header: a change of a number does not change its length."""
-        header = fits_module().Header()
-        first = not self.name
-        header["SIMPLE" if first else "XTENSION"] = True if first else "BINTABLE" if self.dtype.names else "IMAGE"
-        table = self.dtype.names is not None
-        axes = (self.row, self.n) if table else (*self.shape[::-1], self.n) if self.shape else ()
-        header["BITPIX"] = 8 if table or not self.shape else -8 * self.dtype.itemsize
-        header["NAXIS"] = len(axes)
-        for index, length in enumerate(axes, 1):
-            header[f"NAXIS{index}"] = length
-        if first:
-            header["EXTEND"] = True
+        fits, rows = fits_module(), np.empty((0, *self.shape), self.dtype)
+        if self.dtype.names:
+            unit = fits.BinTableHDU(rows, name=self.name)
+        elif self.name:
+            unit = fits.ImageHDU(rows, name=self.name)
         else:
-            header["PCOUNT"], header["GCOUNT"] = 0, 1
-            if table:
-                header["TFIELDS"] = len(self.dtype.names or ())
-            header["EXTNAME"] = self.name
+            unit = fits.PrimaryHDU(rows if self.shape else None)
+        if axes := unit.header["NAXIS"]:
+            unit.header[f"NAXIS{axes}"] = self.n
         for index, name in enumerate(self.dtype.names or (), 1):
-            base, shape = self.dtype[name].subdtype or (self.dtype[name], ())
-            code = "S" if base.kind == "S" else base.str[1:]
-            repeat = base.itemsize if code == "S" else int(np.prod(shape, dtype=int))
-            header[f"TTYPE{index}"] = name
-            header[f"TFORM{index}"] = f"{repeat}{_FORMATS[code]}"
             if name in self.units:
-                header[f"TUNIT{index}"] = self.units[name]
-        for key, value, comment in self.cards:
-            header[key] = (card_value(value), comment) if comment else card_value(value)
-        return header.tostring().encode("ascii")
+                unit.header[f"TUNIT{index}"] = self.units[name]
+        set_cards(unit.header, self.cards)
+        return unit.header.tostring().encode("ascii")
 
 
 def scratch_of(output: Path) -> Path:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._system import one_thread, path_of, paths_of
-from zwfs.frames._fits import fits_module
+from zwfs.frames._fits import card_value, fits_module
 from zwfs.frames._part import Cards, Part, Unit, plan_of
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
@@ -237,7 +237,7 @@ class _Job:
         columns = _columns(stack, keywords)
         rows = _row_type(columns, None if modes is None else len(modes), phases, photons is not None)
         of_files = np.dtype(
-            [("NAME", f"S{max(len(_ascii(one.name)) for one in stack.segments)}"), ("FRAMES", ">i8")]
+            [("NAME", f"S{max(len(card_value(one.name)) for one in stack.segments)}"), ("FRAMES", ">i8")]
         )
         float32, n, shape = np.dtype(">f4"), stack.n, pupil.shape
         cards = _cards(stack, calibration, photons, read_noise, level)
@@ -278,7 +278,7 @@ class _Job:
 
     def files(self) -> NDArray:
         """Rows of the list of files."""
-        return np.array([(_ascii(one.name), one.n) for one in self.stack.segments], self.units[-1].dtype)
+        return np.array([(card_value(one.name), one.n) for one in self.stack.segments], self.units[-1].dtype)
 
     def run(self, part: Part, n_workers: int) -> Iterator[tuple[int, int, int]]:
         """Reconstruct all chunks that are not yet done: first frame, first one after it, and checksum of each."""
@@ -364,10 +364,6 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _ascii(name: str) -> str:
-    return name if name.isascii() and name.isprintable() else ascii(name)[1:-1]
-
-
 def _same_unit(stack: Stack, calibration: Calibration) -> None:
     """Refuse frames of another unit than those of the calibration."""
     for segment in stack.segments:
@@ -402,7 +398,7 @@ def _columns(stack: Stack, keywords: Any) -> dict[str, NDArray]:
         values = [segment.header[key] for segment in stack.segments]
         numbers = all(isinstance(value, int | float) for value in values)
         columns[key] = (
-            np.array(values, float) if numbers else np.array([_ascii(str(one)).encode() for one in values])
+            np.array(values, float) if numbers else np.array([card_value(str(one)).encode() for one in values])
         )
     return columns
 

@@ -24,10 +24,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zwfs import Dimple, Pupil, ZernikeSensor, power_law_screens, zernike_basis
-from zwfs.frames import Calibration, calibrate, pipeline, reconstruct
+from zwfs.frames import Calibration, FileError, calibrate, pipeline, reconstruct
 from zwfs.frames.__main__ import main
 from zwfs.frames._stack import Stack
-from zwfs.frames.files import FileError
 from zwfs.frames.phases import Flag
 from zwfs.frames.pipeline import Optics, reduce_frames
 from zwfs.frames.registration import Image, nearest_good, register_frames

@@ -39,6 +39,7 @@ True
 """
 
 from zwfs.frames import calibration, files, phases, pipeline, refine, registration, telemetry, verdict
+from zwfs.frames._blocks import FileError
 from zwfs.frames._camera import BenchFit, Estimate, FittedPhase, FittedSensor, fit_bench
 from zwfs.frames.calibration import Calibration, calibrate
 from zwfs.frames.telemetry import reconstruct
@@ -49,6 +50,7 @@ __all__ = [
     "Calibration",
     "CameraNoise",
     "Estimate",
+    "FileError",
     "FittedPhase",
     "FittedSensor",
     "calibrate",

@@ -32,7 +32,7 @@ class FileError(ValueError):
 
     Examples
     --------
-    >>> from zwfs.frames.files import FileError
+    >>> from zwfs.frames import FileError
     >>> issubclass(FileError, ValueError)
     True
     """

@@ -24,7 +24,7 @@ from zwfs.frames._part import scratch_of
 from zwfs.frames.pipeline import MeasuredPhase, Optics
 from zwfs.frames.registration import Image, nearest_good
 
-__all__ = ["CameraFile", "FileError", "check_output", "images", "read", "read_all", "write_phase"]
+__all__ = ["CameraFile", "check_output", "images", "read", "read_all", "write_phase"]
 
 _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do that, saturation does
 # Header card of a phase map: no other file is replaced.

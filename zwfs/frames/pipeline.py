@@ -21,6 +21,18 @@ from zwfs.reconstructors import Arcsine, PhaseShifted
 from zwfs.sensor import ZernikeSensor
 from zwfs.units import phase_to_opd
 
+__all__ = [
+    "MeasuredPhase",
+    "Measurement",
+    "Optics",
+    "ideal_frames",
+    "model",
+    "predict_other",
+    "recover_phase",
+    "reduce_frames",
+    "upside_down",
+]
+
 _MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
 
 
@@ -287,48 +299,13 @@ def _reduce(registered: RegisteredFrames, optics: Optics, margin: int) -> Measur
 def measured_pupil(
     images: NDArray, inside: NDArray, n_pixels: float, center: tuple[float, float] | None = None
 ) -> tuple[Pupil, NDArray[np.float64]]:
-    """Pupil of two clear frames, and their counts that make an intensity of 1.
+    """Pupil of two clear frames (2, ny, nx), less the background, and their counts that make an intensity of 1.
 
-    Parameters
-    ----------
-    images : ndarray, shape (2, ny, nx)
-        Counts, less the background.
-    inside : ndarray of bool, shape (ny, nx)
-        Where the flux of the two is compared.
-    n_pixels : float, pixels
-        Diameter. The light outside that circle is stopped. An amplitude of less than a tenth of the largest one
-        counts as dark.
-    center : (float, float), pixels, optional
-        The middle of the images by default.
-
-    Returns
-    -------
-    Pupil
-    ndarray, shape (2,)
-
-    Raises
-    ------
-    ValueError
-        If an image is dark.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs.frames.pipeline import measured_pupil
-    >>> y, x = np.mgrid[:32, :32]
-    >>> disc = np.hypot(x - 15.5, y - 15.5) <= 16
-    >>> pupil, scale = measured_pupil(np.stack([900 * disc, 1100 * disc]), disc, n_pixels=32)
-    >>> pupil.shape, scale.round(6)
-    ((32, 32), array([ 900., 1100.]))
+    The flux of the two is compared inside. The light outside the circle of diameter `n_pixels` is stopped. An
+    amplitude of less than a tenth of the largest one counts as dark.
     """
-    images = _check.real_map("images", images, 3)
-    if len(images) != 2:
-        raise ValueError(f"images has shape {images.shape}: expected (2, ny, nx)")
-    inside = _check.flag_map("inside", inside, images.shape[1:], some=True)
-    n_pixels = _check.number("n_pixels", n_pixels, 0, open_low=True)
     if np.any((scale := images[:, inside].mean(axis=1)) <= 0):
         raise ValueError("images hold no light inside: expected more than 0 counts on average")
-    center = None if center is None else _check.pair("center", center, _check.number)
     amplitude = np.sqrt(np.maximum((images / scale[:, None, None]).mean(axis=0), 0))
     middle = center or tuple((n - 1) / 2 for n in amplitude.shape)
     stop = radius(amplitude.shape, middle) <= n_pixels / 2

@@ -19,11 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._system import one_thread, path_of, paths_of
+from zwfs.frames._blocks import FileError
 from zwfs.frames._fits import card_value, fits_module
 from zwfs.frames._part import Cards, Part, Unit, plan_of
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
-from zwfs.frames.files import FileError, check_output
+from zwfs.frames.files import check_output
 from zwfs.frames.phases import Flag, Phases
 from zwfs.modes import zernike_basis
 

@@ -113,20 +113,19 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
     >>> from zwfs.bench.model import Bench
     >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
     >>> from zwfs.frames.registration import Image, register_frames
-    >>> from zwfs.frames.verdict import CameraNoise, error_bar, judge
+    >>> from zwfs.frames.verdict import CameraNoise, judge
     >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
     >>> pistons = 0.5 * np.arange(-3, 4) / 3
     >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
     >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
     >>> measurement = reduce_frames(register_frames([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
-    >>> verdict = judge(recover_phase(measurement))
+    >>> verdict = judge(recover_phase(measurement), CameraNoise(gain=1.0, read_noise=bench.read_noise))
     >>> verdict.score.round(1), bool(np.all(verdict.score > verdict.control + 0.2))
     (array([0.9, 0.9]), True)
     >>> photons = CameraNoise(gain=1.0).photons(measurement)
     >>> round(photons * measurement.pupil.n_points / bench.photons, 1)
     1.0
-    >>> sigma = error_bar(recover_phase(measurement), CameraNoise(1.0, bench.read_noise))
-    >>> round(float(np.nanmedian(sigma) * photons**0.5), 1)
+    >>> round(float(np.nanmedian(verdict.sigma) * photons**0.5), 1)
     0.6
     """
     _check.instance("result", result, MeasuredPhase)
@@ -153,7 +152,6 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
 
 def near_edges(measurement: Measurement) -> NDArray[np.bool_]:
     """Points within 2 pixels of one that is dark or partly lit, (ny, nx)."""
-    _check.instance("measurement", measurement, Measurement)
     amplitude = np.where(measurement.pupil.inside, measurement.pupil.amplitude, 0)
     # Compared with its surroundings, since the pupil may be lit unevenly.
     around = ndimage.median_filter(amplitude, max(3, round(measurement.registered.diameter / 8)))
@@ -163,20 +161,9 @@ def near_edges(measurement: Measurement) -> NDArray[np.bool_]:
 def error_bar(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64]:
     """Smallest standard error of the phase that photon and read noise allow, at its estimate.
 
-    Noise of the clear frames and errors of the model are not part of it.
-
-    Parameters
-    ----------
-    result : MeasuredPhase
-    noise : CameraNoise
-
-    Returns
-    -------
-    ndarray, shape (ny, nx), radian
-        NaN outside the pupil and at bad points.
+    Noise of the clear frames and errors of the model are not part of it. It is NaN outside the pupil and at bad
+    points, (ny, nx).
     """
-    _check.instance("result", result, MeasuredPhase)
-    _check.instance("noise", noise, CameraNoise)
     measurement = result.measurement
     phase = nearest_good(np.nan_to_num(result.phase), measurement.good)
     sigma = cramer_rao(model(measurement), phase, photons=noise.photons(measurement), read_noise=noise.read_noise)

@@ -22,19 +22,19 @@ def curves(sensor, screens):
 
 def test_only_the_method_that_knows_the_band_stays_at_the_bound(curves):
     for way in WAYS:
-        ratio = curves.error[way] / curves.bound
+        ratio = curves.error(way) / curves.bound
         assert ratio[0] == pytest.approx(1, abs=0.1)
         assert (ratio[2] > 2) == (way in IGNORANT)
-    assert curves.error[KNOWN][2] == pytest.approx(curves.bound[2], rel=0.1)
+    assert curves.error(KNOWN)[2] == pytest.approx(curves.bound[2], rel=0.1)
 
 
 def test_the_bias_grows_with_the_square_of_the_bandwidth(curves):
     for way in IGNORANT:
-        assert curves.bias[way][0] < 1e-6
-        assert curves.bias[way][2] / curves.bias[way][1] == pytest.approx(4, rel=0.05)
+        assert curves.bias(way)[0] < 1e-6
+        assert curves.bias(way)[2] / curves.bias(way)[1] == pytest.approx(4, rel=0.05)
 
 
 def test_bias_and_noise_are_equal_at_the_stated_photons(sensor, screens, curves):
     photons = curves.equal_photons(SHIFTED)[2]
     there = band_curves(sensor, screens, [0.2], photons, chromatic=True)
-    assert there.bound[0] == pytest.approx(curves.bias[SHIFTED][2], rel=1e-3)
+    assert there.bound[0] == pytest.approx(curves.bias(SHIFTED)[2], rel=1e-3)

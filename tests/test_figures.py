@@ -112,7 +112,7 @@ def drawn_methods(curves, pupil, classic, shifted):
     faint = PhotonCurves(three, three, dict.fromkeys(LOOKS, np.ones((3, 3, 2))), np.eye(3) + 1, np.eye(3))
     designs = DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5})
     step = Step("outlines", found, np.ones(2), np.zeros(2))
-    banded = BandCurves(three, dict.fromkeys(bandwidth.WAYS, three), {}, three, 1.0)
+    banded = BandCurves(three, dict.fromkeys(bandwidth.WAYS, three[:, np.newaxis]), {}, three, 1.0)
     triple = zwfs.ZernikeSensor(pupil, *shifted.masks, zwfs.Dimple(1, 0))
     both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(triple.measure(phase))
     bench = Bench(n_pixels=60)

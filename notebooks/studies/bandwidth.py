@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded
+from studies.kit.results import rounded, screen_errors, stacked
 from studies.kit.style import LOOKS
 from studies.kit.tables import Table
 from zwfs.bounds import cramer_rao
@@ -43,13 +43,21 @@ _TOLERANCE = 1e-4  # of the sensor of the bound, which it changes by less than 1
 
 @dataclass(frozen=True)
 class BandCurves:
-    """Errors against the bandwidth, radian rms over all screens."""
+    """Errors against the bandwidth, radian rms."""
 
     bandwidths: NDArray[np.float64]  # (n,), full width over central wavelength
-    error: dict[str, NDArray[np.float64]]  # (n,) of each way, with photon noise
-    bias: dict[str, NDArray[np.float64]]  # (n,) of the ways that ignore the bandwidth, without noise
-    bound: NDArray[np.float64]  # (n,)
+    errors: dict[str, NDArray[np.float64]]  # (n, n_screens) of each way, with photon noise
+    biases: dict[str, NDArray[np.float64]]  # the same of the ways that ignore the bandwidth, without noise
+    bound: NDArray[np.float64]  # (n,), over all screens
     photons: float  # per point and image
+
+    def error(self, way: str) -> NDArray[np.float64]:
+        """Error of a way, over all screens, (n,)."""
+        return _rms(self.errors[way])
+
+    def bias(self, way: str) -> NDArray[np.float64]:
+        """Error of a way without noise, over all screens, (n,)."""
+        return _rms(self.biases[way])
 
     def at(self, bandwidth: float) -> int:
         """Place of the bandwidth that is nearest."""
@@ -57,7 +65,7 @@ class BandCurves:
 
     def equal_photons(self, way: str) -> NDArray[np.float64]:
         """Photons per point and image for which the bias of a way is as large as the bound, (n,)."""
-        bias = np.maximum(self.bias[way], np.finfo(float).tiny)
+        bias = np.maximum(self.bias(way), np.finfo(float).tiny)
         return self.photons * (self.bound / bias) ** 2
 
 
@@ -73,11 +81,11 @@ def band_curves(
     """Reconstruct frames of a flat spectrum, with and without photon noise."""
     widths = np.asarray(bandwidths, float)
     shared = sensor, screens, photons, chromatic, seed
-    errors, biases, bounds = zip(*sweeps.run(_band_point, widths.tolist(), *shared, name="bandwidth"), strict=True)
+    errors, clean, bounds = zip(*sweeps.run(_band_point, widths.tolist(), *shared, name="bandwidth"), strict=True)
     return BandCurves(
         widths,
         {way: np.array([error[way] for error in errors]) for way in WAYS},
-        {way: np.array([bias[way] for bias in biases]) for way in IGNORANT},
+        {way: np.array([error[way] for error in clean]) for way in IGNORANT},
         np.array(bounds),
         photons,
     )
@@ -85,8 +93,8 @@ def band_curves(
 
 def _band_point(
     bandwidth: float, sensor: ZernikeSensor, screens: NDArray, photons: float, chromatic: bool, seed: int
-) -> tuple[dict[str, float], dict[str, float], float]:
-    """Errors with and without noise, and the bound, at one bandwidth."""
+) -> tuple[dict[str, NDArray], dict[str, NDArray], float]:
+    """Errors with and without noise, (n_screens,) each, and the bound, at one bandwidth."""
     light = PolychromaticSensor.flat_band(sensor, bandwidth, _WAVELENGTHS, chromatic=chromatic)
     known = PolychromaticSensor.flat_band(sensor, bandwidth, _KNOWN_WAVELENGTHS, chromatic=chromatic)
     methods = {
@@ -95,20 +103,20 @@ def _band_point(
         KNOWN: MaximumLikelihood(known, photons=photons, n_starts=1),
     }
 
-    def errors(ways: tuple[str, ...], frames: NDArray) -> dict[str, float]:
-        return {way: _rms(reconstruction_error(sensor.pupil, methods[way](frames).phase, screens)) for way in ways}
+    def errors(ways: tuple[str, ...], frames: NDArray) -> dict[str, NDArray]:
+        return {way: reconstruction_error(sensor.pupil, methods[way](frames).phase, screens) for way in ways}
 
     clean = light.measure(screens)
     noisy = np.random.default_rng(seed).poisson(photons * clean) / photons
     rough = PolychromaticSensor.flat_band(
         sensor.with_tolerance(_TOLERANCE), bandwidth, _KNOWN_WAVELENGTHS, chromatic=chromatic
     )
-    bound = _rms(sensor.pupil.gather(cramer_rao(rough, screens, photons=photons)))
+    bound = float(_rms(sensor.pupil.gather(cramer_rao(rough, screens, photons=photons)).ravel()))
     return errors(tuple(WAYS), noisy), errors(IGNORANT, clean), bound
 
 
-def _rms(values: NDArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+def _rms(values: NDArray) -> NDArray[np.float64]:
+    return np.sqrt(np.mean(values**2, axis=-1))
 
 
 CaseCurves = Mapping[tuple[float, bool], BandCurves]  # of each input, radian rms, and chromatic or not
@@ -130,7 +138,7 @@ def draw_band_errors(curves: CaseCurves) -> Figure:
             look, way = LOOKS[method], name.rpartition(" ")[2]
             line, face = _LINES[way]
             axes.plot(
-                100 * one.bandwidths, one.error[name] / one.bound, label=f"{look.name}, bandwidth {way}",
+                100 * one.bandwidths, one.error(name) / one.bound, label=f"{look.name}, bandwidth {way}",
                 color=look.color, marker=look.marker, linestyle=line, markerfacecolor=face, ms=6,
             )  # fmt: skip
         axes.set_title(f"{rms:g} rad rms, {_kind(chromatic)} shifts", fontsize=10)
@@ -157,9 +165,19 @@ def band_columns(curves: CaseCurves) -> dict[str, NDArray]:
         kind = f"{rms:g} rad rms, {_kind(chromatic)}"
         columns["bandwidth"] = one.bandwidths
         columns[f"{kind}: bound (rad rms)"] = one.bound
-        columns |= {f"{kind}: {way}: error (rad rms)": one.error[way] for way in WAYS}
-        columns |= {f"{kind}: {way}: error without noise (rad rms)": bias for way, bias in one.bias.items()}
+        columns |= {f"{kind}: {way}: error (rad rms)": one.error(way) for way in WAYS}
+        columns |= {f"{kind}: {way}: error without noise (rad rms)": one.bias(way) for way in IGNORANT}
     return columns
+
+
+def band_screens(curves: CaseCurves) -> dict[str, NDArray]:
+    """Errors of every single screen."""
+    tables = {}
+    for (rms, chromatic), one in curves.items():
+        errors = one.errors | {f"{way}, without noise": bias for way, bias in one.biases.items()}
+        case = f"{rms:g} rad rms, {_kind(chromatic)}"
+        tables[case] = screen_errors("bandwidth", one.bandwidths, errors)
+    return stacked("case", tables)
 
 
 def costs_table(curves: CaseCurves) -> Table:
@@ -169,7 +187,7 @@ def costs_table(curves: CaseCurves) -> Table:
     rows = [
         [
             f"{rms:g} rad, {_kind(chromatic)}",
-            *(f"{one.bias[way][one.at(width)] / rms:.2%}" for way in IGNORANT for width in TABLED),
+            *(f"{one.bias(way)[one.at(width)] / rms:.2%}" for way in IGNORANT for width in TABLED),
         ]
         for (rms, chromatic), one in curves.items()
     ]
@@ -185,11 +203,11 @@ def numbers(curves: CaseCurves) -> dict[str, float | str]:
             place, case = one.at(width), f"{inputs.index(rms)}_{_kind(chromatic)}_{100 * width:.0f}"
             found[f"photons_shifted_{case}"] = one.equal_photons(SHIFTED)[place]
     for width in TABLED:
-        shares = [one.bias[SHIFTED][one.at(width)] / rms for (rms, _), one in curves.items()]
+        shares = [one.bias(SHIFTED)[one.at(width)] / rms for (rms, _), one in curves.items()]
         found |= {f"least_{100 * width:.0f}": min(shares), f"most_{100 * width:.0f}": max(shares)}
     bounds = np.array([one.bound / one.bound[one.at(0)] for one in curves.values()])
     found |= {
-        "known_most": max((one.error[KNOWN] / one.bound).max() for one in curves.values()),
+        "known_most": max((one.error(KNOWN) / one.bound).max() for one in curves.values()),
         "bound_least": bounds.min(),
         "bound_most": bounds.max(),
     }

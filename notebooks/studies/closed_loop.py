@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded
+from studies.kit.results import rounded, screen_columns
 from studies.kit.style import LOOKS
 from studies.kit.tables import Table
 from zwfs.detector import Detector
@@ -390,6 +390,15 @@ def tuned_columns(trials: Sequence[TunedLoops]) -> dict[str, Sequence[float]]:
         columns[f"{name}: residual (rad rms)"] = [typical(one.settled[name]) for one in trials]
         columns[f"{name}: loops that close"] = [float(one.closed(name)) for one in trials]
     return columns
+
+
+def tuned_screens(trials: Sequence[TunedLoops]) -> dict[str, NDArray]:
+    """Residuals of every single screen, for each input and star."""
+    names = list(trials[0].settled)
+    residuals = {f"{name}: residual (rad rms)": np.stack([one.settled[name] for one in trials]) for name in names}
+    columns = screen_columns({"start (rad rms)": [one.start for one in trials]}, residuals)
+    photons = np.repeat([one.photons for one in trials], trials[0].settled[names[0]].size)
+    return {"photons per point and image": photons} | columns
 
 
 def best_table(rows: Sequence[BestMethods]) -> Table:

@@ -52,7 +52,7 @@ class LinearityCurves(ErrorCurves):
     def screens(self) -> dict[str, NDArray]:
         """Input, rms, Strehl ratio and errors of every single screen, as columns for `publish`."""
         own = {"rms of the screen (rad)": self.size, "Strehl ratio": self.strehl}
-        return screen_columns({"input (rad rms)": self.rms}, own | self._named_errors())
+        return screen_columns({"input (rad rms)": self.rms}, own) | super().screens()
 
 
 def linearity_curves(

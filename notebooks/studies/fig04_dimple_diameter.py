@@ -27,7 +27,7 @@ from studies.kit import sweeps
 from studies.kit.curves import ErrorCurves, Limit, crossing, percent, reach_text, refined_limit
 from studies.kit.methods import opposite_dimples, own_reconstructors, paper_reconstructors
 from studies.kit.parameters import SETUP, parameter_limits
-from studies.kit.results import rounded, screen_columns
+from studies.kit.results import rounded, screen_errors
 from studies.kit.setups import NOISELESS, Noise, check_setup
 from studies.kit.style import LOOKS, OTHER_STYLES, looks_of
 from studies.kit.tables import Table, small
@@ -91,7 +91,7 @@ class DiameterCurves(ErrorCurves):
 
     def screens(self) -> dict[str, NDArray]:
         """Diameter and errors of every single screen, as columns for `publish`."""
-        return screen_columns({"diameter (lambda/D)": self.diameters}, self._named_errors())
+        return screen_errors("diameter (lambda/D)", self.diameters, self.errors)
 
 
 def diameter_curves(

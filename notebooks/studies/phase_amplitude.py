@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 
 from studies.kit import sweeps
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded
+from studies.kit.results import rounded, screen_errors, stacked
 from studies.kit.setups import screens_at
 from studies.kit.style import LOOKS, show_intensity, show_phase
 from studies.kit.tables import Table
@@ -258,6 +258,13 @@ def amplitude_columns(curves: Mapping[str, AmplitudeCurves]) -> dict[str, NDArra
         columns[f"{kind}: bound (rad rms)"] = one.bound
         columns |= {f"{kind}: {way}: error (rad rms)": one.error(way) for way in WAYS}
     return columns
+
+
+def amplitude_screens(curves: Mapping[str, AmplitudeCurves]) -> dict[str, NDArray]:
+    """Errors of every single screen."""
+    axis = "variation of the amplitude"
+    tables = {kind: screen_errors(axis, one.variations, one.errors) for kind, one in curves.items()}
+    return stacked("amplitude", tables)
 
 
 def map_columns(

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from studies.kit.parameters import parameter_limits
+from studies.kit.results import screen_errors
 from studies.kit.setups import screens_at
 from studies.kit.style import ALONE, LOOKS, looks_of, show_phase
 from studies.kit.tables import Table, small
@@ -88,18 +89,13 @@ def draw_estimates(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) 
         residual = wrapped_residual(pupil, phases[name], truth)
         show_phase(panels[0, column], phases[name], limit)
         shown = show_phase(panels[1, column], residual, limit / 4)
-        short, rms = textwrap.fill(look.name, 10), np.sqrt(np.nanmean(residual**2))
+        short, rms = textwrap.fill(look.name, 10), float(np.sqrt(np.nanmean(residual**2)))
         panels[0, column].set_title(short, fontsize=9)
-        panels[1, column].set_title(f"{short}\n{_short(rms)} rad", fontsize=9)
+        panels[1, column].set_title(f"{short}\n{small(rms)} rad", fontsize=9)
     below: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 40}
     figure.colorbar(image, ax=panels[0], label="phase (rad)", **below)
     figure.colorbar(shown, ax=list(panels[1, 1:]), label="residual (rad)", extend="both", **below)
     return figure
-
-
-def _short(value: float) -> str:
-    """Two digits, or a bound where the digits would be those of rounding errors."""
-    return f"{value:.2g}" if value >= 1e-6 else "< $10^{-6}$"
 
 
 def convergence_columns(errors: Mapping[str, Mapping[float, NDArray]]) -> dict[str, NDArray]:
@@ -114,6 +110,12 @@ def convergence_columns(errors: Mapping[str, Mapping[float, NDArray]]) -> dict[s
                 curve = curve[-1] if curve.size == 2 else curve
                 columns[f"{name} at {value:g} rad: quantile {level:g} (rad rms)"] = curve
     return columns
+
+
+def convergence_screens(errors: Mapping[str, Mapping[float, NDArray]]) -> dict[str, NDArray]:
+    """Errors of every single screen at the end."""
+    last = {name: np.stack([error[:, -1] for error in one.values()]) for name, one in errors.items()}
+    return screen_errors("input (rad rms)", list(next(iter(errors.values()))), last)
 
 
 def cut_columns(pupil: Pupil, screen: NDArray, phases: Mapping[str, NDArray]) -> dict[str, NDArray]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from studies.kit.results import screen_columns
+from studies.kit.results import screen_errors
 from zwfs.metrics import dynamic_range
 
 
@@ -46,10 +46,7 @@ class ErrorCurves:
 
     def screens(self) -> dict[str, NDArray]:
         """Input and errors of every single screen, as columns for `publish`."""
-        return screen_columns({"input (rad rms)": self.rms}, self._named_errors())
-
-    def _named_errors(self) -> dict[str, NDArray[np.float64]]:
-        return {f"{name}: error (rad rms)": errors for name, errors in self.errors.items()}
+        return screen_errors("input (rad rms)", self.rms, self.errors)
 
 
 class Limit(NamedTuple):

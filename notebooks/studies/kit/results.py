@@ -61,6 +61,11 @@ def screen_columns(axes: Mapping[str, ArrayLike], values: Mapping[str, NDArray])
     return {header: column.ravel() for header, column in (*named, *values.items())}
 
 
+def screen_errors(axis: str, values: ArrayLike, errors: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """Columns with a row for each screen, from errors (n, n_screens) by name along an axis."""
+    return screen_columns({axis: values}, {f"{name}: error (rad rms)": error for name, error in errors.items()})
+
+
 def stacked(header: str, tables: Mapping[Any, Mapping[str, NDArray]]) -> dict[str, NDArray]:
     """Columns of several tables below each other; the first column has the key of each row's table."""
     columns = list(zip(*(table.values() for table in tables.values()), strict=True))

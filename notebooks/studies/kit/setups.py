@@ -61,17 +61,6 @@ def make_pupil(n_pixels: int, kind: str = "circular", **changes: Any) -> Pupil:
         Diameter of the stop over that of the circle around all segments.
     file : str
         FITS or NPY file of the field amplitude; its longer side has `n_pixels`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is of the wrong kind or out of range, or the file has another number of pixels.
-
-    Examples
-    --------
-    >>> from studies.kit.setups import make_pupil
-    >>> make_pupil(64, "keck", missing=[1, 20]).segments.max()
-    np.int64(37)
     """
     values = PUPILS[kind] | changes
     cut = {"obstruction": values.pop("obstruction", 0.0), "vanes": values.pop("vanes", ())}
@@ -213,18 +202,6 @@ def make_screens(
     d_over_r0 : float
         Strength D/r0 of the turbulence at the largest input, which replaces that in rad rms; 0 keeps the latter.
         An input is then the root mean square over all screens, and single screens scatter around it.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is of the wrong kind or out of range, the pupil has a single segment, or the file does not fit.
-
-    Examples
-    --------
-    >>> from studies.kit.setups import make_pupil, make_screens
-    >>> pupil = make_pupil(32)
-    >>> pupil.rms(make_screens(pupil, 20, -2.0, kind="kolmogorov")(0.3, 2, seed=1)).round(6)
-    array([0.3, 0.3])
     """
     _require_segments(pupil, kind)
     scale = outer_scale if kind == "von_karman" else inf
@@ -337,20 +314,6 @@ class Noise:
         0 for frames without noise.
     read_noise : float, electrons
         Read noise of a pixel, rms.
-
-    Raises
-    ------
-    ValueError
-        If read noise is without photons.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> from studies.kit.setups import Noise
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
-    >>> Noise(photons=500)(sensor, np.zeros(pupil.shape), seed=1).shape
-    (1, 32, 32)
     """
 
     photons: float = 0.0

@@ -63,7 +63,7 @@ def settings(name):
 
 
 def native(name, values, figure, folder=ROOT):
-    """Return the columns that a notebook publishes with these parameters, computed here, with files of a folder."""
+    """Return the columns that a notebook publishes with these parameters, computed here; files are in a folder."""
     given = {key: json.dumps(value) for key, value in values.items()}
     command = [sys.executable, "-c", NATIVE, json.dumps([settings(name), given, figure])]
     paths = os.pathsep.join([str(ROOT), str(ROOT / "notebooks")])
@@ -297,6 +297,14 @@ def test_the_example_of_the_front_page_gives_the_numbers_of_this_python(opened):
     *said, value = expected.strip().split("\n")
     assert lines == said
     assert float(number) == pytest.approx(float(value), rel=1e-9)
+
+
+def test_a_reconstructor_of_the_reader_runs_next_to_the_others(opened):
+    page = opened("book/your_reconstructor.html").page
+    page.get_by_role("button", name="Run", exact=True).click()
+    said = page.locator(".run-said")
+    page.wait_for_function("/FlatReference[ .\\d]+$/.test(document.querySelector('.run-said').textContent.trim())")
+    assert said.inner_text().split() == page.locator(".highlight-text pre").inner_text().split()
 
 
 def test_own_frames_in_npy_are_reconstructed_and_stay_on_this_computer(opened, tmp_path):

@@ -230,7 +230,8 @@ CASES = {
         n_iterations=[1]),
     ),
     "calibration": ({"n_commands": 1, "n_steps": 1, "oversampling": 1, "largest": 0.1},
-        {},
+        {}, {"n_steps": 2, "n_commands": 2}, *each(n_commands=[2, 4], n_steps=[2], oversampling=[2],
+        largest=[0.3, 1.2], n_screens=[2], n_iterations=[1]),
     ),
     "decision": (DECISION,
         {}, {"rms": 0.01, "rms_small": 0.01}, {"photons": 10.0, "photons_faint": 10.0},
@@ -240,6 +241,32 @@ CASES = {
     ),
 }  # fmt: skip
 CASES["fig07_frames"] = CASES["fig08_segments"]
+LAYOUT = (
+    {"n_pixels": 24},
+    *each(n_pixels=[16, 33], diameter=[0.1, 8.0], phase_shift=[0.01, 3.13], rms=[0.0, 4.0], seed=[0, 7]),
+)
+CASES |= {"fig01_sensor_layout": LAYOUT, "fig02_vector_sensor": LAYOUT}
+ODD_BENCHES = [{"static": 0.0}, {"photons": 1e7}, {"n_rings": 1, "missing": []}, {"leakage": 0.5}]
+CASES["fig05_seal_bench"] = (
+    {},
+    *each(bench=ODD_BENCHES, rms=[0.0, 4.0], exponent=[0.0, -4.0], wavelength=[100.0, 2e4]),
+)
+CASES["fig06_reference"] = (
+    BENCH,
+    *each(bench=[*ODD_BENCHES, {"blur": 20.0}, {"diameter": 8.0}, {"static": 3.0}], n_pixels=[32, 200], seed=[0]),
+)
+CASES["own_frames"] = (
+    {"fitted": []},
+    {"fitted": ["background"], "accept_fits": True, "n_iterations": 2},
+    *each(
+        rms=[0.0, 4.0],
+        n_bad=[0, 2000],
+        n_iterations=[1],
+        diameter=[0.5, 3.0],
+        read_noise=[1e3],
+        exposure_ratio=[2.0],
+    ),
+)
 LONG = {"calibration", "decision"}
 COSTLY = {name for name in CASES if name not in ("zernike_sensor", "at_a_glance", "identities")}
 SETS = [

@@ -175,8 +175,7 @@ def band_screens(curves: CaseCurves) -> dict[str, NDArray]:
     tables = {}
     for (rms, chromatic), one in curves.items():
         errors = one.errors | {f"{way}, without noise": bias for way, bias in one.biases.items()}
-        case = f"{rms:g} rad rms, {_kind(chromatic)}"
-        tables[case] = screen_errors("bandwidth", one.bandwidths, errors)
+        tables[f"{rms:g} rad rms, {_kind(chromatic)}"] = screen_errors("bandwidth", one.bandwidths, errors)
     return stacked("case", tables)
 
 

@@ -394,11 +394,11 @@ def tuned_columns(trials: Sequence[TunedLoops]) -> dict[str, Sequence[float]]:
 
 def tuned_screens(trials: Sequence[TunedLoops]) -> dict[str, NDArray]:
     """Residuals of every single screen, for each input and star."""
-    names = list(trials[0].settled)
+    names = trials[0].settled
     residuals = {f"{name}: residual (rad rms)": np.stack([one.settled[name] for one in trials]) for name in names}
     columns = screen_columns({"start (rad rms)": [one.start for one in trials]}, residuals)
-    photons = np.repeat([one.photons for one in trials], trials[0].settled[names[0]].size)
-    return {"photons per point and image": photons} | columns
+    n_screens = columns["screen"].max()
+    return {"photons per point and image": np.repeat([one.photons for one in trials], n_screens)} | columns
 
 
 def best_table(rows: Sequence[BestMethods]) -> Table:

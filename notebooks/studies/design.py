@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter
+from matplotlib.ticker import FixedLocator, FormatStrFormatter
 from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
@@ -97,6 +97,12 @@ class DesignMap:
         return Design(name, float(self.diameters[row]), theta, -theta)
 
 
+def diameters(largest: float, step: float) -> NDArray[np.float64]:
+    """Diameters (lambda/D) from 0.8 on, by a step up to 3 and by ten times the step above."""
+    fine = np.arange(0.8, min(largest, 3.0) + step / 2, step)
+    return np.concatenate([fine, np.arange(fine[-1] + 10 * step, largest + step / 2, 10 * step)]).round(9)
+
+
 def design_map(
     pupil: Pupil, diameters: ArrayLike, angles: ArrayLike, wavefronts: Mapping[str, NDArray]
 ) -> DesignMap:
@@ -124,8 +130,7 @@ def _costs(pupil: Pupil, design: Design, screens: Mapping[str, NDArray]) -> dict
     return {name: 4 * float(np.mean(part**2)) for name, part in zip(screens, np.split(bounds, ends), strict=True)}
 
 
-LEVELS = [1, 1.25, 1.5, 2, 3, 5, 10]
-"""Photon costs at which the colour of a map changes."""
+LEVELS = [1, 1.25, 1.5, 2, 3, 5, 10]  # photon costs at which the colour of a map changes
 
 
 def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[str, NDArray]) -> Figure:
@@ -135,18 +140,17 @@ def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[
     """
     figure, panels = plt.subplots(1, len(maps.costs), figsize=(7, 3.8), sharey=True, squeeze=False)
     x, y = maps.diameters, maps.angles / np.pi
-    half = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
-    extent = x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1]
     colors = {"cmap": "cividis_r", "norm": BoundaryNorm(LEVELS, 256, extend="max")}
     for axes, (name, grid) in zip(panels[0], maps.costs.items(), strict=True):
         axes.grid(False)
-        shown = axes.imshow(grid.T, extent=extent, aspect="auto", interpolation="bilinear", **colors)
+        shown = axes.pcolormesh(x, y, grid.T, shading="gouraud", rasterized=True, **colors)
         for design, cost in zip(designs, costs[name], strict=True):
             if np.isclose(design.theta_a, -design.theta_b):
                 place = design.diameter, design.theta_a / np.pi
                 axes.plot(*place, "o", mfc="#ffffff", mec="#000000", ms=8)
                 axes.annotate(f"{design.name}: {cost:.1f}", place, (8, 0), textcoords="offset points", **_LABEL)
-        axes.set(xlim=extent[:2], ylim=extent[2:], xlabel="diameter (λ/D)")
+        axes.set(xscale="log", xlim=x[[0, -1]], ylim=y[[0, -1]], xlabel="diameter (λ/D)")
+        axes.xaxis.set(major_locator=FixedLocator([1, 2, 3, 5, 8]), major_formatter="{x:g}", minor_formatter="")
         axes.set_title(name, fontsize=10)
         axes.yaxis.set_major_formatter(FormatStrFormatter("±%gπ"))
     panels[0, 0].set_ylabel("phase shifts (rad)")
@@ -155,12 +159,8 @@ def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[
     return figure
 
 
-_LABEL: dict[str, Any] = {
-    "va": "center",
-    "fontsize": 9,
-    "bbox": {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0.15"},
-}
-"""Style of the labels of designs."""
+_BOX = {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0.15"}
+_LABEL: dict[str, Any] = {"va": "center", "fontsize": 9, "bbox": _BOX}  # of designs
 
 
 def design_maps_columns(maps: DesignMap) -> dict[str, NDArray]:
@@ -177,12 +177,12 @@ def _shifts(design: Design) -> str:
     return f"±{a:.3g}π" if np.isclose(a, -b) else f"{a:.3g}π, {b:.3g}π".replace("-", "−")
 
 
-def _slug(design: Design) -> str:
-    return design.name.replace(" ", "_").replace("-", "_")
-
-
 def designs_table(listed: Sequence[Design], costs: Mapping[str, NDArray]) -> Table:
-    """Photon costs of designs, and their share of the photons that the first one needs."""
+    """Photon costs of designs, and their share of the photons that the first one needs; none above 100."""
+
+    def text(cost: float, first: float) -> str:
+        return f"{cost:.2f} ({cost / first:.0%})" if cost <= 100 else "over 100"
+
     return Table(
         ["design", "d (λ/D)", "shifts", *(name.removesuffix(" wavefront") for name in costs)],
         [
@@ -190,7 +190,7 @@ def designs_table(listed: Sequence[Design], costs: Mapping[str, NDArray]) -> Tab
                 design.name,
                 f"{design.diameter:.3g}",
                 _shifts(design),
-                *(f"{cost[index]:.2f} ({cost[index] / cost[0]:.0%})" for cost in costs.values()),
+                *(text(cost[index], cost[0]) for cost in costs.values()),
             ]
             for index, design in enumerate(listed)
         ],
@@ -202,14 +202,15 @@ def numbers(maps: DesignMap, listed: Sequence[Design], costs: Mapping[str, NDArr
     all_round = maps.all_round
     found = {"all_round_diameter": all_round.diameter, "all_round_shift": all_round.theta_a / np.pi}
     for place, (name, cost) in enumerate(costs.items()):
-        found |= {f"{_slug(design)}_{place}": value for design, value in zip(listed, cost, strict=True)}
-        best = maps.best(name)
+        names = (design.name.replace(" ", "_").replace("-", "_") for design in listed)
+        found |= {f"{slug}_{place}": value for slug, value in zip(names, cost, strict=True)}
+        best, least = maps.best(name), maps.costs[name].min(axis=1)
         found |= {
             f"best_{place}": maps.costs[name].min(),
             f"best_diameter_{place}": best.diameter,
             f"best_shift_{place}": best.theta_a / np.pi,
-            f"spread_{place}": maps.costs[name].min(axis=1)[maps.diameters >= 1.8].max() / maps.costs[name].min()
-            - 1,
+            f"spread_{place}": least[maps.diameters >= 1.8].max() / least.min() - 1,
+            f"flat_{place}": maps.costs[next(iter(costs))].flat[maps.costs[name].argmin()],
             f"saved_{place}": 1 - maps.costs[name].min() / cost[0],
             f"saved_all_round_{place}": 1 - found[f"all_round_{place}"] / cost[0],
         }

@@ -262,9 +262,10 @@ def amplitude_columns(curves: Mapping[str, AmplitudeCurves]) -> dict[str, NDArra
 
 def amplitude_screens(curves: Mapping[str, AmplitudeCurves]) -> dict[str, NDArray]:
     """Errors of every single screen."""
-    axis = "variation of the amplitude"
-    tables = {kind: screen_errors(axis, one.variations, one.errors) for kind, one in curves.items()}
-    return stacked("amplitude", tables)
+    variation = "variation of the amplitude"
+    return stacked(
+        "kind", {kind: screen_errors(variation, one.variations, one.errors) for kind, one in curves.items()}
+    )
 
 
 def map_columns(

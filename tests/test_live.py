@@ -72,6 +72,7 @@ def fresh(page):
     """The page in its first state."""
     page.click("#live-play")
     page.click("button:text-is('The paper')")
+    page.evaluate("window.zwfsLive.page.set({ rms: '1', seed: '22', 'per-point': '5.75' })")
     page.wait_for_function("location.hash === ''")
     wait_for_drawing(page)
     return page
@@ -355,6 +356,15 @@ def test_presets_and_buttons_set_the_sensor_up(fresh, preset, expected, named):
     wait_for_drawing(fresh)
     assert [fresh.inner_text(f"#live-verdict-{place}")[0] for place in range(3)] == [*expected]
     assert fresh.inner_text("#live-name-2") == named
+
+
+def test_designs_keep_the_input_and_the_address_follows_them(fresh):
+    fresh.evaluate("window.zwfsLive.page.set({ rms: '0.3', seed: '5', 'per-point': '3' })")
+    fresh.click("button:text-is('Keck')")
+    wait_for_address(fresh, "rms=0.3", "seed=5", "per-point=3", "diameter=2.4")
+    assert fresh.get_attribute("button:text-is('Keck')", "aria-pressed") == "true"
+    fresh.click("#live-play")
+    fresh.wait_for_function("/iterations=[1-9](&|$)/.test(location.hash)")  # while it plays
 
 
 def test_the_state_is_in_the_address(fresh, browser, file):

@@ -6,7 +6,7 @@
   const live = window.zwfsLive;
   const { draw } = live;
   const PAUSE = 800; // ms without a change before the numbers are read out
-  const SETTLED = 300; // ms without a change before the address changes: browsers count such changes
+  const FOLLOW = 500; // ms between changes of the address: browsers count them
   const TURN = 250; // ms of each iteration that is played
   const AGREE = 0.5; // rad: a phase that is nearer to the input, on the circle, is shown on its branch
   const TOLERATED = 0.05; // error that counts as a success, relative to the input, as in the paper
@@ -25,7 +25,7 @@
     diameter: (v) => [`${v.toFixed(2)} λ/D`, `${v.toFixed(2)} lambda over D`],
     "shift-a": (v) => [`${signed(v, 2)} π`, `${v.toFixed(2)} pi`],
     "shift-b": (v) => [`${signed(v, 2)} π`, `${v.toFixed(2)} pi`],
-    "per-point": () => (photons() === Infinity ? ["no noise"] : [`${Number(photons().toPrecision(2))}`]),
+    "per-point": () => (photons() === Infinity ? ["∞", "no noise"] : [`${Number(photons().toPrecision(2))}`]),
     iterations: (v) => [`${v}`],
   };
 
@@ -71,12 +71,14 @@
     if (inputs.some((input) => nameOf(input) in state)) set(state, standard);
   }
 
-  // The preset whose state is that of the controls looks pressed.
+  // A preset is a design: it keeps the input, unless it names one. That of the controls looks pressed.
+  const INPUT = ["rms", "seed", "per-point"];
+  const kept = (input) => (INPUT.includes(nameOf(input)) ? read(input) : standard(input));
   const presets = [...document.querySelectorAll(".live-presets button")];
   function markPreset() {
     for (const button of presets) {
       const goal = parse(button.dataset.live);
-      const same = (input) => Number(read(input)) === Number(goal[nameOf(input)] ?? standard(input));
+      const same = (input) => Number(read(input)) === Number(goal[nameOf(input)] ?? kept(input));
       button.setAttribute("aria-pressed", inputs.every(same));
     }
   }
@@ -101,12 +103,15 @@
 
   const succeeds = (error, rms) => error <= Math.max(TOLERATED * rms, draw.SMALLEST);
 
+  const share = (error, rms) => `${Math.round((100 * error) / rms)} %`;
+
   // The result in one sentence, for everybody.
   function sentence(made, set) {
     const parts = columns(made, set).map(({ name, made: one }) => {
       if (!one) return `${name}: no solution`;
       const error = one.errors.at(-1);
-      return `${name} ${succeeds(error, set.rms) ? "recovers the phase" : "fails"} (${draw.error(error)} rad)`;
+      const off = error < set.rms ? `off by ${share(error, set.rms)}` : "fails";
+      return `${name} ${succeeds(error, set.rms) ? "recovers the phase" : off} (${draw.error(error)} rad)`;
     });
     return `Input ${set.rms.toFixed(2)} rad rms, Strehl ratio ${made.strehl.toFixed(2)}. Errors: ${parts.join(", ")}.`;
   }
@@ -160,7 +165,7 @@
   }
 
   let rest;
-  let settle;
+  let follow;
   function update() {
     const set = settings();
     const start = performance.now();
@@ -170,8 +175,10 @@
     markPreset();
     clearTimeout(rest);
     rest = setTimeout(() => describe(made, set), PAUSE);
-    clearTimeout(settle);
-    settle = setTimeout(toAddress, SETTLED);
+    follow ??= setTimeout(() => {
+      follow = undefined;
+      toAddress();
+    }, FOLLOW);
   }
 
   // At most one update for each frame of the screen, however fast the slider moves.
@@ -212,8 +219,9 @@
   for (const button of document.querySelectorAll("button[data-live]")) {
     button.addEventListener("click", () => {
       play(false);
-      set(parse(button.dataset.live), standard);
-      if (button.closest("#live")) return;
+      const preset = button.closest("#live");
+      set(parse(button.dataset.live), preset ? kept : standard);
+      if (preset) return;
       document.getElementById("live").scrollIntoView();
       if ("play" in button.dataset) play(true);
     });

@@ -45,7 +45,12 @@ def plain_book(tmp_path_factory):
 def test_claims_have_their_verdicts(plain_book):
     rows = read(plain_book / "book" / "claims.html").select("table.claims tbody tr")
     assert len(rows) == 21
-    assert all(row.select_one("[class^=verdict]") for row in rows)
+    assert all(row.select_one("[class*=verdict]") for row in rows)
+    for row in rows[:20]:
+        name = row.select_one("td:last-child a")["href"].removeprefix("#")
+        rule = read(plain_book / "book" / "claims.html").find(id=name)
+        assert f"number: {row.td.get_text()}" in rule.find_parent("details").get_text()
+        assert "def numbers(" in rule.find_parent("details").get_text()
     assert "The 21 claims" in read(plain_book / "book" / "index.html").article.get_text()
 
 
@@ -58,6 +63,15 @@ def test_figures_have_cards_with_their_notebooks_and_the_address_leads_to_the_fr
     assert (plain_book / "_static" / "mathjax" / "tex-chtml-full.js").is_file()
     assert 'url=book/index.html"' in (plain_book / "index.html").read_text("utf-8")
     assert 'url=claims.html"' in (plain_book / "book" / "differences.html").read_text("utf-8")
+
+
+def test_names_of_the_package_in_code_lead_to_the_api(plain_book):
+    page = plain_book / "book" / "index.html"
+    links = {link.get_text(): link["href"] for link in read(page).select(".highlight a")}
+    assert links.keys() >= {"Pupil", "ZernikeSensor", "MaximumLikelihood", "reconstruction_error"}
+    for name, address in links.items():
+        file, _, place = address.partition("#")
+        assert name in read(page.parent / file).find(id=place).get_text()
 
 
 def test_equations_are_numbered_through_the_book_and_those_of_the_paper_as_there(plain_book):

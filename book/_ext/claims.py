@@ -141,7 +141,7 @@ def _row(claim: Claim, finding: Finding) -> list[str]:
     if claim.notebook:
         address = claim.source.replace(claim.notebook, f"../notebooks/{claim.notebook}.ipynb")
         measured.append(f"*[{_title(claim.notebook)}]({address})*")
-        verdict = f"[{verdict}](#rule-{claim.number})"
+        verdict = verdict.replace("]{", f"](#rule-{claim.number}){{")
     return [str(claim.number), f"{claim.statement} *{section}*", " ".join(measured), verdict]
 
 

@@ -32,6 +32,7 @@ POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e([+-])0*(\d+)\b")
 MINUS = re.compile(r"(?<![\w.)-])-(?=\d)")
 PERCENT = re.compile(r"(?:(?<=\d)|^) ?%")  # the number may be in the element before
 DIGITS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+IMPORTED = re.compile(r"^from zwfs[\w.]* import (\([^)]*\)|.*)$", re.MULTILINE)
 CONSOLE = re.compile(r"\bconsole\.(?:log|info|debug)\(")
 FORWARD = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"/><title>{title}</title>
@@ -77,12 +78,28 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
     define(body, Path(app.srcdir, f"{GLOSSARY}.md"))
     for entry in body.select("[role=doc-biblioentry]"):
         entry["role"] = "listitem"  # the role of Sphinx is deprecated: a list has items
+    link_code(app, page, body)
     if body.find(id="phasor"):
         app.add_css_file("phasor.css")
         app.add_js_file("phasor.js", loading_method="defer")
     context["body"] = str(body)
     given = context.get("metatags", "")
     context["metatags"] = given + tags(app.config, page, body, given)
+
+
+def link_code(app: Sphinx, page: str, body: Tag) -> None:
+    """Link names of the package in code to their entries of the API, which link to the source."""
+    known: dict[str, str] = {}
+    for path, entry in sorted(app.env.domaindata["py"]["objects"].items(), key=lambda item: (len(item[0]), item[0])):
+        if entry.objtype in ("class", "function") and page != entry.docname:
+            address = f"{app.builder.get_relative_uri(page, entry.docname)}#{entry.node_id}"
+            known.setdefault(path.rpartition(".")[2], address)
+    code = "\n".join(block.get_text() for block in body.select(".highlight pre"))
+    imported = {name for names in IMPORTED.findall(code) for name in re.findall(r"\w+", names)}
+    for name in body.select(".highlight .n"):
+        before = "".join(part.get_text() for part in reversed(list(name.previous_siblings)[:2]))
+        if name.string in known and (name.string in imported or before == "zwfs."):
+            name.wrap(body.new_tag("a", href=known[name.string], title="Open its entry in the API"))
 
 
 def write_numbers(body: Tag) -> None:

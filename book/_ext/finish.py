@@ -90,7 +90,9 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
 def link_code(app: Sphinx, page: str, body: Tag) -> None:
     """Link names of the package in code to their entries of the API, which link to the source."""
     known: dict[str, str] = {}
-    for path, entry in sorted(app.env.domaindata["py"]["objects"].items(), key=lambda item: (len(item[0]), item[0])):
+    objects = app.env.domaindata["py"]["objects"]
+    for path in sorted(objects, key=lambda path: (len(path), path)):
+        entry = objects[path]
         if entry.objtype in ("class", "function") and page != entry.docname:
             address = f"{app.builder.get_relative_uri(page, entry.docname)}#{entry.node_id}"
             known.setdefault(path.rpartition(".")[2], address)

@@ -54,7 +54,7 @@ def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions
         for figure in published(cell.source) if cell.cell_type == "code" else []:
             cell.metadata.setdefault("mystnb", {}).setdefault("figure", {})["classes"] = VARIANTS + figure
             first = not any(one.id.startswith(CARD) for one in cells)
-            made = ["", f"Commit: {commit}. Versions: {versions}."] if first else []
+            made = ["", f"Commit: {commit}. Versions: {versions}."] if first and versions else []
             text = ["::::{div} run-card", files(name, figure, links), *made, "", run.form(figure, first), "::::"]
             cells.append(new_markdown_cell("\n".join(text), id=f"{CARD}{figure}"[:64]))
     if not any(cell.id.startswith(CARD) for cell in cells):  # the page shows tables only
@@ -82,12 +82,12 @@ def files(name: str, figure: str, links: dict[str, str]) -> str:
 
 
 def versions(run: Path) -> str:
-    """List the versions of Python and packages of a run, from its record."""
+    """List the versions of Python and packages of a run, from its record; nothing without one."""
     try:
         known: dict[str, Any] = json.loads(run.with_suffix(".json").read_bytes()).get("versions", {})
     except (OSError, ValueError):
         known = {}
-    return ", ".join(f"{package} {version}" for package, version in known.items()) or "not recorded"
+    return ", ".join(f"{package} {version}" for package, version in known.items())
 
 
 def commit(root: Path) -> str:

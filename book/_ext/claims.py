@@ -154,7 +154,9 @@ def rules() -> str:
             if claim.notebook == notebook:
                 ends = {"start-at": f"- number: {claim.number}", "end-before": f"- number: {claim.number + 1}"}
                 text += _include("_ext/claims.yml", language="yaml", name=f"rule-{claim.number}", **ends)
-        text += _include(f"../notebooks/studies/{notebook}.py", pyobject="numbers") + "::::\n\n"
+                text += f"[The code of its numbers](#numbers-{notebook})\n\n"
+        code = f"../notebooks/studies/{notebook}.py"
+        text += _include(code, name=f"numbers-{notebook}", pyobject="numbers") + "::::\n\n"
     return text
 
 

@@ -194,7 +194,7 @@ def estimate_table(taken: Recording, fit: BenchFit) -> Table:
     for name, title in _TITLES.items():
         value, sigma = fit[name].value, fit[name].sigma
         deviation = (value - true[name]) / sigma
-        rows.append([title, f"{true[name]:.5g}", f"{value:.4g}", f"{sigma:.1g}", f"{deviation:+.0f}"])
+        rows.append([title, f"{true[name]:.5g}", f"{value:.4g}", f"{sigma:.1g}", f"{round(deviation):+d}"])
     return Table(["parameter", "put in", "fitted", "error bar", "deviation (error bars)"], rows)
 
 

@@ -63,7 +63,7 @@ def header_noise(source: CameraFile, gain: float, read_noise: float) -> CameraNo
 
 def draw_explained(result: MeasuredPhase) -> Figure:
     """Measured frames, modelled frames and their difference, all on one scale; bad pixels are marked."""
-    figure, panels = plt.subplots(2, 3, figsize=(9, 5.6))
+    figure, panels = plt.subplots(2, 3, figsize=(7.2, 5.2))
     top = np.quantile(result.measured[..., *result.measurement.window][:, result.measurement.good], 0.999)
     for row, (measured, modelled, bad) in enumerate(
         zip(result.measured, result.modelled, result.measurement.bad, strict=True)
@@ -86,7 +86,7 @@ def draw_explained(result: MeasuredPhase) -> Figure:
 def draw_phase_map(result: MeasuredPhase, wavelength: float, sigma: NDArray | None = None) -> Figure:
     """Phase in radian, with a second scale in nm, and its error bar; bad points are marked."""
     n_panels = 1 if sigma is None else 2
-    figure, panels = plt.subplots(1, n_panels, figsize=(4.7 * n_panels, 4.6), squeeze=False)
+    figure, panels = plt.subplots(1, n_panels, figsize=(3.6 * n_panels, 4.2), squeeze=False)
     axes = panels[0, 0]
     # Single points at gaps may be off by a turn: they do not set the scale.
     shown = show_phase(axes, result.phase, np.nanquantile(np.abs(result.phase), 0.99))
@@ -108,17 +108,15 @@ def _two_scales(bar: Colorbar, wavelength: float) -> None:
     """Label a colour bar in radian below and in nm above."""
     bar.set_label("rad")
     bar.locator = MaxNLocator(4)
-    nm = bar.ax.secondary_xaxis(
-        "top",
-        functions=(partial(phase_to_opd, wavelength=wavelength), partial(opd_to_phase, wavelength=wavelength)),
-    )
+    both = partial(phase_to_opd, wavelength=wavelength), partial(opd_to_phase, wavelength=wavelength)
+    nm = bar.ax.secondary_xaxis("top", functions=both)
     nm.set_xlabel("nm of wavefront")
     nm.xaxis.set_major_locator(MaxNLocator(4))
 
 
 def draw_gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> Figure:
     """Score on unseen data with its control, misfit, and error where the truth is known, step by step."""
-    figure, panels = plt.subplots(1, 2 + (errors is not None), figsize=(9, 3.8), sharey=True)
+    figure, panels = plt.subplots(1, 2 + (errors is not None), figsize=(7.2, 3.8), sharey=True)
     rows = np.arange(len(work))[::-1]
     # Markers for the images: colours would stand for methods.
     for label, color, values in (
@@ -152,12 +150,12 @@ def draw_signs(measurement: Measurement, height: float = 0.4) -> Figure:
     apart = np.hypot(x - 0.64 * nx, y - 0.62 * ny) / measurement.registered.diameter
     poke = np.where(sensor.pupil.inside, height * np.exp(-((apart / 0.1) ** 2)), 0)
     change = (sensor.measure(poke) - sensor.measure(np.zeros_like(poke)))[(..., *sensor.window)]
-    figure, panels = plt.subplots(1, 4, figsize=(10, 3.2), width_ratios=(1.1, 1, 1, 1))
+    figure, panels = plt.subplots(1, 4, figsize=(7.8, 2.9), width_ratios=(1.1, 1, 1, 1))
     _pulled_mirror(panels[0])
     maps = [(poke, height, "phase of the poke\nabove 0 (red)")]
     for image, shift in zip(change, measurement.optics.phase_shifts, strict=True):
         word = "brighter (red)" if image.sum(where=apart < 0.1) > 0 else "darker (blue)"
-        maps.append((image, np.abs(change).max(), f"image of phase shift {shift / np.pi:+.2g} π\n{word}"))
+        maps.append((image, np.abs(change).max(), f"image, shift {shift / np.pi:+.2g} π\n{word}"))
     for axes, (values, limit, title) in zip(panels[1:], maps, strict=True):
         show_phase(axes, np.where(sensor.pupil.inside, values, np.nan), limit)
         axes.set_title(title, fontsize=10)

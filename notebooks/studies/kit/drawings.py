@@ -85,6 +85,8 @@ class Scene:
         bar.set_label(name, fontsize=self.size)
         axes.tick_params(labelsize=self.size, length=2, pad=1)
         axes.locator_params(nbins=ticks)
+        if ticks == 2:  # a third label, 0, would touch the others
+            bar.set_ticks([one for one in bar.get_ticks() if one and abs(one) <= shown.get_clim()[1]])
 
     def label(
         self, x: float, y: float, text: str, size: float | None = None, ha: str = "center", **style: Any

@@ -86,7 +86,7 @@ def draw_explained(result: MeasuredPhase) -> Figure:
 def draw_phase_map(result: MeasuredPhase, wavelength: float, sigma: NDArray | None = None) -> Figure:
     """Phase in radian, with a second scale in nm, and its error bar; bad points are marked."""
     n_panels = 1 if sigma is None else 2
-    figure, panels = plt.subplots(1, n_panels, figsize=(3.6 * n_panels, 4.2), squeeze=False)
+    figure, panels = plt.subplots(1, n_panels, figsize=((4.7, 7.2)[n_panels - 1], 4.2), squeeze=False)
     axes = panels[0, 0]
     # Single points at gaps may be off by a turn: they do not set the scale.
     shown = show_phase(axes, result.phase, np.nanquantile(np.abs(result.phase), 0.99))

@@ -141,7 +141,7 @@ def _row(claim: Claim, finding: Finding) -> list[str]:
     if claim.notebook:
         address = claim.source.replace(claim.notebook, f"../notebooks/{claim.notebook}.ipynb")
         measured.append(f"*[{_title(claim.notebook)}]({address})*")
-        verdict = verdict.replace("]{", f"](#rule-{claim.number}){{")
+        verdict = _marked(finding.verdict, f"(#rule-{claim.number})")
     return [str(claim.number), f"{claim.statement} *{section}*", " ".join(measured), verdict]
 
 
@@ -171,9 +171,9 @@ def _title(notebook: str) -> str:
     return f"Figure {int(figure[1])}" if figure else notebook.replace("_", " ").capitalize()
 
 
-def _marked(verdict: str) -> str:
-    """Return a verdict with its sign and the class for its colour."""
-    return f"[{SIGNS[verdict]} {verdict}]{{.verdict-{verdict.replace(' ', '-')}}}"
+def _marked(verdict: str, address: str = "") -> str:
+    """Return a verdict with its sign, the class for its colour, and a link if it has an address in brackets."""
+    return f"[{SIGNS[verdict]} {verdict}]{address}{{.verdict-{verdict.replace(' ', '-')}}}"
 
 
 def add_substitutions(app: Sphinx, config: Config) -> None:

@@ -178,7 +178,7 @@ def _shifts(design: Design) -> str:
 
 
 def designs_table(listed: Sequence[Design], costs: Mapping[str, NDArray]) -> Table:
-    """Photon costs of designs, and their share of the photons that the first one needs; none above 100."""
+    """Photon costs of designs, and their share of what the first one needs. Costs above 100 have no number."""
 
     def text(cost: float, first: float) -> str:
         return f"{cost:.2f} ({cost / first:.0%})" if cost <= 100 else "over 100"

@@ -86,7 +86,7 @@ class Block:
         return max(float(end) * self.scale + self.zero for end in ends)
 
     def read(self, first: int, stop: int) -> NDArray:
-        """Return some exposures, shape (stop - first, per, ny, nx): scaled as float32 or float64."""
+        """Return some exposures, (stop - first, per, ny, nx): as they are, or scaled in float32 or float64."""
         with broken(f"{self.name}: it cannot be read"), self.path.open("rb") as file:
             data = self.take(unpacked(file, self.name) if self.packed else file, first, stop)
         if (self.scale, self.zero, self.blank) == (1, 0, None):
@@ -117,8 +117,8 @@ class Block:
 def broken(message: str) -> Iterator[None]:
     """Turn whatever a parser raises on broken bytes into one error that names the file; warnings are ignored.
 
-    But astropy only warns of an extension whose header is cut off, and then leaves out its image, and of wrong
-    checksums.
+    Two warnings of astropy become errors: that of an extension whose header is cut off, since astropy leaves out
+    its image, and that of a wrong checksum.
     """
     try:
         with warnings.catch_warnings():

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb, to_rgba_array
+from matplotlib.text import Text
 
 import zwfs
 from studies import bandwidth, phase_amplitude, zernike_sensor
@@ -189,6 +190,9 @@ def test_variants_are_dark_or_fit_a_phone_and_the_figure_stays(name, drawn_metho
         assert (variant.get_size_inches()[0] < 4) == ("narrow" in kind)
         if kind == "narrow":
             assert not cut_off(variant)
+        for text in variant.findobj(lambda one: isinstance(one, Text) and one.get_bbox_patch()):
+            letters, box = (np.mean(to_rgb(one)) for one in (text.get_color(), text.get_bbox_patch().get_fc()))
+            assert abs(letters - box) > 0.5
     assert plt.get_fignums() == numbers
     assert np.array_equal(pixels(figure), before)
 

@@ -179,10 +179,6 @@ def _shifts(design: Design) -> str:
 
 def designs_table(listed: Sequence[Design], costs: Mapping[str, NDArray]) -> Table:
     """Photon costs of designs, and their share of what the first one needs. Costs above 100 have no number."""
-
-    def text(cost: float, first: float) -> str:
-        return f"{cost:.2f} ({cost / first:.0%})" if cost <= 100 else "over 100"
-
     return Table(
         ["design", "d (λ/D)", "shifts", *(name.removesuffix(" wavefront") for name in costs)],
         [
@@ -190,7 +186,10 @@ def designs_table(listed: Sequence[Design], costs: Mapping[str, NDArray]) -> Tab
                 design.name,
                 f"{design.diameter:.3g}",
                 _shifts(design),
-                *(text(cost[index], cost[0]) for cost in costs.values()),
+                *(
+                    f"{cost[index]:.2f} ({cost[index] / cost[0]:.0%})" if cost[index] <= 100 else "over 100"
+                    for cost in costs.values()
+                ),
             ]
             for index, design in enumerate(listed)
         ],
@@ -202,8 +201,8 @@ def numbers(maps: DesignMap, listed: Sequence[Design], costs: Mapping[str, NDArr
     all_round = maps.all_round
     found = {"all_round_diameter": all_round.diameter, "all_round_shift": all_round.theta_a / np.pi}
     for place, (name, cost) in enumerate(costs.items()):
-        names = (design.name.replace(" ", "_").replace("-", "_") for design in listed)
-        found |= {f"{slug}_{place}": value for slug, value in zip(names, cost, strict=True)}
+        for design, value in zip(listed, cost, strict=True):
+            found[f"{design.name.replace(' ', '_').replace('-', '_')}_{place}"] = value
         best, least = maps.best(name), maps.costs[name].min(axis=1)
         found |= {
             f"best_{place}": maps.costs[name].min(),

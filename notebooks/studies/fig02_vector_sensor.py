@@ -59,7 +59,7 @@ def _vector_row(scene: Scene, y: float, sensor: ZernikeSensor, phase: NDArray, *
     limit = np.nanmax(np.abs(inside))
     shown = scene.picture(pupil_x, y, 1.05, inside, PHASE_MAP, -limit, limit)
     scene.label(pupil_x, y + 0.6, r"pupil: $\phi_{in}$ (rad)")
-    scene.scale(shown, (pupil_x - 0.45, y - 0.66, 0.9, 0.06))
+    scene.scale(shown, (pupil_x - 0.45, y - 0.66, 0.9, 0.06), ticks=2)
     scene.label(0.12, y - 1.2, "unpolarised light", ha="left")
 
     halo = focal_light(pupil, pupil.field(phase), 2.2)

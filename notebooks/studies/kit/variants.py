@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_rgba, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation, Text
@@ -186,7 +187,7 @@ def _darkened(figure: Figure) -> Figure:
             image.colorbar.update_normal(image)
     kept: set[Artist] = {figure, *figure.axes}  # their patches are found as well
     for axes in {*figure.axes} - {image.axes for image in phases}:
-        if axes.images or axes.get_label() == "<colorbar>":
+        if axes.images or axes.findobj(QuadMesh):
             marks = (*axes.images, *axes.lines, *axes.collections, *axes.patches, *axes.texts)
             kept.update(part for artist in marks for part in artist.findobj())
     drawn = set(figure.findobj()) - kept

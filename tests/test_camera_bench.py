@@ -12,7 +12,7 @@ from zwfs.frames._camera.model import Camera, Exposure, Maps
 from zwfs.frames._camera.sensor import FittedSensor, unwrapped
 from zwfs.frames._camera.solve import Light, fine_phase
 
-from .hcipy_bench import BEFORE, CASES
+from .hcipy_bench import BEFORE, BORDER, CASES
 
 FINE = 16
 
@@ -87,6 +87,20 @@ def test_light_of_a_pixel_that_is_lit_in_part_divides():
     np.testing.assert_allclose(maps.mean[4:-4, 12], 0.6 * 1.1, rtol=1e-6)
     np.testing.assert_allclose(maps.mean[4:-4, 5], 1.1, rtol=1e-6)
     np.testing.assert_allclose(maps.rest[4:-4, 12], 0.6 * 1.21 - 0.66**2, rtol=1e-6)
+
+
+def test_model_with_the_true_maps_makes_the_frames_of_a_foreign_bench():
+    """Its grid is that of the bench, so that every step of the model is compared: mask, blur, pixel and place."""
+    bench = replace(
+        CASES["ideal"], aperture="VLT", pixels=40, side=52, blur=0.6, offsets=((0.2, -0.1), (-0.15, 0.25))
+    )
+    phase, n, f = bench.smooth(0.8, seed=1), bench.side + 2 * BORDER, bench.fine
+    exposures = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
+    camera = Camera(n, (bench.side,) * 2, bench.pixels, exposures, np.zeros((1, n * f, n * f)), f, 1.5)
+    arms = [[0, *bench.offsets[side], 0, 1, 1, 0] for side in (0, 1)]
+    values = np.array([*arms[0], *arms[1], bench.diameter, *bench.shifts, 0, bench.blur])
+    images = camera.at(Maps(bench.amplitude, 0 * phase, phase), values).images
+    np.testing.assert_allclose(images, bench.exposed(phase, True), rtol=0, atol=2e-4)
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ is lit, with the field A exp(i phase), and the rest. Its intensity behind a mask
     I = s |A exp(i phase) + r|^2 + (1 - s) |r|^2 = |m exp(i phase) + r|^2 + q,
 
 with the mean field m = s A and the light q = s A^2 - m^2 that does not interfere with r. The relay moves the
-fields to the plane that is conjugate to the camera. A Gaussian blur and the area of a pixel act on the intensity
-as products with its spectrum. A spline takes it to the pixels, at the place that shift, rotation and magnification
-give.
+fields to the plane that is conjugate to the camera. A Gaussian blur acts on the intensity as a product with its
+spectrum. A spline takes it to the place that shift, rotation and magnification give, and a pixel is the mean over
+its points there.
 """
 
 from __future__ import annotations
@@ -106,11 +106,10 @@ class Camera:
         self.defocus = self.defocus_at(frequency[None, :], frequency[:, None])
         half = fft.rfftfreq(size) * f
         self.squares = frequency[:, None] ** 2 + half**2
-        prefilter = [
+        symbols = (
             np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * one / f), _symbol()) for one in (frequency, half)
-        ]
-        pixel = [np.sinc(one) / two for one, two in zip((frequency, half), prefilter, strict=True)]
-        self.pixel = np.multiply.outer(*pixel)
+        )
+        self.prefilter = 1 / np.multiply.outer(*symbols)
 
     def defocus_at(self, u: NDArray, v: NDArray) -> NDArray[np.float64]:
         """Phase at frequencies in cycles per pixel that a unit of focus makes."""
@@ -215,7 +214,7 @@ class _Spline:
         )
         middle = (camera.size - 1) / 2
         (rows, along_y, slope_y), (columns, along_x, slope_x) = (
-            _weights(one * f + middle, camera.size) for one in (down, across)
+            _weights(one * f + middle, camera.size, f) for one in (down, across)
         )
         self._index = (rows[:, :, None] * camera.size + columns[:, None, :]).reshape(len(rows), -1)
         self._starts = np.arange(len(rows) + 1) * self._index.shape[1]
@@ -246,12 +245,21 @@ class _Spline:
         return np.stack([(down * dy + across * dx).reshape(self.shape) for dy, dx in self._moves])
 
 
-def _weights(places: NDArray, size: int) -> tuple[NDArray, NDArray, NDArray]:
-    """Nodes, weights and slopes of the B-splines at each place, (n, degree + 1) each; periodic."""
+def _weights(places: NDArray, size: int, f: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Nodes, weights and slopes, (n, k) each, of the mean over the f points of a pixel in each place; periodic.
+
+    A point stands for the mean over its cell, so that a pixel on the grid is the mean of its cells exactly.
+    """
     spline = BSpline.basis_element(np.arange(_DEGREE + 2) - (_DEGREE + 1) / 2, extrapolate=False)
-    nodes = np.floor(places).astype(int)[:, None] + np.arange(-(_DEGREE // 2), _DEGREE // 2 + 2)
-    away = places[:, None] - nodes
-    return nodes % size, np.nan_to_num(spline(away)), np.nan_to_num(spline.derivative()(away))
+    inner = np.arange(f) - (f - 1) / 2
+    reach = _DEGREE // 2 + f // 2 + 1
+    nodes = np.floor(places).astype(int)[:, None] + np.arange(1 - reach, reach + 1)
+    away = (places[:, None] - nodes)[..., None] + inner
+    return (
+        nodes % size,
+        np.nan_to_num(spline(away)).mean(axis=-1),
+        np.nan_to_num(spline.derivative()(away)).mean(axis=-1),
+    )
 
 
 @dataclass(eq=False)
@@ -284,7 +292,7 @@ class Linearised:
         self._transfer = [
             np.exp(-1j * arm["focus"] * camera.defocus) if arm["focus"] else None for arm in self.arms
         ]
-        self._blur = camera.pixel * np.exp(-2 * (np.pi * self.masks["blur"]) ** 2 * camera.squares)
+        self._blur = camera.prefilter * np.exp(-2 * (np.pi * self.masks["blur"]) ** 2 * camera.squares)
         self._splines = [_Spline(camera, [arm[name] for name in _PLACE]) for arm in self.arms]
         masked = {one.arm for one in camera.exposures if one.mask is not None}
         self._cores = {arm: camera.cores(self.masks["diameter"], self.arms[arm]["focus"]) for arm in masked}

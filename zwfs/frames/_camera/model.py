@@ -6,7 +6,7 @@ is lit, with the field A exp(i phase), and the rest. Its intensity behind a mask
     I = s |A exp(i phase) + r|^2 + (1 - s) |r|^2 = |m exp(i phase) + r|^2 + q,
 
 with the mean field m = s A and the light q = s A^2 - m^2 that does not interfere with r. The relay moves the
-fields to the plane that is conjugate to the camera. A Gaussian blur acts on the intensity as a product with its
+fields to the plane that is conjugate to the camera, and spreads q, which belongs to waves too steep for the grid. A Gaussian blur acts on the intensity as a product with its
 spectrum. A spline takes it to the place that shift, rotation and magnification give, and a pixel is the mean over
 its points there.
 """
@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, sparse
+from scipy import fft, sparse, special
 from scipy.interpolate import BSpline
 
 from zwfs._lowrank import _axis_functions, _quadrature, _rim, _spectra
@@ -30,6 +30,7 @@ from zwfs.masks import Dimple
 _TOLERANCE = 1e-6  # of the reference wave
 _DEGREE = 5  # of the spline that takes an image to the pixels
 _BORDER = 4  # pixels around a frame that are modelled: blurred light that crosses the edge comes back
+_LONGEST = 4.0  # displacement of light that the grid does not resolve, over that of the steepest resolved wave
 _PLACE = ("row", "column", "rotation", "magnification")
 ARM = ("focus", *_PLACE, "flux", "background")
 """Numbers of an optical path: D^2 / lambda for the focus, pixels, pixels, radian and 1 for the place, counts."""
@@ -115,6 +116,24 @@ class Camera:
         """Phase at frequencies in cycles per pixel that a unit of focus makes."""
         return np.pi * self.n_pixels**2 * (u**2 + v**2)
 
+    def spread_at(self, focus: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Factor of the spectrum of the light that the grid does not resolve, and its derivative by the focus.
+
+        The light of an edge has a power of 1 / nu^2 at nu cycles per pixel, and the relay moves it by
+        d = focus D^2 nu across the edge. Only nu > f / 2 is not resolved, so d has the density d_0 / d^2 beyond
+        d_0 = d(f / 2). Over all directions of edges the factor at kappa cycles per pixel is, with x = 2 pi kappa d_0,
+
+            k(x) = int_{d_0}^inf d_0 / d^2 J_0(2 pi kappa d) dd = J_0(x) - x (1 + J_1(x) - int_0^x J_0),
+
+        and k'(x) = (k - J_0) / x. The density ends at r d_0, so that the factor is (k(x) - k(r x) / r) / (1 - 1 / r),
+        which has no kink at focus 0.
+        """
+        unit = np.pi * np.sqrt(self.squares) * self.f * self.n_pixels**2
+        near, far = (_edge_light(x) for x in (unit * abs(focus), _LONGEST * unit * abs(focus)))
+        share = 1 - 1 / _LONGEST
+        slope = (near[1] - far[1]) / share * unit * math.copysign(1, focus)
+        return (near[0] - far[0] / _LONGEST) / share, slope
+
     def cores(self, diameter: float, focus: float) -> NDArray[np.complex128]:
         """Operators (3, q, r) of the dimple's light: itself, and its derivatives by focus and diameter."""
         dimple = Dimple(diameter, 0.0)
@@ -131,6 +150,13 @@ class Camera:
     def at(self, maps: Maps, values: NDArray) -> Linearised:
         """Images and their derivatives at maps and parameters."""
         return Linearised(self, maps, values)
+
+
+def _edge_light(x: NDArray) -> tuple[NDArray, NDArray]:
+    """k(x) and k'(x) of `Camera.spread_at`."""
+    mean = special.j0(x)
+    k = mean - x * (1 + special.j1(x) - special.itj0y0(x)[0])
+    return k, np.divide(k - mean, x, out=np.full_like(x, -1.0), where=x > 1e-9)
 
 
 def _symbol() -> NDArray[np.float64]:
@@ -292,6 +318,8 @@ class Linearised:
         self._transfer = [
             np.exp(-1j * arm["focus"] * camera.defocus) if arm["focus"] else None for arm in self.arms
         ]
+        self._spread = [camera.spread_at(arm["focus"]) for arm in self.arms]
+        self._rest = self._spectrum_of(maps.rest)
         self._blur = camera.prefilter * np.exp(-2 * (np.pi * self.masks["blur"]) ** 2 * camera.squares)
         self._splines = [_Spline(camera, [arm[name] for name in _PLACE]) for arm in self.arms]
         masked = {one.arm for one in camera.exposures if one.mask is not None}
@@ -326,13 +354,19 @@ class Linearised:
             ahead = field + first * light
             across = np.conj(first) * field + second * light
             intensity = (field.conj() * ahead + light.conj() * across).real
-        intensity[camera.window] += self.maps.rest
-        spectrum = fft.rfft2(intensity)
+        spectrum = fft.rfft2(intensity) + self._spread[one.arm][0] * self._rest
         blurred = fft.irfft2(self._blur * spectrum, s=intensity.shape)
         return _Part(field, light, ahead, across, spectrum, blurred, self._splines[one.arm](blurred))
 
-    def _on_camera(self, one: Exposure, intensity: NDArray) -> NDArray[np.float64]:
-        blurred = fft.irfft2(self._blur * fft.rfft2(intensity), s=intensity.shape)
+    def _spectrum_of(self, light: NDArray) -> NDArray[np.complex128]:
+        """Spectrum of a map of light on the whole grid."""
+        whole = np.zeros((self.camera.size,) * 2)
+        whole[self.camera.window] = light
+        return fft.rfft2(whole)
+
+    def _on_camera(self, one: Exposure, spectrum: NDArray) -> NDArray[np.float64]:
+        """Change of an image with that of the spectrum of its intensity."""
+        blurred = fft.irfft2(self._blur * spectrum, s=(self.camera.size,) * 2)
         return self.arms[one.arm]["flux"] * self._splines[one.arm](blurred)
 
     def apply(self, mean: NDArray, rest: NDArray, phase: NDArray) -> list[NDArray[np.float64]]:
@@ -340,13 +374,14 @@ class Linearised:
         camera, changes = self.camera, []
         change = (mean + 1j * self.maps.mean * phase) * self._wave
         states = [self._source(change * turn) for turn in camera.turns]
+        unresolved = self._spectrum_of(rest)
         for one, part in zip(camera.exposures, self._parts, strict=True):
             intensity = _twice(part.ahead, self._relayed(one.arm, states[one.state]))
             if one.mask is not None:
                 light = camera.planes[1].expand(self._cores[one.arm][0] @ states[one.state][2])
                 intensity += _twice(part.across, light)
-            intensity[camera.window] += rest
-            changes.append(self._on_camera(one, intensity))
+            spectrum = fft.rfft2(intensity) + self._spread[one.arm][0] * unresolved
+            changes.append(self._on_camera(one, spectrum))
         return changes
 
     def adjoint(self, pixels: Sequence[NDArray]) -> Maps:
@@ -355,11 +390,12 @@ class Linearised:
         spectra = [np.zeros((camera.size,) * 2, complex) for _ in self._states]
         direct = [np.zeros((camera.size,) * 2, complex) for _ in self._states]
         inputs = [np.zeros(source[2].shape, complex) for source in self._states]
-        rest = np.zeros(self.maps.rest.shape)
+        seen = [np.zeros(self._blur.shape, complex) for _ in self.arms]
         for one, part, weight in zip(camera.exposures, self._parts, pixels, strict=True):
             back = self._splines[one.arm].adjoint(self.arms[one.arm]["flux"] * weight)
-            gain = fft.irfft2(self._blur * fft.rfft2(back), s=back.shape)
-            rest += gain[camera.window]
+            spectrum = self._blur * fft.rfft2(back)
+            seen[one.arm] += spectrum
+            gain = fft.irfft2(spectrum, s=back.shape)
             transfer = self._transfer[one.arm]
             if transfer is None:
                 direct[one.state] += 2 * gain * part.ahead
@@ -369,6 +405,8 @@ class Linearised:
                 core = self._cores[one.arm][0].conj().T
                 inputs[one.state] += core @ camera.planes[1].project(2 * gain * part.across)
         moved = any(one is not None for one in self._transfer)
+        unresolved = sum(spread * each for (spread, _), each in zip(self._spread, seen, strict=True))
+        rest = fft.irfft2(unresolved, s=(camera.size,) * 2)[camera.window]
         total = np.zeros(rest.shape, complex)
         for whole, spectrum, light, turn in zip(direct, spectra, inputs, camera.turns, strict=True):
             field = whole + fft.ifft2(spectrum) if moved else whole
@@ -395,17 +433,18 @@ class Linearised:
                 image = fft.irfft2(slope * part.spectrum, s=part.blurred.shape)
                 out.append(arm["flux"] * self._splines[one.arm](image))
             elif name == "focus":
-                out.append(self._on_camera(one, self._by_focus(one, part, source)))
+                spectrum = fft.rfft2(self._by_focus(one, part, source))
+                out.append(self._on_camera(one, spectrum + self._spread[one.arm][1] * self._rest))
             elif one.mask is None:
                 out.append(zero)
             elif name == "diameter":
                 light = camera.planes[1].expand(self._cores[one.arm][-1] @ source[2])
-                out.append(self._on_camera(one, _twice(part.across, light)))
+                out.append(self._on_camera(one, fft.rfft2(_twice(part.across, light))))
             else:
                 first = self._coefficients.first_slope[one.mask, MASKS.index(name)]
                 second = self._coefficients.second_slope[one.mask, MASKS.index(name)]
                 change = 2 * (first * part.field.conj() * part.light).real + second * np.abs(part.light) ** 2
-                out.append(self._on_camera(one, change))
+                out.append(self._on_camera(one, fft.rfft2(change)))
         return np.reshape(out, (len(wanted), *camera.shape))
 
     def _by_focus(self, one: Exposure, part: _Part, source: tuple[NDArray, NDArray, NDArray]) -> NDArray:

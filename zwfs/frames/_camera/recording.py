@@ -135,14 +135,14 @@ def _continued(phases: NDArray) -> NDArray[np.float64]:
     regions, _ = ndimage.label(np.pad(bad, PAD, constant_values=True))
     unknown = regions == regions[0, 0]
     if np.any(bad & unknown[PAD:-PAD, PAD:-PAD]):  # a pixel of the outline mixes the phase with zeros
-        unknown = ndimage.binary_dilation(unknown)
+        unknown = ndimage.binary_dilation(unknown, np.ones((3, 3)))
     if unknown.all():
         return wide
     n = wide.shape[-1]
-    second = sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(n - 2, n))
-    first = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(n - 1, n))
-    same = sparse.eye_array(n)
-    parts = (sparse.kron(second, same), sparse.kron(same, second), math.sqrt(2) * sparse.kron(first, first))
+    # The least third derivative: a parabola goes on as one.
+    same, *steps = sparse.eye_array(n), *(sparse.csr_array(np.diff(np.eye(n), k, axis=0)) for k in (1, 2, 3))
+    parts = [sparse.kron(steps[2], same), sparse.kron(same, steps[2])]
+    parts += [math.sqrt(3) * sparse.kron(*pair) for pair in (steps[:2], steps[1::-1])]
     bending = sum(one.T @ one for one in parts).tocsc()
     flat, rows = wide.reshape(len(wide), -1).copy(), unknown.ravel()
     right = -(bending[rows][:, ~rows] @ flat[:, ~rows].T)

@@ -32,7 +32,7 @@ def reads():
     return read
 
 
-def test_figures_and_text_come_first_and_all_code_is_in_one_fold_before_the_last_paragraph(reads):
+def test_figures_and_text_come_first_and_all_code_is_in_one_fold_at_the_end(reads):
     page = reads(
         new_markdown_cell("# Question"),
         code(PARAMETERS, "parameters"),
@@ -46,12 +46,12 @@ def test_figures_and_text_come_first_and_all_code_is_in_one_fold_before_the_last
         new_markdown_cell("## Second"),
         code("more = compute()"),
         code("draw(more)", "hide-input", output=True),
-        new_markdown_cell("## Method\n\nText.\n\nNext: elsewhere."),
+        new_markdown_cell("## Method"),
     )
     first = ["# Question", "check()", "output", "::: files", "## Results", "output", "curves = compute()"]
     sources = [PARAMETERS, SET_UP, "curves = compute()", DRAW, "report(curves)", "more = compute()", "draw(more)"]
     fold = ("folded", "\n\n".join(sources))
-    assert page == [*first, "## Second", "output", "## Method\n\nText.", fold, "Next: elsewhere."]
+    assert page == [*first, "## Second", "output", "## Method", fold]
 
 
 def test_a_cell_that_computes_and_prints_keeps_its_code(reads):

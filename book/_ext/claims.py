@@ -64,7 +64,7 @@ class Claim:
     statement: str
     verdicts: list[dict[str, str]]  # the first whose condition applies; otherwise the claim holds
     source: str = ""  # the notebook that measures it, and the heading to link to: ``notebook#its-words``
-    reading: str = ""  # how we read a word of the claim
+    rule: str = ""  # the conditions of the verdicts, in plain words
     given: dict[str, str] = field(default_factory=dict)  # names for expressions
     measured: str = ""  # template of the measured values
 
@@ -153,8 +153,9 @@ def rules() -> str:
         for claim in CLAIMS:
             if claim.notebook == notebook:
                 ends = {"start-at": f"- number: {claim.number}", "end-before": f"- number: {claim.number + 1}"}
-                text += _include("_ext/claims.yml", language="yaml", name=f"rule-{claim.number}", **ends)
-                text += f"[The code of its numbers](#numbers-{notebook})\n\n"
+                text += f"(rule-{claim.number})=\n**Claim {claim.number}.** {claim.rule}\n\n"
+                text += _include("_ext/claims.yml", language="yaml", **ends)
+        text += "**The numbers:**\n\n"
         code = f"../notebooks/studies/{notebook}.py"
         text += _include(code, name=f"numbers-{notebook}", pyobject="numbers") + "::::\n\n"
     return text

@@ -34,8 +34,8 @@ COST_MAP = "cividis_r"
 MOST = 10  # photon cost at the end of its scale
 MAP_SIZE = 2.9, 2.4  # of the map of designs on a phone, inch
 NEAREST = 0.11  # of a label of a contour to anything else, inch
-COST_LINES = dict.fromkeys((1.25, 1.5, 2), "#222222") | dict.fromkeys((3, 5, 10), "#ffffff")
-"""Photon costs at which a line is drawn, and its colour, which differs from that of the map."""
+COST_LINES = dict.fromkeys((1.25, 1.5, 2, 3), "#000000") | dict.fromkeys((5, 10), "#ffffff")
+"""Photon costs at which a line is drawn, and its colour, with a contrast of at least 4.5 to that of the map."""
 
 
 def script() -> str:

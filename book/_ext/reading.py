@@ -6,17 +6,16 @@ A notebook runs from its parameters to its figures. Everywhere but on its page o
 import copy
 
 from nbformat import NotebookNode
-from nbformat.v4 import new_code_cell, new_markdown_cell
+from nbformat.v4 import new_code_cell
 
 from studies.kit.results import published
 
 CARD = "card-"  # with which the ids of the cards begin
 FOLD = "Code of this page"
-NEXT = "\n\nNext:"  # begins the last paragraph of a page
 
 
 def put_in_order(notebook: NotebookNode) -> None:
-    """Move the code of a notebook into a fold before its last paragraph, in place.
+    """Move the code of a notebook into a fold at its end, in place.
 
     The first cell that computes also stays visible, at the end of the section that follows the first figure.
     """
@@ -34,9 +33,6 @@ def put_in_order(notebook: NotebookNode) -> None:
             drawn = drawn or bool(published(cell.source))
             cells.append(without_code(cell) if tagged(cell, "hide-input") else cell)
     notebook.cells = [*cells, *computing, *([fold(code)] if code else [])]
-    if cells and cells[-1].cell_type == "markdown" and NEXT in cells[-1].source:
-        cells[-1].source, _, last = cells[-1].source.rpartition(NEXT)
-        notebook.cells.append(new_markdown_cell(NEXT.strip() + last, id="next"))
 
 
 def tagged(cell: NotebookNode, *tags: str) -> bool:

@@ -16,9 +16,9 @@ function nameWideTables() {
   }
 }
 
-// They and wide code fade at the right until their end is in sight.
+// They, wide code and wide figures fade at the right until their end is in sight.
 function fadeWideBoxes() {
-  for (const box of document.querySelectorAll(".pst-scrollable-table-container, .highlight pre"))
+  for (const box of document.querySelectorAll(".pst-scrollable-table-container, .highlight pre, .wide-figure"))
     box.classList.toggle("more", box.scrollLeft + box.clientWidth < box.scrollWidth - 1);
 }
 

@@ -297,15 +297,12 @@ def numbers(
     # Rms over the screens, without the flat wavefront, of each diameter.
     tilt, others, total = (_rms(values[:, 1:]) for values in (limits.tilt, limits.others, limits.total))
     flat, *aberrated = (crossing(limits.diameters, row, 1.0) for row in limits.factor.T)
-    plain, likely = (
-        np.concatenate([curve.recovered(name, threshold) for curve in masks.values()]) for name in (PLAIN, LIKELY)
-    )
+    plain = np.concatenate([curve.recovered(PLAIN, threshold) for curve in masks.values()])
     found = dict(settings) | {
         "first_input": first.rms[0],
         "last_input": list(curves)[-1],
         "largest": first.diameters[-1],
         "smallest": first.diameters[0],
-        "likely_share": min(curve.recovered(LIKELY, threshold).min() for curve in curves.values()),
         "factor_flat": flat,
         "factor_screens_least": min(aberrated),
         "factor_screens_most": max(aberrated),
@@ -316,10 +313,8 @@ def numbers(
         "others_large": others[large],
         "total_usual": total[usual],
         "total_large": total[large],
-        "recovered_large": first.recovered(PLAIN, threshold)[_nearest(first.diameters, LARGE)],
         "masks_plain_least": plain.min(),
         "masks_plain_most": plain.max(),
-        "masks_likely_least": likely.min(),
     }
     allowed, words = threshold * first.rms[0], f"{percent(threshold)} of the input"
     for name, short in ((PLAIN, "plain"), (ACCELERATED, "accelerated")):

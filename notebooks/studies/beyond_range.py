@@ -552,7 +552,6 @@ def numbers(
     chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
     few = min(noisy, key=lambda curve: abs(np.log(curve.photons / 1e3)))
     at = {name: int(np.argmin(np.abs(chosen.rms - rms))) for name, rms in (("1", 1.0), ("3", 3.0))}
-    plain, _ = found.half(PLAIN, threshold)
     two = int(np.argmin(np.abs(found.curves.rms - 2.0)))
     right = noiseless.errors[LIKELY] <= threshold * noiseless.rms[:, np.newaxis]
     usual = (chosen.rms >= 0.1) & (chosen.rms <= 2)
@@ -560,7 +559,6 @@ def numbers(
     *_, area = model.values()
     pixels = np.median(area.errors[LIKELY], axis=1)
     result = dict(settings) | {
-        "exact_up_to": noiseless.complete_up_to(LIKELY, threshold),
         "n_noiseless": right.size,
         "n_right": np.count_nonzero(right),
         "false_trust": np.count_nonzero(noiseless.consistent & ~right),
@@ -571,7 +569,6 @@ def numbers(
         "modes_over": np.max(chosen.median(MODES)[usual] / chosen.bound[MODES][usual]),
         "modes_from": chosen.rms[usual][0],
         "modes_to": chosen.rms[usual][-1],
-        "plain_half": plain,
         "contracting_at_2": np.mean(found.factor[two] < 1),
         "exact_text": _exact_text(noiseless, threshold),
         "half_text": _half_text(found, threshold),

@@ -361,7 +361,7 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
                 style |= {"markerfacecolor": "white", "linestyle": "--"}
             residual = [typical(one.settled[name]) for one in some]
             axes.semilogy([one.start for one in some], residual, label=method_name(name), **style)
-        axes.set_title(f"{photons:g} photons per point and image", fontsize=10)
+        axes.set_title(f"{photons:g} photon{'s' * (photons != 1)} per point and image", fontsize=10)
         axes.set(xlabel="error at the start (rad rms)", xticks=[one.start for one in some])
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter("{x:g}")

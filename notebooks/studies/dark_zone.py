@@ -232,7 +232,6 @@ def numbers(curves: DriftCurves) -> dict[str, float | str]:
         "per_point": 1e9 / 2 / np.count_nonzero(np.any(drift.modes, axis=0)),
         "saved": 100 * (1 - photons[-1] / photons[1]),
         "above_ideal": 100 * (photons[-1] / photons_ideal - 1),
-        "pair_over_classic": photons[1] / photons[0],
         "agreement_least": np.min(ratios),
         "agreement_most": np.max(ratios),
         "light_gain": least,

@@ -378,8 +378,6 @@ def numbers(
         | {
             "gain_least": min(gains),
             "gain_most": max(gains),
-            "loop_gain_least": min(1 / one.ratio for one in loops[:2]),
-            "loop_gain_most": max(1 / one.ratio for one in loops[:2]),
             "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
             "likelihood_ratio": paired_ratio(settled["MaximumLikelihood"], settled[faint.one])[0],
         },

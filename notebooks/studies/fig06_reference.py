@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from studies.kit.bench import ARMS, check_bench, middle_rows
 from studies.kit.parameters import bench_fields, parameter_limits
-from studies.kit.results import rounded
 from studies.kit.style import show_intensity
 from studies.kit.tables import Table
-from zwfs.bench import Bench, BenchModel
+from zwfs.bench import Bench
 
 LIMITS = parameter_limits(n_pixels=(32, 1024), bench=bench_fields("n_pixels"))
 CHECK_TOGETHER = check_bench
@@ -53,14 +52,3 @@ def error_table(bench: Bench) -> Table:
     """Size of each error of the bench."""
     rows = [[name, float(getattr(bench, name)), unit] for name, unit in UNITS.items()]
     return Table(["error", "value", "unit"], rows)
-
-
-def numbers(model: BenchModel, frames: NDArray) -> dict[str, float | str]:
-    """Numbers for the text: the usable segments, and the share of the light that lies outside of them."""
-    on_segments = frames[..., *model.shifted.window][0, model.segments > 0]
-    return rounded(
-        {
-            "usable_segments": len(model.numbers),
-            "light_outside": 1 - on_segments.sum() / frames[0].sum(),
-        }
-    )

@@ -75,9 +75,7 @@ def agreement_table(correlation: list[float], estimate: Reconstruction, error: N
 
 
 def numbers(correlation: list[float], error: NDArray, commanded: NDArray) -> dict[str, float | str]:
-    """Numbers for the text: the correlation of each image, and the error as a share of the commands."""
-    first, second = correlation
+    """Numbers for the text: the correlation of the second image, and the error as a share of the commands."""
     share = error.std() / commanded.std() if commanded.any() else np.nan
     text = f"{share:.0%} of the input" if commanded.any() else f"{error.std():.2g} rad rms at a flat command"
-    found = rounded({"correlation_first": first, "correlation_second": second, "error_share": share})
-    return found | {"error_text": text}
+    return rounded({"correlation_second": correlation[1]}) | {"error_text": text}

@@ -117,6 +117,5 @@ def numbers(curves: BenchCurves) -> dict[str, float | str]:
             "shifted_worst": mean["shifted"].max(),
             "largest_input": curves.rms.max(),
             "shifted_share_at_01": at_01 / 0.1,
-            "saxton_worse_up_to": worse,
         }
     )

@@ -167,15 +167,34 @@ def _in_sigmas(
     return sensor.pupil.gather(np.abs(residual) / estimate.sigma)
 
 
+_FINE = 1.3  # error over bound up to which the scale is linear, and wide; above it is logarithmic
+
+
+def _stretch(ratio: NDArray) -> NDArray[np.float64]:
+    """Position on the axis of an error over the bound."""
+    return np.where(ratio < _FINE, (ratio - 1) / (_FINE - 1), 1 + 0.6 * np.log10(np.maximum(ratio, _FINE) / _FINE))
+
+
+def _shrink(position: NDArray) -> NDArray[np.float64]:
+    """Error over the bound at a position."""
+    return np.where(position < 1, 1 + (_FINE - 1) * position, _FINE * 10 ** ((np.maximum(position, 1) - 1) / 0.6))
+
+
 def draw_photon_noise(curves: PhotonCurves) -> Figure:
     """Error of each method over the bound, against the number of photons; one panel for each input."""
     size = curves.rms.size
+    ratios = [curves.ratio(name) for name in curves.errors]
+    lowest, highest = np.nanmin(ratios), np.nanmax(ratios)
     figure, panels = plt.subplots(1, size, figsize=(7, 3.6), sharex=True, sharey=True, squeeze=False)
     for place, axes in enumerate(panels[0]):
         axes.axhline(1, color="#999999", lw=5, label="bound", zorder=0)
+        axes.axhline(_FINE, color="#555555", lw=1, zorder=1)
         for name in sorted(curves.errors, key=list(LOOKS).index):
             look = LOOKS[name]
-            axes.loglog(curves.photons, curves.ratio(name)[place], ms=5, label=look.label, **look.style)
+            axes.semilogx(curves.photons, curves.ratio(name)[place], ms=5, label=look.label, **look.style)
+        axes.set_yscale("function", functions=(_stretch, _shrink))
+        axes.set_yticks([1, 1.1, 1.2, _FINE, 10, 100], ["1", "1.1", "1.2", f"{_FINE:g}", "10", "100"])
+        axes.set_ylim(0.95 * min(lowest, 0.98), 1.5 * max(highest, _FINE))
         axes.set_title(f"input {curves.rms[place]:g} rad rms", fontsize=10)
         axes.set_xlabel("photons per point\nand image")
     panels[0, 0].set_ylabel("error / bound")

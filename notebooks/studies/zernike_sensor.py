@@ -20,7 +20,7 @@ from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS, dashed_circle, show_intensity, show_phase
 from zwfs.masks import focal_field
-from zwfs.metrics import reconstruction_error, strehl, wrapped_residual
+from zwfs.metrics import strehl, wrapped_residual
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
@@ -209,14 +209,13 @@ def one_or_two_images_columns(
 
 
 def numbers(pupil: Pupil, truth: NDArray, one: NDArray, pixel: Pixel) -> dict[str, float | str]:
-    """Phases that explain the pixel (radian), and the error of the phase from one image."""
+    """Phases that explain the pixel (radian), the phase from one image, and the Strehl ratio."""
     return rounded(
         {
             "pixel_phase": pixel.phase,
             "mirrored_a": pixel.mirrored[0],
             "mirrored_b": pixel.mirrored[1],
             "one_at_pixel": one[pixel.row, pixel.column],
-            "one_error": float(reconstruction_error(pupil, one, truth)),
             "fold": np.angle(-np.exp(1j * np.angle(pixel.waves[0]))),
             "strehl": float(strehl(pupil, truth)),
         }

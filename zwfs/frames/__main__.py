@@ -72,6 +72,15 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--exposure", type=float, default=1.0, help="of the frames over that of the clear frames")
     one.add_argument("--saturation", type=float, metavar="COUNTS", help="default: SATURATE, or the type's largest")
     one.add_argument("--fit", dest="fitted", nargs="+", default=(), metavar="NAME", help="parameter to fit")
+    one.add_argument(
+        "--commands", metavar="FILE", help="known phases of the frames, radian: fit the bench with them"
+    )
+    one.add_argument(
+        "--noise", type=float, metavar="COUNTS", help="rms of a pixel without light; default: from the frames"
+    )
+    one.add_argument(
+        "--gain", type=float, default=1.0, metavar="ELECTRONS", help="of a count; both with --commands"
+    )
     one.add_argument("--iterations", dest="n_iterations", type=int, default=25, metavar="N", help="default: 25")
     one.add_argument("--tolerance", type=float, default=1e-3, metavar="RAD", help="that ends them; default: 1e-3")
     two = commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
+from scipy import fft, ndimage, sparse
 
 from zwfs import _check
 from zwfs._information import Response
-from zwfs.frames.registration import _TOUCHED, Image, RegisteredFrames, nearest_good
+from zwfs.frames.registration import _TOUCHED, nearest_good
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
@@ -20,9 +19,10 @@ from zwfs.sensor import ZernikeSensor
 if TYPE_CHECKING:
     from zwfs.frames.calibration import Calibration
 
-_FAR = 40  # pixels beyond the camera at which the edge of an image has no effect on the camera
+_FAR = 16  # pixels to which an edge is repeated
 _REACH = 12  # pixels around the pupil that its splines need: farther ones weigh less than 2e-7
 _CUT = _REACH - 1  # of these, those without a coefficient of a spline in the pupil
+_NOISE = 0.2  # of the signal, in squares: the inverse of a blur goes no further
 _NEGLIGIBLE = 1e-10  # of a weight: smaller ones only slow products down, much so if their products are subnormal
 
 
@@ -32,6 +32,7 @@ class Grid(NamedTuple):
     reconstruct: PhaseShifted
     response: Response
     n_points: int
+    weights: NDArray[np.float32]
     offset: NDArray[np.float32]
     flat_frames: NDArray[np.float32]
     boxes: list[tuple[int, Any, Any]]  # image, rows and columns
@@ -67,6 +68,7 @@ class Grid(NamedTuple):
             PhaseShifted(sensor, accelerate=True, **settings),
             Response.of(sensor),
             pupil.n_points,
+            calibration.weights.astype(np.float32),
             calibration.offset.astype(np.float32),
             sensor.measure(np.zeros(pupil.shape)).astype(np.float32),
             boxes,
@@ -74,7 +76,7 @@ class Grid(NamedTuple):
             bad,
             reached & ~bad,
             [_repair(one, ~one) for one in bad],
-            (_spline_filter(size[0]), _spline_filter(size[1])),
+            (_spline_filter(size[0], calibration.blur), _spline_filter(size[1], calibration.blur)),
             [_cubic(corner - _CUT, tuple(size - 2 * _CUT), pupil.inside.ravel()) for corner in corners],
             touching,
             _repair(pupil.inside & ~calibration.good, calibration.good),
@@ -95,7 +97,7 @@ class Grid(NamedTuple):
                 spoiled = odd & self.watched
                 n_bad = np.count_nonzero(spoiled, axis=(1, 2, 3))
                 n_saturated = np.count_nonzero(spoiled & (raw >= level), axis=(1, 2, 3))
-                good = good & ~self._touched(spoiled)
+                good = good & ~self.touched(spoiled)
             raw -= self.dark
         flat = raw.reshape(k, len(self.boxes), -1)
         for index, (pixels, nearest) in enumerate(self.repairs):
@@ -121,31 +123,13 @@ class Grid(NamedTuple):
                 phase[index] = np.where(inside, nearest_good(phase[index], good[index]), 0)
         return phase
 
-    def _touched(self, spoiled: NDArray) -> NDArray[np.bool_]:
+    def touched(self, spoiled: NDArray) -> NDArray[np.bool_]:
         """Points with a bad pixel on one of their sides: (k, 2, h, w) to (k, ny, nx)."""
         k, shape = len(spoiled), self.offset.shape[1:]
         weights = sum(
             one @ spoiled[:, index].reshape(k, -1).T.astype(np.float32) for index, one in enumerate(self.touching)
         )
         return (weights.T > _TOUCHED).reshape(k, *shape)
-
-
-def camera_places(registered: RegisteredFrames) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Row and column of each point of the grid on the two frames, (2, 2, ny, nx), and counts there of one count.
-
-    `RegisteredFrames` resamples images whose counts are the number of the row or of the column. They reach beyond
-    the camera, since splines bend ramps at the edge.
-    """
-    wide = [length + 2 * _FAR for length in registered.frames[0].counts.shape]
-    origins = registered.origins + np.array([[_FAR], [_FAR], [0], [0]])
-
-    def on_grid(counts: NDArray) -> NDArray[np.float64]:
-        image = Image(counts, np.zeros(counts.shape, bool))
-        return replace(registered, frames=(image, image), origins=origins).frames_on_grid()[0]
-
-    response = on_grid(np.ones(wide))
-    ramps = np.indices(wide).astype(float) - _FAR
-    return np.stack([on_grid(ramp) / response for ramp in ramps], axis=1), response.mean(axis=(1, 2))
 
 
 def _span(low: int, size: int, length: int) -> Any:
@@ -163,9 +147,13 @@ def _repair(bad: NDArray[np.bool_], good: NDArray[np.bool_]) -> tuple[NDArray, N
     return np.flatnonzero(bad), nearest[bad]
 
 
-def _spline_filter(size: int) -> NDArray[np.float32]:
-    """Matrix from samples to the coefficients of a cubic spline near the pupil."""
-    matrix = ndimage.spline_filter1d(np.eye(size), 3, axis=0, mode="nearest")
+def _spline_filter(size: int, blur: float) -> NDArray[np.float32]:
+    """Matrix from samples to coefficients of a cubic spline near the pupil, with Wiener's inverse of a blur."""
+    samples = np.pad(np.eye(size), ((_FAR, _FAR), (0, 0)), "edge")
+    spread = np.exp(-2 * (np.pi * blur * fft.rfftfreq(len(samples))) ** 2)[:, np.newaxis]
+    sharp = fft.rfft(samples, axis=0) * (spread * (1 + _NOISE) / (spread**2 + _NOISE))
+    matrix = fft.irfft(sharp, n=len(samples), axis=0)[_FAR:-_FAR] if blur else np.eye(size)
+    matrix = ndimage.spline_filter1d(matrix, 3, axis=0, mode="nearest")
     matrix = np.where(np.abs(matrix) > _NEGLIGIBLE, matrix, 0).astype(np.float32)
     return np.ascontiguousarray(matrix[_CUT:-_CUT])
 

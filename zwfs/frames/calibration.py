@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import warnings
 import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -19,6 +20,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+from scipy.optimize import nnls
 
 from zwfs import _check
 from zwfs._arrays import Immutable, Kind, read_only
@@ -26,18 +29,26 @@ from zwfs._likelihood import Estimator, Noise
 from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
-from zwfs.frames._grid import Grid, camera_places
+from zwfs.frames._camera import BenchFit, fit_bench
+from zwfs.frames._grid import Grid
+from zwfs.frames._known import States, learnt, places_of, read_states, training, unexplained, windows
 from zwfs.frames.files import read_all
 from zwfs.frames.phases import Flag, Phases
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames, reduce_frames
 from zwfs.frames.refine import _check_fit, fit
-from zwfs.frames.registration import register_frames
+from zwfs.frames.registration import nearest_good, radius, register_frames
 from zwfs.metrics import without_piston
+from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
-FORMAT = 1  # of the file; another number is refused
+FORMAT = 2  # of the file; another number is refused
 _NAME = "zwfs calibration"
 _DIM = 0.1  # of the light of the calibration: a frame with less is lost
+_AROUND = 5  # pixels over which squares of errors have a median
+_ODD = 9  # square of an error over that of its neighbours: such a point is worse than they are
+_POWER = 4  # of slopes with which squares of errors of modes grow; 2 of those of points
+_SHARED = 4  # states that the mean of all modes counts for
+_FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 _LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED = (flag.value for flag in Flag)  # plain, and far quicker
 
@@ -70,14 +81,22 @@ class Calibration(Immutable):
         Points of the pupil that are good.
     background, unit : ndarray, shape (2,), counts
         Stray light of the frames, and counts that make an intensity of 1.
-    weights, offset : ndarray, shapes (2, 2) and (2, ny, nx)
-        Frames of an ideal sensor are weights @ intensities + offset: scale, leakage, unmasked light.
+    weights, offset : ndarray, shapes (2, 2, ny, nx) and (2, ny, nx)
+        Frames of an ideal sensor are weights @ intensities + offset at each point.
+    unexplained : ndarray of float32, shape (n_states, ny, nx), radian
+        Errors of the phases of the calibration's frames, from which `sigma` takes what noise does not explain.
+    slopes : ndarray, shape (n_states,), radian
+        Rms difference of these phases at neighbouring points, with which errors grow.
     balance : bool
         Whether both frames are scaled to the same light.
     light : ndarray, shape (2,)
         Mean intensity of the calibration's frames in the pupil.
     residual : float
         Rms difference of the calibration's frames and their model.
+    blur : float, pixels rms
+        That is undone as far as noise allows.
+    n_averaged : int
+        Exposures that were averaged for each state.
     saturation : float, counts
         Pixels that reach it are saturated, the dark included.
     bunit : str
@@ -104,8 +123,12 @@ class Calibration(Immutable):
     offset: NDArray[np.float64]
     balance: bool
     light: NDArray[np.float64]
+    unexplained: NDArray[np.float32]
+    slopes: NDArray[np.float64]
     residual: float
     saturation: float
+    blur: float = 0.0
+    n_averaged: int = 1
     bunit: str = ""
     n_iterations: int = 25
     tolerance: float = 1e-3
@@ -115,13 +138,16 @@ class Calibration(Immutable):
         _check.instance("bunit", self.bunit, str)
         _check.flag("balance", self.balance)
         _check.number("residual", self.residual, 0)
+        _check.number("blur", self.blur, 0, 10)
+        _check.integer("n_averaged", self.n_averaged, 1)
         _check.integer("n_images", self.n_images, 1, 2)
         grid, camera = np.shape(self.amplitude), (self.n_images, *self.shape)
         for name, shape in {"bad": camera, "good": grid}.items():
             _check.flag_map(name, getattr(self, name), shape)
         for name, shape in {
-            "places": (2, 2, *grid), "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2),
-            "offset": (2, *grid), "light": (2,),
+            "places": (2, 2, *grid), "dark": camera, "background": (2,), "unit": (2,),
+            "weights": (2, 2, *grid), "offset": (2, *grid), "light": (2,),
+            "unexplained": (len(self.slopes), *grid),
         }.items():  # fmt: skip
             array = _check.real_array(name, getattr(self, name))
             if array.shape != shape:
@@ -176,7 +202,7 @@ class Calibration(Immutable):
             raise ValueError(f"the frames have shapes {shape} and {images[-1].counts.shape}: expected the same")
         counts, _ = registered.frames_on_grid()
         unit, background = measurement.counts * registered.exposure, measurement.background[:2]
-        places, response = camera_places(registered)
+        response = registered.areas[:2]
         inner = (..., *measurement.window)
         good = measurement.good
         weights, offset = _undoing(measurement)
@@ -187,16 +213,18 @@ class Calibration(Immutable):
             optics=measurement.optics,
             shape=shape,
             n_images=len(images),
-            places=places,
+            places=registered.places()[:2],
             dark=_dark(dark, (len(images), *shape)),
             bad=np.stack([image.bad for image in images]),
             good=good,
             background=background / response,
             unit=unit / response,
-            weights=weights,
+            weights=np.broadcast_to(weights[..., np.newaxis, np.newaxis], (2, 2, *good.shape)),
             offset=offset[inner],
             balance=bool(registered.balance and measurement.optics.opposite),
             light=(counts[:, good].mean(axis=1) - background) / unit,
+            unexplained=np.zeros((0, *good.shape), np.float32),
+            slopes=np.zeros(0),
             residual=0.0,
             saturation=saturation,
             bunit=bunit,
@@ -204,8 +232,128 @@ class Calibration(Immutable):
             tolerance=tolerance,
         )
         frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
-        *_, residual = made._solve(frames, np.broadcast_to(good, (1, *good.shape)), None, judge=True)
-        return replace(made, residual=float(residual[0]))
+        phase, *_, residual = made._solve(frames, good[np.newaxis], None, judge=True)
+        errors = made._sideways(phase[0], frames[0])[np.newaxis]
+        return replace(made, residual=float(residual[0]), unexplained=errors, slopes=made._slopes(phase))
+
+    @classmethod
+    def from_bench(
+        cls,
+        fit: BenchFit,
+        frames: ArrayLike,
+        phases: ArrayLike,
+        dark: ArrayLike | None = None,
+        *,
+        corners: ArrayLike = ((0, 0), (0, 0)),
+        shape: tuple[int, int] | None = None,
+        n_images: int = 2,
+        saturation: float = np.inf,
+        bunit: str = "",
+        n_iterations: int = 25,
+        tolerance: float = 1e-3,
+    ) -> Calibration:
+        """Calibration from a fit of the bench: its geometry, blur and leakage as linear operators.
+
+        The focus of the relay is corrected to first order, around a flat wavefront.
+
+        Parameters
+        ----------
+        fit : BenchFit
+        frames : array_like, shape (n_states, 2, ny, nx) or (n_states, n_frames, 2, ny, nx), counts
+            As for `fit_bench`: less the dark, NaN where bad.
+        phases : array_like, shape (n_states, n, n), radian
+            As for `fit_bench`. The phases of the calibration are on this grid.
+        dark : array_like, shape (ny_camera, nx_camera) or (n_images, ny_camera, nx_camera), counts, optional
+            That was subtracted from the frames; none if left out.
+        corners : array_like of int, shape (2, 2), pixels
+            Row and column on the camera of the first pixel of both frames, if these were cut out.
+        shape : (int, int), optional
+            Rows and columns of a camera image; those of the frames if left out.
+        n_images : int
+            Camera images of an exposure: 1 if both frames were cut out of one.
+        saturation : float, counts
+        bunit : str
+        n_iterations : int
+        tolerance : float, radian
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the fit is none, or shapes do not belong together.
+        """
+        _check.instance("fit", fit, BenchFit)
+        counts, phases = _check.real_array("frames", frames), _check.real_array("phases", phases)
+        n_averaged = counts.shape[1] if counts.ndim == 5 else 1
+        counts = counts.mean(axis=1) if counts.ndim == 5 else counts
+        if counts.ndim != 4 or counts.shape[:2] != (len(phases), 2) or phases.shape[1:] != fit.light.shape:
+            expected = f"(n_states, 2, ny, nx) and (n_states, {len(fit.light)}, {len(fit.light)})"
+            raise ValueError(
+                f"frames and phases have shapes {counts.shape} and {phases.shape}: expected {expected}"
+            )
+        corners = _check.integer_array("corners", corners).reshape(2, 2)
+        shape = counts.shape[2:] if shape is None else shape
+
+        def on_camera(windows: NDArray, outside: float) -> NDArray:
+            whole = np.full((len(windows), n_images, *shape), outside)
+            for index, (row, column) in enumerate(corners):
+                place = slice(row, row + counts.shape[2]), slice(column, column + counts.shape[3])
+                whole[(slice(None), min(index, n_images - 1), *place)] = windows[:, index]
+            return whole
+
+        optics = Optics(
+            fit["diameter"].value, (fit["first"].value, fit["second"].value), leakage=fit["leakage"].value
+        )
+        n_pixels, bad = fit.point.problem.camera.n_pixels, ~np.isfinite(counts).all(axis=0)
+        stop = radius(fit.light.shape, ((len(fit.light) - 1) / 2,) * 2) <= n_pixels / 2
+        pupil = Pupil.from_amplitude(np.sqrt(np.maximum(fit.light * stop, 0)), n_pixels, threshold=_FAINTEST)
+        flux = np.array([fit[f"arm {arm} flux"].value for arm in (0, 1)])
+        made = cls(
+            amplitude=pupil.amplitude,
+            diameter=n_pixels,
+            center=pupil.center,
+            optics=optics,
+            shape=shape,
+            n_images=n_images,
+            places=places_of(fit, counts.shape[2:], corners),
+            dark=_dark(dark, (n_images, *shape)),
+            bad=on_camera(bad[np.newaxis], 0)[0] > 0,
+            good=pupil.inside,
+            background=np.array([fit[f"arm {arm} background"].value for arm in (0, 1)]),
+            unit=flux * fit.light[pupil.inside].mean(),
+            weights=np.zeros((2, 2, *pupil.shape)),
+            offset=np.zeros((2, *pupil.shape)),
+            balance=False,
+            light=np.ones(2),
+            unexplained=np.zeros((0, *pupil.shape), np.float32),
+            slopes=np.zeros(0),
+            residual=0.0,
+            saturation=saturation,
+            blur=fit["blur"].value,
+            n_averaged=n_averaged,
+            bunit=bunit,
+            n_iterations=n_iterations,
+            tolerance=tolerance,
+        )
+        good = pupil.inside & ~made._work.touched(made._work.bad[np.newaxis])[0]
+        made = replace(made, good=good)
+
+        def intensity(windows: NDArray) -> NDArray:
+            values = made._work.on_grid(on_camera(windows, 0) + made.dark, np.inf, good)[0]
+            return values.reshape(len(values), 2, *pupil.shape) / made.unit[:, None, None]
+
+        seen, ideal = training(fit, made.sensor)
+        weights, offset = learnt(intensity(seen), ideal, optics.leakage)
+        light = intensity(np.nan_to_num(counts))[..., good].mean(axis=(0, 2))
+        made = replace(made, weights=weights, offset=offset, light=light)
+        cube = on_camera(np.nan_to_num(counts), 0) + made.dark
+        found = made(cube if n_images == 2 else cube[:, 0], saturation=np.inf)
+        errors = unexplained(found.phase, phases)
+        residual = float(np.sqrt(np.nanmean(found.residual**2)))
+        return replace(made, unexplained=errors, slopes=made._slopes(found.filled), residual=residual)
 
     def save(self, path: str | Path) -> None:
         """Write the calibration as NPZ, in one step; the same calibration gives the same bytes.
@@ -353,10 +501,11 @@ class Calibration(Immutable):
     def sigma(
         self, phases: Phases, photons: float, read_noise: float = 0.0, modes: ArrayLike | None = None
     ) -> NDArray[np.float32]:
-        """Standard error that photon noise and read noise cause: the Cramer-Rao bound at each phase.
+        """Standard error: the Cramer-Rao bound of noise at each phase, and the errors of the calibration's phases.
 
-        At 0.5 rad rms and 1.06 lambda/D the phase-shifted iteration is 6 % above it. Errors of the model are not
-        part of it. It takes longer than the phases, since the information of each frame is inverted.
+        At 0.5 rad rms and 1.06 lambda/D the phase-shifted iteration is 6 % above the bound. Errors that all states
+        of a calibration share are not part of it. It takes longer than the phases, since the information of each
+        frame is inverted.
 
         Parameters
         ----------
@@ -377,15 +526,69 @@ class Calibration(Immutable):
         pupil, model = self.sensor.pupil, propagator(self.sensor, Kind.numpy())
         basis = None if modes is None else pupil.scatter(_check.modes("modes", modes, pupil), fill=0)
         estimator = Estimator(self._work.response, Noise.checked(photons, read_noise), False, basis)
-        maps = phases.filled.reshape(-1, 1, *pupil.shape).astype(np.float64)
-        lost = phases.flags.reshape(-1) & Flag.LOST > 0
-        result = np.full((len(maps), *(pupil.shape if basis is None else (len(basis),))), np.nan, np.float32)
-        for index in np.flatnonzero(~lost):
-            psi = split(maps[index], model.amplitude)
+
+        def variance(phase: NDArray) -> NDArray:
+            psi = split(phase[np.newaxis], model.amplitude)
             points, of_modes = estimator.variance(psi, model.propagate(psi))
-            result[index] = np.sqrt(points[0, 0] if of_modes is None else of_modes[0])
-        result = result.reshape((*phases.flags.shape, *result.shape[1:]))
+            return points[0, 0] if of_modes is None else of_modes[0]
+
+        power = 2 if basis is None else _POWER
+        constant, growing = self._excess(variance(np.zeros(pupil.shape)) / self.n_averaged, basis)
+        maps = phases.filled.reshape(-1, *pupil.shape).astype(np.float64)
+        result = np.full((len(maps), *constant.shape), np.nan, np.float32)
+        for index in np.flatnonzero(phases.flags.reshape(-1) & Flag.LOST == 0):
+            excess = constant + growing * self._slopes(maps[index : index + 1])[0] ** power
+            result[index] = np.sqrt(variance(maps[index]) + excess)
+        result = result.reshape((*phases.flags.shape, *constant.shape))
         return result if basis is not None else np.where(np.isfinite(phases.phase), result, np.float32(np.nan))
+
+    def _excess(self, noise: NDArray, modes: NDArray | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Variance of the calibration's phases, of points or of modes, less that of their noise.
+
+        It is a constant, and a part that grows with the square of the slope; each state says how much. Points are
+        averaged over their neighbours, and modes with the mean of all modes, since states are few.
+        """
+        errors, pupil, n = self.unexplained.astype(np.float64), self.sensor.pupil, len(self.slopes)
+        if not n:
+            return np.zeros(noise.shape), np.zeros(noise.shape)
+        if modes is None:
+            squares, axes = errors**2, self.good
+            own = nearest_good(squares.mean(axis=0), self.good)
+            near = ndimage.median_filter(own, _AROUND)
+            mean = np.where(own > _ODD * near, own, near) - noise
+        else:
+            squares, axes = (pupil.gather(errors) @ self.modal_matrix(modes)) ** 2, np.ones(len(modes), bool)
+            mean = squares.mean(axis=0) - noise
+            mean = (n * mean + _SHARED * mean.mean()) / (n + _SHARED)
+        totals = np.maximum(squares[:, axes].mean(axis=1) - noise[axes].mean(), 0)
+        power = 2 if modes is None else _POWER
+        shares = (
+            nnls(np.stack([np.ones(n), self.slopes**power], axis=1), totals)[0] if n > 2 else np.array([1.0, 0.0])
+        )
+        shares = shares / max(shares[0] + shares[1] * np.mean(self.slopes**power), 1e-30)
+        return shares[0] * np.maximum(mean, 0), shares[1] * np.maximum(mean, 0)
+
+    def _slopes(self, phases: NDArray) -> NDArray[np.float64]:
+        """Rms difference of phases (k, ny, nx) at neighbouring good points, (k,), radian."""
+        waves, parts = np.exp(1j * phases), []
+        for axis in (0, 1):
+            good = np.moveaxis(self.good, axis, 0)
+            parts.append(np.diff(np.moveaxis(waves, axis + 1, 1), axis=1)[:, good[1:] & good[:-1]])
+        return np.sqrt(np.mean(np.abs(np.concatenate(parts, axis=1)) ** 2, axis=1))
+
+    def _sideways(self, phase: NDArray, frames: NDArray) -> NDArray[np.float32]:
+        """Phases that stand for the errors of a single state, whose phase is not known, (ny, nx).
+
+        A phase explains one of two frames. What remains is a difference across the direction in which a phase
+        changes them. The errors along that direction, which are not seen, are taken to be of the same size.
+        """
+        chequered = 1e-3 * (-1.0) ** np.indices(phase.shape).sum(axis=0)  # which no reference wave sees
+        modelled, changed = (self.sensor.measure(phase + step) for step in (0, chequered))
+        left, slope = frames - modelled, (changed - modelled) / chequered
+        strength = np.sum(slope**2, axis=0)
+        across = left[0] * slope[1] - left[1] * slope[0]
+        least = 0.1 * np.median(strength[self.good])
+        return np.where(self.good, across / np.maximum(strength, least), 0).astype(np.float32)
 
     def _starts(self, start: ArrayLike, batch: tuple[int, ...]) -> NDArray:
         """Checked phases at which the iterations start, one for each exposure."""
@@ -420,8 +623,10 @@ class Calibration(Immutable):
         with np.errstate(invalid="ignore", divide="ignore"):
             enough = (relative.min(axis=1) >= _DIM) & (n_good >= (1 - _MOST_BAD) * work.n_points)
             gain = (flux.mean(axis=1, keepdims=True) / flux if self.balance else np.ones_like(flux)) / self.unit
-        weights = (self.weights * np.where(enough[:, np.newaxis], gain, 0)[:, np.newaxis, :]).astype(np.float32)
-        frames = (weights @ values).reshape(k, *self.offset.shape)
+        values *= np.where(enough[:, np.newaxis], gain, 0).astype(np.float32)[..., np.newaxis]
+        values = values.reshape(k, *self.offset.shape)
+        frames = work.weights[:, 0] * values[:, :1]
+        frames += work.weights[:, 1] * values[:, 1:]
         frames += work.offset
         np.maximum(frames, 0, out=frames)
         if not enough.all():
@@ -475,11 +680,16 @@ def calibrate(
     phase_shifts: Sequence[float] = (),
     saturation: float | None = None,
     fitted: Sequence[str] = (),
+    commands: str | Path | None = None,
+    noise: float | None = None,
+    gain: float = 1.0,
     n_iterations: int = 25,
     tolerance: float = 1e-3,
     **settings: Any,
 ) -> Calibration:
     """Calibration from camera files: frames as those to come, and clear frames.
+
+    With known commands of a mirror, `fit_bench` fits a model of the camera to the frames, which takes minutes.
 
     Parameters
     ----------
@@ -494,6 +704,12 @@ def calibrate(
         the header, or with the largest number of their type.
     fitted : sequence of str
         Parameters that `zwfs.frames.refine.fit` fits to these frames.
+    commands : str or Path, optional
+        File with known phases (n_states, n, n), radian, as for `fit_bench`. Then the files of frames hold one or
+        more exposures of each state in turn, (n, ny, nx) or (n, 2, ny, nx). The clear frames may be such a cube.
+    noise : float, counts rms, optional
+    gain : float, electrons / count
+        As for `fit_bench`.
     n_iterations : int
     tolerance : float, radian
     **settings
@@ -525,6 +741,16 @@ def calibrate(
     (1.06, 40)
     """
     _check_settings(n_iterations, tolerance, np.inf if saturation is None else saturation)
+    if commands is not None:
+        if fitted:
+            raise ValueError(
+                f"fitted = {_check.shown(fitted)}: expected none, since the commands determine the optics"
+            )
+        files = frame_files, pupil_files, dark_files, bad_pixel_files
+        kept = {"n_iterations": n_iterations, "tolerance": tolerance}
+        return _from_commands(
+            read_states(*files, commands, saturation), diameter, phase_shifts, noise, gain, settings, kept
+        )
     frames, clear_frames, sources = read_all(frame_files, pupil_files, dark_files, bad_pixel_files, saturation)
     header = sources[0].header
     first = len(frame_files) + len(pupil_files)
@@ -544,6 +770,52 @@ def calibrate(
         )
     except ValueError as error:  # any of the files can be the cause
         raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
+
+
+def _from_commands(
+    states: States,
+    diameter: float,
+    phase_shifts: Sequence[float],
+    noise: float | None,
+    gain: float,
+    settings: dict[str, Any],
+    kept: dict[str, Any],
+) -> Calibration:
+    """Calibration from frames of known commands; what the fit remarks becomes warnings."""
+    header = states.header
+    shifts: Any = tuple(phase_shifts) or (header.get("THETA1", np.pi / 2), header.get("THETA2", -np.pi / 2))
+    (frames, clear), corners, n_pixels = windows(
+        (states.frames, states.clear),
+        states.commands.shape[-1],
+        settings.get("pupil_centers"),
+        settings.get("pupil_diameter"),
+    )
+    design = diameter or header.get("DIMPLE", 1.06)
+    found = fit_bench(
+        frames,
+        clear,
+        states.commands,
+        n_pixels=n_pixels,
+        noise=noise,
+        gain=gain,
+        diameter=design,
+        phase_shifts=shifts,
+    )
+    for remark in found.remarks:
+        warnings.warn(remark, stacklevel=3)
+    n_images, *shape = states.dark.shape
+    return Calibration.from_bench(
+        found,
+        frames,
+        states.commands,
+        states.dark,
+        corners=corners,
+        shape=tuple(shape),
+        n_images=n_images,
+        saturation=states.saturation,
+        bunit=str(header.get("BUNIT", "")),
+        **kept,
+    )
 
 
 def _is_calibration(path: Path) -> bool:

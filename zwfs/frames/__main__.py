@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -93,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     two.add_argument("--phases", action="store_true", default=None, help="write phases, too")
     two.add_argument("--photons", type=float, help="per pixel at an intensity of 1: write standard errors")
     two.add_argument("--read-noise", type=float, default=0.0, metavar="ELECTRONS", help="rms per pixel")
+    two.add_argument("--wavelength", type=float, metavar="NM", help="for the header; default: WAVELEN")
     two.add_argument("--keywords", nargs="+", default=(), metavar="KEY", help="of the headers, for the table")
     two.add_argument("--saturation", type=float, metavar="COUNTS", help="default: that of the calibration")
     two.add_argument("--largest-residual", type=float, metavar="RMS", help="of a consistent frame")
@@ -106,7 +108,10 @@ def _parser() -> argparse.ArgumentParser:
 
 def _calibrate(output: str, pupil_centers: Sequence[float] | None, **settings: Any) -> int:
     centers = None if pupil_centers is None else [pupil_centers[:2], pupil_centers[2:]]
-    found = calibrate(**settings, pupil_centers=centers)
+    with warnings.catch_warnings(record=True) as remarks:
+        found = calibrate(**settings, pupil_centers=centers)
+    for one in remarks:
+        print(f"warning: {one.message}", file=sys.stderr)
     found.save(output)
     print(
         f"{output}: pupil {found.diameter:.2f} pixels wide, residual of the frames {found.residual:.3f}, "

@@ -23,7 +23,7 @@ from zwfs.frames._blocks import FileError, blocks_of
 from zwfs.frames._camera import BenchFit, FittedSensor
 from zwfs.frames._stack import Stack
 from zwfs.frames.files import CameraFile, images, read
-from zwfs.frames.registration import Image, find_pupils
+from zwfs.frames.registration import Circle, Image, find_pupils, nearest_good
 from zwfs.sensor import ZernikeSensor
 
 _SCREENS = 24  # random phases from which weights are learnt
@@ -79,22 +79,6 @@ def learnt(values: NDArray, ideal: NDArray, leakage: float) -> tuple[NDArray[np.
     change = np.linalg.solve(normal, np.einsum("kjyx,kiyx->yxji", centred, missing - offset))
     weights = start[:, :, None, None] + np.transpose(change, (3, 2, 0, 1))
     return weights, ideal.mean(axis=0) - np.einsum("ijyx,jyx->iyx", weights, values.mean(axis=0))
-
-
-def unexplained(phase: NDArray, commands: NDArray) -> NDArray[np.float32]:
-    """Phases of states less their commands and their common flat, (n_states, ny, nx), radian.
-
-    They are 0 where a phase is NaN, and at pixels of the outline whose command may be a mean with unknown ones.
-    """
-    unknown = ~np.isfinite(commands).all(axis=0) | (commands == 0).all(axis=0)
-    if unknown.any():
-        unknown = ndimage.binary_dilation(np.pad(unknown, 1, constant_values=True))[1:-1, 1:-1]
-    waves = np.where(unknown, 0, np.nan_to_num(np.exp(1j * (phase.astype(float) - np.nan_to_num(commands)))))
-    for _ in range(4):  # each phase has its own piston
-        mean = waves.mean(axis=0)
-        waves *= np.exp(-1j * np.angle(np.sum(waves * mean.conj(), axis=(1, 2), keepdims=True)))
-    left = np.angle(waves * waves.mean(axis=0).conj()) * math.sqrt(len(waves) / (len(waves) - 1))
-    return left.astype(np.float32)
 
 
 def _smooth(image: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -168,19 +152,19 @@ def _cube(name: str, files: Sequence[str | Path], n_images: int) -> tuple[NDArra
 
 
 def windows(
-    frames: tuple[NDArray, NDArray], n: int, centers: Sequence[Sequence[float]] | None, diameter: float | None
+    states: States, centers: Sequence[Sequence[float]] | None, diameter: float | None
 ) -> tuple[list[NDArray], NDArray[np.int64], float]:
-    """Cut frames and clear frames, (..., n_images, ny, nx) each, to windows around both pupils.
+    """Cut frames and clear frames to windows around both pupils.
 
     Returns the windows (..., 2, side, side), their corners (2, 2), and the diameter D of the pupil. All sides of a
     window have the same margin around the n pixels of the commands.
     """
-    clear, shape = frames[1].reshape(-1, *frames[1].shape[-3:]), frames[1].shape[-2:]
-    n_images, bad = clear.shape[1], ~np.isfinite(clear).all(axis=0)
-    mean = [Image(np.nan_to_num(one), spoiled, "clear frame") for one, spoiled in
-            zip(clear.mean(axis=0), bad, strict=True)]  # fmt: skip
+    n, (n_images, *shape) = states.commands.shape[-1], states.dark.shape
     if centers is None or diameter is None:
-        circles = [circle for image in mean for circle in find_pupils(image, 3 - n_images, diameter)]
+        mean, circles = states.clear.mean(axis=0), list[Circle]()
+        for one in mean:
+            image = Image(nearest_good(one, np.isfinite(one)), ~np.isfinite(one), "clear frame")
+            circles += find_pupils(image, 3 - n_images, diameter)
         diameter = diameter or float(np.mean([circle.diameter for circle in circles]))
         centers = centers or [(circle.row, circle.column) for circle in circles]
     middles = np.array([_check.pair("pupil_centers", one, _check.number) for one in centers])
@@ -189,9 +173,9 @@ def windows(
         raise ValueError(f"commands have {n} pixels: expected at most {n + 2 * room:.0f}, to fit the frames")
     side = n + 2 * min(max(math.floor(room), 0), n // 6)
     corners = np.rint(middles - (side - 1) / 2).astype(int)
-    cut = [
-        np.stack([one[..., min(index, n_images - 1), row : row + side, column : column + side]
-                  for index, (row, column) in enumerate(corners)], axis=-3)
-        for one in frames
-    ]  # fmt: skip
+    places = [
+        (min(index, n_images - 1), slice(row, row + side), slice(column, column + side))
+        for index, (row, column) in enumerate(corners)
+    ]
+    cut = [np.stack([one[(..., *place)] for place in places], axis=-3) for one in (states.frames, states.clear)]
     return cut, corners, diameter

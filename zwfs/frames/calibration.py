@@ -1,8 +1,7 @@
 """A calibrated bench: what is computed once, so that camera images become phases in one call.
 
-`Calibration.of` takes it from a measurement with clear frames, `save` and `load` keep it in a file, and a call
-turns camera images into phases. It does the same as `reduce_frames` and `recover_phase` of `zwfs.frames.pipeline`,
-in single precision, without making the model anew for each pair of frames.
+`Calibration.of` takes it from a measurement with clear frames, `Calibration.from_bench` from a fit of the bench. A
+call does the same as `reduce_frames` and `recover_phase` of `zwfs.frames.pipeline`, in single precision.
 """
 
 from __future__ import annotations
@@ -20,8 +19,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
-from scipy.optimize import nnls
 
 from zwfs import _check
 from zwfs._arrays import Immutable, Kind, read_only
@@ -30,24 +27,20 @@ from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._camera import BenchFit, fit_bench
+from zwfs.frames._errors import GROWTH, excess, sideways, slopes_of, unexplained
 from zwfs.frames._grid import Grid
-from zwfs.frames._known import States, learnt, places_of, read_states, training, unexplained, windows
+from zwfs.frames._known import learnt, places_of, read_states, training, windows
 from zwfs.frames.files import read_all
 from zwfs.frames.phases import Flag, Phases
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames, reduce_frames
 from zwfs.frames.refine import _check_fit, fit
-from zwfs.frames.registration import nearest_good, radius, register_frames
+from zwfs.frames.registration import radius, register_frames
 from zwfs.metrics import without_piston
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
 FORMAT = 2  # of the file; another number is refused
-_NAME = "zwfs calibration"
 _DIM = 0.1  # of the light of the calibration: a frame with less is lost
-_AROUND = 5  # pixels over which squares of errors have a median
-_ODD = 9  # square of an error over that of its neighbours: such a point is worse than they are
-_POWER = 4  # of slopes with which squares of errors of modes grow; 2 of those of points
-_SHARED = 4  # states that the mean of all modes counts for
 _FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 _LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED = (flag.value for flag in Flag)  # plain, and far quicker
@@ -57,8 +50,8 @@ _LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED = (flag.value for flag in
 class Calibration(Immutable):
     """Sensor and camera of a bench: called on camera images, it returns their phases.
 
-    Make one with `of`, `calibrate` or `load`. It cannot be changed. Its pickle is small, and the model of the
-    sensor is made at the first call of each process.
+    Make one with `of`, `from_bench`, `calibrate` or `load`. It cannot be changed. Its pickle is small, and the
+    model of the sensor is made at the first call of each process.
 
     Attributes
     ----------
@@ -83,22 +76,24 @@ class Calibration(Immutable):
         Stray light of the frames, and counts that make an intensity of 1.
     weights, offset : ndarray, shapes (2, 2, ny, nx) and (2, ny, nx)
         Frames of an ideal sensor are weights @ intensities + offset at each point.
-    unexplained : ndarray of float32, shape (n_states, ny, nx), radian
-        Errors of the phases of the calibration's frames, from which `sigma` takes what noise does not explain.
-    slopes : ndarray, shape (n_states,), radian
-        Rms difference of these phases at neighbouring points, with which errors grow.
     balance : bool
         Whether both frames are scaled to the same light.
     light : ndarray, shape (2,)
         Mean intensity of the calibration's frames in the pupil.
+    unexplained : ndarray of float32, shape (n_states, ny, nx), radian
+        Errors of the phases of the calibration's frames, for `sigma`.
+    slopes : ndarray, shape (n_states,), radian
+        Rms difference of these phases at neighbouring points, with which errors grow.
     residual : float
         Rms difference of the calibration's frames and their model.
+    saturation : float, counts
+        Pixels that reach it are saturated, the dark included.
     blur : float, pixels rms
         That is undone as far as noise allows.
     n_averaged : int
         Exposures that were averaged for each state.
-    saturation : float, counts
-        Pixels that reach it are saturated, the dark included.
+    commanded : bool
+        Whether the grid is that of known commands, and not that of the first image.
     bunit : str
         Unit of the calibration's frames, BUNIT of their header; empty if unknown.
     n_iterations : int
@@ -125,16 +120,19 @@ class Calibration(Immutable):
     light: NDArray[np.float64]
     unexplained: NDArray[np.float32]
     slopes: NDArray[np.float64]
-    residual: float
-    saturation: float
+    residual: float = 0.0
+    saturation: float = np.inf
     blur: float = 0.0
     n_averaged: int = 1
+    commanded: bool = False
     bunit: str = ""
     n_iterations: int = 25
     tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
-        _check_settings(self.n_iterations, self.tolerance, self.saturation)
+        _check.integer("n_iterations", self.n_iterations, 1)
+        _check.number("tolerance", self.tolerance, 0, 2 * np.pi)
+        _limit("saturation", self.saturation, open_low=True)
         _check.instance("bunit", self.bunit, str)
         _check.flag("balance", self.balance)
         _check.number("residual", self.residual, 0)
@@ -142,12 +140,11 @@ class Calibration(Immutable):
         _check.integer("n_averaged", self.n_averaged, 1)
         _check.integer("n_images", self.n_images, 1, 2)
         grid, camera = np.shape(self.amplitude), (self.n_images, *self.shape)
-        for name, shape in {"bad": camera, "good": grid}.items():
-            _check.flag_map(name, getattr(self, name), shape)
+        _check.flag_map("bad", self.bad, camera)
+        _check.flag_map("good", self.good, grid)
         for name, shape in {
-            "places": (2, 2, *grid), "dark": camera, "background": (2,), "unit": (2,),
-            "weights": (2, 2, *grid), "offset": (2, *grid), "light": (2,),
-            "unexplained": (len(self.slopes), *grid),
+            "places": (2, 2, *grid), "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2, *grid),
+            "offset": (2, *grid), "light": (2,), "unexplained": (len(self.slopes), *grid),
         }.items():  # fmt: skip
             array = _check.real_array(name, getattr(self, name))
             if array.shape != shape:
@@ -159,22 +156,11 @@ class Calibration(Immutable):
             object.__setattr__(self, one.name, read_only(getattr(self, one.name)))
 
     def __repr__(self) -> str:
-        return (
-            f"Calibration(pupil of {self.diameter:.2f} pixels, {self.n_images} camera image"
-            f"{'s' * (self.n_images > 1)} of {self.shape}, residual={self.residual:.3g})"
-        )
+        images = f"{self.n_images} camera image{'s' * (self.n_images > 1)} of {self.shape}"
+        return f"Calibration(pupil of {self.diameter:.2f} pixels, {images}, residual={self.residual:.3g})"
 
     @classmethod
-    def of(
-        cls,
-        measurement: Measurement,
-        dark: ArrayLike | None = None,
-        *,
-        saturation: float = np.inf,
-        bunit: str = "",
-        n_iterations: int = 25,
-        tolerance: float = 1e-3,
-    ) -> Calibration:
+    def of(cls, measurement: Measurement, dark: ArrayLike | None = None, **settings: Any) -> Calibration:
         """Calibration of a measurement; pixels that are bad on its frames are ignored from then on.
 
         Parameters
@@ -183,58 +169,41 @@ class Calibration(Immutable):
             Of frames that are taken as those to come, and of clear frames.
         dark : array_like, shape (ny, nx) or (n_images, ny, nx), counts, optional
             That was subtracted from the frames of the measurement; none if left out.
-        saturation : float, counts
-        bunit : str
-        n_iterations : int
-        tolerance : float, radian
+        **settings
+            Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
 
         Returns
         -------
         Calibration
         """
         _check.instance("measurement", measurement, Measurement)
-        _check.instance("bunit", bunit, str)
-        _check_settings(n_iterations, tolerance, saturation)
-        registered, pupil = measurement.registered, measurement.pupil
+        registered, pupil, good = measurement.registered, measurement.pupil, measurement.good
         images = registered.frames[: 1 if registered.frames[0] is registered.frames[1] else 2]
         shape = images[0].counts.shape
         if images[-1].counts.shape != shape:
             raise ValueError(f"the frames have shapes {shape} and {images[-1].counts.shape}: expected the same")
         counts, _ = registered.frames_on_grid()
         unit, background = measurement.counts * registered.exposure, measurement.background[:2]
-        response = registered.areas[:2]
         inner = (..., *measurement.window)
-        good = measurement.good
-        weights, offset = _undoing(measurement)
+
+        def undone(*light: float) -> NDArray[np.float64]:
+            intensity = np.ones_like(measurement.intensity) * np.reshape(light, (2, 1, 1))
+            return ideal_frames(replace(measurement, intensity=intensity))[inner]
+
+        offset = undone(0, 0)
         made = cls(
-            amplitude=pupil.amplitude,
-            diameter=pupil.n_pixels,
-            center=pupil.center,
-            optics=measurement.optics,
-            shape=shape,
-            n_images=len(images),
-            places=registered.places()[:2],
-            dark=_dark(dark, (len(images), *shape)),
-            bad=np.stack([image.bad for image in images]),
-            good=good,
-            background=background / response,
-            unit=unit / response,
-            weights=np.broadcast_to(weights[..., np.newaxis, np.newaxis], (2, 2, *good.shape)),
-            offset=offset[inner],
-            balance=bool(registered.balance and measurement.optics.opposite),
-            light=(counts[:, good].mean(axis=1) - background) / unit,
-            unexplained=np.zeros((0, *good.shape), np.float32),
-            slopes=np.zeros(0),
-            residual=0.0,
-            saturation=saturation,
-            bunit=bunit,
-            n_iterations=n_iterations,
-            tolerance=tolerance,
-        )
+            pupil.amplitude, pupil.n_pixels, pupil.center, measurement.optics, shape, len(images),
+            registered.places()[:2], _dark(dark, (len(images), *shape)), np.stack([image.bad for image in images]),
+            good, background / registered.areas[:2], unit / registered.areas[:2],
+            np.stack([undone(1, 0) - offset, undone(0, 1) - offset], axis=1), offset,
+            bool(registered.balance and measurement.optics.opposite),
+            (counts[:, good].mean(axis=1) - background) / unit,
+            np.zeros((0, *pupil.shape), np.float32), np.zeros(0), **settings,
+        )  # fmt: skip
         frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
         phase, *_, residual = made._solve(frames, good[np.newaxis], None, judge=True)
-        errors = made._sideways(phase[0], frames[0])[np.newaxis]
-        return replace(made, residual=float(residual[0]), unexplained=errors, slopes=made._slopes(phase))
+        errors = sideways(made.sensor, phase[0], frames[0], good)[np.newaxis]
+        return replace(made, residual=float(residual[0]), unexplained=errors, slopes=slopes_of(phase, good))
 
     @classmethod
     def from_bench(
@@ -247,10 +216,7 @@ class Calibration(Immutable):
         corners: ArrayLike = ((0, 0), (0, 0)),
         shape: tuple[int, int] | None = None,
         n_images: int = 2,
-        saturation: float = np.inf,
-        bunit: str = "",
-        n_iterations: int = 25,
-        tolerance: float = 1e-3,
+        **settings: Any,
     ) -> Calibration:
         """Calibration from a fit of the bench: its geometry, blur and leakage as linear operators.
 
@@ -271,10 +237,8 @@ class Calibration(Immutable):
             Rows and columns of a camera image; those of the frames if left out.
         n_images : int
             Camera images of an exposure: 1 if both frames were cut out of one.
-        saturation : float, counts
-        bunit : str
-        n_iterations : int
-        tolerance : float, radian
+        **settings
+            Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
 
         Returns
         -------
@@ -283,77 +247,59 @@ class Calibration(Immutable):
         Raises
         ------
         TypeError, ValueError
-            If the fit is none, or shapes do not belong together.
+            If the fit is of a wrong type, or shapes do not belong together.
         """
         _check.instance("fit", fit, BenchFit)
         counts, phases = _check.real_array("frames", frames), _check.real_array("phases", phases)
         n_averaged = counts.shape[1] if counts.ndim == 5 else 1
         counts = counts.mean(axis=1) if counts.ndim == 5 else counts
-        if counts.ndim != 4 or counts.shape[:2] != (len(phases), 2) or phases.shape[1:] != fit.light.shape:
-            expected = f"(n_states, 2, ny, nx) and (n_states, {len(fit.light)}, {len(fit.light)})"
+        n = len(fit.light)
+        if counts.ndim != 4 or counts.shape[:2] != (len(phases), 2) or phases.shape[1:] != (n, n):
+            expected = f"(n_states, 2, ny, nx) and (n_states, {n}, {n})"
             raise ValueError(
                 f"frames and phases have shapes {counts.shape} and {phases.shape}: expected {expected}"
             )
         corners = _check.integer_array("corners", corners).reshape(2, 2)
         shape = counts.shape[2:] if shape is None else shape
 
-        def on_camera(windows: NDArray, outside: float) -> NDArray:
-            whole = np.full((len(windows), n_images, *shape), outside)
+        def on_camera(pairs: NDArray) -> NDArray:
+            whole = np.zeros((len(pairs), n_images, *shape))
             for index, (row, column) in enumerate(corners):
                 place = slice(row, row + counts.shape[2]), slice(column, column + counts.shape[3])
-                whole[(slice(None), min(index, n_images - 1), *place)] = windows[:, index]
+                whole[(slice(None), min(index, n_images - 1), *place)] = pairs[:, index]
             return whole
 
-        optics = Optics(
-            fit["diameter"].value, (fit["first"].value, fit["second"].value), leakage=fit["leakage"].value
-        )
+        value = {one.name: one.value for one in fit.estimates}
+        optics = Optics(value["diameter"], (value["first"], value["second"]), leakage=value["leakage"])
         n_pixels, bad = fit.point.problem.camera.n_pixels, ~np.isfinite(counts).all(axis=0)
-        stop = radius(fit.light.shape, ((len(fit.light) - 1) / 2,) * 2) <= n_pixels / 2
-        pupil = Pupil.from_amplitude(np.sqrt(np.maximum(fit.light * stop, 0)), n_pixels, threshold=_FAINTEST)
-        flux = np.array([fit[f"arm {arm} flux"].value for arm in (0, 1)])
-        made = cls(
-            amplitude=pupil.amplitude,
-            diameter=n_pixels,
-            center=pupil.center,
-            optics=optics,
-            shape=shape,
-            n_images=n_images,
-            places=places_of(fit, counts.shape[2:], corners),
-            dark=_dark(dark, (n_images, *shape)),
-            bad=on_camera(bad[np.newaxis], 0)[0] > 0,
-            good=pupil.inside,
-            background=np.array([fit[f"arm {arm} background"].value for arm in (0, 1)]),
-            unit=flux * fit.light[pupil.inside].mean(),
-            weights=np.zeros((2, 2, *pupil.shape)),
-            offset=np.zeros((2, *pupil.shape)),
-            balance=False,
-            light=np.ones(2),
-            unexplained=np.zeros((0, *pupil.shape), np.float32),
-            slopes=np.zeros(0),
-            residual=0.0,
-            saturation=saturation,
-            blur=fit["blur"].value,
-            n_averaged=n_averaged,
-            bunit=bunit,
-            n_iterations=n_iterations,
-            tolerance=tolerance,
+        light = fit.light * (radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2)
+        pupil = Pupil.from_amplitude(np.sqrt(np.maximum(light, 0)), n_pixels, threshold=_FAINTEST)
+        background, flux = (
+            np.array([value[f"arm {arm} {key}"] for arm in (0, 1)]) for key in ("background", "flux")
         )
+        made = cls(
+            pupil.amplitude, n_pixels, pupil.center, optics, shape, n_images,
+            places_of(fit, counts.shape[2:], corners), _dark(dark, (n_images, *shape)),
+            on_camera(bad[np.newaxis])[0] > 0, pupil.inside, background,
+            flux * light[pupil.inside].mean(), np.zeros((2, 2, n, n)), np.zeros((2, n, n)), False, np.ones(2),
+            np.zeros((0, n, n), np.float32), np.zeros(0), blur=value["blur"], n_averaged=n_averaged, commanded=True,
+            **settings,
+        )  # fmt: skip
         good = pupil.inside & ~made._work.touched(made._work.bad[np.newaxis])[0]
-        made = replace(made, good=good)
 
-        def intensity(windows: NDArray) -> NDArray:
-            values = made._work.on_grid(on_camera(windows, 0) + made.dark, np.inf, good)[0]
-            return values.reshape(len(values), 2, *pupil.shape) / made.unit[:, None, None]
+        def intensity(pairs: NDArray) -> NDArray:
+            values = made._work.on_grid(on_camera(np.nan_to_num(pairs)) + made.dark, np.inf, good)[0]
+            return values.reshape(len(values), 2, n, n) / made.unit[:, np.newaxis, np.newaxis]
 
         seen, ideal = training(fit, made.sensor)
         weights, offset = learnt(intensity(seen), ideal, optics.leakage)
-        light = intensity(np.nan_to_num(counts))[..., good].mean(axis=(0, 2))
-        made = replace(made, weights=weights, offset=offset, light=light)
-        cube = on_camera(np.nan_to_num(counts), 0) + made.dark
-        found = made(cube if n_images == 2 else cube[:, 0], saturation=np.inf)
-        errors = unexplained(found.phase, phases)
-        residual = float(np.sqrt(np.nanmean(found.residual**2)))
-        return replace(made, unexplained=errors, slopes=made._slopes(found.filled), residual=residual)
+        made = replace(
+            made, good=good, weights=weights, offset=offset, light=intensity(counts)[..., good].mean(axis=(0, 2))
+        )
+        images = on_camera(np.nan_to_num(counts)) + made.dark
+        found = made(images if n_images == 2 else images[:, 0], saturation=np.inf)
+        residual, slopes = float(np.sqrt(np.nanmean(found.residual**2))), slopes_of(found.filled, good)
+        return replace(made, unexplained=unexplained(found.phase, phases), slopes=slopes, residual=residual)
 
     def save(self, path: str | Path) -> None:
         """Write the calibration as NPZ, in one step; the same calibration gives the same bytes.
@@ -389,13 +335,12 @@ class Calibration(Immutable):
             values: dict[str, Any] = json.loads(str(file["values"]))
             found = values.pop("format")
             if found == FORMAT:
-                arrays: dict[str, Any] = {name: file[name] for name in file.files if name != "values"}
-                optics = values.pop("optics")
-                optics["phase_shifts"] = tuple(optics["phase_shifts"])
-                pairs: dict[str, Any] = {name: tuple(values.pop(name)) for name in ("center", "shape")}
-                made = cls(**values, **arrays, **pairs, optics=Optics(**optics))
-                level = np.mean(made.background + made.unit * made.light)
-                made(np.squeeze(made.dark + level, 0) if made.n_images == 1 else made.dark + level)  # a trial
+                values |= {name: file[name] for name in file.files if name != "values"}
+                values |= {name: tuple(values[name]) for name in ("center", "shape")}
+                shifts = {"phase_shifts": tuple(values["optics"]["phase_shifts"])}
+                made = cls(**values | {"optics": Optics(**values["optics"] | shifts)})
+                trial = made.dark + np.mean(made.background + made.unit * made.light)
+                made(trial[0] if made.n_images == 1 else trial)
                 return made
         raise FileError(
             f"{path.name}: a calibration of format {found}: expected format {FORMAT}; make it again with this "
@@ -451,12 +396,17 @@ class Calibration(Immutable):
         level = min(self.saturation if saturation is None else _limit("saturation", saturation), _check.LARGEST)
         largest_residual, judge = _limit("largest_residual", largest_residual), _check.flag("judge", judge)
         counts = counts.reshape(-1, self.n_images, *self.shape)
-        starts = None if start is None else self._starts(start, batch)
-        parts = []
-        for first in range(0, len(counts), _PIECE):
-            piece = slice(first, first + _PIECE)
-            some = None if starts is None else starts[piece]
-            parts.append(self._phases(counts[piece], some, level, largest_residual, judge))
+        if start is not None:
+            maps, grid = _check.real_array("start", start), self.good.shape
+            if maps.shape not in (grid, (*batch, *grid)):
+                raise ValueError(f"start has shape {maps.shape}: expected {grid} or {(*batch, *grid)}")
+            _check.moderate("start", maps)
+            start = np.broadcast_to(maps, (*batch, *grid)).reshape(-1, *grid)
+        pieces = [slice(first, first + _PIECE) for first in range(0, len(counts), _PIECE)]
+        parts = [
+            self._phases(counts[one], None if start is None else start[one], level, largest_residual, judge)
+            for one in pieces
+        ]
         return Phases.joined(parts, batch)
 
     def modal_matrix(self, modes: ArrayLike) -> NDArray[np.float64]:
@@ -504,8 +454,7 @@ class Calibration(Immutable):
         """Standard error: the Cramer-Rao bound of noise at each phase, and the errors of the calibration's phases.
 
         At 0.5 rad rms and 1.06 lambda/D the phase-shifted iteration is 6 % above the bound. Errors that all states
-        of a calibration share are not part of it. It takes longer than the phases, since the information of each
-        frame is inverted.
+        of a calibration share are not part of it. It takes longer than the phases.
 
         Parameters
         ----------
@@ -532,71 +481,22 @@ class Calibration(Immutable):
             points, of_modes = estimator.variance(psi, model.propagate(psi))
             return points[0, 0] if of_modes is None else of_modes[0]
 
-        power = 2 if basis is None else _POWER
-        constant, growing = self._excess(variance(np.zeros(pupil.shape)) / self.n_averaged, basis)
+        noise = variance(np.zeros(pupil.shape)) / self.n_averaged
+        growth = [0.0 * noise] * 2
+        if len(self.slopes):
+            errors = self.unexplained.astype(float)
+            if basis is not None:
+                errors = pupil.gather(errors) @ self.modal_matrix(basis)
+            growth = excess(errors, noise, self.slopes, self.good if basis is None else None)
         maps = phases.filled.reshape(-1, *pupil.shape).astype(np.float64)
-        result = np.full((len(maps), *constant.shape), np.nan, np.float32)
+        result = np.full((len(maps), *noise.shape), np.nan, np.float32)
         for index in np.flatnonzero(phases.flags.reshape(-1) & Flag.LOST == 0):
-            excess = constant + growing * self._slopes(maps[index : index + 1])[0] ** power
-            result[index] = np.sqrt(variance(maps[index]) + excess)
-        result = result.reshape((*phases.flags.shape, *constant.shape))
+            slope = slopes_of(maps[index : index + 1], self.good)[0]
+            result[index] = np.sqrt(
+                variance(maps[index]) + growth[0] + growth[1] * slope ** GROWTH[basis is not None]
+            )
+        result = result.reshape((*phases.flags.shape, *noise.shape))
         return result if basis is not None else np.where(np.isfinite(phases.phase), result, np.float32(np.nan))
-
-    def _excess(self, noise: NDArray, modes: NDArray | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Variance of the calibration's phases, of points or of modes, less that of their noise.
-
-        It is a constant, and a part that grows with the square of the slope; each state says how much. Points are
-        averaged over their neighbours, and modes with the mean of all modes, since states are few.
-        """
-        errors, pupil, n = self.unexplained.astype(np.float64), self.sensor.pupil, len(self.slopes)
-        if not n:
-            return np.zeros(noise.shape), np.zeros(noise.shape)
-        if modes is None:
-            squares, axes = errors**2, self.good
-            own = nearest_good(squares.mean(axis=0), self.good)
-            near = ndimage.median_filter(own, _AROUND)
-            mean = np.where(own > _ODD * near, own, near) - noise
-        else:
-            squares, axes = (pupil.gather(errors) @ self.modal_matrix(modes)) ** 2, np.ones(len(modes), bool)
-            mean = squares.mean(axis=0) - noise
-            mean = (n * mean + _SHARED * mean.mean()) / (n + _SHARED)
-        totals = np.maximum(squares[:, axes].mean(axis=1) - noise[axes].mean(), 0)
-        power = 2 if modes is None else _POWER
-        shares = (
-            nnls(np.stack([np.ones(n), self.slopes**power], axis=1), totals)[0] if n > 2 else np.array([1.0, 0.0])
-        )
-        shares = shares / max(shares[0] + shares[1] * np.mean(self.slopes**power), 1e-30)
-        return shares[0] * np.maximum(mean, 0), shares[1] * np.maximum(mean, 0)
-
-    def _slopes(self, phases: NDArray) -> NDArray[np.float64]:
-        """Rms difference of phases (k, ny, nx) at neighbouring good points, (k,), radian."""
-        waves, parts = np.exp(1j * phases), []
-        for axis in (0, 1):
-            good = np.moveaxis(self.good, axis, 0)
-            parts.append(np.diff(np.moveaxis(waves, axis + 1, 1), axis=1)[:, good[1:] & good[:-1]])
-        return np.sqrt(np.mean(np.abs(np.concatenate(parts, axis=1)) ** 2, axis=1))
-
-    def _sideways(self, phase: NDArray, frames: NDArray) -> NDArray[np.float32]:
-        """Phases that stand for the errors of a single state, whose phase is not known, (ny, nx).
-
-        A phase explains one of two frames. What remains is a difference across the direction in which a phase
-        changes them. The errors along that direction, which are not seen, are taken to be of the same size.
-        """
-        chequered = 1e-3 * (-1.0) ** np.indices(phase.shape).sum(axis=0)  # which no reference wave sees
-        modelled, changed = (self.sensor.measure(phase + step) for step in (0, chequered))
-        left, slope = frames - modelled, (changed - modelled) / chequered
-        strength = np.sum(slope**2, axis=0)
-        across = left[0] * slope[1] - left[1] * slope[0]
-        least = 0.1 * np.median(strength[self.good])
-        return np.where(self.good, across / np.maximum(strength, least), 0).astype(np.float32)
-
-    def _starts(self, start: ArrayLike, batch: tuple[int, ...]) -> NDArray:
-        """Checked phases at which the iterations start, one for each exposure."""
-        maps, shape = _check.real_array("start", start), self.good.shape
-        if maps.shape not in (shape, (*batch, *shape)):
-            raise ValueError(f"start has shape {maps.shape}: expected {shape} or {(*batch, *shape)}")
-        _check.moderate("start", maps)
-        return np.broadcast_to(maps, (*batch, *shape)).reshape(-1, *shape)
 
     @cached_property
     def _content(self) -> bytes:
@@ -656,18 +556,13 @@ class Calibration(Immutable):
         some = np.flatnonzero(holes.any(axis=(1, 2)))
         if some.size:
             phase[some] = self._work.filled(phase[some], good[some])
-            modelled = self.sensor.measure(phase[some])
-            frames[some] = np.where(holes[some, np.newaxis], modelled, frames[some])
+            frames[some] = np.where(holes[some, np.newaxis], self.sensor.measure(phase[some]), frames[some])
             found = reconstruct(frames[some], phase[some])
-            again = np.where(inside, found.phase, 0)
-            phase[some] = self._work.filled(again, good[some])
+            phase[some] = self._work.filled(np.where(inside, found.phase, 0), good[some])
             n_iterations[some] += found.n_iterations
             converged[some] = found.converged
-        if judge:
-            residual = reconstruct.settings.residual(phase, frames)
-        else:
-            residual = np.full(len(phase), np.nan, np.float32)
-        return phase, n_iterations, converged, residual
+        blind = np.full(len(phase), np.nan, np.float32)
+        return phase, n_iterations, converged, reconstruct.settings.residual(phase, frames) if judge else blind
 
 
 def calibrate(
@@ -707,13 +602,13 @@ def calibrate(
     commands : str or Path, optional
         File with known phases (n_states, n, n), radian, as for `fit_bench`. Then the files of frames hold one or
         more exposures of each state in turn, (n, ny, nx) or (n, 2, ny, nx). The clear frames may be such a cube.
-    noise : float, counts rms, optional
-    gain : float, electrons / count
+    noise, gain : float, counts rms and electrons / count
         As for `fit_bench`.
     n_iterations : int
     tolerance : float, radian
     **settings
-        Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel.
+        Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel. With
+        commands only the first two.
 
     Returns
     -------
@@ -730,8 +625,7 @@ def calibrate(
     Examples
     --------
     >>> import tempfile
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.files import write_bench
+    >>> from zwfs.bench import Bench, write_bench
     >>> from zwfs.frames.calibration import calibrate
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)
@@ -740,123 +634,68 @@ def calibrate(
     >>> calibration.optics.diameter, round(calibration.diameter)
     (1.06, 40)
     """
-    _check_settings(n_iterations, tolerance, np.inf if saturation is None else saturation)
+    kept: dict[str, Any] = {"n_iterations": n_iterations, "tolerance": tolerance}
     if commands is not None:
         if fitted:
             raise ValueError(
-                f"fitted = {_check.shown(fitted)}: expected none, since the commands determine the optics"
+                f"fitted = {_check.shown(fitted)}: expected none with commands, which fit all of them"
             )
-        files = frame_files, pupil_files, dark_files, bad_pixel_files
-        kept = {"n_iterations": n_iterations, "tolerance": tolerance}
-        return _from_commands(
-            read_states(*files, commands, saturation), diameter, phase_shifts, noise, gain, settings, kept
+        states = read_states(frame_files, pupil_files, dark_files, bad_pixel_files, commands, saturation)
+        header, (n_images, *shape) = states.header, states.dark.shape
+        (frames, clear), corners, n_pixels = windows(
+            states, settings.get("pupil_centers"), settings.get("pupil_diameter")
         )
-    frames, clear_frames, sources = read_all(frame_files, pupil_files, dark_files, bad_pixel_files, saturation)
-    header = sources[0].header
+        shifts: Any = tuple(phase_shifts) or (header.get("THETA1", np.pi / 2), header.get("THETA2", -np.pi / 2))
+        found = fit_bench(
+            frames, clear, states.commands, n_pixels=n_pixels, noise=noise, gain=gain, phase_shifts=shifts,
+            diameter=diameter or header.get("DIMPLE", 1.06),
+        )  # fmt: skip
+        for remark in found.remarks:
+            warnings.warn(remark, stacklevel=2)
+        return Calibration.from_bench(
+            found, frames, states.commands, states.dark, corners=corners, shape=tuple(shape), n_images=n_images,
+            saturation=states.saturation, bunit=str(header.get("BUNIT", "")), **kept,
+        )  # fmt: skip
+    images, clear_images, sources = read_all(frame_files, pupil_files, dark_files, bad_pixel_files, saturation)
     first = len(frame_files) + len(pupil_files)
     darks = [image for source in sources[first : first + len(dark_files)] for image in source.images]
     try:
         optics = sources[0].optics(diameter, phase_shifts)
         _check_fit("fitted", fitted, optics)
-        registered, optics = fit(register_frames(frames, clear_frames, **settings), optics, fitted)
-        level = sources[0].keyword("SATURATE") if saturation is None and "SATURATE" in header else saturation
-        return Calibration.of(
-            reduce_frames(registered, optics),
-            np.stack(darks) if darks else None,
-            saturation=np.inf if level is None else level,
-            bunit=str(header.get("BUNIT", "")),
-            n_iterations=n_iterations,
-            tolerance=tolerance,
+        registered, optics = fit(register_frames(images, clear_images, **settings), optics, fitted)
+        level = (
+            sources[0].keyword("SATURATE")
+            if saturation is None and "SATURATE" in sources[0].header
+            else saturation
         )
+        return Calibration.of(
+            reduce_frames(registered, optics), np.stack(darks) if darks else None,
+            saturation=np.inf if level is None else level, bunit=str(sources[0].header.get("BUNIT", "")),
+            **kept,
+        )  # fmt: skip
     except ValueError as error:  # any of the files can be the cause
         raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
-
-
-def _from_commands(
-    states: States,
-    diameter: float,
-    phase_shifts: Sequence[float],
-    noise: float | None,
-    gain: float,
-    settings: dict[str, Any],
-    kept: dict[str, Any],
-) -> Calibration:
-    """Calibration from frames of known commands; what the fit remarks becomes warnings."""
-    header = states.header
-    shifts: Any = tuple(phase_shifts) or (header.get("THETA1", np.pi / 2), header.get("THETA2", -np.pi / 2))
-    (frames, clear), corners, n_pixels = windows(
-        (states.frames, states.clear),
-        states.commands.shape[-1],
-        settings.get("pupil_centers"),
-        settings.get("pupil_diameter"),
-    )
-    design = diameter or header.get("DIMPLE", 1.06)
-    found = fit_bench(
-        frames,
-        clear,
-        states.commands,
-        n_pixels=n_pixels,
-        noise=noise,
-        gain=gain,
-        diameter=design,
-        phase_shifts=shifts,
-    )
-    for remark in found.remarks:
-        warnings.warn(remark, stacklevel=3)
-    n_images, *shape = states.dark.shape
-    return Calibration.from_bench(
-        found,
-        frames,
-        states.commands,
-        states.dark,
-        corners=corners,
-        shape=tuple(shape),
-        n_images=n_images,
-        saturation=states.saturation,
-        bunit=str(header.get("BUNIT", "")),
-        **kept,
-    )
 
 
 def _is_calibration(path: Path) -> bool:
     """Whether a file is an NPZ file with the values of a calibration."""
     try:
         with zipfile.ZipFile(path) as file:
-            return "values.npy" in file.namelist() and "places.npy" in file.namelist()
+            return {"values.npy", "places.npy"} <= set(file.namelist())
     except Exception:  # zipfile raises many kinds on damaged bytes
         return False
 
 
 def _limit(name: str, value: Any, *, open_low: bool = False) -> float:
     """Return a number of at least 0, or infinity."""
-    if isinstance(value, float) and value == np.inf:
-        return value
-    return _check.number(name, value, 0, open_low=open_low)
+    return (
+        value if isinstance(value, float) and value == np.inf else _check.number(name, value, 0, open_low=open_low)
+    )
 
 
-def _check_settings(n_iterations: Any, tolerance: Any, saturation: Any) -> None:
-    """Check the numbers that a calibration keeps."""
-    _check.integer("n_iterations", n_iterations, 1)
-    _check.number("tolerance", tolerance, 0, 2 * np.pi)
-    _limit("saturation", saturation, open_low=True)
-
-
-def _dark(dark: ArrayLike | None, shape: tuple[int, int, int]) -> NDArray[np.float32]:
+def _dark(dark: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Checked counts without light, one map for each camera image."""
-    if dark is None:
-        return np.zeros(shape, np.float32)
-    maps = _check.real_array("dark", dark)
+    maps = np.zeros(shape) if dark is None else _check.real_array("dark", dark)
     if maps.shape not in (shape[1:], (1, *shape[1:]), shape):
         raise ValueError(f"dark has shape {maps.shape}: expected {shape}")
     return np.broadcast_to(np.nan_to_num(maps, posinf=0, neginf=0).astype(np.float32), shape)
-
-
-def _undoing(measurement: Measurement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weights (2, 2) and offset (2, ny', nx') that turn intensities into frames of an ideal sensor."""
-
-    def undone(*light: float) -> NDArray[np.float64]:
-        intensity = np.ones_like(measurement.intensity) * np.reshape(light, (2, 1, 1))
-        return ideal_frames(replace(measurement, intensity=intensity))
-
-    offset = undone(0, 0)
-    return np.stack([(undone(*light) - offset)[:, 0, 0] for light in ((1, 0), (0, 1))], axis=1), offset

@@ -121,3 +121,25 @@ def test_command_calibrates_with_known_commands(tmp_path, monkeypatch, taken, ca
     lit = taken.bench.fully_lit
     phases = found(np.where(np.concatenate(list(taken.bad), axis=-1), np.nan, wide(taken.unseen))).phase
     assert rms(taken.errors(phases), lit) < 1.2 * rms(taken.errors(calibration(taken.unseen).phase), lit)
+
+
+@pytest.mark.slow
+def test_turned_pupil_of_a_telescope_with_ten_pokes():
+    """At most the error that the quick calibration had, on all fully lit pixels and away from edges."""
+    taken = Recorded(24, 10, 0.5, aperture="VLT", pixels=96, side=112)
+    calibration = taken.calibration()
+    found = calibration(np.where(taken.bad, np.nan, taken.unseen))
+    assert not found.flags.any()
+    errors, lit = taken.errors(found.phase), taken.bench.fully_lit
+    inner = ndimage.binary_erosion(lit, iterations=3)
+    assert rms(errors, lit) < 0.0133
+    assert rms(errors, inner) < 0.0065
+    photons, noise = calibration.unit.mean(), taken.bench.noise
+    points = errors / calibration.sigma(found, photons, noise)
+    assert 0.8 < rms(points, lit) < 1.3
+    modes = zernike_basis(calibration.sensor.pupil, 50)
+    left = calibration.sensor.pupil.gather(np.where(lit, np.nan_to_num(errors), 0)) @ calibration.modal_matrix(
+        modes
+    )
+    ratio = left / calibration.sigma(found, photons, noise, modes)
+    assert 0.8 < np.median(np.sqrt(np.mean(ratio**2, axis=1))) < 1.3

@@ -280,10 +280,9 @@ class Calibration(Immutable):
         made = cls(
             pupil.amplitude, n_pixels, pupil.center, optics, shape, n_images,
             places_of(fit, counts.shape[2:], corners), _dark(dark, (n_images, *shape)),
-            on_camera(bad[np.newaxis])[0] > 0, pupil.inside, background,
-            flux * light[pupil.inside].mean(), np.zeros((2, 2, n, n)), np.zeros((2, n, n)), False, np.ones(2),
-            np.zeros((0, n, n), np.float32), np.zeros(0), blur=value["blur"], n_averaged=n_averaged, commanded=True,
-            **settings,
+            on_camera(bad[np.newaxis])[0] > 0, pupil.inside, background, flux * light[pupil.inside].mean(),
+            np.zeros((2, 2, n, n)), np.zeros((2, n, n)), False, np.ones(2), np.zeros((0, n, n), np.float32),
+            np.zeros(0), blur=value["blur"], n_averaged=n_averaged, commanded=True, **settings,
         )  # fmt: skip
         good = pupil.inside & ~made._work.touched(made._work.bad[np.newaxis])[0]
 

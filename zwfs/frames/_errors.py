@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from scipy.optimize import nnls
 from zwfs.frames.registration import nearest_good
 from zwfs.sensor import ZernikeSensor
 
-GROWTH = 2, 4  # powers of slopes with which squares of errors grow: those of points, and of modes
+_GROWTH = 2, 4  # powers of slopes with which squares of errors grow: those of points, and of modes
 _AROUND = 5  # pixels over which squares of errors have a median
 _ODD = 9  # square of an error over that of its neighbours: such a point is worse than they are
 _SHARED = 4  # states that the mean of all modes counts for
@@ -59,22 +60,37 @@ def slopes_of(phases: NDArray, good: NDArray[np.bool_]) -> NDArray[np.float64]:
     return np.sqrt(np.mean(np.abs(np.concatenate(parts, axis=1)) ** 2, axis=1))
 
 
-def excess(errors: NDArray, noise: NDArray, slopes: NDArray, good: NDArray[np.bool_] | None) -> list[NDArray]:
-    """Variance less that of noise: a constant, and a factor of a power of the slope.
+class Excess(NamedTuple):
+    """Variance of phases less that of their noise: a constant, and a factor of a power of the slope."""
 
-    States (n, ...) of points have the map `good`, modes have none. States are few: a point has the median of its
-    neighbours, and a mode is averaged with all modes. The states say how variances grow with the slope.
-    """
-    n, squares = len(slopes), errors**2
-    if good is not None:
-        own = nearest_good(squares.mean(axis=0), good)
-        near = ndimage.median_filter(own, _AROUND)
-        mean = np.where(own > _ODD * near, own, near) - noise
-        squares, noise = squares[:, good], noise[good]
-    else:
+    constant: NDArray[np.float64]
+    growing: NDArray[np.float64]
+    power: int
+
+    @classmethod
+    def of(cls, errors: NDArray, noise: NDArray, slopes: NDArray, good: NDArray[np.bool_], modal: bool) -> Excess:
+        """Excess of errors of states (n, ...), of points or of modes, over a variance.
+
+        States are few: a point has the median of its neighbours, and a mode is averaged with all modes. The states
+        say how variances grow with the slope.
+        """
+        n, squares, power = len(slopes), errors**2, _GROWTH[modal]
+        if not n:
+            return cls(0 * noise, 0 * noise, power)
         mean = squares.mean(axis=0) - noise
-        mean = (n * mean + _SHARED * mean.mean()) / (n + _SHARED)
-    powers = np.stack([np.ones(n), slopes ** GROWTH[good is None]], axis=1)
-    totals = np.maximum(squares.mean(axis=1) - noise.mean(), 0)
-    shares = nnls(powers, totals)[0] if n > 2 else np.array([1.0, 0.0])
-    return [np.maximum(mean, 0) * share / max(np.mean(powers @ shares), 1e-30) for share in shares]
+        if modal:
+            mean = (n * mean + _SHARED * mean.mean()) / (n + _SHARED)
+        else:
+            own = nearest_good(squares.mean(axis=0), good)
+            near = ndimage.median_filter(own, _AROUND)
+            mean = np.where(own > _ODD * near, own, near) - noise
+            squares, noise = squares[:, good], noise[good]
+        powers = np.stack([np.ones(n), slopes**power], axis=1)
+        totals = np.maximum(squares.mean(axis=1) - noise.mean(), 0)
+        shares = nnls(powers, totals)[0] if n > 2 else np.array([1.0, 0.0])
+        constant, growing = shares / max(np.mean(powers @ shares), 1e-30)
+        return cls(constant * np.maximum(mean, 0), growing * np.maximum(mean, 0), power)
+
+    def at(self, phase: NDArray, good: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Excess at a phase (ny, nx)."""
+        return self.constant + self.growing * slopes_of(phase[np.newaxis], good)[0] ** self.power

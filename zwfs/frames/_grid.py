@@ -61,7 +61,7 @@ class Grid(NamedTuple):
         dark = np.stack([calibration.dark[i][rows][:, columns] for i, rows, columns in boxes])
         bad = np.stack([calibration.bad[i][rows][:, columns] for i, rows, columns in boxes])
         corners = places - low[:, :, np.newaxis]
-        touching = [_linear(corner, tuple(size)) for corner in corners]
+        touching = [_interpolation(corner, tuple(size)) for corner in corners]
         inside = pupil.inside.ravel().astype(float)
         reached = np.stack([one.T @ inside > 0 for one in touching]).reshape(bad.shape)
         return cls(
@@ -77,7 +77,7 @@ class Grid(NamedTuple):
             reached & ~bad,
             [_repair(one, ~one) for one in bad],
             (_spline_filter(size[0], calibration.blur), _spline_filter(size[1], calibration.blur)),
-            [_cubic(corner - _CUT, tuple(size - 2 * _CUT), pupil.inside.ravel()) for corner in corners],
+            [_interpolation(one - _CUT, tuple(size - 2 * _CUT), pupil.inside.ravel()) for one in corners],
             touching,
             _repair(pupil.inside & ~calibration.good, calibration.good),
         )
@@ -111,6 +111,30 @@ class Grid(NamedTuple):
             [spline @ coefficients[:, index].reshape(k, -1).T for index, spline in enumerate(self.splines)]
         )
         return np.ascontiguousarray(values.transpose(2, 0, 1)), good, n_bad, n_saturated
+
+    def solve(
+        self, frames: NDArray, good: NDArray, start: NDArray | None, judge: bool
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Phases with bad points filled, iterations, whether they converged, and residuals of ideal frames.
+
+        Bad points take no part: in a second iteration their intensity is that of the model. The frames, shape
+        (k, 2, ny, nx), are changed.
+        """
+        reconstruct, sensor = self.reconstruct, self.reconstruct.sensor
+        found = reconstruct(frames, start)
+        phase, n_iterations, converged = found.phase, found.n_iterations, found.converged
+        phase[:, ~sensor.pupil.inside] = 0
+        holes = sensor.pupil.inside & ~good
+        some = np.flatnonzero(holes.any(axis=(1, 2)))
+        if some.size:
+            phase[some] = self.filled(phase[some], good[some])
+            frames[some] = np.where(holes[some, np.newaxis], sensor.measure(phase[some]), frames[some])
+            found = reconstruct(frames[some], phase[some])
+            phase[some] = self.filled(np.where(sensor.pupil.inside, found.phase, 0), good[some])
+            n_iterations[some] += found.n_iterations
+            converged[some] = found.converged
+        blind = np.full(len(phase), np.nan, np.float32)
+        return phase, n_iterations, converged, reconstruct.settings.residual(phase, frames) if judge else blind
 
     def filled(self, phase: NDArray, good: NDArray) -> NDArray:
         """Phases (k, ny, nx) with bad points replaced by the nearest good one."""
@@ -158,32 +182,23 @@ def _spline_filter(size: int, blur: float) -> NDArray[np.float32]:
     return np.ascontiguousarray(matrix[_CUT:-_CUT])
 
 
-def _cubic(places: NDArray, size: tuple[int, int], inside: NDArray) -> Any:
-    """Sparse matrix from coefficients of cubic splines, (h w), to places (2, n); 0 to those not inside."""
+def _interpolation(places: NDArray, size: tuple[int, int], inside: NDArray | None = None) -> Any:
+    """Sparse matrix to places (2, n): of cubic splines from coefficients, 0 outside, or linear, from pixels."""
     base = np.floor(places)
-    t = places - base
-    u = 1 - t
-    weights = np.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / 6
-    return _interpolation(base.astype(int) - 1, weights * inside, size)
-
-
-def _linear(places: NDArray, size: tuple[int, int]) -> Any:
-    """Sparse matrix of linear interpolation, from pixels (h w) to places (2, n)."""
-    base = np.floor(places)
-    return _interpolation(base.astype(int), np.stack([1 - (places - base), places - base]), size)
-
-
-def _interpolation(first: NDArray, weights: NDArray, size: tuple[int, int]) -> Any:
-    """Sparse matrix with weights (m, 2, n) of the m rows and m columns from the first, (2, n)."""
-    m, _, n = weights.shape
+    t, u = places - base, 1 - places + base
+    if inside is None:
+        m, weights = 2, np.stack([u, t])
+    else:
+        cubics = np.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3])
+        m, weights = 4, cubics * inside / 6
     values = weights[:, np.newaxis, 0] * weights[np.newaxis, :, 1]
     values = np.where(np.abs(values) > _NEGLIGIBLE, values, 0)
-    steps = np.arange(m)
+    first, steps = base.astype(int) - (m == 4), np.arange(m)
     rows = first[0] + steps[:, np.newaxis, np.newaxis]
     columns = first[1] + steps[np.newaxis, :, np.newaxis]
     pixels = rows * size[1] + columns
-    points = np.broadcast_to(np.arange(n), pixels.shape)
-    shape = n, size[0] * size[1]
+    points = np.broadcast_to(np.arange(places.shape[1]), pixels.shape)
+    shape = places.shape[1], size[0] * size[1]
     matrix = sparse.csr_array((values.ravel(), (points.ravel(), pixels.ravel())), shape=shape, dtype=np.float32)
     matrix.eliminate_zeros()
     # Half the bytes of each index: reading them takes much of the time of a product.

@@ -27,7 +27,7 @@ from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._camera import BenchFit, fit_bench
-from zwfs.frames._errors import GROWTH, excess, sideways, slopes_of, unexplained
+from zwfs.frames._errors import Excess, sideways, slopes_of, unexplained
 from zwfs.frames._grid import Grid
 from zwfs.frames._known import learnt, places_of, read_states, training, windows
 from zwfs.frames.files import read_all
@@ -42,6 +42,7 @@ from zwfs.sensor import ZernikeSensor
 FORMAT = 2  # of the file; another number is refused
 _DIM = 0.1  # of the light of the calibration: a frame with less is lost
 _FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
+_OF_ARMS = "background", "flux"
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 _LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED = (flag.value for flag in Flag)  # plain, and far quicker
 
@@ -55,23 +56,17 @@ class Calibration(Immutable):
 
     Attributes
     ----------
-    amplitude : ndarray, shape (ny, nx)
-        Of the pupil, 0 outside.
-    diameter : float, pixels
-        Of the pupil, D.
-    center : (float, float), pixels
-        Row and column of the optical axis on the grid of the pupil.
+    amplitude, good : ndarray of float64 and of bool, shape (ny, nx)
+        Amplitude of the pupil, 0 outside, and its good points.
+    diameter, center : float and (float, float), pixels
+        Diameter D of the pupil, and row and column of the optical axis on its grid.
     optics : Optics
-    shape : (int, int)
-        Rows and columns of a camera image.
-    n_images : int
-        Camera images of an exposure: 1 with both pupils on it, or 2.
+    shape, n_images : (int, int) and int
+        Rows and columns of a camera image, and images of an exposure: 1 with both pupils on it, or 2.
     places : ndarray, shape (2, 2, ny, nx), pixels
         Row and column at which each point of the grid of the pupil lies on the camera, for both frames.
     dark, bad : ndarray of float32 and of bool, shape (n_images, ny_camera, nx_camera)
         Counts without light, and pixels that are ignored in all frames.
-    good : ndarray of bool, shape (ny, nx)
-        Points of the pupil that are good.
     background, unit : ndarray, shape (2,), counts
         Stray light of the frames, and counts that make an intensity of 1.
     weights, offset : ndarray, shapes (2, 2, ny, nx) and (2, ny, nx)
@@ -80,10 +75,9 @@ class Calibration(Immutable):
         Whether both frames are scaled to the same light.
     light : ndarray, shape (2,)
         Mean intensity of the calibration's frames in the pupil.
-    unexplained : ndarray of float32, shape (n_states, ny, nx), radian
-        Errors of the phases of the calibration's frames, for `sigma`.
-    slopes : ndarray, shape (n_states,), radian
-        Rms difference of these phases at neighbouring points, with which errors grow.
+    unexplained, slopes : ndarray, shapes (n_states, ny, nx) and (n_states,), radian
+        Errors of the phases of the calibration's frames, for `sigma`. They grow with the rms difference of phases
+        at neighbouring points.
     residual : float
         Rms difference of the calibration's frames and their model.
     saturation : float, counts
@@ -96,10 +90,8 @@ class Calibration(Immutable):
         Whether the grid is that of known commands, and not that of the first image.
     bunit : str
         Unit of the calibration's frames, BUNIT of their header; empty if unknown.
-    n_iterations : int
-        Largest number of iterations.
-    tolerance : float, radian
-        As for `PhaseShifted`: with 0, all iterations are done.
+    n_iterations, tolerance : int and float, radian
+        As for `PhaseShifted`: with a tolerance of 0, all iterations are done.
     """
 
     amplitude: NDArray[np.float64]
@@ -201,23 +193,16 @@ class Calibration(Immutable):
             np.zeros((0, *pupil.shape), np.float32), np.zeros(0), **settings,
         )  # fmt: skip
         frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
-        phase, *_, residual = made._solve(frames, good[np.newaxis], None, judge=True)
+        phase, *_, residual = made._work.solve(frames, good[np.newaxis], None, judge=True)
         errors = sideways(made.sensor, phase[0], frames[0], good)[np.newaxis]
         return replace(made, residual=float(residual[0]), unexplained=errors, slopes=slopes_of(phase, good))
 
     @classmethod
     def from_bench(
-        cls,
-        fit: BenchFit,
-        frames: ArrayLike,
-        phases: ArrayLike,
-        dark: ArrayLike | None = None,
-        *,
-        corners: ArrayLike = ((0, 0), (0, 0)),
-        shape: tuple[int, int] | None = None,
-        n_images: int = 2,
+        cls, fit: BenchFit, frames: ArrayLike, phases: ArrayLike, dark: ArrayLike | None = None, *,
+        corners: ArrayLike = ((0, 0), (0, 0)), shape: tuple[int, int] | None = None, n_images: int = 2,
         **settings: Any,
-    ) -> Calibration:
+    ) -> Calibration:  # fmt: skip
         """Calibration from a fit of the bench: its geometry, blur and leakage as linear operators.
 
         The focus of the relay is corrected to first order, around a flat wavefront.
@@ -231,12 +216,9 @@ class Calibration(Immutable):
             As for `fit_bench`. The phases of the calibration are on this grid.
         dark : array_like, shape (ny_camera, nx_camera) or (n_images, ny_camera, nx_camera), counts, optional
             That was subtracted from the frames; none if left out.
-        corners : array_like of int, shape (2, 2), pixels
-            Row and column on the camera of the first pixel of both frames, if these were cut out.
-        shape : (int, int), optional
-            Rows and columns of a camera image; those of the frames if left out.
-        n_images : int
-            Camera images of an exposure: 1 if both frames were cut out of one.
+        corners, shape, n_images : array_like of int, shape (2, 2); (int, int); int
+            If the frames were cut out: row and column of their first pixels on the camera, rows and columns of a
+            camera image, and the number of these in an exposure.
         **settings
             Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
 
@@ -274,9 +256,7 @@ class Calibration(Immutable):
         n_pixels, bad = fit.point.problem.camera.n_pixels, ~np.isfinite(counts).all(axis=0)
         light = fit.light * (radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2)
         pupil = Pupil.from_amplitude(np.sqrt(np.maximum(light, 0)), n_pixels, threshold=_FAINTEST)
-        background, flux = (
-            np.array([value[f"arm {arm} {key}"] for arm in (0, 1)]) for key in ("background", "flux")
-        )
+        background, flux = (np.array([value[f"arm {arm} {key}"] for arm in (0, 1)]) for key in _OF_ARMS)
         made = cls(
             pupil.amplitude, n_pixels, pupil.center, optics, shape, n_images,
             places_of(fit, counts.shape[2:], corners), _dark(dark, (n_images, *shape)),
@@ -292,9 +272,8 @@ class Calibration(Immutable):
 
         seen, ideal = training(fit, made.sensor)
         weights, offset = learnt(intensity(seen), ideal, optics.leakage)
-        made = replace(
-            made, good=good, weights=weights, offset=offset, light=intensity(counts)[..., good].mean(axis=(0, 2))
-        )
+        light = intensity(counts)[..., good].mean(axis=(0, 2))
+        made = replace(made, good=good, weights=weights, offset=offset, light=light)
         images = on_camera(np.nan_to_num(counts)) + made.dark
         found = made(images if n_images == 2 else images[:, 0], saturation=np.inf)
         residual, slopes = float(np.sqrt(np.nanmean(found.residual**2))), slopes_of(found.filled, good)
@@ -303,10 +282,7 @@ class Calibration(Immutable):
     def save(self, path: str | Path) -> None:
         """Write the calibration as NPZ, in one step; the same calibration gives the same bytes.
 
-        Raises
-        ------
-        TypeError, ValueError
-            If the path is none, or names a file that is not a calibration.
+        Raises TypeError or ValueError if the path is none, or names a file that is not a calibration.
         """
         path = path_of("path", path)
         if path.exists() and not (path.is_file() and _is_calibration(path)):
@@ -319,11 +295,8 @@ class Calibration(Immutable):
 
         Raises
         ------
-        FileNotFoundError
-        FileError
-            A ValueError: if the file is no calibration, broken, or of another format.
-        TypeError, ValueError
-            If the path is none.
+        FileNotFoundError, TypeError, ValueError
+            The last, a FileError, if the file is no calibration, broken, or of another format.
         """
         path = path_of("path", path)
         if not path.is_file():
@@ -357,14 +330,9 @@ class Calibration(Immutable):
         return self._work.reconstruct.sensor
 
     def __call__(
-        self,
-        counts: ArrayLike,
-        start: NDArray | None = None,
-        *,
-        saturation: float | None = None,
-        largest_residual: float = np.inf,
-        judge: bool = True,
-    ) -> Phases:
+        self, counts: ArrayLike, start: NDArray | None = None, *, saturation: float | None = None,
+        largest_residual: float = np.inf, judge: bool = True,
+    ) -> Phases:  # fmt: skip
         """Phases of camera images.
 
         Parameters
@@ -401,11 +369,11 @@ class Calibration(Immutable):
                 raise ValueError(f"start has shape {maps.shape}: expected {grid} or {(*batch, *grid)}")
             _check.moderate("start", maps)
             start = np.broadcast_to(maps, (*batch, *grid)).reshape(-1, *grid)
-        pieces = [slice(first, first + _PIECE) for first in range(0, len(counts), _PIECE)]
-        parts = [
-            self._phases(counts[one], None if start is None else start[one], level, largest_residual, judge)
-            for one in pieces
-        ]
+        parts = []
+        for first in range(0, len(counts), _PIECE):
+            piece = slice(first, first + _PIECE)
+            begin = None if start is None else start[piece]
+            parts.append(self._phases(counts[piece], begin, level, largest_residual, judge))
         return Phases.joined(parts, batch)
 
     def modal_matrix(self, modes: ArrayLike) -> NDArray[np.float64]:
@@ -480,20 +448,14 @@ class Calibration(Immutable):
             points, of_modes = estimator.variance(psi, model.propagate(psi))
             return points[0, 0] if of_modes is None else of_modes[0]
 
-        noise = variance(np.zeros(pupil.shape)) / self.n_averaged
-        growth = [0.0 * noise] * 2
-        if len(self.slopes):
-            errors = self.unexplained.astype(float)
-            if basis is not None:
-                errors = pupil.gather(errors) @ self.modal_matrix(basis)
-            growth = excess(errors, noise, self.slopes, self.good if basis is None else None)
+        noise, errors = variance(np.zeros(pupil.shape)) / self.n_averaged, self.unexplained.astype(float)
+        if basis is not None:
+            errors = pupil.gather(errors) @ self.modal_matrix(basis)
+        more = Excess.of(errors, noise, self.slopes, self.good, basis is not None)
         maps = phases.filled.reshape(-1, *pupil.shape).astype(np.float64)
         result = np.full((len(maps), *noise.shape), np.nan, np.float32)
         for index in np.flatnonzero(phases.flags.reshape(-1) & Flag.LOST == 0):
-            slope = slopes_of(maps[index : index + 1], self.good)[0]
-            result[index] = np.sqrt(
-                variance(maps[index]) + growth[0] + growth[1] * slope ** GROWTH[basis is not None]
-            )
+            result[index] = np.sqrt(variance(maps[index]) + more.at(maps[index], self.good))
         result = result.reshape((*phases.flags.shape, *noise.shape))
         return result if basis is not None else np.where(np.isfinite(phases.phase), result, np.float32(np.nan))
 
@@ -530,7 +492,7 @@ class Calibration(Immutable):
         np.maximum(frames, 0, out=frames)
         if not enough.all():
             frames[~enough] = work.flat_frames  # of a flat wavefront: they converge at once
-        filled, n_iterations, converged, residual = self._solve(frames, good, start, judge)
+        filled, n_iterations, converged, residual = work.solve(frames, good, start, judge)
         flags = _BAD * (n_bad > 0) + _SATURATED * (n_saturated > 0)
         faults = flags + _INCONSISTENT * (residual > limit) + _NOT_CONVERGED * (~converged & (self.tolerance > 0))
         flags = np.where(enough, faults, _LOST + flags)
@@ -539,48 +501,13 @@ class Calibration(Immutable):
         light = relative.mean(axis=1).astype(np.float32)
         return Phases(phase, filled, light, n_bad, n_saturated, residual, n_iterations, flags)
 
-    def _solve(
-        self, frames: NDArray, good: NDArray, start: NDArray | None, judge: bool
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Phases with bad points filled, iterations, whether they converged, and residuals of ideal frames.
-
-        Bad points take no part: in a second iteration their intensity is that of the model. The frames, shape
-        (k, 2, ny, nx), are changed.
-        """
-        reconstruct, inside = self._work.reconstruct, self.sensor.pupil.inside
-        found = reconstruct(frames, start)
-        phase, n_iterations, converged = found.phase, found.n_iterations, found.converged
-        phase[:, ~inside] = 0
-        holes = inside & ~good
-        some = np.flatnonzero(holes.any(axis=(1, 2)))
-        if some.size:
-            phase[some] = self._work.filled(phase[some], good[some])
-            frames[some] = np.where(holes[some, np.newaxis], self.sensor.measure(phase[some]), frames[some])
-            found = reconstruct(frames[some], phase[some])
-            phase[some] = self._work.filled(np.where(inside, found.phase, 0), good[some])
-            n_iterations[some] += found.n_iterations
-            converged[some] = found.converged
-        blind = np.full(len(phase), np.nan, np.float32)
-        return phase, n_iterations, converged, reconstruct.settings.residual(phase, frames) if judge else blind
-
 
 def calibrate(
-    frame_files: Sequence[str | Path],
-    pupil_files: Sequence[str | Path],
-    dark_files: Sequence[str | Path] = (),
-    bad_pixel_files: Sequence[str | Path] = (),
-    *,
-    diameter: float = 0.0,
-    phase_shifts: Sequence[float] = (),
-    saturation: float | None = None,
-    fitted: Sequence[str] = (),
-    commands: str | Path | None = None,
-    noise: float | None = None,
-    gain: float = 1.0,
-    n_iterations: int = 25,
-    tolerance: float = 1e-3,
-    **settings: Any,
-) -> Calibration:
+    frame_files: Sequence[str | Path], pupil_files: Sequence[str | Path], dark_files: Sequence[str | Path] = (),
+    bad_pixel_files: Sequence[str | Path] = (), *, diameter: float = 0.0, phase_shifts: Sequence[float] = (),
+    saturation: float | None = None, fitted: Sequence[str] = (), commands: str | Path | None = None,
+    noise: float | None = None, gain: float = 1.0, n_iterations: int = 25, tolerance: float = 1e-3, **settings: Any,
+) -> Calibration:  # fmt: skip
     """Calibration from camera files: frames as those to come, and clear frames.
 
     With known commands of a mirror, `fit_bench` fits a model of the camera to the frames, which takes minutes.
@@ -589,10 +516,8 @@ def calibrate(
     ----------
     frame_files, pupil_files, dark_files, bad_pixel_files : sequence of str or Path
         See `zwfs.frames.files.read_all`.
-    diameter : float, lambda/D
-        Of the dimple; 0 stands for DIMPLE of the header.
-    phase_shifts : sequence of two floats, radian
-        Of the two frames; those of the header, THETA1 and THETA2, if empty.
+    diameter, phase_shifts : float, lambda/D, and sequence of two floats, radian
+        Of the dimple; DIMPLE, THETA1 and THETA2 of the header if 0 and empty.
     saturation : float, counts, optional
         Of the camera, see `zwfs.frames.files.images`. Without it the frames to come are compared with SATURATE of
         the header, or with the largest number of their type.
@@ -603,8 +528,7 @@ def calibrate(
         more exposures of each state in turn, (n, ny, nx) or (n, 2, ny, nx). The clear frames may be such a cube.
     noise, gain : float, counts rms and electrons / count
         As for `fit_bench`.
-    n_iterations : int
-    tolerance : float, radian
+    n_iterations, tolerance : int and float, radian
     **settings
         Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel. With
         commands only the first two.
@@ -615,11 +539,8 @@ def calibrate(
 
     Raises
     ------
-    FileNotFoundError
-    ImportError
-        If astropy is needed and missing.
-    TypeError, ValueError
-        If a file or a value is not as expected.
+    FileNotFoundError, ImportError, TypeError, ValueError
+        If a file or a value is not as expected, or astropy is needed and missing.
 
     Examples
     --------
@@ -641,9 +562,8 @@ def calibrate(
             )
         states = read_states(frame_files, pupil_files, dark_files, bad_pixel_files, commands, saturation)
         header, (n_images, *shape) = states.header, states.dark.shape
-        (frames, clear), corners, n_pixels = windows(
-            states, settings.get("pupil_centers"), settings.get("pupil_diameter")
-        )
+        place = settings.get("pupil_centers"), settings.get("pupil_diameter")
+        (frames, clear), corners, n_pixels = windows(states, *place)
         shifts: Any = tuple(phase_shifts) or (header.get("THETA1", np.pi / 2), header.get("THETA2", -np.pi / 2))
         found = fit_bench(
             frames, clear, states.commands, n_pixels=n_pixels, noise=noise, gain=gain, phase_shifts=shifts,

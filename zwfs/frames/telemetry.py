@@ -66,24 +66,13 @@ class Summary(NamedTuple):
 
 
 def reconstruct(
-    frames: str | Path | Sequence[str | Path],
-    calibration: Calibration | str | Path,
-    output: str | Path,
-    *,
-    second_frames: str | Path | Sequence[str | Path] = (),
-    modes: int | ArrayLike | None = None,
-    phases: bool | None = None,
-    photons: float | None = None,
-    read_noise: float = 0.0,
-    wavelength: float | None = None,
-    keywords: Sequence[str] = (),
-    saturation: float | None = None,
-    largest_residual: float | None = None,
-    n_workers: int | None = None,
-    restart: bool = False,
-    overwrite: bool = False,
-    progress: Callable[[int, int], Any] | None = None,
-) -> Summary:
+    frames: str | Path | Sequence[str | Path], calibration: Calibration | str | Path, output: str | Path, *,
+    second_frames: str | Path | Sequence[str | Path] = (), modes: int | ArrayLike | None = None,
+    phases: bool | None = None, photons: float | None = None, read_noise: float = 0.0,
+    wavelength: float | None = None, keywords: Sequence[str] = (), saturation: float | None = None,
+    largest_residual: float | None = None, n_workers: int | None = None, restart: bool = False,
+    overwrite: bool = False, progress: Callable[[int, int], Any] | None = None,
+) -> Summary:  # fmt: skip
     """Reconstruct all frames of camera files, and write phases or coefficients with a table as FITS.
 
     The files may be larger than the memory. The output appears when it is complete. An interrupted run keeps the
@@ -134,9 +123,8 @@ def reconstruct(
 
     Raises
     ------
-    FileNotFoundError
-    ImportError
-        If astropy is missing.
+    FileNotFoundError, ImportError
+        If a file or astropy is missing.
     FileError
         A ValueError: if a file is broken, truncated, of another shape, unit or type, or lacks a keyword.
     ValueError
@@ -175,12 +163,14 @@ def reconstruct(
     job = _Job.checked(stack, calibration, modes, phases, photons, read_noise, wavelength, keywords, saturation)
     if largest_residual is not None:
         largest_residual = _check.number("largest_residual", largest_residual, 0)
-    part = Part(path, job.units, job.pieces, job.plan(largest_residual), _check.flag("restart", restart))
+    pieces = _spans(stack.n, job.chunk)
+    part = Part(path, job.units, pieces, job.plan(largest_residual), _check.flag("restart", restart))
     try:
         n_resumed = done = sum(stop - first for first, stop in part.done)
         report = progress or (lambda *_: None)
         report(done, stack.n)
-        part.write(job.units[-1], 0, job.files())
+        names = [(card_value(one.name), one.n) for one in stack.segments]
+        part.write(job.units[-1], 0, np.array(names, job.units[-1].dtype))
         for first, stop, checksum in job.run(part, n_workers):
             part.note(first, stop, checksum)
             done += stop - first
@@ -271,15 +261,6 @@ class _Job:
         """Exposures that a thread handles at once."""
         return max(1, min(_LONGEST, _CHUNK // self.stack.bytes_per_exposure))
 
-    @property
-    def pieces(self) -> list[tuple[int, int]]:
-        """First exposure of each chunk, and the first one after it."""
-        return [(first, min(first + self.chunk, self.stack.n)) for first in range(0, self.stack.n, self.chunk)]
-
-    def files(self) -> NDArray:
-        """Rows of the list of files."""
-        return np.array([(card_value(one.name), one.n) for one in self.stack.segments], self.units[-1].dtype)
-
     def run(self, part: Part, n_workers: int) -> Iterator[tuple[int, int, int]]:
         """Reconstruct all chunks that are not yet done: first frame, first one after it, and checksum of each."""
         chunks = (piece for piece in part.pieces if piece not in part.done)
@@ -300,7 +281,7 @@ class _Job:
         """Flag inconsistent frames, count all flags, and put both into the header."""
         table, n = self.units[-2], self.stack.n
         size, step = max(1, _CHUNK // table.row), -(-n // _SAMPLE)
-        blocks = [(first, min(first + size, n)) for first in range(0, n, size)]
+        blocks = _spans(n, size)
         if limit is None:
             limit = _limit(np.concatenate([part.read(table, *block)["RESIDUAL"][::step] for block in blocks]))
             if self.photons is not None:
@@ -358,6 +339,11 @@ class _Job:
             if self.photons is not None:
                 rows["SIGCOEFF"] = self.calibration.sigma(found, self.photons, self.read_noise, self.modes)
         return rows
+
+
+def _spans(n: int, size: int) -> list[tuple[int, int]]:
+    """First row of each piece of n rows, and the first one after it."""
+    return [(first, min(first + size, n)) for first in range(0, n, size)]
 
 
 def _columns(stack: Stack, keywords: Any) -> dict[str, NDArray]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zwfs import _check
 from zwfs.frames._blocks import Block, FileError, blocks_of
 
 
@@ -64,6 +65,14 @@ class Stack:
         self.bytes_per_exposure = sum(block.row for block in self.segments[0].blocks)
         self._ends = list(accumulate(segment.n for segment in self.segments))
         self.n = self._ends[-1]
+
+    @property
+    def saturation(self) -> float:
+        """Level at which pixels are saturated, as the first file states it or as its type allows."""
+        known, name = "SATURATE" in self.header, self.segments[0].name
+        level = self.header["SATURATE"] if known else self.blocks[0].full_scale
+        name = f"{name}: {'SATURATE' if known else 'largest number of its type'}"
+        return level if level == np.inf else _check.number(name, level, 0, open_low=True)
 
     def places(self, first: int, stop: int) -> list[tuple[int, int, int]]:
         """Segments that hold some exposures, each with its first exposure and the one after its last."""

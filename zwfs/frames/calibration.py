@@ -9,9 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import warnings
 import zipfile
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,15 +24,13 @@ from zwfs._likelihood import Estimator, Noise
 from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
-from zwfs.frames._camera import BenchFit, fit_bench
+from zwfs.frames._camera import BenchFit
 from zwfs.frames._errors import Excess, sideways, slopes_of, unexplained
 from zwfs.frames._grid import Grid
-from zwfs.frames._known import learnt, places_of, read_states, training, windows
-from zwfs.frames.files import read_all
+from zwfs.frames._learnt import learnt, places_of, training
 from zwfs.frames.phases import Flag, Phases
-from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames, reduce_frames
-from zwfs.frames.refine import _check_fit, fit
-from zwfs.frames.registration import radius, register_frames
+from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames
+from zwfs.frames.registration import radius
 from zwfs.metrics import without_piston
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
@@ -282,7 +278,10 @@ class Calibration(Immutable):
     def save(self, path: str | Path) -> None:
         """Write the calibration as NPZ, in one step; the same calibration gives the same bytes.
 
-        Raises TypeError or ValueError if the path is none, or names a file that is not a calibration.
+        Raises
+        ------
+        TypeError, ValueError
+            If the path is none, or names a file that is not a calibration.
         """
         path = path_of("path", path)
         if path.exists() and not (path.is_file() and _is_calibration(path)):
@@ -314,10 +313,7 @@ class Calibration(Immutable):
                 trial = made.dark + np.mean(made.background + made.unit * made.light)
                 made(trial[0] if made.n_images == 1 else trial)
                 return made
-        raise FileError(
-            f"{path.name}: a calibration of format {found}: expected format {FORMAT}; make it again with this "
-            "version of zwfs"
-        )
+        raise FileError(f"{path.name}: a calibration of format {found}: expected format {FORMAT}; make it again")
 
     @cached_property
     def sha256(self) -> str:
@@ -362,9 +358,9 @@ class Calibration(Immutable):
             raise ValueError(f"counts has shape {counts.shape}: expected at least one exposure")
         level = min(self.saturation if saturation is None else _limit("saturation", saturation), _check.LARGEST)
         largest_residual, judge = _limit("largest_residual", largest_residual), _check.flag("judge", judge)
-        counts = counts.reshape(-1, self.n_images, *self.shape)
+        counts, grid = counts.reshape(-1, self.n_images, *self.shape), self.good.shape
         if start is not None:
-            maps, grid = _check.real_array("start", start), self.good.shape
+            maps = _check.real_array("start", start)
             if maps.shape not in (grid, (*batch, *grid)):
                 raise ValueError(f"start has shape {maps.shape}: expected {grid} or {(*batch, *grid)}")
             _check.moderate("start", maps)
@@ -500,100 +496,6 @@ class Calibration(Immutable):
         residual = np.where(enough, residual, np.float32(np.nan))
         light = relative.mean(axis=1).astype(np.float32)
         return Phases(phase, filled, light, n_bad, n_saturated, residual, n_iterations, flags)
-
-
-def calibrate(
-    frame_files: Sequence[str | Path], pupil_files: Sequence[str | Path], dark_files: Sequence[str | Path] = (),
-    bad_pixel_files: Sequence[str | Path] = (), *, diameter: float = 0.0, phase_shifts: Sequence[float] = (),
-    saturation: float | None = None, fitted: Sequence[str] = (), commands: str | Path | None = None,
-    noise: float | None = None, gain: float = 1.0, n_iterations: int = 25, tolerance: float = 1e-3, **settings: Any,
-) -> Calibration:  # fmt: skip
-    """Calibration from camera files: frames as those to come, and clear frames.
-
-    With known commands of a mirror, `fit_bench` fits a model of the camera to the frames, which takes minutes.
-
-    Parameters
-    ----------
-    frame_files, pupil_files, dark_files, bad_pixel_files : sequence of str or Path
-        See `zwfs.frames.files.read_all`.
-    diameter, phase_shifts : float, lambda/D, and sequence of two floats, radian
-        Of the dimple; DIMPLE, THETA1 and THETA2 of the header if 0 and empty.
-    saturation : float, counts, optional
-        Of the camera, see `zwfs.frames.files.images`. Without it the frames to come are compared with SATURATE of
-        the header, or with the largest number of their type.
-    fitted : sequence of str
-        Parameters that `zwfs.frames.refine.fit` fits to these frames.
-    commands : str or Path, optional
-        File with known phases (n_states, n, n), radian, as for `fit_bench`. Then the files of frames hold one or
-        more exposures of each state in turn, (n, ny, nx) or (n, 2, ny, nx). The clear frames may be such a cube.
-    noise, gain : float, counts rms and electrons / count
-        As for `fit_bench`.
-    n_iterations, tolerance : int and float, radian
-    **settings
-        Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel. With
-        commands only the first two.
-
-    Returns
-    -------
-    Calibration
-
-    Raises
-    ------
-    FileNotFoundError, ImportError, TypeError, ValueError
-        If a file or a value is not as expected, or astropy is needed and missing.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from zwfs.bench import Bench, write_bench
-    >>> from zwfs.frames.calibration import calibrate
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)
-    ...     calibration = calibrate([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> calibration.optics.diameter, round(calibration.diameter)
-    (1.06, 40)
-    """
-    kept: dict[str, Any] = {"n_iterations": n_iterations, "tolerance": tolerance}
-    if commands is not None:
-        if fitted:
-            raise ValueError(
-                f"fitted = {_check.shown(fitted)}: expected none with commands, which fit all of them"
-            )
-        states = read_states(frame_files, pupil_files, dark_files, bad_pixel_files, commands, saturation)
-        header, (n_images, *shape) = states.header, states.dark.shape
-        place = settings.get("pupil_centers"), settings.get("pupil_diameter")
-        (frames, clear), corners, n_pixels = windows(states, *place)
-        shifts: Any = tuple(phase_shifts) or (header.get("THETA1", np.pi / 2), header.get("THETA2", -np.pi / 2))
-        found = fit_bench(
-            frames, clear, states.commands, n_pixels=n_pixels, noise=noise, gain=gain, phase_shifts=shifts,
-            diameter=diameter or header.get("DIMPLE", 1.06),
-        )  # fmt: skip
-        for remark in found.remarks:
-            warnings.warn(remark, stacklevel=2)
-        return Calibration.from_bench(
-            found, frames, states.commands, states.dark, corners=corners, shape=tuple(shape), n_images=n_images,
-            saturation=states.saturation, bunit=str(header.get("BUNIT", "")), **kept,
-        )  # fmt: skip
-    images, clear_images, sources = read_all(frame_files, pupil_files, dark_files, bad_pixel_files, saturation)
-    first = len(frame_files) + len(pupil_files)
-    darks = [image for source in sources[first : first + len(dark_files)] for image in source.images]
-    try:
-        optics = sources[0].optics(diameter, phase_shifts)
-        _check_fit("fitted", fitted, optics)
-        registered, optics = fit(register_frames(images, clear_images, **settings), optics, fitted)
-        level = (
-            sources[0].keyword("SATURATE")
-            if saturation is None and "SATURATE" in sources[0].header
-            else saturation
-        )
-        return Calibration.of(
-            reduce_frames(registered, optics), np.stack(darks) if darks else None,
-            saturation=np.inf if level is None else level, bunit=str(sources[0].header.get("BUNIT", "")),
-            **kept,
-        )  # fmt: skip
-    except ValueError as error:  # any of the files can be the cause
-        raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
 
 
 def _is_calibration(path: Path) -> bool:

@@ -224,26 +224,23 @@ class _Job:
             wavelength = stack.header["WAVELEN"]
         if wavelength is not None:
             wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-        level, name = saturation, "saturation"
-        if level is None and calibration.saturation != np.inf:
-            level = calibration.saturation
-        elif level is None:
-            known = "SATURATE" in stack.header
-            level = stack.header["SATURATE"] if known else stack.blocks[0].full_scale
-            name = f"{stack.segments[0].name}: {'SATURATE' if known else 'largest number of its type'}"
-        level = level if level == np.inf else _check.number(name, level, 0, open_low=True)
+        level = calibration.saturation if saturation is None else saturation
+        if level != np.inf:
+            level = _check.number("saturation", level, 0, open_low=True)
+        elif saturation is None:
+            level = stack.saturation
         columns = _columns(stack, keywords)
         rows = _row_type(columns, None if modes is None else len(modes), phases, photons is not None)
         names = max(len(card_value(one.name)) for one in stack.segments)
         of_files, float32 = np.dtype([("NAME", f"S{names}"), ("FRAMES", ">i8")]), np.dtype(">f4")
         cards = _cards(stack, calibration, photons, read_noise, wavelength, level)
+        units = [Unit("", np.dtype("u1"), (), 0, cards, {})]
         if phases:
             cards = [("BUNIT", "rad", "in (-pi, pi]; NaN outside, bad and lost"), *cards]
             units = [Unit("", float32, pupil.shape, stack.n, cards, {})]
-            if photons is not None:
-                units.append(Unit("SIGMA", float32, pupil.shape, stack.n, [("BUNIT", "rad", "")], {}))
-        else:
-            units = [Unit("", np.dtype("u1"), (), 0, cards, {})]
+            units += [Unit("SIGMA", float32, pupil.shape, stack.n, [("BUNIT", "rad", "")], {})] * (
+                photons is not None
+            )
         units.append(Unit("FRAMES", rows, (), stack.n, [], dict.fromkeys(("COEFFS", "SIGCOEFF", "SIGMA"), "rad")))
         units.append(Unit("FILES", of_files, (), len(stack.segments), [], {}))
         return cls(stack, calibration, modes, matrix, photons, read_noise, columns, level, units)

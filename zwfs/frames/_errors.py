@@ -82,7 +82,7 @@ class Excess(NamedTuple):
             mean = (n * mean + _SHARED * mean.mean()) / (n + _SHARED)
         else:
             own = nearest_good(squares.mean(axis=0), good)
-            near = ndimage.median_filter(own, _AROUND)
+            near = ndimage.median_filter(own, _AROUND) / (1 - 2 / (9 * n)) ** 3  # median of chi-square to its mean
             mean = np.where(own > _ODD * near, own, near) - noise
             squares, noise = squares[:, good], noise[good]
         powers = np.stack([np.ones(n), slopes**power], axis=1)

@@ -7,8 +7,9 @@ import pytest
 from scipy import ndimage
 
 from zwfs import zernike_basis
-from zwfs.frames import Calibration, fit_bench, pipeline, reconstruct, registration
+from zwfs.frames import Calibration, calibrate, fit_bench, pipeline, reconstruct, registration
 from zwfs.frames.__main__ import main
+from zwfs.frames._calibrate import _read_states, _windows
 
 from .hcipy_bench import HcipyBench
 
@@ -121,6 +122,54 @@ def test_command_calibrates_with_known_commands(tmp_path, monkeypatch, taken, ca
     lit = taken.bench.fully_lit
     phases = found(np.where(np.concatenate(list(taken.bad), axis=-1), np.nan, wide(taken.unseen))).phase
     assert rms(taken.errors(phases), lit) < 1.2 * rms(taken.errors(calibration(taken.unseen).phase), lit)
+
+
+KINDS = {
+    "cube of pairs": lambda frames: {"frames.npy": frames},
+    "two cubes": lambda frames: {"first.npy": frames[:, 0], "second.npy": frames[:, 1]},
+    "a file for each pair": lambda frames: {f"pair{index}.npy": pair for index, pair in enumerate(frames)},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_states_are_read_from_every_kind_of_file(tmp_path, kind):
+    frames = np.random.default_rng(1).uniform(100, 200, (6, 2, 20, 24))
+    frames[2, 1, 5, 6] = 1e4
+    files = {tmp_path / name: array for name, array in KINDS[kind](frames).items()}
+    extra = {"clear.npy": frames[0], "dark.npy": np.full((20, 24), 100.0), "bad.npy": np.eye(20, 24)}
+    extra |= {"commands.npy": np.zeros((3, 12, 12))}
+    for path, array in (files | {tmp_path / name: array for name, array in extra.items()}).items():
+        np.save(path, array)
+    clear, dark, bad, commands = (tmp_path / name for name in extra)
+    states = _read_states(list(files), [clear], [dark], [bad], commands, 1000.0)
+    expected = np.where(np.eye(20, 24) > 0, np.nan, frames - 100)
+    expected[2, 1, 5, 6] = np.nan
+    np.testing.assert_array_equal(states.frames.reshape(frames.shape), expected)
+    assert states.frames.shape[:2] == (3, 2)
+    windows, corners, _ = _windows(states, [(9.5, 10.0), (9.5, 12.0)], 12.0)
+    assert corners.tolist() == [[2, 2], [2, 4]]
+    np.testing.assert_array_equal(windows[0][:, :, 1], states.frames[:, :, 1, 2:18, 4:20])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"commands": np.zeros((4, 12, 12))}, "4 commands for 6 exposures"),
+        ({"commands": np.zeros((3, 30, 30))}, "commands have 30 pixels: expected at most 20"),
+        ({"fitted": ["scale"]}, "expected none with commands"),
+        ({"clear": np.ones((2, 21, 24))}, r"exposures of shape \(2, 20, 24\): expected"),
+    ],
+)
+def test_states_that_do_not_belong_together_are_named(tmp_path, settings, message):
+    arrays = {"frames": np.ones((6, 2, 20, 24)), "clear": np.ones((2, 20, 24)), "commands": np.zeros((3, 12, 12))}
+    arrays |= {name: settings.pop(name) for name in arrays if name in settings}
+    for name, array in arrays.items():
+        np.save(tmp_path / f"{name}.npy", array)
+    frames, clear, commands = (tmp_path / f"{name}.npy" for name in arrays)
+    with pytest.raises(ValueError, match=message):
+        calibrate(
+            [frames], [clear], commands=commands, pupil_centers=[(9.5, 11.5)] * 2, pupil_diameter=12.0, **settings
+        )
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ from zwfs.frames._stack import Stack
 from zwfs.frames.phases import Flag
 from zwfs.frames.pipeline import Optics, reduce_frames
 from zwfs.frames.registration import Image, nearest_good, register_frames
+from zwfs.frames.telemetry import _limit
 
 from .conftest import code_of
 
@@ -172,7 +173,7 @@ def rewritten(path, **changes):
     ("break_it", "message"),
     [
         (lambda path: np.savez(path, x=np.ones(3)), "expected a calibration"),
-        (lambda path: rewritten(path, format=99), "a calibration of format 99: expected format 1"),
+        (lambda path: rewritten(path, format=99), "a calibration of format 99: expected format 2"),
         (lambda path: rewritten(path, saturation=0), "a broken calibration: saturation = 0"),
     ],
 )
@@ -271,6 +272,39 @@ def test_frames_between_bad_ones_stay_and_none_is_left_out(folder, bench, calibr
     assert strict.counts["INCONSISTENT"] == 10
 
 
+def test_limit_of_the_residual_is_that_of_the_page():
+    """Median + 5 times 1.48 median absolute deviations, at least 1.2 times the median, from 10 frames on."""
+    wide = np.repeat([1.0, 2.0, 3.0], [4, 4, 4])
+    assert _limit(wide) == pytest.approx(2 + 5 * 1.4826)
+    narrow = np.full(10, 2.0)
+    assert _limit(narrow) == pytest.approx(1.2 * 2)
+    assert _limit(narrow[:9]) == np.inf
+    assert _limit(np.append(narrow[:9], np.nan)) == np.inf
+
+
+def test_frames_without_a_phase_are_flagged_however_few_they_are(folder, bench, calibration):
+    """Two images that do not belong together, in a single frame, with a known noise."""
+    cube, half = bench.frames[:2].copy(), bench.frames.shape[2] // 2
+    cube[0, :, half:] = cube[1, :, half:]
+    np.save("few.npy", cube)
+    assert reconstruct("few.npy", calibration, "plain.fits").counts["INCONSISTENT"] == 0
+    found = reconstruct("few.npy", calibration, "phase.fits", photons=PHOTONS)
+    assert found.counts["INCONSISTENT"] == 1
+    noise = np.hypot(calibration.residual, np.sqrt(calibration.light.mean() / PHOTONS))
+    assert found.largest_residual == pytest.approx(5 * noise)
+
+
+def test_header_states_units_and_the_place_of_the_map(folder, calibration):
+    reconstruct("cube.fits", calibration, "phase.fits", wavelength=1650.0, photons=1e4, modes=3, phases=True)
+    with fits.open("phase.fits") as units:
+        header, table = units[0].header, units["FRAMES"].columns
+    assert header["BUNIT"] == "rad"
+    assert header["NMPERRAD"] == pytest.approx(1650 / (2 * np.pi))
+    assert header["MAPFRAME"] == "first image"
+    assert (header["CROPROW"], header["CROPCOL"]) == pytest.approx(tuple(calibration.places[0, :, 0, 0]))
+    assert {table[name].unit for name in ("SIGMA", "COEFFS", "SIGCOEFF")} == {"rad"}
+
+
 # Modes and errors
 
 
@@ -283,7 +317,8 @@ def test_coefficients_are_those_that_were_put_in(bench, calibration):
     np.testing.assert_allclose(calibration.coefficients(replace(found, filled=filled), matrix), put, atol=1e-4)
 
 
-def test_sigma_is_the_scatter_of_many_exposures(bench, calibration):
+def test_sigma_without_errors_of_the_calibration_is_the_scatter_of_many_exposures(bench, calibration):
+    calibration = replace(calibration, unexplained=calibration.unexplained[:0], slopes=np.zeros(0))
     frames = np.stack([bench.expose(bench.sensor.measure(bench.screens[0])) for _ in range(60)])
     modes = zernike_basis(calibration.sensor.pupil, 9)
     found = calibration(frames)
@@ -662,7 +697,8 @@ def test_wrong_argument_is_named(folder, names, settings, error, message):
 # Options of the command that exclude no other, with other values than their defaults.
 RECONSTRUCT = [
     "--modes 5", "--modes 5 --phases", "--photons 1e4", "--photons 1e4 --read-noise 3", "--keywords EXPTIME BUNIT",
-    "--saturation 60000", "--largest-residual 0.5", "--workers 1", "--restart", "--overwrite", "--strict",
+    "--saturation 60000", "--largest-residual 0.5", "--wavelength 1650", "--workers 1",
+    "--restart", "--overwrite", "--strict",
     "--quiet",
 ]  # fmt: skip
 CALIBRATE = [

@@ -40,8 +40,9 @@ True
 
 from zwfs.frames import calibration, files, phases, pipeline, refine, registration, telemetry, verdict
 from zwfs.frames._blocks import FileError
+from zwfs.frames._calibrate import calibrate
 from zwfs.frames._camera import BenchFit, Estimate, FittedPhase, FittedSensor, fit_bench
-from zwfs.frames.calibration import Calibration, calibrate
+from zwfs.frames.calibration import Calibration
 from zwfs.frames.telemetry import reconstruct
 from zwfs.frames.verdict import CameraNoise, judge, order_of_images
 

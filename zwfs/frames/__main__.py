@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from zwfs.frames.calibration import calibrate
+from zwfs.frames._calibrate import calibrate
 from zwfs.frames.telemetry import reconstruct
 
 _EXIT_CODES = """exit codes:
@@ -46,58 +47,61 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m zwfs.frames",
-        description="Camera files of a phase-shifted Zernike wavefront sensor to phases.",
-        epilog=_EXIT_CODES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    commands = parser.add_subparsers(required=True, metavar="command")
     shared: dict[str, Any] = {"epilog": _EXIT_CODES, "formatter_class": argparse.RawDescriptionHelpFormatter}
+    about = "Camera files of a phase-shifted Zernike wavefront sensor to phases."
+    parser = argparse.ArgumentParser(prog="python -m zwfs.frames", description=about, **shared)
+    commands = parser.add_subparsers(required=True, metavar="command")
     files: dict[str, Any] = {"nargs": "+", "metavar": "FILE"}
     one = commands.add_parser("calibrate", help="make a calibration from frames and clear frames", **shared)
     one.set_defaults(run=_calibrate)
-    one.add_argument("output", help="calibration to write, NPZ")
-    one.add_argument("--frames", dest="frame_files", required=True, help="a frame, or one for each image", **files)
-    one.add_argument("--pupils", dest="pupil_files", required=True, help="clear frames, likewise", **files)
-    one.add_argument("--dark", dest="dark_files", default=(), help="counts without light", **files)
-    one.add_argument("--bad-pixels", dest="bad_pixel_files", default=(), help="maps, not 0 where bad", **files)
-    one.add_argument("--diameter", type=float, default=0.0, help="of the dimple in lambda/D; default: DIMPLE")
-    one.add_argument(
-        "--phase-shifts", type=float, nargs=2, default=(), metavar="RAD", help="default: THETA1, THETA2"
-    )
-    one.add_argument("--pupil-centers", type=float, nargs=4, metavar="PIXEL", help="row, column of both pupils")
-    one.add_argument("--pupil-diameter", type=float, metavar="PIXEL", help="default: from the clear frames")
-    one.add_argument("--no-registration", dest="subpixel", action="store_false", help="trust the outlines")
-    one.add_argument("--exposure", type=float, default=1.0, help="of the frames over that of the clear frames")
-    one.add_argument("--saturation", type=float, metavar="COUNTS", help="default: SATURATE, or the type's largest")
-    one.add_argument("--fit", dest="fitted", nargs="+", default=(), metavar="NAME", help="parameter to fit")
-    one.add_argument("--iterations", dest="n_iterations", type=int, default=25, metavar="N", help="default: 25")
-    one.add_argument("--tolerance", type=float, default=1e-3, metavar="RAD", help="that ends them; default: 1e-3")
+    add = one.add_argument
+    add("output", help="calibration to write, NPZ")
+    add("--frames", dest="frame_files", required=True, help="a frame, or one for each image", **files)
+    add("--pupils", dest="pupil_files", required=True, help="clear frames, likewise", **files)
+    add("--dark", dest="dark_files", default=(), help="counts without light", **files)
+    add("--bad-pixels", dest="bad_pixel_files", default=(), help="maps, not 0 where bad", **files)
+    add("--diameter", type=float, default=0.0, help="of the dimple in lambda/D; default: DIMPLE")
+    add("--phase-shifts", type=float, nargs=2, default=(), metavar="RAD", help="default: THETA1, THETA2")
+    add("--pupil-centers", type=float, nargs=4, metavar="PIXEL", help="row, column of both pupils")
+    add("--pupil-diameter", type=float, metavar="PIXEL", help="default: from the clear frames")
+    add("--no-registration", dest="subpixel", action="store_false", help="trust the outlines")
+    add("--exposure", type=float, default=1.0, help="of the frames over that of the clear frames")
+    add("--saturation", type=float, metavar="COUNTS", help="default: SATURATE, or the type's largest")
+    add("--fit", dest="fitted", nargs="+", default=(), metavar="NAME", help="parameter to fit")
+    add("--commands", metavar="FILE", help="known phases of the frames, radian: fit the bench with them")
+    add("--noise", type=float, metavar="COUNTS", help="rms of a pixel without light; default: from the frames")
+    add("--gain", type=float, default=1.0, metavar="ELECTRONS", help="of a count; both with --commands")
+    add("--iterations", dest="n_iterations", type=int, default=25, metavar="N", help="default: 25")
+    add("--tolerance", type=float, default=1e-3, metavar="RAD", help="that ends them; default: 1e-3")
     two = commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared)
     two.set_defaults(run=_reconstruct)
-    two.add_argument("frames", nargs="+", help="FITS or NPY files with frames")
-    two.add_argument("--calibration", required=True, metavar="FILE", help="that `calibrate` wrote")
-    two.add_argument("--output", "-o", required=True, metavar="FILE", help="FITS file to write")
-    two.add_argument("--second", dest="second_frames", default=(), help="of the second images", **files)
-    two.add_argument("--modes", type=int, metavar="N", help="write coefficients of N Zernike modes, not phases")
-    two.add_argument("--phases", action="store_true", default=None, help="write phases, too")
-    two.add_argument("--photons", type=float, help="per pixel at an intensity of 1: write standard errors")
-    two.add_argument("--read-noise", type=float, default=0.0, metavar="ELECTRONS", help="rms per pixel")
-    two.add_argument("--keywords", nargs="+", default=(), metavar="KEY", help="of the headers, for the table")
-    two.add_argument("--saturation", type=float, metavar="COUNTS", help="default: that of the calibration")
-    two.add_argument("--largest-residual", type=float, metavar="RMS", help="of a consistent frame")
-    two.add_argument("--workers", dest="n_workers", type=int, metavar="N", help="default: one for each core")
-    two.add_argument("--restart", action="store_true", help="drop the part of an interrupted run")
-    two.add_argument("--overwrite", action="store_true", help="replace any file")
-    two.add_argument("--strict", action="store_true", help="exit with 3 if frames are flagged")
-    two.add_argument("--quiet", action="store_true", help="no progress bar and no summary")
+    add = two.add_argument
+    add("frames", nargs="+", help="FITS or NPY files with frames")
+    add("--calibration", required=True, metavar="FILE", help="that `calibrate` wrote")
+    add("--output", "-o", required=True, metavar="FILE", help="FITS file to write")
+    add("--second", dest="second_frames", default=(), help="of the second images", **files)
+    add("--modes", type=int, metavar="N", help="write coefficients of N Zernike modes, not phases")
+    add("--phases", action="store_true", default=None, help="write phases, too")
+    add("--photons", type=float, help="per pixel at an intensity of 1: write standard errors")
+    add("--read-noise", type=float, default=0.0, metavar="ELECTRONS", help="rms per pixel")
+    add("--wavelength", type=float, metavar="NM", help="for the header; default: WAVELEN")
+    add("--keywords", nargs="+", default=(), metavar="KEY", help="of the headers, for the table")
+    add("--saturation", type=float, metavar="COUNTS", help="default: that of the calibration")
+    add("--largest-residual", type=float, metavar="RMS", help="of a consistent frame")
+    add("--workers", dest="n_workers", type=int, metavar="N", help="default: one for each core")
+    add("--restart", action="store_true", help="drop the part of an interrupted run")
+    add("--overwrite", action="store_true", help="replace any file")
+    add("--strict", action="store_true", help="exit with 3 if frames are flagged")
+    add("--quiet", action="store_true", help="no progress bar and no summary")
     return parser
 
 
 def _calibrate(output: str, pupil_centers: Sequence[float] | None, **settings: Any) -> int:
     centers = None if pupil_centers is None else [pupil_centers[:2], pupil_centers[2:]]
-    found = calibrate(**settings, pupil_centers=centers)
+    with warnings.catch_warnings(record=True) as remarks:
+        found = calibrate(**settings, pupil_centers=centers)
+    for one in remarks:
+        print(f"warning: {one.message}", file=sys.stderr)
     found.save(output)
     print(
         f"{output}: pupil {found.diameter:.2f} pixels wide, residual of the frames {found.residual:.3f}, "

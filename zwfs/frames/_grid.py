@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
+from scipy import fft, ndimage, sparse
 
 from zwfs import _check
 from zwfs._information import Response
-from zwfs.frames.registration import _TOUCHED, Image, RegisteredFrames, nearest_good
+from zwfs.frames.registration import _TOUCHED, nearest_good
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
@@ -20,9 +19,10 @@ from zwfs.sensor import ZernikeSensor
 if TYPE_CHECKING:
     from zwfs.frames.calibration import Calibration
 
-_FAR = 40  # pixels beyond the camera at which the edge of an image has no effect on the camera
+_FAR = 16  # pixels to which an edge is repeated
 _REACH = 12  # pixels around the pupil that its splines need: farther ones weigh less than 2e-7
 _CUT = _REACH - 1  # of these, those without a coefficient of a spline in the pupil
+_NOISE = 0.2  # of the signal, in squares: the inverse of a blur goes no further
 _NEGLIGIBLE = 1e-10  # of a weight: smaller ones only slow products down, much so if their products are subnormal
 
 
@@ -32,6 +32,7 @@ class Grid(NamedTuple):
     reconstruct: PhaseShifted
     response: Response
     n_points: int
+    weights: NDArray[np.float32]
     offset: NDArray[np.float32]
     flat_frames: NDArray[np.float32]
     boxes: list[tuple[int, Any, Any]]  # image, rows and columns
@@ -60,13 +61,14 @@ class Grid(NamedTuple):
         dark = np.stack([calibration.dark[i][rows][:, columns] for i, rows, columns in boxes])
         bad = np.stack([calibration.bad[i][rows][:, columns] for i, rows, columns in boxes])
         corners = places - low[:, :, np.newaxis]
-        touching = [_linear(corner, tuple(size)) for corner in corners]
+        touching = [_interpolation(corner, tuple(size)) for corner in corners]
         inside = pupil.inside.ravel().astype(float)
         reached = np.stack([one.T @ inside > 0 for one in touching]).reshape(bad.shape)
         return cls(
             PhaseShifted(sensor, accelerate=True, **settings),
             Response.of(sensor),
             pupil.n_points,
+            calibration.weights.astype(np.float32),
             calibration.offset.astype(np.float32),
             sensor.measure(np.zeros(pupil.shape)).astype(np.float32),
             boxes,
@@ -74,8 +76,8 @@ class Grid(NamedTuple):
             bad,
             reached & ~bad,
             [_repair(one, ~one) for one in bad],
-            (_spline_filter(size[0]), _spline_filter(size[1])),
-            [_cubic(corner - _CUT, tuple(size - 2 * _CUT), pupil.inside.ravel()) for corner in corners],
+            (_spline_filter(size[0], calibration.blur), _spline_filter(size[1], calibration.blur)),
+            [_interpolation(one - _CUT, tuple(size - 2 * _CUT), pupil.inside.ravel()) for one in corners],
             touching,
             _repair(pupil.inside & ~calibration.good, calibration.good),
         )
@@ -95,7 +97,7 @@ class Grid(NamedTuple):
                 spoiled = odd & self.watched
                 n_bad = np.count_nonzero(spoiled, axis=(1, 2, 3))
                 n_saturated = np.count_nonzero(spoiled & (raw >= level), axis=(1, 2, 3))
-                good = good & ~self._touched(spoiled)
+                good = good & ~self.touched(spoiled)
             raw -= self.dark
         flat = raw.reshape(k, len(self.boxes), -1)
         for index, (pixels, nearest) in enumerate(self.repairs):
@@ -110,6 +112,30 @@ class Grid(NamedTuple):
         )
         return np.ascontiguousarray(values.transpose(2, 0, 1)), good, n_bad, n_saturated
 
+    def solve(
+        self, frames: NDArray, good: NDArray, start: NDArray | None, judge: bool
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Phases with bad points filled, iterations, whether they converged, and residuals of ideal frames.
+
+        Bad points take no part: in a second iteration their intensity is that of the model. The frames, shape
+        (k, 2, ny, nx), are changed.
+        """
+        reconstruct, sensor = self.reconstruct, self.reconstruct.sensor
+        found = reconstruct(frames, start)
+        phase, n_iterations, converged = found.phase, found.n_iterations, found.converged
+        phase[:, ~sensor.pupil.inside] = 0
+        holes = sensor.pupil.inside & ~good
+        some = np.flatnonzero(holes.any(axis=(1, 2)))
+        if some.size:
+            phase[some] = self.filled(phase[some], good[some])
+            frames[some] = np.where(holes[some, np.newaxis], sensor.measure(phase[some]), frames[some])
+            found = reconstruct(frames[some], phase[some])
+            phase[some] = self.filled(np.where(sensor.pupil.inside, found.phase, 0), good[some])
+            n_iterations[some] += found.n_iterations
+            converged[some] = found.converged
+        blind = np.full(len(phase), np.nan, np.float32)
+        return phase, n_iterations, converged, reconstruct.settings.residual(phase, frames) if judge else blind
+
     def filled(self, phase: NDArray, good: NDArray) -> NDArray:
         """Phases (k, ny, nx) with bad points replaced by the nearest good one."""
         flat = phase.reshape(len(phase), -1)
@@ -121,31 +147,13 @@ class Grid(NamedTuple):
                 phase[index] = np.where(inside, nearest_good(phase[index], good[index]), 0)
         return phase
 
-    def _touched(self, spoiled: NDArray) -> NDArray[np.bool_]:
+    def touched(self, spoiled: NDArray) -> NDArray[np.bool_]:
         """Points with a bad pixel on one of their sides: (k, 2, h, w) to (k, ny, nx)."""
         k, shape = len(spoiled), self.offset.shape[1:]
         weights = sum(
             one @ spoiled[:, index].reshape(k, -1).T.astype(np.float32) for index, one in enumerate(self.touching)
         )
         return (weights.T > _TOUCHED).reshape(k, *shape)
-
-
-def camera_places(registered: RegisteredFrames) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Row and column of each point of the grid on the two frames, (2, 2, ny, nx), and counts there of one count.
-
-    `RegisteredFrames` resamples images whose counts are the number of the row or of the column. They reach beyond
-    the camera, since splines bend ramps at the edge.
-    """
-    wide = [length + 2 * _FAR for length in registered.frames[0].counts.shape]
-    origins = registered.origins + np.array([[_FAR], [_FAR], [0], [0]])
-
-    def on_grid(counts: NDArray) -> NDArray[np.float64]:
-        image = Image(counts, np.zeros(counts.shape, bool))
-        return replace(registered, frames=(image, image), origins=origins).frames_on_grid()[0]
-
-    response = on_grid(np.ones(wide))
-    ramps = np.indices(wide).astype(float) - _FAR
-    return np.stack([on_grid(ramp) / response for ramp in ramps], axis=1), response.mean(axis=(1, 2))
 
 
 def _span(low: int, size: int, length: int) -> Any:
@@ -163,39 +171,34 @@ def _repair(bad: NDArray[np.bool_], good: NDArray[np.bool_]) -> tuple[NDArray, N
     return np.flatnonzero(bad), nearest[bad]
 
 
-def _spline_filter(size: int) -> NDArray[np.float32]:
-    """Matrix from samples to the coefficients of a cubic spline near the pupil."""
-    matrix = ndimage.spline_filter1d(np.eye(size), 3, axis=0, mode="nearest")
+def _spline_filter(size: int, blur: float) -> NDArray[np.float32]:
+    """Matrix from samples to coefficients of a cubic spline near the pupil, with Wiener's inverse of a blur."""
+    samples = np.pad(np.eye(size), ((_FAR, _FAR), (0, 0)), "edge")
+    spread = np.exp(-2 * (np.pi * blur * fft.rfftfreq(len(samples))) ** 2)[:, np.newaxis]
+    sharp = fft.rfft(samples, axis=0) * (spread * (1 + _NOISE) / (spread**2 + _NOISE))
+    matrix = fft.irfft(sharp, n=len(samples), axis=0)[_FAR:-_FAR] if blur else np.eye(size)
+    matrix = ndimage.spline_filter1d(matrix, 3, axis=0, mode="nearest")
     matrix = np.where(np.abs(matrix) > _NEGLIGIBLE, matrix, 0).astype(np.float32)
     return np.ascontiguousarray(matrix[_CUT:-_CUT])
 
 
-def _cubic(places: NDArray, size: tuple[int, int], inside: NDArray) -> Any:
-    """Sparse matrix from coefficients of cubic splines, (h w), to places (2, n); 0 to those not inside."""
+def _interpolation(places: NDArray, size: tuple[int, int], inside: NDArray | None = None) -> Any:
+    """Sparse matrix to places (2, n): of cubic splines from coefficients, 0 outside, or linear, from pixels."""
     base = np.floor(places)
-    t = places - base
-    u = 1 - t
-    weights = np.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / 6
-    return _interpolation(base.astype(int) - 1, weights * inside, size)
-
-
-def _linear(places: NDArray, size: tuple[int, int]) -> Any:
-    """Sparse matrix of linear interpolation, from pixels (h w) to places (2, n)."""
-    base = np.floor(places)
-    return _interpolation(base.astype(int), np.stack([1 - (places - base), places - base]), size)
-
-
-def _interpolation(first: NDArray, weights: NDArray, size: tuple[int, int]) -> Any:
-    """Sparse matrix with weights (m, 2, n) of the m rows and m columns from the first, (2, n)."""
-    m, _, n = weights.shape
+    t, u = places - base, 1 - places + base
+    if inside is None:
+        m, weights = 2, np.stack([u, t])
+    else:
+        cubics = np.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3])
+        m, weights = 4, cubics * inside / 6
     values = weights[:, np.newaxis, 0] * weights[np.newaxis, :, 1]
     values = np.where(np.abs(values) > _NEGLIGIBLE, values, 0)
-    steps = np.arange(m)
+    first, steps = base.astype(int) - (m == 4), np.arange(m)
     rows = first[0] + steps[:, np.newaxis, np.newaxis]
     columns = first[1] + steps[np.newaxis, :, np.newaxis]
     pixels = rows * size[1] + columns
-    points = np.broadcast_to(np.arange(n), pixels.shape)
-    shape = n, size[0] * size[1]
+    points = np.broadcast_to(np.arange(places.shape[1]), pixels.shape)
+    shape = places.shape[1], size[0] * size[1]
     matrix = sparse.csr_array((values.ravel(), (points.ravel(), pixels.ravel())), shape=shape, dtype=np.float32)
     matrix.eliminate_zeros()
     # Half the bytes of each index: reading them takes much of the time of a product.

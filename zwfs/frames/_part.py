@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import json
 import os
 import stat
 import warnings
@@ -33,29 +32,14 @@ Cards = Sequence[tuple[str, Any, str]]
 
 @dataclass
 class Unit:
-    """An image cube or a table of a FITS file, with one row for each exposure, or any other number.
+    """An image cube or a table of a FITS file with n rows; the fields of a table are those of its type."""
 
-    Attributes
-    ----------
-    name : str
-        EXTNAME; none for the first unit.
-    dtype : dtype
-        Of an element, big-endian; that of a table has fields.
-    shape : tuple of int
-        Of a row of a cube; () for a table.
-    n : int
-        Number of rows.
-    cards : sequence of (keyword, value, comment)
-    units : mapping
-        Units of the columns of a table.
-    """
-
-    name: str
-    dtype: np.dtype
-    shape: tuple[int, ...]
+    name: str  # EXTNAME; none for the first unit
+    dtype: np.dtype  # big-endian
+    shape: tuple[int, ...]  # of a row of a cube; () for a table
     n: int
     cards: Cards
-    units: Mapping[str, str]
+    units: Mapping[str, str]  # of the columns of a table
     offset: int = 0  # of the data in the file
 
     @property
@@ -73,10 +57,10 @@ class Unit:
         fits, rows = fits_module(), np.empty((0, *self.shape), self.dtype)
         if self.dtype.names:
             unit = fits.BinTableHDU(rows, name=self.name)
-        elif self.name:
-            unit = fits.ImageHDU(rows, name=self.name)
         else:
-            unit = fits.PrimaryHDU(rows if self.shape else None)
+            unit = (
+                fits.ImageHDU(rows, name=self.name) if self.name else fits.PrimaryHDU(rows if self.shape else None)
+            )
         if axes := unit.header["NAXIS"]:
             unit.header[f"NAXIS{axes}"] = self.n
         for index, name in enumerate(self.dtype.names or (), 1):
@@ -91,125 +75,31 @@ def scratch_of(output: Path) -> Path:
     return output.with_name(f".{output.name}.part")
 
 
-class Scratch:
-    """Scratch folder of an output, with a marker. Files in it are opened without following links.
-
-    Parameters
-    ----------
-    output : Path
-
-    Raises
-    ------
-    ValueError
-        If something else has the name of the folder, or a file in it is a link: it could be data of the user.
-    """
-
-    def __init__(self, output: Path) -> None:
-        self._output, self.path = output, scratch_of(output)
-        new = not os.path.lexists(self.path)
-        if new:
-            self.path.mkdir(0o700)
-        try:
-            self.folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        except OSError as error:
-            raise self._refusal(str(error.strerror)) from None
-        self._files = [self.folder]
-        try:
-            self._check_marker(new)
-        except BaseException:
-            if new:
-                self.remove()
-            self.close()
-            raise
-
-    def open(self, name: str, flags: int) -> int:
-        """Open a file of the folder until `close`, and return its descriptor."""
-        reason = f"its file {name!r} is a link or a device"
-        try:
-            file = os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666, dir_fd=self.folder)
-        except OSError as error:
-            if error.errno == errno.ELOOP:
-                raise self._refusal(reason) from None
-            raise
-        self._files.append(file)
-        status = os.fstat(file)
-        if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
-            raise self._refusal(reason)
-        return file
-
-    def close(self) -> None:
-        """Close all files."""
-        while self._files:
-            os.close(self._files.pop())
-
-    def remove(self) -> None:
-        """Remove the folder and our files."""
-        for name in ("data", "journal", _MARKER):
-            with suppress(FileNotFoundError):
-                os.unlink(name, dir_fd=self.folder)
-        with suppress(OSError):  # a file of somebody else remains
-            self.path.rmdir()
-
-    def _check_marker(self, new: bool) -> None:
-        """Write the marker of a new folder, or check who owns the folder and what the marker says."""
-        name = os.fsencode(self._output.name)
-        if new:
-            os.write(self.open(_MARKER, os.O_WRONLY | os.O_CREAT | os.O_EXCL), name)
-        elif os.fstat(self.folder).st_uid != os.geteuid():
-            raise self._refusal("it belongs to another user")
-        elif _MARKER not in os.listdir(self.folder) or os.read(self.open(_MARKER, os.O_RDONLY), 999) != name:
-            raise self._refusal(f"its file {_MARKER!r} does not hold the name of the output")
-
-    def _refusal(self, reason: str) -> ValueError:
-        return ValueError(
-            f"output = {str(self._output)!r} needs the folder {self.path.name}, which is there and which zwfs did "
-            f"not make ({reason}): expected no such file or folder; move it, or choose another output"
-        )
-
-
 class Part:
-    """Partial file of an output, open for pieces.
+    """Partial file of an output, with the pieces (first row, and the first row after it) that it gets.
 
-    Parameters
-    ----------
-    output : Path
-        Where the complete file will be.
-    units : sequence of Unit
-        All data have a fixed place from the start.
-    pieces : sequence of (int, int)
-        First row of each piece, and the first row after it.
-    plan : str
-        All that decides the bytes of the output. A part of another plan is refused.
-    restart : bool
-        Whether to drop a part that an earlier run wrote.
+    Files in its folder are opened without following links. The plan is all that decides the bytes of the output.
 
-    Raises
-    ------
-    ValueError
-        If there is a part of another plan, another process writes it, or `Scratch` refuses its folder.
-    OSError
-        If there is not enough space; the message names the file and the bytes.
+    Raises ValueError if there is a part of another plan, another process writes it, or something else has the name
+    of the folder: it could be data of the user. OSError if there is not enough space.
     """
 
     def __init__(
         self, output: Path, units: Sequence[Unit], pieces: Sequence[tuple[int, int]], plan: str, restart: bool
     ) -> None:
-        self.output, self.units, self.pieces = output, units, pieces
+        self.output, self.units, self.pieces, self.path = output, units, pieces, scratch_of(output)
         self._plan = hashlib.sha256(plan.encode()).hexdigest().encode()
-        offset = 0
+        self._size, self._files, self._keep = 0, list[int](), True
         for unit in units:
-            unit.offset = offset + len(unit.header())
-            offset = unit.offset + unit.size
-        self._size = offset
-        with self._no_space():
-            output.parent.mkdir(parents=True, exist_ok=True)
-            self._scratch = Scratch(output)
-        self._keep = True
+            unit.offset = self._size + len(unit.header())
+            self._size = unit.offset + unit.size
         try:
             with self._no_space():
-                self._file = self._scratch.open("data", os.O_RDWR | os.O_CREAT)
+                output.parent.mkdir(parents=True, exist_ok=True)
+                self._enter()
+                self._data = self._open("data", os.O_RDWR | os.O_CREAT)
                 self._lock()
-                self._journal = self._scratch.open("journal", os.O_RDWR | os.O_CREAT | os.O_APPEND)
+                self._journal = self._open("journal", os.O_RDWR | os.O_CREAT | os.O_APPEND)
                 self.done = {} if restart else self._earlier()
                 self._keep = bool(self.done)
                 self._begin()
@@ -226,7 +116,7 @@ class Part:
 
     def read(self, unit: Unit, first: int, stop: int) -> NDArray:
         """Read rows of a unit."""
-        content = os.pread(self._file, (stop - first) * unit.row, unit.offset + first * unit.row)
+        content = os.pread(self._data, (stop - first) * unit.row, unit.offset + first * unit.row)
         return np.frombuffer(content, unit.dtype).reshape(-1, *unit.shape).copy()
 
     def note(self, first: int, stop: int, checksum: int) -> None:
@@ -239,21 +129,63 @@ class Part:
         """Write the headers, and give the file its name."""
         with self._no_space():
             self._write_headers()
-            os.fsync(self._file)
-            os.replace("data", self.output, src_dir_fd=self._scratch.folder)
+            os.fsync(self._data)
+            os.replace("data", self.output, src_dir_fd=self._folder)
         self._keep = False
 
     def close(self) -> None:
-        """Close the part; it is removed unless it holds a finished piece."""
+        """Close the part; its folder is removed unless it holds a finished piece, or is not ours."""
         if not self._keep:
-            self._scratch.remove()
-        self._scratch.close()
+            for name in ("data", "journal", _MARKER):
+                with suppress(FileNotFoundError):
+                    os.unlink(name, dir_fd=self._folder)
+            with suppress(OSError):  # a file of somebody else remains
+                self.path.rmdir()
+        while self._files:
+            os.close(self._files.pop())
+
+    def _enter(self) -> None:
+        """Open the folder. A new one gets a marker; that of an earlier one must name the output."""
+        new, name = not os.path.lexists(self.path), os.fsencode(self.output.name)
+        if new:
+            self.path.mkdir(0o700)
+        try:
+            self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except OSError as error:
+            raise self._refusal(str(error.strerror)) from None
+        self._files.append(self._folder)
+        self._keep = not new
+        if new:
+            os.write(self._open(_MARKER, os.O_WRONLY | os.O_CREAT | os.O_EXCL), name)
+        elif os.fstat(self._folder).st_uid != os.geteuid():
+            raise self._refusal("it belongs to another user")
+        elif _MARKER not in os.listdir(self._folder) or os.read(self._open(_MARKER, os.O_RDONLY), 999) != name:
+            raise self._refusal(f"its file {_MARKER!r} does not hold the name of the output")
+
+    def _open(self, name: str, flags: int) -> int:
+        """Open a file of the folder until `close`, and return its descriptor."""
+        reason = f"its file {name!r} is a link or a device"
+        try:
+            file = os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666, dir_fd=self._folder)
+        except OSError as error:
+            raise self._refusal(reason) from None if error.errno == errno.ELOOP else error
+        self._files.append(file)
+        status = os.fstat(file)
+        if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+            raise self._refusal(reason)
+        return file
+
+    def _refusal(self, reason: str) -> ValueError:
+        return ValueError(
+            f"output = {str(self.output)!r} needs the folder {self.path.name}, which is there and which zwfs did "
+            f"not make ({reason}): expected no such file or folder; move it, or choose another output"
+        )
 
     def _lock(self) -> None:
         import fcntl  # not on Windows, where calibrations work
 
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._data, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise ValueError(f"output = {str(self.output)!r} is being written by another process") from None
 
@@ -264,8 +196,8 @@ class Part:
             return {}
         if plan != self._plan:
             raise ValueError(
-                f"{self._scratch.path.name} is part of a run with other frames, another calibration or other "
-                "settings: expected the same; restart to drop it, or choose another output"
+                f"{self.path.name} is part of a run with other frames, another calibration or other settings: "
+                "expected the same; restart to drop it, or choose another output"
             )
         pieces, done = set(self.pieces), {}
         for line in lines[:-1]:  # the last one is empty, or cut
@@ -275,8 +207,8 @@ class Part:
                     done[first, stop] = checksum
         if n_damaged := len(lines) - 1 - len(done):
             warnings.warn(
-                f"{self._scratch.path / 'journal'}: {n_damaged} of {len(lines) - 1} lines or the data that they "
-                "describe are damaged: their frames are reconstructed again",
+                f"{self.path / 'journal'}: {n_damaged} of {len(lines) - 1} lines or the data that they describe "
+                "are damaged: their frames are reconstructed again",
                 stacklevel=4,
             )
         return done
@@ -286,16 +218,16 @@ class Part:
         for unit in self.units[:-1]:
             if unit.n:
                 place = unit.offset + first * unit.row
-                checksum = zlib.crc32(os.pread(self._file, (stop - first) * unit.row, place), checksum)
+                checksum = zlib.crc32(os.pread(self._data, (stop - first) * unit.row, place), checksum)
         return checksum
 
     def _begin(self) -> None:
         """Reserve the space, and write the headers and the journal of the pieces that are done."""
         if not self.done:
-            os.ftruncate(self._file, 0)
-        os.ftruncate(self._file, self._size)
+            os.ftruncate(self._data, 0)
+        os.ftruncate(self._data, self._size)
         if hasattr(os, "posix_fallocate"):  # not on macOS
-            os.posix_fallocate(self._file, 0, self._size)
+            os.posix_fallocate(self._data, 0, self._size)
         os.ftruncate(self._journal, 0)
         rows = (b"%d %d %d\n" % (*piece, checksum) for piece, checksum in self.done.items())
         os.write(self._journal, b"".join((self._plan + b"\n", *rows)))
@@ -309,7 +241,7 @@ class Part:
     def _write(self, content: bytes, place: int) -> None:
         view = memoryview(content)
         while view:
-            n = os.pwrite(self._file, view, place)
+            n = os.pwrite(self._data, view, place)
             view, place = view[n:], place + n
 
     @contextmanager
@@ -319,11 +251,6 @@ class Part:
         except OSError as error:
             raise OSError(
                 error.errno,
-                f"output = {str(self.output)!r} cannot be written ({error.strerror}): expected "
-                f"{self._size} bytes of free space in a folder that can be written",
+                f"output = {str(self.output)!r} cannot be written ({error.strerror}): expected {self._size} bytes "
+                "of free space in a folder that can be written",
             ) from None
-
-
-def plan_of(**values: Any) -> str:
-    """Return values as one string, which is the same for the same values."""
-    return json.dumps(values, sort_keys=True, default=str)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zwfs import _check
 from zwfs.frames._blocks import Block, FileError, blocks_of
 
 
@@ -33,31 +34,12 @@ class Segment:
         """Number of exposures."""
         return self.blocks[0].n
 
-    def read(self, first: int, stop: int) -> NDArray:
-        """Return some exposures, (stop - first, n_images, ny, nx)."""
-        parts = [block.read(first, stop) for block in self.blocks]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
-
 
 class Stack:
-    """Exposures of all files, one after the other.
+    """Exposures of all files, one after the other, each of n_images (1 or 2) of a shape.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        Each with the images of one exposure or more.
-    second_files : sequence of Path
-        As many, with the second image of each exposure, or none.
-    n_images : int
-        Images of an exposure, 1 or 2.
-    shape : (int, int)
-        Of an image.
-
-    Raises
-    ------
-    FileNotFoundError
-    FileError
-        If a file is of another kind, broken, truncated, or holds images of another shape or number.
+    There are as many second files, with the second image of each exposure, as files, or none. Raises
+    FileNotFoundError, or FileError if a file is of another kind, broken, truncated, or holds other images.
     """
 
     def __init__(
@@ -70,35 +52,30 @@ class Stack:
         for index, path in enumerate(files):
             units, header = _units(path, shape)
             seconds = _units(second_files[index], shape)[0] if second_files else []
-            pairs = _exposures(units, seconds, n_images)
-            self.segments += [Segment(blocks, header) for blocks in pairs]
-        first = self.segments[0].blocks[0]
-        for segment in self.segments:
-            for block in segment.blocks:
-                if block.numbers != first.numbers:
-                    raise FileError(
-                        f"{block.name}: its type, BSCALE, BZERO and BLANK are {block.numbers}: expected "
-                        f"{first.numbers}, those of {first.name}"
-                    )
+            self.segments += [Segment(blocks, header) for blocks in _exposures(units, seconds, n_images)]
+        self.header = self.segments[0].header
+        self.blocks = [block for segment in self.segments for block in segment.blocks]
+        first = self.blocks[0]
+        for block in self.blocks:
+            if block.numbers != first.numbers:
+                raise FileError(
+                    f"{block.name}: its type, BSCALE, BZERO and BLANK are {block.numbers}: expected "
+                    f"{first.numbers}, those of {first.name}"
+                )
+        self.bytes_per_exposure = sum(block.row for block in self.segments[0].blocks)
         self._ends = list(accumulate(segment.n for segment in self.segments))
+        self.n = self._ends[-1]
 
     @property
-    def n(self) -> int:
-        """Number of exposures."""
-        return self._ends[-1]
-
-    @property
-    def header(self) -> dict[str, Any]:
-        """Values of the header of the first file."""
-        return self.segments[0].header
-
-    @property
-    def bytes_per_exposure(self) -> int:
-        """Size of the images of an exposure."""
-        return sum(block.row for block in self.segments[0].blocks)
+    def saturation(self) -> float:
+        """Level at which pixels are saturated, as the first file states it or as its type allows."""
+        known, name = "SATURATE" in self.header, self.segments[0].name
+        level = self.header["SATURATE"] if known else self.blocks[0].full_scale
+        name = f"{name}: {'SATURATE' if known else 'largest number of its type'}"
+        return level if level == np.inf else _check.number(name, level, 0, open_low=True)
 
     def places(self, first: int, stop: int) -> list[tuple[int, int, int]]:
-        """Segments that hold some exposures, each with its first and its last but one exposure."""
+        """Segments that hold some exposures, each with its first exposure and the one after its last."""
         found, index = [], bisect_right(self._ends, first)
         while first < stop:
             start = self._ends[index] - self.segments[index].n
@@ -109,17 +86,16 @@ class Stack:
 
     def read(self, first: int, stop: int) -> NDArray:
         """Return some exposures, shape (stop - first, n_images, ny, nx)."""
-        parts = [self.segments[index].read(start, end) for index, start, end in self.places(first, stop)]
+        parts = []
+        for index, start, end in self.places(first, stop):
+            images = [block.read(start, end) for block in self.segments[index].blocks]
+            parts.append(images[0] if len(images) == 1 else np.concatenate(images, axis=1))
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def state(self) -> list[tuple[str, int, int, int]]:
         """Path, exposures, size and time of change of all files: it differs once a file has changed."""
-        blocks = [block for segment in self.segments for block in segment.blocks]
-        stats = [os.stat(block.path) for block in blocks]
-        return [
-            (str(block.path), block.n, stat.st_size, stat.st_mtime_ns)
-            for block, stat in zip(blocks, stats, strict=True)
-        ]
+        found = [(block, os.stat(block.path)) for block in self.blocks]
+        return [(str(block.path), block.n, stat.st_size, stat.st_mtime_ns) for block, stat in found]
 
 
 def _exposures(units: list[Block], seconds: list[Block], n_images: int) -> list[tuple[Block, ...]]:

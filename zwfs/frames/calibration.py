@@ -1,8 +1,7 @@
 """A calibrated bench: what is computed once, so that camera images become phases in one call.
 
-`Calibration.of` takes it from a measurement with clear frames, `save` and `load` keep it in a file, and a call
-turns camera images into phases. It does the same as `reduce_frames` and `recover_phase` of `zwfs.frames.pipeline`,
-in single precision, without making the model anew for each pair of frames.
+`Calibration.of` takes it from a measurement with clear frames, `Calibration.from_bench` from a fit of the bench. A
+call does the same as `reduce_frames` and `recover_phase` of `zwfs.frames.pipeline`, in single precision.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,18 +24,21 @@ from zwfs._likelihood import Estimator, Noise
 from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
-from zwfs.frames._grid import Grid, camera_places
-from zwfs.frames.files import read_all
+from zwfs.frames._camera import BenchFit
+from zwfs.frames._errors import Excess, sideways, slopes_of, unexplained
+from zwfs.frames._grid import Grid
+from zwfs.frames._learnt import learnt, places_of, training
 from zwfs.frames.phases import Flag, Phases
-from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames, reduce_frames
-from zwfs.frames.refine import _check_fit, fit
-from zwfs.frames.registration import register_frames
+from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames
+from zwfs.frames.registration import radius
 from zwfs.metrics import without_piston
+from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
-FORMAT = 1  # of the file; another number is refused
-_NAME = "zwfs calibration"
+FORMAT = 2  # of the file; another number is refused
 _DIM = 0.1  # of the light of the calibration: a frame with less is lost
+_FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
+_OF_ARMS = "background", "flux"
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 _LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED = (flag.value for flag in Flag)  # plain, and far quicker
 
@@ -46,46 +47,47 @@ _LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED = (flag.value for flag in
 class Calibration(Immutable):
     """Sensor and camera of a bench: called on camera images, it returns their phases.
 
-    Make one with `of`, `calibrate` or `load`. It cannot be changed. Its pickle is small, and the model of the
-    sensor is made at the first call of each process.
+    Make one with `of`, `from_bench`, `calibrate` or `load`. It cannot be changed. Its pickle is small, and the
+    model of the sensor is made at the first call of each process.
 
     Attributes
     ----------
-    amplitude : ndarray, shape (ny, nx)
-        Of the pupil, 0 outside.
-    diameter : float, pixels
-        Of the pupil, D.
-    center : (float, float), pixels
-        Row and column of the optical axis on the grid of the pupil.
+    amplitude, good : ndarray of float64 and of bool, shape (ny, nx)
+        Amplitude of the pupil, 0 outside, and its good points.
+    diameter, center : float and (float, float), pixels
+        Diameter D of the pupil, and row and column of the optical axis on its grid.
     optics : Optics
-    shape : (int, int)
-        Rows and columns of a camera image.
-    n_images : int
-        Camera images of an exposure: 1 with both pupils on it, or 2.
+    shape, n_images : (int, int) and int
+        Rows and columns of a camera image, and images of an exposure: 1 with both pupils on it, or 2.
     places : ndarray, shape (2, 2, ny, nx), pixels
         Row and column at which each point of the grid of the pupil lies on the camera, for both frames.
     dark, bad : ndarray of float32 and of bool, shape (n_images, ny_camera, nx_camera)
         Counts without light, and pixels that are ignored in all frames.
-    good : ndarray of bool, shape (ny, nx)
-        Points of the pupil that are good.
     background, unit : ndarray, shape (2,), counts
         Stray light of the frames, and counts that make an intensity of 1.
-    weights, offset : ndarray, shapes (2, 2) and (2, ny, nx)
-        Frames of an ideal sensor are weights @ intensities + offset: scale, leakage, unmasked light.
+    weights, offset : ndarray, shapes (2, 2, ny, nx) and (2, ny, nx)
+        Frames of an ideal sensor are weights @ intensities + offset at each point.
     balance : bool
         Whether both frames are scaled to the same light.
     light : ndarray, shape (2,)
         Mean intensity of the calibration's frames in the pupil.
+    unexplained, slopes : ndarray, shapes (n_states, ny, nx) and (n_states,), radian
+        Errors of the phases of the calibration's frames, for `sigma`. They grow with the rms difference of phases
+        at neighbouring points.
     residual : float
         Rms difference of the calibration's frames and their model.
     saturation : float, counts
         Pixels that reach it are saturated, the dark included.
+    blur : float, pixels rms
+        That is undone as far as noise allows.
+    n_averaged : int
+        Exposures that were averaged for each state.
+    commanded : bool
+        Whether the grid is that of known commands, and not that of the first image.
     bunit : str
         Unit of the calibration's frames, BUNIT of their header; empty if unknown.
-    n_iterations : int
-        Largest number of iterations.
-    tolerance : float, radian
-        As for `PhaseShifted`: with 0, all iterations are done.
+    n_iterations, tolerance : int and float, radian
+        As for `PhaseShifted`: with a tolerance of 0, all iterations are done.
     """
 
     amplitude: NDArray[np.float64]
@@ -104,24 +106,33 @@ class Calibration(Immutable):
     offset: NDArray[np.float64]
     balance: bool
     light: NDArray[np.float64]
-    residual: float
-    saturation: float
+    unexplained: NDArray[np.float32]
+    slopes: NDArray[np.float64]
+    residual: float = 0.0
+    saturation: float = np.inf
+    blur: float = 0.0
+    n_averaged: int = 1
+    commanded: bool = False
     bunit: str = ""
     n_iterations: int = 25
     tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
-        _check_settings(self.n_iterations, self.tolerance, self.saturation)
+        _check.integer("n_iterations", self.n_iterations, 1)
+        _check.number("tolerance", self.tolerance, 0, 2 * np.pi)
+        _limit("saturation", self.saturation, open_low=True)
         _check.instance("bunit", self.bunit, str)
         _check.flag("balance", self.balance)
         _check.number("residual", self.residual, 0)
+        _check.number("blur", self.blur, 0, 10)
+        _check.integer("n_averaged", self.n_averaged, 1)
         _check.integer("n_images", self.n_images, 1, 2)
         grid, camera = np.shape(self.amplitude), (self.n_images, *self.shape)
-        for name, shape in {"bad": camera, "good": grid}.items():
-            _check.flag_map(name, getattr(self, name), shape)
+        _check.flag_map("bad", self.bad, camera)
+        _check.flag_map("good", self.good, grid)
         for name, shape in {
-            "places": (2, 2, *grid), "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2),
-            "offset": (2, *grid), "light": (2,),
+            "places": (2, 2, *grid), "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2, *grid),
+            "offset": (2, *grid), "light": (2,), "unexplained": (len(self.slopes), *grid),
         }.items():  # fmt: skip
             array = _check.real_array(name, getattr(self, name))
             if array.shape != shape:
@@ -133,22 +144,11 @@ class Calibration(Immutable):
             object.__setattr__(self, one.name, read_only(getattr(self, one.name)))
 
     def __repr__(self) -> str:
-        return (
-            f"Calibration(pupil of {self.diameter:.2f} pixels, {self.n_images} camera image"
-            f"{'s' * (self.n_images > 1)} of {self.shape}, residual={self.residual:.3g})"
-        )
+        images = f"{self.n_images} camera image{'s' * (self.n_images > 1)} of {self.shape}"
+        return f"Calibration(pupil of {self.diameter:.2f} pixels, {images}, residual={self.residual:.3g})"
 
     @classmethod
-    def of(
-        cls,
-        measurement: Measurement,
-        dark: ArrayLike | None = None,
-        *,
-        saturation: float = np.inf,
-        bunit: str = "",
-        n_iterations: int = 25,
-        tolerance: float = 1e-3,
-    ) -> Calibration:
+    def of(cls, measurement: Measurement, dark: ArrayLike | None = None, **settings: Any) -> Calibration:
         """Calibration of a measurement; pixels that are bad on its frames are ignored from then on.
 
         Parameters
@@ -157,55 +157,123 @@ class Calibration(Immutable):
             Of frames that are taken as those to come, and of clear frames.
         dark : array_like, shape (ny, nx) or (n_images, ny, nx), counts, optional
             That was subtracted from the frames of the measurement; none if left out.
-        saturation : float, counts
-        bunit : str
-        n_iterations : int
-        tolerance : float, radian
+        **settings
+            Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
 
         Returns
         -------
         Calibration
         """
         _check.instance("measurement", measurement, Measurement)
-        _check.instance("bunit", bunit, str)
-        _check_settings(n_iterations, tolerance, saturation)
-        registered, pupil = measurement.registered, measurement.pupil
+        registered, pupil, good = measurement.registered, measurement.pupil, measurement.good
         images = registered.frames[: 1 if registered.frames[0] is registered.frames[1] else 2]
         shape = images[0].counts.shape
         if images[-1].counts.shape != shape:
             raise ValueError(f"the frames have shapes {shape} and {images[-1].counts.shape}: expected the same")
         counts, _ = registered.frames_on_grid()
         unit, background = measurement.counts * registered.exposure, measurement.background[:2]
-        places, response = camera_places(registered)
         inner = (..., *measurement.window)
-        good = measurement.good
-        weights, offset = _undoing(measurement)
+
+        def undone(*light: float) -> NDArray[np.float64]:
+            intensity = np.ones_like(measurement.intensity) * np.reshape(light, (2, 1, 1))
+            return ideal_frames(replace(measurement, intensity=intensity))[inner]
+
+        offset = undone(0, 0)
         made = cls(
-            amplitude=pupil.amplitude,
-            diameter=pupil.n_pixels,
-            center=pupil.center,
-            optics=measurement.optics,
-            shape=shape,
-            n_images=len(images),
-            places=places,
-            dark=_dark(dark, (len(images), *shape)),
-            bad=np.stack([image.bad for image in images]),
-            good=good,
-            background=background / response,
-            unit=unit / response,
-            weights=weights,
-            offset=offset[inner],
-            balance=bool(registered.balance and measurement.optics.opposite),
-            light=(counts[:, good].mean(axis=1) - background) / unit,
-            residual=0.0,
-            saturation=saturation,
-            bunit=bunit,
-            n_iterations=n_iterations,
-            tolerance=tolerance,
-        )
+            pupil.amplitude, pupil.n_pixels, pupil.center, measurement.optics, shape, len(images),
+            registered.places()[:2], _dark(dark, (len(images), *shape)), np.stack([image.bad for image in images]),
+            good, background / registered.areas[:2], unit / registered.areas[:2],
+            np.stack([undone(1, 0) - offset, undone(0, 1) - offset], axis=1), offset,
+            bool(registered.balance and measurement.optics.opposite),
+            (counts[:, good].mean(axis=1) - background) / unit,
+            np.zeros((0, *pupil.shape), np.float32), np.zeros(0), **settings,
+        )  # fmt: skip
         frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
-        *_, residual = made._solve(frames, np.broadcast_to(good, (1, *good.shape)), None, judge=True)
-        return replace(made, residual=float(residual[0]))
+        phase, *_, residual = made._work.solve(frames, good[np.newaxis], None, judge=True)
+        errors = sideways(made.sensor, phase[0], frames[0], good)[np.newaxis]
+        return replace(made, residual=float(residual[0]), unexplained=errors, slopes=slopes_of(phase, good))
+
+    @classmethod
+    def from_bench(
+        cls, fit: BenchFit, frames: ArrayLike, phases: ArrayLike, dark: ArrayLike | None = None, *,
+        corners: ArrayLike = ((0, 0), (0, 0)), shape: tuple[int, int] | None = None, n_images: int = 2,
+        **settings: Any,
+    ) -> Calibration:  # fmt: skip
+        """Calibration from a fit of the bench: its geometry, blur and leakage as linear operators.
+
+        The focus of the relay is corrected to first order, around a flat wavefront.
+
+        Parameters
+        ----------
+        fit : BenchFit
+        frames : array_like, shape (n_states, 2, ny, nx) or (n_states, n_frames, 2, ny, nx), counts
+            As for `fit_bench`: less the dark, NaN where bad.
+        phases : array_like, shape (n_states, n, n), radian
+            As for `fit_bench`. The phases of the calibration are on this grid.
+        dark : array_like, shape (ny_camera, nx_camera) or (n_images, ny_camera, nx_camera), counts, optional
+            That was subtracted from the frames; none if left out.
+        corners, shape, n_images : array_like of int, shape (2, 2); (int, int); int
+            If the frames were cut out: row and column of their first pixels on the camera, rows and columns of a
+            camera image, and the number of these in an exposure.
+        **settings
+            Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the fit is of a wrong type, or shapes do not belong together.
+        """
+        _check.instance("fit", fit, BenchFit)
+        counts, phases = _check.real_array("frames", frames), _check.real_array("phases", phases)
+        n_averaged = counts.shape[1] if counts.ndim == 5 else 1
+        counts = counts.mean(axis=1) if counts.ndim == 5 else counts
+        n = len(fit.light)
+        if counts.ndim != 4 or counts.shape[:2] != (len(phases), 2) or phases.shape[1:] != (n, n):
+            expected = f"(n_states, 2, ny, nx) and (n_states, {n}, {n})"
+            raise ValueError(
+                f"frames and phases have shapes {counts.shape} and {phases.shape}: expected {expected}"
+            )
+        corners = _check.integer_array("corners", corners).reshape(2, 2)
+        shape = counts.shape[2:] if shape is None else shape
+
+        def on_camera(pairs: NDArray) -> NDArray:
+            whole = np.zeros((len(pairs), n_images, *shape))
+            for index, (row, column) in enumerate(corners):
+                place = slice(row, row + counts.shape[2]), slice(column, column + counts.shape[3])
+                whole[(slice(None), min(index, n_images - 1), *place)] = pairs[:, index]
+            return whole
+
+        value = {one.name: one.value for one in fit.estimates}
+        optics = Optics(value["diameter"], (value["first"], value["second"]), leakage=value["leakage"])
+        n_pixels, bad = fit.point.problem.camera.n_pixels, ~np.isfinite(counts).all(axis=0)
+        light = fit.light * (radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2)
+        pupil = Pupil.from_amplitude(np.sqrt(np.maximum(light, 0)), n_pixels, threshold=_FAINTEST)
+        background, flux = (np.array([value[f"arm {arm} {key}"] for arm in (0, 1)]) for key in _OF_ARMS)
+        made = cls(
+            pupil.amplitude, n_pixels, pupil.center, optics, shape, n_images,
+            places_of(fit, counts.shape[2:], corners), _dark(dark, (n_images, *shape)),
+            on_camera(bad[np.newaxis])[0] > 0, pupil.inside, background, flux * light[pupil.inside].mean(),
+            np.zeros((2, 2, n, n)), np.zeros((2, n, n)), False, np.ones(2), np.zeros((0, n, n), np.float32),
+            np.zeros(0), blur=value["blur"], n_averaged=n_averaged, commanded=True, **settings,
+        )  # fmt: skip
+        good = pupil.inside & ~made._work.touched(made._work.bad[np.newaxis])[0]
+
+        def intensity(pairs: NDArray) -> NDArray:
+            values = made._work.on_grid(on_camera(np.nan_to_num(pairs)) + made.dark, np.inf, good)[0]
+            return values.reshape(len(values), 2, n, n) / made.unit[:, np.newaxis, np.newaxis]
+
+        seen, ideal = training(fit, made.sensor)
+        weights, offset = learnt(intensity(seen), ideal, optics.leakage)
+        light = intensity(counts)[..., good].mean(axis=(0, 2))
+        made = replace(made, good=good, weights=weights, offset=offset, light=light)
+        images = on_camera(np.nan_to_num(counts)) + made.dark
+        found = made(images if n_images == 2 else images[:, 0], saturation=np.inf)
+        residual, slopes = float(np.sqrt(np.nanmean(found.residual**2))), slopes_of(found.filled, good)
+        return replace(made, unexplained=unexplained(found.phase, phases), slopes=slopes, residual=residual)
 
     def save(self, path: str | Path) -> None:
         """Write the calibration as NPZ, in one step; the same calibration gives the same bytes.
@@ -226,11 +294,8 @@ class Calibration(Immutable):
 
         Raises
         ------
-        FileNotFoundError
-        FileError
-            A ValueError: if the file is no calibration, broken, or of another format.
-        TypeError, ValueError
-            If the path is none.
+        FileNotFoundError, TypeError, ValueError
+            The last, a FileError, if the file is no calibration, broken, or of another format.
         """
         path = path_of("path", path)
         if not path.is_file():
@@ -241,18 +306,14 @@ class Calibration(Immutable):
             values: dict[str, Any] = json.loads(str(file["values"]))
             found = values.pop("format")
             if found == FORMAT:
-                arrays: dict[str, Any] = {name: file[name] for name in file.files if name != "values"}
-                optics = values.pop("optics")
-                optics["phase_shifts"] = tuple(optics["phase_shifts"])
-                pairs: dict[str, Any] = {name: tuple(values.pop(name)) for name in ("center", "shape")}
-                made = cls(**values, **arrays, **pairs, optics=Optics(**optics))
-                level = np.mean(made.background + made.unit * made.light)
-                made(np.squeeze(made.dark + level, 0) if made.n_images == 1 else made.dark + level)  # a trial
+                values |= {name: file[name] for name in file.files if name != "values"}
+                values |= {name: tuple(values[name]) for name in ("center", "shape")}
+                shifts = {"phase_shifts": tuple(values["optics"]["phase_shifts"])}
+                made = cls(**values | {"optics": Optics(**values["optics"] | shifts)})
+                trial = made.dark + np.mean(made.background + made.unit * made.light)
+                made(trial[0] if made.n_images == 1 else trial)
                 return made
-        raise FileError(
-            f"{path.name}: a calibration of format {found}: expected format {FORMAT}; make it again with this "
-            "version of zwfs"
-        )
+        raise FileError(f"{path.name}: a calibration of format {found}: expected format {FORMAT}; make it again")
 
     @cached_property
     def sha256(self) -> str:
@@ -265,14 +326,9 @@ class Calibration(Immutable):
         return self._work.reconstruct.sensor
 
     def __call__(
-        self,
-        counts: ArrayLike,
-        start: NDArray | None = None,
-        *,
-        saturation: float | None = None,
-        largest_residual: float = np.inf,
-        judge: bool = True,
-    ) -> Phases:
+        self, counts: ArrayLike, start: NDArray | None = None, *, saturation: float | None = None,
+        largest_residual: float = np.inf, judge: bool = True,
+    ) -> Phases:  # fmt: skip
         """Phases of camera images.
 
         Parameters
@@ -302,13 +358,18 @@ class Calibration(Immutable):
             raise ValueError(f"counts has shape {counts.shape}: expected at least one exposure")
         level = min(self.saturation if saturation is None else _limit("saturation", saturation), _check.LARGEST)
         largest_residual, judge = _limit("largest_residual", largest_residual), _check.flag("judge", judge)
-        counts = counts.reshape(-1, self.n_images, *self.shape)
-        starts = None if start is None else self._starts(start, batch)
+        counts, grid = counts.reshape(-1, self.n_images, *self.shape), self.good.shape
+        if start is not None:
+            maps = _check.real_array("start", start)
+            if maps.shape not in (grid, (*batch, *grid)):
+                raise ValueError(f"start has shape {maps.shape}: expected {grid} or {(*batch, *grid)}")
+            _check.moderate("start", maps)
+            start = np.broadcast_to(maps, (*batch, *grid)).reshape(-1, *grid)
         parts = []
         for first in range(0, len(counts), _PIECE):
             piece = slice(first, first + _PIECE)
-            some = None if starts is None else starts[piece]
-            parts.append(self._phases(counts[piece], some, level, largest_residual, judge))
+            begin = None if start is None else start[piece]
+            parts.append(self._phases(counts[piece], begin, level, largest_residual, judge))
         return Phases.joined(parts, batch)
 
     def modal_matrix(self, modes: ArrayLike) -> NDArray[np.float64]:
@@ -353,10 +414,10 @@ class Calibration(Immutable):
     def sigma(
         self, phases: Phases, photons: float, read_noise: float = 0.0, modes: ArrayLike | None = None
     ) -> NDArray[np.float32]:
-        """Standard error that photon noise and read noise cause: the Cramer-Rao bound at each phase.
+        """Standard error: the Cramer-Rao bound of noise at each phase, and the errors of the calibration's phases.
 
-        At 0.5 rad rms and 1.06 lambda/D the phase-shifted iteration is 6 % above it. Errors of the model are not
-        part of it. It takes longer than the phases, since the information of each frame is inverted.
+        At 0.5 rad rms and 1.06 lambda/D the phase-shifted iteration is 6 % above the bound. Errors that all states
+        of a calibration share are not part of it. It takes longer than the phases.
 
         Parameters
         ----------
@@ -377,23 +438,22 @@ class Calibration(Immutable):
         pupil, model = self.sensor.pupil, propagator(self.sensor, Kind.numpy())
         basis = None if modes is None else pupil.scatter(_check.modes("modes", modes, pupil), fill=0)
         estimator = Estimator(self._work.response, Noise.checked(photons, read_noise), False, basis)
-        maps = phases.filled.reshape(-1, 1, *pupil.shape).astype(np.float64)
-        lost = phases.flags.reshape(-1) & Flag.LOST > 0
-        result = np.full((len(maps), *(pupil.shape if basis is None else (len(basis),))), np.nan, np.float32)
-        for index in np.flatnonzero(~lost):
-            psi = split(maps[index], model.amplitude)
-            points, of_modes = estimator.variance(psi, model.propagate(psi))
-            result[index] = np.sqrt(points[0, 0] if of_modes is None else of_modes[0])
-        result = result.reshape((*phases.flags.shape, *result.shape[1:]))
-        return result if basis is not None else np.where(np.isfinite(phases.phase), result, np.float32(np.nan))
 
-    def _starts(self, start: ArrayLike, batch: tuple[int, ...]) -> NDArray:
-        """Checked phases at which the iterations start, one for each exposure."""
-        maps, shape = _check.real_array("start", start), self.good.shape
-        if maps.shape not in (shape, (*batch, *shape)):
-            raise ValueError(f"start has shape {maps.shape}: expected {shape} or {(*batch, *shape)}")
-        _check.moderate("start", maps)
-        return np.broadcast_to(maps, (*batch, *shape)).reshape(-1, *shape)
+        def variance(phase: NDArray) -> NDArray:
+            psi = split(phase[np.newaxis], model.amplitude)
+            points, of_modes = estimator.variance(psi, model.propagate(psi))
+            return points[0, 0] if of_modes is None else of_modes[0]
+
+        noise, errors = variance(np.zeros(pupil.shape)) / self.n_averaged, self.unexplained.astype(float)
+        if basis is not None:
+            errors = pupil.gather(errors) @ self.modal_matrix(basis)
+        more = Excess.of(errors, noise, self.slopes, self.good, basis is not None)
+        maps = phases.filled.reshape(-1, *pupil.shape).astype(np.float64)
+        result = np.full((len(maps), *noise.shape), np.nan, np.float32)
+        for index in np.flatnonzero(phases.flags.reshape(-1) & Flag.LOST == 0):
+            result[index] = np.sqrt(variance(maps[index]) + more.at(maps[index], self.good))
+        result = result.reshape((*phases.flags.shape, *noise.shape))
+        return result if basis is not None else np.where(np.isfinite(phases.phase), result, np.float32(np.nan))
 
     @cached_property
     def _content(self) -> bytes:
@@ -420,13 +480,15 @@ class Calibration(Immutable):
         with np.errstate(invalid="ignore", divide="ignore"):
             enough = (relative.min(axis=1) >= _DIM) & (n_good >= (1 - _MOST_BAD) * work.n_points)
             gain = (flux.mean(axis=1, keepdims=True) / flux if self.balance else np.ones_like(flux)) / self.unit
-        weights = (self.weights * np.where(enough[:, np.newaxis], gain, 0)[:, np.newaxis, :]).astype(np.float32)
-        frames = (weights @ values).reshape(k, *self.offset.shape)
+        values *= np.where(enough[:, np.newaxis], gain, 0).astype(np.float32)[..., np.newaxis]
+        values = values.reshape(k, *self.offset.shape)
+        frames = work.weights[:, 0] * values[:, :1]
+        frames += work.weights[:, 1] * values[:, 1:]
         frames += work.offset
         np.maximum(frames, 0, out=frames)
         if not enough.all():
             frames[~enough] = work.flat_frames  # of a flat wavefront: they converge at once
-        filled, n_iterations, converged, residual = self._solve(frames, good, start, judge)
+        filled, n_iterations, converged, residual = work.solve(frames, good, start, judge)
         flags = _BAD * (n_bad > 0) + _SATURATED * (n_saturated > 0)
         faults = flags + _INCONSISTENT * (residual > limit) + _NOT_CONVERGED * (~converged & (self.tolerance > 0))
         flags = np.where(enough, faults, _LOST + flags)
@@ -435,156 +497,26 @@ class Calibration(Immutable):
         light = relative.mean(axis=1).astype(np.float32)
         return Phases(phase, filled, light, n_bad, n_saturated, residual, n_iterations, flags)
 
-    def _solve(
-        self, frames: NDArray, good: NDArray, start: NDArray | None, judge: bool
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Phases with bad points filled, iterations, whether they converged, and residuals of ideal frames.
-
-        Bad points take no part: in a second iteration their intensity is that of the model. The frames, shape
-        (k, 2, ny, nx), are changed.
-        """
-        reconstruct, inside = self._work.reconstruct, self.sensor.pupil.inside
-        found = reconstruct(frames, start)
-        phase, n_iterations, converged = found.phase, found.n_iterations, found.converged
-        phase[:, ~inside] = 0
-        holes = inside & ~good
-        some = np.flatnonzero(holes.any(axis=(1, 2)))
-        if some.size:
-            phase[some] = self._work.filled(phase[some], good[some])
-            modelled = self.sensor.measure(phase[some])
-            frames[some] = np.where(holes[some, np.newaxis], modelled, frames[some])
-            found = reconstruct(frames[some], phase[some])
-            again = np.where(inside, found.phase, 0)
-            phase[some] = self._work.filled(again, good[some])
-            n_iterations[some] += found.n_iterations
-            converged[some] = found.converged
-        if judge:
-            residual = reconstruct.settings.residual(phase, frames)
-        else:
-            residual = np.full(len(phase), np.nan, np.float32)
-        return phase, n_iterations, converged, residual
-
-
-def calibrate(
-    frame_files: Sequence[str | Path],
-    pupil_files: Sequence[str | Path],
-    dark_files: Sequence[str | Path] = (),
-    bad_pixel_files: Sequence[str | Path] = (),
-    *,
-    diameter: float = 0.0,
-    phase_shifts: Sequence[float] = (),
-    saturation: float | None = None,
-    fitted: Sequence[str] = (),
-    n_iterations: int = 25,
-    tolerance: float = 1e-3,
-    **settings: Any,
-) -> Calibration:
-    """Calibration from camera files: frames as those to come, and clear frames.
-
-    Parameters
-    ----------
-    frame_files, pupil_files, dark_files, bad_pixel_files : sequence of str or Path
-        See `zwfs.frames.files.read_all`.
-    diameter : float, lambda/D
-        Of the dimple; 0 stands for DIMPLE of the header.
-    phase_shifts : sequence of two floats, radian
-        Of the two frames; those of the header, THETA1 and THETA2, if empty.
-    saturation : float, counts, optional
-        Of the camera, see `zwfs.frames.files.images`. Without it the frames to come are compared with SATURATE of
-        the header, or with the largest number of their type.
-    fitted : sequence of str
-        Parameters that `zwfs.frames.refine.fit` fits to these frames.
-    n_iterations : int
-    tolerance : float, radian
-    **settings
-        Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel.
-
-    Returns
-    -------
-    Calibration
-
-    Raises
-    ------
-    FileNotFoundError
-    ImportError
-        If astropy is needed and missing.
-    TypeError, ValueError
-        If a file or a value is not as expected.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.files import write_bench
-    >>> from zwfs.frames.calibration import calibrate
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)
-    ...     calibration = calibrate([files["frame"]], [files["pupils"]], [files["dark"]])
-    ...
-    >>> calibration.optics.diameter, round(calibration.diameter)
-    (1.06, 40)
-    """
-    _check_settings(n_iterations, tolerance, np.inf if saturation is None else saturation)
-    frames, clear_frames, sources = read_all(frame_files, pupil_files, dark_files, bad_pixel_files, saturation)
-    header = sources[0].header
-    first = len(frame_files) + len(pupil_files)
-    darks = [image for source in sources[first : first + len(dark_files)] for image in source.images]
-    try:
-        optics = sources[0].optics(diameter, phase_shifts)
-        _check_fit("fitted", fitted, optics)
-        registered, optics = fit(register_frames(frames, clear_frames, **settings), optics, fitted)
-        level = sources[0].keyword("SATURATE") if saturation is None and "SATURATE" in header else saturation
-        return Calibration.of(
-            reduce_frames(registered, optics),
-            np.stack(darks) if darks else None,
-            saturation=np.inf if level is None else level,
-            bunit=str(header.get("BUNIT", "")),
-            n_iterations=n_iterations,
-            tolerance=tolerance,
-        )
-    except ValueError as error:  # any of the files can be the cause
-        raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
-
 
 def _is_calibration(path: Path) -> bool:
     """Whether a file is an NPZ file with the values of a calibration."""
     try:
         with zipfile.ZipFile(path) as file:
-            return "values.npy" in file.namelist() and "places.npy" in file.namelist()
+            return {"values.npy", "places.npy"} <= set(file.namelist())
     except Exception:  # zipfile raises many kinds on damaged bytes
         return False
 
 
 def _limit(name: str, value: Any, *, open_low: bool = False) -> float:
     """Return a number of at least 0, or infinity."""
-    if isinstance(value, float) and value == np.inf:
-        return value
-    return _check.number(name, value, 0, open_low=open_low)
+    return (
+        value if isinstance(value, float) and value == np.inf else _check.number(name, value, 0, open_low=open_low)
+    )
 
 
-def _check_settings(n_iterations: Any, tolerance: Any, saturation: Any) -> None:
-    """Check the numbers that a calibration keeps."""
-    _check.integer("n_iterations", n_iterations, 1)
-    _check.number("tolerance", tolerance, 0, 2 * np.pi)
-    _limit("saturation", saturation, open_low=True)
-
-
-def _dark(dark: ArrayLike | None, shape: tuple[int, int, int]) -> NDArray[np.float32]:
+def _dark(dark: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Checked counts without light, one map for each camera image."""
-    if dark is None:
-        return np.zeros(shape, np.float32)
-    maps = _check.real_array("dark", dark)
+    maps = np.zeros(shape) if dark is None else _check.real_array("dark", dark)
     if maps.shape not in (shape[1:], (1, *shape[1:]), shape):
         raise ValueError(f"dark has shape {maps.shape}: expected {shape}")
     return np.broadcast_to(np.nan_to_num(maps, posinf=0, neginf=0).astype(np.float32), shape)
-
-
-def _undoing(measurement: Measurement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weights (2, 2) and offset (2, ny', nx') that turn intensities into frames of an ideal sensor."""
-
-    def undone(*light: float) -> NDArray[np.float64]:
-        intensity = np.ones_like(measurement.intensity) * np.reshape(light, (2, 1, 1))
-        return ideal_frames(replace(measurement, intensity=intensity))
-
-    offset = undone(0, 0)
-    return np.stack([(undone(*light) - offset)[:, 0, 0] for light in ((1, 0), (0, 1))], axis=1), offset

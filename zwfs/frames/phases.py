@@ -56,9 +56,8 @@ class Phases:
         Pixels of both images that are bad here and good in the calibration, and those of them that are saturated.
     residual : ndarray of float32, shape (...)
         Rms difference of measured and modelled frames in the pupil; 1 = mean of a clear frame.
-    n_iterations : ndarray of int, shape (...)
-    flags : ndarray of int, shape (...)
-        Sum of `Flag`; 0 is a good frame.
+    n_iterations, flags : ndarray of int, shape (...)
+        Iterations, and the sum of `Flag`; 0 is a good frame.
     """
 
     phase: NDArray[np.float32]

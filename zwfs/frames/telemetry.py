@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import zlib
 from collections import deque
@@ -12,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +23,7 @@ from zwfs import _check
 from zwfs._system import one_thread, path_of, paths_of
 from zwfs.frames._blocks import FileError
 from zwfs.frames._fits import card_value, fits_module
-from zwfs.frames._part import Cards, Part, Unit, plan_of
+from zwfs.frames._part import Cards, Part, Unit
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
 from zwfs.frames.files import check_output
@@ -33,21 +35,20 @@ _LONGEST = 256  # exposures of them
 _SAMPLE = 2**20  # frames from which the limit of the residual is computed, at most
 _FEWEST = 10  # frames from which on that is possible
 _SIGMAS, _MARGIN = 5.0, 0.2  # excess of an inconsistent residual: deviations, and relative to the median
+_MOST = 5.0  # times the residual of the calibration and of the noise: a larger one is inconsistent in any case
 # Cards of the input that describe its own data.
 _OWN = ("SIMPLE", "XTENSION", "BITPIX", "NAXIS", "EXTEND", "EXTNAME", "PCOUNT", "GCOUNT", "BSCALE", "BZERO",
         "BLANK", "BUNIT", "CHECKSUM", "DATASUM", "COMMENT", "HISTORY", "CONTINUE", "END", "")  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Summary:
+class Summary(NamedTuple):
     """Result of `reconstruct`.
 
     Attributes
     ----------
     output : Path
-    n_frames : int
-    n_flagged : int
-        Frames with a flag.
+    n_frames, n_flagged : int
+        All frames, and those with a flag.
     counts : dict
         Number of frames with each flag, by its name.
     largest_residual : float
@@ -65,30 +66,19 @@ class Summary:
 
 
 def reconstruct(
-    frames: str | Path | Sequence[str | Path],
-    calibration: Calibration | str | Path,
-    output: str | Path,
-    *,
-    second_frames: str | Path | Sequence[str | Path] = (),
-    modes: int | ArrayLike | None = None,
-    phases: bool | None = None,
-    photons: float | None = None,
-    read_noise: float = 0.0,
-    keywords: Sequence[str] = (),
-    saturation: float | None = None,
-    largest_residual: float | None = None,
-    n_workers: int | None = None,
-    restart: bool = False,
-    overwrite: bool = False,
-    progress: Callable[[int, int], Any] | None = None,
-) -> Summary:
+    frames: str | Path | Sequence[str | Path], calibration: Calibration | str | Path, output: str | Path, *,
+    second_frames: str | Path | Sequence[str | Path] = (), modes: int | ArrayLike | None = None,
+    phases: bool | None = None, photons: float | None = None, read_noise: float = 0.0,
+    wavelength: float | None = None, keywords: Sequence[str] = (), saturation: float | None = None,
+    largest_residual: float | None = None, n_workers: int | None = None, restart: bool = False,
+    overwrite: bool = False, progress: Callable[[int, int], Any] | None = None,
+) -> Summary:  # fmt: skip
     """Reconstruct all frames of camera files, and write phases or coefficients with a table as FITS.
 
-    The files may be larger than the memory: they are read in chunks, and the output is written in chunks. The
-    output appears when it is complete. An interrupted run keeps the folder `.NAME.part` next to it. The same call
-    goes on from there, and the file has the same bytes as that of an undisturbed run. If data of that folder are
-    damaged, a warning names it and they are computed again. No frame is left out: frames that cannot be
-    reconstructed are NaN, and flagged in the table.
+    The files may be larger than the memory. The output appears when it is complete. An interrupted run keeps the
+    folder `.NAME.part` next to it. The same call goes on from there, and the file has the same bytes as that of an
+    undisturbed run. Damaged data of that folder are named by a warning, and computed again. No frame is left out:
+    frames that cannot be reconstructed are NaN, and flagged in the table.
 
     Parameters
     ----------
@@ -108,14 +98,16 @@ def reconstruct(
         Photons that an intensity of 1 puts into a pixel: adds the standard error of all phases or coefficients,
         see `Calibration.sigma`. It takes several times as long as the phases.
     read_noise : float, electrons rms / pixel
+    wavelength : float, nm, optional
+        For the header, which then holds the nm of a radian; by default WAVELEN of the first file.
     keywords : sequence of str
         Keywords of the headers that become columns of the table; each file must have them.
     saturation : float, counts, optional
         By default that of the calibration, SATURATE of the first header, or the largest number of an integer type.
     largest_residual : float, optional
-        Residual above which a frame is inconsistent. By default it follows from the frames, if there are 10 or
-        more: median + 5 standard deviations, and at least 1.2 times the median. The deviation is 1.48 times the
-        median absolute deviation.
+        Residual above which a frame is inconsistent. By default it follows from 10 frames or more: median + 5
+        standard deviations (1.48 times the median absolute deviation), and at least 1.2 times the median. With
+        photons it is at most 5 times the residual of the calibration and of the noise, for any number of frames.
     n_workers : int, optional
         Threads; by default one for each core.
     restart : bool
@@ -131,22 +123,19 @@ def reconstruct(
 
     Raises
     ------
-    FileNotFoundError
-    ImportError
-        If astropy is missing.
+    FileNotFoundError, ImportError
+        If a file or astropy is missing.
     FileError
         A ValueError: if a file is broken, truncated, of another shape, unit or type, or lacks a keyword.
     ValueError
-        If `check_output` refuses the output, or something that
-        zwfs did not make has the name of the folder.
+        If `check_output` refuses the output, or something that zwfs did not make has the name of the folder.
     OSError
         If there is no space for the output.
 
     Examples
     --------
     >>> import tempfile
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.bench.files import write_bench
+    >>> from zwfs.bench import Bench, write_bench
     >>> from zwfs.frames import calibrate, reconstruct
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)
@@ -158,7 +147,8 @@ def reconstruct(
     """
     fits_module()
     files, second_files = (
-        _paths(name, one) for name, one in (("frames", frames), ("second_frames", second_frames))
+        [path_of(name, one)] if isinstance(one, str | os.PathLike) else paths_of(name, one)
+        for name, one in (("frames", frames), ("second_frames", second_frames))
     )
     if not files:
         raise ValueError("frames is empty: expected a file")
@@ -167,23 +157,24 @@ def reconstruct(
         inputs.append(path_of("calibration", calibration))
         calibration = Calibration.load(calibration)
     path = check_output(output, inputs, overwrite=overwrite)
-    n_workers = _cores() if n_workers is None else _check.integer("n_workers", n_workers, 1, 256)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    n_workers = cores if n_workers is None else _check.integer("n_workers", n_workers, 1, 256)
     stack = Stack(files, second_files, calibration.n_images, calibration.shape)
-    job = _Job.checked(stack, calibration, modes, phases, photons, read_noise, keywords, saturation)
+    job = _Job.checked(stack, calibration, modes, phases, photons, read_noise, wavelength, keywords, saturation)
     if largest_residual is not None:
         largest_residual = _check.number("largest_residual", largest_residual, 0)
-    part = Part(path, job.units, job.pieces, job.plan(largest_residual), _check.flag("restart", restart))
+    pieces = _spans(stack.n, job.chunk)
+    part = Part(path, job.units, pieces, job.plan(largest_residual), _check.flag("restart", restart))
     try:
-        n_resumed = sum(stop - first for first, stop in part.done)
-        done = n_resumed
-        if progress is not None:
-            progress(done, stack.n)
-        part.write(job.units[-1], 0, job.files())
+        n_resumed = done = sum(stop - first for first, stop in part.done)
+        report = progress or (lambda *_: None)
+        report(done, stack.n)
+        names = [(card_value(one.name), one.n) for one in stack.segments]
+        part.write(job.units[-1], 0, np.array(names, job.units[-1].dtype))
         for first, stop, checksum in job.run(part, n_workers):
             part.note(first, stop, checksum)
             done += stop - first
-            if progress is not None:
-                progress(done, stack.n)
+            report(done, stack.n)
         summary = job.judge(part, path, largest_residual, n_resumed)
         check_output(path, inputs, overwrite=overwrite)  # again: the run may have taken hours
         part.finish()
@@ -208,18 +199,15 @@ class _Job:
 
     @classmethod
     def checked(
-        cls,
-        stack: Stack,
-        calibration: Calibration,
-        modes: Any,
-        phases: Any,
-        photons: Any,
-        read_noise: Any,
-        keywords: Any,
-        saturation: Any,
-    ) -> _Job:
+        cls, stack: Stack, calibration: Calibration, modes: Any, phases: Any, photons: Any, read_noise: Any,
+        wavelength: Any, keywords: Any, saturation: Any,
+    ) -> _Job:  # fmt: skip
+        """Check arguments of `reconstruct`."""
         pupil = calibration.sensor.pupil
-        _same_unit(stack, calibration)
+        for segment in stack.segments:
+            unit, own = str(segment.header.get("BUNIT", "")).strip(), calibration.bunit.strip()
+            if own and unit and unit.lower() != own.lower():
+                raise FileError(f"{segment.name}: BUNIT = {unit!r}: expected {own!r}, that of the calibration")
         if modes is not None:
             modes = zernike_basis(pupil, modes) if isinstance(modes, int) else modes
             modes = pupil.scatter(_check.modes("modes", modes, pupil), fill=0)
@@ -232,54 +220,43 @@ class _Job:
             photons = _check.number("photons", photons, 1e-6, 1e12)
         elif read_noise:
             raise ValueError(f"read_noise = {read_noise:g}: expected a number of photons with it")
-        level = _saturation(stack, calibration) if saturation is None else saturation
+        if wavelength is None and isinstance(stack.header.get("WAVELEN"), int | float):
+            wavelength = stack.header["WAVELEN"]
+        if wavelength is not None:
+            wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
+        level = calibration.saturation if saturation is None else saturation
         if level != np.inf:
             level = _check.number("saturation", level, 0, open_low=True)
+        elif saturation is None:
+            level = stack.saturation
         columns = _columns(stack, keywords)
         rows = _row_type(columns, None if modes is None else len(modes), phases, photons is not None)
-        of_files = np.dtype(
-            [("NAME", f"S{max(len(card_value(one.name)) for one in stack.segments)}"), ("FRAMES", ">i8")]
-        )
-        float32, n, shape = np.dtype(">f4"), stack.n, pupil.shape
-        cards = _cards(stack, calibration, photons, read_noise, level)
-        radian = ("BUNIT", "rad", "")
-        units = [
-            Unit("", float32, shape, n, [("BUNIT", "rad", "in (-pi, pi]; NaN outside, bad and lost"), *cards], {})
-            if phases
-            else Unit("", np.dtype("u1"), (), 0, cards, {})
-        ]
-        if phases and photons is not None:
-            units.append(Unit("SIGMA", float32, shape, n, [radian], {}))
-        in_radian = dict.fromkeys(("COEFFS", "SIGCOEFF", "SIGMA"), "rad")
-        units.append(Unit("FRAMES", rows, (), n, [], in_radian))
+        names = max(len(card_value(one.name)) for one in stack.segments)
+        of_files, float32 = np.dtype([("NAME", f"S{names}"), ("FRAMES", ">i8")]), np.dtype(">f4")
+        cards = _cards(stack, calibration, photons, read_noise, wavelength, level)
+        units = [Unit("", np.dtype("u1"), (), 0, cards, {})]
+        if phases:
+            cards = [("BUNIT", "rad", "in (-pi, pi]; NaN outside, bad and lost"), *cards]
+            units = [Unit("", float32, pupil.shape, stack.n, cards, {})]
+            units += [Unit("SIGMA", float32, pupil.shape, stack.n, [("BUNIT", "rad", "")], {})] * (
+                photons is not None
+            )
+        units.append(Unit("FRAMES", rows, (), stack.n, [], dict.fromkeys(("COEFFS", "SIGCOEFF", "SIGMA"), "rad")))
         units.append(Unit("FILES", of_files, (), len(stack.segments), [], {}))
         return cls(stack, calibration, modes, matrix, photons, read_noise, columns, level, units)
 
     def plan(self, largest_residual: float | None) -> str:
         """All that decides the bytes of the output."""
-        from zwfs import __version__
-
         settings = [self.photons, self.read_noise, self.saturation, largest_residual, self.chunk]
         modes = None if self.modes is None else zlib.crc32(np.ascontiguousarray(self.modes).tobytes())
         headers = [unit.header().hex() for unit in self.units]
-        return plan_of(
-            version=__version__, files=self.stack.state(), calibration=self.calibration.sha256, settings=settings,
-            modes=modes, headers=headers,
-        )  # fmt: skip
+        state = self.stack.state(), self.calibration.sha256, settings, modes, headers
+        return json.dumps(state, default=str)
 
     @property
     def chunk(self) -> int:
         """Exposures that a thread handles at once."""
         return max(1, min(_LONGEST, _CHUNK // self.stack.bytes_per_exposure))
-
-    @property
-    def pieces(self) -> list[tuple[int, int]]:
-        """First exposure of each chunk, and the first one after it."""
-        return [(first, min(first + self.chunk, self.stack.n)) for first in range(0, self.stack.n, self.chunk)]
-
-    def files(self) -> NDArray:
-        """Rows of the list of files."""
-        return np.array([(card_value(one.name), one.n) for one in self.stack.segments], self.units[-1].dtype)
 
     def run(self, part: Part, n_workers: int) -> Iterator[tuple[int, int, int]]:
         """Reconstruct all chunks that are not yet done: first frame, first one after it, and checksum of each."""
@@ -301,9 +278,13 @@ class _Job:
         """Flag inconsistent frames, count all flags, and put both into the header."""
         table, n = self.units[-2], self.stack.n
         size, step = max(1, _CHUNK // table.row), -(-n // _SAMPLE)
-        blocks = [(first, min(first + size, n)) for first in range(0, n, size)]
+        blocks = _spans(n, size)
         if limit is None:
             limit = _limit(np.concatenate([part.read(table, *block)["RESIDUAL"][::step] for block in blocks]))
+            if self.photons is not None:
+                light = float(self.calibration.light.mean())
+                noise = math.sqrt(light / self.photons + (self.read_noise / self.photons) ** 2)
+                limit = min(limit, _MOST * math.hypot(self.calibration.residual, noise))
         counts, n_flagged = {str(flag.name): 0 for flag in Flag}, 0
         for first, stop in blocks:
             rows = part.read(table, first, stop)
@@ -313,7 +294,9 @@ class _Job:
             n_flagged += int(np.count_nonzero(rows["FLAGS"]))
             for flag in Flag:
                 counts[str(flag.name)] += int(np.count_nonzero(rows["FLAGS"] & flag))
-        self.units[0].cards = _with_counts(self.units[0].cards, counts, n_flagged, limit)
+        values: dict[str, Any] = {key: counts[name] for name, (key, _) in _COUNTS.items()}
+        values |= {"NFLAGGED": n_flagged, "RESLIMIT": limit}
+        self.units[0].cards = [(key, values.get(key, one), text) for key, one, text in self.units[0].cards]
         return Summary(output, n, n_flagged, counts, limit, n_resumed)
 
     def _reconstruct(self, part: Part, first: int, stop: int) -> tuple[int, int, int]:
@@ -343,48 +326,21 @@ class _Job:
             at += end - start
         rows["FLAGS"], rows["FLUX"], rows["RESIDUAL"] = found.flags, found.flux, found.residual
         rows["NBAD"], rows["NSATUR"], rows["NITER"] = found.n_bad, found.n_saturated, found.n_iterations
+        lost = found.flags & Flag.LOST > 0
         if sigma is not None:
-            lost = found.flags & Flag.LOST > 0
             rows["SIGMA"][lost] = np.nan
             rows["SIGMA"][~lost] = np.sqrt(np.nanmean(sigma[~lost] ** 2, axis=(1, 2)))
         if self.matrix is not None:
-            lost = found.flags & Flag.LOST > 0
-            rows["COEFFS"] = np.where(
-                lost[:, np.newaxis], np.nan, self.calibration.coefficients(found, self.matrix)
-            )
+            rows["COEFFS"] = self.calibration.coefficients(found, self.matrix)
+            rows["COEFFS"][lost] = np.nan
             if self.photons is not None:
                 rows["SIGCOEFF"] = self.calibration.sigma(found, self.photons, self.read_noise, self.modes)
         return rows
 
 
-def _paths(name: str, value: Any) -> list[Path]:
-    return [path_of(name, value)] if isinstance(value, str | os.PathLike) else paths_of(name, value)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _same_unit(stack: Stack, calibration: Calibration) -> None:
-    """Refuse frames of another unit than those of the calibration."""
-    for segment in stack.segments:
-        unit = str(segment.header.get("BUNIT", "")).strip()
-        if calibration.bunit.strip() and unit and unit.lower() != calibration.bunit.strip().lower():
-            raise FileError(
-                f"{segment.name}: BUNIT = {unit!r}: expected {calibration.bunit!r}, that of the calibration"
-            )
-
-
-def _saturation(stack: Stack, calibration: Calibration) -> float:
-    """Level at which pixels are saturated."""
-    if calibration.saturation != np.inf:
-        return calibration.saturation
-    if "SATURATE" in stack.header:
-        name, level = "SATURATE", stack.header["SATURATE"]
-    else:
-        name, level = "largest number of its type", stack.segments[0].blocks[0].full_scale
-    name = f"{stack.segments[0].name}: {name}"
-    return level if level == np.inf else _check.number(name, level, 0, open_low=True)
+def _spans(n: int, size: int) -> list[tuple[int, int]]:
+    """First row of each piece of n rows, and the first one after it."""
+    return [(first, min(first + size, n)) for first in range(0, n, size)]
 
 
 def _columns(stack: Stack, keywords: Any) -> dict[str, NDArray]:
@@ -408,53 +364,14 @@ def _row_type(keywords: dict[str, NDArray], n_modes: int | None, phases: bool, e
     """Type of the rows of the table."""
     columns: list[tuple] = [("FRAME", ">i8"), ("FILE", ">i4"), ("INDEX", ">i8"), ("FLAGS", ">i2"), ("FLUX", ">f4"),
                ("RESIDUAL", ">f4"), ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4")]  # fmt: skip
-    if errors and phases:
-        columns.append(("SIGMA", ">f4"))
-    if errors and n_modes is not None:
-        columns.append(("SIGCOEFF", ">f4", (n_modes,)))
+    columns += [("SIGMA", ">f4")] * (errors and phases)
     if n_modes is not None:
-        columns.append(("COEFFS", ">f4", (n_modes,)))
-    for name, values in keywords.items():
-        columns.append((name, values.dtype.newbyteorder(">")))
+        columns += [("SIGCOEFF", ">f4", (n_modes,))] * errors + [("COEFFS", ">f4", (n_modes,))]
+    columns += [(name, values.dtype.newbyteorder(">")) for name, values in keywords.items()]
     repeated = {name for name, *_ in columns if [one[0] for one in columns].count(name) > 1}
     if repeated:
         raise ValueError(f"keywords: {sorted(repeated)} are columns already: expected others")
     return np.dtype(columns)
-
-
-def _cards(
-    stack: Stack, calibration: Calibration, photons: float | None, read_noise: float, level: float
-) -> Cards:
-    """Cards of the first header: numbers of the run, then those of the first file."""
-    from zwfs import __version__
-
-    optics = calibration.optics
-    cards: list[tuple[str, Any, str]] = [
-        ("CREATOR", f"zwfs {__version__}", ""),
-        ("NFRAMES", stack.n, "frames, all of them in the table"),
-        ("NFILES", len(stack.segments), ""),
-        *((key, 0, comment) for key, comment in _COUNTS.values()),
-        ("NFLAGGED", 0, "frames with any flag"),
-        ("RESLIMIT", 0.0, "residual above which a frame is inconsistent"),
-        ("RESCALIB", calibration.residual, "residual of the frames of the calibration"),
-        ("CALIBSHA", calibration.sha256, ""),
-        ("PUPDIAM", calibration.diameter, "[pixel] diameter D of the pupil"),
-        ("CENTROW", calibration.center[0], "[pixel] centre of the pupil, from 0"),
-        ("CENTCOL", calibration.center[1], "[pixel] centre of the pupil, from 0"),
-        ("DIMPLE", optics.diameter, "[lambda/D] diameter of the dimple"),
-        *((f"THETA{i}", value, f"[rad] phase shift, image {i}") for i, value in enumerate(optics.phase_shifts, 1)),
-        ("SATURATE", level, "[count] pixels that reach it are saturated"),
-        ("MAXITER", calibration.n_iterations, "largest number of iterations"),
-        ("TOLERANC", calibration.tolerance, "[rad] change that ends the iteration"),
-    ]
-    if photons is not None:
-        cards += [("PHOTONS", photons, "per pixel at an intensity of 1"), ("RDNOISE", read_noise, "[e-] rms")]
-    known = {key for key, *_ in cards}
-    for key, value in stack.header.items():
-        plain = isinstance(value, str | bool | int | float)
-        if plain and key not in known and not any(key == own or key.startswith("NAXIS") for own in _OWN):
-            cards.append((key, value, "of the first file" if len(str(value)) < 40 else ""))
-    return cards
 
 
 _COUNTS = {
@@ -466,11 +383,45 @@ _COUNTS = {
 }
 
 
-def _with_counts(cards: Cards, counts: dict[str, int], n_flagged: int, limit: float) -> Cards:
-    """Cards with the numbers that are known at the end."""
-    values: dict[str, Any] = {key: counts[name] for name, (key, _) in _COUNTS.items()}
-    values |= {"NFLAGGED": n_flagged, "RESLIMIT": limit}
-    return [(key, values.get(key, value), comment) for key, value, comment in cards]
+def _cards(
+    stack: Stack, calibration: Calibration, photons: float | None, read_noise: float, wavelength: float | None,
+    level: float,
+) -> Cards:  # fmt: skip
+    """Cards of the first header: numbers of the run, then those of the first file."""
+    from zwfs import __version__
+
+    optics, (row, column) = calibration.optics, calibration.places[0, :, 0, 0]
+    cards: list[tuple[str, Any, str]] = [
+        ("CREATOR", f"zwfs {__version__}", ""),
+        ("NFRAMES", stack.n, "frames, all of them in the table"),
+        ("NFILES", len(stack.segments), ""),
+        *((key, 0, comment) for key, comment in _COUNTS.values()),
+        ("NFLAGGED", 0, "frames with any flag"),
+        ("RESLIMIT", 0.0, "residual above which a frame is inconsistent"),
+        ("RESCALIB", calibration.residual, "residual of the frames of the calibration"),
+        ("CALIBSHA", calibration.sha256, ""),
+        ("MAPFRAME", "commands" if calibration.commanded else "first image", "frame of reference of the maps"),
+        ("CROPROW", float(row), "[pixel] row of a map's first point, from 0"),
+        ("CROPCOL", float(column), "[pixel] its column, on the first image"),
+        ("PUPDIAM", calibration.diameter, "[pixel] diameter D of the pupil"),
+        ("CENTROW", calibration.center[0], "[pixel] centre of the pupil, from 0"),
+        ("CENTCOL", calibration.center[1], "[pixel] centre of the pupil, from 0"),
+        ("DIMPLE", optics.diameter, "[lambda/D] diameter of the dimple"),
+        *((f"THETA{i}", value, f"[rad] phase shift, image {i}") for i, value in enumerate(optics.phase_shifts, 1)),
+        ("SATURATE", level, "[count] pixels that reach it are saturated"),
+        ("MAXITER", calibration.n_iterations, "largest number of iterations"),
+        ("TOLERANC", calibration.tolerance, "[rad] change that ends the iteration"),
+    ]
+    if wavelength is not None:
+        cards += [("WAVELEN", wavelength, "[nm]"), ("NMPERRAD", wavelength / (2 * math.pi), "[nm] of a radian")]
+    if photons is not None:
+        cards += [("PHOTONS", photons, "per pixel at an intensity of 1"), ("RDNOISE", read_noise, "[e-] rms")]
+    known = {key for key, *_ in cards}
+    for key, value in stack.header.items():
+        plain = isinstance(value, str | bool | int | float)
+        if plain and key not in known and not any(key == own or key.startswith("NAXIS") for own in _OWN):
+            cards.append((key, value, "of the first file" if len(str(value)) < 40 else ""))
+    return cards
 
 
 def _limit(residuals: NDArray) -> float:

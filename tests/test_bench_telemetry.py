@@ -1,0 +1,194 @@
+"""Telemetry of a bench that was calibrated with known commands, on frames that HCIPy simulates."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from zwfs import zernike_basis
+from zwfs.frames import Calibration, calibrate, fit_bench, pipeline, reconstruct, registration
+from zwfs.frames.__main__ import main
+from zwfs.frames._calibrate import _read_states, _windows
+
+from .hcipy_bench import HcipyBench
+
+pytest.importorskip("hcipy")
+OPTICS = {"diameter": 1.08, "shifts": (1.52, -1.60), "leakage": 0.02, "blur": 0.5, "fluxes": (1.0, 0.95)}
+TURNED = {"rotations": (0.0, 1.0), "magnifications": (1.0, 1.01), "offsets": ((0.3, -0.1), (-0.2, 0.3))}
+MAPS = {"amplitude_error": 0.05, "static": 0.1}
+
+
+class Recorded:
+    """Frames of a bench with bad pixels: of commands, without the mask, and of unseen screens."""
+
+    def __init__(self, n_unseen, n_commands, rms, **bench):
+        self.bench = HcipyBench(**OPTICS, **TURNED, **MAPS, **bench)
+        frames, clear, self.phases = self.bench.recording(n_commands)
+        self.bad = np.random.default_rng(5).random(clear.shape) < 0.002
+        self.frames, self.clear = (np.where(self.bad, np.nan, one) for one in (frames, clear))
+        screens = [self.bench.smooth(rms, 1000 + index) for index in range(n_unseen)]
+        self.unseen = np.stack([self.bench.counts(one, (7, index)) for index, one in enumerate(screens)])
+        self.truth = np.stack([self.bench.on_pupil(one + self.bench.flat) for one in screens])
+
+    def calibration(self, **settings):
+        bench = self.bench
+        fit = fit_bench(self.frames, self.clear, self.phases, n_pixels=bench.pixels, noise=bench.noise, **settings)
+        return Calibration.from_bench(fit, self.frames, self.phases)
+
+    def quick(self):
+        """The calibration from the flat alone, and the place of its grid on that of the truth."""
+
+        def image(counts, bad):
+            return registration.Image(registration.nearest_good(counts, ~bad), bad)
+
+        pairs = [list(map(image, pair, self.bad)) for pair in (self.frames[0], self.clear)]
+        measured = pipeline.reduce_frames(registration.register_frames(*pairs), pipeline.Optics())
+        found = Calibration.of(measured)
+        margin = (self.bench.side - self.bench.pixels) // 2
+        return found, np.rint(found.places[0, :, 0, 0]).astype(int) - margin
+
+    def errors(self, phase, corner=(0, 0)):
+        """Phases less the truth, NaN where they are, on the grid of the truth."""
+        n, wide = self.truth.shape[-1], 8
+        whole = np.full((len(phase), n + 2 * wide, n + 2 * wide), np.nan)
+        row, column = wide + corner[0], wide + corner[1]
+        whole[:, row : row + phase.shape[1], column : column + phase.shape[2]] = phase
+        left = np.exp(1j * (whole[:, wide:-wide, wide:-wide] - self.truth))
+        return np.angle(left / np.nanmean(left, axis=(1, 2), keepdims=True))
+
+
+def rms(errors, where):
+    errors = errors[:, where]
+    return np.sqrt(np.nanmean((errors - np.nanmean(errors, axis=1, keepdims=True)) ** 2))
+
+
+@pytest.fixture(scope="module")
+def taken():
+    return Recorded(12, 4, 0.4, pixels=24, side=32)
+
+
+@pytest.fixture(scope="module")
+def calibration(taken):
+    return taken.calibration(n_steps=4)
+
+
+def test_phases_are_better_than_those_of_the_quick_calibration(taken, calibration):
+    found = calibration(np.where(taken.bad, np.nan, taken.unseen))
+    assert not found.flags.any()
+    quick, corner = taken.quick()
+    before = taken.errors(quick(taken.unseen).phase, corner)
+    after, lit = taken.errors(found.phase), taken.bench.fully_lit
+    assert rms(after, lit) < 0.5 * rms(before, lit)
+    assert rms(after, lit) < 0.03
+
+
+def test_error_bars_hold_for_points_and_modes(taken, calibration):
+    found = calibration(np.where(taken.bad, np.nan, taken.unseen))
+    errors, lit = taken.errors(found.phase), taken.bench.fully_lit
+    photons, noise = calibration.unit.mean(), taken.bench.noise
+    inner = ndimage.binary_erosion(lit, iterations=2)
+    assert 0.8 < rms(errors / calibration.sigma(found, photons, noise), inner) < 1.3
+    modes = zernike_basis(calibration.sensor.pupil, 20)
+    left = calibration.sensor.pupil.gather(np.where(lit, np.nan_to_num(errors), 0)) @ calibration.modal_matrix(
+        modes
+    )
+    assert 0.6 < np.sqrt(np.mean((left / calibration.sigma(found, photons, noise, modes)) ** 2)) < 1.6
+
+
+def test_command_calibrates_with_known_commands(tmp_path, monkeypatch, taken, calibration):
+    """Both pupils on one image, two exposures of each state, and a dark."""
+    monkeypatch.chdir(tmp_path)
+
+    def wide(pairs):
+        return np.concatenate([pairs[..., 0, :, :], pairs[..., 1, :, :]], axis=-1) + 200.0
+
+    np.save("frames.npy", wide(np.repeat(taken.frames, 2, axis=0)))
+    np.save("clear.npy", wide(np.stack([taken.clear] * 2)))
+    np.save("dark.npy", np.full(wide(taken.clear).shape, 200.0))
+    np.save("commands.npy", taken.phases)
+    np.save("unseen.npy", wide(taken.unseen))
+    side = taken.bench.side
+    centers = [str(place) for place in (side / 2 - 0.5, side / 2 - 0.5, side / 2 - 0.5, 1.5 * side - 0.5)]
+    files = ["--frames", "frames.npy", "--pupils", "clear.npy", "--dark", "dark.npy", "--commands", "commands.npy"]
+    known = ["--pupil-centers", *centers, "--pupil-diameter", "24", "--noise", str(taken.bench.noise)]
+    with warnings.catch_warnings(action="ignore"):
+        assert main(["calibrate", "bench.npz", *files, *known]) == 0
+    found = Calibration.load("bench.npz")
+    assert found.n_images == 1
+    assert found.n_averaged == 2
+    summary = reconstruct("unseen.npy", found, "phase.fits", photons=found.unit.mean())
+    assert summary.n_flagged == 0
+    lit = taken.bench.fully_lit
+    phases = found(np.where(np.concatenate(list(taken.bad), axis=-1), np.nan, wide(taken.unseen))).phase
+    assert rms(taken.errors(phases), lit) < 1.2 * rms(taken.errors(calibration(taken.unseen).phase), lit)
+
+
+KINDS = {
+    "cube of pairs": lambda frames: {"frames.npy": frames},
+    "two cubes": lambda frames: {"first.npy": frames[:, 0], "second.npy": frames[:, 1]},
+    "a file for each pair": lambda frames: {f"pair{index}.npy": pair for index, pair in enumerate(frames)},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_states_are_read_from_every_kind_of_file(tmp_path, kind):
+    frames = np.random.default_rng(1).uniform(100, 200, (6, 2, 20, 24))
+    frames[2, 1, 5, 6] = 1e4
+    files = {tmp_path / name: array for name, array in KINDS[kind](frames).items()}
+    extra = {"clear.npy": frames[0], "dark.npy": np.full((20, 24), 100.0), "bad.npy": np.eye(20, 24)}
+    extra |= {"commands.npy": np.zeros((3, 12, 12))}
+    for path, array in (files | {tmp_path / name: array for name, array in extra.items()}).items():
+        np.save(path, array)
+    clear, dark, bad, commands = (tmp_path / name for name in extra)
+    states = _read_states(list(files), [clear], [dark], [bad], commands, 1000.0)
+    expected = np.where(np.eye(20, 24) > 0, np.nan, frames - 100)
+    expected[2, 1, 5, 6] = np.nan
+    np.testing.assert_array_equal(states.frames.reshape(frames.shape), expected)
+    assert states.frames.shape[:2] == (3, 2)
+    windows, corners, _ = _windows(states, [(9.5, 10.0), (9.5, 12.0)], 12.0)
+    assert corners.tolist() == [[2, 2], [2, 4]]
+    np.testing.assert_array_equal(windows[0][:, :, 1], states.frames[:, :, 1, 2:18, 4:20])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"commands": np.zeros((4, 12, 12))}, "4 commands for 6 exposures"),
+        ({"commands": np.zeros((3, 30, 30))}, "commands have 30 pixels: expected at most 20"),
+        ({"fitted": ["scale"]}, "expected none with commands"),
+        ({"clear": np.ones((2, 21, 24))}, r"exposures of shape \(2, 20, 24\): expected"),
+    ],
+)
+def test_states_that_do_not_belong_together_are_named(tmp_path, settings, message):
+    arrays = {"frames": np.ones((6, 2, 20, 24)), "clear": np.ones((2, 20, 24)), "commands": np.zeros((3, 12, 12))}
+    arrays |= {name: settings.pop(name) for name in arrays if name in settings}
+    for name, array in arrays.items():
+        np.save(tmp_path / f"{name}.npy", array)
+    frames, clear, commands = (tmp_path / f"{name}.npy" for name in arrays)
+    with pytest.raises(ValueError, match=message):
+        calibrate(
+            [frames], [clear], commands=commands, pupil_centers=[(9.5, 11.5)] * 2, pupil_diameter=12.0, **settings
+        )
+
+
+@pytest.mark.slow
+def test_turned_pupil_of_a_telescope_with_ten_pokes():
+    """At most the error that the quick calibration had, on all fully lit pixels and away from edges."""
+    taken = Recorded(24, 10, 0.5, aperture="VLT", pixels=96, side=112)
+    calibration = taken.calibration()
+    found = calibration(np.where(taken.bad, np.nan, taken.unseen))
+    assert not found.flags.any()
+    errors, lit = taken.errors(found.phase), taken.bench.fully_lit
+    inner = ndimage.binary_erosion(lit, iterations=3)
+    assert rms(errors, lit) < 0.0133
+    assert rms(errors, inner) < 0.0065
+    photons, noise = calibration.unit.mean(), taken.bench.noise
+    points = errors / calibration.sigma(found, photons, noise)
+    assert 0.8 < rms(points, lit) < 1.3
+    modes = zernike_basis(calibration.sensor.pupil, 50)
+    left = calibration.sensor.pupil.gather(np.where(lit, np.nan_to_num(errors), 0)) @ calibration.modal_matrix(
+        modes
+    )
+    ratio = left / calibration.sigma(found, photons, noise, modes)
+    assert 0.8 < np.median(np.sqrt(np.mean(ratio**2, axis=1))) < 1.3

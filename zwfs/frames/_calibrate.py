@@ -1,0 +1,199 @@
+"""Calibration of a bench from its camera files."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zwfs import _check
+from zwfs._system import paths_of
+from zwfs.frames._blocks import FileError, blocks_of
+from zwfs.frames._camera import fit_bench
+from zwfs.frames._stack import Stack
+from zwfs.frames.calibration import Calibration
+from zwfs.frames.files import CameraFile, images, read, read_all
+from zwfs.frames.pipeline import reduce_frames
+from zwfs.frames.refine import _check_fit, fit
+from zwfs.frames.registration import Circle, Image, find_pupils, nearest_good, register_frames
+
+
+def calibrate(
+    frame_files: Sequence[str | Path], pupil_files: Sequence[str | Path], dark_files: Sequence[str | Path] = (),
+    bad_pixel_files: Sequence[str | Path] = (), *, diameter: float = 0.0, phase_shifts: Sequence[float] = (),
+    saturation: float | None = None, fitted: Sequence[str] = (), commands: str | Path | None = None,
+    noise: float | None = None, gain: float = 1.0, n_iterations: int = 25, tolerance: float = 1e-3,
+    **settings: Any,
+) -> Calibration:  # fmt: skip
+    """Calibration from camera files: frames as those to come, and clear frames.
+
+    With known commands of a mirror, `fit_bench` fits a model of the camera to the frames, which takes minutes.
+
+    Parameters
+    ----------
+    frame_files, pupil_files, dark_files, bad_pixel_files : sequence of str or Path
+        See `zwfs.frames.files.read_all`.
+    diameter, phase_shifts : float, lambda/D, and sequence of two floats, radian
+        Of the dimple; DIMPLE, THETA1 and THETA2 of the header if 0 and empty.
+    saturation : float, counts, optional
+        Of the camera, see `zwfs.frames.files.images`. Without it the frames to come are compared with SATURATE of
+        the header, or with the largest number of their type.
+    fitted : sequence of str
+        Parameters that `zwfs.frames.refine.fit` fits to these frames.
+    commands : str or Path, optional
+        File with known phases (n_states, n, n), radian, as for `fit_bench`. Then the files of frames hold one or
+        more exposures of each state in turn, (n, ny, nx) or (n, 2, ny, nx). The clear frames may be such a cube.
+    noise, gain : float, counts rms and electrons / count
+        As for `fit_bench`.
+    n_iterations, tolerance : int and float, radian
+    **settings
+        Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel. With
+        commands only the first two.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    FileNotFoundError, ImportError, TypeError, ValueError
+        If a file or a value is not as expected, or astropy is needed and missing.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from zwfs.bench import Bench, write_bench
+    >>> from zwfs.frames import calibrate
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)
+    ...     calibration = calibrate([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...
+    >>> calibration.optics.diameter, round(calibration.diameter)
+    (1.06, 40)
+    """
+    files = frame_files, pupil_files, dark_files, bad_pixel_files
+    kept: dict[str, Any] = {"n_iterations": n_iterations, "tolerance": tolerance}
+    if commands is not None:
+        if fitted:
+            raise ValueError(
+                f"fitted = {_check.shown(fitted)}: expected none with commands, which fit all of them"
+            )
+        states = _read_states(*files, commands, saturation)
+        header, (n_images, *shape) = states.header, states.dark.shape
+        place = settings.get("pupil_centers"), settings.get("pupil_diameter")
+        (frames, clear), corners, n_pixels = _windows(states, *place)
+        shifts: Any = tuple(phase_shifts) or (header.get("THETA1", np.pi / 2), header.get("THETA2", -np.pi / 2))
+        found = fit_bench(
+            frames, clear, states.commands, n_pixels=n_pixels, noise=noise, gain=gain, phase_shifts=shifts,
+            diameter=diameter or header.get("DIMPLE", 1.06),
+        )  # fmt: skip
+        for remark in found.remarks:
+            warnings.warn(remark, stacklevel=2)
+        return Calibration.from_bench(
+            found, frames, states.commands, states.dark, corners=corners, shape=tuple(shape), n_images=n_images,
+            saturation=states.saturation, bunit=str(header.get("BUNIT", "")), **kept,
+        )  # fmt: skip
+    masked, unmasked, sources = read_all(*files, saturation)
+    first = len(frame_files) + len(pupil_files)
+    darks = [image for source in sources[first : first + len(dark_files)] for image in source.images]
+    try:
+        optics = sources[0].optics(diameter, phase_shifts)
+        _check_fit("fitted", fitted, optics)
+        registered, optics = fit(register_frames(masked, unmasked, **settings), optics, fitted)
+        if saturation is None:
+            saturation = sources[0].keyword("SATURATE") if "SATURATE" in sources[0].header else np.inf
+        kept |= {"saturation": saturation, "bunit": str(sources[0].header.get("BUNIT", ""))}
+        return Calibration.of(reduce_frames(registered, optics), np.stack(darks) if darks else None, **kept)
+    except ValueError as error:  # any of the files can be the cause
+        raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
+
+
+class _States(NamedTuple):
+    """Camera images of known states, counts: less the dark, NaN where bad or saturated."""
+
+    frames: NDArray[np.float64]  # (n_states, n_frames, n_images, ny, nx)
+    clear: NDArray[np.float64]  # (n_frames, n_images, ny, nx)
+    commands: NDArray[np.float64]  # (n_states, n, n), radian
+    dark: NDArray[np.float64]  # (n_images, ny, nx)
+    header: dict[str, Any]  # of the first file of frames
+    saturation: float
+
+
+def _read_states(
+    frame_files: Sequence[str | Path], pupil_files: Sequence[str | Path], dark_files: Sequence[str | Path],
+    bad_pixel_files: Sequence[str | Path], commands: str | Path, saturation: float | None,
+) -> _States:  # fmt: skip
+    """Read camera files of known states; the parameters are those of `calibrate`."""
+    phases = read(commands, max_images=2**20).images
+    frames, stack = _cube("frame_files", frame_files, 0)
+    clear, _ = _cube("pupil_files", pupil_files, frames.shape[1])
+    if frames.shape[1:] != clear.shape[1:]:
+        raise FileError(
+            f"{stack.segments[0].name}: exposures of shape {frames.shape[1:]}: expected {clear.shape[1:]}"
+        )
+    if len(frames) % len(phases):
+        raise FileError(
+            f"{Path(commands).name}: {len(phases)} commands for {len(frames)} exposures: expected an exposure for "
+            "each, or the same number for each"
+        )
+    darks, maps = ([read(path) for path in paths] for paths in (dark_files, bad_pixel_files))
+    mean = CameraFile(clear.mean(axis=0), Path(pupil_files[0]).name, "")
+    bad = np.stack([image.bad for image in images([mean], darks, maps, _check.LARGEST)])
+    dark = np.zeros(clear.shape[1:]) + (np.concatenate([one.images for one in darks]) if darks else 0)
+    level = stack.saturation if saturation is None else saturation
+    clear, frames = (np.where(bad | ~(one < level), np.nan, one - dark) for one in (clear, frames))
+    frames = frames.reshape(len(phases), -1, *frames.shape[1:])
+    return _States(frames, clear, phases, dark, stack.header, level)
+
+
+def _cube(name: str, files: Sequence[str | Path], n_images: int) -> tuple[NDArray[np.float64], Stack]:
+    """All exposures of files, (n, n_images, ny, nx); two files with an image each are the images of exposures.
+
+    Where n_images is 0, it follows from the shapes.
+    """
+    paths = paths_of(name, files)
+    if not paths or not paths[0].is_file():
+        raise FileNotFoundError(f"{name}: {paths[0] if paths else 'empty'}: expected a file")
+    blocks, _ = blocks_of(paths[0])
+    full, several = blocks[0].full, len(paths) > 1
+    n_images = n_images or 1 + (
+        len(blocks) == 2 or len(full) == 4 or len(paths) == 2 or (several and full[0] == 2)
+    )
+    pair = n_images == len(paths) == 2 and len(blocks) == 1 and full[-3:-2] != (2,)
+    stack = Stack(paths[:1] if pair else paths, paths[1:] if pair else [], n_images, (full[-2], full[-1]))
+    return stack.read(0, stack.n).astype(float), stack
+
+
+def _windows(
+    states: _States, centers: Sequence[Sequence[float]] | None, diameter: float | None
+) -> tuple[list[NDArray], NDArray[np.int64], float]:
+    """Cut frames and clear frames to windows around both pupils.
+
+    Returns the windows (..., 2, side, side), their corners (2, 2), and the diameter D of the pupil. All sides of a
+    window have the same margin around the n pixels of the commands.
+    """
+    n, (n_images, *shape) = states.commands.shape[-1], states.dark.shape
+    if centers is None or diameter is None:
+        mean, circles = states.clear.mean(axis=0), list[Circle]()
+        for one in mean:
+            image = Image(nearest_good(one, np.isfinite(one)), ~np.isfinite(one), "clear frame")
+            circles += find_pupils(image, 3 - n_images, diameter)
+        diameter = diameter or float(np.mean([circle.diameter for circle in circles]))
+        centers = centers or [(circle.row, circle.column) for circle in circles]
+    middles = np.array([_check.pair("pupil_centers", one, _check.number) for one in centers])
+    room = np.minimum(middles + 0.5, np.array(shape) - 0.5 - middles).min() - n / 2
+    if room < -0.5:
+        raise ValueError(f"commands have {n} pixels: expected at most {n + 2 * room:.0f}, to fit the frames")
+    side = n + 2 * min(max(math.floor(room), 0), n // 6)
+    corners = np.rint(middles - (side - 1) / 2).astype(int)
+    places = [
+        (min(index, n_images - 1), slice(row, row + side), slice(column, column + side))
+        for index, (row, column) in enumerate(corners)
+    ]
+    cut = [np.stack([one[(..., *place)] for place in places], axis=-3) for one in (states.frames, states.clear)]
+    return cut, corners, diameter

@@ -18,7 +18,6 @@ from zwfs import _check
 from zwfs.frames.pipeline import (
     MeasuredPhase,
     Optics,
-    _reduce,
     predict_other,
     recover_phase,
     reduce_frames,
@@ -93,7 +92,7 @@ def fit(
 
     def residuals(unknowns: NDArray) -> NDArray:
         # Finite differences need a smooth function, so no trial may end an iteration earlier than its neighbours.
-        return recover_phase(_reduce(*trial(unknowns), margin), n_iterations, 1e-8).mismatch.ravel()
+        return recover_phase(reduce_frames(*trial(unknowns), margin), n_iterations, 1e-8).mismatch.ravel()
 
     def jacobian(unknowns: NDArray) -> NDArray:
         base = residuals(unknowns)

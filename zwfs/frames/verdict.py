@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from zwfs import _check
 from zwfs.bounds import cramer_rao
@@ -18,6 +17,7 @@ from zwfs.frames.pipeline import (
     MeasuredPhase,
     Measurement,
     Optics,
+    fully_lit,
     model,
     predict_other,
     recover_phase,
@@ -27,8 +27,8 @@ from zwfs.frames.registration import Placement, RegisteredFrames, nearest_good
 
 __all__ = ["CameraNoise", "ImageOrder", "Verdict", "judge", "order_of_images"]
 
-_NEAR = 2  # pixels from a gap, vane or edge that count as near it
 _LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
+_NEAR = 2  # pixels from a gap, vane or edge that count as near it
 _EXPLAINED = 1.25  # misfit over the noise up to which noise explains the frames
 _LEAST_LEAD = 0.2  # of the score over that of the control
 _UNEVEN = 0.03  # difference of the two flux ratios that is worth a word
@@ -153,9 +153,7 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
 def near_edges(measurement: Measurement) -> NDArray[np.bool_]:
     """Points within 2 pixels of one that is dark or partly lit, (ny, nx)."""
     amplitude = np.where(measurement.pupil.inside, measurement.pupil.amplitude, 0)
-    # Compared with its surroundings, since the pupil may be lit unevenly.
-    around = ndimage.median_filter(amplitude, max(3, round(measurement.registered.diameter / 8)))
-    return ~np.asarray(ndimage.binary_erosion(amplitude > _LIT * around, np.ones((3, 3)), iterations=_NEAR))
+    return ~fully_lit(amplitude, measurement.registered.diameter, _LIT, _NEAR)
 
 
 def error_bar(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64]:
@@ -187,7 +185,7 @@ def _over_noise(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64
     growth = np.real(np.conj(waves) * field) / np.maximum(np.abs(field) ** 2, 1e-300)
     frames, clear = _noise_kept(measurement.registered)
     dark = noise.read_noise**2 / photons
-    of_frames = frames[:, np.newaxis, np.newaxis] * (np.maximum(np.abs(waves) ** 2, 0) + dark) / photons
+    of_frames = frames[:, np.newaxis, np.newaxis] * (np.abs(waves) ** 2 + measurement.rest + dark) / photons
     exposure = measurement.registered.exposure
     of_amplitude = clear.sum() / 4 * exposure * (np.abs(field) ** 2 + dark * exposure) / photons
     variance = np.sum(normal**2 * of_frames, axis=0) + np.sum(normal * growth, axis=0) ** 2 * of_amplitude

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
+from zwfs.frames.pipeline import Optics, near_edges, recover_phase, reduce_frames
 from zwfs.frames.registration import Image, register_frames
-from zwfs.frames.verdict import CameraNoise, judge, near_edges
+from zwfs.frames.verdict import CameraNoise, judge
 
 from . import foreign
 from .hcipy_bench import HcipyBench

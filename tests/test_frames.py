@@ -19,7 +19,7 @@ from zwfs.frames.registration import (
     register,
     register_frames,
 )
-from zwfs.frames.verdict import order_of_images
+from zwfs.frames.verdict import judge, order_of_images
 
 SEAL = "ZWFS_SEAL_FRAMES"
 D, MARGIN = 68, 12
@@ -445,6 +445,10 @@ def test_seal_frames_are_explained(seal_work):
     assert measurement.flux_ratio == pytest.approx((1.22, 1.02), abs=0.01)
     assert np.isnan(measurement.registered.placement.sigma[2:]).all()
     assert np.all(measurement.registered.placement.sigma[:2] < 0.5)
+    for step in (seal_work[3], seal_work[-1]):
+        verdict = judge(step.result)
+        assert "The scale of the phase is not determined" in verdict.findings["scale"]
+        assert verdict.strengths[1] > 2 * verdict.strengths[0]
 
 
 @pytest.mark.slow

@@ -36,6 +36,8 @@ __all__ = [
 ]
 
 _DARK = 0.1  # of the largest amplitude: a point with less is outside
+NEAR = 2  # pixels from a gap, vane or edge that count as near it
+_LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
 _HALF = 0.7  # of the amplitude around it: a point with less is lit in half or less
 _MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
 
@@ -310,16 +312,22 @@ def mean_light(images: NDArray, inside: NDArray) -> tuple[NDArray[np.float64], N
     return np.maximum((images / scale[:, None, None]).mean(axis=0), 0), scale
 
 
-def fully_lit(amplitude: NDArray, diameter: float, least: float, apart: int) -> NDArray[np.bool_]:
+def _fully_lit(amplitude: NDArray, diameter: float, least: float, apart: int) -> NDArray[np.bool_]:
     """Points more than `apart` pixels from one with less than a part of the amplitude of its surroundings."""
     around = ndimage.median_filter(amplitude, max(3, round(diameter / 8)))
     return np.asarray(ndimage.binary_erosion(amplitude > least * around, np.ones((3, 3)), iterations=apart))
 
 
+def near_edges(measurement: Measurement) -> NDArray[np.bool_]:
+    """Points within 2 pixels of one that is dark or partly lit, (ny, nx)."""
+    amplitude = np.where(measurement.pupil.inside, measurement.pupil.amplitude, 0)
+    return ~_fully_lit(amplitude, measurement.registered.diameter, _LIT, NEAR)
+
+
 def _amplitude(light: NDArray, diameter: float) -> NDArray[np.float64]:
     """Mean amplitude of pixels with this light: where they are partly lit, neighbours give the amplitude."""
     root = np.sqrt(light)
-    full = fully_lit(np.where(root > _DARK * root.max(), root, 0), diameter, _HALF, 1)
+    full = _fully_lit(np.where(root > _DARK * root.max(), root, 0), diameter, _HALF, 1)
     return np.minimum(root, light / nearest_good(root, full)) if full.any() else root
 
 
@@ -379,21 +387,34 @@ def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:
 def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[np.float64]:
     """Correlation of each frame with the one that the other frame alone predicts, (2,).
 
-    The phase-shifted iteration sees both frames, and could explain part of their noise. Here the arcsine
-    reconstruction sees one frame, and the model predicts the other one from its phase.
-
     Parameters, as for `recover_phase`.
     """
+    good = measurement.good
+    frames = np.maximum(ideal_frames(measurement), 0)[(..., *measurement.window)]
+    return correlations(frames[:, good], predicted_frames(measurement, n_iterations)[:, good])
+
+
+def predicted_frames(measurement: Measurement, n_iterations: int = 25) -> NDArray[np.float64]:
+    """Ideal frames on the grid of the pupil, (2, ny, nx), each of them predicted from the other one alone.
+
+    The phase-shifted iteration sees both frames, and could explain part of their noise. Here the arcsine
+    reconstruction sees one frame, and the model predicts the other one from its phase.
+    """
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
-    both = model(measurement)
-    frames = np.maximum(ideal_frames(measurement), 0)
-    good, window = measurement.good, measurement.window
-    predicted = np.empty((2, np.count_nonzero(good)))
-    for seen in (0, 1):
+    both, frames = model(measurement), np.maximum(ideal_frames(measurement), 0)
+    predicted = []
+    for seen in (1, 0):
         sensor = ZernikeSensor(measurement.pupil, both.masks[seen], extent=both.extent, tolerance=1e-6)
         estimate = Arcsine(sensor, n_iterations=n_iterations, tolerance=1e-4)(frames[seen : seen + 1])
-        predicted[1 - seen] = both.measure(estimate.phase)[1 - seen][window][good]
-    return correlations(frames[(..., *window)][:, good], predicted)
+        predicted.append(both.measure(estimate.phase)[1 - seen][measurement.window])
+    return np.stack(predicted)
+
+
+def prediction_error(measurement: Measurement, where: NDArray, n_iterations: int = 25) -> NDArray[np.float64]:
+    """Squared error at some points of each frame predicted from the other one, over the variance, (2,)."""
+    frames = ideal_frames(measurement)[(..., *measurement.window)][:, where]
+    predicted = predicted_frames(measurement, n_iterations)[:, where]
+    return np.mean((predicted - frames) ** 2, axis=1) / np.maximum(frames.var(axis=1), 1e-300)
 
 
 def upside_down(measurement: Measurement) -> Measurement:

@@ -101,7 +101,9 @@ def drawn_methods(curves, pupil, classic, shifted):
     bad = np.zeros(frames.shape, bool)
     bad[:, 10, 10] = True
     recording = SimpleNamespace(diameter=float(pupil.n_pixels))
-    measurement = Measurement(recording, Optics(), frames, pupil, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0))
+    measurement = Measurement(
+        recording, Optics(), frames, pupil, 0 * phase, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0)
+    )
     found = MeasuredPhase(phase, frames, 0.9 * frames, measurement, True, 0)
     varied = AmplitudeCurves(three, dict.fromkeys(phase_amplitude.WAYS, np.full((3, 2), 0.1)), {}, three)
     drift, pair, falling = Drift(np.ones((6, 2, 2)), 10.0, 500.0), np.ones(6), np.array([20.0, 10.0])

@@ -19,7 +19,7 @@ from zwfs.frames.registration import (
     register,
     register_frames,
 )
-from zwfs.frames.verdict import order_of_images
+from zwfs.frames.verdict import judge, order_of_images
 
 SEAL = "ZWFS_SEAL_FRAMES"
 D, MARGIN = 68, 12
@@ -157,7 +157,8 @@ def test_background_and_flux_are_measured(recorded):
     # Mask in, the light of two opposite masks is the same: the frames show the same ratio.
     assert measurement.flux_ratio[0] == pytest.approx(1.25, rel=0.02)
     # Blur spreads the same light over the gaps, too.
-    assert measurement.counts[0] * measurement.pupil.n_points == pytest.approx(COUNTS * pupil.n_points, rel=0.02)
+    light = np.sum(measurement.pupil.amplitude**2 + measurement.rest)
+    assert measurement.counts[0] * light == pytest.approx(COUNTS * pupil.n_points, rel=0.02)
 
 
 @pytest.mark.parametrize("balance", [False, True])
@@ -444,6 +445,10 @@ def test_seal_frames_are_explained(seal_work):
     assert measurement.flux_ratio == pytest.approx((1.22, 1.02), abs=0.01)
     assert np.isnan(measurement.registered.placement.sigma[2:]).all()
     assert np.all(measurement.registered.placement.sigma[:2] < 0.5)
+    for step in (seal_work[3], seal_work[-1]):
+        verdict = judge(step.result)
+        assert "The scale of the phase is not determined" in verdict.findings["scale"]
+        assert verdict.strengths[1] > 2 * verdict.strengths[0]
 
 
 @pytest.mark.slow

@@ -259,7 +259,7 @@ CASES["fig06_reference"] = (
 )
 CASES["own_frames"] = (
     {"fitted": []},
-    {"fitted": ["background"], "accept_fits": True, "n_iterations": 2},
+    {"fitted": ["background"], "n_iterations": 2},
     *each(
         rms=[0.0, 4.0],
         n_bad=[0, 2000],

@@ -44,7 +44,6 @@ LIMITS = parameter_limits(
     gain=(0.0, 1e6),
     read_noise=(0.0, 1e6),
     fitted=[_FITTED, ...],
-    accept_fits=bool,
     output=str,
     overwrite=bool,
     n_bad=(0, 2000),
@@ -305,18 +304,18 @@ def _pair(values: Sequence[float] | NDArray, digits: int) -> str:
 
 
 def numbers(
-    chosen: MeasuredPhase, verdict: Verdict, work: Sequence[Step], errors: Sequence[float] | None
+    verdict: Verdict, work: Sequence[Step], errors: Sequence[float] | None, n_fits: int
 ) -> dict[str, float | str]:
-    """Numbers for the text: scores, misfits, and errors of the chosen result and of the last step."""
+    """Numbers for the text: scores, and misfits and errors of the result and of the step before the fits."""
     known = errors or [np.nan] * len(work)
     return rounded(
         {
             "score": verdict.score.min(),
             "control": verdict.control.max(),
-            "misfit": chosen.misfit,
-            "misfit_last": work[-1].result.misfit,
+            "misfit": work[-1].result.misfit,
+            "misfit_plain": work[-1 - n_fits].result.misfit,
             "sigma": np.nan if verdict.sigma is None else np.nanmedian(verdict.sigma),
-            "error": known[[step.result for step in work].index(chosen)],
-            "error_last": known[-1],
+            "error": known[-1],
+            "error_plain": known[-1 - n_fits],
         }
     )

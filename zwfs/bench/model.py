@@ -20,7 +20,8 @@ from zwfs import _check
 from zwfs._arrays import Immutable
 from zwfs.bench.relay import Relay
 from zwfs.detector import Detector
-from zwfs.frames.pipeline import measured_pupil
+from zwfs.frames._outline import radius
+from zwfs.frames.pipeline import mean_light
 from zwfs.masks import Dimple
 from zwfs.metrics import without_piston
 from zwfs.modes import power_law_screens, zernike_basis
@@ -436,7 +437,10 @@ class BenchModel(Immutable):
         top, left = (images.shape[-2] - ny) // 2, (images.shape[-1] - nx) // 2
         inner = images[:, top : top + ny, left : left + nx]
         # The stop of the bench is known; what is dark within it, gaps and missing segments, the images show.
-        pupil, unit = measured_pupil(inner, bench.segments > 0, bench.n_pixels)
+        light, scale = mean_light(inner, bench.segments > 0)
+        stop = radius((ny, nx), ((ny - 1) / 2, (nx - 1) / 2)) <= bench.n_pixels / 2
+        pupil = Pupil.from_amplitude(np.where(stop, np.sqrt(light), 0), bench.n_pixels, threshold=0.1)
+        unit = scale * np.mean(light[pupil.inside])
         plus, minus = Dimple(bench.diameter, bench.phase), Dimple(bench.diameter, -bench.phase)
         return cls(
             ZernikeSensor(pupil, plus, minus, extent=bench.extent),

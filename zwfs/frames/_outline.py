@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
-if TYPE_CHECKING:
-    from zwfs.frames.registration import Circle, Image
+_NEARLY_ALL = 0.98  # of the points of an outline: a few may be noise
+_OUTER = 0.75  # pixels from the outermost points: those with less are on the circle around the pupil
+
+
+class Circle(NamedTuple):
+    """Position of a pupil: row and column of its centre, and its diameter, all in pixels."""
+
+    row: float
+    column: float
+    diameter: float
+
+    def radii(self, shape: tuple[int, int]) -> NDArray[np.float64]:
+        """Distance of every pixel of an image from the centre, in pixels."""
+        return radius(shape, (self.row, self.column))
 
 
 def threshold(image: NDArray) -> float:
@@ -23,59 +36,68 @@ def threshold(image: NDArray) -> float:
     return float(middle[np.argmax(np.where(above > 0, between, 0))])
 
 
-def outline(image: NDArray, region: NDArray, level: float) -> tuple[float, float, float]:
-    """Row, column and diameter of a circle through the edge of a pupil, to a fraction of a pixel.
+def outline(image: NDArray, region: NDArray, level: float, diameter: float | None) -> Circle:
+    """Circle around a pupil, to a fraction of a pixel; its diameter may be known.
 
     The edge lies where rays from the centre cross half of their bright level for the last time. A region of bright
-    pixels gives the first centre and radius. Each pass then takes both from the circle through the edge points.
+    pixels gives the first centre and radius. Each pass then takes both from the circle around the edge points.
     """
     region = ndimage.binary_fill_holes(region)
     row, column = ndimage.center_of_mass(region)
-    radius = np.sqrt(np.count_nonzero(region) / np.pi)
+    size = diameter / 2 if diameter else np.sqrt(np.count_nonzero(region) / np.pi)
     dark = np.median(image[image <= level])
     angles = np.arange(720) * np.pi / 360
     sine, cosine = np.sin(angles), np.cos(angles)
-    for _ in range(4):
+    for _ in range(5):
         # Not beyond 1.08 radii: the next pupil may begin close to this one.
-        reach = np.arange(0.7 * radius, 1.08 * radius, 0.05)
+        reach = np.arange(0.7 * size, 1.08 * size, 0.05)
         rays = np.array([row + np.outer(sine, reach), column + np.outer(cosine, reach)])
         light = ndimage.map_coordinates(image, rays, order=1, mode="constant", cval=dark)
         # The bright level belongs to the ray, because the pupil may be lit unevenly.
-        bright = np.median(light[:, reach < 0.93 * radius], axis=1, keepdims=True)
+        bright = np.median(light[:, reach < 0.93 * size], axis=1, keepdims=True)
         inside = light > (dark + bright) / 2
         last = reach[inside.shape[1] - 1 - np.argmax(inside[:, ::-1], axis=1)]
         edge = np.stack([row + last * sine, column + last * cosine], axis=1)
-        row, column, radius = _circle_through(edge[inside.any(axis=1)])
-    return float(row), float(column), float(2 * radius)
+        if not len(edge := edge[inside.any(axis=1)]):
+            break
+        row, column, size = _circle_along(edge, size) if diameter else _circle_around(edge)
+    return Circle(float(row), float(column), float(2 * size))
 
 
-def _circle_through(points: NDArray) -> tuple[float, float, float]:
-    """Least-squares circle (row, column, radius) through the points, without outliers."""
-    keep = np.ones(len(points), bool)
-    for _ in range(10):
-        some = points[keep]
-        a, b, c = np.linalg.lstsq(np.c_[2 * some, np.ones(len(some))], np.sum(some**2, axis=1), rcond=None)[0]
-        radius = np.sqrt(c + a**2 + b**2)
-        distance = np.hypot(points[:, 0] - a, points[:, 1] - b) - radius
-        distance -= np.median(distance)
-        keep = np.abs(distance) <= 3 * (1.5 * np.median(np.abs(distance)) + 0.05)
-    return a, b, radius
+def _circle_along(points: NDArray, size: float) -> tuple[float, float, float]:
+    """Circle (row, column, radius) of a known radius, from which the points differ least on average."""
+
+    def apart(center: NDArray) -> float:
+        return float(np.abs(np.hypot(*(points - center).T) - size).mean())
+
+    return *_least(apart, points), size
 
 
-def not_cut(circle: Circle, image: Image) -> None:
-    """Refuse a pupil that reaches beyond the image."""
-    ends = {
-        "top": circle.row - circle.diameter / 2 + 0.5,
-        "left": circle.column - circle.diameter / 2 + 0.5,
-        "bottom": image.counts.shape[0] - 0.5 - circle.row - circle.diameter / 2,
-        "right": image.counts.shape[1] - 0.5 - circle.column - circle.diameter / 2,
-    }
-    side, room = min(ends.items(), key=lambda item: item[1])
-    if room < -2:
-        raise ValueError(
-            f"{image.name}: the pupil at row {circle.row:.1f}, column {circle.column:.1f}, {circle.diameter:.1f} "
-            f"pixels wide, is cut off at the {side} (row 0 is the top): expected all of it on the image"
-        )
+def _circle_around(points: NDArray) -> tuple[float, float, float]:
+    """Circle (row, column, radius) through the outermost points.
+
+    The smallest circle around nearly all points decides which ones are outermost: all points of a disc, and the
+    corners of a pupil of segments. The result is the least-squares circle through them.
+    """
+
+    def reach(center: NDArray) -> float:
+        return float(np.quantile(np.hypot(*(points - center).T), _NEARLY_ALL))
+
+    middle = _least(reach, points)
+    outer = points[np.hypot(*(points - middle).T) > reach(middle) - _OUTER]
+    a, b, c = np.linalg.lstsq(np.c_[2 * outer, np.ones(len(outer))], np.sum(outer**2, axis=1), rcond=None)[0]
+    return a, b, np.sqrt(c + a**2 + b**2)
+
+
+def _least(cost: Callable[[NDArray], float], points: NDArray) -> NDArray[np.float64]:
+    """Centre of the least cost, from that of the points."""
+    return optimize.minimize(cost, points.mean(axis=0), method="Nelder-Mead", options={"xatol": 0.01}).x
+
+
+def radius(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[np.float64]:
+    """Distance of every pixel from the centre (row, column), in pixels."""
+    rows, columns = (np.arange(n) - middle for n, middle in zip(shape, center, strict=True))
+    return np.hypot(rows[:, np.newaxis], columns)
 
 
 def turning(rotation: float, magnification: float) -> NDArray[np.float64]:
@@ -93,20 +115,22 @@ class Details:
 
     image: NDArray[np.float64]  # coefficients of splines
     reference: NDArray[np.float64]
-    points: NDArray[np.float64]  # (2, n), from the middle
-    middle: NDArray[np.float64]
-    reach: float  # pixels from the middle to the farthest point
+    points: NDArray[np.float64]  # (2, n), from the centre
+    center: NDArray[np.float64]
+    reach: float  # pixels from the centre to the farthest point
     block: NDArray[np.int64]  # number of the block of pixels that a point belongs to
 
     @classmethod
-    def of(cls, image: NDArray, reference: NDArray, inside: NDArray, blur: float) -> Details:
+    def of(
+        cls, image: NDArray, reference: NDArray, inside: NDArray, center: tuple[float, float], blur: float
+    ) -> Details:
         bands = (
             ndimage.gaussian_filter(one, blur) - ndimage.gaussian_filter(one, 4 * blur)
             for one in (image, reference)
         )
         splines = [ndimage.spline_filter(band, order=3, mode="nearest") for band in bands]
         places = np.argwhere(inside).T
-        middle = (np.array(inside.shape)[:, np.newaxis] - 1) / 2
+        middle = np.reshape(center, (2, 1))
         points = places - middle
         # Errors of neighbours go together: those of different blocks hardly do.
         size = max(1, round(8 * blur))
@@ -134,7 +158,7 @@ class Details:
 
     def _at(self, spline: NDArray, move: Any) -> NDArray[np.float64]:
         turned = turning(np.degrees(move[2] / self.reach), 1 + move[3] / self.reach) @ self.points
-        places = self.middle + np.reshape(move[:2], (2, 1)) + turned
+        places = self.center + np.reshape(move[:2], (2, 1)) + turned
         values = ndimage.map_coordinates(spline, places, order=3, mode="nearest", prefilter=False)
         values -= values.mean()
         return values / max(float(np.linalg.norm(values)), 1e-300)

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from zwfs import _check
-from zwfs.frames.registration import RegisteredFrames, correlations, nearest_good, radius
+from zwfs.frames._outline import radius
+from zwfs.frames.registration import RegisteredFrames, correlations, nearest_good
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
@@ -33,6 +35,10 @@ __all__ = [
     "upside_down",
 ]
 
+_DARK = 0.1  # of the largest amplitude: a point with less is outside
+NEAR = 2  # pixels from a gap, vane or edge that count as near it
+_LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
+_HALF = 0.7  # of the amplitude around it: a point with less is lit in half or less
 _MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
 
 
@@ -88,11 +94,10 @@ class Optics:
         if min(abs(first - second), abs(first - 1), abs(second - 1)) < 1e-9:
             expected = "two that differ by other than 0 mod 2 pi, none of them 0"
             raise ValueError(f"phase_shifts = {_check.shown(self.phase_shifts)}: expected {expected}")
-        _check.number("background", self.background, -1, 1, open_high=True)
-        _check.number("pupil_background", self.pupil_background, -1, 1, open_high=True)
         _check.number("scale", self.scale, 0, open_low=True)
-        _check.number("leakage", self.leakage, 0, 0.5, open_high=True)
-        _check.number("unmasked", self.unmasked, 0, 1, open_high=True)
+        ends = {"background": (-1, 1), "pupil_background": (-1, 1), "leakage": (0, 0.5), "unmasked": (0, 1)}
+        for name, limits in ends.items():
+            _check.number(name, getattr(self, name), *limits, open_high=True)
 
     @property
     def opposite(self) -> bool:
@@ -109,9 +114,11 @@ class Measurement:
     registered : RegisteredFrames
     optics : Optics
     intensity : ndarray, shape (2, ny', nx')
-        Frames; 1 is the mean intensity of the pupil with the mask out. May be negative where there is noise.
+        Frames; 1 is the mean squared amplitude of the pupil. May be negative where there is noise.
     pupil : Pupil
-        Of the mean of the two clear frames, each scaled to the same flux.
+        Its amplitude is the mean over a pixel. A pixel that is lit in part has two areas, of which one is dark.
+    rest : ndarray, shape (ny, nx)
+        Light of a pixel less its squared amplitude: 0 where it is fully lit.
     bad : ndarray of bool, shape (2, ny', nx')
         Where a frame, or in the pupil a clear frame, has a bad pixel.
     margin : int, pixels
@@ -129,6 +136,7 @@ class Measurement:
     optics: Optics
     intensity: NDArray[np.float64]
     pupil: Pupil
+    rest: NDArray[np.float64]
     bad: NDArray[np.bool_]
     margin: int
     counts: NDArray[np.float64]
@@ -230,10 +238,14 @@ class MeasuredPhase:
 def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | None = None) -> Measurement:
     """Bring frames on the grid of the pupil and normalise them.
 
-    The amplitude is common to both images: the mean of the clear frames, each scaled to the same flux. The light
-    of the two frames is balanced where their phase shifts are opposite: the light that two such masks send into
-    the pupil differs by 4 sin(theta) Im <psi, b>, and that is 0 for any field psi, because b is its projection on
-    the dimple.
+    The amplitude is common to both images, and follows from the mean of the clear frames, each scaled to the same
+    flux. A pixel that is lit in part has an area s with the amplitude A of its neighbours. With the reference wave
+    r its mean intensity is s |A exp(i phi) + r|^2 + (1 - s) |r|^2, which is |s A exp(i phi) + r|^2 plus the
+    constant `rest` = s (1 - s) A^2: the amplitude of the pixel is s A, and s A^2 is its light in the clear frames.
+
+    The light of the two frames is balanced where their phase shifts are opposite: the light that two such masks
+    send into the pupil differs by 4 sin(theta) Im <psi, b>, and that is 0 for any field psi, because b is its
+    projection on the dimple.
 
     Parameters
     ----------
@@ -254,28 +266,21 @@ def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | No
     """
     _check.instance("registered", registered, RegisteredFrames)
     _check.instance("optics", optics, Optics)
-    margin = registered.margin if margin is None else _check.integer("margin", margin, 0, registered.margin)
+    margin = registered.margin if margin is None else _check.integer("margin", margin, 0)
     if optics.diameter > registered.diameter:
         raise ValueError(
             f"diameter = {optics.diameter:g} lambda/D: expected at most {registered.diameter:.4g} (pixels of D)"
         )
-    return _reduce(registered, optics, margin)
-
-
-def _reduce(registered: RegisteredFrames, optics: Optics, margin: int) -> Measurement:
-    """Reduce as `reduce_frames` does, without a check: the frames may end a little before the margin does."""
-    n = registered.n_pixels
+    n, center = registered.n_pixels, registered.center
     (frames, bad), (clear, clear_bad) = registered.frames_on_grid(margin), registered.clear_on_grid()
     background = _backgrounds(registered) if registered.background else np.zeros(4)
     frames, clear = frames - background[:2, None, None], clear - background[2:, None, None]
-    center = registered.pupils[0].row - registered.corner[0], registered.pupils[0].column - registered.corner[1]
     stop = radius((n, n), center) <= registered.diameter / 2
-    light = clear[:, stop].mean(axis=1)
-    if np.any(light <= 0):
-        names = " and ".join(dict.fromkeys(image.name for image in registered.clear_frames))
-        raise ValueError(f"{names}: the pupils hold {light} counts on average: expected light")
-    clear = clear - optics.pupil_background * light[:, None, None]
-    pupil, counts = measured_pupil(clear, stop, registered.diameter, center)
+    light, scale = mean_light(clear, stop)
+    light = np.where(stop, np.maximum(light - optics.pupil_background, 0), 0)
+    pupil = Pupil.from_amplitude(_amplitude(light, registered.diameter), registered.diameter, center, _DARK)
+    unit = float(np.mean(_amplitude(light, registered.diameter)[pupil.inside] ** 2))
+    rest = np.where(pupil.inside, light / unit - pupil.amplitude**2, 0)
     inner = (..., slice(margin, margin + n), slice(margin, margin + n))
     bad[inner] |= clear_bad.any(axis=0) & pupil.inside
     good = pupil.inside & ~bad[inner].any(axis=0)
@@ -285,6 +290,7 @@ def _reduce(registered: RegisteredFrames, optics: Optics, margin: int) -> Measur
             f"{n_bad} of the {pupil.n_points} points of the pupil are bad or saturated: "
             f"expected at most {_MOST_BAD:.0%}"
         )
+    counts = scale * unit
     intensity = frames / (counts[:, None, None] * registered.exposure)
     flux = intensity[inner][:, good].mean(axis=1)
     if np.any(flux <= 0):
@@ -292,25 +298,37 @@ def _reduce(registered: RegisteredFrames, optics: Optics, margin: int) -> Measur
     if registered.balance and optics.opposite:
         intensity = intensity * (flux.mean() / flux)[:, None, None]
     flux = flux * counts
-    ratio = flux[0] / flux[1], light[0] / light[1]
-    return Measurement(registered, optics, intensity, pupil, bad, margin, counts, background, ratio)
+    ratio = flux[0] / flux[1], scale[0] / scale[1]
+    return Measurement(registered, optics, intensity, pupil, rest, bad, margin, counts, background, ratio)
 
 
-def measured_pupil(
-    images: NDArray, inside: NDArray, n_pixels: float, center: tuple[float, float] | None = None
-) -> tuple[Pupil, NDArray[np.float64]]:
-    """Pupil of two clear frames (2, ny, nx), less the background, and their counts that make an intensity of 1.
+def mean_light(images: NDArray, inside: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean of two clear frames (2, ny, nx), less the background, and the counts that make an intensity of 1.
 
-    The flux of the two is compared inside. The light outside the circle of diameter `n_pixels` is stopped. An
-    amplitude of less than a tenth of the largest one counts as dark.
+    Each frame is scaled to a mean of 1 inside. No intensity is below 0.
     """
     if np.any((scale := images[:, inside].mean(axis=1)) <= 0):
-        raise ValueError("images hold no light inside: expected more than 0 counts on average")
-    amplitude = np.sqrt(np.maximum((images / scale[:, None, None]).mean(axis=0), 0))
-    middle = center or tuple((n - 1) / 2 for n in amplitude.shape)
-    stop = radius(amplitude.shape, middle) <= n_pixels / 2
-    pupil = Pupil.from_amplitude(np.where(stop, amplitude, 0), n_pixels, center, threshold=0.1)
-    return pupil, scale * np.mean(amplitude[pupil.inside] ** 2)
+        raise ValueError(f"the pupils of the clear frames hold {scale} counts on average: expected light")
+    return np.maximum((images / scale[:, None, None]).mean(axis=0), 0), scale
+
+
+def _fully_lit(amplitude: NDArray, diameter: float, least: float, apart: int) -> NDArray[np.bool_]:
+    """Points more than `apart` pixels from one with less than a part of the amplitude of its surroundings."""
+    around = ndimage.median_filter(amplitude, max(3, round(diameter / 8)))
+    return np.asarray(ndimage.binary_erosion(amplitude > least * around, np.ones((3, 3)), iterations=apart))
+
+
+def near_edges(measurement: Measurement) -> NDArray[np.bool_]:
+    """Points within 2 pixels of one that is dark or partly lit, (ny, nx)."""
+    amplitude = np.where(measurement.pupil.inside, measurement.pupil.amplitude, 0)
+    return ~_fully_lit(amplitude, measurement.registered.diameter, _LIT, NEAR)
+
+
+def _amplitude(light: NDArray, diameter: float) -> NDArray[np.float64]:
+    """Mean amplitude of pixels with this light: where they are partly lit, neighbours give the amplitude."""
+    root = np.sqrt(light)
+    full = _fully_lit(np.where(root > _DARK * root.max(), root, 0), diameter, _HALF, 1)
+    return np.minimum(root, light / nearest_good(root, full)) if full.any() else root
 
 
 def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: float = 1e-4) -> MeasuredPhase:
@@ -369,21 +387,34 @@ def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:
 def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[np.float64]:
     """Correlation of each frame with the one that the other frame alone predicts, (2,).
 
-    The phase-shifted iteration sees both frames, and could explain part of their noise. Here the arcsine
-    reconstruction sees one frame, and the model predicts the other one from its phase.
-
     Parameters, as for `recover_phase`.
     """
+    good = measurement.good
+    frames = np.maximum(ideal_frames(measurement), 0)[(..., *measurement.window)]
+    return correlations(frames[:, good], predicted_frames(measurement, n_iterations)[:, good])
+
+
+def predicted_frames(measurement: Measurement, n_iterations: int = 25) -> NDArray[np.float64]:
+    """Ideal frames on the grid of the pupil, (2, ny, nx), each of them predicted from the other one alone.
+
+    The phase-shifted iteration sees both frames, and could explain part of their noise. Here the arcsine
+    reconstruction sees one frame, and the model predicts the other one from its phase.
+    """
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
-    both = model(measurement)
-    frames = np.maximum(ideal_frames(measurement), 0)
-    good, window = measurement.good, measurement.window
-    predicted = np.empty((2, np.count_nonzero(good)))
-    for seen in (0, 1):
+    both, frames = model(measurement), np.maximum(ideal_frames(measurement), 0)
+    predicted = []
+    for seen in (1, 0):
         sensor = ZernikeSensor(measurement.pupil, both.masks[seen], extent=both.extent, tolerance=1e-6)
         estimate = Arcsine(sensor, n_iterations=n_iterations, tolerance=1e-4)(frames[seen : seen + 1])
-        predicted[1 - seen] = both.measure(estimate.phase)[1 - seen][window][good]
-    return correlations(frames[(..., *window)][:, good], predicted)
+        predicted.append(both.measure(estimate.phase)[1 - seen][measurement.window])
+    return np.stack(predicted)
+
+
+def prediction_error(measurement: Measurement, where: NDArray, n_iterations: int = 25) -> NDArray[np.float64]:
+    """Squared error at some points of each frame predicted from the other one, over the variance, (2,)."""
+    frames = ideal_frames(measurement)[(..., *measurement.window)][:, where]
+    predicted = predicted_frames(measurement, n_iterations)[:, where]
+    return np.mean((predicted - frames) ** 2, axis=1) / np.maximum(frames.var(axis=1), 1e-300)
 
 
 def upside_down(measurement: Measurement) -> Measurement:
@@ -404,7 +435,7 @@ def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:
         circles = registered.pupils if shared else registered.pupils[index : index + 1]
         far = ~image.bad
         for circle in circles:
-            far &= radius(far.shape, (circle.row, circle.column)) > 0.58 * circle.diameter
+            far &= circle.radii(far.shape) > 0.58 * circle.diameter
         enough = np.count_nonzero(far) >= 100 and not image.cut
         levels.append(float(np.median(image.counts[far])) if enough else 0.0)
     dark = np.array(levels) * registered.areas[2:]
@@ -417,11 +448,11 @@ def _scaled(measurement: Measurement) -> NDArray[np.float64]:
 
 
 def _mix(frames: NDArray, measurement: Measurement) -> NDArray[np.float64]:
-    """Add leakage and unmasked light to ideal frames."""
+    """Add leakage, unmasked light, and that of partly lit pixels to ideal frames."""
     optics = measurement.optics
     mixed = (1 - optics.leakage) * frames + optics.leakage * frames[::-1]
     mixed *= 1 - optics.unmasked
-    mixed[(..., *measurement.window)] += optics.unmasked * measurement.pupil.amplitude**2
+    mixed[(..., *measurement.window)] += measurement.rest + optics.unmasked * measurement.pupil.amplitude**2
     return mixed
 
 
@@ -429,6 +460,6 @@ def _unmix(frames: NDArray, measurement: Measurement) -> NDArray[np.float64]:
     """Inverse of `_mix`."""
     optics = measurement.optics
     pure = frames.copy()
-    pure[(..., *measurement.window)] -= optics.unmasked * measurement.pupil.amplitude**2
+    pure[(..., *measurement.window)] -= measurement.rest + optics.unmasked * measurement.pupil.amplitude**2
     pure /= 1 - optics.unmasked
     return ((1 - optics.leakage) * pure - optics.leakage * pure[::-1]) / (1 - 2 * optics.leakage)

@@ -1,4 +1,4 @@
-"""Where the pupils stand on a camera: find them, and register them to a fraction of a pixel.
+"""Positions of the pupils on a camera: find them, and register them to a fraction of a pixel.
 
 The second image may be shifted, rotated and magnified with respect to the first. `register_frames` measures
 all of it, and each image is interpolated once.
@@ -10,28 +10,26 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from zwfs import _check
-from zwfs.frames._outline import Details, not_cut, outline, threshold, turning
+from zwfs.frames._outline import Circle, Details, outline, radius, threshold, turning
 
 __all__ = ["Placement", "RegisteredFrames", "register_frames"]
-
-_Item = TypeVar("_Item")
 
 _REACH = 6  # pixels by which an image may be off its neighbour before sub-pixel registration
 _SMALLEST = 8  # pixels across a pupil: with fewer there is no outline
 _MARGIN = 0.25  # of the diameter: more of the dark surroundings adds nothing
 _TOUCHED = 0.01  # weight of a bad pixel from which on a point is bad
 _ORDER = 3  # of the splines that interpolate an image
+_BLUR = 2.0  # pixels rms: finest detail that counts for registration
 # A rotation or magnification is fitted if its standard error is below so many pixels at the edge of the pupil, or
 # below this part of its value.
 _SURE, _SIGNIFICANT = 0.05, 0.1
-_EDGE = 3  # pixels around the outline that take part where the surroundings are there
+_EDGE, _AROUND = 3, 8  # pixels around the pupil: those that take part where the surroundings are there, and all
 _LARGEST_TURN, _LARGEST_STRETCH = 6.0, 0.06  # degrees, and relative, of the second image
 
 
@@ -74,32 +72,6 @@ class Image:
         object.__setattr__(self, "bad", _check.flag_map("bad", self.bad, counts.shape))
         _check.instance("name", self.name, str)
         _check.flag("cut", self.cut)
-
-
-@dataclass(frozen=True)
-class Circle:
-    """Where a pupil stands: row and column of its centre, and its diameter, all in pixels.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a number is not finite, or the diameter is not above 0.
-
-    Examples
-    --------
-    >>> from zwfs.frames.registration import Circle
-    >>> Circle(row=20.0, column=20.5, diameter=31.0)
-    Circle(row=20.0, column=20.5, diameter=31.0)
-    """
-
-    row: float
-    column: float
-    diameter: float
-
-    def __post_init__(self) -> None:
-        _check.number("row", self.row)
-        _check.number("column", self.column)
-        _check.number("diameter", self.diameter, 0, open_low=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +170,12 @@ class RegisteredFrames:
         first = self.pupils[0]
         return np.round(np.array([first.row, first.column]) - (self.n_pixels - 1) / 2).astype(int)
 
+    @property
+    def center(self) -> tuple[float, float]:
+        """Row and column of the centre of the pupil on its grid."""
+        first = self.pupils[0]
+        return first.row - self.corner[0], first.column - self.corner[1]
+
     @cached_property
     def margin(self) -> int:
         """Pixels around the grid of the pupil that both frames hold."""
@@ -214,20 +192,18 @@ class RegisteredFrames:
 
     def places(self, margin: int = 0) -> NDArray[np.float64]:
         """Row and column of each point of the grid with a margin around it, on each image, (4, 2, ny', nx')."""
-        center = np.array([self.pupils[0].row, self.pupils[0].column])
-        start = self.corner - margin - center
+        start = -np.array(self.center) - margin
         grid = np.indices((self.n_pixels + 2 * margin,) * 2) + start[:, np.newaxis, np.newaxis]
-        return (
-            np.einsum("kij,jyx->kiyx", self.matrices, grid) + (self.origins + center)[..., np.newaxis, np.newaxis]
-        )
+        centers = self.origins + self.corner + self.center
+        return np.einsum("kij,jyx->kiyx", self.matrices, grid) + centers[..., np.newaxis, np.newaxis]
 
     def frames_on_grid(self, margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Frames and their bad pixels, (2, ny', nx') each, on the grid of the pupil with a margin around it."""
         return self._on_grid(slice(0, 2), margin)
 
-    def clear_on_grid(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Clear frames and their bad pixels, (2, ny, nx) each, on the grid of the pupil."""
-        return self._on_grid(slice(2, 4), 0)
+    def clear_on_grid(self, margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Clear frames and their bad pixels, on the same grid."""
+        return self._on_grid(slice(2, 4), margin)
 
     def _on_grid(self, which: slice, margin: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Images on the grid, interpolated once; counts are those of a pixel of the first image."""
@@ -290,36 +266,41 @@ def register_frames(
     exposure = _check.number("exposure", exposure, 0, open_low=True)
     subpixel = _check.flag("subpixel", subpixel)
     background, balance = _check.flag("background", background), _check.flag("balance", balance)
-    _check_images("frames", frames)
-    _check_images("clear_frames", clear_frames)
-    places = None if pupil_centers is None else _check.real_map("pupil_centers", pupil_centers, 2)
-    if places is not None and places.shape != (2, 2):
-        raise ValueError(f"pupil_centers has shape {places.shape}: expected (row, column) of each of two pupils")
-    if places is not None and diameter is None:
+    for name, given in (("frames", frames), ("clear_frames", clear_frames)):
+        _check.sequence(name, given, Image)
+        if len(given) not in (1, 2):
+            raise ValueError(f"{name} holds {len(given)} images: expected 1 or 2")
+    centers = None if pupil_centers is None else _check.real_map("pupil_centers", pupil_centers, 2)
+    if centers is not None and centers.shape != (2, 2):
+        raise ValueError(f"pupil_centers has shape {centers.shape}: expected (row, column) of each of two pupils")
+    if centers is not None and diameter is None:
         raise ValueError("pupil_centers without a pupil_diameter: expected both, or neither")
-    clear_frames, pupils = _locate("clear_frames", clear_frames, places, diameter)
-    _require_same_size(pupils, clear_frames)
-    pairs = _pair(frames), clear_frames
-    formats = [(pair[0] is pair[1], *(image.counts.shape for image in pair)) for pair in pairs]
+    clear, pupils = _locate(clear_frames, centers, diameter)
+    small, large = sorted(circle.diameter for circle in pupils)
+    if large - small > max(2.0, _LARGEST_STRETCH * large):
+        names = " and ".join(dict.fromkeys(image.name for image in clear))
+        raise ValueError(
+            f"{names}: the two pupils are {small:.1f} and {large:.1f} pixels wide: "
+            f"expected the same size, to {_LARGEST_STRETCH:.0%}"
+        )
+    masked, seen = (frames[0], frames[-1]), pupils
+    formats = [(pair[0] is pair[1], *(image.counts.shape for image in pair)) for pair in (masked, clear)]
     moved = formats[0] != formats[1]
     if moved:
-        frames, seen = _locate("frames", frames, places, diameter or pupils[0].diameter)
-    else:
-        frames, seen = _pair(frames), pupils
-        for image in frames:
-            if not np.ptp(image.counts) > 0:
-                raise ValueError(f"{image.name}: every pixel is {image.counts.flat[0]:.6g}: expected light")
-    first = np.array([pupils[0].row, pupils[0].column])
-    origins = np.array([[circle.row, circle.column] for circle in (*seen, *pupils)]) - first
-    rough = RegisteredFrames(frames, clear_frames, pupils, np.round(origins), background, balance, exposure)
+        masked, seen = _locate(frames, None, diameter or pupils[0].diameter)
+    for image in masked:
+        if not np.ptp(image.counts) > 0:
+            raise ValueError(f"{image.name}: every pixel is {image.counts.flat[0]:.6g}: expected light")
+    places = np.array([circle[:2] for circle in (*seen, *pupils)])
+    rough = RegisteredFrames(masked, clear, pupils, np.round(places - places[2]), background, balance, exposure)
     return _register(rough, frames_too=moved) if subpixel else rough
 
 
-def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> tuple[Circle, ...]:
+def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> list[Circle]:
     """Find the bright discs on an image, from left to right, or from top to bottom if they stand so.
 
-    A threshold between dark and bright (Otsu's) gives the outline; a circle goes through it, without the points
-    that a missing segment or a vane pushes inwards. A given diameter, in pixels, replaces that of the outline.
+    A threshold between dark and bright (Otsu's) gives the outline, and the circle around it is the pupil. Its
+    diameter, in pixels, may be given.
     """
     smooth = ndimage.gaussian_filter(image.counts, 1.0)
     if np.ptp(smooth) <= 1e-9 * np.abs(smooth).max(initial=1e-300):
@@ -330,27 +311,22 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> t
     bright = ndimage.binary_closing(np.pad(bright, 8), iterations=6)[8:-8, 8:-8]
     labels, n_found = ndimage.label(bright)
     areas = np.asarray(ndimage.sum_labels(bright, labels, np.arange(1, n_found + 1)))
-    largest = np.flatnonzero(areas > 0.25 * areas.max(initial=0)) + 1
-    if areas.max(initial=0) < 50 or len(largest) != n_pupils:
-        count = len(largest) if areas.max(initial=0) >= 50 else 0
+    largest = np.flatnonzero((areas > 0.25 * areas.max(initial=0)) & (areas.max(initial=0) >= 50)) + 1
+    if len(largest) != n_pupils:
         raise ValueError(
-            f"{image.name}: {count} bright regions as large as a pupil: expected {n_pupils}; "
+            f"{image.name}: {len(largest)} bright regions as large as a pupil: expected {n_pupils}; "
             "give the positions, or look for stray light"
         )
-    circles = [Circle(*outline(smooth, labels == label, level)) for label in largest]
-    if diameter is not None:
-        circles = [replace(circle, diameter=diameter) for circle in circles]
-    for circle in circles:
-        not_cut(circle, image)
-    places = np.array([(circle.row, circle.column) for circle in circles])
-    return tuple(circles[index] for index in np.argsort(places[:, np.argmax(np.ptp(places, axis=0))]))
+    circles = [outline(smooth, labels == label, level, diameter) for label in largest]
+    axis = int(np.argmax(np.ptp([circle[:2] for circle in circles], axis=0)))
+    return sorted(circles, key=lambda circle: circle[axis])
 
 
 def register(
     image: NDArray,
     reference: NDArray,
     inside: NDArray,
-    blur: float = 2.0,
+    center: tuple[float, float] | None = None,
     *,
     turn: bool = False,
     magnification: float = 1.0,
@@ -363,22 +339,22 @@ def register(
     Parameters
     ----------
     image, reference : ndarray, shape (ny, nx)
-        The pupil stands in the middle of the reference.
     inside : ndarray of bool, shape (ny, nx)
         Points of the reference that are compared.
-    blur : float, pixels rms
-        Finest detail that counts.
+    center : (float, float), pixels
+        Row and column of the centre of the pupil on the reference; by default its middle.
     turn : bool
         Whether to measure rotation and magnification, too. One that the images do not determine stays out: its
         standard error exceeds 0.05 pixels at the edge of `inside` and a tenth of its value.
     magnification : float
         Start of the search, with `turn`.
     """
+    center = center or ((len(reference) - 1) / 2, (len(reference[0]) - 1) / 2)
     # Details of three times the width, at every third point, draw the search from farther away.
     thin = np.zeros_like(inside)
     thin[::3, ::3] = True
-    coarse = Details.of(image, reference, inside & thin if np.any(inside & thin) else inside, 3 * blur)
-    details = Details.of(image, reference, inside, blur)
+    coarse = Details.of(image, reference, inside & thin if np.any(inside & thin) else inside, center, 3 * _BLUR)
+    details = Details.of(image, reference, inside, center, _BLUR)
     stretch = (magnification - 1) * details.reach if turn else 0.0
     steps = range(-_REACH, _REACH + 1)
     moves = [(y, x, 0.0, stretch) for y in steps for x in steps]
@@ -407,12 +383,6 @@ def nearest_good(image: NDArray, good: NDArray) -> NDArray:
     return image[tuple(index)]
 
 
-def radius(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[np.float64]:
-    """Distance of every pixel from the centre (row, column), in pixels."""
-    rows, columns = (np.arange(n) - middle for n, middle in zip(shape, center, strict=True))
-    return np.hypot(rows[:, np.newaxis], columns)
-
-
 def correlations(first: NDArray, second: NDArray) -> NDArray[np.float64]:
     """Correlation coefficient of each row, (k, n) and (k, n) to (k,); 0 where one is constant."""
     first, second = (rows - rows.mean(axis=1, keepdims=True) for rows in (first, second))
@@ -420,94 +390,74 @@ def correlations(first: NDArray, second: NDArray) -> NDArray[np.float64]:
     return np.divide(np.sum(first * second, axis=1), scale, out=np.zeros(len(scale)), where=scale > 0)
 
 
-def _check_images(name: str, images: Any) -> None:
-    """Require a sequence of one or two Images."""
-    _check.sequence(name, images, Image)
-    if len(images) not in (1, 2):
-        raise ValueError(f"{name} holds {len(images)} images: expected 1 or 2")
-
-
-def _require_same_size(circles: tuple[Circle, Circle], images: tuple[Image, Image]) -> None:
-    """Refuse two pupils whose sizes differ by more than registration can measure."""
-    small, large = sorted(circle.diameter for circle in circles)
-    if large - small > max(2.0, _LARGEST_STRETCH * large):
-        names = " and ".join(dict.fromkeys(image.name for image in images))
-        raise ValueError(
-            f"{names}: the two pupils are {small:.1f} and {large:.1f} pixels wide: "
-            f"expected the same size, to {_LARGEST_STRETCH:.0%}"
-        )
-
-
-def _pair(some: Sequence[_Item]) -> tuple[_Item, _Item]:
-    """Two of them: the same twice if there is only one."""
-    return some[0], some[-1]
-
-
 def _locate(
-    argument: str, images: Sequence[Image], places: NDArray | None, diameter: float | None
+    images: Sequence[Image], centers: NDArray | None, diameter: float | None
 ) -> tuple[tuple[Image, Image], tuple[Circle, Circle]]:
-    """Two images and the pupil on each."""
-    if places is None or diameter is None or argument == "frames":
-        if len(images) == 1:
-            circles = find_pupils(images[0], 2, diameter)
-        else:
-            circles = tuple(find_pupils(image, 1, diameter)[0] for image in images)
+    """Two images and the pupil on each; surroundings that software cut out are continued."""
+    shared, n_pupils = len(images) == 1, 3 - len(images)
+    if centers is not None and diameter is not None:
+        circles = [Circle(row, column, diameter) for row, column in centers.tolist()]
     else:
-        circles = tuple(Circle(row, column, diameter) for row, column in places.tolist())
-        for circle, image in zip(circles, _pair(images), strict=True):
-            not_cut(circle, image)
-    images = _pair(images)
-    if images[0] is images[1]:
-        return _pair([_extend(images[0], circles)]), _pair(circles)
-    return _pair([_extend(image, [circle]) for image, circle in zip(images, circles, strict=True)]), _pair(circles)
+        circles = [circle for image in images for circle in find_pupils(image, n_pupils, diameter)]
+    pair = images[0], images[-1]
+    for circle, image in zip(circles, pair, strict=True):
+        _require_whole(circle, image)
+    first = _extend(pair[0], circles if shared else circles[:1])
+    return (first, first if shared else _extend(pair[1], circles[1:])), (circles[0], circles[1])
+
+
+def _require_whole(circle: Circle, image: Image) -> None:
+    """Refuse a pupil that reaches more than 2 pixels beyond the image."""
+    ny, nx = image.counts.shape
+    room = {
+        "top": circle.row,
+        "left": circle.column,
+        "bottom": ny - 1 - circle.row,
+        "right": nx - 1 - circle.column,
+    }
+    side = min(room, key=room.__getitem__)
+    if room[side] < circle.diameter / 2 - 2.5:
+        raise ValueError(
+            f"{image.name}: the pupil at row {circle.row:.1f}, column {circle.column:.1f}, {circle.diameter:.1f} "
+            f"pixels wide, is cut off at the {side} (row 0 is the top): expected all of it on the image"
+        )
 
 
 def _extend(image: Image, circles: Sequence[Circle]) -> Image:
     """An image whose surroundings were set to 0 by software, continued by its edge: splines dislike steps."""
-    apart = [radius(image.counts.shape, (one.row, one.column)) / one.diameter for one in circles]
+    apart = [circle.radii(image.counts.shape) / circle.diameter for circle in circles]
     unlit = (image.counts == 0) & (np.min(apart, axis=0) > 0.5)
     if np.count_nonzero(unlit) < 0.05 * unlit.size:
         return image
     return replace(image, counts=nearest_good(image.counts, ~unlit), cut=True)
 
 
-def _register(registered: RegisteredFrames, frames_too: bool) -> RegisteredFrames:
+def _register(rough: RegisteredFrames, frames_too: bool) -> RegisteredFrames:
     """Register the second clear frame to the first, and each frame to, or with, its clear frame."""
-    first, second = registered.pupils
-    center = np.array([first.row, first.column])
-    cut = any(image.cut for image in registered.clear_frames)
+    first, second = rough.pupils
     # The outline takes part, unless software cut it out of its surroundings.
-    reach = 0.45 * registered.diameter if cut else registered.diameter / 2 + _EDGE
-    size = 2 * math.ceil(registered.diameter / 2) + 17
-    reference, image = (
-        ndimage.affine_transform(
-            one.counts, (1, 1), center + np.round(origin) - (size - 1) / 2, (size, size), order=3, mode="nearest"
-        )
-        for one, origin in zip(registered.clear_frames, registered.origins[2:], strict=True)
-    )
-    placement = register(
-        image,
-        reference,
-        radius(reference.shape, ((size - 1) / 2,) * 2) <= reach,
-        turn=True,
-        magnification=second.diameter / first.diameter,
-    )
+    cut = any(image.cut for image in rough.clear_frames)
+    reach = 0.45 * rough.diameter if cut else rough.diameter / 2 + _EDGE
+    reference, image = rough.clear_on_grid(_AROUND)[0]
+    center = rough.center[0] + _AROUND, rough.center[1] + _AROUND
+    inside = radius(reference.shape, center) <= reach
+    ratio = second.diameter / first.diameter
+    placement = register(image, reference, inside, center, turn=True, magnification=ratio)
     if abs(placement.rotation) > _LARGEST_TURN or abs(placement.magnification - 1) > _LARGEST_STRETCH:
         raise ValueError(
             f"the second image is rotated by {placement.rotation:.1f} degrees and magnified by "
             f"{placement.magnification:.3f}: expected at most {_LARGEST_TURN:g} degrees and {_LARGEST_STRETCH:.0%}"
         )
-    shifts = np.zeros((4, 2))
-    shifts[[1, 3]] = placement.shift
-    placement = replace(placement, shift=registered.origins[3] + placement.shift)
-    placed = replace(registered, origins=registered.origins + shifts, placement=placement)
+    origins = rough.origins.copy()
+    origins[[1, 3]] += placement.shift
+    placed = replace(rough, origins=origins, placement=replace(placement, shift=origins[3]))
     if not frames_too:
         return placed
     (frames, _), (images, _) = placed.frames_on_grid(), placed.clear_on_grid()
     # Off the edge, which the mask makes bright or dark.
-    middle = first.row - placed.corner[0], first.column - placed.corner[1]
-    inside = radius(images.shape[1:], middle) <= 0.45 * registered.diameter
-    apart = [register(frame, image, inside).shift for frame, image in zip(frames, images, strict=True)]
-    apart[1] = placement.matrix @ apart[1]
-    shifts[:2] += apart
-    return replace(placed, origins=registered.origins + shifts)
+    inside = radius(images.shape[1:], placed.center) <= 0.45 * placed.diameter
+    moves = [
+        register(frame, image, inside, placed.center).shift for frame, image in zip(frames, images, strict=True)
+    ]
+    turned = np.einsum("kij,kj->ki", placed.matrices[:2], moves)
+    return replace(placed, origins=origins + np.concatenate([turned, np.zeros((2, 2))]))

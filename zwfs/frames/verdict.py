@@ -10,16 +10,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from zwfs import _check
 from zwfs.bounds import cramer_rao
 from zwfs.frames.pipeline import (
+    NEAR,
     MeasuredPhase,
     Measurement,
     Optics,
     model,
+    near_edges,
     predict_other,
+    prediction_error,
     recover_phase,
     upside_down,
 )
@@ -27,10 +29,11 @@ from zwfs.frames.registration import Placement, RegisteredFrames, nearest_good
 
 __all__ = ["CameraNoise", "ImageOrder", "Verdict", "judge", "order_of_images"]
 
-_NEAR = 2  # pixels from a gap, vane or edge that count as near it
-_LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
 _EXPLAINED = 1.25  # misfit over the noise up to which noise explains the frames
 _LEAST_LEAD = 0.2  # of the score over that of the control
+_FACTORS = 0.5, 0.6, 0.7, 0.83, 1.0, 1.2, 1.4, 1.7, 2.0  # on the frames
+_AS_WELL = 0.15  # by which the squared error of a prediction may exceed the least one, and is no worse
+_STRONGER = 1.5  # times the weakest phase that is possible: the scale of the phase is not determined
 _UNEVEN = 0.03  # difference of the two flux ratios that is worth a word
 _EXCESS = 0.02  # light around the pupil, 1 = mean of the pupil, that is worth a word
 _MANY = 0.01  # of the points
@@ -75,8 +78,12 @@ class Verdict:
         them. 1 if noise is all of it; NaN if the noise of the camera is not known.
     sigma : ndarray, shape (ny, nx), radian, or None
         Error bar of the phase: the smallest that photon and read noise allow, without errors of the model.
+    placed : bool
+        Whether the images determine the rotation and the magnification between them.
+    scales, strengths : (float, float), 1 and radian rms
+        Smallest and largest factor on the frames with which they are predicted as well, and the phases they give.
     findings : dict of str
-        Sentences by their topic: fit, unseen data, light, registration, and warnings if there are any.
+        Sentences by their topic: fit, unseen data, scale, light, registration, and warnings if there are any.
     """
 
     score: NDArray[np.float64]
@@ -84,12 +91,21 @@ class Verdict:
     inner: float
     edge: float
     sigma: NDArray[np.float64] | None
+    placed: bool
+    scales: tuple[float, float]
+    strengths: tuple[float, float]
     findings: dict[str, str]
 
     @property
     def explained(self) -> bool | None:
-        """Whether noise explains the misfit far from the edges; None if the noise is not known."""
-        return None if np.isnan(self.inner) else bool(self.inner <= _EXPLAINED)
+        """Whether noise explains the misfit far from the edges.
+
+        None if that cannot be decided: the noise is not known, or noise explains the misfit, but the images do not
+        determine the rotation or the magnification between them, and an error of these changes the phase.
+        """
+        if np.isnan(self.inner) or (self.inner <= _EXPLAINED and not self.placed):
+            return None
+        return bool(self.inner <= _EXPLAINED)
 
 
 def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations: int = 25) -> Verdict:
@@ -139,23 +155,18 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
         ratio = _over_noise(result, noise)
         inner, edge = _rms(ratio[measurement.good & ~near]), _rms(ratio[measurement.good & near])
         sigma = error_bar(result, noise)
+    placed = not np.isnan(measurement.registered.placement.sigma[2:]).any()
+    scales, strengths = _scales(measurement, n_iterations)
     findings = {
-        "fit": _of_fit(result, inner, edge, near),
+        "fit": _of_fit(result, inner, edge, near, placed),
         "unseen data": _of_score(score, control),
+        "scale": _of_scale(scales, strengths),
         "light": _of_light(measurement),
         "registration": _of_place(measurement.registered.placement),
     }
     if warnings := " ".join(_warnings(result)):
         findings["warnings"] = warnings
-    return Verdict(score, control, inner, edge, sigma, findings)
-
-
-def near_edges(measurement: Measurement) -> NDArray[np.bool_]:
-    """Points within 2 pixels of one that is dark or partly lit, (ny, nx)."""
-    amplitude = np.where(measurement.pupil.inside, measurement.pupil.amplitude, 0)
-    # Compared with its surroundings, since the pupil may be lit unevenly.
-    around = ndimage.median_filter(amplitude, max(3, round(measurement.registered.diameter / 8)))
-    return ~np.asarray(ndimage.binary_erosion(amplitude > _LIT * around, np.ones((3, 3)), iterations=_NEAR))
+    return Verdict(score, control, inner, edge, sigma, placed, scales, strengths, findings)
 
 
 def error_bar(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64]:
@@ -187,7 +198,7 @@ def _over_noise(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64
     growth = np.real(np.conj(waves) * field) / np.maximum(np.abs(field) ** 2, 1e-300)
     frames, clear = _noise_kept(measurement.registered)
     dark = noise.read_noise**2 / photons
-    of_frames = frames[:, np.newaxis, np.newaxis] * (np.maximum(np.abs(waves) ** 2, 0) + dark) / photons
+    of_frames = frames[:, np.newaxis, np.newaxis] * (np.abs(waves) ** 2 + measurement.rest + dark) / photons
     exposure = measurement.registered.exposure
     of_amplitude = clear.sum() / 4 * exposure * (np.abs(field) ** 2 + dark * exposure) / photons
     variance = np.sum(normal**2 * of_frames, axis=0) + np.sum(normal * growth, axis=0) ** 2 * of_amplitude
@@ -210,7 +221,36 @@ def _rms(values: NDArray) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
 
 
-def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.bool_]) -> str:
+def _scales(measurement: Measurement, n_iterations: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Range of the factors on the frames with which these are predicted as well, and of the phases, radian rms.
+
+    The squared error of a prediction that counts as well is up to 1.15 times the least one. It is up to twice the
+    least one if that is as large as the variance of the frames: then the model is too wrong to decide.
+    """
+    errors, strengths = [], []
+    for factor in _FACTORS:
+        one = replace(measurement, optics=replace(measurement.optics, scale=factor * measurement.optics.scale))
+        errors.append(float(prediction_error(one, one.good, n_iterations).mean()))
+        waves = np.exp(1j * recover_phase(one, n_iterations).phase[one.good])
+        strengths.append(float(np.angle(waves * np.conj(waves.mean())).std()))
+    least, here = min(errors), errors[_FACTORS.index(1.0)]
+    well = np.array(errors) <= max(here, least * (1 + np.clip(least, _AS_WELL, 1)))
+    factors, phases = np.array(_FACTORS)[well], np.array(strengths)[well]
+    return (float(factors.min()), float(factors.max())), (float(phases.min()), float(phases.max()))
+
+
+def _of_scale(scales: tuple[float, float], strengths: tuple[float, float]) -> str:
+    """Whether the frames determine how strong the phase is."""
+    if scales == (1.0, 1.0):
+        return "Determined: frames that are a fifth brighter or darker are predicted worse."
+    word = "is not" if strengths[1] > _STRONGER * strengths[0] else "is"
+    return (
+        f"The scale of the phase {word} determined: with the frames scaled by {scales[0]:.2f} to {scales[1]:.2f}, "
+        f"they are predicted as well, and the phase has {strengths[0]:.2f} to {strengths[1]:.2f} rad rms."
+    )
+
+
+def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.bool_], placed: bool) -> str:
     """Whether the model explains the frames, and where it does not."""
     good = result.measurement.good
     squares = np.sum((result.measured - result.modelled)[(..., *result.measurement.window)] ** 2, axis=0)
@@ -222,7 +262,7 @@ def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.b
         else "dimple, leakage and background"
     )
     where = (
-        f"{share:.0%} of the squared misfit lies within {_NEAR} pixels of {edges} ({area:.0%} of the points): "
+        f"{share:.0%} of the squared misfit lies within {NEAR} pixels of {edges} ({area:.0%} of the points): "
         f"look at {look}."
     )
     if np.isnan(inner):
@@ -231,6 +271,11 @@ def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.b
     if inner > _EXPLAINED:
         return f"Not explained. {where} Far from {edges} the misfit is {inner:.3g} times that of the noise."
     verdict = f"Explained to within the noise: far from {edges} the misfit is {inner:.2f} times that of the noise."
+    if not placed:
+        verdict = (
+            f"Not decided: far from {edges} the misfit is {inner:.2f} times that of the noise, but the images do "
+            "not determine the rotation or the magnification between them, which change the phase."
+        )
     if edge <= _EXPLAINED:
         return verdict
     return f"{verdict} Near them it is {edge:.3g} times the noise: look at partly lit pixels, focus and blur."

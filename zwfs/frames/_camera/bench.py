@@ -30,7 +30,7 @@ from zwfs.frames._camera.solve import (
     fine_phase,
     minimise,
 )
-from zwfs.frames.registration import radius
+from zwfs.frames._outline import radius
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted

@@ -12,7 +12,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from zwfs import _check
-from zwfs.frames.registration import radius
+from zwfs.frames._outline import radius
 
 PAD = 2
 """Pixels of the maps around the grid of the known phases."""

@@ -1,0 +1,183 @@
+"""What a verdict says at the boundaries of its factors, and what a fit keeps, on frames that HCIPy simulates."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from zwfs.frames.pipeline import Optics, near_edges, recover_phase, reduce_frames, upside_down
+from zwfs.frames.refine import fit, steps
+from zwfs.frames.registration import Image, Placement, RegisteredFrames, register_frames
+from zwfs.frames.verdict import CameraNoise, _of_place, _of_score, judge
+
+from .hcipy_bench import HcipyBench
+
+SHIFTED = {"offsets": ((0.0, 0.0), (0.4, -0.7))}
+
+
+def recorded(bench, clear_photons=None, seed=1):
+    """Frames and clear frames of a screen of 0.5 rad rms, and the screen."""
+    screen = bench.smooth(0.5, seed=seed)
+    clear = replace(bench, photons=clear_photons or bench.photons).counts(0 * screen, (8, seed), masked=False)
+    pairs = bench.counts(screen, (7, seed)), clear
+    return *([Image(one, np.zeros(one.shape, bool)) for one in pair] for pair in pairs), screen
+
+
+def registered(bench, **settings):
+    frames, clear_frames, _ = recorded(bench)
+    return register_frames(frames, clear_frames, **settings)
+
+
+def error(bench, found, screen):
+    """Rms error of a phase at fully lit pixels, radian."""
+    canvas = np.full((bench.side,) * 2, np.nan)
+    row, column = found.measurement.registered.corner
+    n = len(found.phase)
+    canvas[row : row + n, column : column + n] = found.phase
+    start = (bench.side - bench.pixels) // 2
+    phase = canvas[start : start + bench.pixels, start : start + bench.pixels]
+    left = np.exp(1j * (phase - bench.on_pupil(screen)))[bench.fully_lit & np.isfinite(phase)]
+    return np.angle(left * np.conj(left.mean())).std()
+
+
+@pytest.fixture(scope="module")
+def disc():
+    return registered(HcipyBench())
+
+
+@pytest.fixture(scope="module")
+def found(disc):
+    return recover_phase(reduce_frames(disc, Optics()))
+
+
+# Fits
+
+
+def test_fit_keeps_a_value_that_predicts_unseen_blocks_better(disc):
+    assert fit(disc, Optics(scale=1.1), ["scale"])[1].scale == pytest.approx(1, abs=0.01)
+
+
+def test_fit_keeps_nothing_of_frames_that_do_not_belong_together(disc):
+    """The control: a smaller misfit is found here, too."""
+    frames = disc.frames[0], replace(disc.frames[1], counts=disc.frames[1].counts[::-1])
+    nonsense, optics = replace(disc, frames=frames), Optics(1.2, scale=1.1)
+    assert fit(nonsense, optics, ["scale"]) == (nonsense, optics)
+    assert fit(disc, optics, ["scale"])[1].scale < 1.05
+
+
+def test_last_step_on_a_shifted_disc_is_not_worse_than_one_before():
+    bench = HcipyBench(**SHIFTED)
+    frames, clear_frames, screen = recorded(bench)
+    work = steps(frames, clear_frames, Optics(), ["registration", "diameter"])
+    errors = [error(bench, step.result, screen) for step in work]
+    assert [step.name for step in work[-2:]] == ["fit of registration (not kept)", "fit of diameter (not kept)"]
+    assert errors[-1] == min(errors) < 0.015 < errors[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("bench", "optics"),
+    [
+        (HcipyBench(leakage=0.05), Optics()),
+        (HcipyBench("VLT"), Optics(1.2)),
+        (HcipyBench("VLT", **SHIFTED), Optics()),
+        (HcipyBench(diameter=1.1, leakage=0.03, focus=(6e-4, -4e-4), blur=0.6, static=0.15), Optics()),
+    ],
+    ids=["leakage", "diameter", "shift", "all"],
+)
+def test_steps_lower_the_error_or_keep_it(bench, optics):
+    frames, clear_frames, screen = recorded(bench)
+    work = steps(frames, clear_frames, optics, ["registration", "scale", "diameter", "leakage"])
+    first, last = (error(bench, step.result, screen + bench.flat) for step in (work[3], work[-1]))
+    assert last < 1.05 * first
+    if optics.diameter > 1.1 or bench.leakage == 0.05:
+        assert last < first / 3
+
+
+# Sentences
+
+
+def test_rotation_that_is_not_determined_is_named_and_the_misfit_is_not_called_explained():
+    bench = HcipyBench("VLT", rotations=(0.0, 1.5), photons=300.0)
+    verdict = judge(recover_phase(reduce_frames(registered(bench), Optics())), CameraNoise(1.0, bench.noise))
+    assert verdict.inner < 1.25
+    assert not verdict.placed
+    assert verdict.explained is None
+    assert "do not determine the rotation" in verdict.findings["fit"]
+    assert "xplained" not in verdict.findings["fit"]
+    assert "its rotation is not determined" in verdict.findings["registration"]
+
+
+def test_scale_of_the_phase_is_determined_by_frames_that_belong_together_only(found):
+    verdict = judge(found)
+    assert verdict.scales == (1.0, 1.0)
+    assert verdict.findings["scale"].startswith("Determined")
+    nonsense = judge(recover_phase(upside_down(found.measurement)))
+    assert "The scale of the phase is not determined" in nonsense.findings["scale"]
+    assert f"{nonsense.strengths[0]:.2f} to {nonsense.strengths[1]:.2f} rad rms" in nonsense.findings["scale"]
+    assert nonsense.strengths[1] > 1.5 * nonsense.strengths[0]
+
+
+@pytest.mark.parametrize(("factor", "words"), [(1.19, "look at dimple"), (1.21, "look at registration")])
+def test_edges_are_to_blame_if_their_share_exceeds_their_area_by_a_fifth(found, factor, words):
+    measurement = found.measurement
+    near = near_edges(measurement)
+    area = np.mean(near[measurement.good])
+    misfit = np.zeros_like(found.measured)
+    misfit[(..., *measurement.window)] = np.where(near, np.sqrt(factor * (1 - area) / (1 - factor * area)), 1)
+    assert words in judge(replace(found, modelled=found.measured - misfit)).findings["fit"]
+
+
+@pytest.mark.parametrize(("lead", "words"), [(0.21, "belong together"), (0.19, "hardly support")])
+def test_frames_belong_together_if_both_lead_their_control_by_a_fifth(lead, words):
+    control = np.array([0.3, 0.1])
+    assert words in _of_score(control + np.array([lead, 0.5]), control)
+    assert words in _of_score(control + np.array([0.5, lead]), control)
+
+
+@pytest.mark.parametrize(("sigmas", "word"), [(4.9, "consistent with none"), (-5.1, "undone")])
+def test_rotation_and_magnification_are_real_beyond_five_sigma(sigmas, word):
+    turned = Placement(np.zeros(2), 0.1 * sigmas, 1.0, np.array([0.1, 0.1, 0.1, 0.01]))
+    larger = Placement(np.zeros(2), 0.0, 1 + 0.01 * sigmas, np.array([0.1, 0.1, 0.1, 0.01]))
+    assert f"degrees ({word})" in _of_place(turned)
+    assert f"% ({word})" in _of_place(larger)
+
+
+def test_photons_are_those_of_the_mean_of_the_clear_frames_and_their_noise_is_that_of_the_mean():
+    bench = HcipyBench(photons=3e6, fluxes=(1.0, 0.6), read_noise=0.0, background=0.0)
+    frames, clear_frames, _ = recorded(bench, clear_photons=3e3)
+    measurement = reduce_frames(register_frames(frames, clear_frames, exposure=1e3), Optics())
+    assert CameraNoise(2.0).photons(measurement) == pytest.approx(2 * 0.8 * 3e6, rel=0.02)
+    # The noise of the clear frames is nearly all of it here.
+    even = replace(bench, fluxes=(1.0, 1.0))
+    frames, clear_frames, _ = recorded(even, clear_photons=3e3)
+    measurement = reduce_frames(register_frames(frames, clear_frames, exposure=1e3), Optics())
+    assert judge(recover_phase(measurement), CameraNoise(1.0)).inner == pytest.approx(1, abs=0.12)
+
+
+# Places
+
+
+def test_second_image_is_turned_about_the_centre_of_its_pupil():
+    """The offset between the images comes after the rotation."""
+    shape, shift = (60, 140), np.array([3.0, 70.0])
+    rows, columns = np.indices(shape)
+    images = [Image(one.astype(float), np.zeros(shape, bool)) for one in (rows, columns)]
+    placement = Placement(shift, rotation=5.0, magnification=1.02)
+    disc = RegisteredFrames(
+        (images[0], images[0]), (images[0], images[0]), (_circle(), _circle()),
+        np.array([[0.0, 0.0], shift, [0.0, 0.0], shift]), placement=placement,
+    )  # fmt: skip
+    for axis, image in enumerate(images):
+        seen = replace(disc, frames=(image, image)).frames_on_grid()[0] / disc.areas[:2, None, None]
+        middle = (29.0, 30.0)[axis]
+        np.testing.assert_allclose(seen.mean(axis=(1, 2)), [middle, middle + shift[axis]], atol=1e-6)
+        # One column to the right on the first image, on both.
+        step = np.diff(seen, axis=2).mean(axis=(1, 2))
+        np.testing.assert_allclose(step, [axis, placement.matrix[axis, 1]], atol=1e-6)
+
+
+def _circle():
+    from zwfs.frames._outline import Circle
+
+    return Circle(29.0, 30.0, 31.0)

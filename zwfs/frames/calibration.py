@@ -28,9 +28,9 @@ from zwfs.frames._camera import BenchFit
 from zwfs.frames._errors import Excess, sideways, slopes_of, unexplained
 from zwfs.frames._grid import Grid
 from zwfs.frames._learnt import learnt, places_of, training
+from zwfs.frames._outline import radius
 from zwfs.frames.phases import Flag, Phases
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames
-from zwfs.frames.registration import radius
 from zwfs.metrics import without_piston
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor

@@ -6,9 +6,9 @@ is lit, with the field A exp(i phase), and the rest. Its intensity behind a mask
     I = s |A exp(i phase) + r|^2 + (1 - s) |r|^2 = |m exp(i phase) + r|^2 + q,
 
 with the mean field m = s A and the light q = s A^2 - m^2 that does not interfere with r. The relay moves the
-fields to the plane that is conjugate to the camera, and spreads q, which belongs to waves too steep for the grid. A Gaussian blur acts on the intensity as a product with its
-spectrum. A spline takes it to the place that shift, rotation and magnification give, and a pixel is the mean over
-its points there.
+fields to the plane that is conjugate to the camera, and spreads q, which belongs to waves too steep for the grid.
+A Gaussian blur acts on the intensity as a product with its spectrum. A spline takes it to the place that shift,
+rotation and magnification give, and a pixel is the mean over its points there.
 """
 
 from __future__ import annotations
@@ -121,12 +121,13 @@ class Camera:
 
         The light of an edge has a power of 1 / nu^2 at nu cycles per pixel, and the relay moves it by
         d = focus D^2 nu across the edge. Only nu > f / 2 is not resolved, so d has the density d_0 / d^2 beyond
-        d_0 = d(f / 2). Over all directions of edges the factor at kappa cycles per pixel is, with x = 2 pi kappa d_0,
+        d_0 = d(f / 2). Over all directions of edges the factor at kappa cycles per pixel is,
+        with x = 2 pi kappa d_0,
 
             k(x) = int_{d_0}^inf d_0 / d^2 J_0(2 pi kappa d) dd = J_0(x) - x (1 + J_1(x) - int_0^x J_0),
 
-        and k'(x) = (k - J_0) / x. The density ends at r d_0, so that the factor is (k(x) - k(r x) / r) / (1 - 1 / r),
-        which has no kink at focus 0.
+        and k'(x) = (k - J_0) / x. The density ends at r d_0, so that the factor is
+        (k(x) - k(r x) / r) / (1 - 1 / r), which has no kink at focus 0.
         """
         unit = np.pi * np.sqrt(self.squares) * self.f * self.n_pixels**2
         near, far = (_edge_light(x) for x in (unit * abs(focus), _LONGEST * unit * abs(focus)))

@@ -58,9 +58,9 @@ def test_fit_keeps_a_value_that_predicts_unseen_blocks_better(disc):
 
 
 def test_fit_keeps_nothing_of_frames_that_do_not_belong_together(disc):
-    """The control: a smaller misfit is found here, too."""
+    """A lower scale predicts these frames better, too, but the control even more so."""
     frames = disc.frames[0], replace(disc.frames[1], counts=disc.frames[1].counts[::-1])
-    nonsense, optics = replace(disc, frames=frames), Optics(1.2, scale=1.1)
+    nonsense, optics = replace(disc, frames=frames), Optics(scale=1.5)
     assert fit(nonsense, optics, ["scale"]) == (nonsense, optics)
     assert fit(disc, optics, ["scale"])[1].scale < 1.05
 

@@ -28,14 +28,7 @@ _KEYWORD = re.compile("[A-Z0-9_ -]*")  # of the standard, with the blanks of the
 
 
 class FileError(ValueError):
-    """A camera file is broken, too large, or holds no image; the message names the file.
-
-    Examples
-    --------
-    >>> from zwfs.frames import FileError
-    >>> issubclass(FileError, ValueError)
-    True
-    """
+    """A camera file is broken, too large, or holds no image; the message names the file."""
 
 
 @dataclass(frozen=True)

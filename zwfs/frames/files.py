@@ -49,14 +49,6 @@ class CameraFile:
         Largest value that the type of the file's numbers can hold; infinity for floats.
     path : Path, optional
         Of the file, absolute. `write_phase` never replaces it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs.frames.files import CameraFile
-    >>> file = CameraFile(np.ones((1, 8, 8)), "dark.fits", "", header={"EXPTIME": 0.5})
-    >>> file.keyword("EXPTIME")
-    0.5
     """
 
     images: NDArray[np.float64]
@@ -70,13 +62,6 @@ class CameraFile:
         images = _check.real_array("images", self.images)
         if images.ndim != 3 or not images.size:
             raise ValueError(f"images has shape {images.shape}: expected (n, ny, nx)")
-        _check.instance("name", self.name, str)
-        _check.instance("sha256", self.sha256, str)
-        _check.instance("header", self.header, Mapping)
-        if self.full_scale is not np.inf:
-            _check.number("full_scale", self.full_scale, 0, open_low=True)
-        if self.path is not None:
-            _check.instance("path", self.path, Path)
 
     def keyword(self, key: str) -> float:
         """Number under a keyword of the header.
@@ -284,16 +269,6 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     TypeError, ValueError
         If `output` is one of the inputs, also under another name or as a hard link, is a file that `write_phase`
         did not write, is a folder, or cannot be written, or if an input lies in its scratch folder.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from zwfs.frames.files import check_output
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = check_output(f"{folder}/phase.fits")
-    ...
-    >>> path.name
-    'phase.fits'
     """
     overwrite = _check.flag("overwrite", overwrite)
     sources = paths_of("inputs", inputs)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,13 +69,6 @@ class Optics:
     ------
     ValueError
         If the phase shifts are the same or one of them is 0.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs.frames.pipeline import Optics
-    >>> bool(Optics(diameter=1.06, phase_shifts=(np.pi / 2, -np.pi / 2)).opposite)
-    True
     """
 
     diameter: float = 1.06
@@ -204,11 +196,6 @@ class MeasuredPhase:
         return np.sqrt(np.mean((self._inside(self.measured) - self._inside(self.modelled)) ** 2, axis=1))
 
     @cached_property
-    def contrast(self) -> NDArray[np.float64]:
-        """Standard deviation of the measured frames over the good points of the pupil, (2,)."""
-        return self._inside(self.measured).std(axis=1)
-
-    @cached_property
     def excess_light(self) -> float:
         """Mean of measured less modelled light next to the pupil, where no phase was fitted."""
         around = self.measurement.surroundings
@@ -216,7 +203,7 @@ class MeasuredPhase:
 
     @cached_property
     def mismatch(self) -> NDArray[np.float64]:
-        """Measured less modelled frames over the contrast, shape (2, ny', nx').
+        """Measured less modelled frames over the contrast, the rms variation of the frames, shape (2, ny', nx').
 
         Its squares sum up to that of `misfit`. Pupil and surroundings weigh the same, however many pixels they
         have; what belongs to neither is 0.
@@ -224,7 +211,7 @@ class MeasuredPhase:
         around, inside = self.measurement.surroundings, np.zeros(self.measured.shape, bool)
         inside[(..., *self.measurement.window)] = self.measurement.good
         weight = inside / np.count_nonzero(inside) + around / max(1, int(np.count_nonzero(around)))
-        return (self.measured - self.modelled) * np.sqrt(weight / np.mean(self.contrast**2))
+        return (self.measured - self.modelled) * np.sqrt(weight / self._inside(self.measured).var(axis=1).mean())
 
     @property
     def misfit(self) -> float:
@@ -352,7 +339,6 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: f
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     sensor = model(measurement)
     iterate = PhaseShifted(sensor, n_iterations=n_iterations, tolerance=tolerance)
-    measured = _scaled(measurement)
     frames = np.maximum(ideal_frames(measurement), 0)
     inner = (..., *sensor.window)
     bad = measurement.pupil.inside & ~measurement.good
@@ -362,7 +348,7 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: f
         frames[inner] = np.where(bad, clean[inner], frames[inner])
     return MeasuredPhase(
         phase=np.where(measurement.good, estimate.phase, np.nan),
-        measured=measured,
+        measured=_scaled(measurement),
         modelled=_mix(clean, measurement),
         measurement=measurement,
         converged=bool(estimate.converged),
@@ -381,7 +367,10 @@ def model(measurement: Measurement) -> ZernikeSensor:
 def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:
     """Frames of a measurement as those of an ideal sensor: its optics are undone. They may be negative."""
     _check.instance("measurement", measurement, Measurement)
-    return _unmix(_scaled(measurement), measurement)
+    optics, pure = measurement.optics, _scaled(measurement)
+    pure[(..., *measurement.window)] -= measurement.rest + optics.unmasked * measurement.pupil.amplitude**2
+    pure /= 1 - optics.unmasked
+    return ((1 - optics.leakage) * pure - optics.leakage * pure[::-1]) / (1 - 2 * optics.leakage)
 
 
 def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[np.float64]:
@@ -420,11 +409,8 @@ def prediction_error(measurement: Measurement, where: NDArray, n_iterations: int
 def upside_down(measurement: Measurement) -> Measurement:
     """Control of a measurement: its second frame upside down, so that the frames no longer belong together."""
     _check.instance("measurement", measurement, Measurement)
-    flipped: dict[str, Any] = {}
-    for name in ("intensity", "bad"):
-        pair = getattr(measurement, name)
-        flipped[name] = np.stack([pair[0], pair[1, ::-1]])
-    return replace(measurement, **flipped)
+    (first, second), (bad, other) = measurement.intensity, measurement.bad
+    return replace(measurement, intensity=np.stack([first, second[::-1]]), bad=np.stack([bad, other[::-1]]))
 
 
 def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:
@@ -454,12 +440,3 @@ def _mix(frames: NDArray, measurement: Measurement) -> NDArray[np.float64]:
     mixed *= 1 - optics.unmasked
     mixed[(..., *measurement.window)] += measurement.rest + optics.unmasked * measurement.pupil.amplitude**2
     return mixed
-
-
-def _unmix(frames: NDArray, measurement: Measurement) -> NDArray[np.float64]:
-    """Inverse of `_mix`."""
-    optics = measurement.optics
-    pure = frames.copy()
-    pure[(..., *measurement.window)] -= measurement.rest + optics.unmasked * measurement.pupil.amplitude**2
-    pure /= 1 - optics.unmasked
-    return ((1 - optics.leakage) * pure - optics.leakage * pure[::-1]) / (1 - 2 * optics.leakage)

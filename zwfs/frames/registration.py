@@ -52,13 +52,6 @@ class Image:
     ------
     ValueError
         If a count is not finite or beyond 1e38.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from zwfs.frames.registration import Image
-    >>> Image(np.ones((8, 8)), bad=np.zeros((8, 8), bool)).name
-    'image'
     """
 
     counts: NDArray[np.float64]

@@ -187,7 +187,7 @@ def test_turned_pupil_of_a_telescope_with_ten_pokes():
     points = errors / calibration.sigma(found, photons, noise)
     assert 0.8 < rms(points, lit) < 1.3
     modes = zernike_basis(calibration.sensor.pupil, 50)
-    # Sums over modes reach pixels that are lit in part. At the rim a mean with zeros beyond it is no truth.
+    # A mode also has values at pixels of the rim. There the true phase is unknown: its mean includes zeros.
     dark = np.pad((taken.phases == 0).all(axis=0), 1, constant_values=True)
     known = calibration.good & ~ndimage.binary_dilation(dark, np.ones((3, 3)))[1:-1, 1:-1]
     errors = np.where(known, np.nan_to_num(errors - np.nanmean(errors[:, lit])), 0)

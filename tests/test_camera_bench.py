@@ -9,6 +9,7 @@ from scipy import ndimage
 from zwfs import Dimple, Pupil, ZernikeSensor
 from zwfs.frames._camera.bench import fit_bench
 from zwfs.frames._camera.model import Camera, Exposure, Maps
+from zwfs.frames._camera.recording import PAD, Recording
 from zwfs.frames._camera.sensor import FittedSensor, unwrapped
 from zwfs.frames._camera.solve import Light, fine_phase
 
@@ -101,6 +102,41 @@ def test_model_with_the_true_maps_makes_the_frames_of_a_foreign_bench():
     values = np.array([*arms[0], *arms[1], bench.diameter, *bench.shifts, 0, bench.blur])
     images = camera.at(Maps(bench.amplitude, 0 * phase, phase), values).images
     np.testing.assert_allclose(images, bench.exposed(phase, True), rtol=0, atol=2e-4)
+
+
+def test_light_that_the_grid_does_not_resolve_spreads_with_the_focus(monkeypatch):
+    """On a grid coarser than that of the bench, most of the error of a defocused image is gone."""
+    bench = replace(CASES["ideal"], pixels=40, side=52, focus=(1e-3, -6e-4))
+    n, f = bench.side + 2 * BORDER, 2
+    light, mean = (blocks(bench.amplitude**power, bench.fine // f) for power in (2, 1))
+    exposures = [Exposure(0, None, 0), Exposure(1, None, 0)]
+    camera = Camera(n, (bench.side,) * 2, bench.pixels, exposures, np.zeros((1, n * f, n * f)), f, 1.5)
+    arms = [[focus, 0, 0, 0, 1, 1, 0] for focus in bench.focus]
+    values = np.array([*arms[0], *arms[1], bench.diameter, *bench.shifts, 0, 0])
+    true = bench.exposed(np.zeros_like(bench.amplitude), False)
+
+    def error():
+        images = camera.at(Maps(mean, light - mean**2, np.zeros_like(mean)), values).images
+        return np.sqrt(np.mean((np.array(images) - true) ** 2, axis=(1, 2)))
+
+    spread = error()
+    monkeypatch.setattr(Camera, "spread_at", lambda self, focus: (1.0, 0.0))
+    assert np.all(spread < error() / 2)
+
+
+def test_known_phases_go_on_beyond_an_outline_that_cuts_pixels():
+    """Pixels of the rim are means with zeros. One that touches the dark only by its corner has to be replaced."""
+    k, n = 16, 30
+    y, x = (np.mgrid[: n * k, : n * k] + 0.5) / k - n / 2
+    true = np.stack([0.002 * (x**2 - 2 * x * y), 0.05 * x + 0.003 * y**2])
+    lit = np.hypot(y, x) < 14.3
+    phases = np.stack([blocks(one * lit, k) for one in true])
+    frames = np.ones((2, 2, n, n))
+    known = Recording.of(frames, frames[0], phases, 28.6, 1.0, 1.0).phases[:, PAD:-PAD, PAD:-PAD]
+    touched = blocks(lit.astype(float), k) > 0
+    np.testing.assert_allclose(
+        known[:, touched], np.stack([blocks(one, k) for one in true])[:, touched], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import nnls
 
+from zwfs.frames._camera.recording import with_neighbours
 from zwfs.frames.registration import nearest_good
 from zwfs.sensor import ZernikeSensor
 
@@ -26,8 +27,7 @@ def unexplained(phase: NDArray, commands: NDArray) -> NDArray[np.float32]:
     """
     unknown = ~np.isfinite(commands).all(axis=0) | (commands == 0).all(axis=0)
     if unknown.any():
-        wide = np.pad(unknown, 1, constant_values=True)
-        unknown = ndimage.binary_dilation(wide, np.ones((3, 3)))[1:-1, 1:-1]
+        unknown = with_neighbours(unknown)
     waves = np.where(unknown, 0, np.nan_to_num(np.exp(1j * (phase.astype(float) - np.nan_to_num(commands)))))
     for _ in range(4):  # each phase has its own piston
         mean = waves.mean(axis=0)

@@ -295,7 +295,7 @@ class Calibration(Immutable):
         Raises
         ------
         FileNotFoundError, TypeError, ValueError
-            The last, a FileError, if the file is no calibration, broken, or of another format.
+            ValueError is a FileError if the file is broken, is not a calibration, or has another format.
         """
         path = path_of("path", path)
         if not path.is_file():

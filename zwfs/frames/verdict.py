@@ -32,7 +32,7 @@ __all__ = ["CameraNoise", "ImageOrder", "Verdict", "judge", "order_of_images"]
 _EXPLAINED = 1.25  # misfit over the noise up to which noise explains the frames
 _LEAST_LEAD = 0.2  # of the score over that of the control
 _FACTORS = 0.5, 0.6, 0.7, 0.83, 1.0, 1.2, 1.4, 1.7, 2.0  # on the frames
-_AS_WELL = 0.15  # by which the squared error of a prediction may exceed the least one, and is no worse
+_AS_WELL = 0.15  # a prediction whose squared error is larger than the least one by this part is as good
 _STRONGER = 1.5  # times the weakest phase that is possible: the scale of the phase is not determined
 _UNEVEN = 0.03  # difference of the two flux ratios that is worth a word
 _EXCESS = 0.02  # light around the pupil, 1 = mean of the pupil, that is worth a word

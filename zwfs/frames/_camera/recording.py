@@ -128,6 +128,12 @@ def centred(image: NDArray, n: int) -> NDArray:
     return whole[first[0] : first[0] + n, first[1] : first[1] + n]
 
 
+def with_neighbours(unknown: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Unknown pixels and all that touch one, if only by a corner; beyond the grid all are unknown."""
+    wide = np.pad(unknown, 1, constant_values=True)
+    return np.asarray(ndimage.binary_dilation(wide, np.ones((3, 3))))[1:-1, 1:-1]
+
+
 def _continued(phases: NDArray) -> NDArray[np.float64]:
     """Known phases on a wider grid, smoothly continued by a few pixels beyond where they are known."""
     bad = ~np.isfinite(phases).all(axis=0) | (phases == 0).all(axis=0)
@@ -135,7 +141,7 @@ def _continued(phases: NDArray) -> NDArray[np.float64]:
     regions, _ = ndimage.label(np.pad(bad, PAD, constant_values=True))
     unknown = regions == regions[0, 0]
     if np.any(bad & unknown[PAD:-PAD, PAD:-PAD]):  # a pixel of the outline mixes the phase with zeros
-        unknown = ndimage.binary_dilation(unknown, np.ones((3, 3)))
+        unknown = with_neighbours(unknown)
     if unknown.all():
         return wide
     n = wide.shape[-1]

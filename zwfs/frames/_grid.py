@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage, sparse
+from scipy.interpolate import NdBSpline
 
 from zwfs import _check
 from zwfs._information import Response
@@ -26,61 +27,36 @@ _NOISE = 0.2  # of the signal, in squares: the inverse of a blur goes no further
 _NEGLIGIBLE = 1e-10  # of a weight: smaller ones only slow products down, much so if their products are subnormal
 
 
-class Grid(NamedTuple):
+class Grid:
     """Constants of the calls of a calibration, in single precision, on a box of the camera around each pupil."""
 
-    reconstruct: PhaseShifted
-    response: Response
-    n_points: int
-    weights: NDArray[np.float32]
-    offset: NDArray[np.float32]
-    flat_frames: NDArray[np.float32]
-    boxes: list[tuple[int, Any, Any]]  # image, rows and columns
-    dark: NDArray[np.float32]  # (2, h, w), background included
-    bad: NDArray[np.bool_]  # (2, h, w)
-    watched: NDArray[np.bool_]  # (2, h, w), good pixels from which the pupil is made
-    repairs: list[tuple[NDArray, NDArray]]  # bad pixels of each box, and their nearest good ones
-    filters: tuple[NDArray[np.float32], NDArray[np.float32]]  # spline coefficients along rows and columns
-    splines: list[Any]  # sparse (ny nx, h' w'), cubic, 0 outside the pupil
-    touching: list[Any]  # sparse (ny nx, h w), linear
-    holes: tuple[NDArray, NDArray]  # bad points of the pupil, and their nearest good ones
-
-    @classmethod
-    def of(cls, calibration: Calibration) -> Grid:
+    def __init__(self, calibration: Calibration) -> None:
         pupil = Pupil.from_amplitude(calibration.amplitude, calibration.diameter, calibration.center)
         masks = (Dimple(calibration.optics.diameter, shift) for shift in calibration.optics.phase_shifts)
         sensor = ZernikeSensor(pupil, *masks, tolerance=1e-6)
         settings: dict[str, Any] = {"n_iterations": calibration.n_iterations, "tolerance": calibration.tolerance}
+        self.reconstruct, self.response = PhaseShifted(sensor, accelerate=True, **settings), Response.of(sensor)
+        self.weights, self.offset = calibration.weights.astype(np.float32), calibration.offset.astype(np.float32)
+        self.flat_frames = sensor.measure(np.zeros(pupil.shape)).astype(np.float32)
         places = calibration.places.reshape(2, 2, -1)
         low = np.floor(places.min(axis=2)).astype(int) - _REACH
         size = (np.floor(places.max(axis=2)).astype(int) + _REACH + 2 - low).max(axis=0)
-        boxes = []
+        self.boxes: list[tuple[int, Any, Any]] = []  # image, rows and columns
         for index, (row, column) in enumerate(low):
             axes = zip((row, column), size, calibration.shape, strict=True)
-            boxes.append((min(index, calibration.n_images - 1), *(_span(*axis) for axis in axes)))
-        dark = np.stack([calibration.dark[i][rows][:, columns] for i, rows, columns in boxes])
-        bad = np.stack([calibration.bad[i][rows][:, columns] for i, rows, columns in boxes])
-        corners = places - low[:, :, np.newaxis]
-        touching = [_interpolation(corner, tuple(size)) for corner in corners]
-        inside = pupil.inside.ravel().astype(float)
-        reached = np.stack([one.T @ inside > 0 for one in touching]).reshape(bad.shape)
-        return cls(
-            PhaseShifted(sensor, accelerate=True, **settings),
-            Response.of(sensor),
-            pupil.n_points,
-            calibration.weights.astype(np.float32),
-            calibration.offset.astype(np.float32),
-            sensor.measure(np.zeros(pupil.shape)).astype(np.float32),
-            boxes,
-            dark + calibration.background[:, np.newaxis, np.newaxis].astype(np.float32),
-            bad,
-            reached & ~bad,
-            [_repair(one, ~one) for one in bad],
-            (_spline_filter(size[0], calibration.blur), _spline_filter(size[1], calibration.blur)),
-            [_interpolation(one - _CUT, tuple(size - 2 * _CUT), pupil.inside.ravel()) for one in corners],
-            touching,
-            _repair(pupil.inside & ~calibration.good, calibration.good),
-        )
+            self.boxes.append((min(index, calibration.n_images - 1), *(_span(*axis) for axis in axes)))
+        pairs = calibration.dark, calibration.bad
+        dark, bad = (np.stack([one[i][rows][:, columns] for i, rows, columns in self.boxes]) for one in pairs)
+        self.dark, self.bad = dark + calibration.background[:, np.newaxis, np.newaxis].astype(np.float32), bad
+        corners, inside = places - low[:, :, np.newaxis], pupil.inside.ravel().astype(float)
+        self.touching = [_interpolation(one, size, 1, inside) for one in corners]  # from all pixels of a box
+        self.splines = [_interpolation(one - _CUT, size - 2 * _CUT, 3, inside) for one in corners]
+        self.filters = [_spline_filter(length, calibration.blur) for length in size]  # to their coefficients
+        reached = np.stack([one.sum(axis=0) > 0 for one in self.touching])
+        self.watched = reached.reshape(bad.shape) & ~bad  # good pixels from which the pupil is made
+        # Bad pixels of each box, and bad points of the pupil, with their nearest good ones.
+        self.repairs = [_repair(one, ~one) for one in bad]
+        self.holes = _repair(pupil.inside & ~calibration.good, calibration.good)
 
     def on_grid(self, counts: NDArray, level: float, good: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Counts on the grid, (k, 2, n), good points, (k, ny, nx), and bad and saturated pixels, (k,)."""
@@ -182,25 +158,14 @@ def _spline_filter(size: int, blur: float) -> NDArray[np.float32]:
     return np.ascontiguousarray(matrix[_CUT:-_CUT])
 
 
-def _interpolation(places: NDArray, size: tuple[int, int], inside: NDArray | None = None) -> Any:
-    """Sparse matrix to places (2, n): of cubic splines from coefficients, 0 outside, or linear, from pixels."""
-    base = np.floor(places)
-    t, u = places - base, 1 - places + base
-    if inside is None:
-        m, weights = 2, np.stack([u, t])
-    else:
-        cubics = np.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3])
-        m, weights = 4, cubics * inside / 6
-    values = weights[:, np.newaxis, 0] * weights[np.newaxis, :, 1]
-    values = np.where(np.abs(values) > _NEGLIGIBLE, values, 0)
-    first, steps = base.astype(int) - (m == 4), np.arange(m)
-    rows = first[0] + steps[:, np.newaxis, np.newaxis]
-    columns = first[1] + steps[np.newaxis, :, np.newaxis]
-    pixels = rows * size[1] + columns
-    points = np.broadcast_to(np.arange(places.shape[1]), pixels.shape)
-    shape = places.shape[1], size[0] * size[1]
-    matrix = sparse.csr_array((values.ravel(), (points.ravel(), pixels.ravel())), shape=shape, dtype=np.float32)
+def _interpolation(places: NDArray, size: NDArray, degree: int, inside: NDArray) -> sparse.csr_array:
+    """Sparse matrix from coefficients of splines, of degree 1 pixels, to places (2, n); 0 where not inside."""
+    around = (degree + 1) // 2
+    knots = tuple(np.arange(-around, length + around, dtype=float) for length in size)
+    basis = NdBSpline.design_matrix(np.ascontiguousarray(places.T), knots, degree)
+    matrix = sparse.diags_array(inside) @ sparse.csr_array(basis)
+    matrix.data[np.abs(matrix.data) <= _NEGLIGIBLE] = 0
     matrix.eliminate_zeros()
-    # Half the bytes of each index: reading them takes much of the time of a product.
-    matrix.indices, matrix.indptr = matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32)
-    return matrix
+    # Half the bytes of each number: reading them takes much of the time of a product.
+    index = matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32)
+    return sparse.csr_array((matrix.data.astype(np.float32), *index), shape=(len(inside), size.prod()))

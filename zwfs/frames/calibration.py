@@ -468,7 +468,7 @@ class Calibration(Immutable):
 
     @cached_property
     def _work(self) -> Grid:
-        return Grid.of(self)
+        return Grid(self)
 
     def _phases(self, counts: NDArray, start: NDArray | None, level: float, limit: float, judge: bool) -> Phases:
         """Phases of camera images, (k, n_images, ny_camera, nx_camera)."""
@@ -478,7 +478,7 @@ class Calibration(Immutable):
         flux = np.vecdot(values, good.reshape(k, 1, -1).astype(np.float32)) / (n_good[:, np.newaxis] * self.unit)
         relative = flux / self.light
         with np.errstate(invalid="ignore", divide="ignore"):
-            enough = (relative.min(axis=1) >= _DIM) & (n_good >= (1 - _MOST_BAD) * work.n_points)
+            enough = (relative.min(axis=1) >= _DIM) & (n_good >= (1 - _MOST_BAD) * self.sensor.pupil.n_points)
             gain = (flux.mean(axis=1, keepdims=True) / flux if self.balance else np.ones_like(flux)) / self.unit
         values *= np.where(enough[:, np.newaxis], gain, 0).astype(np.float32)[..., np.newaxis]
         values = values.reshape(k, *self.offset.shape)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,10 +19,6 @@ class Circle(NamedTuple):
     row: float
     column: float
     diameter: float
-
-    def radii(self, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """Distance of every pixel of an image from the centre, in pixels."""
-        return radius(shape, (self.row, self.column))
 
 
 def threshold(image: NDArray) -> float:
@@ -66,11 +61,7 @@ def outline(image: NDArray, region: NDArray, level: float, diameter: float | Non
 
 def _circle_along(points: NDArray, size: float) -> tuple[float, float, float]:
     """Circle (row, column, radius) of a known radius, from which the points differ least on average."""
-
-    def apart(center: NDArray) -> float:
-        return float(np.abs(np.hypot(*(points - center).T) - size).mean())
-
-    return *_least(apart, points), size
+    return *_least(lambda center: np.abs(_apart(points, center) - size).mean(), points), size
 
 
 def _circle_around(points: NDArray) -> tuple[float, float, float]:
@@ -79,17 +70,18 @@ def _circle_around(points: NDArray) -> tuple[float, float, float]:
     The smallest circle around nearly all points decides which ones are outermost: all points of a disc, and the
     corners of a pupil of segments. The result is the least-squares circle through them.
     """
-
-    def reach(center: NDArray) -> float:
-        return float(np.quantile(np.hypot(*(points - center).T), _NEARLY_ALL))
-
-    middle = _least(reach, points)
-    outer = points[np.hypot(*(points - middle).T) > reach(middle) - _OUTER]
+    middle = _least(lambda center: np.quantile(_apart(points, center), _NEARLY_ALL), points)
+    apart = _apart(points, middle)
+    outer = points[apart > np.quantile(apart, _NEARLY_ALL) - _OUTER]
     a, b, c = np.linalg.lstsq(np.c_[2 * outer, np.ones(len(outer))], np.sum(outer**2, axis=1), rcond=None)[0]
     return a, b, np.sqrt(c + a**2 + b**2)
 
 
-def _least(cost: Callable[[NDArray], float], points: NDArray) -> NDArray[np.float64]:
+def _apart(points: NDArray, center: NDArray) -> NDArray[np.float64]:
+    return np.hypot(*(points - center).T)
+
+
+def _least(cost: Callable[[NDArray], Any], points: NDArray) -> NDArray[np.float64]:
     """Centre of the least cost, from that of the points."""
     return optimize.minimize(cost, points.mean(axis=0), method="Nelder-Mead", options={"xatol": 0.01}).x
 
@@ -106,36 +98,27 @@ def turning(rotation: float, magnification: float) -> NDArray[np.float64]:
     return magnification * np.array([[cosine, sine], [-sine, cosine]])
 
 
-@dataclass(frozen=True, eq=False)
 class Details:
     """Band-passed image and reference, and their difference after a move.
 
     A move is (rows, columns, rotation, stretch), all in pixels; the last two at the edge of the points.
     """
 
-    image: NDArray[np.float64]  # coefficients of splines
-    reference: NDArray[np.float64]
-    points: NDArray[np.float64]  # (2, n), from the centre
-    center: NDArray[np.float64]
-    reach: float  # pixels from the centre to the farthest point
-    block: NDArray[np.int64]  # number of the block of pixels that a point belongs to
-
-    @classmethod
-    def of(
-        cls, image: NDArray, reference: NDArray, inside: NDArray, center: tuple[float, float], blur: float
-    ) -> Details:
+    def __init__(
+        self, image: NDArray, reference: NDArray, inside: NDArray, center: tuple[float, float], blur: float
+    ) -> None:
         bands = (
             ndimage.gaussian_filter(one, blur) - ndimage.gaussian_filter(one, 4 * blur)
             for one in (image, reference)
         )
-        splines = [ndimage.spline_filter(band, order=3, mode="nearest") for band in bands]
+        self.image, self.reference = (ndimage.spline_filter(band, order=3, mode="nearest") for band in bands)
         places = np.argwhere(inside).T
-        middle = np.reshape(center, (2, 1))
-        points = places - middle
+        self.center = np.reshape(center, (2, 1))
+        self.points = places - self.center
+        self.reach = float(np.hypot(*self.points).max())  # pixels from the centre to the farthest point
         # Errors of neighbours go together: those of different blocks hardly do.
         size = max(1, round(8 * blur))
-        block = np.unique(places[0] // size * inside.shape[1] + places[1] // size, return_inverse=True)[1]
-        return cls(splines[0], splines[1], points, middle, float(np.hypot(*points).max()), block)
+        self.block = np.unique(places[0] // size * inside.shape[1] + places[1] // size, return_inverse=True)[1]
 
     def search(self, start: NDArray, free: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Best move and its standard errors, pixels; what is not free keeps its start."""

@@ -421,7 +421,7 @@ def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:
         circles = registered.pupils if shared else registered.pupils[index : index + 1]
         far = ~image.bad
         for circle in circles:
-            far &= circle.radii(far.shape) > 0.58 * circle.diameter
+            far &= radius(far.shape, circle[:2]) > 0.58 * circle.diameter
         enough = np.count_nonzero(far) >= 100 and not image.cut
         levels.append(float(np.median(image.counts[far])) if enough else 0.0)
     dark = np.array(levels) * registered.areas[2:]

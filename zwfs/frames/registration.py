@@ -346,8 +346,8 @@ def register(
     # Details of three times the width, at every third point, draw the search from farther away.
     thin = np.zeros_like(inside)
     thin[::3, ::3] = True
-    coarse = Details.of(image, reference, inside & thin if np.any(inside & thin) else inside, center, 3 * _BLUR)
-    details = Details.of(image, reference, inside, center, _BLUR)
+    coarse = Details(image, reference, inside & thin if np.any(inside & thin) else inside, center, 3 * _BLUR)
+    details = Details(image, reference, inside, center, _BLUR)
     stretch = (magnification - 1) * details.reach if turn else 0.0
     steps = range(-_REACH, _REACH + 1)
     moves = [(y, x, 0.0, stretch) for y in steps for x in steps]
@@ -418,7 +418,7 @@ def _require_whole(circle: Circle, image: Image) -> None:
 
 def _extend(image: Image, circles: Sequence[Circle]) -> Image:
     """An image whose surroundings were set to 0 by software, continued by its edge: splines dislike steps."""
-    apart = [circle.radii(image.counts.shape) / circle.diameter for circle in circles]
+    apart = [radius(image.counts.shape, circle[:2]) / circle.diameter for circle in circles]
     unlit = (image.counts == 0) & (np.min(apart, axis=0) > 0.5)
     if np.count_nonzero(unlit) < 0.05 * unlit.size:
         return image

@@ -8,13 +8,12 @@ focus of the relay to first order.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from zwfs.frames._camera import BenchFit, FittedSensor
+from zwfs.frames._outline import turning
 from zwfs.sensor import ZernikeSensor
 
 _SCREENS = 24  # random phases from which weights are learnt
@@ -28,16 +27,15 @@ def places_of(fit: BenchFit, shape: tuple[int, int], corners: NDArray) -> NDArra
 
     The fit saw windows of a shape, whose first pixels are the corners (2, 2) on the camera.
     """
-    n = len(fit.light)
-    y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2,) * 2, indexing="ij")
-    places = []
+    n, places = len(fit.light), []
+    grid = np.indices((n, n)) - (n - 1) / 2
     for arm, corner in enumerate(corners):
         row, column, angle, size = (
             fit[f"arm {arm} {name}"].value for name in ("row", "column", "rotation", "magnification")
         )
-        cosine, sine = size * math.cos(angle), size * math.sin(angle)
         middle = np.array([row, column]) + (np.array(shape) - 1) / 2 + corner
-        places.append(np.stack([cosine * y + sine * x, cosine * x - sine * y]) + middle[:, None, None])
+        turned = np.einsum("ij,jyx->iyx", turning(np.degrees(angle), size), grid)
+        places.append(turned + middle[:, None, None])
     return np.stack(places)
 
 
@@ -73,7 +71,6 @@ def learnt(values: NDArray, ideal: NDArray, leakage: float) -> tuple[NDArray[np.
 
 def _smooth(image: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Mean of neighbours inside, without a trace of a chequerboard."""
-    sums = [inside * image, inside.astype(float)]
-    for axis in (0, 1):
-        sums = [ndimage.convolve1d(one, [0.25, 0.5, 0.25], axis=axis, mode="constant") for one in sums]
-    return np.where(inside, sums[0] / np.maximum(sums[1], 1e-9), image)
+    kernel = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25])
+    values, weights = (ndimage.convolve(one, kernel, mode="constant") for one in (inside * image, 1.0 * inside))
+    return np.where(inside, values / np.maximum(weights, 1e-9), image)

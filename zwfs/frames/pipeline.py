@@ -265,8 +265,9 @@ def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | No
     stop = radius((n, n), center) <= registered.diameter / 2
     light, scale = mean_light(clear, stop)
     light = np.where(stop, np.maximum(light - optics.pupil_background, 0), 0)
-    pupil = Pupil.from_amplitude(_amplitude(light, registered.diameter), registered.diameter, center, _DARK)
-    unit = float(np.mean(_amplitude(light, registered.diameter)[pupil.inside] ** 2))
+    amplitude = _amplitude(light, registered.diameter)
+    pupil = Pupil.from_amplitude(amplitude, registered.diameter, center, _DARK)
+    unit = float(np.mean(amplitude[pupil.inside] ** 2))
     rest = np.where(pupil.inside, light / unit - pupil.amplitude**2, 0)
     inner = (..., slice(margin, margin + n), slice(margin, margin + n))
     bad[inner] |= clear_bad.any(axis=0) & pupil.inside

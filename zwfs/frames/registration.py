@@ -394,26 +394,16 @@ def _locate(
         circles = [circle for image in images for circle in find_pupils(image, n_pupils, diameter)]
     pair = images[0], images[-1]
     for circle, image in zip(circles, pair, strict=True):
-        _require_whole(circle, image)
+        room = [*circle[:2], *np.subtract(image.counts.shape, 1) - circle[:2]]
+        if min(room) < circle.diameter / 2 - 2.5:  # it reaches more than 2 pixels beyond the image
+            side = ("top", "left", "bottom", "right")[int(np.argmin(room))]
+            raise ValueError(
+                f"{image.name}: the pupil at row {circle.row:.1f}, column {circle.column:.1f}, "
+                f"{circle.diameter:.1f} pixels wide, is cut off at the {side} (row 0 is the top): "
+                "expected all of it on the image"
+            )
     first = _extend(pair[0], circles if shared else circles[:1])
     return (first, first if shared else _extend(pair[1], circles[1:])), (circles[0], circles[1])
-
-
-def _require_whole(circle: Circle, image: Image) -> None:
-    """Refuse a pupil that reaches more than 2 pixels beyond the image."""
-    ny, nx = image.counts.shape
-    room = {
-        "top": circle.row,
-        "left": circle.column,
-        "bottom": ny - 1 - circle.row,
-        "right": nx - 1 - circle.column,
-    }
-    side = min(room, key=room.__getitem__)
-    if room[side] < circle.diameter / 2 - 2.5:
-        raise ValueError(
-            f"{image.name}: the pupil at row {circle.row:.1f}, column {circle.column:.1f}, {circle.diameter:.1f} "
-            f"pixels wide, is cut off at the {side} (row 0 is the top): expected all of it on the image"
-        )
 
 
 def _extend(image: Image, circles: Sequence[Circle]) -> Image:

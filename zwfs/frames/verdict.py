@@ -253,11 +253,9 @@ def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.b
     squares = np.sum((result.measured - result.modelled)[(..., *result.measurement.window)] ** 2, axis=0)
     share, area = squares[good & near].sum() / squares[good].sum(), np.mean(near[good])
     edges = "gaps, vanes and edges"
-    look = (
-        "registration, focus, blur and partly lit pixels"
-        if share > 1.2 * area
-        else "dimple, leakage and background"
-    )
+    look = "dimple, leakage and background"
+    if share > 1.2 * area:
+        look = "registration, focus, blur and partly lit pixels"
     where = (
         f"{share:.0%} of the squared misfit lies within {NEAR} pixels of {edges} ({area:.0%} of the points): "
         f"look at {look}."
@@ -284,8 +282,8 @@ def _of_score(score: NDArray, control: NDArray) -> str:
     trust = "The frames belong together." if lead >= _LEAST_LEAD else "The frames hardly support this phase."
     return (
         f"Predicted from the other frame alone, the frames correlate by {score[0]:.2f} and {score[1]:.2f} with "
-        "the measured ones. "
-        f"Control, with the second frame upside down: {control[0]:.2f} and {control[1]:.2f}. {trust}"
+        f"the measured ones. Control, with the second frame upside down: {control[0]:.2f} and {control[1]:.2f}. "
+        f"{trust}"
     )
 
 
@@ -299,12 +297,11 @@ def _of_light(measurement: Measurement) -> str:
     if not (measurement.registered.balance and measurement.optics.opposite):
         return facts + "The frames are not balanced."
     facts += "For opposite phase shifts the two ratios should be equal, and balancing assumes it. "
-    if abs(masked / clear - 1) < _UNEVEN:
-        return facts + f"They agree to {abs(masked / clear - 1):.1%}."
-    return facts + (
-        f"They differ by {abs(masked / clear - 1):.0%}, which balancing hides: look for leakage, light that one "
-        "mask does not shift, and stray light."
-    )
+    difference = abs(masked / clear - 1)
+    if difference < _UNEVEN:
+        return f"{facts}They agree to {difference:.1%}."
+    hidden = "which balancing hides: look for leakage, light that one mask does not shift, and stray light"
+    return f"{facts}They differ by {difference:.0%}, {hidden}."
 
 
 def _of_place(placement: Placement) -> str:

@@ -9,7 +9,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -49,6 +49,7 @@ class Block:
     zero: float = 0.0
     blank: int | None = None
     per: int = 1
+    header: dict[str, Any] = field(default_factory=dict, repr=False)  # values of the file's header; none for NPY
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -145,18 +146,16 @@ def unpacked(file: BinaryIO, name: str, max_bytes: int = _MOST_UNPACKED) -> io.B
     return content
 
 
-def blocks_of(path: Path) -> tuple[list[Block], dict[str, Any]]:
-    """Return the images of a file, and the values of its header."""
+def blocks_of(path: Path) -> list[Block]:
+    """Return the images of a file."""
     with path.open("rb") as file:
         packed = file.read(len(_GZIP)) == _GZIP
         file.seek(0)
         return blocks_in(unpacked(file, path.name) if packed else file, path.resolve(), packed=packed)
 
 
-def blocks_in(
-    content: BinaryIO, path: Path, *, packed: bool = False, verify: bool = False
-) -> tuple[list[Block], dict[str, Any]]:
-    """Return the images in the unpacked bytes of a file, and the values of its header, empty for NPY.
+def blocks_in(content: BinaryIO, path: Path, *, packed: bool = False, verify: bool = False) -> list[Block]:
+    """Return the images in the unpacked bytes of a file.
 
     Only with `verify` are all bytes read, and their checksums compared with those of the header.
     """
@@ -165,11 +164,11 @@ def blocks_in(
     content.seek(0)
     if first == _NPY:
         with broken(f"{name}: a broken NPY file"):
-            blocks, header = [_npy(content, path, packed)], dict[str, Any]()
+            blocks = [_npy(content, path, packed)]
     elif first and FIRST_BYTES.startswith(first):
         fits_module()  # without astropy this fails, and not the file
         with broken(f"{name}: a broken FITS file"):
-            blocks, header = _fits(content, path, packed, verify)
+            blocks = _fits(content, path, packed, verify)
     else:
         raise FileError(f"{name}: its first bytes are those of neither a FITS nor an NPY file")
     for block in blocks:
@@ -177,7 +176,7 @@ def blocks_in(
             raise FileError(f"{block.name}: its numbers are {block.dtype}: expected real ones")
         if len(block.full) > 1 and size < block.offset + block.n * block.row:
             raise block.truncated(max(size - block.offset, 0) // block.row)
-    return blocks, header
+    return blocks
 
 
 def _npy(content: BinaryIO, path: Path, packed: bool) -> Block:
@@ -196,8 +195,8 @@ def _npy(content: BinaryIO, path: Path, packed: bool) -> Block:
     return block
 
 
-def _fits(content: BinaryIO, path: Path, packed: bool, verify: bool) -> tuple[list[Block], dict[str, Any]]:
-    """Return the blocks of a FITS file, and the header of its first unit and image."""
+def _fits(content: BinaryIO, path: Path, packed: bool, verify: bool) -> list[Block]:
+    """Return the blocks of a FITS file, with the header of its first unit and image."""
     fits, blocks, header = fits_module(), list[Block](), dict[str, Any]()
     # Not closed, since that would close `content`.
     units = fits.open(content, memmap=False, lazy_load_hdus=False, checksum=verify)
@@ -213,10 +212,12 @@ def _fits(content: BinaryIO, path: Path, packed: bool, verify: bool) -> tuple[li
         blank = cards.get("BLANK") if cards["BITPIX"] > 0 else None
         blank = None if blank is None else _check.integer("BLANK", blank, -(2**63))
         offset, dtype = unit.fileinfo()["datLoc"], np.dtype(_TYPES[cards["BITPIX"]])
-        blocks.append(Block(path, name, offset, dtype, tuple(unit.shape), packed, False, *scaling, blank))
+        blocks.append(
+            Block(path, name, offset, dtype, tuple(unit.shape), packed, False, *scaling, blank, 1, header)
+        )
     if not blocks:
         raise FileError(f"{path.name}: a FITS file without an image")
-    return blocks, header
+    return blocks
 
 
 def header_cards(header: Any) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from zwfs import _check
 from zwfs._system import paths_of
 from zwfs.frames._blocks import FileError, blocks_of
 from zwfs.frames._camera import fit_bench
-from zwfs.frames._outline import Circle
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
 from zwfs.frames.files import CameraFile, images, read, read_all
@@ -135,7 +134,7 @@ def _read_states(
     clear, _ = _cube("pupil_files", pupil_files, frames.shape[1])
     if frames.shape[1:] != clear.shape[1:]:
         raise FileError(
-            f"{stack.segments[0].name}: exposures of shape {frames.shape[1:]}: expected {clear.shape[1:]}"
+            f"{stack.firsts[0].name}: exposures of shape {frames.shape[1:]}: expected {clear.shape[1:]}"
         )
     if len(frames) % len(phases):
         raise FileError(
@@ -160,7 +159,7 @@ def _cube(name: str, files: Sequence[str | Path], n_images: int) -> tuple[NDArra
     paths = paths_of(name, files)
     if not paths or not paths[0].is_file():
         raise FileNotFoundError(f"{name}: {paths[0] if paths else 'empty'}: expected a file")
-    blocks, _ = blocks_of(paths[0])
+    blocks = blocks_of(paths[0])
     full, several = blocks[0].full, len(paths) > 1
     n_images = n_images or 1 + (
         len(blocks) == 2 or len(full) == 4 or len(paths) == 2 or (several and full[0] == 2)
@@ -180,12 +179,11 @@ def _windows(
     """
     n, (n_images, *shape) = states.commands.shape[-1], states.dark.shape
     if centers is None or diameter is None:
-        mean, circles = states.clear.mean(axis=0), list[Circle]()
-        for one in mean:
-            image = Image(nearest_good(one, np.isfinite(one)), ~np.isfinite(one), "clear frame")
-            circles += find_pupils(image, 3 - n_images, diameter)
+        pairs = [(one, np.isfinite(one)) for one in states.clear.mean(axis=0)]
+        clear = [Image(nearest_good(one, good), ~good, "clear frame") for one, good in pairs]
+        circles = [circle for one in clear for circle in find_pupils(one, 3 - n_images, diameter)]
         diameter = diameter or float(np.mean([circle.diameter for circle in circles]))
-        centers = centers or [(circle.row, circle.column) for circle in circles]
+        centers = centers or [circle[:2] for circle in circles]
     middles = np.array([_check.pair("pupil_centers", one, _check.number) for one in centers])
     room = np.minimum(middles + 0.5, np.array(shape) - 0.5 - middles).min() - n / 2
     if room < -0.5:

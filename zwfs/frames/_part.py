@@ -78,7 +78,8 @@ def scratch_of(output: Path) -> Path:
 class Part:
     """Partial file of an output, with the pieces (first row, and the first row after it) that it gets.
 
-    Files in its folder are opened without following links. The plan is all that decides the bytes of the output.
+    A piece has rows of all units but the last and those that are empty. Files in the folder are opened without
+    following links. The plan is all that decides the bytes of the output.
 
     Raises ValueError if there is a part of another plan, another process writes it, or something else has the name
     of the folder: it could be data of the user. OSError if there is not enough space.
@@ -107,22 +108,19 @@ class Part:
             self.close()
             raise
 
-    def write(self, unit: Unit, first: int, rows: NDArray) -> bytes:
-        """Write rows of a unit to their place, and return their bytes."""
-        content = np.ascontiguousarray(rows, unit.dtype).tobytes()
+    def write(self, unit: Unit, first: int, rows: NDArray) -> None:
+        """Write rows of a unit to their place."""
         with self._no_space():
-            self._write(content, unit.offset + first * unit.row)
-        return content
+            self._write(np.ascontiguousarray(rows, unit.dtype).tobytes(), unit.offset + first * unit.row)
 
     def read(self, unit: Unit, first: int, stop: int) -> NDArray:
         """Read rows of a unit."""
-        content = os.pread(self._data, (stop - first) * unit.row, unit.offset + first * unit.row)
-        return np.frombuffer(content, unit.dtype).reshape(-1, *unit.shape).copy()
+        return np.frombuffer(self._read(unit, first, stop), unit.dtype).reshape(-1, *unit.shape).copy()
 
-    def note(self, first: int, stop: int, checksum: int) -> None:
-        """Add a finished piece to the journal: rows of all units, and the checksum of their bytes."""
+    def note(self, first: int, stop: int) -> None:
+        """Add a finished piece, whose rows are written, to the journal."""
         with self._no_space():
-            os.write(self._journal, b"%d %d %d\n" % (first, stop, checksum))
+            os.write(self._journal, b"%d %d %d\n" % (first, stop, self._checksum(first, stop)))
         self._keep = True
 
     def finish(self) -> None:
@@ -213,12 +211,14 @@ class Part:
             )
         return done
 
+    def _read(self, unit: Unit, first: int, stop: int) -> bytes:
+        return os.pread(self._data, (stop - first) * unit.row, unit.offset + first * unit.row)
+
     def _checksum(self, first: int, stop: int) -> int:
         checksum = 0
         for unit in self.units[:-1]:
             if unit.n:
-                place = unit.offset + first * unit.row
-                checksum = zlib.crc32(os.pread(self._data, (stop - first) * unit.row, place), checksum)
+                checksum = zlib.crc32(self._read(unit, first, stop), checksum)
         return checksum
 
     def _begin(self) -> None:

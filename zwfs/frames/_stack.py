@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from itertools import accumulate
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,29 +15,12 @@ from zwfs import _check
 from zwfs.frames._blocks import Block, FileError, blocks_of
 
 
-@dataclass(frozen=True)
-class Segment:
-    """Exposures of a file, or of two files or extensions that hold one image of each exposure."""
-
-    blocks: tuple[Block, ...]
-    header: dict[str, Any] = field(repr=False)
-
-    @property
-    def name(self) -> str:
-        """Of the first file."""
-        return self.blocks[0].name
-
-    @property
-    def n(self) -> int:
-        """Number of exposures."""
-        return self.blocks[0].n
-
-
 class Stack:
     """Exposures of all files, one after the other, each of n_images (1 or 2) of a shape.
 
-    There are as many second files, with the second image of each exposure, as files, or none. Raises
-    FileNotFoundError, or FileError if a file is of another kind, broken, truncated, or holds other images.
+    A segment is a block with exposures, or two blocks that hold one image of each exposure. There are as many
+    second files, with the second image of each exposure, as files, or none. Raises FileNotFoundError, or FileError
+    if a file is of another kind, broken, truncated, or holds other images.
     """
 
     def __init__(
@@ -48,53 +29,50 @@ class Stack:
         if second_files and (n_images == 1 or len(second_files) != len(files)):
             expected = "none, since an exposure of the calibration has one image" if n_images == 1 else len(files)
             raise ValueError(f"second_files holds {len(second_files)} files: expected {expected}")
-        self.segments: list[Segment] = []
+        self.segments: list[tuple[Block, ...]] = []
         for index, path in enumerate(files):
-            units, header = _units(path, shape)
-            seconds = _units(second_files[index], shape)[0] if second_files else []
-            self.segments += [Segment(blocks, header) for blocks in _exposures(units, seconds, n_images)]
-        self.header = self.segments[0].header
-        self.blocks = [block for segment in self.segments for block in segment.blocks]
-        first = self.blocks[0]
-        for block in self.blocks:
+            units = _units(path, shape)
+            seconds = _units(second_files[index], shape) if second_files else []
+            self.segments += _exposures(units, seconds, n_images)
+        self.firsts = [segment[0] for segment in self.segments]
+        first = self.firsts[0]
+        for block in chain(*self.segments):
             if block.numbers != first.numbers:
                 raise FileError(
                     f"{block.name}: its type, BSCALE, BZERO and BLANK are {block.numbers}: expected "
                     f"{first.numbers}, those of {first.name}"
                 )
-        self.bytes_per_exposure = sum(block.row for block in self.segments[0].blocks)
-        self._ends = list(accumulate(segment.n for segment in self.segments))
-        self.n = self._ends[-1]
+        self.header, self.bytes_per_exposure = first.header, sum(block.row for block in self.segments[0])
+        lengths = np.array([block.n for block in self.firsts])
+        self.ends = np.cumsum(lengths)
+        self.starts, self.n = self.ends - lengths, int(self.ends[-1])
 
     @property
     def saturation(self) -> float:
         """Level at which pixels are saturated, as the first file states it or as its type allows."""
-        known, name = "SATURATE" in self.header, self.segments[0].name
-        level = self.header["SATURATE"] if known else self.blocks[0].full_scale
-        name = f"{name}: {'SATURATE' if known else 'largest number of its type'}"
+        known, first = "SATURATE" in self.header, self.firsts[0]
+        level = self.header["SATURATE"] if known else first.full_scale
+        name = f"{first.name}: {'SATURATE' if known else 'largest number of its type'}"
         return level if level == np.inf else _check.number(name, level, 0, open_low=True)
 
-    def places(self, first: int, stop: int) -> list[tuple[int, int, int]]:
+    def places(self, first: int, stop: int) -> list[list[int]]:
         """Segments that hold some exposures, each with its first exposure and the one after its last."""
-        found, index = [], bisect_right(self._ends, first)
-        while first < stop:
-            start = self._ends[index] - self.segments[index].n
-            end = min(stop, self._ends[index])
-            found.append((index, first - start, end - start))
-            first, index = end, index + 1
-        return found
+        last = np.searchsorted(self.ends, stop - 1, "right")
+        some = np.arange(np.searchsorted(self.ends, first, "right"), last + 1)
+        low, high = np.maximum(first, self.starts[some]), np.minimum(stop, self.ends[some])
+        return np.transpose([some, low - self.starts[some], high - self.starts[some]]).tolist()
 
     def read(self, first: int, stop: int) -> NDArray:
         """Return some exposures, shape (stop - first, n_images, ny, nx)."""
         parts = []
         for index, start, end in self.places(first, stop):
-            images = [block.read(start, end) for block in self.segments[index].blocks]
+            images = [block.read(start, end) for block in self.segments[index]]
             parts.append(images[0] if len(images) == 1 else np.concatenate(images, axis=1))
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def state(self) -> list[tuple[str, int, int, int]]:
         """Path, exposures, size and time of change of all files: it differs once a file has changed."""
-        found = [(block, os.stat(block.path)) for block in self.blocks]
+        found = [(block, os.stat(block.path)) for block in chain(*self.segments)]
         return [(str(block.path), block.n, stat.st_size, stat.st_mtime_ns) for block, stat in found]
 
 
@@ -123,13 +101,12 @@ def _exposures(units: list[Block], seconds: list[Block], n_images: int) -> list[
     return [(one, other) for one, other in pairs]
 
 
-def _units(path: Path, shape: tuple[int, int]) -> tuple[list[Block], dict[str, Any]]:
-    """Image units of a file, which must be of a shape, and the values of its header."""
+def _units(path: Path, shape: tuple[int, int]) -> list[Block]:
+    """Image units of a file, which must be of a shape."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    blocks, header = blocks_of(path)
     units = []
-    for block in blocks:
+    for block in blocks_of(path):
         n_axes, per = len(block.full), block.full[1] if len(block.full) == 4 else 1
         if n_axes not in (2, 3, 4) or min(block.full) < 1 or block.shape != shape or per not in (1, 2):
             raise FileError(
@@ -141,4 +118,4 @@ def _units(path: Path, shape: tuple[int, int]) -> tuple[list[Block], dict[str, A
                 "(name, np.ascontiguousarray(images)) writes them"
             )
         units.append(replace(block, per=per))
-    return units, header
+    return units

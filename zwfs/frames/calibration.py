@@ -120,7 +120,7 @@ class Calibration(Immutable):
     def __post_init__(self) -> None:
         _check.integer("n_iterations", self.n_iterations, 1)
         _check.number("tolerance", self.tolerance, 0, 2 * np.pi)
-        _limit("saturation", self.saturation, open_low=True)
+        number_or_inf("saturation", self.saturation, open_low=True)
         _check.instance("bunit", self.bunit, str)
         _check.flag("balance", self.balance)
         _check.number("residual", self.residual, 0)
@@ -356,8 +356,9 @@ class Calibration(Immutable):
         batch = counts.shape[: -len(image)]
         if 0 in counts.shape:
             raise ValueError(f"counts has shape {counts.shape}: expected at least one exposure")
-        level = min(self.saturation if saturation is None else _limit("saturation", saturation), _check.LARGEST)
-        largest_residual, judge = _limit("largest_residual", largest_residual), _check.flag("judge", judge)
+        saturation = self.saturation if saturation is None else number_or_inf("saturation", saturation)
+        level, judge = min(saturation, _check.LARGEST), _check.flag("judge", judge)
+        largest_residual = number_or_inf("largest_residual", largest_residual)
         counts, grid = counts.reshape(-1, self.n_images, *self.shape), self.good.shape
         if start is not None:
             maps = _check.real_array("start", start)
@@ -507,11 +508,10 @@ def _is_calibration(path: Path) -> bool:
         return False
 
 
-def _limit(name: str, value: Any, *, open_low: bool = False) -> float:
+def number_or_inf(name: str, value: Any, *, open_low: bool = False) -> float:
     """Return a number of at least 0, or infinity."""
-    return (
-        value if isinstance(value, float) and value == np.inf else _check.number(name, value, 0, open_low=open_low)
-    )
+    is_inf = isinstance(value, float) and value == np.inf
+    return value if is_inf else _check.number(name, value, 0, open_low=open_low)
 
 
 def _dark(dark: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32]:

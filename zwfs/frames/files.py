@@ -125,23 +125,29 @@ def read(path: str | Path, *, max_bytes: int = 2**29, max_images: int = 2) -> Ca
     ('frame.npy', (1, 16, 16))
     """
     path = path_of("path", path)
-    limits = _check.integer("max_bytes", max_bytes, 1), _check.integer("max_images", max_images, 1)
+    max_bytes, max_images = _check.integer("max_bytes", max_bytes, 1), _check.integer("max_images", max_images, 1)
     if not os.path.isfile(path):
         where = "" if path.is_absolute() else f" in {Path.cwd()}"
         raise FileNotFoundError(f"{path}: no such file{where}")
     name = path.name
     with path.open("rb") as file:
-        content = unpacked(file, name, limits[0])
+        content = unpacked(file, name, max_bytes)
         file.seek(0)
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    blocks, header = blocks_in(content, path, verify=True)
+    blocks = blocks_in(content, path, verify=True)
     shapes = [block.full for block in blocks]
     if len(blocks) > 2 or shapes[0] != shapes[-1] or (len(blocks) == 2 and len(shapes[0]) != 2):
         raise FileError(f"{name}: images of shapes {shapes}: expected one, or two of the same (ny, nx)")
-    _accept(name, shapes[0] if len(blocks) == 1 else (2, *shapes[0]), limits)
+    shape = shapes[0] if len(blocks) == 1 else (2, *shapes[0])
+    if len(shape) not in (2, 3) or min(shape) < 1 or (len(shape) == 3 and shape[0] > max_images):
+        expected = f"(ny, nx), or (n, ny, nx) with n up to {max_images}"
+        raise FileError(f"{name}: its shape is {shape}: expected {expected}")
+    if (n_bytes := 8 * math.prod(shape)) > max_bytes:
+        expected = f"at most max_bytes = {max_bytes}"
+        raise FileError(f"{name}: its shape is {shape}, {n_bytes} bytes as float64: expected {expected}")
     images = [block.scaled(block.take(content, 0, block.n), np.float64)[:, 0] for block in blocks]
     highest = min(block.full_scale for block in blocks)
-    return CameraFile(np.concatenate(images), name, sha256, header, highest, path.resolve())
+    return CameraFile(np.concatenate(images), name, sha256, blocks[0].header, highest, path.resolve())
 
 
 def read_all(
@@ -337,6 +343,7 @@ def write_phase(
     path = check_output(output, [source.path for source in sources if source.path], overwrite=overwrite)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
     measurement, registered, optics = phase.measurement, phase.measurement.registered, phase.measurement.optics
+    placement = registered.placement
     cards = [
         ("BUNIT", "rad", "in (-pi, pi]; NaN outside and at bad points"),
         ("WAVELEN", wavelength, "[nm] wavelength"),
@@ -358,9 +365,6 @@ def write_phase(
         ("NPOINTS", measurement.pupil.n_points, "points of the pupil"),
         ("NBAD", measurement.n_bad, "of these, bad"),
         ("CONVERGE", phase.converged, "the iteration converged"),
-    ]
-    placement = registered.placement
-    cards += [
         ("ROTATE", placement.rotation, "[deg] image 2 from image 1, x to y"),
         ("ROTERR", placement.sigma[2], "[deg] standard error; NaN: not determined"),
         ("MAGNIF", placement.magnification, "size of image 2 over that of image 1"),
@@ -380,19 +384,6 @@ def write_phase(
     bad = (measurement.pupil.inside & ~measurement.good).astype(np.uint8)
     units = (phase.opd(wavelength), "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
     write_file(path, fits_content((phase.phase, "", cards), *units))
-
-
-def _accept(name: str, shape: tuple[int, ...], limits: tuple[int, int]) -> None:
-    """Refuse images of a shape that a header announces, before there is memory for them."""
-    max_bytes, max_images = limits
-    if len(shape) not in (2, 3) or min(shape) < 1 or (len(shape) == 3 and shape[0] > max_images):
-        expected = f"(ny, nx), or (n, ny, nx) with n up to {max_images}"
-        raise FileError(f"{name}: its shape is {shape}: expected {expected}")
-    if 8 * math.prod(shape) > max_bytes:
-        raise FileError(
-            f"{name}: its shape is {shape}, {8 * math.prod(shape)} bytes as float64: "
-            f"expected at most max_bytes = {max_bytes}"
-        )
 
 
 def _usable(counts: NDArray) -> NDArray[np.bool_]:

@@ -9,10 +9,9 @@ import json
 import math
 import os
 import zlib
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +24,7 @@ from zwfs.frames._blocks import FileError
 from zwfs.frames._fits import card_value, fits_module
 from zwfs.frames._part import Cards, Part, Unit
 from zwfs.frames._stack import Stack
-from zwfs.frames.calibration import Calibration
+from zwfs.frames.calibration import Calibration, number_or_inf
 from zwfs.frames.files import check_output
 from zwfs.frames.phases import Flag, Phases
 from zwfs.modes import zernike_basis
@@ -39,6 +38,14 @@ _MOST = 5.0  # times the residual of the calibration and of the noise: a larger 
 # Cards of the input that describe its own data.
 _OWN = ("SIMPLE", "XTENSION", "BITPIX", "NAXIS", "EXTEND", "EXTNAME", "PCOUNT", "GCOUNT", "BSCALE", "BZERO",
         "BLANK", "BUNIT", "CHECKSUM", "DATASUM", "COMMENT", "HISTORY", "CONTINUE", "END", "")  # fmt: skip
+# Card of the first header with the number of frames that have a flag, and its comment.
+_COUNTS = {
+    "LOST": ("NLOST", "lost frames"),
+    "BAD_PIXELS": ("NBADPIX", "frames with more bad pixels"),
+    "SATURATED": ("NSATURAT", "frames with saturated pixels"),
+    "INCONSISTENT": ("NINCONS", "inconsistent frames"),
+    "NOT_CONVERGED": ("NNOTCONV", "frames that did not converge"),
+}
 
 
 class Summary(NamedTuple):
@@ -160,7 +167,7 @@ def reconstruct(
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     n_workers = cores if n_workers is None else _check.integer("n_workers", n_workers, 1, 256)
     stack = Stack(files, second_files, calibration.n_images, calibration.shape)
-    job = _Job.checked(stack, calibration, modes, phases, photons, read_noise, wavelength, keywords, saturation)
+    job = _Job(stack, calibration, modes, phases, photons, read_noise, wavelength, keywords, saturation)
     if largest_residual is not None:
         largest_residual = _check.number("largest_residual", largest_residual, 0)
     pieces = _spans(stack.n, job.chunk)
@@ -169,10 +176,10 @@ def reconstruct(
         n_resumed = done = sum(stop - first for first, stop in part.done)
         report = progress or (lambda *_: None)
         report(done, stack.n)
-        names = [(card_value(one.name), one.n) for one in stack.segments]
-        part.write(job.units[-1], 0, np.array(names, job.units[-1].dtype))
-        for first, stop, checksum in job.run(part, n_workers):
-            part.note(first, stop, checksum)
+        names = [(card_value(one.name), one.n) for one in stack.firsts]
+        part.write(job.files, 0, np.array(names, job.files.dtype))
+        for first, stop in job.run(part, n_workers):
+            part.note(first, stop)
             done += stop - first
             report(done, stack.n)
         summary = job.judge(part, path, largest_residual, n_resumed)
@@ -183,67 +190,112 @@ def reconstruct(
         part.close()
 
 
-@dataclass(frozen=True, eq=False)
 class _Job:
     """Checked arguments of a run, and the units of its output: the table, and the list of files, come last."""
 
-    stack: Stack
-    calibration: Calibration
-    modes: NDArray | None
-    matrix: NDArray | None
-    photons: float | None
-    read_noise: float
-    keywords: dict[str, NDArray]
-    saturation: float
-    units: list[Unit]
-
-    @classmethod
-    def checked(
-        cls, stack: Stack, calibration: Calibration, modes: Any, phases: Any, photons: Any, read_noise: Any,
+    def __init__(
+        self, stack: Stack, calibration: Calibration, modes: Any, phases: Any, photons: Any, read_noise: Any,
         wavelength: Any, keywords: Any, saturation: Any,
-    ) -> _Job:  # fmt: skip
-        """Check arguments of `reconstruct`."""
-        pupil = calibration.sensor.pupil
-        for segment in stack.segments:
-            unit, own = str(segment.header.get("BUNIT", "")).strip(), calibration.bunit.strip()
+    ) -> None:  # fmt: skip
+        self.stack, self.calibration, pupil = stack, calibration, calibration.sensor.pupil
+        for block in stack.firsts:
+            unit, own = str(block.header.get("BUNIT", "")).strip(), calibration.bunit.strip()
             if own and unit and unit.lower() != own.lower():
-                raise FileError(f"{segment.name}: BUNIT = {unit!r}: expected {own!r}, that of the calibration")
-        if modes is not None:
-            modes = zernike_basis(pupil, modes) if isinstance(modes, int) else modes
-            modes = pupil.scatter(_check.modes("modes", modes, pupil), fill=0)
-        matrix = None if modes is None else calibration.modal_matrix(modes)
+                raise FileError(f"{block.name}: BUNIT = {unit!r}: expected {own!r}, that of the calibration")
+        self.modes = zernike_basis(pupil, modes) if isinstance(modes, int) else modes
+        self.matrix = None if modes is None else calibration.modal_matrix(self.modes)
         phases = modes is None if phases is None else _check.flag("phases", phases)
         if not phases and modes is None:
             raise ValueError("phases = False: expected True, or modes")
-        read_noise = _check.number("read_noise", read_noise, 0)
-        if photons is not None:
-            photons = _check.number("photons", photons, 1e-6, 1e12)
-        elif read_noise:
+        self.read_noise = _check.number("read_noise", read_noise, 0)
+        self.photons: Any = None if photons is None else _check.number("photons", photons, 1e-6, 1e12)
+        if read_noise and photons is None:
             raise ValueError(f"read_noise = {read_noise:g}: expected a number of photons with it")
         if wavelength is None and isinstance(stack.header.get("WAVELEN"), int | float):
             wavelength = stack.header["WAVELEN"]
         if wavelength is not None:
             wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
         level = calibration.saturation if saturation is None else saturation
-        if level != np.inf:
-            level = _check.number("saturation", level, 0, open_low=True)
-        elif saturation is None:
+        if saturation is None and level == np.inf:
             level = stack.saturation
-        columns = _columns(stack, keywords)
-        rows = _row_type(columns, None if modes is None else len(modes), phases, photons is not None)
-        names = max(len(card_value(one.name)) for one in stack.segments)
-        of_files, float32 = np.dtype([("NAME", f"S{names}"), ("FRAMES", ">i8")]), np.dtype(">f4")
-        cards = _cards(stack, calibration, photons, read_noise, wavelength, level)
-        units = [Unit("", np.dtype("u1"), (), 0, cards, {})]
+        self.saturation = number_or_inf("saturation", level, open_low=True)
+        self.keywords = _columns(stack, keywords)
+        names = max(len(card_value(one.name)) for one in stack.firsts)
+        of_files = np.dtype([("NAME", f"S{names}"), ("FRAMES", ">i8")])
+        self.files = Unit("FILES", of_files, (), len(stack.firsts), [], {})
+        self.has_sigma = phases and photons is not None
+        units = dict.fromkeys(("COEFFS", "SIGCOEFF", "SIGMA"), "rad")
+        self.table = Unit("FRAMES", self._row_type(), (), stack.n, [], units)
+        cards, float32 = self._cards(wavelength), np.dtype(">f4")
+        maps = [Unit("", np.dtype("u1"), (), 0, cards, {})]
         if phases:
             cards = [("BUNIT", "rad", "in (-pi, pi]; NaN outside, bad and lost"), *cards]
-            units = [Unit("", float32, pupil.shape, stack.n, cards, {})]
-            units += [Unit("SIGMA", float32, pupil.shape, stack.n, [("BUNIT", "rad", "")], {})] * (
-                photons is not None
-            )
-        units.append(Unit("FRAMES", rows, (), stack.n, [], dict.fromkeys(("COEFFS", "SIGCOEFF", "SIGMA"), "rad")))
-        units.append(Unit("FILES", of_files, (), len(stack.segments), [], {}))
-        return cls(stack, calibration, modes, matrix, photons, read_noise, columns, level, units)
+            maps = [Unit("", float32, pupil.shape, stack.n, cards, {})]
+        if self.has_sigma:
+            maps.append(Unit("SIGMA", float32, pupil.shape, stack.n, [("BUNIT", "rad", "")], {}))
+        self.units = [*maps, self.table, self.files]
+
+    def _row_type(self) -> np.dtype:
+        columns: list[tuple] = [
+            ("FRAME", ">i8"), ("FILE", ">i4"), ("INDEX", ">i8"), ("FLAGS", ">i2"), ("FLUX", ">f4"),
+            ("RESIDUAL", ">f4"), ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4"),
+        ]  # fmt: skip
+        columns += [("SIGMA", ">f4")] * self.has_sigma
+        if self.matrix is not None:
+            coefficients = ">f4", self.matrix.shape[1:]
+            columns += [("SIGCOEFF", *coefficients)] * (self.photons is not None) + [("COEFFS", *coefficients)]
+        columns += [(name, values.dtype.newbyteorder(">")) for name, values in self.keywords.items()]
+        names = [name for name, *_ in columns]
+        if repeated := {name for name in names if names.count(name) > 1}:
+            raise ValueError(f"keywords: {sorted(repeated)} are columns already: expected others")
+        return np.dtype(columns)
+
+    def _cards(self, wavelength: float | None) -> Cards:
+        """Cards of the first header: numbers of the run, then those of the first file."""
+        from zwfs import __version__
+
+        stack, calibration, optics = self.stack, self.calibration, self.calibration.optics
+        row, column = calibration.places[0, :, 0, 0].tolist()
+        cards: list[tuple[str, Any, str]] = [
+            ("CREATOR", f"zwfs {__version__}", ""),
+            ("NFRAMES", stack.n, "frames, all of them in the table"),
+            ("NFILES", len(stack.firsts), ""),
+            *((key, 0, comment) for key, comment in _COUNTS.values()),
+            ("NFLAGGED", 0, "frames with any flag"),
+            ("RESLIMIT", 0.0, "residual above which a frame is inconsistent"),
+            ("RESCALIB", calibration.residual, "residual of the frames of the calibration"),
+            ("CALIBSHA", calibration.sha256, ""),
+            ("MAPFRAME", "commands" if calibration.commanded else "first image", "frame of reference of the maps"),
+            ("CROPROW", row, "[pixel] row of a map's first point, from 0"),
+            ("CROPCOL", column, "[pixel] its column, on the first image"),
+            ("PUPDIAM", calibration.diameter, "[pixel] diameter D of the pupil"),
+            ("CENTROW", calibration.center[0], "[pixel] centre of the pupil, from 0"),
+            ("CENTCOL", calibration.center[1], "[pixel] centre of the pupil, from 0"),
+            ("DIMPLE", optics.diameter, "[lambda/D] diameter of the dimple"),
+            *(
+                (f"THETA{i}", value, f"[rad] phase shift, image {i}")
+                for i, value in enumerate(optics.phase_shifts, 1)
+            ),
+            ("SATURATE", self.saturation, "[count] pixels that reach it are saturated"),
+            ("MAXITER", calibration.n_iterations, "largest number of iterations"),
+            ("TOLERANC", calibration.tolerance, "[rad] change that ends the iteration"),
+        ]
+        if wavelength is not None:
+            cards += [
+                ("WAVELEN", wavelength, "[nm]"),
+                ("NMPERRAD", wavelength / (2 * math.pi), "[nm] of a radian"),
+            ]
+        if self.photons is not None:
+            cards += [
+                ("PHOTONS", self.photons, "per pixel at an intensity of 1"),
+                ("RDNOISE", self.read_noise, "[e-] rms"),
+            ]
+        known = {key for key, *_ in cards}
+        for key, value in stack.header.items():
+            plain = isinstance(value, str | bool | int | float)
+            if plain and key not in known and key not in _OWN and not key.startswith("NAXIS"):
+                cards.append((key, value, "of the first file" if len(str(value)) < 40 else ""))
+        return cards
 
     def plan(self, largest_residual: float | None) -> str:
         """All that decides the bytes of the output."""
@@ -258,72 +310,55 @@ class _Job:
         """Exposures that a thread handles at once."""
         return max(1, min(_LONGEST, _CHUNK // self.stack.bytes_per_exposure))
 
-    def run(self, part: Part, n_workers: int) -> Iterator[tuple[int, int, int]]:
-        """Reconstruct all chunks that are not yet done: first frame, first one after it, and checksum of each."""
-        chunks = (piece for piece in part.pieces if piece not in part.done)
+    def run(self, part: Part, n_workers: int) -> Iterator[tuple[int, int]]:
+        """Reconstruct all chunks that are not yet done: first frame of each, and first one after it."""
+        chunks = [piece for piece in part.pieces if piece not in part.done]
         with one_thread(), ThreadPoolExecutor(n_workers) as pool:
-            waiting: deque[Future[tuple[int, int, int]]] = deque()
-            try:
-                for chunk in chunks:
-                    waiting.append(pool.submit(self._reconstruct, part, *chunk))
-                    if len(waiting) > n_workers:
-                        yield waiting.popleft().result()
-                while waiting:
-                    yield waiting.popleft().result()
-            finally:
-                for future in waiting:
-                    future.cancel()
+            yield from pool.map(partial(self._reconstruct, part), chunks)
 
     def judge(self, part: Part, output: Path, limit: float | None, n_resumed: int) -> Summary:
         """Flag inconsistent frames, count all flags, and put both into the header."""
-        table, n = self.units[-2], self.stack.n
-        size, step = max(1, _CHUNK // table.row), -(-n // _SAMPLE)
-        blocks = _spans(n, size)
+        table, n = self.table, self.stack.n
+        blocks, step = _spans(n, max(1, _CHUNK // table.row)), -(-n // _SAMPLE)
         if limit is None:
             limit = _limit(np.concatenate([part.read(table, *block)["RESIDUAL"][::step] for block in blocks]))
             if self.photons is not None:
                 light = float(self.calibration.light.mean())
                 noise = math.sqrt(light / self.photons + (self.read_noise / self.photons) ** 2)
                 limit = min(limit, _MOST * math.hypot(self.calibration.residual, noise))
-        counts, n_flagged = {str(flag.name): 0 for flag in Flag}, 0
+        counts, n_flagged = dict.fromkeys(_COUNTS, 0), 0
         for first, stop in blocks:
             rows = part.read(table, first, stop)
             with np.errstate(invalid="ignore"):
                 rows["FLAGS"] |= np.where(rows["RESIDUAL"] > limit, Flag.INCONSISTENT.value, 0).astype(">i2")
             part.write(table, first, rows)
             n_flagged += int(np.count_nonzero(rows["FLAGS"]))
-            for flag in Flag:
-                counts[str(flag.name)] += int(np.count_nonzero(rows["FLAGS"] & flag))
+            for name in counts:
+                counts[name] += int(np.count_nonzero(rows["FLAGS"] & Flag[name]))
         values: dict[str, Any] = {key: counts[name] for name, (key, _) in _COUNTS.items()}
         values |= {"NFLAGGED": n_flagged, "RESLIMIT": limit}
         self.units[0].cards = [(key, values.get(key, one), text) for key, one, text in self.units[0].cards]
         return Summary(output, n, n_flagged, counts, limit, n_resumed)
 
-    def _reconstruct(self, part: Part, first: int, stop: int) -> tuple[int, int, int]:
+    def _reconstruct(self, part: Part, chunk: tuple[int, int]) -> tuple[int, int]:
         """Read, reconstruct and write some frames."""
-        counts = self.stack.read(first, stop)
+        counts = self.stack.read(*chunk)
         found = self.calibration(counts[:, 0] if counts.shape[1] == 1 else counts, saturation=self.saturation)
         values = {"": found.phase}
-        if self.photons is not None and any(unit.name == "SIGMA" for unit in self.units):
+        if self.has_sigma:
             values["SIGMA"] = self.calibration.sigma(found, self.photons, self.read_noise)
-        values["FRAMES"] = self._rows(found, first, stop, values.get("SIGMA"))
-        checksum = 0
+        values["FRAMES"] = self._rows(found, *chunk, values.get("SIGMA"))
         for unit in self.units[:-1]:
             if unit.n:
-                checksum = zlib.crc32(part.write(unit, first, values[unit.name]), checksum)
-        return first, stop, checksum
+                part.write(unit, chunk[0], values[unit.name])
+        return chunk
 
     def _rows(self, found: Phases, first: int, stop: int, sigma: NDArray | None) -> NDArray:
-        """Rows of the table."""
-        rows = np.zeros(stop - first, self.units[-2].dtype)
-        rows["FRAME"] = np.arange(first, stop)
-        at = 0
-        for segment, start, end in self.stack.places(first, stop):
-            some = slice(at, at + end - start)
-            rows["FILE"][some], rows["INDEX"][some] = segment, np.arange(start, end)
-            for name, values in self.keywords.items():
-                rows[name][some] = values[segment]
-            at += end - start
+        rows, numbers = np.zeros(stop - first, self.table.dtype), np.arange(first, stop)
+        files = np.searchsorted(self.stack.ends, numbers, "right")
+        rows["FRAME"], rows["FILE"], rows["INDEX"] = numbers, files, numbers - self.stack.starts[files]
+        for name, values in self.keywords.items():
+            rows[name] = values[files]
         rows["FLAGS"], rows["FLUX"], rows["RESIDUAL"] = found.flags, found.flux, found.residual
         rows["NBAD"], rows["NSATUR"], rows["NITER"] = found.n_bad, found.n_saturated, found.n_iterations
         lost = found.flags & Flag.LOST > 0
@@ -349,79 +384,14 @@ def _columns(stack: Stack, keywords: Any) -> dict[str, NDArray]:
     columns: dict[str, NDArray] = {}
     for key in keywords:
         key = key.upper()
-        for segment in stack.segments:
-            if key not in segment.header:
-                raise FileError(f"{segment.name}: its header has no {key}: expected it, as one of the keywords")
-        values = [segment.header[key] for segment in stack.segments]
+        for block in stack.firsts:
+            if key not in block.header:
+                raise FileError(f"{block.name}: its header has no {key}: expected it, as one of the keywords")
+        values = [block.header[key] for block in stack.firsts]
         numbers = all(isinstance(value, int | float) for value in values)
-        columns[key] = (
-            np.array(values, float) if numbers else np.array([card_value(str(one)).encode() for one in values])
-        )
+        strings = [card_value(str(value)).encode() for value in values]
+        columns[key] = np.array(values, float) if numbers else np.array(strings)
     return columns
-
-
-def _row_type(keywords: dict[str, NDArray], n_modes: int | None, phases: bool, errors: bool) -> np.dtype:
-    """Type of the rows of the table."""
-    columns: list[tuple] = [("FRAME", ">i8"), ("FILE", ">i4"), ("INDEX", ">i8"), ("FLAGS", ">i2"), ("FLUX", ">f4"),
-               ("RESIDUAL", ">f4"), ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4")]  # fmt: skip
-    columns += [("SIGMA", ">f4")] * (errors and phases)
-    if n_modes is not None:
-        columns += [("SIGCOEFF", ">f4", (n_modes,))] * errors + [("COEFFS", ">f4", (n_modes,))]
-    columns += [(name, values.dtype.newbyteorder(">")) for name, values in keywords.items()]
-    repeated = {name for name, *_ in columns if [one[0] for one in columns].count(name) > 1}
-    if repeated:
-        raise ValueError(f"keywords: {sorted(repeated)} are columns already: expected others")
-    return np.dtype(columns)
-
-
-_COUNTS = {
-    "LOST": ("NLOST", "lost frames"),
-    "BAD_PIXELS": ("NBADPIX", "frames with more bad pixels"),
-    "SATURATED": ("NSATURAT", "frames with saturated pixels"),
-    "INCONSISTENT": ("NINCONS", "inconsistent frames"),
-    "NOT_CONVERGED": ("NNOTCONV", "frames that did not converge"),
-}
-
-
-def _cards(
-    stack: Stack, calibration: Calibration, photons: float | None, read_noise: float, wavelength: float | None,
-    level: float,
-) -> Cards:  # fmt: skip
-    """Cards of the first header: numbers of the run, then those of the first file."""
-    from zwfs import __version__
-
-    optics, (row, column) = calibration.optics, calibration.places[0, :, 0, 0]
-    cards: list[tuple[str, Any, str]] = [
-        ("CREATOR", f"zwfs {__version__}", ""),
-        ("NFRAMES", stack.n, "frames, all of them in the table"),
-        ("NFILES", len(stack.segments), ""),
-        *((key, 0, comment) for key, comment in _COUNTS.values()),
-        ("NFLAGGED", 0, "frames with any flag"),
-        ("RESLIMIT", 0.0, "residual above which a frame is inconsistent"),
-        ("RESCALIB", calibration.residual, "residual of the frames of the calibration"),
-        ("CALIBSHA", calibration.sha256, ""),
-        ("MAPFRAME", "commands" if calibration.commanded else "first image", "frame of reference of the maps"),
-        ("CROPROW", float(row), "[pixel] row of a map's first point, from 0"),
-        ("CROPCOL", float(column), "[pixel] its column, on the first image"),
-        ("PUPDIAM", calibration.diameter, "[pixel] diameter D of the pupil"),
-        ("CENTROW", calibration.center[0], "[pixel] centre of the pupil, from 0"),
-        ("CENTCOL", calibration.center[1], "[pixel] centre of the pupil, from 0"),
-        ("DIMPLE", optics.diameter, "[lambda/D] diameter of the dimple"),
-        *((f"THETA{i}", value, f"[rad] phase shift, image {i}") for i, value in enumerate(optics.phase_shifts, 1)),
-        ("SATURATE", level, "[count] pixels that reach it are saturated"),
-        ("MAXITER", calibration.n_iterations, "largest number of iterations"),
-        ("TOLERANC", calibration.tolerance, "[rad] change that ends the iteration"),
-    ]
-    if wavelength is not None:
-        cards += [("WAVELEN", wavelength, "[nm]"), ("NMPERRAD", wavelength / (2 * math.pi), "[nm] of a radian")]
-    if photons is not None:
-        cards += [("PHOTONS", photons, "per pixel at an intensity of 1"), ("RDNOISE", read_noise, "[e-] rms")]
-    known = {key for key, *_ in cards}
-    for key, value in stack.header.items():
-        plain = isinstance(value, str | bool | int | float)
-        if plain and key not in known and not any(key == own or key.startswith("NAXIS") for own in _OWN):
-            cards.append((key, value, "of the first file" if len(str(value)) < 40 else ""))
-    return cards
 
 
 def _limit(residuals: NDArray) -> float:

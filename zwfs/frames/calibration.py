@@ -409,8 +409,7 @@ class Calibration(Immutable):
             raise ValueError(f"matrix has shape {matrix.shape}: expected ({self.sensor.pupil.n_points}, n_modes)")
         _check.finite("matrix", matrix)
         values = without_piston(self.sensor.pupil.gather(phases.filled))
-        product = values.reshape(-1, len(matrix)) @ matrix.astype(values.dtype, copy=False)
-        return product.reshape((*values.shape[:-1], -1))
+        return values @ matrix.astype(values.dtype, copy=False)
 
     def sigma(
         self, phases: Phases, photons: float, read_noise: float = 0.0, modes: ArrayLike | None = None

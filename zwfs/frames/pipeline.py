@@ -417,12 +417,11 @@ def upside_down(measurement: Measurement) -> Measurement:
 def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:
     """Counts around the pupils of the clear frames, for frames and clear frames, (4,); 0 where cut."""
     levels = []
-    for index, image in enumerate(registered.clear_frames):
-        shared = registered.clear_frames[0] is registered.clear_frames[1]
-        circles = registered.pupils if shared else registered.pupils[index : index + 1]
+    for image in registered.clear_frames:
         far = ~image.bad
-        for circle in circles:
-            far &= radius(far.shape, circle[:2]) > 0.58 * circle.diameter
+        for circle, other in zip(registered.pupils, registered.clear_frames, strict=True):
+            if other is image:  # both pupils may be on one image
+                far &= radius(far.shape, circle[:2]) > 0.58 * circle.diameter
         enough = np.count_nonzero(far) >= 100 and not image.cut
         levels.append(float(np.median(image.counts[far])) if enough else 0.0)
     dark = np.array(levels) * registered.areas[2:]

@@ -200,14 +200,9 @@ def steps(
         scores = (predict_other(one, n_iterations) for one in (measurement, upside_down(measurement)))
         work.append(Step(name, recover_phase(measurement, n_iterations), *scores))
 
-    switches: dict[str, Any] = dict.fromkeys(("subpixel", "background", "balance"), False)
-    add("outlines of the pupils", register_frames(frames, clear_frames, **settings, **switches), optics)
-    for switch, name in (
-        ("subpixel", "registration by content"),
-        ("background", "background around the pupils"),
-        ("balance", "balance of the flux"),
-    ):
-        switches[switch] = True
+    names = "registration by content", "background around the pupils", "balance of the flux"
+    for n_on, name in enumerate(("outlines of the pupils", *names)):
+        switches: dict[str, Any] = {"subpixel": n_on > 0, "background": n_on > 1, "balance": n_on > 2}
         add(name, register_frames(frames, clear_frames, **settings, **switches), optics)
     for number, name in enumerate(fitted, 1):
         last = work[-1].result.measurement

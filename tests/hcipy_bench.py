@@ -144,6 +144,26 @@ class HcipyBench:
         left = np.exp(1j * (np.asarray(phase) - self.on_pupil(truth + self.flat)))[self.fully_lit]
         return np.angle(left * np.conj(left.mean())).std()
 
+    @property
+    def truth(self):
+        """True values of the numbers of a fit by their names, without flux and background."""
+        out = {"diameter": self.diameter, "first": self.shifts[0], "second": self.shifts[1]}
+        out |= {"leakage": self.leakage, "blur": self.blur}
+        for side in (0, 1):
+            out[f"arm {side} focus"] = self.focus[side]
+            out[f"arm {side} rotation"] = np.radians(self.rotations[side])
+            out[f"arm {side} magnification"] = self.magnifications[side]
+            for arm in (side, side + 2):
+                out[f"arm {arm} row"], out[f"arm {arm} column"] = self.offsets[side]
+        return out
+
+    def pulls(self, fit):
+        """Errors of a fit over its error bars, by name; a leakage or blur of 0 is left out, as it is a limit."""
+        pairs = (
+            (fit[name], value) for name, value in self.truth.items() if value or name not in ("leakage", "blur")
+        )
+        return {one.name: (one.value - value) / one.sigma for one, value in pairs}
+
     def recording(self, n_commands=4, rms=0.5, seed=1):
         """Frames of the flat and of smooth commands, clear frames, and the commands on the pupil's grid."""
         commands = [np.zeros((self._size, self._size))]
@@ -182,6 +202,7 @@ BEFORE = {
     "VLT": {"plain": (0.0260, 0.0507, 0.1432), "calibrated": (0.1079, 0.1497, 0.2779)},
     "turned": {"plain": (0.0236, 0.0471, 0.1372), "calibrated": (0.1579, 0.2094, 0.3374)},
 }
+RMS = 0.3, 0.8, 1.2
 
 
 @functools.cache

@@ -39,10 +39,29 @@ from zwfs.sensor import ZernikeSensor
 EXPLAINED = 1.2
 """Mean square of the residuals over the noise up to which a model explains the frames."""
 _FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
-_PASSES = 0.6, 0.02, 0.003  # of the cost: each pass ends when a step promises less
-_AROUND = 3, 5  # pixels over which the residuals of a masked and of a clear arm are averaged
-_MISSED = 1.6  # mean square of residuals over the noise from which a model misses pixels
+_PHASE_PRIOR = MapPrior(0.5, 3.0)
+_PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the physics
 _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
+
+
+class _Pass(NamedTuple):
+    """A stage of the fit."""
+
+    allowed: float  # error of the model that adds to the noise, over the light of a full pixel
+    enough: float  # of the cost: the stage ends when a step promises less
+    n_inner: int  # iterations for a step
+    focus: bool  # whether the focus is free
+    edges: bool  # whether the light is divided anew
+
+
+# With a large error allowed, edges have little weight, and the numbers find their places in a few steps. A focus
+# that is free from the start can take the wrong sign.
+_PASSES = (
+    _Pass(0.1, 0.1, 25, focus=False, edges=False),
+    _Pass(0.05, 0.1, 25, focus=True, edges=False),
+    _Pass(0.01, 0.1, 35, focus=True, edges=True),
+    _Pass(0.0, 1e-3, 35, focus=True, edges=True),
+)
 
 
 class Estimate(NamedTuple):
@@ -178,13 +197,12 @@ def fit_bench(
         _check.integer("n_steps", n_steps, 1),
     )
     start = _coarse(data, diameter, shifts)
-    problem = _problem(data, start, oversampling)
-    best = minimise(problem, _with_flat(problem, start.flat), n_steps, 25, _PASSES[0])
-    missed = np.ones((4, 1, 1))
-    for enough in _PASSES[1:]:
-        missed = np.maximum(missed, _missed(data, best.point))  # what was missed once stays so
-        problem, x = _again(data, best, missed)
-        best = minimise(problem, x, n_steps, 35, enough)
+    best = None
+    for stage in _PASSES:
+        problem, x = _problem(data, start, oversampling) if best is None else _next(data, best, stage.edges)
+        problem = _staged(data, problem, stage)
+        best = minimise(problem, x, n_steps, stage.n_inner, stage.enough)
+    assert best is not None
     return _result(data, best, start.reversed)
 
 
@@ -258,8 +276,8 @@ def _free(data: Recording, start: _Start) -> list[Free]:
     return free + [Free(name, ((None, name),), *values) for name, values in limits.items()]
 
 
-def _problem(data: Recording, start: _Start, f: int) -> Problem:
-    """The first problem of a fit."""
+def _problem(data: Recording, start: _Start, f: int) -> tuple[Problem, NDArray]:
+    """The first problem of a fit, and its start."""
     light, flux = data.light
     n, shape = len(light), data.counts[0].shape
     exposures = [Exposure(2, None, 0), Exposure(3, None, 0)]
@@ -268,13 +286,17 @@ def _problem(data: Recording, start: _Start, f: int) -> Problem:
     values = np.zeros(len(names_of(4)))
     table = values[: 4 * len(ARM)].reshape(4, -1)
     table[:, ARM.index("magnification")], table[:, ARM.index("flux")] = 1, np.tile(flux, 2)
-    division = Light.of(np.kron(light, np.ones((f, f))), light, f)
+    division = Light.sharp(light, f)
     smooth = [ndimage.uniform_filter(one, 3) for one in data.counts]
     free = _free(data, start)
-    phase_map = PhaseMap(n, f, MapPrior(0.5, 3.0), data.n_pixels)
+    phase_map = PhaseMap(n, f, _PHASE_PRIOR, data.n_pixels)
     lights = _light_maps(division, f * data.n_pixels)
     zero = np.zeros((n * f, n * f))
-    return Problem(camera, data.counts, data.weights(smooth), division, zero, phase_map, lights, values, free)
+    weights = data.weights(smooth)
+    problem = Problem(camera, data.counts, weights, division, zero, phase_map, lights, values, free)
+    x = problem.start
+    x[: phase_map.size**2] = white_phase(phase_map, start.flat).ravel()
+    return problem, x
 
 
 def _light_maps(light: Light, n_pixels: float) -> tuple[LightMap, ...]:
@@ -288,29 +310,30 @@ def white_phase(phase_map: PhaseMap, means: NDArray) -> NDArray[np.float64]:
     return fft.irfft2(fft.rfft2(wide) / phase_map.colour, s=wide.shape)
 
 
-def _with_flat(problem: Problem, flat: NDArray) -> NDArray[np.float64]:
-    x = problem.start
-    x[: problem.phase_map.size**2] = white_phase(problem.phase_map, flat).ravel()
-    return x
+def _staged(data: Recording, problem: Problem, stage: _Pass) -> Problem:
+    """The problem with the noise and the free numbers of a stage."""
+    farthest = _FARTHEST if stage.focus else 0.0
+    free = [
+        one._replace(low=-farthest, high=farthest) if one.name.endswith("focus") else one for one in problem.free
+    ]
+    level = stage.allowed * data.light[1][0]
+    weights = [one / np.hypot(1, level * one) for one in problem.weights]
+    return replace(problem, weights=weights, free=free)
 
 
-def _again(data: Recording, best: Minimum, missed: NDArray) -> tuple[Problem, NDArray]:
-    """The problem with light divided, and pixels weighed, by what was fitted."""
+def _next(data: Recording, best: Minimum, edges: bool) -> tuple[Problem, NDArray]:
+    """The problem with pixels weighed, and on demand the light divided, by what was fitted; and its start."""
     point, before = best.point, best.point.problem
-    f, weights = before.camera.f, data.weights(point.model.images)
-    light = Light.of(point.light, point.light_means, f)
+    problem = replace(before, weights=data.weights(point.model.images))
+    if not edges:
+        return problem, point.x
+    light = Light.sharp(np.maximum(point.light_means, 0), before.camera.f)
     free = [
         one if math.isfinite(one.sigma) else one._replace(value=float(point.values[places[0]]))
         for one, places in zip(before.free, before.places, strict=True)
     ]
-    problem = replace(
-        before,
-        light=light,
-        weights=[one / missed[of.arm] for one, of in zip(weights, before.camera.exposures, strict=True)],
-        light_maps=_light_maps(light, f * data.n_pixels),
-        values=point.values,
-        free=free,
-    )
+    lights = _light_maps(light, before.camera.f * data.n_pixels)
+    problem = replace(problem, light=light, light_maps=lights, values=point.values, free=free)
     x, n_phase = problem.start, before.phase_map.size**2
     x[:n_phase], x[problem.n_white :] = point.x[:n_phase], point.x[before.n_white :]
     return problem, x
@@ -323,23 +346,17 @@ def _squares(data: Recording, point: Point) -> list[NDArray[np.float64]]:
     return [(weight * (image - counts)) ** 2 for weight, image, counts in triples]
 
 
-def _missed(data: Recording, point: Point) -> NDArray[np.float64]:
-    """Factors by which the noise grows where the model misses an arm in most states, (4, ny, nx).
-
-    A model on a grid misses light at the edges of the pupil, and the numbers of the bench would bend to explain
-    it. The median over the states keeps a single wrong command out.
-    """
-    squares, factors = _squares(data, point), []
-    arms = [one.arm for one in point.problem.camera.exposures]
-    for arm in range(4):
-        own = [
-            ndimage.uniform_filter(one, _AROUND[arm // 2])
-            for one, of in zip(squares, arms, strict=True)
-            if of == arm
-        ]
-        local = np.median(own, axis=0)
-        factors.append(np.where(local > _MISSED, np.sqrt(np.maximum(local, 1)), 1))
-    return np.array(factors)
+def _finer(data: Recording, point: Point) -> list[NDArray[np.float64]]:
+    """Change of the images over their noise with twice the resolution and sharp edges of the pupil."""
+    of, f = point.problem, 2 * point.problem.camera.f
+    camera = of.camera
+    finer = Camera(
+        camera.n, camera.shape, data.n_pixels, camera.exposures, fine_phase(data.phases, f), f, camera.largest
+    )
+    light = Light.sharp(np.maximum(point.light_means, 0), f)
+    phase = PhaseMap(camera.n, f, _PHASE_PRIOR, data.n_pixels).fine(of.split(point.x)[0][0])
+    images = finer.at(light.maps(light.start, phase), point.values).images
+    return [w * (a - b) for w, a, b in zip(of.weights, images, point.model.images, strict=True)]
 
 
 def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:
@@ -347,7 +364,7 @@ def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:
     pairs = zip(_squares(data, point), data.good, strict=True)
     misfit = np.array([one.sum() / max(1, np.count_nonzero(good)) for one, good in pairs])
     scale = max(1.0, float(np.mean(misfit)))
-    spread = covariance(point, 10) * scale
+    spread = covariance(point, _finer(data, point), scale)
     values = point.x[point.problem.n_white :]
     sigma = np.sqrt(np.diagonal(spread)).tolist()
     estimates = tuple(
@@ -362,17 +379,21 @@ def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:
         misfit,
         data.noise,
         best.converged,
-        tuple(_remarks(data, misfit, estimates, is_reversed)),
+        tuple(_remarks(data, point, misfit, estimates, is_reversed)),
         point,
     )
 
 
-def _remarks(data: Recording, misfit: NDArray, estimates: tuple[Estimate, ...], is_reversed: bool) -> list[str]:
+def _remarks(
+    data: Recording, point: Point, misfit: NDArray, estimates: tuple[Estimate, ...], is_reversed: bool
+) -> list[str]:
     """What does not fit together, in words."""
     out = []
     if is_reversed:
         out.append("The images are in reverse order: the first image has the second of the phase shifts given.")
-    out += [f"{one.name} stands at a limit of the fit." for one in estimates if one.at_limit]
+    for one, of in zip(estimates, point.problem.free, strict=True):
+        if one.at_limit and not (of.name in _PHYSICAL and one.value <= of.low):
+            out.append(f"{one.name} stands at a limit of the fit.")
     states = misfit[2:].reshape(-1, 2).mean(axis=1)
     typical = float(np.median(states))
     for state, misfit in enumerate(states):

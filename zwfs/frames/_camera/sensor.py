@@ -27,6 +27,7 @@ from zwfs.sensor import ZernikeSensor
 _EXPONENTS = (2.0, 3.0, 4.0, 5.0)  # of the spectrum of a phase; held-out pixels choose
 _HELD_OUT = 0.1  # of the pixels
 _TIE = 0.03  # of priors that predict held-out pixels as well as this, the smoothest is taken
+_ALLOWED = 0.05  # error of the model in the first stage, over the light of a full pixel
 _DRAWS = 12  # for the error bars of a phase
 
 
@@ -86,7 +87,8 @@ class FittedSensor:
     """A sensor whose optics are those of a fit: pairs of frames in, phases out.
 
     The phase-shifted iteration with the fitted mask and amplitude gives a start. Then the phase alone is fitted
-    with all of the model. Its prior is smooth to a degree that held-out pixels choose.
+    with all of the model. In the first stage an error of the model adds to the noise, which keeps edges of the
+    pupil from holding a wrong start. The prior is smooth to a degree that held-out pixels choose.
 
     Parameters
     ----------
@@ -132,24 +134,20 @@ class FittedSensor:
         counts, weights = np.where(good, counts, 0), good / sigma
         held = np.random.default_rng(0).random(shape) < _HELD_OUT  # the choice hardly changes the prior
         lit = held & good & (counts > 0.1 * np.median(counts[counts > 0.5 * counts.max()]))
-        best: tuple[float, float, NDArray] | None = None
-        for accelerate in (False, True):  # the second where the plain iteration does not converge
-            means, tried = self._start(counts, accelerate), list[tuple[float, float, NDArray]]()
-            for exponent in _EXPONENTS:
-                seen = self._minimum(counts, weights * ~held, exponent, means, 2 if tried else 3, 20).point
-                means = seen.phase_means
-                score = float(np.mean(((np.array(seen.model.images) - counts) * weights)[lit] ** 2))
-                tried.append((score, exponent, means))
-                if score > 1.1 * min(one[0] for one in tried):
-                    break
-            least = min(one[0] for one in tried)
-            smoothest = [one for one in tried if one[0] <= (1 + _TIE) * least][-1]
-            if best is None or least < best[0]:
-                best = least, smoothest[1], smoothest[2]
-            if least < 2 * EXPLAINED:
+        # Where the start is wrong by a wave, edges of the pupil would hold it there.
+        allowed = _ALLOWED * np.array([arm["flux"] for arm in self.fit.point.model.arms[:2]])
+        soft = weights / np.hypot(1, weights * allowed[:, None, None])
+        means = self._minimum(counts, soft, 3.0, self._start(counts), 5, 20).point.phase_means
+        tried: list[tuple[float, float, NDArray]] = []
+        for exponent in _EXPONENTS:
+            seen = self._minimum(counts, weights * ~held, exponent, means, 2, 20).point
+            means = seen.phase_means
+            score = float(np.mean(((np.array(seen.model.images) - counts) * weights)[lit] ** 2))
+            tried.append((score, exponent, means))
+            if score > 1.1 * min(one[0] for one in tried):
                 break
-        assert best is not None
-        _, exponent, means = best
+        least = min(one[0] for one in tried)
+        _, exponent, means = [one for one in tried if one[0] <= (1 + _TIE) * least][-1]
         end = self._minimum(counts, weights, exponent, means, self.n_steps, 30)
         misfit, phase = float(np.mean(end.point.misfit)), end.point.phase_means[PAD:-PAD, PAD:-PAD]
         return FittedPhase(phase, misfit, misfit < EXPLAINED, end.converged, exponent, end.point)
@@ -204,7 +202,7 @@ class FittedSensor:
         problem = Problem(self._camera, list(counts), list(weights), light, zero, phase_map, (), values)
         return minimise(problem, white_phase(phase_map, start).ravel(), n_steps, n_inner)
 
-    def _start(self, counts: NDArray, accelerate: bool) -> NDArray[np.float64]:
+    def _start(self, counts: NDArray) -> NDArray[np.float64]:
         """Phase of the phase-shifted iteration on images brought back to the pupil, unwrapped and continued."""
         point, n = self.fit.point, self._fitted.phase_map.n
         light = np.maximum(point.light_means, 0)
@@ -223,8 +221,7 @@ class FittedSensor:
         images = ((1 - leaked) * images - leaked * images[::-1]) / (1 - 2 * leaked)
         dimples = (Dimple(masks["diameter"], masks[name]) for name in ("first", "second"))
         sensor = ZernikeSensor(pupil, *dimples, tolerance=1e-5)
-        iterate = PhaseShifted(sensor, n_iterations=25, tolerance=1e-3, accelerate=accelerate)
-        found = iterate(np.maximum(images, 0)).phase
+        found = PhaseShifted(sensor, n_iterations=25, tolerance=1e-3)(np.maximum(images, 0)).phase
         inside = ndimage.binary_erosion(pupil.inside) | (pupil.inside & (light > 0.8))
         phase = unwrapped(np.nan_to_num(found), inside)
         near = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)

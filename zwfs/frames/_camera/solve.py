@@ -19,6 +19,7 @@ from zwfs.frames._camera.prior import MapPrior
 _BINS = 24  # of spatial frequency, for the preconditioner
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
 _LEAST = 1e-3  # damping
+_BLOCK = 6  # pixels along the side of a block whose residuals may be alike
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
 _PIXEL_MEAN = np.array([230.0, 2 * 76.0, 2.0]) / 384  # of a cubic spline over a pixel, as a series of cosines
 
@@ -162,6 +163,22 @@ class Light:
         inner = np.kron(support, np.ones((oversampling,) * 2)) > 0
         return cls(start, np.sqrt(_stretched(power, oversampling)), flat, inner)
 
+    @classmethod
+    def sharp(cls, pixels: NDArray, oversampling: int) -> Light:
+        """Divide the light of each pixel as an edge of the pupil does: the side of its lit neighbours is lit."""
+        n, f = len(pixels), oversampling
+        fine = 2 * f if f < 4 else f
+        plain = cls.of(np.kron(pixels, np.ones((fine, fine))), pixels, fine)
+        blocks = _blocks(plain.amplitude**2, fine)
+        share = np.clip(pixels / blocks.mean(axis=-1), 0, 1)
+        slope = _blocks(_stretched(ndimage.gaussian_filter(share, 0.7), fine), fine)
+        rank = np.argsort(np.argsort(-slope, axis=-1), axis=-1)
+        filled = blocks * np.clip(share[..., None] * fine**2 - rank, 0, 1)
+        flat = filled.reshape(n, n, fine, fine).transpose(0, 2, 1, 3).reshape(n * fine, n * fine)
+        fine_light = np.where(plain.full, plain.start, flat)
+        start = fine_light.reshape(n * f, fine // f, n * f, fine // f).mean(axis=(1, 3))
+        return cls.of(start, pixels, f)
+
     def changed(self, change: NDArray | float) -> NDArray[np.float64]:
         """Light of a change, in units of that of a fully lit point."""
         return self.support * (self.start + self.amplitude**2 * change)
@@ -187,6 +204,12 @@ class Light:
         """Square root of the light, and its tangent where a fully lit point would be much too dark."""
         least = np.maximum(light, self._least)
         return np.sqrt(least) + (light - least) / (2 * np.sqrt(least))
+
+
+def _blocks(fine: NDArray, f: int) -> NDArray[np.float64]:
+    """Points of each pixel, (n, n, f * f)."""
+    n = len(fine) // f
+    return fine.reshape(n, f, n, f).transpose(0, 2, 1, 3).reshape(n, n, f * f)
 
 
 def _stretched(pixels: NDArray, factor: int) -> NDArray[np.float64]:
@@ -341,6 +364,13 @@ class Point:
                 )
             )
         return out
+
+    def along(self, number: int) -> list[NDArray[np.float64]]:
+        """Change of the residuals with a free number."""
+        return [
+            (slopes.T @ (which == number)).reshape(one.shape)
+            for one, (which, slopes) in zip(self.residuals, self.columns, strict=True)
+        ]
 
     @cached_property
     def block(self) -> NDArray[np.float64]:
@@ -527,23 +557,40 @@ def minimise(
     return Minimum(point, converged)
 
 
-def covariance(point: Point, n_inner: int = 15) -> NDArray[np.float64]:
-    """Covariance of the free numbers: the inverse of Schur's complement of the maps.
+def covariance(point: Point, change: Sequence[NDArray], scale: float, n_inner: int = 10) -> NDArray[np.float64]:
+    """Covariance of the free numbers: of the noise, of what the model misses, and of a change of the images.
 
-    S = H_pp - 2 H_pm X + X^T H_mm X with an approximate X = H_mm^-1 H_mp: its error is of second order in that
-    of X.
+    With effects E = J_p - J_m X and X = H_mm^-1 H_mp, the inverse of Schur's complement S = E^T E + X^T X + prior
+    is the covariance of the noise, times `scale`. The error of S is of second order in that of X. Where the model
+    misses something, residuals are alike over some pixels, and the scores E^T r of square blocks scatter more than
+    noise makes them: S^-1 (sum of their squares + X^T X + prior) S^-1 replaces what is smaller. A change d of the
+    images, over their noise, moves the numbers by S^-1 E^T d. The mean square of that over all arms is added.
     """
     n, n_all = point.problem.n_white, len(point.x)
-    free = np.arange(n_all) >= n
-    left, solved, products = [], [], []
-    for index in range(n, n_all):
-        right = point.product(np.eye(1, n_all, index)[0])
-        solution = point.solve(right, free, n_inner, 0.02)
-        left.append(right[:n])
-        solved.append(solution[:n])
-        products.append(point.product(solution)[:n])
-    cross = np.array(left) @ np.array(solved).T
-    schur = point.block - cross - cross.T + np.array(solved) @ np.array(products).T
+    held = np.arange(n_all) >= n
+    effects, followed = [], []
+    for number in range(n_all - n):
+        along = point.along(number)
+        solution = point.solve(point.back(along), held, n_inner, 0.02)
+        effects.append([one - other for one, other in zip(along, point.change(solution), strict=True)])
+        followed.append(solution[:n])
     unit = np.sqrt(np.diagonal(point.block))
-    schur = (schur + schur.T) / 2 / np.outer(unit, unit)
-    return linalg.pinvh(schur, rtol=1e-13) / np.outer(unit, unit)
+    e = np.array([np.concatenate([image.ravel() for image in one]) for one in effects]) / unit[:, None]
+    x = np.array(followed) / unit[:, None]
+    known = x @ x.T + np.diag((point.problem.prior[1] / unit) ** 2)
+    inverse = linalg.pinvh(e @ e.T + known, rtol=1e-13)
+    scores = _block_sums([[r * one for r, one in zip(point.residuals, each, strict=True)] for each in effects])
+    scores = scores / unit[:, None]
+    seen = np.sqrt(np.diagonal(inverse @ (scores @ scores.T + known) @ inverse) / np.diagonal(inverse))
+    grow = np.maximum(math.sqrt(scale), seen)
+    moved = inverse @ (e @ np.concatenate([one.ravel() for one in change])) / unit
+    kinds = np.unique([one.name.split()[-1] for one in point.problem.free], return_inverse=True)[1]
+    alike = (np.bincount(kinds, moved**2) / np.bincount(kinds))[kinds]
+    return inverse * np.outer(grow / unit, grow / unit) + np.diag(alike)
+
+
+def _block_sums(images: Sequence[Sequence[NDArray]]) -> NDArray[np.float64]:
+    """Sums over square blocks of pixels and over the images, (k, n_blocks), of k sets of images."""
+    total = np.array([np.sum(one, axis=0) for one in images])
+    rows, columns = (np.arange(0, length, _BLOCK) for length in total.shape[1:])
+    return np.add.reduceat(np.add.reduceat(total, rows, axis=1), columns, axis=2).reshape(len(total), -1)

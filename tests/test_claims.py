@@ -102,3 +102,15 @@ def test_missing_number_is_named():
     assert claims.judge(claim, {"gain": 2.0, "limit": 1.0, "more": 0.0}) == Finding(HOLDS, "2.0")
     with pytest.raises(ClaimError, match=r"claim 3, one: .*limit"):
         claims.judge(claim, {"gain": 2.0})
+
+
+@pytest.mark.parametrize("number", [number for number, claim in CLAIMS.items() if claim.notebook])
+def test_the_marked_lines_compute_the_numbers_of_a_claim(number):
+    code = (NOTEBOOKS / "studies" / f"{CLAIMS[number].notebook}.py").read_text()
+    options = claims.marked_lines(CLAIMS[number], code)
+    first, last = map(int, options["lines"].split("-"))
+    marked = [code.splitlines()[first - 2 + int(line)] for line in options["emphasize-lines"].split(",")]
+    assert all('"' in line for line in marked)
+    assert last <= len(code.splitlines())
+    if number == 13:
+        assert [line.split('"')[1] for line in marked] == ["fourier_functions", "rank"]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from studies.decision import (
+    Cell,
     Situation,
     calibrated_errors,
     dimmed,
@@ -52,7 +53,17 @@ def test_methods_that_agree_within_the_scatter_are_called_alike(errors):
     assert cell.images == 2  # by the accelerated iteration
     tied = open_cell(worse_by(1e3, errors) | {"PhaseShifted": errors["Arcsine"][::-1]})
     assert tied.images is None
-    assert tied.text.startswith("no difference")
+    assert tied.text.startswith("one image, arcsine, or two images, phase-shifted: 0.")
+    alike = open_cell(worse_by(1e3, errors) | {"LinearTwo": errors["Linear"]} | {"Arcsine": 2 * errors["Linear"]})
+    assert alike.text.startswith("linear, one or two images: 0.")
+
+
+def test_a_cell_of_loops_says_how_many_close():
+    both, settings = (0.7, 0.05), {"n_loops": 12}
+    won = Cell("linear", "linear", both, 0.07, 0.06, 0.09, (1, 12), **settings)
+    assert won.text == "two images, linear: 0.05; 12 of 12 loops close, 1 with one image"
+    tied = Cell("linear", "linear", both, 1.0, 0.9, 1.1, (12, 12), **settings)
+    assert tied.text == "linear, one or two images: 0.05; all 12 loops close"
 
 
 def test_the_simpler_of_two_methods_that_agree_is_named(errors):

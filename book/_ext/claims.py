@@ -1,5 +1,6 @@
 """The paper's claims: their table, with measured values and verdicts, and the rules that give these."""
 
+import ast
 import json
 import math
 import re
@@ -21,6 +22,7 @@ from book._tools.notebook import glued_texts
 HOLDS, REMARK, FAILS, UNTESTED = "holds", "holds with a remark", "does not hold", "not to be tested here"
 # The signs differ in shape, for readers who do not see the colours.
 SIGNS = {HOLDS: "✔", REMARK: "◐", FAILS: "✘", UNTESTED: "○"}
+STUDIES = Path(__file__).parents[2] / "notebooks" / "studies"
 ROUNDING = 1e-12  # the notebooks give no smaller errors
 
 
@@ -67,6 +69,7 @@ class Claim:
     rule: str = ""  # the conditions of the verdicts, in plain words
     given: dict[str, str] = field(default_factory=dict)  # names for expressions
     measured: str = ""  # template of the measured values
+    timed: str = ""  # the function of the benchmarks that measures its times
 
     @property
     def notebook(self) -> str:
@@ -140,7 +143,7 @@ def _row(claim: Claim, finding: Finding) -> list[str]:
     measured += [finding.remark] if finding.remark else []
     if claim.notebook:
         address = claim.source.replace(claim.notebook, f"../notebooks/{claim.notebook}.ipynb")
-        measured.append(f"*[{_title(claim.notebook)}]({address})*")
+        measured.append(f"*[{_title(claim.notebook)}]({address}), [code](#code-{claim.number})*")
         verdict = _marked(finding.verdict, f"(#rule-{claim.number})")
     return [str(claim.number), f"{claim.statement} *{section}*", " ".join(measured), verdict]
 
@@ -150,15 +153,41 @@ def rules() -> str:
     text = ""
     for notebook in dict.fromkeys(claim.notebook for claim in CLAIMS if claim.notebook):
         text += f"::::{{dropdown}} Rules and numbers: {_title(notebook)}\n:class-container: d-print-none\n\n"
+        code = f"../notebooks/studies/{notebook}.py"
         for claim in CLAIMS:
             if claim.notebook == notebook:
                 ends = {"start-at": f"- number: {claim.number}", "end-before": f"- number: {claim.number + 1}"}
                 text += f"(rule-{claim.number})=\n**Claim {claim.number}.** {claim.rule}\n\n"
                 text += _include("_ext/claims.yml", language="yaml", **ends)
-        text += "**The numbers:**\n\n"
-        code = f"../notebooks/studies/{notebook}.py"
+                text += f"(code-{claim.number})=\n**Its numbers**, the marked lines:\n\n"
+                text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))
+                if claim.timed:
+                    text += "**Its times:**\n\n" + _include("../tests/benchmarks/speed.py", pyobject=claim.timed)
+        text += "**All numbers:**\n\n"
         text += _include(code, name=f"numbers-{notebook}", pyobject="numbers") + "::::\n\n"
     return text
+
+
+def marked_lines(claim: Claim, code: str) -> dict[str, str]:
+    """Return the lines of a study that compute the numbers of a claim, as options of ``literalinclude``."""
+    [function] = [
+        one for one in ast.parse(code).body if isinstance(one, ast.FunctionDef) and one.name == "numbers"
+    ]
+    expressions = [*claim.given.values(), claim.measured]
+    expressions += [text for case in claim.verdicts for text in (case["if"], case.get("remark", ""))]
+    names = set(re.findall(r"[a-z]\w+", " ".join(expressions)))
+    found = set()
+    for number, line in enumerate(code.splitlines(), 1):
+        if function.lineno <= number <= (function.end_lineno or 0):
+            # A name as a key, of which a part may be filled in.
+            keys = [re.sub(r"{\w+}", r"\\w*", key) for key in re.findall(r'"([\w{}]+)"(?::|\] =)', line)]
+            if any(re.fullmatch(key, name) for key in keys for name in names):
+                found.add(number)
+    if not found:
+        raise ClaimError(f"claim {claim.number}, {claim.notebook}: no line of its study computes its numbers")
+    first, last = min(found), max(found)
+    marked = ",".join(str(number - first + 1) for number in sorted(found))
+    return {"lines": f"{first}-{last}", "emphasize-lines": marked}
 
 
 def _include(file: str, **options: str) -> str:

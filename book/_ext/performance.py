@@ -135,9 +135,9 @@ def telemetry(measured: dict[str, Any]) -> str:
     files = f"{measured['frames']} simulated frame pairs of {measured['n_pixels']} pixels"
     sigma, of_modes = (one[name] / one["whole"] for name in ("sigma", "sigma of 50 modes"))
     return (
-        f"{files} took {measured['time']:.1f} s with {measured['threads']} threads, files included. "
-        f"The processor time is {measured['processor time']:.1f} s. "
-        f"With one thread alone, a pair takes {one['whole']:.2f} ms: "
+        f"{files} took {measured['time']:.1f} s with {measured['threads']} threads, files included: "
+        f"{1e3 * measured['processor time'] / measured['frames']:.2f} ms of processor time for each pair. "
+        f"The computation alone takes {one['whole']:.2f} ms: "
         f"{one['resampling']:.2f} ms for resampling, {one['iteration']:.2f} ms for the iteration and "
         f"{one['residual']:.2f} ms for the residual. The memory grew by {measured['memory'] / 1e6:.0f} MB. "
         f"Standard errors of all points take {sigma:.0f} times as long as the phase, those of 50 modes "

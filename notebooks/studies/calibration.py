@@ -11,6 +11,7 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from studies.kit import sweeps
@@ -229,6 +230,7 @@ def draw_calibration_errors(errors: Errors) -> Figure:
     axes.plot(errors.rms, found, "*-", color="#333333", ms=9, label="calibrated")
     axes.plot(errors.rms, stated, "o", color="#777777", mfc="none", ms=8, label="error bar, calibrated")
     axes.set(xlabel="input (rad rms)", ylabel="error (rad rms)", yscale="log", xlim=(0, None))
+    axes.yaxis.set(major_formatter="{x:g}", minor_locator=LogLocator(subs=(2, 4, 6)), minor_formatter="{x:g}")
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     return figure
 

@@ -413,6 +413,8 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
     cells = []
     for row in rows:
         loops, best = row.loops, method_name(row.best) if row.best else "one or two images"
+        if not row.best and loops.closed(row.two) > loops.closed(row.one):
+            best = "two images close more loops; the residuals do not decide"
         closed = f"{loops.closed(row.two)} and {loops.closed(row.one)} of {loops.settled[row.one].size}"
         span = f"{row.low:.2f} to {row.high:.2f}" if row.high < np.inf else "one loop"
         ratio = f"{row.ratio:.2f} ({span})"

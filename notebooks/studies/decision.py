@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies import calibration
+from studies.closed_loop import ONE_IMAGE as LOOPS_ONE
+from studies.closed_loop import TWO_IMAGES as LOOPS_TWO
 from studies.closed_loop import (
     BestMethods,
     TunedLoops,
@@ -43,7 +45,7 @@ LIMITS = parameter_limits(
 
 QUICK = {"n_pixels": 32, "n_screens": 2, "n_screens_perfect": 2, "n_screens_loop": 2, "n_screens_calibrated": 0}
 
-COLUMNS = {"perfect": "no errors", "calibrated": "calibrated", "design": "only the design known"}
+COLUMNS = {"perfect": "perfect model", "calibrated": "calibrated bench", "design": "only the design known"}
 """What is known of the bench, and the headers of the table."""
 ONE_IMAGE = {"Linear": "linear", "Arcsine": "arcsine", "LikelihoodOne": "maximum likelihood on modes"}
 TWO_IMAGES = {
@@ -248,10 +250,14 @@ class Cell:
     ratio: float  # error with two images over that with one
     low: float  # the ratio less and plus twice its standard error
     high: float
+    closed: tuple[int, int] | None = None  # loops that close with one and two images
+    n_loops: int = 0
 
     @property
     def images(self) -> int | None:
-        """Number of images that wins, None if the two differ by less than twice the standard error."""
+        """Number of images that wins, None if the two differ by less than twice the standard error or `_ALIKE`."""
+        if max(self.ratio, 1 / self.ratio) <= _ALIKE:
+            return None
         return 2 if self.high < 1 else 1 if self.low > 1 else None
 
     @property
@@ -263,10 +269,26 @@ class Cell:
     def text(self) -> str:
         """Cell of the table."""
         if self.images is None:
-            return f"no difference: {self.error:.2g}"
+            alike = f"{self.one}, one or two images" if self.one == self.two else self._unlike
+            return f"{alike}: {self.error:.2g}{self._closed}"
         factor = max(self.ratio, 1 / self.ratio)
         count, method = ("one image", self.one) if self.images == 1 else ("two images", self.two)
-        return f"{count}, {method}: {self.error:.2g}, {factor:.2g} times smaller"
+        return f"{count}, {method}: {self.error:.2g}{self._closed or f', {factor:.2g} times smaller'}"
+
+    @property
+    def _unlike(self) -> str:
+        return f"one image, {self.one}, or two images, {self.two}"
+
+    @property
+    def _closed(self) -> str:
+        """How many loops close, the winner first."""
+        if self.closed is None:
+            return ""
+        one, two = self.closed
+        if one == two == self.n_loops:
+            return f"; all {self.n_loops} loops close"
+        first, other, count = (one, two, "two images") if self.images == 1 else (two, one, "one image")
+        return f"; {first} of {self.n_loops} loops close, {other} with {count}"
 
 
 @dataclass(frozen=True)
@@ -278,7 +300,7 @@ class Calibrated:
     @property
     def text(self) -> str:
         """Cell of the table."""
-        return f"two images, fitted model: {self.error:.2g}; one image not studied"
+        return f"two images, fitted model: {self.error:.2g}"
 
 
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
@@ -297,10 +319,16 @@ def open_cell(errors: Mapping[str, NDArray]) -> Cell:
 
 def loop_cell(found: BestMethods) -> Cell:
     """Result of the study of closed loops."""
-    settled = found.loops.settled
-    one, two = (method_name(name).partition(",")[0] for name in (found.one, found.two))
-    both = typical(settled[found.one]), typical(settled[found.two])
-    return Cell(one, two, both, found.ratio, found.low, found.high)
+    settled, closes = found.loops.settled, found.loops.closed
+    one, two = (simplest(settled, names) for names in (LOOPS_ONE, LOOPS_TWO))
+    both, ratio = (typical(settled[one]), typical(settled[two])), paired_ratio(settled[two], settled[one])
+    closed, n_loops = (closes(one), closes(two)), settled[one].size
+    return Cell(_plain(one), _plain(two), both, *ratio, closed, n_loops)
+
+
+def _plain(method: str) -> str:
+    """Name of a method without the number of its images."""
+    return method_name(method).partition(",")[0]
 
 
 @dataclass(frozen=True)
@@ -357,6 +385,11 @@ def _cell_text(cell: Cell | Calibrated | None) -> str:
     return "not studied" if cell is None else cell.text
 
 
+def _likelihood_ratios(errors: Sequence[Mapping[str, NDArray]]) -> list[float]:
+    """Error of maximum likelihood over that of the phase-shifted iteration, in each situation without a loop."""
+    return [paired_ratio(one["MaximumLikelihood"], one["PhaseShifted"])[0] for one in errors]
+
+
 def numbers(
     rows: Sequence[Row], errors: Mapping[str, Sequence[Mapping[str, NDArray]]], loops: Sequence[BestMethods]
 ) -> dict[str, float | str]:
@@ -378,6 +411,8 @@ def numbers(
         | {
             "gain_least": min(gains),
             "gain_most": max(gains),
+            "likelihood_least": min(_likelihood_ratios(errors["perfect"])),
+            "likelihood_most": max(_likelihood_ratios(errors["perfect"])),
             "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
             "likelihood_ratio": paired_ratio(settled["MaximumLikelihood"], settled[faint.one])[0],
         },

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.colors import BoundaryNorm
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FormatStrFormatter
 from numpy.typing import ArrayLike, NDArray
@@ -130,7 +130,7 @@ def _costs(pupil: Pupil, design: Design, screens: Mapping[str, NDArray]) -> dict
     return {name: 4 * float(np.mean(part**2)) for name, part in zip(screens, np.split(bounds, ends), strict=True)}
 
 
-LEVELS = [1, 1.25, 1.5, 2, 3, 5, 10]  # photon costs at which the colour of a map changes
+CONTOURS = [1.5, 2, 3, 5]  # photon costs of the lines in a map
 
 
 def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[str, NDArray]) -> Figure:
@@ -140,14 +140,18 @@ def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[
     """
     figure, panels = plt.subplots(1, len(maps.costs), figsize=(7, 3.8), sharey=True, squeeze=False)
     x, y = maps.diameters, maps.angles / np.pi
-    colors = {"cmap": "cividis_r", "norm": BoundaryNorm(LEVELS, 256, extend="max")}
+    colors = {"cmap": "YlGnBu", "norm": LogNorm(1, 10)}
     for axes, (name, grid) in zip(panels[0], maps.costs.items(), strict=True):
         axes.grid(False)
         shown = axes.pcolormesh(x, y, grid.T, shading="gouraud", rasterized=True, **colors)
+        lines = axes.contour(
+            x, y, grid.T, CONTOURS, colors=["#000000", "#000000", "#000000", "#ffffff"], linewidths=1
+        )
+        axes.clabel(lines, fmt="%g", fontsize=9)
         for design, cost in zip(designs, costs[name], strict=True):
             if np.isclose(design.theta_a, -design.theta_b):
                 place = design.diameter, design.theta_a / np.pi
-                axes.plot(*place, "o", mfc="#ffffff", mec="#000000", ms=8)
+                axes.plot(*place, "o", mfc="#ffffff", mec="#000000", ms=8, zorder=7)
                 axes.annotate(f"{design.name}: {cost:.1f}", place, (8, 0), textcoords="offset points", **_LABEL)
         axes.set(xscale="log", xlim=x[[0, -1]], ylim=y[[0, -1]], xlabel="diameter (λ/D)")
         axes.xaxis.set(major_locator=FixedLocator([1, 2, 3, 5, 8]), major_formatter="{x:g}", minor_formatter="")
@@ -155,12 +159,14 @@ def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[
         axes.yaxis.set_major_formatter(FormatStrFormatter("±%gπ"))
     panels[0, 0].set_ylabel("phase shifts (rad)")
     label = "photons / photons of an ideal sensor"
-    figure.colorbar(shown, ax=list(panels[0]), label=label, format="%g", aspect=25)
+    bar = figure.colorbar(shown, ax=list(panels[0]), label=label, extend="max", aspect=25)
+    bar.set_ticks([1, *CONTOURS, 10], labels=[f"{level:g}" for level in (1, *CONTOURS, 10)])
+    bar.minorticks_off()
     return figure
 
 
 _BOX = {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0.15"}
-_LABEL: dict[str, Any] = {"va": "center", "fontsize": 9, "bbox": _BOX}  # of designs
+_LABEL: dict[str, Any] = {"va": "center", "fontsize": 9, "bbox": _BOX, "zorder": 6}  # of designs
 
 
 def design_maps_columns(maps: DesignMap) -> dict[str, NDArray]:

@@ -229,7 +229,7 @@ def draw_linearity(
         mean, std = curves.mean(name), curves.std(name)[drawn]
         line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
         found = 0 < limits[name].value < np.inf
-        reach = f": {limits[name].value:.2g} rad" if found else ""
+        reach = f": limit {limits[name].value:.2g} rad" if found else ""
         plain.plot(rms, mean[drawn], label=look.label + reach, **line)
         low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
         plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
@@ -252,7 +252,7 @@ def draw_linearity(
         fontsize=9,
         va="center",
     )
-    plain.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
+    plain.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(-0.03, None), ylim=(-0.03, None))
     ratio.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     return figure

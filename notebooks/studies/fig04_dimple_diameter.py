@@ -29,7 +29,7 @@ from studies.kit.methods import opposite_dimples, own_reconstructors, paper_reco
 from studies.kit.parameters import SETUP, parameter_limits
 from studies.kit.results import rounded, screen_errors
 from studies.kit.setups import NOISELESS, Noise, check_setup
-from studies.kit.style import LOOKS, OTHER_STYLES, looks_of
+from studies.kit.style import LOOKS, OTHER_STYLES, TALL, looks_of
 from studies.kit.tables import Table, small
 from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error, wrapped_residual
@@ -344,7 +344,7 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
     start = min(0.64 * claimed, end / 2)
     log.text(1.01 * start, limit * 1.3, f"{percent(threshold)} of the input", color="#555555", fontsize=9)
     plain.set_ylim(0, None)
-    log.set(yscale="log", xlim=(start, end), ylim=(floor, 60))  # room for the legend
+    log.set(yscale="log", xlim=(start, end), ylim=(0.3 * floor, 60))  # room for the legend
     log.legend(loc="upper left", fontsize=9, handlelength=1.6)
     return figure
 
@@ -361,7 +361,8 @@ def draw_diameter_methods(curves: Mapping[str, DiameterCurves], threshold: float
     axes.axhline(limit, color="#555555", lw=1)
     axes.text(0.05, limit * 1.2, f"{percent(threshold)} of the input", color="#555555", fontsize=9)
     _diameters(axes, max(curve.diameters[-1] for curve in curves.values()), claimed)
-    axes.set(ylabel="mean error (rad rms)", ylim=(floor / 2, 4))
+    axes.set(ylabel="mean error (rad rms)", ylim=(0.3 * floor, 4))
+    axes.set_gid(TALL)
     figure.legend(loc="outside lower center", ncols=2)
     return figure
 
@@ -550,6 +551,7 @@ def numbers(
         "error_at_26": paper.at(ITERATION, 2.6),
         "contraction_crosses_1": crossing(reasons.diameters, reasons.flat, 1.0),
         "dark_ring": DARK_RING,
+        "n_few": by_method["Linear"].errors["Linear"].shape[-1],
         **{f"claim17_{short}_ratio": ratios[name] for name, short in SHORT.items()},
         "longest": list(by_iterations)[-1],
         "reach": _reach(paper, ITERATION, allowed, of_input, limit),

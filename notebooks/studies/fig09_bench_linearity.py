@@ -51,7 +51,7 @@ def draw_bench_linearity(curves: BenchCurves) -> Figure:
         gain.plot(curves.rms, curves.gain(name), markersize=4, **look.style)
     gain.axhline(1, color="#555555", lw=1)
     plain.set(xlabel="input (rad rms over the segments)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
-    gain.set(xlabel="input (rad rms over the segments)", ylabel="gain: estimated / commanded piston")
+    gain.set(xlabel="input (rad rms over the segments)", ylabel="gain")
     gain.set(xlim=(0, None), ylim=(0, 1.5))
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
     return figure

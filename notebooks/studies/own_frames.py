@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from studies.kit.bench import middle_rows
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
-from studies.kit.style import show_intensity, show_phase
+from studies.kit.style import WIDE, show_intensity, show_phase
 from studies.kit.tables import Table
 from zwfs import opd_to_phase, phase_to_opd
 from zwfs.frames import CameraNoise
@@ -97,7 +97,7 @@ def draw_phase_map(result: MeasuredPhase, wavelength: float, sigma: NDArray | No
     _two_scales(figure.colorbar(shown, ax=axes, location="bottom", aspect=30, extend="both"), wavelength)
     if sigma is not None:
         shown = show_intensity(panels[0, 1], sigma, 2 * np.nanmedian(sigma))
-        panels[0, 1].set_title("error bar: photon and read noise", fontsize=10)
+        panels[0, 1].set_title("error bar: noise only", fontsize=10)
         bar = figure.colorbar(shown, ax=panels[0, 1], location="bottom", aspect=30, extend="max")
         _two_scales(bar, wavelength)
     return figure
@@ -128,14 +128,18 @@ def draw_gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> F
                 points, rows + 0.3 * (1.5 - index), ls="-", lw=0.6, color=color, marker=marker, ms=5, mfc=face,
                 label=f"{label}, frame {index}",
             )  # fmt: skip
-    panels[0].set(xlabel="correlation of frames 1 and 2\nwith their prediction")
+    panels[0].set(xlabel="score and control\n(correlation)")
+    panels[0].margins(x=0.08)
     panels[1].plot([step.result.misfit for step in work], rows, color="#444444", marker="o", ms=5)
-    panels[1].set(xlabel="rms misfit\nover contrast")
+    panels[1].set(xlabel="misfit /\ncontrast")
+    panels[1].set_gid(WIDE)
     if errors is not None:
         panels[2].plot(errors, rows, color="#444444", marker="o", ms=5)
-        panels[2].set(xlabel="error of the segments\n(rad rms)")
+        panels[2].set(xlabel="error of segments\n(rad rms)")
     for axes in panels[1:]:
-        axes.margins(x=0.15)
+        axes.margins(x=0.08)
+        axes.update_datalim([(0, rows[-1])])  # the margin is a share of the whole axis
+        axes.autoscale_view()
         axes.set_xlim(left=0)
     panels[0].set_yticks(rows, [step.name for step in work])
     figure.legend(loc="outside upper center", ncols=2, fontsize=9)
@@ -149,15 +153,20 @@ def draw_signs(measurement: Measurement, height: float = 0.4) -> Figure:
     apart = np.hypot(x - 0.64 * nx, y - 0.62 * ny) / measurement.registered.diameter
     poke = np.where(sensor.pupil.inside, height * np.exp(-((apart / 0.1) ** 2)), 0)
     change = (sensor.measure(poke) - sensor.measure(np.zeros_like(poke)))[(..., *sensor.window)]
-    figure, panels = plt.subplots(1, 4, figsize=(7.8, 2.9), width_ratios=(1.1, 1, 1, 1))
+    figure, panels = plt.subplots(1, 4, figsize=(7.8, 3.4), width_ratios=(1.1, 1, 1, 1))
     _pulled_mirror(panels[0])
     maps = [(poke, height, "phase of the poke\nabove 0 (red)")]
     for image, shift in zip(change, measurement.optics.phase_shifts, strict=True):
         word = "brighter (red)" if image.sum(where=apart < 0.1) > 0 else "darker (blue)"
-        maps.append((image, np.abs(change).max(), f"image, shift {shift / np.pi:+.2g} π\n{word}"))
+        maps.append(
+            (image, np.abs(change).max(), f"image, shift {shift / np.pi:+.2g} π\n{word}".replace("-", "−"))
+        )
     for axes, (values, limit, title) in zip(panels[1:], maps, strict=True):
-        show_phase(axes, np.where(sensor.pupil.inside, values, np.nan), limit)
+        shown = show_phase(axes, np.where(sensor.pupil.inside, values, np.nan), limit)
         axes.set_title(title, fontsize=10)
+        if axes is panels[1]:
+            figure.colorbar(shown, ax=axes, location="bottom", label="phase (rad)", aspect=12)
+    figure.colorbar(shown, ax=list(panels[2:]), location="bottom", label="change of the intensity", aspect=26)
     panels[1].set_xlabel("x: columns, to the right", fontsize=9)
     panels[1].set_ylabel("y: rows, upwards", fontsize=9)
     return figure

@@ -187,7 +187,7 @@ def draw_photon_noise(curves: PhotonCurves) -> Figure:
     lowest, highest = np.nanmin(ratios), np.nanmax(ratios)
     figure, panels = plt.subplots(1, size, figsize=(7, 3.6), sharex=True, sharey=True, squeeze=False)
     for place, axes in enumerate(panels[0]):
-        axes.axhline(1, color="#999999", lw=5, label="bound", zorder=0)
+        axes.axhline(1, color="#999999", lw=5, label="bound", zorder=1)  # the grid is below
         axes.axhline(_FINE, color="#555555", lw=1, zorder=1)
         for name in sorted(curves.errors, key=list(LOOKS).index):
             look = LOOKS[name]

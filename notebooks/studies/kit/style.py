@@ -19,6 +19,10 @@ from zwfs.reconstructors import RECONSTRUCTORS
 PHASE_MAP, INTENSITY_MAP = "RdBu_r", "viridis"
 ALONE = "alone"
 """Group of the panels that share their row with no other on a phone."""
+TALL = "tall"
+"""Group of the panels that are half as tall again on a phone."""
+WIDE = "wide"
+"""Group of the panels that a phone does not show."""
 # Of phases on a dark ground: 0 is dark, the signs keep their hues, and opposite phases are equally light.
 DARK_PHASE_MAP = LinearSegmentedColormap.from_list(
     "zwfs_dark_phase", ["#9fd2ff", "#2f7fc9", "#2a2a2e", "#d1493f", "#ffb8ad"]
@@ -66,7 +70,7 @@ LOOKS |= {
     "Linear": Look("linear", "one image", "#000000", "o", "-"),
     "Arcsine": Look("arcsine", "one image", "#E69F00", "s", "--"),
     "GerchbergSaxton": Look("Gerchberg-Saxton", "two images", "#009E73", "^", "-."),
-    "GerchbergSaxtonModel": Look("Gerchberg-Saxton, model kept", "two images", "#608040", "x", "-"),
+    "GerchbergSaxtonModel": Look("Gerchberg-Saxton, model kept", "two images", "#74583E", "x", "-"),
     "GradientDescent": Look("gradient descent", "two images", "#CC79A7", "D", (0, (3, 1, 1, 1, 1, 1))),
     "GradientDescentPoints": Look("gradient descent on points", "two images", "#D55E00", "d", "--"),
     "GradientDescentStarted": Look("gradient descent, phase-shifted start", "two images", "#7010E0", "+", "-."),

@@ -16,7 +16,7 @@ from matplotlib.colors import to_rgba, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation, Text
 
-from studies.kit.style import ALONE, DARK_PHASE_MAP, PHASE_MAP
+from studies.kit.style import ALONE, DARK_PHASE_MAP, PHASE_MAP, TALL, WIDE
 
 _WIDTH, _HEIGHT = 3.7, 2.7  # of a narrow figure and of each panel in it, inch
 _LETTERS = 11  # points, at most: some figures have larger ones, as pages show them smaller than they are
@@ -50,6 +50,8 @@ def _copy(state: bytes) -> Figure:
 
 def _stacked(figure: Figure) -> Figure:
     """Put the panels of a figure below each other, in place, and pictures in pairs."""
+    for axes in [axes for axes in figure.axes if axes.get_gid() == WIDE]:
+        axes.remove()
     panels = [axes for axes in figure.axes if axes.get_subplotspec()]
     by_columns = _have_common_titles(panels)
     for axes in panels:
@@ -145,7 +147,9 @@ def _height(row: list[Axes], width: float) -> float:
         texts = [axes.get_title() + "\n" * bool(axes.get_title()) + axes.get_xlabel() for axes in row]
         lines = max(len(text.splitlines()) for text in texts)
         return width * max(map(_proportion, row)) + 0.2 * lines
-    return _WIDTH * _proportion(row[0]) if row[0].get_aspect() != "auto" else _HEIGHT
+    if row[0].get_aspect() != "auto":
+        return _WIDTH * _proportion(row[0])
+    return _HEIGHT * (1.5 if row[0].get_gid() == TALL else 1)
 
 
 def _lower(figure: Figure, axes: Axes) -> bool:

@@ -41,11 +41,13 @@ def line(name, bench, fit, seconds):
     truth, pulls = bench.truth, bench.pulls(fit)
     optics = ("diameter", "first", "second")
     relative = max(abs(fit[one].value / truth[one] - 1) for one in optics)
+    off = {one: fit[one].value - truth[one] for one in ("leakage", "blur")}
     print(
-        f"{name:20s} misfit {fit.misfit.mean():.3f}  diameter and shifts {100 * relative:.3f} %, "
-        f"{max(abs(pulls[one]) for one in optics):.1f} sigma  "
-        f"leakage {fit['leakage'].value - truth['leakage']:+.4f}  blur {fit['blur'].value - truth['blur']:+.3f} pixel  worst {max(map(abs, pulls.values())):.1f} sigma  "
-        f"consistent {fit.consistent}  {seconds:.0f} s {' '.join(fit.remarks)}"
+        f"{name:20s} misfit {fit.misfit.mean():.3f}  consistent {fit.consistent}  "
+        f"diameter and shifts {100 * relative:.3f} %, {max(abs(pulls[one]) for one in optics):.1f} sigma  "
+        f"leakage {off['leakage']:+.4f}  blur {off['blur']:+.3f} pixel  "
+        f"worst {max(map(abs, pulls.values())):.1f} sigma  {seconds:.0f} s {' '.join(fit.remarks)}",
+        flush=True,
     )
 
 
@@ -55,7 +57,10 @@ def coverage(name, bench, n_draws):
     for seed in range(n_draws):
         fit, _ = fitted(bench, seed)
         pulls.append(np.abs(list(bench.pulls(fit).values())))
-        print(f"{name:20s} draw {seed}: {np.mean(pulls[-1] < 1):.2f} within one, largest {pulls[-1].max():.1f}")
+        print(
+            f"{name:20s} draw {seed}: {np.mean(pulls[-1] < 1):.2f} within one, largest {pulls[-1].max():.1f}",
+            flush=True,
+        )
     pooled = np.concatenate(pulls)
     print(f"{name:20s} {n_draws} draws: {np.mean(pooled < 1):.3f} within one, largest {pooled.max():.1f}")
 

@@ -564,7 +564,8 @@ def covariance(point: Point, change: Sequence[NDArray], scale: float, n_inner: i
     is the covariance of the noise, times `scale`. The error of S is of second order in that of X. Where the model
     misses something, residuals are alike over some pixels, and the scores E^T r of square blocks scatter more than
     noise makes them: S^-1 (sum of their squares + X^T X + prior) S^-1 replaces what is smaller. A change d of the
-    images, over their noise, moves the numbers by S^-1 E^T d. The mean square of that over all arms is added.
+    images, over their noise, moves the numbers by S^-1 E^T d. It is the largest change that is expected, so that a
+    third of its square is added: the variance of a uniform distribution. All arms have its mean over the arms.
     """
     n, n_all = point.problem.n_white, len(point.x)
     held = np.arange(n_all) >= n
@@ -585,7 +586,7 @@ def covariance(point: Point, change: Sequence[NDArray], scale: float, n_inner: i
     grow = np.maximum(math.sqrt(scale), seen)
     moved = inverse @ (e @ np.concatenate([one.ravel() for one in change])) / unit
     kinds = np.unique([one.name.split()[-1] for one in point.problem.free], return_inverse=True)[1]
-    alike = (np.bincount(kinds, moved**2) / np.bincount(kinds))[kinds]
+    alike = (np.bincount(kinds, moved**2 / 3) / np.bincount(kinds))[kinds]
     return inverse * np.outer(grow / unit, grow / unit) + np.diag(alike)
 
 

@@ -37,7 +37,7 @@ def unseen(bench, fit, seeds=(1, 2)):
 
 
 def line(name, bench, fit, seconds):
-    """Print what a fit found."""
+    """Print the errors of a fit."""
     truth, pulls = bench.truth, bench.pulls(fit)
     optics = ("diameter", "first", "second")
     relative = max(abs(fit[one].value / truth[one] - 1) for one in optics)

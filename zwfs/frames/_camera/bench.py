@@ -26,6 +26,7 @@ from zwfs.frames._camera.solve import (
     PhaseMap,
     Point,
     Problem,
+    allowing,
     covariance,
     fine_phase,
     minimise,
@@ -44,23 +45,23 @@ _PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the
 _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
 
 
-class _Pass(NamedTuple):
+class _Stage(NamedTuple):
     """A stage of the fit."""
 
     allowed: float  # error of the model that adds to the noise, over the light of a full pixel
     enough: float  # of the cost: the stage ends when a step promises less
     n_inner: int  # iterations for a step
     focus: bool  # whether the focus is free
-    edges: bool  # whether the light is divided anew
+    divide: bool  # whether the light is divided anew after it
 
 
 # With a large error allowed, edges have little weight, and the numbers find their places in a few steps. A focus
 # that is free from the start can take the wrong sign.
-_PASSES = (
-    _Pass(0.1, 0.1, 25, focus=False, edges=False),
-    _Pass(0.05, 0.1, 25, focus=True, edges=False),
-    _Pass(0.01, 0.1, 35, focus=True, edges=True),
-    _Pass(0.0, 1e-3, 35, focus=True, edges=True),
+_STAGES = (
+    _Stage(0.1, 0.1, 25, focus=False, divide=False),
+    _Stage(0.05, 0.1, 25, focus=True, divide=True),
+    _Stage(0.01, 0.1, 35, focus=True, divide=True),
+    _Stage(0.0, 1e-3, 35, focus=True, divide=False),
 )
 
 
@@ -178,7 +179,7 @@ def fit_bench(
     oversampling : int
         Points of the model along a pixel.
     n_steps : int
-        Largest number of steps of each of the passes.
+        Largest number of steps of each of the four stages.
 
     Returns
     -------
@@ -197,12 +198,10 @@ def fit_bench(
         _check.integer("n_steps", n_steps, 1),
     )
     start = _coarse(data, diameter, shifts)
-    best = None
-    for stage in _PASSES:
-        problem, x = _problem(data, start, oversampling) if best is None else _next(data, best, stage.edges)
-        problem = _staged(data, problem, stage)
-        best = minimise(problem, x, n_steps, stage.n_inner, stage.enough)
-    assert best is not None
+    problem, x = _problem(data, start, oversampling)
+    for stage in _STAGES:
+        best = minimise(_staged(data, problem, stage), x, n_steps, stage.n_inner, stage.enough)
+        problem, x = _next(data, best, stage.divide)
     return _result(data, best, start.reversed)
 
 
@@ -277,7 +276,7 @@ def _free(data: Recording, start: _Start) -> list[Free]:
 
 
 def _problem(data: Recording, start: _Start, f: int) -> tuple[Problem, NDArray]:
-    """The first problem of a fit, and its start."""
+    """Return the first problem of a fit, and its start."""
     light, flux = data.light
     n, shape = len(light), data.counts[0].shape
     exposures = [Exposure(2, None, 0), Exposure(3, None, 0)]
@@ -310,22 +309,21 @@ def white_phase(phase_map: PhaseMap, means: NDArray) -> NDArray[np.float64]:
     return fft.irfft2(fft.rfft2(wide) / phase_map.colour, s=wide.shape)
 
 
-def _staged(data: Recording, problem: Problem, stage: _Pass) -> Problem:
-    """The problem with the noise and the free numbers of a stage."""
+def _staged(data: Recording, problem: Problem, stage: _Stage) -> Problem:
+    """Return the problem with the noise and the free numbers of a stage."""
     farthest = _FARTHEST if stage.focus else 0.0
     free = [
         one._replace(low=-farthest, high=farthest) if one.name.endswith("focus") else one for one in problem.free
     ]
     level = stage.allowed * data.light[1][0]
-    weights = [one / np.hypot(1, level * one) for one in problem.weights]
-    return replace(problem, weights=weights, free=free)
+    return replace(problem, weights=[allowing(one, level) for one in problem.weights], free=free)
 
 
-def _next(data: Recording, best: Minimum, edges: bool) -> tuple[Problem, NDArray]:
-    """The problem with pixels weighed, and on demand the light divided, by what was fitted; and its start."""
+def _next(data: Recording, best: Minimum, divide: bool) -> tuple[Problem, NDArray]:
+    """Return the next problem and its start, with weights, and on demand the light, by what was fitted."""
     point, before = best.point, best.point.problem
     problem = replace(before, weights=data.weights(point.model.images))
-    if not edges:
+    if not divide:
         return problem, point.x
     light = Light.sharp(np.maximum(point.light_means, 0), before.camera.f)
     free = [

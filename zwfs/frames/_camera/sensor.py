@@ -18,7 +18,7 @@ from zwfs.frames._camera.bench import EXPLAINED, BenchFit, white_phase
 from zwfs.frames._camera.model import Camera, Exposure
 from zwfs.frames._camera.prior import MapPrior
 from zwfs.frames._camera.recording import PAD
-from zwfs.frames._camera.solve import Light, Minimum, PhaseMap, Point, Problem, fine_phase, minimise
+from zwfs.frames._camera.solve import Light, Minimum, PhaseMap, Point, Problem, allowing, fine_phase, minimise
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
@@ -136,7 +136,7 @@ class FittedSensor:
         lit = held & good & (counts > 0.1 * np.median(counts[counts > 0.5 * counts.max()]))
         # Where the start is wrong by a wave, edges of the pupil would hold it there.
         allowed = _ALLOWED * np.array([arm["flux"] for arm in self.fit.point.model.arms[:2]])
-        soft = weights / np.hypot(1, weights * allowed[:, None, None])
+        soft = allowing(weights, allowed[:, None, None])
         means = self._minimum(counts, soft, 3.0, self._start(counts), 5, 20).point.phase_means
         tried: list[tuple[float, float, NDArray]] = []
         for exponent in _EXPONENTS:

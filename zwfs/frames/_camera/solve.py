@@ -94,6 +94,11 @@ class LightMap:
         return fft.irfft2(self.colour * fft.rfft2(whole), s=whole.shape)
 
 
+def allowing(weights: NDArray, error: float | NDArray) -> NDArray[np.float64]:
+    """Weights, one over the noise, with an error of the model added to the noise; those of bad pixels stay 0."""
+    return weights / np.hypot(1, error * weights)
+
+
 def _mean_symbol(size: int) -> NDArray[np.float64]:
     full, half = (
         np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * one), _PIXEL_MEAN)

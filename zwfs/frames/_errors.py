@@ -62,11 +62,15 @@ def slopes_of(phases: NDArray, good: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 class Excess(NamedTuple):
-    """Variance of phases less that of their noise: a constant, and a factor of a power of the slope."""
+    """Variance of phases less that of their noise: a constant, and a factor of a power of the slope.
+
+    Beyond the mean slope of the states all of it grows: few states hardly tell the constant from the growth.
+    """
 
     constant: NDArray[np.float64]
     growing: NDArray[np.float64]
     power: int
+    slope: float  # mean of the states
 
     @classmethod
     def of(cls, errors: NDArray, noise: NDArray, slopes: NDArray, good: NDArray[np.bool_], modal: bool) -> Excess:
@@ -77,7 +81,7 @@ class Excess(NamedTuple):
         """
         n, squares, power = len(slopes), errors**2, _GROWTH[modal]
         if not n:
-            return cls(0 * noise, 0 * noise, power)
+            return cls(0 * noise, 0 * noise, power, math.inf)
         mean = squares.mean(axis=0) - noise
         if modal:
             mean = (n * mean + _SHARED * mean.mean()) / (n + _SHARED)
@@ -90,8 +94,11 @@ class Excess(NamedTuple):
         totals = np.maximum(squares.mean(axis=1) - noise.mean(), 0)
         shares = nnls(powers, totals)[0] if n > 2 else np.array([1.0, 0.0])
         constant, growing = shares / max(np.mean(powers @ shares), 1e-30)
-        return cls(constant * np.maximum(mean, 0), growing * np.maximum(mean, 0), power)
+        mean = np.maximum(mean, 0)
+        return cls(constant * mean, growing * mean, power, float(np.mean(slopes**power) ** (1 / power)))
 
     def at(self, phase: NDArray, good: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Excess at a phase (ny, nx)."""
-        return self.constant + self.growing * slopes_of(phase[np.newaxis], good)[0] ** self.power
+        slope = slopes_of(phase[np.newaxis], good)[0]
+        known = min(slope, self.slope)
+        return (self.constant + self.growing * known**self.power) * (slope / known) ** self.power

@@ -43,7 +43,7 @@ def line(name, bench, fit, seconds):
     relative = max(abs(fit[one].value / truth[one] - 1) for one in optics)
     off = {one: fit[one].value - truth[one] for one in ("leakage", "blur")}
     print(
-        f"{name:20s} misfit {fit.misfit.mean():.3f}  consistent {fit.consistent}  "
+        f"{name:20s} misfit {fit.misfit.mean():.3f}  consistent {fit.consistent}  converged {fit.converged}  "
         f"diameter and shifts {100 * relative:.3f} %, {max(abs(pulls[one]) for one in optics):.1f} sigma  "
         f"leakage {off['leakage']:+.4f}  blur {off['blur']:+.3f} pixel  "
         f"worst {max(map(abs, pulls.values())):.1f} sigma  {seconds:.0f} s {' '.join(fit.remarks)}",

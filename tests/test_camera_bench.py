@@ -8,10 +8,11 @@ from scipy import ndimage
 
 from zwfs import Dimple, Pupil, ZernikeSensor
 from zwfs.frames._camera.bench import fit_bench
+from zwfs.frames._camera.light import Light
 from zwfs.frames._camera.model import Camera, Exposure, Maps
 from zwfs.frames._camera.recording import PAD, Recording
 from zwfs.frames._camera.sensor import FittedSensor, unwrapped
-from zwfs.frames._camera.solve import Light, fine_phase
+from zwfs.frames._camera.solve import fine_phase
 
 from .hcipy_bench import BEFORE, BORDER, CASES, RMS
 

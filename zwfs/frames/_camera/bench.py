@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from zwfs import _check
+from zwfs.frames._camera.light import Light
 from zwfs.frames._camera.model import ARM, Camera, Exposure, names_of
 from zwfs.frames._camera.prior import MapPrior
 from zwfs.frames._camera.recording import PAD, Recording, centred
 from zwfs.frames._camera.solve import (
     Free,
-    Light,
     LightMap,
     Minimum,
     PhaseMap,

@@ -15,10 +15,11 @@ from scipy.sparse.linalg import splu
 
 from zwfs import _check
 from zwfs.frames._camera.bench import EXPLAINED, BenchFit, white_phase
+from zwfs.frames._camera.light import Light
 from zwfs.frames._camera.model import Camera, Exposure
 from zwfs.frames._camera.prior import MapPrior
 from zwfs.frames._camera.recording import PAD
-from zwfs.frames._camera.solve import Light, Minimum, PhaseMap, Point, Problem, allowing, fine_phase, minimise
+from zwfs.frames._camera.solve import Minimum, PhaseMap, Point, Problem, allowing, fine_phase, minimise
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted

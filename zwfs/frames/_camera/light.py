@@ -1,0 +1,109 @@
+"""Light of the pupil on the grid of the model, and how it divides into the two areas of a point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from zwfs.frames._camera.model import Maps
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Where light is, and how it divides into the two areas of a point.
+
+    Attributes
+    ----------
+    start : ndarray, shape (n * f, n * f)
+        Light of no change.
+    amplitude : ndarray, shape (n * f, n * f)
+        Amplitude A of the lit part.
+    full : ndarray of bool, shape (n * f, n * f)
+        Points that are fully lit.
+    support : ndarray of bool, shape (n * f, n * f)
+        Points that may have light.
+    """
+
+    start: NDArray[np.float64]
+    amplitude: NDArray[np.float64]
+    full: NDArray[np.bool_]
+    support: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, start: NDArray, pixels: NDArray, oversampling: int) -> Light:
+        """Divide a fine map of light; `pixels` is the light of each pixel, 1 on average where it is lit."""
+        typical = ndimage.percentile_filter(pixels, 60, 5)
+        whole = (pixels > 0.9 * typical) & (typical > 0.5)
+        full = ndimage.binary_erosion(whole)
+        weight = ndimage.gaussian_filter(full.astype(float), 1.5)
+        near = np.where(
+            weight > 1e-3, ndimage.gaussian_filter(pixels * full, 1.5) / np.maximum(weight, 1e-12), np.nan
+        )
+        index = ndimage.distance_transform_edt(np.isnan(near), return_distances=False, return_indices=True)
+        power = np.maximum(near[tuple(index)], 0.05)
+        support = ndimage.binary_dilation(pixels > 0.1, iterations=2)
+        flat = np.kron(full, np.ones((oversampling,) * 2)) > 0
+        inner = np.kron(support, np.ones((oversampling,) * 2)) > 0
+        return cls(start, np.sqrt(_stretched(power, oversampling)), flat, inner)
+
+    @classmethod
+    def sharp(cls, pixels: NDArray, oversampling: int) -> Light:
+        """Divide the light of each pixel as an edge of the pupil does: the side of its lit neighbours is lit."""
+        n, f = len(pixels), oversampling
+        fine = 2 * f if f < 4 else f
+        plain = cls.of(np.kron(pixels, np.ones((fine, fine))), pixels, fine)
+        blocks = _blocks(plain.amplitude**2, fine)
+        share = np.clip(pixels / blocks.mean(axis=-1), 0, 1)
+        slope = _blocks(_stretched(ndimage.gaussian_filter(share, 0.7), fine), fine)
+        rank = np.argsort(np.argsort(-slope, axis=-1), axis=-1)
+        filled = blocks * np.clip(share[..., None] * fine**2 - rank, 0, 1)
+        flat = filled.reshape(n, n, fine, fine).transpose(0, 2, 1, 3).reshape(n * fine, n * fine)
+        fine_light = np.where(plain.full, plain.start, flat)
+        start = fine_light.reshape(n * f, fine // f, n * f, fine // f).mean(axis=(1, 3))
+        return cls.of(start, pixels, f)
+
+    def changed(self, change: NDArray | float) -> NDArray[np.float64]:
+        """Light of a change, in units of that of a fully lit point."""
+        return self.support * (self.start + self.amplitude**2 * change)
+
+    def maps(self, light: NDArray, phase: NDArray) -> Maps:
+        """Maps of the model."""
+        mean = np.where(self.full, self._root(light), light / self.amplitude)
+        return Maps(mean, np.where(self.full, 0, light - mean**2), phase)
+
+    def slopes(self, light: NDArray) -> tuple[NDArray, NDArray]:
+        """Derivatives of mean field and rest by the change of the light."""
+        power = self.amplitude**2
+        slope = self.support * power
+        root = 0.5 / np.sqrt(np.maximum(light, self._least))
+        mean = np.where(self.full, root, 1 / self.amplitude)
+        return slope * mean, slope * np.where(self.full, 0, 1 - 2 * light / power)
+
+    @property
+    def _least(self) -> NDArray[np.float64]:
+        return 0.5 * self.amplitude**2
+
+    def _root(self, light: NDArray) -> NDArray[np.float64]:
+        """Square root of the light, and its tangent where a fully lit point would be much too dark."""
+        least = np.maximum(light, self._least)
+        return np.sqrt(least) + (light - least) / (2 * np.sqrt(least))
+
+
+def _blocks(fine: NDArray, f: int) -> NDArray[np.float64]:
+    """Points of each pixel, (n, n, f * f)."""
+    n = len(fine) // f
+    return fine.reshape(n, f, n, f).transpose(0, 2, 1, 3).reshape(n, n, f * f)
+
+
+def _stretched(pixels: NDArray, factor: int) -> NDArray[np.float64]:
+    """A smooth map of pixels on a grid that is finer by a factor, linear between the pixels."""
+    n = pixels.shape[-1]
+    places = np.clip((np.arange(n * factor) + 0.5) / factor - 0.5, 0, n - 1)
+    low = np.minimum(places.astype(int), n - 2)
+    along = np.zeros((len(places), n))
+    along[np.arange(len(places)), low] = 1 - (places - low)
+    along[np.arange(len(places)), low + 1] += places - low
+    return along @ pixels @ along.T

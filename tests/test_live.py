@@ -343,7 +343,7 @@ def wait_for_address(page, *parts):
         ("All-round", "✗✗✓", "maximum likelihood"),
         ("Dimple too large", "✗✗✗", "phase-shifted"),
         ("Out of range", "✗✗✗", "phase-shifted"),
-        ("A large input", "✗✗✓", "accelerated"),
+        ("A large input", "✗✗✗", "phase-shifted"),
         ("The same with maximum likelihood", "✗✗✓", "maximum likelihood"),
         ("A small input", "✗✓✓", "phase-shifted"),
     ],

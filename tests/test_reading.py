@@ -57,3 +57,8 @@ def test_figures_and_text_come_first_and_all_code_is_in_one_fold_at_the_end(read
 def test_a_cell_that_computes_and_prints_keeps_its_code(reads):
     source = "table = compute()\ntable"
     assert reads(code(source, output=True)) == [source, ("folded", source)]
+
+
+def test_cells_that_a_page_does_not_need_stand_in_the_fold_alone(reads):
+    page = reads(code(DRAW, "hide-input", output=True), new_markdown_cell("Text"), code("one = 1", "fold"))
+    assert page == ["output", "Text", ("folded", f"{DRAW}\n\none = 1")]

@@ -5,7 +5,7 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,8 +36,18 @@ def below(error: float) -> str:
     return f"at most {text}" if error <= ROUNDING else text
 
 
+def listed(names: Sequence[str]) -> str:
+    """Join names by commas, and the last by "and"."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
+
+
+def sentence(text: str) -> str:
+    """Begin a text with a capital."""
+    return text[:1].upper() + text[1:]
+
+
 RULES = Environment(undefined=StrictUndefined)
-RULES.filters |= {"write": format, "below": below}
+RULES.filters |= {"write": format, "below": below, "listed": listed, "sentence": sentence}
 RULES.globals |= {
     "pi": math.pi,
     "performance": json.loads(Path(__file__).with_name("performance.json").read_text("utf-8")),
@@ -62,10 +72,12 @@ class Claim:
     """A statement of the paper, in our words, and its rule: an entry of claims.yml."""
 
     number: int
+    title: str
     section: str  # of the paper
     statement: str
     verdicts: list[dict[str, str]]  # the first whose condition applies; otherwise the claim holds
     source: str = ""  # the notebook that measures it, and the heading to link to: ``notebook#its-words``
+    code: str = ""  # the function in the study of the notebook that computes its numbers
     rule: str = ""  # the conditions of the verdicts, in plain words
     given: dict[str, str] = field(default_factory=dict)  # names for expressions
     measured: str = ""  # template of the measured values
@@ -129,7 +141,7 @@ def count(judged: dict[int, Finding]) -> str:
 
 def table(judged: dict[int, Finding]) -> str:
     """Return the table of all claims as MyST text."""
-    header = ["", "the paper says", "measured here", "verdict"]
+    header = ["claim", "the paper says", "measured here"]
     rows = [header, ["---"] * len(header), *(_row(claim, judged[claim.number]) for claim in CLAIMS)]
     lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
     return "\n".join([":::{table}", ":class: claims", "", *lines, ":::"])
@@ -139,13 +151,13 @@ def _row(claim: Claim, finding: Finding) -> list[str]:
     section, verdict = f"section {claim.section}", _marked(finding.verdict)
     if page := SECTIONS.get(claim.section):
         section = f"[{section}]({page})"
-    measured = [f"{finding.measured[:1].upper()}{finding.measured[1:]}."] if finding.measured else []
+    measured = [f"{sentence(finding.measured)}."] if finding.measured else []
     measured += [finding.remark] if finding.remark else []
     if claim.notebook:
         address = claim.source.replace(claim.notebook, f"../notebooks/{claim.notebook}.ipynb")
         measured.append(f"*[{_title(claim.notebook)}]({address}), [code](#code-{claim.number})*")
         verdict = _marked(finding.verdict, f"(#rule-{claim.number})")
-    return [str(claim.number), f"{claim.statement} *{section}*", " ".join(measured), verdict]
+    return [f"{claim.number}. **{claim.title}** {verdict}", f"{claim.statement} *{section}*", " ".join(measured)]
 
 
 def rules() -> str:
@@ -154,12 +166,19 @@ def rules() -> str:
     for notebook in dict.fromkeys(claim.notebook for claim in CLAIMS if claim.notebook):
         text += f"::::{{dropdown}} Rules and numbers: {_title(notebook)}\n:class-container: d-print-none\n\n"
         code = f"../notebooks/studies/{notebook}.py"
+        shown: set[str] = set()
         for claim in CLAIMS:
             if claim.notebook == notebook:
                 ends = {"start-at": f"- number: {claim.number}", "end-before": f"- number: {claim.number + 1}"}
                 text += f"(rule-{claim.number})=\n**Claim {claim.number}.** {claim.rule}\n\n"
                 text += _include("_ext/claims.yml", language="yaml", **ends)
-                text += f"(code-{claim.number})=\n**Its numbers**, the marked lines:\n\n"
+                if claim.code not in shown:
+                    alike = [one for one in CLAIMS if (one.notebook, one.code) == (notebook, claim.code)]
+                    text += "".join(f"(code-{one.number})=\n" for one in alike)
+                    numbers = ", ".join(str(one.number) for one in alike)
+                    text += f"**Code that computes** (claim {numbers}):\n\n" + _include(code, pyobject=claim.code)
+                    shown.add(claim.code)
+                text += "**Its numbers**, the marked lines:\n\n"
                 text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))
                 if claim.timed:
                     text += "**Its times:**\n\n" + _include("../tests/benchmarks/speed.py", pyobject=claim.timed)
@@ -183,6 +202,13 @@ def marked_lines(claim: Claim, code: str) -> dict[str, str]:
             keys = [re.sub(r"{\w+}", r"\\w*", key) for key in re.findall(r'"([\w{}]+)"(?::|\] =)', line)]
             if any(re.fullmatch(key, name) for key in keys for name in names):
                 found.add(number)
+    # And the lines of local names on them.
+    lines = code.splitlines()
+    used = set(re.findall(r"\w+", " ".join(re.sub(r'^ *\S*":', "", lines[number - 1]) for number in found)))
+    for one in (one for one in function.body if found and isinstance(one, ast.Assign)):
+        targets = {name.id for target in one.targets for name in ast.walk(target) if isinstance(name, ast.Name)}
+        if targets & (used - {"mean", "rms"}):
+            found |= set(range(one.lineno, (one.end_lineno or one.lineno) + 1))
     if not found:
         raise ClaimError(f"claim {claim.number}, {claim.notebook}: no line of its study computes its numbers")
     first, last = min(found), max(found)

@@ -12,15 +12,19 @@ from studies.kit.results import published
 
 CARD = "card-"  # with which the ids of the cards begin
 FOLD = "Code of this page"
+FOLDED = "fold"  # tag of a cell that computes and yet goes into the fold
 
 
 def put_in_order(notebook: NotebookNode) -> None:
     """Move the code of a notebook into a fold at its end, in place.
 
-    The first cell that computes also stays visible, at the end of the section that follows the first figure.
+    The first cell that computes also stays visible, at the end of the section that follows the first figure. Cells
+    with the tag `FOLDED` do not.
     """
     code = [cell for cell in notebook.cells if cell.cell_type == "code" and not tagged(cell, "remove-cell")]
-    computing = [cell for cell in code if not (cell.outputs or tagged(cell, "hide-input", "parameters"))][:1]
+    computing = [cell for cell in code if not (cell.outputs or tagged(cell, "hide-input", "parameters", FOLDED))][
+        :1
+    ]
     cells: list[NotebookNode] = []
     drawn = described = False  # whether the first figure, and text on it, are above
     for cell in notebook.cells:

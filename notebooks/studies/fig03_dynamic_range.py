@@ -213,7 +213,7 @@ def run_out(reconstructor: PhaseShifted, phase: NDArray) -> float:
 # Look, title, dashes and markers of the variants of Gerchberg-Saxton, by what they do where nothing is measured.
 _UNMEASURED = {
     "zero": ("GerchbergSaxton", "zero where not measured", ("-", "-.", "--", ":"), "^<v>"),
-    "model": ("GerchbergSaxtonModel", "modelled field kept, {:g} D", ("-", "--"), "x+"),
+    "model": ("GerchbergSaxtonModel", "modelled field, {:g} D", ("-", "--"), "x+"),
 }
 
 
@@ -254,7 +254,7 @@ def draw_linearity(
     )
     plain.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(-0.03, None), ylim=(-0.03, None))
     ratio.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
-    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9, columnspacing=1)
     return figure
 
 

@@ -20,7 +20,7 @@ from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS, dashed_circle, show_intensity, show_phase
 from zwfs.masks import focal_field
-from zwfs.metrics import strehl, wrapped_residual
+from zwfs.metrics import wrapped_residual
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
@@ -103,7 +103,8 @@ def draw_sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Fi
         if axes is panels[2]:
             bar.locator = MaxNLocator(2)
     for axes in (panels[0], panels[3]):
-        axes.plot(pixel.column, pixel.row, "+", color="black" if axes is panels[0] else "white", ms=9, mew=1.5)
+        color = "black" if axes is panels[0] else "white"
+        axes.plot(pixel.column, pixel.row, "s", mfc="none", mec=color, ms=7, mew=1.5)
     return figure
 
 
@@ -209,7 +210,7 @@ def one_or_two_images_columns(
 
 
 def numbers(pupil: Pupil, truth: NDArray, one: NDArray, pixel: Pixel) -> dict[str, float | str]:
-    """Phases that explain the pixel (radian), the phase from one image, and the Strehl ratio."""
+    """Phases that explain the pixel, the phase from one image, and the rms of the wavefront, all in radian."""
     return rounded(
         {
             "pixel_phase": pixel.phase,
@@ -217,7 +218,7 @@ def numbers(pupil: Pupil, truth: NDArray, one: NDArray, pixel: Pixel) -> dict[st
             "mirrored_b": pixel.mirrored[1],
             "one_at_pixel": one[pixel.row, pixel.column],
             "fold": np.angle(-np.exp(1j * np.angle(pixel.waves[0]))),
-            "strehl": float(strehl(pupil, truth)),
+            "rms": float(pupil.rms(truth)),
         }
     )
 

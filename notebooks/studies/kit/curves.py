@@ -73,7 +73,7 @@ def reach_text(
     x: ArrayLike,
     error: ArrayLike,
     bound: ArrayLike,
-    limit: Limit,
+    limit: Limit | str,
     words: str = "5 % of the input",
     unit: str = "rad rms",
 ) -> str:

@@ -70,6 +70,17 @@ def test_the_phase_shifted_loop_closes_where_the_linear_one_does_not(pupil, mode
     assert np.all(lost.residual <= 4.0 + lost.open_loop + 1e-9)
 
 
+def test_one_iteration_closes_the_loop_as_three_do(small):
+    pupil, modes, (_, pair) = small
+    flow = FrozenFlow(pupil, 0.7, 12, **WIND, seed=11)
+    settled = []
+    for n in (1, 3):
+        run = follow_flow(PhaseShifted(pair, n_iterations=n, accelerate=True), modes, flow, 40, gain=0.4, **LOOP)
+        assert run.closed().all()
+        settled.append(np.median(run.settled()))
+    assert settled[0] < 1.1 * settled[1]
+
+
 @pytest.mark.parametrize("exponent", [-4.0, -2.0, 0.0])
 def test_the_power_falls_with_the_exponent(exponent):
     whole = Pupil.from_amplitude(np.ones((36, 36)), n_pixels=12)  # 3 D: the screens repeat after that

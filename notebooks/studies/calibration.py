@@ -19,7 +19,7 @@ from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS
 from studies.kit.tables import Table
-from zwfs.frames import BenchFit, FittedSensor, fit_bench
+from zwfs.frames import BenchFit, Calibration, FittedSensor, fit_bench
 from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
 from zwfs.frames.registration import Image, register_frames
 
@@ -30,6 +30,7 @@ LIMITS = {
     "largest": (0.1, 1.2),
     "n_screens": (1, 2),
     "n_iterations": USUAL["n_iterations"],
+    "command_error": (-0.3, 0.3),
 }
 QUICK = {"n_commands": 2, "n_steps": 2, "oversampling": 1, "largest": 0.3, "n_screens": 1}
 
@@ -106,13 +107,27 @@ class Recording:
         return counts / share, sigma / share
 
 
-def calibrate(taken: Recording, n_commands: int = 4, n_steps: int = 6, oversampling: int = 2) -> BenchFit:
-    """Fit the bench to the frames of the flat and of known commands."""
+def calibrate_each(
+    taken: Recording, command_errors: Sequence[float], n_commands: int, n_steps: int, oversampling: int
+) -> list[BenchFit]:
+    """Fit the bench with each relative error of all commands."""
+    settings = n_commands, n_steps, oversampling
+    return sweeps.run(_calibrate, command_errors, taken, *settings, name="calibrations")
+
+
+def _calibrate(command_error: float, taken: Recording, *settings: int) -> BenchFit:
+    return calibrate(taken, *settings, command_error=command_error)
+
+
+def calibrate(
+    taken: Recording, n_commands: int = 4, n_steps: int = 6, oversampling: int = 2, *, command_error: float = 0.0
+) -> BenchFit:
+    """Fit the bench to the frames of the flat and of known commands, which are wrong by a relative error."""
     states = slice(n_commands + 1)
     return fit_bench(
         taken.frames[states],
         taken.clear_frames,
-        taken.commands[states],
+        (1 + command_error) * taken.commands[states],
         n_pixels=taken.commands.shape[-1],
         noise=taken.noise,
         gain=taken.gain,
@@ -195,8 +210,10 @@ def estimate_table(taken: Recording, fit: BenchFit) -> Table:
     for name, title in _TITLES.items():
         value, sigma = fit[name].value, fit[name].sigma
         deviation = (value - true[name]) / sigma
-        rows.append([title, f"{true[name]:.5g}", f"{value:.4g}", f"{sigma:.1g}", f"{round(deviation):+d}"])
-    return Table(["parameter", "put in", "fitted", "error bar", "deviation (error bars)"], rows)
+        digits = max(-int(np.floor(np.log10(sigma))), 0)
+        fitted = f"{value:.{digits}f} ± {sigma:.{digits}f}"
+        rows.append([title, f"{true[name]:.5g}", fitted, f"{round(deviation):+d}"])
+    return Table(["parameter", "put in", "fitted", "deviation (error bars)"], rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +237,19 @@ def measure_inputs(
     numbers = [number for rms in inputs for number in taken.unseen(rms, taken.photons[0])[:n_screens]]
     found = measure(taken, fit, numbers, n_iterations)
     return Errors(inputs, [found[k : k + n_screens] for k in range(0, len(found), n_screens)])
+
+
+def bulk_errors(taken: Recording, fit: BenchFit, errors: Errors) -> NDArray[np.float64]:
+    """Errors of the first screen of each input by `Calibration.from_bench`, as `calibrate --commands`, rad rms."""
+    states = slice(len(fit.misfit) // 2 - 1)
+    calibration = Calibration.from_bench(fit, taken.frames[states], taken.commands[states])
+    found = []
+    for rms in errors.rms:
+        number = taken.unseen(rms, taken.photons[0])[0]
+        phase = calibration(taken.shot(number)[0]).phase.astype(float)
+        lit = taken.arrays["lit"] & np.isfinite(phase)
+        found.append(_error(phase, taken.arrays["unseen"][number] * _UNIT, lit).std())
+    return np.array(found)
 
 
 def draw_calibration_errors(errors: Errors) -> Figure:
@@ -246,8 +276,11 @@ def error_columns(errors: Errors) -> dict[str, NDArray]:
     }
 
 
-def numbers(taken: Recording, fit: BenchFit, errors: Errors) -> dict[str, float | str]:
-    """Numbers for the text: settings, verdict, errors and how well the error bars hold."""
+def numbers(
+    taken: Recording, fit: BenchFit, errors: Errors, wrong_fit: BenchFit, wrong: Errors
+) -> dict[str, float | str]:
+    """Numbers for the text: settings, verdict, errors, how well the error bars hold, and wrong commands."""
+    bulk, spoiled = bulk_errors(taken, fit, errors), wrong.column("calibrated")
     true, plain, found = known_values(taken), errors.column("plain"), errors.column("calibrated")
     every = [one for row in errors.measured for one in row]
     place = int(np.argmin(np.abs(errors.rms - 0.8)))
@@ -271,7 +304,12 @@ def numbers(taken: Recording, fit: BenchFit, errors: Errors) -> dict[str, float 
             "calibrated_largest": found.max(),
             "sigma": errors.column("sigma")[place],
             "inside": 100 * float(np.mean([one.inside for one in every])),
-            "flagged": sum(not one.consistent for one in every),
+            "consistent": sum(one.consistent for one in every),
+            "bulk_least": (plain / bulk).min(),
+            "bulk_most": (plain / bulk).max(),
+            "wrong_least": (plain / spoiled).min(),
+            "wrong_most": (plain / spoiled).max(),
+            "wrong_verdict": "consistent" if wrong_fit.consistent else "not consistent",
             "unseen": len(every),
         },
         ".3g",

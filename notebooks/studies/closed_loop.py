@@ -49,6 +49,9 @@ PLANTS = {
 }
 """Keywords of `AlteredSensor`, for each panel of the figure."""
 
+ALIKE = 1.05
+"""Ratio of errors up to which the simpler one of two methods is named."""
+
 _BOX = 3.0  # D; the screens repeat after this length
 
 
@@ -309,21 +312,28 @@ class BestMethods:
 
     @property
     def best(self) -> str | None:
-        """Best method, None if the two differ by less than twice the standard error."""
+        """Best method, None if the two differ by less than twice the standard error or `ALIKE`."""
+        if max(self.ratio, 1 / self.ratio) <= ALIKE:
+            return None
         return self.two if self.high < 1 else self.one if self.low > 1 else None
 
 
 def best_methods(trials: Iterable[TunedLoops]) -> list[BestMethods]:
     """Compare the best method with one image to that with two, screen by screen.
 
-    The screens that chose the gains also choose the methods.
+    The screens that chose the gains also choose the methods: the simplest one within `ALIKE` of the best.
     """
     rows = []
     for loops in trials:
-        chosen = loops.chosen
-        one, two = (min(names, key=lambda name: chosen[name]) for names in (ONE_IMAGE, TWO_IMAGES))
+        one, two = (_simplest(loops.chosen, names) for names in (ONE_IMAGE, TWO_IMAGES))
         rows.append(BestMethods(loops, one, two, *paired_ratio(loops.settled[two], loops.settled[one])))
     return rows
+
+
+def _simplest(residual: Mapping[str, float], names: Sequence[str]) -> str:
+    """First method whose residual is within `ALIKE` of the smallest one."""
+    limit = ALIKE * min(residual[name] for name in names)
+    return next(name for name in names if residual[name] <= limit)
 
 
 _NAMES = {"Linear": "linear, one image", "LinearTwo": "linear, two images"}
@@ -402,13 +412,13 @@ def tuned_screens(trials: Sequence[TunedLoops]) -> dict[str, NDArray]:
 
 
 def best_table(rows: Sequence[BestMethods]) -> Table:
-    """Return the best method for each input and star, and what the second image gains."""
+    """Return the best method for each input and star, its gain, and what the second image gains."""
     header = (
-        "start (rad rms)",
-        "photons per point and image",
+        "start (rad rms); photons per point and image",
         "best method",
         "residual: two images / one",
         "loops that close: two images, one",
+        "gain: two images, one",
     )
     cells = []
     for row in rows:
@@ -418,7 +428,8 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
         closed = f"{loops.closed(row.two)} and {loops.closed(row.one)} of {loops.settled[row.one].size}"
         span = f"{row.low:.2f} to {row.high:.2f}" if row.high < np.inf else "one loop"
         ratio = f"{row.ratio:.2f} ({span})"
-        cells.append([f"{loops.start:g}", f"{loops.photons:g}", best, ratio, closed])
+        gains = f"{loops.gains[row.two]:g}, {loops.gains[row.one]:g}"
+        cells.append([f"{loops.start:g}; {loops.photons:g}", best, ratio, closed, gains])
     return Table(header, cells)
 
 
@@ -432,6 +443,11 @@ def numbers(
     lost, starts = ~closed["sensor"], {row.loops.start for row in rows}
     unequal = [row.loops.start for row in rows if row.best is not None]
     others = [row.loops.start for row in rows if row.best != row.two]
+    excess = max(one["LinearTwo"] / min(one.values()) for one in residual) - 1
+    equal = max((start for start in starts if start < min(unequal, default=np.inf)), default=np.nan)
+    two_from = min((start for start in starts if start > max(others, default=0)), default=np.nan)
+    between = [row for row in rows if equal < row.loops.start < two_from]
+    diverged = [row.loops.settled[row.one].size - row.loops.closed(row.one) for row in between]
     return rounded(
         dict(settings)
         | {f"closed_{key}": np.count_nonzero(one) for key, one in closed.items()}
@@ -441,9 +457,12 @@ def numbers(
             "rank_wave": found.ranking(-found.wave),
             "reversed_closed": found.reversed[~lost, 0].mean() if not lost.all() else np.nan,
             "reversed_lost": found.reversed[lost, 0].mean() if lost.any() else np.nan,
-            "equal_to": max((start for start in starts if start < min(unequal, default=np.inf)), default=np.nan),
-            "two_from": min((start for start in starts if start > max(others, default=0)), default=np.nan),
-            "linear_two_excess": max(one["LinearTwo"] / min(one.values()) for one in residual) - 1,
+            "equal_to": equal,
+            "two_from": two_from,
+            "between": min((row.loops.start for row in between), default=np.nan),
+            "diverged_least": min(diverged, default=np.nan),
+            "diverged_most": max(diverged, default=np.nan),
+            "linear_two_excess": np.ceil(100 * excess) / 100,  # an upper limit, in whole percents
             "iteration_excess": max(one["PhaseShifted"] / one["LinearTwo"] for one in residual) - 1,
         }
     )

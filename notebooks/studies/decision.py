@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies import calibration
-from studies.closed_loop import ONE_IMAGE as LOOPS_ONE
-from studies.closed_loop import TWO_IMAGES as LOOPS_TWO
 from studies.closed_loop import (
+    ALIKE,
     BestMethods,
     TunedLoops,
     best_methods,
@@ -65,7 +64,16 @@ CHAPTERS = (
 )
 """Chapters that explain the rows without a loop."""
 _N_DARKS = 16  # averaged
-_ALIKE = 1.05  # ratio of errors up to which the simpler one of two methods is named
+
+
+NO_NOISE = 1e9
+"""Photons per point and image at which a loop has almost no noise."""
+LOOP = {"rate": 1000.0, "delay": 2, "stroke": 4.0, "n_steps": 40}
+WIND = {"speed": 2.5, "cutoff": 3.0, "exponent": -2.0}
+GAINS = 0.1, 0.2, 0.4
+"""Settings of the chapter on closed loops."""
+_N_MODES = 80  # of the mirror
+_DIAMETER = 8.0  # of the telescope that the wind speed in m/s belongs to, m
 
 
 class Situation(NamedTuple):
@@ -226,17 +234,14 @@ def _closed_loop(situation: Situation, n_screens: int, seed: int) -> TunedLoops:
     masks = Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2)
     return tuned_loops(
         (ZernikeSensor(pupil, masks[0]), ZernikeSensor(pupil, *masks)),
-        zernike_basis(pupil, 80),
+        zernike_basis(pupil, _N_MODES),
         situation.rms,
         situation.photons,
-        gains=(0.1, 0.2, 0.4),
+        gains=GAINS,
         n_screens=n_screens,
-        n_steps=40,
-        wind={"speed": 2.5, "cutoff": 3.0, "exponent": -2.0},
+        wind=WIND,
         seed=seed,
-        rate=1000.0,
-        delay=2,
-        stroke=4.0,
+        **LOOP,
     )
 
 
@@ -255,8 +260,8 @@ class Cell:
 
     @property
     def images(self) -> int | None:
-        """Number of images that wins, None if the two differ by less than twice the standard error or `_ALIKE`."""
-        if max(self.ratio, 1 / self.ratio) <= _ALIKE:
+        """Number of images that wins, None if the two differ by less than twice the standard error or `ALIKE`."""
+        if max(self.ratio, 1 / self.ratio) <= ALIKE:
             return None
         return 2 if self.high < 1 else 1 if self.low > 1 else None
 
@@ -288,7 +293,8 @@ class Cell:
         if one == two == self.n_loops:
             return f"; all {self.n_loops} loops close"
         first, other, count = (one, two, "two images") if self.images == 1 else (two, one, "one image")
-        return f"; {first} of {self.n_loops} loops close, {other} with {count}"
+        wins = f"all {self.n_loops}" if first == self.n_loops else f"{first} of {self.n_loops}"
+        return f"; {wins} loops close; with {count} {'only ' * (other < first)}{other} of {self.n_loops}"
 
 
 @dataclass(frozen=True)
@@ -300,14 +306,14 @@ class Calibrated:
     @property
     def text(self) -> str:
         """Cell of the table."""
-        return f"two images, fitted model: {self.error:.2g}"
+        return f"two images, fitted model: {self.error:.2g} (one image not studied)"
 
 
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
-    """Name of the first method that agrees with the best one within the scatter, or within `_ALIKE`."""
+    """Name of the first method that agrees with the best one within the scatter, or within `ALIKE`."""
     known = [name for name in names if name in errors]
     best = min(known, key=lambda name: typical(errors[name]))
-    return next(name for name in known if name == best or paired_ratio(errors[name], errors[best])[1] <= _ALIKE)
+    return next(name for name in known if name == best or paired_ratio(errors[name], errors[best])[1] <= ALIKE)
 
 
 def open_cell(errors: Mapping[str, NDArray]) -> Cell:
@@ -319,11 +325,10 @@ def open_cell(errors: Mapping[str, NDArray]) -> Cell:
 
 def loop_cell(found: BestMethods) -> Cell:
     """Result of the study of closed loops."""
-    settled, closes = found.loops.settled, found.loops.closed
-    one, two = (simplest(settled, names) for names in (LOOPS_ONE, LOOPS_TWO))
-    both, ratio = (typical(settled[one]), typical(settled[two])), paired_ratio(settled[two], settled[one])
-    closed, n_loops = (closes(one), closes(two)), settled[one].size
-    return Cell(_plain(one), _plain(two), both, *ratio, closed, n_loops)
+    settled, one, two = found.loops.settled, found.one, found.two
+    both = typical(settled[one]), typical(settled[two])
+    closed, n_loops = (found.loops.closed(one), found.loops.closed(two)), settled[one].size
+    return Cell(_plain(one), _plain(two), both, found.ratio, found.low, found.high, closed, n_loops)
 
 
 def _plain(method: str) -> str:
@@ -376,7 +381,7 @@ def _light(photons: float) -> str:
 
 def decision_table(rows: Iterable[Row]) -> Table:
     """Best method of each situation."""
-    header = ["situation; photons per point and image (both images)", *COLUMNS.values(), "explained in"]
+    header = ["situation; photons per point and image (one image alone)", *COLUMNS.values(), "explained in"]
     cells = [[_cell_text(row.cells[name]) for name in COLUMNS] for row in rows]
     return Table(header, [[row.text, *some, row.chapter] for row, some in zip(rows, cells, strict=True)])
 
@@ -391,7 +396,10 @@ def _likelihood_ratios(errors: Sequence[Mapping[str, NDArray]]) -> list[float]:
 
 
 def numbers(
-    rows: Sequence[Row], errors: Mapping[str, Sequence[Mapping[str, NDArray]]], loops: Sequence[BestMethods]
+    rows: Sequence[Row],
+    errors: Mapping[str, Sequence[Mapping[str, NDArray]]],
+    loops: Sequence[BestMethods],
+    no_noise: BestMethods,
 ) -> dict[str, float | str]:
     """Each cell in words, its error (rad rms), and the error with two images over that with one; and extremes."""
     found: dict[str, float | str] = {}
@@ -414,7 +422,16 @@ def numbers(
             "likelihood_least": min(_likelihood_ratios(errors["perfect"])),
             "likelihood_most": max(_likelihood_ratios(errors["perfect"])),
             "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
-            "likelihood_ratio": paired_ratio(settled["MaximumLikelihood"], settled[faint.one])[0],
+            "likelihood_excess": paired_ratio(settled["MaximumLikelihood"], settled["LinearTwo"])[0] - 1,
+            "photons_faint": faint.loops.photons,
+            "no_noise": typical(no_noise.loops.settled["LinearTwo"]),
+            "loop_rate": LOOP["rate"] / 1e3,
+            "loop_delay": LOOP["delay"],
+            "loop_wind": WIND["speed"] * _DIAMETER,
+            "loop_diameter": _DIAMETER,
+            "loop_modes": _N_MODES,
+            "loop_gain_least": min(GAINS),
+            "loop_gain_most": max(GAINS),
         },
         ".3g",
     )

@@ -5,6 +5,7 @@ The sign of the phase depends on the order of the two images, which `order_of_im
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -299,7 +300,7 @@ def _of_light(measurement: Measurement) -> str:
     facts += "For opposite phase shifts the two ratios should be equal, and balancing assumes it. "
     difference = abs(masked / clear - 1)
     if difference < _UNEVEN:
-        return f"{facts}They agree to {difference:.1%}."
+        return f"{facts}They agree within {max(math.ceil(1e3 * difference), 1) / 10:.1f} %."
     hidden = "which balancing hides: look for leakage, light that one mask does not shift, and stray light"
     return f"{facts}They differ by {difference:.0%}, {hidden}."
 

@@ -281,6 +281,16 @@ class Cell:
         return f"{count}, {method}: {self.error:.2g}{self._closed or f', {factor:.2g} times smaller'}"
 
     @property
+    def sides(self) -> dict[str, str]:
+        """Error and method with two images and with one, or how few loops close."""
+        closed = self.closed or (self.n_loops,) * 2
+        both = zip(("one", "two"), self.typical, (self.one, self.two), closed, strict=True)
+        return {
+            count: f"{error:.2g}, {method}" if n == self.n_loops else f"{n} of {self.n_loops} loops close"
+            for count, error, method, n in both
+        }
+
+    @property
     def _unlike(self) -> str:
         return f"one image, {self.one}, or two images, {self.two}"
 
@@ -341,7 +351,9 @@ class Row:
     """A row of the table; None marks a cell that was not studied."""
 
     key: str
-    text: str
+    start: str
+    photons: str  # per point and image of two
+    both: str  # per point of one image alone
     cells: Mapping[str, Cell | Calibrated | None]
     chapter: Link
 
@@ -360,8 +372,8 @@ def open_rows(
             "calibrated": None if known is None else Calibrated(known),
             "design": open_cell(errors["real"][index]),
         }
-        text = f"open loop, {rms:g} rad rms; {_light(photons)}"
-        rows.append(Row(f"open_{index + 1}", text, cells, CHAPTERS[index]))
+        light = f"{photons:g}", f"{2 * photons:g}"
+        rows.append(Row(f"open_{index + 1}", f"open loop, {rms:g} rad rms", *light, cells, CHAPTERS[index]))
     return rows
 
 
@@ -370,20 +382,18 @@ def loop_rows(found: Iterable[BestMethods]) -> list[Row]:
     rows = []
     for index, one in enumerate(found):
         cells = {"perfect": loop_cell(one), "calibrated": None, "design": None}
-        text = f"closed loop from {one.loops.start:g} rad rms; {_light(one.loops.photons)} per step"
-        rows.append(Row(f"closed_{index + 1}", text, cells, Link("closed loop", "closed_loop.ipynb")))
+        start, photons = f"closed loop from {one.loops.start:g} rad rms", one.loops.photons
+        light = f"{photons:g}", f"{2 * photons:g}"
+        rows.append(Row(f"closed_{index + 1}", start, *light, cells, Link("closed loop", "closed_loop.ipynb")))
     return rows
-
-
-def _light(photons: float) -> str:
-    return f"{photons:g} ({2 * photons:g})"
 
 
 def decision_table(rows: Iterable[Row]) -> Table:
     """Best method of each situation."""
-    header = ["situation; photons per point and image (one image alone)", *COLUMNS.values(), "explained in"]
+    header = ["situation; photons per point and image (one image alone), in a loop per step", *COLUMNS.values(), "explained in"]
     cells = [[_cell_text(row.cells[name]) for name in COLUMNS] for row in rows]
-    return Table(header, [[row.text, *some, row.chapter] for row, some in zip(rows, cells, strict=True)])
+    begun = [f"{row.start}; {row.photons} ({row.both})" for row in rows]
+    return Table(header, [[one, *some, row.chapter] for one, row, some in zip(begun, rows, cells, strict=True)])
 
 
 def _cell_text(cell: Cell | Calibrated | None) -> str:
@@ -401,16 +411,15 @@ def numbers(
     loops: Sequence[BestMethods],
     no_noise: BestMethods,
 ) -> dict[str, float | str]:
-    """Each cell in words, its error (rad rms), and the error with two images over that with one; and extremes."""
+    """Situations and results of the perfect model in words, errors of a calibrated bench (rad rms), and extremes."""
     found: dict[str, float | str] = {}
     for row in rows:
-        found[f"{row.key}_situation"] = row.text
-        for name, cell in row.cells.items():
-            found[f"{row.key}_{name}"] = _cell_text(cell)
-            if cell is not None:
-                found[f"{row.key}_{name}_error"] = cell.error
-            if isinstance(cell, Cell):
-                found[f"{row.key}_{name}_ratio"] = cell.ratio
+        perfect, fitted = row.cells["perfect"], row.cells["calibrated"]
+        found |= {f"{row.key}_start": row.start, f"{row.key}_photons": row.photons}
+        if isinstance(perfect, Cell):
+            found |= {f"{row.key}_{count}": text for count, text in perfect.sides.items()}
+        if fitted is not None:
+            found[f"{row.key}_calibrated"] = fitted.error
     gains = [1 / cell.ratio for row in rows[:2] for cell in row.cells.values() if isinstance(cell, Cell)]
     small, faint = errors["real"][-1], loops[-1]
     settled = faint.loops.settled

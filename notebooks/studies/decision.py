@@ -390,7 +390,8 @@ def loop_rows(found: Iterable[BestMethods]) -> list[Row]:
 
 def decision_table(rows: Iterable[Row]) -> Table:
     """Best method of each situation."""
-    header = ["situation; photons per point and image (one image alone), in a loop per step", *COLUMNS.values(), "explained in"]
+    first = "situation; photons per point and image (one image alone), in a loop per step"
+    header = [first, *COLUMNS.values(), "explained in"]
     cells = [[_cell_text(row.cells[name]) for name in COLUMNS] for row in rows]
     begun = [f"{row.start}; {row.photons} ({row.both})" for row in rows]
     return Table(header, [[one, *some, row.chapter] for one, row, some in zip(begun, rows, cells, strict=True)])
@@ -411,7 +412,7 @@ def numbers(
     loops: Sequence[BestMethods],
     no_noise: BestMethods,
 ) -> dict[str, float | str]:
-    """Situations and results of the perfect model in words, errors of a calibrated bench (rad rms), and extremes."""
+    """Situations and results of the perfect model in words, errors of a calibrated bench, and extremes, rad rms."""
     found: dict[str, float | str] = {}
     for row in rows:
         perfect, fitted = row.cells["perfect"], row.cells["calibrated"]

@@ -412,7 +412,7 @@ def numbers(
     loops: Sequence[BestMethods],
     no_noise: BestMethods,
 ) -> dict[str, float | str]:
-    """Situations and results of the perfect model in words, errors of a calibrated bench, and extremes, rad rms."""
+    """Situations and results of the perfect model in words, errors of a calibrated bench, and extremes."""
     found: dict[str, float | str] = {}
     for row in rows:
         perfect, fitted = row.cells["perfect"], row.cells["calibrated"]

@@ -262,7 +262,7 @@ def draw_saxton_widths(
     variants: Mapping[str, GerchbergSaxton], curves: LinearityCurves, threshold: float
 ) -> Figure:
     """Mean error over the input of Gerchberg-Saxton on detectors of several widths, and of the linear method."""
-    figure, panels = plt.subplots(1, 2, figsize=(7, 4.2), sharex=True)
+    figure, panels = plt.subplots(1, 2, figsize=(7, 4.2), sharex=True, sharey=True)
     for axes, (kind, (family, title, *lines)) in zip(panels, _UNMEASURED.items(), strict=True):
         drawn = {name: method for name, method in variants.items() if method.unmeasured == kind}
         colors = _shades(LOOKS[family].color, len(drawn))
@@ -276,7 +276,7 @@ def draw_saxton_widths(
         axes.set(xlabel="input phase (rad rms)", xlim=(0, None))
         axes.set_title(title.format(method.sensor.extent), fontsize=10)
     zero, model = panels
-    zero.set(ylabel="error / input", ylim=(threshold / 2, None))
+    zero.set_ylabel("error / input")
     style: dict[str, Any] = {"color": "#555555", "fontsize": 9, "ha": "right", "va": "top"}
     line = f"{percent(threshold)} of the input"
     zero.text(0.99, 0.9 * threshold, line, transform=zero.get_yaxis_transform(), **style)

@@ -344,7 +344,9 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
     log.axhline(limit, color="#555555", lw=1)
     end = min(1.4 * claimed, curve.diameters[-1])
     start = min(0.64 * claimed, end / 2)
-    log.text(1.01 * start, limit * 1.3, f"{percent(threshold)} of the input", color="#555555", fontsize=9)
+    log.text(
+        end, limit / 1.3, f"{percent(threshold)} of the input ", color="#555555", fontsize=9, ha="right", va="top"
+    )
     plain.set_ylim(0, None)
     log.set(yscale="log", xlim=(start, end), ylim=(0.3 * floor, 60))  # room for the legend
     log.legend(loc="upper left", fontsize=9, handlelength=1.6)
@@ -382,12 +384,12 @@ def draw_diameter_reasons(reasons: Contraction, claimed: float) -> Figure:
     top.plot(*observed, "o", mfc="none", mec=ring_color, label="observed")
     top.axhline(1, color="#555555", lw=1)
     top.text(0.05, 1.015, "diverges above", color="#555555", fontsize=9)
-    top.set(ylabel="error after / before", ylim=(0, 1.2))
-    top.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
+    top.set(ylabel="error after an iteration / before", ylim=(0, 1.2))
+    top.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1, edgecolor="white")
     for (name, values), style in zip(reasons.sensitivity.items(), OTHER_STYLES, strict=False):
         bottom.plot(diameters, values, lw=1.8, label=name, **style | {"marker": "none"})
     bottom.set(ylabel="sensitivity (1/rad)", ylim=(0, 3.2))  # room for the legend on phones
-    bottom.legend(loc="upper left", fontsize=9, frameon=True, framealpha=1, edgecolor="none")
+    bottom.legend(loc="upper left", fontsize=9, frameon=True, framealpha=1, edgecolor="white")
     for axes in (top, bottom):
         _diameters(axes, diameters[-1], claimed)
     if diameters[-1] > DARK_RING:

@@ -6,6 +6,7 @@ import colorsys
 import pickle
 from collections.abc import Sequence
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -31,12 +32,28 @@ _DIMMEST = 0.22  # luminance of a colour on the dark ground: a contrast of 4.7, 
 _PARTS = "color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"
 
 
+_DRAWN: WeakKeyDictionary[Figure, Figure] = WeakKeyDictionary()  # the narrow variants of drawings
+
+
+def add_narrow(figure: Figure, narrow: Figure) -> Figure:
+    """Give a drawing, whose parts lie on no grid, its narrow variant, and return the drawing."""
+    plt.close(narrow)
+    _DRAWN[figure] = narrow
+    return figure
+
+
+def has_narrow(figure: Figure) -> bool:
+    """Whether a figure has narrow variants."""
+    return figure in _DRAWN or any(axes.get_subplotspec() for axes in figure.axes)
+
+
 def variants(figure: Figure) -> dict[str, Figure]:
-    """Return copies of a figure: "dark", and if its panels lie on a grid "narrow" and "narrow-dark"."""
+    """Return copies of a figure: "dark", and for panels on a grid and some drawings "narrow" and "narrow-dark"."""
     state = pickle.dumps(figure)
     made = {"dark": _darkened(_copy(state))}
-    if any(axes.get_subplotspec() for axes in figure.axes):
-        made["narrow"] = _stacked(_copy(state))
+    if has_narrow(figure):
+        drawn = _DRAWN.get(figure)
+        made["narrow"] = _copy(pickle.dumps(drawn)) if drawn else _stacked(_copy(state))
         made["narrow-dark"] = _darkened(_copy(pickle.dumps(made["narrow"])))
     return made
 

@@ -15,7 +15,7 @@ from studies.kit.parameters import parameter_limits
 from studies.kit.style import INTENSITY_MAP, PHASE_MAP, dashed_circle
 from studies.kit.tables import Table
 from studies.kit.variants import add_narrow
-from zwfs.masks import Dimple
+from zwfs.masks import Mask
 from zwfs.metrics import strehl
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
@@ -143,7 +143,7 @@ def _narrow(sensor: ZernikeSensor, planes: list[_Plane], terms: list[_Term]) -> 
 _REACH = 4.0  # of the picture of the focal plane, lambda/D from its centre, over 161 samples
 
 
-def _mark_dimple(axes: Axes, mask: Dimple) -> None:
+def _mark_dimple(axes: Axes, mask: Mask) -> None:
     """Edge of the dimple."""
     dashed_circle(axes, (80, 80), mask.diameter / 2 * 80 / _REACH)
 

@@ -28,7 +28,7 @@ from studies.kit.parameters import parameter_limits
 from studies.kit.style import INTENSITY_MAP, PHASE_MAP
 from studies.kit.tables import Table
 from studies.kit.variants import add_narrow
-from zwfs.masks import Dimple
+from zwfs.masks import Dimple, Mask
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
@@ -73,7 +73,7 @@ _DOWN = _Places(1.5, 2.42, 3.34, 3.74, 4.4, 0.36, 0.95, 0.62, (0.24, 0.95))
 class _Computed:
     """Computed pictures of a sensor for `phase` (radian)."""
 
-    masks: Sequence[Dimple]
+    masks: Sequence[Mask]
     phase: NDArray
     halo: NDArray
     frames: NDArray
@@ -248,7 +248,7 @@ def _symbol(scene: Scene, x: float, y: float, kind: str, color: str) -> None:
     axes.add_patch(Polygon(np.array(head) + np.array([x, y]), closed=True, fc=color, ec="none"))
 
 
-def _legend(scene: Scene, masks: Sequence[Dimple], places: Sequence[Point]) -> None:
+def _legend(scene: Scene, masks: Sequence[Mask], places: Sequence[Point]) -> None:
     """Key to the lines and signs."""
     for (x, y), look, mask in zip(places[:2], (PLUS, MINUS), masks, strict=True):
         scene.key(x, y, look, f"phase {shift_label(mask, plus=True)}")

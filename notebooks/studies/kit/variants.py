@@ -230,9 +230,12 @@ def dark_color(color: Any) -> tuple[float, ...]:
     """Return a colour for a dark ground: grays inverted, others brighter, the dark ones most."""
     *rgb, alpha = to_rgba(color)
     hue, light, saturation = colorsys.rgb_to_hls(*rgb)
+    brightest = 3 * light  # else dark shades of a colour would look the same
     light = 0.94 - 0.87 * light if saturation < 0.1 or light > 0.8 else max(light, 0.455 + 0.3 * light)
     while saturation >= 0.1 and _luminance(colorsys.hls_to_rgb(hue, light, saturation)) < _DIMMEST:
         light += 0.01
+    while saturation >= 0.1 and _luminance(colorsys.hls_to_rgb(hue, light, saturation)) > brightest:
+        light -= 0.01
     return (*colorsys.hls_to_rgb(hue, light, saturation), alpha)
 
 

@@ -249,11 +249,14 @@ def cut_off(figure):
     return [text for text, fits in zip(texts, inside, strict=True) if not fits]
 
 
+@pytest.mark.parametrize("narrow", [False, True])
 @pytest.mark.parametrize("name", ["draw_sensor_layout", "draw_vector_sensor", "draw_bench_layout"])
-def test_texts_of_a_scene_stay_inside_and_apart(name, drawn_methods):
+def test_texts_of_a_scene_stay_inside_and_apart(name, narrow, drawn_methods):
     use_style(vector=True)
     figure = figure_functions()[name](*drawn_methods[name][0])
-    figure.canvas.draw()
+    if narrow:
+        figure = variants(figure)["narrow"]
+    FigureCanvasAgg(figure).draw()
     boxes = [(text.get_text(), text.get_window_extent()) for text in figure.axes[0].texts]
     others = [axes.bbox for axes in figure.axes[1:] if axes.images]
     for index, (text, box) in enumerate(boxes):

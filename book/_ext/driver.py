@@ -150,7 +150,8 @@ def versions() -> str:
 def kinds(name: str) -> list[str]:
     """Return the kinds of files of a published figure: those for which `draw` needs no variant come first."""
     figure, _, screens = figures[name]
-    narrow = ["narrow.png", "narrow-dark.png"] if any(axes.get_subplotspec() for axes in figure.axes) else []
+    has_narrow = import_module("studies.kit.variants").has_narrow
+    narrow = ["narrow.png", "narrow-dark.png"] if has_narrow(figure) else []
     tables = ["csv"] if screens is None else ["csv", "screens.csv"]
     return [*tables, *import_module("studies.kit.results").METADATA, "dark.png", *narrow]
 

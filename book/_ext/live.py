@@ -17,7 +17,7 @@ from scipy.spatial.distance import cdist
 from sphinx.application import Sphinx
 
 import zwfs
-from studies.design import PUBLISHED
+from studies.design import COST_MAP, PUBLISHED
 from studies.kit.style import DARK_PHASE_MAP, INTENSITY_MAP, PHASE_MAP
 
 DATA = "_static/live-data.js"
@@ -30,7 +30,6 @@ DIAMETERS = (0.5, 3.0)  # lambda/D
 # The core of a dimple is an entire function of the diameter: 14 samples interpolate it to 1e-7.
 N_DIAMETERS = 14
 TOLERANCE = 1e-7  # of the reference waves, which are stored in single precision
-COST_MAP = "cividis_r"
 MOST = 10  # photon cost at the end of its scale
 MAP_SIZE = 2.9, 2.4  # of the map of designs on a phone, inch
 NEAREST = 0.11  # of a label of a contour to anything else, inch

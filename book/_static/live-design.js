@@ -67,6 +67,7 @@
     const x = cost().findIndex((row) => row.includes(least));
     const shift = shifts[cost()[x].indexOf(least)];
     for (const element of map.querySelectorAll(".live-best")) mark(element, diameters[x], [shift, -shift]);
+    find("best").textContent = `best up\nto ${diameters.at(-1)} λ/D`;
     put(find("best"), across(diameters[x]), down(shift));
   }
 

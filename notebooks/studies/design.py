@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FormatStrFormatter
 from numpy.typing import ArrayLike, NDArray
@@ -130,6 +131,9 @@ def _costs(pupil: Pupil, design: Design, screens: Mapping[str, NDArray]) -> dict
     return {name: 4 * float(np.mean(part**2)) for name, part in zip(screens, np.split(bounds, ends), strict=True)}
 
 
+_LABEL_WIDTH = 0.75  # of the label of a design in a panel, over its width
+_NARROWEST = 0.3  # line that gets a number, over the width of a panel, if there is a longer one of its level
+COST_MAP = "cividis_r"
 CONTOURS = [1.5, 2, 3, 5]  # photon costs of the lines in a map
 
 
@@ -140,20 +144,23 @@ def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[
     """
     figure, panels = plt.subplots(1, len(maps.costs), figsize=(7, 3.8), sharey=True, squeeze=False)
     x, y = maps.diameters, maps.angles / np.pi
-    colors = {"cmap": "YlGnBu", "norm": LogNorm(1, 10)}
+    colors = {"cmap": COST_MAP, "norm": LogNorm(1, 10)}
     for axes, (name, grid) in zip(panels[0], maps.costs.items(), strict=True):
         axes.grid(False)
         shown = axes.pcolormesh(x, y, grid.T, shading="gouraud", rasterized=True, **colors)
         lines = axes.contour(
             x, y, grid.T, CONTOURS, colors=["#000000", "#000000", "#000000", "#ffffff"], linewidths=1
         )
-        axes.clabel(lines, fmt="%g", fontsize=9)
+        marked = []
         for design, cost in zip(designs, costs[name], strict=True):
             if np.isclose(design.theta_a, -design.theta_b):
                 place = design.diameter, design.theta_a / np.pi
+                marked.append(place)
                 axes.plot(*place, "o", mfc="#ffffff", mec="#000000", ms=8, zorder=7)
                 axes.annotate(f"{design.name}: {cost:.1f}", place, (8, 0), textcoords="offset points", **_LABEL)
         axes.set(xscale="log", xlim=x[[0, -1]], ylim=y[[0, -1]], xlabel="diameter (λ/D)")
+        axes.spines[:].set(visible=True, color="#888888")
+        axes.clabel(lines, fmt="%g", fontsize=9, manual=_free_places(lines, x, y, marked))
         axes.xaxis.set(major_locator=FixedLocator([1, 2, 3, 5, 8]), major_formatter="{x:g}", minor_formatter="")
         axes.set_title(name, fontsize=10)
         axes.yaxis.set_major_formatter(FormatStrFormatter("±%gπ"))
@@ -163,6 +170,39 @@ def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[
     bar.set_ticks([1, *CONTOURS, 10], labels=[f"{level:g}" for level in (1, *CONTOURS, 10)])
     bar.minorticks_off()
     return figure
+
+
+def _free_places(
+    lines: ContourSet, x: NDArray, y: NDArray, marked: Sequence[tuple[float, float]]
+) -> list[tuple[float, float]]:
+    """Return a point of each long line that is far from the labels of the marked places and from the edges."""
+
+    def fraction(points: ArrayLike) -> NDArray[np.float64]:
+        points = np.asarray(points, float).reshape(-1, 2)
+        across = np.log(points[:, 0] / x[0]) / np.log(x[-1] / x[0])
+        return np.stack([across, (points[:, 1] - y[0]) / (y[-1] - y[0])], axis=-1)
+
+    taken = [
+        np.array([px + shift, py]) for px, py in fraction(marked) for shift in np.arange(0, _LABEL_WIDTH, 0.05)
+    ]
+    levels = [[fraction(one) for one in path.to_polygons(closed_only=False)] for path in lines.get_paths()]
+    every = [one for level in levels for one in level]
+    found: list[NDArray] = []
+    for level in levels:
+        for at in level:
+            if np.ptp(at[:, 0]) < _NARROWEST and len(at) < max(map(len, level)):
+                continue
+            rest = [one for one in every if one is not at] or [at + 1]
+            apart = _apart(at, np.concatenate(rest))
+            room = np.min([np.minimum(at, 1 - at).min(axis=-1), _apart(at, [*taken, *found]), 3 * apart], axis=0)
+            found.append(at[np.argmax(room)])
+    return [(x[0] * (x[-1] / x[0]) ** u, y[0] + v * (y[-1] - y[0])) for u, v in found]
+
+
+def _apart(points: NDArray, others: ArrayLike) -> NDArray[np.float64]:
+    """Distance of each point from the closest of the others; 1 without others."""
+    others = np.asarray(others, float).reshape(-1, 2)
+    return np.linalg.norm(points[:, np.newaxis] - others, axis=-1).min(axis=-1, initial=1)
 
 
 _BOX = {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0.15"}

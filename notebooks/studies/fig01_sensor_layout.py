@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies.kit.drawings import Scene, focal_light, shift_label
+from studies.kit.drawings import NARROW, NARROW_LETTERS, Point, Scene, focal_light, shift_label
 from studies.kit.parameters import parameter_limits
 from studies.kit.style import INTENSITY_MAP, PHASE_MAP, dashed_circle
 from studies.kit.tables import Table
+from studies.kit.variants import add_narrow
+from zwfs.masks import Mask
 from zwfs.metrics import strehl
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
@@ -20,60 +25,143 @@ LIMITS = parameter_limits("n_pixels diameter rms", phase_shift=(-6.2832, 6.2832)
 FOCUS_MAP = "magma"
 
 
+@dataclass(frozen=True)
+class _Term:
+    """Picture of a term of the intensity on the detector, its name, and the sign behind it."""
+
+    name: str
+    sign: str
+    image: NDArray
+    colors: str
+    low: float
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """Picture in a plane of the sensor, its name, and the name, colours and ends of its colour scale."""
+
+    name: str
+    scale: str
+    image: NDArray
+    colors: str
+    low: float
+    high: float
+
+
 def draw_sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:
     """Figure 1: the planes of a sensor with one mask, with the fields computed for `phase` (radian)."""
-    pupil, mask = sensor.pupil, sensor.masks[0]
+    planes, terms = _pictures(sensor, phase)
+    return add_narrow(_wide(sensor, planes, terms), _narrow(sensor, planes, terms))
+
+
+def _pictures(sensor: ZernikeSensor, phase: NDArray) -> tuple[list[_Plane], list[_Term]]:
+    """Pictures in the planes, and those whose sum is the intensity on the detector."""
+    pupil = sensor.pupil
     field = pupil.field(phase)
     wave = sensor.reference_wave(field)[0]
     frame = np.abs(sensor.propagate(field)[0]) ** 2
     inside = np.where(pupil.inside, 1, np.nan)
+    limit = np.nanmax(np.abs(phase * inside))
+    light = focal_light(pupil, field, _REACH)
+    planes = [
+        _Plane("pupil plane", r"phase of $\psi_{in}$ (rad)", phase * inside, PHASE_MAP, -limit, limit),
+        _Plane("focal plane", r"$|\hat\psi_{in}|^2$ (log$_{10}$)", light, FOCUS_MAP, -4, 0),
+        _Plane("detector plane", r"intensity $I_{out}$", frame, INTENSITY_MAP, 0, frame.max()),
+    ]
+    interference = 2 * np.abs(pupil.amplitude * wave) * np.cos(np.angle(field * wave.conj()))
+    terms = [
+        _Term(r"$I_{out}$", "=", frame, INTENSITY_MAP, 0),
+        _Term(r"$I_{in}$", "+", pupil.amplitude**2, INTENSITY_MAP, 0),
+        _Term(r"$I_{ref}$", "+", np.abs(wave) ** 2, INTENSITY_MAP, 0),
+        _Term(r"$2\sqrt{I_{in}I_{ref}}\,\cos(\phi_{in}-\phi_{ref})$", "", interference, PHASE_MAP, -frame.max()),
+    ]
+    return planes, terms
 
-    scene = Scene(9, 6.1)
-    y, half = 3.9, 0.98
+
+def _wide(sensor: ZernikeSensor, planes: list[_Plane], terms: list[_Term]) -> Figure:
+    """Light from left to right, and the terms in a row below."""
+    scene = Scene(9, 6.2)
+    y, half = 4.25, 0.98
     scene.beam([(0.1, half), (2.82, half), (4.5, 0), (6.18, half), (8.9, half)], origin=(0, y))
     scene.axis((0.1, y), (8.9, y))
     for x in (2.82, 6.18):
         scene.lens(x, y, 2.4)
         scene.label(x, y - 1.5, "lens")
     scene.arrows(2.28, 2.66, y, 0.4)
-
-    limit = np.nanmax(np.abs(phase * inside))
-    _plane(scene, 1.25, "pupil plane", r"phase of $\psi_{in}$ (rad)", PHASE_MAP, phase * inside, -limit, limit)
-    light = focal_light(pupil, field, 4)
-    focal = _plane(scene, 4.5, "focal plane", r"$|\hat\psi_{in}|^2$ (log$_{10}$)", FOCUS_MAP, light, -4, 0)
-    # The axis runs from -4 to 4 lambda/D over 161 samples.
-    dashed_circle(focal, (80, 80), mask.diameter / 2 * 20)
-    label = f"{mask.diameter:g} $\\lambda/D$, {shift_label(mask)} rad"
-    focal.text(80, 142, label, color="white", ha="center", fontsize=scene.size)
-    focal.plot([80, 80], [80 + mask.diameter * 10, 138], color="white", lw=0.8)
-    focal.plot([20, 60], [10, 10], color="white", lw=1.5)
-    focal.text(40, 16, r"2 $\lambda/D$", color="white", ha="center", fontsize=scene.size)
-    _plane(scene, 7.75, "detector plane", r"intensity $I_{out}$", INTENSITY_MAP, frame, 0, frame.max())
-
-    interference = 2 * np.abs(pupil.amplitude * wave) * np.cos(np.angle(field * wave.conj()))
-    terms = (
-        (r"$I_{out}$", "=", frame, INTENSITY_MAP, 0),
-        (r"$I_{in}$", "+", pupil.amplitude**2, INTENSITY_MAP, 0),
-        (r"$I_{ref}$", "+", np.abs(wave) ** 2, INTENSITY_MAP, 0),
-        (r"$2\sqrt{I_{in}I_{ref}}\,\cos(\phi_{in}-\phi_{ref})$", "", interference, PHASE_MAP, -frame.max()),
-    )
-    for x, (title, sign, image, colors, low) in zip((1.25, 3.15, 5.05, 6.95), terms, strict=True):
-        term = scene.picture(x, 1.1, 1.3, image, colors, low, frame.max(), edge=None)
-        scene.label(x, 0.12, title)
-        scene.label(x + 0.95, 1.1, sign, size=20, va="center")
-    scene.scale(term, (7.75, 0.45, 0.08, 1.3), "intensity", ticks=5)
+    for x, plane in zip((1.25, 4.5, 7.75), planes, strict=True):
+        shown = scene.picture(x, y, 2.0, plane.image, plane.colors, plane.low, plane.high)
+        scene.label(x, y + 1.64, plane.name, weight="bold")
+        scene.label(x, y + 1.3, plane.scale)
+        scene.scale(shown, (x - 0.75, y - 1.2, 1.5, 0.08))
+        if plane.colors == FOCUS_MAP:
+            _mark_dimple(shown.axes, sensor.masks[0])
+            _mark_length(shown.axes)
+            style: dict[str, Any] = {"color": "white", "ha": "center", "fontsize": scene.size}
+            mask = sensor.masks[0]
+            shown.axes.plot([80, 80], [80 + mask.diameter * 10, 118], color="white", lw=0.8)
+            label = f"dimple\n{mask.diameter:g} $\\lambda/D$, {shift_label(mask)} rad"
+            shown.axes.text(80, 120, label, linespacing=1.1, **style)
+            shown.axes.text(40, 16, r"2 $\lambda/D$", **style)
+    _draw_terms(scene, terms, [(x, 1.52) for x in (1.25, 3.35, 5.45, 7.55)], 1.3)
     return scene.figure
 
 
-def _plane(
-    scene: Scene, x: float, title: str, scale: str, colors: str, image: NDArray, low: float, high: float
-) -> Axes:
-    """Picture of a plane on the optical axis of Figure 1, its name above and its colour scale below."""
-    shown = scene.picture(x, 3.9, 2.0, image, colors, low, high)
-    scene.label(x, 5.78, title, weight="bold")
-    scene.scale(shown, (x - 0.75, 2.7, 1.5, 0.08))
-    scene.label(x, 5.2, scale)
-    return shown.axes
+def _narrow(sensor: ZernikeSensor, planes: list[_Plane], terms: list[_Term]) -> Figure:
+    """Light from top to bottom, and the terms in two rows below."""
+    height, x, half, f, size = 11.85, 0.95, 0.62, 1.3, 1.4
+    scene = Scene(NARROW, height, NARROW_LETTERS, down=(x, height - 0.1))
+    first, focus, second = 0.8 + f, 0.8 + 2 * f, 0.8 + 3 * f
+    end = second + f
+    profile = [(0, half), (first, half), (focus, 0), (second, half), (end, half)]
+    scene.beam(profile, origin=(0, 0))
+    scene.axis((0, 0), (end, 0))
+    for along in (first, second):
+        scene.lens(along, 0, 1.6)
+        scene.label(x + 0.95, scene.place(along, 0)[1], "lens", ha="left", va="center")
+    scene.arrows(first - 0.38, first - 0.12, 0, 0.25)
+    left, mask = x + 0.9, sensor.masks[0]
+    for along, plane in zip((0.8, focus, end), planes, strict=True):
+        y = scene.place(along, 0)[1]
+        shown = scene.picture(x, y, size, plane.image, plane.colors, plane.low, plane.high)
+        top = y + 0.42
+        scene.label(left, top, plane.name, ha="left", va="center", weight="bold")
+        scene.label(left, top - 0.28, plane.scale, ha="left", va="center")
+        scene.scale(shown, (left + 0.1, top - 0.56, 1.4, 0.08))
+        if plane.colors == FOCUS_MAP:
+            _mark_dimple(shown.axes, mask)
+            _mark_length(shown.axes)
+            shown.axes.text(40, 16, r"2 $\lambda/D$", color="white", ha="center", fontsize=scene.size)
+            shown.axes.plot([80 + mask.diameter * 10, 160], [80, 30], color="white", lw=0.8)
+            end_y = y - 0.44
+            scene.callout((x + size / 2, end_y), (left - 0.05, end_y))
+            label = f"dimple: {mask.diameter:g} $\\lambda/D$,\n{shift_label(mask)} rad"
+            scene.label(left, end_y + 0.09, label, ha="left", va="top")
+    _draw_terms(scene, terms, [(0.85, 3.65), (2.65, 3.65), (0.85, 1.45), (2.65, 1.45)], 1.3)
+    return scene.figure
+
+
+_REACH = 4.0  # of the picture of the focal plane, lambda/D from its centre, over 161 samples
+
+
+def _mark_dimple(axes: Axes, mask: Mask) -> None:
+    """Edge of the dimple."""
+    dashed_circle(axes, (80, 80), mask.diameter / 2 * 80 / _REACH)
+
+
+def _mark_length(axes: Axes) -> None:
+    """Line of 2 lambda/D."""
+    axes.plot([20, 60], [10, 10], color="white", lw=1.5)
+
+
+def _draw_terms(scene: Scene, terms: list[_Term], places: list[Point], size: float) -> None:
+    """Intensity on the detector as a sum; the scale of its end holds for all intensities."""
+    high = terms[0].image.max()
+    gap = (places[1][0] - places[0][0] - size) / 2
+    for (x, y), term in zip(places, terms, strict=True):
+        shown = scene.picture(x, y, size, term.image, term.colors, term.low, high, edge=None)
+        scene.label(x, y - size / 2 - 0.12, term.name, va="top")
+        scene.label(x + size / 2 + gap, y, term.sign, size=20, va="center")
+        scene.scale(shown, (x - size / 2, y - size / 2 - 0.53, size, 0.08), ticks=3)
 
 
 def sensor_layout_columns(

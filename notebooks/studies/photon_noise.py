@@ -188,7 +188,7 @@ def draw_photon_noise(curves: PhotonCurves) -> Figure:
     figure, panels = plt.subplots(1, size, figsize=(7, 3.6), sharex=True, sharey=True, squeeze=False)
     for place, axes in enumerate(panels[0]):
         axes.axhline(1, color="#999999", lw=5, label="bound", zorder=1)  # the grid is below
-        axes.axhline(_FINE, color="#555555", lw=1, zorder=1)
+        axes.axhspan(_FINE, 1.5 * max(highest, _FINE), color="#eeeeee", lw=0, zorder=0)
         for name in sorted(curves.errors, key=list(LOOKS).index):
             look = LOOKS[name]
             axes.semilogx(curves.photons, curves.ratio(name)[place], ms=5, label=look.label, **look.style)
@@ -198,6 +198,10 @@ def draw_photon_noise(curves: PhotonCurves) -> Figure:
         axes.set_title(f"input {curves.rms[place]:g} rad rms", fontsize=10)
         axes.set_xlabel("photons per point\nand image")
     panels[0, 0].set_ylabel("error / bound")
+    last = panels[0, -1]
+    style: dict[str, Any] = {"transform": last.get_yaxis_transform(), "ha": "right", "color": "#444444"}
+    last.text(0.97, _FINE * 1.06, "logarithmic", va="bottom", **style)
+    last.text(0.97, _FINE - 0.01, "linear", va="top", **style)
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
     return figure
@@ -264,6 +268,8 @@ def numbers(curves: PhotonCurves, rows: Sequence[ErrorBars]) -> dict[str, float 
     bright = curves.photons >= min(100, curves.photons.max())
     half, one = (int(np.argmin(np.abs(curves.rms - value))) for value in (0.5, 1.0))
     likely, shifted = (curves.ratio(name)[:, bright] for name in TABLED)
+    single = curves.errors[TABLED[0]][:, bright]
+    spread = single.std(axis=-1, ddof=1) / np.sqrt(single.shape[-1])  # of a mean over the screens
     right = next((row for row in rows if row.assumed == 1), rows[0])
     wrong = max(rows, key=lambda row: row.assumed)
     low = min(rows, key=lambda row: row.assumed)
@@ -271,6 +277,8 @@ def numbers(curves: PhotonCurves, rows: Sequence[ErrorBars]) -> dict[str, float 
     return rounded(
         {
             "likely_excess": np.max(likely) - 1,
+            "likely_least": np.min(likely),
+            "likely_scatter": np.mean(spread / curves.bound[:, bright]),
             "shifted_ratio": shifted[half].mean(),
             "shifted_photons": np.mean(shifted[half] ** 2) - 1,
             "arcsine_floor": curves.error("Arcsine")[half, -1],

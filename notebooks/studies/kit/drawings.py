@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import PlaceHolderLayoutEngine
-from matplotlib.patches import Ellipse, FancyArrowPatch, Polygon, Rectangle
+from matplotlib.patches import Ellipse, FancyArrowPatch, Polygon
 from numpy.typing import NDArray
 
 from studies.kit.style import PHASE_MAP
@@ -18,10 +19,14 @@ from zwfs.masks import Mask, focal_field
 from zwfs.pupil import Pupil
 
 _MASK_SAMPLES = 161
-_BEAM, _RAY, _GLASS, _EDGE = "#f8e8c8", "#a8742a", "#cfe3f2", "#33658a"
+_BEAM, _RAY, _EDGE = "#e0a030", "#7a4d0c", "#33658a"
+_CLEAR = 0.18  # opacity of a beam: arrows, axes and edges must stay visible on it
+_GLASS, _CRYSTAL = ("#3f8fc8", 0.28), ("#3f8fc8", 0.5)
 METAL, RETARDER = "#444444", "#7a5195"
 LETTERS = 14.2
 """Size of the letters of a drawing 9 inches wide, points: on a page they are as large as its prose."""
+NARROW, NARROW_LETTERS = 3.7, 11.5
+"""Width of a drawing for a phone, inches, and size of its letters."""
 Point = tuple[float, float]  # inches
 Profile = list[tuple[float, float]]  # distance along a beam and half of its width, inches
 
@@ -40,12 +45,16 @@ PLUS, MINUS = Polarisation("#B2182B", "-"), Polarisation("#313695", (0, (4, 2)))
 
 
 class Scene:
-    """Figure without visible axes: positions in inches from its lower left corner, text of `size` points."""
+    """Figure without visible axes: positions in inches from its lower left corner, text of `size` points.
 
-    def __init__(self, width: float, height: float, size: float = LETTERS) -> None:
+    With `down`, the light goes down from this point, and parts of the optics have positions along and to the left
+    of it.
+    """
+
+    def __init__(self, width: float, height: float, size: float = LETTERS, down: Point | None = None) -> None:
         # Not "none": after it, a figure that is saved twice gets the layout engine of the style.
         self.figure = plt.figure(figsize=(width, height), layout=PlaceHolderLayoutEngine(True, True))
-        self.width, self.height, self.size = width, height, size
+        self.width, self.height, self.size, self.down = width, height, size, down
         self.axes = self.figure.add_axes((0, 0, 1, 1))
         self.axes.set(xlim=(0, width), ylim=(0, height))
         self.axes.set_axis_off()
@@ -94,40 +103,58 @@ class Scene:
         """Text, centred on x unless said otherwise, in points; the size is that of the scene if None."""
         self.axes.text(x, y, text, ha=ha, fontsize=size or self.size, **style)
 
+    def place(self, along: float, across: float) -> Point:
+        """Position of a point of the optics."""
+        return (self.down[0] - across, self.down[1] - along) if self.down else (along, across)
+
+    def _fill(self, points: Profile, **style: Any) -> None:
+        corners = [self.place(*point) for point in points]
+        self.axes.add_patch(Polygon(corners, closed=True, **style))
+
+    def line(self, points: Sequence[Point], **style: Any) -> None:
+        """Line through points of the optics."""
+        self.axes.plot(*np.transpose([self.place(*point) for point in points]), **style)
+
     def beam(self, profile: Profile, origin: Point, angle: float = 0.0) -> None:
         """Beam of light: (distance along the axis, half of the width) at its corners."""
         low, high = _turned(profile, origin, angle)
-        self.axes.add_patch(Polygon([*low, *high[::-1]], closed=True, fc=_BEAM, ec="none"))
+        self._fill([*low, *high[::-1]], fc=(_BEAM, _CLEAR), ec="none")
 
     def edges(self, profile: Profile, origin: Point) -> None:
         """Edges of a beam that holds both polarisations, in both of their colours."""
         for look in (PLUS, MINUS):
             for side in _turned(profile, origin, 0.0):
-                self.axes.plot(*np.transpose(side), color=look.color, ls=look.line, lw=1.2)
+                self.line(side, color=look.color, ls=look.line, lw=1.6)
 
     def axis(self, start: Point, end: Point) -> None:
         """Optical axis."""
-        self.axes.plot(*np.transpose([start, end]), color="#888888", lw=0.7, ls=(0, (8, 3, 2, 3)))
+        self.line([start, end], color="#666666", lw=0.9, ls=(0, (8, 3, 2, 3)))
 
     def arrows(self, start: float, end: float, y: float, apart: float) -> None:
         """Two arrows along the light."""
         for height in (y - apart, y + apart):
-            self.axes.add_patch(
-                FancyArrowPatch((start, height), (end, height), arrowstyle="-|>", mutation_scale=9, color=_RAY)
-            )
+            self.arrow((start, height), (end, height))
+
+    def arrow(self, start: Point, end: Point, color: str = _RAY) -> None:
+        """Arrow from one point to another."""
+        style: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 11, "shrinkA": 0, "shrinkB": 0, "lw": 1.4}
+        self.axes.add_patch(FancyArrowPatch(self.place(*start), self.place(*end), color=color, zorder=4, **style))
 
     def lens(self, x: float, y: float, height: float, angle: float = 0.0) -> None:
         """Lens; `angle` (radian) is that of the light."""
         width = min(0.22, 0.13 * height)
-        self.axes.add_patch(Ellipse((x, y), width, height, angle=np.degrees(angle), fc=_GLASS, ec=_EDGE, lw=1.2))
+        turn = np.degrees(angle) + (90 if self.down else 0)
+        self.axes.add_patch(Ellipse(self.place(x, y), width, height, angle=turn, fc=_GLASS, ec=_EDGE, lw=1.2))
 
     def plate(self, x: float, y: float, width: float, height: float, color: str, edge: str = "none") -> None:
         """Plate across the light."""
-        self.axes.add_patch(Rectangle((x - width / 2, y - height / 2), width, height, fc=color, ec=edge, zorder=3))
+        left, right, low, high = x - width / 2, x + width / 2, y - height / 2, y + height / 2
+        corners = [(left, low), (right, low), (right, high), (left, high)]
+        self._fill(corners, fc=color, ec=edge, zorder=3)
 
     def corner(self, *points: Point) -> None:
         """Light in front of a mirror that folds the beam."""
-        self.axes.add_patch(Polygon(points, closed=True, fc=_BEAM, ec=_BEAM, lw=0.5))
+        self._fill(list(points), fc=(_BEAM, _CLEAR), ec="none")
 
     def stop(self, x: float, y: float, half: float, reach: float) -> None:
         """Two blades that leave an opening of twice `half`."""
@@ -139,18 +166,18 @@ class Scene:
         left, right, low, high = x - width / 2, x + width / 2, y - height / 2, y + height / 2
         for corners, color in (
             ([(left, low), (right, low), (left, high)], _GLASS),
-            ([(right, low), (right, high), (left, high)], "#a9cbe4"),
+            ([(right, low), (right, high), (left, high)], _CRYSTAL),
         ):
-            self.axes.add_patch(Polygon(corners, closed=True, fc=color, ec=_EDGE, lw=1.1, zorder=3))
+            self._fill(corners, fc=color, ec=_EDGE, lw=1.1, zorder=3)
 
     def split_beam(self, start: Point, end: float, half: float, apart: float) -> None:
         """Beams of the two polarisations from a Wollaston prism to their images `apart` from the axis."""
         x, y = start
         for look, sign in ((PLUS, 1), (MINUS, -1)):
             low, high = ([(x, y + edge), (end, y + sign * apart + edge)] for edge in (-half, half))
-            self.axes.add_patch(Polygon([*low, *high[::-1]], closed=True, fc=look.color, ec="none", alpha=0.13))
+            self._fill([*low, *high[::-1]], fc=(look.color, 0.13), ec="none")
             for side in (low, high):
-                self.axes.plot(*np.transpose(side), color=look.color, ls=look.line, lw=1.2)
+                self.line(side, color=look.color, ls=look.line, lw=1.6)
 
     def detector(self, x: float, y: float, height: float) -> None:
         """Detector, from the side."""

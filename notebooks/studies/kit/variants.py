@@ -6,6 +6,7 @@ import colorsys
 import pickle
 from collections.abc import Sequence
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -31,12 +32,28 @@ _DIMMEST = 0.22  # luminance of a colour on the dark ground: a contrast of 4.7, 
 _PARTS = "color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"
 
 
+_DRAWN: WeakKeyDictionary[Figure, Figure] = WeakKeyDictionary()  # the narrow variants of drawings
+
+
+def add_narrow(figure: Figure, narrow: Figure) -> Figure:
+    """Give a drawing, whose parts lie on no grid, its narrow variant, and return the drawing."""
+    plt.close(narrow)
+    _DRAWN[figure] = narrow
+    return figure
+
+
+def has_narrow(figure: Figure) -> bool:
+    """Whether a figure has narrow variants."""
+    return figure in _DRAWN or any(axes.get_subplotspec() for axes in figure.axes)
+
+
 def variants(figure: Figure) -> dict[str, Figure]:
-    """Return copies of a figure: "dark", and if its panels lie on a grid "narrow" and "narrow-dark"."""
+    """Return copies of a figure: "dark", and for panels on a grid and some drawings "narrow" and "narrow-dark"."""
     state = pickle.dumps(figure)
     made = {"dark": _darkened(_copy(state))}
-    if any(axes.get_subplotspec() for axes in figure.axes):
-        made["narrow"] = _stacked(_copy(state))
+    if has_narrow(figure):
+        drawn = _DRAWN.get(figure)
+        made["narrow"] = _copy(pickle.dumps(drawn)) if drawn else _stacked(_copy(state))
         made["narrow-dark"] = _darkened(_copy(pickle.dumps(made["narrow"])))
     return made
 
@@ -213,9 +230,12 @@ def dark_color(color: Any) -> tuple[float, ...]:
     """Return a colour for a dark ground: grays inverted, others brighter, the dark ones most."""
     *rgb, alpha = to_rgba(color)
     hue, light, saturation = colorsys.rgb_to_hls(*rgb)
+    brightest = 3 * light  # else dark shades of a colour would look the same
     light = 0.94 - 0.87 * light if saturation < 0.1 or light > 0.8 else max(light, 0.455 + 0.3 * light)
     while saturation >= 0.1 and _luminance(colorsys.hls_to_rgb(hue, light, saturation)) < _DIMMEST:
         light += 0.01
+    while saturation >= 0.1 and _luminance(colorsys.hls_to_rgb(hue, light, saturation)) > brightest:
+        light -= 0.01
     return (*colorsys.hls_to_rgb(hue, light, saturation), alpha)
 
 

@@ -201,6 +201,19 @@ def test_calibration_of_a_foreign_bench_explains_its_frames(calibrated):
         assert fit[f"arm {side} focus"].value == pytest.approx(bench.focus[side], abs=6e-5)
 
 
+def test_numbers_of_a_converged_fit_stay_in_a_step_of_all_unknowns(calibrated):
+    _, fit = calibrated
+    assert fit.converged
+    point = fit.point
+    step = point.solve(-point.gradient, point.stuck, 300, 1e-3)
+    assert np.abs(step[point.problem.n_white :] / fit.sigma).max() < 0.3
+
+
+def test_fit_that_ends_early_has_not_converged():
+    frames, clear, phases = BENCH.recording()
+    assert not fit_bench(frames, clear, phases, n_pixels=40, noise=BENCH.noise, n_steps=1).converged
+
+
 @pytest.mark.parametrize(("number", "rms"), list(enumerate(RMS)))
 def test_calibrated_phase_has_half_the_error_that_the_plain_route_had(calibrated, number, rms):
     bench, fit = calibrated

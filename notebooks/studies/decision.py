@@ -68,7 +68,7 @@ _N_DARKS = 16  # averaged
 
 NO_NOISE = 1e9
 """Photons per point and image at which a loop has almost no noise."""
-LOOP = {"rate": 1000.0, "delay": 2, "stroke": 4.0, "n_steps": 40}
+LOOP: dict[str, Any] = {"rate": 1000.0, "delay": 2, "stroke": 4.0, "n_steps": 40}
 WIND = {"speed": 2.5, "cutoff": 3.0, "exponent": -2.0}
 GAINS = 0.1, 0.2, 0.4
 """Settings of the chapter on closed loops."""

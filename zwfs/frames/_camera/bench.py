@@ -27,9 +27,9 @@ from zwfs.frames._camera.solve import (
     Point,
     Problem,
     allowing,
-    covariance,
     fine_phase,
     minimise,
+    settle,
 )
 from zwfs.frames._outline import radius
 from zwfs.masks import Dimple
@@ -105,7 +105,8 @@ class BenchFit:
     noise : float, counts rms
         Noise of a pixel without light, as given or as estimated.
     converged : bool
-        Whether the next step promises to lower half the sum of squares by less than a part of 1.
+        Whether the next step of the estimates, which the maps follow, promises to lower half the sum of squares by
+        less than a part of 1.
     remarks : tuple of str
         What does not fit together, in words.
     """
@@ -358,11 +359,12 @@ def _finer(data: Recording, point: Point) -> list[NDArray[np.float64]]:
 
 
 def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:
+    best, equations = settle(best)
     point = best.point
     pairs = zip(_squares(data, point), data.good, strict=True)
     misfit = np.array([one.sum() / max(1, np.count_nonzero(good)) for one, good in pairs])
     scale = max(1.0, float(np.mean(misfit)))
-    spread = covariance(point, _finer(data, point), scale)
+    spread = equations.covariance(point, _finer(data, point), scale)
     values = point.x[point.problem.n_white :]
     sigma = np.sqrt(np.diagonal(spread)).tolist()
     estimates = tuple(

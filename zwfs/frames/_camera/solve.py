@@ -20,6 +20,7 @@ from zwfs.frames._camera.prior import MapPrior
 _BINS = 24  # of spatial frequency, for the preconditioner
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
 _LEAST = 1e-3  # damping
+_ALIKE = 1e-13  # eigenvalue over the largest, below which numbers have the same effect
 _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
 _PIXEL_MEAN = np.array([230.0, 2 * 76.0, 2.0]) / 384  # of a cubic spline over a pixel, as a series of cosines
@@ -465,37 +466,66 @@ def minimise(
     return Minimum(point, converged)
 
 
-def covariance(point: Point, change: Sequence[NDArray], scale: float, n_inner: int = 10) -> NDArray[np.float64]:
-    """Covariance of the free numbers: of the noise, of what the model misses, and of a change of the images.
+class Eliminated:
+    """Equations of the free numbers at a point, where the maps follow.
 
-    With effects E = J_p - J_m X and X = H_mm^-1 H_mp, the inverse of Schur's complement S = E^T E + X^T X + prior
-    is the covariance of the noise, times `scale`. The error of S is of second order in that of X. Where the model
-    misses something, residuals are alike over some pixels, and the scores E^T r of square blocks scatter more than
-    noise makes them: S^-1 (sum of their squares + X^T X + prior) S^-1 replaces what is smaller. A change d of the
-    images, over their noise, moves the numbers by S^-1 E^T d. It is the largest change that is expected, so that a
-    third of its square is added: the variance of a uniform distribution. All arms have its mean over the arms.
+    The maps follow a number by -X, with X = H_mm^-1 H_mp, and the residuals change by its effect E = J_p - J_m X.
+    Schur's complement S = E^T E + X^T X + prior is the matrix of the numbers. The error of S is of second order in
+    that of X.
     """
-    n, n_all = point.problem.n_white, len(point.x)
-    held = np.arange(n_all) >= n
-    effects, followed = [], []
-    for number in range(n_all - n):
-        along = point.along(number)
-        solution = point.solve(point.back(along), held, n_inner, 0.02)
-        effects.append([one - other for one, other in zip(along, point.change(solution), strict=True)])
-        followed.append(solution[:n])
-    unit = np.sqrt(np.diagonal(point.block))
-    e = np.array([np.concatenate([image.ravel() for image in one]) for one in effects]) / unit[:, None]
-    x = np.array(followed) / unit[:, None]
-    known = x @ x.T + np.diag((point.problem.prior[1] / unit) ** 2)
-    inverse = linalg.pinvh(e @ e.T + known, rtol=1e-13)
-    scores = _block_sums([[r * one for r, one in zip(point.residuals, each, strict=True)] for each in effects])
-    scores = scores / unit[:, None]
-    seen = np.sqrt(np.diagonal(inverse @ (scores @ scores.T + known) @ inverse) / np.diagonal(inverse))
-    grow = np.maximum(math.sqrt(scale), seen)
-    moved = inverse @ (e @ np.concatenate([one.ravel() for one in change])) / unit
-    kinds = np.unique([one.name.split()[-1] for one in point.problem.free], return_inverse=True)[1]
-    alike = (np.bincount(kinds, moved**2 / 3) / np.bincount(kinds))[kinds]
-    return inverse * np.outer(grow / unit, grow / unit) + np.diag(alike)
+
+    def __init__(self, point: Point, n_inner: int = 10) -> None:
+        n, n_all = point.problem.n_white, len(point.x)
+        held = np.arange(n_all) >= n
+        effects, followed = [], []
+        for number in range(n_all - n):
+            along = point.along(number)
+            solution = point.solve(point.back(along), held, n_inner, 0.02)
+            effects.append([one - other for one, other in zip(along, point.change(solution), strict=True)])
+            followed.append(solution[:n])
+        self._unit = np.sqrt(np.diagonal(point.block))
+        self._effects, self._x = effects, np.array(followed) / self._unit[:, None]
+        self._e = np.array([np.concatenate([image.ravel() for image in one]) for one in effects])
+        self._e /= self._unit[:, None]
+        self._known = self._x @ self._x.T + np.diag((point.problem.prior[1] / self._unit) ** 2)
+        self._matrix = self._e @ self._e.T + self._known
+
+    def step(self, point: Point) -> tuple[NDArray[np.float64], float]:
+        """Step of the numbers, which the maps follow, and how much it promises to lower the cost."""
+        n, move = point.problem.n_white, ~point.stuck[point.problem.n_white :]
+        slope = (point.gradient[n:] / self._unit - self._x @ point.gradient[:n]) * move
+        step = np.zeros_like(slope)
+        step[move] = -linalg.pinvh(self._matrix[np.ix_(move, move)], rtol=_ALIKE) @ slope[move]
+        return np.concatenate([-self._x.T @ step, step / self._unit]), -float(slope @ step) / 2
+
+    def covariance(self, point: Point, change: Sequence[NDArray], scale: float) -> NDArray[np.float64]:
+        """Covariance of the numbers: of the noise, of what the model misses, and of a change of the images.
+
+        That of the noise is S^-1 times `scale`. Where the model misses something, residuals are alike over some
+        pixels, and the scores E^T r of square blocks scatter more than noise makes them:
+        S^-1 (sum of their squares + X^T X + prior) S^-1 replaces what is smaller. A change d of the images, over
+        their noise, moves the numbers by S^-1 E^T d. It is the largest change that is expected, so that a third of
+        its square is added: the variance of a uniform distribution. All arms have its mean over the arms.
+        """
+        inverse = linalg.pinvh(self._matrix, rtol=_ALIKE)
+        sums = [[r * one for r, one in zip(point.residuals, each, strict=True)] for each in self._effects]
+        scores = _block_sums(sums) / self._unit[:, None]
+        seen = np.diagonal(inverse @ (scores @ scores.T + self._known) @ inverse) / np.diagonal(inverse)
+        grow = np.sqrt(np.maximum(scale, seen)) / self._unit
+        moved = inverse @ (self._e @ np.concatenate([one.ravel() for one in change])) / self._unit
+        kinds = np.unique([one.name.split()[-1] for one in point.problem.free], return_inverse=True)[1]
+        alike = (np.bincount(kinds, moved**2 / 3) / np.bincount(kinds))[kinds]
+        return inverse * np.outer(grow, grow) + np.diag(alike)
+
+
+def settle(best: Minimum) -> tuple[Minimum, Eliminated]:
+    """Take a last step of the numbers, and judge by the next one whether they have converged."""
+    point, equations = best.point, Eliminated(best.point)
+    target, (n, bounds) = point.x + equations.step(point)[0], (point.problem.n_white, point.problem.bounds)
+    target[n:] = np.clip(target[n:], bounds[:, 0], bounds[:, 1])
+    trial = Point(point.problem, target)
+    point = trial if trial.cost < point.cost else point
+    return Minimum(point, equations.step(point)[1] < _SETTLED), equations
 
 
 def _block_sums(images: Sequence[Sequence[NDArray]]) -> NDArray[np.float64]:

@@ -176,7 +176,9 @@ def rules() -> str:
                     alike = [one for one in CLAIMS if (one.notebook, one.code) == (notebook, claim.code)]
                     text += "".join(f"(code-{one.number})=\n" for one in alike)
                     numbers = ", ".join(str(one.number) for one in alike)
-                    text += f"**Code that computes** (claim {numbers}):\n\n" + _include(code, pyobject=claim.code)
+                    where = f"`notebooks/studies/{notebook}.py`"
+                    text += f"**Code that computes** (claim {numbers}), {where}:\n\n"
+                    text += _include(code, pyobject=claim.code)
                     shown.add(claim.code)
                 text += "**Its numbers**, the marked lines:\n\n"
                 text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))

@@ -140,7 +140,7 @@ CONTOURS = [1.5, 2, 3, 5]  # photon costs of the lines in a map
 def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[str, NDArray]) -> Figure:
     """Photon cost against diameter and phase shift, one panel for each kind of wavefront.
 
-    Designs whose phase shifts are of equal size are marked with their cost.
+    Designs whose phase shifts are of equal size are marked with their cost, and a star marks the best one.
     """
     figure, panels = plt.subplots(1, len(maps.costs), figsize=(7, 3.8), sharey=True, squeeze=False)
     x, y = maps.diameters, maps.angles / np.pi
@@ -158,6 +158,8 @@ def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[
                 marked.append(place)
                 axes.plot(*place, "o", mfc="#ffffff", mec="#000000", ms=8, zorder=7)
                 axes.annotate(f"{design.name}: {cost:.1f}", place, (8, 0), textcoords="offset points", **_LABEL)
+        best = maps.best(name)
+        axes.plot(best.diameter, best.theta_a / np.pi, "*", mfc="#ffffff", mec="#000000", ms=13, zorder=6)
         axes.set(xscale="log", xlim=x[[0, -1]], ylim=y[[0, -1]], xlabel="diameter (λ/D)")
         axes.spines[:].set(visible=True, color="#888888")
         axes.clabel(lines, fmt="%g", fontsize=9, manual=_free_places(lines, x, y, marked))

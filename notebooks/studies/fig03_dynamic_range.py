@@ -230,6 +230,8 @@ def draw_linearity(
         line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
         found = 0 < limits[name].value < np.inf
         reach = f": limit {limits[name].value:.2g} rad" if found else ""
+        if limits[name].value == 0:
+            reach = f": above {percent(threshold)}"
         plain.plot(rms, mean[drawn], label=look.label + reach, **line)
         low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
         plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
@@ -268,28 +270,23 @@ def draw_saxton_widths(
         colors = _shades(LOOKS[family].color, len(drawn))
         for (name, method), color, line, marker in zip(drawn.items(), colors, *map(cycle, lines), strict=False):
             ratio = curves.mean(name) / curves.rms
-            axes.semilogy(curves.rms, ratio, color=color, linestyle=line, marker=marker)
-            text, place = _variant_label(method)
-            axes.annotate(text, (curves.rms[0], ratio[0]), textcoords="offset points", fontsize=9, **place)
-        [linear] = axes.plot(curves.rms, curves.mean("Linear") / curves.rms, **LOOKS["Linear"].style)
+            label = f"{method.settings.n_iterations} iterations"
+            axes.semilogy(curves.rms, ratio, color=color, linestyle=line, marker=marker, label=label)
+            if kind == "zero":
+                place: dict[str, Any] = {"xytext": (-7, 0), "textcoords": "offset points", "va": "center"}
+                text = f"{method.sensor.extent:g} D"
+                axes.annotate(text, (curves.rms[0], ratio[0]), color=color, fontsize=9, ha="right", **place)
+        axes.plot(curves.rms, curves.mean("Linear") / curves.rms, label="linear", **LOOKS["Linear"].style)
         axes.axhline(threshold, color="#555555", lw=1)
         axes.set(xlabel="input phase (rad rms)", xlim=(0, None))
         axes.set_title(title.format(method.sensor.extent), fontsize=10)
     zero, model = panels
     zero.set_ylabel("error / input")
+    model.legend(loc="lower right", fontsize=9)
     style: dict[str, Any] = {"color": "#555555", "fontsize": 9, "ha": "right", "va": "top"}
     line = f"{percent(threshold)} of the input"
     zero.text(0.99, 0.9 * threshold, line, transform=zero.get_yaxis_transform(), **style)
-    model.set_ylim(bottom=model.get_ylim()[0] / 4)  # room for the labels
-    figure.legend([linear], ["linear"], loc="outside lower center", fontsize=9)
     return figure
-
-
-def _variant_label(method: GerchbergSaxton) -> tuple[str, dict[str, Any]]:
-    """What distinguishes a variant from the others in its panel, and where to write it at the first point."""
-    if method.unmeasured == "zero":
-        return f"{method.sensor.extent:g} D", {"xytext": (-7, 0), "ha": "right", "va": "center"}
-    return f"{method.settings.n_iterations} iterations", {"xytext": (6, -11), "va": "top"}
 
 
 def _shades(color: str, count: int) -> list[tuple[float, ...]]:

@@ -505,9 +505,11 @@ def _place(curve: DiameterCurves, name: str, limit: float, start: float = 0.0, f
     return f"{diameter:{form}}" if diameter < np.inf else f"not up to {curve.diameters[-1]:g}"
 
 
-def _limit(curve: DiameterCurves, name: str, allowed: float) -> float:
-    """Diameter, from the usual one on, at which an error exceeds what is allowed; 0 if it does at all of them."""
-    return curve.exceeds(name, allowed, _usual(curve)) if (curve.mean(name) <= allowed).any() else 0.0
+def _rise(curve: DiameterCurves, name: str, allowed: float) -> float:
+    """Diameter, from the usual one on, at which an error exceeds what is allowed, or twice its first value."""
+    start = _usual(curve)
+    error = curve.at(name, start)
+    return curve.exceeds(name, 2 * error if error > allowed else allowed, start)
 
 
 def _reach(
@@ -560,7 +562,6 @@ def numbers(
     paper, longest = by_method[ITERATION], list(by_iterations.values())[-1]
     of_input, allowed = f"{percent(threshold)} of the input", threshold * paper.rms[0]
     descent = by_method["GradientDescent"]
-    limits = {name: _limit(by_method[name], name, allowed) for name in SHORT}
     found: dict[str, Any] = {
         "iterations": next(iter(by_iterations)),
         "diameter_5_percent": limit.value,
@@ -571,7 +572,7 @@ def numbers(
         "contraction_crosses_1": crossing(reasons.diameters, reasons.flat, 1.0),
         "dark_ring": DARK_RING,
         "n_few": by_method["Linear"].errors["Linear"].shape[-1],
-        **{f"claim17_{short}_limit": limits[name] for name, short in SHORT.items()},
+        **{f"claim17_{short}_rise": _rise(by_method[name], name, allowed) for name, short in SHORT.items()},
         "longest": list(by_iterations)[-1],
         "reach": _reach(paper, ITERATION, allowed, of_input, limit),
         "reach_1e3": _reach(paper, ITERATION, 1e-3, "10⁻³ rad"),

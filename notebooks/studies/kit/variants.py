@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 import pickle
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -23,6 +24,7 @@ _WIDTH, _HEIGHT = 3.7, 2.7  # of a narrow figure and of each panel in it, inch
 _LETTERS = 11  # points, at most: some figures have larger ones, as pages show them smaller than they are
 _LONE = 0.7  # width of pictures that stand alone in their rows, over that of the figure
 _ENTRY = 420  # points times letters: an entry of a legend with so many letters is as wide as the figure
+_LETTERS_OF_ENTRY = 44  # in a line
 _MARGIN = 0.1  # around what is drawn, inch
 _ROUNDS = 12  # at most, to find the height
 _STEP = 1.8  # of the height over the gaps, which fall by about half of it
@@ -87,10 +89,11 @@ def _stacked(figure: Figure) -> Figure:
         handles: Any = legend.legend_handles
         texts = legend.get_texts()
         legend.remove()
-        labels = [text.get_text() for text in texts]
-        size = min(texts[0].get_fontsize(), _ENTRY / max(map(len, labels)))
+        labels = [textwrap.fill(text.get_text(), _LETTERS_OF_ENTRY) for text in texts]
+        lines = [line for label in labels for line in label.split("\n")]
+        size = min(texts[0].get_fontsize(), _ENTRY / max(map(len, lines)))
         figure.legend(handles, labels, loc="outside lower center", fontsize=size)
-        entries += len(texts)
+        entries += len(lines)
     for text in figure.findobj(Text):
         text.set_fontsize(min(text.get_fontsize(), _LETTERS))
     figure.set_size_inches(_WIDTH, sum(heights) + _BAR * bars + 0.2 * entries)

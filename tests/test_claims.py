@@ -8,7 +8,6 @@ import pytest
 
 from book._ext import claims
 from book._ext.claims import FAILS, HOLDS, REMARK, UNTESTED, Claim, ClaimError, Finding
-
 from studies.fig04_dimple_diameter import SHORT
 
 from .conftest import glued

@@ -411,7 +411,7 @@ def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
                 axes.annotate(f"{count} of {n_loops} close", point, side, ha="right", **text)
     pairs = [[typical(one.settled[name]) for name in TWO_IMAGES if name in one.settled] for one in some]
     if all(max(errors) <= ALIKE * min(errors) for errors in pairs):
-        where = {"transform": axes.transAxes, "ha": "right", "va": "bottom"}
+        where: dict[str, Any] = {"transform": axes.transAxes, "ha": "right", "va": "bottom"}
         label = "the three two-image\ncurves coincide" if len(pairs[0]) == 3 else "the two-image\ncurves coincide"
         axes.text(0.99, 0.03, label, color=_GRAY, fontsize=9, **where)
 

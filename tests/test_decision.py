@@ -61,9 +61,11 @@ def test_methods_that_agree_within_the_scatter_are_called_alike(errors):
 def test_a_cell_of_loops_says_how_many_close():
     both, settings = (0.7, 0.05), {"n_loops": 12}
     won = Cell("linear", "linear", both, 0.07, 0.06, 0.09, (1, 12), **settings)
-    assert won.text == "two images, linear: 0.05; all 12 loops close; with one image only 1 of 12"
+    assert won.text == "two images, linear: 0.050; all 12 loops close; with one image only 1 of 12"
     tied = Cell("linear", "linear", both, 1.0, 0.9, 1.1, (12, 12), **settings)
-    assert tied.text == "linear, one or two images: 0.05; all 12 loops close"
+    assert tied.text == "linear, one or two images: 0.050; all 12 loops close"
+    assert won.sides == {"one": "1 of 12 loops close", "two": "0.050, linear; all 12 loops close"}
+    assert tied.sides == {"one": "0.70, linear", "two": "0.050, linear"}
 
 
 def test_the_simpler_of_two_methods_that_agree_is_named(errors):

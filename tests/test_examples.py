@@ -2,6 +2,7 @@
 
 import re
 
+import nbformat
 import pytest
 
 from .conftest import ROOT
@@ -20,6 +21,19 @@ def test_example_of_the_front_page_prints_what_it_says(capsys):
     (code,), (printed,) = (re.findall(rf"(?m)^```{kind}\n(.*?)^```", page, re.S) for kind in ("python", "text"))
     exec(compile(code, "index.md", "exec"), {})
     assert capsys.readouterr().out == printed
+
+
+def test_example_of_a_loop_prints_the_residual_of_the_table(capsys):
+    cells = nbformat.read(ROOT / "notebooks" / "closed_loop.ipynb", 4).cells
+    (page,) = (cell.source for cell in cells if "## Close a loop" in cell.source)
+    (code,), (printed,) = (re.findall(rf"(?m)^```{kind}\n(.*?)^```", page, re.S) for kind in ("python", "text"))
+    exec(compile(code, "closed_loop.ipynb", "exec"), {})
+    assert capsys.readouterr().out == printed
+    outputs = [
+        output.get("data", {}).get("text/markdown", "") for cell in cells for output in cell.get("outputs", ())
+    ]
+    (row,) = re.findall(r"(?m)^\| 0\.5 rad rms; 1000 photons \|.*", "\n".join(outputs))
+    assert f"| {re.search('[0-9.]+', printed)[0]}, " in row
 
 
 def test_example_of_gradients_fits_the_phase(capsys):

@@ -8,6 +8,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
@@ -52,6 +53,7 @@ PLANTS = {
 ALIKE = 1.05
 """Ratio of errors up to which the simpler one of two methods is named."""
 
+_GRAY = "#666666"
 _BOX = 3.0  # D; the screens repeat after this length
 
 
@@ -260,6 +262,11 @@ def typical(settled: NDArray) -> float:
     return float(np.exp(np.mean(np.log(settled))))
 
 
+def two_digits(error: float) -> str:
+    """Error with two significant digits, trailing zeros included."""
+    return f"{error:#.2g}".rstrip(".")
+
+
 def paired_ratio(first: NDArray, second: NDArray) -> tuple[float, float, float]:
     """Ratio of two errors, screen by screen: geometric mean, and this less and plus twice its standard error."""
     logs = np.log(first / second)
@@ -360,17 +367,23 @@ def draw_linear_loops(found: Divergence) -> Figure:
 
 
 def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
-    """Residual against the error at the start: a panel for each star, a curve for each method at its best gain."""
+    """Residual against the error at the start: a panel for each star, a curve for each method at its best gain.
+
+    Markers are filled for one image and open for two. Texts give the loops that close, where some do not.
+    """
     stars = sorted({one.photons for one in trials})
     figure, panels = plt.subplots(1, len(stars), figsize=(7, 3.8), sharex=True, sharey=True, squeeze=False)
     for axes, photons in zip(panels[0], stars, strict=True):
         some = sorted((one for one in trials if one.photons == photons), key=lambda one: one.start)
         for name in some[0].settled:
             style = LOOKS["Linear" if name == "LinearTwo" else name].style
+            if name in TWO_IMAGES:
+                style["markerfacecolor"] = "white"
             if name == "LinearTwo":
-                style |= {"markerfacecolor": "white", "linestyle": "--"}
+                style["linestyle"] = "--"
             residual = [typical(one.settled[name]) for one in some]
             axes.semilogy([one.start for one in some], residual, label=method_name(name), **style)
+        _mark_closed(axes, some)
         axes.set_title(f"{photons:g} photon{'s' * (photons != 1)} per point and image", fontsize=10)
         axes.set(xlabel="error at the start (rad rms)", xticks=[one.start for one in some])
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -379,6 +392,28 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
     panels[0, 0].set_ylabel("residual (rad rms)")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
+
+
+def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
+    """Draw the limit below which a loop is closed; write how many loops close, and which curves coincide."""
+    text: dict[str, Any] = {"textcoords": "offset points", "color": _GRAY, "fontsize": 9}
+    starts = [one.start for one in some]
+    axes.semilogy(starts, [start / 2 for start in starts], color=_GRAY, lw=1, zorder=1)
+    axes.annotate("closed: below half\nof the start", (starts[0], starts[0] / 2), (0, 16), **text)
+    axes.margins(y=0.12)
+    for one in some:
+        for names, place, side in ((ONE_IMAGE, max, (-8, 3)), (TWO_IMAGES, min, (-8, -12))):
+            drawn = [name for name in names if name in one.settled]
+            n_loops, closed = one.settled[drawn[0]].size, sorted({one.closed(name) for name in drawn})
+            if closed[0] < n_loops:
+                count = "\N{EN DASH}".join(map(str, dict.fromkeys((closed[0], closed[-1]))))
+                point = one.start, place(typical(one.settled[name]) for name in drawn)
+                axes.annotate(f"{count} of {n_loops} close", point, side, ha="right", **text)
+    pairs = [[typical(one.settled[name]) for name in TWO_IMAGES if name in one.settled] for one in some]
+    if all(max(errors) <= ALIKE * min(errors) for errors in pairs):
+        where: dict[str, Any] = {"transform": axes.transAxes, "ha": "right", "va": "bottom"}
+        label = "the three two-image\ncurves coincide" if len(pairs[0]) == 3 else "the two-image\ncurves coincide"
+        axes.text(0.99, 0.03, label, color=_GRAY, fontsize=9, **where)
 
 
 def linear_columns(found: Divergence) -> dict[str, NDArray]:
@@ -412,11 +447,12 @@ def tuned_screens(trials: Sequence[TunedLoops]) -> dict[str, NDArray]:
 
 
 def best_table(rows: Sequence[BestMethods]) -> Table:
-    """Return the best method for each input and star, its gain, and what the second image gains."""
+    """Return the best method for each input and star, and its residual and gain with two images and with one."""
     header = (
-        "start (rad rms); photons per point and image",
+        "start; photons per point and image",
         "best method",
-        "residual: two images / one",
+        "residual (rad rms): two images, one",
+        "ratio",
         "loops that close: two images, one",
         "gain: two images, one",
     )
@@ -429,7 +465,9 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
         span = f"{row.low:.2f} to {row.high:.2f}" if row.high < np.inf else "one loop"
         ratio = f"{row.ratio:.2f} ({span})"
         gains = f"{loops.gains[row.two]:g}, {loops.gains[row.one]:g}"
-        cells.append([f"{loops.start:g}; {loops.photons:g}", best, ratio, closed, gains])
+        residuals = ", ".join(two_digits(typical(loops.settled[name])) for name in (row.two, row.one))
+        light = f"{loops.photons:g} photon{'s' * (loops.photons != 1)}"
+        cells.append([f"{loops.start:g} rad rms; {light}", best, residuals, ratio, closed, gains])
     return Table(header, cells)
 
 

@@ -19,6 +19,7 @@ from studies.closed_loop import (
     method_name,
     paired_ratio,
     tuned_loops,
+    two_digits,
     typical,
 )
 from studies.kit import sweeps
@@ -275,18 +276,21 @@ class Cell:
         """Cell of the table."""
         if self.images is None:
             alike = f"{self.one}, one or two images" if self.one == self.two else self._unlike
-            return f"{alike}: {self.error:.2g}{self._closed}"
+            return f"{alike}: {two_digits(self.error)}{self._closed}"
         factor = max(self.ratio, 1 / self.ratio)
         count, method = ("one image", self.one) if self.images == 1 else ("two images", self.two)
-        return f"{count}, {method}: {self.error:.2g}{self._closed or f', {factor:.2g} times smaller'}"
+        return f"{count}, {method}: {two_digits(self.error)}{self._closed or f', {factor:.2g} times smaller'}"
 
     @property
     def sides(self) -> dict[str, str]:
         """Error and method with two images and with one, or how few loops close."""
         closed = self.closed or (self.n_loops,) * 2
+        more = "" if min(closed) == self.n_loops else f"; all {self.n_loops} loops close"
         both = zip(("one", "two"), self.typical, (self.one, self.two), closed, strict=True)
         return {
-            count: f"{error:.2g}, {method}" if n == self.n_loops else f"{n} of {self.n_loops} loops close"
+            count: f"{two_digits(error)}, {method}{more}"
+            if n == self.n_loops
+            else f"{n} of {self.n_loops} loops close"
             for count, error, method, n in both
         }
 
@@ -316,7 +320,7 @@ class Calibrated:
     @property
     def text(self) -> str:
         """Cell of the table."""
-        return f"two images, fitted model: {self.error:.2g} (one image not studied)"
+        return f"two images, fitted model: {two_digits(self.error)} (one image not studied)"
 
 
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
@@ -353,7 +357,6 @@ class Row:
     key: str
     start: str
     photons: str  # per point and image of two
-    both: str  # per point of one image alone
     cells: Mapping[str, Cell | Calibrated | None]
     chapter: Link
 
@@ -372,8 +375,8 @@ def open_rows(
             "calibrated": None if known is None else Calibrated(known),
             "design": open_cell(errors["real"][index]),
         }
-        light = f"{photons:g}", f"{2 * photons:g}"
-        rows.append(Row(f"open_{index + 1}", f"open loop, {rms:g} rad rms", *light, cells, CHAPTERS[index]))
+        start = f"open loop, {rms:g} rad rms"
+        rows.append(Row(f"open_{index + 1}", start, f"{photons:g}", cells, CHAPTERS[index]))
     return rows
 
 
@@ -382,19 +385,18 @@ def loop_rows(found: Iterable[BestMethods]) -> list[Row]:
     rows = []
     for index, one in enumerate(found):
         cells = {"perfect": loop_cell(one), "calibrated": None, "design": None}
-        start, photons = f"closed loop from {one.loops.start:g} rad rms", one.loops.photons
-        light = f"{photons:g}", f"{2 * photons:g}"
-        rows.append(Row(f"closed_{index + 1}", start, *light, cells, Link("closed loop", "closed_loop.ipynb")))
+        start, photons = f"closed loop from {one.loops.start:g} rad rms", f"{one.loops.photons:g}"
+        rows.append(Row(f"closed_{index + 1}", start, photons, cells, Link("closed loop", "closed_loop.ipynb")))
     return rows
 
 
 def decision_table(rows: Iterable[Row]) -> Table:
     """Best method of each situation."""
-    first = "situation; photons per point and image (one image alone), in a loop per step"
-    header = [first, *COLUMNS.values(), "explained in"]
+    header = ["situation", "photons per point and image", *COLUMNS.values(), "explained in"]
     cells = [[_cell_text(row.cells[name]) for name in COLUMNS] for row in rows]
-    begun = [f"{row.start}; {row.photons} ({row.both})" for row in rows]
-    return Table(header, [[one, *some, row.chapter] for one, row, some in zip(begun, rows, cells, strict=True)])
+    return Table(
+        header, [[row.start, row.photons, *some, row.chapter] for row, some in zip(rows, cells, strict=True)]
+    )
 
 
 def _cell_text(cell: Cell | Calibrated | None) -> str:
@@ -434,6 +436,9 @@ def numbers(
             "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
             "likelihood_excess": paired_ratio(settled["MaximumLikelihood"], settled["LinearTwo"])[0] - 1,
             "photons_faint": faint.loops.photons,
+            "photons_bright": loops[0].loops.photons,
+            "gain_bright": loops[0].loops.gains["LinearTwo"],
+            "gain_faint": loops[1].loops.gains["LinearTwo"],
             "no_noise": typical(no_noise.loops.settled["LinearTwo"]),
             "loop_rate": LOOP["rate"] / 1e3,
             "loop_delay": LOOP["delay"],

@@ -111,7 +111,8 @@ def list_properties(app: Sphinx, what: str, name: str, thing: Any, options: Any,
 def list_call(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
     """Append the call of the objects of a class to its docstring: what it does, its parameters and its result."""
     call = vars(thing).get("__call__") if what == "class" else None
-    if not (text := inspect.getdoc(call) if call else None):
+    text = inspect.getdoc(call)
+    if call is None or not text:
         return
     summary, *parts = re.split(r"^(Parameters|Returns)\n-+\n", text, flags=re.MULTILINE)
     found = dict(zip(parts[::2], (re.split(r"\n+\S.*\n-+\n", part)[0] for part in parts[1::2]), strict=True))

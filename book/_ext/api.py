@@ -108,6 +108,22 @@ def list_properties(app: Sphinx, what: str, name: str, thing: Any, options: Any,
             lines += [key, f"    {' '.join(summary.split())}"]
 
 
+def list_call(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Append the call of the objects of a class to its docstring: what it does, its parameters and its result."""
+    call = vars(thing).get("__call__") if what == "class" else None
+    text = inspect.getdoc(call)
+    if call is None or not text:
+        return
+    summary, *parts = re.split(r"^(Parameters|Returns)\n-+\n", text, flags=re.MULTILINE)
+    found = dict(zip(parts[::2], (re.split(r"\n+\S.*\n-+\n", part)[0] for part in parts[1::2]), strict=True))
+    names = ", ".join(list(inspect.signature(call).parameters)[1:])
+    lines += ["", "Call", "----", f"{thing.__name__}(...)({names})"]
+    lines += [f"    {line}".rstrip() for line in summary.strip().splitlines()]
+    lines += found.get("Parameters", "").strip().splitlines()
+    if returned := found.get("Returns", "").strip():
+        lines += f"returns : {returned}".splitlines()
+
+
 def is_property(value: Any) -> bool:
     """Return whether a member of a class is computed when it is read."""
     return isinstance(value, property | cached_property)
@@ -190,6 +206,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Add the directive and the links."""
     app.add_directive("modules", Modules)
     app.connect("autodoc-process-docstring", list_properties, priority=300)
+    app.connect("autodoc-process-docstring", list_call, priority=310)
     app.connect("autodoc-process-docstring", link_equations, priority=400)
     app.connect("missing-reference", link_name)
     app.connect("html-page-context", drop_links_back)

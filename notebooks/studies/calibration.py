@@ -210,9 +210,9 @@ def estimate_table(taken: Recording, fit: BenchFit) -> Table:
     for name, title in _TITLES.items():
         value, sigma = fit[name].value, fit[name].sigma
         deviation = (value - true[name]) / sigma
-        digits = max(-int(np.floor(np.log10(sigma))), 0)
+        digits = max(1 - int(np.floor(np.log10(sigma))), 0)
         fitted = f"{value:.{digits}f} ± {sigma:.{digits}f}"
-        rows.append([title, f"{true[name]:.5g}", fitted, f"{round(deviation):+d}"])
+        rows.append([title, f"{true[name]:.5g}", fitted, f"{deviation:+.1f}"])
     return Table(["parameter", "put in", "fitted", "deviation (error bars)"], rows)
 
 
@@ -305,7 +305,7 @@ def numbers(
             "sigma": errors.column("sigma")[place],
             "inside": 100 * float(np.mean([one.inside for one in every])),
             "consistent": sum(one.consistent for one in every),
-            "bulk_least": (plain / bulk).min(),
+            "bulk_excess": 100 * (float((bulk / plain).max()) - 1),
             "bulk_most": (plain / bulk).max(),
             "wrong_least": (plain / spoiled).min(),
             "wrong_most": (plain / spoiled).max(),

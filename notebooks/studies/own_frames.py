@@ -96,16 +96,16 @@ def draw_phase_map(result: MeasuredPhase, wavelength: float, sigma: NDArray | No
         figure.legend(loc="outside lower left", fontsize=9)
     _two_scales(figure.colorbar(shown, ax=axes, location="bottom", aspect=30, extend="both"), wavelength)
     if sigma is not None:
-        shown = show_intensity(panels[0, 1], sigma, 2 * np.nanmedian(sigma))
+        shown = show_intensity(panels[0, 1], 1e3 * sigma, 2e3 * np.nanmedian(sigma))
         panels[0, 1].set_title("error bar: noise only", fontsize=10)
         bar = figure.colorbar(shown, ax=panels[0, 1], location="bottom", aspect=30, extend="max")
-        _two_scales(bar, wavelength)
+        _two_scales(bar, wavelength / 1e3, "mrad")
     return figure
 
 
-def _two_scales(bar: Colorbar, wavelength: float) -> None:
-    """Label a colour bar in radian below and in nm above."""
-    bar.set_label("rad")
+def _two_scales(bar: Colorbar, wavelength: float, unit: str = "rad") -> None:
+    """Label a colour bar in this unit of phase below and in nm above: 2 pi units are a wavelength."""
+    bar.set_label(unit)
     bar.locator = MaxNLocator(4)
     both = partial(phase_to_opd, wavelength=wavelength), partial(opd_to_phase, wavelength=wavelength)
     nm = bar.ax.secondary_xaxis("top", functions=both)

@@ -257,8 +257,9 @@ def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.b
     look = "dimple, leakage and background"
     if share > 1.2 * area:
         look = "registration, focus, blur and partly lit pixels"
+    part = "More than 99.5%" if share > 0.995 else f"{share:.0%}"  # 100% would deny the misfit elsewhere
     where = (
-        f"{share:.0%} of the squared misfit lies within {NEAR} pixels of {edges} ({area:.0%} of the points): "
+        f"{part} of the squared misfit lies within {NEAR} pixels of {edges} ({area:.0%} of the points): "
         f"look at {look}."
     )
     if np.isnan(inner):

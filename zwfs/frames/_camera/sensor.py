@@ -116,9 +116,9 @@ class FittedSensor:
         Parameters
         ----------
         frames : array_like, shape (2, ny, nx), counts
-            Less the dark. NaN marks bad pixels.
+            Less the dark, with the exposure of the fit's frames. NaN marks bad pixels.
         sigma : array_like, shape (2, ny, nx) or a number, counts rms
-            Noise of the pixels.
+            Noise of the pixels: ``sqrt(maximum(frames, 0) / gain + noise**2)`` with those of `fit_bench`.
 
         Returns
         -------

@@ -201,12 +201,12 @@ def test_calibration_of_a_foreign_bench_explains_its_frames(calibrated):
         assert fit[f"arm {side} focus"].value == pytest.approx(bench.focus[side], abs=6e-5)
 
 
-def test_numbers_of_a_converged_fit_stay_in_a_step_of_all_unknowns(calibrated):
+def test_numbers_of_a_converged_fit_stay_within_their_error_bars_in_a_step_of_all_unknowns(calibrated):
     _, fit = calibrated
     assert fit.converged
     point = fit.point
     step = point.solve(-point.gradient, point.stuck, 300, 1e-3)
-    assert np.abs(step[point.problem.n_white :] / fit.sigma).max() < 0.3
+    assert np.abs(step[point.problem.n_white :] / fit.sigma).max() < 1
 
 
 def test_fit_that_ends_early_has_not_converged():

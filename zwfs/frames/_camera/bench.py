@@ -106,7 +106,7 @@ class BenchFit:
         Noise of a pixel without light, as given or as estimated.
     converged : bool
         Whether the next step of the estimates, which the maps follow, promises to lower half the sum of squares by
-        less than a part of 1.
+        less than 1.
     remarks : tuple of str
         What does not fit together, in words.
     """

@@ -21,6 +21,7 @@ _BINS = 24  # of spatial frequency, for the preconditioner
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
 _LEAST = 1e-3  # damping
 _ALIKE = 1e-13  # eigenvalue over the largest, below which numbers have the same effect
+_N_MAPS = 80  # iterations for the minimum of the maps
 _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
 _PIXEL_MEAN = np.array([230.0, 2 * 76.0, 2.0]) / 384  # of a cubic spline over a pixel, as a series of cosines
@@ -491,9 +492,14 @@ class Eliminated:
         self._matrix = self._e @ self._e.T + self._known
 
     def step(self, point: Point) -> tuple[NDArray[np.float64], float]:
-        """Step of the numbers, which the maps follow, and how much it promises to lower the cost."""
-        n, move = point.problem.n_white, ~point.stuck[point.problem.n_white :]
-        slope = (point.gradient[n:] / self._unit - self._x @ point.gradient[:n]) * move
+        """Step of the numbers, which the maps follow, and how much it promises to lower the cost.
+
+        The slope along the numbers is that at the maps' own minimum, g_p - H_pm H_mm^-1 g_m.
+        """
+        n, numbers = point.problem.n_white, np.arange(len(point.x)) >= point.problem.n_white
+        maps = point.solve(point.gradient, numbers, _N_MAPS, 0.01)
+        move = ~point.stuck[n:]
+        slope = (point.gradient - point.product(maps))[n:] / self._unit * move
         step = np.zeros_like(slope)
         step[move] = -linalg.pinvh(self._matrix[np.ix_(move, move)], rtol=_ALIKE) @ slope[move]
         return np.concatenate([-self._x.T @ step, step / self._unit]), -float(slope @ step) / 2
@@ -525,7 +531,7 @@ def settle(best: Minimum) -> tuple[Minimum, Eliminated]:
     target[n:] = np.clip(target[n:], bounds[:, 0], bounds[:, 1])
     trial = Point(point.problem, target)
     point = trial if trial.cost < point.cost else point
-    return Minimum(point, equations.step(point)[1] < _SETTLED), equations
+    return Minimum(point, equations.step(point)[1] < 1), equations
 
 
 def _block_sums(images: Sequence[Sequence[NDArray]]) -> NDArray[np.float64]:

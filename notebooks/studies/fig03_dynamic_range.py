@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cProfile
 import pstats
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
@@ -232,7 +233,7 @@ def draw_linearity(
         reach = f": limit {limits[name].value:.2g} rad" if found else ""
         if limits[name].value == 0:
             reach = f": above {percent(threshold)}"
-        plain.plot(rms, mean[drawn], label=look.label + reach, **line)
+        plain.plot(rms, mean[drawn], label=textwrap.fill(look.label + reach, 44), **line)
         low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
         plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
         ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], **line)

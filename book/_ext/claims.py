@@ -23,6 +23,7 @@ HOLDS, REMARK, FAILS, UNTESTED = "holds", "holds with a remark", "does not hold"
 # The signs differ in shape, for readers who do not see the colours.
 SIGNS = {HOLDS: "✔", REMARK: "◐", FAILS: "✘", UNTESTED: "○"}
 STUDIES = Path(__file__).parents[2] / "notebooks" / "studies"
+PARTS = {"sensor": range(1, 7), "range": range(7, 14), "choices": range(14, 18), "bench": range(18, 22)}
 ROUNDING = 1e-12  # the notebooks give no smaller errors
 
 
@@ -139,10 +140,11 @@ def count(judged: dict[int, Finding]) -> str:
     return f"The {len(judged)} claims of the paper: {listed}."
 
 
-def table(judged: dict[int, Finding]) -> str:
-    """Return the table of all claims as MyST text."""
+def table(judged: dict[int, Finding], numbers: range) -> str:
+    """Return the table of some claims as MyST text."""
     header = ["claim", "the paper says", "measured here"]
-    rows = [header, ["---"] * len(header), *(_row(claim, judged[claim.number]) for claim in CLAIMS)]
+    claims = (claim for claim in CLAIMS if claim.number in numbers)
+    rows = [header, ["---"] * len(header), *(_row(claim, judged[claim.number]) for claim in claims)]
     lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
     return "\n".join([":::{table}", ":class: claims", "", *lines, ":::"])
 
@@ -152,7 +154,8 @@ def _row(claim: Claim, finding: Finding) -> list[str]:
     if page := SECTIONS.get(claim.section):
         section = f"[{section}]({page})"
     measured = [f"{sentence(finding.measured)}."] if finding.measured else []
-    measured += [finding.remark] if finding.remark else []
+    sign = "" if finding.verdict == HOLDS else f"{SIGNS[finding.verdict]} "  # of what limits the claim
+    measured += [f"{sign}{finding.remark}"] if finding.remark else []
     if claim.notebook:
         address = claim.source.replace(claim.notebook, f"../notebooks/{claim.notebook}.ipynb")
         measured.append(f"*[{_title(claim.notebook)}]({address}), [code](#code-{claim.number})*")
@@ -235,9 +238,10 @@ def _marked(verdict: str, address: str = "") -> str:
 
 
 def add_substitutions(app: Sphinx, config: Config) -> None:
-    """Define ``{{ claims_table }}`` and others from the notebooks that the book shows."""
+    """Define the tables of the claims, their number and rules, from the notebooks that the book shows."""
     judged = findings(Path(app.srcdir, config.executed_notebooks))
-    added = {"claims_table": table(judged), "claims_count": count(judged), "claims_rules": rules()}
+    added = {f"claims_{name}": table(judged, numbers) for name, numbers in PARTS.items()}
+    added |= {"claims_count": count(judged), "claims_rules": rules()}
     config.myst_substitutions = config.myst_substitutions | added
 
 

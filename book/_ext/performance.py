@@ -86,7 +86,6 @@ def tables(speed: dict[str, Any]) -> dict[str, str]:
         "telemetry": telemetry(speed["telemetry"]),
         "latency": latency(speed["latency"]),
         "late": late(speed["latency"]),
-        "loop": loop(speed),
     }
 
 
@@ -139,20 +138,6 @@ def late(rows: list[dict[str, Any]]) -> str:
         if row["frozen"]
     )
     return f"The median is {found}. A result is late if it takes more than 1.3 times the median."
-
-
-def loop(speed: dict[str, Any]) -> str:
-    """Return sentences on the time of the iteration and of the linear method."""
-    times = {
-        row["n_pixels"]: 1e6 * row["time"]
-        for row in speed["real time"]
-        if (row["dtype"], row["accelerate"], row["n_iterations"]) == ("float32", True, 3)
-    }
-    return (
-        f"The three iterations alone take about {times[40]:.0f} μs at 40 pixels and {times[100]:.0f} μs at 100 "
-        f"pixels. `zwfs.Linear` on one image takes {1e6 * speed['others']['Linear']:.0f} μs at 100 pixels, with "
-        "200 modes, in double precision and with the residual."
-    )
 
 
 def telemetry(measured: dict[str, Any]) -> str:

@@ -54,6 +54,7 @@ ALIKE = 1.05
 """Ratio of errors up to which the simpler one of two methods is named."""
 
 _GRAY = "#666666"
+_WHITE = {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0.1"}  # behind a label
 _BOX = 3.0  # D; the screens repeat after this length
 
 
@@ -408,7 +409,7 @@ def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
             if closed[0] < n_loops:
                 count = "\N{EN DASH}".join(map(str, dict.fromkeys((closed[0], closed[-1]))))
                 point = one.start, place(typical(one.settled[name]) for name in drawn)
-                axes.annotate(f"{count} of {n_loops} close", point, side, ha="right", **text)
+                axes.annotate(f"{count} of {n_loops} close", point, side, ha="right", bbox=_WHITE, **text)
     pairs = [[typical(one.settled[name]) for name in TWO_IMAGES if name in one.settled] for one in some]
     if all(max(errors) <= ALIKE * min(errors) for errors in pairs):
         where: dict[str, Any] = {"transform": axes.transAxes, "ha": "right", "va": "bottom"}
@@ -447,28 +448,30 @@ def tuned_screens(trials: Sequence[TunedLoops]) -> dict[str, NDArray]:
 
 
 def best_table(rows: Sequence[BestMethods]) -> Table:
-    """Return the best method for each input and star, and its residual and gain with two images and with one."""
+    """Return the best method with two images and with one for each input and star, its residual and its gain."""
     header = (
         "start; photons per point and image",
-        "best method",
-        "residual (rad rms): two images, one",
-        "ratio",
+        "two images (residual, rad rms)",
+        "one image",
+        "ratio of the residuals",
         "loops that close: two images, one",
         "gain: two images, one",
     )
     cells = []
     for row in rows:
-        loops, best = row.loops, method_name(row.best) if row.best else "one or two images"
-        if not row.best and loops.closed(row.two) > loops.closed(row.one):
-            best = "two images close more loops; the residuals do not decide"
+        loops = row.loops
+        found = [f"{_short(name)} {two_digits(typical(loops.settled[name]))}" for name in (row.two, row.one)]
         closed = f"{loops.closed(row.two)} and {loops.closed(row.one)} of {loops.settled[row.one].size}"
         span = f"{row.low:.2f} to {row.high:.2f}" if row.high < np.inf else "one loop"
-        ratio = f"{row.ratio:.2f} ({span})"
         gains = f"{loops.gains[row.two]:g}, {loops.gains[row.one]:g}"
-        residuals = ", ".join(two_digits(typical(loops.settled[name])) for name in (row.two, row.one))
         light = f"{loops.photons:g} photon{'s' * (loops.photons != 1)}"
-        cells.append([f"{loops.start:g} rad rms; {light}", best, residuals, ratio, closed, gains])
+        cells.append([f"{loops.start:g} rad rms; {light}", *found, f"{row.ratio:.2f} ({span})", closed, gains])
     return Table(header, cells)
+
+
+def _short(method: str) -> str:
+    """Name of a method without the number of its images."""
+    return method_name(method).partition(",")[0]
 
 
 def numbers(

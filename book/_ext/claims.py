@@ -169,20 +169,13 @@ def rules() -> str:
     for notebook in dict.fromkeys(claim.notebook for claim in CLAIMS if claim.notebook):
         text += f"::::{{dropdown}} Rules and numbers: {_title(notebook)}\n:class-container: d-print-none\n\n"
         code = f"../notebooks/studies/{notebook}.py"
-        shown: set[str] = set()
         for claim in CLAIMS:
             if claim.notebook == notebook:
                 ends = {"start-at": f"- number: {claim.number}", "end-before": f"- number: {claim.number + 1}"}
                 text += f"(rule-{claim.number})=\n**Claim {claim.number}.** {claim.rule}\n\n"
                 text += _include("_ext/claims.yml", language="yaml", **ends)
-                if claim.code not in shown:
-                    alike = [one for one in CLAIMS if (one.notebook, one.code) == (notebook, claim.code)]
-                    text += "".join(f"(code-{one.number})=\n" for one in alike)
-                    numbers = ", ".join(str(one.number) for one in alike)
-                    where = f"`notebooks/studies/{notebook}.py`"
-                    text += f"**Code that computes** (claim {numbers}), {where}:\n\n"
-                    text += _include(code, pyobject=claim.code)
-                    shown.add(claim.code)
+                text += f"(code-{claim.number})=\n**Code that computes its numbers**, "
+                text += f"`notebooks/studies/{notebook}.py`:\n\n" + _include(code, pyobject=claim.code)
                 text += "**Its numbers**, the marked lines:\n\n"
                 text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))
                 if claim.timed:
@@ -211,7 +204,8 @@ def marked_lines(claim: Claim, code: str) -> dict[str, str]:
     lines = code.splitlines()
     used = set(re.findall(r"\w+", " ".join(re.sub(r'^ *\S*":', "", lines[number - 1]) for number in found)))
     for one in (one for one in function.body if found and isinstance(one, ast.Assign)):
-        targets = {name.id for target in one.targets for name in ast.walk(target) if isinstance(name, ast.Name)}
+        named = (name for target in one.targets for name in ast.walk(target) if isinstance(name, ast.Name))
+        targets = {name.id for name in named if isinstance(name.ctx, ast.Store)}
         if targets & (used - {"mean", "rms"}):
             found |= set(range(one.lineno, (one.end_lineno or one.lineno) + 1))
     if not found:

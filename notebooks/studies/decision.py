@@ -273,13 +273,14 @@ class Cell:
 
     @property
     def text(self) -> str:
-        """Cell of the table."""
+        """Error, by how much it is smaller, and the method."""
         if self.images is None:
-            alike = f"{self.one}, one or two images" if self.one == self.two else self._unlike
-            return f"{alike}: {two_digits(self.error)}{self._closed}"
-        factor = max(self.ratio, 1 / self.ratio)
+            both = f"{self.one}, or two images, {self.two}"
+            alike = f"{self.one}, one or two images" if self.one == self.two else f"one image, {both}"
+            return f"{two_digits(self.error)}: {alike}"
         count, method = ("one image", self.one) if self.images == 1 else ("two images", self.two)
-        return f"{count}, {method}: {two_digits(self.error)}{self._closed or f', {factor:.2g} times smaller'}"
+        smaller = f"{max(self.ratio, 1 / self.ratio):.2g} times smaller"
+        return f"{two_digits(self.error)} ({smaller}): {count}, {method}"
 
     @property
     def sides(self) -> dict[str, str]:
@@ -294,22 +295,6 @@ class Cell:
             for count, error, method, n in both
         }
 
-    @property
-    def _unlike(self) -> str:
-        return f"one image, {self.one}, or two images, {self.two}"
-
-    @property
-    def _closed(self) -> str:
-        """How many loops close, the winner first."""
-        if self.closed is None:
-            return ""
-        one, two = self.closed
-        if one == two == self.n_loops:
-            return f"; all {self.n_loops} loops close"
-        first, other, count = (one, two, "two images") if self.images == 1 else (two, one, "one image")
-        wins = f"all {self.n_loops}" if first == self.n_loops else f"{first} of {self.n_loops}"
-        return f"; {wins} loops close; with {count} {'only ' * (other < first)}{other} of {self.n_loops}"
-
 
 @dataclass(frozen=True)
 class Calibrated:
@@ -320,7 +305,7 @@ class Calibrated:
     @property
     def text(self) -> str:
         """Cell of the table."""
-        return f"two images, fitted model: {two_digits(self.error)} (one image not studied)"
+        return f"{two_digits(self.error)}: two images, fitted model"
 
 
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
@@ -384,23 +369,26 @@ def loop_rows(found: Iterable[BestMethods]) -> list[Row]:
     """Rows of closed loops."""
     rows = []
     for index, one in enumerate(found):
-        cells = {"perfect": loop_cell(one), "calibrated": None, "design": None}
+        cells = {"perfect": loop_cell(one)}
         start, photons = f"closed loop from {one.loops.start:g} rad rms", f"{one.loops.photons:g}"
         rows.append(Row(f"closed_{index + 1}", start, photons, cells, Link("closed loop", "closed_loop.ipynb")))
     return rows
 
 
 def decision_table(rows: Iterable[Row]) -> Table:
-    """Best method of each situation."""
+    """Best method of each situation without a loop."""
     header = ["situation", "photons per point and image", *COLUMNS.values(), "explained in"]
-    cells = [[_cell_text(row.cells[name]) for name in COLUMNS] for row in rows]
+    cells = [["not studied" if one is None else one.text for one in map(row.cells.get, COLUMNS)] for row in rows]
     return Table(
         header, [[row.start, row.photons, *some, row.chapter] for row, some in zip(rows, cells, strict=True)]
     )
 
 
-def _cell_text(cell: Cell | Calibrated | None) -> str:
-    return "not studied" if cell is None else cell.text
+def loop_table(rows: Iterable[Row]) -> Table:
+    """Residual of the best method with two images and with one, for each loop."""
+    header = ["situation", "photons per point, image and step", "two images", "one image"]
+    sides = [(row, cell.sides) for row in rows for cell in row.cells.values() if isinstance(cell, Cell)]
+    return Table(header, [[row.start, row.photons, both["two"], both["one"]] for row, both in sides])
 
 
 def _likelihood_ratios(errors: Sequence[Mapping[str, NDArray]]) -> list[float]:
@@ -417,7 +405,7 @@ def numbers(
     """Situations and results of the perfect model in words, errors of a calibrated bench, and extremes."""
     found: dict[str, float | str] = {}
     for row in rows:
-        perfect, fitted = row.cells["perfect"], row.cells["calibrated"]
+        perfect, fitted = row.cells["perfect"], row.cells.get("calibrated")
         found |= {f"{row.key}_start": row.start, f"{row.key}_photons": row.photons}
         if isinstance(perfect, Cell):
             found |= {f"{row.key}_{count}": text for count, text in perfect.sides.items()}

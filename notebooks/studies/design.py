@@ -226,7 +226,7 @@ def _shifts(design: Design) -> str:
 
 
 def designs_table(listed: Sequence[Design], costs: Mapping[str, NDArray]) -> Table:
-    """Photon costs of designs, and their share of what the first one needs. Costs above 100 have no number."""
+    """Photon costs of designs. Costs above 100 have no number."""
     return Table(
         ["design", "d (λ/D)", "shifts", *(name.removesuffix(" wavefront") for name in costs)],
         [
@@ -234,10 +234,7 @@ def designs_table(listed: Sequence[Design], costs: Mapping[str, NDArray]) -> Tab
                 design.name,
                 f"{design.diameter:.3g}",
                 _shifts(design),
-                *(
-                    f"{cost[index]:.2f} ({cost[index] / cost[0]:.0%})" if cost[index] <= 100 else "over 100"
-                    for cost in costs.values()
-                ),
+                *(f"{cost[index]:.2f}" if cost[index] <= 100 else "over 100" for cost in costs.values()),
             ]
             for index, design in enumerate(listed)
         ],

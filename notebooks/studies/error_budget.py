@@ -104,7 +104,7 @@ def effect_columns(budget: Curves) -> dict[str, NDArray | list[str]]:
 def effect_table(budget: Curves) -> Table:
     """Offset, gains and errors with each error of the bench alone."""
     rows = [
-        [_words(error), f"{offset:.1g}" if (offset := curves.mean(NAME)[0]) > 1e-6 else "0", *_cells(curves)]
+        [_words(error), f"{offset:.2g}" if (offset := curves.mean(NAME)[0]) > 1e-6 else "0", *_cells(curves)]
         for error, curves in budget.items()
     ]
     return Table(["error switched on", "offset (rad rms)", *_header(budget)], rows)
@@ -136,4 +136,4 @@ def numbers(budget: Curves, swept: Mapping[float, BenchCurves]) -> dict[str, flo
     found: dict[str, Any] = {}
     for case in ("leakage", "focus_difference", "static", "all"):
         found |= {f"offset_{case}": offsets[case], f"gain_{case}": gains[case]}
-    return rounded(found | {"gain_leakage_10": swept[0.1].gain(NAME)[0] if 0.1 in swept else np.nan})
+    return rounded(found | {"gain_leakage_10": swept[0.1].gain(NAME)[1] if 0.1 in swept else np.nan})

@@ -345,7 +345,13 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
     end = min(1.4 * claimed, curve.diameters[-1])
     start = min(0.64 * claimed, end / 2)
     log.text(
-        end, limit / 1.3, f"{percent(threshold)} of the input ", color="#555555", fontsize=9, ha="right", va="top"
+        end,
+        1.2 * limit,
+        f"{percent(threshold)} of the input ",
+        color="#555555",
+        fontsize=9,
+        ha="right",
+        va="bottom",
     )
     plain.set_ylim(0, None)
     log.set(yscale="log", xlim=(start, end), ylim=(0.3 * floor, 60))  # room for the legend

@@ -74,19 +74,24 @@ def reach_table(curves: BenchCurves) -> Table:
     header = [
         "reconstructor",
         "error at a flat command (rad rms)",
-        "largest input with an error below 25 % (rad rms)",
+        "largest input with an error of at most 25 % (rad rms)",
         "gain at the smallest input",
     ]
     rows = [
         [
             LOOKS[name].name,
             f"{curves.mean(name)[0]:.2g}",
-            reach(curves, name) or "none",
+            _at_least(reach(curves, name), curves.rms.max()),
             float(curves.gain(name)[smallest]),
         ]
         for name in curves.residuals
     ]
     return Table(header, rows)
+
+
+def _at_least(reached: float, largest: float) -> str:
+    """Largest input that a method reaches, in words; the largest one that was tried is a bound."""
+    return f"{'≥ ' if reached == largest else ''}{reached:g}" if reached else "none"
 
 
 def numbers(curves: BenchCurves) -> dict[str, float | str]:

@@ -216,7 +216,8 @@ def _darkened(figure: Figure) -> Figure:
             kept.update(part for artist in marks for part in artist.findobj())
     drawn = set(figure.findobj()) - kept
     arrows = [text.arrow_patch for text in drawn if isinstance(text, Annotation) and text.arrow_patch]
-    for artist in drawn.union(arrows):
+    boxes = [text.get_bbox_patch() for text in drawn if isinstance(text, Text) and text.get_bbox_patch()]
+    for artist in drawn.union(arrows, boxes):
         if getattr(artist, "get_array", lambda: None)() is None:  # else its colours come from a map
             parts = [part for part in _PARTS if hasattr(artist, f"get_{part}") and hasattr(artist, f"set_{part}")]
             colors = {part: getattr(artist, f"get_{part}")() for part in parts}  # all, as one may follow another

@@ -25,7 +25,9 @@ from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
-_EXPONENTS = (2.0, 3.0, 4.0, 5.0)  # of the spectrum of a phase; held-out pixels choose
+# Exponents of the spectrum of a phase, of which held-out pixels choose. The smooth ones come first: from a rough
+# phase, a smooth one is not found in a few steps.
+_EXPONENTS = 5.0, 4.0, 3.0, 2.0
 _HELD_OUT = 0.1  # of the pixels
 _TIE = 0.03  # of priors that predict held-out pixels as well as this, the smoothest is taken
 _ALLOWED = 0.05  # error of the model in the first stage, over the light of a full pixel
@@ -141,14 +143,14 @@ class FittedSensor:
         means = self._minimum(counts, soft, 3.0, self._start(counts), 5, 20).point.phase_means
         tried: list[tuple[float, float, NDArray]] = []
         for exponent in _EXPONENTS:
-            seen = self._minimum(counts, weights * ~held, exponent, means, 2, 20).point
+            seen = self._minimum(counts, weights * ~held, exponent, means, 3, 30).point
             means = seen.phase_means
             score = float(np.mean(((np.array(seen.model.images) - counts) * weights)[lit] ** 2))
             tried.append((score, exponent, means))
             if score > 1.1 * min(one[0] for one in tried):
                 break
         least = min(one[0] for one in tried)
-        _, exponent, means = [one for one in tried if one[0] <= (1 + _TIE) * least][-1]
+        _, exponent, means = next(one for one in tried if one[0] <= (1 + _TIE) * least)
         end = self._minimum(counts, weights, exponent, means, self.n_steps, 30)
         misfit, phase = float(np.mean(end.point.misfit)), end.point.phase_means[PAD:-PAD, PAD:-PAD]
         return FittedPhase(phase, misfit, misfit < EXPLAINED, end.converged, exponent, end.point)

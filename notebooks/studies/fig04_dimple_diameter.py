@@ -344,15 +344,7 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
     log.axhline(limit, color="#555555", lw=1)
     end = min(1.4 * claimed, curve.diameters[-1])
     start = min(0.64 * claimed, end / 2)
-    log.text(
-        end,
-        1.2 * limit,
-        f"{percent(threshold)} of the input ",
-        color="#555555",
-        fontsize=9,
-        ha="right",
-        va="bottom",
-    )
+    log.text(end, 1.2 * limit, f"{percent(threshold)} ", color="#555555", fontsize=9, ha="right", va="bottom")
     plain.set_ylim(0, None)
     log.set(yscale="log", xlim=(start, end), ylim=(0.3 * floor, 60))  # room for the legend
     log.legend(loc="upper left", fontsize=9, handlelength=1.6)

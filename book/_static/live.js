@@ -136,7 +136,7 @@
       const error = one?.errors.at(-1);
       const good = one && succeeds(error, set.rms);
       const verdict = find(`verdict-${place}`);
-      verdict.textContent = one ? `${good ? "✓" : "✗"} error ${draw.error(error)} rad` : "no solution";
+      verdict.textContent = one ? `${good ? "✓" : "✗"} ${draw.error(error)} rad` : "no solution";
       verdict.className = `live-verdict ${good ? "live-good" : "live-bad"}`;
       find(`name-${place}`).textContent = name;
       find(`error-name-${place}`).textContent = name;

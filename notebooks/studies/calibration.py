@@ -258,7 +258,7 @@ def draw_calibration_errors(errors: Errors) -> Figure:
     plain, found, stated = (errors.column(name) for name in ("plain", "calibrated", "sigma"))
     axes.plot(errors.rms, plain, **LOOKS["PhaseShifted"].style, label="values of the design")
     axes.plot(errors.rms, found, "*-", color="#333333", ms=9, label="calibrated")
-    axes.plot(errors.rms, stated, "o", color="#777777", mfc="none", ms=8, label="stated error, calibrated")
+    axes.plot(errors.rms, stated, "o", color="#777777", mfc="none", ms=8, label="error bar, calibrated")
     axes.set(xlabel="input (rad rms)", ylabel="error (rad rms)", yscale="log", xlim=(0, None))
     axes.yaxis.set(major_formatter="{x:g}", minor_locator=LogLocator(subs=(2, 4, 6)), minor_formatter="{x:g}")
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)

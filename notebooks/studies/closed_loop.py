@@ -409,7 +409,7 @@ def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
             if closed[0] < n_loops:
                 count = "\N{EN DASH}".join(map(str, dict.fromkeys((closed[0], closed[-1]))))
                 point = one.start, place(typical(one.settled[name]) for name in drawn)
-                axes.annotate(f"{count} of {n_loops} close", point, side, ha="right", bbox=_WHITE, **text)
+                axes.annotate(f"{count} of {n_loops}", point, side, ha="right", bbox=_WHITE, **text)
     pairs = [[typical(one.settled[name]) for name in TWO_IMAGES if name in one.settled] for one in some]
     if all(max(errors) <= ALIKE * min(errors) for errors in pairs):
         where: dict[str, Any] = {"transform": axes.transAxes, "ha": "right", "va": "bottom"}
@@ -487,8 +487,8 @@ def numbers(
     excess = max(one["LinearTwo"] / min(one.values()) for one in residual) - 1
     equal = max((start for start in starts if start < min(unequal, default=np.inf)), default=np.nan)
     two_from = min((start for start in starts if start > max(others, default=0)), default=np.nan)
-    between = [row for row in rows if equal < row.loops.start < two_from]
-    diverged = [row.loops.settled[row.one].size - row.loops.closed(row.one) for row in between]
+    first = [row.loops for row in rows if row.loops.start == two_from]
+    lost_loops = [one.settled[name].size - one.closed(name) for one in first for name in ONE_IMAGE]
     return rounded(
         dict(settings)
         | {f"closed_{key}": np.count_nonzero(one) for key, one in closed.items()}
@@ -500,9 +500,8 @@ def numbers(
             "reversed_lost": found.reversed[lost, 0].mean() if lost.any() else np.nan,
             "equal_to": equal,
             "two_from": two_from,
-            "between": min((row.loops.start for row in between), default=np.nan),
-            "diverged_least": min(diverged, default=np.nan),
-            "diverged_most": max(diverged, default=np.nan),
+            "lost_least": min(lost_loops, default=np.nan),
+            "lost_most": max(lost_loops, default=np.nan),
             "linear_two_excess": np.ceil(100 * excess) / 100,  # an upper limit, in whole percents
             "iteration_excess": max(one["PhaseShifted"] / one["LinearTwo"] for one in residual) - 1,
         }

@@ -276,7 +276,7 @@ def draw_saxton_widths(
             if kind == "zero":
                 place: dict[str, Any] = {"xytext": (-7, 0), "textcoords": "offset points", "va": "center"}
                 text = f"{method.sensor.extent:g} D"
-                axes.annotate(text, (curves.rms[0], ratio[0]), color=color, fontsize=9, ha="right", **place)
+                axes.annotate(text, (curves.rms[0], ratio[0]), color="#333333", fontsize=9, ha="right", **place)
         axes.plot(curves.rms, curves.mean("Linear") / curves.rms, label="linear", **LOOKS["Linear"].style)
         axes.axhline(threshold, color="#555555", lw=1)
         axes.set(xlabel="input phase (rad rms)", xlim=(0, None))

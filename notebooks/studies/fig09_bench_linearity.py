@@ -101,7 +101,7 @@ def numbers(curves: BenchCurves) -> dict[str, float | str]:
     alike = mean["arcsine"][large] / mean["linear"][large]
     bright, worse = curves.rms > 0, curves.rms[mean["saxton"] > mean["linear"]].max(initial=0.0)
     inputs, linear = curves.rms[bright], mean["linear"][bright]
-    at_01 = next(iter(mean["shifted"][curves.rms == 0.1]), np.nan)
+    at_01, linear_at_01 = (next(iter(mean[one][curves.rms == 0.1]), np.nan) for one in ("shifted", "linear"))
     texts = {
         "linear_reach": reach_text(
             inputs, linear, 0.25 * inputs, Limit(reach(curves, "Linear")), "25 % of the input"
@@ -122,5 +122,6 @@ def numbers(curves: BenchCurves) -> dict[str, float | str]:
             "shifted_worst": mean["shifted"].max(),
             "largest_input": curves.rms.max(),
             "shifted_share_at_01": at_01 / 0.1,
+            "linear_at_01": linear_at_01,
         }
     )

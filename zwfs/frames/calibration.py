@@ -79,7 +79,7 @@ class Calibration(Immutable):
     saturation : float, counts
         Pixels that reach it are saturated, the dark included.
     blur : float, pixels rms
-        That is undone as far as noise allows.
+        Of the camera's images, which the calibration deconvolves as far as the noise allows.
     n_averaged : int
         Exposures that were averaged for each state.
     commanded : bool

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from zwfs import _check
-from zwfs.frames._camera.light import Light
+from zwfs.frames._camera.light import Light, narrow_gaps
 from zwfs.frames._camera.model import ARM, Camera, Exposure, names_of
 from zwfs.frames._camera.prior import MapPrior
 from zwfs.frames._camera.recording import PAD, Recording, centred
@@ -41,6 +41,7 @@ EXPLAINED = 1.2
 """Mean square of the residuals over the noise up to which a model explains the frames."""
 _FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
 _PHASE_PRIOR = MapPrior(0.5, 3.0)
+_FARTHER = 1.35  # times as far as an edge, a gap of a quarter of a pixel scatters light on average
 _PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the physics
 _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
 
@@ -345,8 +346,20 @@ def _squares(data: Recording, point: Point) -> list[NDArray[np.float64]]:
     return [(weight * (image - counts)) ** 2 for weight, image, counts in triples]
 
 
+def _changes(data: Recording, point: Point) -> list[list[NDArray[np.float64]]]:
+    """Changes of the images over their noise with what the model cannot know.
+
+    First, twice the resolution and sharp edges of the pupil. Second, light that narrow gaps scatter farther than
+    edges do.
+    """
+    weights, model = point.problem.weights, point.model
+    gaps = np.kron(narrow_gaps(np.maximum(point.light_means, 0)), np.ones((point.problem.camera.f,) * 2)) > 0
+    others = _finer(data, point), model.scattered(gaps, _FARTHER)
+    return [[w * (a - b) for w, a, b in zip(weights, one, model.images, strict=True)] for one in others]
+
+
 def _finer(data: Recording, point: Point) -> list[NDArray[np.float64]]:
-    """Change of the images over their noise with twice the resolution and sharp edges of the pupil."""
+    """Images with twice the resolution and sharp edges of the pupil."""
     of, f = point.problem, 2 * point.problem.camera.f
     camera = of.camera
     finer = Camera(
@@ -354,8 +367,7 @@ def _finer(data: Recording, point: Point) -> list[NDArray[np.float64]]:
     )
     light = Light.sharp(np.maximum(point.light_means, 0), f)
     phase = PhaseMap(camera.n, f, _PHASE_PRIOR, data.n_pixels).fine(of.split(point.x)[0][0])
-    images = finer.at(light.maps(light.start, phase), point.values).images
-    return [w * (a - b) for w, a, b in zip(of.weights, images, point.model.images, strict=True)]
+    return finer.at(light.maps(light.start, phase), point.values).images
 
 
 def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:
@@ -364,7 +376,7 @@ def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:
     pairs = zip(_squares(data, point), data.good, strict=True)
     misfit = np.array([one.sum() / max(1, np.count_nonzero(good)) for one, good in pairs])
     scale = max(1.0, float(np.mean(misfit)))
-    spread = equations.covariance(point, _finer(data, point), scale)
+    spread = equations.covariance(point, _changes(data, point), scale)
     values = point.x[point.problem.n_white :]
     sigma = np.sqrt(np.diagonal(spread)).tolist()
     estimates = tuple(

@@ -35,9 +35,7 @@ class Light:
     @classmethod
     def of(cls, start: NDArray, pixels: NDArray, oversampling: int) -> Light:
         """Divide a fine map of light; `pixels` is the light of each pixel, 1 on average where it is lit."""
-        typical = ndimage.percentile_filter(pixels, 60, 5)
-        whole = (pixels > 0.9 * typical) & (typical > 0.5)
-        full = ndimage.binary_erosion(whole)
+        full = ndimage.binary_erosion(_fully_lit(pixels))
         weight = ndimage.gaussian_filter(full.astype(float), 1.5)
         near = np.where(
             weight > 1e-3, ndimage.gaussian_filter(pixels * full, 1.5) / np.maximum(weight, 1e-12), np.nan
@@ -72,7 +70,7 @@ class Light:
     def maps(self, light: NDArray, phase: NDArray) -> Maps:
         """Maps of the model."""
         mean = np.where(self.full, self._root(light), light / self.amplitude)
-        return Maps(mean, np.where(self.full, 0, light - mean**2), phase)
+        return Maps(mean, np.where(self.full, 0, light - mean**2), phase, self.support & ~self.full)
 
     def slopes(self, light: NDArray) -> tuple[NDArray, NDArray]:
         """Derivatives of mean field and rest by the change of the light."""
@@ -90,6 +88,17 @@ class Light:
         """Square root of the light, and its tangent where a fully lit point would be much too dark."""
         least = np.maximum(light, self._least)
         return np.sqrt(least) + (light - least) / (2 * np.sqrt(least))
+
+
+def narrow_gaps(pixels: NDArray) -> NDArray[np.bool_]:
+    """Pixels that are lit in part between pixels that are fully lit."""
+    whole = _fully_lit(pixels)
+    return np.asarray(ndimage.binary_closing(np.pad(whole, 1), np.ones((3, 3)))[1:-1, 1:-1] & ~whole)
+
+
+def _fully_lit(pixels: NDArray) -> NDArray[np.bool_]:
+    typical = ndimage.percentile_filter(pixels, 60, 5)
+    return np.asarray((pixels > 0.9 * typical) & (typical > 0.5))
 
 
 def _blocks(fine: NDArray, f: int) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, sparse, special
+from scipy import fft, ndimage, sparse, special
 from scipy.interpolate import BSpline
 
 from zwfs._lowrank import _axis_functions, _quadrature, _rim, _spectra
@@ -47,11 +47,15 @@ class Exposure(NamedTuple):
 
 
 class Maps(NamedTuple):
-    """Mean field and light that does not interfere, and the phase, on the fine grid of the pupil."""
+    """Mean field and light that does not interfere, and the phase, on the fine grid of the pupil.
+
+    The points in `cells` may be lit in part: their light is the mean over their cell.
+    """
 
     mean: NDArray[np.float64]
     rest: NDArray[np.float64]
     phase: NDArray[np.float64]
+    cells: NDArray[np.bool_] | bool = True
 
 
 def names_of(n_arms: int) -> list[str]:
@@ -325,6 +329,9 @@ class Linearised:
         self._splines = [_Spline(camera, [arm[name] for name in _PLACE]) for arm in self.arms]
         masked = {one.arm for one in camera.exposures if one.mask is not None}
         self._cores = {arm: camera.cores(self.masks["diameter"], self.arms[arm]["focus"]) for arm in masked}
+        cells = np.zeros((camera.size,) * 2, bool)
+        cells[camera.window] = maps.cells
+        self._smooth = ~ndimage.binary_dilation(cells) / 24
         self._wave = np.exp(1j * maps.phase)
         self._states = [self._source(maps.mean * self._wave * turn) for turn in camera.turns]
         self._parts = [self._part(one) for one in camera.exposures]
@@ -332,6 +339,14 @@ class Linearised:
             self.arms[one.arm]["flux"] * part.seen + self.arms[one.arm]["background"]
             for one, part in zip(camera.exposures, self._parts, strict=True)
         ]
+
+    def scattered(self, where: NDArray[np.bool_], farther: float) -> list[NDArray[np.float64]]:
+        """Images if the light that the grid does not resolve at some points moves farther by a factor."""
+        light, images = self._spectrum_of(np.where(where, self.maps.rest, 0)), []
+        for one, image in zip(self.camera.exposures, self.images, strict=True):
+            spread, _ = self.camera.spread_at(farther * self.arms[one.arm]["focus"])
+            images.append(image + self._on_camera(one, (spread - self._spread[one.arm][0]) * light))
+        return images
 
     def _source(self, field: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Field on the whole grid, its spectrum, and its coefficients for the light of the dimple."""
@@ -355,7 +370,7 @@ class Linearised:
             ahead = field + first * light
             across = np.conj(first) * field + second * light
             intensity = (field.conj() * ahead + light.conj() * across).real
-        spectrum = fft.rfft2(intensity) + self._spread[one.arm][0] * self._rest
+        spectrum = fft.rfft2(self._cells(intensity)) + self._spread[one.arm][0] * self._rest
         blurred = fft.irfft2(self._blur * spectrum, s=intensity.shape)
         return _Part(field, light, ahead, across, spectrum, blurred, self._splines[one.arm](blurred))
 
@@ -364,6 +379,14 @@ class Linearised:
         whole = np.zeros((self.camera.size,) * 2)
         whole[self.camera.window] = light
         return fft.rfft2(whole)
+
+    def _cells(self, intensity: NDArray) -> NDArray[np.float64]:
+        """Means over the cells of the points.
+
+        A point that may be lit in part stands for its cell. At others the intensity is the value in the middle,
+        and the mean over the cell is larger by 1/24 of the second differences.
+        """
+        return intensity + self._smooth * _differences(intensity)
 
     def _on_camera(self, one: Exposure, spectrum: NDArray) -> NDArray[np.float64]:
         """Change of an image with that of the spectrum of its intensity."""
@@ -381,7 +404,7 @@ class Linearised:
             if one.mask is not None:
                 light = camera.planes[1].expand(self._cores[one.arm][0] @ states[one.state][2])
                 intensity += _twice(part.across, light)
-            spectrum = fft.rfft2(intensity) + self._spread[one.arm][0] * unresolved
+            spectrum = fft.rfft2(self._cells(intensity)) + self._spread[one.arm][0] * unresolved
             changes.append(self._on_camera(one, spectrum))
         return changes
 
@@ -397,6 +420,7 @@ class Linearised:
             spectrum = self._blur * fft.rfft2(back)
             seen[one.arm] += spectrum
             gain = fft.irfft2(spectrum, s=back.shape)
+            gain += _differences(self._smooth * gain)
             transfer = self._transfer[one.arm]
             if transfer is None:
                 direct[one.state] += 2 * gain * part.ahead
@@ -434,18 +458,18 @@ class Linearised:
                 image = fft.irfft2(slope * part.spectrum, s=part.blurred.shape)
                 out.append(arm["flux"] * self._splines[one.arm](image))
             elif name == "focus":
-                spectrum = fft.rfft2(self._by_focus(one, part, source))
+                spectrum = fft.rfft2(self._cells(self._by_focus(one, part, source)))
                 out.append(self._on_camera(one, spectrum + self._spread[one.arm][1] * self._rest))
             elif one.mask is None:
                 out.append(zero)
             elif name == "diameter":
                 light = camera.planes[1].expand(self._cores[one.arm][-1] @ source[2])
-                out.append(self._on_camera(one, fft.rfft2(_twice(part.across, light))))
+                out.append(self._on_camera(one, fft.rfft2(self._cells(_twice(part.across, light)))))
             else:
                 first = self._coefficients.first_slope[one.mask, MASKS.index(name)]
                 second = self._coefficients.second_slope[one.mask, MASKS.index(name)]
                 change = 2 * (first * part.field.conj() * part.light).real + second * np.abs(part.light) ** 2
-                out.append(self._on_camera(one, fft.rfft2(change)))
+                out.append(self._on_camera(one, fft.rfft2(self._cells(change))))
         return np.reshape(out, (len(wanted), *camera.shape))
 
     def _by_focus(self, one: Exposure, part: _Part, source: tuple[NDArray, NDArray, NDArray]) -> NDArray:
@@ -457,6 +481,11 @@ class Linearised:
             light = camera.planes[1].expand(self._cores[one.arm][1] @ source[2])
             intensity += _twice(part.across, light)
         return intensity
+
+
+def _differences(image: NDArray) -> NDArray[np.float64]:
+    """Second differences along both axes, periodic."""
+    return sum((np.roll(image, step, axis) for step in (1, -1) for axis in (0, 1)), -4 * image)
 
 
 def _twice(one: NDArray, other: NDArray) -> NDArray[np.float64]:

@@ -504,23 +504,25 @@ class Eliminated:
         step[move] = -linalg.pinvh(self._matrix[np.ix_(move, move)], rtol=_ALIKE) @ slope[move]
         return np.concatenate([-self._x.T @ step, step / self._unit]), -float(slope @ step) / 2
 
-    def covariance(self, point: Point, change: Sequence[NDArray], scale: float) -> NDArray[np.float64]:
-        """Covariance of the numbers: of the noise, of what the model misses, and of a change of the images.
+    def covariance(self, point: Point, changes: Sequence[Sequence[NDArray]], scale: float) -> NDArray[np.float64]:
+        """Covariance of the numbers: of the noise, of what the model misses, and of changes of the images.
 
         That of the noise is S^-1 times `scale`. Where the model misses something, residuals are alike over some
         pixels, and the scores E^T r of square blocks scatter more than noise makes them:
         S^-1 (sum of their squares + X^T X + prior) S^-1 replaces what is smaller. A change d of the images, over
         their noise, moves the numbers by S^-1 E^T d. It is the largest change that is expected, so that a third of
-        its square is added: the variance of a uniform distribution. All arms have its mean over the arms.
+        its square is added: the variance of a uniform distribution. All arms, and both masks, have its mean.
         """
         inverse = linalg.pinvh(self._matrix, rtol=_ALIKE)
         sums = [[r * one for r, one in zip(point.residuals, each, strict=True)] for each in self._effects]
         scores = _block_sums(sums) / self._unit[:, None]
         seen = np.diagonal(inverse @ (scores @ scores.T + self._known) @ inverse) / np.diagonal(inverse)
         grow = np.sqrt(np.maximum(scale, seen)) / self._unit
-        moved = inverse @ (self._e @ np.concatenate([one.ravel() for one in change])) / self._unit
-        kinds = np.unique([one.name.split()[-1] for one in point.problem.free], return_inverse=True)[1]
-        alike = (np.bincount(kinds, moved**2 / 3) / np.bincount(kinds))[kinds]
+        flat = [np.concatenate([one.ravel() for one in change]) for change in changes]
+        moved = inverse @ (self._e @ np.transpose(flat)) / self._unit[:, None]
+        names = [one.name.split()[-1].replace("second", "first") for one in point.problem.free]
+        kinds = np.unique(names, return_inverse=True)[1]
+        alike = (np.bincount(kinds, np.sum(moved**2, axis=1) / 3) / np.bincount(kinds))[kinds]
         return inverse * np.outer(grow, grow) + np.diag(alike)
 
 

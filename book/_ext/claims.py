@@ -179,7 +179,8 @@ def rules() -> str:
                 text += "**Its numbers**, the marked lines:\n\n"
                 text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))
                 if claim.timed:
-                    text += "**Its times:**\n\n" + _include("../tests/benchmarks/speed.py", pyobject=claim.timed)
+                    text += "**Its times**, `tests/benchmarks/speed.py`:\n\n"
+                    text += _include("../tests/benchmarks/speed.py", pyobject=claim.timed)
         text += "**All numbers:**\n\n"
         text += _include(code, name=f"numbers-{notebook}", pyobject="numbers") + "::::\n\n"
     return text

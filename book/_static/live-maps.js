@@ -1,11 +1,12 @@
-// The pictures of the live page, all with fixed scales: phases, errors, images, the focal plane and the curves.
+// The pictures of the live page: phases, errors, images, the focal plane and the curves. The scales of phases and
+// errors are fixed, but for small inputs, which would be too faint.
 "use strict";
 
 (() => {
   const { size, places, inside, FOCAL, colors } = window.zwfsLive;
-  const PHASE = Math.PI; // radian, end of the scale of phases,
-  const ERROR = 1; // of that of errors,
-  const BRIGHT = 2.5; // and of that of images
+  const SMALL = 0.4; // radian rms: below it, the input sets the scales
+  const ENDS = { phase: Math.PI, error: 1 }; // radian, of the scales
+  const BRIGHT = 2.5; // of the scale of images
   const DECADES = 4; // of the focal plane
   const SMALLEST = 1e-6; // errors below it are rounding and differ from machine to machine
 
@@ -48,8 +49,26 @@
     context.putImageData(image, 0, 0);
   }
 
-  const phase = (name, map) => paint(name, map, "phase", (value) => (value / PHASE + 1) / 2);
-  const difference = (name, map) => paint(name, map, "phase", (value) => (value / ERROR + 1) / 2);
+  // The least of 1, 2 or 5 times a power of ten that is not below a number.
+  function round(number) {
+    const unit = 10 ** Math.floor(Math.log10(number));
+    return unit * [1, 2, 5, 10].find((step) => step * unit >= 0.999 * number);
+  }
+
+  function scale(rms) {
+    const small = rms > 0 && rms < SMALL;
+    ENDS.phase = small ? Math.min(Math.PI, round(5 * rms)) : Math.PI;
+    ENDS.error = small ? round(rms / 2) : 1;
+    for (const bar of document.querySelectorAll(".live-scale[data-end]")) {
+      const end = ENDS[bar.dataset.end];
+      const text = end === Math.PI ? "π" : String(Number(end.toPrecision(1)));
+      bar.firstElementChild.textContent = `−${text}`;
+      bar.lastElementChild.textContent = `+${text} rad`;
+    }
+  }
+
+  const phase = (name, map) => paint(name, map, "phase", (value) => (value / ENDS.phase + 1) / 2);
+  const difference = (name, map) => paint(name, map, "phase", (value) => (value / ENDS.error + 1) / 2);
   const image = (name, map) => paint(name, map, "intensity", (value) => value / BRIGHT, all);
 
   function focal(name, light, diameter) {
@@ -78,5 +97,5 @@
     }
   }
 
-  window.zwfsLive.draw = { SMALLEST, error, phase, difference, image, focal, curves, bars };
+  window.zwfsLive.draw = { SMALLEST, error, scale, phase, difference, image, focal, curves, bars };
 })();

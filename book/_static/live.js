@@ -126,6 +126,7 @@
   }
 
   function show(made, set) {
+    draw.scale(set.rms);
     draw.phase("phase", made.phase);
     draw.focal("focal", made.focal, set.diameter);
     draw.image("image-a", made.frames[0]);

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from studies.kit import sweeps
 from studies.kit.bench import poked_frames, poked_linear
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
-from studies.kit.tables import Link, Table
+from studies.kit.tables import Table
 from zwfs import Arcsine, Dimple, MaximumLikelihood, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
 from zwfs.bench import Bench, BenchModel, segment_pistons, segment_residual, segment_screens
 
@@ -45,8 +46,8 @@ LIMITS = parameter_limits(
 
 QUICK = {"n_pixels": 32, "n_screens": 2, "n_screens_perfect": 2, "n_screens_loop": 2, "n_screens_calibrated": 0}
 
-COLUMNS = {"perfect": "perfect model", "calibrated": "calibrated bench", "design": "only the design known"}
-"""What is known of the bench, and the headers of the table."""
+BENCHES = {"perfect": "perfect model", "real": "only the design known"}
+"""What is known of the bench, and its name in the table."""
 ONE_IMAGE = {"Linear": "linear", "Arcsine": "arcsine", "LikelihoodOne": "maximum likelihood on modes"}
 TWO_IMAGES = {
     "LinearTwo": "linear",
@@ -58,12 +59,6 @@ TWO_IMAGES = {
 """Methods, the simplest first, and their names in the table."""
 UNCORRECTED = "PhaseShifted with the offset of its flat"
 
-CHAPTERS = (
-    Link("from pokes to phases", "calibration.ipynb"),
-    Link("photon noise", "photon_noise.ipynb"),
-    Link("Figure 9", "fig09_bench_linearity.ipynb"),
-)
-"""Chapters that explain the rows without a loop."""
 _N_DARKS = 16  # averaged
 
 
@@ -74,6 +69,7 @@ WIND = {"speed": 2.5, "cutoff": 3.0, "exponent": -2.0}
 GAINS = 0.05, 0.1, 0.2, 0.4, 0.6, 0.8
 """Settings of the chapter on closed loops."""
 _N_MODES = 80  # of the mirror
+_COMPARED = "perfect_1", "perfect_2", "real_1", "real_2"  # rows of the first sentence of the page
 _DIAMETER = 8.0  # of the telescope that the wind speed in m/s belongs to, m
 
 
@@ -212,16 +208,19 @@ def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
     }
 
 
-def calibrated_errors(situations: Sequence[Situation], n_screens: int) -> list[float | None]:
-    """Errors of a calibrated bench that HCIPy simulates, rad rms over the pixels; None if nothing was recorded."""
+def calibrated_errors(situations: Sequence[Situation], n_screens: int) -> list[tuple[float, float] | None]:
+    """Errors of a bench that HCIPy simulates, with the fitted model and with the values of the design.
+
+    They are in rad rms over the pixels; None for a situation that was not recorded.
+    """
     taken = calibration.Recording.read()
     rows = [taken.unseen(*one)[:n_screens] for one in situations]
     if not any(rows):
         return [None] * len(rows)
     fit = calibration.calibrate(taken)
     found = iter(calibration.measure(taken, fit, [number for row in rows for number in row]))
-    errors = [np.array([next(found).calibrated for _ in row]) for row in rows]
-    return [typical(row) if row.size else None for row in errors]
+    errors = [np.array([(one.calibrated, one.plain) for one in islice(found, len(row))]) for row in rows]
+    return [(typical(row[:, 0]), typical(row[:, 1])) if row.size else None for row in errors]
 
 
 def closed_loops(situations: Sequence[Situation], n_screens: int, seed: int) -> list[BestMethods]:
@@ -267,22 +266,6 @@ class Cell:
         return 2 if self.high < 1 else 1 if self.low > 1 else None
 
     @property
-    def error(self) -> float:
-        """Error of the winner, or the smaller one of two that do not differ."""
-        return min(self.typical) if self.images is None else self.typical[self.images - 1]
-
-    @property
-    def text(self) -> str:
-        """Error, by how much it is smaller, and the method."""
-        if self.images is None:
-            both = f"{self.one}, or two images, {self.two}"
-            alike = f"{self.one}, one or two images" if self.one == self.two else f"one image, {both}"
-            return f"{two_digits(self.error)}: {alike}"
-        count, method = ("one image", self.one) if self.images == 1 else ("two images", self.two)
-        smaller = f"{max(self.ratio, 1 / self.ratio):.2g} times smaller"
-        return f"{two_digits(self.error)} ({smaller}): {count}, {method}"
-
-    @property
     def sides(self) -> dict[str, str]:
         """Error and method with two images and with one, or how few loops close."""
         closed = self.closed or (self.n_loops,) * 2
@@ -294,18 +277,6 @@ class Cell:
             else f"{n} of {self.n_loops} loops close"
             for count, error, method, n in both
         }
-
-
-@dataclass(frozen=True)
-class Calibrated:
-    """Error of two images on a calibrated bench, rad rms."""
-
-    error: float
-
-    @property
-    def text(self) -> str:
-        """Cell of the table."""
-        return f"{two_digits(self.error)}: two images, fitted model"
 
 
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
@@ -335,60 +306,63 @@ def _plain(method: str) -> str:
     return method_name(method).partition(",")[0]
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of the table; None marks a cell that was not studied."""
+class Row(NamedTuple):
+    """A row of a table."""
 
     key: str
+    bench: str
     start: str
     photons: str  # per point and image of two
-    cells: Mapping[str, Cell | Calibrated | None]
-    chapter: Link
+    cell: Cell
 
 
-def open_rows(
-    situations: Sequence[Situation],
-    errors: Mapping[str, Sequence[Mapping[str, NDArray]]],
-    calibrated: Sequence[float | None],
-) -> list[Row]:
-    """Rows without a loop."""
-    rows = []
-    for index, (rms, photons) in enumerate(situations):
-        known = calibrated[index]
-        cells = {
-            "perfect": open_cell(errors["perfect"][index]),
-            "calibrated": None if known is None else Calibrated(known),
-            "design": open_cell(errors["real"][index]),
-        }
-        start = f"open loop, {rms:g} rad rms"
-        rows.append(Row(f"open_{index + 1}", start, f"{photons:g}", cells, CHAPTERS[index]))
-    return rows
+def open_rows(situations: Sequence[Situation], errors: Mapping[str, Sequence[Mapping[str, NDArray]]]) -> list[Row]:
+    """Rows without a loop, for each bench."""
+    return [
+        Row(f"{bench}_{index}", BENCHES[bench], f"{rms:g} rad rms", f"{photons:g}", open_cell(some))
+        for bench, rows in errors.items()
+        for index, ((rms, photons), some) in enumerate(zip(situations, rows, strict=True), 1)
+    ]
 
 
 def loop_rows(found: Iterable[BestMethods]) -> list[Row]:
     """Rows of closed loops."""
-    rows = []
-    for index, one in enumerate(found):
-        cells = {"perfect": loop_cell(one)}
-        start, photons = f"closed loop from {one.loops.start:g} rad rms", f"{one.loops.photons:g}"
-        rows.append(Row(f"closed_{index + 1}", start, photons, cells, Link("closed loop", "closed_loop.ipynb")))
-    return rows
+    return [
+        Row(
+            f"closed_{index}",
+            BENCHES["perfect"],
+            f"{one.loops.start:g} rad rms",
+            f"{one.loops.photons:g}",
+            loop_cell(one),
+        )
+        for index, one in enumerate(found, 1)
+    ]
 
 
-def decision_table(rows: Iterable[Row]) -> Table:
-    """Best method of each situation without a loop."""
-    header = ["situation", "photons per point and image", *COLUMNS.values(), "explained in"]
-    cells = [["not studied" if one is None else one.text for one in map(row.cells.get, COLUMNS)] for row in rows]
-    return Table(
-        header, [[row.start, row.photons, *some, row.chapter] for row, some in zip(rows, cells, strict=True)]
-    )
+def open_table(rows: Iterable[Row]) -> Table:
+    """Error of the best method with two images and with one, for each bench and wavefront."""
+    return _table("photons per point and image", [(f"{row.bench}, {row.start}", row) for row in rows])
 
 
 def loop_table(rows: Iterable[Row]) -> Table:
     """Residual of the best method with two images and with one, for each loop."""
-    header = ["situation", "photons per point, image and step", "two images", "one image"]
-    sides = [(row, cell.sides) for row in rows for cell in row.cells.values() if isinstance(cell, Cell)]
-    return Table(header, [[row.start, row.photons, both["two"], both["one"]] for row, both in sides])
+    return _table("photons per point, image and step", [(f"start at {row.start}", row) for row in rows])
+
+
+def _table(photons: str, rows: Iterable[tuple[str, Row]]) -> Table:
+    sides = [(situation, row, row.cell.sides) for situation, row in rows]
+    return Table(
+        ["situation", photons, "two images", "one image"],
+        [[situation, row.photons, both["two"], both["one"]] for situation, row, both in sides],
+    )
+
+
+def calibrated_table(situations: Iterable[Situation], errors: Iterable[tuple[float, float] | None]) -> Table:
+    """Errors of two images with a fitted model, and with the values of the design."""
+    header = ["situation", "photons per point and image", "calibrated", "only the design known"]
+    both = [["not studied"] * 2 if pair is None else list(map(two_digits, pair)) for pair in errors]
+    starts = [[f"{rms:g} rad rms", f"{photons:g}"] for rms, photons in situations]
+    return Table(header, [start + pair for start, pair in zip(starts, both, strict=True)])
 
 
 def _likelihood_ratios(errors: Sequence[Mapping[str, NDArray]]) -> list[float]:
@@ -399,19 +373,19 @@ def _likelihood_ratios(errors: Sequence[Mapping[str, NDArray]]) -> list[float]:
 def numbers(
     rows: Sequence[Row],
     errors: Mapping[str, Sequence[Mapping[str, NDArray]]],
+    calibrated: Sequence[tuple[float, float] | None],
     loops: Sequence[BestMethods],
     no_noise: BestMethods,
 ) -> dict[str, float | str]:
-    """Situations and results of the perfect model in words, errors of a calibrated bench, and extremes."""
+    """Situations and results in words, errors of a calibrated bench, and extremes."""
     found: dict[str, float | str] = {}
     for row in rows:
-        perfect, fitted = row.cells["perfect"], row.cells.get("calibrated")
         found |= {f"{row.key}_start": row.start, f"{row.key}_photons": row.photons}
-        if isinstance(perfect, Cell):
-            found |= {f"{row.key}_{count}": text for count, text in perfect.sides.items()}
-        if fitted is not None:
-            found[f"{row.key}_calibrated"] = fitted.error
-    gains = [1 / cell.ratio for row in rows[:2] for cell in row.cells.values() if isinstance(cell, Cell)]
+        found |= {f"{row.key}_{count}": text for count, text in row.cell.sides.items()}
+    for index, pair in enumerate(calibrated, 1):
+        if pair is not None:
+            found |= {f"calibrated_{index}": pair[0], f"calibrated_gain_{index}": pair[1] / pair[0]}
+    gains = [1 / row.cell.ratio for row in rows if row.key in _COMPARED]
     small, faint = errors["real"][-1], loops[-1]
     settled = faint.loops.settled
     return rounded(

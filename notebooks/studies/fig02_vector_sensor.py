@@ -162,10 +162,10 @@ def _vector_row(scene: Scene, y: float, computed: _Computed, kind: _Kind) -> Non
         scene.label(images - 0.36, center + sign * 0.64, f"image {index + 1}", va="center", color=look.color)
     scene.scale(shown, (images + 0.15, y - 1.31, 0.38, 0.06), ticks=2)
 
-    scene.label(at.focus - 0.13, y - 0.09, "mask", ha="right", va="top")
+    scene.label(at.focus - 0.54, y - 0.22, "mask", ha="right", va="top")
     if kind.liquid:
-        scene.label(4.93, y - 0.76, "quarter-\nwave plate", va="top")
-    scene.label(at.prism + 0.02, y - 0.7, "Wollaston\nprism", va="top")
+        scene.label(5.0, y - 0.76, "quarter-\nwave plate", va="top")
+    scene.label(at.prism - 0.02, y - 0.79, "Wollaston\nprism", va="top")
     scene.label(at.detector - 0.3, y - 1.42, "detector")
     scene.label(at.detector + 0.53, y, "focus shift", ha="left", va="center")
 

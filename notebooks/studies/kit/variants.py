@@ -82,7 +82,7 @@ def _stacked(figure: Figure) -> Figure:
     for place, row in enumerate(rows):
         for column, axes in enumerate(row):
             axes.set_subplotspec(grid[place, column] if len(row) == 2 else grid[place, :])
-    bars = sum(_lower(figure, axes) for axes in list(figure.axes) if axes.get_label() == "<colorbar>")
+    bars = sum(_turn(figure, axes) for axes in list(figure.axes) if axes.get_label() == "<colorbar>")
     entries = 0
     alone = panels[0].get_legend() if len(panels) == 1 else None
     for legend in [*figure.legends, *([alone] if alone else [])]:
@@ -92,7 +92,9 @@ def _stacked(figure: Figure) -> Figure:
         labels = [textwrap.fill(text.get_text(), _LETTERS_OF_ENTRY) for text in texts]
         lines = [line for label in labels for line in label.split("\n")]
         size = min(texts[0].get_fontsize(), _ENTRY / max(map(len, lines)))
-        figure.legend(handles, labels, loc="outside lower center", fontsize=size)
+        # Readers meet the key before the first of several panels.
+        place_of_key: Any = "outside upper center" if len(rows) > 1 else "outside lower center"
+        figure.legend(handles, labels, loc=place_of_key, fontsize=size)
         entries += len(lines)
     for text in figure.findobj(Text):
         text.set_fontsize(min(text.get_fontsize(), _LETTERS))
@@ -172,20 +174,29 @@ def _height(row: list[Axes], width: float) -> float:
     return _HEIGHT * (1.5 if row[0].get_gid() == TALL else 1)
 
 
-def _lower(figure: Figure, axes: Axes) -> bool:
-    """Put a colour bar at the side of pictures below them; return whether a bar is below pictures now."""
+def _turn(figure: Figure, axes: Axes) -> bool:
+    """Put a colour bar at the side of pictures below them, and one that several other panels share above them.
+
+    Return whether a bar is below or above its panels now.
+    """
     info = axes._colorbar_info  # type: ignore[attr-defined]  # the only record of the panels that share the bar
     parents = info["parents"]
-    if info["location"] == "right" and all(map(_is_picture, parents)):
+    pictures = all(map(_is_picture, parents))
+    if info["location"] == "right" and (pictures or len(parents) > 1):
         old: Any = axes._colorbar  # type: ignore[attr-defined]
         label, size = axes.get_ylabel(), axes.yaxis.label.get_fontsize()
+        marks = dict(zip(old.get_ticks(), axes.get_yticklabels(), strict=False))
         ticks = axes.get_yticklabels()[0].get_fontsize()
         mappable, extend = old.mappable, old.extend
         old.remove()
-        bar = figure.colorbar(mappable, ax=parents, location="bottom", extend=extend, aspect=20)
+        place = "bottom" if pictures else "top"
+        bar = figure.colorbar(mappable, ax=parents, location=place, extend=extend, aspect=20)
+        if not pictures:
+            bar.set_ticks(list(marks), labels=[mark.get_text() for mark in marks.values()])
+            bar.minorticks_off()
         bar.set_label(label, fontsize=size)
         bar.ax.tick_params(labelsize=ticks)
-    return all(map(_is_picture, parents))
+    return pictures or len(parents) > 1
 
 
 def _label(axes: Axes, panels: list[Axes]) -> None:

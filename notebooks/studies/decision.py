@@ -393,6 +393,7 @@ def numbers(
         | {
             "gain_least": min(gains),
             "gain_most": max(gains),
+            "gain_small": 1 / next(row.cell.ratio for row in rows if row.key == "real_3"),
             "likelihood_least": min(_likelihood_ratios(errors["perfect"])),
             "likelihood_most": max(_likelihood_ratios(errors["perfect"])),
             "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],

@@ -74,8 +74,8 @@ def reach_table(curves: BenchCurves) -> Table:
     header = [
         "reconstructor",
         "error at a flat command (rad rms)",
-        "largest input with an error of at most 25 % (rad rms)",
-        "gain at the smallest input",
+        "reach (rad rms)",
+        "gain, smallest input",
     ]
     rows = [
         [

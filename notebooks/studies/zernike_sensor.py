@@ -137,7 +137,8 @@ def _phasors(axes: Axes, pixel: Pixel, k: int) -> None:
     axes.add_patch(Circle((0, 0), np.sqrt(intensity), fill=False, ec=color, lw=1.5))
     _arrow(axes, 0, wave, color=_GREY)
     style: dict[str, Any] = {"color": _GREY, "fontsize": 9, "ha": "right", "va": "center"}
-    axes.text(wave.real + 0.04, 0.1 * wave.imag + 0.12, "reference\nwave", **style)
+    ground = {"fc": "white", "ec": "none", "pad": 0.5}
+    axes.text(wave.real + 0.04, 0.1 * wave.imag + 0.12, "reference\nwave", bbox=ground, zorder=1.5, **style)
     axes.plot(0, 0, "+", color="black", ms=8)
     for phase, line, shade in ((pixel.phase, "-", "black"), (pixel.mirrored[k], "--", color)):
         turn = np.exp(1j * phase)

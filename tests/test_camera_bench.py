@@ -182,7 +182,7 @@ TURNED = replace(CASES["turned VLT"], pixels=40, side=52)
 @pytest.fixture(scope="module", params=[BENCH, TURNED], ids=["disc", "turned VLT"])
 def calibrated(request):
     frames, clear, phases = request.param.recording()
-    fit = fit_bench(frames, clear, phases, n_pixels=40, noise=BENCH.noise, n_steps=6)
+    fit = fit_bench(frames, clear, phases, n_pixels=40, noise=BENCH.noise)
     return request.param, fit
 
 

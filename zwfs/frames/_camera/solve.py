@@ -21,6 +21,8 @@ _BINS = 24  # of spatial frequency, for the preconditioner
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
 _LEAST = 1e-3  # damping
 _ALIKE = 1e-13  # eigenvalue over the largest, below which numbers have the same effect
+_LAST = 4  # steps at the end of a fit
+_SHARES = 1.0, 0.5, 0.25  # of such a step: the best one is taken
 _N_MAPS = 80  # iterations for the minimum of the maps
 _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
@@ -492,9 +494,10 @@ class Eliminated:
         self._matrix = self._e @ self._e.T + self._known
 
     def step(self, point: Point) -> tuple[NDArray[np.float64], float]:
-        """Step of the numbers, which the maps follow, and how much it promises to lower the cost.
+        """Step of all unknowns, and how much that of the numbers promises to lower the cost.
 
-        The slope along the numbers is that at the maps' own minimum, g_p - H_pm H_mm^-1 g_m.
+        The maps move to their own minimum and follow the numbers. The slope along the numbers is that at this
+        minimum, g_p - H_pm H_mm^-1 g_m.
         """
         n, numbers = point.problem.n_white, np.arange(len(point.x)) >= point.problem.n_white
         maps = point.solve(point.gradient, numbers, _N_MAPS, 0.01)
@@ -502,7 +505,7 @@ class Eliminated:
         slope = (point.gradient - point.product(maps))[n:] / self._unit * move
         step = np.zeros_like(slope)
         step[move] = -linalg.pinvh(self._matrix[np.ix_(move, move)], rtol=_ALIKE) @ slope[move]
-        return np.concatenate([-self._x.T @ step, step / self._unit]), -float(slope @ step) / 2
+        return np.concatenate([-maps[:n] - self._x.T @ step, step / self._unit]), -float(slope @ step) / 2
 
     def covariance(self, point: Point, changes: Sequence[Sequence[NDArray]], scale: float) -> NDArray[np.float64]:
         """Covariance of the numbers: of the noise, of what the model misses, and of changes of the images.
@@ -527,13 +530,24 @@ class Eliminated:
 
 
 def settle(best: Minimum) -> tuple[Minimum, Eliminated]:
-    """Take a last step of the numbers, and judge by the next one whether they have converged."""
+    """Take last steps of all unknowns, and judge by what the next one promises whether the fit has converged."""
     point, equations = best.point, Eliminated(best.point)
-    target, (n, bounds) = point.x + equations.step(point)[0], (point.problem.n_white, point.problem.bounds)
-    target[n:] = np.clip(target[n:], bounds[:, 0], bounds[:, 1])
-    trial = Point(point.problem, target)
-    point = trial if trial.cost < point.cost else point
-    return Minimum(point, equations.step(point)[1] < 1), equations
+    n, bounds = point.problem.n_white, point.problem.bounds
+    step, promised = equations.step(point)
+    for _ in range(_LAST):
+        trials = []
+        for share in _SHARES:
+            target = point.x + share * step
+            target[n:] = np.clip(target[n:], bounds[:, 0], bounds[:, 1])
+            trials.append(Point(point.problem, target))
+        trial = min(trials, key=lambda one: one.cost)
+        if trial.cost >= point.cost:
+            break
+        point = trial
+        step, promised = equations.step(point)
+        if promised < 1:
+            break
+    return Minimum(point, promised < 1), equations
 
 
 def _block_sums(images: Sequence[Sequence[NDArray]]) -> NDArray[np.float64]:

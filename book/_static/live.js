@@ -74,6 +74,8 @@
   // A preset is a design: it keeps the input, unless it names one. That of the controls looks pressed.
   const INPUT = ["rms", "seed", "per-point"];
   const kept = (input) => (INPUT.includes(nameOf(input)) ? read(input) : standard(input));
+  const ownInput = () => Object.fromEntries(INPUT.map((name) => [name, read(find(name))]));
+  let before; // the input before a preset that names another one: the next preset brings it back
   const presets = [...document.querySelectorAll(".live-presets button")];
   function markPreset() {
     for (const button of presets) {
@@ -211,6 +213,7 @@
   for (const input of inputs) {
     input.addEventListener("input", () => {
       play(false);
+      if (INPUT.includes(nameOf(input))) before = undefined;
       caption(input);
       ask();
     });
@@ -221,8 +224,17 @@
     button.addEventListener("click", () => {
       play(false);
       const preset = button.closest("#live");
-      set(parse(button.dataset.live), preset ? kept : standard);
-      if (preset) return;
+      const goal = parse(button.dataset.live);
+      if (preset) {
+        const input = before ?? ownInput();
+        set({ ...input, ...goal }, standard);
+        before = INPUT.some((name) => name in goal) ? input : undefined;
+        find("tried").textContent = "";
+        return;
+      }
+      set(goal, standard);
+      before = undefined;
+      find("tried").textContent = button.parentElement.textContent.trim();
       document.getElementById("live").scrollIntoView();
       if ("play" in button.dataset) play(true);
     });

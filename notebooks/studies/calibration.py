@@ -283,6 +283,7 @@ def numbers(
     bulk, spoiled = bulk_errors(taken, fit, errors), wrong.column("calibrated")
     true, plain, found = known_values(taken), errors.column("plain"), errors.column("calibrated")
     every = [one for row in errors.measured for one in row]
+    deviations = [(fit[name].value - value) / fit[name].sigma for name, value in true.items()]
     place = int(np.argmin(np.abs(errors.rms - 0.8)))
     return rounded(
         {
@@ -291,7 +292,8 @@ def numbers(
             "misfit": float(np.mean(fit.misfit)),
             "verdict": "consistent" if fit.consistent else "not consistent",
             "remarks": " ".join(fit.remarks) or "none",
-            "largest_deviation": max(abs(fit[name].value - true[name]) / fit[name].sigma for name in true),
+            "largest_deviation": np.abs(deviations).max(),
+            "deviation_rms": np.sqrt(np.mean(np.square(deviations))),
             "diameter_error": 100 * abs(fit["diameter"].value / true["diameter"] - 1),
             "shift_error": 100 * max(abs(fit[name].value / true[name] - 1) for name in ("first", "second")),
             "leakage_error": 100 * abs(fit["leakage"].value - true["leakage"]),

@@ -46,7 +46,7 @@ LIMITS = parameter_limits(
 
 QUICK = {"n_pixels": 32, "n_screens": 2, "n_screens_perfect": 2, "n_screens_loop": 2, "n_screens_calibrated": 0}
 
-BENCHES = {"perfect": "perfect model", "real": "only the design known"}
+BENCHES = {"perfect": "perfect model", "real": "uncalibrated bench"}
 """What is known of the bench, and its name in the table."""
 ONE_IMAGE = {"Linear": "linear", "Arcsine": "arcsine", "LikelihoodOne": "maximum likelihood on modes"}
 TWO_IMAGES = {
@@ -359,7 +359,7 @@ def _table(photons: str, rows: Iterable[tuple[str, Row]]) -> Table:
 
 def calibrated_table(situations: Iterable[Situation], errors: Iterable[tuple[float, float] | None]) -> Table:
     """Errors of two images with a fitted model, and with the values of the design."""
-    header = ["situation", "photons per point and image", "calibrated", "only the design known"]
+    header = ["situation", "photons per point and image", "calibrated", "uncalibrated"]
     both = [["not studied"] * 2 if pair is None else list(map(two_digits, pair)) for pair in errors]
     starts = [[f"{rms:g} rad rms", f"{photons:g}"] for rms, photons in situations]
     return Table(header, [start + pair for start, pair in zip(starts, both, strict=True)])

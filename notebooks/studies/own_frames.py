@@ -135,7 +135,7 @@ def draw_gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> F
     panels[1].set_gid(WIDE)
     if errors is not None:
         panels[2].plot(errors, rows, color="#444444", marker="o", ms=5)
-        panels[2].set(xlabel="error of segments\n(rad rms)")
+        panels[2].set(xlabel="difference from\ncommands (rad rms)")
     for axes in panels[1:]:
         axes.margins(x=0.08)
         axes.update_datalim([(0, rows[-1])])  # the margin is a share of the whole axis

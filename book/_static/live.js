@@ -142,7 +142,7 @@
       verdict.textContent = one ? `${good ? "✓" : "✗"} ${draw.error(error)} rad` : "no solution";
       verdict.className = `live-verdict ${good ? "live-good" : "live-bad"}`;
       find(`name-${place}`).textContent = name;
-      find(`error-name-${place}`).textContent = name;
+      find(`error-name-${place}`).textContent = name.replace("maximum", "max."); // the column is narrow
     });
     const { linear, arcsine, shifted, accelerated, likelihood } = made;
     draw.curves({ linear, arcsine, shifted, accelerated, likelihood });
@@ -234,7 +234,8 @@
       }
       set(goal, standard);
       before = undefined;
-      find("tried").textContent = button.parentElement.textContent.trim();
+      const [name, said] = [button.textContent, button.parentElement.textContent.trim()];
+      find("tried").textContent = `${name}: ${said.slice(name.length).trim()}`;
       document.getElementById("live").scrollIntoView();
       if ("play" in button.dataset) play(true);
     });

@@ -215,7 +215,7 @@ def step_columns(work: Sequence[Step], errors: Sequence[float] | None) -> dict[s
     columns |= {f"score, image {i + 1}": [step.predicted[i] for step in work] for i in range(2)}
     columns |= {f"control, image {i + 1}": [step.control[i] for step in work] for i in range(2)}
     columns |= {"misfit over contrast": [step.result.misfit for step in work]}
-    return columns | {"error of the segments (rad rms)": errors or np.nan}
+    return columns | {"difference from the commands (rad rms)": errors or np.nan}
 
 
 def sign_columns(measurement: Measurement) -> dict[str, NDArray]:

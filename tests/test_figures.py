@@ -193,8 +193,7 @@ def test_variants_are_dark_or_fit_a_phone_and_the_figure_stays(name, drawn_metho
         if kind == "narrow":
             assert not cut_off(variant)
         for text in variant.findobj(lambda one: isinstance(one, Text) and one.get_bbox_patch()):
-            letters, box = (np.mean(to_rgb(one)) for one in (text.get_color(), text.get_bbox_patch().get_fc()))
-            assert abs(letters - box) > 0.5
+            assert contrast(text.get_color(), text.get_bbox_patch().get_fc()) > 4.5, text.get_text()
     assert plt.get_fignums() == numbers
     assert np.array_equal(pixels(figure), before)
 
@@ -309,11 +308,20 @@ VISION = {
 }  # fmt: skip
 
 
+def linear_rgb(color):
+    rgb = np.array(to_rgb(color))
+    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+
+
+def contrast(color, ground):
+    """Contrast of two colours, 1 to 21 (WCAG 2.1); letters need 4.5."""
+    low, high = sorted([0.2126, 0.7152, 0.0722] @ linear_rgb(one) for one in (color, ground))
+    return (high + 0.05) / (low + 0.05)
+
+
 def lab(color, vision):
     """CIE L*a*b* coordinates; their distance is about 2 where a difference just shows."""
-    rgb = np.array(to_rgb(color))
-    light = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    light = np.clip(VISION[vision] @ light, 0, 1)
+    light = np.clip(VISION[vision] @ linear_rgb(color), 0, 1)
     to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
     xyz = to_xyz @ light / to_xyz.sum(axis=1)
     x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)

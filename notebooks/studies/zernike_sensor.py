@@ -71,7 +71,7 @@ IMAGES = ("1", "#B2182B", "-"), ("2", "#313695", "--")
 """Name, colour and line of the images of both masks, as in Figure 2."""
 _WIDTH = 6.8  # inches: names of 10 points are then as large as the prose
 _REACH = 3.0  # of the picture of the focal plane, lambda/D
-_GREY = "#777777"
+_GREY = "#707070"
 
 
 def draw_sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Figure:

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 
 import zwfs
 from zwfs.reconstructors.base import Reconstructor
+from zwfs.turbulence import FrozenFlow
 
 from .conftest import needs_modes
 
@@ -95,6 +96,7 @@ def valid() -> dict:
         "influence": modes, "commands": np.zeros(5), "disturbance": phase[np.newaxis], "drift": 10.0,
         "wavelength": 635.0, "n_actuators": 9, "n_cycles": 1, "wavelengths": [600.0, 650.0],
         "weights": [1.0, 2.0], "bandwidth": 0.1, "n_wavelengths": 2, "n_iterations": 3, "tolerance": 1e-3,
+        "time": 0.01, "speed": 1.0, "cutoff": 3.0,
         # of one callable
         "Pupil.amplitude": pupil.amplitude,
         "Pupil.segments": pupil.segments,
@@ -125,6 +127,7 @@ def valid() -> dict:
     }  # fmt: skip
     instances = {
         "Pupil": pupil,
+        "FrozenFlow": FrozenFlow(pupil, 0.2, 1, seed=1),
         "Dimple": plus,
         "Patch": zwfs.Patch(1.0, lambda u, v: 0.9 * np.exp(1j * u / 9)),
         "Sensor": shifted,

@@ -138,6 +138,35 @@ def test_sharp_light_divides_pixels_as_the_edge_does(center, radius):
     assert np.sum((found - true) ** 2) < np.sum((even - true) ** 2) / 9
 
 
+def test_amplitude_goes_on_along_its_slope_to_the_edge(monkeypatch):
+    """The mean field of a pixel at the edge, whose light alone is known; a constant continuation must fail."""
+    k, n = 16, 24
+    y, x = (np.mgrid[: n * k, : n * k] + 0.5) / k - n / 2
+    field = (1 + 0.015 * y - 0.01 * x - 0.001 * (x**2 + y**2)) * (np.hypot(y, x) < 8.3)
+    light, true = blocks(field**2, k), blocks(field, k)
+    lit = blocks((field > 0).astype(float), k)
+    edge = (lit > 0) & (lit < 1)
+
+    def error():
+        division = Light.of(light, light, 1)
+        return (division.maps(light, 0 * light).mean - true)[edge].std()
+
+    continued = error()
+    assert continued < 0.005
+    monkeypatch.setattr("zwfs.frames._camera.light._STIFF", 1e9)
+    assert error() > 3 * continued
+
+
+@pytest.mark.parametrize("mottling", [0.0, 0.12])
+def test_dark_spots_of_the_illumination_are_not_edges(mottling):
+    y, x = np.indices((40, 40)) - 19.5
+    light = np.hypot(y, x) < 17
+    light = light * (1 + mottling * np.random.default_rng(0).normal(size=light.shape))
+    full = Light.of(light, light, 1).full
+    assert full[np.hypot(y, x) < 14].mean() > 0.95
+    assert not full[np.hypot(y, x) > 17].any()
+
+
 def test_known_phases_go_on_beyond_an_outline_that_cuts_pixels():
     """Pixels of the rim are means with zeros. One that touches the dark only by its corner has to be replaced."""
     k, n = 16, 30
@@ -209,7 +238,8 @@ def test_numbers_of_a_converged_fit_stay_within_their_error_bars_in_a_step_of_al
     assert np.abs(step[point.problem.n_white :] / fit.sigma).max() < 1
 
 
-def test_fit_that_ends_early_has_not_converged():
+def test_fit_that_ends_early_has_not_converged(monkeypatch):
+    monkeypatch.setattr("zwfs.frames._camera.solve._LAST", 1)
     frames, clear, phases = BENCH.recording()
     assert not fit_bench(frames, clear, phases, n_pixels=40, noise=BENCH.noise, n_steps=1).converged
 

@@ -3,7 +3,6 @@ import pytest
 
 from studies.closed_loop import (
     AlteredSensor,
-    FrozenFlow,
     TunedLoops,
     best_methods,
     follow_flow,
@@ -12,6 +11,7 @@ from studies.closed_loop import (
     tuned_loops,
 )
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
+from zwfs.turbulence import FrozenFlow
 
 PLUS, MINUS = Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2)
 

@@ -1,4 +1,4 @@
-"""Phase screens and modes of atmospheric turbulence, from the covariance of Kolmogorov or von Karman."""
+"""Phase screens and modes of turbulence, with the covariance of Kolmogorov or von Karman, and frozen flow."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.special import kv
 
 from zwfs import _check
+from zwfs._arrays import Immutable, read_only
+from zwfs.modes import _STRONGEST
 from zwfs.pupil import Pupil
 
 _KOLMOGOROV = 2 * (24 / 5 * gamma(6 / 5)) ** (5 / 6)  # 6.88
 _REACH = 2.0  # distance at which the embedded covariance ends, in units of the largest distance in the pupil
+
+_BOX = 3.0  # D; screens in the wind repeat after this length
 
 
 def structure_function(separation: ArrayLike, r0: float = 1.0, outer_scale: float = inf) -> NDArray[np.float64]:
@@ -192,6 +196,104 @@ def karhunen_loeve_basis(
     # The sign of an eigenvector is free. The second one of two equal variances is orthogonal to the start.
     modes *= np.sign(modes @ other)[:, np.newaxis]
     return pupil.scatter(modes, fill=0.0), values[order] / n_points
+
+
+class FrozenFlow(Immutable):
+    """Random screens that a wind carries across the pupil without a change of form.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    rms : float, radian
+        Of each screen at the start.
+    n_screens : int
+    speed : float, D/s
+        Of the wind; its direction is random. The screens repeat after 3 D.
+    cutoff : float, cycles/D
+        Largest spatial frequency, from 0.5 to half of the pixels across D.
+    exponent : float
+        Of the power spectral density.
+    seed : int, Generator or SeedSequence, optional
+
+    Attributes
+    ----------
+    velocity : ndarray, shape (n_screens, 2), D/s
+        Along y and x.
+
+    Examples
+    --------
+    Screens at a rate of 1 kHz, for `zwfs.close_loop`:
+
+    >>> import zwfs
+    >>> from zwfs.turbulence import FrozenFlow
+    >>> pupil = zwfs.Pupil.circular(24)
+    >>> flow = FrozenFlow(pupil, rms=0.5, n_screens=12, seed=1)
+    >>> screens = [flow(step / 1000) for step in range(40)]
+    >>> screens[0].shape, pupil.rms(screens[0]).round(6)[0]
+    ((12, 24, 24), np.float64(0.5))
+    """
+
+    def __init__(
+        self,
+        pupil: Pupil,
+        rms: float,
+        n_screens: int,
+        *,
+        speed: float = 2.5,
+        cutoff: float = 5.0,
+        exponent: float = -2.0,
+        seed: int | np.random.Generator | np.random.SeedSequence | None = None,
+    ) -> None:
+        _check.instance("pupil", pupil, Pupil)
+        rms = _check.number("rms", rms, 0, _STRONGEST)
+        n_screens = _check.count("n_screens", n_screens, pupil.amplitude.size)
+        speed = _check.number("speed", speed, 0, 1e6)
+        cutoff = _check.number("cutoff", cutoff, 0.5, pupil.n_pixels / 2)
+        exponent = _check.number("exponent", exponent, -20, 20)
+        rng = _check.generator("seed", seed)
+        self.pupil = pupil
+        n = int(cutoff * _BOX)
+        u = np.arange(-n, n + 1) / _BOX  # frequencies along x, cycles / D
+        v = u[:, np.newaxis]  # the same along y
+        amplitudes = _random_amplitudes(np.hypot(u, v), cutoff, exponent, n_screens, rng)
+        # A screen is the sum of a(v, u) exp(2 pi i (v y + u x)): two matrix products.
+        self._waves_y = read_only(np.exp(2j * np.pi * np.outer(pupil.y, u)))
+        self._waves_x = read_only(np.exp(2j * np.pi * np.outer(u, pupil.x)))
+        # A wind (wy, wx) moves it to y - wy t, x - wx t: each amplitude turns by -2 pi (wy v + wx u) t.
+        direction = rng.uniform(0, 2 * np.pi, n_screens)
+        self.velocity = read_only(speed * np.stack([np.sin(direction), np.cos(direction)], axis=-1))
+        wy, wx = self.velocity.T[..., np.newaxis, np.newaxis]
+        self._turn = read_only(-2j * np.pi * (wy * v + wx * u))
+        scale = rms / pupil.rms(self._screens(amplitudes))
+        self._amplitudes = read_only(amplitudes * scale[:, np.newaxis, np.newaxis])
+
+    def __call__(self, time: float) -> NDArray[np.float64]:
+        """Screens at a time.
+
+        Parameters
+        ----------
+        time : float, second
+
+        Returns
+        -------
+        ndarray, shape (n_screens, ny, nx), radian
+            Piston removed, 0 outside the pupil.
+        """
+        return self._screens(self._amplitudes * np.exp(self._turn * _check.number("time", time, -1e9, 1e9)))
+
+    def _screens(self, amplitudes: NDArray) -> NDArray[np.float64]:
+        inside = self.pupil.gather((self._waves_y @ amplitudes @ self._waves_x).real)
+        return self.pupil.scatter(inside - inside.mean(axis=-1, keepdims=True), fill=0)
+
+
+def _random_amplitudes(
+    frequency: NDArray, cutoff: float, exponent: float, n_screens: int, rng: np.random.Generator
+) -> NDArray[np.complex128]:
+    """Gaussian amplitudes whose power falls as a power of the frequency; 0 for piston and beyond the cutoff."""
+    used = (frequency > 0) & (frequency <= cutoff)
+    scale = np.where(used, np.where(used, frequency, 1) ** (exponent / 2), 0)
+    real, imaginary = rng.standard_normal((2, n_screens, *frequency.shape))
+    return scale * (real + 1j * imaginary)
 
 
 def _continued(distance: NDArray, r0: float, outer_scale: float) -> tuple[NDArray[np.float64], float]:

@@ -211,6 +211,8 @@ def marked_lines(claim: Claim, code: str) -> dict[str, str]:
             found |= set(range(one.lineno, (one.end_lineno or one.lineno) + 1))
     if not found:
         raise ClaimError(f"claim {claim.number}, {claim.notebook}: no line of its study computes its numbers")
+    loops = [node for node in ast.walk(function) if isinstance(node, ast.For)]
+    found |= {one.lineno for one in loops if found & set(range(one.lineno, (one.end_lineno or 0) + 1))}
     first, last = min(found), max(found)
     marked = ",".join(str(number - first + 1) for number in sorted(found))
     return {"lines": f"{first}-{last}", "emphasize-lines": marked}

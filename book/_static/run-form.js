@@ -4,6 +4,7 @@
 (() => {
   const SLIDER = 10; // largest range of a number that gets a slider
   const STEPS = 200; // of a slider
+  const FIRST = 6; // parameters that show at once
 
   // Make an element; a handler is a function, and true sets an attribute without a value.
   function make(tag, attributes = {}, ...content) {
@@ -51,6 +52,11 @@
 
   const range = ({ low, high }) => (low === undefined ? "" : `${short(low)} to ${short(high)}`);
 
+  // Open the folds around an element.
+  function unfold(element) {
+    for (let fold = element.closest("details"); fold; fold = fold.parentElement.closest("details")) fold.open = true;
+  }
+
   // A field: its label, its control, and the text that counts as unchanged.
   class Field {
     constructor(form, path, { meaning, unit, default: standard, limits }, optional = false) {
@@ -75,11 +81,13 @@
         });
       }
       this.write(this.standard);
-      const about = [meaning, unit, range(isList(limits) ? limits.list : limits)].filter(Boolean).join(", ");
+      const name = path.split(".").pop();
+      const words = [meaning, unit].filter(Boolean).join(", ");
+      const about = [words && make("code", {}, name), range(isList(limits) ? limits.list : limits)].filter(Boolean);
       this.element = make("div", { class: "run-field" },
-        make("label", { for: id }, path.split(".").pop()),
+        make("label", { for: id }, words || name),
         this.control,
-        make("small", { id: `${id}-about` }, about));
+        make("small", { id: `${id}-about` }, ...about.flatMap((one, index) => (index ? [": ", one] : [one]))));
       if (limits.low !== undefined && !limits.whole && !optional && limits.high - limits.low <= SLIDER) this.addSlider(path);
       else if (isText(isList(limits) ? limits.list : limits) && /files?$/.test(path)) this.addFiles(form, path);
     }
@@ -191,8 +199,12 @@
         [name, new (parameter.limits.fields ? Mapping : Field)(this, name, parameter)]));
     }
 
+    // The first fields, and the others in a fold.
     get elements() {
-      return Object.values(this.fields).map((field) => field.element);
+      const all = Object.values(this.fields).map((field) => field.element);
+      const rest = all.length > FIRST + 2 ? all.splice(FIRST) : [];
+      const more = make("details", { class: "run-mapping" }, make("summary", {}, `${rest.length} more parameters`), ...rest);
+      return rest.length ? [...all, more] : all;
     }
 
     // Changed values, as JSON text by name.
@@ -233,9 +245,10 @@
         }
       }
       this.put(values);
+      for (const field of Object.values(this.fields)) if (field.changed) unfold(field.element);
       return true;
     }
   }
 
-  window.zwfsForm = { Form, make };
+  window.zwfsForm = { Form, make, unfold };
 })();

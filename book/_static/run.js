@@ -3,7 +3,7 @@
 "use strict";
 
 (() => {
-  const { Form, make } = window.zwfsForm;
+  const { Form, make, unfold } = window.zwfsForm;
   const settings = window.zwfsPython; // run/settings.js
   const notebook = window.zwfsNotebook; // run/NAME.js, on the page of a notebook
   const folder = new URL(".", document.currentScript.src); // _static
@@ -153,6 +153,7 @@
       this.build(place);
       if (this.form.readAddress()) this.details.open = true;
       this.form.element.addEventListener("input", () => this.changed());
+      this.form.element.addEventListener("invalid", (event) => unfold(event.target), true);
       this.changed();
       for (const other of article.querySelectorAll(".run-figure"))
         other.append(make("button", { type: "button", click: () => this.run(other.dataset.figure) }, "Run to this figure with the parameters above"));
@@ -175,10 +176,9 @@
       this.bar = make("progress", { hidden: true, "aria-label": "Progress of the run" });
       this.files = make("p", { class: "run-files" });
       this.form.element = make("form", { submit: (event) => { event.preventDefault(); this.run(this.first); } },
-        make("div", { class: "run-buttons" }, ...presets),
-        make("div", { class: "run-fields" }, ...this.form.elements),
-        make("div", { class: "run-buttons" }, this.start, this.stop, this.rest),
+        make("div", { class: "run-buttons" }, this.start, this.stop, this.rest, ...presets),
         this.bar, this.status, this.files,
+        make("div", { class: "run-fields" }, ...this.form.elements),
         make("p", { class: "run-command" }, "The same from a clone: ", this.command, " ", copy));
       this.details = make("details", { class: "run-details" },
         make("summary", {}, "Change the parameters and run it here"), this.form.element);

@@ -240,16 +240,17 @@ def measure_inputs(
 
 
 def bulk_errors(taken: Recording, fit: BenchFit, errors: Errors) -> NDArray[np.float64]:
-    """Errors of the first screen of each input by `Calibration.from_bench`, as `calibrate --commands`, rad rms."""
+    """Errors of the same screens by `Calibration.from_bench`, as `calibrate --commands`, rad rms."""
     states = slice(len(fit.misfit) // 2 - 1)
     calibration = Calibration.from_bench(fit, taken.frames[states], taken.commands[states])
-    found = []
-    for rms in errors.rms:
-        number = taken.unseen(rms, taken.photons[0])[0]
+
+    def error(number: int) -> float:
         phase = calibration(taken.shot(number)[0]).phase.astype(float)
         lit = taken.arrays["lit"] & np.isfinite(phase)
-        found.append(_error(phase, taken.arrays["unseen"][number] * _UNIT, lit).std())
-    return np.array(found)
+        return float(_error(phase, taken.arrays["unseen"][number] * _UNIT, lit).std())
+
+    shots = [taken.unseen(rms, taken.photons[0])[: len(errors.measured[0])] for rms in errors.rms]
+    return np.array([np.sqrt(np.mean([error(number) ** 2 for number in some])) for some in shots])
 
 
 def draw_calibration_errors(errors: Errors) -> Figure:
@@ -307,6 +308,7 @@ def numbers(
             "sigma": errors.column("sigma")[place],
             "inside": 100 * float(np.mean([one.inside for one in every])),
             "consistent": sum(one.consistent for one in every),
+            "bulk_worst": errors.rms[np.argmax(bulk / plain)],
             "bulk_excess": 100 * (float((bulk / plain).max()) - 1),
             "bulk_most": (plain / bulk).max(),
             "wrong_least": (plain / spoiled).min(),

@@ -19,9 +19,9 @@ from studies.kit.style import LOOKS
 from studies.kit.tables import Table
 from zwfs.detector import Detector
 from zwfs.loop import Mirror, close_loop
-from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, Linear, MaximumLikelihood, PhaseShifted
 from zwfs.sensor import ZernikeSensor
+from zwfs.turbulence import FrozenFlow
 
 LIMITS = parameter_limits(
     "n_modes diameter phase_shift n_screens exponent rms",
@@ -55,54 +55,6 @@ ALIKE = 1.05
 
 _GRAY = "#666666"
 _WHITE = {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0.1"}  # behind a label
-_BOX = 3.0  # D; the screens repeat after this length
-
-
-class FrozenFlow:
-    """Random screens that a wind carries across the pupil without a change of form."""
-
-    def __init__(
-        self,
-        pupil: Pupil,
-        rms: float,
-        n_screens: int,
-        *,
-        speed: float = 2.5,
-        cutoff: float = 5.0,
-        exponent: float = -2.0,
-        seed: int | np.random.Generator | np.random.SeedSequence | None = None,
-    ) -> None:
-        self.pupil = pupil
-        rng = np.random.default_rng(seed)
-        n = int(cutoff * _BOX)
-        u = np.arange(-n, n + 1) / _BOX  # frequencies along x, cycles / D
-        v = u[:, np.newaxis]  # the same along y
-        self._amplitudes = _random_amplitudes(np.hypot(u, v), cutoff, exponent, n_screens, rng)
-        # A screen is the sum of a(v, u) exp(2 pi i (v y + u x)): two matrix products.
-        self._waves_y = np.exp(2j * np.pi * np.outer(pupil.y, u))
-        self._waves_x = np.exp(2j * np.pi * np.outer(u, pupil.x))
-        # A wind (wy, wx) moves it to y - wy t, x - wx t: each amplitude turns by -2 pi (wy v + wx u) t.
-        direction = rng.uniform(0, 2 * np.pi, n_screens)
-        self.velocity = speed * np.stack([np.sin(direction), np.cos(direction)], axis=-1)
-        wy, wx = self.velocity.T[..., np.newaxis, np.newaxis]
-        self._turn = -2j * np.pi * (wy * v + wx * u)
-        self._amplitudes *= (rms / pupil.rms(self(0.0)))[:, np.newaxis, np.newaxis]
-
-    def __call__(self, time: float) -> NDArray[np.float64]:
-        """Screens at a time in seconds, (n_screens, ny, nx), radian: without piston, 0 outside the pupil."""
-        amplitudes = self._amplitudes * np.exp(self._turn * time)
-        inside = self.pupil.gather((self._waves_y @ amplitudes @ self._waves_x).real)
-        return self.pupil.scatter(inside - inside.mean(axis=-1, keepdims=True), fill=0)
-
-
-def _random_amplitudes(
-    frequency: NDArray, cutoff: float, exponent: float, n_screens: int, rng: np.random.Generator
-) -> NDArray[np.complex128]:
-    """Gaussian amplitudes whose power falls as a power of the frequency; 0 for piston and beyond the cutoff."""
-    used = (frequency > 0) & (frequency <= cutoff)
-    scale = np.where(used, np.where(used, frequency, 1) ** (exponent / 2), 0)
-    real, imaginary = rng.standard_normal((2, n_screens, *frequency.shape))
-    return scale * (real + 1j * imaginary)
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ WIND = {"speed": 2.5, "cutoff": 3.0, "exponent": -2.0}
 GAINS = 0.05, 0.1, 0.2, 0.4, 0.6, 0.8
 """Settings of the chapter on closed loops."""
 _N_MODES = 80  # of the mirror
-_COMPARED = "perfect_1", "perfect_2", "real_1", "real_2"  # rows of the first sentence of the page
+_COMPARED = "perfect_1", "perfect_2", "real_1", "real_3"  # rows of the summary
 _DIAMETER = 8.0  # of the telescope that the wind speed in m/s belongs to, m
 
 
@@ -385,15 +385,12 @@ def numbers(
     for index, pair in enumerate(calibrated, 1):
         if pair is not None:
             found |= {f"calibrated_{index}": pair[0], f"calibrated_gain_{index}": pair[1] / pair[0]}
-    gains = [1 / row.cell.ratio for row in rows if row.key in _COMPARED]
+    found |= {f"gain_{row.key}": 1 / row.cell.ratio for row in rows if row.key in _COMPARED}
     small, faint = errors["real"][-1], loops[-1]
     settled = faint.loops.settled
     return rounded(
         found
         | {
-            "gain_least": min(gains),
-            "gain_most": max(gains),
-            "gain_small": 1 / next(row.cell.ratio for row in rows if row.key == "real_3"),
             "likelihood_least": min(_likelihood_ratios(errors["perfect"])),
             "likelihood_most": max(_likelihood_ratios(errors["perfect"])),
             "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],

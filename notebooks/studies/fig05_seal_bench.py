@@ -274,7 +274,7 @@ def layout_table(bench: Bench, pistons: NDArray, wavelength: float) -> Table:
     share = np.bincount(number)[bench.numbers] / np.bincount(number).max()
     center = {one: pupil.points[number == one].mean(axis=0) for one in (1, 3)}
     pitch = float(np.hypot(*(center[3] - center[1])))  # segment 3 touches segment 1
-    rms = float(pistons.std())
+    rms, phase = float(pistons.std()), bench.commanded_phase(pistons)
     return Table(
         ["quantity", "value"],
         [
@@ -285,8 +285,9 @@ def layout_table(bench: Bench, pistons: NDArray, wavelength: float) -> Table:
             ["segments with more than 95 % of their area in the stop", int((share > 0.95).sum())],
             ["smallest share of a segment in the stop", float(share.min())],
             ["fill factor of the stop", pupil.n_points / Pupil.circular(bench.n_pixels).n_points],
-            ["pistons (rad rms)", rms],
-            ["pistons, wavefront (nm rms)", rms * wavelength / (2 * np.pi)],
-            ["Strehl ratio with these pistons", float(strehl(pupil, bench.commanded_phase(pistons)))],
+            ["pistons (rad rms over the segments)", rms],
+            ["pistons, wavefront (nm rms over the segments)", rms * wavelength / (2 * np.pi)],
+            ["pistons (rad rms over the stop, which cuts the outer segments)", float(pupil.gather(phase).std())],
+            ["Strehl ratio with these pistons", float(strehl(pupil, phase))],
         ],
     )

@@ -75,7 +75,7 @@ def agreement_table(correlation: list[float], estimate: Reconstruction, error: N
 
 
 def numbers(correlation: list[float], error: NDArray, commanded: NDArray) -> dict[str, float | str]:
-    """Numbers for the text: the correlation of the second image, and the error as a share of the commands."""
+    """Numbers for the text: input, correlation of the second image, and error as a share of the input."""
     share = error.std() / commanded.std() if commanded.any() else np.nan
     text = f"{share:.0%} of the input" if commanded.any() else f"{error.std():.2g} rad rms at a flat command"
-    return rounded({"correlation_second": correlation[1]}) | {"error_text": text}
+    return rounded({"input": commanded.std(), "correlation_second": correlation[1]}) | {"error_text": text}

@@ -65,12 +65,13 @@ def error_columns(bench: Bench, commanded: NDArray, errors: Mapping[str, NDArray
 
 
 def numbers(errors: Mapping[str, NDArray], commanded: NDArray) -> dict[str, float | str]:
-    """Numbers for the text: rms and largest error of both methods; all arrays are (n_segments,), rad."""
+    """Numbers for the text: input, rms and largest error of both methods; arrays are (n_segments,), rad."""
     linear, shifted = errors["Linear"], errors["PhaseShifted"]
     folded = commanded < _FOLDED
     share = np.abs(linear[folded] / commanded[folded]) if folded.any() else np.array([np.nan])
     return rounded(
         {
+            "input": commanded.std(),
             "linear_at_08": linear.std(),
             "shifted_at_08": shifted.std(),
             "linear_worst": np.abs(linear).max(),

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from studies.kit.bench import middle_rows
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
-from studies.kit.style import WIDE, show_intensity, show_phase
+from studies.kit.style import ALONE, WIDE, show_intensity, show_phase
 from studies.kit.tables import Table
 from zwfs import opd_to_phase, phase_to_opd
 from zwfs.frames import CameraNoise
@@ -50,6 +50,7 @@ LIMITS = parameter_limits(
 )
 
 SHOWN = ("BUNIT", "WAVELEN", "PUPDIAM", "DIMPLE", "ROTATE", "MAGNIF", "NBAD")  # keywords of the phase map
+_SHOWN = 4  # largest difference of the frames on the scale, over its rms
 _BAD = "#FF00FF"  # not in the colour maps, and far from the colours of the methods
 
 
@@ -61,7 +62,7 @@ def header_noise(source: CameraFile, gain: float, read_noise: float) -> CameraNo
 
 
 def draw_explained(result: MeasuredPhase) -> Figure:
-    """Measured frames, modelled frames and their difference, all on one scale; bad pixels are marked."""
+    """Measured frames, modelled frames and their difference; bad pixels are marked."""
     figure, panels = plt.subplots(2, 3, figsize=(7.2, 5.2))
     top = np.quantile(result.measured[..., *result.measurement.window][:, result.measurement.good], 0.999)
     for row, (measured, modelled, bad) in enumerate(
@@ -69,7 +70,8 @@ def draw_explained(result: MeasuredPhase) -> Figure:
     ):
         shown = show_intensity(panels[row, 0], measured, top)
         show_intensity(panels[row, 1], modelled, top)
-        difference = show_phase(panels[row, 2], np.where(bad, np.nan, measured - modelled), top / 2)
+        left = np.where(bad, np.nan, measured - modelled)
+        difference = show_phase(panels[row, 2], left, _SHOWN * result.residual.max())
         for axes in panels[row, ::2]:
             axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=1.2)
         panels[row, 0].set_ylabel(f"image {row + 1}: rms misfit {result.residual[row]:.3f}")
@@ -167,6 +169,7 @@ def draw_signs(measurement: Measurement, height: float = 0.4) -> Figure:
         if axes is panels[1]:
             figure.colorbar(shown, ax=axes, location="bottom", label="phase (rad)", aspect=12)
     figure.colorbar(shown, ax=list(panels[2:]), location="bottom", label="change of the intensity", aspect=26)
+    panels[1].set_gid(ALONE)
     panels[1].set_xlabel("x: columns, to the right", fontsize=9)
     panels[1].set_ylabel("y: rows, upwards", fontsize=9)
     return figure

@@ -248,7 +248,7 @@ def ratio_table(curves: Mapping[float, PhotonCurves]) -> Table:
     """Error over the bound of two methods, by the diameter of the dimples."""
     photons = next(iter(curves.values())).photons
     return Table(
-        ["dimple, input", *(f"{value:g}" for value in photons)],
+        ["dimple, input", *(f"{value:g} photons" for value in photons)],
         [
             [f"{diameter:g} λ/D, {rms:g} rad rms", *cells]
             for diameter, one in curves.items()

@@ -120,7 +120,7 @@ class Calibration(Immutable):
     def __post_init__(self) -> None:
         _check.integer("n_iterations", self.n_iterations, 1)
         _check.number("tolerance", self.tolerance, 0, 2 * np.pi)
-        number_or_inf("saturation", self.saturation, open_low=True)
+        _number_or_inf("saturation", self.saturation, open_low=True)
         _check.instance("bunit", self.bunit, str)
         _check.flag("balance", self.balance)
         _check.number("residual", self.residual, 0)
@@ -356,9 +356,9 @@ class Calibration(Immutable):
         batch = counts.shape[: -len(image)]
         if 0 in counts.shape:
             raise ValueError(f"counts has shape {counts.shape}: expected at least one exposure")
-        saturation = self.saturation if saturation is None else number_or_inf("saturation", saturation)
+        saturation = self.saturation if saturation is None else _number_or_inf("saturation", saturation)
         level, judge = min(saturation, _check.LARGEST), _check.flag("judge", judge)
-        largest_residual = number_or_inf("largest_residual", largest_residual)
+        largest_residual = _number_or_inf("largest_residual", largest_residual)
         counts, grid = counts.reshape(-1, self.n_images, *self.shape), self.good.shape
         if start is not None:
             maps = _check.real_array("start", start)
@@ -371,7 +371,7 @@ class Calibration(Immutable):
             piece = slice(first, first + _PIECE)
             begin = None if start is None else start[piece]
             parts.append(self._phases(counts[piece], begin, level, largest_residual, judge))
-        return Phases.joined(parts, batch)
+        return Phases._joined(parts, batch)
 
     def modal_matrix(self, modes: ArrayLike) -> NDArray[np.float64]:
         """Matrix that fits modes to a phase: least squares over the good points, without the piston.
@@ -507,7 +507,7 @@ def _is_calibration(path: Path) -> bool:
         return False
 
 
-def number_or_inf(name: str, value: Any, *, open_low: bool = False) -> float:
+def _number_or_inf(name: str, value: Any, *, open_low: bool = False) -> float:
     """Return a number of at least 0, or infinity."""
     is_inf = isinstance(value, float) and value == np.inf
     return value if is_inf else _check.number(name, value, 0, open_low=open_low)

@@ -70,7 +70,7 @@ class Phases:
     flags: NDArray[np.int64]
 
     @classmethod
-    def joined(cls, parts: list[Phases], batch: tuple[int, ...]) -> Phases:
+    def _joined(cls, parts: list[Phases], batch: tuple[int, ...]) -> Phases:
         """Join parts of a batch, with one axis each, and return them in its shape."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         whole = (column[0] if len(column) == 1 else np.concatenate(column) for column in columns)

@@ -26,12 +26,9 @@ __all__ = [
     "MeasuredPhase",
     "Measurement",
     "Optics",
-    "ideal_frames",
-    "model",
     "predict_other",
     "recover_phase",
     "reduce_frames",
-    "upside_down",
 ]
 
 _DARK = 0.1  # of the largest amplitude: a point with less is outside

@@ -24,7 +24,7 @@ from zwfs.frames._blocks import FileError
 from zwfs.frames._fits import card_value, fits_module
 from zwfs.frames._part import Cards, Part, Unit
 from zwfs.frames._stack import Stack
-from zwfs.frames.calibration import Calibration, number_or_inf
+from zwfs.frames.calibration import Calibration, _number_or_inf
 from zwfs.frames.files import check_output
 from zwfs.frames.phases import Flag, Phases
 from zwfs.modes import zernike_basis
@@ -218,7 +218,7 @@ class _Job:
         level = calibration.saturation if saturation is None else saturation
         if saturation is None and level == np.inf:
             level = stack.saturation
-        self.saturation = number_or_inf("saturation", level, open_low=True)
+        self.saturation = _number_or_inf("saturation", level, open_low=True)
         self.keywords = _columns(stack, keywords)
         names = max(len(card_value(one.name)) for one in stack.firsts)
         of_files = np.dtype([("NAME", f"S{names}"), ("FRAMES", ">i8")])

@@ -16,7 +16,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
 from math import prod
 from typing import Any, ClassVar, NamedTuple, cast
 
@@ -30,7 +29,7 @@ from zwfs._propagator import Propagator, amplitude_map, angle, propagator, pupil
 from zwfs.polychromatic import PolychromaticSensor
 from zwfs.sensor import Sensor, ZernikeSensor
 
-__all__ = ["ClosedForm", "Estimate", "FixedPoint", "Reconstruction", "Reconstructor", "State", "load"]
+__all__ = ["ClosedForm", "Estimate", "FixedPoint", "Reconstruction", "Reconstructor", "State"]
 
 # Detector pixels handled together: on the processor few enough for its fast memory, enough to vectorise.
 _CHUNK, _CHUNK_ELSEWHERE = 80_000, 40_000_000
@@ -631,38 +630,3 @@ def check_phase(
         raise ValueError(f"{name} has shape {(*own_batch, *shape)}: expected {expected}")
     # As many copies as there are frame sets, of one map or of each.
     return _check.in_kind(name, maps, kind) + kind.zeros(prod(batch), 1, 1)
-
-
-def load(path: str) -> type:
-    """Return the class of a reconstructor from its path.
-
-    Parameters
-    ----------
-    path : str
-        "module:Class", such as "zwfs.reconstructors.linear:Linear". The module may be any that can be imported: a
-        file next to the notebook, or a part of an installed package.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the path has another form, the module or class is missing, or objects of the class cannot be called.
-
-    Examples
-    --------
-    >>> from zwfs.reconstructors.base import load
-    >>> load("zwfs.reconstructors.linear:Linear").__name__
-    'Linear'
-    """
-    if not isinstance(path, str):
-        raise TypeError(f"path = {_check.shown(path)}: expected a string 'module:Class'")
-    module, colon, name = path.partition(":")
-    if not (colon and name.isidentifier() and all(part.isidentifier() for part in module.split("."))):
-        raise ValueError(f"path = {path!r}: expected 'module:Class', such as 'my_method:MyMethod'")
-    try:
-        method = getattr(import_module(module), name, None)
-    except (Exception, SystemExit) as error:  # whatever code raises
-        reason = f"{type(error).__name__}: {error}"
-        raise ValueError(f"path = {path!r}: expected a module that can be imported ({reason})") from error
-    if not isinstance(method, type) or "__call__" not in dir(method):
-        raise ValueError(f"path = {path!r}: expected the class of a reconstructor, got {_check.shown(method)}")
-    return method

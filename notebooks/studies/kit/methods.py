@@ -5,11 +5,13 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zwfs import _check
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import (
@@ -21,7 +23,6 @@ from zwfs.reconstructors import (
     PhaseShifted,
     Reconstruction,
 )
-from zwfs.reconstructors.base import load
 from zwfs.sensor import ZernikeSensor
 
 PAPER = ("Linear", "Arcsine", "GerchbergSaxton", "GradientDescent", "GradientDescentPoints", "PhaseShifted")
@@ -107,12 +108,29 @@ def _asked(method: Any, offered: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in offered.items() if name in inspect.signature(method).parameters}
 
 
+def _load(path: str) -> type:
+    """Return the class of a reconstructor from its path, "module:Class", in any module that can be imported."""
+    if not isinstance(path, str):
+        raise TypeError(f"path = {_check.shown(path)}: expected a string 'module:Class'")
+    module, colon, name = path.partition(":")
+    if not (colon and name.isidentifier() and all(part.isidentifier() for part in module.split("."))):
+        raise ValueError(f"path = {path!r}: expected 'module:Class', such as 'my_method:MyMethod'")
+    try:
+        method = getattr(import_module(module), name, None)
+    except (Exception, SystemExit) as error:  # whatever code raises
+        reason = f"{type(error).__name__}: {error}"
+        raise ValueError(f"path = {path!r}: expected a module that can be imported ({reason})") from error
+    if not isinstance(method, type) or "__call__" not in dir(method):
+        raise ValueError(f"path = {path!r}: expected the class of a reconstructor, got {_check.shown(method)}")
+    return method
+
+
 def _own_classes(paths: Sequence[str]) -> dict[str, Any]:
     """Return a reader's classes by their names, which differ from those of the paper's reconstructors."""
     package = {f"zwfs:{method.__name__}": method for method in RECONSTRUCTORS}
     own: dict[str, Any] = {}
     for path in paths:
-        method = package.get(path) or load(path)
+        method = package.get(path) or _load(path)
         taken = (*PAPER, *REPAIRED, *own)
         if method.__name__ in taken:
             raise ValueError(f"path = {path!r}: expected a name other than {', '.join(taken)}")

@@ -10,6 +10,10 @@ from scipy import ndimage
 
 from zwfs.frames._camera.model import Maps
 
+_WIDTH = 1.5  # pixels rms, of the weights with which neighbours give the light of a fully lit pixel
+_STIFF = 0.1  # pixels squared: with few pixels on a line, a slope across it is that of noise
+_DARKER = 0.1, 0.5  # least and most by which a pixel that is lit in part is darker than its surroundings
+
 
 @dataclass(frozen=True, eq=False)
 class Light:
@@ -36,10 +40,7 @@ class Light:
     def of(cls, start: NDArray, pixels: NDArray, oversampling: int) -> Light:
         """Divide a fine map of light; `pixels` is the light of each pixel, 1 on average where it is lit."""
         full = ndimage.binary_erosion(_fully_lit(pixels))
-        weight = ndimage.gaussian_filter(full.astype(float), 1.5)
-        near = np.where(
-            weight > 1e-3, ndimage.gaussian_filter(pixels * full, 1.5) / np.maximum(weight, 1e-12), np.nan
-        )
+        near = _continued(pixels, full)
         index = ndimage.distance_transform_edt(np.isnan(near), return_distances=False, return_indices=True)
         power = np.maximum(near[tuple(index)], 0.05)
         support = ndimage.binary_dilation(pixels > 0.1, iterations=2)
@@ -96,9 +97,39 @@ def narrow_gaps(pixels: NDArray) -> NDArray[np.bool_]:
     return np.asarray(ndimage.binary_closing(np.pad(whole, 1), np.ones((3, 3)))[1:-1, 1:-1] & ~whole)
 
 
+def _continued(pixels: NDArray, full: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Smooth light of fully lit pixels, continued along its slope; NaN far from them."""
+    if not full.any():  # a pupil of a few pixels
+        return pixels
+    near = _plane(pixels, full)
+    return near + _plane(np.where(full, pixels - near, 0), full)  # the plane alone lowers a maximum
+
+
+def _plane(image: NDArray, full: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Fit a plane to the chosen pixels near each pixel, and return its value there; NaN far from them."""
+
+    def mean(values: NDArray) -> NDArray[np.float64]:
+        return ndimage.gaussian_filter(values * full, _WIDTH) / weight
+
+    weight = np.maximum(ndimage.gaussian_filter(full.astype(float), _WIDTH), 1e-12)
+    places = np.indices(image.shape, float)
+    level, middle = mean(image), np.stack([mean(one) for one in places])
+    spread = np.array([[mean(one * other) for other in places] for one in places]) - middle[:, None] * middle
+    spread += _STIFF * np.eye(2)[..., None, None]
+    along = np.stack([mean(one * image) for one in places]) - middle * level
+    slope = np.linalg.solve(spread.transpose(2, 3, 0, 1), along.transpose(1, 2, 0)[..., None])[..., 0]
+    change = np.sum(slope.transpose(2, 0, 1) * (places - middle), axis=0)
+    return np.where(weight > 1e-3, level + change, np.nan)
+
+
 def _fully_lit(pixels: NDArray) -> NDArray[np.bool_]:
+    """Pixels as bright as their surroundings, but for the scatter of noise and of a mottled illumination."""
     typical = ndimage.percentile_filter(pixels, 60, 5)
-    return np.asarray((pixels > 0.9 * typical) & (typical > 0.5))
+    lit = typical > 0.5 * np.maximum(ndimage.maximum_filter(typical, 7), 0.2)
+    ratio = pixels / np.where(lit, typical, np.inf)
+    middle = np.median(ratio[lit]) if lit.any() else 1.0
+    scatter = 1.4826 * np.median(np.abs(ratio[lit] - middle)) if lit.any() else 0.0
+    return np.asarray(ratio > 1 - np.clip(3 * scatter, *_DARKER))
 
 
 def _blocks(fine: NDArray, f: int) -> NDArray[np.float64]:

@@ -96,7 +96,7 @@ def test_three_pokes_place_the_mirror_on_the_camera(tmp_path, monkeypatch, mirro
 
     strokes = 40 * np.sin(actuators[:, 0] / 3) * np.cos(actuators[:, 1] / 4)
     np.save("strokes.npy", np.stack([0 * strokes, strokes]))
-    exec(code, {"read": read})
+    exec(code, {"read": read, "np": np, "side": side})
     flat, found = np.load("commands.npy")
     true = opd_to_phase(2 * np.tensordot(strokes, influence, 1), 635.0)
     error = (found - true)[pupil.inside].std() / true[pupil.inside].std()

@@ -24,13 +24,16 @@ def test_example_of_the_front_page_prints_what_it_says(capsys):
 
 
 def test_example_of_a_loop_prints_the_residual_of_the_table(capsys):
-    cells = nbformat.read(ROOT / "notebooks" / "closed_loop.ipynb", 4).cells
-    (page,) = (cell.source for cell in cells if "## Close a loop" in cell.source)
-    (code,), (printed,) = (re.findall(rf"(?m)^```{kind}\n(.*?)^```", page, re.S) for kind in ("python", "text"))
-    exec(compile(code, "closed_loop.ipynb", "exec"), {})
+    decision, loops = (
+        nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", 4).cells for name in ("decision", "closed_loop")
+    )
+    (page,) = (cell.source for cell in decision if "## First commands" in cell.source)
+    (code,) = (block for block in re.findall(r"(?m)^```python\n(.*?)^```", page, re.S) if "close_loop" in block)
+    (printed,) = re.findall(r"(?m)^```text\n(.*?)^```", page, re.S)
+    exec(compile(code, "decision.ipynb", "exec"), {})
     assert capsys.readouterr().out == printed
     outputs = [
-        output.get("data", {}).get("text/markdown", "") for cell in cells for output in cell.get("outputs", ())
+        output.get("data", {}).get("text/markdown", "") for cell in loops for output in cell.get("outputs", ())
     ]
     (row,) = re.findall(r"(?m)^\| 0\.5 rad rms; 1000 photons \|.*", "\n".join(outputs))
     assert f"| linear {re.search('[0-9.]+', printed)[0]} |" in row

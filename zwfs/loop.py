@@ -192,7 +192,7 @@ def close_loop(
 
     In each cycle the plant measures the disturbance less the mirror. The reconstructed phase, its piston removed
     on the circle, is fitted by the mirror. The integrator adds `gain` times that to (1 - leak) times its last
-    figure, and the mirror takes the new figure `delay` cycles later. Frames without a photon add nothing.
+    shape, and the mirror takes the new shape `delay` cycles later. Frames without a photon add nothing.
 
     Parameters
     ----------
@@ -206,13 +206,14 @@ def close_loop(
         Wavefront in each cycle: an array with the cycles first, or a generator. Screens are corrected side by
         side.
     gain : float
-        In (0, 2); the loop is stable for any estimate that is right below that, with a delay of 1.
+        In (0, 2). With a delay of 1 and a correct estimate, the loop is stable for each of them; with a delay of 2
+        below 1.
     leak : float
-        Share of the figure that the integrator loses in each cycle, in [0, 1).
+        Share of the shape that the integrator loses in each cycle, in [0, 1).
     delay : int, cycles
         From a measurement to its correction, from 1 to 1000.
     stroke : float, radian rms, optional
-        Largest figure of the mirror, at least 1e-12; one beyond it is scaled down to it. Any figure if left out.
+        Largest shape of the mirror, at least 1e-12; one beyond it is scaled down to it. Any shape if left out.
     camera : Detector, optional
         Its noise is added to all frames; no noise if left out.
     seed : int, Generator or SeedSequence, optional
@@ -264,7 +265,7 @@ def close_loop(
             frames = camera.normalise(counts)
         rows.append((screens.std(axis=-1), pupil.rms(left), strehl(pupil, left), commands, photons))
         found = np.zeros(screens.shape)
-        # A frame without a photon holds no information: the mirror keeps its figure.
+        # A frame without a photon holds no information: the mirror keeps its shape.
         seen = (frames.max(axis=(-2, -1)) > 0).all(axis=-1)
         if seen.any():
             found[seen] = without_piston(pupil.gather(reconstructor(frames[seen]).phase))

@@ -406,14 +406,14 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
         "two images (residual, rad rms)",
         "one image",
         "ratio of the residuals",
-        "loops that close: two images, one",
-        "gain: two images, one",
+        "loops that close: with two images, with one",
+        "gain: with two images, with one",
     )
     cells = []
     for row in rows:
         loops = row.loops
         found = [f"{_short(name)} {two_digits(typical(loops.settled[name]))}" for name in (row.two, row.one)]
-        closed = f"{loops.closed(row.two)} and {loops.closed(row.one)} of {loops.settled[row.one].size}"
+        closed = ", ".join(f"{loops.closed(name)} of {loops.settled[name].size}" for name in (row.two, row.one))
         span = f"{row.low:.2f} to {row.high:.2f}" if row.high < np.inf else "one loop"
         gains = f"{loops.gains[row.two]:g}, {loops.gains[row.one]:g}"
         light = f"{loops.photons:g} photon{'s' * (loops.photons != 1)}"

@@ -232,7 +232,7 @@ def draw_linearity(
         found = 0 < limits[name].value < np.inf
         reach = f": limit {limits[name].value:.2g} rad" if found else ""
         if limits[name].value == 0:
-            reach = f": above {percent(threshold)}"
+            reach = f": never below {percent(threshold)}"
         plain.plot(rms, mean[drawn], label=textwrap.fill(look.label + reach, 44), **line)
         low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
         plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
@@ -246,15 +246,7 @@ def draw_linearity(
     )  # fmt: skip
     ratio.axhline(threshold, color="#555555", lw=1)
     end = ratio.get_yaxis_transform()  # the right end of the line, which no curve crosses
-    ratio.text(
-        1.02,
-        threshold,
-        f"{percent(threshold)}\nof the\ninput",
-        transform=end,
-        color="#555555",
-        fontsize=9,
-        va="center",
-    )
+    ratio.text(1.02, threshold, percent(threshold), transform=end, color="#555555", fontsize=9, va="center")
     plain.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(-0.03, None), ylim=(-0.03, None))
     ratio.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, columnspacing=1)

@@ -74,7 +74,8 @@ def draw_explained(result: MeasuredPhase) -> Figure:
         difference = show_phase(panels[row, 2], left, _SHOWN * result.residual.max())
         for axes in panels[row, ::2]:
             axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=1.2)
-        panels[row, 0].set_ylabel(f"image {row + 1}: rms misfit {result.residual[row]:.3f}")
+        panels[row, 0].set_ylabel(f"image {row + 1}")
+        panels[row, 2].set_xlabel(f"rms {result.residual[row]:.3f}")
     for axes, title in zip(panels[0], ("measured", "modelled", "measured − modelled"), strict=True):
         axes.set_title(title, fontsize=10)
     figure.colorbar(shown, ax=panels[:, :2], label="intensity", location="bottom", shrink=0.6, aspect=40)

@@ -366,7 +366,8 @@ def _finer(data: Recording, point: Point) -> list[NDArray[np.float64]]:
         camera.n, camera.shape, data.n_pixels, camera.exposures, fine_phase(data.phases, f), f, camera.largest
     )
     light = Light.sharp(np.maximum(point.light_means, 0), f)
-    light = replace(light, amplitude=of.light.amplitude.repeat(2, 0).repeat(2, 1))
+    # Halfway between the amplitude of the fit and a new one, of which it is not known which is better.
+    light = replace(light, amplitude=(of.light.amplitude.repeat(2, 0).repeat(2, 1) + light.amplitude) / 2)
     phase = PhaseMap(camera.n, f, _PHASE_PRIOR, data.n_pixels).fine(of.split(point.x)[0][0])
     return finer.at(light.maps(light.start, phase), point.values).images
 

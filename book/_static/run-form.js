@@ -52,6 +52,8 @@
 
   const range = ({ low, high }) => (low === undefined ? "" : `${short(low)} to ${short(high)}`);
 
+  const greek = (text) => text.replaceAll("lambda", "λ").replaceAll("-theta", "−θ").replaceAll("theta", "θ");
+
   // Open the folds around an element.
   function unfold(element) {
     for (let fold = element.closest("details"); fold; fold = fold.parentElement.closest("details")) fold.open = true;
@@ -82,7 +84,7 @@
       }
       this.write(this.standard);
       const name = path.split(".").pop();
-      const words = [meaning, unit].filter(Boolean).join(", ");
+      const words = greek([meaning, unit].filter(Boolean).join(", "));
       const about = [words && make("code", {}, name), range(isList(limits) ? limits.list : limits)].filter(Boolean);
       this.element = make("div", { class: "run-field" },
         make("label", { for: id }, words || name),

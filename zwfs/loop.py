@@ -206,8 +206,8 @@ def close_loop(
         Wavefront in each cycle: an array with the cycles first, or a generator. Screens are corrected side by
         side.
     gain : float
-        In (0, 2). With a delay of 1 and a correct estimate, the loop is stable for each of them; with a delay of 2
-        below 1.
+        In (0, 2). If the estimate is correct, the loop is stable below 2 with a delay of 1, and below 1 with one
+        of 2.
     leak : float
         Share of the shape that the integrator loses in each cycle, in [0, 1).
     delay : int, cycles

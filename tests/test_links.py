@@ -26,7 +26,8 @@ def test_equations_lead_to_the_code_that_cites_them_and_to_its_tests():
     [
         ("The reference waves interfere.", ["reference waves"]),
         ("The wavefront error of a wavefront", ["wavefront error", "wavefront"]),
-        ("A wavefront sensor, a phase shift, and a phase-shifted iteration", ["phase shift"]),
+        ("A wavefront sensor, a phase shift, and a phase-shifted image", ["phase shift"]),
+        ("The phase-shifted iteration", ["phase-shifted iteration"]),
         ("Maximum likelihood, then maximum likelihood", ["Maximum likelihood"]),
     ],
 )

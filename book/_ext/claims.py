@@ -23,6 +23,7 @@ HOLDS, REMARK, FAILS, UNTESTED = "holds", "holds with a remark", "does not hold"
 # The signs differ in shape, for readers who do not see the colours.
 SIGNS = {HOLDS: "✔", REMARK: "◐", FAILS: "✘", UNTESTED: "○"}
 STUDIES = Path(__file__).parents[2] / "notebooks" / "studies"
+SPEED = Path(__file__).parents[2] / "tests" / "benchmarks" / "speed.py"
 PARTS = {"sensor": range(1, 7), "range": range(7, 14), "choices": range(14, 18), "bench": range(18, 22)}
 ROUNDING = 1e-12  # the notebooks give no smaller errors
 
@@ -137,7 +138,7 @@ def count(judged: dict[int, Finding]) -> str:
     """Return a line with the number of claims of each verdict."""
     numbers = Counter(finding.verdict for finding in judged.values())
     listed = ", ".join(f"{numbers[verdict]} {_marked(verdict)}" for verdict in SIGNS if numbers[verdict])
-    return f"The {len(judged)} claims of the paper: {listed}."
+    return f"The [{len(judged)} claims of the paper](claims.md): {listed}."
 
 
 def table(judged: dict[int, Finding], numbers: range) -> str:
@@ -180,7 +181,9 @@ def rules() -> str:
                 text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))
                 if claim.timed:
                     text += "**Its times**, `tests/benchmarks/speed.py`:\n\n"
-                    text += _include("../tests/benchmarks/speed.py", pyobject=claim.timed)
+                    text += _include(
+                        "../tests/benchmarks/speed.py", **timing_lines(claim, SPEED.read_text("utf-8"))
+                    )
         text += "**All numbers:**\n\n"
         text += _include(code, name=f"numbers-{notebook}", pyobject="numbers") + "::::\n\n"
     return text
@@ -216,6 +219,14 @@ def marked_lines(claim: Claim, code: str) -> dict[str, str]:
     first, last = min(found), max(found)
     marked = ",".join(str(number - first + 1) for number in sorted(found))
     return {"lines": f"{first}-{last}", "emphasize-lines": marked}
+
+
+def timing_lines(claim: Claim, code: str) -> dict[str, str]:
+    """Return the function that measures rates and errors of a claim, as options of ``literalinclude``."""
+    [function] = [one for one in ast.parse(code).body if getattr(one, "name", "") == claim.timed]
+    lines = enumerate(code.splitlines()[function.lineno - 1 : function.end_lineno], 1)
+    marked = [str(number) for number, line in lines if '"rate":' in line or '"median error":' in line]
+    return {"pyobject": claim.timed, "emphasize-lines": ",".join(marked)}
 
 
 def _include(file: str, **options: str) -> str:

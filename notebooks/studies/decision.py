@@ -211,7 +211,7 @@ def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
 def calibrated_errors(situations: Sequence[Situation], n_screens: int) -> list[tuple[float, float] | None]:
     """Errors of a bench that HCIPy simulates, with the fitted model and with the values of the design.
 
-    They are in rad rms over the pixels; None for a situation that was not recorded.
+    They are in rad rms over the pixels and the screens; None for a situation that was not recorded.
     """
     taken = calibration.Recording.read()
     rows = [taken.unseen(*one)[:n_screens] for one in situations]
@@ -220,7 +220,7 @@ def calibrated_errors(situations: Sequence[Situation], n_screens: int) -> list[t
     fit = calibration.calibrate(taken)
     found = iter(calibration.measure(taken, fit, [number for row in rows for number in row]))
     errors = [np.array([(one.calibrated, one.plain) for one in islice(found, len(row))]) for row in rows]
-    return [(typical(row[:, 0]), typical(row[:, 1])) if row.size else None for row in errors]
+    return [tuple(np.sqrt(np.mean(row**2, axis=0)).tolist()) if row.size else None for row in errors]
 
 
 def closed_loops(situations: Sequence[Situation], n_screens: int, seed: int) -> list[BestMethods]:
@@ -287,7 +287,7 @@ def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
 
 
 def open_cell(errors: Mapping[str, NDArray]) -> Cell:
-    """Compare the methods without a loop."""
+    """Compare the methods in open loop."""
     one, two = simplest(errors, ONE_IMAGE), simplest(errors, TWO_IMAGES)
     both = typical(errors[one]), typical(errors[two])
     return Cell(ONE_IMAGE[one], TWO_IMAGES[two], both, *paired_ratio(errors[two], errors[one]))
@@ -317,7 +317,7 @@ class Row(NamedTuple):
 
 
 def open_rows(situations: Sequence[Situation], errors: Mapping[str, Sequence[Mapping[str, NDArray]]]) -> list[Row]:
-    """Rows without a loop, for each bench."""
+    """Rows of the open loop, for each bench."""
     return [
         Row(f"{bench}_{index}", BENCHES[bench], f"{rms:g} rad rms", f"{photons:g}", open_cell(some))
         for bench, rows in errors.items()
@@ -366,7 +366,7 @@ def calibrated_table(situations: Iterable[Situation], errors: Iterable[tuple[flo
 
 
 def _likelihood_ratios(errors: Sequence[Mapping[str, NDArray]]) -> list[float]:
-    """Error of maximum likelihood over that of the phase-shifted iteration, in each situation without a loop."""
+    """Error of maximum likelihood over that of the phase-shifted iteration, in each situation of the open loop."""
     return [paired_ratio(one["MaximumLikelihood"], one["PhaseShifted"])[0] for one in errors]
 
 

@@ -232,7 +232,7 @@ def draw_linearity(
         found = 0 < limits[name].value < np.inf
         reach = f": limit {limits[name].value:.2g} rad" if found else ""
         if limits[name].value == 0:
-            reach = f": never below {percent(threshold)}"
+            reach = f": always above {percent(threshold)}".replace(" %", "\N{NO-BREAK SPACE}%")
         plain.plot(rms, mean[drawn], label=textwrap.fill(look.label + reach, 44), **line)
         low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
         plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
@@ -393,9 +393,7 @@ def _phrases(curves: LinearityCurves, limits: Mapping[str, Limit], threshold: fl
         for name, short in (_SHORT | {"GerchbergSaxton": "saxton"}).items()
     }
     return reaches | {
-        "gain_text": f"The second limit is {gain} times the first."
-        if 0 < gain.value < np.inf
-        else "The two limits have no ratio, because not both exist.",
+        "gain_text": f", {gain} times as far" if 0 < gain.value < np.inf else "",
         "alike_text": f"Up to {alike:.2g} rad rms its error is below 10⁻⁶ rad, like that of the iteration."
         if alike
         else "Its error and that of the iteration are not below 10⁻⁶ rad.",

@@ -135,10 +135,10 @@ def draw_gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> F
     panels[0].margins(x=0.08)
     panels[1].plot([step.result.misfit for step in work], rows, color="#444444", marker="o", ms=5)
     panels[1].set(xlabel="misfit /\ncontrast")
-    panels[1].set_gid(WIDE)
     if errors is not None:
         panels[2].plot(errors, rows, color="#444444", marker="o", ms=5)
         panels[2].set(xlabel="difference from\ncommands (rad rms)")
+        panels[2].set_gid(WIDE)
     for axes in panels[1:]:
         axes.margins(x=0.08)
         axes.update_datalim([(0, rows[-1])])  # the margin is a share of the whole axis
@@ -280,7 +280,7 @@ def step_table(work: Sequence[Step], errors: Sequence[float] | None) -> Table:
             ]
         )
     scores = ["score", "control", "misfit over contrast"]
-    return Table(["step", *scores, "scale", "dimple", "leakage", "error (rad rms)"], rows)
+    return Table(["step", *scores, "scale", "dimple", "leakage", "difference from commands (rad rms)"], rows)
 
 
 def image_table(frames: Sequence[Image], clear_frames: Sequence[Image]) -> Table:

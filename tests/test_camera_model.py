@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from zwfs import Dimple, Pupil, ZernikeSensor
-from zwfs.frames._camera.light import narrow_gaps
 from zwfs.frames._camera.model import Camera, Exposure, Maps, names_of
 
 N, F, SHAPE = 20, 2, (28, 28)
@@ -103,28 +102,3 @@ def test_change_of_the_maps_is_that_of_finite_differences_and_has_an_adjoint(cam
     seen = sum(np.vdot(one, two) for one, two in zip(pixels, applied, strict=True))
     back = sum(np.vdot(one, two) for one, two in zip(point.adjoint(pixels)[:3], change, strict=True))
     assert back == pytest.approx(seen, rel=1e-10)
-
-
-def test_light_that_is_scattered_farther_leaves_its_place_and_is_conserved(camera):
-    lit = np.zeros((N * F, N * F))
-    lit[16:24, 16:24] = 1
-    # Light that does not interfere, in a gap in the middle; wide frames hold all of it.
-    rest, gap = 0 * lit, np.zeros(lit.shape, bool)
-    gap[20], rest[20, 16:24] = True, 0.2
-    point = camera.at(Maps(lit, rest, 0 * lit), VALUES)
-    same, far = (point.scattered(gap, farther) for farther in (1.0, 3.0))
-    for image, alike, moved in zip(point.images, same, far, strict=True):
-        np.testing.assert_allclose(alike, image, rtol=0, atol=1e-9)
-        assert moved.sum() == pytest.approx(image.sum(), rel=1e-3)
-    # The first arm has a focus, the third one has none.
-    assert np.abs(far[0] - point.images[0]).max() > 1e-3
-    np.testing.assert_allclose(far[2], point.images[2], rtol=0, atol=1e-9)
-
-
-def test_narrow_gaps_are_not_edges():
-    pixels = np.ones((20, 20))
-    pixels[:3] = 0
-    pixels[3], pixels[10] = 0.5, 0.7
-    gaps = narrow_gaps(pixels)
-    assert gaps[10, 2:-2].all()
-    assert not gaps[:9].any()

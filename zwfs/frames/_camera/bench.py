@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from zwfs import _check
-from zwfs.frames._camera.light import Light, narrow_gaps
+from zwfs.frames._camera.light import Light
 from zwfs.frames._camera.model import ARM, Camera, Exposure, names_of
 from zwfs.frames._camera.prior import MapPrior
 from zwfs.frames._camera.recording import PAD, Recording, centred
@@ -41,7 +41,6 @@ EXPLAINED = 1.2
 """Mean square of the residuals over the noise up to which a model explains the frames."""
 _FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
 _PHASE_PRIOR = MapPrior(0.5, 3.0)
-_FARTHER = 1.35  # times as far as an edge, a gap of a quarter of a pixel scatters light on average
 _PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the physics
 _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
 
@@ -347,19 +346,10 @@ def _squares(data: Recording, point: Point) -> list[NDArray[np.float64]]:
 
 
 def _changes(data: Recording, point: Point) -> list[list[NDArray[np.float64]]]:
-    """Changes of the images over their noise with what the model cannot know.
+    """Changes of the images over their noise with twice the resolution.
 
-    First, twice the resolution and sharp edges of the pupil. Second, light that narrow gaps scatter farther than
-    edges do.
+    First, the light is divided anew. Second, each point keeps its light, and is divided as an edge divides it.
     """
-    weights, model = point.problem.weights, point.model
-    gaps = np.kron(narrow_gaps(np.maximum(point.light_means, 0)), np.ones((point.problem.camera.f,) * 2)) > 0
-    others = _finer(data, point), model.scattered(gaps, _FARTHER)
-    return [[w * (a - b) for w, a, b in zip(weights, one, model.images, strict=True)] for one in others]
-
-
-def _finer(data: Recording, point: Point) -> list[NDArray[np.float64]]:
-    """Images with twice the resolution and sharp edges of the pupil."""
     of, f = point.problem, 2 * point.problem.camera.f
     camera = of.camera
     finer = Camera(
@@ -367,9 +357,21 @@ def _finer(data: Recording, point: Point) -> list[NDArray[np.float64]]:
     )
     light = Light.sharp(np.maximum(point.light_means, 0), f)
     # Halfway between the amplitude of the fit and a new one, of which it is not known which is better.
-    light = replace(light, amplitude=(of.light.amplitude.repeat(2, 0).repeat(2, 1) + light.amplitude) / 2)
+    light = replace(light, amplitude=(_repeated(of.light.amplitude) + light.amplitude) / 2)
+    n = len(point.light)
+    sharp = _repeated(light.start.reshape(n, 2, n, 2).mean(axis=(1, 3)))
+    share = np.divide(light.start, sharp, out=np.ones_like(sharp), where=sharp > 1e-6)
     phase = PhaseMap(camera.n, f, _PHASE_PRIOR, data.n_pixels).fine(of.split(point.x)[0][0])
-    return finer.at(light.maps(light.start, phase), point.values).images
+    changes = []
+    for divided in (light.start, share * _repeated(point.light)):
+        images = finer.at(light.maps(divided, phase), point.values).images
+        changes.append([w * (a - b) for w, a, b in zip(of.weights, images, point.model.images, strict=True)])
+    return changes
+
+
+def _repeated(image: NDArray) -> NDArray[np.float64]:
+    """Map on a grid that is finer by 2."""
+    return image.repeat(2, axis=0).repeat(2, axis=1)
 
 
 def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:

@@ -91,12 +91,6 @@ class Light:
         return np.sqrt(least) + (light - least) / (2 * np.sqrt(least))
 
 
-def narrow_gaps(pixels: NDArray) -> NDArray[np.bool_]:
-    """Pixels that are lit in part between pixels that are fully lit."""
-    whole = _fully_lit(pixels)
-    return np.asarray(ndimage.binary_closing(np.pad(whole, 1), np.ones((3, 3)))[1:-1, 1:-1] & ~whole)
-
-
 def _continued(pixels: NDArray, full: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Smooth light of fully lit pixels, continued along its slope; NaN far from them."""
     if not full.any():  # a pupil of a few pixels

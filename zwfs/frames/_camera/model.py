@@ -340,14 +340,6 @@ class Linearised:
             for one, part in zip(camera.exposures, self._parts, strict=True)
         ]
 
-    def scattered(self, where: NDArray[np.bool_], farther: float) -> list[NDArray[np.float64]]:
-        """Images if the light that the grid does not resolve at some points moves farther by a factor."""
-        light, images = self._spectrum_of(np.where(where, self.maps.rest, 0)), []
-        for one, image in zip(self.camera.exposures, self.images, strict=True):
-            spread, _ = self.camera.spread_at(farther * self.arms[one.arm]["focus"])
-            images.append(image + self._on_camera(one, (spread - self._spread[one.arm][0]) * light))
-        return images
-
     def _source(self, field: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Field on the whole grid, its spectrum, and its coefficients for the light of the dimple."""
         whole = np.zeros((self.camera.size,) * 2, complex)

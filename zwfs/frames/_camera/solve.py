@@ -25,6 +25,7 @@ _LAST = 8  # steps at the end of a fit
 _SHARES = 1.0, 0.5, 0.25  # of such a step: the best one is taken
 _N_MAPS = 80  # iterations for the minimum of the maps
 _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
+_MISSED = 0.23  # errors of fits to frames of HCIPy, over the changes with a finer grid (rms)
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
 _PIXEL_MEAN = np.array([230.0, 2 * 76.0, 2.0]) / 384  # of a cubic spline over a pixel, as a series of cosines
 
@@ -513,8 +514,8 @@ class Eliminated:
         That of the noise is S^-1 times `scale`. Where the model misses something, residuals are alike over some
         pixels, and the scores E^T r of square blocks scatter more than noise makes them:
         S^-1 (sum of their squares + X^T X + prior) S^-1 replaces what is smaller. A change d of the images, over
-        their noise, moves the numbers by S^-1 E^T d. It is the largest change that is expected, so that a third of
-        its square is added: the variance of a uniform distribution. All arms, and both masks, have its mean.
+        their noise, moves the numbers by S^-1 E^T d. The errors of the model are taken to be a part of the rms of
+        these moves.
         """
         inverse = linalg.pinvh(self._matrix, rtol=_ALIKE)
         sums = [[r * one for r, one in zip(point.residuals, each, strict=True)] for each in self._effects]
@@ -523,10 +524,8 @@ class Eliminated:
         grow = np.sqrt(np.maximum(scale, seen)) / self._unit
         flat = [np.concatenate([one.ravel() for one in change]) for change in changes]
         moved = inverse @ (self._e @ np.transpose(flat)) / self._unit[:, None]
-        names = [one.name.split()[-1].replace("second", "first") for one in point.problem.free]
-        kinds = np.unique(names, return_inverse=True)[1]
-        alike = (np.bincount(kinds, np.sum(moved**2, axis=1) / 3) / np.bincount(kinds))[kinds]
-        return inverse * np.outer(grow, grow) + np.diag(alike)
+        missed = _MISSED**2 * np.mean(moved**2, axis=1)
+        return inverse * np.outer(grow, grow) + np.diag(missed)
 
 
 def settle(best: Minimum) -> tuple[Minimum, Eliminated]:

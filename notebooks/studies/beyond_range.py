@@ -417,7 +417,7 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
     bottom = noisy[-1].median(MODES).min() / 3
     if exact:
         light.text(
-            0.98, 0.02, f"no noise: exact up to {exact:g} rad rms", ha="right", fontsize=9, color=_INK,
+            0.98, 0.02, f"no noise: all recovered to {exact:g} rad rms", ha="right", fontsize=9, color=_INK,
             transform=light.transAxes,
         )  # fmt: skip
     for axes in (methods, light):

@@ -141,6 +141,15 @@ def count(judged: dict[int, Finding]) -> str:
     return f"The [{len(judged)} claims of the paper](claims.md): {listed}."
 
 
+def by_verdict(judged: dict[int, Finding]) -> str:
+    """Return a list of the verdicts, with links to the rows of their claims."""
+    lines = []
+    for verdict in SIGNS:
+        rows = [f"[{number}](#claim-{number})" for number, found in judged.items() if found.verdict == verdict]
+        lines += [f"- {_marked(verdict)}: {', '.join(rows)}"] if rows else []
+    return "\n".join(lines)
+
+
 def table(judged: dict[int, Finding], numbers: range) -> str:
     """Return the table of some claims as MyST text."""
     header = ["claim", "the paper says", "measured here"]
@@ -161,7 +170,11 @@ def _row(claim: Claim, finding: Finding) -> list[str]:
         address = claim.source.replace(claim.notebook, f"../notebooks/{claim.notebook}.ipynb")
         measured.append(f"*[{_title(claim.notebook)}]({address}), [code](#code-{claim.number})*")
         verdict = _marked(finding.verdict, f"(#rule-{claim.number})")
-    return [f"{claim.number}. **{claim.title}** {verdict}", f"{claim.statement} *{section}*", " ".join(measured)]
+    return [
+        f"[{claim.number}.]{{#claim-{claim.number}}} **{claim.title}** {verdict}",
+        f"{claim.statement} *{section}*",
+        " ".join(measured),
+    ]
 
 
 def rules() -> str:
@@ -249,7 +262,7 @@ def add_substitutions(app: Sphinx, config: Config) -> None:
     """Define the tables of the claims, their number and rules, from the notebooks that the book shows."""
     judged = findings(Path(app.srcdir, config.executed_notebooks))
     added = {f"claims_{name}": table(judged, numbers) for name, numbers in PARTS.items()}
-    added |= {"claims_count": count(judged), "claims_rules": rules()}
+    added |= {"claims_count": count(judged), "claims_list": by_verdict(judged), "claims_rules": rules()}
     config.myst_substitutions = config.myst_substitutions | added
 
 

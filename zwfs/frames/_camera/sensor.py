@@ -25,11 +25,11 @@ from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
-# Exponents of the spectrum of a phase, of which held-out pixels choose. The smooth ones come first: from a rough
+# Exponents of the spectrum of a phase, of which the evidence chooses. The smooth ones come first: from a rough
 # phase, a smooth one is not found in a few steps.
-_EXPONENTS = 5.0, 4.0, 3.0, 2.0
-_HELD_OUT = 0.1  # of the pixels
-_TIE = 0.03  # of priors that predict held-out pixels as well as this, the smoothest is taken
+_EXPONENTS = 8.0, 6.0, 4.5, 3.0, 2.0
+_STRONGER = 4.5  # factor on the first rms for each unit of the exponent: the same density at about 10 cycles / D
+_UPDATES = 3  # of the rms by the evidence
 _ALLOWED = 0.05  # error of the model in the first stage, over the light of a full pixel
 _DRAWS = 12  # for the error bars of a phase
 
@@ -48,7 +48,7 @@ class FittedPhase(NDArrayOperatorsMixin):
         Whether the model explains the frames within their noise.
     converged : bool
     exponent : float
-        Of the spectrum of the prior, as chosen by held-out pixels.
+        Of the spectrum of the prior, as chosen by the evidence.
     """
 
     phase: NDArray[np.float64]
@@ -91,7 +91,8 @@ class FittedSensor:
 
     The phase-shifted iteration with the fitted mask and amplitude gives a start. Then the phase alone is fitted
     with all of the model. In the first stage an error of the model adds to the noise, which keeps edges of the
-    pupil from holding a wrong start. The prior is smooth to a degree that held-out pixels choose.
+    pupil from holding a wrong start. The prior is smooth to a degree that the evidence chooses: the probability of
+    the frames with all phases of the prior.
 
     Parameters
     ----------
@@ -135,25 +136,25 @@ class FittedSensor:
             raise ValueError(f"sigma reaches down to {sigma.min():.6g}: expected more than 0")
         good = np.isfinite(counts)
         counts, weights = np.where(good, counts, 0), good / sigma
-        held = np.random.default_rng(0).random(shape) < _HELD_OUT  # the choice hardly changes the prior
-        lit = held & good & (counts > 0.1 * np.median(counts[counts > 0.5 * counts.max()]))
         # Where the start is wrong by a wave, edges of the pupil would hold it there.
         allowed = _ALLOWED * np.array([arm["flux"] for arm in self.fit.point.model.arms[:2]])
         soft = allowing(weights, allowed[:, None, None])
-        means = self._minimum(counts, soft, 3.0, self._start(counts), 5, 20).point.phase_means
-        tried: list[tuple[float, float, NDArray]] = []
+        start = self._start(counts)
+        prior = MapPrior(_rms_of(start), 3.0)
+        means = self._minimum(counts, soft, prior, start, 5, 20).point.phase_means
+        least = math.inf
         for exponent in _EXPONENTS:
-            seen = self._minimum(counts, weights * ~held, exponent, means, 3, 30).point
-            means = seen.phase_means
-            score = float(np.mean(((np.array(seen.model.images) - counts) * weights)[lit] ** 2))
-            tried.append((score, exponent, means))
-            if score > 1.1 * min(one[0] for one in tried):
+            rms, now = _rms_of(means) * _STRONGER ** (exponent - 4), means
+            for _ in range(_UPDATES):
+                point = self._minimum(counts, weights, MapPrior(rms, exponent), now, 3, 30).point
+                now, (evidence, growth) = point.phase_means, point.evidence
+                rms *= math.sqrt(growth)
+            if evidence > least:
                 break
-        least = min(one[0] for one in tried)
-        _, exponent, means = next(one for one in tried if one[0] <= (1 + _TIE) * least)
-        end = self._minimum(counts, weights, exponent, means, self.n_steps, 30)
+            least, prior, means = evidence, MapPrior(rms, exponent), now
+        end = self._minimum(counts, weights, prior, means, self.n_steps, 30)
         misfit, phase = float(np.mean(end.point.misfit)), end.point.phase_means[PAD:-PAD, PAD:-PAD]
-        return FittedPhase(phase, misfit, misfit < EXPLAINED, end.converged, exponent, end.point)
+        return FittedPhase(phase, misfit, misfit < EXPLAINED, end.converged, prior.exponent, end.point)
 
     def frames(self, phase: ArrayLike) -> NDArray[np.float64]:
         """Frames that the model predicts for a phase.
@@ -193,12 +194,10 @@ class FittedSensor:
         return camera
 
     def _minimum(
-        self, counts: NDArray, weights: NDArray, exponent: float, start: NDArray, n_steps: int, n_inner: int
+        self, counts: NDArray, weights: NDArray, prior: MapPrior, start: NDArray, n_steps: int, n_inner: int
     ) -> Minimum:
         """Fit of the phase alone."""
         of = self._fitted
-        inside = start[of.phase_map.n // 4 : -of.phase_map.n // 4]
-        prior = MapPrior(max(0.1, 2 * float(inside.std())), exponent)
         phase_map = PhaseMap(of.phase_map.n, of.camera.f, prior, of.camera.n_pixels)
         light, values = self._light, self.fit.point.values
         zero = np.zeros(light.start.shape)
@@ -229,6 +228,12 @@ class FittedSensor:
         phase = unwrapped(np.nan_to_num(found), inside)
         near = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
         return phase[tuple(near)] - phase[inside].mean()
+
+
+def _rms_of(phase: NDArray) -> float:
+    """First rms of a prior, from that of a phase in the middle of its map."""
+    n = len(phase)
+    return max(0.1, 2 * float(phase[n // 4 : -n // 4].std()))
 
 
 def unwrapped(phase: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -366,6 +366,21 @@ class Point:
             out.append(float(d @ self.product(d)) / one.size**2 * (1 + response))
         return out
 
+    @cached_property
+    def evidence(self) -> tuple[float, float]:
+        """Minus the logarithm of the evidence of the phase's prior, and a factor on its variance.
+
+        Laplace's approximation, with approximate eigenvalues e of the matrix: cost + sum(log e) / 2. The
+        factor makes the evidence stationary (MacKay 1992): |x|^2 / sum(1 - 1 / e), with the white numbers x.
+        """
+        spectrum, size = self._spectra[0], self.problem.phase_map.size
+        twice = np.full(spectrum.shape[1], 2.0)  # half the plane stands for all of it
+        twice[0] = 1
+        twice[-1] = 1 + size % 2
+        determined = float(np.sum((1 - 1 / spectrum) * twice))
+        squares = float(np.sum(self.x[: size**2] ** 2))
+        return self.cost + float(np.sum(np.log(spectrum) * twice)) / 2, squares / max(determined, 1)
+
     def _response(self, probe: NDArray, answer: NDArray, of: PhaseMap | LightMap) -> NDArray[np.float64]:
         """Mean response of the images at each spatial frequency of a map."""
         f = self.problem.camera.f

@@ -84,6 +84,8 @@ class Claim:
     given: dict[str, str] = field(default_factory=dict)  # names for expressions
     measured: str = ""  # template of the measured values
     timed: str = ""  # the function of the benchmarks that measures its times
+    also: str = ""  # another notebook whose numbers the rule uses
+    refined: str = ""  # the function in `kit/curves.py` that its code calls
 
     @property
     def notebook(self) -> str:
@@ -130,8 +132,9 @@ def judge(claim: Claim, numbers: Mapping[str, Any]) -> Finding:
 
 def findings(folder: Path) -> dict[int, Finding]:
     """Judge every claim by the executed notebooks in a folder."""
-    numbers = {name: glued(folder / f"{name}.ipynb") for name in {claim.notebook for claim in CLAIMS} if name}
-    return {claim.number: judge(claim, numbers.get(claim.notebook, {})) for claim in CLAIMS}
+    names = {name for claim in CLAIMS for name in (claim.notebook, claim.also) if name}
+    numbers = {"": {}} | {name: glued(folder / f"{name}.ipynb") for name in names}
+    return {claim.number: judge(claim, numbers[claim.also] | numbers[claim.notebook]) for claim in CLAIMS}
 
 
 def count(judged: dict[int, Finding]) -> str:
@@ -181,7 +184,8 @@ def rules() -> str:
     """Return as MyST text, in one fold for each notebook, the rules of its claims and the code of its numbers."""
     text = ""
     for notebook in dict.fromkeys(claim.notebook for claim in CLAIMS if claim.notebook):
-        text += f"::::{{dropdown}} Rules and numbers: {_title(notebook)}\n:class-container: d-print-none\n\n"
+        text += f"::::{{dropdown}} Rules and numbers: {_title(notebook)}\n"
+        text += ":class-container: d-print-none claim-code\n\n"
         code = f"../notebooks/studies/{notebook}.py"
         for claim in CLAIMS:
             if claim.notebook == notebook:
@@ -190,6 +194,8 @@ def rules() -> str:
                 text += _include("_ext/claims.yml", language="yaml", **ends)
                 text += f"(code-{claim.number})=\n**Code that computes its numbers**, "
                 text += f"`notebooks/studies/{notebook}.py`:\n\n" + _include(code, pyobject=claim.code)
+                if claim.refined:
+                    text += _include("../notebooks/studies/kit/curves.py", pyobject=claim.refined)
                 text += "**Its numbers**, the marked lines:\n\n"
                 text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))
                 if claim.timed:

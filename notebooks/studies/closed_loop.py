@@ -406,18 +406,20 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
         "two images (residual, rad rms)",
         "one image",
         "ratio of the residuals",
-        "loops that close: with two images, with one",
-        "gain: with two images, with one",
+        "loops that close with two images",
+        "with one",
+        "gain with two images",
+        "with one",
     )
     cells = []
     for row in rows:
         loops = row.loops
         found = [f"{_short(name)} {two_digits(typical(loops.settled[name]))}" for name in (row.two, row.one)]
-        closed = ", ".join(f"{loops.closed(name)} of {loops.settled[name].size}" for name in (row.two, row.one))
+        closed = [f"{loops.closed(name)} of {loops.settled[name].size}" for name in (row.two, row.one)]
         span = f"{row.low:.2f} to {row.high:.2f}" if row.high < np.inf else "one loop"
-        gains = f"{loops.gains[row.two]:g}, {loops.gains[row.one]:g}"
+        gains = [f"{loops.gains[name]:g}" for name in (row.two, row.one)]
         light = f"{loops.photons:g} photon{'s' * (loops.photons != 1)}"
-        cells.append([f"{loops.start:g} rad rms; {light}", *found, f"{row.ratio:.2f} ({span})", closed, gains])
+        cells.append([f"{loops.start:g} rad rms; {light}", *found, f"{row.ratio:.2f} ({span})", *closed, *gains])
     return Table(header, cells)
 
 

@@ -157,7 +157,7 @@ def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[
                 place = design.diameter, design.theta_a / np.pi
                 marked.append(place)
                 axes.plot(*place, "o", mfc="#ffffff", mec="#000000", ms=8, zorder=7)
-                axes.annotate(f"{design.name}: {cost:.1f}", place, (8, 0), textcoords="offset points", **_LABEL)
+                axes.annotate(f"{design.name}: {cost:.2f}", place, (8, 0), textcoords="offset points", **_LABEL)
         best = maps.best(name)
         axes.plot(best.diameter, best.theta_a / np.pi, "*", mfc="#ffffff", mec="#000000", ms=13, zorder=6)
         axes.set(xscale="log", xlim=x[[0, -1]], ylim=y[[0, -1]], xlabel="diameter (λ/D)")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from studies.kit.bench import middle_rows
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
-from studies.kit.style import ALONE, WIDE, show_intensity, show_phase
+from studies.kit.style import ALONE, show_intensity, show_phase
 from studies.kit.tables import Table
 from zwfs import opd_to_phase, phase_to_opd
 from zwfs.frames import CameraNoise
@@ -138,7 +138,8 @@ def draw_gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> F
     if errors is not None:
         panels[2].plot(errors, rows, color="#444444", marker="o", ms=5)
         panels[2].set(xlabel="difference from\ncommands (rad rms)")
-        panels[2].set_gid(WIDE)
+    for axes in panels:
+        axes.set_gid(ALONE)
     for axes in panels[1:]:
         axes.margins(x=0.08)
         axes.update_datalim([(0, rows[-1])])  # the margin is a share of the whole axis

@@ -21,8 +21,6 @@ ALONE = "alone"
 """Group of the panels that share their row with no other on a phone."""
 TALL = "tall"
 """Group of the panels that are half as tall again on a phone."""
-WIDE = "wide"
-"""Group of the panels that a phone does not show."""
 # Of phases on a dark ground: 0 is dark, the signs keep their hues, and opposite phases are equally light.
 DARK_PHASE_MAP = LinearSegmentedColormap.from_list(
     "zwfs_dark_phase", ["#9fd2ff", "#2f7fc9", "#2a2a2e", "#d1493f", "#ffb8ad"]

@@ -18,7 +18,7 @@ from matplotlib.colors import to_rgba, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation, Text
 
-from studies.kit.style import ALONE, DARK_PHASE_MAP, PHASE_MAP, TALL, WIDE
+from studies.kit.style import ALONE, DARK_PHASE_MAP, PHASE_MAP, TALL
 
 _WIDTH, _HEIGHT = 3.7, 2.7  # of a narrow figure and of each panel in it, inch
 _LETTERS = 11  # points, at most: some figures have larger ones, as pages show them smaller than they are
@@ -69,8 +69,6 @@ def _copy(state: bytes) -> Figure:
 
 def _stacked(figure: Figure) -> Figure:
     """Put the panels of a figure below each other, in place, and pictures in pairs."""
-    for axes in [axes for axes in figure.axes if axes.get_gid() == WIDE]:
-        axes.remove()
     panels = [axes for axes in figure.axes if axes.get_subplotspec()]
     by_columns = _have_common_titles(panels)
     for axes in panels:

@@ -25,11 +25,10 @@ from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
-# Exponents of the spectrum of a phase, of which the evidence chooses. The smooth ones come first: from a rough
-# phase, a smooth one is not found in a few steps.
-_EXPONENTS = 8.0, 6.0, 4.5, 3.0, 2.0
+# Exponents of the spectrum of a phase, of which the evidence chooses, and how often it updates the rms. The smooth
+# ones come first: from a rough phase, a smooth one is not found in a few steps.
+_PRIORS = (8.0, 4), (5.0, 2), (3.0, 2)
 _STRONGER = 4.5  # factor on the first rms for each unit of the exponent: the same density at about 10 cycles / D
-_UPDATES = 3  # of the rms by the evidence
 _ALLOWED = 0.05  # error of the model in the first stage, over the light of a full pixel
 _DRAWS = 12  # for the error bars of a phase
 
@@ -143,9 +142,9 @@ class FittedSensor:
         prior = MapPrior(_rms_of(start), 3.0)
         means = self._minimum(counts, soft, prior, start, 5, 20).point.phase_means
         least = math.inf
-        for exponent in _EXPONENTS:
+        for exponent, n_updates in _PRIORS:
             rms, now = _rms_of(means) * _STRONGER ** (exponent - 4), means
-            for _ in range(_UPDATES):
+            for _ in range(n_updates):
                 point = self._minimum(counts, weights, MapPrior(rms, exponent), now, 3, 30).point
                 now, (evidence, growth) = point.phase_means, point.evidence
                 rms *= math.sqrt(growth)

@@ -25,7 +25,7 @@ _LAST = 8  # steps at the end of a fit
 _SHARES = 1.0, 0.5, 0.25  # of such a step: the best one is taken
 _N_MAPS = 80  # iterations for the minimum of the maps
 _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
-_MISSED = 0.23  # errors of fits to frames of HCIPy, over the changes with a finer grid (rms)
+_MISSED = 0.3  # errors of fits to frames of HCIPy, over the changes with a finer grid (rms)
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
 _PIXEL_MEAN = np.array([230.0, 2 * 76.0, 2.0]) / 384  # of a cubic spline over a pixel, as a series of cosines
 

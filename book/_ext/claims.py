@@ -133,7 +133,8 @@ def judge(claim: Claim, numbers: Mapping[str, Any]) -> Finding:
 def findings(folder: Path) -> dict[int, Finding]:
     """Judge every claim by the executed notebooks in a folder."""
     names = {name for claim in CLAIMS for name in (claim.notebook, claim.also) if name}
-    numbers = {"": {}} | {name: glued(folder / f"{name}.ipynb") for name in names}
+    numbers: dict[str, dict[str, float]] = {"": {}}
+    numbers |= {name: glued(folder / f"{name}.ipynb") for name in names}
     return {claim.number: judge(claim, numbers[claim.also] | numbers[claim.notebook]) for claim in CLAIMS}
 
 

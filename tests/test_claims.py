@@ -80,6 +80,7 @@ def test_verdict_is_the_recorded_one_and_any_but_holds_and_fails_is_explained(ju
         (16, {"error_at_26": 0.0}, FAILS),
         (16, {"diameter_5_percent_400": 2.33}, HOLDS),
         (17, {"claim17_descent_rise": 2.3, "claim17_saxton_rise": 2.3}, HOLDS),
+        (17, {"claim17_descent_points_rise": 1.6}, FAILS),
         (17, dict.fromkeys([f"claim17_{one}_rise" for one in SHORT.values()], 1.6), FAILS),
         # Leakage lowers the gain by more than 1 %.
         (19, {"gain_leakage": 1.0}, FAILS),

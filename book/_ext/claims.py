@@ -23,7 +23,7 @@ HOLDS, REMARK, FAILS, UNTESTED = "holds", "holds with a remark", "does not hold"
 # The signs differ in shape, for readers who do not see the colours.
 SIGNS = {HOLDS: "✔", REMARK: "◐", FAILS: "✘", UNTESTED: "○"}
 STUDIES = Path(__file__).parents[2] / "notebooks" / "studies"
-SPEED = Path(__file__).parents[2] / "tests" / "benchmarks" / "speed.py"
+BENCHMARKS = Path(__file__).parents[2] / "tests" / "benchmarks"
 PARTS = {"sensor": range(1, 7), "range": range(7, 14), "choices": range(14, 18), "bench": range(18, 22)}
 ROUNDING = 1e-12  # the notebooks give no smaller errors
 
@@ -83,7 +83,7 @@ class Claim:
     rule: str = ""  # the conditions of the verdicts, in plain words
     given: dict[str, str] = field(default_factory=dict)  # names for expressions
     measured: str = ""  # template of the measured values
-    timed: str = ""  # the function of the benchmarks that measures its times
+    timed: list[dict[str, str]] = field(default_factory=list)  # functions of the benchmarks that measure its times
     also: str = ""  # another notebook whose numbers the rule uses
     refined: str = ""  # the function in `kit/curves.py` that its code calls
 
@@ -149,7 +149,11 @@ def by_verdict(judged: dict[int, Finding]) -> str:
     """Return a list of the verdicts, with links to the rows of their claims."""
     lines = []
     for verdict in SIGNS:
-        rows = [f"[{number}](#claim-{number})" for number, found in judged.items() if found.verdict == verdict]
+        rows = [
+            f"[{one.number}\u00a0{one.title}](#claim-{one.number})"
+            for one in CLAIMS
+            if judged[one.number].verdict == verdict
+        ]
         lines += [f"- {_marked(verdict)}: {', '.join(rows)}"] if rows else []
     return "\n".join(lines)
 
@@ -199,11 +203,9 @@ def rules() -> str:
                     text += _include("../notebooks/studies/kit/curves.py", pyobject=claim.refined)
                 text += "**Its numbers**, the marked lines:\n\n"
                 text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))
-                if claim.timed:
-                    text += "**Its times**, `tests/benchmarks/speed.py`:\n\n"
-                    text += _include(
-                        "../tests/benchmarks/speed.py", **timing_lines(claim, SPEED.read_text("utf-8"))
-                    )
+                for timed in claim.timed:
+                    file, options = timing_lines(**timed)
+                    text += f"**Its times**, `tests/benchmarks/{timed['file']}`:\n\n" + _include(file, **options)
         text += "**All numbers:**\n\n"
         text += _include(code, name=f"numbers-{notebook}", pyobject="numbers") + "::::\n\n"
     return text
@@ -241,12 +243,16 @@ def marked_lines(claim: Claim, code: str) -> dict[str, str]:
     return {"lines": f"{first}-{last}", "emphasize-lines": marked}
 
 
-def timing_lines(claim: Claim, code: str) -> dict[str, str]:
-    """Return the function that measures rates and errors of a claim, as options of ``literalinclude``."""
-    [function] = [one for one in ast.parse(code).body if getattr(one, "name", "") == claim.timed]
-    lines = enumerate(code.splitlines()[function.lineno - 1 : function.end_lineno], 1)
-    marked = [str(number) for number, line in lines if '"rate":' in line or '"median error":' in line]
-    return {"pyobject": claim.timed, "emphasize-lines": ",".join(marked)}
+def timing_lines(file: str, function: str, marks: str) -> tuple[str, dict[str, str]]:
+    """Return the file and the options of ``literalinclude`` for a function of the benchmarks.
+
+    Lines in which the pattern `marks` is found are emphasized.
+    """
+    code = (BENCHMARKS / file).read_text("utf-8")
+    [found] = [one for one in ast.parse(code).body if getattr(one, "name", "") == function]
+    lines = enumerate(code.splitlines()[found.lineno - 1 : found.end_lineno], 1)
+    marked = [str(number) for number, line in lines if re.search(marks, line)]
+    return f"../tests/benchmarks/{file}", {"pyobject": function, "emphasize-lines": ",".join(marked)}
 
 
 def _include(file: str, **options: str) -> str:

@@ -23,6 +23,7 @@ from book._tools.project import PDF
 
 VARIANTS = "variants-"  # with which the class of a figure begins that may have dark and narrow variants
 PHONE = "(max-width: 600px)"
+BY_ROW = "table:is(.claims, .decision), :is(.tag_decision, .tag_closed-loop) table"
 CARD = "_static/front.png"
 CARD_ALT = "A wavefront, its two images, and three reconstructions."
 LENGTH = 200  # characters of a description
@@ -75,6 +76,7 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
         image.parent.wrap(body.new_tag("div", **{"class": "wide-figure"}))
     for figure in body.select(f"figure[class*={VARIANTS}]"):
         add_variants(app, figure)
+    name_cells(body)
     define(body, Path(app.srcdir, f"{GLOSSARY}.md"))
     for entry in body.select("[role=doc-biblioentry]"):
         entry["role"] = "listitem"  # the role of Sphinx is deprecated: a list has items
@@ -85,6 +87,16 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
     context["body"] = str(body)
     given = context.get("metatags", "")
     context["metatags"] = given + tags(app.config, page, body, given)
+
+
+def name_cells(body: Tag) -> None:
+    """Give the cells of the tables in `BY_ROW` the heads of their columns, for narrow screens."""
+    for table in body.select(BY_ROW):
+        table["class"] = " ".join([*table.get_attribute_list("class"), "rows"])
+        heads = [plain(head) for head in table.select("thead th")]
+        for row in table.select("tbody tr"):
+            for head, cell in list(zip(heads, row.find_all("td", recursive=False), strict=True))[1:]:
+                cell["data-head"] = head[:1].upper() + head[1:]
 
 
 def link_code(app: Sphinx, page: str, body: Tag) -> None:

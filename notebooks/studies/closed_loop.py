@@ -403,13 +403,13 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
     """Return the best method with two images and with one for each input and star, its residual and its gain."""
     header = (
         "start; photons per point and image",
-        "two images (residual, rad rms)",
-        "one image",
+        "residual with two images (rad rms)",
+        "residual with one image",
         "ratio of the residuals",
         "loops that close with two images",
-        "with one",
+        "loops that close with one",
         "gain with two images",
-        "with one",
+        "gain with one",
     )
     cells = []
     for row in rows:

@@ -359,8 +359,11 @@ def _table(photons: str, rows: Iterable[tuple[str, Row]]) -> Table:
 
 def calibrated_table(situations: Iterable[Situation], errors: Iterable[tuple[float, float] | None]) -> Table:
     """Errors of two images with a fitted model, and with the values of the design."""
-    header = ["situation", "photons per point and image", "calibrated", "uncalibrated"]
-    both = [["not studied"] * 2 if pair is None else list(map(two_digits, pair)) for pair in errors]
+    header = ["situation", "photons per point and image", "calibrated", "uncalibrated", "ratio"]
+    both = [
+        ["not studied"] * 3 if pair is None else [*map(two_digits, pair), f"{pair[1] / pair[0]:.1f}"]
+        for pair in errors
+    ]
     starts = [[f"{rms:g} rad rms", f"{photons:g}"] for rms, photons in situations]
     return Table(header, [start + pair for start, pair in zip(starts, both, strict=True)])
 

@@ -200,14 +200,14 @@ def _vector_column(scene: Scene, top: float, computed: _Computed, kind: _Kind) -
         name = f"{circular} circular" if kind.liquid else "linear"
         scene.label(middle, y(at.focus - 0.58), shift_label(mask, plus=True), color=look.color)
         scene.label(middle, y(at.focus - 0.8), name, color=look.color)
-        _symbol(scene, middle - 0.38, y(at.focus - 0.64), circular if kind.liquid else linear, look.color)
+        _symbol(scene, middle - 0.42, y(at.focus - 0.6), circular if kind.liquid else linear, look.color)
         if kind.liquid:
             _symbol(scene, x - sign * 0.4, y(at.focus + 0.28), swapped, look.color)
             _symbol(scene, x - sign * 0.56, y(at.focus + 0.66), linear, look.color)
         else:
             _symbol(scene, x - sign * 0.5, y(at.focus + 0.5), linear, look.color)
         _symbol(scene, x - sign * 1.02, y(at.prism + 0.2), linear, look.color)
-        middle = x - sign * (at.apart + 0.02)
+        middle = x - sign * (at.apart - 0.05)
         frame, high = computed.frames[index], computed.frames.max()
         below = y(at.detector + 0.88)
         shown = scene.picture(middle, below, 1.02, frame, INTENSITY_MAP, 0, high, edge=look.color)

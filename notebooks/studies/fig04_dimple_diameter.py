@@ -13,7 +13,7 @@ estimate before, and keeps its phase: the phase shifts drop out.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -69,8 +69,6 @@ SHORT = {
     "GradientDescentPoints": "descent_points",
 }
 """Names of the methods in the numbers for the text."""
-# Gradient descent fits modes, unless its name says points.
-_LOOKS = {"GradientDescent": replace(LOOKS["GradientDescent"], name="gradient descent on modes")}
 _MODES = {"tilt": 0, "defocus": 2, "high order (Noll 150)": 148}  # by their place among the modes
 _TOLERANCE = 1e-12  # of the low-rank factors, as the spectrum is to be exact where the iteration is
 
@@ -358,7 +356,7 @@ def draw_diameter_methods(curves: Mapping[str, DiameterCurves], threshold: float
     for name, look in looks_of(curves):
         curve = curves[name]
         mean = np.maximum(curve.mean(name), floor)
-        axes.semilogy(curve.diameters, mean, markersize=4.5, label=_LOOKS.get(name, look).label, **look.style)
+        axes.semilogy(curve.diameters, mean, markersize=4.5, label=look.label, **look.style)
     limit = threshold * curve.rms[0]
     axes.axhline(limit, color="#555555", lw=1)
     axes.text(0.05, limit * 1.2, f"{percent(threshold)} of the input", color="#555555", fontsize=9)
@@ -539,7 +537,7 @@ def methods_table(curves: Mapping[str, DiameterCurves], threshold: float) -> Tab
         ],
         [
             [
-                _LOOKS.get(name, LOOKS[name]).name,
+                LOOKS[name].name,
                 *(small(curve.at(name, diameter)) for diameter in (USUAL, 2.0, 2.6, 3.5)),
                 _start(curve, name, threshold),
                 _doubled(curve, name),

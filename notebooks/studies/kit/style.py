@@ -69,7 +69,7 @@ LOOKS |= {
     "Arcsine": Look("arcsine", "one image", "#E69F00", "s", "--"),
     "GerchbergSaxton": Look("Gerchberg-Saxton", "two images", "#009E73", "^", "-."),
     "GerchbergSaxtonModel": Look("Gerchberg-Saxton, modelled field", "two images", "#74583E", "x", "-"),
-    "GradientDescent": Look("gradient descent", "two images", "#CC79A7", "D", (0, (3, 1, 1, 1, 1, 1))),
+    "GradientDescent": Look("gradient descent on modes", "two images", "#CC79A7", "D", (0, (3, 1, 1, 1, 1, 1))),
     "GradientDescentPoints": Look("gradient descent on points", "two images", "#D55E00", "d", "--"),
     "GradientDescentStarted": Look("gradient descent, phase-shifted start", "two images", "#7010E0", "+", "-."),
     "PhaseShifted": Look("phase-shifted", "two images", "#0072B2", "v", ":"),

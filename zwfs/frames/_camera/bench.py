@@ -41,6 +41,7 @@ EXPLAINED = 1.2
 """Mean square of the residuals over the noise up to which a model explains the frames."""
 _FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
 _PHASE_PRIOR = MapPrior(0.5, 3.0)
+_DIVIDED = 0.1  # rms error of the light of a point that an edge or a vane divides, over that of a full one
 _PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the physics
 _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
 
@@ -306,7 +307,9 @@ def _problem(data: Recording, start: _Start, f: int) -> tuple[Problem, NDArray]:
 
 
 def _light_maps(light: Light, n_pixels: float) -> tuple[LightMap, ...]:
-    return (LightMap(light.support, MapPrior(0.2, 3.0, outer_scale=0.1), n_pixels),)
+    """Smooth changes of the light, and free ones of the points that edges and vanes divide."""
+    smooth = LightMap(light.support, MapPrior(0.2, 3.0, outer_scale=0.1), n_pixels)
+    return smooth, LightMap(light.support & ~light.full, MapPrior(_DIVIDED), n_pixels)
 
 
 def white_phase(phase_map: PhaseMap, means: NDArray) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,9 @@ from zwfs.frames._camera.model import Maps
 
 _WIDTH = 1.5  # pixels rms, of the weights with which neighbours give the light of a fully lit pixel
 _STIFF = 0.1  # pixels squared: with few pixels on a line, a slope across it is that of noise
+# Steps of the grid over which an edge crosses a point: 1 for an edge along the grid. With a half, the light of edges
+# and vanes that does not interfere has no bias.
+_CROSSED = 0.5
 _DARKER = 0.1, 0.5  # least and most by which a pixel that is lit in part is darker than its surroundings
 
 
@@ -56,9 +60,8 @@ class Light:
         plain = cls.of(np.kron(pixels, np.ones((fine, fine))), pixels, fine)
         blocks = _blocks(plain.amplitude**2, fine)
         share = np.clip(pixels / blocks.mean(axis=-1), 0, 1)
-        slope = _blocks(_stretched(ndimage.gaussian_filter(share, 0.7), fine), fine)
-        rank = np.argsort(np.argsort(-slope, axis=-1), axis=-1)
-        filled = blocks * np.clip(share[..., None] * fine**2 - rank, 0, 1)
+        height = _blocks(_stretched(ndimage.gaussian_filter(share, 0.7), fine), fine)
+        filled = blocks * _beyond_edge(height, share)
         flat = filled.reshape(n, n, fine, fine).transpose(0, 2, 1, 3).reshape(n * fine, n * fine)
         fine_light = np.where(plain.full, plain.start, flat)
         start = fine_light.reshape(n * f, fine // f, n * f, fine // f).mean(axis=(1, 3))
@@ -124,6 +127,22 @@ def _fully_lit(pixels: NDArray) -> NDArray[np.bool_]:
     middle = np.median(ratio[lit]) if lit.any() else 1.0
     scatter = 1.4826 * np.median(np.abs(ratio[lit] - middle)) if lit.any() else 0.0
     return np.asarray(ratio > 1 - np.clip(3 * scatter, *_DARKER))
+
+
+def _beyond_edge(height: NDArray, share: NDArray) -> NDArray[np.float64]:
+    """Part of each point that is lit, (..., f * f), if a share of a pixel lies on the higher side of a level.
+
+    A point that the level crosses is lit in part.
+    """
+    step = np.ptp(height, axis=-1) / (math.isqrt(height.shape[-1]) - 1)
+    width = np.maximum(_CROSSED * step, 1e-12)[..., None]
+    low, high = height.min(axis=-1, keepdims=True) - width, height.max(axis=-1, keepdims=True) + width
+    for _ in range(40):
+        level = (low + high) / 2
+        lit = np.clip((height - level) / width + 0.5, 0, 1)
+        more = lit.mean(axis=-1) > share
+        low[more], high[~more] = level[more], level[~more]
+    return lit
 
 
 def _blocks(fine: NDArray, f: int) -> NDArray[np.float64]:

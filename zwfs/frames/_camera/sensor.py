@@ -147,7 +147,7 @@ class FittedSensor:
             for _ in range(n_updates):
                 point = self._minimum(counts, weights, MapPrior(rms, exponent), now, 3, 30).point
                 now, (evidence, growth) = point.phase_means, point.evidence
-                rms *= math.sqrt(growth)
+                rms *= math.sqrt(max(growth, 0.01))  # an rms of 0 allows no phase
             if evidence > least:
                 break
             least, prior, means = evidence, MapPrior(rms, exponent), now

@@ -311,16 +311,6 @@ def test_error_bars_of_a_fit_cover_the_true_values():
 
 
 @pytest.mark.slow
-def test_poor_fit_is_repeated_with_the_light_divided_anew(monkeypatch):
-    bench = CASES["VLT"]
-    frames, clear, phases = bench.recording(seed=2)
-    settings = {"n_pixels": bench.pixels, "noise": bench.noise}
-    assert fit_bench(frames, clear, phases, **settings).misfit.mean() < 1.1
-    monkeypatch.setattr("zwfs.frames._camera.bench._AGAIN", ())
-    assert fit_bench(frames, clear, phases, **settings).misfit.mean() > 1.2
-
-
-@pytest.mark.slow
 def test_reverse_order_and_a_command_with_the_wrong_sign_are_reported():
     frames, clear, phases = BENCH.recording()
     settings = {"n_pixels": BENCH.pixels, "noise": BENCH.noise, "n_steps": 3}

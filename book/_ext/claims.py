@@ -141,7 +141,7 @@ def findings(folder: Path) -> dict[int, Finding]:
 def count(judged: dict[int, Finding]) -> str:
     """Return a line with the number of claims of each verdict."""
     numbers = Counter(finding.verdict for finding in judged.values())
-    listed = ", ".join(f"{numbers[verdict]} {_marked(verdict)}" for verdict in SIGNS if numbers[verdict])
+    listed = ", ".join(f"{numbers[verdict]} {_marked(verdict)}" for verdict in SIGNS)
     return f"The [{len(judged)} claims of the paper](claims.md): {listed}."
 
 
@@ -154,7 +154,7 @@ def by_verdict(judged: dict[int, Finding]) -> str:
             for one in CLAIMS
             if judged[one.number].verdict == verdict
         ]
-        lines += [f"- {_marked(verdict)}: {', '.join(rows)}"] if rows else []
+        lines.append(f"- {_marked(verdict)}: {', '.join(rows) or 'none'}")
     return "\n".join(lines)
 
 
@@ -197,15 +197,16 @@ def rules() -> str:
                 ends = {"start-at": f"- number: {claim.number}", "end-before": f"- number: {claim.number + 1}"}
                 text += f"(rule-{claim.number})=\n**Claim {claim.number}.** {claim.rule}\n\n"
                 text += _include("_ext/claims.yml", language="yaml", **ends)
-                text += f"(code-{claim.number})=\n**Code that computes its numbers**, "
+                text += f"(code-{claim.number})=\n"
+                for timed in claim.timed:
+                    file, options = timing_lines(**timed)
+                    text += f"**Its times**, `tests/benchmarks/{timed['file']}`:\n\n" + _include(file, **options)
+                text += "**Code that computes its numbers**, "
                 text += f"`notebooks/studies/{notebook}.py`:\n\n" + _include(code, pyobject=claim.code)
                 if claim.refined:
                     text += _include("../notebooks/studies/kit/curves.py", pyobject=claim.refined)
                 text += "**Its numbers**, the marked lines:\n\n"
                 text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))
-                for timed in claim.timed:
-                    file, options = timing_lines(**timed)
-                    text += f"**Its times**, `tests/benchmarks/{timed['file']}`:\n\n" + _include(file, **options)
         text += "**All numbers:**\n\n"
         text += _include(code, name=f"numbers-{notebook}", pyobject="numbers") + "::::\n\n"
     return text

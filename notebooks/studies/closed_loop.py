@@ -316,6 +316,7 @@ def draw_linear_loops(found: Divergence) -> Figure:
         axes.set_title(f"{name}:\n{closed.sum()} of {closed.size} close", fontsize=10)
         axes.set(xlabel="time (ms)", xlim=(0, 1e3 * run.times[-1]))
     panels[0, 0].set_ylabel("residual (rad rms)")
+    panels[0, 0].yaxis.set_major_formatter("{x:g}")
     return figure
 
 
@@ -400,26 +401,19 @@ def tuned_screens(trials: Sequence[TunedLoops]) -> dict[str, NDArray]:
 
 
 def best_table(rows: Sequence[BestMethods]) -> Table:
-    """Return the best method with two images and with one for each input and star, its residual and its gain."""
-    header = (
-        "start; photons per point and image",
-        "residual with two images (rad rms)",
-        "residual with one image",
-        "ratio of the residuals",
-        "loops that close with two images",
-        "loops that close with one",
-        "gain with two images",
-        "gain with one",
-    )
+    """Return the best method with two images and with one for each input and star, and how its loops end."""
+    header = "start; photons per point and image", "two images", "one image", "ratio of the residuals"
     cells = []
     for row in rows:
         loops = row.loops
-        found = [f"{_short(name)} {two_digits(typical(loops.settled[name]))}" for name in (row.two, row.one)]
-        closed = [f"{loops.closed(name)} of {loops.settled[name].size}" for name in (row.two, row.one)]
+        ends = [
+            f"{_short(name)}: {two_digits(typical(loops.settled[name]))}; {loops.closed(name)} of "
+            f"{loops.settled[name].size} close; gain {loops.gains[name]:g}"
+            for name in (row.two, row.one)
+        ]
         span = f"{row.low:.2f} to {row.high:.2f}" if row.high < np.inf else "one loop"
-        gains = [f"{loops.gains[name]:g}" for name in (row.two, row.one)]
         light = f"{loops.photons:g} photon{'s' * (loops.photons != 1)}"
-        cells.append([f"{loops.start:g} rad rms; {light}", *found, f"{row.ratio:.2f} ({span})", *closed, *gains])
+        cells.append([f"{loops.start:g} rad rms; {light}", *ends, f"{row.ratio:.2f} ({span})"])
     return Table(header, cells)
 
 

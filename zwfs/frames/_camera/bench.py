@@ -20,6 +20,7 @@ from zwfs.frames._camera.model import ARM, Camera, Exposure, names_of
 from zwfs.frames._camera.prior import MapPrior
 from zwfs.frames._camera.recording import PAD, Recording, centred
 from zwfs.frames._camera.solve import (
+    MISSED,
     Free,
     LightMap,
     Minimum,
@@ -42,6 +43,7 @@ EXPLAINED = 1.2
 _FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
 _PHASE_PRIOR = MapPrior(0.5, 3.0)
 _DIVIDED = 0.1  # rms error of the light of a point that an edge or a vane divides, over that of a full one
+_PIXEL = 1 / 12  # pixels squared: variance of the area of a pixel; f points along it lack 1 / f^2 of it
 _PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the physics
 _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
 
@@ -62,10 +64,8 @@ _STAGES = (
     _Stage(0.1, 0.1, 25, focus=False, divide=False),
     _Stage(0.05, 0.1, 25, focus=True, divide=True),
     _Stage(0.01, 0.1, 35, focus=True, divide=True),
-    _Stage(0.0, 1e-3, 35, focus=True, divide=True),
+    _Stage(0.0, 1e-3, 35, focus=True, divide=False),
 )
-_AGAIN = (_STAGES[-1],) * 2  # where the light of edges and vanes is divided wrongly, it is divided anew
-_GOOD = 1.1  # misfit that ends them
 
 
 class Estimate(NamedTuple):
@@ -203,13 +203,9 @@ def fit_bench(
     )
     start = _coarse(data, diameter, shifts)
     problem, x = _problem(data, start, oversampling)
-    found: list[Minimum] = []
-    for stage in (*_STAGES, *_AGAIN):
-        if len(found) >= len(_STAGES) and np.mean(found[-1].point.misfit) < _GOOD:
-            break
-        found.append(minimise(_staged(data, problem, stage), x, n_steps, stage.n_inner, stage.enough))
-        problem, x = _next(data, found[-1], stage.divide)
-    best = min(found[len(_STAGES) - 1 :], key=lambda one: one.point.cost)
+    for stage in _STAGES:
+        best = minimise(_staged(data, problem, stage), x, n_steps, stage.n_inner, stage.enough)
+        problem, x = _next(data, best, stage.divide)
     return _result(data, best, start.reversed)
 
 
@@ -391,6 +387,8 @@ def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:
     scale = max(1.0, float(np.mean(misfit)))
     spread = equations.covariance(point, _changes(data, point), scale)
     values = point.x[point.problem.n_white :]
+    blur = [one.name for one in point.problem.free].index("blur")
+    spread[blur, blur] += (MISSED * _PIXEL / point.problem.camera.f**2 / (2 * values[blur])) ** 2
     sigma = np.sqrt(np.diagonal(spread)).tolist()
     estimates = tuple(
         Estimate(one.name, value, error, not one.low < value < one.high)

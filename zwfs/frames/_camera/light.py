@@ -13,8 +13,8 @@ from zwfs.frames._camera.model import Maps
 
 _WIDTH = 1.5  # pixels rms, of the weights with which neighbours give the light of a fully lit pixel
 _STIFF = 0.1  # pixels squared: with few pixels on a line, a slope across it is that of noise
-# Steps of the grid over which an edge crosses a point: 1 for an edge along the grid. With a half, the light of edges
-# and vanes that does not interfere has no bias.
+# Steps of the grid over which an edge crosses a point: 1 for an edge along the grid. A half takes away the bias of
+# the light of edges and vanes that does not interfere.
 _CROSSED = 0.5
 _DARKER = 0.1, 0.5  # least and most by which a pixel that is lit in part is darker than its surroundings
 

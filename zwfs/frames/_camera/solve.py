@@ -25,8 +25,9 @@ _LAST = 8  # steps at the end of a fit
 _SHARES = 1.0, 0.5, 0.25  # of such a step: the best one is taken
 _N_MAPS = 80  # iterations for the minimum of the maps
 _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
-_MISSED = 0.3  # errors of fits to frames of HCIPy, over the changes with a finer grid (rms)
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
+MISSED = 0.3
+"""Errors of fits to frames of HCIPy, over the changes with a finer grid (rms)."""
 _PIXEL_MEAN = np.array([230.0, 2 * 76.0, 2.0]) / 384  # of a cubic spline over a pixel, as a series of cosines
 
 
@@ -539,7 +540,7 @@ class Eliminated:
         grow = np.sqrt(np.maximum(scale, seen)) / self._unit
         flat = [np.concatenate([one.ravel() for one in change]) for change in changes]
         moved = inverse @ (self._e @ np.transpose(flat)) / self._unit[:, None]
-        missed = _MISSED**2 * np.mean(moved**2, axis=1)
+        missed = MISSED**2 * np.mean(moved**2, axis=1)
         return inverse * np.outer(grow, grow) + np.diag(missed)
 
 

@@ -36,7 +36,7 @@ def test_example_of_a_loop_prints_the_residual_of_the_table(capsys):
         output.get("data", {}).get("text/markdown", "") for cell in loops for output in cell.get("outputs", ())
     ]
     (row,) = re.findall(r"(?m)^\| 0\.5 rad rms; 1000 photons \|.*", "\n".join(outputs))
-    assert f"| linear {re.search('[0-9.]+', printed)[0]} |" in row
+    assert f"| linear: {re.search('[0-9.]+', printed)[0]};" in row
 
 
 def test_example_of_gradients_fits_the_phase(capsys):

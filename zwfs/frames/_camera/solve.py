@@ -391,7 +391,9 @@ class Point:
         sent, got = fft.rfft2(np.stack([probe, answer]))
         power = np.bincount(bins, (np.abs(sent) ** 2).ravel(), _BINS)
         heard = np.bincount(bins, (sent.conj() * got).real.ravel(), _BINS)
-        curve = np.maximum(heard / power, _FAINTEST * (heard / power).max())
+        # A random probe may hold nothing of a frequency.
+        curve = heard / np.maximum(power, 1e-9 * power.max())
+        curve = np.maximum(curve, _FAINTEST * curve.max())
         scale, gain = (1, f**2) if isinstance(of, PhaseMap) else (f, 1)
         v, u = fft.fftfreq(of.size)[:, None] * scale, fft.rfftfreq(of.size) * scale
         spectrum = np.exp(np.interp(np.hypot(u, v), (edges[1:] + edges[:-1]) / 2, np.log(curve)))

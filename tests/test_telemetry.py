@@ -23,7 +23,7 @@ from astropy.io import fits
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zwfs import Dimple, Pupil, ZernikeSensor, power_law_screens, zernike_basis
+from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, zernike_basis
 from zwfs.frames import Calibration, FileError, calibrate, pipeline, reconstruct
 from zwfs.frames.__main__ import main
 from zwfs.frames._stack import Stack
@@ -315,6 +315,66 @@ def test_coefficients_are_those_that_were_put_in(bench, calibration):
     filled = np.tensordot(put, np.nan_to_num(modes), 1)
     found = calibration(bench.frames[:4])
     np.testing.assert_allclose(calibration.coefficients(replace(found, filled=filled), matrix), put, atol=1e-4)
+
+
+def linear(calibration):
+    return Linear(calibration.sensor, zernike_basis(calibration.sensor.pupil, 60))
+
+
+def test_linear_method_replaces_the_iteration(bench):
+    small, leakage = bench.screens[:3] / 8, 0.05
+    frames = bench.sensor.measure(small)
+    images = bench.expose((1 - leakage) * frames + leakage * frames[:, ::-1])
+
+    def gain(optics):  # of the phases over those that were put in
+        calibration = bench.calibration(optics)
+        phase = calibration(images, method=linear(calibration)).phase
+        row, column = np.rint(calibration.places[0, :, 0, 0] - MARGIN).astype(int)
+        found = phase[:, -row : D - row, -column : D - column]
+        inside = np.isfinite(found[0]) & bench.pupil.inside
+        found, put = (one[:, inside] - one[:, inside].mean(axis=1, keepdims=True) for one in (found, small))
+        return np.sum(found * put) / np.sum(put**2)
+
+    assert gain(Optics(leakage=leakage)) == pytest.approx(1, abs=0.03)
+    assert gain(Optics()) == pytest.approx(1 - 2 * leakage, abs=0.03)
+
+
+@pytest.mark.parametrize("order", [1, -1], ids=["loop", "control: images exchanged"])
+def test_linear_loop_closes_on_camera_images(bench, calibration, order):
+    method, pupil = linear(calibration), calibration.sensor.pupil
+    matrix = calibration.modal_matrix(zernike_basis(pupil, 30))
+    modes = zernike_basis(Pupil.circular(D), 30)
+    start = 0.5 * bench.screens[0] / bench.screens[0][bench.pupil.inside].std()
+    command = np.zeros(30)
+    for _ in range(12):
+        left = start - np.tensordot(command, np.nan_to_num(modes), 1)
+        phases = calibration(bench.expose(bench.sensor.measure(left)[::order]), method=method)
+        command = command + 0.4 * calibration.coefficients(phases, matrix)
+    inside = bench.pupil.inside
+    best = start - np.tensordot(np.linalg.lstsq(modes[:, inside].T, start[inside])[0], np.nan_to_num(modes), 1)
+    assert (rms(left[inside]) < 1.2 * rms(best[inside]) + 0.02) == (order == 1)
+
+
+def test_method_keeps_the_flags_and_fills_bad_pixels(bench, calibration):
+    images = np.stack([bench.frames[0], bench.frames[0], np.full_like(bench.frames[0], DARK)]).astype(float)
+    images[1][pixel(calibration, (20, 20))] = np.nan
+    found = calibration(images, method=linear(calibration))
+    assert found.flags.tolist() == [0, Flag.BAD_PIXELS, Flag.LOST]
+    assert np.isfinite(found.filled[:2]).all()
+    assert rms(found.filled[1] - found.filled[0]) < 0.01
+    same = PhaseShifted(calibration.sensor, accelerate=True, tolerance=1e-3)
+    assert rms(calibration(images[:2], method=same).phase - calibration(images[:2]).phase) < 1e-3
+
+
+def test_method_of_another_sensor_is_refused(bench, calibration):
+    other = replace(calibration, n_iterations=3)
+    with pytest.raises(ValueError, match="method has another sensor"):
+        calibration(bench.frames[0], method=linear(other))
+    with pytest.raises(TypeError, match="method is a str: expected a Reconstructor"):
+        calibration(bench.frames[0], method="linear")
+    flat = np.zeros(calibration.good.shape)
+    with pytest.raises(ValueError, match="start with method = Linear"):
+        calibration(bench.frames[0], flat, method=linear(calibration))
 
 
 def test_sigma_without_errors_of_the_calibration_is_the_scatter_of_many_exposures(bench, calibration):

@@ -15,6 +15,7 @@ from zwfs.frames.registration import _TOUCHED, nearest_good
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
+from zwfs.reconstructors.base import Reconstructor
 from zwfs.sensor import ZernikeSensor
 
 if TYPE_CHECKING:
@@ -89,14 +90,15 @@ class Grid:
         return np.ascontiguousarray(values.transpose(2, 0, 1)), good, n_bad, n_saturated
 
     def solve(
-        self, frames: NDArray, good: NDArray, start: NDArray | None, judge: bool
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        self, frames: NDArray, good: NDArray, start: NDArray | None = None, judge: bool = True,
+        method: Reconstructor | None = None,
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:  # fmt: skip
         """Phases with bad points filled, iterations, whether they converged, and residuals of ideal frames.
 
         Bad points take no part: in a second iteration their intensity is that of the model. The frames, shape
         (k, 2, ny, nx), are changed.
         """
-        reconstruct, sensor = self.reconstruct, self.reconstruct.sensor
+        reconstruct, sensor = method or self.reconstruct, self.reconstruct.sensor
         found = reconstruct(frames, start)
         phase, n_iterations, converged = found.phase, found.n_iterations, found.converged
         phase[:, ~sensor.pupil.inside] = 0
@@ -105,7 +107,7 @@ class Grid:
         if some.size:
             phase[some] = self.filled(phase[some], good[some])
             frames[some] = np.where(holes[some, np.newaxis], sensor.measure(phase[some]), frames[some])
-            found = reconstruct(frames[some], phase[some])
+            found = reconstruct(frames[some], phase[some] if reconstruct.iterative else None)
             phase[some] = self.filled(np.where(sensor.pupil.inside, found.phase, 0), good[some])
             n_iterations[some] += found.n_iterations
             converged[some] = found.converged

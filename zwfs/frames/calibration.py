@@ -33,6 +33,7 @@ from zwfs.frames.phases import Flag, Phases
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames
 from zwfs.metrics import without_piston
 from zwfs.pupil import Pupil
+from zwfs.reconstructors.base import Reconstructor
 from zwfs.sensor import ZernikeSensor
 
 FORMAT = 2  # of the file; another number is refused
@@ -189,7 +190,7 @@ class Calibration(Immutable):
             np.zeros((0, *pupil.shape), np.float32), np.zeros(0), **settings,
         )  # fmt: skip
         frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
-        phase, *_, residual = made._work.solve(frames, good[np.newaxis], None, judge=True)
+        phase, *_, residual = made._work.solve(frames, good[np.newaxis])
         errors = sideways(made.sensor, phase[0], frames[0], good)[np.newaxis]
         return replace(made, residual=float(residual[0]), unexplained=errors, slopes=slopes_of(phase, good))
 
@@ -327,7 +328,7 @@ class Calibration(Immutable):
 
     def __call__(
         self, counts: ArrayLike, start: NDArray | None = None, *, saturation: float | None = None,
-        largest_residual: float = np.inf, judge: bool = True,
+        largest_residual: float = np.inf, judge: bool = True, method: Reconstructor | None = None,
     ) -> Phases:  # fmt: skip
         """Phases of camera images.
 
@@ -343,6 +344,8 @@ class Calibration(Immutable):
             Residual above which a frame is inconsistent.
         judge : bool
             Whether to compute the residual, which takes a tenth of the time; without it the residual is NaN.
+        method : Reconstructor, optional
+            Replaces the phase-shifted iteration, such as `zwfs.Linear(calibration.sensor, modes)`.
 
         Returns
         -------
@@ -366,11 +369,17 @@ class Calibration(Immutable):
                 raise ValueError(f"start has shape {maps.shape}: expected {grid} or {(*batch, *grid)}")
             _check.moderate("start", maps)
             start = np.broadcast_to(maps, (*batch, *grid)).reshape(-1, *grid)
+        if method is not None:
+            _check.instance("method", method, Reconstructor)
+            if method.sensor is not self.sensor:
+                raise ValueError("method has another sensor: expected `sensor` of this calibration")
+            if start is not None and not method.iterative:
+                raise ValueError(f"start with method = {method!r}: expected none, because it does not iterate")
         parts = []
         for first in range(0, len(counts), _PIECE):
             piece = slice(first, first + _PIECE)
             begin = None if start is None else start[piece]
-            parts.append(self._phases(counts[piece], begin, level, largest_residual, judge))
+            parts.append(self._phases(counts[piece], begin, level, largest_residual, judge, method))
         return Phases._joined(parts, batch)
 
     def modal_matrix(self, modes: ArrayLike) -> NDArray[np.float64]:
@@ -470,7 +479,10 @@ class Calibration(Immutable):
     def _work(self) -> Grid:
         return Grid(self)
 
-    def _phases(self, counts: NDArray, start: NDArray | None, level: float, limit: float, judge: bool) -> Phases:
+    def _phases(
+        self, counts: NDArray, start: NDArray | None, level: float, limit: float, judge: bool,
+        method: Reconstructor | None,
+    ) -> Phases:  # fmt: skip
         """Phases of camera images, (k, n_images, ny_camera, nx_camera)."""
         work, k = self._work, len(counts)
         values, good, n_bad, n_saturated = work.on_grid(counts, level, self.good)
@@ -485,10 +497,11 @@ class Calibration(Immutable):
         frames = work.weights[:, 0] * values[:, :1]
         frames += work.weights[:, 1] * values[:, 1:]
         frames += work.offset
-        np.maximum(frames, 0, out=frames)
+        if method is None:
+            np.maximum(frames, 0, out=frames)
         if not enough.all():
             frames[~enough] = work.flat_frames  # of a flat wavefront: they converge at once
-        filled, n_iterations, converged, residual = work.solve(frames, good, start, judge)
+        filled, n_iterations, converged, residual = work.solve(frames, good, start, judge, method)
         flags = _BAD * (n_bad > 0) + _SATURATED * (n_saturated > 0)
         faults = flags + _INCONSISTENT * (residual > limit) + _NOT_CONVERGED * (~converged & (self.tolerance > 0))
         flags = np.where(enough, faults, _LOST + flags)

@@ -282,9 +282,8 @@ def _weights(places: NDArray, size: int, f: int) -> tuple[NDArray, NDArray, NDAr
     A point stands for the mean over its cell, so that a pixel on the grid is the mean of its cells exactly.
     """
     spline = BSpline.basis_element(np.arange(_DEGREE + 2) - (_DEGREE + 1) / 2, extrapolate=False)
-    inner = np.arange(f) - (f - 1) / 2
-    reach = _DEGREE // 2 + f // 2 + 1
-    nodes = np.floor(places).astype(int)[:, None] + np.arange(1 - reach, reach + 1)
+    inner, n = np.arange(f) - (f - 1) / 2, _DEGREE + f  # nodes that a pixel meets
+    nodes = np.floor(places - n / 2).astype(int)[:, None] + np.arange(1, n + 1)
     away = (places[:, None] - nodes)[..., None] + inner
     return (
         nodes % size,
@@ -407,20 +406,22 @@ class Linearised:
         direct = [np.zeros((camera.size,) * 2, complex) for _ in self._states]
         inputs = [np.zeros(source[2].shape, complex) for source in self._states]
         seen = [np.zeros(self._blur.shape, complex) for _ in self.arms]
+        back_transfers = [None if one is None else one.conj() for one in self._transfer]
         for one, part, weight in zip(camera.exposures, self._parts, pixels, strict=True):
             back = self._splines[one.arm].adjoint(self.arms[one.arm]["flux"] * weight)
             spectrum = self._blur * fft.rfft2(back)
             seen[one.arm] += spectrum
             gain = fft.irfft2(spectrum, s=back.shape)
             gain += _differences(self._smooth * gain)
-            transfer = self._transfer[one.arm]
-            if transfer is None:
-                direct[one.state] += 2 * gain * part.ahead
+            gain *= 2
+            back_transfer = back_transfers[one.arm]
+            if back_transfer is None:
+                direct[one.state] += gain * part.ahead
             else:
-                spectra[one.state] += transfer.conj() * fft.fft2(2 * gain * part.ahead)
+                spectra[one.state] += back_transfer * fft.fft2(gain * part.ahead)
             if one.mask is not None:
                 core = self._cores[one.arm][0].conj().T
-                inputs[one.state] += core @ camera.planes[1].project(2 * gain * part.across)
+                inputs[one.state] += core @ camera.planes[1].project(gain * part.across)
         moved = any(one is not None for one in self._transfer)
         unresolved = sum(spread * each for (spread, _), each in zip(self._spread, seen, strict=True))
         rest = fft.irfft2(unresolved, s=(camera.size,) * 2)[camera.window]
@@ -477,7 +478,13 @@ class Linearised:
 
 def _differences(image: NDArray) -> NDArray[np.float64]:
     """Second differences along both axes, periodic."""
-    return sum((np.roll(image, step, axis) for step in (1, -1) for axis in (0, 1)), -4 * image)
+    out = -4 * image
+    for inner, far in ((out, image), (out.T, image.T)):
+        inner[1:] += far[:-1]
+        inner[:-1] += far[1:]
+        inner[0] += far[-1]
+        inner[-1] += far[0]
+    return out
 
 
 def _twice(one: NDArray, other: NDArray) -> NDArray[np.float64]:

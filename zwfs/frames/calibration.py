@@ -345,7 +345,7 @@ class Calibration(Immutable):
         judge : bool
             Whether to compute the residual, which takes a tenth of the time; without it the residual is NaN.
         method : Reconstructor, optional
-            Replaces the phase-shifted iteration, such as `zwfs.Linear(calibration.sensor, modes)`.
+            Replaces the phase-shifted iteration, such as ``zwfs.Linear(calibration.sensor, modes)``.
 
         Returns
         -------

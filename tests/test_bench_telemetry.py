@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from zwfs import zernike_basis
+from zwfs import Linear, zernike_basis
 from zwfs.frames import Calibration, calibrate, fit_bench, pipeline, reconstruct, registration
 from zwfs.frames.__main__ import main
 from zwfs.frames._calibrate import _read_states, _windows
@@ -194,3 +194,14 @@ def test_turned_pupil_of_a_telescope_with_ten_pokes():
     left = calibration.sensor.pupil.gather(errors) @ calibration.modal_matrix(modes)
     ratio = left / calibration.sigma(found, photons, noise, modes)
     assert 0.8 < np.median(np.sqrt(np.mean(ratio**2, axis=1))) < 1.3
+
+
+def test_linear_method_measures_small_screens_on_a_fitted_bench(taken, calibration):
+    bench = taken.bench
+    screen = bench.smooth(0.1, 1000)
+    method = Linear(calibration.sensor, zernike_basis(calibration.sensor.pupil, 60))
+    phase = calibration(bench.counts(screen, (8, 0)), method=method).phase
+    truth = np.where(np.isfinite(phase), bench.on_pupil(screen + bench.flat), np.nan)
+    inside = bench.fully_lit & np.isfinite(phase)
+    assert rms((phase - truth)[np.newaxis], inside) < 0.3 * rms(truth[np.newaxis], inside)
+    assert rms((phase + truth)[np.newaxis], inside) > rms(truth[np.newaxis], inside)  # control: the other sign

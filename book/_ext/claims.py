@@ -85,7 +85,7 @@ class Claim:
     measured: str = ""  # template of the measured values
     timed: list[dict[str, str]] = field(default_factory=list)  # functions of the benchmarks that measure its times
     also: str = ""  # another notebook whose numbers the rule uses
-    refined: str = ""  # the function in `kit/curves.py` that its code calls
+    refined: list[str] = field(default_factory=list)  # functions in `kit/curves.py` that its code calls
 
     @property
     def notebook(self) -> str:
@@ -203,8 +203,8 @@ def rules() -> str:
                     text += f"**Its times**, `tests/benchmarks/{timed['file']}`:\n\n" + _include(file, **options)
                 text += "**Code that computes its numbers**, "
                 text += f"`notebooks/studies/{notebook}.py`:\n\n" + _include(code, pyobject=claim.code)
-                if claim.refined:
-                    text += _include("../notebooks/studies/kit/curves.py", pyobject=claim.refined)
+                for function in claim.refined:
+                    text += _include("../notebooks/studies/kit/curves.py", pyobject=function)
                 text += "**Its numbers**, the marked lines:\n\n"
                 text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))
         text += "**All numbers:**\n\n"

@@ -406,11 +406,13 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
     cells = []
     for row in rows:
         loops = row.loops
-        ends = [
-            f"{_short(name)}: {two_digits(typical(loops.settled[name]))}; {loops.closed(name)} of "
-            f"{loops.settled[name].size} close; gain {loops.gains[name]:g}"
-            for name in (row.two, row.one)
-        ]
+        ends = []
+        for name in (row.two, row.one):
+            n, closed = loops.settled[name].size, loops.closed(name)
+            few = f"; {closed} of {n} close" if closed < n else ""
+            ends.append(
+                f"{_short(name)}: {two_digits(typical(loops.settled[name]))}; gain {loops.gains[name]:g}{few}"
+            )
         span = f"{row.low:.2f} to {row.high:.2f}" if row.high < np.inf else "one loop"
         light = f"{loops.photons:g} photon{'s' * (loops.photons != 1)}"
         cells.append([f"{loops.start:g} rad rms; {light}", *ends, f"{row.ratio:.2f} ({span})"])

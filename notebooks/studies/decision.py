@@ -70,6 +70,7 @@ GAINS = 0.05, 0.1, 0.2, 0.4, 0.6, 0.8
 """Settings of the chapter on closed loops."""
 _N_MODES = 80  # of the mirror
 _COMPARED = "perfect_1", "perfect_2", "real_1", "real_3"  # rows of the summary
+_MUCH = 3.0  # ratio of errors beyond which one image fails
 _DIAMETER = 8.0  # of the telescope that the wind speed in m/s belongs to, m
 
 
@@ -388,12 +389,17 @@ def numbers(
     for index, pair in enumerate(calibrated, 1):
         if pair is not None:
             found |= {f"calibrated_{index}": pair[0], f"calibrated_gain_{index}": pair[1] / pair[0]}
-    found |= {f"gain_{row.key}": 1 / row.cell.ratio for row in rows if row.key in _COMPARED}
-    small, faint = errors["real"][-1], loops[-1]
+    for row in rows:
+        if row.key in _COMPARED:
+            key, cell = f"gain_{row.key}", row.cell
+            found |= {key: 1 / cell.ratio, f"{key}_least": 1 / cell.high, f"{key}_most": 1 / cell.low}
+    small, faint, bright = errors["real"][-1], loops[-1], errors["perfect"][0]
+    ratio = bright[simplest(bright, ONE_IMAGE)] / bright[simplest(bright, TWO_IMAGES)]
     settled = faint.loops.settled
     return rounded(
         found
         | {
+            "one_fails": float(np.mean(ratio > _MUCH)),
             "likelihood_least": min(_likelihood_ratios(errors["perfect"])),
             "likelihood_most": max(_likelihood_ratios(errors["perfect"])),
             "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],

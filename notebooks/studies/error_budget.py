@@ -117,7 +117,8 @@ def leakage_table(swept: Mapping[float, BenchCurves]) -> Table:
 
 def _header(some: Mapping[Any, BenchCurves]) -> list[str]:
     inputs = next((one.rms[one.rms > 0] for one in some.values()), ())
-    return [f"{quantity} at {value:g}" for quantity in ("gain", "error") for value in inputs]
+    quantities = {"gain": "", "error": " (rad rms)"}
+    return [f"{name} at {value:g} rad rms{unit}" for name, unit in quantities.items() for value in inputs]
 
 
 def _cells(curves: BenchCurves) -> list[str]:

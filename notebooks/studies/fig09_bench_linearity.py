@@ -53,7 +53,7 @@ def draw_bench_linearity(curves: BenchCurves) -> Figure:
     plain.set(xlabel="input (rad rms over the segments)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
     gain.set(xlabel="input (rad rms over the segments)", ylabel="gain")
     gain.set(xlim=(0, None), ylim=(0, 1.5))
-    figure.legend(loc="outside lower center", ncols=3, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=9, columnspacing=1.0, handletextpad=0.5)
     return figure
 
 

@@ -85,6 +85,7 @@ def drawn_methods(curves, pupil, classic, shifted):
     lines = {f"curve {i}": three for i in range(4)}
     reasons = Contraction(three, three, np.full((3, 2), 0.5), {1.0: 0.5}, lines)
     bench_curves = BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(two, 0.1 * pistons))
+    five = ["Linear", "Arcsine", "GerchbergSaxton", "GradientDescent", "PhaseShifted"]
     compared = ["PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood"]
     trials = DiameterCurves(np.full(3, 0.5), dict.fromkeys(compared, np.full((3, 3), 0.1)), three)
     limits = DimpleLimits(three, np.full((3, 2), 0.5), np.full((3, 2, 4), 2.0))
@@ -155,7 +156,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_reference_intensities": ((frames, frames), ()),
         "draw_measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
         "draw_segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),
-        "draw_bench_linearity": ((bench_curves,), two),
+        "draw_bench_linearity": ((BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(five, pistons)),), five),
         "draw_budget": ((dict.fromkeys(["none", "blur"], bench_curves), "PhaseShifted"), shifted_only),
         "draw_calibration_errors": ((calibrated,), shifted_only),
         "draw_explained": ((found,), ()),
@@ -181,12 +182,14 @@ def test_every_figure_is_tested_for_its_colours(drawn_methods):
     assert set(drawn_methods) == set(figure_functions())
 
 
-CROWDED = "draw_diameter_methods", "draw_convergence", "draw_photon_noise"  # drawn with more methods than in the book
+# Drawn here with more methods than in the book.
+CROWDED = "draw_diameter_methods", "draw_convergence", "draw_photon_noise"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", figure_functions())
 def test_variants_are_dark_or_fit_a_phone_and_the_figure_stays(name, drawn_methods):
+    use_style()
     figure = figure_functions()[name](*drawn_methods[name][0])
     before, numbers = pixels(figure), plt.get_fignums()
     for kind, variant in variants(figure).items():

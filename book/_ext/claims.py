@@ -19,7 +19,7 @@ from sphinx.errors import ExtensionError
 
 from book._tools.notebook import glued_texts
 
-HOLDS, REMARK, FAILS, UNTESTED = "holds", "holds with a remark", "does not hold", "not to be tested here"
+HOLDS, REMARK, FAILS, UNTESTED = "holds", "holds in part", "does not hold", "not to be tested here"
 # The signs differ in shape, for readers who do not see the colours.
 SIGNS = {HOLDS: "✔", REMARK: "◐", FAILS: "✘", UNTESTED: "○"}
 STUDIES = Path(__file__).parents[2] / "notebooks" / "studies"

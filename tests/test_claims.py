@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from book._ext import claims
-from book._ext.claims import FAILS, HOLDS, REMARK, UNTESTED, Claim, ClaimError, Finding
+from book._ext.claims import FAILS, HOLDS, PARTLY, UNTESTED, Claim, ClaimError, Finding
 from studies.fig04_dimple_diameter import SHORT
 
 from .conftest import glued
@@ -20,6 +20,12 @@ CLAIMS = {claim.number: claim for claim in claims.CLAIMS}
 @pytest.fixture(scope="module")
 def judged():
     return claims.findings(NOTEBOOKS)
+
+
+@pytest.mark.parametrize("verdict", [HOLDS, PARTLY, FAILS])
+def test_every_verdict_has_its_colour_in_both_modes(verdict):
+    style = (NOTEBOOKS.parent / "book" / "_static" / "custom.css").read_text()
+    assert style.count(f".verdict-{verdict.replace(' ', '-')} {{") == 2
 
 
 def test_every_claim_is_there_once():
@@ -51,11 +57,11 @@ def test_verdict_is_the_recorded_one_and_any_but_holds_and_fails_is_explained(ju
         (5, {"best_difference": 3.0}, FAILS),
         # "About 0.3" is 0.2 to 0.4.
         (7, {"arcsine_limit": 0.2}, HOLDS),
-        (7, {"arcsine_limit": 0.41}, REMARK),
+        (7, {"arcsine_limit": 0.41}, PARTLY),
         (7, {"arcsine_over_linear": 1.0}, FAILS),
         # Ten times the range: by all, some or none of the methods.
         (8, {"linear_limit": 0.1, "saxton_limit": 1.1, "shifted_limit": 1.1, "descent_limit": 1.1}, HOLDS),
-        (8, {"linear_limit": 0.1, "saxton_limit": 0.2, "shifted_limit": 1.1, "descent_limit": 1.1}, REMARK),
+        (8, {"linear_limit": 0.1, "saxton_limit": 0.2, "shifted_limit": 1.1, "descent_limit": 1.1}, PARTLY),
         (8, {"linear_limit": 1.0}, FAILS),
         (9, {"saxton_error": 0.001}, FAILS),
         (9, {"saxton_widest_error": 1.0}, FAILS),
@@ -65,16 +71,16 @@ def test_verdict_is_the_recorded_one_and_any_but_holds_and_fails_is_explained(ju
         (10, {"modes_recovered_at_1": 1.0}, HOLDS),
         # "Around 1" is 0.8 to 1.2.
         (11, {"wrap_onset": 1.2}, HOLDS),
-        (11, {"wrap_onset": 0.7}, REMARK),
+        (11, {"wrap_onset": 0.7}, PARTLY),
         (11, {"wrap_onset": 1.6}, FAILS),
         (12, {"shifted_limit": 1.2, "accelerated_at_2": 0.4}, HOLDS),
-        (12, {"shifted_limit": 1.2}, REMARK),
-        (12, {"shifted_limit": 1.3}, REMARK),
+        (12, {"shifted_limit": 1.2}, PARTLY),
+        (12, {"shifted_limit": 1.3}, PARTLY),
         (12, {"shifted_limit": 0.7}, FAILS),
         (13, {"fourier_functions": 1.0}, FAILS),
         (14, {"error_max_allowed_pairs": 2e-3}, FAILS),
         (14, {"zero_works": 1.0}, HOLDS),
-        (15, {"best_noise": 1.0, "noise_at_half_pi": 1.0, "best_noise_aberrated": 0.6}, REMARK),
+        (15, {"best_noise": 1.0, "noise_at_half_pi": 1.0, "best_noise_aberrated": 0.6}, PARTLY),
         # "About 2.2" is 2.0 to 2.4.
         (16, {"diameter_5_percent": 2.5}, FAILS),
         (16, {"error_at_26": 0.0}, FAILS),

@@ -19,9 +19,9 @@ from sphinx.errors import ExtensionError
 
 from book._tools.notebook import glued_texts
 
-HOLDS, REMARK, FAILS, UNTESTED = "holds", "holds in part", "does not hold", "not to be tested here"
+HOLDS, PARTLY, FAILS, UNTESTED = "holds", "holds in part", "does not hold", "not to be tested here"
 # The signs differ in shape, for readers who do not see the colours.
-SIGNS = {HOLDS: "✔", REMARK: "◐", FAILS: "✘", UNTESTED: "○"}
+SIGNS = {HOLDS: "✔", PARTLY: "◐", FAILS: "✘", UNTESTED: "○"}
 STUDIES = Path(__file__).parents[2] / "notebooks" / "studies"
 BENCHMARKS = Path(__file__).parents[2] / "tests" / "benchmarks"
 PARTS = {"sensor": range(1, 7), "range": range(7, 14), "choices": range(14, 18), "bench": range(18, 22)}
@@ -64,7 +64,7 @@ class ClaimError(ExtensionError):
 class Finding:
     """Result of a rule."""
 
-    verdict: str  # one of `HOLDS`, `REMARK`, `FAILS` and `UNTESTED`
+    verdict: str  # one of `HOLDS`, `PARTLY`, `FAILS` and `UNTESTED`
     measured: str = ""  # the measured values in words
     remark: str = ""  # the condition under which the claim holds, or the reason why it does not
 

@@ -117,8 +117,7 @@ def leakage_table(swept: Mapping[float, BenchCurves]) -> Table:
 
 def _header(some: Mapping[Any, BenchCurves]) -> list[str]:
     inputs = next((one.rms[one.rms > 0] for one in some.values()), ())
-    quantities = {"gain": "", "error": " (rad rms)"}
-    return [f"{name} at {value:g} rad rms{unit}" for name, unit in quantities.items() for value in inputs]
+    return [f"{quantity} at {value:g} rad rms" for quantity in ("gain", "error (rad rms)") for value in inputs]
 
 
 def _cells(curves: BenchCurves) -> list[str]:

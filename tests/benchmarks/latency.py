@@ -1,6 +1,6 @@
 """Time of single frames in a process that runs for long: python -m tests.benchmarks.latency [frames] prints JSON.
 
-Each frame pair goes from camera counts to the phase and 50 modes, as in the loop of the page on real time. The
+Each frame pair goes from camera counts to the phase, by three iterations, and to 50 modes. The
 process is warm and uses one core. Set OMP_NUM_THREADS=1, as `make bench` does, and keep the computer quiet: unlike
 the other benchmarks this one takes the time of the clock, since a control loop waits for it.
 

@@ -322,6 +322,7 @@ class Linearised:
         self._transfer = [
             np.exp(-1j * arm["focus"] * camera.defocus) if arm["focus"] else None for arm in self.arms
         ]
+        self._back_transfer = [one if one is None else one.conj() for one in self._transfer]
         self._spread = [camera.spread_at(arm["focus"]) for arm in self.arms]
         self._rest = self._spectrum_of(maps.rest)
         self._blur = camera.prefilter * np.exp(-2 * (np.pi * self.masks["blur"]) ** 2 * camera.squares)
@@ -406,7 +407,6 @@ class Linearised:
         direct = [np.zeros((camera.size,) * 2, complex) for _ in self._states]
         inputs = [np.zeros(source[2].shape, complex) for source in self._states]
         seen = [np.zeros(self._blur.shape, complex) for _ in self.arms]
-        back_transfers = [None if one is None else one.conj() for one in self._transfer]
         for one, part, weight in zip(camera.exposures, self._parts, pixels, strict=True):
             back = self._splines[one.arm].adjoint(self.arms[one.arm]["flux"] * weight)
             spectrum = self._blur * fft.rfft2(back)
@@ -414,11 +414,11 @@ class Linearised:
             gain = fft.irfft2(spectrum, s=back.shape)
             gain += _differences(self._smooth * gain)
             gain *= 2
-            back_transfer = back_transfers[one.arm]
-            if back_transfer is None:
+            transfer = self._back_transfer[one.arm]
+            if transfer is None:
                 direct[one.state] += gain * part.ahead
             else:
-                spectra[one.state] += back_transfer * fft.fft2(gain * part.ahead)
+                spectra[one.state] += transfer * fft.fft2(gain * part.ahead)
             if one.mask is not None:
                 core = self._cores[one.arm][0].conj().T
                 inputs[one.state] += core @ camera.planes[1].project(gain * part.across)

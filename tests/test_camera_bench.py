@@ -257,6 +257,22 @@ def test_numbers_of_a_converged_fit_stay_within_their_error_bars_in_a_step_of_al
     assert np.abs(step[point.problem.n_white :] / fit.sigma).max() < 1
 
 
+def test_equations_with_several_right_sides_are_solved_in_fewer_steps(calibrated):
+    _, fit = calibrated
+    point = fit.point
+    held = np.arange(len(point.x)) >= point.problem.n_white
+    right = np.where(held, 0, [point.back(point.along(number)) for number in range(4)])
+
+    def energy(found):
+        """Part of the quadratic form that the equations make small."""
+        return np.array([one @ point.product(one) / 2 - one @ b for one, b in zip(found, right, strict=True)])
+
+    together = energy(point.solve(right, held, 8, 0))
+    alone = energy([point.solve(one, held, 8, 0) for one in right])
+    assert np.all(together < alone)
+    assert np.all(alone < 0)
+
+
 def test_fit_that_ends_early_has_not_converged(monkeypatch):
     monkeypatch.setattr("zwfs.frames._camera.solve._LAST", 1)
     frames, clear, phases = BENCH.recording()

@@ -177,6 +177,17 @@ def test_two_images_win_far_from_flat_and_cost_nothing_near_it(small, photons):
     assert far.loops.closed("LinearTwo") > far.loops.closed("Linear")
 
 
+def test_read_noise_favours_the_image_that_has_the_light_of_both(small):
+    _, modes, sensors = small
+    settings = {"wind": WIND, "seed": 7, **LOOP}
+    silent, noisy = (
+        best_methods([tuned_loops(sensors, modes, 0.3, 1.0, [0.1], 8, 35, read_noise=electrons, **settings)])[0]
+        for electrons in (0.0, 2.0)
+    )
+    assert noisy.low > silent.high
+    assert noisy.low > 1
+
+
 def test_the_best_method_is_chosen_on_other_screens_and_only_beyond_the_errors():
     residual = np.geomspace(0.1, 0.2, 9)
     noise = np.exp(0.05 * np.random.default_rng(1).standard_normal(9))

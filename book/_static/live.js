@@ -110,7 +110,7 @@
   // The result in one sentence, for everybody.
   function sentence(made, set) {
     const parts = columns(made, set).map(({ name, made: one }) => {
-      if (!one) return `${name}: no solution`;
+      if (!one) return `${name}: no unique solution`;
       const error = one.errors.at(-1);
       const off = error < set.rms ? `off by ${share(error, set.rms)}` : "fails";
       return `${name} ${succeeds(error, set.rms) ? "recovers the phase" : off} (${draw.error(error)} rad)`;
@@ -139,7 +139,7 @@
       const error = one?.errors.at(-1);
       const good = one && succeeds(error, set.rms);
       const verdict = find(`verdict-${place}`);
-      verdict.textContent = one ? `${good ? "✓" : "✗"} ${draw.error(error)} rad` : "no solution";
+      verdict.textContent = one ? `${good ? "✓" : "✗"} ${draw.error(error)} rad` : "no unique solution";
       verdict.className = `live-verdict ${good ? "live-good" : "live-bad"}`;
       find(`name-${place}`).textContent = name;
       find(`error-name-${place}`).textContent = name.replace("maximum", "max."); // the column is narrow
@@ -159,7 +159,7 @@
       find(`image-${letter}`).setAttribute("aria-label", `Image ${m + 1}, brightest ${brightest.toFixed(2)}`);
     });
     columns(made, set).forEach(({ name, made: one }, place) => {
-      const error = one ? `error ${draw.error(one.errors.at(-1))} radian rms` : "no solution";
+      const error = one ? `error ${draw.error(one.errors.at(-1))} radian rms` : "no unique solution";
       find(`found-${place}`).setAttribute("aria-label", `Phase of the ${name} method, ${error}`);
       find(`error-${place}`).setAttribute("aria-label", `Map of the error of the ${name} method, ${error}`);
     });

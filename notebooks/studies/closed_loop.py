@@ -26,6 +26,7 @@ from zwfs.turbulence import FrozenFlow
 LIMITS = parameter_limits(
     "n_modes diameter phase_shift n_screens exponent rms",
     n_pixels=(16, 200),
+    read_noise=(0.0, 100.0),
     n_screens_linear=(1, 1000),
     speed=(0.0, 100.0),
     cutoff=(1.0, 16.0),  # a pupil of the fewest pixels shows no higher frequency
@@ -83,14 +84,18 @@ def follow_flow(
     plant: Any = None,
     rate: float = 1000.0,
     photons: float | None = None,
+    read_noise: float = 0.0,
     **settings: Any,
 ) -> LoopRun:
     """Correct drifting screens with a Zernike sensor and a mirror of modes; `settings` are those of `close_loop`.
 
-    `photons` are detected in each step, and the images share them. Without `photons` the frames have no noise.
+    `photons` are detected in each step, and the images share them; each pixel adds read noise, electrons rms.
+    Without `photons` the frames have no noise.
     """
     sensor = reconstructor.sensor
-    camera = None if photons is None else Detector(sensor.pupil, photons / sensor.n_masks)
+    camera = None
+    if photons is not None:
+        camera = Detector(sensor.pupil, photons / sensor.n_masks, read_noise=read_noise)
     times = np.arange(n_steps) / rate
     mirror = Mirror(sensor.pupil, modes)
     record = close_loop(plant or sensor, mirror, reconstructor, map(flow, times), camera=camera, **settings)
@@ -182,7 +187,9 @@ def linear_loops(
     return Divergence(runs, np.stack(sensor.reversed, axis=1), growth, strength[:-1] / strength[-1])
 
 
-def loop_methods(sensors: Sequence[ZernikeSensor], modes: NDArray, photons: float) -> dict[str, Any]:
+def loop_methods(
+    sensors: Sequence[ZernikeSensor], modes: NDArray, photons: float, read_noise: float
+) -> dict[str, Any]:
     """Return reconstructors for one and two images (`sensors`); `photons` are those per point and image of two."""
     one, two = sensors
     methods = (
@@ -190,7 +197,7 @@ def loop_methods(sensors: Sequence[ZernikeSensor], modes: NDArray, photons: floa
         Arcsine(one, n_iterations=5, tolerance=0),
         Linear(two, modes),
         PhaseShifted(two, n_iterations=3, tolerance=0, accelerate=True),
-        MaximumLikelihood(two, photons=photons, n_iterations=3, n_starts=1),
+        MaximumLikelihood(two, photons=photons, read_noise=read_noise, n_iterations=3, n_starts=1),
     )
     return dict(zip((*ONE_IMAGE, *TWO_IMAGES), methods, strict=True))
 
@@ -239,6 +246,7 @@ def tuned_loops(
     *,
     wind: Mapping[str, float],
     seed: int,
+    read_noise: float = 0.0,
     **settings: Any,
 ) -> TunedLoops:
     """Choose the gain of each method on half as many screens, and evaluate it on new screens and noise."""
@@ -246,12 +254,12 @@ def tuned_loops(
     first, then = map(int, np.random.SeedSequence(seed).generate_state(2))
     few = FrozenFlow(pupil, start, max(1, n_screens // 2), **wind, seed=first)
     many = FrozenFlow(pupil, start, n_screens, **wind, seed=then)
-    settings |= {"photons": 2 * photons * pupil.n_points}
+    settings |= {"photons": 2 * photons * pupil.n_points, "read_noise": read_noise}
 
     def settle(name: str, flow: FrozenFlow, gain: float, noise: int) -> NDArray:
         return follow_flow(made[name], modes, flow, n_steps, gain=gain, seed=noise, **settings).settled()
 
-    made = loop_methods(sensors, modes, photons)
+    made = loop_methods(sensors, modes, photons, read_noise)
     scores = {name: {gain: typical(settle(name, few, gain, first)) for gain in gains} for name in made}
     best = {name: min(tried, key=lambda gain: tried[gain]) for name, tried in scores.items()}
     settled = {name: settle(name, many, gain, then) for name, gain in best.items()}
@@ -425,9 +433,19 @@ def _short(method: str) -> str:
 
 
 def numbers(
-    found: Divergence, rows: Sequence[BestMethods], settings: Mapping[str, float]
+    found: Divergence, rows: Sequence[BestMethods], noisy: Sequence[BestMethods], settings: Mapping[str, float]
 ) -> dict[str, float | str]:
-    """Return the loops that close, what ranks them, and what the second image gains."""
+    """Return the loops that close, what ranks them, and what the second image gains, without and with read noise.
+
+    Those with read noise are ordered by the error at the start.
+    """
+    ends = {"small": noisy[0], "large": noisy[-1]}
+    read = {
+        f"noisy_{key}_{n}": typical(row.loops.settled[getattr(row, n)])
+        for key, row in ends.items()
+        for n in ("one", "two")
+    }
+    read |= {f"noisy_{key}": row.loops.start for key, row in ends.items()}
     names = dict(zip(("sensor", "wave", "signs"), PLANTS, strict=True))
     closed, run = {key: found.runs[name].closed() for key, name in names.items()}, found.runs["the sensor"]
     residual = [{name: typical(one) for name, one in row.loops.settled.items()} for row in rows]
@@ -441,6 +459,7 @@ def numbers(
     lost_loops = [one.settled[name].size - one.closed(name) for one in first for name in ONE_IMAGE]
     return rounded(
         dict(settings)
+        | read
         | {f"closed_{key}": np.count_nonzero(one) for key, one in closed.items()}
         | {
             "n_loops": len(run.residual),

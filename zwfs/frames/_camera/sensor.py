@@ -71,13 +71,12 @@ class FittedPhase(NDArrayOperatorsMixin):
     def sigma(self) -> NDArray[np.float64]:
         """Error bar of each pixel, (n, n), radian: from draws of the noise and of the prior, and the misfit."""
         point, rng = self._point, np.random.default_rng(0)  # the choice changes the error bars by some percent
-        problem, draws = point.problem, []
-        held = np.zeros(point.x.shape, bool)
+        problem, right = point.problem, []
         for _ in range(_DRAWS):
             noise = [rng.normal(size=one.shape) * (one > 0) for one in problem.weights]
-            right = point.back(noise) + rng.normal(size=point.x.shape)
-            white, _ = problem.split(point.solve(right, held, 60, 0.03))
-            draws.append(problem.phase_map.means(white[0])[PAD:-PAD, PAD:-PAD])
+            right.append(point.back(noise) + rng.normal(size=point.x.shape))
+        found = point.solve(np.array(right), np.zeros(point.x.shape, bool), 60, 0.03)
+        draws = [problem.phase_map.means(problem.split(one)[0][0])[PAD:-PAD, PAD:-PAD] for one in found]
         lit = point.light_means[PAD:-PAD, PAD:-PAD] > 0.3
         left = np.stack([one - one[lit].mean() for one in draws])
         variance = ndimage.gaussian_filter(np.mean(left**2, axis=0), 1.0)

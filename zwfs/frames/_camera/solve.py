@@ -20,13 +20,14 @@ from zwfs.frames._camera.prior import MapPrior
 _BINS = 24  # of spatial frequency, for the preconditioner
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
 _LEAST = 1e-3  # damping
+_DEPENDENT = 1e-12  # eigenvalue over the largest, below which directions depend on each other
 _ALIKE = 1e-13  # eigenvalue over the largest, below which numbers have the same effect
-_LAST = 8  # steps at the end of a fit
-_SHARES = 1.0, 0.5, 0.25  # of such a step: the best one is taken
+_LAST = 12  # steps at the end of a fit
+_SHARES = 1.0, 0.5, 0.25, 0.1  # of such a step: the best one is taken
 _N_MAPS = 80  # iterations for the minimum of the maps
 _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
-MISSED = 0.3
+MISSED = 0.7
 """Errors of fits to frames of HCIPy, over the changes with a finer grid (rms)."""
 _PIXEL_MEAN = np.array([230.0, 2 * 76.0, 2.0]) / 384  # of a cubic spline over a pixel, as a series of cosines
 
@@ -238,6 +239,12 @@ class Point:
         parts = [*self.residuals, x[: problem.n_white], self.excess]
         self.cost = sum(float(np.vdot(one, one)) for one in parts) / 2
 
+    def moved(self, change: NDArray) -> Point:
+        """Return the point after a change of the unknowns; no number passes a limit."""
+        n, x = self.problem.n_white, self.x + change
+        x[n:] = np.clip(x[n:], *self.problem.bounds.T)
+        return Point(self.problem, x)
+
     @property
     def phase_means(self) -> NDArray[np.float64]:
         """Phase, mean over each pixel."""
@@ -423,25 +430,32 @@ class Point:
     def solve(
         self, right: NDArray, held: NDArray[np.bool_], n_inner: int, tolerance: float, damping: float = 0.0
     ) -> NDArray[np.float64]:
-        """Solution of the damped equations by conjugate gradients; what is held stays."""
+        """Solutions of the damped equations for one or several right sides, (n,) or (k, n); what is held stays.
+
+        Block conjugate gradients (O'Leary 1980): each solution is the best in the directions of all right sides.
+        """
 
         def product(d: NDArray) -> NDArray:
             return self.product(d) + damping * self.scale(d) if damping else self.product(d)
 
-        x, r = np.zeros_like(right), np.where(held, 0, right)
-        z = np.where(held, 0, self.precondition(r))
-        d, size = z, float(r @ z)
-        goal = tolerance**2 * size
+        def free(one: NDArray) -> NDArray:
+            return np.where(held, 0, one)
+
+        r = free(np.atleast_2d(right))
+        x, z = np.zeros_like(r), np.array([free(self.precondition(one)) for one in r])
+        d, sizes = z, np.vecdot(r, z)
+        goals = tolerance**2 * sizes
         for _ in range(n_inner):
-            if size <= goal or size <= 0:
+            if np.all(sizes <= goals):
                 break
-            along = np.where(held, 0, product(d))
-            step = size / float(d @ along)
-            x, r = x + step * d, r - step * along
-            z = np.where(held, 0, self.precondition(r))
-            before, size = size, float(r @ z)
-            d = z + size / before * d
-        return x
+            d = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)
+            along = np.array([free(product(one)) for one in d])
+            inverse = linalg.pinvh(d @ along.T, rtol=_DEPENDENT)
+            step = inverse @ (d @ r.T)
+            x, r = x + step.T @ d, r - step.T @ along
+            z = np.array([free(self.precondition(one)) for one in r])
+            d, sizes = z - (inverse @ (along @ z.T)).T @ d, np.vecdot(r, z)
+        return x.reshape(np.shape(right))
 
 
 @dataclass(frozen=True, eq=False)
@@ -465,16 +479,13 @@ def minimise(
     """
     point = Point(problem, problem.start if x is None else x)
     damping, converged, promised = 1e-2, False, math.inf
-    n, bounds = problem.n_white, problem.bounds
     for _ in range(n_steps):
         if converged or promised <= enough * point.cost:
             break
         for _ in range(10):
             change = point.solve(-point.gradient, point.stuck, n_inner, 0.03, damping)
-            target = point.x + change
-            target[n:] = np.clip(target[n:], bounds[:, 0], bounds[:, 1])
             promised = -float(point.gradient @ change) / 2
-            trial = Point(problem, target)
+            trial = point.moved(change)
             gain = point.cost - trial.cost
             if gain >= 0 or promised < _SETTLED:
                 break
@@ -499,16 +510,14 @@ class Eliminated:
     def __init__(self, point: Point, n_inner: int = 10) -> None:
         n, n_all = point.problem.n_white, len(point.x)
         held = np.arange(n_all) >= n
-        effects, followed = [], []
-        for number in range(n_all - n):
-            along = point.along(number)
-            solution = point.solve(point.back(along), held, n_inner, 0.02)
-            effects.append([one - other for one, other in zip(along, point.change(solution), strict=True)])
-            followed.append(solution[:n])
         self._unit = np.sqrt(np.diagonal(point.block))
-        self._effects, self._x = effects, np.array(followed) / self._unit[:, None]
-        self._e = np.array([np.concatenate([image.ravel() for image in one]) for one in effects])
-        self._e /= self._unit[:, None]
+        along = [[one / unit for one in point.along(number)] for number, unit in enumerate(self._unit)]
+        followed = point.solve(np.array([point.back(one) for one in along]), held, n_inner, 0.02)
+        self._effects = [
+            [one - other for one, other in zip(of, point.change(solution), strict=True)]
+            for of, solution in zip(along, followed, strict=True)
+        ]
+        self._x, self._e = followed[:, :n], np.array([_joined(one) for one in self._effects])
         self._known = self._x @ self._x.T + np.diag((point.problem.prior[1] / self._unit) ** 2)
         self._matrix = self._e @ self._e.T + self._known
 
@@ -537,11 +546,10 @@ class Eliminated:
         """
         inverse = linalg.pinvh(self._matrix, rtol=_ALIKE)
         sums = [[r * one for r, one in zip(point.residuals, each, strict=True)] for each in self._effects]
-        scores = _block_sums(sums) / self._unit[:, None]
+        scores = _block_sums(sums)
         seen = np.diagonal(inverse @ (scores @ scores.T + self._known) @ inverse) / np.diagonal(inverse)
         grow = np.sqrt(np.maximum(scale, seen)) / self._unit
-        flat = [np.concatenate([one.ravel() for one in change]) for change in changes]
-        moved = inverse @ (self._e @ np.transpose(flat)) / self._unit[:, None]
+        moved = inverse @ (self._e @ np.transpose([_joined(one) for one in changes])) / self._unit[:, None]
         missed = MISSED**2 * np.mean(moved**2, axis=1)
         return inverse * np.outer(grow, grow) + np.diag(missed)
 
@@ -549,15 +557,9 @@ class Eliminated:
 def settle(best: Minimum) -> tuple[Minimum, Eliminated]:
     """Take last steps of all unknowns, and judge by what the next one promises whether the fit has converged."""
     point, equations = best.point, Eliminated(best.point)
-    n, bounds = point.problem.n_white, point.problem.bounds
     step, promised = equations.step(point)
     for _ in range(_LAST):
-        trials = []
-        for share in _SHARES:
-            target = point.x + share * step
-            target[n:] = np.clip(target[n:], bounds[:, 0], bounds[:, 1])
-            trials.append(Point(point.problem, target))
-        trial = min(trials, key=lambda one: one.cost)
+        trial = min((point.moved(share * step) for share in _SHARES), key=lambda one: one.cost)
         if trial.cost >= point.cost:
             break
         point = trial
@@ -565,6 +567,11 @@ def settle(best: Minimum) -> tuple[Minimum, Eliminated]:
         if promised < 1:
             break
     return Minimum(point, promised < 1), equations
+
+
+def _joined(images: Sequence[NDArray]) -> NDArray[np.float64]:
+    """All pixels of images, (n_pixels,)."""
+    return np.concatenate([one.ravel() for one in images])
 
 
 def _block_sums(images: Sequence[Sequence[NDArray]]) -> NDArray[np.float64]:

@@ -273,6 +273,18 @@ def test_equations_with_several_right_sides_are_solved_in_fewer_steps(calibrated
     assert np.all(alone < 0)
 
 
+def test_other_values_replace_those_of_a_fit_and_explain_its_frames_worse(calibrated):
+    _, fit = calibrated
+    wrong = fit.replaced({"diameter": 1.06, "leakage": 0.0})
+    assert (wrong["diameter"].value, wrong["leakage"].value) == (1.06, 0.0)
+    assert wrong["first"] == fit["first"]
+    assert wrong.point.cost > 2 * fit.point.cost
+    with pytest.raises(KeyError, match="'size': expected one of"):
+        fit.replaced({"size": 1.0})
+    with pytest.raises(TypeError, match="diameter = 'large'"):
+        fit.replaced({"diameter": "large"})
+
+
 def test_fit_that_ends_early_has_not_converged(monkeypatch):
     monkeypatch.setattr("zwfs.frames._camera.solve._LAST", 1)
     frames, clear, phases = BENCH.recording()

@@ -141,26 +141,44 @@ class Measured(NamedTuple):
 
     plain: float
     calibrated: float
+    same_prior: float  # with the values of the design and the prior of the calibrated route; NaN if not measured
     sigma: float  # error bar that the fit states, rms over the same pixels
     inside: float  # share of these pixels with an error below the error bar
     misfit: float
     consistent: bool
 
 
-def measure(taken: Recording, fit: BenchFit, numbers: Sequence[int], n_iterations: int = 25) -> list[Measured]:
-    """Measure unseen screens by the plain route with the values of the design, and with the fitted optics."""
-    return sweeps.run(_measure, numbers, taken, FittedSensor(fit), n_iterations, name="calibrated_errors")
+def measure(
+    taken: Recording, fit: BenchFit, numbers: Sequence[int], n_iterations: int = 25, *, control: bool = False
+) -> list[Measured]:
+    """Measure unseen screens by the plain route with the values of the design, and with the fitted optics.
+
+    The control has the values of the design with all else of the fitted route: its maps, places and smooth prior.
+    """
+    sensors = [FittedSensor(fit), *([FittedSensor(designed(fit))] if control else [])]
+    return sweeps.run(_measure, numbers, taken, sensors, n_iterations, name="calibrated_errors")
 
 
-def _measure(number: int, taken: Recording, sensor: FittedSensor, n_iterations: int) -> Measured:
+def designed(fit: BenchFit) -> BenchFit:
+    """Return a fit with the optics of the design: no leakage, no focus, and a blur far below a pixel."""
+    design, optics = Optics(), {"leakage": 0.0, "blur": 0.02, "arm 0 focus": 0.0, "arm 1 focus": 0.0}
+    first, second = design.phase_shifts
+    return fit.replaced(optics | {"diameter": design.diameter, "first": first, "second": second})
+
+
+def _measure(number: int, taken: Recording, sensors: Sequence[FittedSensor], n_iterations: int) -> Measured:
     counts, sigma = taken.shot(number)
-    found, lit = sensor(counts, sigma), taken.arrays["lit"]
-    left = _error(found.phase, taken.arrays["unseen"][number] * _UNIT, lit)
+    truth, lit = taken.arrays["unseen"][number] * _UNIT, taken.arrays["lit"]
+    found, *control = (sensor(counts, sigma) for sensor in sensors)
+    left = _error(found.phase, truth, lit)
+    same_prior = float(_error(control[0].phase, truth, lit).std()) if control else np.nan
     bars = found.sigma[lit]
     plain = _plain(counts, taken, number, n_iterations)
     inside = float(np.mean(np.abs(left) < bars))
     stated = float(np.sqrt(np.mean(bars**2)))
-    return Measured(float(plain.std()), float(left.std()), stated, inside, found.misfit, found.consistent)
+    return Measured(
+        float(plain.std()), float(left.std()), same_prior, stated, inside, found.misfit, found.consistent
+    )
 
 
 def _plain(counts: NDArray, taken: Recording, number: int, n_iterations: int) -> NDArray[np.float64]:
@@ -230,12 +248,18 @@ class Errors:
 
 
 def measure_inputs(
-    taken: Recording, fit: BenchFit, largest: float, n_screens: int, n_iterations: int = 25
+    taken: Recording,
+    fit: BenchFit,
+    largest: float,
+    n_screens: int,
+    n_iterations: int = 25,
+    *,
+    control: bool = False,
 ) -> Errors:
-    """Measure the bright unseen screens up to an error."""
+    """Measure the bright unseen screens up to an error; on demand with the control of `measure`."""
     inputs = taken.inputs(largest)
     numbers = [number for rms in inputs for number in taken.unseen(rms, taken.photons[0])[:n_screens]]
-    found = measure(taken, fit, numbers, n_iterations)
+    found = measure(taken, fit, numbers, n_iterations, control=control)
     return Errors(inputs, [found[k : k + n_screens] for k in range(0, len(found), n_screens)])
 
 
@@ -256,7 +280,9 @@ def bulk_errors(taken: Recording, fit: BenchFit, errors: Errors) -> NDArray[np.f
 def draw_calibration_errors(errors: Errors) -> Figure:
     """Error against the input, with the values of the design and calibrated, and the error bar that is stated."""
     figure, axes = plt.subplots(figsize=(6, 4.2))
-    plain, found, stated = (errors.column(name) for name in ("plain", "calibrated", "sigma"))
+    names = "plain", "calibrated", "same_prior", "sigma"
+    plain, found, control, stated = (errors.column(name) for name in names)
+    axes.plot(errors.rms, control, "s--", color="#777777", ms=5, label="design, prior of the fit (control)")
     axes.plot(errors.rms, plain, **LOOKS["PhaseShifted"].style, label="values of the design")
     axes.plot(errors.rms, found, "*-", color="#333333", ms=9, label="calibrated")
     axes.plot(errors.rms, stated, "o", color="#777777", mfc="none", ms=8, label="error bar, calibrated")
@@ -272,6 +298,7 @@ def error_columns(errors: Errors) -> dict[str, NDArray]:
         "input (rad rms)": errors.rms,
         "plain route: error (rad rms)": errors.column("plain"),
         "calibrated: error (rad rms)": errors.column("calibrated"),
+        "values of the design with the same prior: error (rad rms)": errors.column("same_prior"),
         "calibrated: error bar (rad rms)": errors.column("sigma"),
         "calibrated: misfit": np.array([np.mean([one.misfit for one in row]) for row in errors.measured]),
     }
@@ -289,6 +316,7 @@ def numbers(
     return rounded(
         {
             "commands": len(fit.misfit) / 2 - 2,
+            "n_screens": len(errors.measured[0]),
             "photons": float(taken.arrays["photons"]),
             "misfit": float(np.mean(fit.misfit)),
             "verdict": "consistent" if fit.consistent else "not consistent",
@@ -304,6 +332,8 @@ def numbers(
             "gain": plain[place] / found[place],
             "gain_least": (plain / found).min(),
             "gain_most": (plain / found).max(),
+            "control_least": (errors.column("same_prior") / plain).min(),
+            "control_most": (errors.column("same_prior") / plain).max(),
             "calibrated_largest": found.max(),
             "sigma": errors.column("sigma")[place],
             "inside": 100 * float(np.mean([one.inside for one in every])),

@@ -311,7 +311,7 @@ class Cell:
 
     one: str
     two: str
-    typical: tuple[float, float]  # errors with one and two images, geometric mean over the screens, rad rms
+    typical: tuple[float, float]  # errors with one and two images, rad rms: geometric mean, of loops that close
     ratio: float  # error with two images over that with one
     low: float  # the ratio less and plus twice its standard error
     high: float
@@ -334,6 +334,8 @@ class Cell:
         return {
             count: f"{two_digits(error)}, {method}{more}"
             if n == self.n_loops
+            else f"{two_digits(error)}, {method}; {n} of {self.n_loops} loops close"
+            if n > self.n_loops / 2
             else f"{n} of {self.n_loops} loops close"
             for count, error, method, n in both
         }
@@ -355,10 +357,11 @@ def open_cell(errors: Mapping[str, NDArray]) -> Cell:
 
 def loop_cell(found: BestMethods) -> Cell:
     """Result of the study of closed loops."""
-    settled, one, two = found.loops.settled, found.one, found.two
-    both = typical(settled[one]), typical(settled[two])
-    closed, n_loops = (found.loops.closed(one), found.loops.closed(two)), settled[one].size
-    return Cell(_plain(one), _plain(two), both, found.ratio, found.low, found.high, closed, n_loops)
+    one, two = (found.loops.settled[name] for name in (found.one, found.two))
+    ends = [settled[settled < found.loops.start / 2] for settled in (one, two)]
+    both = typical(ends[0] if ends[0].size else one), typical(ends[1] if ends[1].size else two)
+    names, closed = (_plain(found.one), _plain(found.two)), (ends[0].size, ends[1].size)
+    return Cell(*names, both, found.ratio, found.low, found.high, closed, one.size)
 
 
 def _plain(method: str) -> str:

@@ -7,6 +7,7 @@ pair of frames.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -133,6 +134,18 @@ class BenchFit:
     def sigma(self) -> NDArray[np.float64]:
         """Error bars of the estimates, (n_estimates,)."""
         return np.sqrt(np.diagonal(self.covariance))
+
+    def replaced(self, values: Mapping[str, float]) -> BenchFit:
+        """Return the fit with other values of some numbers, such as those of a design; the maps stay.
+
+        Misfit, error bars and remarks are those of the fit, not of the values.
+        """
+        x, n = self.point.x.copy(), self.point.problem.n_white
+        names = [one.name for one in self.estimates]
+        for name, value in values.items():
+            x[n + names.index(self[name].name)] = _check.number(name, value)
+        estimates = (one._replace(value=values.get(one.name, one.value)) for one in self.estimates)
+        return replace(self, estimates=tuple(estimates), point=Point(self.point.problem, x))
 
     def __getitem__(self, name: str) -> Estimate:
         """Estimate of a name."""

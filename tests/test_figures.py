@@ -121,7 +121,7 @@ def drawn_methods(curves, pupil, classic, shifted):
     both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(triple.measure(phase))
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
-    calibrated = Errors(three, [[Measured(0.2, 0.1, 0.1, 0.7, 1.0, True)]] * 3)
+    calibrated = Errors(three, [[Measured(0.2, 0.1, 0.3, 0.1, 0.7, 1.0, True)]] * 3)
     return {
         "draw_slice": ((sliced, "error", "x"), ()),
         "draw_sensor_layout": ((classic, phase), ()),

@@ -7,7 +7,7 @@ import pytest
 
 from zwfs.frames.pipeline import Optics, near_edges, recover_phase, reduce_frames, upside_down
 from zwfs.frames.refine import fit, steps
-from zwfs.frames.registration import Image, Placement, RegisteredFrames, register_frames
+from zwfs.frames.registration import FRAMES, Image, Placement, RegisteredFrames, register_frames
 from zwfs.frames.verdict import CameraNoise, _of_place, _of_score, judge
 
 from .hcipy_bench import HcipyBench
@@ -169,7 +169,7 @@ def test_second_image_is_turned_about_the_centre_of_its_pupil():
         np.array([[0.0, 0.0], shift, [0.0, 0.0], shift]), placement=placement,
     )  # fmt: skip
     for axis, image in enumerate(images):
-        seen = replace(disc, frames=(image, image)).frames_on_grid()[0] / disc.areas[:2, None, None]
+        seen = replace(disc, frames=(image, image))._on_grid(FRAMES)[0] / disc.areas[:2, None, None]
         middle = (29.0, 30.0)[axis]
         np.testing.assert_allclose(seen.mean(axis=(1, 2)), [middle, middle + shift[axis]], atol=1e-6)
         # One column to the right on the first image, on both.

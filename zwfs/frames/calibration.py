@@ -31,6 +31,7 @@ from zwfs.frames._learnt import learnt, places_of, training
 from zwfs.frames._outline import radius
 from zwfs.frames.phases import Flag, Phases
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames
+from zwfs.frames.registration import FRAMES
 from zwfs.metrics import without_piston
 from zwfs.pupil import Pupil
 from zwfs.reconstructors.base import Reconstructor
@@ -171,7 +172,7 @@ class Calibration(Immutable):
         shape = images[0].counts.shape
         if images[-1].counts.shape != shape:
             raise ValueError(f"the frames have shapes {shape} and {images[-1].counts.shape}: expected the same")
-        counts, _ = registered.frames_on_grid()
+        counts, _ = registered._on_grid(FRAMES)
         unit, background = measurement.counts * registered.exposure, measurement.background[:2]
         inner = (..., *measurement.window)
 

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from zwfs import _check
 from zwfs.frames._outline import radius
-from zwfs.frames.registration import RegisteredFrames, correlations, nearest_good
+from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, RegisteredFrames, correlations, nearest_good
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
@@ -256,7 +256,7 @@ def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | No
             f"diameter = {optics.diameter:g} lambda/D: expected at most {registered.diameter:.4g} (pixels of D)"
         )
     n, center = registered.n_pixels, registered.center
-    (frames, bad), (clear, clear_bad) = registered.frames_on_grid(margin), registered.clear_on_grid()
+    (frames, bad), (clear, clear_bad) = registered._on_grid(FRAMES, margin), registered._on_grid(CLEAR_FRAMES)
     background = _backgrounds(registered) if registered.background else np.zeros(4)
     frames, clear = frames - background[:2, None, None], clear - background[2:, None, None]
     stop = radius((n, n), center) <= registered.diameter / 2

@@ -30,6 +30,7 @@ _BLUR = 2.0  # pixels rms: finest detail that counts for registration
 # below this part of its value.
 _SURE, _SIGNIFICANT = 0.05, 0.1
 _EDGE, _AROUND = 3, 8  # pixels around the pupil: those that take part where the surroundings are there, and all
+FRAMES, CLEAR_FRAMES = slice(0, 2), slice(2, 4)  # of the four images
 _LARGEST_TURN, _LARGEST_STRETCH = 6.0, 0.06  # degrees, and relative, of the second image
 
 
@@ -190,16 +191,11 @@ class RegisteredFrames:
         centers = self.origins + self.corner + self.center
         return np.einsum("kij,jyx->kiyx", self.matrices, grid) + centers[..., np.newaxis, np.newaxis]
 
-    def frames_on_grid(self, margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Frames and their bad pixels, (2, ny', nx') each, on the grid of the pupil with a margin around it."""
-        return self._on_grid(slice(0, 2), margin)
+    def _on_grid(self, which: slice, margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """`FRAMES` or `CLEAR_FRAMES`, and their bad pixels, on the grid with a margin, (2, ny', nx').
 
-    def clear_on_grid(self, margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Clear frames and their bad pixels, on the same grid."""
-        return self._on_grid(slice(2, 4), margin)
-
-    def _on_grid(self, which: slice, margin: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Images on the grid, interpolated once; counts are those of a pixel of the first image."""
+        They are interpolated once. Counts are those of a pixel of the first image.
+        """
         places = self.places(margin)[which]
         counts, bad = np.empty((2, *places.shape[2:])), np.empty((2, *places.shape[2:]), bool)
         for index, image in enumerate(self.images[which]):
@@ -421,7 +417,7 @@ def _register(rough: RegisteredFrames, frames_too: bool) -> RegisteredFrames:
     # The outline takes part, unless software cut it out of its surroundings.
     cut = any(image.cut for image in rough.clear_frames)
     reach = 0.45 * rough.diameter if cut else rough.diameter / 2 + _EDGE
-    reference, image = rough.clear_on_grid(_AROUND)[0]
+    reference, image = rough._on_grid(CLEAR_FRAMES, _AROUND)[0]
     center = rough.center[0] + _AROUND, rough.center[1] + _AROUND
     inside = radius(reference.shape, center) <= reach
     ratio = second.diameter / first.diameter
@@ -436,7 +432,7 @@ def _register(rough: RegisteredFrames, frames_too: bool) -> RegisteredFrames:
     placed = replace(rough, origins=origins, placement=replace(placement, shift=origins[3]))
     if not frames_too:
         return placed
-    (frames, _), (images, _) = placed.frames_on_grid(), placed.clear_on_grid()
+    (frames, _), (images, _) = (placed._on_grid(which) for which in (FRAMES, CLEAR_FRAMES))
     # Off the edge, which the mask makes bright or dark.
     inside = radius(images.shape[1:], placed.center) <= 0.45 * placed.diameter
     moves = [

@@ -26,7 +26,7 @@ from zwfs.frames.pipeline import (
     recover_phase,
     upside_down,
 )
-from zwfs.frames.registration import Placement, RegisteredFrames, nearest_good
+from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Placement, RegisteredFrames, nearest_good
 
 __all__ = ["CameraNoise", "ImageOrder", "Verdict", "judge", "order_of_images"]
 
@@ -212,7 +212,8 @@ def _noise_kept(registered: RegisteredFrames) -> tuple[NDArray[np.float64], NDAr
         return tuple(replace(one, counts=rng.normal(size=one.counts.shape)) for one in images)
 
     white = replace(registered, frames=noise(registered.frames), clear_frames=noise(registered.clear_frames))
-    return white.frames_on_grid()[0].var(axis=(1, 2)), white.clear_on_grid()[0].var(axis=(1, 2))
+    frames, clear = (white._on_grid(which)[0].var(axis=(1, 2)) for which in (FRAMES, CLEAR_FRAMES))
+    return frames, clear
 
 
 def _rms(values: NDArray) -> float:

@@ -153,7 +153,7 @@ def measure(
 ) -> list[Measured]:
     """Measure unseen screens by the plain route with the values of the design, and with the fitted optics.
 
-    The control has the values of the design with all else of the fitted route: its maps, places and smooth prior.
+    A control keeps the maps, places and prior of the fit, and replaces its optics by the values of the design.
     """
     sensors = [FittedSensor(fit), *([FittedSensor(designed(fit))] if control else [])]
     return sweeps.run(_measure, numbers, taken, sensors, n_iterations, name="calibrated_errors")

@@ -139,6 +139,20 @@ class BenchFit:
         """Return the fit with other values of some numbers, such as those of a design; the maps stay.
 
         Misfit, error bars and remarks are those of the fit, not of the values.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            By the names of `estimates`, in their units.
+
+        Returns
+        -------
+        BenchFit
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            If no estimate has the name, or a value is not a finite number.
         """
         x, n = self.point.x.copy(), self.point.problem.n_white
         names = [one.name for one in self.estimates]

@@ -331,7 +331,8 @@ def draw_linear_loops(found: Divergence) -> Figure:
 def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
     """Residual against the error at the start: a panel for each star, a curve for each method at its best gain.
 
-    Markers are filled for one image and open for two. Texts give the loops that close, where some do not.
+    Markers are filled for one image and open for two; bars are two standard errors either way. Texts give the
+    loops that close, where some do not.
     """
     stars = sorted({one.photons for one in trials})
     figure, panels = plt.subplots(1, len(stars), figsize=(7, 3.8), sharex=True, sharey=True, squeeze=False)
@@ -343,10 +344,13 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
                 style["markerfacecolor"] = "white"
             if name == "LinearTwo":
                 style["linestyle"] = "--"
-            residual = [typical(one.settled[name]) for one in some]
-            axes.semilogy([one.start for one in some], residual, label=method_name(name), **style)
+            means = np.array([paired_ratio(one.settled[name], np.ones_like(one.settled[name])) for one in some])
+            starts = [one.start for one in some]
+            axes.semilogy(starts, means[:, 0], label=method_name(name), **style)
+            if np.isfinite(means).all():  # more than one screen
+                axes.vlines(starts, *means[:, 1:].T, color=style["color"], lw=1)
         _mark_closed(axes, some)
-        axes.set_title(f"{photons:g} photon{'s' * (photons != 1)} per point and image", fontsize=10)
+        axes.set_title(f"{photons:g} photon{'s' * (photons != 1)} per point, image and step", fontsize=10)
         axes.set(xlabel="error at the start (rad rms)", xticks=[one.start for one in some])
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter("{x:g}")

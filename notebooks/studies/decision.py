@@ -450,7 +450,8 @@ def numbers(
         found |= {f"{row.key}_{count}": text for count, text in row.cell.sides.items()}
     for index, pair in enumerate(calibrated, 1):
         if pair is not None:
-            found |= {f"calibrated_{index}": pair[0], f"calibrated_gain_{index}": pair[1] / pair[0]}
+            calibrated, plain = pair
+            found |= {f"plain_{index}": plain, f"calibrated_gain_{index}": plain / calibrated}
     for row in rows:
         if row.key in _COMPARED:
             key, cell = f"gain_{row.key}", row.cell

@@ -187,3 +187,18 @@ def test_keyboard_alone_reads_switches_and_searches(page):
     page.keyboard.type("Gerchberg")
     page.keyboard.press("Enter")
     page.wait_for_url("**/search.html?q=Gerchberg")
+
+
+def test_first_tap_on_a_word_defines_it_and_the_second_opens_the_glossary(browser):
+    context = browser.new_context(viewport={"width": 390, "height": 800}, has_touch=True, is_mobile=True)
+    page = context.new_page()
+    page.goto(address("notebooks/zernike_sensor.html"))
+    settle(page)
+    word = page.locator("a[data-definition]").first
+    word.tap()
+    shown = word.evaluate("one => getComputedStyle(one, '::after').content")
+    assert word.get_attribute("data-definition")[:20] in shown
+    assert page.url.endswith("zernike_sensor.html")
+    word.tap()
+    page.wait_for_url("**/book/glossary.html#*")
+    context.close()

@@ -158,7 +158,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),
         "draw_bench_linearity": ((BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(five, pistons)),), five),
         "draw_budget": ((dict.fromkeys(["none", "blur"], bench_curves), "PhaseShifted"), shifted_only),
-        "draw_calibration_errors": ((calibrated,), shifted_only),
+        "draw_calibration_errors": ((calibrated, three), shifted_only),
         "draw_explained": ((found,), ()),
         "draw_phase_map": ((found, 635.0), ()),
         "draw_gains": (([step] * 2, [0.1, 0.2]), ()),

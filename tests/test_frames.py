@@ -371,6 +371,10 @@ def test_bench_writes_what_the_pipeline_reads(tmp_path):
     known = PhaseShifted(model.shifted)(model.normalise(bench.frames(commanded, 1))).phase
     # As good as one who knows where the pupils stand.
     assert error < segment_residual(model.pistons(known), commanded).std() + 0.03 < 0.18
+    written = write_bench(tmp_path, bench, seed=2)
+    flat = camera.read_all([written["frame"]], [written["pupils"]], [written["dark"]])[:2]
+    flat = recover_phase(reduce_frames(register_frames(*flat), Optics()))
+    assert bench_error(bench, commanded, found, flat) < 0.7 * error
 
 
 def test_phase_file_says_where_it_comes_from(tmp_path, recorded):

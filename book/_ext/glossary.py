@@ -12,9 +12,10 @@ from sphinx.application import Sphinx
 from sphinx.transforms import SphinxTransform
 
 GLOSSARY = "book/glossary"
-WITHOUT = {GLOSSARY, "book/bibliography", "book/index", "book/notation"}
+WITHOUT = {GLOSSARY, "book/bibliography", "book/notation"}
 TERM = re.compile(r"^(\w.*)\n  (\S.*)", re.MULTILINE)
 ROLE = re.compile(r"\{\w+\}`([^`<]*?)(?: <[^`]*>)?`")
+EMPHASIS = re.compile(r"\*([^*]+)\*")
 PROSE = (nodes.paragraph, nodes.emphasis, nodes.strong, nodes.list_item)
 
 
@@ -57,7 +58,7 @@ def terms(glossary: Path) -> list[str]:
 def definitions(glossary: Path) -> dict[str, str]:
     """Return the definition of each term on the page of the glossary, as plain text."""
     entries = TERM.findall(glossary.read_text("utf-8").partition("```{glossary}")[2])
-    return {term: ROLE.sub(r"\1", definition) for term, definition in entries}
+    return {term: EMPHASIS.sub(r"\1", ROLE.sub(r"\1", definition)) for term, definition in entries}
 
 
 def define(body: BeautifulSoup, glossary: Path) -> None:

@@ -33,3 +33,15 @@ addEventListener("DOMContentLoaded", () => {
   for (const arrow of document.querySelectorAll(".bd-links summary"))
     arrow.setAttribute("aria-label", `Pages of: ${arrow.closest("li").querySelector("a").textContent.trim()}`);
 });
+
+// Without hover, the first tap on a word of the glossary shows its definition, and the second one opens the glossary.
+let tapped;
+addEventListener("click", (event) => {
+  const word = event.target.closest("a[data-definition]");
+  tapped?.classList.remove("tapped");
+  if (word && word !== tapped && matchMedia("(hover: none)").matches) {
+    event.preventDefault();
+    word.classList.add("tapped");
+  }
+  tapped = word;
+});

@@ -402,22 +402,23 @@ def loop_rows(found: Iterable[BestMethods], bench: str) -> list[Row]:
     ]
 
 
-def open_table(rows: Iterable[Row]) -> Table:
-    """Error of the best method with two images and with one, for each bench and wavefront."""
-    return _table("photons per point and image", [(f"{row.bench}, {row.start}", row) for row in rows])
+def open_table(rows: Sequence[Row]) -> Table:
+    """Error of the best method with two images and with one, and their ratio, for each bench and wavefront."""
+    header = ["situation", "photons per point and image", "two images", "one image", "one over two"]
+    ratios = ([1 / one for one in (row.cell.ratio, row.cell.high, row.cell.low)] for row in rows)
+    texts = ["{:.2g} ({:.2g} to {:.2g})".format(*three) for three in ratios]
+    return Table(header, [[*_cells(row), text] for row, text in zip(rows, texts, strict=True)])
 
 
 def loop_table(rows: Iterable[Row]) -> Table:
     """Residual of the best method with two images and with one, for each loop."""
-    return _table("photons per point, image and step", [(f"{row.bench}, {row.start}", row) for row in rows])
+    header = ["situation", "photons per point, image and step", "two images", "one image"]
+    return Table(header, [_cells(row) for row in rows])
 
 
-def _table(photons: str, rows: Iterable[tuple[str, Row]]) -> Table:
-    sides = [(situation, row, row.cell.sides) for situation, row in rows]
-    return Table(
-        ["situation", photons, "two images", "one image"],
-        [[situation, row.photons, both["two"], both["one"]] for situation, row, both in sides],
-    )
+def _cells(row: Row) -> list[str]:
+    sides = row.cell.sides
+    return [f"{row.bench}, {row.start}", row.photons, sides["two"], sides["one"]]
 
 
 def calibrated_table(situations: Iterable[Situation], errors: Iterable[tuple[float, float] | None]) -> Table:
@@ -450,8 +451,7 @@ def numbers(
         found |= {f"{row.key}_{count}": text for count, text in row.cell.sides.items()}
     for index, pair in enumerate(calibrated, 1):
         if pair is not None:
-            calibrated, plain = pair
-            found |= {f"plain_{index}": plain, f"calibrated_gain_{index}": plain / calibrated}
+            found |= {f"calibrated_gain_{index}": pair[1] / pair[0]}
     for row in rows:
         if row.key in _COMPARED:
             key, cell = f"gain_{row.key}", row.cell

@@ -30,6 +30,7 @@ from zwfs.sensor import ZernikeSensor
 LIMITS = parameter_limits(
     "n_pixels n_modes diameter phase_shift rms_max n_rms rms_fine n_screens exponent n_iterations extent "
     "threshold",
+    steeper=(-6.0, 0.0),
     rms_beyond=[(0.0, 4.0), ...],
     extents=[(1.0, 8.0)],
     **SETUP,
@@ -410,6 +411,14 @@ _SHORT = {
     "GerchbergSaxtonModel": "saxton_model",
     "GradientDescent": "descent",
 }
+
+
+def steep_numbers(limits: Mapping[str, Limit]) -> dict[str, float | str]:
+    """Limits of the linear method and of the iteration with another spectrum, and their ratio."""
+    linear, shifted = limits["Linear"], limits["PhaseShifted"]
+    return rounded({
+        "steep_linear": linear.value, "steep_shifted": shifted.value, "steep_gain": shifted.over(linear).value
+    })  # fmt: skip
 
 
 def numbers(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -20,11 +21,12 @@ from studies.kit.results import rounded
 from studies.kit.style import ALONE, show_intensity, show_phase
 from studies.kit.tables import Table
 from zwfs import opd_to_phase, phase_to_opd
+from zwfs.bench import Bench, write_bench
 from zwfs.frames import CameraNoise
-from zwfs.frames.files import CameraFile
-from zwfs.frames.pipeline import MeasuredPhase, Measurement, model
+from zwfs.frames.files import CameraFile, read_all
+from zwfs.frames.pipeline import MeasuredPhase, Measurement, model, recover_phase, reduce_frames
 from zwfs.frames.refine import Step
-from zwfs.frames.registration import Image
+from zwfs.frames.registration import Image, register_frames
 from zwfs.frames.verdict import Verdict
 
 _FITTED = "registration", "scale", "background", "diameter", "leakage", "unmasked", "pupil_background"
@@ -59,6 +61,15 @@ def header_noise(source: CameraFile, gain: float, read_noise: float) -> CameraNo
     gain = gain or (source.keyword("EGAIN") if "EGAIN" in source.header else 0.0)
     read_noise = read_noise or (source.keyword("RDNOISE") if "RDNOISE" in source.header else 0.0)
     return CameraNoise(gain, read_noise) if gain else None
+
+
+def simulated_flat(bench: Bench, phase: MeasuredPhase, n_iterations: int, seed: int) -> MeasuredPhase:
+    """Phase of frames of the flat mirror of a simulated bench, with the optics of another phase."""
+    with tempfile.TemporaryDirectory() as folder:
+        paths = write_bench(folder, bench, seed=np.random.default_rng([seed, 1]))
+        frames, clear_frames, _ = read_all([paths["frame"]], [paths["pupils"]], [paths["dark"]])
+        registered = register_frames(frames, clear_frames)
+    return recover_phase(reduce_frames(registered, phase.measurement.optics), n_iterations)
 
 
 def draw_explained(result: MeasuredPhase) -> Figure:
@@ -215,11 +226,13 @@ def phase_columns(result: MeasuredPhase, verdict: Verdict, wavelength: float) ->
 
 
 def step_columns(work: Sequence[Step], errors: Sequence[float] | None) -> dict[str, Any]:
-    """Scores of each step."""
+    """Scores of each step, and the fitted optics."""
     columns: dict[str, Any] = {"step": [step.name for step in work]}
     columns |= {f"score, image {i + 1}": [step.predicted[i] for step in work] for i in range(2)}
     columns |= {f"control, image {i + 1}": [step.control[i] for step in work] for i in range(2)}
     columns |= {"misfit over contrast": [step.result.misfit for step in work]}
+    optics = [step.result.measurement.optics for step in work]
+    columns |= {name: [getattr(one, name) for one in optics] for name in ("scale", "diameter", "leakage")}
     return columns | {"difference from the commands (rad rms)": errors or np.nan}
 
 
@@ -263,27 +276,6 @@ def result_table(result: MeasuredPhase) -> Table:
     )
 
 
-def step_table(work: Sequence[Step], errors: Sequence[float] | None) -> Table:
-    """Scores of each step, and the fitted optics."""
-    rows = []
-    for index, step in enumerate(work):
-        optics = step.result.measurement.optics
-        rows.append(
-            [
-                step.name,
-                _pair(step.predicted, 2),
-                _pair(step.control, 2),
-                f"{step.result.misfit:.3f}",
-                f"{optics.scale:.2f}",
-                f"{optics.diameter:.2f}",
-                f"{optics.leakage:.2f}",
-                f"{errors[index]:.3f}" if errors else "unknown",
-            ]
-        )
-    scores = ["score", "control", "misfit over contrast"]
-    return Table(["step", *scores, "scale", "dimple", "leakage", "difference from commands (rad rms)"], rows)
-
-
 def image_table(frames: Sequence[Image], clear_frames: Sequence[Image]) -> Table:
     """Size, brightest good pixel and number of bad pixels of each image."""
     rows = [
@@ -318,9 +310,12 @@ def _pair(values: Sequence[float] | NDArray, digits: int) -> str:
 
 
 def numbers(
-    verdict: Verdict, work: Sequence[Step], errors: Sequence[float] | None, n_fits: int
+    verdict: Verdict, work: Sequence[Step], errors: Sequence[float] | None, n_fits: int, error_flat: float
 ) -> dict[str, float | str]:
-    """Numbers for the text: scores, and misfits and errors of the result and of the step before the fits."""
+    """Numbers for the text: scores, and misfits and errors of the result and of the step before the fits.
+
+    `error_flat` is the error of the result less the phase of a flat mirror.
+    """
     known = errors or [np.nan] * len(work)
     return rounded(
         {
@@ -330,6 +325,7 @@ def numbers(
             "misfit_plain": work[-1 - n_fits].result.misfit,
             "sigma": np.nan if verdict.sigma is None else np.nanmedian(verdict.sigma),
             "error": known[-1],
+            "error_flat": error_flat,
             "error_plain": known[-1 - n_fits],
         }
     )

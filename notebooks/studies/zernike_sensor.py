@@ -210,8 +210,8 @@ def one_or_two_images_columns(
     }
 
 
-def numbers(pupil: Pupil, truth: NDArray, one: NDArray, pixel: Pixel) -> dict[str, float | str]:
-    """Phases that explain the pixel, the phase from one image, and the rms of the wavefront, all in radian."""
+def numbers(one: NDArray, pixel: Pixel) -> dict[str, float | str]:
+    """Phases that explain the pixel, and the phase from one image, in radian."""
     return rounded(
         {
             "pixel_phase": pixel.phase,
@@ -219,7 +219,6 @@ def numbers(pupil: Pupil, truth: NDArray, one: NDArray, pixel: Pixel) -> dict[st
             "mirrored_b": pixel.mirrored[1],
             "one_at_pixel": one[pixel.row, pixel.column],
             "fold": np.angle(-np.exp(1j * np.angle(pixel.waves[0]))),
-            "rms": float(pupil.rms(truth)),
         }
     )
 

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._system import is_there, path_of, write_file
@@ -114,7 +114,9 @@ def write_bench(
     return paths
 
 
-def bench_error(bench: Bench, commanded: ArrayLike, phase: MeasuredPhase) -> float:
+def bench_error(
+    bench: Bench, commanded: ArrayLike, phase: MeasuredPhase, flat: MeasuredPhase | None = None
+) -> float:
     """Rms error of the segment pistons in the phase of frames that `write_bench` wrote, radian.
 
     Parameters
@@ -122,9 +124,19 @@ def bench_error(bench: Bench, commanded: ArrayLike, phase: MeasuredPhase) -> flo
     bench : Bench
     commanded : array_like, shape (n_segments,), radian
     phase : MeasuredPhase
+    flat : MeasuredPhase, optional
+        Phase of the flat mirror, whose pistons are subtracted.
     """
     _check.instance("bench", bench, Bench)
     _check.instance("phase", phase, MeasuredPhase)
+    pistons = _pistons(bench, phase)
+    if flat is not None:
+        _check.instance("flat", flat, MeasuredPhase)
+        pistons = pistons - _pistons(bench, flat)
+    return float(segment_residual(pistons, commanded).std())
+
+
+def _pistons(bench: Bench, phase: MeasuredPhase) -> NDArray[np.float64]:
     registered = phase.measurement.registered
     canvas = np.full(registered.clear_frames[0].counts.shape, np.nan)
     row, column = registered.corner
@@ -132,5 +144,4 @@ def bench_error(bench: Bench, commanded: ArrayLike, phase: MeasuredPhase) -> flo
     # The pupil stands in the middle of the left half of the image.
     ny, nx = bench.segments.shape
     top = (len(canvas) - ny) // 2
-    pistons = segment_pistons(canvas[top : top + ny, top : top + nx], bench.segments, bench.numbers)
-    return float(segment_residual(pistons, commanded).std())
+    return segment_pistons(canvas[top : top + ny, top : top + nx], bench.segments, bench.numbers)

@@ -7,6 +7,7 @@ import pytest
 from scipy import ndimage
 
 from zwfs import Linear, zernike_basis
+from zwfs._images import nearest_good
 from zwfs.frames import Calibration, calibrate, fit_bench, pipeline, reconstruct, registration
 from zwfs.frames.__main__ import main
 from zwfs.frames._calibrate import _read_states, _windows
@@ -40,7 +41,7 @@ class Recorded:
         """The calibration from the flat alone, and the place of its grid on that of the truth."""
 
         def image(counts, bad):
-            return registration.Image(registration.nearest_good(counts, ~bad), bad)
+            return registration.Image(nearest_good(counts, ~bad), bad)
 
         pairs = [list(map(image, pair, self.bad)) for pair in (self.frames[0], self.clear)]
         measured = pipeline.reduce_frames(registration.register_frames(*pairs), pipeline.Optics())

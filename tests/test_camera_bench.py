@@ -8,12 +8,12 @@ import pytest
 from scipy import ndimage
 
 from zwfs import Dimple, Pupil, ZernikeSensor
-from zwfs.frames._camera.bench import fit_bench
-from zwfs.frames._camera.light import Light
-from zwfs.frames._camera.model import Camera, Exposure, Maps
-from zwfs.frames._camera.recording import PAD, Recording
-from zwfs.frames._camera.sensor import FittedSensor, unwrapped
-from zwfs.frames._camera.solve import fine_phase
+from zwfs._camera.bench import fit_bench
+from zwfs._camera.light import Light
+from zwfs._camera.model import Camera, Exposure, Maps
+from zwfs._camera.recording import PAD, Recording
+from zwfs._camera.sensor import FittedSensor, unwrapped
+from zwfs._camera.solve import fine_phase
 
 from .hcipy_bench import BEFORE, BORDER, CASES, RMS
 
@@ -172,7 +172,7 @@ def test_amplitude_goes_on_along_its_slope_to_the_edge(monkeypatch):
 
     continued = error()
     assert continued < 0.005
-    monkeypatch.setattr("zwfs.frames._camera.light._STIFF", 1e9)
+    monkeypatch.setattr("zwfs._camera.light._STIFF", 1e9)
     assert error() > 3 * continued
 
 
@@ -286,7 +286,7 @@ def test_other_values_replace_those_of_a_fit_and_explain_its_frames_worse(calibr
 
 
 def test_fit_that_ends_early_has_not_converged(monkeypatch):
-    monkeypatch.setattr("zwfs.frames._camera.solve._LAST", 1)
+    monkeypatch.setattr("zwfs._camera.solve._LAST", 1)
     frames, clear, phases = BENCH.recording()
     assert not fit_bench(frames, clear, phases, n_pixels=40, noise=BENCH.noise, n_steps=1).converged
 
@@ -321,7 +321,7 @@ def test_evidence_chooses_a_prior_as_smooth_as_the_phase(calibrated, monkeypatch
     found = measured(smooth)
     assert found.exponent > measured(segments(bench, 0.3)).exponent
     # Control: a prior for rough phases amplifies the noise of the highest frequencies.
-    monkeypatch.setattr("zwfs.frames._camera.sensor._PRIORS", ((3.0, 2),))
+    monkeypatch.setattr("zwfs._camera.sensor._PRIORS", ((3.0, 2),))
     assert bench.error(measured(smooth), smooth) > 1.5 * bench.error(found, smooth)
 
 

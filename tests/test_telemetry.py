@@ -24,12 +24,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, zernike_basis
+from zwfs._images import nearest_good
 from zwfs.frames import Calibration, FileError, calibrate, pipeline, reconstruct
 from zwfs.frames.__main__ import main
 from zwfs.frames._stack import Stack
 from zwfs.frames.phases import Flag
 from zwfs.frames.pipeline import Optics, reduce_frames
-from zwfs.frames.registration import Image, nearest_good, register_frames
+from zwfs.frames.registration import Image, register_frames
 from zwfs.frames.telemetry import _limit
 
 from .conftest import code_of

@@ -78,11 +78,13 @@ def own_names(module: ModuleType) -> list[str]:
     """Return the public names that a module, or a private part of a package, defines."""
     package = hasattr(module, "__path__")
     public = vars(module) if package else getattr(module, "__all__", vars(module))
+    # A package may also export what a private part of the whole package defines.
+    private = (f"{module.__name__}._", f"{PACKAGE}._") if package else (f"{module.__name__}._",)
     return [
         name
         for name, thing in vars(module).items()
         if (inspect.isclass(thing) or inspect.isfunction(thing))
-        and (thing.__module__ == module.__name__ or thing.__module__.startswith(f"{module.__name__}._"))
+        and (thing.__module__ == module.__name__ or thing.__module__.startswith(private))
         and name in public
         and not name.startswith("_")
     ]

@@ -18,9 +18,9 @@ from scipy import ndimage, sparse
 
 from zwfs import _check
 from zwfs._arrays import Immutable
+from zwfs._images import radius
 from zwfs.bench.relay import Relay
 from zwfs.detector import Detector
-from zwfs.frames._outline import radius
 from zwfs.frames.pipeline import mean_light
 from zwfs.masks import Dimple
 from zwfs.metrics import without_piston

@@ -38,10 +38,10 @@ True
 >>> folder.cleanup()
 """
 
+from zwfs._camera import BenchFit, Estimate, FittedPhase, FittedSensor, fit_bench
 from zwfs.frames import calibration, files, phases, pipeline, refine, registration, telemetry, verdict
 from zwfs.frames._blocks import FileError
 from zwfs.frames._calibrate import calibrate
-from zwfs.frames._camera import BenchFit, Estimate, FittedPhase, FittedSensor, fit_bench
 from zwfs.frames.calibration import Calibration
 from zwfs.frames.telemetry import reconstruct
 from zwfs.frames.verdict import CameraNoise, judge, order_of_images

@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
+from zwfs._camera import fit_bench
+from zwfs._images import nearest_good
 from zwfs._system import paths_of
 from zwfs.frames._blocks import FileError, blocks_of
-from zwfs.frames._camera import fit_bench
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
 from zwfs.frames.files import CameraFile, images, read, read_all
 from zwfs.frames.pipeline import reduce_frames
 from zwfs.frames.refine import _check_fit, fit
-from zwfs.frames.registration import Image, find_pupils, nearest_good, register_frames
+from zwfs.frames.registration import Image, find_pupils, register_frames
 
 
 def calibrate(

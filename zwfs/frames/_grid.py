@@ -10,8 +10,9 @@ from scipy import fft, ndimage, sparse
 from scipy.interpolate import NdBSpline
 
 from zwfs import _check
+from zwfs._images import nearest_good
 from zwfs._information import Response
-from zwfs.frames.registration import _TOUCHED, nearest_good
+from zwfs.frames.registration import _TOUCHED
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from zwfs.frames._camera import BenchFit, FittedSensor
-from zwfs.frames._outline import turning
+from zwfs._camera import BenchFit, FittedSensor
+from zwfs._images import turning
 from zwfs.sensor import ZernikeSensor
 
 _SCREENS = 24  # random phases from which weights are learnt

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
+from zwfs._images import turning
+
 _NEARLY_ALL = 0.98  # of the points of an outline: a few may be noise
 _OUTER = 0.75  # pixels from the outermost points: those with less are on the circle around the pupil
 
@@ -84,18 +86,6 @@ def _apart(points: NDArray, center: NDArray) -> NDArray[np.float64]:
 def _least(cost: Callable[[NDArray], Any], points: NDArray) -> NDArray[np.float64]:
     """Centre of the least cost, from that of the points."""
     return optimize.minimize(cost, points.mean(axis=0), method="Nelder-Mead", options={"xatol": 0.01}).x
-
-
-def radius(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[np.float64]:
-    """Distance of every pixel from the centre (row, column), in pixels."""
-    rows, columns = (np.arange(n) - middle for n, middle in zip(shape, center, strict=True))
-    return np.hypot(rows[:, np.newaxis], columns)
-
-
-def turning(rotation: float, magnification: float) -> NDArray[np.float64]:
-    """Matrix of a rotation (degrees) and a magnification, for (row, column)."""
-    sine, cosine = np.sin(np.radians(rotation)), np.cos(np.radians(rotation))
-    return magnification * np.array([[cosine, sine], [-sine, cosine]])
 
 
 class Details:

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
+from zwfs._images import nearest_good
 from zwfs._system import is_there, path_of, paths_of, write_file
 from zwfs.frames._blocks import FileError, blocks_in, unpacked
 from zwfs.frames._fits import fits_content, fits_module, has_card
 from zwfs.frames._part import scratch_of
 from zwfs.frames.pipeline import MeasuredPhase, Optics
-from zwfs.frames.registration import Image, nearest_good
+from zwfs.frames.registration import Image
 
 __all__ = ["CameraFile", "check_output", "images", "read", "read_all", "write_phase"]
 

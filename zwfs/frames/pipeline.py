@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from zwfs import _check
-from zwfs.frames._outline import radius
-from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, RegisteredFrames, correlations, nearest_good
+from zwfs._images import nearest_good, radius
+from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, RegisteredFrames, correlations
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from zwfs import _check
-from zwfs.frames._outline import Circle, Details, outline, radius, threshold, turning
+from zwfs._images import nearest_good, radius, turning
+from zwfs.frames._outline import Circle, Details, outline, threshold
 
 __all__ = ["Placement", "RegisteredFrames", "register_frames"]
 
@@ -362,14 +363,6 @@ def register(
     scale = np.array([1, 1, np.degrees(1 / details.reach), 1 / details.reach])
     rows, columns, rotation, stretch = best * scale
     return Placement(np.array([rows, columns]), float(rotation), float(1 + stretch), sigma * scale)
-
-
-def nearest_good(image: NDArray, good: NDArray) -> NDArray:
-    """An image with every pixel that is not good replaced by the nearest good one, of which there must be one."""
-    if good.all():
-        return image
-    index = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
-    return image[tuple(index)]
 
 
 def correlations(first: NDArray, second: NDArray) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
+from zwfs._images import nearest_good
 from zwfs.bounds import cramer_rao
 from zwfs.frames.pipeline import (
     NEAR,
@@ -26,7 +27,7 @@ from zwfs.frames.pipeline import (
     recover_phase,
     upside_down,
 )
-from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Placement, RegisteredFrames, nearest_good
+from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Placement, RegisteredFrames
 
 __all__ = ["CameraNoise", "ImageOrder", "Verdict", "judge", "order_of_images"]
 

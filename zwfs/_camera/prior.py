@@ -26,7 +26,7 @@ class MapPrior:
 
     Examples
     --------
-    >>> from zwfs.frames._camera.prior import MapPrior
+    >>> from zwfs._camera.prior import MapPrior
     >>> spectrum = MapPrior(rms=0.5, exponent=2.0).spectrum(32, n_pixels=24)
     >>> spectrum.shape, bool(spectrum[0, 1] > spectrum[0, 2])
     ((32, 17), True)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from zwfs.frames._camera.model import Maps
+from zwfs._camera.model import Maps
+from zwfs._images import nearest_good
 
 _WIDTH = 1.5  # pixels rms, of the weights with which neighbours give the light of a fully lit pixel
 _STIFF = 0.1  # pixels squared: with few pixels on a line, a slope across it is that of noise
@@ -45,8 +46,7 @@ class Light:
         """Divide a fine map of light; `pixels` is the light of each pixel, 1 on average where it is lit."""
         full = ndimage.binary_erosion(_fully_lit(pixels))
         near = _continued(pixels, full)
-        index = ndimage.distance_transform_edt(np.isnan(near), return_distances=False, return_indices=True)
-        power = np.maximum(near[tuple(index)], 0.05)
+        power = np.maximum(nearest_good(near, ~np.isnan(near)), 0.05)
         support = ndimage.binary_dilation(pixels > 0.1, iterations=2)
         flat = np.kron(full, np.ones((oversampling,) * 2)) > 0
         inner = np.kron(support, np.ones((oversampling,) * 2)) > 0

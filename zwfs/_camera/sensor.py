@@ -14,12 +14,13 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from zwfs import _check
-from zwfs.frames._camera.bench import EXPLAINED, BenchFit, white_phase
-from zwfs.frames._camera.light import Light
-from zwfs.frames._camera.model import Camera, Exposure
-from zwfs.frames._camera.prior import MapPrior
-from zwfs.frames._camera.recording import PAD
-from zwfs.frames._camera.solve import Minimum, PhaseMap, Point, Problem, allowing, fine_phase, minimise
+from zwfs._camera.bench import EXPLAINED, BenchFit, white_phase
+from zwfs._camera.light import Light
+from zwfs._camera.model import Camera, Exposure
+from zwfs._camera.prior import MapPrior
+from zwfs._camera.recording import PAD
+from zwfs._camera.solve import Minimum, PhaseMap, Point, Problem, allowing, fine_phase, minimise
+from zwfs._images import nearest_good
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
@@ -223,9 +224,8 @@ class FittedSensor:
         sensor = ZernikeSensor(pupil, *dimples, tolerance=1e-5)
         found = PhaseShifted(sensor, n_iterations=25, tolerance=1e-3)(np.maximum(images, 0)).phase
         inside = ndimage.binary_erosion(pupil.inside) | (pupil.inside & (light > 0.8))
-        phase = unwrapped(np.nan_to_num(found), inside)
-        near = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
-        return phase[tuple(near)] - phase[inside].mean()
+        phase = nearest_good(unwrapped(np.nan_to_num(found), inside), inside)
+        return phase - phase[inside].mean()
 
 
 def _rms_of(phase: NDArray) -> float:

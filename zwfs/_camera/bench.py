@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from zwfs import _check
-from zwfs.frames._camera.light import Light
-from zwfs.frames._camera.model import ARM, Camera, Exposure, names_of
-from zwfs.frames._camera.prior import MapPrior
-from zwfs.frames._camera.recording import PAD, Recording, centred
-from zwfs.frames._camera.solve import (
+from zwfs._camera.light import Light
+from zwfs._camera.model import ARM, Camera, Exposure, names_of
+from zwfs._camera.prior import MapPrior
+from zwfs._camera.recording import PAD, Recording, centred
+from zwfs._camera.solve import (
     MISSED,
     Free,
     LightMap,
@@ -33,7 +33,7 @@ from zwfs.frames._camera.solve import (
     minimise,
     settle,
 )
-from zwfs.frames._outline import radius
+from zwfs._images import radius
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy import fft, linalg
 from scipy.interpolate import BSpline
 
-from zwfs.frames._camera.light import Light
-from zwfs.frames._camera.model import Camera, Linearised, names_of
-from zwfs.frames._camera.prior import MapPrior
+from zwfs._camera.light import Light
+from zwfs._camera.model import Camera, Linearised, names_of
+from zwfs._camera.prior import MapPrior
 
 _BINS = 24  # of spatial frequency, for the preconditioner
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones

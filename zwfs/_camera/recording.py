@@ -12,7 +12,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from zwfs import _check
-from zwfs.frames._outline import radius
+from zwfs._images import nearest_good, radius
 
 PAD = 2
 """Pixels of the maps around the grid of the known phases."""
@@ -154,5 +154,4 @@ def _continued(phases: NDArray) -> NDArray[np.float64]:
     right = -(bending[rows][:, ~rows] @ flat[:, ~rows].T)
     flat[:, rows] = splu(bending[rows][:, rows].tocsc()).solve(right).T
     far = ndimage.distance_transform_edt(unknown) > _REACH
-    near = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
-    return flat.reshape(wide.shape)[(slice(None), *near)]
+    return nearest_good(flat.reshape(wide.shape), ~far)

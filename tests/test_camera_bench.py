@@ -10,7 +10,7 @@ from scipy import ndimage
 from zwfs import Dimple, Pupil, ZernikeSensor
 from zwfs._camera.bench import fit_bench
 from zwfs._camera.light import Light
-from zwfs._camera.model import Camera, Exposure, Maps
+from zwfs._camera.model import Camera, Exposure, Linearised, Maps
 from zwfs._camera.recording import PAD, Recording
 from zwfs._camera.sensor import FittedSensor, unwrapped
 from zwfs._camera.solve import fine_phase
@@ -65,7 +65,7 @@ def modelled(partly_lit, f, areas):
     mean = mean if areas else np.sqrt(light)
     camera = Camera(24, (24, 24), 20, [Exposure(0, 0, 0)], np.zeros((1, 24 * f, 24 * f)), f, 1.5)
     values = np.array([0, 0, 0, 0, 1, 1, 0, 1.1, 1.5, -1.5, 0, blur])
-    (image,) = camera.at(Maps(mean, light - mean**2, blocks(phase, k)), values).images
+    (image,) = Linearised(camera, Maps(mean, light - mean**2, blocks(phase, k)), values).images
     return image
 
 
@@ -102,7 +102,7 @@ def test_model_with_the_true_maps_makes_the_frames_of_a_foreign_bench():
     camera = Camera(n, (bench.side,) * 2, bench.pixels, exposures, np.zeros((1, n * f, n * f)), f, 1.5)
     arms = [[0, *bench.offsets[side], 0, 1, 1, 0] for side in (0, 1)]
     values = np.array([*arms[0], *arms[1], bench.diameter, *bench.shifts, 0, bench.blur])
-    images = camera.at(Maps(bench.amplitude, 0 * phase, phase), values).images
+    images = Linearised(camera, Maps(bench.amplitude, 0 * phase, phase), values).images
     np.testing.assert_allclose(images, bench.exposed(phase, True), rtol=0, atol=2e-4)
 
 
@@ -118,7 +118,7 @@ def test_light_that_the_grid_does_not_resolve_spreads_with_the_focus(monkeypatch
     true = bench.exposed(np.zeros_like(bench.amplitude), False)
 
     def error():
-        images = camera.at(Maps(mean, light - mean**2, np.zeros_like(mean)), values).images
+        images = Linearised(camera, Maps(mean, light - mean**2, np.zeros_like(mean)), values).images
         return np.sqrt(np.mean((np.array(images) - true) ** 2, axis=(1, 2)))
 
     spread = error()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from zwfs import Dimple, Pupil, ZernikeSensor
-from zwfs._camera.model import Camera, Exposure, Maps, names_of
+from zwfs._camera.model import Camera, Exposure, Linearised, Maps, names_of
 
 N, F, SHAPE = 20, 2, (28, 28)
 EXPOSURES = [Exposure(0, 0, 0), Exposure(1, 1, 0), Exposure(2, None, 0), Exposure(0, 0, 1), Exposure(1, 1, 1)]
@@ -40,7 +40,7 @@ def test_images_without_errors_are_those_of_the_sensor():
     phase = 0.4 * np.random.default_rng(2).normal(size=(N, N))
     still = Camera(N, SHAPE, N, EXPOSURES[:3], np.zeros((1, N, N)), 1, 1.5)
     values = np.array([*[0, 0, 0, 0, 1, 1, 0] * 3, 1.06, np.pi / 2, -np.pi / 2, 0, 0.0])
-    point = still.at(Maps(pupil.amplitude, np.zeros((N, N)), phase), values)
+    point = Linearised(still, Maps(pupil.amplitude, np.zeros((N, N)), phase), values)
     sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=SHAPE[0] / N)
     fine = [np.abs(part.field) ** 2 for part in point._parts[2:]]
     margin = (still.size - SHAPE[0]) // 2
@@ -63,7 +63,7 @@ def test_values_in_the_middle_of_a_point_become_means_over_its_cell():
         lit, edges = (away < 8).astype(float), np.abs(away - 8) < 1 / f
         still = Camera(N, SHAPE, N, EXPOSURES[:3], np.zeros((1, N * f, N * f)), f, 1.5)
         maps = Maps(lit, 0 * lit, phase, edges if means else True)
-        return still.at(maps, values).images[0][8:-8, 8:-8]
+        return Linearised(still, maps, values).images[0][8:-8, 8:-8]
 
     true = image(8)
     for f, factor in ((1, 5), (2, 20)):
@@ -76,8 +76,8 @@ def test_derivatives_are_those_of_finite_differences(camera, maps, index):
     name = names_of(3)[index]
     step = np.zeros(VALUES.size)
     step[index] = 1e-4 * SCALE[index]
-    point = camera.at(maps, VALUES)
-    up, down = (camera.at(maps, VALUES + sign * step).images for sign in (1, -1))
+    point = Linearised(camera, maps, VALUES)
+    up, down = (Linearised(camera, maps, VALUES + sign * step).images for sign in (1, -1))
     for number, exposure in enumerate(EXPOSURES):
         own = not name.startswith("arm") or int(name.split()[1]) == exposure.arm
         exact = point.slopes(number, [name.split()[-1]])[0] * step[index] if own else 0 * up[number]
@@ -88,10 +88,12 @@ def test_derivatives_are_those_of_finite_differences(camera, maps, index):
 def test_change_of_the_maps_is_that_of_finite_differences_and_has_an_adjoint(camera, maps):
     rng = np.random.default_rng(3)
     change = rng.normal(size=(3, N * F, N * F))
-    point = camera.at(maps, VALUES)
+    point = Linearised(camera, maps, VALUES)
     up, down = (
-        camera.at(
-            Maps(*(one + sign * 1e-6 * two for one, two in zip(maps[:3], change, strict=True)), EDGES), VALUES
+        Linearised(
+            camera,
+            Maps(*(one + sign * 1e-6 * two for one, two in zip(maps[:3], change, strict=True)), EDGES),
+            VALUES,
         ).images
         for sign in (1, -1)
     )

@@ -7,7 +7,7 @@ pair of frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -17,14 +17,13 @@ from scipy import fft, ndimage
 
 from zwfs import _check
 from zwfs._camera.light import Light
-from zwfs._camera.model import ARM, Camera, Exposure, names_of
-from zwfs._camera.prior import MapPrior
-from zwfs._camera.recording import PAD, Recording, centred
+from zwfs._camera.model import ARM, Camera, Exposure, Linearised, names_of
+from zwfs._camera.recording import PAD, Recording, aligned, centred
 from zwfs._camera.solve import (
     MISSED,
     Free,
     LightMap,
-    Minimum,
+    MapPrior,
     PhaseMap,
     Point,
     Problem,
@@ -33,7 +32,7 @@ from zwfs._camera.solve import (
     minimise,
     settle,
 )
-from zwfs._images import radius
+from zwfs._images import radius, turning
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
@@ -50,8 +49,6 @@ _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the 
 
 
 class _Stage(NamedTuple):
-    """A stage of the fit."""
-
     allowed: float  # error of the model that adds to the noise, over the light of a full pixel
     enough: float  # of the cost: the stage ends when a step promises less
     n_inner: int  # iterations for a step
@@ -169,6 +166,16 @@ class BenchFit:
         raise KeyError(f"{name!r}: expected one of {[one.name for one in self.estimates]}")
 
 
+def places_of(arms: Sequence[Mapping[str, float]], n: int, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Row and column of each of the n x n pixels of the maps on a frame behind each arm, (n_arms, 2, n, n)."""
+    grid, places = np.indices((n, n)) - (n - 1) / 2, []
+    for arm in arms:
+        middle = np.array([arm["row"], arm["column"]]) + (np.array(shape) - 1) / 2
+        turned = np.einsum("ij,jyx->iyx", turning(np.degrees(arm["rotation"]), arm["magnification"]), grid)
+        places.append(turned + middle[:, None, None])
+    return np.stack(places)
+
+
 def fit_bench(
     frames: ArrayLike,
     clear_frames: ArrayLike,
@@ -231,14 +238,12 @@ def fit_bench(
     start = _coarse(data, diameter, shifts)
     problem, x = _problem(data, start, oversampling)
     for stage in _STAGES:
-        best = minimise(_staged(data, problem, stage), x, n_steps, stage.n_inner, stage.enough)
-        problem, x = _next(data, best, stage.divide)
-    return _result(data, best, start.reversed)
+        point, _ = minimise(_staged(data, problem, stage), x, n_steps, stage.n_inner, stage.enough)
+        problem, x = _next(data, point, stage.divide)
+    return _result(data, point, start.reversed)
 
 
 class _Start(NamedTuple):
-    """Best of the coarse grid."""
-
     diameter: float
     shifts: tuple[float, float]
     flat: NDArray[np.float64]
@@ -254,22 +259,17 @@ def _coarse(data: Recording, diameter: float, shifts: tuple[float, float]) -> _S
     inside = pupil.inside
     scale = flux * np.mean(light[inside])
     frames = np.stack([centred(one, n) for one in data.counts[2:]]).reshape(-1, 2, n, n) / scale[:, None, None]
-    best: tuple[float, _Start] | None = None
+    found: list[tuple[float, _Start]] = []
     for order in (False, True):
         pair = shifts[::-1] if order else shifts
         for factor in _DIAMETERS:
             sensor = ZernikeSensor(pupil, *(Dimple(factor * diameter, one) for one in pair), tolerance=1e-4)
-            found = PhaseShifted(sensor, n_iterations=15)(np.maximum(frames, 0)).phase
-            waves = np.where(inside, np.exp(1j * (np.nan_to_num(found) - data.phases)), 0)
-            for _ in range(3):  # each phase has its own piston
-                mean = waves.mean(axis=0)
-                waves = waves * np.exp(-1j * np.angle(np.sum(waves * mean.conj(), axis=(1, 2))))[:, None, None]
+            phase = PhaseShifted(sensor, n_iterations=15)(np.maximum(frames, 0)).phase
+            waves = aligned(np.where(inside, np.exp(1j * (np.nan_to_num(phase) - data.phases)), 0))
             flat = np.angle(ndimage.gaussian_filter(waves.mean(axis=0), 1.0))
             misfit = float(np.mean((sensor.measure(flat + data.phases) - frames)[..., inside] ** 2))
-            if best is None or misfit < best[0]:
-                best = misfit, _Start(factor * diameter, pair, np.where(inside, flat, 0), order)
-    assert best is not None
-    return best[1]
+            found.append((misfit, _Start(factor * diameter, pair, np.where(inside, flat, 0), order)))
+    return min(found, key=lambda one: one[0])[1]
 
 
 def _free(data: Recording, start: _Start) -> list[Free]:
@@ -321,9 +321,7 @@ def _problem(data: Recording, start: _Start, f: int) -> tuple[Problem, NDArray]:
     free = _free(data, start)
     phase_map = PhaseMap(n, f, _PHASE_PRIOR, data.n_pixels)
     lights = _light_maps(division, f * data.n_pixels)
-    zero = np.zeros((n * f, n * f))
-    weights = data.weights(smooth)
-    problem = Problem(camera, data.counts, weights, division, zero, phase_map, lights, values, free)
+    problem = Problem(camera, data.counts, data.weights(smooth), division, phase_map, lights, values, free)
     x = problem.start
     x[: phase_map.size**2] = white_phase(phase_map, start.flat).ravel()
     return problem, x
@@ -352,9 +350,9 @@ def _staged(data: Recording, problem: Problem, stage: _Stage) -> Problem:
     return replace(problem, weights=[allowing(one, level) for one in problem.weights], free=free)
 
 
-def _next(data: Recording, best: Minimum, divide: bool) -> tuple[Problem, NDArray]:
+def _next(data: Recording, point: Point, divide: bool) -> tuple[Problem, NDArray]:
     """Return the next problem and its start, with weights, and on demand the light, by what was fitted."""
-    point, before = best.point, best.point.problem
+    before = point.problem
     problem = replace(before, weights=data.weights(point.model.images))
     if not divide:
         return problem, point.x
@@ -370,13 +368,6 @@ def _next(data: Recording, best: Minimum, divide: bool) -> tuple[Problem, NDArra
     return problem, x
 
 
-def _squares(data: Recording, point: Point) -> list[NDArray[np.float64]]:
-    """Square of each residual over the noise of its pixel."""
-    images = point.model.images
-    triples = zip(data.weights(images), images, data.counts, strict=True)
-    return [(weight * (image - counts)) ** 2 for weight, image, counts in triples]
-
-
 def _changes(data: Recording, point: Point) -> list[list[NDArray[np.float64]]]:
     """Changes of the images over their noise with twice the resolution.
 
@@ -387,30 +378,25 @@ def _changes(data: Recording, point: Point) -> list[list[NDArray[np.float64]]]:
     finer = Camera(
         camera.n, camera.shape, data.n_pixels, camera.exposures, fine_phase(data.phases, f), f, camera.largest
     )
-    light = Light.sharp(np.maximum(point.light_means, 0), f)
+    light, twice = Light.sharp(np.maximum(point.light_means, 0), f), np.ones((2, 2))
     # Halfway between the amplitude of the fit and a new one, of which it is not known which is better.
-    light = replace(light, amplitude=(_repeated(of.light.amplitude) + light.amplitude) / 2)
+    light = replace(light, amplitude=(np.kron(of.light.amplitude, twice) + light.amplitude) / 2)
     n = len(point.light)
-    sharp = _repeated(light.start.reshape(n, 2, n, 2).mean(axis=(1, 3)))
+    sharp = np.kron(light.start.reshape(n, 2, n, 2).mean(axis=(1, 3)), twice)
     share = np.divide(light.start, sharp, out=np.ones_like(sharp), where=sharp > 1e-6)
     phase = PhaseMap(camera.n, f, _PHASE_PRIOR, data.n_pixels).fine(of.split(point.x)[0][0])
     changes = []
-    for divided in (light.start, share * _repeated(point.light)):
-        images = finer.at(light.maps(divided, phase), point.values).images
+    for divided in (light.start, share * np.kron(point.light, twice)):
+        images = Linearised(finer, light.maps(divided, phase), point.values).images
         changes.append([w * (a - b) for w, a, b in zip(of.weights, images, point.model.images, strict=True)])
     return changes
 
 
-def _repeated(image: NDArray) -> NDArray[np.float64]:
-    """Map on a grid that is finer by 2."""
-    return image.repeat(2, axis=0).repeat(2, axis=1)
-
-
-def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:
-    best, equations = settle(best)
-    point = best.point
-    pairs = zip(_squares(data, point), data.good, strict=True)
-    misfit = np.array([one.sum() / max(1, np.count_nonzero(good)) for one, good in pairs])
+def _result(data: Recording, point: Point, is_reversed: bool) -> BenchFit:
+    point, converged, equations = settle(point)
+    images = point.model.images
+    residuals = zip(data.weights(images), images, data.counts, data.good, strict=True)
+    misfit = np.array([np.sum((w * (a - b)) ** 2) / max(1, np.count_nonzero(ok)) for w, a, b, ok in residuals])
     scale = max(1.0, float(np.mean(misfit)))
     spread = equations.covariance(point, _changes(data, point), scale)
     values = point.x[point.problem.n_white :]
@@ -428,7 +414,7 @@ def _result(data: Recording, best: Minimum, is_reversed: bool) -> BenchFit:
         point.light_means[PAD:-PAD, PAD:-PAD],
         misfit,
         data.noise,
-        best.converged,
+        converged,
         tuple(_remarks(data, point, misfit, estimates, is_reversed)),
         point,
     )

@@ -22,24 +22,12 @@ _DARKER = 0.1, 0.5  # least and most by which a pixel that is lit in part is dar
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Where light is, and how it divides into the two areas of a point.
+    """Where light is, and how it divides into the two areas of a point, on the fine grid."""
 
-    Attributes
-    ----------
-    start : ndarray, shape (n * f, n * f)
-        Light of no change.
-    amplitude : ndarray, shape (n * f, n * f)
-        Amplitude A of the lit part.
-    full : ndarray of bool, shape (n * f, n * f)
-        Points that are fully lit.
-    support : ndarray of bool, shape (n * f, n * f)
-        Points that may have light.
-    """
-
-    start: NDArray[np.float64]
-    amplitude: NDArray[np.float64]
-    full: NDArray[np.bool_]
-    support: NDArray[np.bool_]
+    start: NDArray[np.float64]  # light of no change
+    amplitude: NDArray[np.float64]  # A of the lit part
+    full: NDArray[np.bool_]  # points that are fully lit
+    support: NDArray[np.bool_]  # points that may have light
 
     @classmethod
     def of(cls, start: NDArray, pixels: NDArray, oversampling: int) -> Light:
@@ -48,8 +36,7 @@ class Light:
         near = _continued(pixels, full)
         power = np.maximum(nearest_good(near, ~np.isnan(near)), 0.05)
         support = ndimage.binary_dilation(pixels > 0.1, iterations=2)
-        flat = np.kron(full, np.ones((oversampling,) * 2)) > 0
-        inner = np.kron(support, np.ones((oversampling,) * 2)) > 0
+        flat, inner = (np.kron(one, np.ones((oversampling,) * 2)) > 0 for one in (full, support))
         return cls(start, np.sqrt(_stretched(power, oversampling)), flat, inner)
 
     @classmethod
@@ -72,7 +59,6 @@ class Light:
         return self.support * (self.start + self.amplitude**2 * change)
 
     def maps(self, light: NDArray, phase: NDArray) -> Maps:
-        """Maps of the model."""
         mean = np.where(self.full, self._root(light), light / self.amplitude)
         return Maps(mean, np.where(self.full, 0, light - mean**2), phase, self.support & ~self.full)
 
@@ -153,10 +139,4 @@ def _blocks(fine: NDArray, f: int) -> NDArray[np.float64]:
 
 def _stretched(pixels: NDArray, factor: int) -> NDArray[np.float64]:
     """A smooth map of pixels on a grid that is finer by a factor, linear between the pixels."""
-    n = pixels.shape[-1]
-    places = np.clip((np.arange(n * factor) + 0.5) / factor - 0.5, 0, n - 1)
-    low = np.minimum(places.astype(int), n - 2)
-    along = np.zeros((len(places), n))
-    along[np.arange(len(places)), low] = 1 - (places - low)
-    along[np.arange(len(places)), low + 1] += places - low
-    return along @ pixels @ along.T
+    return ndimage.zoom(pixels, factor, order=1, mode="nearest", grid_mode=True)

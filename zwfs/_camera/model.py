@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage, sparse, special
 from scipy.interpolate import BSpline
 
-from zwfs._lowrank import _axis_functions, _quadrature, _rim, _spectra
+from zwfs._lowrank import Plane, _axis_functions, _quadrature, _rim, _spectra
 from zwfs.masks import Dimple
 
 _TOLERANCE = 1e-6  # of the reference wave
 _DEGREE = 5  # of the spline that takes an image to the pixels
+_SPLINE = BSpline.basis_element(np.arange(_DEGREE + 2) - (_DEGREE + 1) / 2, extrapolate=False)
 _BORDER = 4  # pixels around a frame that are modelled: blurred light that crosses the edge comes back
 _LONGEST = 4.0  # displacement of light that the grid does not resolve, over that of the steepest resolved wave
 _PLACE = ("row", "column", "rotation", "magnification")
@@ -66,21 +67,9 @@ def names_of(n_arms: int) -> list[str]:
 class Camera:
     """Grids of the model and all that does not depend on its parameters.
 
-    Parameters
-    ----------
-    n : int, pixels
-        Rows and columns of the maps.
-    shape : (int, int), pixels
-        Of a frame, whose middle is that of the maps but for the shift of its arm.
-    n_pixels : float, pixels
-        Diameter D.
-    exposures : sequence of Exposure
-    commands : ndarray, shape (n_states, n * f, n * f), radian
-        Phases that the states add.
-    oversampling : int
-        Points f along a pixel.
-    largest : float, lambda/D
-        Largest diameter of the dimple.
+    The maps have n x n pixels with f = oversampling points along each, and the middle of a frame is theirs but for
+    the shift of its arm. The states add the phases `commands`, (n_states, n * f, n * f). The diameter D has
+    n_pixels, and that of the dimple is at most `largest` lambda/D.
     """
 
     def __init__(
@@ -105,16 +94,14 @@ class Camera:
         self.turns = np.exp(1j * commands)
         axis = (np.arange(size) - (size - 1) / 2) / (n_pixels * f)
         spread = math.sqrt(2) * (inner + size) / (n_pixels * f)
-        self.planes = tuple(_Plane(one, largest, spread) for one in (axis[self.window[0]], axis))
-        self._spread = spread
+        self._axes, self._spread = (axis[self.window[0]], axis), spread
+        self.planes = tuple(_plane(one, largest, spread) for one in self._axes)
         frequency = fft.fftfreq(size) * f  # cycles per pixel
         self.defocus = self.defocus_at(frequency[None, :], frequency[:, None])
         half = fft.rfftfreq(size) * f
         self.squares = frequency[:, None] ** 2 + half**2
-        symbols = (
-            np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * one / f), _symbol()) for one in (frequency, half)
-        )
-        self.prefilter = 1 / np.multiply.outer(*symbols)
+        samples = _SPLINE(np.arange(_DEGREE // 2 + 1))
+        self.prefilter = 1 / symbol([samples[0], *(2 * samples[1:])], size)
 
     def defocus_at(self, u: NDArray, v: NDArray) -> NDArray[np.float64]:
         """Phase at frequencies in cycles per pixel that a unit of focus makes."""
@@ -149,12 +136,11 @@ class Camera:
         defocus = self.defocus_at(u / self.n_pixels, v / self.n_pixels)
         factors = np.stack([disc, -1j * defocus * disc, rim])
         factors = factors * np.exp(-1j * focus * defocus) / (self.n_pixels * self.f) ** 2
-        source, target = (plane.spectra(u, v) for plane in self.planes)
+        source, target = (
+            plane.combine.T @ _spectra(((plane.along_y, axis), (plane.along_x, axis)), u, v)
+            for plane, axis in zip(self.planes, self._axes, strict=True)
+        )
         return (target.conj() * factors[:, np.newaxis, :]) @ source.T
-
-    def at(self, maps: Maps, values: NDArray) -> Linearised:
-        """Images and their derivatives at maps and parameters."""
-        return Linearised(self, maps, values)
 
 
 def _edge_light(x: NDArray) -> tuple[NDArray, NDArray]:
@@ -164,36 +150,22 @@ def _edge_light(x: NDArray) -> tuple[NDArray, NDArray]:
     return k, np.divide(k - mean, x, out=np.full_like(x, -1.0), where=x > 1e-9)
 
 
-def _symbol() -> NDArray[np.float64]:
-    """Chebyshev coefficients of the sum of the central B-spline at whole numbers times cosines."""
-    spline = BSpline.basis_element(np.arange(_DEGREE + 2) - (_DEGREE + 1) / 2, extrapolate=False)
-    values = spline(np.arange(_DEGREE // 2 + 1))
-    return np.concatenate([values[:1], 2 * values[1:]])
+def symbol(series: Sequence[float], size: int) -> NDArray[np.float64]:
+    """Factors of the spectrum of a real map by a filter along both axes, of which a series of cosines is known."""
+    full, half = (
+        np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * one), series)
+        for one in (fft.fftfreq(size), fft.rfftfreq(size))
+    )
+    return np.multiply.outer(full, half)
 
 
-class _Plane:
+def _plane(axis: NDArray, largest: float, spread: float) -> Plane:
     """Few real functions on a square grid that hold all waves from a disc of the focal plane."""
-
-    def __init__(self, axis: NDArray, largest: float, spread: float) -> None:
-        self._axis = axis
-        self._along = _axis_functions(axis, largest / 2, _TOLERANCE)
-        u, v, _ = _quadrature(Dimple(largest, 0.0), spread, _TOLERANCE)
-        waves = _spectra(((self._along, axis),) * 2, u, v)
-        functions, strength, _ = np.linalg.svd(np.concatenate([waves.real, waves.imag], 1), full_matrices=False)
-        self._combine = functions[:, strength > _TOLERANCE * strength[0]]
-
-    def project(self, field: NDArray) -> NDArray:
-        """Coefficients of a field, (n, n) to (r,)."""
-        return (self._along @ field @ self._along.T).ravel() @ self._combine
-
-    def expand(self, coefficients: NDArray) -> NDArray:
-        """Field of coefficients: the adjoint of `project`."""
-        square = (self._combine @ coefficients).reshape((len(self._along),) * 2)
-        return self._along.T @ square @ self._along
-
-    def spectra(self, u: NDArray, v: NDArray) -> NDArray[np.complex128]:
-        """Fourier sums of all functions, (r, n_nodes)."""
-        return self._combine.T @ _spectra(((self._along, self._axis),) * 2, u, v)
+    along = _axis_functions(axis, largest / 2, _TOLERANCE)
+    u, v, _ = _quadrature(Dimple(largest, 0.0), spread, _TOLERANCE)
+    waves = _spectra(((along, axis),) * 2, u, v)
+    functions, strength, _ = np.linalg.svd(np.concatenate([waves.real, waves.imag], 1), full_matrices=False)
+    return Plane(along, along, functions[:, strength > _TOLERANCE * strength[0]])
 
 
 class Coefficients(NamedTuple):
@@ -281,14 +253,13 @@ def _weights(places: NDArray, size: int, f: int) -> tuple[NDArray, NDArray, NDAr
 
     A point stands for the mean over its cell, so that a pixel on the grid is the mean of its cells exactly.
     """
-    spline = BSpline.basis_element(np.arange(_DEGREE + 2) - (_DEGREE + 1) / 2, extrapolate=False)
     inner, n = np.arange(f) - (f - 1) / 2, _DEGREE + f  # nodes that a pixel meets
     nodes = np.floor(places - n / 2).astype(int)[:, None] + np.arange(1, n + 1)
     away = (places[:, None] - nodes)[..., None] + inner
     return (
         nodes % size,
-        np.nan_to_num(spline(away)).mean(axis=-1),
-        np.nan_to_num(spline.derivative()(away)).mean(axis=-1),
+        np.nan_to_num(_SPLINE(away)).mean(axis=-1),
+        np.nan_to_num(_SPLINE.derivative()(away)).mean(axis=-1),
     )
 
 

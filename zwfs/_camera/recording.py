@@ -134,9 +134,22 @@ def with_neighbours(unknown: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(ndimage.binary_dilation(wide, np.ones((3, 3))))[1:-1, 1:-1]
 
 
+def unknown_in(phases: NDArray) -> NDArray[np.bool_]:
+    """Pixels at which the phases of states are not known: one is NaN, or all are 0, (n_states, n, n) to (n, n)."""
+    return ~np.isfinite(phases).all(axis=0) | (phases == 0).all(axis=0)
+
+
+def aligned(waves: NDArray) -> NDArray[np.complex128]:
+    """Waves of states, (n_states, n, n), less the piston of each with respect to their mean."""
+    for _ in range(3):
+        mean = waves.mean(axis=0)
+        waves = waves * np.exp(-1j * np.angle(np.sum(waves * mean.conj(), axis=(1, 2), keepdims=True)))
+    return waves
+
+
 def _continued(phases: NDArray) -> NDArray[np.float64]:
     """Known phases on a wider grid, smoothly continued by a few pixels beyond where they are known."""
-    bad = ~np.isfinite(phases).all(axis=0) | (phases == 0).all(axis=0)
+    bad = unknown_in(phases)
     wide = np.pad(np.nan_to_num(phases), ((0, 0), (PAD, PAD), (PAD, PAD)))
     regions, _ = ndimage.label(np.pad(bad, PAD, constant_values=True))
     unknown = regions == regions[0, 0]

@@ -14,12 +14,11 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from zwfs import _check
-from zwfs._camera.bench import EXPLAINED, BenchFit, white_phase
+from zwfs._camera.bench import EXPLAINED, BenchFit, places_of, white_phase
 from zwfs._camera.light import Light
-from zwfs._camera.model import Camera, Exposure
-from zwfs._camera.prior import MapPrior
+from zwfs._camera.model import Camera, Exposure, Linearised
 from zwfs._camera.recording import PAD
-from zwfs._camera.solve import Minimum, PhaseMap, Point, Problem, allowing, fine_phase, minimise
+from zwfs._camera.solve import MapPrior, PhaseMap, Point, Problem, allowing, fine_phase, minimise
 from zwfs._images import nearest_good
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
@@ -140,20 +139,20 @@ class FittedSensor:
         soft = allowing(weights, allowed[:, None, None])
         start = self._start(counts)
         prior = MapPrior(_rms_of(start), 3.0)
-        means = self._minimum(counts, soft, prior, start, 5, 20).point.phase_means
+        means = self._minimum(counts, soft, prior, start, 5, 20)[0].phase_means
         least = math.inf
         for exponent, n_updates in _PRIORS:
             rms, now = _rms_of(means) * _STRONGER ** (exponent - 4), means
             for _ in range(n_updates):
-                point = self._minimum(counts, weights, MapPrior(rms, exponent), now, 3, 30).point
+                point, _ = self._minimum(counts, weights, MapPrior(rms, exponent), now, 3, 30)
                 now, (evidence, growth) = point.phase_means, point.evidence
                 rms *= math.sqrt(max(growth, 0.01))  # an rms of 0 allows no phase
             if evidence > least:
                 break
             least, prior, means = evidence, MapPrior(rms, exponent), now
-        end = self._minimum(counts, weights, prior, means, self.n_steps, 30)
-        misfit, phase = float(np.mean(end.point.misfit)), end.point.phase_means[PAD:-PAD, PAD:-PAD]
-        return FittedPhase(phase, misfit, misfit < EXPLAINED, end.converged, prior.exponent, end.point)
+        point, converged = self._minimum(counts, weights, prior, means, self.n_steps, 30)
+        misfit, phase = float(np.mean(point.misfit)), point.phase_means[PAD:-PAD, PAD:-PAD]
+        return FittedPhase(phase, misfit, misfit < EXPLAINED, converged, prior.exponent, point)
 
     def frames(self, phase: ArrayLike) -> NDArray[np.float64]:
         """Frames that the model predicts for a phase.
@@ -171,7 +170,7 @@ class FittedSensor:
         _check.trailing_shape("phase", phase, self.flat.shape, "the grid of the pupil")
         fine = fine_phase(np.pad(phase, PAD, "edge"), self._fitted.camera.f)
         point = self.fit.point
-        return np.stack(self._camera.at(self._light.maps(point.light, fine), point.values).images)
+        return np.stack(Linearised(self._camera, self._light.maps(point.light, fine), point.values).images)
 
     @property
     def _fitted(self) -> Problem:
@@ -194,13 +193,12 @@ class FittedSensor:
 
     def _minimum(
         self, counts: NDArray, weights: NDArray, prior: MapPrior, start: NDArray, n_steps: int, n_inner: int
-    ) -> Minimum:
+    ) -> tuple[Point, bool]:
         """Fit of the phase alone."""
         of = self._fitted
         phase_map = PhaseMap(of.phase_map.n, of.camera.f, prior, of.camera.n_pixels)
-        light, values = self._light, self.fit.point.values
-        zero = np.zeros(light.start.shape)
-        problem = Problem(self._camera, list(counts), list(weights), light, zero, phase_map, (), values)
+        values = self.fit.point.values
+        problem = Problem(self._camera, list(counts), list(weights), self._light, phase_map, (), values)
         return minimise(problem, white_phase(phase_map, start).ravel(), n_steps, n_inner)
 
     def _start(self, counts: NDArray) -> NDArray[np.float64]:
@@ -209,15 +207,11 @@ class FittedSensor:
         light = np.maximum(point.light_means, 0)
         pupil = Pupil.from_amplitude(np.sqrt(light), self._fitted.camera.n_pixels, threshold=0.3)
         power = np.mean(pupil.amplitude[pupil.inside] ** 2) / np.mean(light[pupil.inside])
-        masks = point.model.masks
-        y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2,) * 2, indexing="ij")
+        masks, arms = point.model.masks, point.model.arms[:2]
         images = np.empty((2, n, n))
-        for side, arm in enumerate(point.model.arms[:2]):
-            cosine, sine = (arm["magnification"] * one(arm["rotation"]) for one in (math.cos, math.sin))
-            rows = cosine * y + sine * x + arm["row"] + (counts.shape[1] - 1) / 2
-            columns = cosine * x - sine * y + arm["column"] + (counts.shape[2] - 1) / 2
+        for side, (arm, places) in enumerate(zip(arms, places_of(arms, n, counts.shape[1:]), strict=True)):
             image = (counts[side] - arm["background"]) / arm["flux"] * power
-            images[side] = ndimage.map_coordinates(image, [rows, columns], order=3, mode="nearest")
+            images[side] = ndimage.map_coordinates(image, places, order=3, mode="nearest")
         leaked = min(masks["leakage"], 0.4)
         images = ((1 - leaked) * images - leaked * images[::-1]) / (1 - 2 * leaked)
         dimples = (Dimple(masks["diameter"], masks[name]) for name in ("first", "second"))

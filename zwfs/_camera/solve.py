@@ -14,8 +14,7 @@ from scipy import fft, linalg
 from scipy.interpolate import BSpline
 
 from zwfs._camera.light import Light
-from zwfs._camera.model import Camera, Linearised, names_of
-from zwfs._camera.prior import MapPrior
+from zwfs._camera.model import Camera, Linearised, names_of, symbol
 
 _BINS = 24  # of spatial frequency, for the preconditioner
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
@@ -29,7 +28,7 @@ _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
 MISSED = 0.7
 """Errors of fits to frames of HCIPy, over the changes with a finer grid (rms)."""
-_PIXEL_MEAN = np.array([230.0, 2 * 76.0, 2.0]) / 384  # of a cubic spline over a pixel, as a series of cosines
+_PIXEL_MEAN = 230 / 384, 2 * 76 / 384, 2 / 384  # of a cubic spline over a pixel, as a series of cosines
 
 
 class Free(NamedTuple):
@@ -43,23 +42,30 @@ class Free(NamedTuple):
     sigma: float = math.inf  # of its prior
 
 
-class PhaseMap:
-    """White numbers to the mean of a phase over each pixel, and to the phase on the fine grid, by a cubic spline.
+class MapPrior(NamedTuple):
+    """Gaussian prior of a map: its power spectral density is a power law, flat below 1 cycle / outer scale."""
 
-    Parameters
-    ----------
-    n : int, pixels
-    oversampling : int
-    prior : MapPrior
-    n_pixels : float, pixels
-        Diameter D.
-    """
+    rms: float  # of a pixel
+    exponent: float = 0.0  # 0 for pixels that are independent
+    outer_scale: float = 2.0  # D
+
+    def spectrum(self, size: int, n_pixels: float) -> NDArray[np.float64]:
+        """Variance of each frequency on a periodic grid, on half the plane, (size, size // 2 + 1)."""
+        v, u = fft.fftfreq(size)[:, None], fft.rfftfreq(size)
+        bend = 1 / (self.outer_scale * n_pixels)
+        shape = (u**2 + v**2 + bend**2) ** (-self.exponent / 2)
+        twice = np.where((u == 0) | (u == 0.5), 1.0, 2.0)  # half the plane stands for all of it
+        return shape * self.rms**2 * size**2 / np.sum(shape * twice)
+
+
+class PhaseMap:
+    """White numbers to the means of a phase over the pixels, and to a cubic spline of it on the fine grid."""
 
     def __init__(self, n: int, oversampling: int, prior: MapPrior, n_pixels: float) -> None:
         self.n, self.size = n, fft.next_fast_len(round(1.2 * n), real=True)
         self.colour = np.sqrt(prior.spectrum(self.size, n_pixels))
         self._along = fine_spline(n, oversampling, self.size)
-        self._means = self.colour / _mean_symbol(self.size)
+        self._means = self.colour / symbol(_PIXEL_MEAN, self.size)
 
     def means(self, white: NDArray) -> NDArray[np.float64]:
         """Mean over each pixel, (n, n)."""
@@ -76,15 +82,7 @@ class PhaseMap:
 
 
 class LightMap:
-    """White numbers to the change of the light on some points of the fine grid.
-
-    Parameters
-    ----------
-    where : ndarray of bool, shape (n * f, n * f)
-    prior : MapPrior
-    n_pixels : float
-        Diameter D on the fine grid.
-    """
+    """White numbers to the change of the light on some points of the fine grid, where D has n_pixels points."""
 
     def __init__(self, where: NDArray, prior: MapPrior, n_pixels: float) -> None:
         self.where, self.n = where, len(where)
@@ -92,7 +90,6 @@ class LightMap:
         self.colour = np.sqrt(prior.spectrum(self.size, n_pixels))
 
     def fine(self, white: NDArray) -> NDArray[np.float64]:
-        """Change of the light on the fine grid."""
         return fft.irfft2(self.colour * fft.rfft2(white), s=white.shape)[: self.n, : self.n] * self.where
 
     def adjoint(self, fine: NDArray) -> NDArray[np.float64]:
@@ -105,14 +102,6 @@ class LightMap:
 def allowing(weights: NDArray, error: float | NDArray) -> NDArray[np.float64]:
     """Weights, one over the noise, with an error of the model added to the noise; those of bad pixels stay 0."""
     return weights / np.hypot(1, error * weights)
-
-
-def _mean_symbol(size: int) -> NDArray[np.float64]:
-    full, half = (
-        np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * one), _PIXEL_MEAN)
-        for one in (fft.fftfreq(size), fft.rfftfreq(size))
-    )
-    return np.multiply.outer(full, half)
 
 
 def fine_spline(n: int, oversampling: int, size: int) -> NDArray[np.float64]:
@@ -132,7 +121,7 @@ def fine_phase(means: NDArray, oversampling: int) -> NDArray[np.float64]:
     # A period that is the map and its mirror image has no jump.
     both = np.concatenate([padded, padded[..., ::-1]], -1)
     both = np.concatenate([both, both[..., ::-1, :]], -2)
-    nodes = fft.irfft2(fft.rfft2(both) / _mean_symbol(both.shape[-1]), s=both.shape[-2:])
+    nodes = fft.irfft2(fft.rfft2(both) / symbol(_PIXEL_MEAN, both.shape[-1]), s=both.shape[-2:])
     nodes = nodes[..., margin - 2 : margin + n + 2, margin - 2 : margin + n + 2]
     along = fine_spline(n + 4, oversampling, n + 4)[2 * oversampling : -2 * oversampling]
     return along @ nodes @ along.T
@@ -140,32 +129,15 @@ def fine_phase(means: NDArray, oversampling: int) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Images, the model, and what is unknown.
-
-    Attributes
-    ----------
-    camera : Camera
-    counts, weights : list of ndarray
-        Images, and one over the noise of each pixel; 0 for bad pixels.
-    light : Light
-    phase : ndarray, shape (n * f, n * f), radian
-        Mean of the prior of the phase, on the fine grid.
-    phase_map : PhaseMap
-    light_maps : tuple of LightMap
-        None if the light is known.
-    values : ndarray
-        Of all numbers; those of `free` are where a fit starts.
-    free : sequence of Free
-    """
+    """Images, the model, and what is unknown."""
 
     camera: Camera
     counts: Sequence[NDArray[np.float64]]
-    weights: Sequence[NDArray[np.float64]]
+    weights: Sequence[NDArray[np.float64]]  # one over the noise of each pixel; 0 for bad pixels
     light: Light
-    phase: NDArray[np.float64]
     phase_map: PhaseMap
-    light_maps: tuple[LightMap, ...]
-    values: NDArray[np.float64]
+    light_maps: tuple[LightMap, ...]  # empty if the light is known
+    values: NDArray[np.float64]  # all numbers; those of `free` are where a fit starts
     free: Sequence[Free] = ()
 
     @cached_property
@@ -188,17 +160,14 @@ class Problem:
 
     @property
     def maps(self) -> tuple[PhaseMap | LightMap, ...]:
-        """All maps, that of the phase first."""
         return (self.phase_map, *self.light_maps)
 
     @cached_property
     def n_white(self) -> int:
-        """Number of white unknowns."""
         return sum(one.size**2 for one in self.maps)
 
     @property
     def start(self) -> NDArray[np.float64]:
-        """Where a fit starts."""
         return np.concatenate([np.zeros(self.n_white), self.prior[0]])
 
     def split(self, x: NDArray) -> tuple[list[NDArray], NDArray]:
@@ -209,9 +178,8 @@ class Problem:
 
     def light_change(self, white: Sequence[NDArray]) -> NDArray[np.float64]:
         """Change of the light on the fine grid."""
-        return sum(
-            (of.fine(one) for one, of in zip(white[1:], self.light_maps, strict=True)), np.zeros(self.phase.shape)
-        )
+        pairs = zip(white[1:], self.light_maps, strict=True)
+        return sum((of.fine(one) for one, of in pairs), np.zeros(self.light.start.shape))
 
     def all_values(self, free: NDArray) -> NDArray[np.float64]:
         """All numbers, with those that are free."""
@@ -228,9 +196,9 @@ class Point:
         self.problem, self.x = problem, x
         white, free = problem.split(x)
         self.light = problem.light.changed(problem.light_change(white))
-        self.phase = problem.phase + problem.phase_map.fine(white[0])
+        self.phase = problem.phase_map.fine(white[0])
         self.values = problem.all_values(free)
-        self.model: Linearised = problem.camera.at(problem.light.maps(self.light, self.phase), self.values)
+        self.model = Linearised(problem.camera, problem.light.maps(self.light, self.phase), self.values)
         self.residuals = [
             weight * (image - counts)
             for weight, image, counts in zip(problem.weights, self.model.images, problem.counts, strict=True)
@@ -247,12 +215,10 @@ class Point:
 
     @property
     def phase_means(self) -> NDArray[np.float64]:
-        """Phase, mean over each pixel."""
         return self.problem.phase_map.means(self.problem.split(self.x)[0][0])
 
     @property
     def light_means(self) -> NDArray[np.float64]:
-        """Light, mean over each pixel."""
         n, f = self.problem.phase_map.n, self.problem.camera.f
         return self.light.reshape(n, f, n, f).mean(axis=(1, 3))
 
@@ -295,7 +261,6 @@ class Point:
 
     @cached_property
     def block(self) -> NDArray[np.float64]:
-        """Matrix of the free numbers."""
         block = np.diag(self.problem.prior[1] ** 2 + 1e-300)
         for which, slopes in self.columns:
             block[np.ix_(which, which)] += slopes @ slopes.T
@@ -338,7 +303,6 @@ class Point:
 
     @cached_property
     def gradient(self) -> NDArray[np.float64]:
-        """Of the cost."""
         n = self.problem.n_white
         gradient = self.back(self.residuals)
         gradient[:n] += self.x[:n]
@@ -423,7 +387,6 @@ class Point:
         return np.concatenate([*self._filtered(r, -1), free])
 
     def scale(self, d: NDArray) -> NDArray[np.float64]:
-        """Damping times a vector."""
         free = np.diagonal(self.block) * d[self.problem.n_white :]
         return np.concatenate([*self._filtered(d, 1), free])
 
@@ -458,24 +421,16 @@ class Point:
         return x.reshape(np.shape(right))
 
 
-@dataclass(frozen=True, eq=False)
-class Minimum:
-    """Where a fit ended."""
-
-    point: Point
-    converged: bool
-
-
 def minimise(
     problem: Problem,
     x: NDArray | None = None,
     n_steps: int = 30,
     n_inner: int = 60,
     enough: float = 0.0,
-) -> Minimum:
+) -> tuple[Point, bool]:
     """Levenberg and Marquardt's method on all unknowns, until a step promises no more than a part of 1.
 
-    It ends earlier when a step promises less than `enough` of the cost.
+    It ends earlier when a step promises less than `enough` of the cost. Returns whether it has converged, too.
     """
     point = Point(problem, problem.start if x is None else x)
     damping, converged, promised = 1e-2, False, math.inf
@@ -496,7 +451,7 @@ def minimise(
         share = gain / promised if promised > 0 else 1.0
         damping *= 0.2 if share > 0.75 else 1.0 if share > 0.4 else 4.0
         damping = max(damping, _LEAST)
-    return Minimum(point, converged)
+    return point, converged
 
 
 class Eliminated:
@@ -554,9 +509,9 @@ class Eliminated:
         return inverse * np.outer(grow, grow) + np.diag(missed)
 
 
-def settle(best: Minimum) -> tuple[Minimum, Eliminated]:
+def settle(point: Point) -> tuple[Point, bool, Eliminated]:
     """Take last steps of all unknowns, and judge by what the next one promises whether the fit has converged."""
-    point, equations = best.point, Eliminated(best.point)
+    equations = Eliminated(point)
     step, promised = equations.step(point)
     for _ in range(_LAST):
         trial = min((point.moved(share * step) for share in _SHARES), key=lambda one: one.cost)
@@ -566,7 +521,7 @@ def settle(best: Minimum) -> tuple[Minimum, Eliminated]:
         step, promised = equations.step(point)
         if promised < 1:
             break
-    return Minimum(point, promised < 1), equations
+    return point, promised < 1, equations
 
 
 def _joined(images: Sequence[NDArray]) -> NDArray[np.float64]:

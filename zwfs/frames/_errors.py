@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import nnls
 
-from zwfs._camera.recording import with_neighbours
+from zwfs._camera.recording import aligned, unknown_in, with_neighbours
 from zwfs._images import nearest_good
 from zwfs.sensor import ZernikeSensor
 
@@ -25,13 +25,11 @@ def unexplained(phase: NDArray, commands: NDArray) -> NDArray[np.float32]:
 
     They are 0 where a phase is NaN, and at pixels of the outline whose command may be a mean with unknown ones.
     """
-    unknown = ~np.isfinite(commands).all(axis=0) | (commands == 0).all(axis=0)
+    unknown = unknown_in(commands)
     if unknown.any():
         unknown = with_neighbours(unknown)
-    waves = np.where(unknown, 0, np.nan_to_num(np.exp(1j * (phase.astype(float) - np.nan_to_num(commands)))))
-    for _ in range(4):  # each phase has its own piston
-        mean = waves.mean(axis=0)
-        waves *= np.exp(-1j * np.angle(np.sum(waves * mean.conj(), axis=(1, 2), keepdims=True)))
+    waves = np.nan_to_num(np.exp(1j * (phase.astype(float) - np.nan_to_num(commands))))
+    waves = aligned(np.where(unknown, 0, waves))
     left = np.angle(waves * waves.mean(axis=0).conj()) * math.sqrt(len(waves) / (len(waves) - 1))
     return left.astype(np.float32)
 

@@ -13,30 +13,12 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from zwfs._camera import BenchFit, FittedSensor
-from zwfs._images import turning
 from zwfs.sensor import ZernikeSensor
 
 _SCREENS = 24  # random phases from which weights are learnt
 _RMS = (0.15, 0.3, 0.5, 0.8)  # radian, of these
 _FINEST = 20  # cycles / D
 _STIFFNESS = 1e-3  # variance of the frames up to which a weight stays what leakage alone makes it
-
-
-def places_of(fit: BenchFit, shape: tuple[int, int], corners: NDArray) -> NDArray[np.float64]:
-    """Row and column at which each point of the maps lies on the camera, (2, 2, n, n).
-
-    The fit saw windows of a shape, whose first pixels are the corners (2, 2) on the camera.
-    """
-    n, places = len(fit.light), []
-    grid = np.indices((n, n)) - (n - 1) / 2
-    for arm, corner in enumerate(corners):
-        row, column, angle, size = (
-            fit[f"arm {arm} {name}"].value for name in ("row", "column", "rotation", "magnification")
-        )
-        middle = np.array([row, column]) + (np.array(shape) - 1) / 2 + corner
-        turned = np.einsum("ij,jyx->iyx", turning(np.degrees(angle), size), grid)
-        places.append(turned + middle[:, None, None])
-    return np.stack(places)
 
 
 def training(fit: BenchFit, sensor: ZernikeSensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs._arrays import Immutable, Kind, read_only
 from zwfs._camera import BenchFit
+from zwfs._camera.bench import places_of
 from zwfs._images import radius
 from zwfs._likelihood import Estimator, Noise
 from zwfs._propagator import propagator, split
@@ -28,7 +29,7 @@ from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._errors import Excess, sideways, slopes_of, unexplained
 from zwfs.frames._grid import Grid
-from zwfs.frames._learnt import learnt, places_of, training
+from zwfs.frames._learnt import learnt, training
 from zwfs.frames.phases import Flag, Phases
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames
 from zwfs.frames.registration import FRAMES
@@ -257,7 +258,8 @@ class Calibration(Immutable):
         background, flux = (np.array([value[f"arm {arm} {key}"] for arm in (0, 1)]) for key in _OF_ARMS)
         made = cls(
             pupil.amplitude, n_pixels, pupil.center, optics, shape, n_images,
-            places_of(fit, counts.shape[2:], corners), _dark(dark, (n_images, *shape)),
+            places_of(fit.point.model.arms[:2], n, counts.shape[2:]) + corners[..., None, None],
+            _dark(dark, (n_images, *shape)),
             on_camera(bad[np.newaxis])[0] > 0, pupil.inside, background, flux * light[pupil.inside].mean(),
             np.zeros((2, 2, n, n)), np.zeros((2, n, n)), False, np.ones(2), np.zeros((0, n, n), np.float32),
             np.zeros(0), blur=value["blur"], n_averaged=n_averaged, commanded=True, **settings,

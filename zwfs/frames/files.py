@@ -21,7 +21,7 @@ from zwfs._images import nearest_good
 from zwfs._system import is_there, path_of, paths_of, write_file
 from zwfs.frames._blocks import FileError, blocks_in, unpacked
 from zwfs.frames._fits import fits_content, fits_module, has_card
-from zwfs.frames._part import scratch_of
+from zwfs.frames._part import Cards, scratch_of
 from zwfs.frames.pipeline import MeasuredPhase, Optics
 from zwfs.frames.registration import Image
 
@@ -117,13 +117,15 @@ def read(path: str | Path, *, max_bytes: int = 2**29, max_images: int = 2) -> Ca
     --------
     >>> import tempfile
     >>> import numpy as np
-    >>> from zwfs.frames.files import read
+    >>> from zwfs.frames.files import images, read
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     np.save(f"{folder}/frame.npy", np.eye(16))
     ...     file = read(f"{folder}/frame.npy")
     ...
     >>> file.name, file.images.shape
     ('frame.npy', (1, 16, 16))
+    >>> images([file], saturation=2.0)[0].counts.shape
+    (16, 16)
     """
     path = path_of("path", path)
     max_bytes, max_images = _check.integer("max_bytes", max_bytes, 1), _check.integer("max_images", max_images, 1)
@@ -207,19 +209,6 @@ def images(
     ValueError
         If the number of images or a shape is wrong, every pixel of an image or of its dark is bad, or the
         bad-pixel map marks all of them.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from zwfs.frames.files import images, read
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     np.save(f"{folder}/frame.npy", np.eye(16))
-    ...     file = read(f"{folder}/frame.npy")
-    ...
-    >>> (image,) = images([file], saturation=2.0)
-    >>> image.counts.shape
-    (16, 16)
     """
     for argument, given in (("files", files), ("darks", darks), ("bad_pixels", bad_pixels)):
         _check.sequence(argument, given, CameraFile)
@@ -348,12 +337,8 @@ def write_phase(
     cards = [
         ("BUNIT", "rad", "in (-pi, pi]; NaN outside and at bad points"),
         ("WAVELEN", wavelength, "[nm] wavelength"),
-        ("PUPDIAM", registered.diameter, "[pixel] diameter D of the pupil"),
         ("PIXSCALE", 1 / registered.diameter, "[D] width of a pixel"),
-        ("CENTROW", measurement.pupil.center[0], "[pixel] centre of the pupil, from 0"),
-        ("CENTCOL", measurement.pupil.center[1], "[pixel] centre of the pupil, from 0"),
-        ("DIMPLE", optics.diameter, "[lambda/D] diameter of the dimple"),
-        *((f"THETA{i}", value, f"[rad] phase shift, image {i}") for i, value in enumerate(optics.phase_shifts, 1)),
+        *sensor_cards(registered.diameter, measurement.pupil.center, optics),
         ("BACKGRND", optics.background, "background of the frames, 1 = mean of pupil"),
         ("PUPBACK", optics.pupil_background, "the same of the clear frames"),
         ("SCALE", optics.scale, "factor on the frames"),
@@ -385,6 +370,17 @@ def write_phase(
     bad = (measurement.pupil.inside & ~measurement.good).astype(np.uint8)
     units = (phase.opd(wavelength), "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
     write_file(path, fits_content((phase.phase, "", cards), *units))
+
+
+def sensor_cards(diameter: float, center: tuple[float, float], optics: Optics) -> Cards:
+    """Header cards of the pupil (pixels) and of the masks."""
+    return [
+        ("PUPDIAM", diameter, "[pixel] diameter D of the pupil"),
+        ("CENTROW", center[0], "[pixel] centre of the pupil, from 0"),
+        ("CENTCOL", center[1], "[pixel] centre of the pupil, from 0"),
+        ("DIMPLE", optics.diameter, "[lambda/D] diameter of the dimple"),
+        *((f"THETA{i}", value, f"[rad] phase shift, image {i}") for i, value in enumerate(optics.phase_shifts, 1)),
+    ]
 
 
 def _usable(counts: NDArray) -> NDArray[np.bool_]:

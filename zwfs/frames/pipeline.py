@@ -364,7 +364,6 @@ def model(measurement: Measurement) -> ZernikeSensor:
 
 def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:
     """Frames of a measurement as those of an ideal sensor: its optics are undone. They may be negative."""
-    _check.instance("measurement", measurement, Measurement)
     optics, pure = measurement.optics, _scaled(measurement)
     pure[(..., *measurement.window)] -= measurement.rest + optics.unmasked * measurement.pupil.amplitude**2
     pure /= 1 - optics.unmasked
@@ -406,7 +405,6 @@ def prediction_error(measurement: Measurement, where: NDArray, n_iterations: int
 
 def upside_down(measurement: Measurement) -> Measurement:
     """Control of a measurement: its second frame upside down, so that the frames no longer belong together."""
-    _check.instance("measurement", measurement, Measurement)
     (first, second), (bad, other) = measurement.intensity, measurement.bad
     return replace(measurement, intensity=np.stack([first, second[::-1]]), bad=np.stack([bad, other[::-1]]))
 

@@ -25,7 +25,7 @@ from zwfs.frames._fits import card_value, fits_module
 from zwfs.frames._part import Cards, Part, Unit
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration, _number_or_inf
-from zwfs.frames.files import check_output
+from zwfs.frames.files import check_output, sensor_cards
 from zwfs.frames.phases import Flag, Phases
 from zwfs.modes import zernike_basis
 
@@ -216,8 +216,7 @@ class _Job:
         if wavelength is not None:
             wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
         level = calibration.saturation if saturation is None else saturation
-        if saturation is None and level == np.inf:
-            level = stack.saturation
+        level = stack.saturation if saturation is None and level == np.inf else level
         self.saturation = _number_or_inf("saturation", level, open_low=True)
         self.keywords = _columns(stack, keywords)
         names = max(len(card_value(one.name)) for one in stack.firsts)
@@ -254,7 +253,7 @@ class _Job:
         """Cards of the first header: numbers of the run, then those of the first file."""
         from zwfs import __version__
 
-        stack, calibration, optics = self.stack, self.calibration, self.calibration.optics
+        stack, calibration = self.stack, self.calibration
         row, column = calibration.places[0, :, 0, 0].tolist()
         cards: list[tuple[str, Any, str]] = [
             ("CREATOR", f"zwfs {__version__}", ""),
@@ -268,14 +267,7 @@ class _Job:
             ("MAPFRAME", "commands" if calibration.commanded else "first image", "frame of reference of the maps"),
             ("CROPROW", row, "[pixel] row of a map's first point, from 0"),
             ("CROPCOL", column, "[pixel] its column, on the first image"),
-            ("PUPDIAM", calibration.diameter, "[pixel] diameter D of the pupil"),
-            ("CENTROW", calibration.center[0], "[pixel] centre of the pupil, from 0"),
-            ("CENTCOL", calibration.center[1], "[pixel] centre of the pupil, from 0"),
-            ("DIMPLE", optics.diameter, "[lambda/D] diameter of the dimple"),
-            *(
-                (f"THETA{i}", value, f"[rad] phase shift, image {i}")
-                for i, value in enumerate(optics.phase_shifts, 1)
-            ),
+            *sensor_cards(calibration.diameter, calibration.center, calibration.optics),
             ("SATURATE", self.saturation, "[count] pixels that reach it are saturated"),
             ("MAXITER", calibration.n_iterations, "largest number of iterations"),
             ("TOLERANC", calibration.tolerance, "[rad] change that ends the iteration"),

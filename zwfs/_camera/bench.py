@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft, ndimage
+from scipy import ndimage
 
 from zwfs import _check
 from zwfs._camera.light import Light
@@ -273,18 +273,16 @@ def _coarse(data: Recording, diameter: float, shifts: tuple[float, float]) -> _S
 
 
 def _free(data: Recording, start: _Start) -> list[Free]:
-    """Numbers that are free, and where they start."""
+    """Numbers that are free, and where they start; a stage limits the focus."""
     _, flux = data.light
     free = []
     for side in (0, 1):
-        both = (side, side + 2)
-
-        def shared(name: str, *limits: float, arms: tuple[int, int] = both) -> Free:
-            return Free(f"arm {arms[0]} {name}", tuple((arm, name) for arm in arms), *limits)
-
-        free += [shared("focus", 0.0, -_FARTHEST, _FARTHEST), shared("rotation", 0.0, -0.3, 0.3, 0.05)]
-        free += [shared("magnification", 1.0, 0.7, 1.4, 0.05)]
-        for arm in both:
+        shared = {"focus": (0.0,), "rotation": (0.0, -0.3, 0.3, 0.05), "magnification": (1.0, 0.7, 1.4, 0.05)}
+        free += [
+            Free(f"arm {side} {name}", ((side, name), (side + 2, name)), *limits)
+            for name, limits in shared.items()
+        ]
+        for arm in (side, side + 2):
             names = {
                 "row": (0.0, -6.0, 6.0),
                 "column": (0.0, -6.0, 6.0),
@@ -323,7 +321,7 @@ def _problem(data: Recording, start: _Start, f: int) -> tuple[Problem, NDArray]:
     lights = _light_maps(division, f * data.n_pixels)
     problem = Problem(camera, data.counts, data.weights(smooth), division, phase_map, lights, values, free)
     x = problem.start
-    x[: phase_map.size**2] = white_phase(phase_map, start.flat).ravel()
+    x[: phase_map.size**2] = phase_map.white(start.flat)
     return problem, x
 
 
@@ -331,13 +329,6 @@ def _light_maps(light: Light, n_pixels: float) -> tuple[LightMap, ...]:
     """Smooth changes of the light, and free ones of the points that edges and vanes divide."""
     smooth = LightMap(light.support, MapPrior(0.2, 3.0, outer_scale=0.1), n_pixels)
     return smooth, LightMap(light.support & ~light.full, MapPrior(_DIVIDED), n_pixels)
-
-
-def white_phase(phase_map: PhaseMap, means: NDArray) -> NDArray[np.float64]:
-    """White numbers of a phase, mean over each pixel."""
-    size, n = phase_map.size, phase_map.n
-    wide = np.pad(means, ((0, size - n),) * 2, "linear_ramp")
-    return fft.irfft2(fft.rfft2(wide) / phase_map.colour, s=wide.shape)
 
 
 def _staged(data: Recording, problem: Problem, stage: _Stage) -> Problem:

@@ -137,7 +137,7 @@ class Camera:
         factors = np.stack([disc, -1j * defocus * disc, rim])
         factors = factors * np.exp(-1j * focus * defocus) / (self.n_pixels * self.f) ** 2
         source, target = (
-            plane.combine.T @ _spectra(((plane.along_y, axis), (plane.along_x, axis)), u, v)
+            plane.combine.T @ _spectra(((plane.along_y, axis),) * 2, u, v)
             for plane, axis in zip(self.planes, self._axes, strict=True)
         )
         return (target.conj() * factors[:, np.newaxis, :]) @ source.T
@@ -277,12 +277,7 @@ class _Part:
 
 
 class Linearised:
-    """Images at one point, their derivatives by the maps (`apply`, `adjoint`) and the parameters (`slopes`).
-
-    Attributes
-    ----------
-    images : list of ndarray, counts
-    """
+    """Images at one point, their derivatives by the maps (`apply`, `adjoint`) and the parameters (`slopes`)."""
 
     def __init__(self, camera: Camera, maps: Maps, values: NDArray) -> None:
         self.camera, self.maps = camera, maps
@@ -290,10 +285,7 @@ class Linearised:
         self.arms = [dict(zip(ARM, row, strict=True)) for row in split.tolist()]
         self.masks = dict(zip(MASKS, values[-len(MASKS) :].tolist(), strict=True))
         self._coefficients = coefficients(self.masks)
-        self._transfer = [
-            np.exp(-1j * arm["focus"] * camera.defocus) if arm["focus"] else None for arm in self.arms
-        ]
-        self._back_transfer = [one if one is None else one.conj() for one in self._transfer]
+        self._transfer = [np.exp(-1j * arm["focus"] * camera.defocus) for arm in self.arms]
         self._spread = [camera.spread_at(arm["focus"]) for arm in self.arms]
         self._rest = self._spectrum_of(maps.rest)
         self._blur = camera.prefilter * np.exp(-2 * (np.pi * self.masks["blur"]) ** 2 * camera.squares)
@@ -311,24 +303,19 @@ class Linearised:
             for one, part in zip(camera.exposures, self._parts, strict=True)
         ]
 
-    def _source(self, field: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Field on the whole grid, its spectrum, and its coefficients for the light of the dimple."""
+    def _source(self, field: NDArray) -> tuple[NDArray, NDArray]:
+        """Spectrum of a field on the whole grid, and its coefficients for the light of the dimple."""
         whole = np.zeros((self.camera.size,) * 2, complex)
         whole[self.camera.window] = field
-        moved = any(one is not None for one in self._transfer)
-        return whole, fft.fft2(whole) if moved else whole, self.camera.planes[0].project(field)
-
-    def _relayed(self, arm: int, source: tuple[NDArray, NDArray, NDArray]) -> NDArray[np.complex128]:
-        transfer = self._transfer[arm]
-        return source[0] if transfer is None else fft.ifft2(transfer * source[1])
+        return fft.fft2(whole), self.camera.planes[0].project(field)
 
     def _part(self, one: Exposure) -> _Part:
         camera, source = self.camera, self._states[one.state]
-        field = self._relayed(one.arm, source)
+        field = fft.ifft2(self._transfer[one.arm] * source[0])
         light = across = np.zeros(0, complex)
         ahead, intensity = field, field.real**2 + field.imag**2
         if one.mask is not None:
-            light = camera.planes[1].expand(self._cores[one.arm][0] @ source[2])
+            light = camera.planes[1].expand(self._cores[one.arm][0] @ source[1])
             first, second = self._coefficients.first[one.mask], self._coefficients.second[one.mask]
             ahead = field + first * light
             across = np.conj(first) * field + second * light
@@ -363,9 +350,9 @@ class Linearised:
         states = [self._source(change * turn) for turn in camera.turns]
         unresolved = self._spectrum_of(rest)
         for one, part in zip(camera.exposures, self._parts, strict=True):
-            intensity = _twice(part.ahead, self._relayed(one.arm, states[one.state]))
+            intensity = _twice(part.ahead, fft.ifft2(self._transfer[one.arm] * states[one.state][0]))
             if one.mask is not None:
-                light = camera.planes[1].expand(self._cores[one.arm][0] @ states[one.state][2])
+                light = camera.planes[1].expand(self._cores[one.arm][0] @ states[one.state][1])
                 intensity += _twice(part.across, light)
             spectrum = fft.rfft2(self._cells(intensity)) + self._spread[one.arm][0] * unresolved
             changes.append(self._on_camera(one, spectrum))
@@ -375,8 +362,7 @@ class Linearised:
         """Adjoint of `apply`."""
         camera = self.camera
         spectra = [np.zeros((camera.size,) * 2, complex) for _ in self._states]
-        direct = [np.zeros((camera.size,) * 2, complex) for _ in self._states]
-        inputs = [np.zeros(source[2].shape, complex) for source in self._states]
+        inputs = [np.zeros(source[1].shape, complex) for source in self._states]
         seen = [np.zeros(self._blur.shape, complex) for _ in self.arms]
         for one, part, weight in zip(camera.exposures, self._parts, pixels, strict=True):
             back = self._splines[one.arm].adjoint(self.arms[one.arm]["flux"] * weight)
@@ -385,21 +371,15 @@ class Linearised:
             gain = fft.irfft2(spectrum, s=back.shape)
             gain += _differences(self._smooth * gain)
             gain *= 2
-            transfer = self._back_transfer[one.arm]
-            if transfer is None:
-                direct[one.state] += gain * part.ahead
-            else:
-                spectra[one.state] += transfer * fft.fft2(gain * part.ahead)
+            spectra[one.state] += self._transfer[one.arm].conj() * fft.fft2(gain * part.ahead)
             if one.mask is not None:
                 core = self._cores[one.arm][0].conj().T
                 inputs[one.state] += core @ camera.planes[1].project(gain * part.across)
-        moved = any(one is not None for one in self._transfer)
         unresolved = sum(spread * each for (spread, _), each in zip(self._spread, seen, strict=True))
         rest = fft.irfft2(unresolved, s=(camera.size,) * 2)[camera.window]
         total = np.zeros(rest.shape, complex)
-        for whole, spectrum, light, turn in zip(direct, spectra, inputs, camera.turns, strict=True):
-            field = whole + fft.ifft2(spectrum) if moved else whole
-            total += turn.conj() * (field[camera.window] + camera.planes[0].expand(light))
+        for spectrum, light, turn in zip(spectra, inputs, camera.turns, strict=True):
+            total += turn.conj() * (fft.ifft2(spectrum)[camera.window] + camera.planes[0].expand(light))
         total *= self._wave.conj()
         return Maps(total.real, rest, self.maps.mean * total.imag)
 
@@ -427,7 +407,7 @@ class Linearised:
             elif one.mask is None:
                 out.append(zero)
             elif name == "diameter":
-                light = camera.planes[1].expand(self._cores[one.arm][-1] @ source[2])
+                light = camera.planes[1].expand(self._cores[one.arm][-1] @ source[1])
                 out.append(self._on_camera(one, fft.rfft2(self._cells(_twice(part.across, light)))))
             else:
                 first = self._coefficients.first_slope[one.mask, MASKS.index(name)]
@@ -436,13 +416,13 @@ class Linearised:
                 out.append(self._on_camera(one, fft.rfft2(self._cells(change))))
         return np.reshape(out, (len(wanted), *camera.shape))
 
-    def _by_focus(self, one: Exposure, part: _Part, source: tuple[NDArray, NDArray, NDArray]) -> NDArray:
+    def _by_focus(self, one: Exposure, part: _Part, source: tuple[NDArray, NDArray]) -> NDArray:
         """Derivative of an intensity by the focus."""
-        camera, transfer = self.camera, self._transfer[one.arm]
-        spectrum = fft.fft2(source[0]) if transfer is None else transfer * source[1]
-        intensity = _twice(part.ahead, fft.ifft2(-1j * camera.defocus * spectrum))
+        camera = self.camera
+        field = fft.ifft2(-1j * camera.defocus * self._transfer[one.arm] * source[0])
+        intensity = _twice(part.ahead, field)
         if one.mask is not None:
-            light = camera.planes[1].expand(self._cores[one.arm][1] @ source[2])
+            light = camera.planes[1].expand(self._cores[one.arm][1] @ source[1])
             intensity += _twice(part.across, light)
         return intensity
 

@@ -14,7 +14,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from zwfs import _check
-from zwfs._camera.bench import EXPLAINED, BenchFit, places_of, white_phase
+from zwfs._camera.bench import EXPLAINED, BenchFit, places_of
 from zwfs._camera.light import Light
 from zwfs._camera.model import Camera, Exposure, Linearised
 from zwfs._camera.recording import PAD
@@ -199,7 +199,7 @@ class FittedSensor:
         phase_map = PhaseMap(of.phase_map.n, of.camera.f, prior, of.camera.n_pixels)
         values = self.fit.point.values
         problem = Problem(self._camera, list(counts), list(weights), self._light, phase_map, (), values)
-        return minimise(problem, white_phase(phase_map, start).ravel(), n_steps, n_inner)
+        return minimise(problem, phase_map.white(start), n_steps, n_inner)
 
     def _start(self, counts: NDArray) -> NDArray[np.float64]:
         """Phase of the phase-shifted iteration on images brought back to the pupil, unwrapped and continued."""

@@ -71,6 +71,11 @@ class PhaseMap:
         """Mean over each pixel, (n, n)."""
         return fft.irfft2(self.colour * fft.rfft2(white), s=white.shape)[: self.n, : self.n]
 
+    def white(self, means: NDArray) -> NDArray[np.float64]:
+        """White numbers, (size * size,), of a phase with these means."""
+        wide = np.pad(means, ((0, self.size - self.n),) * 2, "linear_ramp")
+        return fft.irfft2(fft.rfft2(wide) / self.colour, s=wide.shape).ravel()
+
     def fine(self, white: NDArray) -> NDArray[np.float64]:
         """Phase on the fine grid."""
         return self._along @ fft.irfft2(self._means * fft.rfft2(white), s=white.shape) @ self._along.T
@@ -181,13 +186,6 @@ class Problem:
         pairs = zip(white[1:], self.light_maps, strict=True)
         return sum((of.fine(one) for one, of in pairs), np.zeros(self.light.start.shape))
 
-    def all_values(self, free: NDArray) -> NDArray[np.float64]:
-        """All numbers, with those that are free."""
-        values = self.values.copy()
-        for places, value in zip(self.places, free.tolist(), strict=True):
-            values[places] = value
-        return values
-
 
 class Point:
     """Model, residuals and cost at given unknowns, and Gauss and Newton's matrix there."""
@@ -197,7 +195,9 @@ class Point:
         white, free = problem.split(x)
         self.light = problem.light.changed(problem.light_change(white))
         self.phase = problem.phase_map.fine(white[0])
-        self.values = problem.all_values(free)
+        self.values = problem.values.copy()
+        for places, value in zip(problem.places, free.tolist(), strict=True):
+            self.values[places] = value
         self.model = Linearised(problem.camera, problem.light.maps(self.light, self.phase), self.values)
         self.residuals = [
             weight * (image - counts)
@@ -235,21 +235,12 @@ class Point:
     @cached_property
     def columns(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
         """Free numbers that change each image, and its changes over the noise with each, (k, n_pixels)."""
-        out = []
-        for index, one in enumerate(self.problem.camera.exposures):
-            which = [
-                (number, [name for arm, name in free.places if arm is None or arm == one.arm])
-                for number, free in enumerate(self.problem.free)
-            ]
-            which = [(number, names) for number, names in which if names]
-            names = [names[0] for _, names in which]
-            slopes = self.model.slopes(index, names) * self.problem.weights[index]
-            out.append(
-                (
-                    np.array([number for number, _ in which], int),
-                    slopes.reshape(len(names), self.problem.weights[index].size),
-                )
-            )
+        out, places = [], [(number, *at) for number, free in enumerate(self.problem.free) for at in free.places]
+        for index, weight in enumerate(self.problem.weights):
+            own = self.problem.camera.exposures[index].arm
+            names = {number: name for number, arm, name in places if arm in (None, own)}
+            slopes = self.model.slopes(index, list(names.values())) * weight
+            out.append((np.array(list(names), int), slopes.reshape(len(names), weight.size)))
         return out
 
     def along(self, number: int) -> list[NDArray[np.float64]]:
@@ -387,6 +378,7 @@ class Point:
         return np.concatenate([*self._filtered(r, -1), free])
 
     def scale(self, d: NDArray) -> NDArray[np.float64]:
+        """Matrix of the damping times a vector."""
         free = np.diagonal(self.block) * d[self.problem.n_white :]
         return np.concatenate([*self._filtered(d, 1), free])
 
@@ -421,19 +413,12 @@ class Point:
         return x.reshape(np.shape(right))
 
 
-def minimise(
-    problem: Problem,
-    x: NDArray | None = None,
-    n_steps: int = 30,
-    n_inner: int = 60,
-    enough: float = 0.0,
-) -> tuple[Point, bool]:
+def minimise(problem: Problem, x: NDArray, n_steps: int, n_inner: int, enough: float = 0.0) -> tuple[Point, bool]:
     """Levenberg and Marquardt's method on all unknowns, until a step promises no more than a part of 1.
 
     It ends earlier when a step promises less than `enough` of the cost. Returns whether it has converged, too.
     """
-    point = Point(problem, problem.start if x is None else x)
-    damping, converged, promised = 1e-2, False, math.inf
+    point, damping, converged, promised = Point(problem, x), 1e-2, False, math.inf
     for _ in range(n_steps):
         if converged or promised <= enough * point.cost:
             break
@@ -462,12 +447,12 @@ class Eliminated:
     that of X.
     """
 
-    def __init__(self, point: Point, n_inner: int = 10) -> None:
+    def __init__(self, point: Point) -> None:
         n, n_all = point.problem.n_white, len(point.x)
         held = np.arange(n_all) >= n
         self._unit = np.sqrt(np.diagonal(point.block))
         along = [[one / unit for one in point.along(number)] for number, unit in enumerate(self._unit)]
-        followed = point.solve(np.array([point.back(one) for one in along]), held, n_inner, 0.02)
+        followed = point.solve(np.array([point.back(one) for one in along]), held, 10, 0.02)
         self._effects = [
             [one - other for one, other in zip(of, point.change(solution), strict=True)]
             for of, solution in zip(along, followed, strict=True)

@@ -168,7 +168,8 @@ class BenchFit:
 
 def places_of(arms: Sequence[Mapping[str, float]], n: int, shape: tuple[int, int]) -> NDArray[np.float64]:
     """Row and column of each of the n x n pixels of the maps on a frame behind each arm, (n_arms, 2, n, n)."""
-    grid, places = np.indices((n, n)) - (n - 1) / 2, []
+    grid = np.indices((n, n)) - (n - 1) / 2
+    places = []
     for arm in arms:
         middle = np.array([arm["row"], arm["column"]]) + (np.array(shape) - 1) / 2
         turned = np.einsum("ij,jyx->iyx", turning(np.degrees(arm["rotation"]), arm["magnification"]), grid)
@@ -369,7 +370,8 @@ def _changes(data: Recording, point: Point) -> list[list[NDArray[np.float64]]]:
     finer = Camera(
         camera.n, camera.shape, data.n_pixels, camera.exposures, fine_phase(data.phases, f), f, camera.largest
     )
-    light, twice = Light.sharp(np.maximum(point.light_means, 0), f), np.ones((2, 2))
+    twice = np.ones((2, 2))
+    light = Light.sharp(np.maximum(point.light_means, 0), f)
     # Halfway between the amplitude of the fit and a new one, of which it is not known which is better.
     light = replace(light, amplitude=(np.kron(of.light.amplitude, twice) + light.amplitude) / 2)
     n = len(point.light)

@@ -54,12 +54,15 @@ class Light:
         start = fine_light.reshape(n * f, fine // f, n * f, fine // f).mean(axis=(1, 3))
         return cls.of(start, pixels, f)
 
-    def changed(self, change: NDArray | float) -> NDArray[np.float64]:
+    def changed(self, change: NDArray) -> NDArray[np.float64]:
         """Light of a change, in units of that of a fully lit point."""
         return self.support * (self.start + self.amplitude**2 * change)
 
     def maps(self, light: NDArray, phase: NDArray) -> Maps:
-        mean = np.where(self.full, self._root(light), light / self.amplitude)
+        least = np.maximum(light, self._least)
+        # The tangent of the root where a fully lit point would be much too dark.
+        root = np.sqrt(least) + (light - least) / (2 * np.sqrt(least))
+        mean = np.where(self.full, root, light / self.amplitude)
         return Maps(mean, np.where(self.full, 0, light - mean**2), phase, self.support & ~self.full)
 
     def slopes(self, light: NDArray) -> tuple[NDArray, NDArray]:
@@ -73,11 +76,6 @@ class Light:
     @property
     def _least(self) -> NDArray[np.float64]:
         return 0.5 * self.amplitude**2
-
-    def _root(self, light: NDArray) -> NDArray[np.float64]:
-        """Square root of the light, and its tangent where a fully lit point would be much too dark."""
-        least = np.maximum(light, self._least)
-        return np.sqrt(least) + (light - least) / (2 * np.sqrt(least))
 
 
 def _continued(pixels: NDArray, full: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -138,5 +136,5 @@ def _blocks(fine: NDArray, f: int) -> NDArray[np.float64]:
 
 
 def _stretched(pixels: NDArray, factor: int) -> NDArray[np.float64]:
-    """A smooth map of pixels on a grid that is finer by a factor, linear between the pixels."""
+    """A map of pixels on a grid that is finer by a factor, linear between the pixels."""
     return ndimage.zoom(pixels, factor, order=1, mode="nearest", grid_mode=True)

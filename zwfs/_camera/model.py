@@ -310,12 +310,12 @@ class Linearised:
         return fft.fft2(whole), self.camera.planes[0].project(field)
 
     def _part(self, one: Exposure) -> _Part:
-        camera, source = self.camera, self._states[one.state]
-        field = fft.ifft2(self._transfer[one.arm] * source[0])
+        spectrum, inputs = self._states[one.state]
+        field = fft.ifft2(self._transfer[one.arm] * spectrum)
         light = across = np.zeros(0, complex)
         ahead, intensity = field, field.real**2 + field.imag**2
         if one.mask is not None:
-            light = camera.planes[1].expand(self._cores[one.arm][0] @ source[1])
+            light = self.camera.planes[1].expand(self._cores[one.arm][0] @ inputs)
             first, second = self._coefficients.first[one.mask], self._coefficients.second[one.mask]
             ahead = field + first * light
             across = np.conj(first) * field + second * light
@@ -343,19 +343,26 @@ class Linearised:
         blurred = fft.irfft2(self._blur * spectrum, s=(self.camera.size,) * 2)
         return self.arms[one.arm]["flux"] * self._splines[one.arm](blurred)
 
+    def _change(
+        self, index: int, field: NDArray, inputs: NDArray, core: int, rest: NDArray | float
+    ) -> NDArray[np.float64]:
+        """Change of an image with field, light of the dimple (a core times inputs) and spectrum of `rest`."""
+        one, part = self.camera.exposures[index], self._parts[index]
+        intensity = _twice(part.ahead, field)
+        if one.mask is not None:
+            intensity += _twice(part.across, self.camera.planes[1].expand(self._cores[one.arm][core] @ inputs))
+        return self._on_camera(one, fft.rfft2(self._cells(intensity)) + rest)
+
     def apply(self, mean: NDArray, rest: NDArray, phase: NDArray) -> list[NDArray[np.float64]]:
         """Change of the images with a change of the maps."""
-        camera, changes = self.camera, []
         change = (mean + 1j * self.maps.mean * phase) * self._wave
-        states = [self._source(change * turn) for turn in camera.turns]
+        states = [self._source(change * turn) for turn in self.camera.turns]
         unresolved = self._spectrum_of(rest)
-        for one, part in zip(camera.exposures, self._parts, strict=True):
-            intensity = _twice(part.ahead, fft.ifft2(self._transfer[one.arm] * states[one.state][0]))
-            if one.mask is not None:
-                light = camera.planes[1].expand(self._cores[one.arm][0] @ states[one.state][1])
-                intensity += _twice(part.across, light)
-            spectrum = fft.rfft2(self._cells(intensity)) + self._spread[one.arm][0] * unresolved
-            changes.append(self._on_camera(one, spectrum))
+        changes = []
+        for index, one in enumerate(self.camera.exposures):
+            spectrum, inputs = states[one.state]
+            field = fft.ifft2(self._transfer[one.arm] * spectrum)
+            changes.append(self._change(index, field, inputs, 0, self._spread[one.arm][0] * unresolved))
         return changes
 
     def adjoint(self, pixels: Sequence[NDArray]) -> Maps:
@@ -386,7 +393,7 @@ class Linearised:
     def slopes(self, index: int, wanted: Sequence[str]) -> NDArray[np.float64]:
         """Derivatives of one image by numbers of its arm or of the masks, (k, ny, nx)."""
         camera, one, part = self.camera, self.camera.exposures[index], self._parts[index]
-        arm, source = self.arms[one.arm], self._states[one.state]
+        arm, (source, inputs) = self.arms[one.arm], self._states[one.state]
         zero = np.zeros(camera.shape)
         place = arm["flux"] * self._splines[one.arm].slopes(part.blurred) if set(wanted) & set(_PLACE) else None
         out = []
@@ -402,29 +409,18 @@ class Linearised:
                 image = fft.irfft2(slope * part.spectrum, s=part.blurred.shape)
                 out.append(arm["flux"] * self._splines[one.arm](image))
             elif name == "focus":
-                spectrum = fft.rfft2(self._cells(self._by_focus(one, part, source)))
-                out.append(self._on_camera(one, spectrum + self._spread[one.arm][1] * self._rest))
+                field = fft.ifft2(-1j * camera.defocus * self._transfer[one.arm] * source)
+                out.append(self._change(index, field, inputs, 1, self._spread[one.arm][1] * self._rest))
             elif one.mask is None:
                 out.append(zero)
             elif name == "diameter":
-                light = camera.planes[1].expand(self._cores[one.arm][-1] @ source[1])
-                out.append(self._on_camera(one, fft.rfft2(self._cells(_twice(part.across, light)))))
+                out.append(self._change(index, 0 * part.field, inputs, 2, 0.0))
             else:
                 first = self._coefficients.first_slope[one.mask, MASKS.index(name)]
                 second = self._coefficients.second_slope[one.mask, MASKS.index(name)]
                 change = 2 * (first * part.field.conj() * part.light).real + second * np.abs(part.light) ** 2
                 out.append(self._on_camera(one, fft.rfft2(self._cells(change))))
         return np.reshape(out, (len(wanted), *camera.shape))
-
-    def _by_focus(self, one: Exposure, part: _Part, source: tuple[NDArray, NDArray]) -> NDArray:
-        """Derivative of an intensity by the focus."""
-        camera = self.camera
-        field = fft.ifft2(-1j * camera.defocus * self._transfer[one.arm] * source[0])
-        intensity = _twice(part.ahead, field)
-        if one.mask is not None:
-            light = camera.planes[1].expand(self._cores[one.arm][1] @ source[1])
-            intensity += _twice(part.across, light)
-        return intensity
 
 
 def _differences(image: NDArray) -> NDArray[np.float64]:

@@ -235,7 +235,8 @@ class Point:
     @cached_property
     def columns(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
         """Free numbers that change each image, and its changes over the noise with each, (k, n_pixels)."""
-        out, places = [], [(number, *at) for number, free in enumerate(self.problem.free) for at in free.places]
+        places = [(number, *at) for number, free in enumerate(self.problem.free) for at in free.places]
+        out = []
         for index, weight in enumerate(self.problem.weights):
             own = self.problem.camera.exposures[index].arm
             names = {number: name for number, arm, name in places if arm in (None, own)}
@@ -418,7 +419,8 @@ def minimise(problem: Problem, x: NDArray, n_steps: int, n_inner: int, enough: f
 
     It ends earlier when a step promises less than `enough` of the cost. Returns whether it has converged, too.
     """
-    point, damping, converged, promised = Point(problem, x), 1e-2, False, math.inf
+    point = Point(problem, x)
+    damping, converged, promised = 1e-2, False, math.inf
     for _ in range(n_steps):
         if converged or promised <= enough * point.cost:
             break

@@ -22,13 +22,7 @@ _EXIT_CODES = """exit codes:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit code.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Those of the command line if left out.
-    """
+    """Run the command, by default with the arguments of the command line, and return its exit code."""
     options = vars(_parser().parse_args(arguments))
     run = options.pop("run")
     previous = signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -53,7 +53,6 @@ class Block:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of an image."""
         return self.full[-2:]
 
     @property
@@ -103,7 +102,6 @@ class Block:
         return values if self.blank is None else np.where(data == self.blank, np.nan, values)
 
     def truncated(self, n: int) -> FileError:
-        """Return the error for a file that ends after `n` exposures."""
         return FileError(f"{self.name}: truncated: it ends in exposure {n} of {self.n} (counted from 0)")
 
 
@@ -147,7 +145,6 @@ def unpacked(file: BinaryIO, name: str, max_bytes: int = _MOST_UNPACKED) -> io.B
 
 
 def blocks_of(path: Path) -> list[Block]:
-    """Return the images of a file."""
     with path.open("rb") as file:
         packed = file.read(len(_GZIP)) == _GZIP
         file.seek(0)

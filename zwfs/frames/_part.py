@@ -109,12 +109,10 @@ class Part:
             raise
 
     def write(self, unit: Unit, first: int, rows: NDArray) -> None:
-        """Write rows of a unit to their place."""
         with self._no_space():
             self._write(np.ascontiguousarray(rows, unit.dtype).tobytes(), unit.offset + first * unit.row)
 
     def read(self, unit: Unit, first: int, stop: int) -> NDArray:
-        """Read rows of a unit."""
         return np.frombuffer(self._read(unit, first, stop), unit.dtype).reshape(-1, *unit.shape).copy()
 
     def note(self, first: int, stop: int) -> None:

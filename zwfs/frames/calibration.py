@@ -469,7 +469,6 @@ class Calibration(Immutable):
 
     @cached_property
     def _content(self) -> bytes:
-        """Bytes of the file."""
         plain = {one.name: getattr(self, one.name) for one in fields(self)}
         arrays: dict[str, Any] = {name: value for name, value in plain.items() if isinstance(value, np.ndarray)}
         values = {name: value for name, value in plain.items() if name not in arrays}

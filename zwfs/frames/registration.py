@@ -321,23 +321,12 @@ def register(
     turn: bool = False,
     magnification: float = 1.0,
 ) -> Placement:
-    """Shift between two images of one pupil, to a fraction of a pixel; on request with rotation and magnification.
+    """Shift of an image from a reference (ny, nx), to a fraction of a pixel; with `turn` also how it is turned.
 
-    Maximises the correlation of the two, after a band-pass that keeps gaps, vanes and edges but takes away noise,
-    the illumination, and the grid of a deformable mirror, whose contrast depends on the focus of the camera.
-
-    Parameters
-    ----------
-    image, reference : ndarray, shape (ny, nx)
-    inside : ndarray of bool, shape (ny, nx)
-        Points of the reference that are compared.
-    center : (float, float), pixels
-        Row and column of the centre of the pupil on the reference; by default its middle.
-    turn : bool
-        Whether to measure rotation and magnification, too. One that the images do not determine stays out: its
-        standard error exceeds 0.05 pixels at the edge of `inside` and a tenth of its value.
-    magnification : float
-        Start of the search, with `turn`.
+    Maximises the correlation of the two at the points `inside` the reference, after a band-pass that keeps gaps,
+    vanes and edges but takes away noise, the illumination, and the grid of a deformable mirror, whose contrast
+    depends on the focus of the camera. With `turn`, a rotation or magnification that the images do not determine
+    stays out: its standard error exceeds 0.05 pixels at the edge of `inside` and a tenth of its value.
     """
     center = center or ((len(reference) - 1) / 2, (len(reference[0]) - 1) / 2)
     # Details of three times the width, at every third point, draw the search from farther away.

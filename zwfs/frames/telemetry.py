@@ -333,7 +333,6 @@ class _Job:
         return Summary(output, n, n_flagged, counts, limit, n_resumed)
 
     def _reconstruct(self, part: Part, chunk: tuple[int, int]) -> tuple[int, int]:
-        """Read, reconstruct and write some frames."""
         counts = self.stack.read(*chunk)
         found = self.calibration(counts[:, 0] if counts.shape[1] == 1 else counts, saturation=self.saturation)
         values = {"": found.phase}

@@ -41,7 +41,6 @@ from zwfs.sensor import ZernikeSensor
 FORMAT = 2  # of the file; another number is refused
 _DIM = 0.1  # of the light of the calibration: a frame with less is lost
 _FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
-_OF_ARMS = "background", "flux"
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 _LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED = (flag.value for flag in Flag)  # plain, and far quicker
 
@@ -250,19 +249,19 @@ class Calibration(Immutable):
                 whole[(slice(None), min(index, n_images - 1), *place)] = pairs[:, index]
             return whole
 
-        value = {one.name: one.value for one in fit.estimates}
-        optics = Optics(value["diameter"], (value["first"], value["second"]), leakage=value["leakage"])
+        masks, arms = fit.point.model.masks, fit.point.model.arms[:2]
+        optics = Optics(masks["diameter"], (masks["first"], masks["second"]), leakage=masks["leakage"])
         n_pixels, bad = fit.point.problem.camera.n_pixels, ~np.isfinite(counts).all(axis=0)
         light = fit.light * (radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2)
         pupil = Pupil.from_amplitude(np.sqrt(np.maximum(light, 0)), n_pixels, threshold=_FAINTEST)
-        background, flux = (np.array([value[f"arm {arm} {key}"] for arm in (0, 1)]) for key in _OF_ARMS)
+        background, flux = (np.array([arm[key] for arm in arms]) for key in ("background", "flux"))
         made = cls(
             pupil.amplitude, n_pixels, pupil.center, optics, shape, n_images,
-            places_of(fit.point.model.arms[:2], n, counts.shape[2:]) + corners[..., None, None],
+            places_of(arms, n, counts.shape[2:]) + corners[..., None, None],
             _dark(dark, (n_images, *shape)),
             on_camera(bad[np.newaxis])[0] > 0, pupil.inside, background, flux * light[pupil.inside].mean(),
             np.zeros((2, 2, n, n)), np.zeros((2, n, n)), False, np.ones(2), np.zeros((0, n, n), np.float32),
-            np.zeros(0), blur=value["blur"], n_averaged=n_averaged, commanded=True, **settings,
+            np.zeros(0), blur=masks["blur"], n_averaged=n_averaged, commanded=True, **settings,
         )  # fmt: skip
         good = pupil.inside & ~made._work.touched(made._work.bad[np.newaxis])[0]
 

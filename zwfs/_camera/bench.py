@@ -6,7 +6,6 @@ pair of frames.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -17,7 +16,7 @@ from scipy import ndimage
 
 from zwfs import _check
 from zwfs._camera.light import Light
-from zwfs._camera.model import ARM, Camera, Exposure, Linearised, names_of
+from zwfs._camera.model import Camera, Exposure, Linearised, names_of
 from zwfs._camera.recording import PAD, Recording, aligned, centred
 from zwfs._camera.solve import (
     MISSED,
@@ -313,8 +312,7 @@ def _problem(data: Recording, start: _Start, f: int) -> tuple[Problem, NDArray]:
     exposures += [Exposure(side, side, state) for state in range(len(data.phases)) for side in (0, 1)]
     camera = Camera(n, shape, data.n_pixels, exposures, fine_phase(data.phases, f), f, 1.9 * start.diameter)
     values = np.zeros(len(names_of(4)))
-    table = values[: 4 * len(ARM)].reshape(4, -1)
-    table[:, ARM.index("magnification")], table[:, ARM.index("flux")] = 1, np.tile(flux, 2)
+    values[names_of(4).index("arm 2 flux")] = flux[0]  # the only number that is not free
     division = Light.sharp(light, f)
     smooth = [ndimage.uniform_filter(one, 3) for one in data.counts]
     free = _free(data, start)
@@ -349,12 +347,7 @@ def _next(data: Recording, point: Point, divide: bool) -> tuple[Problem, NDArray
     if not divide:
         return problem, point.x
     light = Light.sharp(np.maximum(point.light_means, 0), before.camera.f)
-    free = [
-        one if math.isfinite(one.sigma) else one._replace(value=float(point.values[places[0]]))
-        for one, places in zip(before.free, before.places, strict=True)
-    ]
-    lights = _light_maps(light, before.camera.f * data.n_pixels)
-    problem = replace(problem, light=light, light_maps=lights, values=point.values, free=free)
+    problem = replace(problem, light=light, light_maps=_light_maps(light, before.camera.f * data.n_pixels))
     x, n_phase = problem.start, before.phase_map.size**2
     x[:n_phase], x[problem.n_white :] = point.x[:n_phase], point.x[before.n_white :]
     return problem, x
@@ -400,17 +393,9 @@ def _result(data: Recording, point: Point, is_reversed: bool) -> BenchFit:
         Estimate(one.name, value, error, not one.low < value < one.high)
         for one, value, error in zip(point.problem.free, values.tolist(), sigma, strict=True)
     )
-    return BenchFit(
-        estimates,
-        spread,
-        point.phase_means[PAD:-PAD, PAD:-PAD],
-        point.light_means[PAD:-PAD, PAD:-PAD],
-        misfit,
-        data.noise,
-        converged,
-        tuple(_remarks(data, point, misfit, estimates, is_reversed)),
-        point,
-    )
+    remarks = tuple(_remarks(data, point, misfit, estimates, is_reversed))
+    flat, light = (one[PAD:-PAD, PAD:-PAD] for one in (point.phase_means, point.light_means))
+    return BenchFit(estimates, spread, flat, light, misfit, data.noise, converged, remarks, point)
 
 
 def _remarks(

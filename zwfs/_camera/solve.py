@@ -36,7 +36,7 @@ class Free(NamedTuple):
 
     name: str
     places: tuple[tuple[int | None, str], ...]  # (arm, or None for the masks; name)
-    value: float
+    value: float  # where a fit starts, and the mean of its prior
     low: float = -math.inf
     high: float = math.inf
     sigma: float = math.inf  # of its prior
@@ -142,7 +142,7 @@ class Problem:
     light: Light
     phase_map: PhaseMap
     light_maps: tuple[LightMap, ...]  # empty if the light is known
-    values: NDArray[np.float64]  # all numbers; those of `free` are where a fit starts
+    values: NDArray[np.float64]  # all numbers; those that are free do not count
     free: Sequence[Free] = ()
 
     @cached_property

@@ -151,7 +151,7 @@ def _edge_light(x: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def symbol(series: Sequence[float], size: int) -> NDArray[np.float64]:
-    """Factors of the spectrum of a real map by a filter along both axes, of which a series of cosines is known."""
+    """Spectrum, (size, size // 2 + 1), of a filter whose spectrum along each axis is a series of cosines."""
     full, half = (
         np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * one), series)
         for one in (fft.fftfreq(size), fft.rfftfreq(size))
@@ -346,7 +346,10 @@ class Linearised:
     def _change(
         self, index: int, field: NDArray, inputs: NDArray, core: int, rest: NDArray | float
     ) -> NDArray[np.float64]:
-        """Change of an image with field, light of the dimple (a core times inputs) and spectrum of `rest`."""
+        """Change of an image with the field, the light of the dimple, and the spectrum of what is not resolved.
+
+        The operator number `core` of `Camera.cores` gives the light of the dimple from `inputs`.
+        """
         one, part = self.camera.exposures[index], self._parts[index]
         intensity = _twice(part.ahead, field)
         if one.mask is not None:

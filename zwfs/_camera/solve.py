@@ -165,6 +165,7 @@ class Problem:
 
     @property
     def maps(self) -> tuple[PhaseMap | LightMap, ...]:
+        """All maps, that of the phase first."""
         return (self.phase_map, *self.light_maps)
 
     @cached_property
@@ -253,6 +254,7 @@ class Point:
 
     @cached_property
     def block(self) -> NDArray[np.float64]:
+        """Matrix of the free numbers."""
         block = np.diag(self.problem.prior[1] ** 2 + 1e-300)
         for which, slopes in self.columns:
             block[np.ix_(which, which)] += slopes @ slopes.T

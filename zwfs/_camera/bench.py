@@ -186,7 +186,7 @@ def fit_bench(
     gain: float = 1.0,
     diameter: float = 1.06,
     phase_shifts: tuple[float, float] = (np.pi / 2, -np.pi / 2),
-    oversampling: int = 2,
+    oversampling: int | None = None,
     n_steps: int = 10,
 ) -> BenchFit:
     """Fit a model of the optics to frames of a mirror in known states, and to clear frames.
@@ -214,8 +214,9 @@ def fit_bench(
         Of the dimple, by design. The fit starts from the best of several diameters around it.
     phase_shifts : (float, float), radian
         Of the two images, by design. The fit tries both orders, and a remark reports a reversed one.
-    oversampling : int
-        Points of the model along a pixel.
+    oversampling : int, optional
+        Points of the model along a pixel. By default 2, and if the misfit is above 1 with them, the fit goes on
+        with 3: light at vanes and gaps needs the finer grid.
     n_steps : int
         Largest number of steps of each stage.
 
@@ -231,15 +232,13 @@ def fit_bench(
     data = Recording.of(frames, clear_frames, phases, n_pixels, noise, gain)
     diameter = _check.number("diameter", diameter, 0, open_low=True)
     shifts = _check.pair("phase_shifts", phase_shifts, _check.number)
-    oversampling, n_steps = (
-        _check.integer("oversampling", oversampling, 1, 8),
-        _check.integer("n_steps", n_steps, 1),
-    )
+    if oversampling is not None:
+        oversampling = _check.integer("oversampling", oversampling, 1, 8)
+    n_steps = _check.integer("n_steps", n_steps, 1)
     start = _coarse(data, diameter, shifts)
-    problem, x = _problem(data, start, oversampling)
-    for stage in _STAGES:
-        point, _ = minimise(_staged(data, problem, stage), x, n_steps, stage.n_inner, stage.enough)
-        problem, x = _next(data, point, stage.divide)
+    point = _fitted(data, *_problem(data, start, oversampling or 2), _STAGES, n_steps)
+    if oversampling is None and np.mean(point.misfit) > 1:
+        point = _fitted(data, *_divided(data, point, 3), _STAGES[1:], n_steps)
     return _result(data, point, start.reversed)
 
 
@@ -330,6 +329,14 @@ def _light_maps(light: Light, n_pixels: float) -> tuple[LightMap, ...]:
     return smooth, LightMap(light.support & ~light.full, MapPrior(_DIVIDED), n_pixels)
 
 
+def _fitted(data: Recording, problem: Problem, x: NDArray, stages: Sequence[_Stage], n_steps: int) -> Point:
+    """Return where the stages of a fit end."""
+    for stage in stages:
+        point, _ = minimise(_staged(data, problem, stage), x, n_steps, stage.n_inner, stage.enough)
+        problem, x = _next(data, point, stage.divide)
+    return point
+
+
 def _staged(data: Recording, problem: Problem, stage: _Stage) -> Problem:
     """Return the problem with the noise and the free numbers of a stage."""
     farthest = _FARTHEST if stage.focus else 0.0
@@ -342,15 +349,32 @@ def _staged(data: Recording, problem: Problem, stage: _Stage) -> Problem:
 
 def _next(data: Recording, point: Point, divide: bool) -> tuple[Problem, NDArray]:
     """Return the next problem and its start, with weights, and on demand the light, by what was fitted."""
-    before = point.problem
-    problem = replace(before, weights=data.weights(point.model.images))
-    if not divide:
-        return problem, point.x
-    light = Light.sharp(np.maximum(point.light_means, 0), before.camera.f)
-    problem = replace(problem, light=light, light_maps=_light_maps(light, before.camera.f * data.n_pixels))
-    x, n_phase = problem.start, before.phase_map.size**2
+    if divide:
+        return _divided(data, point, point.problem.camera.f)
+    return replace(point.problem, weights=data.weights(point.model.images)), point.x
+
+
+def _divided(data: Recording, point: Point, f: int) -> tuple[Problem, NDArray]:
+    """Return the next problem and its start, with the light divided anew into f points along a pixel."""
+    before, light = point.problem, Light.sharp(np.maximum(point.light_means, 0), f)
+    problem = replace(
+        before,
+        camera=_camera(data, before.camera, f),
+        weights=data.weights(point.model.images),
+        light=light,
+        phase_map=PhaseMap(before.camera.n, f, _PHASE_PRIOR, data.n_pixels),
+        light_maps=_light_maps(light, f * data.n_pixels),
+    )
+    x, n_phase = problem.start, problem.phase_map.size**2
     x[:n_phase], x[problem.n_white :] = point.x[:n_phase], point.x[before.n_white :]
     return problem, x
+
+
+def _camera(data: Recording, of: Camera, f: int) -> Camera:
+    """Return a camera with f points along a pixel."""
+    if f == of.f:
+        return of
+    return Camera(of.n, of.shape, data.n_pixels, of.exposures, fine_phase(data.phases, f), f, of.largest)
 
 
 def _changes(data: Recording, point: Point) -> list[list[NDArray[np.float64]]]:
@@ -359,18 +383,14 @@ def _changes(data: Recording, point: Point) -> list[list[NDArray[np.float64]]]:
     First, the light is divided anew. Second, each point keeps its light, and is divided as an edge divides it.
     """
     of, f = point.problem, 2 * point.problem.camera.f
-    camera = of.camera
-    finer = Camera(
-        camera.n, camera.shape, data.n_pixels, camera.exposures, fine_phase(data.phases, f), f, camera.largest
-    )
-    twice = np.ones((2, 2))
+    finer, twice = _camera(data, of.camera, f), np.ones((2, 2))
     light = Light.sharp(np.maximum(point.light_means, 0), f)
     # Halfway between the amplitude of the fit and a new one, of which it is not known which is better.
     light = replace(light, amplitude=(np.kron(of.light.amplitude, twice) + light.amplitude) / 2)
     n = len(point.light)
     sharp = np.kron(light.start.reshape(n, 2, n, 2).mean(axis=(1, 3)), twice)
     share = np.divide(light.start, sharp, out=np.ones_like(sharp), where=sharp > 1e-6)
-    phase = PhaseMap(camera.n, f, _PHASE_PRIOR, data.n_pixels).fine(of.split(point.x)[0][0])
+    phase = PhaseMap(finer.n, f, _PHASE_PRIOR, data.n_pixels).fine(of.split(point.x)[0][0])
     changes = []
     for divided in (light.start, share * np.kron(point.light, twice)):
         images = Linearised(finer, light.maps(divided, phase), point.values).images

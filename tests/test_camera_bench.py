@@ -348,3 +348,16 @@ def test_reverse_order_and_a_command_with_the_wrong_sign_are_reported():
     wrong = fit_bench(frames, clear, phases, **settings)
     assert any(one.startswith("State 2") for one in wrong.remarks)
     assert not wrong.consistent
+
+
+@pytest.mark.slow
+def test_light_of_vanes_needs_a_finer_grid():
+    """The control with a fixed grid does not explain the same frames."""
+    bench = replace(CASES["turned VLT"], pixels=56, side=72).reversed
+    frames, clear, phases = bench.recording(seed=1)
+    settings = {"n_pixels": bench.pixels, "noise": bench.noise}
+    fit, fixed = (fit_bench(frames, clear, phases, **settings, **grid) for grid in ({}, {"oversampling": 2}))
+    assert fit.converged
+    assert np.mean(fit.misfit) < 1 < 1.2 < np.mean(fixed.misfit)
+    for name in ("diameter", "first", "second"):
+        assert fit[name].value == pytest.approx(bench.truth[name], rel=2e-3)

@@ -142,7 +142,7 @@ def count(judged: dict[int, Finding]) -> str:
     """Return a line with the number of claims of each verdict."""
     numbers = Counter(finding.verdict for finding in judged.values())
     listed = ", ".join(f"{numbers[verdict]} {_marked(verdict)}" for verdict in SIGNS)
-    return f"The [{len(judged)} claims of the paper](claims.md): {listed}."
+    return f"Of [{len(judged)} claims that we chose from the paper](claims.md): {listed}."
 
 
 def by_verdict(judged: dict[int, Finding]) -> str:

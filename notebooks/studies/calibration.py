@@ -286,10 +286,10 @@ def draw_calibration_errors(errors: Errors, not_smooth: NDArray) -> Figure:
     names = "plain", "calibrated", "same_prior", "sigma"
     plain, found, control, stated = (errors.column(name) for name in names)
     axes.plot(errors.rms, control, "s--", color="#777777", ms=5, label="design, smooth phases")
-    axes.plot(errors.rms, plain, **LOOKS["PhaseShifted"].style, label="values of the design")
+    axes.plot(errors.rms, plain, **LOOKS["PhaseShifted"].style, label="design, not smooth")
     axes.plot(errors.rms, not_smooth, "D:", color="#333333", mfc="none", ms=6, label="calibrated, not smooth")
     axes.plot(errors.rms, found, "*-", color="#333333", ms=9, label="calibrated, smooth phases")
-    axes.plot(errors.rms, stated, "o", color="#777777", mfc="none", ms=8, label="error bar of these")
+    axes.plot(errors.rms, stated, "o", color="#777777", mfc="none", ms=8, label="error bar of the stars")
     axes.set(xlabel="input (rad rms)", ylabel="error (rad rms)", yscale="log", xlim=(0, None))
     axes.yaxis.set(major_formatter="{x:g}", minor_locator=LogLocator(subs=(2, 4, 6)), minor_formatter="{x:g}")
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)

@@ -8,6 +8,8 @@ import zipfile
 import pytest
 
 import zwfs
+from book._ext.run import ABOUT, package, zipped
+from book._tools.project import Project
 
 from .conftest import ROOT, new_reconstructor
 
@@ -63,3 +65,16 @@ def test_the_wheel_says_that_the_package_has_types(tmp_path):
     sources = (file for file in (ROOT / "zwfs").rglob("*") if file.suffix in (".py", ".typed"))
     assert held == {file.relative_to(ROOT).as_posix() for file in sources}
     assert "zwfs/py.typed" in held
+
+
+def test_pip_installs_the_package_that_the_front_page_offers(tmp_path):
+    files = package(Project(ROOT))
+    about = {name: (ROOT / name).read_bytes() for name in ABOUT}
+    (tmp_path / "zwfs.zip").write_bytes(zipped(files | about))
+    pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-build-isolation", "--target", "here"]
+    subprocess.run([*pip, "zwfs.zip"], cwd=tmp_path, check=True, capture_output=True)
+    here = tmp_path / "here"
+    installed = {
+        one.relative_to(here).as_posix() for one in here.rglob("zwfs/**/*") if one.suffix in (".py", ".typed")
+    }
+    assert installed == set(files)

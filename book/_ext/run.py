@@ -32,7 +32,9 @@ from studies.kit.results import published
 
 COPY = "_static/pyodide"
 DATA = "_static/run"
+PACKAGE = "_static/zwfs.zip"
 KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the version that this book uses
+ABOUT = ("pyproject.toml", "README.md", "LICENSE", "LICENSE-TEXT")
 SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
 SKIPPED = "colab"  # tag of cells that the page leaves out
 POLICY = '<meta http-equiv="Content-Security-Policy" content="{}"/>'
@@ -114,10 +116,7 @@ def limits(parameter: Parameter) -> dict[str, Any]:
 
 def site(project: Project) -> bytes:
     """Return a ZIP of the code and data that the page needs."""
-    files = {
-        f"zwfs/{file.relative_to(project.root / 'zwfs').as_posix()}": file.read_bytes()
-        for file in (project.root / "zwfs").rglob("*.py")
-    }
+    files = package(project)
     studies = (file for file in project.modules() if file.is_relative_to(project.studies))
     files |= {file.relative_to(project.notebooks).as_posix(): file.read_bytes() for file in studies}
     files["driver.py"] = Path(__file__).with_name("driver.py").read_bytes()
@@ -127,6 +126,14 @@ def site(project: Project) -> bytes:
         if file.suffix == ".py" or file.match("*.dist-info/METADATA") or file.match("*.dist-info/licenses/*"):
             files[file.as_posix()] = file.read_binary()
     return zipped(files)
+
+
+def package(project: Project) -> dict[str, bytes]:
+    """Return the files of the package by name."""
+    files = (
+        file for file in (project.root / "zwfs").rglob("*") if file.suffix == ".py" or file.name == "py.typed"
+    )
+    return {file.relative_to(project.root).as_posix(): file.read_bytes() for file in files}
 
 
 def zipped(files: dict[str, bytes]) -> bytes:
@@ -150,6 +157,8 @@ def write(app: Sphinx, exception: Exception | None) -> None:
         notebook = nbformat.read(source, as_version=4)
         write_script(folder / f"{source.stem}.js", "zwfsNotebook", described(notebook, source.stem))
     write_script(folder / "files.js", "zwfsFiles", base64.b64encode(site(project)).decode())
+    about = {name: (project.root / name).read_bytes() for name in ABOUT}
+    Path(app.outdir, PACKAGE).write_bytes(zipped(package(project) | about))  # pip installs it
     known, where = json.loads(KNOWN.read_text("utf-8")), place(app)
     write_script(folder / "settings.js", "zwfsPython", known | {"place": where})
     add_policies(Path(app.outdir), where)

@@ -53,7 +53,8 @@ class Address:
     def texts(self) -> dict[str, str]:
         """Return the parts of pages that depend on the address, as MyST."""
         if not self.repository:
-            return {"install": "In a clone of the repository:\n\n```sh\npip install .\n```", "clone": ""}
+            package = 'Download the package, <a href="../_static/zwfs.zip" download>zwfs.zip</a>, and install it:'
+            return {"install": f"{package}\n\n```sh\npip install zwfs.zip\n```", "clone": ""}
         return {
             "install": f'```sh\npip install "zwfs @ git+{self.repository}"\n```',
             "clone": f"```sh\ngit clone {self.repository}\ncd {self.folder}\n```",

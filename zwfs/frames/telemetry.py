@@ -216,7 +216,8 @@ class _Job:
         if wavelength is not None:
             wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
         level = calibration.saturation if saturation is None else saturation
-        level = stack.saturation if saturation is None and level == np.inf else level
+        if saturation is None and level == np.inf:
+            level = stack.saturation
         self.saturation = _number_or_inf("saturation", level, open_low=True)
         self.keywords = _columns(stack, keywords)
         names = max(len(card_value(one.name)) for one in stack.firsts)

@@ -51,7 +51,8 @@ def test_claims_have_their_verdicts(plain_book):
         rule = read(plain_book / "book" / "claims.html").find(id=name)
         assert f"number: {int(row.td.get_text().partition('.')[0])}" in rule.find_parent("details").get_text()
         assert "def numbers(" in rule.find_parent("details").get_text()
-    assert "The 21 claims" in read(plain_book / "book" / "index.html").article.get_text()
+    counts = re.search(r"Of 21 claims.*", read(plain_book / "book" / "index.html").article.get_text()).group()
+    assert sum(map(int, re.findall(r"\d+(?= [✔◐✘○])", counts))) == 21
 
 
 def test_figures_have_cards_with_their_notebooks_and_the_address_leads_to_the_front_page(plain_book):
@@ -114,7 +115,10 @@ def test_book_without_an_address_promises_none(plain_book):
         public = [link for link in links(file) if re.search("executablebooks|/issues/new|/blob/", link)]
         assert not launches(file) | {*public}, file.name
         assert not read(file).select("link[rel=canonical], meta[property='og:url'], meta[property='og:image']")
-    assert "pip install .\n" in read(plain_book / "book" / "index.html").article.get_text()
+    front = plain_book / "book" / "index.html"
+    (archive,) = (link for link in links(front) if link.endswith(".zip"))
+    assert f"pip install {archive.rpartition('/')[2]}\n" in read(front).article.get_text()
+    assert (front.parent / archive).is_file()
     assert "git clone" not in read(plain_book / "book" / "checking.html").article.get_text()
 
 

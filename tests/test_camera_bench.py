@@ -351,6 +351,21 @@ def test_reverse_order_and_a_command_with_the_wrong_sign_are_reported():
 
 
 @pytest.mark.slow
+def test_focus_has_its_sign_on_sharp_images(monkeypatch):
+    """Without a second try, the fit ends with one or both signs reversed, and says that it explains nothing."""
+    bench = replace(CASES["disc"], blur=0.3)
+    frames, clear, phases = bench.recording(seed=3)
+    settings = {"n_pixels": bench.pixels, "noise": bench.noise, "oversampling": 2}
+    fit = fit_bench(frames, clear, phases, **settings)
+    monkeypatch.setattr("zwfs._camera.bench._WRONG", np.inf)
+    control = fit_bench(frames, clear, phases, **settings)
+    assert fit.consistent
+    assert not control.consistent
+    for side in (0, 1):
+        assert fit[f"arm {side} focus"].value == pytest.approx(bench.focus[side], abs=3e-5)
+
+
+@pytest.mark.slow
 def test_light_of_vanes_needs_a_finer_grid():
     """The control with a fixed grid does not explain the same frames."""
     bench = replace(CASES["turned VLT"], pixels=56, side=72).reversed

@@ -41,8 +41,12 @@ EXPLAINED = 1.2
 """Mean square of the residuals over the noise up to which a model explains the frames."""
 _FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
 _PHASE_PRIOR = MapPrior(0.5, 3.0)
+_LEAST_FOCUS = 2e-4  # D^2 / lambda, where a fit starts with another sign of the focus
+_WRONG = 3.0  # misfit of a wrong sign of the focus, over that of noise, at least
 _DIVIDED = 0.1  # rms error of the light of a point that an edge or a vane divides, over that of a full one
 _PIXEL = 1 / 12  # pixels squared: variance of the area of a pixel; f points along it lack 1 / f^2 of it
+# Errors in frames of HCIPy, almost without noise, of which a finer grid shows too little: radian and D^2 / lambda.
+_ACCURACY = {"phase shift": 3e-4, "focus": 5e-6}
 _PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the physics
 _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
 
@@ -53,13 +57,14 @@ class _Stage(NamedTuple):
     n_inner: int  # iterations for a step
     focus: bool  # whether the focus is free
     divide: bool  # whether the light is divided anew after it
+    signs: bool = False  # whether other signs of the focus are tried if it does not explain the frames
 
 
 # With a large error allowed, edges have little weight, and the numbers find their places in a few steps. A focus
-# that is free from the start can take the wrong sign.
+# that is free from the start can take the wrong sign; on sharp images it can take it later, too.
 _STAGES = (
     _Stage(0.1, 0.1, 25, focus=False, divide=False),
-    _Stage(0.05, 0.1, 25, focus=True, divide=True),
+    _Stage(0.05, 0.1, 25, focus=True, divide=True, signs=True),
     _Stage(0.01, 0.1, 35, focus=True, divide=True),
     _Stage(0.0, 1e-3, 35, focus=True, divide=False),
 )
@@ -73,7 +78,8 @@ class Estimate(NamedTuple):
     name : str
     value : float
     sigma : float
-        One standard deviation, with the maps and all other numbers free. It grows with the root of the misfit.
+        One standard deviation, with the maps and all other numbers free. It grows with the root of the misfit, and
+        includes what the model misses, as far as a finer grid or frames of HCIPy show it.
     at_limit : bool
         Whether the value is one of its limits, so that the error bar does not hold.
     """
@@ -332,9 +338,30 @@ def _light_maps(light: Light, n_pixels: float) -> tuple[LightMap, ...]:
 def _fitted(data: Recording, problem: Problem, x: NDArray, stages: Sequence[_Stage], n_steps: int) -> Point:
     """Return where the stages of a fit end."""
     for stage in stages:
-        point, _ = minimise(_staged(data, problem, stage), x, n_steps, stage.n_inner, stage.enough)
+        staged = _staged(data, problem, stage)
+        point, _ = minimise(staged, x, n_steps, stage.n_inner, stage.enough)
+        if stage.signs and np.mean(point.misfit) > _WRONG * _expected(problem, staged):
+            others = [
+                minimise(staged, one, n_steps, stage.n_inner, stage.enough)[0] for one in _other_signs(point)
+            ]
+            point = min(point, *others, key=lambda one: one.cost)
         problem, x = _next(data, point, stage.divide)
     return point
+
+
+def _expected(problem: Problem, staged: Problem) -> float:
+    """Return the misfit of noise alone, with the error that a stage allows."""
+    pairs = zip(problem.weights, staged.weights, strict=True)
+    return float(np.mean([np.mean((few / many)[many > 0] ** 2) for many, few in pairs]))
+
+
+def _other_signs(point: Point) -> list[NDArray[np.float64]]:
+    """Return the unknowns of a point with all other signs of the focus in the two arms."""
+    focus = [point.problem.n_white + k for k, one in enumerate(point.problem.free) if one.name.endswith("focus")]
+    signed = np.copysign(np.maximum(np.abs(point.x[focus]), _LEAST_FOCUS), point.x[focus])
+    starts = np.repeat(point.x[None], 3, axis=0)
+    starts[:, focus] = signed * [(-1, -1), (-1, 1), (1, -1)]
+    return list(starts)
 
 
 def _staged(data: Recording, problem: Problem, stage: _Stage) -> Problem:
@@ -406,8 +433,10 @@ def _result(data: Recording, point: Point, is_reversed: bool) -> BenchFit:
     scale = max(1.0, float(np.mean(misfit)))
     spread = equations.covariance(point, _changes(data, point), scale)
     values = point.x[point.problem.n_white :]
-    blur = [one.name for one in point.problem.free].index("blur")
+    kinds = [one.kind for one in point.problem.free]
+    blur = kinds.index("blur")
     spread[blur, blur] += (MISSED * _PIXEL / point.problem.camera.f**2 / (2 * values[blur])) ** 2
+    spread += np.diag([_ACCURACY.get(kind, 0.0) ** 2 for kind in kinds])
     sigma = np.sqrt(np.diagonal(spread)).tolist()
     estimates = tuple(
         Estimate(one.name, value, error, not one.low < value < one.high)

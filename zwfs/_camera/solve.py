@@ -41,6 +41,11 @@ class Free(NamedTuple):
     high: float = math.inf
     sigma: float = math.inf  # of its prior
 
+    @property
+    def kind(self) -> str:
+        """Name without that of the arm or the image."""
+        return "phase shift" if self.name in ("first", "second") else self.name.split()[-1]
+
 
 class MapPrior(NamedTuple):
     """Gaussian prior of a map: its power spectral density is a power law, flat below 1 cycle / outer scale."""
@@ -456,7 +461,7 @@ class Eliminated:
         held = np.arange(n_all) >= n
         self._unit = np.sqrt(np.diagonal(point.block))
         along = [[one / unit for one in point.along(number)] for number, unit in enumerate(self._unit)]
-        followed = point.solve(np.array([point.back(one) for one in along]), held, 10, 0.02)
+        followed = point.solve(np.array([point.back(one) for one in along]), held, 16, 0.01)
         self._effects = [
             [one - other for one, other in zip(of, point.change(solution), strict=True)]
             for of, solution in zip(along, followed, strict=True)
@@ -486,15 +491,19 @@ class Eliminated:
         pixels, and the scores E^T r of square blocks scatter more than noise makes them:
         S^-1 (sum of their squares + X^T X + prior) S^-1 replaces what is smaller. A change d of the images, over
         their noise, moves the numbers by S^-1 E^T d. The errors of the model are taken to be a part of the rms of
-        these moves.
+        these moves. Few changes are known, so the rms, over the noise, is that of all numbers of a kind, such as
+        the focus of both arms.
         """
         inverse = linalg.pinvh(self._matrix, rtol=_ALIKE)
         sums = [[r * one for r, one in zip(point.residuals, each, strict=True)] for each in self._effects]
         scores = _block_sums(sums)
         seen = np.diagonal(inverse @ (scores @ scores.T + self._known) @ inverse) / np.diagonal(inverse)
         grow = np.sqrt(np.maximum(scale, seen)) / self._unit
-        moved = inverse @ (self._e @ np.transpose([_joined(one) for one in changes])) / self._unit[:, None]
-        missed = MISSED**2 * np.mean(moved**2, axis=1)
+        moved = inverse @ (self._e @ np.transpose([_joined(one) for one in changes]))
+        squares = np.mean(moved**2, axis=1) / np.diagonal(inverse)
+        kinds = np.array([one.kind for one in point.problem.free])
+        alike = np.array([np.mean(squares[kinds == kind]) for kind in kinds])
+        missed = MISSED**2 * alike * np.diagonal(inverse) / self._unit**2
         return inverse * np.outer(grow, grow) + np.diag(missed)
 
 

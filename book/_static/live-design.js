@@ -99,7 +99,7 @@
     const [a, b] = pair.map((shift) => `${shift.toFixed(2)}π`.replace("-", "−"));
     const known = photons(diameter, pair);
     const other = Math.abs(a + b) > 1e-6 ? "the map has shifts of equal size only" : "not on this map";
-    const answer = known ? `${known.toPrecision(3)} times the photons of an ideal sensor` : other;
+    const answer = known ? `${known.toPrecision(3)} times the photons of an ideal sensor (${wavefronts()})` : other;
     return `${diameter.toFixed(2)} λ/D, ${a} and ${b}: ${answer}`;
   }
 

@@ -112,8 +112,8 @@
     const parts = columns(made, set).map(({ name, made: one }) => {
       if (!one) return `${name}: no unique solution`;
       const error = one.errors.at(-1);
-      const off = error < set.rms ? `off by ${share(error, set.rms)}` : "fails";
-      return `${name} ${succeeds(error, set.rms) ? "recovers the phase" : off} (${draw.error(error)} rad)`;
+      const found = succeeds(error, set.rms) ? "recovers the phase" : `off by ${share(error, set.rms)}`;
+      return `${name} ${found} (${draw.error(error)} rad)`;
     });
     return `Input ${set.rms.toFixed(2)} rad rms, Strehl ratio ${made.strehl.toFixed(2)}. Errors: ${parts.join(", ")}.`;
   }

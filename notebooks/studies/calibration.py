@@ -241,10 +241,13 @@ class Errors:
     rms: NDArray[np.float64]  # (n,) rad
     measured: list[list[Measured]]  # for each input, one for each screen
 
+    def single(self, name: str) -> NDArray[np.float64]:
+        """Attribute of each screen, (n, n_screens)."""
+        return np.array([[getattr(one, name) for one in row] for row in self.measured])
+
     def column(self, name: str) -> NDArray[np.float64]:
         """Root mean square over the screens of an attribute, (n,)."""
-        values = np.array([[getattr(one, name) for one in row] for row in self.measured])
-        return np.sqrt(np.mean(values**2, axis=1))
+        return np.sqrt(np.mean(self.single(name) ** 2, axis=1))
 
 
 def measure_inputs(
@@ -290,6 +293,8 @@ def draw_calibration_errors(errors: Errors, not_smooth: NDArray) -> Figure:
     axes.plot(errors.rms, not_smooth, "D:", color="#333333", mfc="none", ms=6, label="calibrated, not smooth")
     axes.plot(errors.rms, found, "*-", color="#333333", ms=9, label="calibrated, smooth phases")
     axes.plot(errors.rms, stated, "o", color="#777777", mfc="none", ms=8, label="error bar of the stars")
+    for name, color in (("plain", LOOKS["PhaseShifted"].color), ("calibrated", "#333333")):
+        axes.plot(errors.rms, errors.single(name), "_", color=color, ms=9)
     axes.set(xlabel="input (rad rms)", ylabel="error (rad rms)", yscale="log", xlim=(0, None))
     axes.yaxis.set(major_formatter="{x:g}", minor_locator=LogLocator(subs=(2, 4, 6)), minor_formatter="{x:g}")
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)

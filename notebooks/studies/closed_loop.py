@@ -368,13 +368,15 @@ def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
     axes.annotate("closed: below half\nof the start", (starts[0], starts[0] / 2), (0, 16), **text)
     axes.margins(y=0.12)
     for one in some:
-        for names, place, side in ((ONE_IMAGE, max, (-8, 3)), (TWO_IMAGES, min, (-8, -12))):
+        for names, of, place, side in ((ONE_IMAGE, "", max, (-8, 3)), (TWO_IMAGES, "two: ", min, (-8, -12))):
             drawn = [name for name in names if name in one.settled]
             n_loops, closed = one.settled[drawn[0]].size, sorted({one.closed(name) for name in drawn})
             if closed[0] < n_loops:
                 count = "\N{EN DASH}".join(map(str, dict.fromkeys((closed[0], closed[-1]))))
                 point = one.start, place(typical(one.settled[name]) for name in drawn)
-                axes.annotate(f"{count} of {n_loops}", point, side, ha="right", bbox=_WHITE, **text)
+                first = one.start == min(starts)  # no room on its left
+                offset, align = ((6, -18), "left") if first else (side, "right")
+                axes.annotate(f"{of}{count} of {n_loops}", point, offset, ha=align, bbox=_WHITE, **text)
     pairs = [[typical(one.settled[name]) for name in TWO_IMAGES if name in one.settled] for one in some]
     if all(max(errors) <= ALIKE * min(errors) for errors in pairs):
         where: dict[str, Any] = {"transform": axes.transAxes, "ha": "right", "va": "bottom"}
@@ -414,7 +416,7 @@ def tuned_screens(trials: Sequence[TunedLoops]) -> dict[str, NDArray]:
 
 def best_table(rows: Sequence[BestMethods]) -> Table:
     """Return the best method with two images and with one for each input and star, and how its loops end."""
-    header = "start; photons per point and image", "two images", "one image", "ratio of the residuals"
+    header = "start; photons per point and image", "two images", "one image", "one over two"
     cells = []
     for row in rows:
         loops = row.loops
@@ -425,9 +427,9 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
             ends.append(
                 f"{_short(name)}: {two_digits(typical(loops.settled[name]))}; gain {loops.gains[name]:g}{few}"
             )
-        span = f"{row.low:.2f} to {row.high:.2f}" if row.high < np.inf else "one loop"
+        span = f"{1 / row.high:.2g} to {1 / row.low:.2g}" if row.high < np.inf else "one loop"
         light = f"{loops.photons:g} photon{'s' * (loops.photons != 1)}"
-        cells.append([f"{loops.start:g} rad rms; {light}", *ends, f"{row.ratio:.2f} ({span})"])
+        cells.append([f"{loops.start:g} rad rms; {light}", *ends, f"{1 / row.ratio:.2g} ({span})"])
     return Table(header, cells)
 
 

@@ -68,7 +68,7 @@ NO_NOISE = 1e9
 """Photons per point and image at which a loop has almost no noise."""
 LOOP: dict[str, Any] = {"rate": 1000.0, "delay": 2, "stroke": 4.0, "n_steps": 40}
 WIND = {"speed": 2.5, "cutoff": 3.0, "exponent": -2.0}
-GAINS = 0.05, 0.1, 0.2, 0.4, 0.6, 0.8
+GAINS = 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9
 """Settings of the chapter on closed loops."""
 BENCH_GAIN = 0.4
 """Of the loops on a bench with errors."""

@@ -479,8 +479,8 @@ def numbers(
     for name, short in _SHORT.items():
         found[f"{short}_limit"] = limits[name].value
     found |= _phrases(curves, limits, threshold)
-    longer = Limit(by_width.dynamic_range(repaired, threshold))
-    found["saxton_model_limit_longer"] = longer.value
-    found["saxton_model_reach_longer"] = _reach(by_width, repaired, threshold, longer)
+    longer = round(by_width.dynamic_range(repaired, threshold), 1)  # between inputs that lie far apart
+    found["saxton_model_limit_longer"] = longer
+    found["saxton_model_reach_longer"] = _reach(by_width, repaired, threshold, Limit(longer))
     # All digits of a rounding error but its power of ten depend on the machine.
     return rounded(found) | rounded({"run_out": 10 ** np.ceil(np.log10(run_out))}, ".0e")

@@ -34,10 +34,14 @@ SHORT = {
 """Reconstructors by their names in the text."""
 
 
-def reach(curves: BenchCurves, name: str, ratio: float = 0.25) -> float:
-    """Largest input whose mean error is at most `ratio` times the input, rad rms; 0 if there is none."""
-    good = (curves.rms > 0) & (curves.mean(name) <= ratio * curves.rms)
-    return float(curves.rms[good].max(initial=0.0))
+def reach(curves: BenchCurves, name: str) -> float:
+    """Largest input whose mean error is at most 25 % of the input, rad rms; 0 if there is none."""
+    return float(_within(curves, name).max(initial=0.0))
+
+
+def _within(curves: BenchCurves, name: str) -> NDArray[np.floating]:
+    """Inputs above 0 whose mean error is at most 25 % of the input, rad rms."""
+    return curves.rms[(curves.rms > 0) & (curves.mean(name) <= 0.25 * curves.rms)]
 
 
 def draw_bench_linearity(curves: BenchCurves) -> Figure:
@@ -69,19 +73,19 @@ def curve_columns(curves: BenchCurves) -> dict[str, NDArray]:
 
 
 def reach_table(curves: BenchCurves) -> Table:
-    """Error at a flat command, reach and gain of each reconstructor."""
+    """Error at a flat command, inputs with a small relative error, and gain of each reconstructor."""
     smallest = np.flatnonzero(curves.rms > 0)[0]
     header = [
         "reconstructor",
         "error at a flat command (rad rms)",
-        "reach (rad rms)",
+        "error ≤ 25 % of the input (rad rms)",
         "gain, smallest input",
     ]
     rows = [
         [
             LOOKS[name].name,
             f"{curves.mean(name)[0]:.2g}",
-            _at_least(reach(curves, name), curves.rms.max()),
+            _span(_within(curves, name), curves.rms.max()),
             float(curves.gain(name)[smallest]),
         ]
         for name in curves.residuals
@@ -89,9 +93,11 @@ def reach_table(curves: BenchCurves) -> Table:
     return Table(header, rows)
 
 
-def _at_least(reached: float, largest: float) -> str:
-    """Largest input that a method reaches, in words; the largest one that was tried is a bound."""
-    return f"{'≥ ' if reached == largest else ''}{reached:g}" if reached else "none"
+def _span(inputs: NDArray, largest: float) -> str:
+    """Smallest and largest of some inputs, in words; the largest one that was tried is a bound."""
+    if not inputs.size:
+        return "none"
+    return f"{inputs[0]:g} to {'≥ ' if inputs[-1] == largest else ''}{inputs[-1]:g}"
 
 
 def numbers(curves: BenchCurves) -> dict[str, float | str]:

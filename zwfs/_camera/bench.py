@@ -6,6 +6,7 @@ pair of frames.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -45,8 +46,10 @@ _LEAST_FOCUS = 2e-4  # D^2 / lambda, where a fit starts with another sign of the
 _WRONG = 3.0  # misfit of a wrong sign of the focus, over that of noise, at least
 _DIVIDED = 0.1  # rms error of the light of a point that an edge or a vane divides, over that of a full one
 _PIXEL = 1 / 12  # pixels squared: variance of the area of a pixel; f points along it lack 1 / f^2 of it
-# Errors in frames of HCIPy, almost without noise, of which a finer grid shows too little: radian and D^2 / lambda.
-_ACCURACY = {"phase shift": 3e-4, "focus": 5e-6}
+# Errors in frames of HCIPy of which a finer grid shows too little: with a blur (radian, D^2 / lambda), and without
+# (pixels, radian, 1), where light that changes within a pixel aliases.
+_BLURRED = {"phase shift": 3e-4, "focus": 5e-6}
+_SHARP = {"row": 1.2e-3, "column": 1.2e-3, "rotation": 2e-4, "magnification": 4e-5}
 _PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the physics
 _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
 
@@ -436,7 +439,9 @@ def _result(data: Recording, point: Point, is_reversed: bool) -> BenchFit:
     kinds = [one.kind for one in point.problem.free]
     blur = kinds.index("blur")
     spread[blur, blur] += (MISSED * _PIXEL / point.problem.camera.f**2 / (2 * values[blur])) ** 2
-    spread += np.diag([_ACCURACY.get(kind, 0.0) ** 2 for kind in kinds])
+    passed = math.exp(-2 * (math.pi * values[blur]) ** 2)  # by the blur, at one cycle per pixel
+    missed = [(1 - passed) * _BLURRED.get(kind, 0.0) + passed * _SHARP.get(kind, 0.0) for kind in kinds]
+    spread += np.diag(np.square(missed))
     sigma = np.sqrt(np.diagonal(spread)).tolist()
     estimates = tuple(
         Estimate(one.name, value, error, not one.low < value < one.high)

@@ -326,13 +326,14 @@ def test_evidence_chooses_a_prior_as_smooth_as_the_phase(calibrated, monkeypatch
 
 
 @pytest.mark.slow
-def test_error_bars_of_a_fit_cover_the_true_values():
+@pytest.mark.parametrize("bench", [BENCH, replace(CASES["ideal"], pixels=40, side=56)], ids=["errors", "ideal"])
+def test_error_bars_of_a_fit_cover_the_true_values(bench):
     """Numbers of five draws of the noise. The error bars also hold what the model misses."""
     pulls = []
     for seed in range(5):
-        frames, clear, phases = BENCH.recording(seed=seed)
-        fit = fit_bench(frames, clear, phases, n_pixels=BENCH.pixels, noise=BENCH.noise)
-        pulls.append(list(BENCH.pulls(fit).values()))
+        frames, clear, phases = bench.recording(seed=seed)
+        fit = fit_bench(frames, clear, phases, n_pixels=bench.pixels, noise=bench.noise)
+        pulls.append(list(bench.pulls(fit).values()))
     pulls = np.abs(pulls)
     assert 0.5 < np.mean(pulls < 1) < 0.85
     assert pulls.max() < 4.5

@@ -291,9 +291,10 @@ def draw_calibration_errors(errors: Errors, not_smooth: NDArray) -> Figure:
     axes.plot(errors.rms, control, "s--", color="#777777", ms=5, label="design, smooth phases")
     axes.plot(errors.rms, plain, **LOOKS["PhaseShifted"].style, label="design, not smooth")
     axes.plot(errors.rms, not_smooth, "D:", color="#333333", mfc="none", ms=6, label="calibrated, not smooth")
-    axes.plot(errors.rms, found, "*-", color="#333333", ms=9, label="calibrated, smooth phases")
-    axes.plot(errors.rms, stated, "o", color="#777777", mfc="none", ms=8, label="error bar of the stars")
-    for name, color in (("plain", LOOKS["PhaseShifted"].color), ("calibrated", "#333333")):
+    best = LOOKS["MaximumLikelihood"].color
+    axes.plot(errors.rms, found, "*-", color=best, ms=9, label="calibrated, smooth phases")
+    axes.plot(errors.rms, stated, "o", color=best, mfc="none", ms=8, label="error bar of the stars")
+    for name, color in (("plain", LOOKS["PhaseShifted"].color), ("calibrated", best)):
         axes.plot(errors.rms, errors.single(name), "_", color=color, ms=9)
     axes.set(xlabel="input (rad rms)", ylabel="error (rad rms)", yscale="log", xlim=(0, None))
     axes.yaxis.set(major_formatter="{x:g}", minor_locator=LogLocator(subs=(2, 4, 6)), minor_formatter="{x:g}")
@@ -331,7 +332,7 @@ def numbers(
             "misfit": float(np.mean(fit.misfit)),
             "verdict": "consistent" if fit.consistent else "not consistent",
             "remarks": " ".join(fit.remarks) or "none",
-            "largest_deviation": np.abs(deviations).max(),
+            "largest_deviation": np.round(np.abs(deviations).max(), 1),  # as in the table
             "deviation_rms": np.sqrt(np.mean(np.square(deviations))),
             "diameter_error": 100 * abs(fit["diameter"].value / true["diameter"] - 1),
             "shift_error": 100 * max(abs(fit[name].value / true[name] - 1) for name in ("first", "second")),

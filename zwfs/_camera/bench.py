@@ -355,7 +355,7 @@ def _fitted(data: Recording, problem: Problem, x: NDArray, stages: Sequence[_Sta
 def _expected(problem: Problem, staged: Problem) -> float:
     """Return the misfit of noise alone, with the error that a stage allows."""
     pairs = zip(problem.weights, staged.weights, strict=True)
-    return float(np.mean([np.mean((few / many)[many > 0] ** 2) for many, few in pairs]))
+    return float(np.mean([np.mean((few[many > 0] / many[many > 0]) ** 2) for many, few in pairs]))
 
 
 def _other_signs(point: Point) -> list[NDArray[np.float64]]:

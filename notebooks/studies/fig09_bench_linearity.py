@@ -35,12 +35,12 @@ SHORT = {
 
 
 def reach(curves: BenchCurves, name: str) -> float:
-    """Largest input whose mean error is at most 25 % of the input, rad rms; 0 if there is none."""
+    """Return the largest input of `_within`, rad rms, or 0."""
     return float(_within(curves, name).max(initial=0.0))
 
 
 def _within(curves: BenchCurves, name: str) -> NDArray[np.floating]:
-    """Inputs above 0 whose mean error is at most 25 % of the input, rad rms."""
+    """Return the inputs (rad rms) at which the mean error is at most 25 % of the input, without 0."""
     return curves.rms[(curves.rms > 0) & (curves.mean(name) <= 0.25 * curves.rms)]
 
 

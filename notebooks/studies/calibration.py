@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from studies.kit import sweeps
 from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
-from studies.kit.style import LOOKS
+from studies.kit.style import LOOKS, OTHER_STYLES
 from studies.kit.tables import Table
 from zwfs.frames import BenchFit, Calibration, FittedSensor, fit_bench
 from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
@@ -291,7 +291,7 @@ def draw_calibration_errors(errors: Errors, not_smooth: NDArray) -> Figure:
     axes.plot(errors.rms, control, "s--", color="#777777", ms=5, label="design, smooth phases")
     axes.plot(errors.rms, plain, **LOOKS["PhaseShifted"].style, label="design, not smooth")
     axes.plot(errors.rms, not_smooth, "D:", color="#333333", mfc="none", ms=6, label="calibrated, not smooth")
-    best = LOOKS["MaximumLikelihood"].color
+    best = OTHER_STYLES[1]["color"]
     axes.plot(errors.rms, found, "*-", color=best, ms=9, label="calibrated, smooth phases")
     axes.plot(errors.rms, stated, "o", color=best, mfc="none", ms=8, label="error bar of the stars")
     for name, color in (("plain", LOOKS["PhaseShifted"].color), ("calibrated", best)):

@@ -344,6 +344,7 @@ def wait_for_address(page, *parts):
         ("Dimple too large", "✗✗✗", "phase-shifted"),
         ("Out of range", "✗✗✗", "phase-shifted"),
         ("A large input", "✗✗✗", "phase-shifted"),
+        ("The same, accelerated", "✗✗✓", "accelerated"),
         ("The same with maximum likelihood", "✗✗✓", "maximum likelihood"),
         ("A small input", "✗✓✓", "phase-shifted"),
     ],

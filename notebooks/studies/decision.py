@@ -50,13 +50,13 @@ QUICK |= {"n_pixels": 32, "n_screens_calibrated": 0, "n_steps_bench": 6}
 
 BENCHES = {"perfect": "perfect model", "real": "uncalibrated bench"}
 """What is known of the bench, and its name in the table."""
-ONE_IMAGE = {"Linear": "linear", "Arcsine": "arcsine", "LikelihoodOne": "maximum likelihood on modes"}
+ONE_IMAGE = {"Linear": "linear", "Arcsine": "arcsine", "LikelihoodOne": "maximum likelihood on pistons"}
 TWO_IMAGES = {
     "LinearTwo": "linear",
     "PhaseShifted": "phase-shifted",
     "Accelerated": "phase-shifted, accelerated",
     "MaximumLikelihood": "maximum likelihood",
-    "LikelihoodModes": "maximum likelihood on modes",
+    "LikelihoodModes": "maximum likelihood on pistons",
 }
 """Methods, the simplest first, and their names in the table."""
 UNCORRECTED = "PhaseShifted with the offset of its flat"

@@ -368,7 +368,7 @@ def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
     axes.annotate("closed: below half\nof the start", (starts[0], starts[0] / 2), (0, 16), **text)
     axes.margins(y=0.12)
     for one in some:
-        for names, of, place, side in ((ONE_IMAGE, "", max, (-8, 3)), (TWO_IMAGES, "two: ", min, (-8, -12))):
+        for names, of, place, side in ((ONE_IMAGE, "", max, (-8, 3)), (TWO_IMAGES, "two: ", min, (-8, -20))):
             drawn = [name for name in names if name in one.settled]
             n_loops, closed = one.settled[drawn[0]].size, sorted({one.closed(name) for name in drawn})
             if closed[0] < n_loops:

@@ -449,6 +449,7 @@ def numbers(
     found: dict[str, Any] = {
         "saxton_limit": limits["GerchbergSaxton"].value,
         "gain": gain.value,
+        "gain_over_arcsine": limits["PhaseShifted"].over(limits["Arcsine"]).value,
         "arcsine_over_linear": np.max(mean["Arcsine"][low] / mean["Linear"][low], initial=0),
         "arcsine_ratio_at_05": mean["Arcsine"][half] / rms[half],
         "alike_up_to": alike,

@@ -359,6 +359,17 @@ def test_presets_and_buttons_set_the_sensor_up(fresh, preset, expected, named):
     assert fresh.inner_text("#live-name-2") == named
 
 
+def test_next_leads_through_all_that_there_is_to_try(fresh):
+    names = re.findall(r"<button .*?>(.*?)</button>", TRIES)
+    first, *others = names
+    fresh.click(f"button:text-is('{first}')")
+    for name in others:
+        assert fresh.inner_text("#live-next") == f"Next: {name}"
+        fresh.click("#live-next")
+        assert fresh.inner_text("#live-tried").startswith(f"{name}: ")
+    assert fresh.is_hidden("#live-next")
+
+
 def test_designs_keep_the_input_and_the_address_follows_them(fresh):
     fresh.evaluate("window.zwfsLive.page.set({ rms: '0.3', seed: '5', 'per-point': '3' })")
     fresh.click("button:text-is('Keck')")

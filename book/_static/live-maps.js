@@ -25,13 +25,13 @@
   }
 
   function scientific(number) {
-    const [digits, exponent] = number.toExponential(1).split("e");
-    return `${digits} × ${power(10 ** Number(exponent))}`;
+    const [digits, exponent] = number.toExponential(0).split("e");
+    return `${digits}×${power(10 ** Number(exponent))}`;
   }
 
   function error(number) {
     if (number < SMALLEST) return `< ${power(SMALLEST)}`;
-    return number < 0.01 ? scientific(number) : number.toPrecision(2);
+    return number < 0.001 ? scientific(number) : number.toPrecision(2);
   }
 
   // Paint values on a canvas, transparent elsewhere; level turns a value into a share of the palette.

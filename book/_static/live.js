@@ -220,6 +220,14 @@
     caption(input);
   }
   find("play").addEventListener("click", () => play(!playing));
+  const tries = [...document.querySelectorAll("button[data-live]")].filter((button) => !button.closest("#live"));
+  const next = find("next");
+  const offer = (place) => {
+    next.hidden = place >= tries.length;
+    next.textContent = `Next: ${tries[place]?.textContent}`;
+    next.onclick = () => tries[place].click();
+  };
+  offer(0);
   for (const button of document.querySelectorAll("button[data-live]")) {
     button.addEventListener("click", () => {
       play(false);
@@ -236,6 +244,7 @@
       before = undefined;
       const [name, said] = [button.textContent, button.parentElement.textContent.trim()];
       find("tried").textContent = `${name}: ${said.slice(name.length).trim()}`;
+      offer(tries.indexOf(button) + 1);
       document.getElementById("live").scrollIntoView();
       if ("play" in button.dataset) play(true);
     });

@@ -224,7 +224,7 @@
   const next = find("next");
   const offer = (place) => {
     next.hidden = place >= tries.length;
-    next.textContent = `Next: ${tries[place]?.textContent}`;
+    next.textContent = `Next: ${tries[place]?.textContent ?? "nothing"}`;
     next.onclick = () => tries[place].click();
   };
   offer(0);

@@ -433,7 +433,7 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
 def draw_model_errors(curves: Mapping[str, ErrorCurves], noise: NoiseCurves, threshold: float) -> Figure:
     """Median error against the input for frames that the model does not describe, for two methods."""
     figure, panels = plt.subplots(1, 2, figsize=(7, 4.6), sharey=True)
-    styles = [*OTHER_STYLES, {"color": _INK, "marker": "s", "linestyle": "-"}]
+    styles = [*OTHER_STYLES, {"color": _INK, "marker": "o", "markerfacecolor": "none", "linestyle": "-"}]
     for axes, name in zip(panels, (ACCELERATED, LIKELY), strict=True):
         for (kind, curve), style in zip(curves.items(), styles, strict=False):
             axes.plot(curve.rms, np.median(curve.errors[name], axis=1), label=kind, ms=5, **style)
@@ -464,7 +464,7 @@ def draw_causes(found: Causes, threshold: float) -> Figure:
     color = LOOKS[PLAIN].color
     contracts = 100 * np.mean(found.factor < 1, axis=1)
     [line] = share.plot(found.curves.rms, contracts, color=_INK, lw=4, alpha=0.4)
-    handles, labels = [line], ["contracts near the solution"]
+    handles, labels = [line], ["reduces a small error"]
     for name, (label, dashes, marker) in _CAUSES.items():
         tone = color if name in (PLAIN, ACCELERATED) else OTHER_STYLES[1 if name == SECANT else 2]["color"]
         style: dict[str, Any] = {"color": tone, "ls": dashes, "marker": marker, "ms": 5, "mfc": "#ffffff"}

@@ -55,7 +55,7 @@ ALIKE = 1.05
 """Ratio of errors up to which the simpler one of two methods is named."""
 
 _GRAY = "#666666"
-_WHITE = {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0.1"}  # behind a label
+_WHITE = {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0"}  # behind a label
 
 
 @dataclass(frozen=True)
@@ -366,9 +366,9 @@ def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
     starts = [one.start for one in some]
     axes.semilogy(starts, [start / 2 for start in starts], color=_GRAY, lw=1, zorder=1)
     axes.annotate("closed: below half\nof the start", (starts[0], starts[0] / 2), (0, 16), **text)
-    axes.margins(y=0.12)
+    axes.margins(y=0.17)
     for one in some:
-        for names, of, place, side in ((ONE_IMAGE, "", max, (-8, 3)), (TWO_IMAGES, "two: ", min, (-8, -20))):
+        for names, of, place, side in ((ONE_IMAGE, "", max, (-8, 1)), (TWO_IMAGES, "two: ", min, (-8, -20))):
             drawn = [name for name in names if name in one.settled]
             n_loops, closed = one.settled[drawn[0]].size, sorted({one.closed(name) for name in drawn})
             if closed[0] < n_loops:

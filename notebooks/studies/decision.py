@@ -37,7 +37,7 @@ LIMITS = parameter_limits(
     extent=(1.1, 2.0),
     photons_calibration=(100.0, 1e9),
     poke=(0.001, 1.5),
-    **dict.fromkeys(("rms", "rms_small", "rms_loop", "rms_loop_small"), (0.01, 4.0)),
+    **dict.fromkeys(("rms", "rms_small", "rms_loop", "rms_loop_middle", "rms_loop_small"), (0.01, 4.0)),
     **dict.fromkeys(("photons", "photons_faint"), (10.0, 1e9)),
     **dict.fromkeys(("photons_loop", "photons_loop_faint"), (0.01, 1e9)),
     **dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop", "n_screens_bench"), (2, 1000)),

@@ -336,8 +336,9 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
         axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0)
         _diameters(axes, curve.diameters[-1], claimed)
         axes.set_ylabel("error (rad rms)")
-    for (number, other), style in zip(others, OTHER_STYLES[1:], strict=False):
-        log.plot(other.diameters, np.maximum(other.mean(name), floor), ms=4, label=f"{number} iterations", **style)
+    for (number, other), style, face in zip(others, OTHER_STYLES[1:], (None, "#ffffff"), strict=False):
+        style = style | {"ms": 5, "mfc": face, "label": f"{number} iterations"}
+        log.plot(other.diameters, np.maximum(other.mean(name), floor), **style)
     limit = threshold * curve.rms[0]
     log.axhline(limit, color="#555555", lw=1)
     end = min(1.4 * claimed, curve.diameters[-1])
@@ -573,6 +574,6 @@ def numbers(
         "reach": _reach(paper, ITERATION, allowed, of_input, limit),
         "reach_1e3": _reach(paper, ITERATION, 1e-3, "10⁻³ rad"),
         "reach_longest": _reach(longest, ITERATION, allowed, of_input),
-        "descent_reach": _reach(descent, "GradientDescent", allowed, of_input, start=_usual(descent), form=".2g"),
+        "descent_reach": _reach(descent, "GradientDescent", allowed, of_input, start=_usual(descent), form=".3g"),
     }
     return rounded(found, ".4g")

@@ -34,6 +34,7 @@ def draw_segment_errors(bench: Bench, commanded: NDArray, errors: Mapping[str, N
         [["points"] * len(maps), list(maps)], figsize=(7, 5.6), height_ratios=[1, 1.3]
     )
     points = panels["points"]
+    figure.set_layout_engine("constrained", hspace=0.08)  # between the label of an axis and titles
     for name, values in errors.items():
         look = LOOKS[name]
         rms = np.sqrt(np.mean(values**2))

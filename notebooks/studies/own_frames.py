@@ -169,6 +169,7 @@ def draw_signs(measurement: Measurement, height: float = 0.4) -> Figure:
     poke = np.where(sensor.pupil.inside, height * np.exp(-((apart / 0.1) ** 2)), 0)
     change = (sensor.measure(poke) - sensor.measure(np.zeros_like(poke)))[(..., *sensor.window)]
     figure, panels = plt.subplots(1, 4, figsize=(7.8, 3.4), width_ratios=(1.1, 1, 1, 1))
+    figure.set_layout_engine("constrained", wspace=0.06)
     _pulled_mirror(panels[0])
     maps = [(poke, height, "phase of the poke\nabove 0 (red)")]
     for image, shift in zip(change, measurement.optics.phase_shifts, strict=True):
@@ -183,8 +184,8 @@ def draw_signs(measurement: Measurement, height: float = 0.4) -> Figure:
             figure.colorbar(shown, ax=axes, location="bottom", label="phase (rad)", aspect=12)
     figure.colorbar(shown, ax=list(panels[2:]), location="bottom", label="change of the intensity", aspect=26)
     panels[1].set_gid(ALONE)
-    panels[1].set_xlabel("x: columns, to the right", fontsize=9)
-    panels[1].set_ylabel("y: rows, upwards", fontsize=9)
+    panels[1].set_xlabel("x: columns, to the right", fontsize=10)
+    panels[1].set_ylabel("y: rows, upwards", fontsize=10)
     return figure
 
 
@@ -197,12 +198,12 @@ def _pulled_mirror(axes: Axes) -> None:
     axes.plot(0.35 + 0.3 * pit, y, color="#444444", lw=1.2)
     arrow = {"arrowstyle": "->", "color": "#444444"}
     axes.annotate("", (0.9, 0.8), (0.5, 0.8), arrowprops=arrow)
-    axes.text(0.0, 0.86, "light", fontsize=9)
+    axes.text(0.0, 0.86, "light", fontsize=10)
     axes.annotate("", (0.0, -0.8), (0.3, -0.8), arrowprops=arrow)
     axes.annotate("", (1.15, 0.0), (1.0, 0.0), arrowprops={"arrowstyle": "<->", "color": "#444444"})
     axes.text(1.2, -0.05, "h", fontsize=10)
-    axes.text(0.0, -1.12, "reflected wavefront, late by 2 h", fontsize=9)
-    axes.set(xlim=(0, 1.5), ylim=(-1.2, 1.05), xticks=[], yticks=[])
+    axes.text(0.0, -1.24, "reflected, late by 2 h", fontsize=10)
+    axes.set(xlim=(0, 1.5), ylim=(-1.3, 1.05), xticks=[], yticks=[])
     axes.set_title("mirror pulled back by h:\nOPD = +2 h, phase above 0", fontsize=10)
     axes.grid(False)
     axes.spines[:].set_visible(False)

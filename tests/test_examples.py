@@ -3,7 +3,10 @@
 import re
 
 import nbformat
+import numpy as np
 import pytest
+
+from zwfs.bench import Bench, write_bench
 
 from .conftest import ROOT
 
@@ -39,6 +42,17 @@ def test_example_of_a_loop_prints_the_residuals_of_the_table(capsys):
     (row,) = re.findall(r"(?m)^\| perfect model, 0\.5 rad rms \| 1000 \|(.*) \|(.*) \|", "\n".join(outputs))
     for (closed, residual), cell in zip(shown, row, strict=True):
         assert cell.strip() == f"{residual}, linear; {closed} of 24 loops close".replace("; 24 of", "; all")
+
+
+def test_example_of_a_verdict_needs_only_the_package(tmp_path, monkeypatch, capsys):
+    notebook = nbformat.read(ROOT / "notebooks" / "own_frames.ipynb", 4)
+    (text,) = (cell.source for cell in notebook.cells if "With the package alone" in cell.source)
+    monkeypatch.chdir(tmp_path)
+    write_bench(".", Bench(n_pixels=40), seed=1)
+    exec(compile(re.search(r"```python\n(.*?)```", text, re.S)[1], "own_frames", "exec"), {})
+    assert "fit: Not explained" in capsys.readouterr().out
+    phase, error_bar = np.load("phase.npy"), np.load("error_bar.npy")
+    assert 0 < np.nanmedian(error_bar) < np.nanstd(phase)
 
 
 def test_example_of_gradients_fits_the_phase(capsys):

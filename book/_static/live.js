@@ -224,7 +224,8 @@
   const next = find("next");
   const offer = (place) => {
     next.hidden = place >= tries.length;
-    next.textContent = `Next: ${tries[place]?.textContent ?? "nothing"}`;
+    if (next.hidden) return;
+    next.textContent = `Next: ${tries[place].textContent}`;
     next.onclick = () => tries[place].click();
   };
   offer(0);

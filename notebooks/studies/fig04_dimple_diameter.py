@@ -336,8 +336,8 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
         axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0)
         _diameters(axes, curve.diameters[-1], claimed)
         axes.set_ylabel("error (rad rms)")
-    for (number, other), style, face in zip(others, OTHER_STYLES[1:], (None, "#ffffff"), strict=False):
-        style = style | {"ms": 5, "mfc": face, "label": f"{number} iterations"}
+    for index, ((number, other), style) in enumerate(zip(others, OTHER_STYLES[1:], strict=False)):
+        style = style | {"ms": 5, "mfc": "#ffffff" if index % 2 else None, "label": f"{number} iterations"}
         log.plot(other.diameters, np.maximum(other.mean(name), floor), **style)
     limit = threshold * curve.rms[0]
     log.axhline(limit, color="#555555", lw=1)

@@ -359,7 +359,7 @@ def test_presets_and_buttons_set_the_sensor_up(fresh, preset, expected, named):
     assert fresh.inner_text("#live-name-2") == named
 
 
-def test_next_leads_through_all_that_there_is_to_try(fresh):
+def test_next_leads_through_all_that_there_is_to_try_and_begins_again(fresh):
     names = re.findall(r"<button .*?>(.*?)</button>", TRIES)
     first, *others = names
     fresh.click(f"button:text-is('{first}')")
@@ -367,7 +367,9 @@ def test_next_leads_through_all_that_there_is_to_try(fresh):
         assert fresh.inner_text("#live-next") == f"Next: {name}"
         fresh.click("#live-next")
         assert fresh.inner_text("#live-tried").startswith(f"{name}: ")
-    assert fresh.is_hidden("#live-next")
+    assert fresh.inner_text("#live-next") == f"Again: {first}"
+    fresh.click("#live-next")
+    assert fresh.inner_text("#live-next") == f"Next: {others[0]}"
 
 
 def test_designs_keep_the_input_and_the_address_follows_them(fresh):

@@ -223,10 +223,9 @@
   const tries = [...document.querySelectorAll("button[data-live]")].filter((button) => !button.closest("#live"));
   const next = find("next");
   const offer = (place) => {
-    next.hidden = place >= tries.length;
-    if (next.hidden) return;
-    next.textContent = `Next: ${tries[place].textContent}`;
-    next.onclick = () => tries[place].click();
+    const button = tries[place % tries.length];
+    next.textContent = `${place < tries.length ? "Next" : "Again"}: ${button.textContent}`;
+    next.onclick = () => button.click();
   };
   offer(0);
   for (const button of document.querySelectorAll("button[data-live]")) {

@@ -15,6 +15,7 @@ from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from studies.kit import sweeps
+from studies.kit.curves import percent
 from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS, OTHER_STYLES
@@ -30,9 +31,16 @@ LIMITS = {
     "largest": (0.1, 1.2),
     "n_screens": (1, 2),
     "n_iterations": USUAL["n_iterations"],
-    "command_error": (-0.3, 0.3),
+    "command_errors": [(-0.3, 0.3), ...],
 }
-QUICK = {"n_commands": 2, "n_steps": 2, "oversampling": 1, "largest": 0.3, "n_screens": 1}
+QUICK = {
+    "n_commands": 2,
+    "n_steps": 2,
+    "oversampling": 1,
+    "largest": 0.3,
+    "n_screens": 1,
+    "command_errors": [0.05],
+}
 
 _UNIT = 1e-4  # rad, of the phases in the file
 
@@ -315,11 +323,27 @@ def error_columns(errors: Errors, not_smooth: NDArray) -> dict[str, NDArray]:
     }
 
 
-def numbers(
-    taken: Recording, fit: BenchFit, errors: Errors, not_smooth: NDArray, wrong_fit: BenchFit, wrong: Errors
-) -> dict[str, float | str]:
-    """Numbers for the text: settings, verdict, errors, how well the error bars hold, and wrong commands."""
-    spoiled = wrong.column("calibrated")
+def command_table(command_errors: Sequence[float], fits: Sequence[BenchFit], measured: Sequence[Errors]) -> Table:
+    """Improvement and verdict of the fits to commands with these relative errors."""
+    rows = []
+    for command_error, fit, errors in zip(command_errors, fits, measured, strict=True):
+        gain = errors.column("plain") / errors.column("calibrated")
+        rows.append([percent(command_error), f"{gain.min():.1f} to {gain.max():.1f} times", _verdict(fit)])
+    return Table(["error of all commands", "error of unseen screens, smaller by", "verdict of the fit"], rows)
+
+
+def accepted_error(command_errors: Sequence[float], fits: Sequence[BenchFit]) -> float:
+    """Largest relative error of the commands at which the verdict of the fit is still *consistent*."""
+    both = zip(command_errors, fits, strict=True)
+    return max((abs(error) for error, fit in both if fit.consistent), default=0.0)
+
+
+def _verdict(fit: BenchFit) -> str:
+    return "consistent" if fit.consistent else "not consistent"
+
+
+def numbers(taken: Recording, fit: BenchFit, errors: Errors, not_smooth: NDArray) -> dict[str, float | str]:
+    """Numbers for the text: settings, verdict, errors, and how well the error bars hold."""
     true, plain, found = known_values(taken), errors.column("plain"), errors.column("calibrated")
     every = [one for row in errors.measured for one in row]
     deviations = [(fit[name].value - value) / fit[name].sigma for name, value in true.items()]
@@ -330,7 +354,7 @@ def numbers(
             "n_screens": len(errors.measured[0]),
             "photons": float(taken.arrays["photons"]),
             "misfit": float(np.mean(fit.misfit)),
-            "verdict": "consistent" if fit.consistent else "not consistent",
+            "verdict": _verdict(fit),
             "remarks": " ".join(fit.remarks) or "none",
             "largest_deviation": np.round(np.abs(deviations).max(), 1),  # as in the table
             "deviation_rms": np.sqrt(np.mean(np.square(deviations))),
@@ -352,9 +376,6 @@ def numbers(
             "bulk_worst": errors.rms[np.argmax(not_smooth / plain)],
             "bulk_excess": 100 * (float((not_smooth / plain).max()) - 1),
             "bulk_most": (plain / not_smooth).max(),
-            "wrong_least": (plain / spoiled).min(),
-            "wrong_most": (plain / spoiled).max(),
-            "wrong_verdict": "consistent" if wrong_fit.consistent else "not consistent",
             "unseen": len(every),
         },
         ".3g",

@@ -30,6 +30,7 @@ from studies.kit.results import rounded
 from studies.kit.tables import Table
 from zwfs import Arcsine, Dimple, MaximumLikelihood, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
 from zwfs.bench import Bench, BenchModel, segment_pistons, segment_residual, segment_screens
+from zwfs.turbulence import FrozenFlow
 
 LIMITS = parameter_limits(
     "n_iterations",
@@ -40,13 +41,12 @@ LIMITS = parameter_limits(
     **dict.fromkeys(("rms", "rms_small", "rms_loop", "rms_loop_middle", "rms_loop_small"), (0.01, 4.0)),
     **dict.fromkeys(("photons", "photons_faint"), (10.0, 1e9)),
     **dict.fromkeys(("photons_loop", "photons_loop_faint"), (0.01, 1e9)),
-    **dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop", "n_screens_bench"), (2, 1000)),
+    **dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop"), (2, 1000)),
     n_screens_calibrated=(0, 2),
-    n_steps_bench=(6, 1000),
 )
 
-QUICK = dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop", "n_screens_bench"), 2)
-QUICK |= {"n_pixels": 32, "n_screens_calibrated": 0, "n_steps_bench": 6}
+QUICK = dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop"), 2)
+QUICK |= {"n_pixels": 32, "n_screens_calibrated": 0}
 
 BENCHES = {"perfect": "perfect model", "real": "uncalibrated bench"}
 """What is known of the bench, and its name in the table."""
@@ -70,8 +70,8 @@ LOOP: dict[str, Any] = {"rate": 1000.0, "delay": 2, "stroke": 4.0, "n_steps": 40
 WIND = {"speed": 2.5, "cutoff": 3.0, "exponent": -2.0}
 GAINS = 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9
 """Settings of the chapter on closed loops."""
-BENCH_GAIN = 0.4
-"""Of the loops on a bench with errors."""
+_ON_BENCH = {"Linear": "classic", "LinearTwo": "shifted"}
+"""Methods of the loops on a bench with errors, and their sensors in `BenchModel`."""
 _N_MODES = 80  # of the mirror
 _COMPARED = "perfect_1", "perfect_2", "real_1", "real_3"  # rows of the summary
 _MUCH = 3.0  # ratio of errors beyond which one image fails
@@ -265,44 +265,70 @@ def _closed_loop(situation: Situation, n_screens: int, seed: int) -> TunedLoops:
     )
 
 
-def bench_loops(
-    known: Known, situations: Sequence[Situation], n_loops: int, n_steps: int, seed: int
-) -> list[BestMethods]:
-    """Close linear loops on a bench, with the delay of the other loops, from a constant error of its segments.
+def bench_loops(known: Known, situations: Sequence[Situation], n_screens: int, seed: int) -> list[BestMethods]:
+    """Close linear loops on a bench, with the wind, the delay and the gains of the other loops.
 
     The response to pokes calibrates the method, and the mirror is led to its flat command.
     """
-    model, found = known.model, []
-    methods = {
-        name: poked_linear(sensor, model, known.poked, known.poke)
-        for name, sensor in (("Linear", model.classic), ("LinearTwo", model.shifted))
-    }
+    tasks = [(situation, name) for situation in situations for name in _ON_BENCH]
+    found = iter(sweeps.run(_tuned_on_bench, tasks, known, n_screens, seed, name="bench_loops"))
+    compared = []
     for rms, photons in situations:
-        screens = segment_screens(known.bench, rms, n_loops, seed=seed)
-        settled = {
-            name: np.array([_bench_loop(known, linear, photons, screen, n_steps, seed) for screen in screens])
-            for name, linear in methods.items()
-        }
-        gains, chosen = dict.fromkeys(settled, BENCH_GAIN), {name: typical(one) for name, one in settled.items()}
-        loops = TunedLoops(rms, photons, gains, chosen, settled)
-        found.append(
-            BestMethods(loops, "Linear", "LinearTwo", *paired_ratio(settled["LinearTwo"], settled["Linear"]))
+        each = zip(*islice(found, len(_ON_BENCH)), strict=True)
+        gains, chosen, settled = (dict(zip(_ON_BENCH, some, strict=True)) for some in each)
+        ratio = paired_ratio(settled["LinearTwo"], settled["Linear"])
+        compared.append(BestMethods(TunedLoops(rms, photons, gains, chosen, settled), *_ON_BENCH, *ratio))
+    return compared
+
+
+def _tuned_on_bench(
+    task: tuple[Situation, str], known: Known, n_screens: int, seed: int
+) -> tuple[float, float, NDArray[np.float64]]:
+    """Best gain on half as many screens, the residual there, and the residuals on new screens, rad rms."""
+    (rms, photons), name = task
+    linear = poked_linear(getattr(known.model, _ON_BENCH[name]), known.model, known.poked, known.poke)
+    first, then = map(int, np.random.SeedSequence(seed).generate_state(2))
+
+    def settle(n: int, gain: float, noise: int) -> NDArray[np.float64]:
+        loops = zip(
+            drifting_pistons(known.bench, rms, n, noise), np.random.SeedSequence(noise).spawn(n), strict=True
         )
-    return found
+        return np.array([_bench_loop(known, linear, photons, gain, *one) for one in loops])
+
+    scores = {gain: typical(settle(max(1, n_screens // 2), gain, first)) for gain in GAINS}
+    best = min(scores, key=lambda gain: scores[gain])
+    return best, scores[best], settle(n_screens, best, then)
 
 
-def _bench_loop(known: Known, linear: Any, photons: float, screen: NDArray, n_steps: int, seed: int) -> float:
+def drifting_pistons(bench: Bench, rms: float, n_screens: int, seed: int) -> NDArray[np.float64]:
+    """Pistons of the segments under screens that the wind moves, (n_screens, n_steps, n_segments), rad.
+
+    Each sequence starts with this error over the segments.
+    """
+    flow = FrozenFlow(Pupil.circular(bench.n_pixels), rms, n_screens, **WIND, seed=seed)
+    members = bench.segments.ravel() == bench.numbers[:, np.newaxis]
+    means = (members / members.sum(axis=1, keepdims=True)).T
+    steps = range(LOOP["n_steps"])
+    pistons = np.stack([flow(step / LOOP["rate"]).reshape(n_screens, -1) @ means for step in steps], axis=1)
+    pistons -= pistons.mean(axis=-1, keepdims=True)
+    return pistons * (rms / pistons[:, 0].std(axis=-1))[:, np.newaxis, np.newaxis]
+
+
+def _bench_loop(
+    known: Known, linear: Any, photons: float, gain: float, pistons: NDArray, seed: np.random.SeedSequence
+) -> float:
     """Residual of a loop over its last third, rad rms over the segments."""
     model, k, delay = known.model, linear.sensor.n_masks, LOOP["delay"]
     flat = model.pistons(linear(known.flat[:k] / model.scale[:k]).phase)
-    camera, mirror = Camera.of(known, photons, k), [np.zeros_like(screen)] * delay
-    for noise in np.random.SeedSequence(seed).spawn(n_steps):
-        counts, share = camera.shot(screen + mirror[-delay], noise)
+    camera, mirror = Camera.of(known, photons, k), [np.zeros(pistons.shape[-1])] * delay
+    left = []
+    for wanted, noise in zip(pistons, seed.spawn(len(pistons)), strict=True):
+        left.append(wanted + mirror[-delay])
+        counts, share = camera.shot(left[-1], noise)
         found = model.pistons(linear(counts / share / model.scale[:k]).phase) - flat
-        mirror.append(mirror[-1] - BENCH_GAIN * found)
+        mirror.append(mirror[-1] - gain * found)
     # Not modulo 2 pi: a segment that is a wave off is not flat, though the sensor sees no error.
-    left = np.array(mirror[:n_steps])[-max(1, n_steps // 3) :] + screen
-    return float(np.sqrt(np.mean(left.var(axis=1))))
+    return float(np.sqrt(np.mean(np.var(left[-(len(left) // 3) :], axis=1))))
 
 
 @dataclass(frozen=True)
@@ -475,7 +501,6 @@ def numbers(
             "loop_wind": WIND["speed"] * _DIAMETER,
             "loop_diameter": _DIAMETER,
             "loop_modes": _N_MODES,
-            "bench_gain": BENCH_GAIN,
             "loop_gain_least": min(GAINS),
             "loop_gain_most": max(GAINS),
         },

@@ -132,14 +132,13 @@ def latency(rows: list[dict[str, Any]]) -> str:
 
 def late(rows: list[dict[str, Any]]) -> str:
     """Return a sentence on the median and the share of late calls, with the garbage collector off."""
-    found = ", and ".join(
-        f"{1e6 * row['p50']:.0f} μs at {row['n_pixels']} pixels, where {100 * row['late']:.1f} % are late"
-        for row in rows
-        if row["frozen"]
-    )
-    slow = [f"{row['n_pixels']}" for row in rows if row["frozen"] and row["p99"] > 1e-3]
+    frozen = [row for row in rows if row["frozen"]]
+    found = " and ".join(f"{1e6 * row['p50']:.0f} μs at {row['n_pixels']} pixels" for row in frozen)
+    shares = " and ".join(f"{100 * row['late']:.1f} % at {row['n_pixels']} pixels" for row in frozen)
+    slow = [f"{row['n_pixels']}" for row in frozen if row["p99"] > 1e-3]
     missed = f" At {' and '.join(slow)} pixels more than 1 % of the results take longer than 1 ms." if slow else ""
-    return f"The median is {found}. A result is late if it takes more than 1.3 times the median.{missed}"
+    defined = "A result is *late* if it takes more than 1.3 times the median"
+    return f"The median is {found}. {defined}: {shares} are late.{missed}"
 
 
 def telemetry(measured: dict[str, Any]) -> str:

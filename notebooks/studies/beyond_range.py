@@ -525,7 +525,8 @@ def _exact_text(noiseless: NoiseCurves, threshold: float) -> str:
     n_screens = noiseless.errors[LIKELY][noiseless.rms <= exact].size
     if not exact:
         return f"loses screens already at {noiseless.rms[0]:.2g} rad rms"
-    return f"recovers all {n_screens} simulated screens of up to {exact:.2g} rad rms"
+    each = noiseless.errors[LIKELY].shape[-1]
+    return f"recovers all {n_screens} simulated screens ({each} for each input) of up to {exact:.2g} rad rms"
 
 
 def _half_text(found: Causes, threshold: float) -> str:

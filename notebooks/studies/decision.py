@@ -276,8 +276,9 @@ def bench_loops(known: Known, situations: Sequence[Situation], n_screens: int, s
     for rms, photons in situations:
         each = zip(*islice(found, len(_ON_BENCH)), strict=True)
         gains, chosen, settled = (dict(zip(_ON_BENCH, some, strict=True)) for some in each)
+        loops = TunedLoops(rms, photons, gains, chosen, settled)
         ratio = paired_ratio(settled["LinearTwo"], settled["Linear"])
-        compared.append(BestMethods(TunedLoops(rms, photons, gains, chosen, settled), *_ON_BENCH, *ratio))
+        compared.append(BestMethods(loops, "Linear", "LinearTwo", *ratio))
     return compared
 
 

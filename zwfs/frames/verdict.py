@@ -267,13 +267,14 @@ def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.b
     if np.isnan(inner):
         size = f"the rms misfit is {np.mean(result.residual):.3f} of the mean light"
         return f"Not compared with the noise of the camera, which is not known: {size}. {where}"
+    far = f"ar from {edges} the misfit is {inner:.3g} times what noise alone would cause"
     if inner > _EXPLAINED:
-        return f"Not explained. {where} Far from {edges} the misfit is {inner:.3g} times that of the noise."
-    verdict = f"Explained to within the noise: far from {edges} the misfit is {inner:.2f} times that of the noise."
+        return f"Not explained. {where} F{far}."
+    verdict = f"Explained to within the noise: f{far}."
     if not placed:
         verdict = (
-            f"Not decided: far from {edges} the misfit is {inner:.2f} times that of the noise, but the images do "
-            "not determine the rotation or the magnification between them, which change the phase."
+            f"Not decided: f{far}, but the images do not determine the rotation or the magnification "
+            "between them, which change the phase."
         )
     if edge <= _EXPLAINED:
         return verdict
@@ -292,7 +293,7 @@ def _of_score(score: NDArray, control: NDArray) -> str:
 
 
 def _of_light(measurement: Measurement) -> str:
-    """Flux ratios of the images, and the assumption that balancing makes."""
+    """Flux ratios of the images, which should be equal with and without the mask."""
     masked, clear = measurement.flux_ratio
     facts = (
         f"The light of image 1 is {masked:.3f} times that of image 2 behind the mask, and {clear:.3f} times "
@@ -300,12 +301,12 @@ def _of_light(measurement: Measurement) -> str:
     )
     if not (measurement.registered.balance and measurement.optics.opposite):
         return facts + "The frames are not balanced."
-    facts += "For opposite phase shifts the two ratios should be equal, and balancing assumes it. "
+    facts += "For opposite phase shifts the two ratios should be equal. "
     difference = abs(masked / clear - 1)
     if difference < _UNEVEN:
         return f"{facts}They agree within {max(math.ceil(1e3 * difference), 1) / 10:.1f} %."
-    hidden = "which balancing hides: look for leakage, light that one mask does not shift, and stray light"
-    return f"{facts}They differ by {difference:.0%}, {hidden}."
+    look = "look for leakage, light that one mask does not shift, and stray light"
+    return f"{facts}They differ by {difference:.0%}, which the scaling of the frames hides: {look}."
 
 
 def _of_place(placement: Placement) -> str:

@@ -254,7 +254,6 @@ def numbers(maps: DesignMap, listed: Sequence[Design], costs: Mapping[str, NDArr
             f"best_diameter_{place}": best.diameter,
             f"best_shift_{place}": best.theta_a / np.pi,
             f"spread_{place}": least[maps.diameters >= 1.8].max() / least.min() - 1,
-            f"flat_{place}": maps.costs[next(iter(costs))].flat[maps.costs[name].argmin()],
             f"saved_{place}": 1 - maps.costs[name].min() / cost[0],
             f"saved_all_round_{place}": 1 - found[f"all_round_{place}"] / cost[0],
         }

@@ -313,15 +313,13 @@ def _pair(values: Sequence[float] | NDArray, digits: int) -> str:
 def numbers(
     verdict: Verdict, work: Sequence[Step], errors: Sequence[float] | None, n_fits: int, error_flat: float
 ) -> dict[str, float | str]:
-    """Numbers for the text: scores, and misfits and errors of the result and of the step before the fits.
+    """Numbers for the text: misfits and errors of the result and of the step before the fits.
 
     `error_flat` is the error of the result less the phase of a flat mirror.
     """
     known = errors or [np.nan] * len(work)
     return rounded(
         {
-            "score": verdict.score.min(),
-            "control": verdict.control.max(),
             "misfit": work[-1].result.misfit,
             "misfit_plain": work[-1 - n_fits].result.misfit,
             "sigma": np.nan if verdict.sigma is None else np.nanmedian(verdict.sigma),

@@ -268,8 +268,6 @@ def numbers(curves: PhotonCurves, rows: Sequence[ErrorBars]) -> dict[str, float 
     bright = curves.photons >= min(100, curves.photons.max())
     half, one = (int(np.argmin(np.abs(curves.rms - value))) for value in (0.5, 1.0))
     likely, shifted = (curves.ratio(name)[:, bright] for name in TABLED)
-    single = curves.errors[TABLED[0]][:, bright]
-    spread = single.std(axis=-1, ddof=1) / np.sqrt(single.shape[-1])  # of a mean over the screens
     right = next((row for row in rows if row.assumed == 1), rows[0])
     wrong = max(rows, key=lambda row: row.assumed)
     low = min(rows, key=lambda row: row.assumed)
@@ -277,8 +275,6 @@ def numbers(curves: PhotonCurves, rows: Sequence[ErrorBars]) -> dict[str, float 
     return rounded(
         {
             "likely_excess": np.max(likely) - 1,
-            "likely_least": np.min(likely),
-            "likely_scatter": np.mean(spread / curves.bound[:, bright]),
             "shifted_ratio": shifted[half].mean(),
             "shifted_photons": np.mean(shifted[half] ** 2) - 1,
             "arcsine_floor": curves.error("Arcsine")[half, -1],

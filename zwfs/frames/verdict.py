@@ -267,13 +267,13 @@ def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.b
     if np.isnan(inner):
         size = f"the rms misfit is {np.mean(result.residual):.3f} of the mean light"
         return f"Not compared with the noise of the camera, which is not known: {size}. {where}"
-    far = f"ar from {edges} the misfit is {inner:.3g} times what noise alone would cause"
+    far = f"from {edges} the misfit is {inner:.3g} times what noise alone would cause"
     if inner > _EXPLAINED:
-        return f"Not explained. {where} F{far}."
-    verdict = f"Explained to within the noise: f{far}."
+        return f"Not explained. {where} Far {far}."
+    verdict = f"Explained to within the noise: far {far}."
     if not placed:
         verdict = (
-            f"Not decided: f{far}, but the images do not determine the rotation or the magnification "
+            f"Not decided: far {far}, but the images do not determine the rotation or the magnification "
             "between them, which change the phase."
         )
     if edge <= _EXPLAINED:

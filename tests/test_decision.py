@@ -1,5 +1,7 @@
 """The table of the best methods: what decides a cell, and whether the comparison is fair."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -61,8 +63,12 @@ def test_a_cell_of_loops_says_how_many_close():
     both, settings = (0.7, 0.05), {"n_loops": 12}
     won = Cell("linear", "linear", both, 0.07, 0.06, 0.09, (1, 12), **settings)
     tied = Cell("linear", "linear", both, 1.0, 0.9, 1.1, (12, 12), **settings)
-    assert won.sides == {"one": "1 of 12 loops close", "two": "0.050, linear; all 12 loops close"}
-    assert tied.sides == {"one": "0.70, linear", "two": "0.050, linear"}
+    assert won.sides == {"one": "1 of 12 loops close", "two": "0.050, linear; 12 of 12 loops close"}
+    assert tied.sides == {
+        "one": "0.70, linear; 12 of 12 loops close",
+        "two": "0.050, linear; 12 of 12 loops close",
+    }
+    assert replace(won, closed=None).sides == {"one": "0.70, linear", "two": "0.050, linear"}
 
 
 def test_the_simpler_of_two_methods_that_agree_is_named(errors):

@@ -352,7 +352,7 @@ def _causes_point(
 
 
 _INK = "#555555"
-_BOUND: dict[str, Any] = {"color": _INK, "lw": 8, "alpha": 0.3, "solid_capstyle": "round", "zorder": 1.5}
+_BOUND: dict[str, Any] = {"color": "#888888", "lw": 2, "zorder": 1.5}
 _FLOOR = 1e-7  # of a drawn error: below it digits are rounding errors
 
 
@@ -404,7 +404,7 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
         methods.plot(chosen.rms, chosen.median(name), **method_line(name))
     methods.set_title(f"{_spaced(chosen.photons)} photons per point and image", fontsize=10)
     methods.set_ylabel("median error (rad rms)")
-    line = method_line(LIKELY) | {"label": "_"}
+    line = method_line(LIKELY) | {"label": "_", "linestyle": ""}
     for curve in noisy:
         light.plot(curve.rms, curve.median(LIKELY), **line)
         light.plot(curve.rms, curve.bound[LIKELY], label="_", **_BOUND)
@@ -529,6 +529,17 @@ def _exact_text(noiseless: NoiseCurves, threshold: float) -> str:
     return f"recovers all {n_screens} simulated screens ({each} for each input) of up to {exact:.2g} rad rms"
 
 
+def _flag_text(right: NDArray[np.bool_], consistent: NDArray[np.bool_]) -> str:
+    """Say how often the flag is right about solutions without noise."""
+    if np.all(right & consistent):
+        return f"All {right.size} solutions without noise are right, and the flag accepts all of them."
+    wrong, refused = np.count_nonzero(consistent & ~right), np.count_nonzero(right & ~consistent)
+    return (
+        f"Of {right.size} solutions without noise, {np.count_nonzero(right)} are right. "
+        f"The flag accepts {wrong} wrong and refuses {refused} right ones."
+    )
+
+
 def _half_text(found: Causes, threshold: float) -> str:
     """Input at which the plain iteration recovers half of the screens, in words."""
     half, error = found.half(PLAIN, threshold)
@@ -560,10 +571,6 @@ def numbers(
     *_, area = model.values()
     pixels = np.median(area.errors[LIKELY], axis=1)
     result = dict(settings) | {
-        "n_noiseless": right.size,
-        "n_right": np.count_nonzero(right),
-        "false_trust": np.count_nonzero(noiseless.consistent & ~right),
-        "false_alarms": np.count_nonzero(~noiseless.consistent & right),
         "few_photons": few.photons,
         "shown_photons": chosen.photons,
         "modes_share": np.median(chosen.median(MODES)[usual] / chosen.median(LIKELY)[usual]),
@@ -573,6 +580,7 @@ def numbers(
         "contracting_at_2": np.mean(found.factor[two] < 1),
         "exact_text": _exact_text(noiseless, threshold),
         "half_text": _half_text(found, threshold),
+        "flag_text": _flag_text(right, noiseless.consistent),
         "pixels_text": reach_text(
             area.rms, pixels, PIXEL_ERROR, Limit(crossing(area.rms, pixels, PIXEL_ERROR)), f"{PIXEL_ERROR:g} rad"
         ),

@@ -1,4 +1,4 @@
-"""From pokes to phases: calibration with known commands, and unseen screens, on a bench that HCIPy simulates."""
+"""From known commands to phases: a calibration, and unseen screens, on a bench that HCIPy simulates."""
 
 from __future__ import annotations
 
@@ -297,11 +297,12 @@ def draw_calibration_errors(errors: Errors, not_smooth: NDArray) -> Figure:
     names = "plain", "calibrated", "same_prior", "sigma"
     plain, found, control, stated = (errors.column(name) for name in names)
     axes.plot(errors.rms, control, "s--", color="#777777", ms=5, label="design, smooth phases")
-    axes.plot(errors.rms, plain, **LOOKS["PhaseShifted"].style, label="design, not smooth")
-    axes.plot(errors.rms, not_smooth, "D:", color="#333333", mfc="none", ms=6, label="calibrated, not smooth")
+    axes.plot(errors.rms, plain, **LOOKS["PhaseShifted"].style, label="design, any phase (iteration)")
+    [line] = axes.plot(errors.rms, not_smooth, "D:", color="#333333", mfc="none", ms=6)
+    line.set_label("calibrated, any phase (iteration)")
     best = OTHER_STYLES[1]["color"]
     axes.plot(errors.rms, found, "*-", color=best, ms=9, label="calibrated, smooth phases")
-    axes.plot(errors.rms, stated, "o", color=best, mfc="none", ms=8, label="error bar of the stars")
+    axes.plot(errors.rms, stated, "o", color=best, mfc="none", ms=8, label="error bar that this fit states")
     for name, color in (("plain", LOOKS["PhaseShifted"].color), ("calibrated", best)):
         axes.plot(errors.rms, errors.single(name), "_", color=color, ms=9)
     axes.set(xlabel="input (rad rms)", ylabel="error (rad rms)", yscale="log", xlim=(0, None))

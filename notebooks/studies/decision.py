@@ -354,18 +354,17 @@ class Cell:
 
     @property
     def sides(self) -> dict[str, str]:
-        """Error and method with two images and with one, or how few loops close."""
-        closed = self.closed or (self.n_loops,) * 2
-        more = "" if min(closed) == self.n_loops else f"; all {self.n_loops} loops close"
-        both = zip(("one", "two"), self.typical, (self.one, self.two), closed, strict=True)
-        return {
-            count: f"{two_digits(error)}, {method}{more}"
-            if n == self.n_loops
-            else f"{two_digits(error)}, {method}; {n} of {self.n_loops} loops close"
-            if n > self.n_loops / 2
-            else f"{n} of {self.n_loops} loops close"
-            for count, error, method, n in both
-        }
+        """Error and method with two images and with one, and how many loops close; no error if few do."""
+
+        def side(error: float, method: str, closed: int | None) -> str:
+            found = f"{two_digits(error)}, {method}"
+            if closed is None:
+                return found
+            end = f"{closed} of {self.n_loops} loops close"
+            return f"{found}; {end}" if closed > self.n_loops / 2 else end
+
+        sides = map(side, self.typical, (self.one, self.two), self.closed or (None, None))
+        return dict(zip(("one", "two"), sides, strict=True))
 
 
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
@@ -469,6 +468,7 @@ def numbers(
     errors: Mapping[str, Sequence[Mapping[str, NDArray]]],
     calibrated: Sequence[tuple[float, float] | None],
     loops: Sequence[BestMethods],
+    on_bench: Sequence[BestMethods],
     no_noise: BestMethods,
 ) -> dict[str, float | str]:
     """Situations and results in words, errors of a calibrated bench, and extremes."""
@@ -484,6 +484,7 @@ def numbers(
             key, cell = f"gain_{row.key}", row.cell
             found |= {key: 1 / cell.ratio, f"{key}_least": 1 / cell.high, f"{key}_most": 1 / cell.low}
     small, faint, bright = errors["real"][-1], loops[-1], errors["perfect"][0]
+    gains = sorted(one.loops.gains["LinearTwo"] for one in on_bench)
     ratio = bright[simplest(bright, ONE_IMAGE)] / bright[simplest(bright, TWO_IMAGES)]
     return rounded(
         found
@@ -504,6 +505,9 @@ def numbers(
             "loop_modes": _N_MODES,
             "loop_gain_least": min(GAINS),
             "loop_gain_most": max(GAINS),
+            "left_real_1": two_digits(loop_cell(on_bench[0]).typical[1]),
+            "left_real_3": two_digits(loop_cell(on_bench[2]).typical[1]),
+            "gain_bench": " to ".join(dict.fromkeys(f"{gain:g}" for gain in (gains[0], gains[-1]))),
         },
         ".3g",
     )

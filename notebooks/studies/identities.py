@@ -286,10 +286,10 @@ def identities_table(found: Mapping[str, float | str], resolution: float) -> Tab
         "patch_two_wave_error": "(5), behind a patch of uneven phase and amplitude",
         "patch_model_error": "low-rank model of the reference wave of this patch",
         "determinant_error": "(10): the determinant is the sine of the difference of the reference phases",
-        "half_difference_error": "this difference is half of that of the phase shifts, modulo π (rad)",
+        "half_difference_error": "reference phases differ by half as much as the phase shifts, modulo π (rad)",
         "diversity_at_0": "determinant of equal phase shifts",
         "true_wave_error": "(9): phase from two images and their true reference waves (rad)",
-        "one_step_error": "the same by one iteration from the true phase (rad)",
+        "one_step_error": "phase from two images by one iteration from the true phase (rad)",
     }
     rows = [[title, _text(float(found[name]), resolution)] for name, title in titles.items()]
     return Table(["equation of the paper", "largest error"], rows)

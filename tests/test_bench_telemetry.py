@@ -1,5 +1,6 @@
 """Telemetry of a bench that was calibrated with known commands, on frames that HCIPy simulates."""
 
+import sys
 import warnings
 
 import numpy as np
@@ -97,9 +98,10 @@ def test_error_bars_hold_for_points_and_modes(taken, calibration):
     assert 0.6 < np.sqrt(np.mean((left / calibration.sigma(found, photons, noise, modes)) ** 2)) < 1.6
 
 
-def test_command_calibrates_with_known_commands(tmp_path, monkeypatch, taken, calibration):
+def test_command_calibrates_with_known_commands(tmp_path, monkeypatch, capsys, taken, calibration):
     """Both pupils on one image, two exposures of each state, and a dark."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
 
     def wide(pairs):
         return np.concatenate([pairs[..., 0, :, :], pairs[..., 1, :, :]], axis=-1) + 200.0
@@ -115,6 +117,7 @@ def test_command_calibrates_with_known_commands(tmp_path, monkeypatch, taken, ca
     known = ["--pupil-centers", *centers, "--pupil-diameter", "24", "--noise", str(taken.bench.noise)]
     with warnings.catch_warnings(action="ignore"):
         assert main(["calibrate", "bench.npz", *files, *known]) == 0
+    assert "stage 4 of 4" in capsys.readouterr().err
     found = Calibration.load("bench.npz")
     assert found.n_images == 1
     assert found.n_averaged == 2

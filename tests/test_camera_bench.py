@@ -288,7 +288,12 @@ def test_other_values_replace_those_of_a_fit_and_explain_its_frames_worse(calibr
 def test_fit_that_ends_early_has_not_converged(monkeypatch):
     monkeypatch.setattr("zwfs._camera.solve._LAST", 1)
     frames, clear, phases = BENCH.recording()
-    assert not fit_bench(frames, clear, phases, n_pixels=40, noise=BENCH.noise, n_steps=1).converged
+    steps = []
+    settings = {"n_pixels": 40, "noise": BENCH.noise, "oversampling": 2, "n_steps": 1, "progress": steps.append}
+    assert not fit_bench(frames, clear, phases, **settings).converged
+    first, *stages, last = dict.fromkeys(text.partition(",")[0] for text in steps)
+    assert (first, last) == ("dimple and order of the images", "error bars")
+    assert stages == [f"stage {number} of 4" for number in range(1, 5)]
 
 
 @pytest.mark.parametrize(("number", "rms"), list(enumerate(RMS)))

@@ -7,9 +7,10 @@ pair of frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -197,6 +198,7 @@ def fit_bench(
     phase_shifts: tuple[float, float] = (np.pi / 2, -np.pi / 2),
     oversampling: int | None = None,
     n_steps: int = 10,
+    progress: Callable[[str], Any] | None = None,
 ) -> BenchFit:
     """Fit a model of the optics to frames of a mirror in known states, and to clear frames.
 
@@ -228,6 +230,8 @@ def fit_bench(
         with 3: light at vanes and gaps needs the finer grid.
     n_steps : int
         Largest number of steps of each stage.
+    progress : callable, optional
+        Called with a short text before each step.
 
     Returns
     -------
@@ -244,10 +248,13 @@ def fit_bench(
     if oversampling is not None:
         oversampling = _check.integer("oversampling", oversampling, 1, 8)
     n_steps = _check.integer("n_steps", n_steps, 1)
+    report = progress or (lambda text: None)
+    report("dimple and order of the images")
     start = _coarse(data, diameter, shifts)
-    point = _fitted(data, *_problem(data, start, oversampling or 2), _STAGES, n_steps)
+    point = _fitted(data, *_problem(data, start, oversampling or 2), _STAGES, n_steps, report)
     if oversampling is None and np.mean(point.misfit) > 1:
-        point = _fitted(data, *_divided(data, point, 3), _STAGES[1:], n_steps)
+        point = _fitted(data, *_divided(data, point, 3), _STAGES[1:], n_steps, report)
+    report("error bars")
     return _result(data, point, start.reversed)
 
 
@@ -338,18 +345,25 @@ def _light_maps(light: Light, n_pixels: float) -> tuple[LightMap, ...]:
     return smooth, LightMap(light.support & ~light.full, MapPrior(_DIVIDED), n_pixels)
 
 
-def _fitted(data: Recording, problem: Problem, x: NDArray, stages: Sequence[_Stage], n_steps: int) -> Point:
+def _fitted(
+    data: Recording, problem: Problem, x: NDArray, stages: Sequence[_Stage], n_steps: int,
+    report: Callable[[str], Any],
+) -> Point:  # fmt: skip
     """Return where the stages of a fit end."""
-    for stage in stages:
+    for number, stage in enumerate(stages, 1):
         staged = _staged(data, problem, stage)
-        point, _ = minimise(staged, x, n_steps, stage.n_inner, stage.enough)
+        name = f"stage {number} of {len(stages)}, {problem.camera.f} points along a pixel"
+        settings: Any = n_steps, stage.n_inner, stage.enough, partial(_report_step, report, name)
+        point, _ = minimise(staged, x, *settings)
         if stage.signs and np.mean(point.misfit) > _WRONG * _expected(problem, staged):
-            others = [
-                minimise(staged, one, n_steps, stage.n_inner, stage.enough)[0] for one in _other_signs(point)
-            ]
+            others = [minimise(staged, one, *settings)[0] for one in _other_signs(point)]
             point = min(point, *others, key=lambda one: one.cost)
         problem, x = _next(data, point, stage.divide)
     return point
+
+
+def _report_step(report: Callable[[str], Any], name: str, step: int) -> None:
+    report(f"{name}, step {step}")
 
 
 def _expected(problem: Problem, staged: Problem) -> float:

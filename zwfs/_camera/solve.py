@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -421,16 +421,21 @@ class Point:
         return x.reshape(np.shape(right))
 
 
-def minimise(problem: Problem, x: NDArray, n_steps: int, n_inner: int, enough: float = 0.0) -> tuple[Point, bool]:
+def minimise(
+    problem: Problem, x: NDArray, n_steps: int, n_inner: int, enough: float = 0.0,
+    report: Callable[[int], Any] = lambda step: None,
+) -> tuple[Point, bool]:  # fmt: skip
     """Levenberg and Marquardt's method on all unknowns, until a step promises no more than a part of 1.
 
-    It ends earlier when a step promises less than `enough` of the cost. Returns whether it has converged, too.
+    It ends earlier when a step promises less than `enough` of the cost. `report` is called before each step with
+    its number, from 1 on. Returns whether it has converged, too.
     """
     point = Point(problem, x)
     damping, converged, promised = 1e-2, False, math.inf
-    for _ in range(n_steps):
+    for step in range(n_steps):
         if converged or promised <= enough * point.cost:
             break
+        report(step + 1)
         for _ in range(10):
             change = point.solve(-point.gradient, point.stuck, n_inner, 0.03, damping)
             promised = -float(point.gradient @ change) / 2

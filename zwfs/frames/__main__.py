@@ -18,7 +18,7 @@ _EXIT_CODES = """exit codes:
   1    a file or a value was refused, or the disk is full; the message names the cause
   2    the command line is wrong
   3    complete, but frames are flagged (only with --strict)
-  130  interrupted; the same command goes on from there"""
+  130  interrupted; the same `reconstruct` goes on from there"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return run(**options)
     except KeyboardInterrupt:
-        print("\ninterrupted: the same command goes on from there", file=sys.stderr)
+        print(f"\ninterrupted{': the same command goes on from there' * (run is _reconstruct)}", file=sys.stderr)
         return 130
     except (OSError, ValueError, TypeError, ImportError) as error:
         message = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
@@ -67,6 +67,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--gain", type=float, default=1.0, metavar="ELECTRONS", help="of a count; both with --commands")
     add("--iterations", dest="n_iterations", type=int, default=25, metavar="N", help="default: 25")
     add("--tolerance", type=float, default=1e-3, metavar="RAD", help="that ends them; default: 1e-3")
+    add("--quiet", action="store_true", help="do not show the steps of a fit")
     two = commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared)
     two.set_defaults(run=_reconstruct)
     add = two.add_argument
@@ -90,10 +91,15 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _calibrate(output: str, pupil_centers: Sequence[float] | None, **settings: Any) -> int:
+def _calibrate(output: str, pupil_centers: Sequence[float] | None, quiet: bool, **settings: Any) -> int:
     centers = None if pupil_centers is None else [pupil_centers[:2], pupil_centers[2:]]
+    shown = sys.stderr.isatty() and not quiet
     with warnings.catch_warnings(record=True) as remarks:
-        found = calibrate(**settings, pupil_centers=centers)
+        try:
+            found = calibrate(**settings, pupil_centers=centers, progress=_step if shown else None)
+        finally:
+            if shown and settings["commands"]:
+                print(file=sys.stderr)
     for one in remarks:
         print(f"warning: {one.message}", file=sys.stderr)
     found.save(output)
@@ -111,6 +117,10 @@ def _reconstruct(output: str, strict: bool, quiet: bool, **settings: Any) -> int
         flags = ", ".join(f"{n} {name.lower().replace('_', ' ')}" for name, n in found.counts.items() if n)
         print(f"{Path(output)}: {found.n_frames} frames, {found.n_flagged} flagged{f': {flags}' if flags else ''}")
     return 3 if strict and found.n_flagged else 0
+
+
+def _step(text: str) -> None:
+    print(f"\r{text:<60}", end="", file=sys.stderr, flush=True)
 
 
 def _bar(done: int, total: int) -> None:

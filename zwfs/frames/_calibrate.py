@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ def calibrate(
     bad_pixel_files: Sequence[str | Path] = (), *, diameter: float = 0.0, phase_shifts: Sequence[float] = (),
     saturation: float | None = None, fitted: Sequence[str] = (), commands: str | Path | None = None,
     noise: float | None = None, gain: float = 1.0, n_iterations: int = 25, tolerance: float = 1e-3,
-    **settings: Any,
+    progress: Callable[[str], Any] | None = None, **settings: Any,
 ) -> Calibration:  # fmt: skip
     """Calibration from camera files: frames as those to come, and clear frames.
 
@@ -52,6 +52,8 @@ def calibrate(
     noise, gain : float, counts rms and electrons / count
         As for `fit_bench`.
     n_iterations, tolerance : int and float, radian
+    progress : callable, optional
+        With commands, called with a short text before each step of the fit.
     **settings
         Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel. With
         commands only the first two.
@@ -91,7 +93,7 @@ def calibrate(
         shifts: Any = tuple(phase_shifts) or (header.get("THETA1", np.pi / 2), header.get("THETA2", -np.pi / 2))
         found = fit_bench(
             frames, clear, states.commands, n_pixels=n_pixels, noise=noise, gain=gain, phase_shifts=shifts,
-            diameter=diameter or header.get("DIMPLE", 1.06),
+            diameter=diameter or header.get("DIMPLE", 1.06), progress=progress,
         )  # fmt: skip
         for remark in found.remarks:
             warnings.warn(remark, stacklevel=2)

@@ -368,7 +368,7 @@ def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
     starts = [one.start for one in some]
     axes.semilogy(starts, [start / 2 for start in starts], color=_GRAY, lw=1, zorder=1)
     axes.annotate("closed: below half\nof the start", (starts[0], starts[0] / 2), (-6, 16), **text)
-    axes.margins(y=0.17)
+    axes.margins(y=0.22)
     for one in some:
         for names, of, place, side in ((ONE_IMAGE, "one: ", max, (-8, 1)), (TWO_IMAGES, "two: ", min, (-8, -22))):
             drawn = [name for name in names if name in one.settled]

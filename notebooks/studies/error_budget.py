@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
+from studies.fig06_reference import UNITS
 from studies.kit import sweeps
 from studies.kit.bench import BenchCurves, bench_curves, bench_reconstructors, check_bench
 from studies.kit.parameters import bench_fields, parameter_limits
@@ -101,10 +102,15 @@ def effect_columns(budget: Curves) -> dict[str, NDArray | list[str]]:
     }
 
 
-def effect_table(budget: Curves) -> Table:
-    """Offset, gains and errors with each error of the bench alone."""
+def effect_table(budget: Curves, bench: Bench) -> Table:
+    """Size of each error of a bench, and offset, gains and errors with this error alone."""
+    sizes = {name: f" ({getattr(bench, name):g} {unit})" for name, unit in UNITS.items()}
     rows = [
-        [_words(error), f"{offset:.2g}" if (offset := curves.mean(NAME)[0]) > 1e-6 else "0", *_cells(curves)]
+        [
+            _words(error) + sizes.get(error, ""),
+            f"{offset:.2g}" if (offset := curves.mean(NAME)[0]) > 1e-6 else "0",
+            *_cells(curves),
+        ]
         for error, curves in budget.items()
     ]
     return Table(["error switched on", "offset (rad rms)", *_header(budget)], rows)

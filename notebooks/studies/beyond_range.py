@@ -269,7 +269,7 @@ def wrong_frames(
         f"second image {errors.image_shift:g} pixel off": camera.frames(fine, errors.image_shift),
         f"dimples {errors.diameter:.0%} larger": ZernikeSensor(pupil, *wider).measure(screens),
         f"one phase shift {errors.shift:.0%} off": ZernikeSensor(pupil, shifted, second).measure(screens),
-        "pixels are areas, model exact": camera.frames(fine),
+        "phase varies within a pixel": camera.frames(fine),
     }
 
 

@@ -54,6 +54,7 @@ PLANTS = {
 ALIKE = 1.05
 """Ratio of errors up to which the simpler one of two methods is named."""
 
+_MOST = 0.95  # share of loops that close, beyond which a figure does not give their number
 _SIDEWAYS = 0.017  # between the markers of a figure, rad rms
 _GRAY = "#666666"
 _WHITE = {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0"}  # behind a label
@@ -333,7 +334,7 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
     """Residual against the error at the start: a panel for each star, a curve for each method at its best gain.
 
     Markers are filled for one image and open for two, and moved sideways so that none hides another; bars are two
-    standard errors either way. Texts give the loops that close, where some do not.
+    standard errors either way. Texts give the loops that close, where more than a few do not.
     """
     stars = sorted({one.photons for one in trials})
     figure, panels = plt.subplots(1, len(stars), figsize=(7, 3.8), sharex=True, sharey=True, squeeze=False)
@@ -363,22 +364,20 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
 
 
 def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
-    """Draw the limit below which a loop is closed; write how many loops close with one and with two images."""
-    text: dict[str, Any] = {"textcoords": "offset points", "color": _GRAY, "fontsize": 9, "zorder": 0.9}
+    """Draw the limit below which a loop is closed; write how many loops close, where more than a few do not."""
+    text: dict[str, Any] = {"textcoords": "offset points", "color": _GRAY, "fontsize": 9, "zorder": 1.5}
     starts = [one.start for one in some]
     axes.semilogy(starts, [start / 2 for start in starts], color=_GRAY, lw=1, zorder=1)
     axes.annotate("closed: below half\nof the start", (starts[0], starts[0] / 2), (-6, 16), **text)
-    axes.margins(y=0.22)
+    axes.margins(y=0.17)
     for one in some:
         for names, of, place, side in ((ONE_IMAGE, "one: ", max, (-8, 1)), (TWO_IMAGES, "two: ", min, (-8, -22))):
             drawn = [name for name in names if name in one.settled]
             n_loops, closed = one.settled[drawn[0]].size, sorted({one.closed(name) for name in drawn})
-            if closed[0] < n_loops:
+            if closed[0] < _MOST * n_loops:
                 count = "\N{EN DASH}".join(map(str, dict.fromkeys((closed[0], closed[-1]))))
                 point = one.start, place(typical(one.settled[name]) for name in drawn)
-                first = one.start == min(starts)  # no room on its left
-                offset, align = ((-2, -28), "left") if first else (side, "right")
-                axes.annotate(f"{of}{count} of {n_loops}", point, offset, ha=align, bbox=_WHITE, **text)
+                axes.annotate(f"{of}{count} of {n_loops}", point, side, ha="right", bbox=_WHITE, **text)
 
 
 def linear_columns(found: Divergence) -> dict[str, NDArray]:
@@ -443,12 +442,13 @@ def numbers(
     Those with read noise are ordered by the error at the start.
     """
     ends = {"small": noisy[0], "large": noisy[-1]}
-    read = {
+    read: dict[str, Any] = {
         f"noisy_{key}_{n}": typical(row.loops.settled[getattr(row, n)])
         for key, row in ends.items()
         for n in ("one", "two")
     }
     read |= {f"noisy_{key}": row.loops.start for key, row in ends.items()}
+    read["noisy_small_span"] = f"{1 / noisy[0].ratio:.2f} ({1 / noisy[0].high:.2f} to {1 / noisy[0].low:.2f})"
     names = dict(zip(("sensor", "wave", "signs"), PLANTS, strict=True))
     closed, run = {key: found.runs[name].closed() for key, name in names.items()}, found.runs["the sensor"]
     residual = [{name: typical(one) for name, one in row.loops.settled.items()} for row in rows]

@@ -4,7 +4,7 @@ import nbformat
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_output
 
-from book._ext.reading import put_in_order
+from book._ext.reading import COMPUTING, put_in_order
 
 PARAMETERS, SET_UP, DRAW = "rms = 0.5", "import zwfs", 'publish(figure, "range", {})'
 
@@ -48,7 +48,16 @@ def test_figures_and_text_come_first_and_all_code_is_in_one_fold_at_the_end(read
         code("draw(more)", "hide-input", output=True),
         new_markdown_cell("## Method"),
     )
-    first = ["# Question", "check()", "output", "::: files", "## Results", "output", "curves = compute()"]
+    first = [
+        "# Question",
+        "check()",
+        "output",
+        "::: files",
+        "## Results",
+        "output",
+        COMPUTING,
+        "curves = compute()",
+    ]
     sources = [PARAMETERS, SET_UP, "curves = compute()", DRAW, "report(curves)", "more = compute()", "draw(more)"]
     fold = ("folded", "\n\n".join(sources))
     assert page == [*first, "## Second", "output", "## Method", fold]

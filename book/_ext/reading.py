@@ -6,25 +6,28 @@ A notebook runs from its parameters to its figures. Everywhere but on its page o
 import copy
 
 from nbformat import NotebookNode
-from nbformat.v4 import new_code_cell
+from nbformat.v4 import new_code_cell, new_markdown_cell
 
 from studies.kit.results import published
 
 CARD = "card-"  # with which the ids of the cards begin
 FOLD = "Code of this page"
+COMPUTING = "This code computes the first figure:"
 FOLDED = "fold"  # tag of a cell that computes and yet goes into the fold
 
 
 def put_in_order(notebook: NotebookNode) -> None:
     """Move the code of a notebook into a fold at its end, in place.
 
-    The first cell that computes also stays visible, at the end of the section that follows the first figure. Cells
-    with the tag `FOLDED` do not.
+    The first cell that computes also stays visible, with a line before it, at the end of the section that follows
+    the first figure. Cells with the tag `FOLDED` do not.
     """
     code = [cell for cell in notebook.cells if cell.cell_type == "code" and not tagged(cell, "remove-cell")]
     computing = [cell for cell in code if not (cell.outputs or tagged(cell, "hide-input", "parameters", FOLDED))][
         :1
     ]
+    if computing:
+        computing.insert(0, new_markdown_cell(COMPUTING, id="computing"))
     cells: list[NotebookNode] = []
     drawn = described = False  # whether the first figure, and text on it, are above
     for cell in notebook.cells:

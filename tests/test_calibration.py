@@ -77,8 +77,8 @@ def test_three_pokes_place_the_mirror_on_the_camera(tmp_path, monkeypatch, mirro
     """The code of the page finds flip, rotation and scale; with the actuators in a wrong order it fails."""
     monkeypatch.chdir(tmp_path)
     notebook = nbformat.read(study.__file__.replace("studies/calibration.py", "calibration.ipynb"), as_version=4)
-    texts = [cell.source for cell in notebook.cells if "Steps 2 and 3 in code" in cell.source]
-    code = re.search(r"Steps 2 and 3 in code.*?```python\n(.*?)```", texts[0], re.DOTALL)[1]
+    texts = [cell.source for cell in notebook.cells if "Code of steps 2 and 3" in cell.source]
+    code = re.search(r"Code of steps 2 and 3.*?```python\n(.*?)```", texts[0], re.DOTALL)[1]
     n, side, angle = 40, 52, np.radians(8)
     turn = 3.4 * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]) @ np.diag([1, -1])
     actuators = np.indices((12, 12)).reshape(2, -1).T

@@ -423,10 +423,15 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
             ends.append(
                 f"{_short(name)}: {two_digits(typical(loops.settled[name]))}; gain {loops.gains[name]:g}{few}"
             )
-        span = f"{1 / row.high:.2g} to {1 / row.low:.2g}" if row.high < np.inf else "one loop"
         light = f"{loops.photons:g} photon{'s' * (loops.photons != 1)}"
-        cells.append([f"{loops.start:g} rad rms; {light}", *ends, f"{1 / row.ratio:.2g} ({span})"])
+        cells.append([f"{loops.start:g} rad rms; {light}", *ends, _one_over_two(row, ".2g")])
     return Table(header, cells)
+
+
+def _one_over_two(row: BestMethods, form: str) -> str:
+    """Residual with one image over that with two, and in brackets two standard errors either way."""
+    span = f"{1 / row.high:{form}} to {1 / row.low:{form}}" if row.high < np.inf else "one loop"
+    return f"{1 / row.ratio:{form}} ({span})"
 
 
 def _short(method: str) -> str:
@@ -448,7 +453,7 @@ def numbers(
         for n in ("one", "two")
     }
     read |= {f"noisy_{key}": row.loops.start for key, row in ends.items()}
-    read["noisy_small_span"] = f"{1 / noisy[0].ratio:.2f} ({1 / noisy[0].high:.2f} to {1 / noisy[0].low:.2f})"
+    read["noisy_small_span"] = _one_over_two(noisy[0], ".2f")
     names = dict(zip(("sensor", "wave", "signs"), PLANTS, strict=True))
     closed, run = {key: found.runs[name].closed() for key, name in names.items()}, found.runs["the sensor"]
     residual = [{name: typical(one) for name, one in row.loops.settled.items()} for row in rows]

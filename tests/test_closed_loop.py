@@ -128,6 +128,22 @@ def test_altered_sensors_keep_what_they_promise(small):
     assert abs(mean[0] - mean[1]) > 0.01
 
 
+def test_the_difference_of_two_images_keeps_its_sign_over_more_phases_than_one_image(small):
+    pupil, modes, (_, pair) = small
+    point = np.zeros((1, *pupil.shape))  # the others are flat, and keep the reference wave
+    point[0, 12, 12] = 1.0
+    angles = np.linspace(-3, 3, 121)
+    slopes = np.array([pair.jacobian(angle * point, point)[0, :, 12, 12] for angle in angles])
+    one, two = angles[slopes[:, 0] > 0], angles[slopes[:, 0] - slopes[:, 1] > 0]
+    assert (one.min(), one.max()) == pytest.approx((-np.pi / 4, 3 * np.pi / 4), abs=0.1)
+    assert (two.min(), two.max()) == pytest.approx((-np.pi / 2, np.pi / 2), abs=0.1)
+    # Light that both images share changes no estimate: the method uses the difference.
+    flat = pair.measure(np.zeros(pupil.shape))
+    shared = np.random.default_rng(1).normal(size=pupil.shape) * pupil.inside
+    linear = Linear(pair, modes)
+    assert np.nanmax(np.abs(linear(flat + shared).phase - linear(flat).phase)) < 1e-9
+
+
 @pytest.mark.parametrize(("gain", "delay", "expected"), [(0.4, 1, 0.6), (0.4, 2, 0.4**0.5), (1.5, 2, 1.5**0.5)])
 def test_around_a_flat_wavefront_the_growth_is_that_of_the_integrator(small, gain, delay, expected):
     pupil, modes, (sensor, _) = small

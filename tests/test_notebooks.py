@@ -19,6 +19,7 @@ from book._tools.run import FRONT_FIGURE
 from studies.kit.results import published
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
+GLUED = "application/papermill.record/text/plain"
 WIDTH = 76  # letters of code that fit a page in a window 1280 pixels wide
 
 
@@ -53,7 +54,7 @@ def pair(kind, stored, fresh):
 
 
 def glued(stored, fresh):
-    data = {"application/papermill.record/text/plain": "0.5"}
+    data = {GLUED: "0.5"}
     metadata = [{"scrapbook": {"name": name}} for name in (stored, fresh)]
     return display(data=data, metadata=metadata[0], run={"data": data, "metadata": metadata[1]})
 
@@ -69,10 +70,17 @@ SAME = {
     "coordinates within the tolerance": pair("image/svg+xml", svg("1.25"), svg("1.26")),
     "names of a vector picture": pair("image/svg+xml", svg(name="m1"), svg(name="other")),
     "a glued value": glued("x", "x"),
+    "the last digit of a table": pair("text/markdown", "| 1.10 ± 0.42 | +0.9 |", "| 1.10 ± 0.43 | +0.8 |"),
+    "a glued number within the tolerance": pair(GLUED, "0.952", "0.957"),
 }
 TAMPERED = {
     "digits": printed("rms 0.125 rad", "rms 0.126 rad"),
     "a glued name": glued("x", "y"),
+    "a glued number": pair(GLUED, "0.01", "0.02"),
+    "digits of a glued text": pair(GLUED, "'0.021, arcsine'", "'0.023, arcsine'"),
+    "digits of a table": pair("text/markdown", "| 0.42 |", "| 0.44 |"),
+    "a count of a table": pair("text/markdown", "| 23 of 24 |", "| 24 of 24 |"),
+    "a word of a table": pair("text/markdown", "| linear |", "| arcsine |"),
     "12 pixels": pair("image/png", png(), png(changed=12)),
     "all pixels": pair("image/png", png(), png(value=250)),
     "the size of a picture": pair("image/png", png(shape=(40, 50)), png(shape=(50, 40))),

@@ -464,7 +464,7 @@ def draw_causes(found: Causes, threshold: float) -> Figure:
     color = LOOKS[PLAIN].color
     contracts = 100 * np.mean(found.factor < 1, axis=1)
     [line] = share.plot(found.curves.rms, contracts, color=_INK, lw=4, alpha=0.4)
-    handles, labels = [line], ["reduces a small error"]
+    handles, labels = [line], ["plain, from close to the true phase"]
     for name, (label, dashes, marker) in _CAUSES.items():
         tone = color if name in (PLAIN, ACCELERATED) else OTHER_STYLES[1 if name == SECANT else 2]["color"]
         style: dict[str, Any] = {"color": tone, "ls": dashes, "marker": marker, "ms": 5, "mfc": "#ffffff"}

@@ -357,7 +357,7 @@ def numbers(taken: Recording, fit: BenchFit, errors: Errors, not_smooth: NDArray
             "misfit": float(np.mean(fit.misfit)),
             "verdict": _verdict(fit),
             "remarks": " ".join(fit.remarks) or "none",
-            "largest_deviation": np.round(np.abs(deviations).max(), 1),  # as in the table
+            "largest_deviation": np.abs(deviations).max(),
             "deviation_rms": np.sqrt(np.mean(np.square(deviations))),
             "diameter_error": 100 * abs(fit["diameter"].value / true["diameter"] - 1),
             "shift_error": 100 * max(abs(fit[name].value / true[name] - 1) for name in ("first", "second")),

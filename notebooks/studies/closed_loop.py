@@ -54,10 +54,8 @@ PLANTS = {
 ALIKE = 1.05
 """Ratio of errors up to which the simpler one of two methods is named."""
 
-_MOST = 0.95  # share of loops that close, beyond which a figure does not give their number
 _SIDEWAYS = 0.017  # between the markers of a figure, rad rms
 _GRAY = "#666666"
-_WHITE = {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0"}  # behind a label
 
 
 @dataclass(frozen=True)
@@ -280,6 +278,11 @@ class BestMethods:
     low: float  # the ratio less and plus twice its standard error
     high: float
 
+    @classmethod
+    def of(cls, loops: TunedLoops, one: str, two: str) -> BestMethods:
+        """Compare two methods screen by screen."""
+        return cls(loops, one, two, *paired_ratio(loops.settled[two], loops.settled[one]))
+
     @property
     def best(self) -> str | None:
         """Best method, None if the two differ by less than twice the standard error or `ALIKE`."""
@@ -296,7 +299,7 @@ def best_methods(trials: Iterable[TunedLoops]) -> list[BestMethods]:
     rows = []
     for loops in trials:
         one, two = (_simplest(loops.chosen, names) for names in (ONE_IMAGE, TWO_IMAGES))
-        rows.append(BestMethods(loops, one, two, *paired_ratio(loops.settled[two], loops.settled[one])))
+        rows.append(BestMethods.of(loops, one, two))
     return rows
 
 
@@ -334,10 +337,10 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
     """Residual against the error at the start: a panel for each star, a curve for each method at its best gain.
 
     Markers are filled for one image and open for two, and moved sideways so that none hides another; bars are two
-    standard errors either way. Texts give the loops that close, where more than a few do not.
+    standard errors either way. The upper axis counts the loops that close.
     """
     stars = sorted({one.photons for one in trials})
-    figure, panels = plt.subplots(1, len(stars), figsize=(7, 3.8), sharex=True, sharey=True, squeeze=False)
+    figure, panels = plt.subplots(1, len(stars), figsize=(7, 4.4), sharex=True, sharey=True, squeeze=False)
     for axes, photons in zip(panels[0], stars, strict=True):
         some = sorted((one for one in trials if one.photons == photons), key=lambda one: one.start)
         drawn = [name for name in (*TWO_IMAGES, *ONE_IMAGE) if name in some[0].settled]
@@ -353,7 +356,9 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
             if np.isfinite(means).all():  # more than one screen
                 axes.vlines(places, *means[:, 1:].T, color=style["color"], lw=1)
         _mark_closed(axes, some)
-        axes.set_title(f"{photons:g} photon{'s' * (photons != 1)} per point, image and step", fontsize=10)
+        light = f"{photons:g} photon{'s' * (photons != 1)} per point, image and step"
+        n_loops = next(iter(some[0].settled.values())).size
+        axes.set_title(f"{light}\nloops that close, of {n_loops}:", fontsize=10, pad=30)
         axes.set(xlabel="error at the start (rad rms)", xticks=[one.start for one in some])
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter("{x:g}")
@@ -364,20 +369,19 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
 
 
 def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
-    """Draw the limit below which a loop is closed; write how many loops close, where more than a few do not."""
-    text: dict[str, Any] = {"textcoords": "offset points", "color": _GRAY, "fontsize": 9, "zorder": 1.5}
+    """Draw the limit below which a loop is closed; count the closed loops above the panel, for each start."""
     starts = [one.start for one in some]
     axes.semilogy(starts, [start / 2 for start in starts], color=_GRAY, lw=1, zorder=1)
-    axes.annotate("closed: below half\nof the start", (starts[0], starts[0] / 2), (-6, 16), **text)
+    style: dict[str, Any] = {"textcoords": "offset points", "color": _GRAY, "fontsize": 9}
+    axes.annotate("closed: below half\nof the start", (starts[0], starts[0] / 2), (-6, 16), **style)
     axes.margins(y=0.17)
+    place = axes.get_xaxis_transform()  # starts of the axis, and heights in units of the panel
     for one in some:
-        for names, of, place, side in ((ONE_IMAGE, "one: ", max, (-8, 1)), (TWO_IMAGES, "two: ", min, (-8, -22))):
-            drawn = [name for name in names if name in one.settled]
-            n_loops, closed = one.settled[drawn[0]].size, sorted({one.closed(name) for name in drawn})
-            if closed[0] < _MOST * n_loops:
-                count = "\N{EN DASH}".join(map(str, dict.fromkeys((closed[0], closed[-1]))))
-                point = one.start, place(typical(one.settled[name]) for name in drawn)
-                axes.annotate(f"{of}{count} of {n_loops}", point, side, ha="right", bbox=_WHITE, **text)
+        lines = []
+        for label, names in (("one", ONE_IMAGE), ("two", TWO_IMAGES)):
+            closed = sorted({one.closed(name) for name in names if name in one.settled})
+            lines.append(f"{label}: " + "\N{EN DASH}".join(map(str, dict.fromkeys((closed[0], closed[-1])))))
+        axes.text(one.start, 1.02, "\n".join(lines), transform=place, ha="center", fontsize=9)
 
 
 def linear_columns(found: Divergence) -> dict[str, NDArray]:
@@ -464,6 +468,7 @@ def numbers(
     equal = max((start for start in starts if start < min(unequal, default=np.inf)), default=np.nan)
     two_from = min((start for start in starts if start > max(others, default=0)), default=np.nan)
     first = [row.loops for row in rows if row.loops.start == two_from]
+    linear = BestMethods.of(max(first, key=lambda one: one.photons), "Linear", "LinearTwo") if first else None
     lost_loops = [one.settled[name].size - one.closed(name) for one in first for name in ONE_IMAGE]
     return rounded(
         dict(settings)
@@ -477,6 +482,7 @@ def numbers(
             "reversed_lost": found.reversed[lost, 0].mean() if lost.any() else np.nan,
             "equal_to": equal,
             "two_from": two_from,
+            "linear_span": _one_over_two(linear, ".2g") if linear else "unknown",
             "lost_least": min(lost_loops, default=np.nan),
             "lost_most": max(lost_loops, default=np.nan),
             "linear_two_excess": np.ceil(100 * excess) / 100,  # an upper limit, in whole percents

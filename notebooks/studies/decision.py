@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binomtest
 
 from studies import calibration
 from studies.closed_loop import (
@@ -41,11 +42,11 @@ LIMITS = parameter_limits(
     **dict.fromkeys(("rms", "rms_small", "rms_loop", "rms_loop_middle", "rms_loop_small"), (0.01, 4.0)),
     **dict.fromkeys(("photons", "photons_faint"), (10.0, 1e9)),
     **dict.fromkeys(("photons_loop", "photons_loop_faint"), (0.01, 1e9)),
-    **dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop"), (2, 1000)),
+    **dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop", "n_loops_bench"), (2, 1000)),
     n_screens_calibrated=(0, 2),
 )
 
-QUICK = dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop"), 2)
+QUICK = dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop", "n_loops_bench"), 2)
 QUICK |= {"n_pixels": 32, "n_screens_calibrated": 0}
 
 BENCHES = {"perfect": "perfect model", "real": "uncalibrated bench"}
@@ -277,15 +278,14 @@ def bench_loops(known: Known, situations: Sequence[Situation], n_screens: int, s
         each = zip(*islice(found, len(_ON_BENCH)), strict=True)
         gains, chosen, settled = (dict(zip(_ON_BENCH, some, strict=True)) for some in each)
         loops = TunedLoops(rms, photons, gains, chosen, settled)
-        ratio = paired_ratio(settled["LinearTwo"], settled["Linear"])
-        compared.append(BestMethods(loops, "Linear", "LinearTwo", *ratio))
+        compared.append(BestMethods.of(loops, "Linear", "LinearTwo"))
     return compared
 
 
 def _tuned_on_bench(
     task: tuple[Situation, str], known: Known, n_screens: int, seed: int
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Best gain on half as many screens, the residual there, and the residuals on new screens, rad rms."""
+    """Best gain on an eighth as many screens, the residual there, and the residuals on new screens, rad rms."""
     (rms, photons), name = task
     linear = poked_linear(getattr(known.model, _ON_BENCH[name]), known.model, known.poked, known.poke)
     first, then = map(int, np.random.SeedSequence(seed).generate_state(2))
@@ -296,7 +296,7 @@ def _tuned_on_bench(
         )
         return np.array([_bench_loop(known, linear, photons, gain, *one) for one in loops])
 
-    scores = {gain: typical(settle(max(1, n_screens // 2), gain, first)) for gain in GAINS}
+    scores = {gain: typical(settle(max(1, n_screens // 8), gain, first)) for gain in GAINS}
     best = min(scores, key=lambda gain: scores[gain])
     return best, scores[best], settle(n_screens, best, then)
 
@@ -388,6 +388,13 @@ def loop_cell(found: BestMethods) -> Cell:
     both = typical(ends[0] if ends[0].size else one), typical(ends[1] if ends[1].size else two)
     names, closed = (_plain(found.one), _plain(found.two)), (ends[0].size, ends[1].size)
     return Cell(*names, both, found.ratio, found.low, found.high, closed, one.size)
+
+
+def chance(found: BestMethods) -> float:
+    """How probable a difference as large in the number of closed loops is by chance: the two-sided sign test."""
+    one, two = (found.loops.settled[name] < found.loops.start / 2 for name in (found.one, found.two))
+    n_unequal = np.count_nonzero(one != two)
+    return float(binomtest(np.count_nonzero(two & ~one), n_unequal).pvalue) if n_unequal else 1.0
 
 
 def _plain(method: str) -> str:
@@ -498,6 +505,8 @@ def numbers(
             "gain_bright": loops[0].loops.gains["LinearTwo"],
             "gain_faint": loops[1].loops.gains["LinearTwo"],
             "no_noise": typical(no_noise.loops.settled["LinearTwo"]),
+            "chance_perfect": max(chance(loops[2]), 1e-3),  # upper limits
+            "chance_real": max(chance(on_bench[1]), 1e-3),
             "loop_rate": LOOP["rate"] / 1e3,
             "loop_delay": LOOP["delay"],
             "loop_wind": WIND["speed"] * _DIAMETER,

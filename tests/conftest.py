@@ -16,6 +16,7 @@ import zwfs
 from zwfs.bench import Bench, BenchModel
 
 ROOT = Path(__file__).parent.parent
+os.environ.pop("ZWFS_SWEEPS", None)  # a test computes, and reads no stored results
 
 
 def new_reconstructor():

@@ -53,6 +53,13 @@ def pair(kind, stored, fresh):
     return display(data={kind: stored}, run={"data": {kind: fresh}, "metadata": {}})
 
 
+def rounding(kind, stored, fresh):
+    """The same in a cell whose numbers depend on how a processor rounds."""
+    cell = pair(kind, stored, fresh)
+    cell.metadata["tags"] = ["rounding"]
+    return cell
+
+
 def glued(stored, fresh):
     data = {GLUED: "0.5"}
     metadata = [{"scrapbook": {"name": name}} for name in (stored, fresh)]
@@ -70,17 +77,18 @@ SAME = {
     "coordinates within the tolerance": pair("image/svg+xml", svg("1.25"), svg("1.26")),
     "names of a vector picture": pair("image/svg+xml", svg(name="m1"), svg(name="other")),
     "a glued value": glued("x", "x"),
-    "the last digit of a table": pair("text/markdown", "| 1.10 ± 0.42 | +0.9 |", "| 1.10 ± 0.43 | +0.8 |"),
-    "a glued number within the tolerance": pair(GLUED, "0.952", "0.957"),
+    "the last digit of a table": rounding("text/markdown", "| 1.10 ± 0.42 | +0.9 |", "| 1.10 ± 0.43 | +0.8 |"),
+    "a glued number within the tolerance": rounding(GLUED, "0.952", "0.957"),
 }
 TAMPERED = {
     "digits": printed("rms 0.125 rad", "rms 0.126 rad"),
     "a glued name": glued("x", "y"),
-    "a glued number": pair(GLUED, "0.01", "0.02"),
-    "digits of a glued text": pair(GLUED, "'0.021, arcsine'", "'0.023, arcsine'"),
-    "digits of a table": pair("text/markdown", "| 0.42 |", "| 0.44 |"),
-    "a count of a table": pair("text/markdown", "| 23 of 24 |", "| 24 of 24 |"),
-    "a word of a table": pair("text/markdown", "| linear |", "| arcsine |"),
+    "the last digit of another table": pair("text/markdown", "| gain 0.8 |", "| gain 0.9 |"),
+    "a glued number": rounding(GLUED, "0.01", "0.02"),
+    "digits of a glued text": rounding(GLUED, "'0.021, arcsine'", "'0.023, arcsine'"),
+    "digits of a table": rounding("text/markdown", "| 0.42 |", "| 0.44 |"),
+    "a count of a table": rounding("text/markdown", "| 23 of 24 |", "| 24 of 24 |"),
+    "a word of a table": rounding("text/markdown", "| linear |", "| arcsine |"),
     "12 pixels": pair("image/png", png(), png(changed=12)),
     "all pixels": pair("image/png", png(), png(value=250)),
     "the size of a picture": pair("image/png", png(shape=(40, 50)), png(shape=(50, 40))),

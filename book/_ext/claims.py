@@ -19,23 +19,22 @@ from sphinx.errors import ExtensionError
 
 from book._tools.notebook import glued_texts
 
-HOLDS, PARTLY, FAILS, UNTESTED = "holds", "holds in part", "does not hold", "not to be tested here"
+HOLDS, PARTLY, FAILS, UNTESTED = "holds", "holds in part", "does not hold", "not testable here"
 # The signs differ in shape, for readers who do not see the colours.
 SIGNS = {HOLDS: "✔", PARTLY: "◐", FAILS: "✘", UNTESTED: "○"}
 STUDIES = Path(__file__).parents[2] / "notebooks" / "studies"
 BENCHMARKS = Path(__file__).parents[2] / "tests" / "benchmarks"
 PARTS = {"sensor": range(1, 7), "range": range(7, 14), "choices": range(14, 18), "bench": range(18, 22)}
-ROUNDING = 1e-12  # the notebooks give no smaller errors
 
 
 def below(error: float) -> str:
-    """Write a small error with one digit, rounded up: the notebooks give none below `ROUNDING`."""
+    """Write an upper limit of a small error: one digit, rounded up."""
     exponent = math.floor(math.log10(error))
     digit = math.ceil(error / 10**exponent - 1e-9)
     if digit == 10:
         digit, exponent = 1, exponent + 1
     text = f"$10^{{{exponent}}}$" if digit == 1 else f"${digit}\\times10^{{{exponent}}}$"
-    return f"at most {text}" if error <= ROUNDING else text
+    return f"at most {text}"
 
 
 def listed(names: Sequence[str]) -> str:
@@ -79,7 +78,7 @@ class Claim:
     statement: str
     verdicts: list[dict[str, str]]  # the first whose condition applies; otherwise the claim holds
     source: str = ""  # the notebook that measures it, and the heading to link to: ``notebook#its-words``
-    code: str = ""  # the function in the study of the notebook that computes its numbers
+    code: list[str] = field(default_factory=list)  # functions and classes in its study that compute its numbers
     rule: str = ""  # the conditions of the verdicts, in plain words
     given: dict[str, str] = field(default_factory=dict)  # names for expressions
     measured: str = ""  # template of the measured values
@@ -202,7 +201,9 @@ def rules() -> str:
                     file, options = timing_lines(**timed)
                     text += f"**Its times**, `tests/benchmarks/{timed['file']}`:\n\n" + _include(file, **options)
                 text += "**Code that computes its numbers**, "
-                text += f"`notebooks/studies/{notebook}.py`:\n\n" + _include(code, pyobject=claim.code)
+                text += f"`notebooks/studies/{notebook}.py`:\n\n"
+                for name in claim.code:
+                    text += _include(code, pyobject=name)
                 for function in claim.refined:
                     text += _include("../notebooks/studies/kit/curves.py", pyobject=function)
                 text += "**Its numbers**, the marked lines:\n\n"

@@ -12,7 +12,7 @@ from studies.kit.results import published
 
 CARD = "card-"  # with which the ids of the cards begin
 FOLD = "Code of this page"
-COMPUTING = "This code computes the first figure:"
+COMPUTING = "This code computes the numbers of the first figure:"
 FOLDED = "fold"  # tag of a cell that computes and yet goes into the fold
 
 

@@ -260,7 +260,7 @@ def _complete_up_to(curve: DiameterCurves, name: str, threshold: float) -> str:
     """Largest diameter up to which a method recovers every screen."""
     lost = np.flatnonzero(curve.recovered(name, threshold) < 1)
     if not lost.size:
-        return f"{curve.diameters[-1]:g}, the largest"
+        return f"{curve.diameters[-1]:g}, the largest tried"
     return f"{curve.diameters[lost[0] - 1]:g}" if lost[0] else "none"
 
 

@@ -239,7 +239,7 @@ def estimate_table(taken: Recording, fit: BenchFit) -> Table:
         digits = max(1 - int(np.floor(np.log10(sigma))), 0)
         fitted = f"{value:.{digits}f} ± {sigma:.{digits}f}"
         rows.append([title, f"{true[name]:.5g}", fitted, f"{deviation:+.1f}"])
-    return Table(["parameter", "put in", "fitted", "deviation (error bars)"], rows)
+    return Table(["parameter", "of the bench", "fitted", "deviation (error bars)"], rows)
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,7 +54,7 @@ PLANTS = {
 ALIKE = 1.05
 """Ratio of errors up to which the simpler one of two methods is named."""
 
-_SIDEWAYS = 0.017  # between the markers of a figure, rad rms
+_SIDEWAYS = 0.085  # between the markers of one start, over the smallest distance of two starts
 _GRAY = "#666666"
 
 
@@ -212,9 +212,9 @@ class TunedLoops:
     chosen: Mapping[str, float]  # residual with that gain on the screens that chose it, radian rms
     settled: Mapping[str, NDArray]  # (n_screens,) residual on new screens, radian rms
 
-    def closed(self, method: str) -> int:
-        """Return how many loops settle below half of the error at the start."""
-        return int(np.count_nonzero(self.settled[method] < self.start / 2))
+    def closed(self, method: str) -> NDArray[np.bool_]:
+        """Whether each loop settled below half of the error at its start, shape (n_screens,)."""
+        return self.settled[method] < self.start / 2
 
 
 def typical(settled: NDArray) -> float:
@@ -343,6 +343,7 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
     figure, panels = plt.subplots(1, len(stars), figsize=(7, 4.4), sharex=True, sharey=True, squeeze=False)
     for axes, photons in zip(panels[0], stars, strict=True):
         some = sorted((one for one in trials if one.photons == photons), key=lambda one: one.start)
+        step = _SIDEWAYS * min(np.diff([one.start for one in some]), default=some[0].start)
         drawn = [name for name in (*TWO_IMAGES, *ONE_IMAGE) if name in some[0].settled]
         for index, name in enumerate(drawn):
             style = LOOKS["Linear" if name == "LinearTwo" else name].style
@@ -351,7 +352,7 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
             if name == "LinearTwo":
                 style["linestyle"] = "--"
             means = np.array([paired_ratio(one.settled[name], np.ones_like(one.settled[name])) for one in some])
-            places = [one.start + _SIDEWAYS * (index - len(drawn) // 2) for one in some]
+            places = [one.start + step * (index - len(drawn) // 2) for one in some]
             axes.semilogy(places, means[:, 0], label=method_name(name), **style)
             if np.isfinite(means).all():  # more than one screen
                 axes.vlines(places, *means[:, 1:].T, color=style["color"], lw=1)
@@ -379,7 +380,7 @@ def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
     for one in some:
         lines = []
         for label, names in (("one", ONE_IMAGE), ("two", TWO_IMAGES)):
-            closed = sorted({one.closed(name) for name in names if name in one.settled})
+            closed = sorted({one.closed(name).sum() for name in names if name in one.settled})
             lines.append(f"{label}: " + "\N{EN DASH}".join(map(str, dict.fromkeys((closed[0], closed[-1])))))
         axes.text(one.start, 1.02, "\n".join(lines), transform=place, ha="center", fontsize=9)
 
@@ -401,7 +402,7 @@ def tuned_columns(trials: Sequence[TunedLoops]) -> dict[str, Sequence[float]]:
     for name in trials[0].settled:
         columns[f"{name}: gain"] = [one.gains[name] for one in trials]
         columns[f"{name}: residual (rad rms)"] = [typical(one.settled[name]) for one in trials]
-        columns[f"{name}: loops that close"] = [float(one.closed(name)) for one in trials]
+        columns[f"{name}: loops that close"] = [float(one.closed(name).sum()) for one in trials]
     return columns
 
 
@@ -422,23 +423,23 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
         loops = row.loops
         ends = []
         for name in (row.two, row.one):
-            n, closed = loops.settled[name].size, loops.closed(name)
+            n, closed = loops.settled[name].size, loops.closed(name).sum()
             few = f"; {closed} of {n} close" if closed < n else ""
             ends.append(
-                f"{_short(name)}: {two_digits(typical(loops.settled[name]))}; gain {loops.gains[name]:g}{few}"
+                f"{short_name(name)}: {two_digits(typical(loops.settled[name]))}; gain {loops.gains[name]:g}{few}"
             )
         light = f"{loops.photons:g} photon{'s' * (loops.photons != 1)}"
-        cells.append([f"{loops.start:g} rad rms; {light}", *ends, _one_over_two(row, ".2g")])
+        cells.append([f"{loops.start:g} rad rms; {light}", *ends, one_over_two(row, ".2g")])
     return Table(header, cells)
 
 
-def _one_over_two(row: BestMethods, form: str) -> str:
-    """Residual with one image over that with two, and in brackets two standard errors either way."""
+def one_over_two(row: Any, form: str) -> str:
+    """Error with one image over that with two, and in brackets two standard errors either way."""
     span = f"{1 / row.high:{form}} to {1 / row.low:{form}}" if row.high < np.inf else "one loop"
     return f"{1 / row.ratio:{form}} ({span})"
 
 
-def _short(method: str) -> str:
+def short_name(method: str) -> str:
     """Name of a method without the number of its images."""
     return method_name(method).partition(",")[0]
 
@@ -457,7 +458,7 @@ def numbers(
         for n in ("one", "two")
     }
     read |= {f"noisy_{key}": row.loops.start for key, row in ends.items()}
-    read["noisy_small_span"] = _one_over_two(noisy[0], ".2f")
+    read["noisy_small_span"] = one_over_two(noisy[0], ".2f")
     names = dict(zip(("sensor", "wave", "signs"), PLANTS, strict=True))
     closed, run = {key: found.runs[name].closed() for key, name in names.items()}, found.runs["the sensor"]
     residual = [{name: typical(one) for name, one in row.loops.settled.items()} for row in rows]
@@ -469,7 +470,7 @@ def numbers(
     two_from = min((start for start in starts if start > max(others, default=0)), default=np.nan)
     first = [row.loops for row in rows if row.loops.start == two_from]
     linear = BestMethods.of(max(first, key=lambda one: one.photons), "Linear", "LinearTwo") if first else None
-    lost_loops = [one.settled[name].size - one.closed(name) for one in first for name in ONE_IMAGE]
+    lost_loops = [np.count_nonzero(~one.closed(name)) for one in first for name in ONE_IMAGE]
     return rounded(
         dict(settings)
         | read
@@ -482,7 +483,7 @@ def numbers(
             "reversed_lost": found.reversed[lost, 0].mean() if lost.any() else np.nan,
             "equal_to": equal,
             "two_from": two_from,
-            "linear_span": _one_over_two(linear, ".2g") if linear else "unknown",
+            "linear_span": one_over_two(linear, ".2g") if linear else "unknown",
             "lost_least": min(lost_loops, default=np.nan),
             "lost_most": max(lost_loops, default=np.nan),
             "linear_two_excess": np.ceil(100 * excess) / 100,  # an upper limit, in whole percents

@@ -18,8 +18,9 @@ from studies.closed_loop import (
     BestMethods,
     TunedLoops,
     best_methods,
-    method_name,
+    one_over_two,
     paired_ratio,
+    short_name,
     tuned_loops,
     two_digits,
     typical,
@@ -383,23 +384,28 @@ def open_cell(errors: Mapping[str, NDArray]) -> Cell:
 
 def loop_cell(found: BestMethods) -> Cell:
     """Result of the study of closed loops."""
-    one, two = (found.loops.settled[name] for name in (found.one, found.two))
-    ends = [settled[settled < found.loops.start / 2] for settled in (one, two)]
-    both = typical(ends[0] if ends[0].size else one), typical(ends[1] if ends[1].size else two)
-    names, closed = (_plain(found.one), _plain(found.two)), (ends[0].size, ends[1].size)
-    return Cell(*names, both, found.ratio, found.low, found.high, closed, one.size)
+    loops, names = found.loops, (found.one, found.two)
+    closed = [loops.closed(name) for name in names]
+    left = [
+        typical(loops.settled[name][ends if ends.any() else ~ends])
+        for name, ends in zip(names, closed, strict=True)
+    ]
+    counts = int(closed[0].sum()), int(closed[1].sum())
+    one, two = map(short_name, names)
+    return Cell(one, two, (left[0], left[1]), found.ratio, found.low, found.high, counts, closed[0].size)
 
 
-def chance(found: BestMethods) -> float:
-    """How probable a difference as large in the number of closed loops is by chance: the two-sided sign test."""
-    one, two = (found.loops.settled[name] < found.loops.start / 2 for name in (found.one, found.two))
-    n_unequal = np.count_nonzero(one != two)
-    return float(binomtest(np.count_nonzero(two & ~one), n_unequal).pvalue) if n_unequal else 1.0
+def chance(loops: TunedLoops) -> float:
+    """Probability of as unequal counts of closed loops if one image and two closed equally often.
 
-
-def _plain(method: str) -> str:
-    """Name of a method without the number of its images."""
-    return method_name(method).partition(",")[0]
+    It is that of the two-sided sign test, for the linear method with two images and the method with one image for
+    which it is largest, and at least 0.001.
+    """
+    two, found = loops.closed("LinearTwo"), [1e-3]
+    for one in (loops.closed(name) for name in ONE_IMAGE if name in loops.settled):
+        n_unequal = np.count_nonzero(one != two)
+        found.append(binomtest(np.count_nonzero(two & ~one), n_unequal).pvalue if n_unequal else 1.0)
+    return max(found)
 
 
 class Row(NamedTuple):
@@ -438,9 +444,7 @@ def loop_rows(found: Iterable[BestMethods], bench: str) -> list[Row]:
 def open_table(rows: Sequence[Row]) -> Table:
     """Error of the best method with two images and with one, and their ratio, for each bench and wavefront."""
     header = ["situation", "photons per point and image", "two images", "one image", "one over two"]
-    ratios = ([1 / one for one in (row.cell.ratio, row.cell.high, row.cell.low)] for row in rows)
-    texts = ["{:.2g} ({:.2g} to {:.2g})".format(*three) for three in ratios]
-    return Table(header, [[*_cells(row), text] for row, text in zip(rows, texts, strict=True)])
+    return Table(header, [[*_cells(row), one_over_two(row.cell, ".2g")] for row in rows])
 
 
 def loop_table(rows: Iterable[Row]) -> Table:
@@ -483,6 +487,7 @@ def numbers(
     for row in rows:
         found |= {f"{row.key}_start": row.start, f"{row.key}_photons": row.photons}
         found |= {f"{row.key}_{count}": text for count, text in row.cell.sides.items()}
+        found |= {f"{row.key}_left": two_digits(row.cell.typical[1])} if row.cell.closed else {}
     for index, pair in enumerate(calibrated, 1):
         if pair is not None:
             found |= {f"calibrated_gain_{index}": pair[1] / pair[0]}
@@ -491,6 +496,7 @@ def numbers(
             key, cell = f"gain_{row.key}", row.cell
             found |= {key: 1 / cell.ratio, f"{key}_least": 1 / cell.high, f"{key}_most": 1 / cell.low}
     small, faint, bright = errors["real"][-1], loops[-1], errors["perfect"][0]
+    middle = loops[2].loops  # its start is that of the second row on the bench
     gains = sorted(one.loops.gains["LinearTwo"] for one in on_bench)
     ratio = bright[simplest(bright, ONE_IMAGE)] / bright[simplest(bright, TWO_IMAGES)]
     return rounded(
@@ -505,8 +511,8 @@ def numbers(
             "gain_bright": loops[0].loops.gains["LinearTwo"],
             "gain_faint": loops[1].loops.gains["LinearTwo"],
             "no_noise": typical(no_noise.loops.settled["LinearTwo"]),
-            "chance_perfect": max(chance(loops[2]), 1e-3),  # upper limits
-            "chance_real": max(chance(on_bench[1]), 1e-3),
+            "chance_perfect": chance(middle),
+            "chance_real": chance(on_bench[1].loops),
             "loop_rate": LOOP["rate"] / 1e3,
             "loop_delay": LOOP["delay"],
             "loop_wind": WIND["speed"] * _DIAMETER,
@@ -514,8 +520,6 @@ def numbers(
             "loop_modes": _N_MODES,
             "loop_gain_least": min(GAINS),
             "loop_gain_most": max(GAINS),
-            "left_real_1": two_digits(loop_cell(on_bench[0]).typical[1]),
-            "left_real_3": two_digits(loop_cell(on_bench[2]).typical[1]),
             "gain_bench": " to ".join(dict.fromkeys(f"{gain:g}" for gain in (gains[0], gains[-1]))),
         },
         ".3g",

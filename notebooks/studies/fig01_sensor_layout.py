@@ -189,7 +189,7 @@ def identity_table(
         [
             ["the two sides differ by less than 1e-13", bool(np.abs(measured - two_waves).max() < 1e-13)],
             [
-                "share of the light inside the image of the pupil",
+                "share of all light inside the image of the pupil",
                 float(measured[pupil.inside].sum() / pupil.n_points),
             ],
             ["mean intensity of the reference wave inside the pupil", float(reference[pupil.inside].mean())],

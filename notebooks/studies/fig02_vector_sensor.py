@@ -295,7 +295,7 @@ def pair_table(plus: Dimple, minus: Dimple, turn: NDArray, images: NDArray) -> T
         [
             ["phase shift for the first polarisation (π)", plus.phase / np.pi],
             ["phase shift for the second (π)", minus.phase / np.pi],
-            ["between the reference waves, mean (π)", float(np.abs(turn).mean() / np.pi)],
+            ["phase between the reference waves, mean (π)", float(np.abs(turn).mean() / np.pi)],
             ["det M, smallest modulus in the pupil", float(determinant.min())],
             ["the modulus is that of sin(Δθ/2) within 1e-12", bool(np.abs(determinant - expected).max() < 1e-12)],
             ["light of image 1 inside the pupil", float(images[0].mean())],

@@ -319,7 +319,7 @@ def _reach(curves: LinearityCurves, name: str, threshold: float, limit: Limit) -
 def _place(curves: LinearityCurves, limit: Limit) -> str:
     """Input at which a curve exceeds the threshold, in words."""
     if limit.value == 0:
-        return "from the start"
+        return "at all inputs"
     return str(limit) if limit.value < np.inf else f"beyond {curves.rms[-1]:g}"
 
 

@@ -453,7 +453,8 @@ def limits_table(curves: Mapping[int, DiameterCurves], threshold: float, limit: 
     if np.isfinite(limit.value):
         rows[0][-1] = f"{limit.value:.2f}"
     return Table(
-        ["iterations", "passes 10⁻³ rad at about (λ/D)", f"passes {percent(threshold)} at about (λ/D)"], rows
+        ["iterations", "exceeds 10⁻³ rad above about (λ/D)", f"exceeds {percent(threshold)} above about (λ/D)"],
+        rows,
     )
 
 
@@ -469,7 +470,7 @@ def factors_table(reasons: Contraction, curve: DiameterCurves, n_iterations: int
             "diameter (λ/D)",
             "factor, flat",
             "factor, first screen",
-            "observed on it",
+            "observed, first screen",
             "tilt sensitivity (1/rad)",
             f"mean error after {n_iterations} (rad rms)",
         ],
@@ -534,7 +535,7 @@ def methods_table(curves: Mapping[str, DiameterCurves], threshold: float) -> Tab
             "at 2.6",
             "at 3.5 (λ/D)",
             f"passes {percent(threshold)} at about (λ/D)",
-            "twice that at 1.06 from about (λ/D)",
+            "exceeds twice the error at 1.06 above about (λ/D)",
         ],
         [
             [

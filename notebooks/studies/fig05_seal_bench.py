@@ -284,7 +284,7 @@ def layout_table(bench: Bench, pistons: NDArray, wavelength: float) -> Table:
             ["width of a gap (% of a segment)", bench.gap / pitch * 100],
             ["segments with more than 95 % of their area in the stop", int((share > 0.95).sum())],
             ["smallest share of a segment in the stop", float(share.min())],
-            ["fill factor of the stop", pupil.n_points / Pupil.circular(bench.n_pixels).n_points],
+            ["share of the stop that segments cover", pupil.n_points / Pupil.circular(bench.n_pixels).n_points],
             ["pistons (rad rms over the segments)", rms],
             ["pistons, wavefront (nm rms over the segments)", rms * wavelength / (2 * np.pi)],
             ["pistons (rad rms over the stop, which cuts the outer segments)", float(pupil.gather(phase).std())],

@@ -78,7 +78,7 @@ def reach_table(curves: BenchCurves) -> Table:
     header = [
         "reconstructor",
         "error at a flat command (rad rms)",
-        "error ≤ 25 % of the input (rad rms)",
+        "inputs with an error ≤ 25 % (rad rms)",
         "gain, smallest input",
     ]
     rows = [

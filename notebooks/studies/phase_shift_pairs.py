@@ -310,11 +310,11 @@ def allowed_table(maps: PairMaps) -> Table:
             ["all, in either order", maps.error.size],
             ["refused by PhaseShifted", int(maps.singular.sum())],
             [
-                "these are those with equal shifts mod 2π or a shift of 0",
+                "refused: exactly those with equal shifts mod 2π or a shift of 0",
                 bool(np.array_equal(maps.singular, maps.forbidden)),
             ],
             ["largest error of the others (rad rms)", small(worst)],
-            ["largest over smallest error of these, less 1", small(worst / least - 1)],
+            ["largest error of the others over the smallest, minus 1", small(worst / least - 1)],
             ["some pair with a shift of 0 works", maps.zero_works],
         ],
     )
@@ -331,7 +331,7 @@ def close_table(rows: NDArray) -> Table:
 def drawn_table(rows: Sequence[DrawnNoise]) -> Table:
     """Predicted noise next to that of draws."""
     return Table(
-        ["pair", "noise", "predicted (rad √photon)", "drawn", "standard error"],
+        ["pair", "noise", "predicted (rad √photon)", "simulated", "standard error"],
         [
             [
                 f"{_pi(row.theta_a)}, {_pi(row.theta_b)}",

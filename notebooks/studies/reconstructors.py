@@ -151,7 +151,7 @@ def results_table(pupil: Pupil, screen: NDArray, found: Mapping[str, Reconstruct
 def accuracy_table(rows: NDArray) -> Table:
     """Rank and error of the low-rank model, see `model_accuracy`."""
     return Table(
-        ["tolerance", "rank", "error of the reference wave, below"],
+        ["tolerance", "rank", "error of the reference wave is below"],
         [
             [f"{tolerance:.0e}", int(rank), f"{10.0 ** np.ceil(np.log10(error)):.0e}"]
             for tolerance, rank, error in rows

@@ -128,7 +128,7 @@ def test_altered_sensors_keep_what_they_promise(small):
     assert abs(mean[0] - mean[1]) > 0.01
 
 
-def test_the_difference_of_two_images_keeps_its_sign_up_to_a_quarter_turn_on_both_sides(small):
+def test_the_difference_of_two_images_rises_and_has_the_right_sign_further_than_one_image_below_zero(small):
     pupil, modes, (_, pair) = small
     point = np.zeros((1, *pupil.shape))  # the others are flat, and keep the reference wave
     point[0, 12, 12] = 1.0
@@ -137,6 +137,10 @@ def test_the_difference_of_two_images_keeps_its_sign_up_to_a_quarter_turn_on_bot
     one, two = angles[slopes[:, 0] > 0], angles[slopes[:, 0] - slopes[:, 1] > 0]
     assert (one.min(), one.max()) == pytest.approx((-np.pi / 4, 3 * np.pi / 4), abs=0.1)
     assert (two.min(), two.max()) == pytest.approx((-np.pi / 2, np.pi / 2), abs=0.1)
+    signals = np.array([pair.measure(angle * point[0])[:, 12, 12] for angle in angles])
+    signals = signals - pair.measure(np.zeros(pupil.shape))[:, 12, 12]
+    assert angles[signals[:, 0] * angles < -1e-6].max() == pytest.approx(-np.pi / 2, abs=0.1)
+    assert np.all((signals[:, 0] - signals[:, 1]) * angles > -1e-6)
     # Light that both images share changes no estimate: the method uses the difference.
     flat = pair.measure(np.zeros(pupil.shape))
     shared = np.random.default_rng(1).normal(size=pupil.shape) * pupil.inside

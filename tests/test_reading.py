@@ -55,7 +55,7 @@ def test_figures_and_text_come_first_and_all_code_is_in_one_fold_at_the_end(read
         "::: files",
         "## Results",
         "output",
-        COMPUTING,
+        COMPUTING.format("figure"),
         "curves = compute()",
     ]
     sources = [PARAMETERS, SET_UP, "curves = compute()", DRAW, "report(curves)", "more = compute()", "draw(more)"]

@@ -140,7 +140,7 @@ def findings(folder: Path) -> dict[int, Finding]:
 def count(judged: dict[int, Finding]) -> str:
     """Return a line with the number of claims of each verdict."""
     numbers = Counter(finding.verdict for finding in judged.values())
-    listed = ", ".join(f"{numbers[verdict]} {_marked(verdict)}" for verdict in SIGNS)
+    listed = ", ".join(f"{_marked(verdict)}: {numbers[verdict]}" for verdict in SIGNS)
     return f"Of [{len(judged)} claims that we chose from the paper](claims.md): {listed}."
 
 

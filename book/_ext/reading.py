@@ -12,7 +12,7 @@ from studies.kit.results import published
 
 CARD = "card-"  # with which the ids of the cards begin
 FOLD = "Code of this page"
-COMPUTING = "This code computes the numbers of the first figure:"
+COMPUTING = "This code computes the numbers of the {}:"
 FOLDED = "fold"  # tag of a cell that computes and yet goes into the fold
 
 
@@ -27,7 +27,8 @@ def put_in_order(notebook: NotebookNode) -> None:
         :1
     ]
     if computing:
-        computing.insert(0, new_markdown_cell(COMPUTING, id="computing"))
+        figure = "first figure" if sum(bool(published(cell.source)) for cell in code) > 1 else "figure"
+        computing.insert(0, new_markdown_cell(COMPUTING.format(figure), id="computing"))
     cells: list[NotebookNode] = []
     drawn = described = False  # whether the first figure, and text on it, are above
     for cell in notebook.cells:

@@ -292,7 +292,7 @@ def numbers(
     settings: Mapping[str, float],
 ) -> dict[str, float | str]:
     """Return the settings and the numbers of the text, with the failing points at the first input."""
-    first = next(iter(curves.values()))
+    first, last = (list(curves.values())[place] for place in (0, -1))
     usual, large, ring = (_nearest(limits.diameters, diameter) for diameter in (USUAL, LARGE, DARK_RING))
     # Rms over the screens, without the flat wavefront, of each diameter.
     tilt, others, total = (_rms(values[:, 1:]) for values in (limits.tilt, limits.others, limits.total))
@@ -301,6 +301,7 @@ def numbers(
     found = dict(settings) | {
         "first_input": first.rms[0],
         "last_input": list(curves)[-1],
+        "plain_last": last.exceeds(PLAIN, threshold * last.rms[0]),
         "largest": first.diameters[-1],
         "smallest": first.diameters[0],
         "factor_flat": flat,

@@ -460,7 +460,7 @@ def _cells(row: Row) -> list[str]:
 
 def calibrated_table(situations: Iterable[Situation], errors: Iterable[tuple[float, float] | None]) -> Table:
     """Errors of two images with a fitted model, and with the values of the design."""
-    header = ["situation", "photons per point and image", "calibrated", "uncalibrated", "ratio"]
+    header = ["situation", "photons per point and image", "fitted model", "design values", "ratio"]
     both = [
         ["not studied"] * 3 if pair is None else [*map(two_digits, pair), f"{pair[1] / pair[0]:.1f}"]
         for pair in errors

@@ -563,6 +563,7 @@ def numbers(
     found: dict[str, Any] = {
         "iterations": next(iter(by_iterations)),
         "diameter_5_percent": limit.value,
+        "diameter_5_percent_error": limit.error,
         "diameter_5_percent_400": longest.exceeds(ITERATION, allowed),
         "input": paper.rms[0],
         "error_at_20": paper.at(ITERATION, 2.0),

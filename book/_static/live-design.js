@@ -115,7 +115,8 @@
   function choose(x, y) {
     const [diameter, shift] = [diameters[within(diameters, x)], shifts[within(shifts, y)]];
     current = [diameter, [shift, -shift]];
-    page.set({ diameter: diameter.toFixed(2), "shift-a": shift.toFixed(2), "shift-b": (-shift).toFixed(2) });
+    const changes = { diameter: diameter.toFixed(2), "shift-a": shift.toFixed(2), "shift-b": (-shift).toFixed(2) };
+    page.set(diameter > 2.2 ? { ...changes, likelihood: "1" } : changes); // beyond, the iteration diverges
   }
 
   map.addEventListener("click", (event) => {

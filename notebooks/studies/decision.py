@@ -497,7 +497,10 @@ def numbers(
             found |= {key: 1 / cell.ratio, f"{key}_least": 1 / cell.high, f"{key}_most": 1 / cell.low}
     small, faint, bright = errors["real"][-1], loops[-1], errors["perfect"][0]
     middle = loops[2].loops  # its start is that of the second row on the bench
-    gains = sorted(one.loops.gains["LinearTwo"] for one in on_bench)
+    gains = {name: sorted({one.loops.gains[name] for one in on_bench}) for name in _ON_BENCH}
+    gain_one, gain_two = (
+        " to ".join(f"{gain:g}" for gain in (some[0], some[-1])[: len(some)]) for some in gains.values()
+    )
     ratio = bright[simplest(bright, ONE_IMAGE)] / bright[simplest(bright, TWO_IMAGES)]
     return rounded(
         found
@@ -520,7 +523,8 @@ def numbers(
             "loop_modes": _N_MODES,
             "loop_gain_least": min(GAINS),
             "loop_gain_most": max(GAINS),
-            "gain_bench": " to ".join(dict.fromkeys(f"{gain:g}" for gain in (gains[0], gains[-1]))),
+            "gain_bench": gain_two,
+            "gain_bench_one": gain_one,
         },
         ".3g",
     )

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from studies.kit.bench import BenchCurves, check_bench
-from studies.kit.curves import Limit, reach_text
+from studies.kit.curves import Limit, percent, reach_text
 from studies.kit.parameters import bench_fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS
@@ -33,6 +33,8 @@ SHORT = {
 }
 """Reconstructors by their names in the text."""
 
+_SHARE = 0.25  # of the input: the largest error of a reconstructor that works on the bench
+
 
 def reach(curves: BenchCurves, name: str) -> float:
     """Return the largest input of `_within`, rad rms, or 0."""
@@ -40,8 +42,8 @@ def reach(curves: BenchCurves, name: str) -> float:
 
 
 def _within(curves: BenchCurves, name: str) -> NDArray[np.floating]:
-    """Return the inputs (rad rms) at which the mean error is at most 25 % of the input, without 0."""
-    return curves.rms[(curves.rms > 0) & (curves.mean(name) <= 0.25 * curves.rms)]
+    """Return the inputs (rad rms) at which the mean error is at most `_SHARE` of the input, without 0."""
+    return curves.rms[(curves.rms > 0) & (curves.mean(name) <= _SHARE * curves.rms)]
 
 
 def draw_bench_linearity(curves: BenchCurves) -> Figure:
@@ -53,6 +55,9 @@ def draw_bench_linearity(curves: BenchCurves) -> Figure:
         low, high = np.maximum(mean - std, 0), mean + std
         plain.fill_between(curves.rms, low, high, color=look.color, alpha=0.15, lw=0)
         gain.plot(curves.rms, curves.gain(name), markersize=4, **look.style)
+    plain.plot(
+        curves.rms, _SHARE * curves.rms, color="#555555", lw=1, ls=":", label=f"{percent(_SHARE)} of the input"
+    )
     gain.axhline(1, color="#555555", lw=1)
     plain.set(xlabel="input (rad rms over the segments)", ylabel="error (rad rms)", xlim=(0, None), ylim=(0, None))
     gain.set(xlabel="input (rad rms over the segments)", ylabel="gain")
@@ -110,7 +115,7 @@ def numbers(curves: BenchCurves) -> dict[str, float | str]:
     at_01, linear_at_01 = (next(iter(mean[one][curves.rms == 0.1]), np.nan) for one in ("shifted", "linear"))
     texts = {
         "linear_reach": reach_text(
-            inputs, linear, 0.25 * inputs, Limit(reach(curves, "Linear")), "25 % of the input"
+            inputs, linear, _SHARE * inputs, Limit(reach(curves, "Linear")), "25 % of the input"
         ),
         "alike_text": f"From {curves.rms[large][0]:.2g} rad rms on, the median ratio of the arcsine's error to "
         f"that of the linear method is {np.median(alike):.2f}."

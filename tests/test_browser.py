@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from .conftest import ROOT, watch
+from .conftest import ROOT, serving, watch
 
 HTML = ROOT / "_build" / "html"
 WIDTHS = (1280, 390)
@@ -159,6 +159,16 @@ def test_search_finds_a_chapter_before_the_api(page):
     page.wait_for_url(lambda url: "search.html" not in url)
     assert "Gerchberg" in page.locator("article").inner_text()
     assert said == outside(asked) == []
+
+
+def test_search_shows_excerpts_of_prose(page):
+    with serving(HTML) as place:  # pages in files have no excerpts
+        page.goto(f"{place}search.html?q=latency")
+        page.locator(".search-summary", has_text="found").wait_for()
+        page.locator("#search-results p.context").first.wait_for()
+        excerpts = page.locator("#search-results p.context").all_inner_texts()
+    assert any("latency" in text.lower() for text in excerpts)
+    assert not [text for text in excerpts if "import " in text or "{file" in text]
 
 
 def test_no_page_minds_a_query_in_its_address(page):

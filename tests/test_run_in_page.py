@@ -1,16 +1,12 @@
 """Python in the pages of the built book, in a browser, against the same cells in this Python."""
 
 import csv
-import functools
 import io
 import json
 import os
 import re
 import subprocess
 import sys
-import threading
-from contextlib import contextmanager
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +14,7 @@ import pytest
 
 from zwfs.bench import Bench
 
-from .conftest import ROOT, code_of, watch
+from .conftest import ROOT, code_of, serving, watch
 
 HTML = ROOT / "_build" / "html"
 PYODIDE = os.environ.get("ZWFS_PYODIDE", "")
@@ -86,20 +82,9 @@ def columns(text):
     return made
 
 
-@contextmanager
-def serving():
-    """Serve the built book on this computer, and return its address."""
-    handler = functools.partial(SimpleHTTPRequestHandler, directory=HTML)
-    handler.func.log_message = lambda *_: None
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
-
-
 @pytest.fixture(scope="module")
 def book():
-    with serving() as address:
+    with serving(HTML) as address:
         yield address
 
 

@@ -10,3 +10,14 @@ var Scorer = {
   term: 5,
   partialTerm: 2,
 };
+
+// The excerpts show prose, not code or lists of contents. `Search` is defined after this file, in the same script.
+queueMicrotask(() => {
+  const all = Search.htmlToText;
+  Search.htmlToText = (html, anchor) => {
+    const page = new DOMParser().parseFromString(html, "text/html");
+    const unread = ".highlight, .onlyprint, details.hide, button, form, nav, svg, .live, .math";
+    for (const part of page.querySelectorAll(unread)) part.remove();
+    return all(page.documentElement.outerHTML, anchor);
+  };
+});

@@ -337,7 +337,7 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
     """Residual against the error at the start: a panel for each star, a curve for each method at its best gain.
 
     Markers are filled for one image and open for two, and moved sideways so that none hides another; bars are two
-    standard errors either way. The upper axis counts the loops that close.
+    standard errors either way. Above each panel stands how many loops close.
     """
     stars = sorted({one.photons for one in trials})
     figure, panels = plt.subplots(1, len(stars), figsize=(7, 4.4), sharex=True, sharey=True, squeeze=False)

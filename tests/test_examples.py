@@ -35,13 +35,14 @@ def test_example_of_a_loop_prints_the_residuals_of_the_table(capsys):
     exec(compile(code.replace("# One image: ", ""), "own.md", "exec"), {})
     shown = [re.fullmatch(r"(\d+) of 24 loops close, residual ([0-9.]+) rad rms\n", out).groups() for out in
              (two, capsys.readouterr().out)]  # fmt: skip
-    cells = nbformat.read(ROOT / "notebooks" / "decision.ipynb", 4).cells
+    cells = nbformat.read(ROOT / "notebooks" / "closed_loop.ipynb", 4).cells
     outputs = [
         output.get("data", {}).get("text/markdown", "") for cell in cells for output in cell.get("outputs", ())
     ]
-    (row,) = re.findall(r"(?m)^\| perfect model, 0\.5 rad rms \| 1000 \|(.*) \|(.*) \|", "\n".join(outputs))
+    (row,) = re.findall(r"(?m)^\| 0\.5 rad rms; 1000 photons \|(.*?) \|(.*?) \|", "\n".join(outputs))
     for (closed, residual), cell in zip(shown, row, strict=True):
-        assert cell.strip() == f"{residual}, linear; {closed} of 24 loops close"
+        some = "" if closed == "24" else f"; {closed} of 24 close"
+        assert cell.strip() == f"linear: {residual}; gain 0.6{some}"
 
 
 def test_example_of_a_verdict_needs_only_the_package(tmp_path, monkeypatch, capsys):

@@ -90,7 +90,8 @@ COMPUTE = """settings => {
         map.forEach((value, k) => { out[live.places[k]] = value; });
         return out;
     };
-    const made = live.compute({ photons: Infinity, accelerated: false, likelihood: false, ...settings });
+    const standard = { photons: Infinity, both: false, accelerated: false, likelihood: false };
+    const made = live.compute({ ...standard, ...settings });
     const found = (one) => one && {
         errors: one.errors,
         residual: rows(one.residual),
@@ -150,6 +151,8 @@ def test_sensor_and_reconstructors_agree_with_zwfs(compute, pupil, modes, rms, s
         if iterations:
             reconstruct = method(sensor, n_iterations=iterations, tolerance=0.0)
             histories[name] = reconstruct(sensor.measure(phase), history=True).history
+    made["both"] = compute(rms, seed, diameter, shifts, 0, both=True)["linear"]
+    histories["both"] = zwfs.Linear(both, modes, poke=1e-4)(both.measure(phase)).phase[np.newaxis]
     for name, history in histories.items():
         assert_same_phase(pupil, made[name]["phase"], history[-1])
         residual = zwfs.wrapped_residual(pupil, history[-1], phase)
@@ -274,7 +277,10 @@ def test_singular_shifts_are_refused_as_by_zwfs(compute, pupil, modes, shifts):
     made = compute(0.5, 7, 1.06, shifts, 1)
     refused = is_refused(zwfs.PhaseShifted, sensor_of(pupil, 1.06, shifts))
     assert (made["shifted"] is None) == refused == (shifts in SINGULAR)
-    assert (made["linear"] is None) == is_refused(zwfs.Linear, sensor_of(pupil, 1.06, shifts[:1]), modes)
+    for n_images, both in ((1, False), (2, True)):
+        made = compute(0.5, 7, 1.06, shifts, 1, both=both)
+        sensor = sensor_of(pupil, 1.06, shifts[:n_images])
+        assert (made["linear"] is None) == is_refused(zwfs.Linear, sensor, modes)
 
 
 def test_maximum_likelihood_needs_one_dimple_that_changes_the_light(compute):
@@ -347,6 +353,7 @@ def wait_for_address(page, *parts):
         ("The same, accelerated", "✗✗✓", "accelerated"),
         ("The same with maximum likelihood", "✗✗✓", "maximum likelihood"),
         ("A small input", "✗✓✓", "phase-shifted"),
+        ("The same, linear from both images", "✓✓✓", "phase-shifted"),
     ],
 )
 def test_presets_and_buttons_set_the_sensor_up(fresh, preset, expected, named):

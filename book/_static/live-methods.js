@@ -56,7 +56,8 @@
 
   // The linear method for dimples of one diameter. A mode z changes the image of a dimple with the phase shift theta by
   // 2 sin(theta) (b z - B z) around a flat wavefront, where B is the light through the dimple and b that of the flat
-  // wavefront. So the least-squares problem is the same for all phase shifts, and falls apart into four classes.
+  // wavefront. So the least-squares problem is the same for all phase shifts, and falls apart into four classes. Two
+  // images count as one: the mean of both signals, each divided by its sine, with the squared sines as weights.
   function linearFor(functions) {
     const ones = through(functions, phasors(map()), nInside)[0];
     const classes = modes.classes.map(({ start, places, columns }, kind) => {
@@ -77,12 +78,12 @@
     });
     const largest = Math.max(...classes.map((one) => one.largest));
 
-    // Phase of an image that differs from that of a flat wavefront by a signal.
-    return (signal, sine) => {
+    // Phase of a signal: the difference to the image of a flat wavefront, divided by the sine of the phase shift.
+    return (signal) => {
       const sums = mirrored(signal, nInside);
       const coefficients = new Float64Array(modes.list.length);
       for (const { start, places, answers, factor, least, weakest } of classes) {
-        let some = solve(factor, dots(answers, sums, start, nInside).map((sum) => sum / (2 * sine)));
+        let some = solve(factor, dots(answers, sums, start, nInside).map((sum) => sum / 2));
         if (least < CONDITIONING ** 2 * largest) {
           const share = dot(weakest, some);
           some = some.map((value, k) => value - share * weakest[k]);
@@ -112,12 +113,16 @@
   }
 
   // Methods are { estimate, step }: the estimate is a field of modulus 1, which a step replaces.
-  function linear({ flat, frames, steps, solveLinear }) {
-    const sine = steps[0][1];
-    if (Math.abs(sine) < DARK) return null;
-    const reference = live.intensity(live.behind(phasors(map()), flat, steps[0]));
-    const signal = frames[0].map((value, k) => value - reference[k]);
-    return { estimate: phasors(solveLinear(signal, sine)), step: () => {} };
+  function linear({ flat, frames, steps, solveLinear }, nImages) {
+    const used = steps.slice(0, nImages);
+    const strength = used.reduce((sum, [, sine]) => sum + sine * sine, 0);
+    if (strength < DARK ** 2) return null;
+    const signal = map();
+    used.forEach((step, m) => {
+      const reference = live.intensity(live.behind(phasors(map()), flat, step));
+      for (const k of inside) signal[k] += (step[1] * (frames[m][k] - reference[k])) / strength;
+    });
+    return { estimate: phasors(solveLinear(signal)), step: () => {} };
   }
 
   function arcsine({ functions, flat, frames, steps }) {
@@ -312,8 +317,8 @@
   }
 
   /* settings: rms (radian), seed (1 to nSeeds), diameter (lambda/D), shifts (two, radian), photons (that an
-     intensity of 1 puts into a pixel of each image; Infinity: no noise), iterations, accelerated and likelihood (whether
-     to compute them). Maps are those of live-model.js:
+     intensity of 1 puts into a pixel of each image; Infinity: no noise), iterations, both (whether the linear method
+     uses both images), accelerated and likelihood (whether to compute them). Maps are those of live-model.js:
      phase         input, radian
      strehl        of the input
      focal         intensity in the focal plane, rows
@@ -331,7 +336,7 @@
     const problem = { ...model, frames, steps, perPixel: photons };
     return {
       ...{ phase, strehl, focal, frames },
-      linear: follow(linear(problem), truth, 0),
+      linear: follow(linear(problem, set.both ? 2 : 1), truth, 0),
       arcsine: follow(arcsine(problem), truth, iterations),
       shifted: follow(phaseShifted(problem), truth, iterations),
       accelerated: set.accelerated ? follow(accelerated(problem), truth, iterations) : null,

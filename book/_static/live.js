@@ -93,14 +93,16 @@
     shifts: [value("shift-a") * Math.PI, value("shift-b") * Math.PI],
     photons: photons(),
     iterations: value("iterations"),
+    both: find("both").checked,
     accelerated: find("accelerated").checked,
     likelihood: find("likelihood").checked,
   });
 
-  function columns(made, { accelerated, likelihood }) {
+  function columns(made, { both, accelerated, likelihood }) {
     const iteration = accelerated ? ["accelerated", "accelerated"] : ["shifted", "phase-shifted"];
     const last = likelihood ? ["likelihood", "maximum likelihood"] : iteration;
-    return [["linear", "linear"], ["arcsine", "arcsine"], last].map(([key, name]) => ({ key, name, made: made[key] }));
+    const linear = ["linear", both ? "linear (both)" : "linear"];
+    return [linear, ["arcsine", "arcsine"], last].map(([key, name]) => ({ key, name, made: made[key] }));
   }
 
   const succeeds = (error, rms) => error <= Math.max(TOLERATED * rms, draw.SMALLEST);

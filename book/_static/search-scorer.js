@@ -1,6 +1,9 @@
-// A search lists the chapters before the API pages.
+// A search lists the chapters before the glossary, the bibliography and the API pages.
 var Scorer = {
-  score: ([page, , , , score]) => (page.startsWith("book/api") ? score - 100 : score),
+  score([page, , , , score]) {
+    if (page.startsWith("book/api")) return score - 100;
+    return ["book/glossary", "book/bibliography"].includes(page) ? score / 20 : score;
+  },
   objNameMatch: 11,
   objPartialMatch: 6,
   objPrio: { 0: 15, 1: 5, 2: -5 },
@@ -11,13 +14,15 @@ var Scorer = {
   partialTerm: 2,
 };
 
-// The excerpts show prose, not code or lists of contents. `Search` is defined after this file, in the same script.
+// The excerpts show prose, not code or lists of contents; that of an index entry, which is a word, shows its section.
+// `Search` is defined after this file, in the same script.
 queueMicrotask(() => {
   const all = Search.htmlToText;
   Search.htmlToText = (html, anchor) => {
     const page = new DOMParser().parseFromString(html, "text/html");
     const unread = ".highlight, .onlyprint, details.hide, button, form, nav, svg, .live, .math";
     for (const part of page.querySelectorAll(unread)) part.remove();
-    return all(page.documentElement.outerHTML, anchor);
+    const section = anchor.startsWith("#index-") && page.querySelector(anchor)?.closest("section");
+    return all(page.documentElement.outerHTML, section ? `#${section.id}` : anchor);
   };
 });

@@ -17,11 +17,9 @@ from studies.closed_loop import (
     ALIKE,
     BestMethods,
     TunedLoops,
-    best_methods,
     one_over_two,
     paired_ratio,
     short_name,
-    tuned_loops,
     two_digits,
     typical,
 )
@@ -30,7 +28,7 @@ from studies.kit.bench import poked_frames, poked_linear
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
 from studies.kit.tables import Table
-from zwfs import Arcsine, Dimple, MaximumLikelihood, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
+from zwfs import Arcsine, MaximumLikelihood, PhaseShifted, Pupil
 from zwfs.bench import Bench, BenchModel, segment_pistons, segment_residual, segment_screens
 from zwfs.turbulence import FrozenFlow
 
@@ -43,14 +41,14 @@ LIMITS = parameter_limits(
     **dict.fromkeys(("rms", "rms_small", "rms_loop", "rms_loop_middle", "rms_loop_small"), (0.01, 4.0)),
     **dict.fromkeys(("photons", "photons_faint"), (10.0, 1e9)),
     **dict.fromkeys(("photons_loop", "photons_loop_faint"), (0.01, 1e9)),
-    **dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop", "n_loops_bench"), (2, 1000)),
+    **dict.fromkeys(("n_screens", "n_screens_perfect", "n_loops"), (2, 1000)),
     n_screens_calibrated=(0, 2),
 )
 
-QUICK = dict.fromkeys(("n_screens", "n_screens_perfect", "n_screens_loop", "n_loops_bench"), 2)
+QUICK = dict.fromkeys(("n_screens", "n_screens_perfect", "n_loops"), 2)
 QUICK |= {"n_pixels": 32, "n_screens_calibrated": 0}
 
-BENCHES = {"perfect": "perfect model", "real": "uncalibrated bench"}
+BENCHES = {"perfect": "perfect model", "real": "bench with errors"}
 """What is known of the bench, and its name in the table."""
 ONE_IMAGE = {"Linear": "linear", "Arcsine": "arcsine", "LikelihoodOne": "maximum likelihood on pistons"}
 TWO_IMAGES = {
@@ -66,15 +64,12 @@ UNCORRECTED = "PhaseShifted with the offset of its flat"
 _N_DARKS = 16  # averaged
 
 
-NO_NOISE = 1e9
-"""Photons per point and image at which a loop has almost no noise."""
-LOOP: dict[str, Any] = {"rate": 1000.0, "delay": 2, "stroke": 4.0, "n_steps": 40}
+RATE, DELAY, N_STEPS = 1000.0, 2, 40  # of the loops: 1/s, steps, steps
 WIND = {"speed": 2.5, "cutoff": 3.0, "exponent": -2.0}
 GAINS = 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9
 """Settings of the chapter on closed loops."""
 _ON_BENCH = {"Linear": "classic", "LinearTwo": "shifted"}
-"""Methods of the loops on a bench with errors, and their sensors in `BenchModel`."""
-_N_MODES = 80  # of the mirror
+"""Methods of the loops, and their sensors in `BenchModel`."""
 _COMPARED = "perfect_1", "perfect_2", "real_1", "real_3"  # rows of the summary
 _MUCH = 3.0  # ratio of errors beyond which one image fails
 _DIAMETER = 8.0  # of the telescope that the wind speed in m/s belongs to, m
@@ -245,30 +240,8 @@ def calibrated_errors(situations: Sequence[Situation], n_screens: int) -> list[t
     return [tuple(np.sqrt(np.mean(row**2, axis=0)).tolist()) if row.size else None for row in errors]
 
 
-def closed_loops(situations: Sequence[Situation], n_screens: int, seed: int) -> list[BestMethods]:
-    """Close loops with each method at its best gain, with the settings of the chapter on closed loops."""
-    return best_methods(sweeps.run(_closed_loop, situations, n_screens, seed, name="closed_loops"))
-
-
-def _closed_loop(situation: Situation, n_screens: int, seed: int) -> TunedLoops:
-    """All methods in one situation."""
-    pupil = Pupil.circular(24)
-    masks = Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2)
-    return tuned_loops(
-        (ZernikeSensor(pupil, masks[0]), ZernikeSensor(pupil, *masks)),
-        zernike_basis(pupil, _N_MODES),
-        situation.rms,
-        situation.photons,
-        gains=GAINS,
-        n_screens=n_screens,
-        wind=WIND,
-        seed=seed,
-        **LOOP,
-    )
-
-
 def bench_loops(known: Known, situations: Sequence[Situation], n_screens: int, seed: int) -> list[BestMethods]:
-    """Close linear loops on a bench, with the wind, the delay and the gains of the other loops.
+    """Close linear loops on a bench, with the wind, the delay and the gains of the chapter on closed loops.
 
     The response to pokes calibrates the method, and the mirror is led to its flat command.
     """
@@ -310,8 +283,8 @@ def drifting_pistons(bench: Bench, rms: float, n_screens: int, seed: int) -> NDA
     flow = FrozenFlow(Pupil.circular(bench.n_pixels), rms, n_screens, **WIND, seed=seed)
     members = bench.segments.ravel() == bench.numbers[:, np.newaxis]
     means = (members / members.sum(axis=1, keepdims=True)).T
-    steps = range(LOOP["n_steps"])
-    pistons = np.stack([flow(step / LOOP["rate"]).reshape(n_screens, -1) @ means for step in steps], axis=1)
+    steps = range(N_STEPS)
+    pistons = np.stack([flow(step / RATE).reshape(n_screens, -1) @ means for step in steps], axis=1)
     pistons -= pistons.mean(axis=-1, keepdims=True)
     return pistons * (rms / pistons[:, 0].std(axis=-1))[:, np.newaxis, np.newaxis]
 
@@ -320,12 +293,12 @@ def _bench_loop(
     known: Known, linear: Any, photons: float, gain: float, pistons: NDArray, seed: np.random.SeedSequence
 ) -> float:
     """Residual of a loop over its last third, rad rms over the segments."""
-    model, k, delay = known.model, linear.sensor.n_masks, LOOP["delay"]
+    model, k = known.model, linear.sensor.n_masks
     flat = model.pistons(linear(known.flat[:k] / model.scale[:k]).phase)
-    camera, mirror = Camera.of(known, photons, k), [np.zeros(pistons.shape[-1])] * delay
+    camera, mirror = Camera.of(known, photons, k), [np.zeros(pistons.shape[-1])] * DELAY
     left = []
     for wanted, noise in zip(pistons, seed.spawn(len(pistons)), strict=True):
-        left.append(wanted + mirror[-delay])
+        left.append(wanted + mirror[-DELAY])
         counts, share = camera.shot(left[-1], noise)
         found = model.pistons(linear(counts / share / model.scale[:k]).phase) - flat
         mirror.append(mirror[-1] - gain * found)
@@ -391,28 +364,25 @@ def loop_cell(found: BestMethods) -> Cell:
         for name, ends in zip(names, closed, strict=True)
     ]
     counts = int(closed[0].sum()), int(closed[1].sum())
-    one, two = map(short_name, names)
+    one, two = (f"{short_name(name)}, gain {loops.gains[name]:g}" for name in names)
     return Cell(one, two, (left[0], left[1]), found.ratio, found.low, found.high, counts, closed[0].size)
 
 
 def chance(loops: TunedLoops) -> float:
-    """Probability of as unequal counts of closed loops if one image and two closed equally often.
+    """Probability of as unequal counts of closed loops if one image and two closed equally often, at least 0.001.
 
-    It is that of the two-sided sign test, for the linear method with two images and the method with one image for
-    which it is largest, and at least 0.001.
+    It is that of the two-sided sign test.
     """
-    two, found = loops.closed("LinearTwo"), [1e-3]
-    for one in (loops.closed(name) for name in ONE_IMAGE if name in loops.settled):
-        n_unequal = np.count_nonzero(one != two)
-        found.append(binomtest(np.count_nonzero(two & ~one), n_unequal).pvalue if n_unequal else 1.0)
-    return max(found)
+    one, two = loops.closed("Linear"), loops.closed("LinearTwo")
+    n_unequal = int(np.count_nonzero(one != two))
+    return max(1e-3, binomtest(int(np.count_nonzero(two & ~one)), n_unequal).pvalue) if n_unequal else 1.0
 
 
 class Row(NamedTuple):
     """A row of a table."""
 
     key: str
-    bench: str
+    situation: str
     start: str
     photons: str  # per point and image of two
     cell: Cell
@@ -420,24 +390,20 @@ class Row(NamedTuple):
 
 def open_rows(situations: Sequence[Situation], errors: Mapping[str, Sequence[Mapping[str, NDArray]]]) -> list[Row]:
     """Rows of the open loop, for each bench."""
+    starts = [f"{one.rms:g} rad rms" for one in situations]
     return [
-        Row(f"{bench}_{index}", BENCHES[bench], f"{rms:g} rad rms", f"{photons:g}", open_cell(some))
+        Row(f"{bench}_{index}", f"{BENCHES[bench]}, {start}", start, f"{one.photons:g}", open_cell(some))
         for bench, rows in errors.items()
-        for index, ((rms, photons), some) in enumerate(zip(situations, rows, strict=True), 1)
+        for index, (one, start, some) in enumerate(zip(situations, starts, rows, strict=True), 1)
     ]
 
 
-def loop_rows(found: Iterable[BestMethods], bench: str) -> list[Row]:
-    """Rows of closed loops on one of `BENCHES`."""
+def loop_rows(found: Sequence[BestMethods]) -> list[Row]:
+    """Rows of the closed loops."""
+    starts = [f"{one.loops.start:g} rad rms" for one in found]
     return [
-        Row(
-            f"closed_{bench}_{index}",
-            BENCHES[bench],
-            f"{one.loops.start:g} rad rms",
-            f"{one.loops.photons:g}",
-            loop_cell(one),
-        )
-        for index, one in enumerate(found, 1)
+        Row(f"closed_{index}", start, start, f"{one.loops.photons:g}", loop_cell(one))
+        for index, (start, one) in enumerate(zip(starts, found, strict=True), 1)
     ]
 
 
@@ -448,14 +414,14 @@ def open_table(rows: Sequence[Row]) -> Table:
 
 
 def loop_table(rows: Iterable[Row]) -> Table:
-    """Residual of the best method with two images and with one, for each loop."""
-    header = ["situation", "photons per point, image and step", "two images", "one image"]
+    """Residual and gain with two images and with one, for each loop."""
+    header = ["initial error", "photons per point, image and step", "two images", "one image"]
     return Table(header, [_cells(row) for row in rows])
 
 
 def _cells(row: Row) -> list[str]:
     sides = row.cell.sides
-    return [f"{row.bench}, {row.start}", row.photons, sides["two"], sides["one"]]
+    return [row.situation, row.photons, sides["two"], sides["one"]]
 
 
 def calibrated_table(situations: Iterable[Situation], errors: Iterable[tuple[float, float] | None]) -> Table:
@@ -479,15 +445,15 @@ def numbers(
     errors: Mapping[str, Sequence[Mapping[str, NDArray]]],
     calibrated: Sequence[tuple[float, float] | None],
     loops: Sequence[BestMethods],
-    on_bench: Sequence[BestMethods],
-    no_noise: BestMethods,
 ) -> dict[str, float | str]:
     """Situations and results in words, errors of a calibrated bench, and extremes."""
     found: dict[str, float | str] = {}
     for row in rows:
         found |= {f"{row.key}_start": row.start, f"{row.key}_photons": row.photons}
         found |= {f"{row.key}_{count}": text for count, text in row.cell.sides.items()}
-        found |= {f"{row.key}_left": two_digits(row.cell.typical[1])} if row.cell.closed else {}
+        if row.cell.closed:
+            left, span = two_digits(row.cell.typical[1]), one_over_two(row.cell, ".2f")
+            found |= {f"{row.key}_left": left, f"{row.key}_span": span}
     for index, pair in enumerate(calibrated, 1):
         if pair is not None:
             found |= {f"calibrated_gain_{index}": pair[1] / pair[0]}
@@ -495,12 +461,9 @@ def numbers(
         if row.key in _COMPARED:
             key, cell = f"gain_{row.key}", row.cell
             found |= {key: 1 / cell.ratio, f"{key}_least": 1 / cell.high, f"{key}_most": 1 / cell.low}
-    small, faint, bright = errors["real"][-1], loops[-1], errors["perfect"][0]
-    middle = loops[2].loops  # its start is that of the second row on the bench
-    gains = {name: sorted({one.loops.gains[name] for one in on_bench}) for name in _ON_BENCH}
-    gain_one, gain_two = (
-        " to ".join(f"{gain:g}" for gain in (some[0], some[-1])[: len(some)]) for some in gains.values()
-    )
+    for index, one in enumerate(loops, 1):
+        found[f"closed_{index}_gain"] = one.loops.gains["LinearTwo"]
+    small, bright = errors["real"][-1], errors["perfect"][0]
     ratio = bright[simplest(bright, ONE_IMAGE)] / bright[simplest(bright, TWO_IMAGES)]
     return rounded(
         found
@@ -509,22 +472,13 @@ def numbers(
             "likelihood_least": min(_likelihood_ratios(errors["perfect"])),
             "likelihood_most": max(_likelihood_ratios(errors["perfect"])),
             "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
-            "photons_faint": faint.loops.photons,
-            "photons_bright": loops[0].loops.photons,
-            "gain_bright": loops[0].loops.gains["LinearTwo"],
-            "gain_faint": loops[1].loops.gains["LinearTwo"],
-            "no_noise": typical(no_noise.loops.settled["LinearTwo"]),
-            "chance_perfect": chance(middle),
-            "chance_real": chance(on_bench[1].loops),
-            "loop_rate": LOOP["rate"] / 1e3,
-            "loop_delay": LOOP["delay"],
+            "chance": chance(loops[2].loops),
+            "loop_rate": RATE / 1e3,
+            "loop_delay": DELAY,
             "loop_wind": WIND["speed"] * _DIAMETER,
             "loop_diameter": _DIAMETER,
-            "loop_modes": _N_MODES,
             "loop_gain_least": min(GAINS),
             "loop_gain_most": max(GAINS),
-            "gain_bench": gain_two,
-            "gain_bench_one": gain_one,
         },
         ".3g",
     )

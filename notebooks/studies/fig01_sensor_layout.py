@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies.kit.drawings import NARROW, NARROW_LETTERS, Point, Scene, focal_light, shift_label
+from studies.kit.drawings import FOCUS_MAP, NARROW, NARROW_LETTERS, Point, Scene, focal_light, shift_label
 from studies.kit.parameters import parameter_limits
 from studies.kit.style import INTENSITY_MAP, PHASE_MAP, dashed_circle
 from studies.kit.tables import Table
@@ -21,8 +21,6 @@ from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
 LIMITS = parameter_limits("n_pixels diameter rms", phase_shift=(-6.2832, 6.2832))
-
-FOCUS_MAP = "magma"
 
 
 @dataclass(frozen=True)

@@ -447,6 +447,7 @@ def numbers(
     recovered = {name: curves.recovered(name, threshold)[one] for name in curves.errors}
     recovered |= {name: descents.recovered(name, threshold)[0] for name in descents.errors}
     found: dict[str, Any] = {
+        "n_screens": curves.strehl.shape[1],
         "saxton_limit": limits["GerchbergSaxton"].value,
         "gain": gain.value,
         "gain_over_arcsine": limits["PhaseShifted"].over(limits["Arcsine"]).value,
@@ -478,7 +479,7 @@ def numbers(
         "rank": methods["PhaseShifted"].sensor.rank,
     }
     for name, short in _SHORT.items():
-        found[f"{short}_limit"] = limits[name].value
+        found |= {f"{short}_limit": limits[name].value, f"{short}_limit_error": limits[name].error}
     found |= _phrases(curves, limits, threshold)
     longer = round(by_width.dynamic_range(repaired, threshold), 1)  # between inputs that lie far apart
     found["saxton_model_limit_longer"] = longer

@@ -12,14 +12,15 @@ import numpy as np
 from IPython.display import HTML
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
+from studies.kit.drawings import FOCUS_MAP, NARROW, NARROW_LETTERS, Point, Scene, focal_light
 from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
-from studies.kit.style import LOOKS, dashed_circle, show_intensity, show_phase
-from zwfs.masks import focal_field
+from studies.kit.style import INTENSITY_MAP, LOOKS, PHASE_MAP, dashed_circle, show_phase
+from studies.kit.variants import add_narrow
 from zwfs.metrics import wrapped_residual
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
@@ -74,38 +75,91 @@ _REACH = 3.0  # of the picture of the focal plane, lambda/D
 _GREY = "#707070"
 
 
+@dataclass(frozen=True)
+class _Step:
+    """Picture of a step of the light, its names, the colours and ends of its scale, and the colour of its mark."""
+
+    name: str
+    shows: str
+    image: NDArray
+    colors: str
+    low: float
+    high: float
+    mark: str = ""
+
+
 def draw_sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Figure:
-    """Phase in the pupil, focal plane with the first mask, its reference wave and its image."""
+    """Path of the light: pupil, focus with the first mask, and the reference wave and the image on the camera."""
     pupil = sensor.pupil
     field = pupil.field(phase)
     wave = np.abs(sensor.reference_wave(field)[0]) ** 2
     image = sensor.measure(phase)[0]
-    axis = np.linspace(-_REACH, _REACH, 121)
-    focus = np.abs(focal_field(pupil, field, axis, axis)) ** 2
-
-    figure, panels = plt.subplots(1, 4, figsize=(_WIDTH, 2.75))
     inside = np.where(pupil.inside, phase, np.nan)
-    shown = (
-        show_phase(panels[0], inside, np.nanmax(np.abs(inside))),
-        show_intensity(panels[1], focus, 1.0),
-        show_intensity(panels[2], wave, wave.max()),
-        show_intensity(panels[3], image, image.max()),
-    )
-    shown[1].set(cmap="magma", norm="log", clim=(1e-3, 1), extent=(-_REACH, _REACH, -_REACH, _REACH))
-    dashed_circle(panels[1], (0, 0), sensor.masks[0].diameter / 2)
-    titles = "1. pupil:\nphase", "2. focus:\ndimple (dashed)", "3. reference\nwave", "4. camera:\nimage"
-    units = "rad", "intensity", "intensity", "intensity"
-    for axes, picture, title, unit in zip(panels, shown, titles, units, strict=True):
-        axes.set_title(title, fontsize=10)
-        bar = figure.colorbar(picture, ax=axes, location="bottom", label=unit, aspect=12, pad=0.03)
-        if axes is panels[1]:
-            bar.set_ticks([1e-2, 1e-1])  # none at the ends, next to those of other panels
-        if axes is panels[2]:
-            bar.locator = MaxNLocator(2)
-    for axes in (panels[0], panels[3]):
-        color = "black" if axes is panels[0] else "white"
-        axes.plot(pixel.column, pixel.row, "s", mfc="none", mec=color, ms=7, mew=1.5)
-    return figure
+    limit = np.nanmax(np.abs(inside))
+    focus = focal_light(pupil, field, _REACH)
+    steps = [
+        _Step("1. pupil", "phase (rad)", inside, PHASE_MAP, -limit, limit, "black"),
+        _Step("2. focus, dimple", "intensity (log$_{10}$)", focus, FOCUS_MAP, -3, 0),
+        _Step("3. reference wave", "intensity", wave, INTENSITY_MAP, 0, wave.max()),
+        _Step("4. image", "intensity", image, INTENSITY_MAP, 0, image.max(), "white"),
+    ]
+    return add_narrow(_steps_across(sensor, steps, pixel), _steps_down(sensor, steps, pixel))
+
+
+def _steps_across(sensor: ZernikeSensor, steps: list[_Step], pixel: Pixel) -> Figure:
+    """Light from left to right."""
+    scene = Scene(9, 3.5)
+    y, size, lenses = 1.62, 1.8, (2.2, 4.8)
+    _draw_path(scene, 0.1, lenses, 8.0, origin=(0, y))
+    for x in lenses:
+        scene.label(x, 0.16, "lens")
+    scene.label(7.02, 0.16, "on the camera")
+    for x, step in zip((1.05, 3.5, 6.03, 8.02), steps, strict=True):
+        shown = _draw_step(scene, step, (x, y), size, sensor, pixel)
+        scene.label(x, y + 1.35, step.name, weight="bold")
+        scene.label(x, y + 1.05, step.shows)
+        scene.scale(shown, (x - 0.7, y - 1.06, 1.4, 0.08), ticks=3)
+    return scene.figure
+
+
+def _steps_down(sensor: ZernikeSensor, steps: list[_Step], pixel: Pixel) -> Figure:
+    """Light from top to bottom."""
+    height, x, size, lenses = 8.0, 0.95, 1.4, (1.85, 4.05)
+    scene = Scene(NARROW, height, NARROW_LETTERS, down=(x, height - 0.05))
+    _draw_path(scene, 0, lenses, 7.2, origin=(0, 0))
+    for along in lenses:
+        scene.label(x + 0.95, scene.place(along, 0)[1], "lens", ha="left", va="center")
+    left = x + 0.85
+    for along, step in zip((0.8, 2.95, 5.5, 7.2), steps, strict=True):
+        y = scene.place(along, 0)[1]
+        shown = _draw_step(scene, step, (x, y), size, sensor, pixel)
+        scene.label(left, y + 0.42, step.name, ha="left", va="center", weight="bold")
+        scene.label(left, y + 0.14, step.shows, ha="left", va="center")
+        scene.scale(shown, (left + 0.1, y - 0.14, 1.4, 0.08), ticks=3)
+    return scene.figure
+
+
+def _draw_path(scene: Scene, start: float, lenses: tuple[float, float], end: float, origin: Point) -> None:
+    """Beam through two lenses with a focus between them."""
+    y, half = origin[1], 0.7
+    focus = sum(lenses) / 2
+    scene.beam([(start, half), (lenses[0], half), (focus, 0), (lenses[1], half), (end, half)], origin)
+    scene.axis((start, y), (end, y))
+    for along in lenses:
+        scene.lens(along, y, 1.7)
+
+
+def _draw_step(
+    scene: Scene, step: _Step, at: Point, size: float, sensor: ZernikeSensor, pixel: Pixel
+) -> AxesImage:
+    """Picture with the edge of the dimple or the mark of the pixel."""
+    shown = scene.picture(*at, size, step.image, step.colors, step.low, step.high)
+    if step.colors == FOCUS_MAP:
+        middle = (step.image.shape[0] - 1) / 2
+        dashed_circle(shown.axes, (middle, middle), sensor.masks[0].diameter / 2 * middle / _REACH)
+    if step.mark:
+        shown.axes.plot(pixel.column, pixel.row, "s", mfc="none", mec=step.mark, ms=7, mew=1.5)
+    return shown
 
 
 def draw_pixel_phasors(pixel: Pixel) -> Figure:

@@ -23,6 +23,7 @@ _BEAM, _RAY, _EDGE = "#e0a030", "#7a4d0c", "#33658a"
 _CLEAR = 0.18  # opacity of a beam: arrows, axes and edges must stay visible on it
 _GLASS, _CRYSTAL = ("#3f8fc8", 0.28), ("#3f8fc8", 0.5)
 METAL, RETARDER = "#444444", "#7a5195"
+FOCUS_MAP = "magma"
 LETTERS = 14.2
 """Size of the letters of a drawing 9 inches wide, points: on a page they are as large as its prose."""
 NARROW, NARROW_LETTERS = 3.7, 11.5

@@ -25,7 +25,7 @@ PATH = 0.05  # of each number in a vector picture, SVG units
 GLUED = "application/papermill.record/text/plain"
 TEXTS = "text/markdown", GLUED
 ROUNDING = "rounding"
-SHARE = 0.01  # of a glued number; in tables and glued texts it is one in the last digit
+SHARE = 0.02  # of a glued number; in tables and glued texts it is one in the last digit
 
 NUMBER = re.compile(r"(?<![\w.#])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 EMBEDDED = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=\s]+)")

@@ -78,13 +78,13 @@ SAME = {
     "names of a vector picture": pair("image/svg+xml", svg(name="m1"), svg(name="other")),
     "a glued value": glued("x", "x"),
     "the last digit of a table": rounding("text/markdown", "| 1.10 ± 0.42 | +0.9 |", "| 1.10 ± 0.43 | +0.8 |"),
-    "a glued number within the tolerance": rounding(GLUED, "0.952", "0.957"),
+    "a glued number within the tolerance": rounding(GLUED, "1.97", "1.95"),
 }
 TAMPERED = {
     "digits": printed("rms 0.125 rad", "rms 0.126 rad"),
     "a glued name": glued("x", "y"),
     "the last digit of another table": pair("text/markdown", "| gain 0.8 |", "| gain 0.9 |"),
-    "a glued number": rounding(GLUED, "0.01", "0.02"),
+    "a glued number": rounding(GLUED, "1.97", "1.92"),
     "digits of a glued text": rounding(GLUED, "'0.021, arcsine'", "'0.023, arcsine'"),
     "digits of a table": rounding("text/markdown", "| 0.42 |", "| 0.44 |"),
     "a count of a table": rounding("text/markdown", "| 23 of 24 |", "| 24 of 24 |"),

@@ -468,7 +468,10 @@ def draw_causes(found: Causes, threshold: float) -> Figure:
     for name, (label, dashes, marker) in _CAUSES.items():
         tone = color if name in (PLAIN, ACCELERATED) else OTHER_STYLES[1 if name == SECANT else 2]["color"]
         style: dict[str, Any] = {"color": tone, "ls": dashes, "marker": marker, "ms": 5, "mfc": "#ffffff"}
-        handles += share.plot(found.curves.rms, 100 * found.curves.recovered(name, threshold), **style)
+        recovered = found.curves.recovered(name, threshold)
+        error = np.sqrt(recovered * (1 - recovered) / found.curves.errors[name].shape[1])  # of a binomial share
+        handles += share.plot(found.curves.rms, 100 * recovered, **style)
+        share.errorbar(found.curves.rms, 100 * recovered, 100 * error, fmt="none", ecolor=tone, lw=1)
         labels.append(label)
         example.semilogy(np.maximum(found.example[name], _FLOOR), **style)
     share.set(xlabel="input (rad rms)", ylabel="screens (%)", ylim=(-4, 104))

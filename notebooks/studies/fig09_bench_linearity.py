@@ -130,6 +130,7 @@ def numbers(curves: BenchCurves) -> dict[str, float | str]:
             **{f"offset_{short}": mean[short][0] for short in ("shifted", "linear", "saxton")},
             "arcsine_over_linear": round(np.median(alike), 3) if alike.size else np.nan,
             **{f"reach_{short}": reach(curves, name) for short, name in SHORT.items()},
+            "lowest_shifted": next(iter(_within(curves, SHORT["shifted"])), np.nan),
             "shifted_worst": mean["shifted"].max(),
             "largest_input": curves.rms.max(),
             "shifted_share_at_01": at_01 / 0.1,

@@ -6,6 +6,7 @@ import nbformat
 import numpy as np
 import pytest
 
+from studies.closed_loop import two_digits
 from zwfs.bench import Bench, write_bench
 
 from .conftest import ROOT
@@ -43,6 +44,27 @@ def test_example_of_a_loop_prints_the_residuals_of_the_table(capsys):
     for (closed, residual), cell in zip(shown, row, strict=True):
         some = "" if closed == "24" else f"; {closed} of 24 close"
         assert cell.strip() == f"linear: {residual}; gain 0.6{some}"
+
+
+def test_table_of_delays_and_winds_is_that_of_the_example(capsys):
+    page = (ROOT / "book" / "own.md").read_text("utf-8")
+    (code,) = re.findall(r"(?m)^```python\n(.*?)^```", page, re.S)
+    rows = re.findall(r"(?m)^\| ([123]) \| (.*?) \| (.*?) \| (.*?) \|$", page)
+    assert len(rows) == 3
+
+    def residual(delay, speed, gain):
+        changed = code.replace('"gain": 0.6, "delay": 2', f'"gain": {gain}, "delay": {delay}')
+        changed = changed.replace("cutoff=3.0", f"cutoff=3.0, speed={speed / 8}").replace(
+            "{residual:.3f}", "{residual}"
+        )
+        exec(compile(changed, "own.md", "exec"), {})
+        return float(re.search(r"residual (\S+)", capsys.readouterr().out)[1])
+
+    for delay, *cells in rows:
+        for speed, cell in zip((20, 10, 5), cells, strict=True):
+            found = {gain: residual(delay, speed, gain) for gain in (0.2, 0.4, 0.6, 0.8)}
+            best = min(found, key=found.get)
+            assert cell == f"{two_digits(found[best])}, gain {best}"
 
 
 def test_example_of_a_verdict_needs_only_the_package(tmp_path, monkeypatch, capsys):

@@ -366,6 +366,15 @@ def test_presets_and_buttons_set_the_sensor_up(fresh, preset, expected, named):
     assert fresh.inner_text("#live-name-2") == named
 
 
+def test_reset_brings_back_the_input_that_presets_keep(fresh):
+    fresh.click("button:text-is('Few photons')")
+    fresh.click("#live-reset")
+    fresh.wait_for_function("location.hash === ''")
+    fresh.click("button:text-is('SEAL')")
+    wait_for_address(fresh, "diameter=1.1")
+    assert "rms" not in fresh.evaluate("location.hash")
+
+
 def test_next_leads_through_all_that_there_is_to_try_and_begins_again(fresh):
     names = re.findall(r"<button .*?>(.*?)</button>", TRIES)
     first, *others = names

@@ -222,6 +222,12 @@
     caption(input);
   }
   find("play").addEventListener("click", () => play(!playing));
+  find("reset").addEventListener("click", () => {
+    play(false);
+    before = undefined;
+    find("tried").textContent = "";
+    set({}, standard);
+  });
   const tries = [...document.querySelectorAll("button[data-live]")].filter((button) => !button.closest("#live"));
   const next = find("next");
   const offer = (place) => {

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies.kit.drawings import FOCUS_MAP, NARROW, NARROW_LETTERS, Point, Scene, focal_light, shift_label
+from studies.kit.drawings import FOCUS_MAP, NARROW, NARROW_LETTERS, Plane, Point, Scene, focal_light, shift_label
 from studies.kit.parameters import parameter_limits
 from studies.kit.style import INTENSITY_MAP, PHASE_MAP, dashed_circle
 from studies.kit.tables import Table
@@ -34,25 +34,13 @@ class _Term:
     low: float
 
 
-@dataclass(frozen=True)
-class _Plane:
-    """Picture in a plane of the sensor, its name, and the name, colours and ends of its colour scale."""
-
-    name: str
-    scale: str
-    image: NDArray
-    colors: str
-    low: float
-    high: float
-
-
 def draw_sensor_layout(sensor: ZernikeSensor, phase: NDArray) -> Figure:
     """Figure 1: the planes of a sensor with one mask, with the fields computed for `phase` (radian)."""
     planes, terms = _pictures(sensor, phase)
     return add_narrow(_wide(sensor, planes, terms), _narrow(sensor, planes, terms))
 
 
-def _pictures(sensor: ZernikeSensor, phase: NDArray) -> tuple[list[_Plane], list[_Term]]:
+def _pictures(sensor: ZernikeSensor, phase: NDArray) -> tuple[list[Plane], list[_Term]]:
     """Pictures in the planes, and those whose sum is the intensity on the detector."""
     pupil = sensor.pupil
     field = pupil.field(phase)
@@ -62,9 +50,9 @@ def _pictures(sensor: ZernikeSensor, phase: NDArray) -> tuple[list[_Plane], list
     limit = np.nanmax(np.abs(phase * inside))
     light = focal_light(pupil, field, _REACH)
     planes = [
-        _Plane("pupil plane", r"phase of $\psi_{in}$ (rad)", phase * inside, PHASE_MAP, -limit, limit),
-        _Plane("focal plane", r"$|\hat\psi_{in}|^2$ (log$_{10}$)", light, FOCUS_MAP, -4, 0),
-        _Plane("detector plane", r"intensity $I_{out}$", frame, INTENSITY_MAP, 0, frame.max()),
+        Plane("pupil plane", r"phase of $\psi_{in}$ (rad)", phase * inside, PHASE_MAP, -limit, limit),
+        Plane("focal plane", r"$|\hat\psi_{in}|^2$ (log$_{10}$)", light, FOCUS_MAP, -4, 0),
+        Plane("detector plane", r"intensity $I_{out}$", frame, INTENSITY_MAP, 0, frame.max()),
     ]
     interference = 2 * np.abs(pupil.amplitude * wave) * np.cos(np.angle(field * wave.conj()))
     terms = [
@@ -76,14 +64,12 @@ def _pictures(sensor: ZernikeSensor, phase: NDArray) -> tuple[list[_Plane], list
     return planes, terms
 
 
-def _wide(sensor: ZernikeSensor, planes: list[_Plane], terms: list[_Term]) -> Figure:
+def _wide(sensor: ZernikeSensor, planes: list[Plane], terms: list[_Term]) -> Figure:
     """Light from left to right, and the terms in a row below."""
     scene = Scene(9, 6.2)
-    y, half = 4.25, 0.98
-    scene.beam([(0.1, half), (2.82, half), (4.5, 0), (6.18, half), (8.9, half)], origin=(0, y))
-    scene.axis((0.1, y), (8.9, y))
-    for x in (2.82, 6.18):
-        scene.lens(x, y, 2.4)
+    y, lenses = 4.25, (2.82, 6.18)
+    scene.path(0.1, lenses, 8.9, y, half=0.98, height=2.4)
+    for x in lenses:
         scene.label(x, y - 1.5, "lens")
     scene.arrows(2.28, 2.66, y, 0.4)
     for x, plane in zip((1.25, 4.5, 7.75), planes, strict=True):
@@ -104,17 +90,14 @@ def _wide(sensor: ZernikeSensor, planes: list[_Plane], terms: list[_Term]) -> Fi
     return scene.figure
 
 
-def _narrow(sensor: ZernikeSensor, planes: list[_Plane], terms: list[_Term]) -> Figure:
+def _narrow(sensor: ZernikeSensor, planes: list[Plane], terms: list[_Term]) -> Figure:
     """Light from top to bottom, and the terms in two rows below."""
-    height, x, half, f, size = 11.85, 0.95, 0.62, 1.3, 1.4
+    height, x, f, size = 11.85, 0.95, 1.3, 1.4
     scene = Scene(NARROW, height, NARROW_LETTERS, down=(x, height - 0.1))
     first, focus, second = 0.8 + f, 0.8 + 2 * f, 0.8 + 3 * f
     end = second + f
-    profile = [(0, half), (first, half), (focus, 0), (second, half), (end, half)]
-    scene.beam(profile, origin=(0, 0))
-    scene.axis((0, 0), (end, 0))
+    scene.path(0, (first, second), end, 0, half=0.62, height=1.6)
     for along in (first, second):
-        scene.lens(along, 0, 1.6)
         scene.label(x + 0.95, scene.place(along, 0)[1], "lens", ha="left", va="center")
     scene.arrows(first - 0.38, first - 0.12, 0, 0.25)
     left, mask = x + 0.9, sensor.masks[0]

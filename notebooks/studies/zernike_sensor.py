@@ -16,7 +16,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
 from numpy.typing import ArrayLike, NDArray
 
-from studies.kit.drawings import FOCUS_MAP, NARROW, NARROW_LETTERS, Point, Scene, focal_light
+from studies.kit.drawings import FOCUS_MAP, NARROW, NARROW_LETTERS, Plane, Point, Scene, focal_light
 from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
 from studies.kit.style import INTENSITY_MAP, LOOKS, PHASE_MAP, dashed_circle, show_phase
@@ -73,19 +73,7 @@ IMAGES = ("1", "#B2182B", "-"), ("2", "#313695", "--")
 _WIDTH = 6.8  # inches: names of 10 points are then as large as the prose
 _REACH = 3.0  # of the picture of the focal plane, lambda/D
 _GREY = "#707070"
-
-
-@dataclass(frozen=True)
-class _Step:
-    """Picture of a step of the light, its names, the colours and ends of its scale, and the colour of its mark."""
-
-    name: str
-    shows: str
-    image: NDArray
-    colors: str
-    low: float
-    high: float
-    mark: str = ""
+_MARKS = {"1. pupil": "black", "4. image": "white"}  # of the pixel: colour by the name of the picture
 
 
 def draw_sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Figure:
@@ -98,35 +86,35 @@ def draw_sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Fi
     limit = np.nanmax(np.abs(inside))
     focus = focal_light(pupil, field, _REACH)
     steps = [
-        _Step("1. pupil", "phase (rad)", inside, PHASE_MAP, -limit, limit, "black"),
-        _Step("2. focus, dimple", "intensity (log$_{10}$)", focus, FOCUS_MAP, -3, 0),
-        _Step("3. reference wave", "intensity", wave, INTENSITY_MAP, 0, wave.max()),
-        _Step("4. image", "intensity", image, INTENSITY_MAP, 0, image.max(), "white"),
+        Plane("1. pupil", "phase (rad)", inside, PHASE_MAP, -limit, limit),
+        Plane("2. focus, dimple", "intensity (log$_{10}$)", focus, FOCUS_MAP, -3, 0),
+        Plane("3. reference wave", "intensity", wave, INTENSITY_MAP, 0, wave.max()),
+        Plane("4. image", "intensity", image, INTENSITY_MAP, 0, image.max()),
     ]
     return add_narrow(_steps_across(sensor, steps, pixel), _steps_down(sensor, steps, pixel))
 
 
-def _steps_across(sensor: ZernikeSensor, steps: list[_Step], pixel: Pixel) -> Figure:
+def _steps_across(sensor: ZernikeSensor, steps: list[Plane], pixel: Pixel) -> Figure:
     """Light from left to right."""
     scene = Scene(9, 3.5)
     y, size, lenses = 1.62, 1.8, (2.2, 4.8)
-    _draw_path(scene, 0.1, lenses, 8.0, origin=(0, y))
+    scene.path(0.1, lenses, 8.0, y, half=0.7, height=1.7)
     for x in lenses:
         scene.label(x, 0.16, "lens")
     scene.label(7.02, 0.16, "on the camera")
     for x, step in zip((1.05, 3.5, 6.03, 8.02), steps, strict=True):
         shown = _draw_step(scene, step, (x, y), size, sensor, pixel)
         scene.label(x, y + 1.35, step.name, weight="bold")
-        scene.label(x, y + 1.05, step.shows)
+        scene.label(x, y + 1.05, step.scale)
         scene.scale(shown, (x - 0.7, y - 1.06, 1.4, 0.08), ticks=3)
     return scene.figure
 
 
-def _steps_down(sensor: ZernikeSensor, steps: list[_Step], pixel: Pixel) -> Figure:
+def _steps_down(sensor: ZernikeSensor, steps: list[Plane], pixel: Pixel) -> Figure:
     """Light from top to bottom."""
     height, x, size, lenses = 8.0, 0.95, 1.4, (1.85, 4.05)
     scene = Scene(NARROW, height, NARROW_LETTERS, down=(x, height - 0.05))
-    _draw_path(scene, 0, lenses, 7.2, origin=(0, 0))
+    scene.path(0, lenses, 7.2, 0, half=0.7, height=1.7)
     for along in lenses:
         scene.label(x + 0.95, scene.place(along, 0)[1], "lens", ha="left", va="center")
     left = x + 0.85
@@ -134,31 +122,21 @@ def _steps_down(sensor: ZernikeSensor, steps: list[_Step], pixel: Pixel) -> Figu
         y = scene.place(along, 0)[1]
         shown = _draw_step(scene, step, (x, y), size, sensor, pixel)
         scene.label(left, y + 0.42, step.name, ha="left", va="center", weight="bold")
-        scene.label(left, y + 0.14, step.shows, ha="left", va="center")
+        scene.label(left, y + 0.14, step.scale, ha="left", va="center")
         scene.scale(shown, (left + 0.1, y - 0.14, 1.4, 0.08), ticks=3)
     return scene.figure
 
 
-def _draw_path(scene: Scene, start: float, lenses: tuple[float, float], end: float, origin: Point) -> None:
-    """Beam through two lenses with a focus between them."""
-    y, half = origin[1], 0.7
-    focus = sum(lenses) / 2
-    scene.beam([(start, half), (lenses[0], half), (focus, 0), (lenses[1], half), (end, half)], origin)
-    scene.axis((start, y), (end, y))
-    for along in lenses:
-        scene.lens(along, y, 1.7)
-
-
 def _draw_step(
-    scene: Scene, step: _Step, at: Point, size: float, sensor: ZernikeSensor, pixel: Pixel
+    scene: Scene, step: Plane, at: Point, size: float, sensor: ZernikeSensor, pixel: Pixel
 ) -> AxesImage:
     """Picture with the edge of the dimple or the mark of the pixel."""
     shown = scene.picture(*at, size, step.image, step.colors, step.low, step.high)
     if step.colors == FOCUS_MAP:
         middle = (step.image.shape[0] - 1) / 2
         dashed_circle(shown.axes, (middle, middle), sensor.masks[0].diameter / 2 * middle / _REACH)
-    if step.mark:
-        shown.axes.plot(pixel.column, pixel.row, "s", mfc="none", mec=step.mark, ms=7, mew=1.5)
+    if color := _MARKS.get(step.name):
+        shown.axes.plot(pixel.column, pixel.row, "s", mfc="none", mec=color, ms=7, mew=1.5)
     return shown
 
 

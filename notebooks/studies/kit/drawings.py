@@ -45,6 +45,18 @@ class Polarisation:
 PLUS, MINUS = Polarisation("#B2182B", "-"), Polarisation("#313695", (0, (4, 2)))
 
 
+@dataclass(frozen=True)
+class Plane:
+    """Picture in a plane of a sensor, its name, and the name, colours and ends of its colour scale."""
+
+    name: str
+    scale: str
+    image: NDArray
+    colors: str
+    low: float
+    high: float
+
+
 class Scene:
     """Figure without visible axes: positions in inches from its lower left corner, text of `size` points.
 
@@ -152,6 +164,16 @@ class Scene:
         left, right, low, high = x - width / 2, x + width / 2, y - height / 2, y + height / 2
         corners = [(left, low), (right, low), (right, high), (left, high)]
         self._fill(corners, fc=color, ec=edge, zorder=3)
+
+    def path(
+        self, start: float, lenses: tuple[float, float], end: float, y: float, half: float, height: float
+    ) -> None:
+        """Beam of a width of twice `half` through two lenses of some height, with a focus between them."""
+        profile = [(start, half), (lenses[0], half), (sum(lenses) / 2, 0.0), (lenses[1], half), (end, half)]
+        self.beam(profile, origin=(0, y))
+        self.axis((start, y), (end, y))
+        for along in lenses:
+            self.lens(along, y, height)
 
     def corner(self, *points: Point) -> None:
         """Light in front of a mirror that folds the beam."""

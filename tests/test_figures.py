@@ -147,7 +147,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_pairs": ((PairMaps(three, *np.full((5, 3, 3), 1.0)),), ()),
         "draw_pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
         "draw_photon_noise": ((faint,), LOOKS),
-        "draw_error_bars": (([ErrorBars(k, EXPECTED, k, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
+        "draw_error_bars": (([ErrorBars(k, EXPECTED, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
         "draw_design_maps": ((designs, PUBLISHED, {"flat": three}), ()),
         "draw_band_errors": (({(0.1, False): banded, (0.1, True): banded},), [*shifted_only, "MaximumLikelihood"]),
         "draw_held_drift": ((held,), ()),

@@ -171,8 +171,10 @@ def _row(claim: Claim, finding: Finding) -> list[str]:
     if page := SECTIONS.get(claim.section):
         section = f"[{section}]({page})"
     measured = [f"{sentence(finding.measured)}."] if finding.measured else []
-    sign = "" if finding.verdict == HOLDS else f"{SIGNS[finding.verdict]} "  # of what limits the claim
-    measured += [f"{sign}{finding.remark}"] if finding.remark else []
+    if finding.remark and finding.verdict == HOLDS:
+        measured.append(finding.remark)
+    elif finding.remark:  # what limits the claim comes first
+        measured.insert(0, f"{SIGNS[finding.verdict]} {finding.remark}")
     if claim.notebook:
         address = claim.source.replace(claim.notebook, f"../notebooks/{claim.notebook}.ipynb")
         measured.append(f"*[{_title(claim.notebook)}]({address}), [code](#code-{claim.number})*")

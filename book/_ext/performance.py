@@ -68,7 +68,8 @@ def peers(rows: list[dict[str, Any]]) -> str:
         quickest = min(accurate, key=lambda row: row["ratio"], default=None)
         for row in mine:
             if row["default"] or row is quickest:
-                setting = f"{package}, {row['setting']}{' (default)' if row['default'] else ''}"
+                usual = "our choice" if package == "prysm" else "default"  # prysm has no default
+                setting = f"{package}, {row['setting']}{f' ({usual})' if row['default'] else ''}"
                 lines.append([setting, f"{row['ratio']:.3g}", power(row["error"])])
     return table(["package and setting", "time (zwfs\u00a0=\u00a01)", INTENSITY], lines)
 

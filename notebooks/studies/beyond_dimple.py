@@ -50,7 +50,6 @@ LIMITS = parameter_limits(
     n_screens_few=(1, 100),
 )
 QUICK = {"n_pixels": 40, "n_screens": 3, "step": 0.5, "step_fine": 0.3}
-USUAL, LARGE = 1.06, 3.0  # diameters of the paper and of a dimple beyond its limit, lambda/D
 _TILTS = 2  # the first modes: Noll 2 and 3
 
 
@@ -71,18 +70,15 @@ def dimple_curves(
     return diameter_curves(make, diameters, screens)
 
 
-def failing_limits(
+def failing_limit(
     curve: DiameterCurves, pupil: Pupil, phase_shift: float, n_iterations: int, screens: NDArray, threshold: float
-) -> dict[str, Limit]:
-    """Diameter at which the mean error of each iteration exceeds the threshold, from other screens."""
+) -> Limit:
+    """Diameter at which the mean error of the paper's iteration exceeds the threshold, from other screens."""
 
-    def limit(name: str) -> Limit:
-        def make(diameters: NDArray) -> DiameterCurves:
-            return dimple_curves(pupil, phase_shift, n_iterations, diameters, screens, [name])
+    def make(diameters: NDArray) -> DiameterCurves:
+        return dimple_curves(pupil, phase_shift, n_iterations, diameters, screens, [PLAIN])
 
-        return diameter_limit(curve, name, make, threshold)
-
-    return {name: limit(name) for name in (PLAIN, ACCELERATED)}
+    return diameter_limit(curve, PLAIN, make, threshold)
 
 
 @dataclass(frozen=True)
@@ -286,43 +282,24 @@ def instruments_table(curves: Mapping[str, ErrorCurves], threshold: float) -> Ta
 def numbers(
     curves: Mapping[float, DiameterCurves],
     limits: DimpleLimits,
-    masks: Mapping[str, ErrorCurves],
-    fails: Mapping[str, Limit],
+    fails: Limit,
     threshold: float,
     settings: Mapping[str, float],
 ) -> dict[str, float | str]:
-    """Return the settings and the numbers of the text, with the failing points at the first input."""
+    """Return the settings and the numbers of the text, with the failing point at the first input."""
     first, last = (list(curves.values())[place] for place in (0, -1))
-    usual, large, ring = (_nearest(limits.diameters, diameter) for diameter in (USUAL, LARGE, DARK_RING))
-    # Rms over the screens, without the flat wavefront, of each diameter.
-    tilt, others, total = (_rms(values[:, 1:]) for values in (limits.tilt, limits.others, limits.total))
-    flat, *aberrated = (crossing(limits.diameters, row, 1.0) for row in limits.factor.T)
-    plain = np.concatenate([curve.recovered(PLAIN, threshold) for curve in masks.values()])
+    ring = int(np.argmin(np.abs(limits.diameters - DARK_RING)))
+    allowed, words = threshold * first.rms[0], f"{percent(threshold)} of the input"
     found = dict(settings) | {
         "first_input": first.rms[0],
         "last_input": list(curves)[-1],
         "plain_last": last.exceeds(PLAIN, threshold * last.rms[0]),
         "largest": first.diameters[-1],
         "smallest": first.diameters[0],
-        "factor_flat": flat,
-        "factor_screens_least": min(aberrated),
-        "factor_screens_most": max(aberrated),
+        "factor_flat": crossing(limits.diameters, limits.factor[:, 0], 1.0),
         "tilt_flat_ring": limits.tilt[ring, 0],
         "others_flat_ring": limits.others[ring, 0],
-        "tilt_screens_most": tilt.max(),
-        "others_usual": others[usual],
-        "others_large": others[large],
-        "total_usual": total[usual],
-        "total_large": total[large],
-        "masks_plain_least": plain.min(),
-        "masks_plain_most": plain.max(),
+        "tilt_screens_most": _rms(limits.tilt[:, 1:]).max(),  # of each diameter, rms over the screens
+        "plain_reach": reach_text(first.diameters, first.mean(PLAIN), allowed, fails, words, "λ/D"),
     }
-    allowed, words = threshold * first.rms[0], f"{percent(threshold)} of the input"
-    for name, short in ((PLAIN, "plain"), (ACCELERATED, "accelerated")):
-        error = first.mean(name)
-        found[f"{short}_reach"] = reach_text(first.diameters, error, allowed, fails[name], words, "λ/D")
     return rounded(found, ".4g")
-
-
-def _nearest(diameters: NDArray, diameter: float) -> int:
-    return int(np.argmin(np.abs(diameters - diameter)))

@@ -566,18 +566,18 @@ def numbers(
     noiseless, *noisy = curves
     chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
     few = min(noisy, key=lambda curve: abs(np.log(curve.photons / 1e3)))
-    at = {name: int(np.argmin(np.abs(chosen.rms - rms))) for name, rms in (("1", 1.0), ("3", 3.0))}
+    one, three = (int(np.argmin(np.abs(chosen.rms - rms))) for rms in (1.0, 3.0))
     two = int(np.argmin(np.abs(found.curves.rms - 2.0)))
     right = noiseless.errors[LIKELY] <= threshold * noiseless.rms[:, np.newaxis]
     usual = (chosen.rms >= 0.1) & (chosen.rms <= 2)
     usual |= not usual.any()
-    *_, area = model.values()
+    amplitude, offset, *_, area = model.values()
+    place = int(np.argmin(np.abs(area.rms - 1.0)))
     pixels = np.median(area.errors[LIKELY], axis=1)
     result = dict(settings) | {
         "few_photons": few.photons,
         "shown_photons": chosen.photons,
         "modes_share": np.median(chosen.median(MODES)[usual] / chosen.median(LIKELY)[usual]),
-        "modes_over": np.max(chosen.median(MODES)[usual] / chosen.bound[MODES][usual]),
         "modes_from": chosen.rms[usual][0],
         "modes_to": chosen.rms[usual][-1],
         "contracting_at_2": np.mean(found.factor[two] < 1),
@@ -587,17 +587,14 @@ def numbers(
         "pixels_text": reach_text(
             area.rms, pixels, PIXEL_ERROR, Limit(crossing(area.rms, pixels, PIXEL_ERROR)), f"{PIXEL_ERROR:g} rad"
         ),
-        "threshold_text": percent(threshold),
-        "model_input": area.rms[np.argmin(np.abs(area.rms - 1.0))],
+        "model_input": area.rms[place],
+        "amplitude_1": np.median(amplitude.errors[LIKELY][place]),
+        "offset_1": np.median(offset.errors[LIKELY][place]),
         "input_2": found.curves.rms[two],
-        **{f"input_{name}": chosen.rms[place] for name, place in at.items()},
+        "input_3": chosen.rms[three],
+        "few_likely_3": few.median(LIKELY)[three],
+        "shown_likely_1": chosen.median(LIKELY)[one],
     }
     for name, method in (("plain", PLAIN), ("dimmed", DIMMED), ("accelerated", ACCELERATED)):
         result[f"{name}_at_2"] = found.curves.recovered(method, threshold)[two]
-    for rms, place in at.items():
-        result[f"few_likely_{rms}"] = few.median(LIKELY)[place]
-        result[f"shown_likely_{rms}"] = chosen.median(LIKELY)[place]
-    short = "amplitude", "offset", "diameter", "shift", "area"
-    for name, curve in zip(short, model.values(), strict=True):
-        result[f"{name}_1"] = np.median(curve.errors[LIKELY][np.argmin(np.abs(curve.rms - 1.0))])
     return rounded(result, ".3g")

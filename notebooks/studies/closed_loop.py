@@ -451,18 +451,11 @@ def numbers(
 
     Those with read noise are ordered by the error at the start.
     """
-    ends = {"small": noisy[0], "large": noisy[-1]}
-    read: dict[str, Any] = {
-        f"noisy_{key}_{n}": typical(row.loops.settled[getattr(row, n)])
-        for key, row in ends.items()
-        for n in ("one", "two")
-    }
-    read |= {f"noisy_{key}": row.loops.start for key, row in ends.items()}
-    read["noisy_small_span"] = one_over_two(noisy[0], ".2f")
+    small, large = noisy[0], noisy[-1]
     names = dict(zip(("sensor", "wave", "signs"), PLANTS, strict=True))
-    closed, run = {key: found.runs[name].closed() for key, name in names.items()}, found.runs["the sensor"]
+    closed = {key: found.runs[name].closed() for key, name in names.items()}
     residual = [{name: typical(one) for name, one in row.loops.settled.items()} for row in rows]
-    lost, starts = ~closed["sensor"], {row.loops.start for row in rows}
+    starts = {row.loops.start for row in rows}
     unequal = [row.loops.start for row in rows if row.best is not None]
     others = [row.loops.start for row in rows if row.best != row.two]
     excess = max(one["LinearTwo"] / min(one.values()) for one in residual) - 1
@@ -473,20 +466,21 @@ def numbers(
     lost_loops = [np.count_nonzero(~one.closed(name)) for one in first for name in ONE_IMAGE]
     return rounded(
         dict(settings)
-        | read
         | {f"closed_{key}": np.count_nonzero(one) for key, one in closed.items()}
         | {
-            "n_loops": len(run.residual),
+            "n_loops": closed["sensor"].size,
             "rank_growth": found.ranking(found.growth),
             "rank_wave": found.ranking(-found.wave),
-            "reversed_closed": found.reversed[~lost, 0].mean() if not lost.all() else np.nan,
-            "reversed_lost": found.reversed[lost, 0].mean() if lost.any() else np.nan,
             "equal_to": equal,
             "two_from": two_from,
             "linear_span": one_over_two(linear, ".2g") if linear else "unknown",
             "lost_least": min(lost_loops, default=np.nan),
             "lost_most": max(lost_loops, default=np.nan),
             "linear_two_excess": np.ceil(100 * excess) / 100,  # an upper limit, in whole percents
-            "iteration_excess": max(one["PhaseShifted"] / one["LinearTwo"] for one in residual) - 1,
+            "noisy_small": small.loops.start,
+            "noisy_small_span": one_over_two(small, ".2f"),
+            "noisy_large": large.loops.start,
+            "noisy_large_one": typical(large.loops.settled[large.one]),
+            "noisy_large_two": typical(large.loops.settled[large.two]),
         }
     )

@@ -216,27 +216,23 @@ def photons_table(curves: DriftCurves) -> Table:
 def numbers(curves: DriftCurves) -> dict[str, float | str]:
     """Return photons, residuals and gains; sensors are numbered in their order."""
     drift, gains, by_gain = curves.drift, curves.gains, curves.by_gain
-    *errors, ideal = curves.errors.values()
-    best, target = errors[-1], 1.5 * drift.rms
-    photons = [photons_to_hold(one, drift, target) for one in errors]
-    photons_ideal = photons_to_hold(ideal, drift, target)
-    found: dict[str, float] = {"drift": drift.rms, "target": target}
-    for index, needed in enumerate(photons):
-        found[f"photons_{index}"] = needed
+    *_, paper, best, ideal = curves.errors.values()
+    target = 1.5 * drift.rms
+    needed, needed_best, needed_ideal = (photons_to_hold(one, drift, target) for one in (paper, best, ideal))
     ratios = [
-        held / kalman_limit(one, drift, curves.photons)
-        for held, one in zip(curves.held.values(), errors, strict=True)
+        held / kalman_limit(curves.errors[name], drift, curves.photons) for name, held in curves.held.items()
     ]
     least, most = min(by_gain), max(by_gain)
-    found |= {
-        "per_point": 1e9 / 2 / np.count_nonzero(np.any(drift.modes, axis=0)),
-        "saved": 100 * (1 - photons[-1] / photons[1]),
-        "above_ideal": 100 * (photons[-1] / photons_ideal - 1),
+    found = {
+        "drift": drift.rms,
+        "target": target,
+        "photons_1": needed,
+        "photons_2": needed_best,
+        "above_ideal": 100 * (needed_best / needed_ideal - 1),
         "agreement_least": np.min(ratios),
         "agreement_most": np.max(ratios),
         "light_gain": least,
         "most_light": most,
-        "best_gain": best_gain(best, drift, least),
         "highest_gain": max(gains),
         "too_fast": by_gain[least][np.argmax(gains)] / kalman_limit(best, drift, least),
         "too_slow": by_gain[most][np.argmin(gains)] / kalman_limit(best, drift, most),

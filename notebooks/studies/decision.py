@@ -70,7 +70,6 @@ GAINS = 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9
 """Settings of the chapter on closed loops."""
 _ON_BENCH = {"Linear": "classic", "LinearTwo": "shifted"}
 """Methods of the loops, and their sensors in `BenchModel`."""
-_COMPARED = "perfect_1", "perfect_2", "real_1", "real_3"  # rows of the summary
 _MUCH = 3.0  # ratio of errors beyond which one image fails
 _DIAMETER = 8.0  # of the telescope that the wind speed in m/s belongs to, m
 
@@ -452,22 +451,19 @@ def numbers(
         found |= {f"{row.key}_start": row.start, f"{row.key}_photons": row.photons}
         found |= {f"{row.key}_{count}": text for count, text in row.cell.sides.items()}
         if row.cell.closed:
-            left, span = two_digits(row.cell.typical[1]), one_over_two(row.cell, ".2f")
-            found |= {f"{row.key}_left": left, f"{row.key}_span": span}
+            found[f"{row.key}_span"] = one_over_two(row.cell, ".2f")
     for index, pair in enumerate(calibrated, 1):
         if pair is not None:
             found |= {f"calibrated_gain_{index}": pair[1] / pair[0]}
-    for row in rows:
-        if row.key in _COMPARED:
-            key, cell = f"gain_{row.key}", row.cell
-            found |= {key: 1 / cell.ratio, f"{key}_least": 1 / cell.high, f"{key}_most": 1 / cell.low}
-    for index, one in enumerate(loops, 1):
-        found[f"closed_{index}_gain"] = one.loops.gains["LinearTwo"]
+    [cell] = (row.cell for row in rows if row.key == "real_3")
     small, bright = errors["real"][-1], errors["perfect"][0]
     ratio = bright[simplest(bright, ONE_IMAGE)] / bright[simplest(bright, TWO_IMAGES)]
     return rounded(
         found
         | {
+            "gain_real_3": 1 / cell.ratio,
+            "gain_real_3_least": 1 / cell.high,
+            "gain_real_3_most": 1 / cell.low,
             "one_fails": float(np.mean(ratio > _MUCH)),
             "likelihood_least": min(_likelihood_ratios(errors["perfect"])),
             "likelihood_most": max(_likelihood_ratios(errors["perfect"])),

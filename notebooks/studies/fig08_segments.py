@@ -66,7 +66,7 @@ def error_columns(bench: Bench, commanded: NDArray, errors: Mapping[str, NDArray
 
 
 def numbers(errors: Mapping[str, NDArray], commanded: NDArray) -> dict[str, float | str]:
-    """Numbers for the text: input, rms and largest error of both methods; arrays are (n_segments,), rad."""
+    """Numbers for the text: input, rms of the errors of both methods; arrays are (n_segments,), rad."""
     linear, shifted = errors["Linear"], errors["PhaseShifted"]
     folded = commanded < _FOLDED
     share = np.abs(linear[folded] / commanded[folded]) if folded.any() else np.array([np.nan])
@@ -75,8 +75,6 @@ def numbers(errors: Mapping[str, NDArray], commanded: NDArray) -> dict[str, floa
             "input": commanded.std(),
             "linear_at_08": linear.std(),
             "shifted_at_08": shifted.std(),
-            "linear_worst": np.abs(linear).max(),
-            "shifted_worst": np.abs(shifted).max(),
             "folded_least": share.min(),
             "folded_most": share.max(),
         }

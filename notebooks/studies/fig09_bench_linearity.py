@@ -24,13 +24,7 @@ LIMITS = parameter_limits(
 CHECK_TOGETHER = check_bench
 QUICK = {"n_pixels": 68, "n_rms": 5, "n_screens": 2}
 
-SHORT = {
-    "linear": "Linear",
-    "arcsine": "Arcsine",
-    "shifted": "PhaseShifted",
-    "saxton": "GerchbergSaxton",
-    "descent": "GradientDescent",
-}
+SHORT = {"linear": "Linear", "shifted": "PhaseShifted", "saxton": "GerchbergSaxton"}
 """Reconstructors by their names in the text."""
 
 _SHARE = 0.25  # of the input: the largest error of a reconstructor that works on the bench
@@ -109,10 +103,9 @@ def numbers(curves: BenchCurves) -> dict[str, float | str]:
     """Numbers for the text: offset and reach of the reconstructors, and how they compare."""
     mean = {short: curves.mean(name) for short, name in SHORT.items()}
     large = curves.rms >= 0.3
-    alike = mean["arcsine"][large] / mean["linear"][large]
+    alike = curves.mean("Arcsine")[large] / mean["linear"][large]
     bright, worse = curves.rms > 0, curves.rms[mean["saxton"] > mean["linear"]].max(initial=0.0)
     inputs, linear = curves.rms[bright], mean["linear"][bright]
-    at_01, linear_at_01 = (next(iter(mean[one][curves.rms == 0.1]), np.nan) for one in ("shifted", "linear"))
     texts = {
         "linear_reach": reach_text(
             inputs, linear, _SHARE * inputs, Limit(reach(curves, "Linear")), "25 % of the input"
@@ -127,13 +120,12 @@ def numbers(curves: BenchCurves) -> dict[str, float | str]:
     }
     return texts | rounded(
         {
-            **{f"offset_{short}": mean[short][0] for short in ("shifted", "linear", "saxton")},
+            "offset_shifted": mean["shifted"][0],
             "arcsine_over_linear": round(np.median(alike), 3) if alike.size else np.nan,
             **{f"reach_{short}": reach(curves, name) for short, name in SHORT.items()},
             "lowest_shifted": next(iter(_within(curves, SHORT["shifted"])), np.nan),
             "shifted_worst": mean["shifted"].max(),
             "largest_input": curves.rms.max(),
-            "shifted_share_at_01": at_01 / 0.1,
-            "linear_at_01": linear_at_01,
+            "shifted_share_at_01": next(iter(mean["shifted"][curves.rms == 0.1]), np.nan) / 0.1,
         }
     )

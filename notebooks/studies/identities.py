@@ -112,6 +112,7 @@ class ApproximationErrors:
     phase: float  # of the wave, radian rms
     amplitude: float  # of the wave, relative
     wave: float  # but for a constant phase, relative
+    wave_standard_error: float
     one_image: float  # of one step of reconstruction, radian rms
     two_images: float  # of the same with two images
 
@@ -130,14 +131,16 @@ def approximation_errors(sensor: ZernikeSensor, screens: NDArray, power: float =
     def phase_error(phase: NDArray, truth: NDArray) -> float:
         return float(reconstruction_error(pupil, pupil.scatter(phase), truth).mean())
 
-    def relative(gap: NDArray) -> float:
-        return float(np.mean(np.linalg.norm(gap, axis=-1) / np.linalg.norm(first, axis=-1)))
+    def relative(gap: NDArray) -> NDArray:
+        return np.linalg.norm(gap, axis=-1) / np.linalg.norm(first, axis=-1)
 
     overlap = np.mean(first * first_guess.conj(), axis=-1, keepdims=True)
+    wave = relative(first_guess * overlap / np.abs(overlap) - first)
     return ApproximationErrors(
         phase=phase_error(np.angle(first_guess), pupil.scatter(np.angle(first))),
-        amplitude=relative(np.abs(first_guess) - np.abs(first)),
-        wave=relative(first_guess * overlap / np.abs(overlap) - first),
+        amplitude=float(relative(np.abs(first_guess) - np.abs(first)).mean()),
+        wave=float(wave.mean()),
+        wave_standard_error=float(wave.std() / np.sqrt(len(wave))),
         one_image=phase_error(arccosine_phase(frames[:, 0], amplitude, first_guess), screens),
         two_images=phase_error(pair_phase(frames, amplitude, guess), screens),
     )
@@ -273,7 +276,8 @@ def numbers(
     }
     for value, ending in QUOTED.items():
         one = approximate[BEST][inputs.index(value)]
-        found |= {f"wave_error_{ending}": one.wave, f"step_error_{ending}": one.two_images}
+        found |= {f"wave_error_{ending}": one.wave, f"wave_error_{ending}_error": one.wave_standard_error}
+        found[f"step_error_{ending}"] = one.two_images
     for name, short in ((BEST, "wave"), (LITERAL, "literal")):
         found[f"{short}_amplitude_error_05"] = approximate[name][inputs.index(0.5)].amplitude
     return rounded(found, ".5g")

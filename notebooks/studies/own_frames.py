@@ -310,21 +310,12 @@ def _pair(values: Sequence[float] | NDArray, digits: int) -> str:
     return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
-def numbers(
-    verdict: Verdict, work: Sequence[Step], errors: Sequence[float] | None, n_fits: int, error_flat: float
-) -> dict[str, float | str]:
-    """Numbers for the text: misfits and errors of the result and of the step before the fits.
-
-    `error_flat` is the error of the result less the phase of a flat mirror.
-    """
-    known = errors or [np.nan] * len(work)
+def numbers(verdict: Verdict, errors: Sequence[float] | None, error_flat: float) -> dict[str, float | str]:
+    """Numbers for the text: error bar and error of the result, and its error less the phase of a flat mirror."""
     return rounded(
         {
-            "misfit": work[-1].result.misfit,
-            "misfit_plain": work[-1 - n_fits].result.misfit,
             "sigma": np.nan if verdict.sigma is None else np.nanmedian(verdict.sigma),
-            "error": known[-1],
+            "error": errors[-1] if errors else np.nan,
             "error_flat": error_flat,
-            "error_plain": known[-1 - n_fits],
         }
     )

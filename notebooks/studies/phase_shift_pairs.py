@@ -368,7 +368,6 @@ def _pi(angle: float) -> str:
 def numbers(maps: PairMaps, rows: Sequence[DrawnNoise]) -> dict[str, float | str]:
     """Numbers of the claims of section 4.2 on pairs."""
     found = {
-        "n_singular": maps.singular.sum(),
         "n_allowed": (~maps.singular).sum(),
         "singular_as_expected": np.array_equal(maps.singular, maps.forbidden),
         "zero_works": maps.zero_works,
@@ -381,13 +380,11 @@ def numbers(maps: PairMaps, rows: Sequence[DrawnNoise]) -> dict[str, float | str
             f"noise_at_half_pi{suffix}": maps.at(name, HALF, -HALF),
             f"best_pi{suffix}": abs(theta_a) / np.pi,
         }
-    moved = maps.at("aberrated", *maps.best("flat")[:2])
     found |= {
         "gain_flat": 1 - found["best_noise"] / found["noise_at_half_pi"],
         "photons_saved_flat": 1 - (found["best_noise"] / found["noise_at_half_pi"]) ** 2,
         "gain_aberrated": 1 - found["best_noise_aberrated"] / found["noise_at_half_pi_aberrated"],
         "gain_bound": 1 - found["best_noise_bound"] / found["noise_at_half_pi_bound"],
-        "gain_moved": 1 - moved / found["noise_at_half_pi_aberrated"],
         "drawn_difference": max(abs(row.drawn / row.expected - 1) for row in rows),
     }
     return rounded(found, ".4g")

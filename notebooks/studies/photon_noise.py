@@ -124,7 +124,6 @@ class ErrorBars(NamedTuple):
 
     assumed: float  # photons that the method assumes, over the right number
     within: NDArray[np.float64]  # share of the points within each of `SIGMAS`
-    chi2: float  # reduced, mean over the screens
     consistent: float  # share of the screens
 
 
@@ -149,7 +148,7 @@ def error_bars(
         estimate = method(frames)
         error = _in_sigmas(sensor, estimate, screens)
         within = np.mean(error[..., np.newaxis] < SIGMAS, axis=(0, 1))
-        rows.append(ErrorBars(factor, within, float(estimate.chi2.mean()), float(estimate.consistent.mean())))
+        rows.append(ErrorBars(factor, within, float(estimate.consistent.mean())))
     return rows
 
 
@@ -286,8 +285,6 @@ def numbers(curves: PhotonCurves, rows: Sequence[ErrorBars]) -> dict[str, float 
             "within_right": right.within[place],
             "within_wrong": wrong.within[place],
             "within_modest": low.within[place],
-            "chi2_wrong": wrong.chi2,
-            "chi2_modest": low.chi2,
             "consistent_right": right.consistent,
             "consistent_wrong": wrong.consistent,
             "consistent_modest": low.consistent,

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs.masks import Dimple
@@ -21,12 +20,11 @@ from zwfs.reconstructors import (
     GradientDescent,
     Linear,
     PhaseShifted,
-    Reconstruction,
 )
 from zwfs.sensor import ZernikeSensor
 
 PAPER = ("Linear", "Arcsine", "GerchbergSaxton", "GradientDescent", "GradientDescentPoints", "PhaseShifted")
-REPAIRED = ("GerchbergSaxtonModel", "GradientDescentStarted")
+MODEL_SAXTON = "GerchbergSaxtonModel"
 OWN_CHAPTER = ("MaximumLikelihood",)  # reconstructors of the package that Figures 3 and 4 leave to other chapters
 
 
@@ -54,33 +52,11 @@ def paper_reconstructors(
     return dict(zip(PAPER, methods, strict=True))
 
 
-@dataclass(frozen=True)
-class _Started:
-    """Reconstructor that starts from the phase of a different one for the same frames."""
-
-    first: Any
-    then: Any
-
-    @property
-    def sensor(self) -> ZernikeSensor:
-        """Sensor of both reconstructors."""
-        return self.then.sensor
-
-    def __call__(self, frames: ArrayLike) -> Reconstruction:
-        """Reconstruct the phase of each frame set."""
-        return self.then(frames, start=self.first(frames).phase)
-
-
-def repaired_reconstructors(reconstructors: Mapping[str, Any]) -> dict[str, Any]:
-    """Return variants of `paper_reconstructors`, with their settings, that avoid a failure of the originals."""
-    shifted, original = reconstructors["PhaseShifted"].sensor, reconstructors["GerchbergSaxton"].settings
-    steps = {"n_iterations": original.n_iterations, "tolerance": original.tolerance}
-    start = PhaseShifted(shifted, n_iterations=5)
-    methods = (
-        GerchbergSaxton(shifted, **steps, unmeasured="model"),
-        _Started(start, reconstructors["GradientDescent"]),
-    )
-    return dict(zip(REPAIRED, methods, strict=True))
+def model_saxton(reconstructors: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the variant of Gerchberg-Saxton, with its settings, that keeps the field off the detector."""
+    settings = reconstructors["GerchbergSaxton"].settings
+    steps = {"n_iterations": settings.n_iterations, "tolerance": settings.tolerance}
+    return {MODEL_SAXTON: GerchbergSaxton(reconstructors["PhaseShifted"].sensor, **steps, unmeasured="model")}
 
 
 def own_reconstructors(paths: Sequence[str], reconstructors: Mapping[str, Any], modes: NDArray) -> dict[str, Any]:
@@ -131,7 +107,7 @@ def _own_classes(paths: Sequence[str]) -> dict[str, Any]:
     own: dict[str, Any] = {}
     for path in paths:
         method = package.get(path) or _load(path)
-        taken = (*PAPER, *REPAIRED, *own)
+        taken = (*PAPER, MODEL_SAXTON, *own)
         if method.__name__ in taken:
             raise ValueError(f"path = {path!r}: expected a name other than {', '.join(taken)}")
         own[method.__name__] = method

@@ -71,7 +71,6 @@ LOOKS |= {
     "GerchbergSaxtonModel": Look("Gerchberg-Saxton, modelled field", "two images", "#74583E", "x", "-"),
     "GradientDescent": Look("gradient descent on modes", "two images", "#CC79A7", "D", (0, (3, 1, 1, 1, 1, 1))),
     "GradientDescentPoints": Look("gradient descent on points", "two images", "#D55E00", "d", "--"),
-    "GradientDescentStarted": Look("gradient descent, phase-shifted start", "two images", "#7010E0", "+", "-."),
     "PhaseShifted": Look("phase-shifted", "two images", "#0072B2", "v", ":"),
     "MaximumLikelihood": Look("maximum likelihood", "", "#661100", "*", "-"),
 }

@@ -38,6 +38,8 @@ def test_verdict_is_the_recorded_one_and_any_but_holds_and_fails_is_explained(ju
     found = judged[number]
     assert found.verdict == VERDICTS[str(number)], found.measured
     assert found.remark or found.verdict in (HOLDS, FAILS)
+    assert bool(found.because) == (found.verdict == PARTLY)
+    assert found.because in ("", *claims.REASONS)
     assert found.measured or found.verdict == UNTESTED
 
 
@@ -52,7 +54,7 @@ def test_verdict_is_the_recorded_one_and_any_but_holds_and_fails_is_explained(ju
         (6, {"true_wave_error": 1e-11}, FAILS),
         # The approximation is satisfactory up to 5 %.
         (3, {"wave_error_01": 0.051}, FAILS),
-        (3, {"wave_error_05": 0.051}, PARTLY),
+        (3, {"claimed_wave_error": 0.051}, PARTLY),
         # The most diversity is at a difference of pi.
         (5, {"best_difference": 3.0}, FAILS),
         # "About 0.3" is 0.2 to 0.4.

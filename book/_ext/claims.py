@@ -22,6 +22,7 @@ from book._tools.notebook import glued_texts
 HOLDS, PARTLY, FAILS, UNTESTED = "holds", "holds in part", "does not hold", "not testable here"
 # The signs differ in shape, for readers who do not see the colours.
 SIGNS = {HOLDS: "✔", PARTLY: "◐", FAILS: "✘", UNTESTED: "○"}
+REASONS = ("a part does not hold", "a number differs", "the paper leaves a condition open")  # of `PARTLY`
 STUDIES = Path(__file__).parents[2] / "notebooks" / "studies"
 BENCHMARKS = Path(__file__).parents[2] / "tests" / "benchmarks"
 PARTS = {"sensor": range(1, 7), "range": range(7, 14), "choices": range(14, 18), "bench": range(18, 22)}
@@ -66,6 +67,7 @@ class Finding:
     verdict: str  # one of `HOLDS`, `PARTLY`, `FAILS` and `UNTESTED`
     measured: str = ""  # the measured values in words
     remark: str = ""  # the condition under which the claim holds, or the reason why it does not
+    because: str = ""  # one of `REASONS` for `PARTLY`
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,8 @@ def judge(claim: Claim, numbers: Mapping[str, Any]) -> Finding:
         measured = RULES.from_string(claim.measured).render(known)
         for case in claim.verdicts:
             if find(case["if"]):
-                return Finding(case["verdict"], measured, RULES.from_string(case.get("remark", "")).render(known))
+                remark = RULES.from_string(case.get("remark", "")).render(known)
+                return Finding(case["verdict"], measured, remark, case.get("because", ""))
     except UndefinedError as error:
         needed = f"{error.message}: the notebook does not glue it"
         raise ClaimError(f"claim {claim.number}, {claim.notebook}: {needed}") from None
@@ -140,21 +143,27 @@ def findings(folder: Path) -> dict[int, Finding]:
 def count(judged: dict[int, Finding]) -> str:
     """Return a line with the number of claims of each verdict."""
     numbers = Counter(finding.verdict for finding in judged.values())
-    listed = ", ".join(f"{_marked(verdict)}: {numbers[verdict]}" for verdict in SIGNS)
-    return f"Of [{len(judged)} claims that we chose from the paper](claims.md): {listed}."
+    reasons = Counter(finding.because for finding in judged.values())
+    why = "; ".join(f"{reason}: {reasons[reason]}" for reason in REASONS)
+    verdicts = {verdict: f"{_marked(verdict)}: {numbers[verdict]}" for verdict in SIGNS}
+    verdicts[PARTLY] += f" ({why})"
+    return f"Of [{len(judged)} claims that we chose from the paper](claims.md): {', '.join(verdicts.values())}."
 
 
 def by_verdict(judged: dict[int, Finding]) -> str:
     """Return a list of the verdicts, with links to the rows of their claims."""
-    lines = []
+    groups: dict[tuple[str, str], list[str]] = {}
     for verdict in SIGNS:
-        rows = [
-            f"[{one.number}\u00a0{one.title}](#claim-{one.number})"
-            for one in CLAIMS
-            if judged[one.number].verdict == verdict
-        ]
-        lines.append(f"- {_marked(verdict)}: {', '.join(rows) or 'none'}")
-    return "\n".join(lines)
+        for reason in REASONS if verdict == PARTLY else ("",):
+            groups[verdict, reason] = [
+                f"[{one.number}\u00a0{one.title}](#claim-{one.number})"
+                for one in CLAIMS
+                if (judged[one.number].verdict, judged[one.number].because) == (verdict, reason)
+            ]
+    return "\n".join(
+        f"- {_marked(verdict)}{f', {reason}' if reason else ''}: {', '.join(rows) or 'none'}"
+        for (verdict, reason), rows in groups.items()
+    )
 
 
 def table(judged: dict[int, Finding], numbers: range) -> str:
@@ -180,7 +189,8 @@ def _row(claim: Claim, finding: Finding) -> list[str]:
         measured.append(f"*[{_title(claim.notebook)}]({address}), [code](#code-{claim.number})*")
         verdict = _marked(finding.verdict, f"(#rule-{claim.number})")
     return [
-        f"[{claim.number}.]{{#claim-{claim.number}}} **{claim.title}** {verdict}",
+        f"[{claim.number}.]{{#claim-{claim.number}}} **{claim.title}** {verdict}"
+        + (f": {finding.because}" if finding.because else ""),
         f"{claim.statement} *{section}*",
         " ".join(measured),
     ]

@@ -11,7 +11,7 @@ var Scorer = {
   title: 15,
   partialTitle: 7,
   term: 5,
-  partialTerm: 2,
+  partialTerm: 0, // *gain* is a part of *again*
 };
 
 // The excerpts show prose, not code or lists of contents; that of an index entry, which is a word, shows its section.

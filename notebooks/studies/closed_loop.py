@@ -324,8 +324,8 @@ def draw_linear_loops(found: Divergence) -> Figure:
     figure, panels = plt.subplots(1, len(found.runs), figsize=(7, 3), sharex=True, sharey=True, squeeze=False)
     for axes, (name, run) in zip(panels[0], found.runs.items(), strict=True):
         closed = run.closed()
-        axes.semilogy(1e3 * run.times, run.residual[closed].T, lw=1, color="#999999")
-        axes.semilogy(1e3 * run.times, run.residual[~closed].T, lw=1, color=LOOKS["Linear"].color)
+        axes.semilogy(1e3 * run.times, run.residual[closed].T, lw=0.8, color="#999999")
+        axes.semilogy(1e3 * run.times, run.residual[~closed].T, lw=2, color=LOOKS["Linear"].color)
         axes.set_title(f"{name}:\n{closed.sum()} of {closed.size} close", fontsize=10)
         axes.set(xlabel="time (ms)", xlim=(0, 1e3 * run.times[-1]))
     panels[0, 0].set_ylabel("residual (rad rms)")
@@ -429,14 +429,17 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
                 f"{short_name(name)}: {two_digits(typical(loops.settled[name]))}; gain {loops.gains[name]:g}{few}"
             )
         light = f"{loops.photons:g} photon{'s' * (loops.photons != 1)}"
-        cells.append([f"{loops.start:g} rad rms; {light}", *ends, one_over_two(row, ".2g")])
+        cells.append([f"{loops.start:g} rad rms; {light}", *ends, one_over_two(row)])
     return Table(header, cells)
 
 
-def one_over_two(row: Any, form: str) -> str:
+def one_over_two(row: Any) -> str:
     """Error with one image over that with two, and in brackets two standard errors either way."""
-    span = f"{1 / row.high:{form}} to {1 / row.low:{form}}" if row.high < np.inf else "one loop"
-    return f"{1 / row.ratio:{form}} ({span})"
+    if np.isinf(row.high):
+        return f"{1 / row.ratio:.2g} (one loop)"
+    low, high = 1 / row.high, 1 / row.low
+    digits = 0 if row.ratio <= 0.1 else 2 if high - low < 0.2 else 1
+    return f"{1 / row.ratio:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def short_name(method: str) -> str:
@@ -473,12 +476,12 @@ def numbers(
             "rank_wave": found.ranking(-found.wave),
             "equal_to": equal,
             "two_from": two_from,
-            "linear_span": one_over_two(linear, ".2g") if linear else "unknown",
+            "linear_span": one_over_two(linear) if linear else "unknown",
             "lost_least": min(lost_loops, default=np.nan),
             "lost_most": max(lost_loops, default=np.nan),
             "linear_two_excess": np.ceil(100 * excess) / 100,  # an upper limit, in whole percents
             "noisy_small": small.loops.start,
-            "noisy_small_span": one_over_two(small, ".2f"),
+            "noisy_small_span": one_over_two(small),
             "noisy_large": large.loops.start,
             "noisy_large_one": typical(large.loops.settled[large.one]),
             "noisy_large_two": typical(large.loops.settled[large.two]),

@@ -409,7 +409,7 @@ def loop_rows(found: Sequence[BestMethods]) -> list[Row]:
 def open_table(rows: Sequence[Row]) -> Table:
     """Error of the best method with two images and with one, and their ratio, for each bench and wavefront."""
     header = ["situation", "photons per point and image", "two images", "one image", "one over two"]
-    return Table(header, [[*_cells(row), one_over_two(row.cell, ".2g")] for row in rows])
+    return Table(header, [[*_cells(row), one_over_two(row.cell)] for row in rows])
 
 
 def loop_table(rows: Iterable[Row]) -> Table:
@@ -425,7 +425,7 @@ def _cells(row: Row) -> list[str]:
 
 def calibrated_table(situations: Iterable[Situation], errors: Iterable[tuple[float, float] | None]) -> Table:
     """Errors of two images with a fitted model, and with the values of the design."""
-    header = ["situation", "photons per point and image", "fitted model", "design values", "ratio"]
+    header = ["situation", "photons per point and image", "fitted model, smooth phases", "design values", "ratio"]
     both = [
         ["not studied"] * 3 if pair is None else [*map(two_digits, pair), f"{pair[1] / pair[0]:.1f}"]
         for pair in errors
@@ -451,7 +451,7 @@ def numbers(
         found |= {f"{row.key}_start": row.start, f"{row.key}_photons": row.photons}
         found |= {f"{row.key}_{count}": text for count, text in row.cell.sides.items()}
         if row.cell.closed:
-            found[f"{row.key}_span"] = one_over_two(row.cell, ".2f")
+            found[f"{row.key}_span"] = one_over_two(row.cell)
     for index, pair in enumerate(calibrated, 1):
         if pair is not None:
             found |= {f"calibrated_gain_{index}": pair[1] / pair[0]}

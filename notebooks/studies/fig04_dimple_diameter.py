@@ -338,10 +338,7 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
         axes.set_ylabel("error (rad rms)")
     for index, ((number, other), style) in enumerate(zip(others, OTHER_STYLES[1:], strict=False)):
         style = style | {"ms": 5, "mfc": "#ffffff" if index % 2 else None, "label": f"{number} iterations"}
-        mean, std = other.mean(name), other.std(name)
-        low, high = (np.maximum(mean + sign * std, floor) for sign in (-1, 1))
-        log.fill_between(other.diameters, low, high, color=style["color"], alpha=0.15, lw=0)
-        log.plot(other.diameters, np.maximum(mean, floor), **style)
+        log.plot(other.diameters, np.maximum(other.mean(name), floor), **style)
     limit = threshold * curve.rms[0]
     log.axhline(limit, color="#555555", lw=1)
     end = min(1.4 * claimed, curve.diameters[-1])

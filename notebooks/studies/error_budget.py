@@ -66,13 +66,26 @@ def effects(budget: Curves, name: str = NAME) -> tuple[NDArray, NDArray, NDArray
     )
 
 
+def standard_errors(budget: Curves, name: str = NAME) -> tuple[NDArray, NDArray, NDArray]:
+    """Standard errors of `effects`, from the scatter of the screens."""
+    scatter = []
+    for curves in budget.values():
+        commanded = curves.commanded[1]
+        residuals = curves.residuals[name][1] - curves.residuals[name][0].mean(axis=0)
+        gains = np.sum(commanded * residuals, axis=-1) / np.sum(commanded**2, axis=-1)
+        scatter.append([values.std() / np.sqrt(len(gains)) for values in (*curves.errors[name][:2], gains)])
+    offset, error, gain = np.array(scatter).T
+    return offset, gain, error
+
+
 def draw_budget(budget: Curves, name: str) -> Figure:
     """Effect of each error alone: offset at a flat command, gain and error at the first other input."""
     figure, panels = plt.subplots(1, 3, figsize=(7, 3.6), sharey=True)
     rows = np.arange(len(budget))[::-1]
     value = next(iter(budget.values())).rms[1]
     offsets, gains, errors = effects(budget, name)
-    for axes, label, values in zip(
+    offset_scatter, gain_scatter, error_scatter = standard_errors(budget, name)
+    for axes, label, values, scatter in zip(
         panels,
         (
             "error at a flat\ncommand (rad rms)",
@@ -80,9 +93,10 @@ def draw_budget(budget: Curves, name: str) -> Figure:
             f"error at {value:g} rad\nrms (rad rms)",
         ),
         (offsets, 100 * (gains - 1), errors),
+        (offset_scatter, 100 * gain_scatter, error_scatter),
         strict=True,
     ):
-        axes.barh(rows, values, color=LOOKS[name].color, height=0.65)
+        axes.barh(rows, values, xerr=scatter, ecolor="#555555", color=LOOKS[name].color, height=0.65)
         axes.axvline(0, color="#555555", lw=1)
         axes.set(xlabel=label)
         axes.grid(axis="y", visible=False)

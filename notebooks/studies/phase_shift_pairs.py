@@ -365,9 +365,21 @@ def _pi(angle: float) -> str:
     return f"{angle / np.pi:.3g}π".replace("-", "−")
 
 
-def numbers(maps: PairMaps, rows: Sequence[DrawnNoise]) -> dict[str, float | str]:
-    """Numbers of the claims of section 4.2 on pairs."""
-    found = {
+def gain_errors(maps: PairMaps, pupil: Pupil, diameter: float, screens: NDArray) -> dict[str, float]:
+    """Standard errors over the screens of the gains of the best pairs for the screens, see `numbers`."""
+    usual = [phase_noise(_sensor(pupil, diameter, HALF, -HALF), screen) for screen in screens]
+    found = {}
+    for name, field in (("aberrated", "photon"), ("bound", "bound")):
+        sensor = _sensor(pupil, diameter, *maps.best(name)[:2])
+        best = [phase_noise(sensor, screen) for screen in screens]
+        ratios = [_rms(getattr(a, field)) / _rms(getattr(b, field)) for a, b in zip(best, usual, strict=True)]
+        found[f"gain_{name}_error"] = float(np.std(ratios) / np.sqrt(len(ratios)))
+    return found
+
+
+def numbers(maps: PairMaps, rows: Sequence[DrawnNoise], errors: Mapping[str, float]) -> dict[str, float | str]:
+    """Numbers of the claims of section 4.2 on pairs; `errors` from `gain_errors`."""
+    found = dict(errors) | {
         "n_allowed": (~maps.singular).sum(),
         "singular_as_expected": np.array_equal(maps.singular, maps.forbidden),
         "zero_works": maps.zero_works,

@@ -59,6 +59,11 @@ class PhotonCurves:
         """`error` over the bound, shape (n_rms, n_photons)."""
         return self.error(name) / self.bound
 
+    def ratio_error(self, name: str) -> NDArray[np.float64]:
+        """Standard error of `ratio`, from the scatter of the screens, shape (n_rms, n_photons)."""
+        squares = self.errors[name] ** 2
+        return squares.std(axis=-1) / np.sqrt(squares.shape[-1]) / (2 * self.error(name) * self.bound)
+
     def screens(self) -> dict[str, NDArray]:
         """Input, photons and errors of every single screen, as columns for `publish`."""
         axes = {"input (rad rms)": self.rms, "photons per point and image": self.photons}
@@ -189,8 +194,9 @@ def draw_photon_noise(curves: PhotonCurves) -> Figure:
         axes.axhline(1, color="#999999", lw=5, label="bound", zorder=1)  # the grid is below
         axes.axhspan(_FINE, 1.5 * max(highest, _FINE), color="#eeeeee", lw=0, zorder=0)
         for name in sorted(curves.errors, key=list(LOOKS).index):
-            look = LOOKS[name]
-            axes.semilogx(curves.photons, curves.ratio(name)[place], ms=5, label=look.label, **look.style)
+            look, ratio, error = LOOKS[name], curves.ratio(name)[place], curves.ratio_error(name)[place]
+            axes.semilogx(curves.photons, ratio, ms=5, label=look.label, **look.style)
+            axes.vlines(curves.photons, ratio - error, ratio + error, color=look.color, lw=1.5)
         axes.set_yscale("function", functions=(_stretch, _shrink))
         axes.set_yticks([1, 1.1, 1.2, _FINE, 10, 100], ["1", "1.1", "1.2", f"{_FINE:g}", "10", "100"])
         axes.set_ylim(0.95 * min(lowest, 0.98), 1.5 * max(highest, _FINE))

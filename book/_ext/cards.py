@@ -47,20 +47,25 @@ def run_of(app: Sphinx, source: Path) -> Path:
 
 
 def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions: str, commit: str) -> None:
-    """Add a card under each figure of an executed notebook, in place; the first one has the form of parameters."""
+    """Add a card under each figure of an executed notebook, in place; the first one has the form of parameters.
+
+    The last line of the page says from which commit and versions its figures come.
+    """
     cells = []
     for cell in notebook.cells:
         cells.append(cell)
         for figure in published(cell.source) if cell.cell_type == "code" else []:
             cell.metadata.setdefault("mystnb", {}).setdefault("figure", {})["classes"] = VARIANTS + figure
             first = not any(one.id.startswith(CARD) for one in cells)
-            made = ["", f"Commit: {commit}. Versions: {versions}."] if first and versions else []
-            text = ["::::{div} run-card", files(name, figure, links), *made, "", run.form(figure, first), "::::"]
+            text = ["::::{div} run-card", files(name, figure, links), "", run.form(figure, first), "::::"]
             cells.append(new_markdown_cell("\n".join(text), id=f"{CARD}{figure}"[:64]))
     if not any(cell.id.startswith(CARD) for cell in cells):  # the page shows tables only
         place = next((number for number, cell in enumerate(cells, 1) if cell.get("outputs")), len(cells))
         text = ["::::{div} run-card", files(name, "", links), "", run.form("", True), "::::"]
         cells.insert(place, new_markdown_cell("\n".join(text), id=f"{CARD}{name}"[:64]))
+    if versions:
+        made = f"::::{{div}} run-card\nCommit: {commit}. Versions: {versions}.\n::::"
+        cells.append(new_markdown_cell(made, id=f"{CARD}made"))
     notebook.cells = cells
 
 

@@ -143,10 +143,9 @@ def findings(folder: Path) -> dict[int, Finding]:
 def count(judged: dict[int, Finding]) -> str:
     """Return a line with the number of claims of each verdict."""
     numbers = Counter(finding.verdict for finding in judged.values())
-    reasons = Counter(finding.because for finding in judged.values())
-    why = "; ".join(f"{reason}: {reasons[reason]}" for reason in REASONS)
+    open_ones = sum(finding.because == REASONS[-1] for finding in judged.values())
     verdicts = {verdict: f"{_marked(verdict)}: {numbers[verdict]}" for verdict in SIGNS}
-    verdicts[PARTLY] += f" ({why})"
+    verdicts[PARTLY] += f" (for {open_ones} of them, {REASONS[-1]})"
     return f"Of [{len(judged)} claims that we chose from the paper](claims.md): {', '.join(verdicts.values())}."
 
 

@@ -137,13 +137,17 @@ def error_limits(
     modes: NDArray | Screens,
     curves: LinearityCurves,
     threshold: float,
+    more: Mapping[str, int] = REFINED,
     **settings: Any,
 ) -> dict[str, Limit]:
-    """Input at which each mean error exceeds `threshold` times the input; that of `REFINED` from other screens."""
+    """Input at which each mean error exceeds `threshold` times the input; those of `more` from other screens.
+
+    `more` gives the screens of each input close to the limit, over those of the curves.
+    """
     limits = {name: Limit(curves.dynamic_range(name, threshold)) for name in curves.errors}
 
     def refined(name: str) -> Limit:
-        method, n_screens = {name: reconstructors[name]}, REFINED[name] * curves.strehl.shape[1]
+        method, n_screens = {name: reconstructors[name]}, more[name] * curves.strehl.shape[1]
 
         def ratios(rms: NDArray) -> NDArray:
             tried = linearity_curves(method, modes, rms, n_screens, first_task=1000, **settings)
@@ -152,7 +156,7 @@ def error_limits(
         return refined_limit(ratios, limits[name].value, threshold, width=0.15)
 
     finite = [name for name, limit in limits.items() if 0 < limit.value < np.inf]
-    return limits | {name: refined(name) for name in finite if name in REFINED}
+    return limits | {name: refined(name) for name in finite if name in more}
 
 
 def saxton_by_width(
@@ -412,6 +416,7 @@ def numbers(
     methods: Mapping[str, Any],
     variants: Mapping[str, GerchbergSaxton],
     by_width: LinearityCurves,
+    longer: Limit,
     passes: Mapping[str, int],
     fourier: set[str],
 ) -> dict[str, float | str]:
@@ -462,7 +467,6 @@ def numbers(
     for name, short in _SHORT.items():
         found |= {f"{short}_limit": limits[name].value, f"{short}_limit_error": limits[name].error}
     found |= _phrases(curves, limits, threshold)
-    longer = round(by_width.dynamic_range(repaired, threshold), 1)  # between inputs that lie far apart
-    found["saxton_model_limit_longer"] = longer
-    found["saxton_model_reach_longer"] = _reach(by_width, repaired, threshold, Limit(longer))
+    found |= {"saxton_model_limit_longer": longer.value, "saxton_model_limit_longer_error": longer.error}
+    found["saxton_model_reach_longer"] = _reach(by_width, repaired, threshold, longer)
     return rounded(found)

@@ -247,16 +247,10 @@ def copy_mathjax(folder: Path) -> None:
         copy_asset_file(file, target)
 
 
-def number_no_figures(app: Sphinx, config: Config) -> None:
-    """Switch off the numbers of figures, which Jupyter Book switches on: captions say the paper's."""
-    config.numfig = False
-
-
 def setup(app: Sphinx) -> dict[str, bool]:
     """Finish each page, and their folder at the end."""
     app.add_config_value("moved_pages", {}, "html")  # old to new address of each page that merged into another
     app.connect("config-inited", add_substitutions)
-    app.connect("config-inited", number_no_figures, priority=900)
     app.connect("html-page-context", finish_page)
     # Before the extension that would write another index.html.
     app.connect("build-finished", finish_files, priority=400)

@@ -68,13 +68,13 @@ def effects(budget: Curves, name: str = NAME) -> tuple[NDArray, NDArray, NDArray
 
 def standard_errors(budget: Curves, name: str = NAME) -> tuple[NDArray, NDArray, NDArray]:
     """Standard errors of `effects`, from the scatter of the screens."""
-    scatter = []
+    found = []
     for curves in budget.values():
         commanded = curves.commanded[1]
         residuals = curves.residuals[name][1] - curves.residuals[name][0].mean(axis=0)
         gains = np.sum(commanded * residuals, axis=-1) / np.sum(commanded**2, axis=-1)
-        scatter.append([values.std() / np.sqrt(len(gains)) for values in (*curves.errors[name][:2], gains)])
-    offset, error, gain = np.array(scatter).T
+        found.append([values.std() / np.sqrt(len(gains)) for values in (*curves.errors[name][:2], gains)])
+    offset, error, gain = np.array(found).T
     return offset, gain, error
 
 

@@ -13,8 +13,8 @@ from .hcipy_bench import CASES
 FILE = ROOT / "notebooks" / "studies" / "calibration.npz"
 BENCH = replace(CASES["disc"], pixels=40, side=52)
 GAIN = 4.0  # electrons / count
-PHOTONS, FAINT = 1e4, 100.0  # per pixel of an unseen screen, and of the last two
-RMS = (0.1, 0.1, 0.3, 0.3, 0.5, 0.5, 0.8, 0.8, 1.2, 1.2, 0.5, 0.5)  # of the unseen screens, rad
+N_SCREENS = 6  # unseen screens of each error and light
+RMS, PHOTONS = (0.1, 0.3, 0.5, 0.8, 1.2, 0.5), (1e4, 1e4, 1e4, 1e4, 1e4, 100.0)  # of these screens: rad, per pixel
 UNIT = 1e-4  # rad, of the phases
 SETTINGS = ("photons", "read_noise", "background", "diameter", "shifts", "leakage", "blur", "focus", "offsets")
 
@@ -27,8 +27,8 @@ def exposed(photons):
 def made():
     """All arrays of the file."""
     frames, clear, commands = BENCH.recording()
-    photons = np.array([PHOTONS] * (len(RMS) - 2) + [FAINT] * 2)
-    screens = [BENCH.smooth(rms, seed=300 + number) for number, rms in enumerate(RMS)]
+    errors, photons = np.repeat([RMS, PHOTONS], N_SCREENS, axis=1)
+    screens = [BENCH.smooth(rms, seed=300 + number) for number, rms in enumerate(errors)]
     exposures = enumerate(zip(screens, photons, strict=True))
     # The plain route has the grid of the first image, where the pupil is not in the middle.
     first = replace(BENCH, blur=0.0, fluxes=(1.0, 1.0))
@@ -41,7 +41,7 @@ def made():
         "unseen_on_camera": _phases([first._recorded(one + BENCH.flat, 0) for one in screens]),
         "lit": BENCH.fully_lit,
         "lit_on_camera": first._recorded(BENCH.lit, 0) > 0.999,
-        "unseen_rms": np.array(RMS),
+        "unseen_rms": errors,
         "unseen_photons": photons,
         "gain": np.array(GAIN),
         **{name: np.array(getattr(BENCH, name)) for name in SETTINGS},

@@ -57,9 +57,9 @@ def test_verdict_is_the_recorded_one_and_any_but_holds_and_fails_is_explained(ju
         (3, {"claimed_wave_error": 0.051}, PARTLY),
         # The most diversity is at a difference of pi.
         (5, {"best_difference": 3.0}, FAILS),
-        # "About 0.3" is 0.2 to 0.4.
-        (7, {"arcsine_limit": 0.2}, HOLDS),
-        (7, {"arcsine_limit": 0.41}, PARTLY),
+        # "About" a number is within 20 % of it.
+        (7, {"arcsine_limit": 0.25}, HOLDS),
+        (7, {"arcsine_limit": 0.37}, PARTLY),
         (7, {"arcsine_over_linear": 1.0}, FAILS),
         # Ten times the range: by all, some or none of the methods.
         (8, {"linear_limit": 0.1, "saxton_limit": 1.1, "shifted_limit": 1.1, "descent_limit": 1.1}, HOLDS),
@@ -71,21 +71,19 @@ def test_verdict_is_the_recorded_one_and_any_but_holds_and_fails_is_explained(ju
         (10, {"alike_up_to": 0.4}, FAILS),
         (10, {"descent_passes": 0.0}, FAILS),
         (10, {"modes_recovered_at_1": 1.0}, HOLDS),
-        # "Around 1" is 0.8 to 1.2.
         (11, {"wrap_onset": 1.2}, HOLDS),
         (11, {"wrap_onset": 0.7}, PARTLY),
         (11, {"wrap_onset": 1.6}, FAILS),
-        (12, {"shifted_limit": 1.2, "accelerated_at_2": 0.4}, HOLDS),
+        (12, {"shifted_limit": 1.2, "plain_at_2": 0.1}, HOLDS),
         (12, {"shifted_limit": 1.2}, PARTLY),
         (12, {"shifted_limit": 1.3}, PARTLY),
         (12, {"shifted_limit": 0.7}, FAILS),
         (14, {"error_max_allowed_pairs": 2e-3}, FAILS),
         (14, {"zero_works": 1.0}, HOLDS),
         (15, {"best_noise": 1.0, "noise_at_half_pi": 1.0, "best_noise_aberrated": 0.6}, PARTLY),
-        # "About 2.2" is 2.0 to 2.4.
-        (16, {"diameter_5_percent": 2.5}, FAILS),
+        (16, {"diameter_5_percent": 2.7}, FAILS),
         (16, {"error_at_26": 0.0}, FAILS),
-        (16, {"diameter_5_percent_400": 2.33}, HOLDS),
+        (16, {"diameter_5_percent": 2.5}, HOLDS),
         (17, {"claim17_descent_rise": 2.3, "claim17_saxton_rise": 2.3}, HOLDS),
         (17, {"claim17_descent_points_rise": 1.6}, FAILS),
         (17, dict.fromkeys([f"claim17_{one}_rise" for one in SHORT.values()], 1.6), FAILS),
@@ -109,21 +107,18 @@ def test_another_measurement_changes_the_verdict(number, changed, verdict):
 @pytest.mark.parametrize(
     ("times", "verdict"),
     [
-        # Of 25 iterations, of the slowest in a hundred results, and the rate of three iterations.
-        ((2e-3, 2e-3, 500.0), HOLDS),
-        ((2e-3, 2e-3, 2000.0), PARTLY),
-        ((2e-3, 9e-4, 2000.0), PARTLY),
-        ((9e-4, 2e-3, 2000.0), PARTLY),
-        ((9e-4, 9e-4, 2000.0), FAILS),
+        # Time of 25 iterations, and rate and error of fewer.
+        ((2e-3, 500.0, 1e-3), HOLDS),
+        ((2e-3, 2000.0, 1e-3), PARTLY),
+        ((2e-3, 2000.0, 5e-2), HOLDS),
+        ((9e-4, 500.0, 1e-3), FAILS),
     ],
 )
 def test_the_verdict_on_real_time_depends_on_the_measured_times(times, verdict):
     performance = json.loads(json.dumps(claims.RULES.globals["performance"]))
     performance["speed"]["others"]["PhaseShifted"] = times[0]
-    for late in performance["speed"]["latency"]:
-        late["p99"] = times[1]
     for one in performance["speed"]["real time"]:
-        one["rate"] = times[2]
+        one |= {"rate": times[1], "median error": times[2]}
     numbers = claims.glued(NOTEBOOKS / f"{CLAIMS[13].notebook}.ipynb") | {"performance": performance}
     assert claims.judge(CLAIMS[13], numbers).verdict == verdict
 

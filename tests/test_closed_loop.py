@@ -5,6 +5,7 @@ from studies.closed_loop import (
     AlteredSensor,
     TunedLoops,
     best_methods,
+    compare_dimples,
     follow_flow,
     linear_loops,
     loop_growth,
@@ -206,6 +207,20 @@ def test_read_noise_favours_the_image_that_has_the_light_of_both(small):
     )
     assert noisy.low > silent.high
     assert noisy.low > 1
+
+
+def test_dimples_that_need_fewer_photons_leave_less_in_faint_light(small):
+    pupil, modes, sensors = small
+    settings = {"wind": WIND, "seed": 7, "only": ["LinearTwo"], **LOOP}
+
+    def trial(diameter, shift):
+        pair = ZernikeSensor(pupil, *(Dimple(diameter, sign * shift) for sign in (1, -1)))
+        return tuned_loops((sensors[0], pair), modes, 0.5, 1.0, [0.1, 0.2], 24, 35, **settings)
+
+    usual = [trial(1.06, np.pi / 2)]
+    better, worse = (compare_dimples(usual, trial(*design)) for design in ((1.8, 0.7 * np.pi), (0.6, np.pi / 2)))
+    assert better.high < 1 < worse.low
+    assert compare_dimples(usual, usual[0]).ratio == 1
 
 
 def test_the_best_method_is_chosen_on_other_screens_and_only_beyond_the_errors():

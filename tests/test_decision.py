@@ -63,12 +63,10 @@ def test_a_cell_of_loops_says_how_many_close():
     both, settings = (0.7, 0.05), {"n_loops": 12}
     won = Cell("linear", "linear", both, 0.07, 0.06, 0.09, (1, 12), **settings)
     tied = Cell("linear", "linear", both, 1.0, 0.9, 1.1, (12, 12), **settings)
-    assert won.sides == {"one": "1 of 12 loops close", "two": "0.050, linear; 12 of 12 loops close"}
-    assert tied.sides == {
-        "one": "0.70, linear; 12 of 12 loops close",
-        "two": "0.050, linear; 12 of 12 loops close",
-    }
-    assert replace(won, closed=None).sides == {"one": "0.70, linear", "two": "0.050, linear"}
+    assert won.texts == {"two": "0.050", "one": "–", "closed": "12 / 1", "method": "linear"}
+    assert tied.texts == {"two": "0.050", "one": "0.70", "closed": "12 / 12", "method": "linear"}
+    mixed = replace(won, one="arcsine", closed=None)
+    assert mixed.texts == {"two": "0.050", "one": "0.70", "closed": "–", "method": "linear; one image: arcsine"}
 
 
 def test_the_simpler_of_two_methods_that_agree_is_named(errors):

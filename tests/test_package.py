@@ -8,7 +8,7 @@ import zipfile
 import pytest
 
 import zwfs
-from book._ext.run import ABOUT, package, zipped
+from book._ext.run import package, repository, zipped
 from book._tools.project import Project
 
 from .conftest import ROOT, new_reconstructor
@@ -67,14 +67,19 @@ def test_the_wheel_says_that_the_package_has_types(tmp_path):
     assert "zwfs/py.typed" in held
 
 
+def test_the_repository_that_the_front_page_offers_is_whole(tmp_path):
+    listed = subprocess.run(["git", "-C", ROOT, "ls-files"], capture_output=True, text=True, check=True).stdout
+    offered = repository(Project(ROOT))
+    assert {name for name in listed.split() if not name.startswith(".")} <= offered.keys()
+    assert not [name for name in offered if "__pycache__" in name or name.startswith((".", "_build"))]
+
+
 def test_pip_installs_the_package_that_the_front_page_offers(tmp_path):
-    files = package(Project(ROOT))
-    about = {name: (ROOT / name).read_bytes() for name in ABOUT}
-    (tmp_path / "zwfs.zip").write_bytes(zipped(files | about))
+    (tmp_path / "zwfs.zip").write_bytes(zipped(repository(Project(ROOT))))
     pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-build-isolation", "--target", "here"]
     subprocess.run([*pip, "zwfs.zip"], cwd=tmp_path, check=True, capture_output=True)
     here = tmp_path / "here"
     installed = {
         one.relative_to(here).as_posix() for one in here.rglob("zwfs/**/*") if one.suffix in (".py", ".typed")
     }
-    assert installed == set(files)
+    assert installed == set(package(Project(ROOT)))

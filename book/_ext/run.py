@@ -32,9 +32,9 @@ from studies.kit.results import published
 
 COPY = "_static/pyodide"
 DATA = "_static/run"
-PACKAGE = "_static/zwfs.zip"
+REPOSITORY = "_static/zwfs.zip"
 KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the version that this book uses
-ABOUT = ("pyproject.toml", "README.md", "LICENSE", "LICENSE-TEXT")
+FOLDERS = ("book", "environment", "notebooks", "tests", "zwfs")
 SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
 SKIPPED = "colab"  # tag of cells that the page leaves out
 POLICY = '<meta http-equiv="Content-Security-Policy" content="{}"/>'
@@ -136,6 +136,18 @@ def package(project: Project) -> dict[str, bytes]:
     return {file.relative_to(project.root).as_posix(): file.read_bytes() for file in files}
 
 
+def repository(project: Project) -> dict[str, bytes]:
+    """Return the files of the repository by name, but none of those that its tools leave behind."""
+    files = [file for folder in FOLDERS for file in (project.root / folder).rglob("*")] + [*project.root.iterdir()]
+    named = {file.relative_to(project.root): file for file in sorted(files) if file.is_file()}
+    hidden = re.compile(r"\.|__pycache__|.*\.egg-info")
+    return {
+        name.as_posix(): file.read_bytes()
+        for name, file in named.items()
+        if not any(map(hidden.match, name.parts))
+    }
+
+
 def zipped(files: dict[str, bytes]) -> bytes:
     """Return a ZIP of files by name; the same content gives the same bytes."""
     stream = io.BytesIO()
@@ -157,8 +169,7 @@ def write(app: Sphinx, exception: Exception | None) -> None:
         notebook = nbformat.read(source, as_version=4)
         write_script(folder / f"{source.stem}.js", "zwfsNotebook", described(notebook, source.stem))
     write_script(folder / "files.js", "zwfsFiles", base64.b64encode(site(project)).decode())
-    about = {name: (project.root / name).read_bytes() for name in ABOUT}
-    Path(app.outdir, PACKAGE).write_bytes(zipped(package(project) | about))  # pip installs it
+    Path(app.outdir, REPOSITORY).write_bytes(zipped(repository(project)))  # pip installs it
     known, where = json.loads(KNOWN.read_text("utf-8")), place(app)
     write_script(folder / "settings.js", "zwfsPython", known | {"place": where})
     add_policies(Path(app.outdir), where)

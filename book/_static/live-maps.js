@@ -63,7 +63,7 @@
       const end = ENDS[bar.dataset.end];
       const text = end === Math.PI ? "π" : String(Number(end.toPrecision(1)));
       bar.firstElementChild.textContent = `−${text}`;
-      bar.lastElementChild.textContent = `+${text} rad`;
+      bar.lastElementChild.textContent = `+${text}`;
     }
   }
 

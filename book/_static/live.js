@@ -10,6 +10,7 @@
   const TURN = 250; // ms of each iteration that is played
   const AGREE = 0.5; // rad: a phase that is nearer to the input, on the circle, is shown on its branch
   const TOLERATED = 0.05; // error that counts as a success, relative to the input, as in the paper
+  const RANDOM = Math.PI / Math.sqrt(3); // rad rms: error of random phases
 
   const find = (name) => document.getElementById(`live-${name}`);
   const inputs = [...document.querySelectorAll("#live .live-controls input")];
@@ -107,14 +108,15 @@
 
   const succeeds = (error, rms) => error <= Math.max(TOLERATED * rms, draw.SMALLEST);
 
-  const share = (error, rms) => `${Math.round((100 * error) / rms)} %`;
+  const off = (error, rms) =>
+    error > 0.85 * RANDOM ? "is hardly better than random" : `is off by ${Math.round((100 * error) / rms)} %`;
 
   // The result in one sentence, for everybody.
   function sentence(made, set) {
     const parts = columns(made, set).map(({ name, made: one }) => {
       if (!one) return `${name}: no unique solution`;
       const error = one.errors.at(-1);
-      const found = succeeds(error, set.rms) ? "recovers the phase" : `off by ${share(error, set.rms)}`;
+      const found = succeeds(error, set.rms) ? "recovers the phase" : off(error, set.rms);
       return `${name} ${found} (${draw.error(error)} rad)`;
     });
     return `Input ${set.rms.toFixed(2)} rad rms, Strehl ratio ${made.strehl.toFixed(2)}. Errors: ${parts.join(", ")}.`;
@@ -141,10 +143,10 @@
       const error = one?.errors.at(-1);
       const good = one && succeeds(error, set.rms);
       const verdict = find(`verdict-${place}`);
-      verdict.textContent = one ? `${good ? "✓" : "✗"} ${draw.error(error)} rad` : "no unique solution";
+      verdict.textContent = one ? `${good ? "✓" : "✗"} ${draw.error(error)} rad` : "✗ ambiguous";
       verdict.className = `live-verdict ${good ? "live-good" : "live-bad"}`;
-      find(`name-${place}`).textContent = name;
-      find(`error-name-${place}`).textContent = name.replace("maximum", "max."); // the column is narrow
+      for (const title of ["name", "error-name"])
+        find(`${title}-${place}`).textContent = name.replace("maximum", "max."); // the column is narrow
     });
     const { linear, arcsine, shifted, accelerated, likelihood } = made;
     draw.curves({ linear, arcsine, shifted, accelerated, likelihood });
@@ -250,7 +252,8 @@
       }
       set(goal, standard);
       before = undefined;
-      const [name, said] = [button.textContent, button.parentElement.textContent.trim()];
+      const [name, whole] = [button.textContent, button.parentElement.textContent.trim()];
+      const said = whole.replace(/ \(\d+\)/g, ""); // an equation's number would be no link here
       find("tried").textContent = `${name}: ${said.slice(name.length).trim()}`;
       offer(tries.indexOf(button) + 1);
       document.getElementById("live").scrollIntoView();

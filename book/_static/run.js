@@ -156,7 +156,7 @@
       this.form.element.addEventListener("invalid", (event) => unfold(event.target), true);
       this.changed();
       for (const other of article.querySelectorAll(".run-figure"))
-        other.append(make("button", { type: "button", click: () => this.run(other.dataset.figure) }, "Run to this figure with the parameters above"));
+        other.append(make("button", { type: "button", click: () => this.run(other.dataset.figure) }, "Compute this figure again, too"));
     }
 
     build(place) {

@@ -1,6 +1,9 @@
-// A search lists the chapters before the glossary, the bibliography and the API pages.
+// A search lists the chapters before the glossary, the bibliography and the API pages; but a name of the code, such as
+// PhaseShifted or zernike_basis, leads to its entry first.
 var Scorer = {
-  score([page, , , , score]) {
+  score([page, title, , , score]) {
+    const asked = new URLSearchParams(location.search).get("q") ?? "";
+    if (/[a-z][A-Z]|[._]/.test(asked) && title.split(".").pop() === asked.trim().split(".").pop()) return score + 100;
     if (page.startsWith("book/api")) return score - 100;
     return ["book/glossary", "book/bibliography"].includes(page) ? score / 20 : score;
   },
@@ -20,8 +23,9 @@ queueMicrotask(() => {
   const all = Search.htmlToText;
   Search.htmlToText = (html, anchor) => {
     const page = new DOMParser().parseFromString(html, "text/html");
-    const unread = ".highlight, .onlyprint, details.hide, button, form, nav, svg, .live, .math";
+    const unread = ".bd-header-article, .highlight, .onlyprint, details.hide, button, form, nav, svg, .live";
     for (const part of page.querySelectorAll(unread)) part.remove();
+    for (const formula of page.querySelectorAll(".math")) formula.textContent = "…";
     const section = anchor.startsWith("#index-") && page.querySelector(anchor)?.closest("section");
     return all(page.documentElement.outerHTML, section ? `#${section.id}` : anchor);
   };

@@ -53,8 +53,12 @@ class Address:
     def texts(self) -> dict[str, str]:
         """Return the parts of pages that depend on the address, as MyST."""
         if not self.repository:
-            package = 'Download the package, <a href="../_static/zwfs.zip" download>zwfs.zip</a>, and install it:'
-            return {"install": f"{package}\n\n```sh\npip install zwfs.zip\n```", "clone": ""}
+            link = '<a href="../_static/zwfs.zip" download>zwfs.zip</a>'
+            package = f"Download the repository, {link} (MIT licence), and install the package:"
+            return {
+                "install": f"{package}\n\n```sh\npip install zwfs.zip\n```",
+                "clone": f"Unpack {link}, the whole repository.",
+            }
         return {
             "install": f'```sh\npip install "zwfs @ git+{self.repository}"\n```',
             "clone": f"```sh\ngit clone {self.repository}\ncd {self.folder}\n```",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
+from typing import Any, Literal
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -11,7 +13,8 @@ from numpy.typing import NDArray
 
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
-from studies.kit.style import ALONE, LOOKS, show_intensity, show_phase
+from studies.kit.style import LOOKS, show_intensity, show_phase
+from studies.kit.variants import add_narrow
 from zwfs.metrics import reconstruction_error, wrapped_residual
 from zwfs.pupil import Pupil
 
@@ -19,35 +22,56 @@ LIMITS = parameter_limits("n_pixels n_modes diameter phase_shift rms exponent n_
 
 _ROUNDING = 1e-15  # rad
 _SEES = {"one image": "from image 1", "two images": "from both images"}
-_LETTERS = 13  # points: on a phone the figure is as wide as the page
 _RIGHT = 1.0  # radian, error up to which a point is drawn on the branch of the true phase
 
 
 def draw_steps(pupil: Pupil, phase: NDArray, frames: NDArray, estimates: Mapping[str, NDArray]) -> Figure:
-    """One wavefront, its two images, and the phase that each method estimates."""
+    """One wavefront, its two images, and the phase that each method estimates.
+
+    On a phone the last estimate stands next to the wavefront.
+    """
+    *others, best = estimates
+    images = ["Image 1", "Image 2"]
+    maps = partial(_draw_maps, pupil, phase, dict(zip(images, frames, strict=True)), estimates)
+    wide = maps([["input", *images], [*others, best]], (7.2, 5.3), 13, "right")
+    return add_narrow(wide, maps([["input", best], images, others], (3.7, 7.5), 11, "bottom"))
+
+
+def _draw_maps(
+    pupil: Pupil,
+    phase: NDArray,
+    frames: Mapping[str, NDArray],
+    estimates: Mapping[str, NDArray],
+    layout: list[Any],  # rows of names
+    size: tuple[float, float],
+    letters: float,
+    bars: Literal["right", "bottom"],
+) -> Figure:
+    """Draw the maps in this order; a colour bar stands next to the images, and one next to the last row."""
     truth = np.where(pupil.inside, phase, np.nan)
     rms = np.sqrt(np.nanmean(truth**2))
     limit = 3 * rms
-    figure, panels = plt.subplots(2, 3, figsize=(7.2, 5.3))
-    shown = show_phase(panels[0, 0], truth, limit)
-    panels[0, 0].set_gid(ALONE)
-    panels[0, 0].set_title(f"Input: {rms:.1f} rad rms", fontsize=_LETTERS)
-    top = np.quantile(frames, 0.99)
-    for axes, frame, number in zip(panels[0, 1:], frames, ("1", "2"), strict=True):
-        light = show_intensity(axes, np.where(pupil.inside, frame, np.nan), top)
-        axes.set_title(f"Image {number}", fontsize=_LETTERS)
-    for axes, (name, estimate) in zip(panels[1], estimates.items(), strict=True):
+    figure, panels = plt.subplot_mosaic(layout, figsize=size)
+    shown = show_phase(panels["input"], truth, limit)
+    panels["input"].set_title(f"Input: {rms:.1f} rad rms", fontsize=letters)
+    top = np.quantile(list(frames.values()), 0.99)
+    for title, frame in frames.items():
+        light = show_intensity(panels[title], np.where(pupil.inside, frame, np.nan), top)
+        panels[title].set_title(title, fontsize=letters)
+    for name, estimate in estimates.items():
         look, error = LOOKS[name], wrapped_residual(pupil, estimate, phase)
         right = np.abs(error) < _RIGHT
         piston = np.mean((estimate - truth)[right]) if right.any() else 0.0
-        show_phase(axes, np.where(right, truth + error, estimate - piston), limit)
-        axes.set_title(f"{look.name.capitalize()},\n{_SEES[look.sees]}", fontsize=_LETTERS)
-        axes.set_xlabel(_error(np.sqrt(np.nanmean(error**2))), fontsize=_LETTERS)
-    bars = [figure.colorbar(light, ax=panels[0], aspect=18, extend="max")]
-    bars += [figure.colorbar(shown, ax=panels[1], aspect=18, extend="both")]
-    for bar, label in zip(bars, ("intensity", "phase (rad)"), strict=True):
-        bar.set_label(label, fontsize=_LETTERS)
-        bar.ax.tick_params(labelsize=_LETTERS - 1)
+        show_phase(panels[name], np.where(right, truth + error, estimate - piston), limit)
+        panels[name].set_title(f"{look.name.capitalize()},\n{_SEES[look.sees]}", fontsize=letters)
+        panels[name].set_xlabel(_error(np.sqrt(np.nanmean(error**2))), fontsize=letters)
+    [beside] = (row for row in layout if {*frames} <= {*row})
+    for mappable, row, label in ((light, beside, "intensity"), (shown, layout[-1], "phase (rad)")):
+        extend = "max" if mappable is light else "both"
+        places = [panels[name] for name in row]
+        bar = figure.colorbar(mappable, ax=places, location=bars, aspect=18, extend=extend)
+        bar.set_label(label, fontsize=letters)
+        bar.ax.tick_params(labelsize=letters - 1)
     return figure
 
 

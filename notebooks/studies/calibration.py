@@ -29,7 +29,8 @@ LIMITS = {
     "n_steps": (1, 30),
     "oversampling": (1, 4),
     "largest": (0.1, 1.2),
-    "n_screens": (1, 2),
+    "n_screens": (1, 6),
+    "n_screens_wrong": (1, 6),
     "n_iterations": USUAL["n_iterations"],
     "command_errors": [(-0.3, 0.3), ...],
 }
@@ -39,6 +40,7 @@ QUICK = {
     "oversampling": 1,
     "largest": 0.3,
     "n_screens": 1,
+    "n_screens_wrong": 1,
     "command_errors": [0.05],
 }
 
@@ -253,6 +255,10 @@ class Errors:
         """Attribute of each screen, (n, n_screens)."""
         return np.array([[getattr(one, name) for one in row] for row in self.measured])
 
+    def first(self, n_screens: int) -> Errors:
+        """Those of the first screens of each input."""
+        return Errors(self.rms, [row[:n_screens] for row in self.measured])
+
     def column(self, name: str) -> NDArray[np.float64]:
         """Root mean square over the screens of an attribute, (n,)."""
         return np.sqrt(np.mean(self.single(name) ** 2, axis=1))
@@ -375,5 +381,5 @@ def numbers(taken: Recording, fit: BenchFit, errors: Errors, not_smooth: NDArray
             "bulk_most": (plain / not_smooth).max(),
             "unseen": len(every),
         },
-        ".3g",
+        ".4g",
     )

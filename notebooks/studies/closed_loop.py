@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
-from studies.kit.parameters import parameter_limits
+from studies.kit.parameters import USUAL, parameter_limits
 from studies.kit.results import rounded, screen_columns
 from studies.kit.style import LOOKS
 from studies.kit.tables import Table
@@ -36,6 +36,8 @@ LIMITS = parameter_limits(
     gains=[(0.01, 1.99)],
     delay=(1, 10),
     stroke=(0.1, 100.0),
+    other_diameter=USUAL["diameter"],
+    other_shift=USUAL["phase_shift"],
     photons=[(0.01, 1e9)],
     photons_zero=(1.0, 1e12),
     inputs=[(0.01, 4.0)],
@@ -247,6 +249,7 @@ def tuned_loops(
     wind: Mapping[str, float],
     seed: int,
     read_noise: float = 0.0,
+    only: Sequence[str] = (*ONE_IMAGE, *TWO_IMAGES),
     **settings: Any,
 ) -> TunedLoops:
     """Choose the gain of each method on half as many screens, and evaluate it on new screens and noise."""
@@ -259,7 +262,7 @@ def tuned_loops(
     def settle(name: str, flow: FrozenFlow, gain: float, noise: int) -> NDArray:
         return follow_flow(made[name], modes, flow, n_steps, gain=gain, seed=noise, **settings).settled()
 
-    made = loop_methods(sensors, modes, photons, read_noise)
+    made = {name: one for name, one in loop_methods(sensors, modes, photons, read_noise).items() if name in only}
     scores = {name: {gain: typical(settle(name, few, gain, first)) for gain in gains} for name in made}
     best = {name: min(tried, key=lambda gain: tried[gain]) for name, tried in scores.items()}
     settled = {name: settle(name, many, gain, then) for name, gain in best.items()}
@@ -301,6 +304,13 @@ def best_methods(trials: Iterable[TunedLoops]) -> list[BestMethods]:
         one, two = (_simplest(loops.chosen, names) for names in (ONE_IMAGE, TWO_IMAGES))
         rows.append(BestMethods.of(loops, one, two))
     return rows
+
+
+def compare_dimples(usual: Iterable[TunedLoops], other: TunedLoops) -> BestMethods:
+    """Compare linear loops with two images behind other dimples with those behind the usual ones."""
+    [same] = (one for one in usual if (one.start, one.photons) == (other.start, other.photons))
+    settled = {"usual": same.settled["LinearTwo"], "other": other.settled["LinearTwo"]}
+    return BestMethods.of(replace(same, settled=settled), "usual", "other")
 
 
 def _simplest(residual: Mapping[str, float], names: Sequence[str]) -> str:
@@ -487,3 +497,12 @@ def numbers(
             "noisy_large_two": typical(large.loops.settled[large.two]),
         }
     )
+
+
+def dimple_numbers(trials: Mapping[str, BestMethods]) -> dict[str, float | str]:
+    """Residuals with the usual dimples and with others, and their ratio, for each star by name."""
+    found: dict[str, float | str] = {}
+    for star, one in trials.items():
+        found[f"dimple_{star}_span"] = one_over_two(one)
+        found |= {f"dimple_{star}_{name}": typical(left) for name, left in one.loops.settled.items()}
+    return rounded(found)

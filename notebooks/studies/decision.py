@@ -27,7 +27,7 @@ from studies.kit import sweeps
 from studies.kit.bench import poked_frames, poked_linear
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
-from studies.kit.tables import Table
+from studies.kit.tables import MISSING, Table
 from zwfs import Arcsine, MaximumLikelihood, PhaseShifted, Pupil
 from zwfs.bench import Bench, BenchModel, segment_pistons, segment_residual, segment_screens
 from zwfs.turbulence import FrozenFlow
@@ -42,7 +42,7 @@ LIMITS = parameter_limits(
     **dict.fromkeys(("photons", "photons_faint"), (10.0, 1e9)),
     **dict.fromkeys(("photons_loop", "photons_loop_faint"), (0.01, 1e9)),
     **dict.fromkeys(("n_screens", "n_screens_perfect", "n_loops"), (2, 1000)),
-    n_screens_calibrated=(0, 2),
+    n_screens_calibrated=(0, 6),
 )
 
 QUICK = dict.fromkeys(("n_screens", "n_screens_perfect", "n_loops"), 2)
@@ -326,18 +326,15 @@ class Cell:
         return 2 if self.high < 1 else 1 if self.low > 1 else None
 
     @property
-    def sides(self) -> dict[str, str]:
-        """Error and method with two images and with one, and how many loops close; no error if few do."""
-
-        def side(error: float, method: str, closed: int | None) -> str:
-            found = f"{two_digits(error)}, {method}"
-            if closed is None:
-                return found
-            end = f"{closed} of {self.n_loops} loops close"
-            return f"{found}; {end}" if closed > self.n_loops / 2 else end
-
-        sides = map(side, self.typical, (self.one, self.two), self.closed or (None, None))
-        return dict(zip(("one", "two"), sides, strict=True))
+    def texts(self) -> dict[str, str]:
+        """Errors with two images and with one, methods, and loops that close; no error where at most half do."""
+        enough = [self.closed is None or number > self.n_loops / 2 for number in self.closed or (0, 0)]
+        one, two = (
+            two_digits(error) if well else MISSING for error, well in zip(self.typical, enough, strict=True)
+        )
+        method = self.two if self.one == self.two or not enough[0] else f"{self.two}; one image: {self.one}"
+        closed = MISSING if self.closed is None else "{1} / {0}".format(*self.closed)
+        return {"two": two, "one": one, "closed": closed, "method": method}
 
 
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
@@ -408,19 +405,26 @@ def loop_rows(found: Sequence[BestMethods]) -> list[Row]:
 
 def open_table(rows: Sequence[Row]) -> Table:
     """Error of the best method with two images and with one, and their ratio, for each bench and wavefront."""
-    header = ["situation", "photons per point and image", "two images", "one image", "one over two"]
-    return Table(header, [[*_cells(row), one_over_two(row.cell)] for row in rows])
+    header = ["situation", "photons per point and image", "error, two images", "error, one image", "one over two"]
+    header += ["method"]
+    return Table(header, [_cells(row, "two", "one", "ratio", "method") for row in rows])
 
 
-def loop_table(rows: Iterable[Row]) -> Table:
-    """Residual and gain with two images and with one, for each loop."""
-    header = ["initial error", "photons per point, image and step", "two images", "one image"]
-    return Table(header, [_cells(row) for row in rows])
+def loop_table(rows: Sequence[Row]) -> Table:
+    """Loops that close, residual and gain with two images and with one."""
+    n_loops = max((row.cell.n_loops for row in rows), default=0)
+    header = [
+        "initial error",
+        "photons per point, image and step",
+        f"loops that close (of {n_loops}), two / one image",
+    ]
+    header += ["error, two images", "error, one image", "method"]
+    return Table(header, [_cells(row, "closed", "two", "one", "method") for row in rows])
 
 
-def _cells(row: Row) -> list[str]:
-    sides = row.cell.sides
-    return [row.situation, row.photons, sides["two"], sides["one"]]
+def _cells(row: Row, *names: str) -> list[str]:
+    texts = row.cell.texts | {"ratio": one_over_two(row.cell)}
+    return [row.situation, row.photons, *(texts[name] for name in names)]
 
 
 def calibrated_table(situations: Iterable[Situation], errors: Iterable[tuple[float, float] | None]) -> Table:
@@ -449,7 +453,7 @@ def numbers(
     found: dict[str, float | str] = {}
     for row in rows:
         found |= {f"{row.key}_start": row.start, f"{row.key}_photons": row.photons}
-        found |= {f"{row.key}_{count}": text for count, text in row.cell.sides.items()}
+        found |= {f"{row.key}_{name}": text for name, text in row.cell.texts.items()}
         if row.cell.closed:
             found[f"{row.key}_span"] = one_over_two(row.cell)
     for index, pair in enumerate(calibrated, 1):

@@ -70,8 +70,8 @@ def test_the_wheel_says_that_the_package_has_types(tmp_path):
 def test_the_repository_that_the_front_page_offers_is_whole(tmp_path):
     listed = subprocess.run(["git", "-C", ROOT, "ls-files"], capture_output=True, text=True, check=True).stdout
     offered = repository(Project(ROOT))
-    assert {name for name in listed.split() if not name.startswith(".")} <= offered.keys()
-    assert not [name for name in offered if "__pycache__" in name or name.startswith((".", "_build"))]
+    assert {f"zwfs-book/{name}" for name in listed.split() if not name.startswith(".")} <= offered.keys()
+    assert not [name for name in offered if "__pycache__" in name or "/_build/" in name or "/." in name]
 
 
 def test_pip_installs_the_package_that_the_front_page_offers(tmp_path):

@@ -162,6 +162,7 @@ def by_verdict(judged: dict[int, Finding]) -> str:
     return "\n".join(
         f"- {_marked(verdict)}{f', {reason}' if reason else ''}: {', '.join(rows) or 'none'}"
         for (verdict, reason), rows in groups.items()
+        if rows or not reason
     )
 
 
@@ -215,10 +216,14 @@ def rules() -> str:
                 text += f"`notebooks/studies/{notebook}.py`:\n\n"
                 for name in claim.code:
                     text += _include(code, pyobject=name)
+                if claim.refined:
+                    text += "From `notebooks/studies/kit/curves.py`:\n\n"
                 for function in claim.refined:
                     text += _include("../notebooks/studies/kit/curves.py", pyobject=function)
-                text += "**Its numbers**, the marked lines:\n\n"
+                text += f"**Its numbers**, the marked lines of `notebooks/studies/{notebook}.py`:\n\n"
                 text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))
+                if claim.also:
+                    text += f"The others are from [{_title(claim.also)}](../notebooks/{claim.also}.ipynb).\n\n"
         text += "**All numbers:**\n\n"
         text += _include(code, name=f"numbers-{notebook}", pyobject="numbers") + "::::\n\n"
     return text

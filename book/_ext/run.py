@@ -142,7 +142,7 @@ def repository(project: Project) -> dict[str, bytes]:
     named = {file.relative_to(project.root): file for file in sorted(files) if file.is_file()}
     hidden = re.compile(r"\.|__pycache__|.*\.egg-info")
     return {
-        name.as_posix(): file.read_bytes()
+        f"zwfs-book/{name.as_posix()}": file.read_bytes()
         for name, file in named.items()
         if not any(map(hidden.match, name.parts))
     }

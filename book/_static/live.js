@@ -10,7 +10,7 @@
   const TURN = 250; // ms of each iteration that is played
   const AGREE = 0.5; // rad: a phase that is nearer to the input, on the circle, is shown on its branch
   const TOLERATED = 0.05; // error that counts as a success, relative to the input, as in the paper
-  const RANDOM = Math.PI / Math.sqrt(3); // rad rms: error of random phases
+  const NO_USE = (0.85 * Math.PI) / Math.sqrt(3); // rad rms: an error that is hardly smaller than that of random phases
 
   const find = (name) => document.getElementById(`live-${name}`);
   const inputs = [...document.querySelectorAll("#live .live-controls input")];
@@ -109,7 +109,7 @@
   const succeeds = (error, rms) => error <= Math.max(TOLERATED * rms, draw.SMALLEST);
 
   const off = (error, rms) =>
-    error > 0.85 * RANDOM ? "is hardly better than random" : `is off by ${Math.round((100 * error) / rms)} %`;
+    error > NO_USE ? "is hardly better than random" : `is off by ${Math.round((100 * error) / rms)} %`;
 
   // The result in one sentence, for everybody.
   function sentence(made, set) {
@@ -122,10 +122,18 @@
     return `Input ${set.rms.toFixed(2)} rad rms, Strehl ratio ${made.strehl.toFixed(2)}. Errors: ${parts.join(", ")}.`;
   }
 
+  // A phase that has nothing to do with the input: without its piston, the principal value.
+  function centred(phase) {
+    const sum = (part) => live.inside.reduce((total, k) => total + part(phase[k]), 0);
+    const piston = Math.atan2(sum(Math.sin), sum(Math.cos));
+    return phase.map((value) => Math.atan2(Math.sin(value - piston), Math.cos(value - piston)));
+  }
+
   // The phase of a method with the piston of the input: on the branch of the input where they agree, else the principal
   // value.
-  function found(input, residual) {
+  function found(input, residual, lost) {
     const phase = input.map((value, k) => value + residual[k]);
+    if (lost) return centred(phase);
     for (const k of live.inside)
       if (Math.abs(residual[k]) > AGREE) phase[k] -= 2 * Math.PI * Math.round(phase[k] / (2 * Math.PI));
     return phase;
@@ -138,9 +146,9 @@
     draw.image("image-a", made.frames[0]);
     draw.image("image-b", made.frames[1]);
     columns(made, set).forEach(({ name, made: one }, place) => {
-      draw.phase(`found-${place}`, one && found(made.phase, one.residual));
-      draw.difference(`error-${place}`, one?.residual);
       const error = one?.errors.at(-1);
+      draw.phase(`found-${place}`, one && found(made.phase, one.residual, error > NO_USE));
+      draw.difference(`error-${place}`, one?.residual);
       const good = one && succeeds(error, set.rms);
       const verdict = find(`verdict-${place}`);
       verdict.textContent = one ? `${good ? "✓" : "✗"} ${draw.error(error)} rad` : "✗ ambiguous";

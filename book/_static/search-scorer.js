@@ -1,9 +1,10 @@
 // A search lists the chapters before the glossary, the bibliography and the API pages; but a name of the code, such as
-// PhaseShifted or zernike_basis, leads to its entry first.
+// PhaseShifted or zernike_basis, leads to its entry first, and the words of a heading lead to its section.
 var Scorer = {
   score([page, title, , , score]) {
     const asked = new URLSearchParams(location.search).get("q") ?? "";
     if (/[a-z][A-Z]|[._]/.test(asked) && title.split(".").pop() === asked.trim().split(".").pop()) return score + 100;
+    if (title.split(" > ").pop().toLowerCase() === asked.trim().toLowerCase()) return score + 50;
     if (page.startsWith("book/api")) return score - 100;
     return ["book/glossary", "book/bibliography"].includes(page) ? score / 20 : score;
   },

@@ -377,7 +377,7 @@ def _phrases(curves: LinearityCurves, limits: Mapping[str, Limit], threshold: fl
     rms, gain = curves.rms, limits["PhaseShifted"].over(limits["Linear"])
     both = np.maximum(curves.mean("PhaseShifted"), curves.mean("GradientDescent")) < 1e-6
     alike = rms[both].max(initial=0)
-    onset = rms[np.mean(curves.wrapped > 0, axis=1) >= 0.5].min(initial=np.inf)
+    onset = _wrap_onset(curves)
     return {
         "linear_reach": _reach(curves, "Linear", threshold, limits["Linear"]),
         "shifted_reach": _reach(curves, "PhaseShifted", threshold, limits["PhaseShifted"]),
@@ -400,12 +400,24 @@ _SHORT = {
 }
 
 
-def steep_numbers(limits: Mapping[str, Limit]) -> dict[str, float | str]:
-    """Limits of the linear method and of the iteration with another spectrum, and their ratio."""
-    linear, shifted = limits["Linear"], limits["PhaseShifted"]
-    return rounded({
-        "steep_linear": linear.value, "steep_shifted": shifted.value, "steep_gain": shifted.over(linear).value
-    })  # fmt: skip
+def steep_numbers(curves: LinearityCurves, limits: Mapping[str, Limit]) -> dict[str, float | str]:
+    """Limits of some methods with another spectrum, and the input from which on half of its screens have wraps."""
+    linear, arcsine, shifted = (limits[name] for name in ("Linear", "Arcsine", "PhaseShifted"))
+    return rounded(
+        {
+            "steep_linear": linear.value,
+            "steep_arcsine": arcsine.value,
+            "steep_arcsine_error": arcsine.error,
+            "steep_shifted": shifted.value,
+            "steep_gain": shifted.over(linear).value,
+            "steep_wrap_onset": _wrap_onset(curves),
+        }
+    )
+
+
+def _wrap_onset(curves: LinearityCurves) -> float:
+    """Smallest input at which half of the screens reach beyond +-pi, infinity if none does."""
+    return float(curves.rms[np.mean(curves.wrapped > 0, axis=1) >= 0.5].min(initial=np.inf))
 
 
 def numbers(
@@ -448,7 +460,7 @@ def numbers(
         "strehl_at_limit": np.interp(limits["PhaseShifted"].value, rms, curves.strehl.mean(axis=1)),
         "wrapped_screens_at_05": with_wraps[half],
         "wrapped_screens_at_1": with_wraps[one],
-        "wrap_onset": rms[with_wraps >= 0.5].min(initial=np.inf),
+        "wrap_onset": _wrap_onset(curves),
         "saxton_extent": usual.extent,
         "saxton_iterations": methods["GerchbergSaxton"].settings.n_iterations,
         "saxton_error": offset,

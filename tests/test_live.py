@@ -347,7 +347,7 @@ def wait_for_address(page, *parts):
         ("Keck", "✗✗✓", "maximum likelihood"),
         ("OZIRIIS", "✗✗✓", "maximum likelihood"),
         ("All-round", "✗✗✓", "maximum likelihood"),
-        ("Dimple too large", "✗✗✗", "phase-shifted"),
+        ("Large dimple", "✗✗✗", "phase-shifted"),
         ("Out of range", "✗✗✗", "phase-shifted"),
         ("A large input", "✗✗✗", "phase-shifted"),
         ("The same, accelerated", "✗✗✓", "accelerated"),

@@ -20,6 +20,7 @@ from book._ext.glossary import GLOSSARY, define
 from book._ext.performance import PICTURES
 from book._tools.address import setting
 from book._tools.project import PDF
+from studies.kit.tables import MISSING
 
 VARIANTS = "variants-"  # with which the class of a figure begins that may have dark and narrow variants
 PHONE = "(max-width: 600px)"
@@ -97,6 +98,8 @@ def name_cells(body: Tag) -> None:
         for row in table.select("tbody tr"):
             for head, cell in list(zip(heads, row.find_all("td", recursive=False), strict=True))[1:]:
                 cell["data-head"] = head[:1].upper() + head[1:]
+                if plain(cell) == MISSING:
+                    cell["class"] = " ".join([*cell.get_attribute_list("class"), "missing"])
 
 
 def link_code(app: Sphinx, page: str, body: Tag) -> None:

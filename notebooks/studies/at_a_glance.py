@@ -65,8 +65,8 @@ def _draw_maps(
         show_phase(panels[name], np.where(right, truth + error, estimate - piston), limit)
         panels[name].set_title(f"{look.name.capitalize()},\n{_SEES[look.sees]}", fontsize=letters)
         panels[name].set_xlabel(_error(np.sqrt(np.nanmean(error**2))), fontsize=letters)
-    [beside] = (row for row in layout if {*frames} <= {*row})
-    for mappable, row, label in ((light, beside, "intensity"), (shown, layout[-1], "phase (rad)")):
+    [images] = (row for row in layout if {*frames} <= {*row})
+    for mappable, row, label in ((light, images, "intensity"), (shown, layout[-1], "phase (rad)")):
         extend = "max" if mappable is light else "both"
         places = [panels[name] for name in row]
         bar = figure.colorbar(mappable, ax=places, location=bars, aspect=18, extend=extend)

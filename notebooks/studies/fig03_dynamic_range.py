@@ -401,7 +401,7 @@ _SHORT = {
 
 
 def steep_numbers(curves: LinearityCurves, limits: Mapping[str, Limit]) -> dict[str, float | str]:
-    """Limits of some methods with another spectrum, and the input from which on half of its screens have wraps."""
+    """Limits of some methods with another spectrum, and the smallest input at which half of its screens wrap."""
     linear, arcsine, shifted = (limits[name] for name in ("Linear", "Arcsine", "PhaseShifted"))
     return rounded(
         {

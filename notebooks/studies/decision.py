@@ -328,13 +328,15 @@ class Cell:
     @property
     def texts(self) -> dict[str, str]:
         """Errors with two images and with one, methods, and loops that close; no error where at most half do."""
-        enough = [self.closed is None or number > self.n_loops / 2 for number in self.closed or (0, 0)]
-        one, two = (
-            two_digits(error) if well else MISSING for error, well in zip(self.typical, enough, strict=True)
-        )
-        method = self.two if self.one == self.two or not enough[0] else f"{self.two}; one image: {self.one}"
-        closed = MISSING if self.closed is None else "{1} / {0}".format(*self.closed)
+        one, two = self._error(0), self._error(1)
+        alike = self.one == self.two or one == MISSING
+        method = self.two if alike else f"{self.two}; one image: {self.one}"
+        closed = f"{self.closed[1]} / {self.closed[0]}" if self.closed else MISSING
         return {"two": two, "one": one, "closed": closed, "method": method}
+
+    def _error(self, place: int) -> str:
+        few = self.closed is not None and self.closed[place] <= self.n_loops / 2
+        return MISSING if few else two_digits(self.typical[place])
 
 
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:

@@ -161,6 +161,20 @@ def test_search_finds_a_chapter_before_the_api(page):
     assert said == outside(asked) == []
 
 
+@pytest.mark.parametrize(
+    ("asked", "target"),
+    [
+        ("PhaseShifted", "book/api_reconstructors.html#zwfs.PhaseShifted"),
+        ("zernike_basis", "book/api_sensor.html#zwfs.zernike_basis"),
+        ("what limits two images", "notebooks/zernike_sensor.html#what-limits-two-images"),
+    ],
+)
+def test_search_leads_from_a_name_to_its_entry_and_from_a_heading_to_its_section(page, asked, target):
+    page.goto(f"{address('search.html')}?q={asked}")
+    page.locator(".search-summary", has_text="found").wait_for()
+    assert target in page.locator("#search-results li a").first.get_attribute("href")
+
+
 def test_search_shows_excerpts_of_prose(page):
     with serving(HTML) as place:  # pages in files have no excerpts
         page.goto(f"{place}search.html?q=latency")

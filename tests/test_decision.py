@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from studies.decision import (
+    BENCHES,
     Cell,
+    Row,
     Situation,
     bench_loops,
     calibrated_errors,
     dimmed,
+    draw_comparison,
     know_bench,
     open_cell,
     open_loop_errors,
@@ -67,6 +70,20 @@ def test_a_cell_of_loops_says_how_many_close():
     assert tied.texts == {"two": "0.050", "one": "0.70", "closed": "12 / 12", "method": "linear"}
     mixed = replace(won, one="arcsine", closed=None)
     assert mixed.texts == {"two": "0.050", "one": "0.70", "closed": "–", "method": "linear; one image: arcsine"}
+
+
+def test_the_picture_starts_with_small_errors_and_writes_equal_values_once():
+    won, tied = (Cell("linear", "linear", both, 0.1, 0.1, 0.1) for both in ((0.3, 0.03), (0.0021, 0.0021)))
+    rows = [Row("a", BENCHES["real"], SITUATIONS[0], won), Row("b", BENCHES["real"], SITUATIONS[2], tied)]
+    loop = Row("c", "", Situation(0.5, 1.0), Cell("linear", "linear", (0.1, 0.1), 1.0, 0.9, 1.1, (4, 12), 12))
+    left, right = draw_comparison(rows, [loop]).axes
+    assert [label.get_text().partition("\n")[2] for label in left.get_yticklabels()] == [
+        "0.1 rad, 10000 photons",
+        "0.5 rad, 10000 photons",
+    ]
+    assert sorted(text.get_text() for text in left.texts) == ["0.0021", "0.030", "0.30"]
+    assert sorted(text.get_text() for text in right.texts) == ["12", "4"]
+    assert [label.get_text() for label in right.get_yticklabels()] == ["0.5 rad, 1 photon"]
 
 
 def test_the_simpler_of_two_methods_that_agree_is_named(errors):

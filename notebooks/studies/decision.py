@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice
 from typing import Any, NamedTuple
 
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
@@ -27,6 +30,7 @@ from studies.kit import sweeps
 from studies.kit.bench import poked_frames, poked_linear
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
+from studies.kit.style import OTHER_STYLES, TALL
 from studies.kit.tables import MISSING, Table
 from zwfs import Arcsine, MaximumLikelihood, PhaseShifted, Pupil
 from zwfs.bench import Bench, BenchModel, segment_pistons, segment_residual, segment_screens
@@ -70,6 +74,10 @@ GAINS = 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9
 """Settings of the chapter on closed loops."""
 _ON_BENCH = {"Linear": "classic", "LinearTwo": "shifted"}
 """Methods of the loops, and their sensors in `BenchModel`."""
+_MARKERS: dict[str, dict[str, Any]] = {
+    "two images": {"color": OTHER_STYLES[0]["color"], "marker": "o", "ms": 11, "mfc": "none", "mew": 2},
+    "one image": {"color": OTHER_STYLES[1]["color"], "marker": "X", "ms": 8},
+}
 _MUCH = 3.0  # ratio of errors beyond which one image fails
 _DIAMETER = 8.0  # of the telescope that the wind speed in m/s belongs to, m
 
@@ -377,39 +385,119 @@ def chance(loops: TunedLoops) -> float:
 
 
 class Row(NamedTuple):
-    """A row of a table."""
+    """A row of the figure and of a table."""
 
     key: str
-    situation: str
-    start: str
-    photons: str  # per point and image of two
+    bench: str  # in words; none for a loop
+    at: Situation
     cell: Cell
+
+    @property
+    def start(self) -> str:
+        """Wavefront error in words."""
+        return f"{self.at.rms:g} rad rms"
+
+    @property
+    def photons(self) -> str:
+        """Photons per point and image of two."""
+        return f"{self.at.photons:g}"
 
 
 def open_rows(situations: Sequence[Situation], errors: Mapping[str, Sequence[Mapping[str, NDArray]]]) -> list[Row]:
     """Rows of the open loop, for each bench."""
-    starts = [f"{one.rms:g} rad rms" for one in situations]
     return [
-        Row(f"{bench}_{index}", f"{BENCHES[bench]}, {start}", start, f"{one.photons:g}", open_cell(some))
+        Row(f"{bench}_{index}", BENCHES[bench], situation, open_cell(some))
         for bench, rows in errors.items()
-        for index, (one, start, some) in enumerate(zip(situations, starts, rows, strict=True), 1)
+        for index, (situation, some) in enumerate(zip(situations, rows, strict=True), 1)
     ]
 
 
 def loop_rows(found: Sequence[BestMethods]) -> list[Row]:
     """Rows of the closed loops."""
-    starts = [f"{one.loops.start:g} rad rms" for one in found]
     return [
-        Row(f"closed_{index}", start, start, f"{one.loops.photons:g}", loop_cell(one))
-        for index, (start, one) in enumerate(zip(starts, found, strict=True), 1)
+        Row(f"closed_{index}", "", Situation(one.loops.start, one.loops.photons), loop_cell(one))
+        for index, one in enumerate(found, 1)
     ]
+
+
+def in_order(rows: Iterable[Row]) -> list[Row]:
+    """Rows of the same bench one after the other, small errors and bright light first."""
+    return sorted(rows, key=lambda row: (row.bench == BENCHES["real"], row.at.rms, -row.at.photons))
+
+
+def draw_comparison(open_loop: Sequence[Row], loops: Sequence[Row]) -> Figure:
+    """Errors in open loop and loops that close, with two images and with one."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 4.2), width_ratios=(1.25, 1))
+    open_loop, loops = in_order(open_loop), in_order(loops)
+    errors = [row.cell.typical for row in open_loop]
+    _pairs(left, open_loop, errors, two_digits)
+    room = np.min(errors) / 25, 6 * np.max(errors)  # for the numbers next to the markers
+    left.set(xscale="log", xlim=room, title="open loop", xlabel="error (rad rms)")
+    n_loops = loops[0].cell.n_loops
+    _pairs(right, loops, [row.cell.closed or (0, 0) for row in loops], str)
+    right.set(xlim=(-0.15 * n_loops, 1.15 * n_loops), xticks=(0, n_loops / 2, n_loops))
+    right.set(title="closed loop", xlabel=f"loops that close (of {n_loops})")
+    figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+    return figure
+
+
+def _pairs(axes: Axes, rows: Sequence[Row], values: Sequence[tuple[float, float]], text: Callable) -> None:
+    """Mark the values with one image and with two in each row, and write them next to the markers."""
+    places = np.arange(len(rows))[::-1]
+    one, two = np.transpose(values)
+    axes.hlines(places, one, two, color="#999999", lw=2, zorder=1)
+    for (label, style), xs in zip(_MARKERS.items(), (two, one), strict=True):
+        axes.plot(xs, places, ls="none", label=label, **style)
+    for place, pair in zip(places, values, strict=True):
+        low, high = sorted(pair)
+        _beside(axes, high, place, text(high), 1)
+        if text(low) != text(high):
+            _beside(axes, low, place, text(low), -1)
+    axes.set_yticks(places, [_label(row) for row in rows])
+    axes.set_ylim(-0.6, len(rows) - 0.4)
+    axes.grid(axis="y", visible=False)
+    axes.set_gid(TALL)
+
+
+def _beside(axes: Axes, x: float, y: float, text: str, side: int) -> None:
+    place: dict[str, Any] = {"textcoords": "offset points", "ha": "left" if side > 0 else "right", "va": "center"}
+    axes.annotate(text, (x, y), (9 * side, 0), **place)
+
+
+def _label(row: Row) -> str:
+    light = f"{row.photons} photon{'' if row.photons == '1' else 's'}"
+    first = f"{row.bench}\n" if row.bench else ""
+    return f"{first}{row.at.rms:g} rad, {light}"
+
+
+def comparison_columns(open_loop: Sequence[Row], loops: Sequence[Row]) -> dict[str, list | NDArray]:
+    """Errors, their ratio with two standard errors either way, and loops that close in each row of the figure."""
+    rows = in_order(open_loop) + in_order(loops)
+    cells = [row.cell for row in rows]
+    one, two = np.transpose([cell.typical for cell in cells])
+    closed = [cell.closed or ("", "") for cell in cells]
+    return {
+        "loop": ["closed" if cell.closed else "open" for cell in cells],
+        "bench": [row.bench or BENCHES["real"] for row in rows],
+        "wavefront error (rad rms)": [row.at.rms for row in rows],
+        "photons per point and image": [row.at.photons for row in rows],
+        "method, two images": [cell.two for cell in cells],
+        "method, one image": [cell.one for cell in cells],
+        "error, two images (rad rms)": two,
+        "error, one image (rad rms)": one,
+        "one over two": np.array([1 / cell.ratio for cell in cells]),
+        "one over two, low": np.array([1 / cell.high for cell in cells]),
+        "one over two, high": np.array([1 / cell.low for cell in cells]),
+        "loops that close, two images": [pair[1] for pair in closed],
+        "loops that close, one image": [pair[0] for pair in closed],
+    }
 
 
 def open_table(rows: Sequence[Row]) -> Table:
     """Error of the best method with two images and with one, and their ratio, for each bench and wavefront."""
     header = ["situation", "photons per point and image", "error, two images", "error, one image", "one over two"]
     header += ["method"]
-    return Table(header, [_cells(row, "two", "one", "ratio", "method") for row in rows])
+    return Table(header, [_cells(row, "two", "one", "ratio", "method") for row in in_order(rows)])
 
 
 def loop_table(rows: Sequence[Row]) -> Table:
@@ -421,12 +509,13 @@ def loop_table(rows: Sequence[Row]) -> Table:
         f"loops that close (of {n_loops}), two / one image",
     ]
     header += ["error, two images", "error, one image", "method"]
-    return Table(header, [_cells(row, "closed", "two", "one", "method") for row in rows])
+    return Table(header, [_cells(row, "closed", "two", "one", "method") for row in in_order(rows)])
 
 
 def _cells(row: Row, *names: str) -> list[str]:
     texts = row.cell.texts | {"ratio": one_over_two(row.cell)}
-    return [row.situation, row.photons, *(texts[name] for name in names)]
+    situation = f"{row.bench}, {row.start}" if row.bench else row.start
+    return [situation, row.photons, *(texts[name] for name in names)]
 
 
 def calibrated_table(situations: Iterable[Situation], errors: Iterable[tuple[float, float] | None]) -> Table:

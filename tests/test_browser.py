@@ -167,6 +167,8 @@ def test_search_finds_a_chapter_before_the_api(page):
         ("PhaseShifted", "book/api_reconstructors.html#zwfs.PhaseShifted"),
         ("zernike_basis", "book/api_sensor.html#zwfs.zernike_basis"),
         ("what limits two images", "notebooks/zernike_sensor.html#what-limits-two-images"),
+        ("which dimples", "notebooks/design.html"),
+        ("phase shifts", "notebooks/phase_shift_pairs.html"),
     ],
 )
 def test_search_leads_from_a_name_to_its_entry_and_from_a_heading_to_its_section(page, asked, target):

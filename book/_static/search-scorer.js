@@ -1,12 +1,17 @@
 // A search lists the chapters before the glossary, the bibliography and the API pages; but a name of the code, such as
-// PhaseShifted or zernike_basis, leads to its entry first, and the words of a heading lead to its section.
+// PhaseShifted or zernike_basis, leads to its entry first, and the words of a heading lead to its section: first if they
+// are all of it, and before the text of other pages if they are two words or more of it, in singular or plural.
 var Scorer = {
   score([page, title, , , score]) {
     const asked = new URLSearchParams(location.search).get("q") ?? "";
     if (/[a-z][A-Z]|[._]/.test(asked) && title.split(".").pop() === asked.trim().split(".").pop()) return score + 100;
-    if (title.split(" > ").pop().toLowerCase() === asked.trim().toLowerCase()) return score + 50;
+    const heading = title.split(" > ").pop().toLowerCase();
+    if (heading === asked.trim().toLowerCase()) return score + 50;
     if (page.startsWith("book/api")) return score - 100;
-    return ["book/glossary", "book/bibliography"].includes(page) ? score / 20 : score;
+    if (["book/glossary", "book/bibliography"].includes(page)) return score / 20;
+    const words = (text) => (text.toLowerCase().match(/\p{L}{3,}/gu) ?? []).map((word) => word.replace(/s$/, ""));
+    const [sought, found] = [words(asked), words(heading)];
+    return sought.length > 1 && sought.every((word) => found.includes(word)) ? score + 30 : score;
   },
   objNameMatch: 11,
   objPartialMatch: 6,

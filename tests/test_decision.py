@@ -104,7 +104,7 @@ def test_one_image_gets_the_light_that_two_share():
 
 
 def test_winners_on_a_bench_without_errors_do_not_depend_on_the_screens(known):
-    errors = open_loop_errors({"perfect": known}, SITUATIONS, {"perfect": 8}, 25, seed=7)["perfect"]
+    errors = open_loop_errors({"perfect": known}, {"perfect": SITUATIONS}, {"perfect": 8}, 25, seed=7)["perfect"]
     cells = [open_cell(one) for one in errors]
     assert [cell.images for cell in cells] == [2, 2, None]
     assert all(cell.two == "phase-shifted" for cell in cells[:2])

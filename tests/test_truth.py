@@ -125,6 +125,7 @@ RANGE = SMALL | {
 }  # fmt: skip
 DIMPLE = SMALL | {"inputs": [0.5], "step": 2.0, "step_fine": 0.3, "diameter_max": 3.5, "n_screens_few": 1}
 DECISION = BENCH | {
+    "n_pixels_fine": 40,
     "n_screens": 2, "n_screens_perfect": 2, "n_loops": 2,
     "n_screens_calibrated": 0, "n_iterations": 3,
 }  # fmt: skip

@@ -377,6 +377,7 @@ def numbers(taken: Recording, fit: BenchFit, errors: Errors, not_smooth: NDArray
             "sigma": errors.column("sigma")[place],
             "inside": 100 * float(np.mean([one.inside for one in every])),
             "consistent": sum(one.consistent for one in every),
+            "bulk_error": not_smooth[place],
             "bulk_worst": errors.rms[np.argmax(not_smooth / plain)],
             "bulk_most": (plain / not_smooth).max(),
             "unseen": len(every),

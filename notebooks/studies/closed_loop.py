@@ -56,7 +56,7 @@ PLANTS = {
 ALIKE = 1.05
 """Ratio of errors up to which the simpler one of two methods is named."""
 
-_SIDEWAYS = 0.085  # between the markers of one start, over the smallest distance of two starts
+_SIDEWAYS = 0.085  # between the markers of one start, over the distance of two starts
 _GRAY = "#666666"
 
 
@@ -353,7 +353,7 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
     figure, panels = plt.subplots(1, len(stars), figsize=(7, 4.4), sharex=True, sharey=True, squeeze=False)
     for axes, photons in zip(panels[0], stars, strict=True):
         some = sorted((one for one in trials if one.photons == photons), key=lambda one: one.start)
-        step = _SIDEWAYS * min(np.diff([one.start for one in some]), default=some[0].start)
+        starts = np.arange(len(some))  # in equal steps: the small ones, which lie close together, matter most
         drawn = [name for name in (*TWO_IMAGES, *ONE_IMAGE) if name in some[0].settled]
         for index, name in enumerate(drawn):
             style = LOOKS["Linear" if name == "LinearTwo" else name].style
@@ -362,7 +362,7 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
             if name == "LinearTwo":
                 style["linestyle"] = "--"
             means = np.array([paired_ratio(one.settled[name], np.ones_like(one.settled[name])) for one in some])
-            places = [one.start + step * (index - len(drawn) // 2) for one in some]
+            places = starts + _SIDEWAYS * (index - len(drawn) // 2)
             axes.semilogy(places, means[:, 0], label=method_name(name), **style)
             if np.isfinite(means).all():  # more than one screen
                 axes.vlines(places, *means[:, 1:].T, color=style["color"], lw=1)
@@ -370,7 +370,8 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
         light = f"{photons:g} photon{'s' * (photons != 1)} per point, image and step"
         n_loops = next(iter(some[0].settled.values())).size
         axes.set_title(f"{light}\nloops that close, of {n_loops}:", fontsize=10, pad=30)
-        axes.set(xlabel="error at the start (rad rms)", xticks=[one.start for one in some])
+        axes.set(xlabel="error at the start (rad rms)", xticks=starts)
+        axes.set_xticklabels([f"{one.start:g}" for one in some])
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter("")
@@ -381,18 +382,18 @@ def draw_tuned_loops(trials: Sequence[TunedLoops]) -> Figure:
 
 def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
     """Draw the limit below which a loop is closed; count the closed loops above the panel, for each start."""
-    starts = [one.start for one in some]
-    axes.semilogy(starts, [start / 2 for start in starts], color=_GRAY, lw=1, zorder=1)
+    limits = [one.start / 2 for one in some]
+    axes.semilogy(range(len(some)), limits, color=_GRAY, lw=1, zorder=1)
     style: dict[str, Any] = {"textcoords": "offset points", "color": _GRAY, "fontsize": 9}
-    axes.annotate("closed: below half\nof the start", (starts[0], starts[0] / 2), (-6, 16), **style)
+    axes.annotate("closed: below half\nof the start", (0, limits[0]), (-6, 16), **style)
     axes.margins(y=0.17)
-    place = axes.get_xaxis_transform()  # starts of the axis, and heights in units of the panel
-    for one in some:
+    place = axes.get_xaxis_transform()  # places on the axis, and heights in units of the panel
+    for number, one in enumerate(some):
         lines = []
         for label, names in (("one", ONE_IMAGE), ("two", TWO_IMAGES)):
             closed = sorted({one.closed(name).sum() for name in names if name in one.settled})
             lines.append(f"{label}: " + "\N{EN DASH}".join(map(str, dict.fromkeys((closed[0], closed[-1])))))
-        axes.text(one.start, 1.02, "\n".join(lines), transform=place, ha="center", fontsize=9)
+        axes.text(number, 1.02, "\n".join(lines), transform=place, ha="center", fontsize=9)
 
 
 def linear_columns(found: Divergence) -> dict[str, NDArray]:

@@ -38,7 +38,7 @@ from zwfs.turbulence import FrozenFlow
 
 LIMITS = parameter_limits(
     "n_iterations",
-    n_pixels=(32, 136),
+    **dict.fromkeys(("n_pixels", "n_pixels_fine"), (32, 136)),
     extent=(1.1, 2.0),
     photons_calibration=(100.0, 1e9),
     poke=(0.001, 1.5),
@@ -47,12 +47,14 @@ LIMITS = parameter_limits(
     **dict.fromkeys(("photons_loop", "photons_loop_faint"), (0.01, 1e9)),
     **dict.fromkeys(("n_screens", "n_screens_perfect", "n_loops"), (2, 1000)),
     n_screens_calibrated=(0, 6),
+    other_diameter=(0.1, 2.2),
+    other_shift=(0.05, 0.95),
 )
 
 QUICK = dict.fromkeys(("n_screens", "n_screens_perfect", "n_loops"), 2)
-QUICK |= {"n_pixels": 32, "n_screens_calibrated": 0}
+QUICK |= {"n_pixels": 32, "n_pixels_fine": 32, "n_screens_calibrated": 0}
 
-BENCHES = {"perfect": "perfect model", "real": "bench with errors"}
+BENCHES = {"perfect": "perfect model", "real": "bench with errors", "fine": "bench, finer pixels"}
 """What is known of the bench, and its name in the table."""
 ONE_IMAGE = {"Linear": "linear", "Arcsine": "arcsine", "LikelihoodOne": "maximum likelihood on pistons"}
 TWO_IMAGES = {
@@ -164,16 +166,16 @@ def shots(known: Known, photons: float, command: NDArray, seed: np.random.SeedSe
 
 def open_loop_errors(
     benches: Mapping[str, Known],
-    situations: Sequence[Situation],
+    situations: Mapping[str, Sequence[Situation]],
     n_screens: Mapping[str, int],
     n_iterations: int,
     seed: int,
 ) -> dict[str, list[dict[str, NDArray[np.float64]]]]:
-    """Errors of all methods on each bench in each situation, (n_screens,) by name, rad rms over the segments."""
-    rows = range(len(situations))
-    tasks = [(name, row, screen) for name in benches for row in rows for screen in range(n_screens[name])]
+    """Errors of all methods on each bench in its situations, (n_screens,) by name, rad rms over the segments."""
+    rows = {name: range(len(those)) for name, those in situations.items()}
+    tasks = [(name, row, screen) for name in benches for row in rows[name] for screen in range(n_screens[name])]
     errors = iter(sweeps.run(_errors, tasks, benches, situations, n_iterations, seed, name="open_loop_errors"))
-    some = {name: [[next(errors) for _ in range(n_screens[name])] for _ in rows] for name in benches}
+    some = {name: [[next(errors) for _ in range(n_screens[name])] for _ in rows[name]] for name in benches}
     return {
         name: [{method: np.array([one[method] for one in row]) for method in row[0]} for row in found]
         for name, found in some.items()
@@ -183,13 +185,13 @@ def open_loop_errors(
 def _errors(
     task: tuple[str, int, int],
     benches: Mapping[str, Known],
-    situations: Sequence[Situation],
+    situations: Mapping[str, Sequence[Situation]],
     n_iterations: int,
     seed: int,
 ) -> dict[str, float]:
     """Errors of all methods on one screen; each method subtracts what it finds for the flat command."""
     name, row, screen = task
-    known, (rms, photons) = benches[name], situations[row]
+    known, (rms, photons) = benches[name], situations[name][row]
     draws, noise = np.random.SeedSequence(seed, spawn_key=(row, screen)).spawn(2)
     model, bench = known.model, known.bench
     [command] = segment_screens(bench, rms, 1, seed=draws)
@@ -261,6 +263,24 @@ def bench_loops(known: Known, situations: Sequence[Situation], n_screens: int, s
         loops = TunedLoops(rms, photons, gains, chosen, settled)
         compared.append(BestMethods.of(loops, "Linear", "LinearTwo"))
     return compared
+
+
+def dimple_ratios(
+    loops: Sequence[BestMethods], known: Known, n_screens: int, seed: int
+) -> list[tuple[float, float, float]]:
+    """Residual of two images on a bench with other dimples over that of these loops, which differ in nothing else.
+
+    Each is the ratio of the geometric means over the loops that close with both, with two standard errors either
+    way.
+    """
+    tasks = [(Situation(one.loops.start, one.loops.photons), "LinearTwo") for one in loops]
+    found = sweeps.run(_tuned_on_bench, tasks, known, n_screens, seed, name="dimple_ratios")
+    ratios = []
+    for one, (_, _, other) in zip(loops, found, strict=True):
+        usual = one.loops.settled["LinearTwo"]
+        both = np.maximum(usual, other) < one.loops.start / 2
+        ratios.append(paired_ratio(other[both], usual[both]) if both.any() else (np.nan, np.nan, np.nan))
+    return ratios
 
 
 def _tuned_on_bench(
@@ -403,12 +423,14 @@ class Row(NamedTuple):
         return f"{self.at.photons:g}"
 
 
-def open_rows(situations: Sequence[Situation], errors: Mapping[str, Sequence[Mapping[str, NDArray]]]) -> list[Row]:
+def open_rows(
+    situations: Mapping[str, Sequence[Situation]], errors: Mapping[str, Sequence[Mapping[str, NDArray]]]
+) -> list[Row]:
     """Rows of the open loop, for each bench."""
     return [
         Row(f"{bench}_{index}", BENCHES[bench], situation, open_cell(some))
         for bench, rows in errors.items()
-        for index, (situation, some) in enumerate(zip(situations, rows, strict=True), 1)
+        for index, (situation, some) in enumerate(zip(situations[bench], rows, strict=True), 1)
     ]
 
 
@@ -422,7 +444,8 @@ def loop_rows(found: Sequence[BestMethods]) -> list[Row]:
 
 def in_order(rows: Iterable[Row]) -> list[Row]:
     """Rows of the same bench one after the other, small errors and bright light first."""
-    return sorted(rows, key=lambda row: (row.bench == BENCHES["real"], row.at.rms, -row.at.photons))
+    benches = ["", *BENCHES.values()]
+    return sorted(rows, key=lambda row: (benches.index(row.bench), row.at.rms, -row.at.photons))
 
 
 def draw_comparison(open_loop: Sequence[Row], loops: Sequence[Row]) -> Figure:
@@ -539,14 +562,14 @@ def numbers(
     errors: Mapping[str, Sequence[Mapping[str, NDArray]]],
     calibrated: Sequence[tuple[float, float] | None],
     loops: Sequence[BestMethods],
+    dimples: Sequence[tuple[float, float, float]],
 ) -> dict[str, float | str]:
     """Situations and results in words, errors of a calibrated bench, and extremes."""
     found: dict[str, float | str] = {}
     for row in rows:
         found |= {f"{row.key}_start": row.start, f"{row.key}_photons": row.photons}
         found |= {f"{row.key}_{name}": text for name, text in row.cell.texts.items()}
-        if row.cell.closed:
-            found[f"{row.key}_span"] = one_over_two(row.cell)
+        found[f"{row.key}_span"] = one_over_two(row.cell)
     for index, pair in enumerate(calibrated, 1):
         if pair is not None:
             found |= {f"calibrated_gain_{index}": pair[1] / pair[0]}
@@ -563,6 +586,9 @@ def numbers(
             "likelihood_least": min(_likelihood_ratios(errors["perfect"])),
             "likelihood_most": max(_likelihood_ratios(errors["perfect"])),
             "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
+            "fine_iteration": typical(errors["fine"][0]["PhaseShifted"]),
+            "dimple_least": min(ratio for ratio, _, _ in dimples),
+            "dimple_most": max(ratio for ratio, _, _ in dimples),
             "chance": chance(loops[2].loops),
             "loop_rate": RATE / 1e3,
             "loop_delay": DELAY,

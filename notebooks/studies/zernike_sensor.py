@@ -167,7 +167,6 @@ def _phasors(axes: Axes, pixel: Pixel, k: int) -> None:
     wave, intensity = pixel.waves[k], pixel.intensities(pixel.phase)[k]
     axes.add_patch(Circle((wave.real, wave.imag), 1, fill=False, ec=_GREY, ls=":", lw=1.5))
     axes.add_patch(Circle((0, 0), np.sqrt(intensity), fill=False, ec=color, lw=1.5))
-    _arrow(axes, 0, wave, color=_GREY)
     style: dict[str, Any] = {"color": _GREY, "fontsize": 9, "ha": "right", "va": "center"}
     ground = {"fc": "white", "ec": "none", "pad": 0.5}
     axes.text(wave.real + 0.04, 0.1 * wave.imag + 0.12, "reference\nwave", bbox=ground, zorder=1.5, **style)
@@ -181,6 +180,7 @@ def _phasors(axes: Axes, pixel: Pixel, k: int) -> None:
         height = "top" if turn.imag < -0.5 else "bottom" if turn.imag > 0.5 else "center"
         text = f"{phase:+.2f} rad".replace("-", "−")
         axes.text(label.real, label.imag, text, color=shade, ha=side, va=height)
+    _arrow(axes, 0, wave, color=_GREY)  # last: its head covers the starts of the others
     axes.set(title=f"image {name}: intensity {intensity:.2f}", xlim=(-2.3, 1.7), ylim=(-2, 1.6), aspect="equal")
     axes.set_axis_off()
 

@@ -471,20 +471,22 @@ def _pairs(axes: Axes, rows: Sequence[Row], values: Sequence[tuple[float, float]
     axes.hlines(places, one, two, color="#999999", lw=2, zorder=1)
     for (label, style), xs in zip(_MARKERS.items(), (two, one), strict=True):
         axes.plot(xs, places, ls="none", label=label, **style)
+    colors = [_MARKERS[name]["color"] for name in ("one image", "two images")]
     for place, pair in zip(places, values, strict=True):
-        low, high = sorted(pair)
-        _beside(axes, high, place, text(high), 1)
-        if text(low) != text(high):
-            _beside(axes, low, place, text(low), -1)
+        (low, below), (high, above) = sorted(zip(pair, colors, strict=True))
+        alike = text(low) == text(high)
+        _beside(axes, high, place, text(high), 1, "black" if alike else above)
+        if not alike:
+            _beside(axes, low, place, text(low), -1, below)
     axes.set_yticks(places, [_label(row) for row in rows])
     axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.grid(axis="y", visible=False)
     axes.set_gid(TALL)
 
 
-def _beside(axes: Axes, x: float, y: float, text: str, side: int) -> None:
+def _beside(axes: Axes, x: float, y: float, text: str, side: int, color: str) -> None:
     place: dict[str, Any] = {"textcoords": "offset points", "ha": "left" if side > 0 else "right", "va": "center"}
-    axes.annotate(text, (x, y), (9 * side, 0), **place)
+    axes.annotate(text, (x, y), (9 * side, 0), color=color, **place)
 
 
 def _label(row: Row) -> str:

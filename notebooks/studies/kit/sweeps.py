@@ -38,6 +38,7 @@ from time import sleep
 from types import CodeType, ModuleType, SimpleNamespace
 from typing import Any
 from uuid import uuid4
+from warnings import filterwarnings
 
 import numpy as np
 import scipy
@@ -134,6 +135,8 @@ def _parallel_results(
     # A cluster receives all tasks at once, so that it can grow while they wait. Here joblib joins tasks of a few
     # milliseconds to batches of 0.2 s or more.
     sizes = {"batch_size": "auto"} if client is None else {"batch_size": 1, "pre_dispatch": "all"}
+    # A worker that grew is replaced, which changes no result; the warning would put a path into a page.
+    filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
     yield from Parallel(n_jobs=n_jobs or -1, return_as="generator_unordered", **sizes)(calls)
 
 

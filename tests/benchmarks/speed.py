@@ -64,18 +64,18 @@ def _reading(method, frames, name):
     return lambda: getattr(method(frames), name)
 
 
-def real_time(n_pixels, seconds, rms=0.8):
+def real_time(n_pixels, dtype, seconds, rms=0.8):
     """Rates and errors of one frame pair at a time, 20 screens as those of Figure 3, by options."""
     pupil = Pupil.circular(n_pixels)
     sensor = ZernikeSensor(pupil, *DIMPLES)
     screens = screens_at(zernike_basis(pupil, 200), rms, 20, 2024, 7)
-    rows, calls, frames = [], {}, sensor.measure(screens).astype(np.float32)
+    rows, calls, frames = [], {}, sensor.measure(screens).astype(dtype)
     for accelerate, n in ((False, 4), (False, 5), (False, 6), (True, 2), (True, 3), (True, 4)):
         method = PhaseShifted(sensor, n_iterations=n, tolerance=0.0, accelerate=accelerate)
         error = reconstruction_error(pupil, method(frames).phase, screens)
         calls[len(rows)] = partial(method, frames[0])
         rows.append({
-            "n_pixels": n_pixels, "dtype": "float32", "accelerate": accelerate, "n_iterations": n,
+            "n_pixels": n_pixels, "dtype": dtype, "accelerate": accelerate, "n_iterations": n,
             "median error": float(np.median(error)), "largest error": float(error.max()),
         })  # fmt: skip
     for index, time in best_of_each(calls, seconds).items():
@@ -173,7 +173,12 @@ def likelihood(seconds, n_pixels=100):
 def results(seconds=2.0):
     """All of the above: numbers, lists and dictionaries only."""
     return {
-        "real time": [row for n_pixels in (100, 40) for row in real_time(n_pixels, seconds)],
+        "real time": [
+            row
+            for n_pixels in (100, 40)
+            for dtype in ("float32", "float64")
+            for row in real_time(n_pixels, dtype, seconds)
+        ],
         "closed loop": [closed_loop(n_pixels, seconds) for n_pixels in (100, 40)],
         "slope": slope(seconds),
         "others": others(seconds),

@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex, to_rgb, to_rgba_array
 from matplotlib.text import Text
 
 import zwfs
-from studies import bandwidth, phase_amplitude, zernike_sensor
+from studies import bandwidth, decision, phase_amplitude, zernike_sensor
 from studies.bandwidth import BandCurves
 from studies.beyond_dimple import DimpleLimits
 from studies.beyond_range import DIMMED, SECANT, Causes, NoiseCurves
@@ -122,6 +122,9 @@ def drawn_methods(curves, pupil, classic, shifted):
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
     calibrated = Errors(three, [[Measured(0.2, 0.1, 0.3, 0.1, 0.7, 1.0, True)]] * 3)
+    cell = decision.Cell("one", "two", (0.2, 0.1), 0.5, 0.4, 0.6)
+    decided = decision.Row("row", "perfect model", decision.Situation(0.5, 1.0), cell)
+    looped = replace(cell, closed=(1, 2), n_loops=2)
     return {
         "draw_slice": ((sliced, "error", "x"), ()),
         "draw_sensor_layout": ((classic, phase), ()),
@@ -157,6 +160,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
         "draw_segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),
         "draw_bench_linearity": ((BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(five, pistons)),), five),
+        "draw_comparison": (([decided], [decided._replace(cell=looped)]), ()),
         "draw_budget": ((dict.fromkeys(["none", "blur"], bench_curves), "PhaseShifted"), shifted_only),
         "draw_calibration_errors": ((calibrated, three), shifted_only),
         "draw_explained": ((found,), ()),

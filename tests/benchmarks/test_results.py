@@ -14,7 +14,7 @@ def test_numbers_of_the_performance_page_are_those_that_were_measured():
 
 
 def test_real_time_settings_meet_their_errors():
-    rows = speed.real_time(40, seconds=0)
+    rows = speed.real_time(40, "float32", seconds=0)
     json.dumps(rows)
     fewest = {row["n_iterations"]: row["median error"] for row in rows if row["accelerate"]}
     assert fewest[2] < 0.01

@@ -265,13 +265,10 @@ def bench_loops(known: Known, situations: Sequence[Situation], n_screens: int, s
     return compared
 
 
-def dimple_ratios(
-    loops: Sequence[BestMethods], known: Known, n_screens: int, seed: int
-) -> list[tuple[float, float, float]]:
+def dimple_ratios(loops: Sequence[BestMethods], known: Known, n_screens: int, seed: int) -> list[float]:
     """Residual of two images on a bench with other dimples over that of these loops, which differ in nothing else.
 
-    Each is the ratio of the geometric means over the loops that close with both, with two standard errors either
-    way.
+    Each is the ratio of the geometric means over the loops that close with both; NaN if there are none.
     """
     tasks = [(Situation(one.loops.start, one.loops.photons), "LinearTwo") for one in loops]
     found = sweeps.run(_tuned_on_bench, tasks, known, n_screens, seed, name="dimple_ratios")
@@ -279,7 +276,7 @@ def dimple_ratios(
     for one, (_, _, other) in zip(loops, found, strict=True):
         usual = one.loops.settled["LinearTwo"]
         both = np.maximum(usual, other) < one.loops.start / 2
-        ratios.append(paired_ratio(other[both], usual[both]) if both.any() else (np.nan, np.nan, np.nan))
+        ratios.append(paired_ratio(other[both], usual[both])[0] if both.any() else np.nan)
     return ratios
 
 
@@ -475,16 +472,16 @@ def _pairs(axes: Axes, rows: Sequence[Row], values: Sequence[tuple[float, float]
     for place, pair in zip(places, values, strict=True):
         (low, below), (high, above) = sorted(zip(pair, colors, strict=True))
         alike = text(low) == text(high)
-        _beside(axes, high, place, text(high), 1, "black" if alike else above)
+        _write_next_to(axes, high, place, text(high), 1, "black" if alike else above)
         if not alike:
-            _beside(axes, low, place, text(low), -1, below)
+            _write_next_to(axes, low, place, text(low), -1, below)
     axes.set_yticks(places, [_label(row) for row in rows])
     axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.grid(axis="y", visible=False)
     axes.set_gid(TALL)
 
 
-def _beside(axes: Axes, x: float, y: float, text: str, side: int, color: str) -> None:
+def _write_next_to(axes: Axes, x: float, y: float, text: str, side: int, color: str) -> None:
     place: dict[str, Any] = {"textcoords": "offset points", "ha": "left" if side > 0 else "right", "va": "center"}
     axes.annotate(text, (x, y), (9 * side, 0), color=color, **place)
 
@@ -564,7 +561,7 @@ def numbers(
     errors: Mapping[str, Sequence[Mapping[str, NDArray]]],
     calibrated: Sequence[tuple[float, float] | None],
     loops: Sequence[BestMethods],
-    dimples: Sequence[tuple[float, float, float]],
+    dimples: Sequence[float],
 ) -> dict[str, float | str]:
     """Situations and results in words, errors of a calibrated bench, and extremes."""
     found: dict[str, float | str] = {}
@@ -589,8 +586,8 @@ def numbers(
             "likelihood_most": max(_likelihood_ratios(errors["perfect"])),
             "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
             "fine_iteration": typical(errors["fine"][0]["PhaseShifted"]),
-            "dimple_least": min(ratio for ratio, _, _ in dimples),
-            "dimple_most": max(ratio for ratio, _, _ in dimples),
+            "dimple_least": min(dimples),
+            "dimple_most": max(dimples),
             "chance": chance(loops[2].loops),
             "loop_rate": RATE / 1e3,
             "loop_delay": DELAY,

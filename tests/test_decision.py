@@ -66,10 +66,12 @@ def test_a_cell_of_loops_says_how_many_close():
     both, settings = (0.7, 0.05), {"n_loops": 12}
     won = Cell("linear", "linear", both, 0.07, 0.06, 0.09, (1, 12), **settings)
     tied = Cell("linear", "linear", both, 1.0, 0.9, 1.1, (12, 12), **settings)
-    assert won.texts == {"two": "0.050", "one": "–", "closed": "12 / 1", "method": "linear"}
-    assert tied.texts == {"two": "0.050", "one": "0.70", "closed": "12 / 12", "method": "linear"}
-    mixed = replace(won, one="arcsine", closed=None)
-    assert mixed.texts == {"two": "0.050", "one": "0.70", "closed": "–", "method": "linear; one image: arcsine"}
+    counts = {"closed": "12 / 1", "closed_one": "1", "closed_two": "12"}
+    assert won.texts == {"two": "0.050", "one": "–", "method": "linear", **counts}
+    assert (tied.texts["one"], tied.texts["closed"], tied.texts["closed_one"]) == ("0.70", "12 / 12", "12")
+    mixed = replace(won, one="arcsine", closed=None).texts
+    assert (mixed["two"], mixed["one"], mixed["method"]) == ("0.050", "0.70", "linear; one image: arcsine")
+    assert (mixed["closed_one"], mixed["closed_two"]) == ("–", "–")
 
 
 def test_the_picture_starts_with_small_errors_and_writes_equal_values_once():

@@ -412,8 +412,9 @@ def test_the_state_is_in_the_address(fresh, browser, file):
         shared.evaluate("text => { location.hash = text; }", text)
         shared.wait_for_function(f"rms => {same}.rms === rms", arg=rms)
         assert shared.evaluate(f"{same}.seed") == 22
+    # Nor does a link to a heading take the settings out of the address.
     shared.evaluate("location.hash = '#what-to-try'")
-    shared.wait_for_timeout(50)
+    wait_for_address(shared, "rms=4")
     assert shared.evaluate(f"{same}.rms") == 4
     # Addresses of an earlier version counted the photons of all 3228 points.
     shared.evaluate("location.hash = '#photons=6'")
@@ -444,11 +445,14 @@ def test_page_answers_the_keyboard_and_keeps_its_height(fresh):
 
 def test_a_design_is_chosen_by_mouse_and_by_keyboard(fresh):
     design = "document.getElementById('live-design').textContent"
+    fresh.click("#live-next")
+    assert fresh.inner_text("#live-tried")
     box = fresh.locator("#live-designs").bounding_box()
     # The map has 23 diameters from 0.8 lambda/D on, and 14 shifts from 0.3 pi on, upwards.
     place = {"x": box["width"] * 8.5 / 23, "y": box["height"] * (1 - 8.5 / 14)}
     fresh.click("#live-designs", position=place)
     fresh.wait_for_function(f"{design}.startsWith('1.60 λ/D, 0.70π')")
+    assert not fresh.inner_text("#live-tried")  # the comment was on another sensor
     fresh.focus("#live-designs")
     fresh.keyboard.press("ArrowRight")
     fresh.keyboard.press("ArrowDown")

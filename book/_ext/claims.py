@@ -94,9 +94,8 @@ class Claim:
         return self.source.partition("#")[0]
 
 
-_KEPT = yaml.safe_load(Path(__file__).with_name("claims.yml").read_text("utf-8"))
-SECTIONS: dict[str, str] = _KEPT["sections"]  # the page that treats a section of the paper
-CLAIMS = [Claim(**entry) for entry in _KEPT["claims"]]
+_KEPT = yaml.safe_load(Path(__file__).with_name("claims.yml").read_text("utf-8"))["claims"]
+CLAIMS = [Claim(**entry) for entry in _KEPT]
 
 
 def glued(notebook: Path) -> dict[str, float]:
@@ -145,8 +144,8 @@ def count(judged: dict[int, Finding]) -> str:
     numbers = Counter(finding.verdict for finding in judged.values())
     open_ones = sum(finding.because == REASONS[-1] for finding in judged.values())
     verdicts = {verdict: f"{_marked(verdict)}: {numbers[verdict]}" for verdict in SIGNS}
-    verdicts[PARTLY] += f" (for {open_ones} of them, {REASONS[-1]})"
-    return f"Of [{len(judged)} claims that we chose from the paper](claims.md): {', '.join(verdicts.values())}."
+    counted = f"Of [{len(judged)} claims that we chose from the paper](claims.md): {', '.join(verdicts.values())}."
+    return f"{counted} For {open_ones} of the {numbers[PARTLY]} that hold in part, {REASONS[-1]}."
 
 
 def by_verdict(judged: dict[int, Finding]) -> str:
@@ -176,9 +175,7 @@ def table(judged: dict[int, Finding], numbers: range) -> str:
 
 
 def _row(claim: Claim, finding: Finding) -> list[str]:
-    section, verdict = f"section {claim.section}", _marked(finding.verdict)
-    if page := SECTIONS.get(claim.section):
-        section = f"[{section}]({page})"
+    verdict = _marked(finding.verdict)
     measured = [f"{sentence(finding.measured)}."] if finding.measured else []
     if finding.remark and finding.verdict == HOLDS:
         measured.append(finding.remark)
@@ -191,7 +188,7 @@ def _row(claim: Claim, finding: Finding) -> list[str]:
     return [
         f"[{claim.number}.]{{#claim-{claim.number}}} **{claim.title}** {verdict}"
         + (f": {finding.because}" if finding.because else ""),
-        f"{claim.statement} *{section}*",
+        f"{claim.statement} *Section {claim.section}*",
         " ".join(measured),
     ]
 

@@ -59,11 +59,12 @@
     return old ? { "per-point": String(old - 3.5), ...state } : state;
   }
 
+  const changed = () => inputs.filter((input) => read(input) !== standard(input));
+
   function toAddress() {
-    const changed = inputs.filter((input) => read(input) !== standard(input));
-    const state = new URLSearchParams(changed.map((input) => [nameOf(input), read(input)]));
+    const state = new URLSearchParams(changed().map((input) => [nameOf(input), read(input)]));
     const bare = location.href.replace(/#.*/, "");
-    history.replaceState(null, "", changed.length ? `${bare}#${state}` : bare);
+    history.replaceState(null, "", changed().length ? `${bare}#${state}` : bare);
   }
 
   // An address without a state, such as that of a heading, changes nothing.
@@ -268,14 +269,24 @@
       if ("play" in button.dataset) play(true);
     });
   }
-  addEventListener("hashchange", (event) => fromAddress(event.newURL));
+  addEventListener("hashchange", (event) => {
+    fromAddress(event.newURL);
+    if (changed().length) toAddress(); // a link to a heading has replaced the settings
+  });
 
   new MutationObserver(() => {
     draw.bars();
     ask();
   }).observe(document.documentElement, { attributeFilter: ["data-theme"] });
 
-  live.page = { set, settings, listen: (listener) => listeners.push(listener) };
+  // Another panel changes the sensor: the comment of the tour no longer fits.
+  function change(changes) {
+    play(false);
+    find("tried").textContent = "";
+    set(changes);
+  }
+
+  live.page = { set: change, settings, listen: (listener) => listeners.push(listener) };
   draw.bars();
   fromAddress(location.href);
   update();

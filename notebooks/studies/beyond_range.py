@@ -566,8 +566,8 @@ def numbers(
     noiseless, *noisy = curves
     chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
     few = min(noisy, key=lambda curve: abs(np.log(curve.photons / 1e3)))
-    one, three = (int(np.argmin(np.abs(chosen.rms - rms))) for rms in (1.0, 3.0))
-    two = int(np.argmin(np.abs(found.curves.rms - 2.0)))
+    one, two, three = (int(np.argmin(np.abs(chosen.rms - rms))) for rms in (1.0, 2.0, 3.0))
+    limit = int(np.argmin(np.abs(found.curves.rms - 2.0)))
     right = noiseless.errors[LIKELY] <= threshold * noiseless.rms[:, np.newaxis]
     usual = (chosen.rms >= 0.1) & (chosen.rms <= 2)
     usual |= not usual.any()
@@ -580,7 +580,7 @@ def numbers(
         "modes_share": np.median(chosen.median(MODES)[usual] / chosen.median(LIKELY)[usual]),
         "modes_from": chosen.rms[usual][0],
         "modes_to": chosen.rms[usual][-1],
-        "contracting_at_2": np.mean(found.factor[two] < 1),
+        "contracting_at_2": np.mean(found.factor[limit] < 1),
         "exact_text": _exact_text(noiseless, threshold),
         "half_text": _half_text(found, threshold),
         "flag_text": _flag_text(right, noiseless.consistent),
@@ -590,11 +590,12 @@ def numbers(
         "model_input": area.rms[place],
         "amplitude_1": np.median(amplitude.errors[LIKELY][place]),
         "offset_1": np.median(offset.errors[LIKELY][place]),
-        "input_2": found.curves.rms[two],
+        "input_2": found.curves.rms[limit],
         "input_3": chosen.rms[three],
         "few_likely_3": few.median(LIKELY)[three],
         "shown_likely_1": chosen.median(LIKELY)[one],
+        "shown_likely_2": chosen.median(LIKELY)[two],
     }
     for name, method in (("plain", PLAIN), ("dimmed", DIMMED), ("accelerated", ACCELERATED)):
-        result[f"{name}_at_2"] = found.curves.recovered(method, threshold)[two]
+        result[f"{name}_at_2"] = found.curves.recovered(method, threshold)[limit]
     return rounded(result, ".3g")

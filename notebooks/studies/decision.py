@@ -356,8 +356,9 @@ class Cell:
         one, two = self._error(0), self._error(1)
         alike = self.one == self.two or one == MISSING
         method = self.two if alike else f"{self.two}; one image: {self.one}"
-        closed = f"{self.closed[1]} / {self.closed[0]}" if self.closed else MISSING
-        return {"two": two, "one": one, "closed": closed, "method": method}
+        first, both = self.closed or (MISSING, MISSING)
+        closed = {"closed": f"{both} / {first}", "closed_one": f"{first}", "closed_two": f"{both}"}
+        return {"two": two, "one": one, "method": method, **closed}
 
     def _error(self, place: int) -> str:
         few = self.closed is not None and self.closed[place] <= self.n_loops / 2
@@ -447,43 +448,41 @@ def in_order(rows: Iterable[Row]) -> list[Row]:
 
 def draw_comparison(open_loop: Sequence[Row], loops: Sequence[Row]) -> Figure:
     """Errors in open loop and loops that close, with two images and with one."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 4.2), width_ratios=(1.25, 1))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 5), width_ratios=(1.25, 1))
     open_loop, loops = in_order(open_loop), in_order(loops)
     errors = [row.cell.typical for row in open_loop]
     _pairs(left, open_loop, errors, two_digits)
-    room = np.min(errors) / 25, 6 * np.max(errors)  # for the numbers next to the markers
+    room = np.min(errors) / 3, 3 * np.max(errors)  # for the numbers at the markers
     left.set(xscale="log", xlim=room, title="open loop", xlabel="error (rad rms)")
     n_loops = loops[0].cell.n_loops
     _pairs(right, loops, [row.cell.closed or (0, 0) for row in loops], str)
-    right.set(xlim=(-0.15 * n_loops, 1.15 * n_loops), xticks=(0, n_loops / 2, n_loops))
+    right.set(xlim=(-0.1 * n_loops, 1.1 * n_loops), xticks=(0, n_loops / 2, n_loops))
     right.set(title="closed loop", xlabel=f"loops that close (of {n_loops})")
     figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     return figure
 
 
 def _pairs(axes: Axes, rows: Sequence[Row], values: Sequence[tuple[float, float]], text: Callable) -> None:
-    """Mark the values with one image and with two in each row, and write them next to the markers."""
+    """Mark the values in each row; that with two images is above its marker, that with one image below."""
     places = np.arange(len(rows))[::-1]
     one, two = np.transpose(values)
     axes.hlines(places, one, two, color="#999999", lw=2, zorder=1)
     for (label, style), xs in zip(_MARKERS.items(), (two, one), strict=True):
         axes.plot(xs, places, ls="none", label=label, **style)
-    colors = [_MARKERS[name]["color"] for name in ("one image", "two images")]
-    for place, pair in zip(places, values, strict=True):
-        (low, below), (high, above) = sorted(zip(pair, colors, strict=True))
-        alike = text(low) == text(high)
-        _write_next_to(axes, high, place, text(high), 1, "black" if alike else above)
+    for place, (single, pair) in zip(places, values, strict=True):
+        alike = text(single) == text(pair)
+        _write(axes, pair, place, text(pair), "black" if alike else _MARKERS["two images"]["color"], up=True)
         if not alike:
-            _write_next_to(axes, low, place, text(low), -1, below)
+            _write(axes, single, place, text(single), _MARKERS["one image"]["color"], up=False)
     axes.set_yticks(places, [_label(row) for row in rows])
     axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.grid(axis="y", visible=False)
     axes.set_gid(TALL)
 
 
-def _write_next_to(axes: Axes, x: float, y: float, text: str, side: int, color: str) -> None:
-    place: dict[str, Any] = {"textcoords": "offset points", "ha": "left" if side > 0 else "right", "va": "center"}
-    axes.annotate(text, (x, y), (9 * side, 0), color=color, **place)
+def _write(axes: Axes, x: float, y: float, text: str, color: str, *, up: bool) -> None:
+    place: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom" if up else "top"}
+    axes.annotate(text, (x, y), (0, 6 if up else -5), color=color, **place)
 
 
 def _label(row: Row) -> str:
@@ -585,6 +584,7 @@ def numbers(
             "likelihood_least": min(_likelihood_ratios(errors["perfect"])),
             "likelihood_most": max(_likelihood_ratios(errors["perfect"])),
             "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
+            "flat_ratio": paired_ratio(small["PhaseShifted"], small[simplest(small, ONE_IMAGE)])[0],
             "fine_iteration": typical(errors["fine"][0]["PhaseShifted"]),
             "dimple_least": min(dimples),
             "dimple_most": max(dimples),

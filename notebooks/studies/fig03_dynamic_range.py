@@ -38,6 +38,8 @@ LIMITS = parameter_limits(
 CHECK_TOGETHER = check_setup
 QUICK = {"n_pixels": 64, "n_rms": 6, "rms_fine": [0.05], "rms_beyond": [1.6, 2.0], "n_screens": 4}
 
+STATED = {"Arcsine": 0.3, "PhaseShifted": 1.0}
+"""Inputs up to about which methods work, in the text of section 4.1, rad rms."""
 _PASSES = ("split_expand", "split_adjoint")  # functions that pass through the low-rank model of the sensor
 
 
@@ -229,6 +231,8 @@ def draw_linearity(
         ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], **line)
         if found:
             ratio.plot(limits[name].value, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
+        if name in STATED:
+            ratio.plot(STATED[name], threshold, "*", color=look.color, mec="white", ms=15, zorder=6)
     plain.plot(rms, threshold * rms, color="#555555", lw=1)
     plain.annotate(
         percent(threshold), (rms[-1], threshold * rms[-1]), (4, 0), textcoords="offset points",

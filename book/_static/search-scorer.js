@@ -29,7 +29,7 @@ queueMicrotask(() => {
   const all = Search.htmlToText;
   Search.htmlToText = (html, anchor) => {
     const page = new DOMParser().parseFromString(html, "text/html");
-    const unread = ".bd-header-article, .highlight, .onlyprint, details.hide, button, form, nav, svg, .live";
+    const unread = ".bd-header-article, .highlight, .onlyprint, details.hide, button, form, nav, noscript, svg, .live";
     for (const part of page.querySelectorAll(unread)) part.remove();
     for (const formula of page.querySelectorAll(".math")) formula.textContent = "…";
     const section = anchor.startsWith("#index-") && page.querySelector(anchor)?.closest("section");

@@ -343,7 +343,6 @@ def wait_for_address(page, *parts):
     ("preset", "expected", "named"),
     [
         ("The paper", "✗✗✓", "phase-shifted"),
-        ("SEAL", "✗✗✓", "phase-shifted"),
         ("Keck", "✗✗✓", "max. likelihood"),
         ("OZIRIIS", "✗✗✓", "max. likelihood"),
         ("All-round", "✗✗✓", "accelerated"),
@@ -370,8 +369,8 @@ def test_reset_brings_back_the_input_that_presets_keep(fresh):
     fresh.click("button:text-is('Few photons')")
     fresh.click("#live-reset")
     fresh.wait_for_function("location.hash === ''")
-    fresh.click("button:text-is('SEAL')")
-    wait_for_address(fresh, "diameter=1.1")
+    fresh.click("button:text-is('OZIRIIS')")
+    wait_for_address(fresh, "diameter=2.05")
     assert "rms" not in fresh.evaluate("location.hash")
 
 

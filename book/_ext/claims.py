@@ -203,7 +203,8 @@ def rules() -> str:
         for claim in CLAIMS:
             if claim.notebook == notebook:
                 ends = {"start-at": f"- number: {claim.number}", "end-before": f"- number: {claim.number + 1}"}
-                text += f"(rule-{claim.number})=\n**Claim {claim.number}.** {claim.rule}\n\n"
+                row = f"[Claim {claim.number}](#claim-{claim.number})"
+                text += f"(rule-{claim.number})=\n**{row}.** {claim.rule}\n\n"
                 text += _include("_ext/claims.yml", language="yaml", **ends)
                 text += f"(code-{claim.number})=\n"
                 for timed in claim.timed:

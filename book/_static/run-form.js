@@ -84,7 +84,9 @@
       }
       this.write(this.standard);
       const name = path.split(".").pop();
-      const words = greek([meaning, unit].filter(Boolean).join(", "));
+      // A meaning that begins with *of* or *per* continues the name: *seed* of all random screens.
+      const noun = /^(of|per) /.test(meaning) ? `${name.replace(/^n_/, "").replaceAll("_", " ")} ` : "";
+      const words = greek([noun + meaning, unit].filter(Boolean).join(", "));
       const about = [words && make("code", {}, name), range(isList(limits) ? limits.list : limits)].filter(Boolean);
       this.element = make("div", { class: "run-field" },
         make("label", { for: id }, words || name),

@@ -233,7 +233,9 @@ CASES = {
         bench=[{"static": 0.0}, {"photons": 1e7}, {"n_rings": 1, "missing": []}, {"blur": 20.0}],
         n_iterations=[1]),
     ),
-    "calibration": ({"n_commands": 1, "n_steps": 1, "oversampling": 1, "largest": 0.1, "command_errors": []},
+    "calibration": (
+        dict.fromkeys(("n_commands", "n_steps", "oversampling", "n_screens"), 1)
+        | {"largest": 0.1, "command_errors": []},
         {}, {"n_steps": 2, "n_commands": 2}, *each(n_commands=[4], n_steps=[2], oversampling=[2],
         largest=[1.2], n_screens=[2], n_iterations=[1], command_errors=[[-0.3]]),
     ),

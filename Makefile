@@ -56,7 +56,7 @@ test: $(READY) ## test the package and the tools, print the coverage, and compar
 	$(BIN)/python -m pytest $(QUICK) --cov --cov-report term:skip-covered tests
 	$(BIN)/python -m pytest --numprocesses auto --doctest-modules zwfs
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --nbval --nbval-current-env \
-		--nbval-cell-timeout 1200 notebooks
+		--nbval-cell-timeout 2400 notebooks
 
 test-fast: $(READY) ## test the package only, in about 3 minutes
 	$(BIN)/python -m pytest $(QUICK) $$(grep -LE "ROOT|book|notebooks|studies" tests/test_*.py)

@@ -39,7 +39,7 @@ CHECK_TOGETHER = check_setup
 QUICK = {"n_pixels": 64, "n_rms": 6, "rms_fine": [0.05], "rms_beyond": [1.6, 2.0], "n_screens": 4}
 
 STATED = {"Arcsine": 0.3, "PhaseShifted": 1.0}
-"""Inputs up to about which methods work, in the text of section 4.1, rad rms."""
+"""Limits of two methods in the text of section 4.1, about, rad rms."""
 _PASSES = ("split_expand", "split_adjoint")  # functions that pass through the low-rank model of the sensor
 
 

@@ -45,7 +45,7 @@ def targets():
     """Public callables by name: functions, classes with documented parameters, and the methods of all classes."""
     found = {}
     for module in (importlib.import_module(f"zwfs.{name}") for name in MODULES):
-        for name, thing in vars(module).items():
+        for name, thing in inspect.getmembers(module):  # of a package, too, which imports at the first use
             if (
                 name.startswith("_")
                 or name in INTERNAL

@@ -1,15 +1,20 @@
 """The package as a whole: what `import zwfs` imports, which names it has, and what type checkers learn of them."""
 
+import pickle
+import pkgutil
 import shutil
 import subprocess
 import sys
 import zipfile
+from importlib import import_module
+from pathlib import Path
 
 import pytest
 
 import zwfs
 from book._ext.run import package, repository, zipped
 from book._tools.project import Project
+from zwfs._lazy import offered
 
 from .conftest import ROOT, new_reconstructor
 
@@ -20,9 +25,27 @@ def run(*command, folder=ROOT):
 
 def test_import_is_light():
     late = {"astropy", "cloudpickle", "distributed", "jax", "joblib", "matplotlib", "threadpoolctl"}
-    late |= {"scipy.optimize", "zwfs.frames"}
+    late |= {"numpy", "scipy", "zwfs.frames", "zwfs.pupil"}
     done = run("-c", f"import sys, zwfs; print({late} & set(sys.modules), zwfs.__version__ > '0')")
     assert done.stdout == "set() True\n", done.stderr
+
+
+def test_the_sensor_does_without_the_packages_of_others_but_numpy():
+    late = {"astropy", "matplotlib", "scipy.optimize", "zwfs.frames", "zwfs.reconstructors"}
+    done = run("-c", f"import sys; from zwfs import Pupil, ZernikeSensor; print({late} & set(sys.modules))")
+    assert done.stdout == "set()\n", done.stderr
+
+
+@pytest.mark.parametrize("name", ["zwfs", "zwfs.bench", "zwfs.frames", "zwfs.reconstructors"])
+def test_a_package_offers_the_names_that_type_checkers_see_and_its_modules(name):
+    package = import_module(name)
+    assert offered(Path(package.__file__).read_text("utf-8")).keys() == set(package.__all__) <= set(dir(package))
+    for own in package.__all__:
+        assert getattr(package, own) is vars(package)[own]
+    for module in pkgutil.iter_modules(package.__path__):
+        if module.name != "__main__":
+            assert getattr(package, module.name) is sys.modules[f"{name}.{module.name}"]
+    assert pickle.loads(pickle.dumps(zwfs.Pupil)) is zwfs.pupil.Pupil
 
 
 def test_an_unknown_name_is_an_attribute_error():

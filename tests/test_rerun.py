@@ -18,7 +18,7 @@ import nbformat
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
-from book._tools import declared, record, rerun
+from book._tools import declared, rerun
 from book._tools.__main__ import main
 from book._tools.declared import ParameterError
 from book._tools.notebook import read
@@ -184,28 +184,6 @@ def test_the_recorded_command_gives_the_same_parameters():
     given = {"files": ["\U0001d54f.fits", "a 'b' \"c\""], "n": 3}
     options = shlex.split(rerun.command("fig", given).removeprefix(f"{rerun.COMMAND} fig"))
     assert declared.assignments([text for text in options if text != "-p"]) == given
-
-
-def test_a_notebook_depends_on_its_studies_the_kit_and_all_of_the_package(project):
-    (project.notebooks / "studies").unlink()
-    write(project, "fig01_small", new_code_cell("from studies import fig01_small as study"))
-    parts = {
-        "zwfs/pupil.py": True,
-        "zwfs/frames/camera.py": True,
-        "notebooks/studies/kit/style.py": True,
-        "notebooks/studies/fig01_small.py": True,
-        "notebooks/studies/shared.py": True,
-        "notebooks/studies/fig02_works.py": False,
-    }
-    for name in parts:
-        (project.root / name).parent.mkdir(parents=True, exist_ok=True)
-        (project.root / name).write_text("")
-    (project.notebooks / "studies" / "fig01_small.py").write_text("from studies.shared import light\n")
-    for name, counts in parts.items():
-        before = record.key(project, "fig01_small")
-        with (project.root / name).open("a") as file:
-            file.write("# changed\n")
-        assert (record.key(project, "fig01_small") != before) == counts, name
 
 
 def test_folder_holds_all_that_was_made(ran):

@@ -6,27 +6,34 @@ function checks its arguments: a TypeError or a ValueError names the argument, i
 
 from typing import TYPE_CHECKING
 
-from zwfs.bounds import cramer_rao
-from zwfs.detector import Detector
-from zwfs.loop import LoopRecord, Mirror, close_loop, hold_drift
-from zwfs.masks import Dimple, Patch
-from zwfs.metrics import dynamic_range, reconstruction_error, strehl, wrapped_residual
-from zwfs.modes import noll_to_nm, power_law_screens, zernike_basis
-from zwfs.polychromatic import PolychromaticSensor
-from zwfs.pupil import Pupil
-from zwfs.reconstructors import (
-    RECONSTRUCTORS,
-    Arcsine,
-    GerchbergSaxton,
-    GradientDescent,
-    LikelihoodReconstruction,
-    Linear,
-    MaximumLikelihood,
-    PhaseShifted,
-    Reconstruction,
-)
-from zwfs.sensor import ZernikeSensor
-from zwfs.units import opd_to_phase, phase_to_opd
+from zwfs import _lazy
+
+if TYPE_CHECKING:
+    from zwfs.bounds import cramer_rao
+    from zwfs.detector import Detector
+    from zwfs.loop import LoopRecord, Mirror, close_loop, hold_drift
+    from zwfs.masks import Dimple, Patch
+    from zwfs.metrics import dynamic_range, reconstruction_error, strehl, wrapped_residual
+    from zwfs.modes import noll_to_nm, power_law_screens, zernike_basis
+    from zwfs.polychromatic import PolychromaticSensor
+    from zwfs.pupil import Pupil
+    from zwfs.reconstructors import (
+        RECONSTRUCTORS,
+        Arcsine,
+        GerchbergSaxton,
+        GradientDescent,
+        LikelihoodReconstruction,
+        Linear,
+        MaximumLikelihood,
+        PhaseShifted,
+        Reconstruction,
+    )
+    from zwfs.sensor import ZernikeSensor
+    from zwfs.units import opd_to_phase, phase_to_opd
+else:
+    __getattr__, __dir__ = _lazy.offer(__name__)
+
+__version__ = "0.1.0"
 
 __all__ = [
     "RECONSTRUCTORS",
@@ -59,15 +66,3 @@ __all__ = [
     "wrapped_residual",
     "zernike_basis",
 ]
-
-
-if TYPE_CHECKING:  # a type checker would take any misspelt name for one that __getattr__ knows
-    __version__: str
-else:
-
-    def __getattr__(name: str) -> str:
-        if name != "__version__":
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from importlib.metadata import version  # takes longer to import than half of this package
-
-        return version(__name__)

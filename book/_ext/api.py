@@ -19,6 +19,8 @@ from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import make_refnode
 
+from zwfs._lazy import offered
+
 PACKAGE = "zwfs"
 PAGE = "book/api"
 KINDS = ("class", "data", "exception", "function")
@@ -54,7 +56,7 @@ def section(name: str) -> list[str]:
     module = importlib.import_module(name)
     directives = []
     for own in own_names(module):
-        thing = vars(module)[own]
+        thing = getattr(module, own)
         kind = "class" if inspect.isclass(thing) else "function"
         listed = methods(thing) if inspect.isclass(thing) else []
         options = [f"   :members: {', '.join(listed)}"] if listed else []
@@ -77,12 +79,14 @@ def modules() -> list[str]:
 def own_names(module: ModuleType) -> list[str]:
     """Return the public names that a module, or a private part of a package, defines."""
     package = hasattr(module, "__path__")
-    public = vars(module) if package else getattr(module, "__all__", vars(module))
+    public = getattr(module, "__all__", vars(module))
     # A package may also export what a private part of the whole package defines.
     private = (f"{module.__name__}._", f"{PACKAGE}._") if package else (f"{module.__name__}._",)
+    # A package imports what it offers at its first use.
+    named = {name: getattr(module, name) for name in (public if package else vars(module))}
     return [
         name
-        for name, thing in vars(module).items()
+        for name, thing in named.items()
         if (inspect.isclass(thing) or inspect.isfunction(thing))
         and (thing.__module__ == module.__name__ or thing.__module__.startswith(private))
         and name in public
@@ -132,20 +136,24 @@ def is_property(value: Any) -> bool:
 
 
 def constants(module: ModuleType) -> dict[str, str]:
-    """Return the docstrings of the public constants of a module: the strings after the assignments."""
-    documented = ModuleAnalyzer.for_module(module.__name__).find_attr_docs()
-    return {
-        name: " ".join(lines).strip()
-        for (owner, name), lines in documented.items()
-        if not owner and not name.startswith("_")
-    }
+    """Return the docstrings of the public constants of a module: the strings after the assignments.
+
+    A package may also offer constants of a private part.
+    """
+    offers = offered(inspect.getsource(module))
+    found = {}
+    for part in (module.__name__, *sorted({home for home, _ in offers.values() if "._" in home})):
+        for (owner, name), lines in ModuleAnalyzer.for_module(part).find_attr_docs().items():
+            if not owner and not name.startswith("_") and (part == module.__name__ or name in offers):
+                found[name] = " ".join(lines).strip()
+    return found
 
 
 def path(module: ModuleType, name: str) -> str:
     """Return the shortest path from which a name can be imported; a path can also be that of a module."""
     parts, taken = module.__name__.split("."), modules()
     for package in (importlib.import_module(".".join(parts[:depth])) for depth in range(1, len(parts))):
-        same = getattr(package, name, None) is vars(module)[name]
+        same = getattr(package, name, None) is getattr(module, name)
         if same and name in package.__all__ and f"{package.__name__}.{name}" not in taken:
             return f"{package.__name__}.{name}"
     return f"{module.__name__}.{name}"

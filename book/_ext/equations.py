@@ -74,7 +74,7 @@ def docstrings() -> Iterator[tuple[str, str]]:
     for name in api.modules():
         module = importlib.import_module(name)
         for own in api.own_names(module):
-            thing, path = vars(module)[own], api.path(module, own)
+            thing, path = getattr(module, own), api.path(module, own)
             yield path, inspect.getdoc(thing) or ""
             listed = api.methods(thing) if inspect.isclass(thing) else []
             for member in vars(thing) if inspect.isclass(thing) else ():

@@ -1,15 +1,13 @@
 """Places of the files of a project."""
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
+
+from .imports import dependencies
 
 # Environment variables for the extensions of the book: the folder of the executed notebooks from the root, the
 # name of the PDF, and a folder with Pyodide to copy into the book.
 EXECUTED, PDF, PYODIDE = "ZWFS_EXECUTED", "ZWFS_PDF", "ZWFS_PYODIDE"
-
-# Names after "from studies import" or "from studies.", in code and in the JSON of a notebook.
-IMPORTED = re.compile(r"from studies(?:\.(\w+) import| import (\w+))")
 
 
 class ToolError(Exception):
@@ -73,14 +71,9 @@ class Project:
         return sorted([*files, *self.studies.glob("*.npz")])
 
     def depends_on(self, name: str) -> set[Path]:
-        """Return what a notebook depends on: all files but those of the studies that it does not import."""
-        studies = {file.stem: file for file in self.studies.glob("*.py")}
-        found: set[str] = set()
-        waiting = [self.source(name)]
-        while waiting:
-            text = waiting.pop().read_text("utf-8")
-            new = {one for pair in IMPORTED.findall(text) for one in pair if one in studies} - found
-            found |= new
-            waiting += [studies[one] for one in new]
-        unused = studies.keys() - found - {"__init__"}
-        return {file for file in self.modules() if file.parent != self.studies or file.stem not in unused}
+        """Return what a notebook depends on: the modules that it imports, directly or not, and their data."""
+        modules = {}
+        for file in self.modules():
+            folder = self.notebooks if file.is_relative_to(self.notebooks) else self.root
+            modules[".".join(file.relative_to(folder).with_suffix("").parts).removesuffix(".__init__")] = file
+        return dependencies(self.source(name), modules)

@@ -38,13 +38,21 @@ True
 >>> folder.cleanup()
 """
 
-from zwfs._camera import BenchFit, Estimate, FittedPhase, FittedSensor, fit_bench
-from zwfs.frames import calibration, files, phases, pipeline, refine, registration, telemetry, verdict
-from zwfs.frames._blocks import FileError
-from zwfs.frames._calibrate import calibrate
-from zwfs.frames.calibration import Calibration
-from zwfs.frames.telemetry import reconstruct
-from zwfs.frames.verdict import CameraNoise, judge, order_of_images
+from typing import TYPE_CHECKING
+
+from zwfs import _lazy
+
+if TYPE_CHECKING:
+    from zwfs._camera.bench import BenchFit, Estimate, fit_bench
+    from zwfs._camera.sensor import FittedPhase, FittedSensor
+    from zwfs.frames import calibration, files, phases, pipeline, refine, registration, telemetry, verdict
+    from zwfs.frames._blocks import FileError
+    from zwfs.frames._calibrate import calibrate
+    from zwfs.frames.calibration import Calibration
+    from zwfs.frames.telemetry import reconstruct
+    from zwfs.frames.verdict import CameraNoise, judge, order_of_images
+else:
+    __getattr__, __dir__ = _lazy.offer(__name__)
 
 __all__ = [
     "BenchFit",

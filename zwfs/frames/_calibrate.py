@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs._camera import fit_bench
+from zwfs._camera.bench import fit_bench
 from zwfs._images import nearest_good
 from zwfs._system import paths_of
 from zwfs.frames._blocks import FileError, blocks_of

@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Immutable, Kind, read_only
-from zwfs._camera import BenchFit
-from zwfs._camera.bench import places_of
+from zwfs._camera.bench import BenchFit, places_of
 from zwfs._images import radius
 from zwfs._likelihood import Estimator, Noise
 from zwfs._propagator import propagator, split

@@ -1,18 +1,23 @@
 """Reconstructors: built once for a sensor, then called on frames; all return a `Reconstruction`.
 
-A new method is a module here, its import and its place in `RECONSTRUCTORS`.
+A new method is a module here, its import below and its place in `RECONSTRUCTORS`, in `_list.py`.
 """
 
-from zwfs.reconstructors.arcsine import Arcsine
-from zwfs.reconstructors.base import Reconstruction
-from zwfs.reconstructors.gerchberg_saxton import GerchbergSaxton
-from zwfs.reconstructors.gradient_descent import GradientDescent
-from zwfs.reconstructors.linear import Linear
-from zwfs.reconstructors.maximum_likelihood import LikelihoodReconstruction, MaximumLikelihood
-from zwfs.reconstructors.phase_shifted import PhaseShifted
+from typing import TYPE_CHECKING
 
-RECONSTRUCTORS = (Arcsine, GerchbergSaxton, GradientDescent, Linear, MaximumLikelihood, PhaseShifted)
-"""All reconstructors of the package."""
+from zwfs import _lazy
+
+if TYPE_CHECKING:
+    from zwfs.reconstructors._list import RECONSTRUCTORS
+    from zwfs.reconstructors.arcsine import Arcsine
+    from zwfs.reconstructors.base import Reconstruction
+    from zwfs.reconstructors.gerchberg_saxton import GerchbergSaxton
+    from zwfs.reconstructors.gradient_descent import GradientDescent
+    from zwfs.reconstructors.linear import Linear
+    from zwfs.reconstructors.maximum_likelihood import LikelihoodReconstruction, MaximumLikelihood
+    from zwfs.reconstructors.phase_shifted import PhaseShifted
+else:
+    __getattr__, __dir__ = _lazy.offer(__name__)
 
 __all__ = [
     "RECONSTRUCTORS",

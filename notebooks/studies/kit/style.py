@@ -14,8 +14,6 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from zwfs.reconstructors import RECONSTRUCTORS
-
 PHASE_MAP, INTENSITY_MAP = "RdBu_r", "viridis"
 ALONE = "alone"
 """Group of the panels that share their row with no other on a phone."""
@@ -74,8 +72,6 @@ LOOKS |= {
     "PhaseShifted": Look("phase-shifted", "two images", "#0072B2", "v", ":"),
     "MaximumLikelihood": Look("maximum likelihood", "", "#661100", "*", "-"),
 }
-for _method in RECONSTRUCTORS:
-    LOOKS[_method.__name__]
 # Curves that stand for no method have other colours, from Tol's muted palette, and other markers.
 OTHER_STYLES: tuple[dict[str, Any], ...] = tuple(
     {"color": color, "marker": marker, "linestyle": line}

@@ -79,7 +79,7 @@ def test_the_commit_is_that_of_this_folder_alone(tmp_path):
 @pytest.mark.parametrize(
     ("name", "code"),
     [
-        ("fig01_sensor_layout", "from studies import fig01_sensor_layout as s; from studies.kit import sweeps"),
+        ("fig01_sensor_layout", "from studies import fig01_sensor_layout as s; from studies.kit import variants"),
         ("calibration", "from studies import calibration as s; assert len(s.Recording.read().frames) == 5"),
     ],
 )

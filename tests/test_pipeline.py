@@ -2,16 +2,18 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 
+import joblib
 import nbformat
 import pytest
 import yaml
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
-from book._tools import book, record, run, scratch
+from book._tools import book, execute, record, run, scratch
 from book._tools.__main__ import main
 from book._tools.execute import NotebookError
 from book._tools.project import Project
@@ -91,12 +93,33 @@ def test_only_what_changed_runs_again(ran):
     assert run_all(ran)[0] == ["first"]
 
 
+def test_the_start_says_how_long_the_longest_come_first_and_the_rest_is_said_now_and_then(ran, monkeypatch):
+    (ran.root / "book" / "_tools").mkdir(parents=True)
+    (ran.root / run.SECONDS).write_text(json.dumps({"second": 300, "third": 1}))
+    shutil.rmtree(ran.executed)
+    begun, said = [], []
+    monkeypatch.setattr(run, "execute", lambda runs, finished, say: begun.extend(one.name for one in runs))
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 4)
+    run.run(ran, said.append)
+    assert begun == ["second", "first", "third"]
+    assert said == ["running 3 of 3 notebooks, about 5 min on 4 free cores", "notebooks: 3 run, 0 unchanged"]
+    monkeypatch.undo()
+    monkeypatch.setattr(execute, "SILENCE", 0.3)
+    (ran.root / run.SECONDS).write_text(json.dumps({"second": 300, "third": 1000, "first": 2}))
+    assert any(re.fullmatch(r"[012]/3 notebooks: .*cell \d/\d.*", line) for line in run_all(ran)[1])
+    assert all(0 < record.read_record(ran, name)["processor"] < 60 for name in ALL)
+    run.refresh(ran)
+    stored = json.loads((ran.root / run.SECONDS).read_text())
+    assert stored["third"] < 60
+
+
 def test_refreshed_notebooks_are_current(ran, monkeypatch):
     monkeypatch.setattr(run, "FRONT_FIGURE", "third")
     picture = ran.executed / "third.files" / "third.png"
     write_file(picture, b"a picture")
     files = [f"notebooks/{name}.ipynb" for name in ("first", "second", "third")]
-    assert run.refresh(ran) == [*files, "book/_static/front.png", "codecheck.yml"]
+    assert run.refresh(ran) == [*files, "book/_static/front.png", "codecheck.yml", run.SECONDS]
+    assert json.loads((ran.root / run.SECONDS).read_text()).keys() == ALL
     check = yaml.safe_load((ran.root / "codecheck.yml").read_text())
     assert [one["file"] for one in check["manifest"]] == [*files, "book/_static/front.png"]
     assert check["certificate"] == "2026-001"
@@ -109,7 +132,7 @@ def test_refreshed_notebooks_are_current(ran, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "stale"),
     [
-        (lambda p: (p.root / "zwfs" / "__init__.py").write_text("gain = 2\n"), ALL),
+        (lambda p: (p.root / "zwfs" / "__init__.py").write_text("gain = 2\n"), {"first"}),
         (lambda p: (p.root / "environment" / "requirements.lock").write_text("numpy==3\n"), ALL),
         (lambda p: write(p, "first", "print(n)"), {"first"}),
         (lambda p: (p.executed / "first.ipynb").write_text("half of a noteb"), {"first"}),

@@ -811,6 +811,18 @@ def test_exit_code_says_how_the_command_ended(folder, capsys):
     assert stopped.value.code == 2
 
 
+def test_progress_is_reported_in_lines_without_a_terminal(folder, capsys, monkeypatch):
+    monkeypatch.setattr("zwfs.frames.__main__._PERIOD", -1.0)
+    arguments = ["reconstruct", "cube.fits", "--calibration", "bench.npz", "--overwrite", "-o", "phase.fits"]
+    assert main(arguments) == 0
+    assert capsys.readouterr().err.splitlines()[-1] == "12 of 12 frames"
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    assert main(arguments) == 0
+    assert f"\r[{'#' * 40}] 12 of 12 frames" in capsys.readouterr().err
+    assert main([*arguments, "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
 # The command with a pause after each chunk: it cannot end before the test stops it.
 SLOW = """
 import signal, sys, time

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from sphinx_external_toc.parsing import MalformedError, parse_toc_yaml
 from zwfs._system import write_file
 
 from . import pdf as printing
-from .execute import TRACEBACK_LINES
+from .execute import SILENCE, TRACEBACK_LINES, tell
 from .project import EXECUTED, PDF, PYODIDE, Project, ToolError
 from .record import commit, digest, digest_files
 from .run import refresh, run
@@ -22,6 +23,10 @@ from .scratch import scratch_folder, swap
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 JUPYTER_BOOK = Path(sys.executable).with_name("jupyter-book")
 OPTIONS = ["-W", "-n", "--keep-going"]  # warnings are errors, and all of them are listed
+NEXT = """next:
+  make rerun FIGURE=3 ARGS="-p n_screens=5"   run a notebook with other parameters
+  make lab                                    open the notebooks
+  make help                                   list all commands"""
 NO_PDF = (
     "the PDF needs Chromium: install one, run .venv/bin/playwright install chromium, or name one in ZWFS_CHROMIUM"
 )
@@ -37,9 +42,10 @@ def book(project: Project) -> None:
     check_contents(project)
     run(project)
     print(f"book: {'built' if build(project, chromium) else 'unchanged'}")
-    print(f"open {(project.build / 'html' / 'index.html').relative_to(project.root)}")
     if not chromium:
         print(NO_PDF)
+    print(f"open {(project.build / 'html' / 'index.html').relative_to(project.root)}")
+    print(NEXT)
 
 
 def pdf(project: Project) -> None:
@@ -83,15 +89,30 @@ def build(project: Project, chromium: str | None = None) -> bool:
         if html.is_dir() and json.loads(record.read_bytes()) == made_from:
             return False
     record.unlink(missing_ok=True)  # a failure from here on must be followed by a build
+    tell("building the pages")
     with scratch_folder(project.build, "building-") as scratch:
         pages = _write_pages(project, scratch, {PDF: printing.NAME} if chromium else {})
         if chromium:
+            tell("making the PDF")
             (pages / printing.NAME).write_bytes(printing.print_book(project.root, pages, chromium))
         # Sphinx needs it for a later build in the same place. Its digest depends on the place.
         (pages / ".buildinfo").unlink(missing_ok=True)
         swap(pages, html, scratch / "earlier")
     write_file(record, json.dumps(made_from).encode())
     return True
+
+
+def _output(process: subprocess.Popen[str]) -> str:
+    """Wait for a process, with a line after each `SILENCE`, and return its output; an interruption ends it."""
+    begin = time.monotonic()
+    try:
+        while True:
+            with suppress(subprocess.TimeoutExpired):
+                return process.communicate(timeout=SILENCE)[0]
+            tell(f"building the pages: {time.monotonic() - begin:.0f} s")
+    except BaseException:
+        process.kill()
+        raise
 
 
 def _digest(project: Project, printed: bool) -> str:
@@ -112,16 +133,12 @@ def _digest(project: Project, printed: bool) -> str:
 def _write_pages(project: Project, output: Path, environment: dict[str, str]) -> Path:
     """Run ``jupyter-book build .`` with the executed notebooks, and return the folder of the pages."""
     executed = {EXECUTED: str(project.executed.relative_to(project.root))}
-    done = subprocess.run(
-        [JUPYTER_BOOK, "build", *OPTIONS, "--path-output", output, "."],
-        cwd=project.root,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env=os.environ | executed | environment,
-    )
-    if done.returncode:
-        said = COLOUR.sub("", done.stdout).replace(f"{project.root}{os.sep}", "")
+    command = [JUPYTER_BOOK, "build", *OPTIONS, "--path-output", output, "."]
+    place = {"cwd": project.root, "env": os.environ | executed | environment}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **place) as build:
+        log = _output(build)
+    if build.returncode:
+        said = COLOUR.sub("", log).replace(f"{project.root}{os.sep}", "")
         lines = said.partition("\nThe above exception was the direct cause")[0].strip().splitlines()
         marked = [line for line in lines if "WARNING:" in line or "ERROR:" in line]
         raise BookError("\n".join(["the book was not built:", *(marked or lines[-TRACEBACK_LINES:])]))

@@ -1,8 +1,9 @@
-"""Execution of notebooks with papermill: in parallel, with a progress bar, stopped cleanly by an interruption."""
+"""Execution of notebooks with papermill: in parallel, with progress, stopped cleanly by an interruption."""
 
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
@@ -12,6 +13,7 @@ from typing import Any
 
 import joblib
 import papermill
+import psutil
 from nbformat import NotebookNode
 from papermill.clientwrap import PapermillNotebookClient
 from papermill.engines import NBClientEngine, papermill_engines
@@ -31,6 +33,7 @@ ENVIRONMENT = dict.fromkeys(LIBRARIES, "1") | {"PYTHONHASHSEED": "0"}
 CORES = "LOKY_MAX_CPU_COUNT"  # the number of cores for the sweeps of a notebook, see `studies.kit.sweeps`
 
 PERIOD = 0.2  # of the progress bar, second
+SILENCE = 30.0  # longest without a line of output where there is no progress bar, second
 TRACEBACK_LINES = 12
 LOG_CHARACTERS = 2000
 
@@ -45,6 +48,7 @@ class Run:
     error: NotebookError | None = None
     key: str | None = None  # see `record.key`; None if the inputs changed during the run
     seconds = 0.0
+    processor = 0.0  # seconds of user and system time of the kernel and of what it starts
     cell = 0  # the cell that runs, from 1; 0 before the first one
     _client: Any = None
     _stopped = False
@@ -121,6 +125,14 @@ class Run:
         self._progress.unlink(missing_ok=True)
         self.cell = number
 
+    def end_cell(self) -> None:
+        """Note the processor time so far."""
+        with suppress(psutil.Error):  # a process has just ended
+            kernel = psutil.Process(self._client.km.provisioner.pid)
+            # User and system time, and those of its children that have ended.
+            times = [process.cpu_times()[:4] for process in (kernel, *kernel.children(recursive=True))]
+            self.processor = max(self.processor, round(sum(map(sum, times)), 1))
+
     def stop(self) -> None:
         """End the kernel and all processes that it started, at once."""
         self._stopped = True
@@ -166,13 +178,17 @@ class Engine(NBClientEngine):
         cls, nb_man: Any, kernel_name: str, *, run: Run, environment: dict[str, str], **_: Any
     ) -> None:
         """Run the cells of a notebook."""
-        begin, run.cells = nb_man.cell_start, list(nb_man.nb.cells)
+        begin, end, run.cells = nb_man.cell_start, nb_man.cell_complete, list(nb_man.nb.cells)
 
         def cell_start(cell: NotebookNode, cell_index: int, **options: Any) -> None:
             run.begin_cell(cell_index + 1)
             begin(cell, cell_index, **options)
 
-        nb_man.cell_start = cell_start
+        def cell_complete(cell: NotebookNode, cell_index: int, **options: Any) -> None:
+            run.end_cell()
+            end(cell, cell_index, **options)
+
+        nb_man.cell_start, nb_man.cell_complete = cell_start, cell_complete
         client = PapermillNotebookClient(
             nb_man, kernel_name=kernel_name, timeout=None, shutdown_kernel="immediate"
         )
@@ -182,10 +198,17 @@ class Engine(NBClientEngine):
 papermill_engines.register("zwfs", Engine)
 
 
-def execute(runs: list[Run], finished: Callable[[Run], None]) -> None:
+def tell(text: str) -> None:
+    """Print a line above the progress bar, at once."""
+    tqdm.write(text)
+    sys.stdout.flush()
+
+
+def execute(runs: list[Run], finished: Callable[[Run], None], say: Callable[[str], None] = tell) -> None:
     """Execute notebooks in parallel, by default on all cores; `finished` takes each run at its end.
 
-    The error of all that failed is raised after the end of the last one.
+    Without a terminal for the progress bar, `say` reports after each `SILENCE`. The error of all that failed is
+    raised after the end of the last one.
     """
     n_processes = min(joblib.cpu_count(), len(runs))
     cores = max(1, joblib.cpu_count() // n_processes)
@@ -194,12 +217,17 @@ def execute(runs: list[Run], finished: Callable[[Run], None]) -> None:
         ThreadPoolExecutor(n_processes) as pool,
     ):
         waiting = {pool.submit(run.execute, cores): run for run in runs}
+        said = time.monotonic()
         try:
             while waiting:
                 for future in wait(waiting, PERIOD, FIRST_COMPLETED).done:
                     future.result()
                     finished(waiting.pop(future))
+                    said = time.monotonic()
                 _show(bar, runs, list(waiting.values()))
+                if bar.disable and time.monotonic() - said > SILENCE:
+                    say(f"{bar.desc}: {bar.postfix}")
+                    said = time.monotonic()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for run in runs:

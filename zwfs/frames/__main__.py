@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 from zwfs.frames._calibrate import calibrate
 from zwfs.frames.telemetry import reconstruct
 
+_PERIOD = 10.0  # second between two lines of progress where there is no terminal
 _EXIT_CODES = """exit codes:
   0    complete
   1    a file or a value was refused, or the disk is full; the message names the cause
@@ -67,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--gain", type=float, default=1.0, metavar="ELECTRONS", help="of a count; both with --commands")
     add("--iterations", dest="n_iterations", type=int, default=25, metavar="N", help="default: 25")
     add("--tolerance", type=float, default=1e-3, metavar="RAD", help="that ends them; default: 1e-3")
-    add("--quiet", action="store_true", help="do not show the steps of a fit")
+    add("--quiet", action="store_true", help="no steps of a fit")
     two = commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared)
     two.set_defaults(run=_reconstruct)
     add = two.add_argument
@@ -87,18 +89,17 @@ def _parser() -> argparse.ArgumentParser:
     add("--restart", action="store_true", help="drop the part of an interrupted run")
     add("--overwrite", action="store_true", help="replace any file")
     add("--strict", action="store_true", help="exit with 3 if frames are flagged")
-    add("--quiet", action="store_true", help="no progress bar and no summary")
+    add("--quiet", action="store_true", help="no progress and no summary")
     return parser
 
 
 def _calibrate(output: str, pupil_centers: Sequence[float] | None, quiet: bool, **settings: Any) -> int:
     centers = None if pupil_centers is None else [pupil_centers[:2], pupil_centers[2:]]
-    shown = sys.stderr.isatty() and not quiet
     with warnings.catch_warnings(record=True) as remarks:
         try:
-            found = calibrate(**settings, pupil_centers=centers, progress=_step if shown else None)
+            found = calibrate(**settings, pupil_centers=centers, progress=None if quiet else _Progress())
         finally:
-            if shown and settings["commands"]:
+            if settings["commands"] and not quiet and sys.stderr.isatty():
                 print(file=sys.stderr)
     for one in remarks:
         print(f"warning: {one.message}", file=sys.stderr)
@@ -111,22 +112,34 @@ def _calibrate(output: str, pupil_centers: Sequence[float] | None, quiet: bool, 
 
 
 def _reconstruct(output: str, strict: bool, quiet: bool, **settings: Any) -> int:
-    bar = _bar if sys.stderr.isatty() and not quiet else None
-    found = reconstruct(output=output, progress=bar, **settings)
+    found = reconstruct(output=output, progress=None if quiet else _Progress().frames, **settings)
     if not quiet:
         flags = ", ".join(f"{n} {name.lower().replace('_', ' ')}" for name, n in found.counts.items() if n)
         print(f"{Path(output)}: {found.n_frames} frames, {found.n_flagged} flagged{f': {flags}' if flags else ''}")
     return 3 if strict and found.n_flagged else 0
 
 
-def _step(text: str) -> None:
-    print(f"\r{text:<60}", end="", file=sys.stderr, flush=True)
+class _Progress:
+    """Progress on stderr: on a terminal in one place, elsewhere a line after each `_PERIOD`."""
 
+    def __init__(self) -> None:
+        self._said = time.monotonic()
 
-def _bar(done: int, total: int) -> None:
-    width = 40 * done // total
-    end = "\n" if done == total else ""
-    print(f"\r[{'#' * width}{'.' * (40 - width)}] {done} of {total} frames", end=end, file=sys.stderr, flush=True)
+    def __call__(self, text: str) -> None:
+        """Report a step."""
+        if sys.stderr.isatty():
+            print(f"\r{text:<60}", end="", file=sys.stderr, flush=True)
+        elif time.monotonic() - self._said > _PERIOD:
+            print(text, file=sys.stderr, flush=True)
+            self._said = time.monotonic()
+
+    def frames(self, done: int, total: int) -> None:
+        """Report the number of finished frames."""
+        width = 40 * done // total if sys.stderr.isatty() else 0
+        bar = f"[{'#' * width}{'.' * (40 - width)}] " if sys.stderr.isatty() else ""
+        self(f"{bar}{done} of {total} frames")
+        if bar and done == total:
+            print(file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ PIN = $(UV) pip compile $(if $(PACKAGE),--upgrade-package $(PACKAGE),--upgrade) 
 
 # The folder and the Python of the environment. The set-up writes them to $(READY) at its end. After an interruption,
 # a move of the folder or a change of Python they differ, and the set-up is repeated.
-IDENTITY := $(BIN)/python -I -c 'import sys; print(sys.prefix, *sys.version_info[:2])'
+IDENTITY := $(BIN)/python -I -X utf8 -c 'import sys; print(sys.prefix, *sys.version_info[:2])'
 ifneq ($(shell $(IDENTITY) 2>/dev/null | cmp -s - $(READY) && echo same),same)
 .PHONY: $(BIN)/uv
 endif
@@ -21,6 +21,10 @@ ifneq ($(shell test -d "$$HOME" && test -w "$$HOME" && echo writable),writable)
 $(shell mkdir -p _build/home)
 export HOME := $(CURDIR)/_build/home
 endif
+
+# What runs depends on the lock and on this folder, not on variables of the caller.
+unexport $(filter PYTHON% MPLBACKEND MATPLOTLIBRC,$(.VARIABLES))
+export PYTHONUTF8 = 1
 
 # One thread for each process: the same numbers on every machine, and no contention between notebooks.
 export OMP_NUM_THREADS = 1

@@ -17,6 +17,8 @@ import pytest
 from matplotlib.testing.compare import calculate_rms
 from PIL import Image
 
+from book._tools.environment import clean
+
 # Levels of 0 to 255. One changed digit of a label exceeds the rms of all pixels.
 # Processors differ by up to 35 levels in a pixel; a moved marker changes pixels by 100.
 RMS, PIXEL = 0.5, 60
@@ -33,9 +35,10 @@ NAME = re.compile(r'(?<=\bid=")[^"]+|(?<=href="#)[^"]+|(?<=url\(#)[^)]+')
 
 # Notebooks that run at the same time share the cores.
 workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-os.environ["LOKY_MAX_CPU_COUNT"] = str(max(1, os.cpu_count() // workers))
-for name in ("OMP", "OPENBLAS", "MKL"):
-    os.environ[f"{name}_NUM_THREADS"] = "1"
+environment = clean(os.environ)
+environment["LOKY_MAX_CPU_COUNT"] = str(max(1, os.cpu_count() // workers))
+os.environ.clear()
+os.environ.update(environment)
 
 
 def pytest_collectstart(collector):

@@ -170,8 +170,8 @@ if "KILLED" in os.environ:
 uv.chmod(0o755)
 """
 PYTHON = """#!/bin/sh
-[ "$2" = venv ] && set -- "$@" --without-pip
-exec {} "$@"
+[ "$2" = venv ] || exec {python} "$@"
+{python} "$@" --without-pip && cp '{pip}' .venv/lib/python*/site-packages
 """
 
 
@@ -183,17 +183,16 @@ def clone(tmp_path):
     for name in ("Makefile", "pyproject.toml", LOCK, UV_LOCK, CHECK):
         shutil.copy(ROOT / name, folder / name)
     (tmp_path / "pip.py").write_text(PIP)
-    (tmp_path / "python").write_text(PYTHON.format(sys.executable))
+    (tmp_path / "python").write_text(PYTHON.format(python=sys.executable, pip=tmp_path / "pip.py"))
     (tmp_path / "python").chmod(0o755)
     return folder
 
 
 def make(folder, *arguments, **variables):
     """Run make, and return its status and what it says."""
-    environment = os.environ | {"PYTHONPATH": str(folder.parent)} | variables
     command = ["make", *arguments, f"PYTHON={folder.parent / 'python'}"]
-    run = {"cwd": folder, "env": environment, "start_new_session": True, "capture_output": True, "text": True}
-    done = subprocess.run(command, **run)
+    run = {"cwd": folder, "env": os.environ | variables, "start_new_session": True}
+    done = subprocess.run(command, **run, capture_output=True, text=True)
     return done.returncode, done.stdout
 
 
@@ -204,8 +203,8 @@ def test_environment_is_set_up_once_and_again_after_a_kill_in_a_moved_folder_and
     assert make(clone, "-s", ".venv/.ready", KILLED="yes")[0] != 0
     assert (clone / ".venv" / "bin" / "uv").exists()
     assert make(clone, "-s", ".venv/.ready") == (0, READY)
-    moved = clone.rename(clone.with_name("it's moved"))
-    assert make(moved, "-s", ".venv/.ready") == (0, READY)
+    moved, locale = clone.rename(clone.with_name("it's bewegt für alle")), {"LC_ALL": "de_XX.ISO-8859-1"}
+    assert make(moved, "-s", ".venv/.ready", **locale) == (0, READY)
     assert make(moved, "-s", ".venv/.ready") == (0, "")
     python = moved / ".venv" / "bin" / "python"
     python.unlink()

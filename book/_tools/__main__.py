@@ -9,6 +9,11 @@ if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is not signal.SIG_
     # The imports below take a second, and there is nothing to remove yet: Ctrl-C needs no traceback.
     signal.signal(signal.SIGINT, lambda *_: (os.write(2, b"interrupted\n"), os._exit(1)))
 
+from .environment import enter_clean
+
+if __name__ == "__main__":
+    enter_clean()
+
 from .project import Project, ToolError, one_line
 from .scratch import end_cleanly_on_signals, one_at_a_time, remove_abandoned
 

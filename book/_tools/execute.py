@@ -23,17 +23,16 @@ from tqdm import tqdm
 from studies.kit import results, sweeps
 
 from . import declared
+from .environment import clean
 from .notebook import read, to_bytes
 from .project import Project, ToolError
 from .record import key
 
-# One thread for each kernel: the numbers do not depend on how many notebooks run at the same time.
-LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-ENVIRONMENT = dict.fromkeys(LIBRARIES, "1") | {"PYTHONHASHSEED": "0"}
 CORES = "LOKY_MAX_CPU_COUNT"  # the number of cores for the sweeps of a notebook, see `studies.kit.sweeps`
 
 PERIOD = 0.2  # of the progress bar, second
 SILENCE = 30.0  # longest without a line of output where there is no progress bar, second
+PICTURES = ("image/png", "image/svg+xml")  # a cell shows a figure as one of them
 TRACEBACK_LINES = 12
 LOG_CHARACTERS = 2000
 
@@ -91,6 +90,7 @@ class Run:
                 self._papermill(source, cores)
             if not _complete(self.notebook):
                 raise RuntimeError("the cell ended Python: expected all cells to run")
+            self._check_pictures()
             # The result of a notebook that is edited during the run is not current.
             self.key = made_from if key(self.project, self.name) == made_from else None
         except Exception as error:
@@ -109,8 +109,17 @@ class Run:
             progress_bar=False,
             request_save_on_cell_execute=False,
             run=self,
-            environment=os.environ | ENVIRONMENT | own,
+            environment=clean(os.environ) | own,
         )
+
+    def _check_pictures(self) -> None:
+        """Refuse a run in which a cell publishes a figure that it does not show."""
+        for number, cell in enumerate(self.notebook.cells, 1):
+            figures = results.published(cell.source) if cell.cell_type == "code" else []
+            kinds = [kind for output in cell.get("outputs", ()) for kind in output.get("data", ())]
+            if sum(kind in PICTURES for kind in kinds) < len(figures):
+                self.cell = number
+                raise RuntimeError(f"no picture of {', '.join(figures)}: expected each figure in the output")
 
     def start_kernel(self, client: PapermillNotebookClient, environment: dict[str, str]) -> None:
         """Run the cells in a kernel with this environment; its messages go to a log."""

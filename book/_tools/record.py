@@ -15,7 +15,7 @@ from . import notebook
 from .project import Project
 
 # The modules that the content of an executed notebook depends on.
-RUNNER = [Path(__file__).with_name(name) for name in ("execute.py", "notebook.py")]
+RUNNER = [Path(__file__).with_name(name) for name in ("environment.py", "execute.py", "notebook.py")]
 
 
 def digest(parts: Iterable[bytes]) -> str:

@@ -11,6 +11,7 @@ import io
 import os
 import re
 from decimal import Decimal
+from itertools import zip_longest
 
 import numpy as np
 import pytest
@@ -39,6 +40,12 @@ environment = clean(os.environ)
 environment["LOKY_MAX_CPU_COUNT"] = str(max(1, os.cpu_count() // workers))
 os.environ.clear()
 os.environ.update(environment)
+
+
+def pytest_configure(config):
+    """Keep the cells of a notebook in one process, as ``--dist loadfile`` does."""
+    if getattr(config.option, "dist", None) == "load":  # that of -n alone
+        config.option.dist = "loadfile"
 
 
 def pytest_collectstart(collector):
@@ -98,12 +105,20 @@ def compare(old, new, rounding):
 def compare_text(old, new, rounding):
     """Return how two texts differ; None if `rounding` may explain it."""
     if not rounding or NUMBER.sub("", old) != NUMBER.sub("", new):
-        return f"{old!r} stored, {new!r} in the fresh run"
+        return first_difference(old, new)
     for a, b in zip(*map(NUMBER.findall, (old, new)), strict=True):
         allowed = SHARE * abs(float(a)) if old == a else last_digit(a)
         if abs(Decimal(a) - Decimal(b)) > allowed:
             return f"{a} stored, {b} in the fresh run, in {old!r}"
     return None
+
+
+def first_difference(old, new):
+    """Return the first lines or tags in which two texts differ."""
+    pieces = (re.split(r"(?<=[\n>])", text) for text in (old, new))
+    pairs = zip_longest(*pieces, fillvalue="")
+    a, b = next(pair for pair in pairs if pair[0] != pair[1])
+    return f"{a.strip()!r} stored, {b.strip()!r} in the fresh run"
 
 
 def last_digit(number):
@@ -132,7 +147,7 @@ def compare_svg(old, new):
     rasters = [EMBEDDED.findall(svg) for svg in (old, new)]
     texts = [numbered(EMBEDDED.sub("", svg)) for svg in (old, new)]
     if NUMBER.sub("", texts[0]) != NUMBER.sub("", texts[1]):
-        return "vector pictures differ by more than numbers"
+        return f"{first_difference(*texts)}, in a vector picture"
     for a, b in zip(*map(NUMBER.findall, texts), strict=True):
         if abs(float(a) - float(b)) > PATH:
             return f"{a} stored, {b} in the fresh run, in a vector picture"

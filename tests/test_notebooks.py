@@ -102,15 +102,27 @@ TAMPERED = {
 }
 
 
+MESSAGES = [
+    "- rms 0.126 rad",
+    "+ rms 0.125 rad",
+    "'| gain 0.8 |' stored, '| gain 0.9 |' in the fresh run",
+    "1.97 stored, 1.92 in the fresh run, in '1.97'",
+    "'rad</text>' stored, 'deg</text>' in the fresh run, in a vector picture",
+]
+
+
 def test_tampered_cells_fail_and_others_pass(tmp_path):
     cells = [*SAME.values(), *TAMPERED.values()]
     nbformat.write(new_notebook(cells=cells), tmp_path / "one.ipynb")
     shutil.copy(NOTEBOOKS / "conftest.py", tmp_path)
-    command = [sys.executable, "-m", "pytest", "--nbval", "-q", "--color=no"]
+    # In two processes, which get whole notebooks.
+    nbformat.write(new_notebook(cells=[new_code_cell("n = 1", execution_count=1)]), tmp_path / "two.ipynb")
+    command = [sys.executable, "-m", "pytest", "--nbval", "-q", "--color=no", "-n", "2"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     failed = re.findall(r"(?m)^FAILED one.ipynb::Cell (\d+)", done.stdout)
     names = [*SAME, *TAMPERED]
     assert [names[int(number)] for number in failed] == list(TAMPERED), done.stdout[-4000:]
+    assert [message for message in MESSAGES if message not in done.stdout] == []
 
 
 @pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)

@@ -5,6 +5,7 @@ import pkgutil
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from importlib import import_module
 from pathlib import Path
@@ -76,11 +77,13 @@ def test_type_checkers_know_modules_and_results_and_accept_a_new_reconstructor(t
 
 
 @pytest.mark.slow
-def test_the_wheel_says_that_the_package_has_types(tmp_path):
-    for name in ("pyproject.toml", "README.md", "LICENSE", "LICENSE-TEXT"):
+def test_the_wheel_says_that_the_package_has_types_and_the_sources_come_without_tests(tmp_path):
+    for name in ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "LICENSE-TEXT"):
         shutil.copy(ROOT / name, tmp_path)
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_nothing.py").touch()
     shutil.copytree(ROOT / "zwfs", tmp_path / "zwfs", ignore=shutil.ignore_patterns("__pycache__"))
-    build = "from setuptools.build_meta import build_wheel; build_wheel('wheels')"
+    build = "from setuptools.build_meta import build_sdist, build_wheel; build_wheel('wheels'); build_sdist('.')"
     done = run("-c", build, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     (wheel,) = (tmp_path / "wheels").glob("*.whl")
@@ -88,6 +91,9 @@ def test_the_wheel_says_that_the_package_has_types(tmp_path):
     sources = (file for file in (ROOT / "zwfs").rglob("*") if file.suffix in (".py", ".typed"))
     assert held == {file.relative_to(ROOT).as_posix() for file in sources}
     assert "zwfs/py.typed" in held
+    (archive,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(archive) as files:
+        assert not [name for name in files.getnames() if "test" in name]
 
 
 def test_the_repository_that_the_front_page_offers_is_whole(tmp_path):

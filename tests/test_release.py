@@ -53,7 +53,7 @@ def test_unit_tests_are_those_of_the_package_and_an_unknown_python_is_refused():
         release.pythons(PROJECT, ["2.7"])
 
 
-@pytest.mark.parametrize("name", ["ci.yml", "release.yml"])
+@pytest.mark.parametrize("name", ["ci.yml", "lock.yml", "release.yml"])
 def test_workflows_pin_actions_and_have_the_least_privileges(name):
     text = (ROOT / ".github" / "workflows" / name).read_text("utf-8")
     used = re.findall(r"uses: (\S+)@(\S+)", text)

@@ -139,6 +139,8 @@ def refused(project, *arguments):
         (["1", "-f", "a.yaml", "-f", "b.yaml"], "-f a.yaml -f b.yaml: expected one file"),
         (["--line=1 -p n=10"], "n = 10: expected an integer in [1, 9]"),
         (["--line=1", "--list"], "--line replaces all other arguments"),
+        (["--line", "1 -p n=10"], "n = 10: expected an integer in [1, 9]"),
+        (["1", "-p", "width.kind=3"], "unknown parameter 'width.kind': did you mean 'width'?"),
     ],
 )
 def test_bad_requests_are_refused_before_anything_runs(project, arguments, message):
@@ -178,6 +180,22 @@ def test_command_line_wins_over_the_file(project, monkeypatch):
     rerun.rerun(project, ["fig01_small", "-f", str(project.root / "mine.yaml"), "-p", "n=6"])
     rerun.rerun(project, ["fig01", "-p", "width=1.5", "-p", "steps=[]"])
     assert made == [{"n": 6, "width": 2.0}, {"steps": []}]
+
+
+def test_a_field_of_a_parameter_is_set_by_the_name_that_the_list_shows():
+    known = declared.parameters(read(ROOT / "notebooks" / "fig03_dynamic_range.ipynb"))
+
+    def changed(*texts, **given):
+        return declared.accept(declared.joined(given | declared.assignments(list(texts)), known), known)
+
+    assert changed("pupil.kind=vlt") == {"pupil": {"kind": "vlt"}}
+    both = {"kind": "vlt", "obstruction": 0.2}
+    assert changed("pupil.obstruction=0.2", pupil={"kind": "vlt", "obstruction": 0.1}) == {"pupil": both}
+    assert changed("pupil={kind: vlt}", "pupil.obstruction=0.2") == {"pupil": both}
+    assert changed("pupil.kind=circular") == {}
+    for text, message in {"pupil.knd=vlt": "pupil.knd", "pupil.kind=moon": "pupil.kind = 'moon'"}.items():
+        with pytest.raises(ParameterError, match=message):
+            changed(text)
 
 
 def test_the_recorded_command_gives_the_same_parameters():
@@ -306,6 +324,12 @@ def test_command_line_ends_with_2_and_one_line(capsys):
     assert main(["rerun", "3", "-p", "n_screen=5"]) == 2
     message = "rerun: unknown parameter 'n_screen': did you mean 'n_screens'?\n"
     assert capsys.readouterr() == ("", message)
+
+
+def test_a_missing_file_is_found_before_the_notebook_starts(capsys, monkeypatch):
+    monkeypatch.setattr(rerun, "make", lambda *arguments: pytest.fail("the notebook was started"))
+    assert main(["rerun", "own_frames", "-p", "frame_files=[nowhere.fits]"]) == 2
+    assert capsys.readouterr().err == "rerun: frame_files: nowhere.fits: no such file\n"
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder in which nobody can write")

@@ -148,6 +148,18 @@ def study_of(notebook: NotebookNode) -> ModuleType | None:
     return import_module(f"studies.{named[1]}") if named else None
 
 
+def joined(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]:
+    """Return values in which ``pupil.kind`` has replaced a field of `pupil`, the given one or else the default."""
+    whole = dict(given)
+    for name in given:
+        parameter, dot, field = name.partition(".")
+        if dot and parameter in known and isinstance(known[parameter].limits, Fields):
+            others = whole.get(parameter, known[parameter].default)
+            if isinstance(others, dict):
+                whole[parameter] = others | {field: whole.pop(name)}
+    return whole
+
+
 def accept(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]:
     """Check values, and return those that are not the defaults."""
     for name in given:

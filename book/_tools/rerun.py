@@ -37,6 +37,7 @@ EXAMPLES = """examples:
   rerun                                     list the notebooks
   rerun 3 --list                            list the parameters of Figure 3
   rerun 3 -p rms_max=2.0 -p n_screens=50    run it
+  rerun 3 -p pupil.kind=vlt                 a field of a parameter
   rerun phase_shift_pairs -f mine.yaml      with parameters from a file
 """
 
@@ -66,7 +67,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     asked = parser.parse_args(arguments)
     if asked.line is None:
         return asked
-    if len(arguments) > 1:
+    if any(value for name, value in vars(asked).items() if name != "line"):
         raise ParameterError("--line replaces all other arguments: expected no other")
     try:
         return parse(shlex.split(asked.line))
@@ -90,7 +91,7 @@ def rerun(project: Project, arguments: list[str]) -> None:
         return
     notebook = read(project.source(name))
     known = declared.parameters(notebook)
-    changed = declared.accept(_given(asked), known)
+    changed = declared.accept(declared.joined(_given(asked), known), known)
     with chdir(project.notebooks):  # as the notebook runs: its files are named from there
         declared.accept_together(notebook, {key: one.default for key, one in known.items()} | changed)
         if classes := changed.get("reconstructors"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -50,6 +51,18 @@ LIMITS = parameter_limits(
     overwrite=bool,
     n_bad=(0, 2000),
 )
+FILES = ("frame_files", "pupil_files", "dark_files", "bad_pixel_files")
+
+
+def check_files(**values: Any) -> None:
+    """Refuse a file that does not exist, before any work."""
+    for name in FILES:
+        for path in values[name]:
+            if not Path(path).is_file():
+                raise FileNotFoundError(f"{name}: {path}: no such file")
+
+
+CHECK_TOGETHER = check_files
 
 SHOWN = ("BUNIT", "WAVELEN", "PUPDIAM", "DIMPLE", "ROTATE", "MAGNIF", "NBAD")  # keywords of the phase map
 _SHOWN = 4  # largest difference of the frames on the scale, over its rms

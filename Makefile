@@ -26,6 +26,11 @@ endif
 unexport $(filter PYTHON% MPLBACKEND MATPLOTLIBRC,$(.VARIABLES))
 export PYTHONUTF8 = 1
 
+# Python and setuptools read and write the path of this folder in the encoding of the locale, which may not be installed.
+ifneq ($(shell locale charmap 2>/dev/null),UTF-8)
+export LC_ALL := C.UTF-8
+endif
+
 # One thread for each process: the same numbers on every machine, and no contention between notebooks.
 export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1

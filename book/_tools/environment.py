@@ -15,7 +15,7 @@ REMOVED = ("MPLBACKEND", "PYTHON")
 def clean(given: Mapping[str, str]) -> dict[str, str]:
     """Return an environment without the variables that change results, and with those that fix them."""
     matplotlib = find_spec("matplotlib")
-    fixed = dict.fromkeys(LIBRARIES, "1") | {"PYTHONHASHSEED": "0", "PYTHONUTF8": "1"}
+    fixed = dict.fromkeys(LIBRARIES, "1") | {"LC_ALL": "C.UTF-8", "PYTHONHASHSEED": "0", "PYTHONUTF8": "1"}
     fixed["IPYTHONDIR"] = str(Path(sys.prefix, ".ipython"))  # not that of the user, with files that run at a start
     if matplotlib and matplotlib.origin:  # its own settings, not those of the user
         fixed["MATPLOTLIBRC"] = str(Path(matplotlib.origin).with_name("mpl-data") / "matplotlibrc")

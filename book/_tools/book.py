@@ -134,8 +134,10 @@ def _write_pages(project: Project, output: Path, environment: dict[str, str]) ->
     """Run ``jupyter-book build .`` with the executed notebooks, and return the folder of the pages."""
     executed = {EXECUTED: str(project.executed.relative_to(project.root))}
     command = [JUPYTER_BOOK, "build", *OPTIONS, "--path-output", output, "."]
-    place = {"cwd": project.root, "env": os.environ | executed | environment}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **place) as build:
+    variables, pipe = os.environ | executed | environment, subprocess.PIPE
+    with subprocess.Popen(
+        command, cwd=project.root, env=variables, stdout=pipe, stderr=subprocess.STDOUT, text=True
+    ) as build:
         log = _output(build)
     if build.returncode:
         said = COLOUR.sub("", log).replace(f"{project.root}{os.sep}", "")

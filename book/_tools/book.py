@@ -133,7 +133,7 @@ def _digest(project: Project, printed: bool) -> str:
 def _write_pages(project: Project, output: Path, environment: dict[str, str]) -> Path:
     """Run ``jupyter-book build .`` with the executed notebooks, and return the folder of the pages."""
     executed = {EXECUTED: str(project.executed.relative_to(project.root))}
-    command = [JUPYTER_BOOK, "build", *OPTIONS, "--path-output", output, "."]
+    command: list[str | Path] = [JUPYTER_BOOK, "build", *OPTIONS, "--path-output", output, "."]
     variables, pipe = os.environ | executed | environment, subprocess.PIPE
     with subprocess.Popen(
         command, cwd=project.root, env=variables, stdout=pipe, stderr=subprocess.STDOUT, text=True

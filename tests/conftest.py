@@ -26,7 +26,7 @@ os.environ.pop("ZWFS_SWEEPS", None)  # a test computes, and reads no stored resu
 def new_reconstructor():
     """Return the path and the code of the reconstructor in CONTRIBUTING."""
     text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
-    path = r"`(zwfs/reconstructors/(?!__init__)\w+\.py)`"
+    path = r"`(zwfs/reconstructors/(?!_)\w+\.py)`"
     return re.search(rf"{path}.*?^```python\n(.*?)^```", text, re.M | re.S).groups()
 
 

@@ -12,6 +12,17 @@ def airy(diameter, x, y):
     return np.where(r > 0, diameter / 2 * j1(np.pi * diameter * far) / far, np.pi * diameter**2 / 4)
 
 
+def exact_ellipse(pupil, width, height, turned, field):
+    """Reference wave of an ellipse (lambda/D) that takes the light away, turned by an angle (radian) from x to y.
+
+    The kernel is the Fourier transform of the ellipse: that of a disc of diameter 1, stretched.
+    """
+    y, x = (np.arange(-(n - 1), n) / pupil.n_pixels for n in pupil.shape)
+    wave = np.exp(-1j * turned) * (x + 1j * y[:, np.newaxis])  # real and imaginary along the axes of the ellipse
+    kernel = width * height * airy(1.0, width * wave.real, height * wave.imag)
+    return -fftconvolve(kernel, np.where(pupil.inside, field, 0), mode="valid") / pupil.n_pixels**2
+
+
 def exact_reference(pupil, dimple, field, margin=0, shift=(0.0, 0.0)):
     """Reference wave by the exact kernel, on a detector `margin` pixels wider than the pupil on each side.
 

@@ -9,10 +9,10 @@ import pytest
 from scipy.special import j0
 
 import zwfs
-from zwfs import Detector, Dimple, Patch, Pupil, ZernikeSensor, zernike_basis
+from zwfs import Detector, Dimple, Patch, Pupil, ZernikeSensor, _lowrank, zernike_basis
 
 from .conftest import needs_modes
-from .reference import exact_reference
+from .reference import exact_ellipse, exact_reference
 
 
 def ramp(u, v):
@@ -95,6 +95,67 @@ def test_patch_of_several_rings_is_a_sum_of_airy_kernels(complex_field):
     exact = -sum(step * disc for step, disc in zip(steps, discs, strict=True))
     sensor = ZernikeSensor(pupil, Patch(3.0, rings, breaks=edges[:3]), extent=1.5, tolerance=1e-14)
     np.testing.assert_allclose(sensor.reference_wave(field)[0], exact, rtol=0, atol=1e-12)
+
+
+def ellipse(width, height, turned, **settings):
+    """Opaque ellipse, turned by an angle from u to v."""
+
+    def along(u, v):
+        wave = (u + 1j * v) * np.exp(-1j * turned)
+        return np.hypot(wave.real / width, wave.imag / height)
+
+    def outline(angle):
+        return 1 / along(np.cos(angle), np.sin(angle))
+
+    breaks = [0.3, outline]  # the circle is not needed, and disturbs nothing
+    return Patch(width, lambda u, v: np.where(along(u, v) < 0.5, 0, 1), breaks=breaks, **settings)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "settings"), [(1.6, 1.0, {}), (1.01, 1.0, {}), (1.2, 0.5, {"n_samples": 96})]
+)
+def test_ellipse_with_its_outline_is_as_exact_as_a_dimple(complex_field, width, height, settings):
+    pupil = Pupil.circular(16)
+    field = complex_field(pupil)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sensor = ZernikeSensor(pupil, ellipse(width, height, 0.4, **settings), tolerance=1e-14)
+    exact = exact_ellipse(pupil, width, height, 0.4, field)
+    np.testing.assert_allclose(sensor.reference_wave(field)[0], exact, rtol=0, atol=1e-12)
+
+
+def test_outline_scales_with_the_wavelength(complex_field):
+    pupil = Pupil.circular(16)
+    phase = 0.3 * complex_field(pupil).real
+    band = zwfs.PolychromaticSensor(
+        ZernikeSensor(pupil, ellipse(1.6, 1.0, 0.4)), [600.0, 700.0], reference_wavelength=600.0
+    )
+    at_700 = ZernikeSensor(pupil, ellipse(1.6 * 6 / 7, 6 / 7, 0.4)).measure(phase * 6 / 7)
+    both = (band.reference.measure(phase) + at_700) / 2
+    np.testing.assert_allclose(band.measure(phase), both, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("outline", "message"),
+    [
+        (lambda angle: np.full(3, 0.5), r"breaks\[0\]\(angle\) has shape \(3,\)"),
+        (lambda angle: np.nan * angle, r"breaks\[0\]\(angle\) holds .* NaN"),
+        (lambda angle: "wide", r"breaks\[0\]\(angle\) has dtype"),
+        (lambda angle: 0.9 + 0.2 * np.cos(angle), r"breaks\[0\]\(angle\) reaches from 0\.7.* to 1\.1: "),
+    ],
+)
+def test_bad_outline_is_named(outline, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        ZernikeSensor(Pupil.circular(8), Patch(1.0, lambda u, v: 1, breaks=[outline]))
+
+
+def test_samples_are_refused_by_their_own_name_and_the_others_work():
+    with pytest.raises(ValueError, match=r"n_samples = 2048: expected an integer in \[0, 1024\]"):
+        Patch(1.0, ramp, n_samples=2048)
+    pupil = Pupil.circular(40)
+    with pytest.raises(ValueError, match=r"masks\[0\]\.n_samples = 1024: expected at most \d{3} for a mask 3 "):
+        ZernikeSensor(pupil, Patch(3.0, ramp, n_samples=1024))
+    _lowrank._check_mask(0, Patch(1.0, ramp, n_samples=1024), 40, (pupil.y, pupil.x) * 2, np.sqrt(2))
 
 
 @pytest.mark.parametrize("diameter", [0.5, 1.5, 5.0])

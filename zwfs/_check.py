@@ -358,6 +358,17 @@ def items(name: str, values: Any, expected: str) -> Iterable[Any]:
     return values
 
 
+def breaks(name: str, values: Any, diameter: float) -> tuple[Any, ...]:
+    """Return the checked breaks of a mask, circles in order; outlines are checked where they are used."""
+    known = list(items(name, values, "diameters, such as (1.0,), or functions of the angle"))
+    circles = sorted(
+        number(f"{name}[{index}]", value, 0, diameter, open_low=True, open_high=True)
+        for index, value in enumerate(known)
+        if not callable(value)
+    )
+    return (*circles, *filter(callable, known))
+
+
 def any_numbers(name: str, value: Any) -> NDArray:
     """Return `value` as an array of NumPy of bools, integers, real or complex numbers; the dtype is kept."""
     array = _made(name, value, np.asarray)

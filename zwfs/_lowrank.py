@@ -27,11 +27,12 @@ from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs._arrays import Immutable, Kind, any_array, is_complex, joined, parted, product, read_only
-from zwfs.masks import Dimple, Mask
+from zwfs.masks import Dimple, Mask, Outline
 
 _NODES = 2048  # of a quadrature handled together: wide detectors and large masks have many
 _ROUNDING = 1e-13  # error of a reference wave, relative to the incoming one, that rounding may cause
 _ATTRIBUTES = ("diameter", "breaks", "n_samples", "transmission")  # of a mask
+_OUTLINED = 64  # nodes around the axis, at least, where an outline is no circle
 _MOST_WORK = 5e9  # quadrature nodes times coefficients: about 15 seconds
 
 
@@ -305,10 +306,7 @@ def _check_mask(index: int, mask: Mask, n_pixels: float, axes: Sequence[NDArray]
         )
     name = f"masks[{index}]"
     diameter = _check.number(f"{name}.diameter", mask.diameter, 0, open_low=True)
-    breaks = [
-        _check.number(f"{name}.breaks", value, 0, diameter, open_low=True, open_high=True)
-        for value in _check.items(f"{name}.breaks", mask.breaks, "diameters")
-    ]
+    breaks = _check.breaks(f"{name}.breaks", mask.breaks, diameter)
     n_samples = _check.integer(f"{name}.n_samples", mask.n_samples, 0)
     if diameter > n_pixels * (1 + 1e-12):
         raise ValueError(
@@ -316,12 +314,17 @@ def _check_mask(index: int, mask: Mask, n_pixels: float, axes: Sequence[NDArray]
             "the focal field of a sampled pupil repeats beyond"
         )
     coefficients = math.prod(min(diameter * np.ptp(axis) + 8, axis.size) for axis in axes)
-    n_nodes = (len(breaks) + 1) * max(np.pi * diameter * reach + 20, n_samples) ** 2 / 2
-    if coefficients * n_nodes > _MOST_WORK:
+    most, needed = math.sqrt(2 * _MOST_WORK / coefficients / (len(breaks) + 1)), np.pi * diameter * reach + 20
+    if needed <= most < n_samples:
         raise ValueError(
-            f"{name} is {diameter:g} lambda/D wide, with {len(breaks)} breaks and n_samples = {n_samples}, on a "
-            f"detector that is {np.ptp(axes[-1]):.3g} D wide: expected a smaller mask or a smaller extent, for "
-            "which the factors are small"
+            f"{name}.n_samples = {n_samples}: expected at most {int(most)} for a mask {diameter:g} lambda/D wide, "
+            f"with {len(breaks)} breaks"
+        )
+    if needed > most:
+        raise ValueError(
+            f"{name} is {diameter:g} lambda/D wide, with {len(breaks)} breaks, on a detector that is "
+            f"{np.ptp(axes[-1]):.3g} D wide: expected a smaller mask or a smaller extent, for which the factors "
+            "are small"
         )
 
 
@@ -338,7 +341,7 @@ def _warn_of_quadrature(index: int, mask: Mask, error: float, tolerance: float) 
     warnings.warn(
         f"masks[{index}]: the reference wave has an error of about {error:.1g}, relative to the strongest "
         f"response, which exceeds the tolerance of {tolerance:g}; the transmission varies too fast for the nodes "
-        "of its quadrature: name circles at which it jumps in `breaks`, or raise `n_samples` (now "
+        "of its quadrature: name circles and outlines at which it jumps in `breaks`, or raise `n_samples` (now "
         f"{mask.n_samples})",
         UserWarning,
         stacklevel=6,  # the caller of the sensor, beyond the end of its constructor
@@ -366,16 +369,39 @@ def _quadrature(
     mask: Mask, reach: float, tolerance: float, refinement: float = 1.0
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Nodes u, v and weights on the patch: Gauss-Legendre along the radius, equispaced around the axis."""
-    edges = np.array([0.0, *mask.breaks, mask.diameter]) / 2
-    n_angles = max(_bandwidth(2 * np.pi * edges[-1] * reach, tolerance), mask.n_samples + mask.n_samples % 2)
+    asked = max(mask.n_samples + mask.n_samples % 2, _OUTLINED * any(map(callable, mask.breaks)))
+    n_angles = max(_bandwidth(np.pi * mask.diameter * reach, tolerance), asked)
     n_angles = 2 * round(n_angles * refinement / 2)
-    unit, unit_weights = gauss_legendre(n_angles // 2)
-    low, high = edges[:-1, np.newaxis], edges[1:, np.newaxis]
-    radius = (low + (high - low) * (unit + 1) / 2).ravel()
-    ring = radius * ((high - low) / 2 * unit_weights).ravel()
+    unit, unit_weights = (one[:, np.newaxis] for one in gauss_legendre(n_angles // 2))
     angle = 2 * np.pi * np.arange(n_angles) / n_angles
-    u, v = np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))
-    return u.ravel(), v.ravel(), np.repeat(ring * 2 * np.pi / n_angles, n_angles)
+    edges = _radii(mask, angle)[:, np.newaxis]
+    low, high = edges[:-1], edges[1:]
+    radius = low + (high - low) * (unit + 1) / 2
+    ring = radius * ((high - low) / 2 * unit_weights)
+    weights = ring * 2 * np.pi / n_angles
+    return (radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel(), weights.ravel()
+
+
+def _radii(mask: Mask, angle: NDArray) -> NDArray[np.float64]:
+    """Radii of the centre, the breaks and the rim of a mask at angles: (n,) to (n_breaks + 2, n), in order."""
+    widths = [np.zeros(angle.shape)]
+    for index, one in enumerate(mask.breaks):
+        widths.append(_width(f"breaks[{index}]", one, angle, mask.diameter) if callable(one) else one + widths[0])
+    return np.sort([*widths, mask.diameter + widths[0]], axis=0) / 2
+
+
+def _width(name: str, outline: Outline, angle: NDArray, diameter: float) -> NDArray[np.float64]:
+    """Checked diameters of an outline at angles; an outline that touches the rim may round beyond it."""
+    widths = _check.real_array(f"{name}(angle)", outline(angle.copy()))
+    if widths.shape not in ((), angle.shape):
+        raise ValueError(f"{name}(angle) has shape {widths.shape}: expected {angle.shape}, as angle")
+    _check.finite(f"{name}(angle)", widths)
+    low, high = widths.min(), widths.max()
+    if low < 0 or high > diameter * (1 + 1e-12):
+        raise ValueError(
+            f"{name}(angle) reaches from {low:.6g} to {high:.6g}: expected diameters in [0, {diameter:g}]"
+        )
+    return np.minimum(np.broadcast_to(widths, angle.shape), diameter)
 
 
 def _rim(mask: Mask, reach: float, tolerance: float, refinement: float = 1.0) -> tuple[NDArray, NDArray, NDArray]:

@@ -15,7 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from zwfs import _check
 from zwfs.pupil import Pupil
 
-_MOST_SAMPLES = 2048  # a quarter of a minute for 100 pixels
+_MOST_SAMPLES = 1024  # seconds for a mask of 1 lambda/D
+
+Outline = Callable[[NDArray], NDArray]
+"""Outline of a part of a mask: its diameter, twice the distance from the axis, lambda/D, at angles in radian."""
 
 
 class Mask(Protocol):
@@ -26,8 +29,8 @@ class Mask(Protocol):
         """Diameter of the disc, lambda/D."""
 
     @property
-    def breaks(self) -> Sequence[float]:
-        """Diameters of circles at which the transmission jumps, lambda/D, in order."""
+    def breaks(self) -> Sequence[float | Outline]:
+        """Diameters of circles, lambda/D, and outlines at which the transmission jumps."""
 
     @property
     def n_samples(self) -> int:
@@ -88,10 +91,14 @@ class Patch:
     """Patch of any complex transmission, the general mask of section 2.1 of the paper.
 
     The transmission is integrated by Gauss-Legendre nodes along the radius and equispaced ones around the axis.
-    It should be smooth, except at circles, which are to be named in `breaks`; a function with structure finer than
-    that of the diffraction pattern of the pupil needs a larger `n_samples`. A sensor estimates the error of this
-    quadrature and warns where it exceeds the tolerance. The error falls only slowly with `n_samples` where the
-    transmission jumps across the angle, as at the edges of a square.
+    It should be smooth, except at circles and outlines, which are to be named in `breaks`; a function with
+    structure finer than that of the diffraction pattern of the pupil needs a larger `n_samples`. A sensor
+    estimates the error of this quadrature and warns where it exceeds the tolerance.
+
+    A smooth outline in `breaks` is as exact as a circle: the reference wave of an ellipse of 1.6 x 1.0 lambda/D
+    has an error of 2e-14 at the smallest tolerance. Without its outline the error is 1e-4 with 1024 samples.
+    Corners limit the accuracy: a square of 1 lambda/D with its outline has an error of 2e-4 with 256 samples, and
+    of 5e-5 with 512.
 
     Parameters
     ----------
@@ -100,11 +107,13 @@ class Patch:
     function : callable
         `function(u, v)` gives the complex transmission at focal coordinates in lambda/D (arrays of one shape;
         u is horizontal, v vertical); its modulus may not be above 1.
-    breaks : sequence of float, lambda/D
-        Diameters of circles at which the transmission jumps.
+    breaks : sequence of float or callable, lambda/D
+        Where the transmission jumps: diameters of circles, and outlines around the axis. An outline is a function
+        `outline(angle)` of angles in radian, from the axis of u to that of v, that gives the diameter there, twice
+        the distance from the axis, at most `diameter`.
     n_samples : int
-        Smallest number of nodes around the axis, at most 2048; half as many are taken along each radius. Raise it
-        for a transmission with fine structure or jumps across the angle.
+        Smallest number of nodes around the axis, at most 1024, fewer for wide masks; half as many are taken along
+        each radius. Raise it for a transmission with fine structure, or an outline with corners.
 
     References
     ----------
@@ -119,23 +128,31 @@ class Patch:
     >>> ring = zwfs.Patch(2.0, two_steps, breaks=[1.0])
     >>> zwfs.ZernikeSensor(zwfs.Pupil.circular(32), ring).n_masks
     1
+
+    An ellipse of 1.6 x 1.0 lambda/D:
+
+    >>> def inside(u, v):
+    ...     return np.where(np.hypot(u / 1.6, v) < 0.5, 1j, 1)
+    ...
+    >>> def outline(angle):
+    ...     return 1 / np.hypot(np.cos(angle) / 1.6, np.sin(angle))
+    ...
+    >>> zwfs.ZernikeSensor(zwfs.Pupil.circular(32), zwfs.Patch(1.6, inside, breaks=[outline])).n_masks
+    1
     """
 
     diameter: float
     function: Callable[[NDArray, NDArray], NDArray]
-    breaks: Sequence[float] = ()
+    breaks: Sequence[float | Outline] = ()
     n_samples: int = 0
 
     def __post_init__(self) -> None:
         diameter = _check.number("diameter", self.diameter, 0, open_low=True)
         if not callable(self.function):
             raise TypeError(f"function = {_check.shown(self.function)}: expected a callable of (u, v)")
-        breaks = sorted(
-            _check.number(f"breaks[{i}]", value, 0, diameter, open_low=True, open_high=True)
-            for i, value in enumerate(_check.items("breaks", self.breaks, "diameters, such as (1.0,)"))
-        )
+        breaks = _check.breaks("breaks", self.breaks, diameter)
         n_samples = _check.integer("n_samples", self.n_samples, 0, _MOST_SAMPLES)
-        for name, value in {"diameter": diameter, "breaks": tuple(breaks), "n_samples": n_samples}.items():
+        for name, value in {"diameter": diameter, "breaks": breaks, "n_samples": n_samples}.items():
             object.__setattr__(self, name, value)
 
     def transmission(self, u: NDArray, v: NDArray) -> NDArray[np.complex128]:

@@ -11,7 +11,7 @@ from zwfs import _check
 from zwfs._arrays import read_only
 from zwfs._lowrank import Factors, factorise
 from zwfs._propagator import Channels
-from zwfs.masks import Dimple, Mask
+from zwfs.masks import Dimple, Mask, Outline
 from zwfs.sensor import Sensor, ZernikeSensor
 
 _MOST_WAVELENGTHS = 64
@@ -213,8 +213,8 @@ class _Scaled:
         return self.mask.diameter * self.ratio
 
     @property
-    def breaks(self) -> tuple[float, ...]:
-        return tuple(one * self.ratio for one in self.mask.breaks)
+    def breaks(self) -> tuple[float | Outline, ...]:
+        return tuple(self._wider(one) if callable(one) else one * self.ratio for one in self.mask.breaks)
 
     @property
     def n_samples(self) -> int:
@@ -222,3 +222,6 @@ class _Scaled:
 
     def transmission(self, u: NDArray, v: NDArray) -> NDArray[np.complex128]:
         return self.mask.transmission(u / self.ratio, v / self.ratio)
+
+    def _wider(self, outline: Outline) -> Outline:
+        return lambda angle: outline(angle) * self.ratio

@@ -92,9 +92,14 @@ def per_kind(make: Callable[[Owner, Kind], Constants]) -> Callable[[Owner, Kind]
     return kept
 
 
+def is_array(value: Any) -> bool:
+    """Whether a value is an array or a number of a library that follows the standard."""
+    return bool(array_api_compat.is_array_api_obj(value))
+
+
 def any_array(value: Any) -> tuple[Any, Any]:
     """Return an array and its namespace. What does not follow the standard becomes an array of NumPy."""
-    if not isinstance(value, np.ndarray | np.generic) and array_api_compat.is_array_api_obj(value):
+    if not isinstance(value, np.ndarray | np.generic) and is_array(value):
         return value, array_api_compat.array_namespace(value)
     array = np.asarray(value)  # subclasses become plain arrays
     if not array.dtype.isnative:  # as in FITS files

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zwfs._arrays import Kind, any_array, holds, is_jax, read_only
+from zwfs._arrays import Kind, any_array, holds, is_array, is_jax, read_only
 
 _STRONGEST = 1e15  # value of a mode, and of its inverse: squares summed over a pupil fit in single precision
 LARGEST = 1e38  # number in a map: the square of its sum is far from the range of a float
@@ -125,6 +125,13 @@ def wavelength(value: Any) -> float:
     return number("wavelength", value, 1e-12, 1e12)
 
 
+def callback(name: str, value: Any) -> Callable[..., Any]:
+    """Return a function that reports progress; None is one that does nothing."""
+    if value is not None and not callable(value):
+        raise TypeError(f"{name} = {shown(value)}: expected a function, or None")
+    return value or (lambda *_: None)
+
+
 def number_field(owner: Any, name: str, low: float = -math.inf, high: float = math.inf, **ends: bool) -> None:
     """Check a number among the fields of a frozen dataclass, see `number`, and keep it as a float."""
     object.__setattr__(owner, name, number(name, getattr(owner, name), low, high, **ends))
@@ -166,6 +173,17 @@ def real_any(name: str, value: Any) -> NDArray:
     if not xp.isdtype(array.dtype, ("real floating", "integral")):
         raise TypeError(f"{name} has dtype {array.dtype}: expected real numbers")
     return xp.astype(array, xp.float64)
+
+
+def array_of(name: str, value: Any, kind: str, shape: tuple[int, ...] | None = None) -> None:
+    """Require an array of any library, of a kind of numbers as the array API names it, and of a shape."""
+    if isinstance(value, np.generic) or not is_array(value):
+        raise TypeError(f"{name} is a {type(value).__name__}: expected an array")
+    array, xp = _of_any_library(name, value)
+    if not xp.isdtype(array.dtype, kind):
+        raise TypeError(f"{name} has dtype {array.dtype}: expected {kind}")
+    if shape not in (None, tuple(array.shape)):
+        raise ValueError(f"{name} has shape {tuple(array.shape)}: expected {shape}")
 
 
 def complex_array(name: str, value: Any) -> NDArray:
@@ -240,7 +258,12 @@ def _of_any_library(name: str, value: Any) -> tuple[Any, Any]:
             f"{name} is an array of JAX: expected np.asarray({name}); zwfs.jax.measure(sensor) returns the frames "
             "in JAX, with gradients"
         )
-    return _made(name, value, any_array)
+    array, xp = _made(name, value, any_array)
+    if xp is np and array.dtype.kind == "V":  # which xp.isdtype does not know
+        raise TypeError(
+            f"{name} is a table, of dtype {shown(array.dtype)}: expected numbers, as one of its columns"
+        )
+    return array, xp
 
 
 def _made(name: str, value: Any, make: Callable[[Any], Any]) -> Any:
@@ -297,8 +320,11 @@ def values_inside(name: str, array: Any, pupil: Any) -> NDArray:
     return values
 
 
-def modes(name: str, value: Any, pupil: Any) -> NDArray[np.float64]:
-    """Return modes, (n_modes, ny, nx), at the points of a pupil: (n_modes, n_points), read-only."""
+def modes(name: str, value: Any, pupil: Any, *, distinct: bool = False) -> NDArray[np.float64]:
+    """Return modes, (n_modes, ny, nx), at the points of a pupil: (n_modes, n_points), read-only.
+
+    If they are to be `distinct`, no mode may be a combination of others.
+    """
     array = real_array(name, value)
     if array.ndim != 3 or not len(array):
         raise ValueError(f"{name} has shape {array.shape}: expected (n_modes, ny, nx)")
@@ -312,7 +338,18 @@ def modes(name: str, value: Any, pupil: Any) -> NDArray[np.float64]:
         raise ValueError(
             f"{name} reaches {largest:.3g} in the pupil: expected between {1 / _STRONGEST:g} and {_STRONGEST:g}"
         )
+    if distinct:
+        independent(name, values)
     return read_only(values)
+
+
+def independent(name: str, values: NDArray, where: str = "") -> None:
+    """Require that no mode, (n_modes, n_points), is a combination of others."""
+    unit = values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-300)
+    strength = np.linalg.eigvalsh(unit @ unit.T)
+    rank = int(np.count_nonzero(strength > 1e-14 * strength[-1]))
+    if rank < len(values):
+        raise ValueError(f"{name}: {rank} of {len(values)} are linearly independent{where}: expected all of them")
 
 
 def map_inside(name: str, array: Any, pupil: Any) -> NDArray:

@@ -160,6 +160,7 @@ class BenchFit:
         KeyError, TypeError, ValueError
             If no estimate has the name, or a value is not a finite number.
         """
+        _check.instance("values", values, Mapping)
         x, n = self.point.x.copy(), self.point.problem.n_white
         names = [one.name for one in self.estimates]
         for name, value in values.items():
@@ -248,7 +249,7 @@ def fit_bench(
     if oversampling is not None:
         oversampling = _check.integer("oversampling", oversampling, 1, 8)
     n_steps = _check.integer("n_steps", n_steps, 1)
-    report = progress or (lambda text: None)
+    report = _check.callback("progress", progress)
     report("dimple and order of the images")
     start = _coarse(data, diameter, shifts)
     point = _fitted(data, *_problem(data, start, oversampling or 2), _STAGES, n_steps, report)

@@ -60,6 +60,8 @@ class Recording:
             raise ValueError(
                 "phases holds 1 state: expected two or more, which fix the place and the plane of the maps"
             )
+        if unknown_in(phases).all():
+            raise ValueError("phases is 0 in all states, or NaN, at every pixel: expected known phases")
         n_pixels = _check.number("n_pixels", n_pixels, 1)
         if any((length - phases.shape[1]) % 2 for length in clear.shape[1:]):
             raise ValueError(

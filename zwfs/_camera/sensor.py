@@ -129,9 +129,14 @@ class FittedSensor:
         shape = (2, *self._fitted.camera.shape)
         if counts.shape != shape:
             raise ValueError(f"frames has shape {counts.shape}: expected {shape}")
-        sigma = np.broadcast_to(_check.real_array("sigma", sigma), shape)
-        if not np.all(sigma > 0):
-            raise ValueError(f"sigma reaches down to {sigma.min():.6g}: expected more than 0")
+        sigma = _check.real_array("sigma", sigma)
+        if sigma.shape not in ((), shape):
+            raise ValueError(f"sigma has shape {sigma.shape}: expected {shape}, or a number")
+        if not np.all((sigma > 0) & (sigma < np.inf)):
+            raise ValueError(
+                f"sigma reaches from {sigma.min():.6g} to {sigma.max():.6g}: expected finite values above 0"
+            )
+        sigma = np.broadcast_to(sigma, shape)
         good = np.isfinite(counts)
         counts, weights = np.where(good, counts, 0), good / sigma
         # Where the start is wrong by a wave, edges of the pupil would hold it there.

@@ -8,7 +8,9 @@ required parameter of a new name; without one its tests fail.
 import importlib
 import inspect
 import re
+import tempfile
 import warnings
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from decimal import Decimal
 from fractions import Fraction
@@ -19,12 +21,16 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import zwfs
+from zwfs.bench import Bench, write_bench
+from zwfs.frames import BenchFit, Calibration, calibrate, fit_bench, pipeline, reconstruct
+from zwfs.frames.files import read_all
+from zwfs.frames.registration import register_frames
 from zwfs.reconstructors.base import Reconstructor
 from zwfs.turbulence import FrozenFlow
 
 from .conftest import needs_modes
 
-# The public face: what simulates a sensor and reconstructs a phase. Tests of camera frames are in other files.
+# What simulates a sensor and reconstructs a phase. Most tests of camera frames are in other files.
 MODULES = (
     *("pupil", "modes", "turbulence", "masks", "sensor", "polychromatic", "detector", "bounds", "loop", "metrics"),
     *("units", "reconstructors"),
@@ -32,10 +38,12 @@ MODULES = (
 
 # Results that may be infinite: the limit lies beyond what was sampled, or no limit is set.
 INFINITE = {"dynamic_range", "Detector", "structure_function", "turbulent_screens", "karhunen_loeve_basis"}
+# Documented by their attributes.
+RESULTS = {"Reconstruction": zwfs.Reconstruction, "Calibration": Calibration}
 # Hooks of the base classes of reconstructors.
 INTERNAL = {"model", "solve", "invert", "begin", "step", "constants"}
 # Give back what they are given, NaN and infinity too.
-PASSED = {"Pupil.gather", "Pupil.scatter", "phase_to_opd", "opd_to_phase"}
+PASSED = {"Reconstruction", "Pupil.gather", "Pupil.scatter", "phase_to_opd", "opd_to_phase"}
 # Take complex numbers where the valid ones are real.
 COMPLEX = {"Pupil.gather", "Pupil.scatter", "focal_field"}
 
@@ -65,7 +73,20 @@ def targets():
                     shown = not key.startswith("_") or key == "__call__"
                     if shown and key not in INTERNAL and callable(getattr(thing, key)):
                         found[f"{name}.{key}"] = member
-    return found
+    return found | RESULTS
+
+
+@cache
+def camera():
+    """Frames of a small bench, their measurement and calibration."""
+    bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
+    with tempfile.TemporaryDirectory() as folder:
+        files = write_bench(folder, bench, seed=1)
+        kinds = [[files[name]] for name in ("frame", "pupils", "dark")]
+        frames, clear, _ = read_all(*kinds)
+        registered = register_frames(frames, clear)
+        measurement = pipeline.reduce_frames(registered, pipeline.Optics(1.06, (1.5, -1.5)))
+        return frames, clear, measurement, calibrate(*kinds)
 
 
 @cache
@@ -139,6 +160,9 @@ def valid() -> dict:
         "Reconstruction": method(shifted.measure(phase)),
         **methods,
     }
+    instances["Calibration"] = camera()[-1]
+    for name in RESULTS:
+        arguments |= {f"{name}.{field}": getattr(instances[name], field) for field in parameters(name)}
     for value in arguments.values():
         if isinstance(value, np.ndarray):
             value.setflags(write=False)  # who writes to an input raises
@@ -169,6 +193,7 @@ BAD = {
     "generator": (i for i in ()), "range": range(0), "Ellipsis": ..., "slice": slice(None),
     "datetime": np.datetime64(0, "s"),
     "timedelta array": np.zeros(3, "m8[s]"), "str array": np.array(["a", "b"]), "structured": np.zeros(3, "i4,f4"),
+    "table of FITS": np.zeros((12, 12), "i4,f4").view(np.recarray), "row of a table": np.zeros(1, "i4,f4")[0],
     "None": None, "list of None": [None], "list of str": ["a"], "nested": [[[[1.0]]]],
     "exception": ValueError("x"),
 }  # fmt: skip
@@ -320,7 +345,8 @@ class Call:
 def right(name):
     """Places of the numbers in the result of the valid call that are not finite."""
     with np.errstate(all="ignore"):
-        results = [Call(name)(), Call(name)(history=True) if "history" in parameters(name) else None]
+        longer = "history" in parameters(name) and name not in RESULTS
+        results = [Call(name)(), Call(name)(history=True) if longer else None]
         found = list(leaves(results))
     return {path[3:] for path, array in found if is_number(array) and not np.isfinite(array).all()}
 
@@ -383,3 +409,63 @@ def test_a_bad_value_is_named(name, parameter):
         if (found := judge(call, parameter, label, value, plain)) is not None
     }
     assert not wrong, "\n".join(f"{name}({parameter}={label}): {found}" for label, found in wrong.items())
+
+
+PUPIL = zwfs.Pupil.circular(8)
+SENSOR = zwfs.ZernikeSensor(PUPIL, zwfs.Dimple(1.06, 1.5), zwfs.Dimple(1.06, -1.5))
+SAME = np.stack([zwfs.zernike_basis(PUPIL, 4)[3]] * 6)
+RECORDING = {"frames": np.ones((2, 2, 8, 8)), "clear_frames": np.ones((2, 8, 8)), "phases": np.ones((2, 8, 8))}
+
+
+def fitted(**changes):
+    return fit_bench(**RECORDING | {"n_pixels": 8, "noise": 1.0} | changes)
+
+
+REFUSED = {
+    r"modes: 1 of 6 are linearly independent": lambda: zwfs.MaximumLikelihood(SENSOR, SAME),
+    r"modes: 1 of 6 are linearly": lambda: zwfs.cramer_rao(SENSOR, 0 * PUPIL.amplitude, photons=1e4, modes=SAME),
+    "measurement is a int: expected": lambda: pipeline.predict_other(5),
+    "measurement is a str: expected": lambda: pipeline.recover_phase("a"),
+    "measurement is a NoneType: expected": lambda: pipeline.upside_down(None),
+    "margin = 0.5: expected an integer": lambda: camera()[2].registered.places(0.5),
+    r"margin = 1000000: expected an integer in \[0, ": lambda: camera()[2].registered.places(10**6),
+    r"pupil_diameter = 65504: expected .* \[8, ": lambda: register_frames(*camera()[:2], pupil_diameter=65504),
+    "progress = 5: expected a function": lambda: fitted(progress=5),
+    "progress = 'a': expected a function": lambda: calibrate(["a.fits"], ["b.fits"], progress="a"),
+    "commands = 5: expected a str or a Path": lambda: calibrate(["a.fits"], ["b.fits"], commands=5),
+    "exposure with commands: expected": lambda: calibrate(["a.fits"], ["b.fits"], commands="c.npy", exposure=2.0),
+    "phase_shifts = 5: expected": lambda: calibrate(["a.fits"], ["b.fits"], phase_shifts=5),
+    "phases is 0 in all states, or NaN": lambda: fitted(phases=np.zeros((2, 8, 8))),
+    "phases is 0 in all states, or NaN, at": lambda: fitted(phases=np.full((2, 8, 8), np.nan)),
+    r"values is a list: expected a Mapping": lambda: BenchFit.replaced(None, []),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_bad_argument_is_refused_by_its_name_before_any_work(message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        REFUSED[message]()
+
+
+def test_modes_that_a_prior_tells_apart_need_not_be_independent():
+    zwfs.MaximumLikelihood(SENSOR, SAME, photons=1e4, prior=np.eye(6))
+
+
+def test_progress_of_telemetry_is_refused_by_its_name(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((1, *camera()[-1].shape)))
+    with pytest.raises(TypeError, match="progress = 5: expected a function"):
+        reconstruct(tmp_path / "a.npy", camera()[-1], tmp_path / "b.fits", progress=5)
+
+
+def test_file_that_claims_a_larger_calibration_than_it_holds_is_refused_unread(tmp_path):
+    camera()[-1].save(tmp_path / "whole.npz")
+    with zipfile.ZipFile(tmp_path / "whole.npz") as whole, zipfile.ZipFile(tmp_path / "big.npz", "w") as big:
+        for name in whole.namelist():
+            if name != "dark.npy":
+                big.writestr(name, whole.read(name))
+        with big.open("dark.npy", "w") as dark:
+            np.lib.format.write_array_header_1_0(
+                dark, {"descr": "<f4", "fortran_order": False, "shape": (1, 2**15, 2**15)}
+            )
+    with pytest.raises(ValueError, match=r"big\.npz: its array dark\.npy has shape \(1, 32768, 32768\) and type"):
+        Calibration.load(tmp_path / "big.npz")

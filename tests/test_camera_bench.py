@@ -14,6 +14,7 @@ from zwfs._camera.model import Camera, Exposure, Linearised, Maps
 from zwfs._camera.recording import PAD, Recording
 from zwfs._camera.sensor import FittedSensor, unwrapped
 from zwfs._camera.solve import fine_phase
+from zwfs.frames import Calibration
 
 from .hcipy_bench import BEFORE, BORDER, CASES, RMS
 
@@ -283,6 +284,18 @@ def test_other_values_replace_those_of_a_fit_and_explain_its_frames_worse(calibr
         fit.replaced({"size": 1.0})
     with pytest.raises(TypeError, match="diameter = 'large'"):
         fit.replaced({"diameter": "large"})
+    pair, known = np.ones((2, 52, 52)), np.zeros((2, 52, 52))
+    with pytest.raises(ValueError, match=r"sigma has shape \(3,\): expected \(2, 52, 52\), or a number"):
+        FittedSensor(fit)(pair, np.ones(3))
+    for message, frames, phases, settings in (
+        (r"frames and phases have shapes \(2, 2, 52, 52\) and \(\)", [pair] * 2, 5.0, {}),
+        (r"corners = \[\[0, 0\]\]: expected two pairs", [pair] * 2, known, {"corners": [[0, 0]]}),
+        (r"corners = \[\[0, 0\], \[0, 1\]\]: expected", [pair] * 2, known, {"corners": [[0, 0], [0, 1]]}),
+        (r"shape = 5: expected two numbers", [pair] * 2, known, {"shape": 5}),
+        (r"n_images = 3: expected an integer in \[1, 2\]", [pair] * 2, known, {"n_images": 3}),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            Calibration.from_bench(fit, frames, phases, **settings)
 
 
 def test_fit_that_ends_early_has_not_converged(monkeypatch):

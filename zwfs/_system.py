@@ -14,6 +14,8 @@ from typing import Any
 
 from zwfs import _check
 
+_LONGEST = 255  # bytes of the name of a file or a folder
+
 
 def write_file(path: Path, content: bytes) -> None:
     """Write a file, and its folder if need be, in one step: whoever looks sees the old one or all of the new.
@@ -41,7 +43,8 @@ def path_of(name: str, value: Any) -> Path:
     """Path that the operating system accepts."""
     try:
         path = Path(value)
-        if value != "" and b"\0" not in os.fsencode(path):
+        longest = max((len(os.fsencode(part)) for part in path.parts), default=0)
+        if value != "" and b"\0" not in os.fsencode(path) and longest <= _LONGEST:
             return path
     except TypeError:
         raise TypeError(f"{name} = {_check.shown(value)}: expected a str or a Path") from None

@@ -82,7 +82,7 @@ def cramer_rao(
         require_one_wavelength(sensor)
     require_information(sensor, unknown)
     pupil = sensor.pupil
-    basis = None if modes is None else pupil.scatter(_check.modes("modes", modes, pupil), fill=0)
+    basis = None if modes is None else pupil.scatter(_check.modes("modes", modes, pupil, distinct=True), fill=0)
     maps, batch = pupil_maps("phase", _check.real_array("phase", phase), sensor)
     estimator = Estimator(Response.of(sensor), noise, unknown, basis)
     model = propagator(sensor, Kind.numpy())

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from zwfs import _check
 from zwfs._camera.bench import fit_bench
 from zwfs._images import nearest_good
-from zwfs._system import paths_of
+from zwfs._system import path_of, paths_of
 from zwfs.frames._blocks import FileError, blocks_of
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
 from zwfs.frames.files import CameraFile, images, read, read_all
 from zwfs.frames.pipeline import reduce_frames
 from zwfs.frames.refine import _check_fit, fit
-from zwfs.frames.registration import Image, find_pupils, register_frames
+from zwfs.frames.registration import Image, check_centers, check_diameter, find_pupils, register_frames
 
 
 def calibrate(
@@ -79,9 +79,15 @@ def calibrate(
     >>> calibration.optics.diameter, round(calibration.diameter)
     (1.06, 40)
     """
+    progress = _check.callback("progress", progress)
     files = frame_files, pupil_files, dark_files, bad_pixel_files
     kept: dict[str, Any] = {"n_iterations": n_iterations, "tolerance": tolerance}
+    diameter = _check.number("diameter", diameter, 0)
+    _check.sequence("phase_shifts", phase_shifts, expected="a list of two numbers")
     if commands is not None:
+        commands = path_of("commands", commands)
+        if others := set(settings) - {"pupil_centers", "pupil_diameter"}:
+            raise TypeError(f"{min(others)} with commands: expected pupil_centers and pupil_diameter only")
         if fitted:
             raise ValueError(
                 f"fitted = {_check.shown(fitted)}: expected none with commands, which fit all of them"
@@ -181,13 +187,14 @@ def _windows(
     window have the same margin around the n pixels of the commands.
     """
     n, (n_images, *shape) = states.commands.shape[-1], states.dark.shape
-    if centers is None or diameter is None:
+    diameter = None if diameter is None else check_diameter(diameter, tuple(shape))
+    middles = None if centers is None else check_centers(centers)
+    if middles is None or diameter is None:
         pairs = [(one, np.isfinite(one)) for one in states.clear.mean(axis=0)]
         clear = [Image(nearest_good(one, good), ~good, "clear frame") for one, good in pairs]
         circles = [circle for one in clear for circle in find_pupils(one, 3 - n_images, diameter)]
         diameter = diameter or float(np.mean([circle.diameter for circle in circles]))
-        centers = centers or [circle[:2] for circle in circles]
-    middles = np.array([_check.pair("pupil_centers", one, _check.number) for one in centers])
+        middles = np.array([circle[:2] for circle in circles]) if middles is None else middles
     room = np.minimum(middles + 0.5, np.array(shape) - 0.5 - middles).min() - n / 2
     if room < -0.5:
         raise ValueError(f"commands have {n} pixels: expected at most {n + 2 * room:.0f}, to fit the frames")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import zipfile
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
@@ -40,6 +41,7 @@ from zwfs.sensor import ZernikeSensor
 FORMAT = 2  # of the file; another number is refused
 _DIM = 0.1  # of the light of the calibration: a frame with less is lost
 _FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
+_WIDEST = 2**16  # rows or columns of a camera
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 _LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED = (flag.value for flag in Flag)  # plain, and far quicker
 
@@ -128,21 +130,35 @@ class Calibration(Immutable):
         _check.number("blur", self.blur, 0, 10)
         _check.integer("n_averaged", self.n_averaged, 1)
         _check.integer("n_images", self.n_images, 1, 2)
-        grid, camera = np.shape(self.amplitude), (self.n_images, *self.shape)
-        _check.flag_map("bad", self.bad, camera)
-        _check.flag_map("good", self.good, grid)
-        for name, shape in {
+        _check.number("diameter", self.diameter, 1)
+        _check.pair("center", self.center, _check.number)
+        _check.instance("optics", self.optics, Optics)
+        _check.flag("commanded", self.commanded)
+        shape = _check.pair("shape", self.shape, _check.integer, 1, _WIDEST)
+        amplitude = _check.real_map("amplitude", self.amplitude)
+        _check.non_negative("amplitude", amplitude)
+        grid, camera = amplitude.shape, (self.n_images, *shape)
+        n_states = _check.real_array("slopes", self.slopes).size
+        bad, good = _check.flag_map("bad", self.bad, camera), _check.flag_map("good", self.good, grid)
+        if not np.any(good & (amplitude > 0)):
+            raise ValueError("amplitude is 0 at all good points: expected light at some")
+        arrays = {"amplitude": amplitude, "bad": bad, "good": good}
+        for name, size in {
             "places": (2, 2, *grid), "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2, *grid),
-            "offset": (2, *grid), "light": (2,), "unexplained": (len(self.slopes), *grid),
+            "offset": (2, *grid), "light": (2,), "unexplained": (n_states, *grid), "slopes": (n_states,),
         }.items():  # fmt: skip
             array = _check.real_array(name, getattr(self, name))
-            if array.shape != shape:
-                raise ValueError(f"{name} has shape {array.shape}: expected {shape}")
+            if array.shape != size:
+                raise ValueError(f"{name} has shape {array.shape}: expected {size}")
             _check.finite(name, array)
+            arrays[name] = array
             if name in ("unit", "light") and np.any(array <= 0):
                 raise ValueError(f"{name} = {_check.shown(array)}: expected values above 0")
-        for one in fields(self):
-            object.__setattr__(self, one.name, read_only(getattr(self, one.name)))
+        if np.any(np.abs(arrays["places"]) > 2 * max(shape)):  # the work grows with the distance
+            reach = np.abs(arrays["places"]).max()
+            raise ValueError(f"places reaches {reach:.3g}: expected pixels of a camera image of {shape}")
+        for name, array in arrays.items():
+            object.__setattr__(self, name, read_only(array))
 
     def __repr__(self) -> str:
         images = f"{self.n_images} camera image{'s' * (self.n_images > 1)} of {self.shape}"
@@ -233,13 +249,20 @@ class Calibration(Immutable):
         n_averaged = counts.shape[1] if counts.ndim == 5 else 1
         counts = counts.mean(axis=1) if counts.ndim == 5 else counts
         n = len(fit.light)
-        if counts.ndim != 4 or counts.shape[:2] != (len(phases), 2) or phases.shape[1:] != (n, n):
-            expected = f"(n_states, 2, ny, nx) and (n_states, {n}, {n})"
+        frame = 2, *fit.point.problem.camera.shape
+        if counts.shape[1:] != frame or phases.shape != (len(counts), n, n):
+            expected = f"(n_states, {', '.join(map(str, frame))}) and (n_states, {n}, {n}), those of the fit"
             raise ValueError(
                 f"frames and phases have shapes {counts.shape} and {phases.shape}: expected {expected}"
             )
-        corners = _check.integer_array("corners", corners).reshape(2, 2)
-        shape = counts.shape[2:] if shape is None else shape
+        shape = counts.shape[2:] if shape is None else _check.pair("shape", shape, _check.integer, 1, _WIDEST)
+        n_images = _check.integer("n_images", n_images, 1, 2)
+        corners, most = _check.integer_array("corners", corners), np.subtract(shape, counts.shape[2:])
+        if corners.shape != (2, 2) or np.any(corners < 0) or np.any(corners > most):
+            raise ValueError(
+                f"corners = {_check.shown(corners.tolist())}: expected two pairs of a row and a column, from "
+                f"(0, 0) to {tuple(most.tolist())}, so that frames of {counts.shape[2:]} lie on one of {shape}"
+            )
 
         def on_camera(pairs: NDArray) -> NDArray:
             whole = np.zeros((len(pairs), n_images, *shape))
@@ -304,6 +327,7 @@ class Calibration(Immutable):
             raise FileNotFoundError(f"{path}: no such file: expected a calibration")
         if not _is_calibration(path):
             raise FileError(f"{path.name}: expected a calibration, which `calibrate` writes")
+        _check_sizes(path)
         with broken(f"{path.name}: a broken calibration"), np.load(path, allow_pickle=False) as file:
             values: dict[str, Any] = json.loads(str(file["values"]))
             found = values.pop("format")
@@ -404,9 +428,7 @@ class Calibration(Immutable):
         values = _check.modes("modes", modes, self.sensor.pupil)
         good = self.sensor.pupil.gather(self.good)
         centred = values[:, good] - values[:, good].mean(axis=1, keepdims=True)
-        rank = int(np.linalg.matrix_rank(centred))
-        if rank < len(values):
-            raise ValueError(f"modes: {rank} of {len(values)} are independent on the good points: expected all")
+        _check.independent("modes", centred, " on the good points")
         matrix = np.zeros((good.size, len(values)))
         matrix[good] = np.linalg.pinv(centred)
         return matrix
@@ -415,11 +437,14 @@ class Calibration(Immutable):
         """Coefficients of modes, (..., n_modes), radian, by one product with a `modal_matrix`."""
         _check.instance("phases", phases, Phases)
         matrix = _check.real_array("matrix", matrix)
+        _check.moderate("matrix", matrix)
         if matrix.ndim != 2 or len(matrix) != self.sensor.pupil.n_points:
             raise ValueError(f"matrix has shape {matrix.shape}: expected ({self.sensor.pupil.n_points}, n_modes)")
-        _check.finite("matrix", matrix)
         values = without_piston(self.sensor.pupil.gather(phases.filled))
-        return values @ matrix.astype(values.dtype, copy=False)
+        with np.errstate(over="ignore", invalid="ignore"):
+            coefficients = values @ matrix.astype(values.dtype, copy=False)
+        _check.finite("the product of phases and matrix", coefficients)
+        return coefficients
 
     def sigma(
         self, phases: Phases, photons: float, read_noise: float = 0.0, modes: ArrayLike | None = None
@@ -518,6 +543,21 @@ def _is_calibration(path: Path) -> bool:
             return {"values.npy", "places.npy"} <= set(file.namelist())
     except Exception:  # zipfile raises many kinds on damaged bytes
         return False
+
+
+def _check_sizes(path: Path) -> None:
+    """Require that the arrays of an NPZ file, by their shapes, are no larger than the file."""
+    size = path.stat().st_size
+    with broken(f"{path.name}: a broken calibration"), zipfile.ZipFile(path) as file:
+        for name in file.namelist():
+            with file.open(name) as member:
+                np.lib.format.read_magic(member)
+                shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+            if math.prod(shape) * dtype.itemsize > size:
+                raise FileError(
+                    f"{path.name}: its array {name} has shape {shape} and type {dtype}: expected at most the "
+                    f"{size} bytes of the file"
+                )
 
 
 def _number_or_inf(name: str, value: Any, *, open_low: bool = False) -> float:

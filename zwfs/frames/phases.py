@@ -55,7 +55,8 @@ class Phases:
     n_bad, n_saturated : ndarray of int, shape (...)
         Pixels of both images that are bad here and good in the calibration, and those of them that are saturated.
     residual : ndarray of float32, shape (...)
-        Rms difference of measured and modelled frames in the pupil; 1 = mean of a clear frame.
+        Rms difference of measured and modelled frames in the pupil; 1 = mean of a clear frame. NaN if the frame is
+        lost, or was not judged.
     n_iterations, flags : ndarray of int, shape (...)
         Iterations, and the sum of `Flag`; 0 is a good frame.
     """

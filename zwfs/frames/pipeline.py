@@ -77,7 +77,7 @@ class Optics:
     unmasked: float = 0.0
 
     def __post_init__(self) -> None:
-        _check.number("diameter", self.diameter, 0, open_low=True)
+        _check.number("diameter", self.diameter, 1e-3)
         _check.pair("phase_shifts", self.phase_shifts, _check.number)
         first, second = np.exp(1j * np.array(self.phase_shifts))
         if min(abs(first - second), abs(first - 1), abs(second - 1)) < 1e-9:
@@ -364,6 +364,7 @@ def model(measurement: Measurement) -> ZernikeSensor:
 
 def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:
     """Frames of a measurement as those of an ideal sensor: its optics are undone. They may be negative."""
+    _check.instance("measurement", measurement, Measurement)
     optics, pure = measurement.optics, _scaled(measurement)
     pure[(..., *measurement.window)] -= measurement.rest + optics.unmasked * measurement.pupil.amplitude**2
     pure /= 1 - optics.unmasked
@@ -375,6 +376,7 @@ def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[n
 
     Parameters, as for `recover_phase`.
     """
+    _check.instance("measurement", measurement, Measurement)
     good = measurement.good
     frames = np.maximum(ideal_frames(measurement), 0)[(..., *measurement.window)]
     return correlations(frames[:, good], predicted_frames(measurement, n_iterations)[:, good])
@@ -405,6 +407,7 @@ def prediction_error(measurement: Measurement, where: NDArray, n_iterations: int
 
 def upside_down(measurement: Measurement) -> Measurement:
     """Control of a measurement: its second frame upside down, so that the frames no longer belong together."""
+    _check.instance("measurement", measurement, Measurement)
     (first, second), (bad, other) = measurement.intensity, measurement.bad
     return replace(measurement, intensity=np.stack([first, second[::-1]]), bad=np.stack([bad, other[::-1]]))
 

@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,6 +188,7 @@ class RegisteredFrames:
 
     def places(self, margin: int = 0) -> NDArray[np.float64]:
         """Row and column of each point of the grid with a margin around it, on each image, (4, 2, ny', nx')."""
+        margin = _check.integer("margin", margin, 0, max(max(image.counts.shape) for image in self.images))
         start = -np.array(self.center) - margin
         grid = np.indices((self.n_pixels + 2 * margin,) * 2) + start[:, np.newaxis, np.newaxis]
         centers = self.origins + self.corner + self.center
@@ -252,7 +254,6 @@ def register_frames(
     TypeError, ValueError
         If the number of images is wrong, the pupils are not found, cut, or of different size.
     """
-    diameter = None if pupil_diameter is None else _check.number("pupil_diameter", pupil_diameter, _SMALLEST)
     exposure = _check.number("exposure", exposure, 0, open_low=True)
     subpixel = _check.flag("subpixel", subpixel)
     background, balance = _check.flag("background", background), _check.flag("balance", balance)
@@ -260,9 +261,9 @@ def register_frames(
         _check.sequence(name, given, Image)
         if len(given) not in (1, 2):
             raise ValueError(f"{name} holds {len(given)} images: expected 1 or 2")
-    centers = None if pupil_centers is None else _check.real_map("pupil_centers", pupil_centers, 2)
-    if centers is not None and centers.shape != (2, 2):
-        raise ValueError(f"pupil_centers has shape {centers.shape}: expected (row, column) of each of two pupils")
+    shape = clear_frames[0].counts.shape
+    diameter = None if pupil_diameter is None else check_diameter(pupil_diameter, shape)
+    centers = None if pupil_centers is None else check_centers(pupil_centers)
     if centers is not None and diameter is None:
         raise ValueError("pupil_centers without a pupil_diameter: expected both, or neither")
     clear, pupils = _locate(clear_frames, centers, diameter)
@@ -284,6 +285,19 @@ def register_frames(
     places = np.array([circle[:2] for circle in (*seen, *pupils)])
     rough = RegisteredFrames(masked, clear, pupils, np.round(places - places[2]), background, balance, exposure)
     return _register(rough, frames_too=moved) if subpixel else rough
+
+
+def check_centers(centers: Any) -> NDArray[np.float64]:
+    """Return the centres of two pupils, (2, 2)."""
+    centers = _check.real_map("pupil_centers", centers)
+    if centers.shape != (2, 2):
+        raise ValueError(f"pupil_centers has shape {centers.shape}: expected (row, column) of each of two pupils")
+    return centers
+
+
+def check_diameter(diameter: Any, shape: tuple[int, ...]) -> float:
+    """Return a diameter of pupils that stand on a clear frame of a shape."""
+    return _check.number("pupil_diameter", diameter, _SMALLEST, min(shape) + 4)  # cut by 2 pixels on each side
 
 
 def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> list[Circle]:
@@ -371,12 +385,13 @@ def _locate(
     else:
         circles = [circle for image in images for circle in find_pupils(image, n_pupils, diameter)]
     pair = images[0], images[-1]
+    given = "of pupil_centers " if centers is not None else ""
     for circle, image in zip(circles, pair, strict=True):
         room = [*circle[:2], *np.subtract(image.counts.shape, 1) - circle[:2]]
         if min(room) < circle.diameter / 2 - 2.5:  # it reaches more than 2 pixels beyond the image
             side = ("top", "left", "bottom", "right")[int(np.argmin(room))]
             raise ValueError(
-                f"{image.name}: the pupil at row {circle.row:.1f}, column {circle.column:.1f}, "
+                f"{image.name}: the pupil {given}at row {circle.row:.1f}, column {circle.column:.1f}, "
                 f"{circle.diameter:.1f} pixels wide, is cut off at the {side} (row 0 is the top): "
                 "expected all of it on the image"
             )

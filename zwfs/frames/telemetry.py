@@ -170,11 +170,11 @@ def reconstruct(
     job = _Job(stack, calibration, modes, phases, photons, read_noise, wavelength, keywords, saturation)
     if largest_residual is not None:
         largest_residual = _check.number("largest_residual", largest_residual, 0)
+    report = _check.callback("progress", progress)
     pieces = _spans(stack.n, job.chunk)
     part = Part(path, job.units, pieces, job.plan(largest_residual), _check.flag("restart", restart))
     try:
         n_resumed = done = sum(stop - first for first, stop in part.done)
-        report = progress or (lambda *_: None)
         report(done, stack.n)
         names = [(card_value(one.name), one.n) for one in stack.firsts]
         part.write(job.files, 0, np.array(names, job.files.dtype))

@@ -73,6 +73,21 @@ class Reconstruction:
     settings: Settings
     frames: NDArray[np.floating]
 
+    def __post_init__(self) -> None:
+        _check.instance("settings", self.settings, Settings)
+        sensor, grid = self.settings.sensor, self.settings.sensor.pupil.shape
+        _check.array_of("phase", self.phase, "real floating")
+        _check.trailing_shape("phase", self.phase, grid, "the shape of the pupil")
+        batch = tuple(self.phase.shape[:-2])
+        _check.array_of("n_iterations", self.n_iterations, "integral", batch)
+        _check.array_of("converged", self.converged, "bool", batch)
+        _check.array_of("n_unsolved", self.n_unsolved, "integral", batch)
+        _check.array_of("frames", self.frames, "real floating", (*batch, sensor.n_masks, *grid))
+        if self.history is not None:
+            _check.array_of("history", self.history, "real floating")
+            n_maps = tuple(self.history.shape[-3:-2]) or (1,)
+            _check.array_of("history", self.history, "real floating", (*batch, *n_maps, *grid))
+
     def __repr__(self) -> str:
         xp, n_frames = Kind.of(self.phase).xp, prod(self.converged.shape)
         n_converged = int(xp.count_nonzero(self.converged))

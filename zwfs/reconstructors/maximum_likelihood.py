@@ -229,7 +229,8 @@ class MaximumLikelihood(Reconstructor):
             require_one_wavelength(sensor)
         require_information(sensor, unknown)
         pupil = sensor.pupil
-        values = None if modes is None else _check.modes("modes", modes, pupil)
+        # A prior decides between modes that the frames do not tell apart.
+        values = None if modes is None else _check.modes("modes", modes, pupil, distinct=prior is None)
         basis = None if values is None else read_only(pupil.scatter(values, fill=0))
         precision = _precision(prior, values, noise)
         rough = sensor.with_tolerance(max(_COARSE, sensor.tolerance))

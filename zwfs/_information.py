@@ -87,6 +87,40 @@ def _products(along: NDArray) -> tuple[NDArray, NDArray]:
     return along[first] * along[second], unfold.reshape(-1, first.size)
 
 
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """Sets of columns, (n, m) each, of which a set has zeros outside of a span: only the span is stored."""
+
+    blocks: list[NDArray]  # (n, width of the span)
+    spans: list[slice]
+    size: int  # m
+
+    @classmethod
+    def of(cls, sets: NDArray, kind: Kind) -> _Columns:
+        """Sets of columns from an array (s, n, m)."""
+        used = [np.flatnonzero(np.any(one, axis=0)) for one in sets]
+        spans = [slice(int(one.min(initial=0)), int(one.max(initial=-1)) + 1) for one in used]
+        blocks = [kind.array(np.ascontiguousarray(one[:, span])) for one, span in zip(sets, spans, strict=True)]
+        return cls(blocks, spans, sets.shape[-1])
+
+    def products(self, coefficients: Sequence[NDArray], kind: Kind) -> NDArray:
+        """Sum over the sets of coefficients times columns: (..., n) for each set to (..., m)."""
+        total = kind.zeros(*coefficients[0].shape[:-1], self.size)
+        for one, block, span in zip(coefficients, self.blocks, self.spans, strict=True):
+            total[..., span] += one @ block
+        return total
+
+    def congruent(self, pairs: NDArray, kind: Kind) -> NDArray:
+        """X^T Q X of columns X for all pairs of sets: Q of (k, pairs, n, n) to (k, m, m)."""
+        total = kind.zeros(pairs.shape[0], self.size, self.size)
+        for index, (i, j) in enumerate(_pairs_of(len(self.blocks))):
+            part = self.blocks[i].T @ pairs[:, index, ...] @ self.blocks[j]
+            total[:, self.spans[i], self.spans[j]] += part
+            if i != j:
+                total[:, self.spans[j], self.spans[i]] += kind.xp.matrix_transpose(part)
+        return total
+
+
 class Response(Immutable):
     """Low-rank response of the frames of a sensor to its field, from which the information is made.
 
@@ -129,12 +163,11 @@ class Response(Immutable):
         columns = np.zeros((n_parts + len(split), len(inner.combine), 2 * n_inputs))
         columns[:n_parts, :, :n_inputs] = _side_by_side([inner.combine[np.newaxis]] * n_parts)
         columns[n_parts:, :, n_inputs:] = left @ split
-        detector = outer.combine @ split
         return _Constants(
             kind, self._pupil.n_points, self._window, self._ratios,
             kind.array(self._pupil.inside), kind.array(np.where(self._pupil.inside, _SMALLEST, 1.0)),
             _Pairs.of(inner.along_y, inner.along_x, kind), _Pairs.of(outer.along_y, outer.along_x, kind),
-            kind.array(columns), kind.array(detector), turns,
+            _Columns.of(columns, kind), _Columns.of(outer.combine @ split, kind), turns,
         )  # fmt: skip
 
     def information(self, tangents: NDArray, waves: NDArray, weights: NDArray | None) -> Information:
@@ -162,8 +195,8 @@ class _Constants:
     outside: NDArray  # (ny, nx), 1 outside, and the smallest share of information inside
     inner: _Pairs
     outer: _Pairs
-    columns: NDArray  # (s, a * b, 4 r n_wavelengths), functions times maps to columns of K and B
-    detector: NDArray  # (n_sets, a' * b', 2 r n_wavelengths), the same for H
+    columns: _Columns  # s sets, (a * b, 4 r n_wavelengths): functions times maps to columns of K and B
+    detector: _Columns  # n_sets, (a' * b', 2 r n_wavelengths), the same for H
     turns: tuple[NDArray[np.complex128], ...]  # (n_masks, n) for each wavelength: factors of the cores of a mask
 
 
@@ -207,7 +240,7 @@ class Information:
             _accumulate(pairs, [along[i] * weighted[j] for i, j in _pairs_of(n_sets)])
             _accumulate(local, [change[i] * seen[j] for i in unknowns for j in unknowns])
             _accumulate(mixed, [along[s][(..., *window)] * seen[c] for s in range(n_sets) for c in unknowns])
-        gram = _congruent(constants.outer.gram(xp.stack(pairs, axis=1), xp), constants.detector, xp)
+        gram = constants.detector.congruent(constants.outer.gram(xp.stack(pairs, axis=1), xp), constants.kind)
         scale = xp.sum(local[0], axis=(-2, -1))[:, np.newaxis, np.newaxis] / constants.n_points
         blocks = [local[c * n_unknowns : (c + 1) * n_unknowns] for c in unknowns]
         for c in unknowns:
@@ -225,7 +258,8 @@ class Information:
         local = _inverse_blocks(self.local, damping)
         scaled = [_times(local, one) for one in self.sets]
         pairs = [_dot(self.sets[i], scaled[j]) for i, j in _pairs_of(len(self.sets))]
-        capacitance = _congruent(constants.inner.gram(xp.stack(pairs, axis=1), xp), constants.columns, xp)
+        products = constants.inner.gram(xp.stack(pairs, axis=1), xp)
+        capacitance = constants.columns.congruent(products, constants.kind)
         rank = self.gram.shape[-1]
         eye = constants.kind.array(np.eye(rank))
         capacitance[:, :rank, rank:] += eye
@@ -249,9 +283,8 @@ class Information:
         constants, xp = self.constants, self.constants.kind.xp
         flat = xp.reshape(modes, (modes.shape[0], -1))
         local = xp.reshape(self.local[0][0], (self.gram.shape[0], 1, -1))
-        columns: Any = 0  # (k, m, 4 r), products of the columns of K and B with the modes
-        for one, matrix in zip(self.sets, constants.columns, strict=True):
-            columns = columns + constants.inner.project(modes * one[0][:, np.newaxis, ...], xp) @ matrix
+        seen = [constants.inner.project(modes * one[0][:, np.newaxis, ...], xp) for one in self.sets]
+        columns = constants.columns.products(seen, constants.kind)  # (k, m, 4 r), of K and B with the modes
         rank = self.gram.shape[-1]
         inputs, mixed = columns[..., :rank], columns[..., rank:]
         cross = mixed @ xp.matrix_transpose(inputs)
@@ -260,14 +293,9 @@ class Information:
 
     def _project(self, unknowns: list[NDArray]) -> NDArray:
         """Products of the columns of K and B with maps of the unknowns: (k, 4 r)."""
-        inner, xp = self.constants.inner, self.constants.kind.xp
-        return reduce(
-            add,
-            (
-                inner.project(_dot(one, unknowns), xp) @ x
-                for one, x in zip(self.sets, self.constants.columns, strict=True)
-            ),
-        )
+        constants = self.constants
+        seen = [constants.inner.project(_dot(one, unknowns), constants.kind.xp) for one in self.sets]
+        return constants.columns.products(seen, constants.kind)
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,15 +324,15 @@ class Inverse:
         xp, columns = constants.kind.xp, constants.columns
         inverse = xp.linalg.inv(self.capacitance)
         forms = []
-        for i, j in _pairs_of(len(columns)):
-            block = columns[i, ...] @ inverse[:, :-1, :-1] @ columns[j, ...].T
+        for i, j in _pairs_of(len(columns.blocks)):
+            block = columns.blocks[i] @ inverse[:, columns.spans[i], columns.spans[j]] @ columns.blocks[j].T
             forms.append(block if i == j else block + xp.matrix_transpose(block))  # a form of a symmetric matrix
         maps = constants.inner.forms(xp.stack(forms, axis=1), xp)
         cross = self._expand(xp.concat([inverse[:, :-1, -1], 0 * inverse[:, :1, -1]], axis=1))
         variance = []
         for c, (own, one) in enumerate(zip(self.piston, cross, strict=True)):
             total = self.local[c][c] - own * (2 * one + inverse[:, -1:, -1:] * own)
-            for index, (i, j) in enumerate(_pairs_of(len(columns))):
+            for index, (i, j) in enumerate(_pairs_of(len(columns.blocks))):
                 total = total - self.scaled[i][c] * self.scaled[j][c] * maps[:, index, ...]
             variance.append(total)
         variance[0] = variance[0] - 1 / (info.scale * constants.n_points)
@@ -315,8 +343,8 @@ class Inverse:
         """Sum of the columns times the inverse of the diagonal: (k, 4 r + 1) to a list of maps."""
         constants = self.information.constants
         total = [weights[:, -1:, np.newaxis] * one for one in self.piston]
-        for one, matrix in zip(self.scaled, constants.columns, strict=True):
-            wave = constants.inner.expand(weights[:, :-1] @ matrix.T, constants.kind.xp)
+        for one, block, span in zip(self.scaled, constants.columns.blocks, constants.columns.spans, strict=True):
+            wave = constants.inner.expand(weights[:, span] @ block.T, constants.kind.xp)
             _accumulate(total, [new * wave for new in one])
         return total
 
@@ -378,12 +406,3 @@ def _inverse_blocks(blocks: list[list[NDArray]], damping: NDArray | float) -> li
     second, cross = blocks[1][1] + damping, blocks[0][1]
     determinant = first * second - cross * cross
     return [[second / determinant, -cross / determinant], [-cross / determinant, first / determinant]]
-
-
-def _congruent(pairs: NDArray, columns: NDArray, xp: Any) -> NDArray:
-    """Return X^T Q X of columns X, (s, n, m), for all pairs of sets: Q of (k, pairs, n, n) to (k, m, m)."""
-    total: Any = 0
-    for index, (i, j) in enumerate(_pairs_of(columns.shape[0])):
-        part = columns[i, ...].T @ pairs[:, index, ...] @ columns[j, ...]
-        total = total + (part if i == j else part + xp.matrix_transpose(part))
-    return total

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -255,19 +256,41 @@ def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | No
         raise ValueError(
             f"diameter = {optics.diameter:g} lambda/D: expected at most {registered.diameter:.4g} (pixels of D)"
         )
+    return reduce_with(clear_light(registered, optics.pupil_background), registered, optics, margin)
+
+
+class ClearLight(NamedTuple):
+    """What the clear frames give: the pupil, and the units of the frames."""
+
+    pupil: Pupil
+    rest: NDArray[np.float64]  # see `Measurement`
+    bad: NDArray[np.bool_]  # (ny, nx), points of the pupil at which a clear frame has a bad pixel
+    counts: NDArray[np.float64]  # (2,), see `Measurement`
+    background: NDArray[np.float64]  # (4,), see `Measurement`
+
+
+def clear_light(registered: RegisteredFrames, pupil_background: float) -> ClearLight:
+    """Amplitude of the pupil, and units of the frames, from the clear frames alone."""
     n, center = registered.n_pixels, registered.center
-    (frames, bad), (clear, clear_bad) = registered._on_grid(FRAMES, margin), registered._on_grid(CLEAR_FRAMES)
+    clear, bad = registered._on_grid(CLEAR_FRAMES)
     background = _backgrounds(registered) if registered.background else np.zeros(4)
-    frames, clear = frames - background[:2, None, None], clear - background[2:, None, None]
     stop = radius((n, n), center) <= registered.diameter / 2
-    light, scale = mean_light(clear, stop)
-    light = np.where(stop, np.maximum(light - optics.pupil_background, 0), 0)
+    light, scale = mean_light(clear - background[2:, None, None], stop)
+    light = np.where(stop, np.maximum(light - pupil_background, 0), 0)
     amplitude = _amplitude(light, registered.diameter)
     pupil = Pupil.from_amplitude(amplitude, registered.diameter, center, _DARK)
     unit = float(np.mean(amplitude[pupil.inside] ** 2))
     rest = np.where(pupil.inside, light / unit - pupil.amplitude**2, 0)
+    return ClearLight(pupil, rest, bad.any(axis=0) & pupil.inside, scale * unit, background)
+
+
+def reduce_with(clear: ClearLight, registered: RegisteredFrames, optics: Optics, margin: int) -> Measurement:
+    """Bring the frames on the grid of the pupil and normalise them, see `reduce_frames`."""
+    pupil, counts, n = clear.pupil, clear.counts, registered.n_pixels
+    frames, bad = registered._on_grid(FRAMES, margin)
+    frames = frames - clear.background[:2, None, None]
     inner = (..., slice(margin, margin + n), slice(margin, margin + n))
-    bad[inner] |= clear_bad.any(axis=0) & pupil.inside
+    bad[inner] |= clear.bad
     good = pupil.inside & ~bad[inner].any(axis=0)
     n_bad = pupil.n_points - np.count_nonzero(good)
     if n_bad > _MOST_BAD * pupil.n_points:
@@ -275,7 +298,6 @@ def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | No
             f"{n_bad} of the {pupil.n_points} points of the pupil are bad or saturated: "
             f"expected at most {_MOST_BAD:.0%}"
         )
-    counts = scale * unit
     intensity = frames / (counts[:, None, None] * registered.exposure)
     flux = intensity[inner][:, good].mean(axis=1)
     if np.any(flux <= 0):
@@ -283,8 +305,10 @@ def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | No
     if registered.balance and optics.opposite:
         intensity = intensity * (flux.mean() / flux)[:, None, None]
     flux = flux * counts
-    ratio = flux[0] / flux[1], scale[0] / scale[1]
-    return Measurement(registered, optics, intensity, pupil, rest, bad, margin, counts, background, ratio)
+    ratio = flux[0] / flux[1], counts[0] / counts[1]
+    return Measurement(
+        registered, optics, intensity, pupil, clear.rest, bad, margin, counts, clear.background, ratio
+    )
 
 
 def mean_light(images: NDArray, inside: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

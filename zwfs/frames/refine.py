@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,17 @@ from scipy import optimize
 
 from zwfs import _check
 from zwfs.frames.pipeline import (
+    ClearLight,
     MeasuredPhase,
+    Measurement,
     Optics,
+    clear_light,
     near_edges,
     predict_other,
     prediction_error,
     recover_phase,
     reduce_frames,
+    reduce_with,
     upside_down,
 )
 from zwfs.frames.registration import Image, RegisteredFrames, register_frames
@@ -96,29 +101,45 @@ def fit(
     seen[before.window] &= far | ~before.pupil.inside
     unseen = far & ~even[before.window]
 
-    def trial(unknowns: NDArray) -> tuple[RegisteredFrames, Optics]:
+    def moved(shifts: tuple[float, ...]) -> RegisteredFrames:
         origins = registered.origins.copy()
-        origins[images] += unknowns[len(values) :].reshape(-1, 2)
-        changes: dict[str, Any] = dict(zip(values, unknowns.tolist(), strict=False))
-        return replace(registered, origins=origins), replace(optics, **changes)
+        origins[images] += np.reshape(shifts, (-1, 2))
+        return replace(registered, origins=origins)
 
-    def residuals(unknowns: NDArray) -> NDArray:
+    # Few trials change the clear frames: only the last of the images is one.
+    @lru_cache(maxsize=1)
+    def clear(shift: tuple[float, ...], pupil_background: float) -> ClearLight:
+        return clear_light(moved((0.0,) * (n_shifts - len(shift)) + shift), pupil_background)
+
+    def trial(unknowns: tuple[float, ...]) -> Measurement:
+        changes: dict[str, Any] = dict(zip(values, unknowns, strict=False))
+        changed, shifts = replace(optics, **changes), unknowns[len(values) :]
+        light = clear(shifts[-2:], changed.pupil_background)
+        return reduce_with(light, moved(shifts), changed, margin)
+
+    @lru_cache(maxsize=1)  # a derivative begins where the search has just been
+    def residuals(unknowns: tuple[float, ...]) -> NDArray:
         # Finite differences need a smooth function, so no trial may end an iteration earlier than its neighbours.
-        return recover_phase(reduce_frames(*trial(unknowns), margin), n_iterations, 1e-8).mismatch[:, seen].ravel()
+        return recover_phase(trial(unknowns), n_iterations, 1e-8).mismatch[:, seen].ravel()
 
     def jacobian(unknowns: NDArray) -> NDArray:
-        base = residuals(unknowns)
+        base = residuals(tuple(unknowns.tolist()))
         around = unknowns + np.diag(np.where(unknowns + change > high, -change, change))
-        slopes = [(residuals(one) - base) / (one - unknowns)[index] for index, one in enumerate(around)]
+        slopes = [
+            (residuals(tuple(one.tolist())) - base) / (one - unknowns)[index] for index, one in enumerate(around)
+        ]
         return np.transpose(slopes)
 
-    best = optimize.least_squares(residuals, start, jacobian, bounds=(low, high), x_scale=step, max_nfev=n_steps)
-    found = trial(best.x)
-    after = reduce_frames(*found, margin)
+    best = optimize.least_squares(
+        lambda unknowns: residuals(tuple(unknowns.tolist())),
+        start, jacobian, bounds=(low, high), x_scale=step, max_nfev=n_steps,
+    )  # fmt: skip
+    after = trial(tuple(best.x.tolist()))
     old, new, control = (
         prediction_error(one, unseen, n_iterations) for one in (before, after, upside_down(after))
     )
-    return found if np.all(new < (1 - _GAIN) * np.minimum(old, control)) else (registered, optics)
+    kept = after if np.all(new < (1 - _GAIN) * np.minimum(old, control)) else before
+    return kept.registered, kept.optics
 
 
 def _check_fit(argument: str, names: Any, optics: Any) -> None:

@@ -114,7 +114,9 @@ def drawn_methods(curves, pupil, classic, shifted):
     )
     sliced = Grid({"x": np.arange(2), "screen": np.zeros(2), "error": np.ones(2)}, ("x",))
     widths = replace(curves, errors={"narrow": curves.errors["Linear"]} | curves.errors)
-    faint = PhotonCurves(three, three, dict.fromkeys(LOOKS, np.ones((3, 3, 2))), np.eye(3) + 1, np.eye(3))
+    faint = PhotonCurves(
+        three, three, dict.fromkeys(LOOKS, np.ones((3, 3, 2))), np.full((3, 3, 2), 2.0), np.eye(3)
+    )
     designs = DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5})
     step = Step("outlines", found, np.ones(2), np.zeros(2))
     banded = BandCurves(three, dict.fromkeys(bandwidth.WAYS, three[:, np.newaxis]), {}, three, 1.0)

@@ -48,21 +48,16 @@ class PhotonCurves:
     rms: NDArray[np.floating]  # (n_rms,), input, radian rms
     photons: NDArray[np.floating]  # (n_photons,), per point and image of the sensor with the bound
     errors: dict[str, NDArray[np.float64]]  # (n_rms, n_photons, n_screens), radian rms
-    bound: NDArray[np.float64]  # (n_rms, n_photons), rms over points and screens, radian
+    bound: NDArray[np.float64]  # (n_rms, n_photons, n_screens), rms over the points, radian
     within: NDArray[np.float64]  # (n_rms, n_photons), share of the points within one standard error
 
     def error(self, name: str) -> NDArray[np.float64]:
-        """Error of a reconstructor, rms over the screens, shape (n_rms, n_photons), radian rms."""
-        return np.sqrt(np.mean(self.errors[name] ** 2, axis=-1))
+        """Error of a reconstructor, median over the screens, shape (n_rms, n_photons), radian rms."""
+        return np.median(self.errors[name], axis=-1)
 
     def ratio(self, name: str) -> NDArray[np.float64]:
-        """`error` over the bound, shape (n_rms, n_photons)."""
-        return self.error(name) / self.bound
-
-    def ratio_error(self, name: str) -> NDArray[np.float64]:
-        """Standard error of `ratio`, from the scatter of the screens, shape (n_rms, n_photons)."""
-        squares = self.errors[name] ** 2
-        return squares.std(axis=-1) / np.sqrt(squares.shape[-1]) / (2 * self.error(name) * self.bound)
+        """Error over the bound, median over the screens, shape (n_rms, n_photons)."""
+        return np.median(self.errors[name] / self.bound, axis=-1)
 
     def screens(self) -> dict[str, NDArray]:
         """Input, photons and errors of every single screen, as columns for `publish`."""
@@ -95,7 +90,7 @@ def photon_curves(
         rms,
         photons,
         {name: np.reshape([one[name] for one in errors], (*shape, n_screens)) for name in errors[0]},
-        np.reshape(bound, shape),
+        np.reshape(bound, (*shape, n_screens)),
         np.reshape(within, shape),
     )
 
@@ -108,8 +103,8 @@ def _photon_point(
     n_screens: int,
     exponent: float,
     seed: int,
-) -> tuple[dict[str, NDArray], float, float]:
-    """One input and number of photons: errors (n_screens,) by name, bound, and share within one sigma."""
+) -> tuple[dict[str, NDArray], NDArray, float]:
+    """One input and number of photons: errors by name, and bound, (n_screens,), and share within one sigma."""
     (task, rms), (place, photons) = cell
     screens = screens_at(modes, rms, n_screens, seed, task, exponent)
     likely = MaximumLikelihood(sensor, photons=photons)
@@ -120,8 +115,8 @@ def _photon_point(
         estimate = method(_noisy(method.sensor, screens, share, noise))
         errors[name] = reconstruction_error(sensor.pupil, estimate.phase, screens)
     within = np.mean(_in_sigmas(sensor, estimate, screens) < 1)
-    bound = cramer_rao(sensor, screens, photons=photons)
-    return errors, float(np.sqrt(np.mean(sensor.pupil.gather(bound) ** 2))), float(within)
+    bound = sensor.pupil.gather(cramer_rao(sensor, screens, photons=photons))
+    return errors, np.sqrt(np.mean(bound**2, axis=-1)), float(within)
 
 
 class ErrorBars(NamedTuple):
@@ -194,9 +189,8 @@ def draw_photon_noise(curves: PhotonCurves) -> Figure:
         axes.axhline(1, color="#999999", lw=5, label="bound", zorder=1)  # the grid is below
         axes.axhspan(_FINE, 1.5 * max(highest, _FINE), color="#eeeeee", lw=0, zorder=0)
         for name in sorted(curves.errors, key=list(LOOKS).index):
-            look, ratio, error = LOOKS[name], curves.ratio(name)[place], curves.ratio_error(name)[place]
+            look, ratio = LOOKS[name], curves.ratio(name)[place]
             axes.semilogx(curves.photons, ratio, ms=5, label=look.label, **look.style)
-            axes.vlines(curves.photons, ratio - error, ratio + error, color=look.color, lw=1.5)
         axes.set_yscale("function", functions=(_stretch, _shrink))
         axes.set_yticks([1, 1.1, 1.2, _FINE, 10, 100], ["1", "1.1", "1.2", f"{_FINE:g}", "10", "100"])
         axes.set_ylim(0.95 * min(lowest, 0.98), 1.5 * max(highest, _FINE))
@@ -233,12 +227,12 @@ TABLED = "MaximumLikelihood", "PhaseShifted"
 
 
 def photon_noise_columns(curves: PhotonCurves) -> dict[str, NDArray]:
-    """Columns of the errors and the bound."""
+    """Columns of the errors and the bound, medians over the screens."""
     size = curves.rms.size, curves.photons.size
     grid = {
         "input (rad rms)": np.repeat(curves.rms, size[1]),
         "photons per point and image": np.tile(curves.photons, size[0]),
-        "bound: error (rad rms)": curves.bound.ravel(),
+        "bound: error (rad rms)": np.median(curves.bound, axis=-1).ravel(),
     }
     return grid | {f"{name}: error (rad rms)": curves.error(name).ravel() for name in curves.errors}
 
@@ -270,7 +264,7 @@ def _cells(first: NDArray, second: NDArray) -> list[list[str]]:
 
 def numbers(curves: PhotonCurves, rows: Sequence[ErrorBars]) -> dict[str, float | str]:
     """Numbers of the text: errors (radian), ratios and shares."""
-    bright = curves.photons >= min(100, curves.photons.max())
+    bright, bound = curves.photons >= min(100, curves.photons.max()), np.median(curves.bound, axis=-1)
     half, one = (int(np.argmin(np.abs(curves.rms - value))) for value in (0.5, 1.0))
     likely, shifted = (curves.ratio(name)[:, bright] for name in TABLED)
     right = next((row for row in rows if row.assumed == 1), rows[0])
@@ -284,8 +278,8 @@ def numbers(curves: PhotonCurves, rows: Sequence[ErrorBars]) -> dict[str, float 
             "shifted_photons": np.mean(shifted[half] ** 2) - 1,
             "arcsine_floor": curves.error("Arcsine")[half, -1],
             "saxton_floor": curves.error("GerchbergSaxton")[half, -1],
-            "bound_at_100": curves.bound[half, int(np.argmin(np.abs(curves.photons - 100)))],
-            "bound_growth": (curves.bound[one] / curves.bound[0]).mean(),
+            "bound_at_100": bound[half, int(np.argmin(np.abs(curves.photons - 100)))],
+            "bound_growth": (bound[one] / bound[0]).mean(),
             "within_low": curves.within[:, bright].min(),
             "within_high": curves.within[:, bright].max(),
             "within_right": right.within[place],

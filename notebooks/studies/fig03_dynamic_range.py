@@ -126,11 +126,11 @@ def curves_at(
 
 # Methods whose limits are refined, with the screens of each input close to the limit, over those of the curves.
 REFINED = {
-    "Linear": 10,
-    "Arcsine": 10,
-    "PhaseShifted": 10,
-    "GerchbergSaxtonModel": 2,
-    "GradientDescent": 1,
+    "Linear": 3,
+    "Arcsine": 3,
+    "PhaseShifted": 3,
+    "GerchbergSaxtonModel": 1,
+    "GradientDescent": 0.5,
 }
 
 
@@ -139,7 +139,7 @@ def error_limits(
     modes: NDArray | Screens,
     curves: LinearityCurves,
     threshold: float,
-    more: Mapping[str, int] = REFINED,
+    more: Mapping[str, float] = REFINED,
     **settings: Any,
 ) -> dict[str, Limit]:
     """Input at which each mean error exceeds `threshold` times the input; those of `more` from other screens.
@@ -149,7 +149,7 @@ def error_limits(
     limits = {name: Limit(curves.dynamic_range(name, threshold)) for name in curves.errors}
 
     def refined(name: str) -> Limit:
-        method, n_screens = {name: reconstructors[name]}, more[name] * curves.strehl.shape[1]
+        method, n_screens = {name: reconstructors[name]}, round(more[name] * curves.strehl.shape[1])
 
         def ratios(rms: NDArray) -> NDArray:
             tried = linearity_curves(method, modes, rms, n_screens, first_task=1000, **settings)
@@ -306,7 +306,7 @@ def _reach(curves: LinearityCurves, name: str, threshold: float, limit: Limit) -
     """Inputs above 0 at which an error stays within the threshold, in words."""
     bright = curves.rms > 0
     rms, error = curves.rms[bright], curves.mean(name)[bright]
-    return reach_text(rms, error, threshold * rms, limit, f"{percent(threshold)} of the input")
+    return reach_text(rms, error, threshold * rms, f"{limit.value:.2g}", f"{percent(threshold)} of the input")
 
 
 def _place(curves: LinearityCurves, limit: Limit) -> str:
@@ -379,13 +379,11 @@ def work_table(passes: Mapping[str, int]) -> Table:
 def _phrases(curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float) -> dict[str, str]:
     """Sentences, and parts of them, that hold for any parameters: a limit need not exist."""
     rms, gain = curves.rms, limits["PhaseShifted"].over(limits["Linear"])
-    both = np.maximum(curves.mean("PhaseShifted"), curves.mean("GradientDescent")) < 1e-6
-    alike = rms[both].max(initial=0)
-    onset = _wrap_onset(curves)
+    alike, onset = _alike_up_to(curves), _wrap_onset(curves)
     return {
         "linear_reach": _reach(curves, "Linear", threshold, limits["Linear"]),
         "shifted_reach": _reach(curves, "PhaseShifted", threshold, limits["PhaseShifted"]),
-        "gain_text": f", {gain} times as far" if 0 < gain.value < np.inf else "",
+        "gain_text": f", {gain.value:.2g} times as far" if 0 < gain.value < np.inf else "",
         "alike_text": f"Up to {alike:.2g} rad rms its error is below 10⁻⁶ rad, like that of the iteration."
         if alike
         else "Its error and that of the iteration are not below 10⁻⁶ rad.",
@@ -411,12 +409,17 @@ def steep_numbers(curves: LinearityCurves, limits: Mapping[str, Limit]) -> dict[
         {
             "steep_linear": linear.value,
             "steep_arcsine": arcsine.value,
-            "steep_arcsine_error": arcsine.error,
             "steep_shifted": shifted.value,
             "steep_gain": shifted.over(linear).value,
             "steep_wrap_onset": _wrap_onset(curves),
         }
     )
+
+
+def _alike_up_to(curves: LinearityCurves) -> float:
+    """Largest input up to which the errors of the iteration and of descent on modes are below 1e-6 rad, or 0."""
+    both = np.maximum(curves.mean("PhaseShifted"), curves.mean("GradientDescent")) < 1e-6
+    return float(curves.rms[np.logical_and.accumulate(both)].max(initial=0))
 
 
 def _wrap_onset(curves: LinearityCurves) -> float:
@@ -444,7 +447,7 @@ def numbers(
     usual, wide = methods["GerchbergSaxton"].sensor, variants[widest].sensor
     tenth, half, one = (int(np.argmin(np.abs(rms - value))) for value in (0.1, 0.5, 1.0))
     offset, offset_widest = mean["GerchbergSaxton"][tenth], by_width.mean(widest)[0]
-    alike = rms[np.maximum(mean["PhaseShifted"], mean["GradientDescent"]) < 1e-6].max(initial=0)
+    alike = _alike_up_to(curves)
     low = (rms > 0) & (rms <= 0.3)
     with_wraps = np.mean(curves.wrapped > 0, axis=1)
     recovered = {name: curves.recovered(name, threshold)[one] for name in curves.errors}
@@ -481,8 +484,8 @@ def numbers(
         "rank": methods["PhaseShifted"].sensor.rank,
     }
     for name, short in _SHORT.items():
-        found |= {f"{short}_limit": limits[name].value, f"{short}_limit_error": limits[name].error}
+        found[f"{short}_limit"] = limits[name].value
     found |= _phrases(curves, limits, threshold)
-    found |= {"saxton_model_limit_longer": longer.value, "saxton_model_limit_longer_error": longer.error}
+    found["saxton_model_limit_longer"] = longer.value
     found["saxton_model_reach_longer"] = _reach(by_width, repaired, threshold, longer)
     return rounded(found)

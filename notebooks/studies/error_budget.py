@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from studies.fig06_reference import UNITS
 from studies.kit import sweeps
-from studies.kit.bench import BenchCurves, bench_curves, bench_reconstructors, check_bench
+from studies.kit.bench import BenchCurves, bench_curves, check_bench
 from studies.kit.parameters import bench_fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS
 from studies.kit.tables import Table
 from zwfs.bench import Bench, BenchModel
+from zwfs.reconstructors import PhaseShifted
 
 LIMITS = parameter_limits(
     "inputs n_screens n_iterations",
@@ -33,27 +34,19 @@ Curves = Mapping[str, BenchCurves]  # by the error that is switched on
 
 
 def error_budget(
-    benches: Mapping[Any, Bench],
-    names: Sequence[str],
-    rms: ArrayLike,
-    n_screens: int,
-    *,
-    n_iterations: int = 25,
-    seed: int = 0,
+    benches: Mapping[Any, Bench], rms: ArrayLike, n_screens: int, *, n_iterations: int = 25, seed: int = 0
 ) -> dict[Any, BenchCurves]:
-    """Curves of benches that differ in their errors, each with its model and reconstructors."""
-    shared = list(names), np.asarray(rms, dtype=float), n_screens, n_iterations, seed
+    """Curves of the phase-shifted iteration on benches that differ in their errors, each with its own model."""
+    shared = np.asarray(rms, dtype=float), n_screens, n_iterations, seed
     curves = sweeps.run(_bench_case, benches.values(), *shared, name="error_budget")
     return dict(zip(benches, curves, strict=True))
 
 
-def _bench_case(
-    bench: Bench, names: Sequence[str], rms: NDArray, n_screens: int, n_iterations: int, seed: int
-) -> BenchCurves:
-    """Model one bench, build its reconstructors, and return their curves."""
+def _bench_case(bench: Bench, rms: NDArray, n_screens: int, n_iterations: int, seed: int) -> BenchCurves:
+    """Curves of one bench."""
     model = BenchModel.from_images(bench, seed)
-    methods = bench_reconstructors(bench, model, n_iterations=n_iterations, seed=seed)
-    return bench_curves(bench, model, {name: methods[name] for name in names}, rms, n_screens, seed=seed)
+    methods = {NAME: PhaseShifted(model.shifted, n_iterations=n_iterations)}
+    return bench_curves(bench, model, methods, rms, n_screens, seed=seed)
 
 
 def effects(budget: Curves, name: str = NAME) -> tuple[NDArray, NDArray, NDArray]:

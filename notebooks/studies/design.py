@@ -34,7 +34,9 @@ LIMITS = parameter_limits(
 )
 QUICK = {"n_pixels": 32, "n_screens": 2, "step": 0.4, "n_angles": 7}
 
-_TOLERANCE = 1e-4  # of the model of the sensor: changes the bound by less than 1e-3, and is several times faster
+# Tolerances of the model of the sensor, for dimples up to 3 lambda/D and for larger ones, which take most of the
+# time. They change costs below 10 by less than 1e-3.
+_TOLERANCES = 1e-4, 1e-3
 
 
 class Design(NamedTuple):
@@ -124,7 +126,7 @@ def _row(
 def _costs(pupil: Pupil, design: Design, screens: Mapping[str, NDArray]) -> dict[str, float]:
     """Photon cost of one design, by the name of the wavefronts."""
     masks = [Dimple(design.diameter, theta) for theta in design[2:]]
-    sensor = ZernikeSensor(pupil, *masks, tolerance=_TOLERANCE)
+    sensor = ZernikeSensor(pupil, *masks, tolerance=_TOLERANCES[design.diameter > 3])
     together = np.concatenate(list(screens.values()))
     bounds = pupil.gather(cramer_rao(sensor, together, photons=1 / sensor.n_masks))
     ends = np.cumsum([len(phases) for phases in screens.values()])[:-1]

@@ -149,7 +149,7 @@ def error_limits(
     limits = {name: Limit(curves.dynamic_range(name, threshold)) for name in curves.errors}
 
     def refined(name: str) -> Limit:
-        method, n_screens = {name: reconstructors[name]}, round(more[name] * curves.strehl.shape[1])
+        method, n_screens = {name: reconstructors[name]}, max(1, round(more[name] * curves.strehl.shape[1]))
 
         def ratios(rms: NDArray) -> NDArray:
             tried = linearity_curves(method, modes, rms, n_screens, first_task=1000, **settings)

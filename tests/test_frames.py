@@ -161,6 +161,16 @@ def test_background_and_flux_are_measured(recorded):
     assert measurement.counts[0] * light == pytest.approx(COUNTS * pupil.n_points, rel=0.02)
 
 
+def test_longer_exposure_of_the_frames_has_more_light_and_more_background(recorded):
+    """The background is that around the pupils of the clear frames, which were exposed for a third of the time."""
+    _, masked, bare = recorded
+    usual = reduce_frames(register_frames([image(masked)], [image(bare)]), Optics())
+    longer = reduce_frames(register_frames([image(3.0 * masked)], [image(bare)], exposure=3.0), Optics())
+    np.testing.assert_allclose(longer.background, [1500, 1500, 500, 500], rtol=0.02)
+    np.testing.assert_allclose(longer.intensity, usual.intensity, atol=1e-9)
+    assert longer.flux_ratio == pytest.approx(usual.flux_ratio)
+
+
 @pytest.mark.parametrize("balance", [False, True])
 def test_balance_gives_both_frames_the_same_light_in_the_pupil(recorded, balance):
     _, masked, bare = recorded
@@ -379,6 +389,8 @@ def test_bench_writes_what_the_pipeline_reads(tmp_path):
 
 def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
     _, masked, bare = recorded
+    masked = masked.copy()
+    masked[:, 92:] = 500 + 0.9 * (masked[:, 92:] - 500)  # its second image has less light than that without a mask
     bad = np.zeros(masked.shape, bool)
     bad[40, 50] = True
     registered = register_frames([image(masked, bad=bad)], [image(bare)])
@@ -396,7 +408,11 @@ def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
         assert units["BAD"].data.sum() == found.measurement.n_bad == header["NBAD"] > 0
         assert (header["BUNIT"], units["PHASE_NM"].header["BUNIT"]) == ("rad", "nm")
         assert (header["WAVELEN"], header["DIMPLE"]) == (635, 1.1)
-        assert header["CORR1"] == pytest.approx(found.correlation[0])
+        assert [header[f"CORR{i}"] for i in (1, 2)] == pytest.approx([*found.correlation])
+        left, right = (np.split(frame - 500, 2, axis=1) for frame in (masked, bare))
+        light = [first.sum() / second.sum() for first, second in (left, right)]
+        assert [header["FLUXMASK"], header["FLUXOUT"]] == pytest.approx(light, rel=0.02)
+        assert [header["ROW2"] - header["ROW1"], header["COL2"] - header["COL1"]] == pytest.approx(SECOND, abs=0.1)
         assert (header["FILE1"], header["SHA1"], header["DATE-OBS"]) == ("frame.fits", "ab" * 32, "2023-05-01")
         assert header["CREATOR"].startswith("zwfs ")
     with pytest.raises(ValueError, match="wavelength = 0"):

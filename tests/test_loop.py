@@ -15,6 +15,7 @@ from zwfs import (
     hold_drift,
     zernike_basis,
 )
+from zwfs.loop import LoopRecord
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +111,16 @@ def test_photons_of_each_cycle_are_counted(mirror, modes, sensor, shifted):
     assert record.photons.mean() == pytest.approx(expected, rel=0.02)
     with pytest.raises(ValueError, match="read-only"):
         record.photons[0, 0] = 1
+
+
+def test_settled_residual_is_that_of_the_last_cycles():
+    residual = np.array([[0.5, 0.4, 0.3, 0.1], [0.2, 0.2, 0.2, 0.6]])
+    record = LoopRecord(residual, residual, residual, residual[..., np.newaxis], residual)
+    np.testing.assert_allclose(record.settled(1), [0.1, 0.6])
+    np.testing.assert_allclose(record.settled(2), np.sqrt([(0.3**2 + 0.1**2) / 2, (0.2**2 + 0.6**2) / 2]))
+    np.testing.assert_allclose(record.settled(4), np.sqrt(np.mean(residual**2, axis=1)))
+    with pytest.raises(ValueError, match="n_cycles = 5"):
+        record.settled(5)
 
 
 def test_a_ramp_lags_by_the_speed_over_the_gain(mirror, modes, sensor, shifted):

@@ -136,6 +136,24 @@ def test_fourier_modes_have_their_frequency(pupil):
     assert mode_frequencies(pupil, wave[np.newaxis])[0] == pytest.approx(np.hypot(5, 3), rel=0.1)
 
 
+def test_fourier_modes_are_cosine_and_sine_of_every_frequency_by_growing_frequency():
+    """On a square of whole cycles, where the Fourier transform of a mode is a line at its frequency."""
+    pupil = Pupil.from_amplitude(np.ones((24, 24)))
+    modes = fourier_basis(pupil, 68)
+    power = np.abs(np.fft.fft2(modes)).reshape(68, -1) ** 2
+    lines = (power > 0.4 * power.sum(axis=1, keepdims=True)).argmax(
+        axis=1
+    )
+    cycles = np.fft.fftfreq(24, 1 / 24)
+    frequencies = np.hypot(cycles[:, np.newaxis], cycles).ravel()
+    np.testing.assert_allclose(frequencies[lines], np.sort(frequencies)[1:69])
+    np.testing.assert_array_equal(lines[::2], lines[1::2])
+    assert len(set(lines)) == 34
+    # Even and odd about the middle of the pupil.
+    np.testing.assert_allclose(modes[::2], modes[::2, ::-1, ::-1], atol=1e-9)
+    np.testing.assert_allclose(modes[1::2], -modes[1::2, ::-1, ::-1], atol=1e-9)
+
+
 @pytest.mark.parametrize(
     "made", [fourier_basis, lambda p, n: zernike_basis(p, n)[::-1], lambda p, n: zernike_basis(p, n + 3)[3:]]
 )

@@ -56,6 +56,15 @@ def test_variances_of_noll(pupil, kolmogorov):
     np.testing.assert_allclose(residuals[[1, 2, 4, 9]], [0.134, 0.111, 0.0648, 0.0401], rtol=0.06)
 
 
+def test_screens_are_independent_of_each_other(pupil, kolmogorov):
+    """Two screens come from one transform: the tilts, which are added, and all other modes."""
+    modes = pupil.gather(zernike_basis(pupil, 10))
+    coefficients = pupil.gather(kolmogorov) @ modes.T
+    for first, second in ((coefficients[::2], coefficients[1::2]), (coefficients[1:-1:2], coefficients[2::2])):
+        between = np.corrcoef(first, second, rowvar=False)[:10, 10:]
+        assert np.abs(between).max() < 4.5 / np.sqrt(len(first))
+
+
 @pytest.mark.parametrize(("n_pixels", "n_modes", "outer_scale"), [(24, 60, inf), (24, 60, 2.0), (28, 15, 2.0)])
 def test_karhunen_loeve_modes_are_all_eigenvectors_of_the_covariance(n_pixels, n_modes, outer_scale):
     """Against a dense solution, in which modes of equal variance, such as the two tilts, are all present.

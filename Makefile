@@ -71,10 +71,10 @@ test-fast: $(READY) ## test the package only, in about 3 minutes
 	$(BIN)/python -m pytest $(QUICK) $$(grep -LE "ROOT|book|notebooks|studies" tests/test_*.py)
 
 test-slow: $(READY) ## the rest of the tests: real builds of the book, kills, clusters, long fits, full books in a browser
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --benchmark-disable -m slow tests
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --benchmark-disable -m "slow and not fuzz" tests
 
-fuzz: $(READY) ## try 1000 new camera files, calibrations and parameters for each property, in about 10 minutes
-	$(BIN)/python -m pytest --numprocesses auto --hypothesis-profile fuzz tests/test_fuzzing.py
+fuzz: $(READY) ## try 1000 new camera files and options for each property, and each odd parameter of a notebook alone
+	$(BIN)/python -m pytest --numprocesses auto --hypothesis-profile fuzz tests/test_fuzzing.py tests/test_truth.py
 
 figures: $(READY) ## replace the committed notebooks by freshly run ones
 	@$(BIN)/python -m book._tools figures

@@ -276,14 +276,33 @@ CASES["own_frames"] = (
 )
 LONG = {"calibration", "decision"}
 COSTLY = {name for name in CASES if name not in ("zernike_sensor", "at_a_glance", "identities")}
+
+
+def packed(odds):
+    """Odd values of different parameters together: every value is in one of few sets."""
+    packs = []
+    for odd in odds:
+        free = next((pack for pack in packs if not pack.keys() & odd.keys()), None)
+        if free is None:
+            packs.append(free := {})
+        free.update(odd)
+    return packs
+
+
+def marks(name, place):
+    return [pytest.mark.slow] if name in LONG or (name in COSTLY and place) else []
+
+
 SETS = [
-    pytest.param(name, base | odd, marks=[pytest.mark.slow] if name in LONG or (name in COSTLY and place) else [])
+    pytest.param(name, base | pack, marks=marks(name, place))
     for name, (base, *odds) in CASES.items()
-    for place, odd in enumerate(odds)
+    for place, pack in enumerate([odds[0], *packed(odds[1:])])
 ]
+FUZZ = pytest.mark.slow, pytest.mark.fuzz
+ALONE = [(name, base | odd) for name, (base, *odds) in CASES.items() for odd in odds[1:]]
 
 
-@pytest.mark.parametrize(("name", "given"), SETS)
+@pytest.mark.parametrize(("name", "given"), [*SETS, *(pytest.param(*one, marks=FUZZ) for one in ALONE)])
 @pytest.mark.filterwarnings("ignore")  # of phases beyond what a sensor resolves
 def test_text_of_odd_parameters_names_no_limit_that_does_not_exist(name, given, monkeypatch):
     text, tables = run(name, given, monkeypatch)

@@ -25,13 +25,17 @@ class ReleaseError(ToolError):
 
 
 def release_check(project: Project) -> None:
-    """Build the package, test it in an empty environment, check the changelog and what notebooks import."""
+    """Build the package, test it in an empty environment, check the changelog and what notebooks import.
+
+    All unit tests are collected, which imports what they need, and those of the core run, with all examples.
+    """
     version = about(project)["version"]
     check_changelog((project.root / "CHANGELOG.md").read_text("utf-8"), version)
     with scratch_folder(project.build, "releasing-") as scratch:
         wheel, _ = build(project, version, scratch / "dist")
         python = environment(project, scratch / "env", f"zwfs[test] @ {wheel.as_uri()}")
-        test(project, python, scratch, unit_tests(project))
+        test(project, python, scratch, unit_tests(project), "-q", "--collect-only")
+        test(project, python, scratch, core_tests(), "--doctest-modules")
         check_imports(project, wheel, scratch / "notebooks")
         swap(scratch / "dist", project.build / "dist", scratch / "earlier")
     print(f"zwfs {version} can be released: _build/dist")
@@ -50,7 +54,7 @@ def pythons(project: Project, asked: list[str]) -> None:
         with scratch_folder(project.build, "releasing-") as scratch:
             wheel, _ = build(project, about(project)["version"], scratch / "dist")
             python = environment(project, scratch / "env", f"zwfs[test] @ {wheel.as_uri()}", found, lowest)
-            test(project, python, scratch, [f"tests/test_{name}.py" for name in CORE], "--doctest-modules")
+            test(project, python, scratch, core_tests(), "--doctest-modules")
         print(f"Python {name}: passed")
 
 
@@ -121,10 +125,16 @@ def unit_tests(project: Project) -> list[str]:
     return [f"tests/{file.name}" for file in files if not READS_CHECKOUT.search(file.read_text("utf-8"))]
 
 
+def core_tests() -> list[str]:
+    """Return the tests of the sensor and of what it stands on."""
+    return [f"tests/test_{name}.py" for name in CORE]
+
+
 def test(project: Project, python: Path, scratch: Path, files: list[str], *options: str) -> None:
     """Run tests against an installed package, in a folder without its source."""
     place = scratch / "tests-only"
-    shutil.copytree(project.root / "tests", place / "tests", ignore=shutil.ignore_patterns("__pycache__"))
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(project.root / "tests", place / "tests", ignore=ignored, dirs_exist_ok=True)
     shutil.copy(project.root / "pyproject.toml", place)
     examples = ["--pyargs", "zwfs"] if "--doctest-modules" in options else []
     ask = [str(python), "-c", "import zwfs; print(zwfs.__file__)"]

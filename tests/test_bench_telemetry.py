@@ -1,15 +1,18 @@
 """Telemetry of a bench that was calibrated with known commands, on frames that HCIPy simulates."""
 
+import functools
+import io
 import sys
 import warnings
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from scipy import ndimage
 
 from zwfs import Linear, zernike_basis
 from zwfs._images import nearest_good
-from zwfs.frames import Calibration, calibrate, fit_bench, pipeline, reconstruct, registration
+from zwfs.frames import Calibration, _calibrate, calibrate, fit_bench, pipeline, reconstruct, registration
 from zwfs.frames.__main__ import main
 from zwfs.frames._calibrate import _read_states, _windows
 
@@ -71,9 +74,51 @@ def taken():
     return Recorded(12, 4, 0.4, pixels=24, side=32)
 
 
+def wide(pairs):
+    """Pairs of images as one image with both pupils on it."""
+    return np.concatenate([pairs[..., 0, :, :], pairs[..., 1, :, :]], axis=-1)
+
+
 @pytest.fixture(scope="module")
-def calibration(taken):
-    return taken.calibration(n_steps=4)
+def files(taken, tmp_path_factory):
+    """Folder with files of the bench: two exposures of each state, a dark, and unseen screens."""
+    folder = tmp_path_factory.mktemp("bench")
+    arrays = {
+        "frames": 200 + wide(np.repeat(taken.frames, 2, axis=0)),
+        "clear": 200 + wide(np.stack([taken.clear] * 2)),
+        "dark": np.full(wide(taken.clear).shape, 200.0),
+        "commands": taken.phases,
+        "unseen": 200 + wide(taken.unseen),
+    }
+    for name, array in arrays.items():
+        np.save(folder / f"{name}.npy", array)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def command(taken, files):
+    """Calibration that the command makes with known commands, and what it says."""
+    side, said = taken.bench.side, io.StringIO()
+    said.isatty = lambda: True
+    centers = [str(place) for place in (side / 2 - 0.5, side / 2 - 0.5, side / 2 - 0.5, 1.5 * side - 0.5)]
+    names = ["--frames", "frames.npy", "--pupils", "clear.npy", "--dark", "dark.npy", "--commands", "commands.npy"]
+    known = ["--pupil-centers", *centers, "--pupil-diameter", "24", "--noise", str(taken.bench.noise)]
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(action="ignore"):
+        patch.chdir(files)
+        patch.setattr(sys, "stderr", said)
+        patch.setattr(_calibrate, "fit_bench", functools.partial(fit_bench, n_steps=4, oversampling=2))  # quick
+        assert main(["calibrate", "bench.npz", *names, *known]) == 0
+    return Calibration.load(files / "bench.npz"), said.getvalue()
+
+
+@pytest.fixture(scope="module")
+def calibration(command):
+    return command[0]
+
+
+@pytest.fixture(scope="module")
+def found(taken, calibration):
+    return calibration(wide(np.where(taken.bad, np.nan, taken.unseen)))
 
 
 def test_quick_calibration_needs_no_flat_mirror(taken):
@@ -85,8 +130,7 @@ def test_quick_calibration_needs_no_flat_mirror(taken):
     assert rms(change, np.isfinite(change).all(axis=0)) < 0.02
 
 
-def test_phases_are_better_than_those_of_the_quick_calibration(taken, calibration):
-    found = calibration(np.where(taken.bad, np.nan, taken.unseen))
+def test_phases_are_better_than_those_of_the_quick_calibration(taken, found):
     assert not found.flags.any()
     quick, corner = taken.quick()
     before = taken.errors(quick(taken.unseen).phase, corner)
@@ -95,8 +139,7 @@ def test_phases_are_better_than_those_of_the_quick_calibration(taken, calibratio
     assert rms(after, lit) < 0.03
 
 
-def test_error_bars_hold_for_points_and_modes(taken, calibration):
-    found = calibration(np.where(taken.bad, np.nan, taken.unseen))
+def test_error_bars_hold_for_points_and_modes(taken, calibration, found):
     errors, lit = taken.errors(found.phase), taken.bench.fully_lit
     photons, noise = calibration.unit.mean(), taken.bench.noise
     inner = ndimage.binary_erosion(lit, iterations=2)
@@ -108,34 +151,15 @@ def test_error_bars_hold_for_points_and_modes(taken, calibration):
     assert 0.6 < np.sqrt(np.mean((left / calibration.sigma(found, photons, noise, modes)) ** 2)) < 1.6
 
 
-def test_command_calibrates_with_known_commands(tmp_path, monkeypatch, capsys, taken, calibration):
+def test_command_calibrates_with_known_commands(files, command, found):
     """Both pupils on one image, two exposures of each state, and a dark."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-
-    def wide(pairs):
-        return np.concatenate([pairs[..., 0, :, :], pairs[..., 1, :, :]], axis=-1) + 200.0
-
-    np.save("frames.npy", wide(np.repeat(taken.frames, 2, axis=0)))
-    np.save("clear.npy", wide(np.stack([taken.clear] * 2)))
-    np.save("dark.npy", np.full(wide(taken.clear).shape, 200.0))
-    np.save("commands.npy", taken.phases)
-    np.save("unseen.npy", wide(taken.unseen))
-    side = taken.bench.side
-    centers = [str(place) for place in (side / 2 - 0.5, side / 2 - 0.5, side / 2 - 0.5, 1.5 * side - 0.5)]
-    files = ["--frames", "frames.npy", "--pupils", "clear.npy", "--dark", "dark.npy", "--commands", "commands.npy"]
-    known = ["--pupil-centers", *centers, "--pupil-diameter", "24", "--noise", str(taken.bench.noise)]
-    with warnings.catch_warnings(action="ignore"):
-        assert main(["calibrate", "bench.npz", *files, *known]) == 0
-    assert "stage 4 of 4" in capsys.readouterr().err
-    found = Calibration.load("bench.npz")
-    assert found.n_images == 1
-    assert found.n_averaged == 2
-    summary = reconstruct("unseen.npy", found, "phase.fits", photons=found.unit.mean())
+    calibration, said = command
+    assert "stage 4 of 4" in said
+    assert calibration.n_images == 1
+    assert calibration.n_averaged == 2
+    summary = reconstruct(files / "unseen.npy", calibration, files / "phase.fits", photons=calibration.unit.mean())
     assert summary.n_flagged == 0
-    lit = taken.bench.fully_lit
-    phases = found(np.where(np.concatenate(list(taken.bad), axis=-1), np.nan, wide(taken.unseen))).phase
-    assert rms(taken.errors(phases), lit) < 1.2 * rms(taken.errors(calibration(taken.unseen).phase), lit)
+    np.testing.assert_allclose(fits.getdata(files / "phase.fits"), found.phase, atol=0.05)
 
 
 KINDS = {
@@ -187,10 +211,10 @@ def test_states_that_do_not_belong_together_are_named(tmp_path, settings, messag
 
 
 @pytest.mark.slow
-def test_turned_pupil_of_a_telescope_with_ten_pokes():
+def test_turned_pupil_of_a_telescope():
     """At most the error that the quick calibration had, on all fully lit pixels and away from edges."""
-    taken = Recorded(24, 10, 0.5, aperture="VLT", pixels=96, side=112)
-    calibration = taken.calibration()
+    taken = Recorded(12, 4, 0.5, aperture="VLT", pixels=40, side=52)
+    calibration = taken.calibration(n_steps=4, oversampling=2)
     found = calibration(np.where(taken.bad, np.nan, taken.unseen))
     assert not found.flags.any()
     errors, lit = taken.errors(found.phase), taken.bench.fully_lit
@@ -214,7 +238,7 @@ def test_linear_method_measures_small_screens_on_a_fitted_bench(taken, calibrati
     bench = taken.bench
     screen = bench.smooth(0.1, 1000)
     method = Linear(calibration.sensor, zernike_basis(calibration.sensor.pupil, 60))
-    phase = calibration(bench.counts(screen, (8, 0)), method=method).phase
+    phase = calibration(wide(bench.counts(screen, (8, 0))), method=method).phase
     truth = np.where(np.isfinite(phase), bench.on_pupil(screen + bench.flat), np.nan)
     inside = bench.fully_lit & np.isfinite(phase)
     assert rms((phase - truth)[np.newaxis], inside) < 0.3 * rms(truth[np.newaxis], inside)

@@ -141,9 +141,7 @@ def test_fourier_modes_are_cosine_and_sine_of_every_frequency_by_growing_frequen
     pupil = Pupil.from_amplitude(np.ones((24, 24)))
     modes = fourier_basis(pupil, 68)
     power = np.abs(np.fft.fft2(modes)).reshape(68, -1) ** 2
-    lines = (power > 0.4 * power.sum(axis=1, keepdims=True)).argmax(
-        axis=1
-    )
+    lines = (power > 0.4 * power.sum(axis=1, keepdims=True)).argmax(axis=1)
     cycles = np.fft.fftfreq(24, 1 / 24)
     frequencies = np.hypot(cycles[:, np.newaxis], cycles).ravel()
     np.testing.assert_allclose(frequencies[lines], np.sort(frequencies)[1:69])

@@ -186,7 +186,6 @@ def assert_equal_columns(found, expected, tolerance=1e-9):
          "rms_fine": [], "rms_beyond": [], "n_screens": 1, "noise": {"photons": 1e10}}, 1e-6),
         ("fig09_bench_linearity", "fig09_bench_linearity", {"n_pixels": 40, "rms_max": 0.4, "n_rms": 2,
          "n_screens": 1}, 1e-6),
-        ("fig01_sensor_layout", "fig01_sensor_layout", {"n_pixels": 40, "rms": 0.8}, 1e-9),
         ("beyond_range", "beyond_range", {"n_pixels": 32, "n_modes": 50, "inputs": [0.1, 0.5], "n_screens": 1,
          "inputs_noiseless": [], "photons": [1e4, 1e10], "n_screens_limit": 10, "inputs_limit": [0.5, 0.8],
          "photons_shown": 1e4}, 1e-6),

@@ -43,12 +43,13 @@ def plain_book(tmp_path_factory):
 
 
 def test_claims_have_their_verdicts(plain_book):
-    rows = read(plain_book / "book" / "claims.html").select("table.claims tbody tr")
+    page = read(plain_book / "book" / "claims.html")
+    rows = page.select("table.claims tbody tr")
     assert len(rows) == 21
     assert all(row.select_one("[class*=verdict]") for row in rows)
     for row in rows[:20]:
         name = row.select_one("td:first-child a")["href"].removeprefix("#")
-        rule = read(plain_book / "book" / "claims.html").find(id=name)
+        rule = page.find(id=name)
         assert f"number: {int(row.td.get_text().partition('.')[0])}" in rule.find_parent("details").get_text()
         assert "def numbers(" in rule.find_parent("details").get_text()
     counts = re.search(r"Of 21 claims.*", read(plain_book / "book" / "index.html").article.get_text()).group()
@@ -116,40 +117,42 @@ def test_a_build_in_another_folder_gives_the_same_pages_and_pictures(plain_book,
         assert file.read_bytes() == (published_book / file.relative_to(plain_book)).read_bytes(), file.name
 
 
-def links(file):
-    return {link["href"] for link in read(file).find_all("a", href=True)}
+def links(page):
+    return {link["href"] for link in page.find_all("a", href=True)}
 
 
-def launches(file):
-    return {link for link in links(file) if urlsplit(link).netloc in ("mybinder.org", "colab.research.google.com")}
+def launches(page):
+    return {link for link in links(page) if urlsplit(link).netloc in ("mybinder.org", "colab.research.google.com")}
 
 
 def test_book_without_an_address_promises_none(plain_book):
     for file in plain_book.glob("**/*.html"):
-        public = [link for link in links(file) if re.search("executablebooks|/issues/new|/blob/", link)]
-        assert not launches(file) | {*public}, file.name
-        assert not read(file).select("link[rel=canonical], meta[property='og:url'], meta[property='og:image']")
-    front = plain_book / "book" / "index.html"
+        page = read(file)
+        public = [link for link in links(page) if re.search("executablebooks|/issues/new|/blob/", link)]
+        assert not launches(page) | {*public}, file.name
+        assert not page.select("link[rel=canonical], meta[property='og:url'], meta[property='og:image']")
+    front = read(plain_book / "book" / "index.html")
     (archive,) = (link for link in links(front) if link.endswith(".zip"))
-    assert f"pip install {archive.rpartition('/')[2]}\n" in read(front).article.get_text()
-    assert (front.parent / archive).is_file()
+    assert f"pip install {archive.rpartition('/')[2]}\n" in front.article.get_text()
+    assert (plain_book / "book" / archive).is_file()
     assert "git clone" not in read(plain_book / "book" / "checking.html").article.get_text()
 
 
 def test_book_with_an_address_has_buttons_links_and_a_card(published_book):
     notebook = "notebooks/fig03_dynamic_range"
-    assert launches(published_book / f"{notebook}.html") == {
+    assert launches(read(published_book / f"{notebook}.html")) == {
         f"https://mybinder.org/v2/gh/reader/sensor/main?urlpath=lab/tree/{notebook}.ipynb",
         f"https://colab.research.google.com/github/reader/sensor/blob/main/{notebook}.ipynb",
     }
-    front = published_book / "book" / "index.html"
+    place = published_book / "book"
+    front = read(place / "index.html")
     assert not launches(front)
     assert {PUBLISHED.repository, f"{PUBLISHED.repository}/edit/main/book/index.md"} <= links(front)
     assert [link for link in links(front) if link.startswith(f"{PUBLISHED.repository}/issues/new")]
-    assert 'pip install "zwfs @ git+https://github.com/reader/sensor"' in read(front).article.get_text()
-    assert f"git clone {PUBLISHED.repository}\n" in read(front.with_name("checking.html")).article.get_text()
-    assert f"{PUBLISHED.repository}/blob/main/tests/test_sensor.py" in links(front.with_name("methods.html"))
-    told = {tag["property"]: tag["content"] for tag in read(front).head.select("meta[property]")}
+    assert 'pip install "zwfs @ git+https://github.com/reader/sensor"' in front.article.get_text()
+    assert f"git clone {PUBLISHED.repository}\n" in read(place / "checking.html").article.get_text()
+    assert f"{PUBLISHED.repository}/blob/main/tests/test_sensor.py" in links(read(place / "methods.html"))
+    told = {tag["property"]: tag["content"] for tag in front.head.select("meta[property]")}
     assert told["og:url"] == f"{PUBLISHED.book}book/index.html"
     assert told["og:image"] == f"{PUBLISHED.book}_static/front.png"
     assert (published_book / "_static" / "front.png").is_file()

@@ -47,7 +47,7 @@ unexport FIGURE ARGS
 QUICK := --numprocesses auto --dist loadfile --benchmark-disable -m "not slow"
 
 .DELETE_ON_ERROR:
-.PHONY: help book pdf lab test test-fast test-slow fuzz figures rerun lint bench release-check pythons address lock clean
+.PHONY: help book pdf lab test test-fast test-slow coverage fuzz figures rerun lint bench release-check pythons address lock clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 21
@@ -61,8 +61,8 @@ pdf: $(READY) ## build the book and its PDF, _build/html/zwfs.pdf: needs Chromiu
 lab: $(READY) ## open the notebooks in JupyterLab
 	$(BIN)/jupyter lab notebooks
 
-test: $(READY) ## test the package and the tools, print the coverage, and compare each notebook with a fresh run
-	$(BIN)/python -m pytest $(QUICK) --cov --cov-report term:skip-covered tests
+test: $(READY) ## test the package and the tools, and compare each notebook with a fresh run
+	$(BIN)/python -m pytest $(QUICK) tests
 	$(BIN)/python -m pytest --numprocesses auto --doctest-modules zwfs
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --nbval --nbval-current-env \
 		--nbval-cell-timeout 2400 notebooks
@@ -72,6 +72,9 @@ test-fast: $(READY) ## test the package only, in about 3 minutes
 
 test-slow: $(READY) ## the rest of the tests: real builds of the book, kills, clusters, long fits, full books in a browser
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --benchmark-disable -m "slow and not fuzz" tests
+
+coverage: $(READY) ## the quick tests again, twice as slow, with the lines that they do not reach
+	$(BIN)/python -m pytest $(QUICK) --cov --cov-report term:skip-covered tests
 
 fuzz: $(READY) ## try 1000 new camera files and options for each property, and each odd parameter of a notebook alone
 	$(BIN)/python -m pytest --numprocesses auto --hypothesis-profile fuzz tests/test_fuzzing.py tests/test_truth.py

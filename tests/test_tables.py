@@ -17,6 +17,12 @@ def test_few_digits_are_shown_and_truths_in_words():
     assert "| 3.1 |" in Table(["a"], [[3.14159]], digits=2)._repr_markdown_()
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_a_dash_stands_for_a_number_that_does_not_exist(value):
+    assert Table(["a", "b"], [[value, 0.0]])._repr_markdown_().splitlines()[2:] == ["| – | 0 |"]
+    assert small(value) == "–"
+
+
 def test_a_bar_does_not_end_the_cell():
     assert Table(["a"], [["|det M|"]])._repr_markdown_().endswith("| \\|det M\\| |")
 

@@ -115,12 +115,12 @@ def test_light_that_the_grid_does_not_resolve_spreads_with_the_focus(monkeypatch
     n, f = bench.side + 2 * BORDER, 2
     light, mean = (blocks(bench.amplitude**power, bench.fine // f) for power in (2, 1))
     exposures = [Exposure(0, None, 0), Exposure(1, None, 0)]
-    camera = Camera(n, (bench.side,) * 2, bench.pixels, exposures, np.zeros((1, n * f, n * f)), f, 1.5)
     arms = [[focus, 0, 0, 0, 1, 1, 0] for focus in bench.focus]
     values = np.array([*arms[0], *arms[1], bench.diameter, *bench.shifts, 0, 0])
     true = bench.exposed(np.zeros_like(bench.amplitude), False)
 
     def error():
+        camera = Camera(n, (bench.side,) * 2, bench.pixels, exposures, np.zeros((1, n * f, n * f)), f, 1.5)
         images = Linearised(camera, Maps(mean, light - mean**2, np.zeros_like(mean)), values).images
         return np.sqrt(np.mean((np.array(images) - true) ** 2, axis=(1, 2)))
 
@@ -266,22 +266,23 @@ def test_numbers_of_a_converged_fit_stay_within_their_error_bars_in_a_step_of_al
     fit = fitted(BENCH)
     assert fit.converged
     point = fit.point
-    step = point.solve(-point.gradient, point.stuck, 300, 1e-3)
+    step = point.matrix.solve(-point.gradient, point.stuck, 300, 1e-3)
     assert np.abs(step[point.problem.n_white :] / fit.sigma).max() < 1
 
 
 @pytest.mark.slow
 def test_equations_with_several_right_sides_are_solved_in_fewer_steps():
     point = fitted(BENCH).point
+    matrix = point.matrix
     held = np.arange(len(point.x)) >= point.problem.n_white
-    right = np.where(held, 0, [point.back(point.along(number)) for number in range(4)])
+    right = np.where(held, 0, [matrix.back(matrix.along(number)) for number in range(4)])
 
     def energy(found):
         """Part of the quadratic form that the equations make small."""
-        return np.array([one @ point.product(one) / 2 - one @ b for one, b in zip(found, right, strict=True)])
+        return np.array([one @ matrix.product(one) / 2 - one @ b for one, b in zip(found, right, strict=True)])
 
-    together = energy(point.solve(right, held, 8, 0))
-    alone = energy([point.solve(one, held, 8, 0) for one in right])
+    together = energy(matrix.solve(right, held, 8, 0))
+    alone = energy([matrix.solve(one, held, 8, 0) for one in right])
     assert np.all(together < alone)
     assert np.all(alone < 0)
 

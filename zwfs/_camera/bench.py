@@ -22,6 +22,7 @@ from zwfs._camera.model import Camera, Exposure, Linearised, names_of
 from zwfs._camera.recording import PAD, Recording, aligned, centred
 from zwfs._camera.solve import (
     MISSED,
+    Eliminated,
     Free,
     LightMap,
     MapPrior,
@@ -252,11 +253,12 @@ def fit_bench(
     report = _check.callback("progress", progress)
     report("dimple and order of the images")
     start = _coarse(data, diameter, shifts)
-    point = _fitted(data, *_problem(data, start, oversampling or 2), _STAGES, n_steps, report)
+    point = _fitted(data, *_problem(data, start, oversampling or 2), range(len(_STAGES)), n_steps, report)
     if oversampling is None and np.mean(point.misfit) > 1:
-        point = _fitted(data, *_divided(data, point, 3), _STAGES[1:], n_steps, report)
+        point = _fitted(data, *_divided(data, point, 3), range(1, len(_STAGES)), n_steps, report)
     report("error bars")
-    return _result(data, point, start.reversed)
+    settled = settle(point, partial(_report_step, report, "error bars"))
+    return _result(data, *settled, start.reversed)
 
 
 class _Start(NamedTuple):
@@ -334,7 +336,8 @@ def _problem(data: Recording, start: _Start, f: int) -> tuple[Problem, NDArray]:
     free = _free(data, start)
     phase_map = PhaseMap(n, f, _PHASE_PRIOR, data.n_pixels)
     lights = _light_maps(division, f * data.n_pixels)
-    problem = Problem(camera, data.counts, data.weights(smooth), division, phase_map, lights, values, free)
+    images = np.array(data.counts), data.weights(np.array(smooth))
+    problem = Problem(camera, *images, division, phase_map, lights, values, free)
     x = problem.start
     x[: phase_map.size**2] = phase_map.white(start.flat)
     return problem, x
@@ -347,13 +350,14 @@ def _light_maps(light: Light, n_pixels: float) -> tuple[LightMap, ...]:
 
 
 def _fitted(
-    data: Recording, problem: Problem, x: NDArray, stages: Sequence[_Stage], n_steps: int,
+    data: Recording, problem: Problem, x: NDArray, numbers: range, n_steps: int,
     report: Callable[[str], Any],
 ) -> Point:  # fmt: skip
-    """Return where the stages of a fit end."""
-    for number, stage in enumerate(stages, 1):
+    """Return where some stages of a fit end."""
+    for number in numbers:
+        stage = _STAGES[number]
         staged = _staged(data, problem, stage)
-        name = f"stage {number} of {len(stages)}, {problem.camera.f} points along a pixel"
+        name = f"stage {number + 1} of {len(_STAGES)}, {problem.camera.f} points along a pixel"
         settings: Any = n_steps, stage.n_inner, stage.enough, partial(_report_step, report, name)
         point, _ = minimise(staged, x, *settings)
         if stage.signs and np.mean(point.misfit) > _WRONG * _expected(problem, staged):
@@ -389,7 +393,7 @@ def _staged(data: Recording, problem: Problem, stage: _Stage) -> Problem:
         one._replace(low=-farthest, high=farthest) if one.name.endswith("focus") else one for one in problem.free
     ]
     level = stage.allowed * data.light[1][0]
-    return replace(problem, weights=[allowing(one, level) for one in problem.weights], free=free)
+    return replace(problem, weights=allowing(problem.weights, level), free=free)
 
 
 def _next(data: Recording, point: Point, divide: bool) -> tuple[Problem, NDArray]:
@@ -422,16 +426,17 @@ def _camera(data: Recording, of: Camera, f: int) -> Camera:
     return Camera(of.n, of.shape, data.n_pixels, of.exposures, fine_phase(data.phases, f), f, of.largest)
 
 
-def _changes(data: Recording, point: Point) -> list[list[NDArray[np.float64]]]:
+def _changes(data: Recording, point: Point) -> NDArray[np.float64]:
     """Changes of the images over their noise with twice the resolution.
 
     First, the light is divided anew. Second, each point keeps its light, and is divided as an edge divides it.
     """
     of, f = point.problem, 2 * point.problem.camera.f
+    before: Any = of.light
     finer, twice = _camera(data, of.camera, f), np.ones((2, 2))
     light = Light.sharp(np.maximum(point.light_means, 0), f)
     # Halfway between the amplitude of the fit and a new one, of which it is not known which is better.
-    light = replace(light, amplitude=(np.kron(of.light.amplitude, twice) + light.amplitude) / 2)
+    light = replace(light, amplitude=(np.kron(before.amplitude, twice) + light.amplitude) / 2)
     n = len(point.light)
     sharp = np.kron(light.start.reshape(n, 2, n, 2).mean(axis=(1, 3)), twice)
     share = np.divide(light.start, sharp, out=np.ones_like(sharp), where=sharp > 1e-6)
@@ -439,15 +444,16 @@ def _changes(data: Recording, point: Point) -> list[list[NDArray[np.float64]]]:
     changes = []
     for divided in (light.start, share * np.kron(point.light, twice)):
         images = Linearised(finer, light.maps(divided, phase), point.values).images
-        changes.append([w * (a - b) for w, a, b in zip(of.weights, images, point.model.images, strict=True)])
-    return changes
+        changes.append(of.weights * (images - point.model.images))
+    return np.array(changes)
 
 
-def _result(data: Recording, point: Point, is_reversed: bool) -> BenchFit:
-    point, converged, equations = settle(point)
+def _result(
+    data: Recording, point: Point, converged: bool, equations: Eliminated, is_reversed: bool
+) -> BenchFit:  # fmt: skip
     images = point.model.images
-    residuals = zip(data.weights(images), images, data.counts, data.good, strict=True)
-    misfit = np.array([np.sum((w * (a - b)) ** 2) / max(1, np.count_nonzero(ok)) for w, a, b, ok in residuals])
+    residuals = data.weights(images) * (images - data.counts)
+    misfit = np.sum(residuals**2, axis=(1, 2)) / np.maximum(np.count_nonzero(data.good, axis=(1, 2)), 1)
     scale = max(1.0, float(np.mean(misfit)))
     spread = equations.covariance(point, _changes(data, point), scale)
     values = point.x[point.problem.n_white :]

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -45,6 +44,15 @@ class Exposure(NamedTuple):
     arm: int
     mask: int | None
     state: int
+
+
+class _Group(NamedTuple):
+    """Images with the same optical path and mask, and their states."""
+
+    arm: int
+    mask: int | None
+    images: list[int]
+    states: list[int]
 
 
 class Maps(NamedTuple):
@@ -81,27 +89,58 @@ class Camera:
         commands: NDArray,
         oversampling: int,
         largest: float,
+        *,
+        n_arms: int | None = None,
+        real: Any = np.float64,
     ) -> None:
         self.n, self.shape, self.n_pixels, self.f, self.largest = n, shape, n_pixels, oversampling, largest
-        self.exposures = tuple(exposures)
-        self.n_arms = 1 + max(one.arm for one in exposures)
+        self.exposures, self.commands, self.real = tuple(exposures), commands, real
+        self.n_arms = n_arms or 1 + max(one.arm for one in exposures)
         f, inner = oversampling, n * oversampling
         size = max(n, *shape) * f + 2 * _BORDER * f
         while (size - inner) % 2 or fft.next_fast_len(size) != size:
             size += 1
         self.size = size
         self.window = (slice((size - inner) // 2, (size + inner) // 2),) * 2
-        self.turns = np.exp(1j * commands)
+        self.turns = self.complex(np.exp(1j * commands))
         axis = (np.arange(size) - (size - 1) / 2) / (n_pixels * f)
         spread = math.sqrt(2) * (inner + size) / (n_pixels * f)
         self._axes, self._spread = (axis[self.window[0]], axis), spread
-        self.planes = tuple(_plane(one, largest, spread) for one in self._axes)
+        self.planes = tuple(_plane(one, largest, spread, real) for one in self._axes)
         frequency = fft.fftfreq(size) * f  # cycles per pixel
         self.defocus = self.defocus_at(frequency[None, :], frequency[:, None])
         half = fft.rfftfreq(size) * f
         self.squares = frequency[:, None] ** 2 + half**2
         samples = _SPLINE(np.arange(_DEGREE // 2 + 1))
         self.prefilter = 1 / symbol([samples[0], *(2 * samples[1:])], size)
+
+        self._optics: Optics | None = None
+
+    def complex(self, values: NDArray) -> NDArray:
+        """Complex numbers in the precision of the camera."""
+        return values.astype(np.result_type(self.real, np.complex64))
+
+    @cached_property
+    def groups(self) -> list[_Group]:
+        """Exposures with the same optical path and mask."""
+        kinds = list(dict.fromkeys((one.arm, one.mask) for one in self.exposures))
+        numbers = [[k for k, one in enumerate(self.exposures) if (one.arm, one.mask) == kind] for kind in kinds]
+        return [
+            _Group(*kind, images, [self.exposures[k].state for k in images])
+            for kind, images in zip(kinds, numbers, strict=True)
+        ]
+
+    @cached_property
+    def single(self) -> Camera:
+        """The same in single precision."""
+        settings: Any = self.exposures, self.commands, self.f, self.largest
+        return Camera(self.n, self.shape, self.n_pixels, *settings, n_arms=self.n_arms, real=np.float32)
+
+    def optics(self, values: NDArray) -> Optics:
+        """Optics with these numbers; those of the last call are kept."""
+        if self._optics is None or not np.array_equal(self._optics.values, values):
+            self._optics = Optics(self, values)
+        return self._optics
 
     def defocus_at(self, u: NDArray, v: NDArray) -> NDArray[np.float64]:
         """Phase at frequencies in cycles per pixel that a unit of focus makes."""
@@ -150,6 +189,12 @@ def _edge_light(x: NDArray) -> tuple[NDArray, NDArray]:
     return k, np.divide(k - mean, x, out=np.full_like(x, -1.0), where=x > 1e-9)
 
 
+def pooled(fine: NDArray, f: int) -> NDArray[np.float64]:
+    """Mean over blocks of f x f points, (..., n * f, n * f) to (..., n, n)."""
+    n = fine.shape[-1] // f
+    return fine.reshape(*fine.shape[:-2], n, f, n, f).mean(axis=(-3, -1)) if f > 1 else fine
+
+
 def symbol(series: Sequence[float], size: int) -> NDArray[np.float64]:
     """Spectrum, (size, size // 2 + 1), of a filter whose spectrum along each axis is a series of cosines."""
     full, half = (
@@ -159,13 +204,14 @@ def symbol(series: Sequence[float], size: int) -> NDArray[np.float64]:
     return np.multiply.outer(full, half)
 
 
-def _plane(axis: NDArray, largest: float, spread: float) -> Plane:
+def _plane(axis: NDArray, largest: float, spread: float, real: Any) -> Plane:
     """Few real functions on a square grid that hold all waves from a disc of the focal plane."""
     along = _axis_functions(axis, largest / 2, _TOLERANCE)
     u, v, _ = _quadrature(Dimple(largest, 0.0), spread, _TOLERANCE)
     waves = _spectra(((along, axis),) * 2, u, v)
     functions, strength, _ = np.linalg.svd(np.concatenate([waves.real, waves.imag], 1), full_matrices=False)
-    return Plane(along, along, functions[:, strength > _TOLERANCE * strength[0]])
+    kept = functions[:, strength > _TOLERANCE * strength[0]]
+    return Plane(*(one.astype(real) for one in (along, along, kept)))
 
 
 class Coefficients(NamedTuple):
@@ -203,7 +249,7 @@ class _Spline:
 
     def __init__(self, camera: Camera, place: Sequence[float]) -> None:
         row, column, rotation, magnification = place
-        self.shape, self.size, f = camera.shape, camera.size, camera.f
+        self.shape, self.size, self.real, f = camera.shape, camera.size, camera.real, camera.f
         y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in camera.shape), indexing="ij")
         y, x = y.ravel() - row, x.ravel() - column
         cosine, sine = math.cos(rotation) / magnification, math.sin(rotation) / magnification
@@ -225,7 +271,7 @@ class _Spline:
 
     def _of(self, pair: int) -> sparse.csr_array:
         first, second = self._pairs[pair]
-        weights = (first[:, :, None] * second[:, None, :]).ravel()
+        weights = (first[:, :, None] * second[:, None, :]).ravel().astype(self.real)
         return sparse.csr_array((weights, self._index.ravel(), self._starts), (self._index.shape[0], self.size**2))
 
     @cached_property
@@ -236,11 +282,11 @@ class _Spline:
     def _gradient(self) -> tuple[sparse.csr_array, sparse.csr_array]:
         return self._of(1), self._of(2)
 
-    def __call__(self, image: NDArray) -> NDArray:
-        return (self._matrix @ image.ravel()).reshape(self.shape)
+    def __call__(self, images: NDArray) -> NDArray:
+        return _each(self._matrix, images, self.shape)
 
     def adjoint(self, pixels: NDArray) -> NDArray:
-        return (self._matrix.T @ pixels.ravel()).reshape(self.size, self.size)
+        return _each(self._matrix.T, pixels, (self.size, self.size))
 
     def slopes(self, image: NDArray) -> NDArray:
         """Derivatives by row, column, rotation and magnification, (4, ny, nx)."""
@@ -248,86 +294,128 @@ class _Spline:
         return np.stack([(down * dy + across * dx).reshape(self.shape) for dy, dx in self._moves])
 
 
+def _each(matrix: sparse.sparray, images: NDArray, shape: tuple[int, int]) -> NDArray:
+    """Product of a matrix with each image of a stack, (..., *shape)."""
+    flat = images.reshape(-1, images.shape[-2] * images.shape[-1])
+    return np.ascontiguousarray((matrix @ flat.T).T).reshape(*images.shape[:-2], *shape)
+
+
 def _weights(places: NDArray, size: int, f: int) -> tuple[NDArray, NDArray, NDArray]:
     """Nodes, weights and slopes, (n, k) each, of the mean over the f points of a pixel in each place; periodic.
 
     A point stands for the mean over its cell, so that a pixel on the grid is the mean of its cells exactly.
     """
-    inner, n = np.arange(f) - (f - 1) / 2, _DEGREE + f  # nodes that a pixel meets
-    nodes = np.floor(places - n / 2).astype(int)[:, None] + np.arange(1, n + 1)
-    away = (places[:, None] - nodes)[..., None] + inner
-    return (
-        nodes % size,
-        np.nan_to_num(_SPLINE(away)).mean(axis=-1),
-        np.nan_to_num(_SPLINE.derivative()(away)).mean(axis=-1),
-    )
+    n = _DEGREE + f  # nodes that a pixel meets
+    first = np.floor(places - n / 2).astype(int) + 1
+    values, slopes = np.zeros((2, len(places), n))
+    rows = np.arange(len(places))[:, None]
+    for inner in np.arange(f) - (f - 1) / 2:
+        start = np.floor(places + inner - (_DEGREE + 1) / 2).astype(int) + 1
+        columns = (start - first)[:, None] + np.arange(_DEGREE + 1)
+        value, slope = _basis(places + inner - start - (_DEGREE - 1) / 2)
+        values[rows, columns] += value / f
+        slopes[rows, columns] += slope / f
+    return (first[:, None] + np.arange(n)) % size, values, slopes
 
 
-@dataclass(eq=False)
-class _Part:
-    """Steps of the model of one image that its derivative needs."""
-
-    field: NDArray[np.complex128]
-    light: NDArray[np.complex128]  # of the dimple
-    ahead: NDArray[np.complex128]  # half the derivative of the intensity by the field, conjugated
-    across: NDArray[np.complex128]  # the same by the light of the dimple
-    spectrum: NDArray[np.complex128]  # of the intensity
-    blurred: NDArray[np.float64]
-    seen: NDArray[np.float64]  # before flux and background
+def _basis(part: NDArray) -> tuple[NDArray, NDArray]:
+    """Values and slopes, (n, degree + 1), of the B-splines that are not 0 at a part of a step past a node."""
+    values = np.ones((len(part), 1))
+    for degree in range(1, _DEGREE + 1):
+        lower, steps = values, np.arange(degree + 1)
+        before, after = (np.pad(lower, ((0, 0), pad)) for pad in ((1, 0), (0, 1)))
+        rising = part[:, None] + degree - steps
+        values = (rising * before + (degree + 1 - rising) * after) / degree
+    return values, before - after
 
 
-class Linearised:
-    """Images at one point, their derivatives by the maps (`apply`, `adjoint`) and the parameters (`slopes`)."""
+class Optics:
+    """All of the model that depends on the numbers alone."""
 
-    def __init__(self, camera: Camera, maps: Maps, values: NDArray) -> None:
-        self.camera, self.maps = camera, maps
+    def __init__(self, camera: Camera, values: NDArray) -> None:
+        real, self.values = camera.real, values.copy()
         split = values[: -len(MASKS)].reshape(camera.n_arms, len(ARM))
         self.arms = [dict(zip(ARM, row, strict=True)) for row in split.tolist()]
         self.masks = dict(zip(MASKS, values[-len(MASKS) :].tolist(), strict=True))
-        self._coefficients = coefficients(self.masks)
-        self._transfer = [np.exp(-1j * arm["focus"] * camera.defocus) for arm in self.arms]
-        self._spread = [camera.spread_at(arm["focus"]) for arm in self.arms]
-        self._rest = self._spectrum_of(maps.rest)
-        self._blur = camera.prefilter * np.exp(-2 * (np.pi * self.masks["blur"]) ** 2 * camera.squares)
-        self._splines = [_Spline(camera, [arm[name] for name in _PLACE]) for arm in self.arms]
-        masked = {one.arm for one in camera.exposures if one.mask is not None}
-        self._cores = {arm: camera.cores(self.masks["diameter"], self.arms[arm]["focus"]) for arm in masked}
+        self.coefficients = coefficients(self.masks)
+        used = {one.arm for one in camera.exposures}
+        self.transfer, self.spread, self.splines, self.cores = ({} for _ in range(4))
+        spread = {focus: camera.spread_at(focus) for focus in {self.arms[number]["focus"] for number in used}}
+        for number in used:
+            arm = self.arms[number]
+            self.transfer[number] = camera.complex(np.exp(-1j * arm["focus"] * camera.defocus))
+            self.spread[number] = [np.asarray(one, real) for one in spread[arm["focus"]]]
+            self.splines[number] = _Spline(camera, [arm[name] for name in _PLACE])
+        for number in {one.arm for one in camera.exposures if one.mask is not None}:
+            self.cores[number] = camera.complex(camera.cores(self.masks["diameter"], self.arms[number]["focus"]))
+        blur = np.exp(-2 * (np.pi * self.masks["blur"]) ** 2 * camera.squares)
+        self.blur = (camera.prefilter * blur).astype(real)
+
+
+class _Part(NamedTuple):
+    """Steps of the model of some images that its derivative needs, (n_images, size, size) each."""
+
+    field: NDArray[np.complex128]
+    ahead: NDArray[np.complex128]  # half the derivative of the intensity by the field, conjugated
+    spectrum: NDArray[np.complex128]  # of the intensity
+    blurred: NDArray[np.float64]
+    seen: NDArray[np.float64]  # before flux and background
+    light: NDArray[np.complex128] | None = None  # of the dimple
+    across: NDArray[np.complex128] | None = None  # half the derivative by the light of the dimple, conjugated
+
+
+class Linearised:
+    """Images at one point, their derivatives by the maps (`apply`, `adjoint`) and the parameters (`slopes`).
+
+    All images stand in one array, (n_images, ny, nx).
+    """
+
+    def __init__(self, camera: Camera, maps: Maps, values: NDArray) -> None:
+        self.camera, self.optics = camera, camera.optics(values)
+        self.arms, self.masks = self.optics.arms, self.optics.masks
+        mean, rest, phase = (one.astype(camera.real) for one in maps[:3])
+        self.maps = Maps(mean, rest, phase, maps.cells)
+        self._rest = self._spectrum_of(rest)
         cells = np.zeros((camera.size,) * 2, bool)
         cells[camera.window] = maps.cells
-        self._smooth = ~ndimage.binary_dilation(cells) / 24
-        self._wave = np.exp(1j * maps.phase)
-        self._states = [self._source(maps.mean * self._wave * turn) for turn in camera.turns]
-        self._parts = [self._part(one) for one in camera.exposures]
-        self.images = [
-            self.arms[one.arm]["flux"] * part.seen + self.arms[one.arm]["background"]
-            for one, part in zip(camera.exposures, self._parts, strict=True)
-        ]
+        self._smooth = (~ndimage.binary_dilation(cells) / 24).astype(camera.real)
+        self._wave = np.exp(1j * phase)
+        self._spectra, self._inputs = self._source(mean * self._wave * camera.turns)
+        self._parts = [self._part(one) for one in camera.groups]
+        self.images = np.empty((len(camera.exposures), *camera.shape), camera.real)
+        for group, part in zip(camera.groups, self._parts, strict=True):
+            arm = self.arms[group.arm]
+            self.images[group.images] = arm["flux"] * part.seen + arm["background"]
 
-    def _source(self, field: NDArray) -> tuple[NDArray, NDArray]:
-        """Spectrum of a field on the whole grid, and its coefficients for the light of the dimple."""
-        whole = np.zeros((self.camera.size,) * 2, complex)
-        whole[self.camera.window] = field
-        return fft.fft2(whole), self.camera.planes[0].project(field)
+    def _source(self, fields: NDArray) -> tuple[NDArray, NDArray]:
+        """Spectra of fields on the whole grid, and their coefficients for the light of the dimple."""
+        whole = np.zeros((*fields.shape[:-2], self.camera.size, self.camera.size), fields.dtype)
+        whole[(..., *self.camera.window)] = fields
+        return fft.fft2(whole, overwrite_x=True), self.camera.planes[0].project(fields)
 
-    def _part(self, one: Exposure) -> _Part:
-        spectrum, inputs = self._states[one.state]
-        field = fft.ifft2(self._transfer[one.arm] * spectrum)
-        light = across = np.zeros(0, complex)
+    def _part(self, group: _Group) -> _Part:
+        optics = self.optics
+        field = fft.ifft2(optics.transfer[group.arm] * self._spectra[group.states], overwrite_x=True)
+        light = across = None
         ahead, intensity = field, field.real**2 + field.imag**2
-        if one.mask is not None:
-            light = self.camera.planes[1].expand(self._cores[one.arm][0] @ inputs)
-            first, second = self._coefficients.first[one.mask], self._coefficients.second[one.mask]
+        if group.mask is not None:
+            light = self._dimple_light(group, self._inputs[group.states], 0)
+            first, second = (numbers[group.mask].item() for numbers in optics.coefficients[:2])
             ahead = field + first * light
             across = np.conj(first) * field + second * light
-            intensity = (field.conj() * ahead + light.conj() * across).real
-        spectrum = fft.rfft2(self._cells(intensity)) + self._spread[one.arm][0] * self._rest
-        blurred = fft.irfft2(self._blur * spectrum, s=intensity.shape)
-        return _Part(field, light, ahead, across, spectrum, blurred, self._splines[one.arm](blurred))
+            intensity = (_twice(field, ahead) + _twice(light, across)) / 2
+        spectrum = fft.rfft2(self._cells(intensity)) + optics.spread[group.arm][0] * self._rest
+        blurred = fft.irfft2(optics.blur * spectrum, s=intensity.shape[-2:])
+        return _Part(field, ahead, spectrum, blurred, optics.splines[group.arm](blurred), light, across)
+
+    def _dimple_light(self, group: _Group, inputs: NDArray, core: int) -> NDArray:
+        """Light of the dimple in images, by the operator number `core` of `Camera.cores`."""
+        return self.camera.planes[1].expand(inputs @ self.optics.cores[group.arm][core].T)
 
     def _spectrum_of(self, light: NDArray) -> NDArray[np.complex128]:
-        """Spectrum of a map of light on the whole grid."""
-        whole = np.zeros((self.camera.size,) * 2)
-        whole[self.camera.window] = light
+        """Spectrum of maps of light on the whole grid."""
+        whole = np.zeros((*light.shape[:-2], self.camera.size, self.camera.size), light.dtype)
+        whole[(..., *self.camera.window)] = light
         return fft.rfft2(whole)
 
     def _cells(self, intensity: NDArray) -> NDArray[np.float64]:
@@ -338,67 +426,71 @@ class Linearised:
         """
         return intensity + self._smooth * _differences(intensity)
 
-    def _on_camera(self, one: Exposure, spectrum: NDArray) -> NDArray[np.float64]:
-        """Change of an image with that of the spectrum of its intensity."""
-        blurred = fft.irfft2(self._blur * spectrum, s=(self.camera.size,) * 2)
-        return self.arms[one.arm]["flux"] * self._splines[one.arm](blurred)
+    def _on_camera(self, arm: int, spectrum: NDArray) -> NDArray[np.float64]:
+        """Change of images with that of the spectra of their intensities."""
+        blurred = fft.irfft2(self.optics.blur * spectrum, s=(self.camera.size,) * 2)
+        return self.arms[arm]["flux"] * self.optics.splines[arm](blurred)
 
     def _change(
-        self, index: int, field: NDArray, inputs: NDArray, core: int, rest: NDArray | float
+        self, group: _Group, part: _Part, field: NDArray, dimple: NDArray | None, rest: NDArray | float
     ) -> NDArray[np.float64]:
-        """Change of an image with the field, the light of the dimple, and the spectrum of what is not resolved.
-
-        The operator number `core` of `Camera.cores` gives the light of the dimple from `inputs`.
-        """
-        one, part = self.camera.exposures[index], self._parts[index]
+        """Change of images with the field, the light of the dimple, and the spectrum of what is not resolved."""
         intensity = _twice(part.ahead, field)
-        if one.mask is not None:
-            intensity += _twice(part.across, self.camera.planes[1].expand(self._cores[one.arm][core] @ inputs))
-        return self._on_camera(one, fft.rfft2(self._cells(intensity)) + rest)
+        if part.across is not None and dimple is not None:
+            intensity += _twice(part.across, dimple)
+        return self._on_camera(group.arm, fft.rfft2(self._cells(intensity)) + rest)
 
-    def apply(self, mean: NDArray, rest: NDArray, phase: NDArray) -> list[NDArray[np.float64]]:
-        """Change of the images with a change of the maps."""
-        change = (mean + 1j * self.maps.mean * phase) * self._wave
-        states = [self._source(change * turn) for turn in self.camera.turns]
-        unresolved = self._spectrum_of(rest)
-        changes = []
-        for index, one in enumerate(self.camera.exposures):
-            spectrum, inputs = states[one.state]
-            field = fft.ifft2(self._transfer[one.arm] * spectrum)
-            changes.append(self._change(index, field, inputs, 0, self._spread[one.arm][0] * unresolved))
-        return changes
+    def apply(self, mean: NDArray, rest: NDArray, phase: NDArray) -> NDArray[np.float64]:
+        """Change of the images with a change of the maps, (..., n, n) to (..., n_images, ny, nx)."""
+        camera, optics = self.camera, self.optics
+        change = (mean + 1j * (self.maps.mean * phase)).astype(self._wave.dtype) * self._wave
+        spectra, inputs = self._source(change[..., None, :, :] * camera.turns)
+        unresolved = self._spectrum_of(rest.astype(camera.real))[..., None, :, :]
+        out = np.empty((*change.shape[:-2], *self.images.shape), camera.real)
+        for group, part in zip(camera.groups, self._parts, strict=True):
+            field = fft.ifft2(optics.transfer[group.arm] * spectra[..., group.states, :, :], overwrite_x=True)
+            masked = group.mask is not None
+            dimple = self._dimple_light(group, inputs[..., group.states, :], 0) if masked else None
+            unseen = optics.spread[group.arm][0] * unresolved
+            out[..., group.images, :, :] = self._change(group, part, field, dimple, unseen)
+        return out
 
-    def adjoint(self, pixels: Sequence[NDArray]) -> Maps:
+    def adjoint(self, pixels: NDArray) -> Maps:
         """Adjoint of `apply`."""
-        camera = self.camera
-        spectra = [np.zeros((camera.size,) * 2, complex) for _ in self._states]
-        inputs = [np.zeros(source[1].shape, complex) for source in self._states]
-        seen = [np.zeros(self._blur.shape, complex) for _ in self.arms]
-        for one, part, weight in zip(camera.exposures, self._parts, pixels, strict=True):
-            back = self._splines[one.arm].adjoint(self.arms[one.arm]["flux"] * weight)
-            spectrum = self._blur * fft.rfft2(back)
-            seen[one.arm] += spectrum
-            gain = fft.irfft2(spectrum, s=back.shape)
+        camera, optics = self.camera, self.optics
+        pixels = np.asarray(pixels, camera.real)
+        lead, unresolved = pixels.shape[:-3], np.zeros((), self._rest.dtype)
+        spectra, inputs = (np.zeros((*lead, *one.shape), one.dtype) for one in (self._spectra, self._inputs))
+        for group, part in zip(camera.groups, self._parts, strict=True):
+            arm = group.arm
+            back = optics.splines[arm].adjoint(self.arms[arm]["flux"] * pixels[..., group.images, :, :])
+            spectrum = optics.blur * fft.rfft2(back)
+            unresolved = unresolved + optics.spread[arm][0] * spectrum.sum(axis=-3)
+            gain = fft.irfft2(spectrum, s=back.shape[-2:])
             gain += _differences(self._smooth * gain)
             gain *= 2
-            spectra[one.state] += self._transfer[one.arm].conj() * fft.fft2(gain * part.ahead)
-            if one.mask is not None:
-                core = self._cores[one.arm][0].conj().T
-                inputs[one.state] += core @ camera.planes[1].project(gain * part.across)
-        unresolved = sum(spread * each for (spread, _), each in zip(self._spread, seen, strict=True))
-        rest = fft.irfft2(unresolved, s=(camera.size,) * 2)[camera.window]
-        total = np.zeros(rest.shape, complex)
-        for spectrum, light, turn in zip(spectra, inputs, camera.turns, strict=True):
-            total += turn.conj() * (fft.ifft2(spectrum)[camera.window] + camera.planes[0].expand(light))
-        total *= self._wave.conj()
+            ahead = fft.fft2(gain * part.ahead, overwrite_x=True)
+            spectra[..., group.states, :, :] += optics.transfer[arm].conj() * ahead
+            if part.across is not None:
+                across = camera.planes[1].project(gain * part.across)
+                inputs[..., group.states, :] += across @ optics.cores[arm][0].conj()
+        window = (..., *camera.window)
+        rest = fft.irfft2(unresolved, s=(camera.size,) * 2)[window]
+        fields = fft.ifft2(spectra, overwrite_x=True)[window] + camera.planes[0].expand(inputs)
+        total = np.sum(camera.turns.conj() * fields, axis=-3) * self._wave.conj()
         return Maps(total.real, rest, self.maps.mean * total.imag)
 
     def slopes(self, index: int, wanted: Sequence[str]) -> NDArray[np.float64]:
         """Derivatives of one image by numbers of its arm or of the masks, (k, ny, nx)."""
-        camera, one, part = self.camera, self.camera.exposures[index], self._parts[index]
-        arm, (source, inputs) = self.arms[one.arm], self._states[one.state]
+        camera, optics, state = self.camera, self.optics, self.camera.exposures[index].state
+        group, parts = next(
+            pair for pair in zip(camera.groups, self._parts, strict=True) if index in pair[0].images
+        )
+        own: Any = [each if each is None else each[group.images.index(index)] for each in parts]
+        part = _Part(*own)
+        flux, spread = self.arms[group.arm]["flux"], optics.spread[group.arm][1]
         zero = np.zeros(camera.shape)
-        place = arm["flux"] * self._splines[one.arm].slopes(part.blurred) if set(wanted) & set(_PLACE) else None
+        place = flux * optics.splines[group.arm].slopes(part.blurred) if set(wanted) & set(_PLACE) else None
         out = []
         for name in wanted:
             if name in _PLACE and place is not None:
@@ -408,32 +500,33 @@ class Linearised:
             elif name == "background":
                 out.append(zero + 1)
             elif name == "blur":
-                slope = -4 * np.pi**2 * self.masks["blur"] * camera.squares * self._blur
-                image = fft.irfft2(slope * part.spectrum, s=part.blurred.shape)
-                out.append(arm["flux"] * self._splines[one.arm](image))
+                slope = -4 * np.pi**2 * self.masks["blur"] * camera.squares
+                out.append(self._on_camera(group.arm, slope * part.spectrum))
             elif name == "focus":
-                field = fft.ifft2(-1j * camera.defocus * self._transfer[one.arm] * source)
-                out.append(self._change(index, field, inputs, 1, self._spread[one.arm][1] * self._rest))
-            elif one.mask is None:
+                field = fft.ifft2(-1j * camera.defocus * optics.transfer[group.arm] * self._spectra[state])
+                dimple = None if group.mask is None else self._dimple_light(group, self._inputs[state], 1)
+                out.append(self._change(group, part, field, dimple, spread * self._rest))
+            elif group.mask is None or part.light is None:
                 out.append(zero)
             elif name == "diameter":
-                out.append(self._change(index, 0 * part.field, inputs, 2, 0.0))
+                dimple = self._dimple_light(group, self._inputs[state], 2)
+                out.append(self._change(group, part, 0 * part.field, dimple, 0.0))
             else:
-                first = self._coefficients.first_slope[one.mask, MASKS.index(name)]
-                second = self._coefficients.second_slope[one.mask, MASKS.index(name)]
+                first = optics.coefficients.first_slope[group.mask, MASKS.index(name)]
+                second = optics.coefficients.second_slope[group.mask, MASKS.index(name)]
                 change = 2 * (first * part.field.conj() * part.light).real + second * np.abs(part.light) ** 2
-                out.append(self._on_camera(one, fft.rfft2(self._cells(change))))
+                out.append(self._on_camera(group.arm, fft.rfft2(self._cells(change))))
         return np.reshape(out, (len(wanted), *camera.shape))
 
 
-def _differences(image: NDArray) -> NDArray[np.float64]:
+def _differences(images: NDArray) -> NDArray[np.float64]:
     """Second differences along both axes, periodic."""
-    out = -4 * image
-    for inner, far in ((out, image), (out.T, image.T)):
-        inner[1:] += far[:-1]
-        inner[:-1] += far[1:]
-        inner[0] += far[-1]
-        inner[-1] += far[0]
+    out = -4 * images
+    for inner, far in ((out, images), (out.swapaxes(-1, -2), images.swapaxes(-1, -2))):
+        inner[..., 1:, :] += far[..., :-1, :]
+        inner[..., :-1, :] += far[..., 1:, :]
+        inner[..., 0, :] += far[..., -1, :]
+        inner[..., -1, :] += far[..., 0, :]
     return out
 
 

@@ -90,10 +90,10 @@ class Recording:
             raise ValueError(f"clear_frames hold {flux} counts on average in the pupil: expected light")
         return np.maximum((inner / flux[:, None, None]).mean(axis=0), 0), flux
 
-    def weights(self, images: list[NDArray]) -> list[NDArray[np.float64]]:
-        """One over the noise of each pixel, for the images of a model."""
-        pairs = zip(images, self.good, self.n_frames, strict=True)
-        return [ok * np.sqrt(k / (np.maximum(image, 0) / self.gain + self.noise**2)) for image, ok, k in pairs]
+    def weights(self, images: NDArray) -> NDArray[np.float64]:
+        """One over the noise of each pixel, for the images of a model, (n_images, ny, nx)."""
+        frames = np.array(self.n_frames)[:, None, None]
+        return self.good * np.sqrt(frames / (np.maximum(images, 0) / self.gain + self.noise**2))
 
 
 def _mean_of(name: str, images: ArrayLike, n_axes: int) -> tuple[NDArray[np.float64], int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +15,7 @@ from scipy.sparse.linalg import splu
 
 from zwfs import _check
 from zwfs._camera.bench import EXPLAINED, BenchFit, places_of
-from zwfs._camera.light import Light
+from zwfs._camera.light import KnownLight
 from zwfs._camera.model import Camera, Exposure, Linearised
 from zwfs._camera.recording import PAD
 from zwfs._camera.solve import MapPrior, PhaseMap, Point, Problem, allowing, fine_phase, minimise
@@ -46,16 +46,22 @@ class FittedPhase(NDArrayOperatorsMixin):
     consistent : bool
         Whether the model explains the frames within their noise.
     converged : bool
-    exponent : float
-        Of the spectrum of the prior, as chosen by the evidence.
+    prior : MapPrior
+        Of the phase: `rms` (radian), `exponent` of the spectrum and `outer_scale` (D), as given or as chosen by
+        the evidence.
     """
 
     phase: NDArray[np.float64]
     misfit: float
     consistent: bool
     converged: bool
-    exponent: float
+    prior: MapPrior
     _point: Point
+
+    @property
+    def exponent(self) -> float:
+        """Exponent of the spectrum of the prior."""
+        return self.prior.exponent
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
         return np.array(self.phase, dtype=dtype, copy=True if copy is None else copy)
@@ -73,10 +79,10 @@ class FittedPhase(NDArrayOperatorsMixin):
         point, rng = self._point, np.random.default_rng(0)  # the choice changes the error bars by some percent
         problem, right = point.problem, []
         for _ in range(_DRAWS):
-            noise = [rng.normal(size=one.shape) * (one > 0) for one in problem.weights]
-            right.append(point.back(noise) + rng.normal(size=point.x.shape))
-        found = point.solve(np.array(right), np.zeros(point.x.shape, bool), 60, 0.03)
-        draws = [problem.phase_map.means(problem.split(one)[0][0])[PAD:-PAD, PAD:-PAD] for one in found]
+            noise = rng.normal(size=problem.weights.shape) * (problem.weights > 0)
+            right.append(point.matrix.back(noise) + rng.normal(size=point.x.shape))
+        found = point.matrix.solve(np.array(right), np.zeros(point.x.shape, bool), 60, 0.03)
+        draws = problem.phase_map.means(problem.split(found)[0][0])[:, PAD:-PAD, PAD:-PAD]
         lit = point.light_means[PAD:-PAD, PAD:-PAD] > 0.3
         left = np.stack([one - one[lit].mean() for one in draws])
         variance = ndimage.gaussian_filter(np.mean(left**2, axis=0), 1.0)
@@ -111,7 +117,7 @@ class FittedSensor:
         """Phase of the optics at a flat command, (n, n)."""
         return self.fit.flat
 
-    def __call__(self, frames: ArrayLike, sigma: ArrayLike) -> FittedPhase:
+    def __call__(self, frames: ArrayLike, sigma: ArrayLike, prior: MapPrior | None = None) -> FittedPhase:
         """Phase of one pair of frames.
 
         Parameters
@@ -120,6 +126,9 @@ class FittedSensor:
             Less the dark, with the exposure of the fit's frames. NaN marks bad pixels.
         sigma : array_like, shape (2, ny, nx) or a number, counts rms
             Noise of the pixels: ``sqrt(maximum(frames, 0) / gain + noise**2)`` with those of `fit_bench`.
+        prior : MapPrior, optional
+            That of an earlier result. It saves more than half of the time, and fits phases of the same roughness
+            and strength only. By default the evidence chooses one.
 
         Returns
         -------
@@ -143,21 +152,26 @@ class FittedSensor:
         allowed = _ALLOWED * np.array([arm["flux"] for arm in self.fit.point.model.arms[:2]])
         soft = allowing(weights, allowed[:, None, None])
         start = self._start(counts)
-        prior = MapPrior(_rms_of(start), 3.0)
-        means = self._minimum(counts, soft, prior, start, 5, 20)[0].phase_means
+        means = self._minimum(counts, soft, MapPrior(_rms_of(start), 3.0), start, 5, 20)[0].phase_means
+        if prior is None:
+            prior, means = self._chosen(counts, weights, means)
+        point, converged = self._minimum(counts, weights, prior, means, self.n_steps, 30)
+        misfit, phase = float(np.mean(point.misfit)), point.phase_means[PAD:-PAD, PAD:-PAD]
+        return FittedPhase(phase, misfit, misfit < EXPLAINED, converged, prior, point)
+
+    def _chosen(self, counts: NDArray, weights: NDArray, means: NDArray) -> tuple[MapPrior, NDArray]:
+        """Prior that the evidence chooses, and the phase with it."""
         least = math.inf
         for exponent, n_updates in _PRIORS:
             rms, now = _rms_of(means) * _STRONGER ** (exponent - 4), means
             for _ in range(n_updates):
                 point, _ = self._minimum(counts, weights, MapPrior(rms, exponent), now, 3, 30)
-                now, (evidence, growth) = point.phase_means, point.evidence
+                now, (evidence, growth) = point.phase_means, point.matrix.evidence
                 rms *= math.sqrt(max(growth, 0.01))  # an rms of 0 allows no phase
             if evidence > least:
                 break
             least, prior, means = evidence, MapPrior(rms, exponent), now
-        point, converged = self._minimum(counts, weights, prior, means, self.n_steps, 30)
-        misfit, phase = float(np.mean(point.misfit)), point.phase_means[PAD:-PAD, PAD:-PAD]
-        return FittedPhase(phase, misfit, misfit < EXPLAINED, converged, prior.exponent, point)
+        return prior, means
 
     def frames(self, phase: ArrayLike) -> NDArray[np.float64]:
         """Frames that the model predicts for a phase.
@@ -174,27 +188,25 @@ class FittedSensor:
         phase = _check.real_map("phase", phase, 2)
         _check.trailing_shape("phase", phase, self.flat.shape, "the grid of the pupil")
         fine = fine_phase(np.pad(phase, PAD, "edge"), self._fitted.camera.f)
-        point = self.fit.point
-        return np.stack(Linearised(self._camera, self._light.maps(point.light, fine), point.values).images)
+        maps = self._light.maps(self._light.start, fine)
+        return Linearised(self._camera, maps, self.fit.point.values).images
 
     @property
     def _fitted(self) -> Problem:
         return self.fit.point.problem
 
-    @property
-    def _light(self) -> Light:
-        return replace(self._fitted.light, start=self.fit.point.light)
+    @cached_property
+    def _light(self) -> KnownLight:
+        light = self.fit.point.light
+        return KnownLight(self._fitted.light.maps(light, 0 * light), light)
 
     @cached_property
     def _camera(self) -> Camera:
         """The camera behind the two masks alone."""
         of = self._fitted.camera
-        exposures = [Exposure(0, 0, 0), Exposure(1, 1, 0), Exposure(2, None, 0), Exposure(3, None, 0)]
-        camera = Camera(
-            of.n, of.shape, of.n_pixels, exposures, np.zeros((1, of.n * of.f, of.n * of.f)), of.f, of.largest
-        )
-        camera.exposures = camera.exposures[:2]
-        return camera
+        flat = np.zeros((1, of.n * of.f, of.n * of.f))
+        settings: Any = [Exposure(0, 0, 0), Exposure(1, 1, 0)], flat, of.f, of.largest
+        return Camera(of.n, of.shape, of.n_pixels, *settings, n_arms=of.n_arms)
 
     def _minimum(
         self, counts: NDArray, weights: NDArray, prior: MapPrior, start: NDArray, n_steps: int, n_inner: int
@@ -202,8 +214,7 @@ class FittedSensor:
         """Fit of the phase alone."""
         of = self._fitted
         phase_map = PhaseMap(of.phase_map.n, of.camera.f, prior, of.camera.n_pixels)
-        values = self.fit.point.values
-        problem = Problem(self._camera, list(counts), list(weights), self._light, phase_map, (), values)
+        problem = Problem(self._camera, counts, weights, self._light, phase_map, (), self.fit.point.values)
         return minimise(problem, phase_map.white(start), n_steps, n_inner)
 
     def _start(self, counts: NDArray) -> NDArray[np.float64]:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import fft, linalg
 from scipy.interpolate import BSpline
 
-from zwfs._camera.light import Light
-from zwfs._camera.model import Camera, Linearised, names_of, symbol
+from zwfs._camera.light import KnownLight, Light
+from zwfs._camera.model import Camera, Linearised, names_of, pooled, symbol
 
 _BINS = 24  # of spatial frequency, for the preconditioner
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
@@ -23,7 +23,9 @@ _DEPENDENT = 1e-12  # eigenvalue over the largest, below which directions depend
 _ALIKE = 1e-13  # eigenvalue over the largest, below which numbers have the same effect
 _LAST = 12  # steps at the end of a fit
 _SHARES = 1.0, 0.5, 0.25, 0.1  # of such a step: the best one is taken
+_TOGETHER = 6  # vectors that are multiplied at once: with more, the arrays exceed the cache
 _N_MAPS = 80  # iterations for the minimum of the maps
+_N_FOLLOWED = 16  # iterations for the maps that follow the numbers
 _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
 MISSED = 0.7
@@ -73,8 +75,8 @@ class PhaseMap:
         self._means = self.colour / symbol(_PIXEL_MEAN, self.size)
 
     def means(self, white: NDArray) -> NDArray[np.float64]:
-        """Mean over each pixel, (n, n)."""
-        return fft.irfft2(self.colour * fft.rfft2(white), s=white.shape)[: self.n, : self.n]
+        """Mean over each pixel, (..., n, n)."""
+        return fft.irfft2(self.colour * fft.rfft2(white), s=white.shape[-2:])[..., : self.n, : self.n]
 
     def white(self, means: NDArray) -> NDArray[np.float64]:
         """White numbers, (size * size,), of a phase with these means."""
@@ -83,12 +85,12 @@ class PhaseMap:
 
     def fine(self, white: NDArray) -> NDArray[np.float64]:
         """Phase on the fine grid."""
-        return self._along @ fft.irfft2(self._means * fft.rfft2(white), s=white.shape) @ self._along.T
+        return self._along @ fft.irfft2(self._means * fft.rfft2(white), s=white.shape[-2:]) @ self._along.T
 
     def adjoint(self, fine: NDArray) -> NDArray[np.float64]:
         """Adjoint of `fine`."""
         nodes = self._along.T @ fine @ self._along
-        return fft.irfft2(self._means * fft.rfft2(nodes), s=nodes.shape)
+        return fft.irfft2(self._means * fft.rfft2(nodes), s=nodes.shape[-2:])
 
 
 class LightMap:
@@ -100,13 +102,14 @@ class LightMap:
         self.colour = np.sqrt(prior.spectrum(self.size, n_pixels))
 
     def fine(self, white: NDArray) -> NDArray[np.float64]:
-        return fft.irfft2(self.colour * fft.rfft2(white), s=white.shape)[: self.n, : self.n] * self.where
+        change = fft.irfft2(self.colour * fft.rfft2(white), s=white.shape[-2:])
+        return change[..., : self.n, : self.n] * self.where
 
     def adjoint(self, fine: NDArray) -> NDArray[np.float64]:
         """Adjoint of `fine`."""
-        whole = np.zeros((self.size, self.size))
-        whole[: self.n, : self.n] = fine * self.where
-        return fft.irfft2(self.colour * fft.rfft2(whole), s=whole.shape)
+        whole = np.zeros((*fine.shape[:-2], self.size, self.size))
+        whole[..., : self.n, : self.n] = fine * self.where
+        return fft.irfft2(self.colour * fft.rfft2(whole), s=whole.shape[-2:])
 
 
 def allowing(weights: NDArray, error: float | NDArray) -> NDArray[np.float64]:
@@ -142,9 +145,9 @@ class Problem:
     """Images, the model, and what is unknown."""
 
     camera: Camera
-    counts: Sequence[NDArray[np.float64]]
-    weights: Sequence[NDArray[np.float64]]  # one over the noise of each pixel; 0 for bad pixels
-    light: Light
+    counts: NDArray[np.float64]  # (n_images, ny, nx)
+    weights: NDArray[np.float64]  # one over the noise of each pixel; 0 for bad pixels
+    light: Light | KnownLight
     phase_map: PhaseMap
     light_maps: tuple[LightMap, ...]  # empty if the light is known
     values: NDArray[np.float64]  # all numbers; those that are free do not count
@@ -184,17 +187,37 @@ class Problem:
     def split(self, x: NDArray) -> tuple[list[NDArray], NDArray]:
         """White maps and free numbers."""
         ends = np.cumsum([one.size**2 for one in self.maps])
-        *white, free = np.split(x, ends)
-        return [one.reshape(of.size, -1) for one, of in zip(white, self.maps, strict=True)], free
+        *white, free = np.split(x, ends, axis=-1)
+        shapes = [(*x.shape[:-1], one.size, one.size) for one in self.maps]
+        return [one.reshape(shape) for one, shape in zip(white, shapes, strict=True)], free
+
+    def joined(self, phase: NDArray, light: NDArray) -> NDArray[np.float64]:
+        """Adjoint of the maps, with zeros for the free numbers."""
+        parts = [self.phase_map.adjoint(phase), *(one.adjoint(light) for one in self.light_maps)]
+        lead = phase.shape[:-2]
+        white = [one.reshape(*lead, -1) for one in parts]
+        return np.concatenate([*white, np.zeros((*lead, len(self.free)))], axis=-1)
 
     def light_change(self, white: Sequence[NDArray]) -> NDArray[np.float64]:
         """Change of the light on the fine grid."""
         pairs = zip(white[1:], self.light_maps, strict=True)
-        return sum((of.fine(one) for one, of in pairs), np.zeros(self.light.start.shape))
+        zero = np.zeros((*white[0].shape[:-2], *self.light.start.shape))
+        return sum((of.fine(one) for one, of in pairs), zero)
+
+    def columns(self, model: Linearised) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
+        """Free numbers that change each image, and its changes over the noise with each, (k, n_pixels)."""
+        places = [(number, *at) for number, free in enumerate(self.free) for at in free.places]
+        out = []
+        for index, weight in enumerate(self.weights):
+            own = self.camera.exposures[index].arm
+            names = {number: name for number, arm, name in places if arm in (None, own)}
+            slopes = model.slopes(index, list(names.values())) * weight
+            out.append((np.array(list(names), int), slopes.reshape(len(names), weight.size)))
+        return out
 
 
 class Point:
-    """Model, residuals and cost at given unknowns, and Gauss and Newton's matrix there."""
+    """Model, residuals and cost at given unknowns."""
 
     def __init__(self, problem: Problem, x: NDArray) -> None:
         self.problem, self.x = problem, x
@@ -205,12 +228,9 @@ class Point:
         for places, value in zip(problem.places, free.tolist(), strict=True):
             self.values[places] = value
         self.model = Linearised(problem.camera, problem.light.maps(self.light, self.phase), self.values)
-        self.residuals = [
-            weight * (image - counts)
-            for weight, image, counts in zip(problem.weights, self.model.images, problem.counts, strict=True)
-        ]
+        self.residuals = problem.weights * (self.model.images - problem.counts)
         self.excess = (free - problem.prior[0]) * problem.prior[1]
-        parts = [*self.residuals, x[: problem.n_white], self.excess]
+        parts = self.residuals, x[: problem.n_white], self.excess
         self.cost = sum(float(np.vdot(one, one)) for one in parts) / 2
 
     def moved(self, change: NDArray) -> Point:
@@ -225,87 +245,29 @@ class Point:
 
     @property
     def light_means(self) -> NDArray[np.float64]:
-        n, f = self.problem.phase_map.n, self.problem.camera.f
-        return self.light.reshape(n, f, n, f).mean(axis=(1, 3))
+        return pooled(self.light, self.problem.camera.f)
 
     @cached_property
     def misfit(self) -> NDArray[np.float64]:
         """Mean square of the residuals of each image."""
-        pairs = zip(self.residuals, self.problem.weights, strict=True)
-        return np.array([np.vdot(r, r) / max(1, np.count_nonzero(w)) for r, w in pairs])
+        n_good = np.count_nonzero(self.problem.weights, axis=(1, 2))
+        return np.sum(self.residuals**2, axis=(1, 2)) / np.maximum(n_good, 1)
 
     @cached_property
-    def _light_slopes(self) -> tuple[NDArray, NDArray]:
+    def light_slopes(self) -> tuple[NDArray, NDArray]:
+        """Derivatives of mean field and rest by the change of the light."""
         return self.problem.light.slopes(self.light)
 
     @cached_property
-    def columns(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
-        """Free numbers that change each image, and its changes over the noise with each, (k, n_pixels)."""
-        places = [(number, *at) for number, free in enumerate(self.problem.free) for at in free.places]
-        out = []
-        for index, weight in enumerate(self.problem.weights):
-            own = self.problem.camera.exposures[index].arm
-            names = {number: name for number, arm, name in places if arm in (None, own)}
-            slopes = self.model.slopes(index, list(names.values())) * weight
-            out.append((np.array(list(names), int), slopes.reshape(len(names), weight.size)))
-        return out
-
-    def along(self, number: int) -> list[NDArray[np.float64]]:
-        """Change of the residuals with a free number."""
-        return [
-            (slopes.T @ (which == number)).reshape(one.shape)
-            for one, (which, slopes) in zip(self.residuals, self.columns, strict=True)
-        ]
-
-    @cached_property
-    def block(self) -> NDArray[np.float64]:
-        """Matrix of the free numbers."""
-        block = np.diag(self.problem.prior[1] ** 2 + 1e-300)
-        for which, slopes in self.columns:
-            block[np.ix_(which, which)] += slopes @ slopes.T
-        return block
-
-    def change(self, d: NDArray) -> list[NDArray[np.float64]]:
-        """Change of the residuals with the unknowns."""
-        problem = self.problem
-        white, free = problem.split(d)
-        light = problem.light_change(white)
-        mean, rest = (light * one for one in self._light_slopes)
-        images = self.model.apply(mean, rest, problem.phase_map.fine(white[0]))
-        changes = [weight * image for weight, image in zip(problem.weights, images, strict=True)]
-        if free.any():
-            for one, (which, slopes) in zip(changes, self.columns, strict=True):
-                one += (free[which] @ slopes).reshape(one.shape)
-        return changes
-
-    def back(self, residuals: Sequence[NDArray]) -> NDArray[np.float64]:
-        """Adjoint of `change`."""
-        problem = self.problem
-        maps = self.model.adjoint([w * r for w, r in zip(problem.weights, residuals, strict=True)])
-        mean, rest = self._light_slopes
-        light = maps.mean * mean + maps.rest * rest
-        parts = [problem.phase_map.adjoint(maps.phase).ravel()]
-        parts += [one.adjoint(light).ravel() for one in problem.light_maps]
-        free = np.zeros(len(problem.free))
-        if len(free):
-            for image, (which, slopes) in zip(residuals, self.columns, strict=True):
-                free[which] += slopes @ image.ravel()
-        return np.concatenate([*parts, free])
-
-    def product(self, d: NDArray) -> NDArray[np.float64]:
-        """Matrix times a vector."""
-        n = self.problem.n_white
-        out = self.back(self.change(d))
-        out[:n] += d[:n]
-        out[n:] += d[n:] * self.problem.prior[1] ** 2
-        return out
-
-    @cached_property
     def gradient(self) -> NDArray[np.float64]:
-        n = self.problem.n_white
-        gradient = self.back(self.residuals)
+        problem, n = self.problem, self.problem.n_white
+        maps = self.model.adjoint(problem.weights * self.residuals)
+        mean, rest = self.light_slopes
+        gradient = problem.joined(maps.phase, maps.mean * mean + maps.rest * rest)
         gradient[:n] += self.x[:n]
-        gradient[n:] += self.excess * self.problem.prior[1]
+        gradient[n:] = self.excess * problem.prior[1]
+        for image, (which, slopes) in zip(self.residuals, problem.columns(self.model), strict=True):
+            gradient[n + which] += slopes @ image.ravel()
         return gradient
 
     @cached_property
@@ -318,17 +280,84 @@ class Point:
         return stuck
 
     @cached_property
+    def matrix(self) -> Matrix:
+        return Matrix(self)
+
+
+class Matrix:
+    """Gauss and Newton's matrix at a point, in single precision.
+
+    It decides how fast a fit converges, and not to what: gradient and cost are those of `Point`. Leading axes of
+    the arguments are those of several vectors.
+    """
+
+    def __init__(self, point: Point) -> None:
+        self.problem, self.x, self.cost = point.problem, point.x, point.cost
+        self.model = Linearised(self.problem.camera.single, point.model.maps, point.values)
+        self._light, self._slopes, self._zero = point.light, point.light_slopes, np.zeros_like(point.phase)
+
+    @cached_property
+    def columns(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
+        """Free numbers that change each image, and its changes over the noise with each, (k, n_pixels)."""
+        return self.problem.columns(self.model)
+
+    def along(self, number: int) -> NDArray[np.float64]:
+        """Change of the residuals with a free number."""
+        out = [slopes.T @ (which == number) for which, slopes in self.columns]
+        return np.reshape(out, self.problem.weights.shape)
+
+    @cached_property
+    def block(self) -> NDArray[np.float64]:
+        """Matrix of the free numbers."""
+        block = np.diag(self.problem.prior[1] ** 2 + 1e-300)
+        for which, slopes in self.columns:
+            block[np.ix_(which, which)] += slopes @ slopes.T
+        return block
+
+    def change(self, d: NDArray) -> NDArray[np.float64]:
+        """Change of the residuals with the unknowns, (..., n) to (..., n_images, ny, nx)."""
+        problem = self.problem
+        white, free = problem.split(d)
+        light = problem.light_change(white)
+        mean, rest = (light * one for one in self._slopes)
+        changes = problem.weights * self.model.apply(mean, rest, problem.phase_map.fine(white[0]))
+        if free.any():
+            for index, (which, slopes) in enumerate(self.columns):
+                changes[..., index, :, :] += (free[..., which] @ slopes).reshape(
+                    *d.shape[:-1], *changes.shape[-2:]
+                )
+        return changes
+
+    def back(self, residuals: NDArray) -> NDArray[np.float64]:
+        """Adjoint of `change`."""
+        problem = self.problem
+        maps = self.model.adjoint(problem.weights * residuals)
+        mean, rest = self._slopes
+        out = problem.joined(maps.phase, maps.mean * mean + maps.rest * rest)
+        for index, (which, slopes) in enumerate(self.columns):
+            image = residuals[..., index, :, :]
+            out[..., problem.n_white + which] += image.reshape(*image.shape[:-2], -1) @ slopes.T
+        return out
+
+    def product(self, d: NDArray) -> NDArray[np.float64]:
+        """Matrix times vectors."""
+        n = self.problem.n_white
+        out = self.back(self.change(d))
+        out[..., :n] += d[..., :n]
+        out[..., n:] += d[..., n:] * self.problem.prior[1] ** 2
+        return out
+
+    @cached_property
     def _spectra(self) -> list[NDArray[np.float64]]:
         """Approximate eigenvalues of the matrix for each map, by random vectors."""
         rng = np.random.default_rng(0)  # the choice hardly changes the number of steps
-        problem, (mean, rest), zero = self.problem, self._light_slopes, np.zeros(self.phase.shape)
+        problem, zero, (mean, rest) = self.problem, self._zero, self._slopes
         out = []
         for number, one in enumerate(problem.maps):
-            where = (self.light > 0.3) if isinstance(one, PhaseMap) else one.where
-            probe = rng.choice([-1.0, 1.0], self.phase.shape) * where
-            change = (probe * mean, probe * rest, zero) if number else (zero, zero, probe)
-            images = self.model.apply(*change)
-            maps = self.model.adjoint([w**2 * image for w, image in zip(problem.weights, images, strict=True)])
+            where: NDArray = one.where if isinstance(one, LightMap) else self._light > 0.3
+            probe = rng.choice([-1.0, 1.0], where.shape) * where
+            images = self.model.apply(*((probe * mean, probe * rest, zero) if number else (zero, zero, probe)))
+            maps = self.model.adjoint(problem.weights**2 * images)
             answer = (maps.mean * mean + maps.rest * rest) * where if number else maps.phase
             response = self._response(probe, answer, one)
             white = [rng.normal(size=(of.size,) * 2) * (of is one) for of in problem.maps]
@@ -372,23 +401,25 @@ class Point:
     def _filtered(self, d: NDArray, power: int) -> list[NDArray]:
         white, _ = self.problem.split(d)
         return [
-            fft.irfft2(fft.rfft2(one) * response**power, s=one.shape).ravel()
+            fft.irfft2(fft.rfft2(one) * response**power, s=one.shape[-2:]).reshape(*d.shape[:-1], -1)
             for one, response in zip(white, self._spectra, strict=True)
         ]
 
+    @cached_property
+    def _inverse_block(self) -> NDArray[np.float64]:
+        unit = np.sqrt(np.diagonal(self.block))
+        scaled = self.block / np.outer(unit, unit) + 1e-9 * np.eye(len(unit))
+        return linalg.inv(scaled) / np.outer(unit, unit)
+
     def precondition(self, r: NDArray) -> NDArray[np.float64]:
-        """Approximate inverse of the matrix times a vector."""
-        free = r[self.problem.n_white :]
-        if free.size:
-            unit = np.sqrt(np.diagonal(self.block))
-            scaled = self.block / np.outer(unit, unit) + 1e-9 * np.eye(len(unit))
-            free = linalg.solve(scaled, free / unit, assume_a="pos") / unit
-        return np.concatenate([*self._filtered(r, -1), free])
+        """Approximate inverse of the matrix times vectors."""
+        free = r[..., self.problem.n_white :]
+        return np.concatenate([*self._filtered(r, -1), free @ self._inverse_block if free.size else free], axis=-1)
 
     def scale(self, d: NDArray) -> NDArray[np.float64]:
-        """Matrix of the damping times a vector."""
-        free = np.diagonal(self.block) * d[self.problem.n_white :]
-        return np.concatenate([*self._filtered(d, 1), free])
+        """Matrix of the damping times vectors."""
+        free = np.diagonal(self.block) * d[..., self.problem.n_white :]
+        return np.concatenate([*self._filtered(d, 1), free], axis=-1)
 
     def solve(
         self, right: NDArray, held: NDArray[np.bool_], n_inner: int, tolerance: float, damping: float = 0.0
@@ -399,24 +430,25 @@ class Point:
         """
 
         def product(d: NDArray) -> NDArray:
-            return self.product(d) + damping * self.scale(d) if damping else self.product(d)
+            out = np.concatenate([self.product(few) for few in np.array_split(d, -(-len(d) // _TOGETHER))])
+            return out + damping * self.scale(d) if damping else out
 
         def free(one: NDArray) -> NDArray:
             return np.where(held, 0, one)
 
         r = free(np.atleast_2d(right))
-        x, z = np.zeros_like(r), np.array([free(self.precondition(one)) for one in r])
+        x, z = np.zeros_like(r), free(self.precondition(r))
         d, sizes = z, np.vecdot(r, z)
         goals = tolerance**2 * sizes
         for _ in range(n_inner):
             if np.all(sizes <= goals):
                 break
             d = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)
-            along = np.array([free(product(one)) for one in d])
+            along = free(product(d))
             inverse = linalg.pinvh(d @ along.T, rtol=_DEPENDENT)
             step = inverse @ (d @ r.T)
             x, r = x + step.T @ d, r - step.T @ along
-            z = np.array([free(self.precondition(one)) for one in r])
+            z = free(self.precondition(r))
             d, sizes = z - (inverse @ (along @ z.T)).T @ d, np.vecdot(r, z)
         return x.reshape(np.shape(right))
 
@@ -437,7 +469,7 @@ def minimise(
             break
         report(step + 1)
         for _ in range(10):
-            change = point.solve(-point.gradient, point.stuck, n_inner, 0.03, damping)
+            change = point.matrix.solve(-point.gradient, point.stuck, n_inner, 0.03, damping)
             promised = -float(point.gradient @ change) / 2
             trial = point.moved(change)
             gain = point.cost - trial.cost
@@ -462,16 +494,13 @@ class Eliminated:
     """
 
     def __init__(self, point: Point) -> None:
-        n, n_all = point.problem.n_white, len(point.x)
+        n, n_all, matrix = point.problem.n_white, len(point.x), point.matrix
         held = np.arange(n_all) >= n
-        self._unit = np.sqrt(np.diagonal(point.block))
-        along = [[one / unit for one in point.along(number)] for number, unit in enumerate(self._unit)]
-        followed = point.solve(np.array([point.back(one) for one in along]), held, 16, 0.01)
-        self._effects = [
-            [one - other for one, other in zip(of, point.change(solution), strict=True)]
-            for of, solution in zip(along, followed, strict=True)
-        ]
-        self._x, self._e = followed[:, :n], np.array([_joined(one) for one in self._effects])
+        self._unit = np.sqrt(np.diagonal(matrix.block))
+        along = np.array([matrix.along(number) / unit for number, unit in enumerate(self._unit)])
+        followed = matrix.solve(matrix.back(along), held, _N_FOLLOWED, 0.01)
+        self._effects = along - matrix.change(followed)
+        self._x, self._e = followed[:, :n], self._effects.reshape(len(along), -1)
         self._known = self._x @ self._x.T + np.diag((point.problem.prior[1] / self._unit) ** 2)
         self._matrix = self._e @ self._e.T + self._known
 
@@ -481,15 +510,15 @@ class Eliminated:
         The maps move to their own minimum and follow the numbers. The slope along the numbers is that at this
         minimum, g_p - H_pm H_mm^-1 g_m.
         """
-        n, numbers = point.problem.n_white, np.arange(len(point.x)) >= point.problem.n_white
-        maps = point.solve(point.gradient, numbers, _N_MAPS, 0.01)
+        n, numbers, matrix = point.problem.n_white, np.arange(len(point.x)) >= point.problem.n_white, point.matrix
+        maps = matrix.solve(point.gradient, numbers, _N_MAPS, 0.01)
         move = ~point.stuck[n:]
-        slope = (point.gradient - point.product(maps))[n:] / self._unit * move
+        slope = (point.gradient - matrix.product(maps))[n:] / self._unit * move
         step = np.zeros_like(slope)
         step[move] = -linalg.pinvh(self._matrix[np.ix_(move, move)], rtol=_ALIKE) @ slope[move]
         return np.concatenate([-maps[:n] - self._x.T @ step, step / self._unit]), -float(slope @ step) / 2
 
-    def covariance(self, point: Point, changes: Sequence[Sequence[NDArray]], scale: float) -> NDArray[np.float64]:
+    def covariance(self, point: Point, changes: NDArray, scale: float) -> NDArray[np.float64]:
         """Covariance of the numbers: of the noise, of what the model misses, and of changes of the images.
 
         That of the noise is S^-1 times `scale`. Where the model misses something, residuals are alike over some
@@ -500,11 +529,10 @@ class Eliminated:
         the focus of both arms.
         """
         inverse = linalg.pinvh(self._matrix, rtol=_ALIKE)
-        sums = [[r * one for r, one in zip(point.residuals, each, strict=True)] for each in self._effects]
-        scores = _block_sums(sums)
+        scores = _block_sums(np.sum(point.residuals * self._effects, axis=1))
         seen = np.diagonal(inverse @ (scores @ scores.T + self._known) @ inverse) / np.diagonal(inverse)
         grow = np.sqrt(np.maximum(scale, seen)) / self._unit
-        moved = inverse @ (self._e @ np.transpose([_joined(one) for one in changes]))
+        moved = inverse @ (self._e @ changes.reshape(len(changes), -1).T)
         squares = np.mean(moved**2, axis=1) / np.diagonal(inverse)
         kinds = np.array([one.kind for one in point.problem.free])
         alike = np.array([np.mean(squares[kinds == kind]) for kind in kinds])
@@ -512,11 +540,15 @@ class Eliminated:
         return inverse * np.outer(grow, grow) + np.diag(missed)
 
 
-def settle(point: Point) -> tuple[Point, bool, Eliminated]:
-    """Take last steps of all unknowns, and judge by what the next one promises whether the fit has converged."""
+def settle(point: Point, report: Callable[[int], Any]) -> tuple[Point, bool, Eliminated]:
+    """Take last steps of all unknowns, and judge by what the next one promises whether the fit has converged.
+
+    `report` is called before each step with its number, from 1 on.
+    """
     equations = Eliminated(point)
     step, promised = equations.step(point)
-    for _ in range(_LAST):
+    for number in range(_LAST):
+        report(number + 1)
         trial = min((point.moved(share * step) for share in _SHARES), key=lambda one: one.cost)
         if trial.cost >= point.cost:
             break
@@ -527,13 +559,7 @@ def settle(point: Point) -> tuple[Point, bool, Eliminated]:
     return point, promised < 1, equations
 
 
-def _joined(images: Sequence[NDArray]) -> NDArray[np.float64]:
-    """All pixels of images, (n_pixels,)."""
-    return np.concatenate([one.ravel() for one in images])
-
-
-def _block_sums(images: Sequence[Sequence[NDArray]]) -> NDArray[np.float64]:
-    """Sums over square blocks of pixels and over the images, (k, n_blocks), of k sets of images."""
-    total = np.array([np.sum(one, axis=0) for one in images])
-    rows, columns = (np.arange(0, length, _BLOCK) for length in total.shape[1:])
-    return np.add.reduceat(np.add.reduceat(total, rows, axis=1), columns, axis=2).reshape(len(total), -1)
+def _block_sums(images: NDArray) -> NDArray[np.float64]:
+    """Sums over square blocks of pixels, (k, n_blocks), of k images."""
+    rows, columns = (np.arange(0, length, _BLOCK) for length in images.shape[1:])
+    return np.add.reduceat(np.add.reduceat(images, rows, axis=1), columns, axis=2).reshape(len(images), -1)

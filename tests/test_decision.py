@@ -11,7 +11,6 @@ from studies.decision import (
     Row,
     Situation,
     bench_loops,
-    calibrated_errors,
     dimmed,
     draw_comparison,
     know_bench,
@@ -110,11 +109,6 @@ def test_winners_on_a_bench_without_errors_do_not_depend_on_the_screens(known):
     cells = [open_cell(one) for one in errors]
     assert [cell.images for cell in cells] == [2, 2, None]
     assert all(cell.two == "phase-shifted" for cell in cells[:2])
-
-
-def test_a_situation_that_was_not_recorded_on_the_calibrated_bench_has_no_error():
-    assert calibrated_errors([Situation(0.45, 1e4), Situation(0.5, 300.0)], 2) == [None, None]
-    assert calibrated_errors(SITUATIONS, 0) == [None] * 3
 
 
 def test_loops_of_two_images_bring_more_benches_to_flat():

@@ -126,8 +126,8 @@ RANGE = SMALL | {
 DIMPLE = SMALL | {"inputs": [0.5], "step": 2.0, "step_fine": 0.3, "diameter_max": 3.5, "n_screens_few": 1}
 DECISION = BENCH | {
     "n_pixels_fine": 40,
-    "n_screens": 2, "n_screens_perfect": 2, "n_loops": 2,
-    "n_screens_calibrated": 0, "n_iterations": 3,
+    "n_screens": 2, "n_screens_fine": 2, "n_screens_perfect": 2, "n_loops": 2,
+    "n_iterations": 3,
 }  # fmt: skip
 LOOP = {
     "n_pixels": 16, "n_modes": 6, "n_screens": 1, "n_screens_linear": 2, "n_steps": 8, "inputs": [0.4],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -13,9 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.stats import binomtest
 
-from studies import calibration
 from studies.closed_loop import (
     ALIKE,
     BestMethods,
@@ -33,7 +30,7 @@ from studies.kit.results import rounded
 from studies.kit.style import OTHER_STYLES, TALL
 from studies.kit.tables import MISSING, Table
 from zwfs import Arcsine, MaximumLikelihood, PhaseShifted, Pupil
-from zwfs.bench import Bench, BenchModel, segment_pistons, segment_residual, segment_screens
+from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.turbulence import FrozenFlow
 
 LIMITS = parameter_limits(
@@ -45,14 +42,13 @@ LIMITS = parameter_limits(
     **dict.fromkeys(("rms", "rms_small", "rms_loop", "rms_loop_middle", "rms_loop_small"), (0.01, 4.0)),
     **dict.fromkeys(("photons", "photons_faint"), (10.0, 1e9)),
     **dict.fromkeys(("photons_loop", "photons_loop_faint"), (0.01, 1e9)),
-    **dict.fromkeys(("n_screens", "n_screens_perfect", "n_loops"), (2, 1000)),
-    n_screens_calibrated=(0, 6),
+    **dict.fromkeys(("n_screens", "n_screens_fine", "n_screens_perfect", "n_loops"), (2, 1000)),
     other_diameter=(0.1, 2.2),
     other_shift=(0.05, 0.95),
 )
 
-QUICK = dict.fromkeys(("n_screens", "n_screens_perfect", "n_loops"), 2)
-QUICK |= {"n_pixels": 32, "n_pixels_fine": 32, "n_screens_calibrated": 0}
+QUICK = dict.fromkeys(("n_screens", "n_screens_fine", "n_screens_perfect", "n_loops"), 2)
+QUICK |= {"n_pixels": 32, "n_pixels_fine": 32}
 
 BENCHES = {"perfect": "perfect model", "real": "bench with errors", "fine": "bench, finer pixels"}
 """What is known of the bench, and its name in the table."""
@@ -62,7 +58,6 @@ TWO_IMAGES = {
     "PhaseShifted": "phase-shifted",
     "Accelerated": "phase-shifted, accelerated",
     "MaximumLikelihood": "maximum likelihood",
-    "LikelihoodModes": "maximum likelihood on pistons",
 }
 """Methods, the simplest first, and their names in the table."""
 UNCORRECTED = "PhaseShifted with the offset of its flat"
@@ -72,7 +67,7 @@ _N_DARKS = 16  # averaged
 
 RATE, DELAY, N_STEPS = 1000.0, 2, 40  # of the loops: 1/s, steps, steps
 WIND = {"speed": 2.5, "cutoff": 3.0, "exponent": -2.0}
-GAINS = 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9
+GAINS = 0.1, 0.2, 0.4, 0.6, 0.8
 """Settings of the chapter on closed loops."""
 _ON_BENCH = {"Linear": "classic", "LinearTwo": "shifted"}
 """Methods of the loops, and their sensors in `BenchModel`."""
@@ -94,7 +89,7 @@ class Situation(NamedTuple):
 class Shot(NamedTuple):
     """Frames less the dark, photoelectrons."""
 
-    counts: NDArray[np.float64]  # (n_images, ny, nx)
+    counts: NDArray[np.float64]  # (..., n_images, ny, nx)
     share: float  # light of the exposure over that of the calibration
 
 
@@ -113,9 +108,9 @@ class Camera(NamedTuple):
         share = light * np.count_nonzero(known.bench.segments) / known.bench.photons
         return cls(dimmed(known.bench, light), share * known.dark, share, n_images)
 
-    def shot(self, command: NDArray, seed: np.random.SeedSequence) -> Shot:
-        """Take frames of a command."""
-        return Shot((self.bench.frames(command, seed) - self.dark)[: self.n_images], self.share)
+    def shot(self, commands: NDArray, seed: np.random.SeedSequence | np.random.Generator) -> Shot:
+        """Take frames of commands, (..., n_segments)."""
+        return Shot((self.bench.frames(commands, seed) - self.dark)[..., : self.n_images, :, :], self.share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,14 +149,14 @@ def dimmed(bench: Bench, photons: float) -> Bench:
     return replace(bench, photons=total, background=background, read_noise=read_noise)
 
 
-def shots(known: Known, photons: float, command: NDArray, seed: np.random.SeedSequence) -> list[Shot]:
-    """Take frames of one image and of two.
+def shots(known: Known, photons: float, commands: NDArray, seed: np.random.SeedSequence) -> list[Shot]:
+    """Take frames of commands with one image and with two.
 
     `photons` are those per point and image of two; one image gets those of both. On its own the first image would
     be brighter than the mean of the two by the imbalance of the bench.
     """
     cameras = [Camera.of(known, photons, n_images) for n_images in (1, 2)]
-    return [camera.shot(command, noise) for camera, noise in zip(cameras, seed.spawn(2), strict=True)]
+    return [camera.shot(commands, noise) for camera, noise in zip(cameras, seed.spawn(2), strict=True)]
 
 
 def open_loop_errors(
@@ -172,81 +167,58 @@ def open_loop_errors(
     seed: int,
 ) -> dict[str, list[dict[str, NDArray[np.float64]]]]:
     """Errors of all methods on each bench in its situations, (n_screens,) by name, rad rms over the segments."""
-    rows = {name: range(len(those)) for name, those in situations.items()}
-    tasks = [(name, row, screen) for name in benches for row in rows[name] for screen in range(n_screens[name])]
-    errors = iter(sweeps.run(_errors, tasks, benches, situations, n_iterations, seed, name="open_loop_errors"))
-    some = {name: [[next(errors) for _ in range(n_screens[name])] for _ in rows[name]] for name in benches}
-    return {
-        name: [{method: np.array([one[method] for one in row]) for method in row[0]} for row in found]
-        for name, found in some.items()
-    }
+    tasks = [(name, row) for name in benches for row in range(len(situations[name]))]
+    shared = benches, situations, n_screens, n_iterations, seed
+    errors = iter(sweeps.run(_errors, tasks, *shared, name="open_loop_errors"))
+    return {name: [next(errors) for _ in situations[name]] for name in benches}
 
 
 def _errors(
-    task: tuple[str, int, int],
+    task: tuple[str, int],
     benches: Mapping[str, Known],
     situations: Mapping[str, Sequence[Situation]],
+    n_screens: Mapping[str, int],
     n_iterations: int,
     seed: int,
-) -> dict[str, float]:
-    """Errors of all methods on one screen; each method subtracts what it finds for the flat command."""
-    name, row, screen = task
+) -> dict[str, NDArray[np.float64]]:
+    """Errors of all methods in a situation, (n_screens,); each subtracts what it finds for the flat command."""
+    name, row = task
     known, (rms, photons) = benches[name], situations[name][row]
-    draws, noise = np.random.SeedSequence(seed, spawn_key=(row, screen)).spawn(2)
+    draws, noise = np.random.SeedSequence(seed, spawn_key=(row,)).spawn(2)
     model, bench = known.model, known.bench
-    [command] = segment_screens(bench, rms, 1, seed=draws)
-    alone, pair = shots(known, photons, command, noise)
+    commands = segment_screens(bench, rms, n_screens[name], seed=draws)
+    alone, pair = shots(known, photons, commands, noise)
 
-    def error(phase: NDArray, flat: NDArray | float) -> float:
-        found = segment_pistons(phase, bench.segments, bench.numbers) - flat
-        return float(np.sqrt(np.mean(segment_residual(found, command) ** 2)))
+    def errors(pistons: NDArray) -> NDArray[np.float64]:
+        return np.sqrt(np.mean(segment_residual(pistons, commands) ** 2, axis=-1))
 
     found = {}
     for method, reconstruct in _methods(known, photons, n_iterations).items():
         n_images = reconstruct.sensor.n_masks
         shot = alone if n_images == 1 else pair
-        counts = np.stack([known.flat[:n_images], shot.counts / shot.share])
-        flat, phase = reconstruct(counts / model.scale[:n_images]).phase
-        found[method] = error(phase, model.pistons(flat))
+        counts = np.concatenate([known.flat[np.newaxis, :n_images], shot.counts / shot.share])
+        pistons = model.pistons(reconstruct(counts / model.scale[:n_images]).phase)
+        found[method] = errors(pistons[1:] - pistons[0])
         if method == "PhaseShifted":
-            found[UNCORRECTED] = error(phase, 0.0)
+            found[UNCORRECTED] = errors(pistons[1:])
     return found
 
 
-@lru_cache(maxsize=1)  # of a bench and a light, for all screens
 def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
     """Return the methods that know the design of the mask, the clear frames, and the response to pokes."""
     one, two, modes = known.model.classic, known.model.shifted, known.model.modes
     share = photons * np.count_nonzero(known.bench.segments) / known.bench.photons
     noise = np.sqrt(share) * known.noise  # of a pixel without light, as in `shots`
-    single: dict[str, Any] = {"photons": 2 * photons, "read_noise": np.sqrt(2) * noise}
-    double: dict[str, Any] = {"photons": photons, "read_noise": noise}
+    # Of maximum likelihood, the first start explains the frames or no start does.
     return {
         "Linear": poked_linear(one, known.model, known.poked, known.poke),
         "Arcsine": Arcsine(one, n_iterations=n_iterations),
-        "LikelihoodOne": MaximumLikelihood(one, modes, **single),
+        "LikelihoodOne": MaximumLikelihood(one, modes, photons=2 * photons, read_noise=noise * 2**0.5, n_starts=1),
         "LinearTwo": poked_linear(two, known.model, known.poked, known.poke),
         "PhaseShifted": PhaseShifted(two, n_iterations=n_iterations),
         "Accelerated": PhaseShifted(two, n_iterations=n_iterations, accelerate=True),
-        # Of two images, the first start explains the frames or no start does.
-        "MaximumLikelihood": MaximumLikelihood(two, n_starts=1, **double),
-        "LikelihoodModes": MaximumLikelihood(two, modes, n_starts=1, **double),
+        "MaximumLikelihood": MaximumLikelihood(two, n_starts=1, photons=photons, read_noise=noise),
     }
-
-
-def calibrated_errors(situations: Sequence[Situation], n_screens: int) -> list[tuple[float, float] | None]:
-    """Errors of a bench that HCIPy simulates, with the fitted model and with the values of the design.
-
-    They are in rad rms over the pixels and the screens; None for a situation that was not recorded.
-    """
-    taken = calibration.Recording.read()
-    rows = [taken.unseen(*one)[:n_screens] for one in situations]
-    if not any(rows):
-        return [None] * len(rows)
-    fit = calibration.calibrate(taken)
-    found = iter(calibration.measure(taken, fit, [number for row in rows for number in row]))
-    errors = [np.array([(one.calibrated, one.plain) for one in islice(found, len(row))]) for row in rows]
-    return [tuple(np.sqrt(np.mean(row**2, axis=0)).tolist()) if row.size else None for row in errors]
 
 
 def bench_loops(known: Known, situations: Sequence[Situation], n_screens: int, seed: int) -> list[BestMethods]:
@@ -283,18 +255,15 @@ def dimple_ratios(loops: Sequence[BestMethods], known: Known, n_screens: int, se
 def _tuned_on_bench(
     task: tuple[Situation, str], known: Known, n_screens: int, seed: int
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Best gain on an eighth as many screens, the residual there, and the residuals on new screens, rad rms."""
+    """Best gain on a sixth as many screens, the residual there, and the residuals on new screens, rad rms."""
     (rms, photons), name = task
     linear = poked_linear(getattr(known.model, _ON_BENCH[name]), known.model, known.poked, known.poke)
     first, then = map(int, np.random.SeedSequence(seed).generate_state(2))
 
     def settle(n: int, gain: float, noise: int) -> NDArray[np.float64]:
-        loops = zip(
-            drifting_pistons(known.bench, rms, n, noise), np.random.SeedSequence(noise).spawn(n), strict=True
-        )
-        return np.array([_bench_loop(known, linear, photons, gain, *one) for one in loops])
+        return _close_loops(known, linear, photons, gain, drifting_pistons(known.bench, rms, n, noise), noise)
 
-    scores = {gain: typical(settle(max(1, n_screens // 8), gain, first)) for gain in GAINS}
+    scores = {gain: typical(settle(max(1, n_screens // 6), gain, first)) for gain in GAINS}
     best = min(scores, key=lambda gain: scores[gain])
     return best, scores[best], settle(n_screens, best, then)
 
@@ -313,21 +282,22 @@ def drifting_pistons(bench: Bench, rms: float, n_screens: int, seed: int) -> NDA
     return pistons * (rms / pistons[:, 0].std(axis=-1))[:, np.newaxis, np.newaxis]
 
 
-def _bench_loop(
-    known: Known, linear: Any, photons: float, gain: float, pistons: NDArray, seed: np.random.SeedSequence
-) -> float:
-    """Residual of a loop over its last third, rad rms over the segments."""
+def _close_loops(
+    known: Known, linear: Any, photons: float, gain: float, pistons: NDArray, seed: int
+) -> NDArray[np.float64]:
+    """Residuals of loops over their last third, (n_screens,), rad rms over the segments."""
     model, k = known.model, linear.sensor.n_masks
+    noise = np.random.default_rng([seed, 1])  # not that of the screens
     flat = model.pistons(linear(known.flat[:k] / model.scale[:k]).phase)
-    camera, mirror = Camera.of(known, photons, k), [np.zeros(pistons.shape[-1])] * DELAY
-    left = []
-    for wanted, noise in zip(pistons, seed.spawn(len(pistons)), strict=True):
-        left.append(wanted + mirror[-DELAY])
-        counts, share = camera.shot(left[-1], noise)
+    camera, mirror = Camera.of(known, photons, k), [np.zeros(pistons[:, 0].shape)] * DELAY
+    residual = []
+    for wanted in pistons.swapaxes(0, 1):
+        residual.append(wanted + mirror[-DELAY])
+        counts, share = camera.shot(residual[-1], noise)
         found = model.pistons(linear(counts / share / model.scale[:k]).phase) - flat
         mirror.append(mirror[-1] - gain * found)
     # Not modulo 2 pi: a segment that is a wave off is not flat, though the sensor sees no error.
-    return float(np.sqrt(np.mean(np.var(left[-(len(left) // 3) :], axis=1))))
+    return np.sqrt(np.mean(np.var(residual[-(len(residual) // 3) :], axis=-1), axis=0))
 
 
 @dataclass(frozen=True)
@@ -390,16 +360,6 @@ def loop_cell(found: BestMethods) -> Cell:
     counts = int(closed[0].sum()), int(closed[1].sum())
     one, two = (f"{short_name(name)}, gain {loops.gains[name]:g}" for name in names)
     return Cell(one, two, (left[0], left[1]), found.ratio, found.low, found.high, counts, closed[0].size)
-
-
-def chance(loops: TunedLoops) -> float:
-    """Probability of as unequal counts of closed loops if one image and two closed equally often, at least 0.001.
-
-    It is that of the two-sided sign test.
-    """
-    one, two = loops.closed("Linear"), loops.closed("LinearTwo")
-    n_unequal = int(np.count_nonzero(one != two))
-    return max(1e-3, binomtest(int(np.count_nonzero(two & ~one)), n_unequal).pvalue) if n_unequal else 1.0
 
 
 class Row(NamedTuple):
@@ -539,17 +499,6 @@ def _cells(row: Row, *names: str) -> list[str]:
     return [situation, row.photons, *(texts[name] for name in names)]
 
 
-def calibrated_table(situations: Iterable[Situation], errors: Iterable[tuple[float, float] | None]) -> Table:
-    """Errors of two images with a fitted model, and with the values of the design."""
-    header = ["situation", "photons per point and image", "fitted model, smooth phases", "design values", "ratio"]
-    both = [
-        ["not studied"] * 3 if pair is None else [*map(two_digits, pair), f"{pair[1] / pair[0]:.1f}"]
-        for pair in errors
-    ]
-    starts = [[f"{rms:g} rad rms", f"{photons:g}"] for rms, photons in situations]
-    return Table(header, [start + pair for start, pair in zip(starts, both, strict=True)])
-
-
 def _likelihood_ratios(errors: Sequence[Mapping[str, NDArray]]) -> list[float]:
     """Error of maximum likelihood over that of the phase-shifted iteration, in each situation of the open loop."""
     return [paired_ratio(one["MaximumLikelihood"], one["PhaseShifted"])[0] for one in errors]
@@ -558,19 +507,14 @@ def _likelihood_ratios(errors: Sequence[Mapping[str, NDArray]]) -> list[float]:
 def numbers(
     rows: Sequence[Row],
     errors: Mapping[str, Sequence[Mapping[str, NDArray]]],
-    calibrated: Sequence[tuple[float, float] | None],
-    loops: Sequence[BestMethods],
     dimples: Sequence[float],
 ) -> dict[str, float | str]:
-    """Situations and results in words, errors of a calibrated bench, and extremes."""
+    """Situations and results in words, and extremes."""
     found: dict[str, float | str] = {}
     for row in rows:
         found |= {f"{row.key}_start": row.start, f"{row.key}_photons": row.photons}
         found |= {f"{row.key}_{name}": text for name, text in row.cell.texts.items()}
         found[f"{row.key}_span"] = one_over_two(row.cell)
-    for index, pair in enumerate(calibrated, 1):
-        if pair is not None:
-            found |= {f"calibrated_gain_{index}": pair[1] / pair[0]}
     [cell] = (row.cell for row in rows if row.key == "real_3")
     small, bright = errors["real"][-1], errors["perfect"][0]
     ratio = bright[simplest(bright, ONE_IMAGE)] / bright[simplest(bright, TWO_IMAGES)]
@@ -588,7 +532,6 @@ def numbers(
             "fine_iteration": typical(errors["fine"][0]["PhaseShifted"]),
             "dimple_least": min(dimples),
             "dimple_most": max(dimples),
-            "chance": chance(loops[2].loops),
             "loop_rate": RATE / 1e3,
             "loop_delay": DELAY,
             "loop_wind": WIND["speed"] * _DIAMETER,

@@ -151,7 +151,7 @@ class Measured(NamedTuple):
 
     plain: float
     calibrated: float
-    same_prior: float  # with the values of the design and the prior of the calibrated route; NaN if not measured
+    same_prior: float  # with the values of the design and the prior of the calibrated route; NaN without a control
     sigma: float  # error bar that the fit states, rms over the same pixels
     inside: float  # share of these pixels with an error below the error bar
     misfit: float
@@ -159,14 +159,21 @@ class Measured(NamedTuple):
 
 
 def measure(
-    taken: Recording, fit: BenchFit, numbers: Sequence[int], n_iterations: int = 25, *, control: bool = False
+    taken: Recording,
+    fit: BenchFit,
+    numbers: Sequence[int],
+    n_iterations: int = 25,
+    *,
+    controls: Sequence[int] = (),
 ) -> list[Measured]:
     """Measure unseen screens by the plain route with the values of the design, and with the fitted optics.
 
-    A control keeps the maps, places and prior of the fit, and replaces its optics by the values of the design.
+    For the screens in `controls`, a control keeps the maps, places and prior of the fit, and replaces its optics
+    by the values of the design.
     """
-    sensors = [FittedSensor(fit), *([FittedSensor(designed(fit))] if control else [])]
-    return sweeps.run(_measure, numbers, taken, sensors, n_iterations, name="calibrated_errors")
+    tasks = [(number, number in controls) for number in numbers]
+    shared = taken, FittedSensor(fit), FittedSensor(designed(fit)), n_iterations
+    return sweeps.run(_measure, tasks, *shared, name="calibrated_errors")
 
 
 def designed(fit: BenchFit) -> BenchFit:
@@ -176,12 +183,15 @@ def designed(fit: BenchFit) -> BenchFit:
     return fit.replaced(optics | {"diameter": design.diameter, "first": first, "second": second})
 
 
-def _measure(number: int, taken: Recording, sensors: Sequence[FittedSensor], n_iterations: int) -> Measured:
+def _measure(
+    task: tuple[int, bool], taken: Recording, sensor: FittedSensor, design: FittedSensor, n_iterations: int
+) -> Measured:
+    number, with_control = task
     counts, sigma = taken.shot(number)
     truth, lit = taken.arrays["unseen"][number] * _UNIT, taken.arrays["lit"]
-    found, *control = (sensor(counts, sigma) for sensor in sensors)
+    found = sensor(counts, sigma)
     left = _error(found.phase, truth, lit)
-    same_prior = float(_error(control[0].phase, truth, lit).std()) if control else np.nan
+    same_prior = float(_error(design(counts, sigma).phase, truth, lit).std()) if with_control else np.nan
     bars = found.sigma[lit]
     plain = _plain(counts, taken, number, n_iterations)
     inside = float(np.mean(np.abs(left) < bars))
@@ -260,8 +270,8 @@ class Errors:
         return Errors(self.rms, [row[:n_screens] for row in self.measured])
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """Root mean square over the screens of an attribute, (n,)."""
-        return np.sqrt(np.mean(self.single(name) ** 2, axis=1))
+        """Root mean square of an attribute over the screens for which it was measured, (n,)."""
+        return np.sqrt(np.nanmean(self.single(name) ** 2, axis=1))
 
 
 def measure_inputs(
@@ -273,11 +283,18 @@ def measure_inputs(
     *,
     control: bool = False,
 ) -> Errors:
-    """Measure the bright unseen screens up to an error; on demand with the control of `measure`."""
+    """Measure the bright unseen screens up to an error; on demand the first ones with a control."""
     inputs = taken.inputs(largest)
     numbers = [number for rms in inputs for number in taken.unseen(rms, taken.photons[0])[:n_screens]]
-    found = measure(taken, fit, numbers, n_iterations, control=control)
+    found = measure(taken, fit, numbers, n_iterations, controls=numbers[::n_screens] if control else [])
     return Errors(inputs, [found[k : k + n_screens] for k in range(0, len(found), n_screens)])
+
+
+def measure_faint(taken: Recording, fit: BenchFit, n_screens: int, n_iterations: int = 25) -> Errors:
+    """Measure the unseen screens with the least light."""
+    rms = taken.arrays["unseen_rms"][taken.arrays["unseen_photons"] == taken.photons[-1]][:1]
+    numbers = taken.unseen(rms[0], taken.photons[-1])[:n_screens]
+    return Errors(rms, [measure(taken, fit, numbers, n_iterations)])
 
 
 def bulk_errors(taken: Recording, fit: BenchFit, errors: Errors) -> NDArray[np.float64]:
@@ -339,19 +356,23 @@ def command_table(command_errors: Sequence[float], fits: Sequence[BenchFit], mea
     return Table(["error of all commands", "error of unseen screens, smaller by", "verdict of the fit"], rows)
 
 
-def accepted_error(command_errors: Sequence[float], fits: Sequence[BenchFit]) -> float:
-    """Largest relative error of the commands at which the verdict of the fit is still *consistent*."""
+def refused_error(command_errors: Sequence[float], fits: Sequence[BenchFit]) -> float:
+    """Smallest relative error of the commands at which the verdict of the fit is *not consistent*."""
     both = zip(command_errors, fits, strict=True)
-    return max((abs(error) for error, fit in both if fit.consistent), default=0.0)
+    return min((abs(error) for error, fit in both if not fit.consistent), default=np.nan)
 
 
 def _verdict(fit: BenchFit) -> str:
     return "consistent" if fit.consistent else "not consistent"
 
 
-def numbers(taken: Recording, fit: BenchFit, errors: Errors, not_smooth: NDArray) -> dict[str, float | str]:
+def numbers(
+    taken: Recording, fit: BenchFit, errors: Errors, faint: Errors, not_smooth: NDArray
+) -> dict[str, float | str]:
     """Numbers for the text: settings, verdict, errors, and how well the error bars hold."""
     true, plain, found = known_values(taken), errors.column("plain"), errors.column("calibrated")
+    control = errors.single("same_prior") / errors.single("plain")
+    [faint_plain], [faint_found] = faint.column("plain"), faint.column("calibrated")
     every = [one for row in errors.measured for one in row]
     deviations = [(fit[name].value - value) / fit[name].sigma for name, value in true.items()]
     place = int(np.argmin(np.abs(errors.rms - 0.8)))
@@ -372,8 +393,13 @@ def numbers(taken: Recording, fit: BenchFit, errors: Errors, not_smooth: NDArray
             "gain": plain[place] / found[place],
             "gain_least": (plain / found).min(),
             "gain_most": (plain / found).max(),
-            "control_least": (errors.column("same_prior") / plain).min(),
-            "control_most": (errors.column("same_prior") / plain).max(),
+            "control_least": np.nanmin(control),
+            "control_most": np.nanmax(control),
+            "faint_photons": taken.photons[-1],
+            "faint_input": faint.rms[0],
+            "faint_plain": faint_plain,
+            "faint_calibrated": faint_found,
+            "faint_gain": faint_plain / faint_found,
             "sigma": errors.column("sigma")[place],
             "inside": 100 * float(np.mean([one.inside for one in every])),
             "consistent": sum(one.consistent for one in every),

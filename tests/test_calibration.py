@@ -67,7 +67,7 @@ def test_frames_of_a_different_bench_are_flagged(taken, fit):
     [number] = taken.unseen(0.3, taken.photons[0])[:1]
     frames = taken.arrays["unseen_frames"].copy()
     frames[number, 1] = frames[number, 1, ::-1]
-    [one] = study.measure(replace(taken, arrays={**taken.arrays, "unseen_frames": frames}), fit, [number])
+    [[one]] = study.measure(replace(taken, arrays={**taken.arrays, "unseen_frames": frames}), fit, [[number]])
     assert not one.consistent
     assert one.misfit > 10
 

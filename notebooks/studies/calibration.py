@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -156,24 +156,26 @@ class Measured(NamedTuple):
     inside: float  # share of these pixels with an error below the error bar
     misfit: float
     consistent: bool
+    prior: Any = None  # of the calibrated route
 
 
 def measure(
     taken: Recording,
     fit: BenchFit,
-    numbers: Sequence[int],
+    series: Sequence[Sequence[int]],
     n_iterations: int = 25,
     *,
-    controls: Sequence[int] = (),
-) -> list[Measured]:
-    """Measure unseen screens by the plain route with the values of the design, and with the fitted optics.
+    priors: Sequence[Any] | None = None,
+    control: bool = False,
+) -> list[list[Measured]]:
+    """Measure series of unseen screens by the plain route with the design's values, and with the fitted optics.
 
-    For the screens in `controls`, a control keeps the maps, places and prior of the fit, and replaces its optics
-    by the values of the design.
+    The first screen of each series chooses the prior of the others, unless it is given. A control measures this
+    screen again with the maps, places and prior of the fit, and the optics of the design.
     """
-    tasks = [(number, number in controls) for number in numbers]
-    shared = taken, FittedSensor(fit), FittedSensor(designed(fit)), n_iterations
-    return sweeps.run(_measure, tasks, *shared, name="calibrated_errors")
+    tasks = list(zip(series, priors or [None] * len(series), strict=True))
+    sensors = FittedSensor(fit), FittedSensor(designed(fit)) if control else None
+    return sweeps.run(_measure_series, tasks, taken, *sensors, n_iterations, name="calibrated_errors")
 
 
 def designed(fit: BenchFit) -> BenchFit:
@@ -183,22 +185,40 @@ def designed(fit: BenchFit) -> BenchFit:
     return fit.replaced(optics | {"diameter": design.diameter, "first": first, "second": second})
 
 
+def _measure_series(
+    task: tuple[Sequence[int], Any],
+    taken: Recording,
+    sensor: FittedSensor,
+    design: FittedSensor | None,
+    n_iterations: int,
+) -> list[Measured]:
+    numbers, prior = task
+    measured: list[Measured] = []
+    for number in numbers:
+        measured.append(_measure(number, taken, sensor, None if measured else design, n_iterations, prior))
+        prior = measured[-1].prior
+    return measured
+
+
 def _measure(
-    task: tuple[int, bool], taken: Recording, sensor: FittedSensor, design: FittedSensor, n_iterations: int
+    number: int,
+    taken: Recording,
+    sensor: FittedSensor,
+    design: FittedSensor | None,
+    n_iterations: int,
+    prior: Any,
 ) -> Measured:
-    number, with_control = task
     counts, sigma = taken.shot(number)
     truth, lit = taken.arrays["unseen"][number] * _UNIT, taken.arrays["lit"]
-    found = sensor(counts, sigma)
+    found = sensor(counts, sigma, prior)
     left = _error(found.phase, truth, lit)
-    same_prior = float(_error(design(counts, sigma).phase, truth, lit).std()) if with_control else np.nan
+    same_prior = float(_error(design(counts, sigma, found.prior).phase, truth, lit).std()) if design else np.nan
     bars = found.sigma[lit]
-    plain = _plain(counts, taken, number, n_iterations)
+    plain = float(_plain(counts, taken, number, n_iterations).std())
     inside = float(np.mean(np.abs(left) < bars))
     stated = float(np.sqrt(np.mean(bars**2)))
-    return Measured(
-        float(plain.std()), float(left.std()), same_prior, stated, inside, found.misfit, found.consistent
-    )
+    calibrated = float(left.std())
+    return Measured(plain, calibrated, same_prior, stated, inside, found.misfit, found.consistent, found.prior)
 
 
 def _plain(counts: NDArray, taken: Recording, number: int, n_iterations: int) -> NDArray[np.float64]:
@@ -281,20 +301,20 @@ def measure_inputs(
     n_screens: int,
     n_iterations: int = 25,
     *,
+    like: Errors | None = None,
     control: bool = False,
 ) -> Errors:
-    """Measure the bright unseen screens up to an error; on demand the first ones with a control."""
+    """Measure the bright unseen screens up to an error, on demand with the priors of others, or with a control."""
     inputs = taken.inputs(largest)
-    numbers = [number for rms in inputs for number in taken.unseen(rms, taken.photons[0])[:n_screens]]
-    found = measure(taken, fit, numbers, n_iterations, controls=numbers[::n_screens] if control else [])
-    return Errors(inputs, [found[k : k + n_screens] for k in range(0, len(found), n_screens)])
+    series = [taken.unseen(rms, taken.photons[0])[:n_screens] for rms in inputs]
+    priors = [row[0].prior for row in like.measured] if like else None
+    return Errors(inputs, measure(taken, fit, series, n_iterations, priors=priors, control=control))
 
 
 def measure_faint(taken: Recording, fit: BenchFit, n_screens: int, n_iterations: int = 25) -> Errors:
     """Measure the unseen screens with the least light."""
     rms = taken.arrays["unseen_rms"][taken.arrays["unseen_photons"] == taken.photons[-1]][:1]
-    numbers = taken.unseen(rms[0], taken.photons[-1])[:n_screens]
-    return Errors(rms, [measure(taken, fit, numbers, n_iterations)])
+    return Errors(rms, measure(taken, fit, [taken.unseen(rms[0], taken.photons[-1])[:n_screens]], n_iterations))
 
 
 def bulk_errors(taken: Recording, fit: BenchFit, errors: Errors) -> NDArray[np.float64]:

@@ -354,7 +354,7 @@ def test_evidence_chooses_a_prior_as_smooth_as_the_phase(monkeypatch):
     found = measured(smooth)
     assert found.exponent > measured(segments(bench, 0.3)).exponent
     # Control: a prior for rough phases amplifies the noise of the highest frequencies.
-    monkeypatch.setattr("zwfs._camera.sensor._PRIORS", ((3.0, 2),))
+    monkeypatch.setattr("zwfs._camera.sensor._EXPONENTS", (3.0,))
     assert bench.error(measured(smooth), smooth) > 1.5 * bench.error(found, smooth)
 
 

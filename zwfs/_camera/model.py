@@ -254,6 +254,7 @@ class _Spline:
         y, x = y.ravel() - row, x.ravel() - column
         cosine, sine = math.cos(rotation) / magnification, math.sin(rotation) / magnification
         across, down = cosine * x + sine * y, cosine * y - sine * x
+        self.places = down, across  # of the pixels, in pixels of the maps from their middle
         # Changes of (down, across), in pixels, with each number of the place.
         self._moves = (
             (-cosine, -sine),
@@ -440,8 +441,11 @@ class Linearised:
             intensity += _twice(part.across, dimple)
         return self._on_camera(group.arm, fft.rfft2(self._cells(intensity)) + rest)
 
-    def apply(self, mean: NDArray, rest: NDArray, phase: NDArray) -> NDArray[np.float64]:
-        """Change of the images with a change of the maps, (..., n, n) to (..., n_images, ny, nx)."""
+    def apply(self, mean: NDArray, rest: NDArray, phase: NDArray, *, dimple: bool = True) -> NDArray[np.float64]:
+        """Change of the images with a change of the maps, (..., n, n) to (..., n_images, ny, nx).
+
+        Without `dimple`, the light of the dimple stays as it is.
+        """
         camera, optics = self.camera, self.optics
         change = (mean + 1j * (self.maps.mean * phase)).astype(self._wave.dtype) * self._wave
         spectra, inputs = self._source(change[..., None, :, :] * camera.turns)
@@ -449,10 +453,25 @@ class Linearised:
         out = np.empty((*change.shape[:-2], *self.images.shape), camera.real)
         for group, part in zip(camera.groups, self._parts, strict=True):
             field = fft.ifft2(optics.transfer[group.arm] * spectra[..., group.states, :, :], overwrite_x=True)
-            masked = group.mask is not None
-            dimple = self._dimple_light(group, inputs[..., group.states, :], 0) if masked else None
+            moves = dimple and group.mask is not None
+            light = self._dimple_light(group, inputs[..., group.states, :], 0) if moves else None
             unseen = optics.spread[group.arm][0] * unresolved
-            out[..., group.images, :, :] = self._change(group, part, field, dimple, unseen)
+            out[..., group.images, :, :] = self._change(group, part, field, light, unseen)
+        return out
+
+    @property
+    def phase_slope(self) -> NDArray:
+        """Derivative of the field by the phase."""
+        return 1j * self.maps.mean * self._wave
+
+    def of_dimple(self, inputs: NDArray) -> NDArray[np.float64]:
+        """Change of the images with the coefficients of the dimple's light, (k, r) to (k, n_images, ny, nx)."""
+        out = np.zeros((len(inputs), *self.images.shape), self.camera.real)
+        for group, part in zip(self.camera.groups, self._parts, strict=True):
+            if part.across is not None:
+                light = self._dimple_light(group, inputs[:, None].astype(self._wave.dtype), 0)
+                change = self._cells(_twice(part.across, light))
+                out[:, group.images] = self._on_camera(group.arm, fft.rfft2(change))
         return out
 
     def adjoint(self, pixels: NDArray) -> Maps:

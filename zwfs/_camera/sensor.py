@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +15,7 @@ from scipy.sparse.linalg import splu
 
 from zwfs import _check
 from zwfs._camera.bench import EXPLAINED, BenchFit, places_of
+from zwfs._camera.explicit import Explicit, Posterior
 from zwfs._camera.light import KnownLight
 from zwfs._camera.model import Camera, Exposure, Linearised
 from zwfs._camera.recording import PAD
@@ -25,9 +26,12 @@ from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
-# Exponents of the spectrum of a phase, of which the evidence chooses, and how often it updates the rms. The smooth
-# ones come first: from a rough phase, a smooth one is not found in a few steps.
-_PRIORS = (8.0, 4), (5.0, 2), (3.0, 2)
+# Exponents of the spectrum of a phase, of which the evidence chooses. The smooth ones come first: from a rough
+# phase, a smooth one is not found in a few steps.
+_EXPONENTS = 8.0, 5.0, 3.0
+_UPDATES = 4  # of the rms of a prior
+_STATIONARY = 0.1  # logarithm of the factor on the variance of a prior, below which no update follows
+_POWERS = 0.5, 2.0  # least and most power of this factor in an update of the rms
 _STRONGER = 4.5  # factor on the first rms for each unit of the exponent: the same density at about 10 cycles / D
 _ALLOWED = 0.05  # error of the model in the first stage, over the light of a full pixel
 _DRAWS = 12  # for the error bars of a phase
@@ -41,6 +45,8 @@ class FittedPhase(NDArrayOperatorsMixin):
     ----------
     phase : ndarray, shape (n, n), radian
         Mean over each pixel, that of the optics included.
+    sigma : ndarray, shape (n, n), radian
+        Error bar of each pixel.
     misfit : float
         Mean square of the residuals over the noise.
     consistent : bool
@@ -52,11 +58,11 @@ class FittedPhase(NDArrayOperatorsMixin):
     """
 
     phase: NDArray[np.float64]
+    sigma: NDArray[np.float64]
     misfit: float
     consistent: bool
     converged: bool
     prior: MapPrior
-    _point: Point
 
     @property
     def exponent(self) -> float:
@@ -72,21 +78,6 @@ class FittedPhase(NDArrayOperatorsMixin):
 
     def __getitem__(self, index: Any) -> Any:
         return self.phase[index]
-
-    @cached_property
-    def sigma(self) -> NDArray[np.float64]:
-        """Error bar of each pixel, (n, n), radian: from draws of the noise and of the prior, and the misfit."""
-        point, rng = self._point, np.random.default_rng(0)  # the choice changes the error bars by some percent
-        problem, right = point.problem, []
-        for _ in range(_DRAWS):
-            noise = rng.normal(size=problem.weights.shape) * (problem.weights > 0)
-            right.append(point.matrix.back(noise) + rng.normal(size=point.x.shape))
-        found = point.matrix.solve(np.array(right), np.zeros(point.x.shape, bool), 60, 0.03)
-        draws = problem.phase_map.means(problem.split(found)[0][0])[:, PAD:-PAD, PAD:-PAD]
-        lit = point.light_means[PAD:-PAD, PAD:-PAD] > 0.3
-        left = np.stack([one - one[lit].mean() for one in draws])
-        variance = ndimage.gaussian_filter(np.mean(left**2, axis=0), 1.0)
-        return np.sqrt(variance * max(1.0, self.misfit))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +118,7 @@ class FittedSensor:
         sigma : array_like, shape (2, ny, nx) or a number, counts rms
             Noise of the pixels: ``sqrt(maximum(frames, 0) / gain + noise**2)`` with those of `fit_bench`.
         prior : MapPrior, optional
-            That of an earlier result. It saves more than half of the time, and fits phases of the same roughness
+            That of an earlier result. It saves half of the time, and fits phases of the same roughness
             and strength only. By default the evidence chooses one.
 
         Returns
@@ -152,26 +143,48 @@ class FittedSensor:
         allowed = _ALLOWED * np.array([arm["flux"] for arm in self.fit.point.model.arms[:2]])
         soft = allowing(weights, allowed[:, None, None])
         start = self._start(counts)
-        means = self._minimum(counts, soft, MapPrior(_rms_of(start), 3.0), start, 5, 20)[0].phase_means
-        if prior is None:
-            prior, means = self._chosen(counts, weights, means)
-        point, converged = self._minimum(counts, weights, prior, means, self.n_steps, 30)
+        problem = self._problem(counts, soft, MapPrior(_rms_of(start), 3.0))
+        point = minimise(problem, problem.phase_map.white(start), 5, 20)[0]
+        point = Point(replace(problem, weights=weights), point.x)
+        point = self._chosen(point) if prior is None else self._under(prior, point, Explicit.of(point))
+        point, converged = _lowered(point, self.n_steps)
         misfit, phase = float(np.mean(point.misfit)), point.phase_means[PAD:-PAD, PAD:-PAD]
-        return FittedPhase(phase, misfit, misfit < EXPLAINED, converged, prior, point)
+        bars = _error_bars(point) * math.sqrt(max(1.0, misfit))
+        return FittedPhase(phase, bars, misfit, misfit < EXPLAINED, converged, point.problem.phase_map.prior)
 
-    def _chosen(self, counts: NDArray, weights: NDArray, means: NDArray) -> tuple[MapPrior, NDArray]:
-        """Prior that the evidence chooses, and the phase with it."""
-        least = math.inf
-        for exponent, n_updates in _PRIORS:
-            rms, now = _rms_of(means) * _STRONGER ** (exponent - 4), means
-            for _ in range(n_updates):
-                point, _ = self._minimum(counts, weights, MapPrior(rms, exponent), now, 3, 30)
-                now, (evidence, growth) = point.phase_means, point.matrix.evidence
-                rms *= math.sqrt(max(growth, 0.01))  # an rms of 0 allows no phase
+    def _chosen(self, start: Point) -> Point:
+        """Phase with the prior that the evidence chooses."""
+        exponent, rms, data = _EXPONENTS[0], _rms_of(start.phase_means), Explicit.of(start)
+        prior = MapPrior(rms * _STRONGER ** (exponent - 4), exponent)
+        point, converged = _lowered(self._under(prior, start, data), 4)
+        if not converged:  # the matrix at the start may be far from that of this phase
+            data = Explicit.of(point)
+        least, best = math.inf, point
+        for exponent in _EXPONENTS:
+            prior = _stronger(best, 0.5)
+            prior = MapPrior(prior.rms * _STRONGER ** (exponent - prior.exponent), exponent)
+            point = self._strongest(prior, best, data)
+            evidence = point.matrix.evidence[0]
             if evidence > least:
                 break
-            least, prior, means = evidence, MapPrior(rms, exponent), now
-        return prior, means
+            least, best = evidence, point
+        return best
+
+    def _strongest(self, prior: MapPrior, point: Point, data: Explicit | None) -> Point:
+        """Phase with the strength of the prior at which the evidence is largest."""
+        known: list[tuple[float, float]] = []
+        power = 0.5
+        for _ in range(_UPDATES):
+            point, _ = _lowered(self._under(prior, point, data), 2)
+            strength, growth = math.log(prior.rms), _growth(point)
+            if abs(growth) < _STATIONARY:
+                break
+            if known:  # Newton's step with the slope between the last two
+                before, then = known[-1]
+                power = float(np.clip((strength - before) / (then - growth), *_POWERS)) if then != growth else 0.5
+            known.append((strength, growth))
+            prior = _stronger(point, power)
+        return point
 
     def frames(self, phase: ArrayLike) -> NDArray[np.float64]:
         """Frames that the model predicts for a phase.
@@ -208,14 +221,20 @@ class FittedSensor:
         settings: Any = [Exposure(0, 0, 0), Exposure(1, 1, 0)], flat, of.f, of.largest
         return Camera(of.n, of.shape, of.n_pixels, *settings, n_arms=of.n_arms)
 
-    def _minimum(
-        self, counts: NDArray, weights: NDArray, prior: MapPrior, start: NDArray, n_steps: int, n_inner: int
-    ) -> tuple[Point, bool]:
-        """Fit of the phase alone."""
+    def _problem(self, counts: NDArray, weights: NDArray, prior: MapPrior) -> Problem:
+        values = self.fit.point.values
+        return Problem(self._camera, counts, weights, self._light, self._phase_map(prior), (), values)
+
+    def _phase_map(self, prior: MapPrior) -> PhaseMap:
         of = self._fitted
-        phase_map = PhaseMap(of.phase_map.n, of.camera.f, prior, of.camera.n_pixels)
-        problem = Problem(self._camera, counts, weights, self._light, phase_map, (), self.fit.point.values)
-        return minimise(problem, phase_map.white(start), n_steps, n_inner)
+        return PhaseMap(of.phase_map.n, of.camera.f, prior, of.camera.n_pixels)
+
+    def _under(self, prior: MapPrior, point: Point, data: Explicit | None) -> Point:
+        """The same phase with another prior."""
+        phase_map = self._phase_map(prior)
+        guide = None if data is None else Posterior(data, phase_map)
+        problem = replace(point.problem, phase_map=phase_map, guide=guide)
+        return Point(problem, phase_map.white(point.phase_means))
 
     def _start(self, counts: NDArray) -> NDArray[np.float64]:
         """Phase of the phase-shifted iteration on images brought back to the pupil, unwrapped and continued."""
@@ -236,6 +255,35 @@ class FittedSensor:
         inside = ndimage.binary_erosion(pupil.inside) | (pupil.inside & (light > 0.8))
         phase = nearest_good(unwrapped(np.nan_to_num(found), inside), inside)
         return phase - phase[inside].mean()
+
+
+def _growth(point: Point) -> float:
+    """Logarithm of the factor on the variance of the prior that the evidence asks for."""
+    return math.log(max(point.matrix.evidence[1], 0.01))  # an rms of 0 allows no phase
+
+
+def _stronger(point: Point, power: float) -> MapPrior:
+    """Prior with an update of its rms."""
+    prior = point.problem.phase_map.prior
+    return prior._replace(rms=prior.rms * math.exp(power * _growth(point)))
+
+
+def _lowered(point: Point, n_steps: int) -> tuple[Point, bool]:
+    """Point with a lower cost, and whether it has converged."""
+    return minimise(point.problem, point.x, n_steps, 30 if point.problem.guide is None else 15)
+
+
+def _error_bars(point: Point) -> NDArray[np.float64]:
+    """Error bar of each pixel of a phase, from draws of the noise and of the prior."""
+    problem, right, rng = point.problem, [], np.random.default_rng(0)  # the choice changes them by some percent
+    for _ in range(_DRAWS):
+        noise = rng.normal(size=problem.weights.shape) * (problem.weights > 0)
+        right.append(point.matrix.back(noise) + rng.normal(size=point.x.shape))
+    found = point.matrix.solve(np.array(right), np.zeros(point.x.shape, bool), 60, 0.03)
+    draws = problem.phase_map.means(problem.split(found)[0][0])[:, PAD:-PAD, PAD:-PAD]
+    lit = point.light_means[PAD:-PAD, PAD:-PAD] > 0.3
+    left = np.stack([one - one[lit].mean() for one in draws])
+    return np.sqrt(ndimage.gaussian_filter(np.mean(left**2, axis=0), 1.0))
 
 
 def _rms_of(phase: NDArray) -> float:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from scipy.interpolate import BSpline
 
 from zwfs._camera.light import KnownLight, Light
 from zwfs._camera.model import Camera, Linearised, names_of, pooled, symbol
+
+if TYPE_CHECKING:
+    from zwfs._camera.explicit import Posterior
 
 _BINS = 24  # of spatial frequency, for the preconditioner
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
@@ -69,10 +72,10 @@ class PhaseMap:
     """White numbers to the means of a phase over the pixels, and to a cubic spline of it on the fine grid."""
 
     def __init__(self, n: int, oversampling: int, prior: MapPrior, n_pixels: float) -> None:
-        self.n, self.size = n, fft.next_fast_len(round(1.2 * n), real=True)
+        self.n, self.prior, self.size = n, prior, fft.next_fast_len(round(1.2 * n), real=True)
         self.colour = np.sqrt(prior.spectrum(self.size, n_pixels))
-        self._along = fine_spline(n, oversampling, self.size)
-        self._means = self.colour / symbol(_PIXEL_MEAN, self.size)
+        self.along = fine_spline(n, oversampling, self.size)
+        self.spline = self.colour / symbol(_PIXEL_MEAN, self.size)
 
     def means(self, white: NDArray) -> NDArray[np.float64]:
         """Mean over each pixel, (..., n, n)."""
@@ -85,12 +88,15 @@ class PhaseMap:
 
     def fine(self, white: NDArray) -> NDArray[np.float64]:
         """Phase on the fine grid."""
-        return self._along @ fft.irfft2(self._means * fft.rfft2(white), s=white.shape[-2:]) @ self._along.T
+        return self.along @ self.coefficients(white) @ self.along.T
 
     def adjoint(self, fine: NDArray) -> NDArray[np.float64]:
         """Adjoint of `fine`."""
-        nodes = self._along.T @ fine @ self._along
-        return fft.irfft2(self._means * fft.rfft2(nodes), s=nodes.shape[-2:])
+        return self.coefficients(self.along.T @ fine @ self.along)
+
+    def coefficients(self, white: NDArray) -> NDArray[np.float64]:
+        """Coefficients of the spline, (..., size, size); the operator is its own adjoint."""
+        return fft.irfft2(self.spline * fft.rfft2(white), s=white.shape[-2:])
 
 
 class LightMap:
@@ -152,6 +158,7 @@ class Problem:
     light_maps: tuple[LightMap, ...]  # empty if the light is known
     values: NDArray[np.float64]  # all numbers; those that are free do not count
     free: Sequence[Free] = ()
+    guide: Posterior | None = None  # explicit matrix; only where the phase alone is unknown
 
     @cached_property
     def places(self) -> list[list[int]]:
@@ -371,14 +378,18 @@ class Matrix:
         """Minus the logarithm of the evidence of the phase's prior, and a factor on its variance.
 
         Laplace's approximation, with approximate eigenvalues e of the matrix: cost + sum(log e) / 2. The
-        factor makes the evidence stationary (MacKay 1992): |x|^2 / sum(1 - 1 / e), with the white numbers x.
+        factor makes the evidence stationary (MacKay 1992): |x|^2 / sum(1 - 1 / e), with the white numbers x. An
+        explicit matrix gives both sums.
         """
-        spectrum, size = self._spectra[0], self.problem.phase_map.size
+        size, guide = self.problem.phase_map.size, self.problem.guide
+        squares = float(np.sum(self.x[: size**2] ** 2))
+        if guide:
+            return self.cost + guide.log_determinant / 2, squares / max(guide.determined, 1)
+        spectrum = self._spectra[0]
         twice = np.full(spectrum.shape[1], 2.0)  # half the plane stands for all of it
         twice[0] = 1
         twice[-1] = 1 + size % 2
         determined = float(np.sum((1 - 1 / spectrum) * twice))
-        squares = float(np.sum(self.x[: size**2] ** 2))
         return self.cost + float(np.sum(np.log(spectrum) * twice)) / 2, squares / max(determined, 1)
 
     def _response(self, probe: NDArray, answer: NDArray, of: PhaseMap | LightMap) -> NDArray[np.float64]:
@@ -413,11 +424,15 @@ class Matrix:
 
     def precondition(self, r: NDArray) -> NDArray[np.float64]:
         """Approximate inverse of the matrix times vectors."""
+        if self.problem.guide:
+            return self.problem.guide.inverse(r)
         free = r[..., self.problem.n_white :]
         return np.concatenate([*self._filtered(r, -1), free @ self._inverse_block if free.size else free], axis=-1)
 
     def scale(self, d: NDArray) -> NDArray[np.float64]:
         """Matrix of the damping times vectors."""
+        if self.problem.guide:
+            return self.problem.guide.scale(d)
         free = np.diagonal(self.block) * d[..., self.problem.n_white :]
         return np.concatenate([*self._filtered(d, 1), free], axis=-1)
 

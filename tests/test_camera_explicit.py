@@ -1,0 +1,57 @@
+"""The explicit matrix of a phase, against products with it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from zwfs import Pupil
+from zwfs._camera.explicit import Explicit, Posterior
+from zwfs._camera.light import KnownLight
+from zwfs._camera.model import Camera, Exposure, Maps
+from zwfs._camera.solve import MapPrior, PhaseMap, Point, Problem
+
+N, F, SHAPE = 24, 2, (30, 30)
+VALUES = np.array(
+    [
+        *(3e-4, 0.3, -0.4, 0.8, 1.02, 1e4, 2),
+        *(-2e-4, -0.2, 0.6, 0.02, 1.01, 1e4, 1),
+        *(1.1, 1.5, -1.4, 0.05, 0.7),
+    ]
+)
+
+
+@pytest.fixture(scope="module")
+def guided():
+    light = np.pad(Pupil.circular(16 * F).amplitude, 4 * F)
+    exposures = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
+    camera = Camera(N, SHAPE, 16, exposures, np.zeros((1, N * F, N * F)), F, 1.5)
+    phase_map = PhaseMap(N, F, MapPrior(0.5, 4.0), 16)
+    known = KnownLight(Maps(light, 0 * light, 0 * light, False), light)
+    images = np.full((2, *SHAPE), 1e4), np.full((2, *SHAPE), 1e-2)
+    problem = Problem(camera, *images, known, phase_map, (), VALUES)
+    white = 0.5 * np.random.default_rng(0).normal(size=phase_map.size**2)
+    data = Explicit.of(Point(problem, white))
+    return Point(replace(problem, guide=Posterior(data, phase_map)), white)
+
+
+def test_inverse_of_the_explicit_matrix_is_that_of_the_products(guided):
+    true = np.random.default_rng(1).normal(size=guided.x.shape)
+    guide, means = guided.problem.guide, guided.problem.phase_map.means
+    left = guide.inverse(guided.matrix.product(true)) - true
+    size = guided.problem.phase_map.size
+    error, phase = (means(one.reshape(size, size))[7:-7, 7:-7] for one in (left, true))
+    assert error.std() < 0.05 * phase.std()
+
+
+def test_sums_of_the_evidence_are_those_of_the_eigenvalues(guided):
+    matrix = guided.matrix.product(np.eye(len(guided.x)))
+    values = np.linalg.eigvalsh((matrix + matrix.T) / 2)
+    guide = guided.problem.guide
+    assert guide.determined == pytest.approx(np.sum(1 - 1 / values), rel=0.1)
+    assert guide.log_determinant == pytest.approx(np.sum(np.log(values)), rel=0.05)
+
+
+def test_large_pupil_has_no_explicit_matrix(guided, monkeypatch):
+    monkeypatch.setattr("zwfs._camera.explicit._MOST", 100)
+    assert Explicit.of(guided) is None

@@ -1,0 +1,124 @@
+"""Explicit matrix of a phase behind known optics, which makes the search for the phase short.
+
+The unknowns are the coefficients of the phase's spline where there is light. A coefficient changes the images near
+its own place, and through the light of the dimple, which few numbers describe. Coefficients far apart do not share
+a pixel, so one derivative gives the local changes of a whole comb of them.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, linalg, ndimage, sparse
+
+from zwfs._camera.model import pooled
+from zwfs._camera.solve import PhaseMap, Point
+
+_MOST = 3000  # coefficients: with more, the factors take longer than conjugate gradients without them
+_APART = 8  # pixels between the coefficients of a comb
+_TOGETHER = 8  # combs that are applied at once: with more, the arrays exceed the cache
+_FAINTEST = 1e-3  # part of the light of the dimple that counts, over the largest
+_DAMPED = 1e-3, 1e-7  # part of each diagonal element, and of the largest, that is added to it
+_PROBES = 16  # random vectors for a trace
+
+
+class Explicit:
+    """Gauss and Newton's matrix A of the coefficients at a point, without the prior."""
+
+    def __init__(self, point: Point, lit: NDArray[np.bool_]) -> None:
+        self._point, self.where = point, np.nonzero(lit)
+        rows, columns = (one.astype(np.int32) for one in self.where)
+        size = point.problem.phase_map.size
+        # Place of each pair of coefficients in a map of covariances.
+        self.pairs = (rows[:, None] - rows) % size * size + (columns[:, None] - columns) % size
+        self._number = np.full(lit.shape, -1)
+        self._number[lit] = np.arange(len(self.where[0]))
+        near, into, along = self._near(), *self._dimple()
+        half = (near.T @ into + along.T @ (into.T @ into) / 2) @ along
+        matrix = (near.T @ near).toarray() + half + half.T
+        self.diagonal = np.diagonal(matrix).copy()
+        matrix[np.diag_indices_from(matrix)] += _DAMPED[0] * self.diagonal + _DAMPED[1] * matrix.max()
+        lower = linalg.cholesky(matrix, lower=True, overwrite_a=True)
+        self.log_determinant = 2 * float(np.sum(np.log(np.diagonal(lower))))
+        self.inverse = linalg.lapack.dpotri(lower, lower=True)[0]  # its lower triangle
+
+    @classmethod
+    def of(cls, point: Point) -> Explicit | None:
+        """Matrix at a point, or None for a pupil of too many pixels."""
+        lit = ndimage.binary_dilation(pooled(point.light, point.problem.camera.f) > 0.01)
+        return cls(point, lit) if np.count_nonzero(lit) <= _MOST else None
+
+    def _near(self) -> sparse.csr_array:
+        """Change of the residuals with each coefficient, but for the light of the dimple."""
+        point, along = self._point, self._point.problem.phase_map.along
+        model, zero, starts = point.matrix.model, np.zeros_like(point.phase), np.arange(_APART)
+        combs = np.array([along[:, start : len(self._number) : _APART].sum(axis=1) for start in starts])
+        fine = (combs[:, None, :, None] * combs[:, None, :]).reshape(-1, *zero.shape)
+        parts = [model.apply(zero, zero, few, dimple=False) for few in np.split(fine, len(fine) // _TOGETHER)]
+        changes = (point.problem.weights * np.concatenate(parts)).reshape(len(fine), -1)
+        column = np.concatenate([self._owners(exposure.arm) for exposure in model.camera.exposures], axis=1)
+        row = np.broadcast_to(np.arange(column.shape[1]), column.shape)
+        seen = (column >= 0) & (changes != 0)
+        size = column.shape[1], len(self.where[0])
+        return sparse.csr_array((changes[seen], (row[seen], column[seen])), size)
+
+    def _owners(self, arm: int) -> NDArray[np.intp]:
+        """Number of the coefficient of each comb next to each pixel, (n_combs, n_pixels); -1 if it is dark."""
+        n, starts = len(self._number), np.arange(_APART)[:, None]
+        places = (one + (n - 1) / 2 for one in self._point.matrix.model.optics.splines[arm].places)
+        row, column = (starts + _APART * np.rint((one - starts) / _APART).astype(int) for one in places)
+        padded = np.pad(self._number, 1, constant_values=-1)
+        row, column = (np.clip(one, -1, n) + 1 for one in (row, column))
+        return padded[row[:, None], column].reshape(_APART**2, -1)
+
+    def _dimple(self) -> tuple[NDArray, NDArray]:
+        """Change of the residuals with the light of the dimple, and of that light with the coefficients."""
+        problem, model = self._point.problem, self._point.matrix.model
+        _, strength, basis = linalg.svd(np.concatenate([core[0] for core in model.optics.cores.values()]))
+        basis = basis[: np.count_nonzero(strength > _FAINTEST * strength[0])]
+        fields = model.camera.planes[0].expand(basis) * model.phase_slope
+        along = problem.phase_map.along
+        moved = (along.T @ fields @ along)[:, self.where[0], self.where[1]]
+        images = problem.weights * model.of_dimple(np.concatenate([basis.conj(), 1j * basis.conj()]))
+        return images.reshape(len(images), -1).T, np.concatenate([moved.real, moved.imag])
+
+
+class Posterior:
+    """Gauss and Newton's matrix with a prior, I + B^T A B, where B takes white numbers to coefficients.
+
+    Its inverse is I - B^T (A^-1 + B B^T)^-1 B.
+    """
+
+    def __init__(self, data: Explicit, prior: PhaseMap) -> None:
+        self._data, self._prior = data, prior
+        self._covariance = fft.irfft2(prior.spline**2, s=(prior.size,) * 2).take(data.pairs)
+        self._factor = linalg.cho_factor(data.inverse + self._covariance, lower=True, overwrite_a=True)
+        self.log_determinant = data.log_determinant + 2 * float(np.sum(np.log(np.diagonal(self._factor[0]))))
+
+    @cached_property
+    def determined(self) -> float:
+        """Number of white numbers that the images determine."""
+        probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(self._covariance), _PROBES))
+        return float(np.vdot(probes, linalg.cho_solve(self._factor, self._covariance @ probes))) / _PROBES
+
+    def inverse(self, r: NDArray) -> NDArray[np.float64]:
+        """Inverse of the matrix times vectors."""
+        return r - self._white(linalg.cho_solve(self._factor, self._coefficients(r).T).T)
+
+    def scale(self, d: NDArray) -> NDArray[np.float64]:
+        """Matrix of the damping times vectors."""
+        return self._white(self._data.diagonal * self._coefficients(d))
+
+    def _coefficients(self, white: NDArray) -> NDArray[np.float64]:
+        maps = white.reshape(*white.shape[:-1], self._prior.size, self._prior.size)
+        rows, columns = self._data.where
+        return self._prior.coefficients(maps)[..., rows, columns]
+
+    def _white(self, coefficients: NDArray) -> NDArray[np.float64]:
+        """Adjoint of `_coefficients`."""
+        maps = np.zeros((*coefficients.shape[:-1], self._prior.size, self._prior.size))
+        rows, columns = self._data.where
+        maps[..., rows, columns] = coefficients
+        return self._prior.coefficients(maps).reshape(*coefficients.shape[:-1], -1)

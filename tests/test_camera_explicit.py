@@ -52,6 +52,13 @@ def test_sums_of_the_evidence_are_those_of_the_eigenvalues(guided):
     assert guide.log_determinant == pytest.approx(np.sum(np.log(values)), rel=0.05)
 
 
+def test_images_without_a_good_pixel_leave_the_prior(guided):
+    problem = replace(guided.problem, weights=np.zeros((2, *SHAPE)))
+    posterior = Posterior(Explicit.of(Point(problem, guided.x)), problem.phase_map)
+    np.testing.assert_allclose(posterior.inverse(guided.x), guided.x, rtol=0, atol=1e-6)
+    assert posterior.determined < 1e-6
+
+
 def test_large_pupil_has_no_explicit_matrix(guided, monkeypatch):
     monkeypatch.setattr("zwfs._camera.explicit._MOST", 100)
     assert Explicit.of(guided) is None

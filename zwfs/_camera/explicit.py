@@ -21,6 +21,7 @@ _APART = 8  # pixels between the coefficients of a comb
 _TOGETHER = 8  # combs that are applied at once: with more, the arrays exceed the cache
 _FAINTEST = 1e-3  # part of the light of the dimple that counts, over the largest
 _DAMPED = 1e-3, 1e-7  # part of each diagonal element, and of the largest, that is added to it
+_UNSEEN = 1e-12  # added to all, for images without a good pixel
 _PROBES = 16  # random vectors for a trace
 
 
@@ -39,8 +40,8 @@ class Explicit:
         half = (near.T @ into + along.T @ (into.T @ into) / 2) @ along
         matrix = (near.T @ near).toarray() + half + half.T
         self.diagonal = np.diagonal(matrix).copy()
-        matrix[np.diag_indices_from(matrix)] += _DAMPED[0] * self.diagonal + _DAMPED[1] * matrix.max()
-        lower = linalg.cholesky(matrix, lower=True, overwrite_a=True)
+        matrix[np.diag_indices_from(matrix)] += _DAMPED[0] * self.diagonal + _DAMPED[1] * matrix.max() + _UNSEEN
+        lower = linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
         self.log_determinant = 2 * float(np.sum(np.log(np.diagonal(lower))))
         self.inverse = linalg.lapack.dpotri(lower, lower=True)[0]  # its lower triangle
 
@@ -94,22 +95,26 @@ class Posterior:
     def __init__(self, data: Explicit, prior: PhaseMap) -> None:
         self._data, self._prior = data, prior
         self._covariance = fft.irfft2(prior.spline**2, s=(prior.size,) * 2).take(data.pairs)
-        self._factor = linalg.cho_factor(data.inverse + self._covariance, lower=True, overwrite_a=True)
+        total = data.inverse + self._covariance
+        self._factor = linalg.cho_factor(total, lower=True, overwrite_a=True, check_finite=False)
         self.log_determinant = data.log_determinant + 2 * float(np.sum(np.log(np.diagonal(self._factor[0]))))
 
     @cached_property
     def determined(self) -> float:
         """Number of white numbers that the images determine."""
         probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(self._covariance), _PROBES))
-        return float(np.vdot(probes, linalg.cho_solve(self._factor, self._covariance @ probes))) / _PROBES
+        return float(np.vdot(probes, self._solve(self._covariance @ probes))) / _PROBES
 
     def inverse(self, r: NDArray) -> NDArray[np.float64]:
         """Inverse of the matrix times vectors."""
-        return r - self._white(linalg.cho_solve(self._factor, self._coefficients(r).T).T)
+        return r - self._white(self._solve(self._coefficients(r).T).T)
 
     def scale(self, d: NDArray) -> NDArray[np.float64]:
         """Matrix of the damping times vectors."""
         return self._white(self._data.diagonal * self._coefficients(d))
+
+    def _solve(self, right: NDArray) -> NDArray[np.float64]:
+        return linalg.cho_solve(self._factor, right, check_finite=False)
 
     def _coefficients(self, white: NDArray) -> NDArray[np.float64]:
         maps = white.reshape(*white.shape[:-1], self._prior.size, self._prior.size)

@@ -107,7 +107,7 @@ def command(taken, files):
         patch.chdir(files)
         patch.setattr(sys, "stderr", said)
         patch.setattr(_calibrate, "fit_bench", functools.partial(fit_bench, n_steps=4, oversampling=2))  # quick
-        assert main(["calibrate", "bench.npz", *names, *known]) == 0
+        assert main(["calibrate", "bench.npz", *names, *known]) == 0, said.getvalue()
     return Calibration.load(files / "bench.npz"), said.getvalue()
 
 

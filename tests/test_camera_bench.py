@@ -209,7 +209,7 @@ def test_known_phases_go_on_beyond_an_outline_that_cuts_pixels():
     [
         ({"phases": np.zeros((1, 24, 24)), "frames": np.ones((1, 2, 24, 24))}, "phases holds 1 state"),
         ({"phases": np.zeros((3, 24, 24))}, "one for each state"),
-        ({"phases": np.zeros((2, 23, 23))}, "even differences"),
+        ({"phases": np.ones((2, 23, 23))}, "even differences"),
         ({"clear_frames": np.ones((2, 20, 20))}, "clear_frames has shape"),
         ({"clear_frames": np.zeros((2, 24, 24))}, "expected light"),
         ({"noise": 0.0}, "noise = 0"),
@@ -220,7 +220,7 @@ def test_data_that_do_not_belong_together_are_refused(change, message):
     data = {
         "frames": np.ones((2, 2, 24, 24)),
         "clear_frames": np.ones((2, 24, 24)),
-        "phases": np.zeros((2, 24, 24)),
+        "phases": np.ones((2, 24, 24)),
     }
     with pytest.raises(ValueError, match=message):
         fit_bench(**{**data, "n_pixels": 20, "noise": 1.0, **change})

@@ -60,7 +60,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--phase-shifts", type=float, nargs=2, default=(), metavar="RAD", help="default: THETA1, THETA2")
     add("--pupil-centers", type=float, nargs=4, metavar="PIXEL", help="row, column of both pupils")
     add("--pupil-diameter", type=float, metavar="PIXEL", help="default: from the clear frames")
-    add("--no-registration", dest="subpixel", action="store_false", help="trust the outlines")
+    add(
+        "--no-registration",
+        dest="subpixel",
+        action="store_false",
+        default=argparse.SUPPRESS,
+        help="trust the outlines",
+    )
     add("--exposure", type=float, default=argparse.SUPPRESS, help="of the frames over that of the clear frames: 1")
     add("--saturation", type=float, metavar="COUNTS", help="default: SATURATE, or the type's largest")
     add("--fit", dest="fitted", nargs="+", default=(), metavar="NAME", help="parameter to fit")

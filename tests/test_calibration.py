@@ -20,7 +20,7 @@ def taken():
 
 @pytest.fixture(scope="module")
 def fit(taken):
-    return study.calibrate(taken, n_steps=3)
+    return study.calibrate(taken)
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +52,12 @@ def test_fit_recovers_the_bench(taken, fit):
         elif name.endswith(("row", "column", "leakage")):
             assert fit[name].value == pytest.approx(value, abs=0.02), name
     assert fit.consistent
+
+
+@pytest.mark.slow
+def test_fit_to_commands_that_are_wrong_by_two_percent_is_not_consistent(taken):
+    wrong = {**taken.arrays, "commands": 1.02 * taken.arrays["commands"]}
+    assert not study.calibrate(replace(taken, arrays=wrong)).consistent
 
 
 def test_calibrated_phases_are_better_than_those_of_the_design_and_their_error_bars_hold(measured):

@@ -15,7 +15,6 @@ from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from studies.kit import sweeps
-from studies.kit.curves import percent
 from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS, OTHER_STYLES
@@ -30,9 +29,7 @@ LIMITS = {
     "oversampling": (1, 4),
     "largest": (0.1, 1.2),
     "n_screens": (1, 6),
-    "n_screens_wrong": (1, 6),
     "n_iterations": USUAL["n_iterations"],
-    "command_errors": [(-0.3, 0.3), ...],
 }
 QUICK = {
     "n_commands": 2,
@@ -40,8 +37,6 @@ QUICK = {
     "oversampling": 1,
     "largest": 0.3,
     "n_screens": 1,
-    "n_screens_wrong": 1,
-    "command_errors": [0.05],
 }
 
 _UNIT = 1e-4  # rad, of the phases in the file
@@ -117,27 +112,13 @@ class Recording:
         return counts / share, sigma / share
 
 
-def calibrate_each(
-    taken: Recording, command_errors: Sequence[float], n_commands: int, n_steps: int, oversampling: int
-) -> list[BenchFit]:
-    """Fit the bench with each relative error of all commands."""
-    settings = n_commands, n_steps, oversampling
-    return sweeps.run(_calibrate, command_errors, taken, *settings, name="calibrations")
-
-
-def _calibrate(command_error: float, taken: Recording, *settings: int) -> BenchFit:
-    return calibrate(taken, *settings, command_error=command_error)
-
-
-def calibrate(
-    taken: Recording, n_commands: int = 4, n_steps: int = 6, oversampling: int = 2, *, command_error: float = 0.0
-) -> BenchFit:
-    """Fit the bench to the frames of the flat and of known commands, which are wrong by a relative error."""
+def calibrate(taken: Recording, n_commands: int = 4, n_steps: int = 3, oversampling: int = 2) -> BenchFit:
+    """Fit the bench to the frames of the flat and of known commands."""
     states = slice(n_commands + 1)
     return fit_bench(
         taken.frames[states],
         taken.clear_frames,
-        (1 + command_error) * taken.commands[states],
+        taken.commands[states],
         n_pixels=taken.commands.shape[-1],
         noise=taken.noise,
         gain=taken.gain,
@@ -165,17 +146,15 @@ def measure(
     series: Sequence[Sequence[int]],
     n_iterations: int = 25,
     *,
-    priors: Sequence[Any] | None = None,
     control: bool = False,
 ) -> list[list[Measured]]:
     """Measure series of unseen screens by the plain route with the design's values, and with the fitted optics.
 
-    The first screen of each series chooses the prior of the others, unless it is given. A control measures this
-    screen again with the maps, places and prior of the fit, and the optics of the design.
+    The first screen of each series chooses the prior of the others. A control measures this screen again with the
+    maps, places and prior of the fit, and the optics of the design.
     """
-    tasks = list(zip(series, priors or [None] * len(series), strict=True))
     sensors = FittedSensor(fit), FittedSensor(designed(fit)) if control else None
-    return sweeps.run(_measure_series, tasks, taken, *sensors, n_iterations, name="calibrated_errors")
+    return sweeps.run(_measure_series, series, taken, *sensors, n_iterations, name="calibrated_errors")
 
 
 def designed(fit: BenchFit) -> BenchFit:
@@ -186,14 +165,13 @@ def designed(fit: BenchFit) -> BenchFit:
 
 
 def _measure_series(
-    task: tuple[Sequence[int], Any],
+    numbers: Sequence[int],
     taken: Recording,
     sensor: FittedSensor,
     design: FittedSensor | None,
     n_iterations: int,
 ) -> list[Measured]:
-    numbers, prior = task
-    measured: list[Measured] = []
+    prior, measured = None, []
     for number in numbers:
         measured.append(_measure(number, taken, sensor, None if measured else design, n_iterations, prior))
         prior = measured[-1].prior
@@ -285,10 +263,6 @@ class Errors:
         """Attribute of each screen, (n, n_screens)."""
         return np.array([[getattr(one, name) for one in row] for row in self.measured])
 
-    def first(self, n_screens: int) -> Errors:
-        """Those of the first screens of each input."""
-        return Errors(self.rms, [row[:n_screens] for row in self.measured])
-
     def column(self, name: str) -> NDArray[np.float64]:
         """Root mean square of an attribute over the screens for which it was measured, (n,)."""
         return np.sqrt(np.nanmean(self.single(name) ** 2, axis=1))
@@ -301,14 +275,12 @@ def measure_inputs(
     n_screens: int,
     n_iterations: int = 25,
     *,
-    like: Errors | None = None,
     control: bool = False,
 ) -> Errors:
-    """Measure the bright unseen screens up to an error, on demand with the priors of others, or with a control."""
+    """Measure the bright unseen screens up to an error, on demand with a control."""
     inputs = taken.inputs(largest)
     series = [taken.unseen(rms, taken.photons[0])[:n_screens] for rms in inputs]
-    priors = [row[0].prior for row in like.measured] if like else None
-    return Errors(inputs, measure(taken, fit, series, n_iterations, priors=priors, control=control))
+    return Errors(inputs, measure(taken, fit, series, n_iterations, control=control))
 
 
 def measure_faint(taken: Recording, fit: BenchFit, n_screens: int, n_iterations: int = 25) -> Errors:
@@ -365,21 +337,6 @@ def error_columns(errors: Errors, not_smooth: NDArray) -> dict[str, NDArray]:
         "calibrated: error bar (rad rms)": errors.column("sigma"),
         "calibrated: misfit": np.array([np.mean([one.misfit for one in row]) for row in errors.measured]),
     }
-
-
-def command_table(command_errors: Sequence[float], fits: Sequence[BenchFit], measured: Sequence[Errors]) -> Table:
-    """Improvement and verdict of the fits to commands with these relative errors."""
-    rows = []
-    for command_error, fit, errors in zip(command_errors, fits, measured, strict=True):
-        gain = errors.column("plain") / errors.column("calibrated")
-        rows.append([percent(command_error), f"{gain.min():.1f} to {gain.max():.1f} times", _verdict(fit)])
-    return Table(["error of all commands", "error of unseen screens, smaller by", "verdict of the fit"], rows)
-
-
-def refused_error(command_errors: Sequence[float], fits: Sequence[BenchFit]) -> float:
-    """Smallest relative error of the commands at which the verdict of the fit is *not consistent*."""
-    both = zip(command_errors, fits, strict=True)
-    return min((abs(error) for error, fit in both if not fit.consistent), default=np.nan)
 
 
 def _verdict(fit: BenchFit) -> str:

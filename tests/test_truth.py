@@ -278,11 +278,16 @@ LONG = {"calibration", "decision"}
 COSTLY = {name for name in CASES if name not in ("zernike_sensor", "at_a_glance", "identities")}
 
 
+def alike(parameters):
+    """Parameters, of which those of the mask count as one: together, their odd values leave no reference wave."""
+    return {"mask" if name.startswith(("diameter", "phase_shift")) else name for name in parameters}
+
+
 def packed(odds):
     """Odd values of different parameters together: every value is in one of few sets."""
     packs = []
     for odd in odds:
-        free = next((pack for pack in packs if not pack.keys() & odd.keys()), None)
+        free = next((pack for pack in packs if not alike(pack) & alike(odd)), None)
         if free is None:
             packs.append(free := {})
         free.update(odd)

@@ -165,7 +165,7 @@ def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[
         axes.set(xscale="log", xlim=x[[0, -1]], ylim=y[[0, -1]], xlabel="diameter (λ/D)")
         axes.spines[:].set(visible=True, color="#888888")
         axes.clabel(lines, fmt="%g", fontsize=9, manual=_free_places(lines, x, y, marked))
-        axes.xaxis.set(major_locator=FixedLocator([1, 2, 3, 5, 8]), major_formatter="{x:g}", minor_formatter="")
+        axes.xaxis.set(major_locator=FixedLocator([1, 2, 3, 5, 7]), major_formatter="{x:g}", minor_formatter="")
         axes.set_title(name, fontsize=10)
         axes.yaxis.set_major_formatter(FormatStrFormatter("±%gπ"))
     panels[0, 0].set_ylabel("phase shifts (rad)")

@@ -252,10 +252,10 @@ def tuned_loops(
     only: Sequence[str] = (*ONE_IMAGE, *TWO_IMAGES),
     **settings: Any,
 ) -> TunedLoops:
-    """Choose the gain of each method on a quarter as many screens, and evaluate it on new screens and noise."""
+    """Choose the gain of each method on a sixth as many screens, and evaluate it on new screens and noise."""
     pupil = sensors[0].pupil
     first, then = map(int, np.random.SeedSequence(seed).generate_state(2))
-    few = FrozenFlow(pupil, start, max(1, n_screens // 4), **wind, seed=first)
+    few = FrozenFlow(pupil, start, max(1, n_screens // 6), **wind, seed=first)
     many = FrozenFlow(pupil, start, n_screens, **wind, seed=then)
     settings |= {"photons": 2 * photons * pupil.n_points, "read_noise": read_noise}
 

@@ -67,7 +67,7 @@ _N_DARKS = 16  # averaged
 
 RATE, DELAY, N_STEPS = 1000.0, 2, 40  # of the loops: 1/s, steps, steps
 WIND = {"speed": 2.5, "cutoff": 3.0, "exponent": -2.0}
-GAINS = 0.1, 0.2, 0.4, 0.6, 0.8
+GAINS = 0.1, 0.2, 0.6, 0.8
 """Settings of the chapter on closed loops."""
 _ON_BENCH = {"Linear": "classic", "LinearTwo": "shifted"}
 """Methods of the loops, and their sensors in `BenchModel`."""
@@ -258,14 +258,13 @@ def _tuned_on_bench(
     """Best gain on a sixth as many screens, the residual there, and the residuals on new screens, rad rms."""
     (rms, photons), name = task
     linear = poked_linear(getattr(known.model, _ON_BENCH[name]), known.model, known.poked, known.poke)
+    camera = Camera.of(known, photons, linear.sensor.n_masks)
     first, then = map(int, np.random.SeedSequence(seed).generate_state(2))
-
-    def settle(n: int, gain: float, noise: int) -> NDArray[np.float64]:
-        return _close_loops(known, linear, photons, gain, drifting_pistons(known.bench, rms, n, noise), noise)
-
-    scores = {gain: typical(settle(max(1, n_screens // 6), gain, first)) for gain in GAINS}
+    few = drifting_pistons(known.bench, rms, max(1, n_screens // 6), first)
+    scores = {gain: typical(_close_loops(known, linear, camera, gain, few, first)) for gain in GAINS}
     best = min(scores, key=lambda gain: scores[gain])
-    return best, scores[best], settle(n_screens, best, then)
+    many = drifting_pistons(known.bench, rms, n_screens, then)
+    return best, scores[best], _close_loops(known, linear, camera, best, many, then)
 
 
 def drifting_pistons(bench: Bench, rms: float, n_screens: int, seed: int) -> NDArray[np.float64]:
@@ -283,13 +282,13 @@ def drifting_pistons(bench: Bench, rms: float, n_screens: int, seed: int) -> NDA
 
 
 def _close_loops(
-    known: Known, linear: Any, photons: float, gain: float, pistons: NDArray, seed: int
+    known: Known, linear: Any, camera: Camera, gain: float, pistons: NDArray, seed: int
 ) -> NDArray[np.float64]:
     """Residuals of loops over their last third, (n_screens,), rad rms over the segments."""
     model, k = known.model, linear.sensor.n_masks
     noise = np.random.default_rng([seed, 1])  # not that of the screens
     flat = model.pistons(linear(known.flat[:k] / model.scale[:k]).phase)
-    camera, mirror = Camera.of(known, photons, k), [np.zeros(pistons[:, 0].shape)] * DELAY
+    mirror = [np.zeros(pistons[:, 0].shape)] * DELAY
     residual = []
     for wanted in pistons.swapaxes(0, 1):
         residual.append(wanted + mirror[-DELAY])

@@ -131,8 +131,8 @@ def sampled_diameters(step: float, diameter_max: float, step_fine: float) -> NDA
     return _up_to(diameter_max, [*coarse, *fine, *TABLED])
 
 
-def near_limit(diameters: NDArray, low: float = 1.5, high: float = 2.5) -> NDArray[np.float64]:
-    """Diameters for more iterations, which only lead farther away beyond 2.5 lambda/D; all if none is near."""
+def near_limit(diameters: NDArray, low: float = 1.75, high: float = 2.5) -> NDArray[np.float64]:
+    """Diameters for more iterations: fewer suffice below, and more lead away above; all if none is near."""
     near = diameters[(diameters >= low) & (diameters <= high)]
     return near if near.size else diameters
 

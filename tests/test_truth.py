@@ -234,10 +234,9 @@ CASES = {
         n_iterations=[1]),
     ),
     "calibration": (
-        dict.fromkeys(("n_commands", "n_steps", "oversampling", "n_screens"), 1)
-        | {"largest": 0.1, "command_errors": []},
+        dict.fromkeys(("n_commands", "n_steps", "oversampling", "n_screens"), 1) | {"largest": 0.1},
         {}, {"n_steps": 2, "n_commands": 2}, *each(n_commands=[4], n_steps=[2], oversampling=[2],
-        largest=[1.2], n_screens=[2], n_iterations=[1], command_errors=[[-0.3]]),
+        largest=[1.2], n_screens=[2], n_iterations=[1]),
     ),
     "decision": (DECISION,
         {}, {"rms": 0.01, "rms_small": 0.01}, {"photons": 10.0, "photons_faint": 10.0},

@@ -171,7 +171,8 @@ def _measure_series(
     design: FittedSensor | None,
     n_iterations: int,
 ) -> list[Measured]:
-    prior, measured = None, []
+    prior: Any = None
+    measured: list[Measured] = []
     for number in numbers:
         measured.append(_measure(number, taken, sensor, None if measured else design, n_iterations, prior))
         prior = measured[-1].prior

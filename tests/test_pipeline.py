@@ -225,7 +225,8 @@ def small_book(ran):
 
 
 def test_the_book_shows_runs_and_offers_their_files_and_links_must_work(small_book):
-    write(small_book, "first", "def publish(*_): pass\npublish(None, 'numbers', {})", publish("numbers.csv", "2"))
+    shown = "from IPython.display import SVG\ndef publish(*_): return SVG('<svg/>')\npublish(None, 'numbers', {})"
+    write(small_book, "first", shown, publish("numbers.csv", "2"))
     run_all(small_book)
     index = small_book.root / "book" / "index.md"
     index.write_text("# A book\n\n{download}`data <../_build/notebooks/third.files/numbers.csv>`\n")

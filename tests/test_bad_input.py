@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 import zwfs
 from zwfs.bench import Bench, write_bench
-from zwfs.frames import BenchFit, Calibration, calibrate, fit_bench, pipeline, reconstruct
+from zwfs.frames import BenchFit, Calibration, FittedSensor, calibrate, fit_bench, pipeline, reconstruct
 from zwfs.frames.files import read_all
 from zwfs.frames.registration import register_frames
 from zwfs.reconstructors.base import Reconstructor
@@ -438,6 +438,7 @@ REFUSED = {
     "phases is 0 in all states, or NaN": lambda: fitted(phases=np.zeros((2, 8, 8))),
     "phases is 0 in all states, or NaN, at": lambda: fitted(phases=np.full((2, 8, 8), np.nan)),
     r"values is a list: expected a Mapping": lambda: BenchFit.replaced(None, []),
+    "prior is a int: expected a MapPrior": lambda: FittedSensor.__call__(None, [1.0], 1.0, prior=5),
 }
 
 

@@ -298,7 +298,7 @@ def test_other_values_replace_those_of_a_fit_and_explain_its_frames_worse():
         fit.replaced({"size": 1.0})
     with pytest.raises(TypeError, match="diameter = 'large'"):
         fit.replaced({"diameter": "large"})
-    pair, known = np.ones((2, 52, 52)), np.zeros((2, 52, 52))
+    pair, known = np.ones((2, 52, 52)), np.zeros((2, *fit.light.shape))
     with pytest.raises(ValueError, match=r"sigma has shape \(3,\): expected \(2, 52, 52\), or a number"):
         FittedSensor(fit)(pair, np.ones(3))
     for message, frames, phases, settings in (

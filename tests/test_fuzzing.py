@@ -3,9 +3,11 @@
 `make test` tries 50 examples of each property, always the same ones. `make fuzz` tries 1000 new ones.
 """
 
+import gc
 import gzip
 import io
 import re
+import warnings
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 
@@ -169,6 +171,13 @@ def put(folder, name, content):
     path = folder / name
     path.write_bytes(content)
     return path
+
+
+@pytest.fixture(scope="module", autouse=True)
+def collected():
+    """Collect what earlier tests did not close: it warns when it is collected, and warnings are errors here."""
+    with warnings.catch_warnings(action="ignore"):
+        gc.collect()
 
 
 @pytest.mark.filterwarnings("error", "ignore::hypothesis.errors.HypothesisWarning")

@@ -125,6 +125,8 @@ class FittedSensor:
         -------
         FittedPhase
         """
+        if prior is not None:
+            _check.instance("prior", prior, MapPrior)
         counts = _check.real_array("frames", frames)
         shape = (2, *self._fitted.camera.shape)
         if counts.shape != shape:

@@ -97,7 +97,7 @@ def test_a_new_reconstructor_is_a_file_and_an_entry(copy):
     tested = [f"tests/test_{name}.py" for name in ("reconstructors", "bad_input", "figures", "sensor")]
     options = "-q", "-n", "0", "-p", "no:cacheprovider", "-k", "WirtingerFlow or look or can_be_changed"
     passed = run(copy, "-m", "pytest", *options, *tested)
-    assert int(re.search(r"(\d+) passed", passed)[1]) > 30
+    assert int(re.search(r"(\d+) passed", passed)[1]) > 20
     run(copy, "-m", "ruff", "check", path)
     run(copy, "-m", "ruff", "format", "--check", path)
 

@@ -278,8 +278,11 @@ COSTLY = {name for name in CASES if name not in ("zernike_sensor", "at_a_glance"
 
 
 def alike(parameters):
-    """Parameters, of which those of the mask count as one: together, their odd values leave no reference wave."""
-    return {"mask" if name.startswith(("diameter", "phase_shift")) else name for name in parameters}
+    """Parameters, of which those of the mask and of the band count as one.
+
+    Together, odd values of a mask leave no reference wave, and a wide band of a large dimple takes minutes.
+    """
+    return {"mask" if name.startswith(("diameter", "phase_shift", "bandwidth")) else name for name in parameters}
 
 
 def packed(odds):

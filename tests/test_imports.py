@@ -19,7 +19,7 @@ BOOK = Project(ROOT)
 NAMES = [path.stem for path in BOOK.sources()]
 # Together they load most of the package.
 TRIED = ("calibration", "closed_loop", "fig03_dynamic_range", "fig08_segments", "own_frames", "reconstructors")
-# Runs the imports of each notebook in a process of its own, which begins with the packages of others.
+# Runs the imports of each notebook in a separate process, which has already imported Matplotlib and SciPy.
 LOADED = """
 import json, os, sys
 import matplotlib.pyplot, scipy.fft, scipy.linalg, scipy.ndimage, scipy.optimize, scipy.special

@@ -353,7 +353,7 @@ def _fitted(
     data: Recording, problem: Problem, x: NDArray, numbers: range, n_steps: int,
     report: Callable[[str], Any],
 ) -> Point:  # fmt: skip
-    """Return where some stages of a fit end."""
+    """Return the point at which these stages of a fit end."""
     for number in numbers:
         stage = _STAGES[number]
         staged = _staged(data, problem, stage)

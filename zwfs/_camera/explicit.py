@@ -1,4 +1,4 @@
-"""Explicit matrix of a phase behind known optics, which makes the search for the phase short.
+"""Explicit Gauss-Newton matrix of a phase behind known optics, with which a fit needs few iterations.
 
 The unknowns are the coefficients of the phase's spline where there is light. A coefficient changes the images near
 its own place, and through the light of the dimple, which few numbers describe. Coefficients far apart do not share
@@ -52,7 +52,7 @@ class Explicit:
         return cls(point, lit) if np.count_nonzero(lit) <= _MOST else None
 
     def _near(self) -> sparse.csr_array:
-        """Change of the residuals with each coefficient, but for the light of the dimple."""
+        """Change of the residuals with each coefficient, without the light of the dimple."""
         point, along = self._point, self._point.problem.phase_map.along
         model, zero, starts = point.matrix.model, np.zeros_like(point.phase), np.arange(_APART)
         combs = np.array([along[:, start : len(self._number) : _APART].sum(axis=1) for start in starts])

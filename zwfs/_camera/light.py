@@ -80,7 +80,7 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class KnownLight:
-    """Light that a fit leaves as it is, in the place of `Light`."""
+    """Known light, which a fit does not change. It replaces `Light`."""
 
     known: Maps  # of which the phase does not count
     start: NDArray[np.float64]

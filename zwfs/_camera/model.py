@@ -132,7 +132,7 @@ class Camera:
 
     @cached_property
     def single(self) -> Camera:
-        """The same in single precision."""
+        """Camera with the same settings in single precision."""
         settings: Any = self.exposures, self.commands, self.f, self.largest
         return Camera(self.n, self.shape, self.n_pixels, *settings, n_arms=self.n_arms, real=np.float32)
 
@@ -331,7 +331,7 @@ def _basis(part: NDArray) -> tuple[NDArray, NDArray]:
 
 
 class Optics:
-    """All of the model that depends on the numbers alone."""
+    """The part of the model that depends on the numbers, and not on the maps."""
 
     def __init__(self, camera: Camera, values: NDArray) -> None:
         real, self.values = camera.real, values.copy()
@@ -354,7 +354,7 @@ class Optics:
 
 
 class _Part(NamedTuple):
-    """Steps of the model of some images that its derivative needs, (n_images, size, size) each."""
+    """Intermediate results for images of one group that the derivative needs, (n_images, size, size) each."""
 
     field: NDArray[np.complex128]
     ahead: NDArray[np.complex128]  # half the derivative of the intensity by the field, conjugated

@@ -21,10 +21,11 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import zwfs
-from zwfs.bench import Bench, write_bench
+from zwfs.bench import Bench, BenchModel, write_bench
 from zwfs.frames import BenchFit, Calibration, FittedSensor, calibrate, fit_bench, pipeline, reconstruct
 from zwfs.frames.files import read_all
 from zwfs.frames.registration import register_frames
+from zwfs.loop import HeldDrift, LoopRecord
 from zwfs.reconstructors.base import Reconstructor
 from zwfs.turbulence import FrozenFlow
 
@@ -33,17 +34,18 @@ from .conftest import needs_modes
 # What simulates a sensor and reconstructs a phase. Most tests of camera frames are in other files.
 MODULES = (
     *("pupil", "modes", "turbulence", "masks", "sensor", "polychromatic", "detector", "bounds", "loop", "metrics"),
-    *("units", "reconstructors"),
+    *("units", "reconstructors", "jax", "bench.files", "bench.model"),
 )
 
 # Results that may be infinite: the limit lies beyond what was sampled, or no limit is set.
 INFINITE = {"dynamic_range", "Detector", "structure_function", "turbulent_screens", "karhunen_loeve_basis"}
 # Documented by their attributes.
-RESULTS = {"Reconstruction": zwfs.Reconstruction, "Calibration": Calibration}
+_RESULTS = zwfs.Reconstruction, zwfs.LikelihoodReconstruction, LoopRecord, HeldDrift, BenchModel, Calibration
+RESULTS = {kind.__name__: kind for kind in _RESULTS}
 # Hooks of the base classes of reconstructors.
 INTERNAL = {"model", "solve", "invert", "begin", "step", "constants"}
 # Give back what they are given, NaN and infinity too.
-PASSED = {"Reconstruction", "Pupil.gather", "Pupil.scatter", "phase_to_opd", "opd_to_phase"}
+PASSED = {*RESULTS, "Pupil.gather", "Pupil.scatter", "phase_to_opd", "opd_to_phase"}
 # Take complex numbers where the valid ones are real.
 COMPLEX = {"Pupil.gather", "Pupil.scatter", "focal_field"}
 
@@ -73,15 +75,18 @@ def targets():
                     shown = not key.startswith("_") or key == "__call__"
                     if shown and key not in INTERNAL and callable(getattr(thing, key)):
                         found[f"{name}.{key}"] = member
+    del found["Bench"]  # 26 parameters at 20 ms a value: see test_bench.py
     return found | RESULTS
+
+
+BENCH = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
 
 
 @cache
 def camera():
     """Frames of a small bench, their measurement and calibration."""
-    bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
     with tempfile.TemporaryDirectory() as folder:
-        files = write_bench(folder, bench, seed=1)
+        files = write_bench(folder, BENCH, seed=1)
         kinds = [[files[name]] for name in ("frame", "pupils", "dark")]
         frames, clear, _ = read_all(*kinds)
         registered = register_frames(frames, clear)
@@ -98,7 +103,7 @@ def valid() -> dict:
     classic, shifted = zwfs.ZernikeSensor(pupil, plus), zwfs.ZernikeSensor(pupil, plus, minus)
     phase = zwfs.power_law_screens(modes, 0.2, 1, seed=1)[0]
     field = pupil.amplitude * np.exp(1j * phase)
-    methods = {}
+    pistons, methods = np.linspace(-0.5, 0.5, BENCH.n_segments), {}
     for kind in zwfs.RECONSTRUCTORS:
         options = {"n_iterations": 3} if kind.iterative else {}
         options |= {"modes": modes} if needs_modes(kind) else {}
@@ -118,6 +123,8 @@ def valid() -> dict:
         "wavelength": 635.0, "n_actuators": 9, "n_cycles": 1, "wavelengths": [600.0, 650.0],
         "weights": [1.0, 2.0], "bandwidth": 0.1, "n_wavelengths": 2, "n_iterations": 3, "tolerance": 1e-3,
         "time": 0.01, "speed": 1.0, "cutoff": 3.0,
+        "bench": BENCH, "folder": ".", "pistons": pistons, "commanded": pistons, "found": pistons,
+        "numbers": BENCH.numbers,
         # of one callable
         "Pupil.amplitude": pupil.amplitude,
         "Pupil.segments": pupil.segments,
@@ -139,6 +146,11 @@ def valid() -> dict:
         "Linear.amplitude": pupil.amplitude,
         "GradientDescent.modes": modes,
         "GradientDescent.cost.phase": pupil.gather(phase),
+        "BenchModel.normalise.counts": BENCH.frames(seed=1),
+        "BenchModel.pistons.phase": BENCH.commanded_phase(pistons),
+        "segment_pistons.phase": BENCH.commanded_phase(pistons),
+        "segment_pistons.segments": BENCH.segments,
+        "bench_error.phase": pipeline.recover_phase(camera()[2]),
         "MaximumLikelihood.photons": 1e4,
         "MaximumLikelihood.modes": modes,
         "MaximumLikelihood.prior": np.eye(5),
@@ -160,7 +172,13 @@ def valid() -> dict:
         "Reconstruction": method(shifted.measure(phase)),
         **methods,
     }
-    instances["Calibration"] = camera()[-1]
+    instances |= {
+        "Calibration": camera()[-1],
+        "LikelihoodReconstruction": methods["MaximumLikelihood"](shifted.measure(phase)),
+        "HeldDrift": zwfs.hold_drift(shifted, modes, drift=10.0, photons=1e9, wavelength=635.0),
+        "Bench": BENCH,
+        "BenchModel": BenchModel.from_images(BENCH, 1),
+    }
     for name in RESULTS:
         arguments |= {f"{name}.{field}": getattr(instances[name], field) for field in parameters(name)}
     for value in arguments.values():
@@ -388,7 +406,8 @@ CASES = [(name, parameter) for name in targets() for parameter in parameters(nam
 
 
 @pytest.fixture(autouse=True)
-def _one_thread():
+def _one_thread_in_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     with threadpool_limits(1):
         yield
 

@@ -175,15 +175,21 @@ def real_any(name: str, value: Any) -> NDArray:
     return xp.astype(array, xp.float64)
 
 
-def array_of(name: str, value: Any, kind: str, shape: tuple[int, ...] | None = None) -> None:
-    """Require an array of any library, of a kind of numbers as the array API names it, and of a shape."""
+def array_of(name: str, value: Any, kind: str, shape: tuple[int | str, ...] | None = None) -> None:
+    """Require an array of any library, of a kind of numbers as the array API names it, and of a shape.
+
+    A name in the shape, such as "n_modes", stands for any length.
+    """
     if isinstance(value, np.generic) or not is_array(value):
         raise TypeError(f"{name} is a {type(value).__name__}: expected an array")
     array, xp = _of_any_library(name, value)
     if not xp.isdtype(array.dtype, kind):
         raise TypeError(f"{name} has dtype {array.dtype}: expected {kind}")
-    if shape not in (None, tuple(array.shape)):
-        raise ValueError(f"{name} has shape {tuple(array.shape)}: expected {shape}")
+    if shape is not None:
+        known = [length if isinstance(n, str) else n for n, length in zip(shape, array.shape, strict=False)]
+        if len(shape) != array.ndim or known != list(array.shape):
+            expected = str(shape).replace("'", "")
+            raise ValueError(f"{name} has shape {tuple(array.shape)}: expected {expected}")
 
 
 def complex_array(name: str, value: Any) -> NDArray:

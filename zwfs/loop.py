@@ -166,7 +166,11 @@ class LoopRecord:
     photons: NDArray[np.float64]
 
     def __post_init__(self) -> None:
+        cycles: tuple[int | str, ...] = "n_screens", "n_cycles"
         for name, values in vars(self).items():
+            shape = (*cycles, "n_actuators") if name == "commands" else cycles
+            _check.array_of(name, values, "real floating", shape)
+            cycles = values.shape[:2]
             object.__setattr__(self, name, read_only(values))
 
     def settled(self, n_cycles: int) -> NDArray[np.float64]:
@@ -293,6 +297,12 @@ class HeldDrift:
     gain: NDArray[np.float64]
     lag: NDArray[np.float64]
     noise: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        shape: tuple[int | str, ...] = ("n_modes",)
+        for name, values in vars(self).items():
+            _check.array_of(name, values, "real floating", shape)
+            shape = values.shape
 
     @property
     def residual(self) -> float:

@@ -416,6 +416,14 @@ class BenchModel(Immutable):
     scale: NDArray[np.float64]
     dark: NDArray[np.float64]
 
+    def __post_init__(self) -> None:
+        _check.instance("shifted", self.shifted, ZernikeSensor)
+        _check.instance("classic", self.classic, ZernikeSensor)
+        _check.array_of("segments", self.segments, "integral", self.shifted.pupil.shape)
+        _check.array_of("numbers", self.numbers, "integral", ("n_segments",))
+        _check.array_of("scale", self.scale, "real floating", (2, 1, 1))
+        _check.array_of("dark", self.dark, "real floating", (2, *self.shifted.detector_shape))
+
     @classmethod
     def from_images(cls, bench: Bench, seed: Seed = None) -> BenchModel:
         """Record clear frames and a dark on a bench, and model the sensor from them.

@@ -84,9 +84,7 @@ class Reconstruction:
         _check.array_of("n_unsolved", self.n_unsolved, "integral", batch)
         _check.array_of("frames", self.frames, "real floating", (*batch, sensor.n_masks, *grid))
         if self.history is not None:
-            _check.array_of("history", self.history, "real floating")
-            n_maps = tuple(self.history.shape[-3:-2]) or (1,)
-            _check.array_of("history", self.history, "real floating", (*batch, *n_maps, *grid))
+            _check.array_of("history", self.history, "real floating", (*batch, "n_iterations + 1", *grid))
 
     def __repr__(self) -> str:
         xp, n_frames = Kind.of(self.phase).xp, prod(self.converged.shape)

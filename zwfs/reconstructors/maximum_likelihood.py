@@ -68,6 +68,19 @@ class LikelihoodReconstruction(Reconstruction):
     noise_variance: NDArray[np.floating]
     estimator: Estimator
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check.instance("estimator", self.estimator, Estimator)
+        batch = tuple(self.converged.shape)
+        if self.amplitude is not None:
+            _check.array_of("amplitude", self.amplitude, "real floating", tuple(self.phase.shape))
+        if self.coefficients is not None:
+            _check.array_of("coefficients", self.coefficients, "real floating", (*batch, "n_modes"))
+        _check.array_of("chi2", self.chi2, "real floating", batch)
+        _check.array_of("explained", self.explained, "bool", batch)
+        _check.array_of("n_starts", self.n_starts, "integral", batch)
+        _check.array_of("noise_variance", self.noise_variance, "real floating", batch)
+
     @property
     def consistent(self) -> NDArray[np.bool_]:
         """Whether the fit converged and explains the frames to within its noise, shape (...).

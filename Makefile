@@ -10,8 +10,9 @@ PIN = $(UV) pip compile $(if $(PACKAGE),--upgrade-package $(PACKAGE),--upgrade) 
 	--no-emit-index-url --custom-compile-command "make lock"
 
 # The folder and the Python of the environment. The set-up writes them to $(READY) at its end. After an interruption,
-# a move of the folder or a change of Python they differ, and the set-up is repeated.
-IDENTITY := $(BIN)/python -I -X utf8 -c 'import sys; print(sys.prefix, *sys.version_info[:2])'
+# a move of the folder or a change of Python they differ, and the set-up is repeated. Python reads the path of this
+# folder in the encoding of the locale.
+IDENTITY := LC_ALL=C.UTF-8 $(BIN)/python -I -X utf8 -c 'import sys; print(sys.prefix, *sys.version_info[:2])'
 ifneq ($(shell $(IDENTITY) 2>/dev/null | cmp -s - $(READY) && echo same),same)
 .PHONY: $(BIN)/uv
 endif

@@ -205,7 +205,10 @@ def test_environment_is_set_up_once_and_again_after_a_kill_in_a_moved_folder_and
     assert make(clone, "-s", ".venv/.ready") == (0, READY)
     moved, locale = clone.rename(clone.with_name("it's bewegt für alle")), {"LC_ALL": "de_XX.ISO-8859-1"}
     assert make(moved, "-s", ".venv/.ready", **locale) == (0, READY)
+    for packages in moved.glob(".venv/lib/python3*/site-packages"):  # as an editable installation does
+        (packages / "zwfs.pth").write_text(f"{moved}\n", encoding="utf8")
     assert make(moved, "-s", ".venv/.ready") == (0, "")
+    assert make(moved, "-s", ".venv/.ready", **locale) == (0, "")
     python = moved / ".venv" / "bin" / "python"
     python.unlink()
     python.symlink_to("/usr/bin/python0")

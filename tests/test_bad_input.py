@@ -232,7 +232,11 @@ PLAIN = {
 
 
 def variants(value):
-    """Bad and unusual forms of a valid value that is an array: (label, value, plain value or None)."""
+    """Bad and unusual forms of a valid number or array: (label, value, plain value or None)."""
+    if type(value) is int and abs(value) < 128:
+        yield "as int8", np.int8(value), value
+    if type(value) is float and np.isfinite(value):
+        yield "as Fraction", Fraction(value), value
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fc" or not value.ndim:
         return
     hole, pole = value.copy(), value.copy()

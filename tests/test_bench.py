@@ -1,3 +1,5 @@
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -478,6 +480,13 @@ def test_segment_screens_are_averaged_power_law_screens(perfect):
 def test_bad_parameters_are_named(change):
     with pytest.raises(ValueError, match=rf"^{next(iter(change))} = .*: .*expected"):
         Bench(**{**SMALL, **change})
+
+
+def test_numbers_of_other_types_are_kept_as_plain_ones():
+    small = {name: np.int8(value) if isinstance(value, int) else value for name, value in SMALL.items()}
+    other = Bench(**small, subpixels=np.int8(4), seed=np.uint8(1), focus=[Fraction(1, 10**4)] * 4)
+    plain = Bench(**SMALL, subpixels=4, seed=1, focus=(1e-4,) * 4)
+    np.testing.assert_array_equal(other.frames(seed=2), plain.frames(seed=2))
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,11 @@ def number_field(owner: Any, name: str, low: float = -math.inf, high: float = ma
     object.__setattr__(owner, name, number(name, getattr(owner, name), low, high, **ends))
 
 
+def integer_field(owner: Any, name: str, low: int, high: float = _INT64) -> None:
+    """Check an integer among the fields of a frozen dataclass, see `integer`, and keep it as an int."""
+    object.__setattr__(owner, name, integer(name, getattr(owner, name), low, high))
+
+
 def float_dtype(name: str, value: Any) -> np.dtype:
     """Return `value` as the dtype float32 or float64."""
     name_of = np.dtype(value).name if isinstance(value, type | np.dtype) else value

@@ -158,8 +158,8 @@ class Bench:
     subpixels: int = 1
 
     def __post_init__(self) -> None:
-        _check.integer("n_pixels", self.n_pixels, 2)
-        _check.integer("subpixels", self.subpixels, 1, 16)
+        _check.integer_field(self, "n_pixels", 2)
+        _check.integer_field(self, "subpixels", 1, 16)
         _check.number_field(self, "extent", 1, 10)
         _check.sequence("missing", self.missing, expected="segment numbers, such as (21,)")
         _check.number_field(self, "dimple_error", -0.9, 10)
@@ -173,15 +173,17 @@ class Bench:
         _check.sequence("focus", self.focus, expected="four numbers, one for each image")
         if len(self.focus) != 4:
             raise ValueError(f"focus has {len(self.focus)} values: expected four, one for each image")
-        for index, distance in enumerate(self.focus):
-            _check.number(f"focus[{index}]", distance, -1e-2, 1e-2)
+        distances = [
+            _check.number(f"focus[{index}]", value, -1e-2, 1e-2) for index, value in enumerate(self.focus)
+        ]
+        object.__setattr__(self, "focus", tuple(distances))
         _check.number_field(self, "astigmatism", -1e-2, 1e-2)
         _check.number_field(self, "unmodulated", 0, 1, open_high=True)
         _check.number_field(self, "coherent", 0, 0.5, open_high=True)
         _check.number_field(self, "blur", 0, self.n_pixels)
         for name in ("halo", "static", "quilting", "photons", "read_noise", "background"):
             _check.number_field(self, name, 0)
-        _check.integer("seed", self.seed, 0, math.inf)
+        _check.integer_field(self, "seed", 0, math.inf)
         if not self.photons and (self.read_noise or self.background):
             raise ValueError(
                 f"photons = 0 with read_noise = {self.read_noise:g} and background = {self.background:g}: "

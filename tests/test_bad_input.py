@@ -192,7 +192,10 @@ MASKED = np.ma.array(np.ones(3), mask=[0, 1, 0])
 
 
 class _Evil:
-    """Object that cannot be an array."""
+    """Object that can neither be an array nor be printed."""
+
+    def __repr__(self):
+        raise RuntimeError("no text")
 
     def __array__(self, dtype=None, copy=None):
         raise RuntimeError("no array")

@@ -54,8 +54,8 @@ def shown(value: Any) -> str:
     """Return the representation of `value` in one line of at most 80 characters."""
     try:
         text = " ".join(repr(value).split())
-    except ValueError:  # Python refuses to print integers of more than 4300 digits
-        return f"a {type(value).__name__} of too many digits"
+    except Exception:  # Python refuses to print integers of more than 4300 digits; other objects raise anything
+        return f"a {type(value).__name__} that cannot be printed"
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 

@@ -227,7 +227,7 @@ class MaximumLikelihood(Reconstructor):
         seed: int = 0,
     ) -> None:
         if isinstance(amplitude, str) and amplitude != "unknown":
-            raise ValueError(f"amplitude = {amplitude!r}: expected an array or 'unknown'")
+            raise ValueError(f"amplitude = {_check.shown(amplitude)}: expected an array or 'unknown'")
         unknown = isinstance(amplitude, str)
         known = None if isinstance(amplitude, str) else amplitude
         super().__init__(sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=known)

@@ -15,6 +15,7 @@ from zwfs import (
     GerchbergSaxton,
     GradientDescent,
     Linear,
+    MaximumLikelihood,
     PhaseShifted,
     ZernikeSensor,
     reconstruction_error,
@@ -773,3 +774,27 @@ def test_every_result_says_whether_it_explains_the_frames(make, method, screens)
         result.explains(photons=0)
     with pytest.raises(ValueError, match="read_noise = 1: expected 0"):
         result.explains(read_noise=1.0)
+
+
+@pytest.mark.parametrize("method", [
+    lambda sensor: MaximumLikelihood(sensor),
+    lambda sensor: MaximumLikelihood(sensor, photons=1000.0),
+    lambda sensor: GerchbergSaxton(sensor, unmeasured="model", n_iterations=200),
+    lambda sensor: GradientDescent(sensor, n_iterations=200),
+])  # fmt: skip
+def test_pixels_that_are_not_recorded_have_no_weight(pupil, modes, method):
+    """Frames that hold 0 outside the pupil, where there is light, give the exact phase all the same."""
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), recorded=pupil.inside)
+    phase = 0.4 * modes[5]
+    found = method(sensor)(sensor.measure(phase) * pupil.inside)
+    assert found.consistent
+    assert reconstruction_error(pupil, found.phase, phase) < 2e-5
+
+
+def test_recorded_pixels_hold_the_pupil_and_suit_the_method(pupil):
+    mask, most = Dimple(1.06, np.pi / 2), pupil.inside.copy()
+    most[np.nonzero(pupil.inside)[0][0], np.nonzero(pupil.inside)[1][0]] = False
+    with pytest.raises(ValueError, match="recorded is False at 1 points of the pupil"):
+        ZernikeSensor(pupil, mask, recorded=most)
+    with pytest.raises(ValueError, match="unmeasured = 'zero'"):
+        GerchbergSaxton(ZernikeSensor(pupil, mask, recorded=pupil.inside))

@@ -23,7 +23,18 @@ from astropy.io import fits
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, zernike_basis
+from zwfs import (
+    Dimple,
+    GerchbergSaxton,
+    GradientDescent,
+    Linear,
+    MaximumLikelihood,
+    PhaseShifted,
+    Pupil,
+    ZernikeSensor,
+    power_law_screens,
+    zernike_basis,
+)
 from zwfs._images import nearest_good
 from zwfs.frames import Calibration, FileError, calibrate, pipeline, reconstruct
 from zwfs.frames.__main__ import main
@@ -102,9 +113,12 @@ def rms(difference):
 # The calibrated object
 
 
-@pytest.mark.parametrize("optics", [Optics(), Optics(leakage=0.05, unmasked=0.1, background=0.02, scale=1.03)])
+@pytest.mark.parametrize(
+    ("optics", "apart"), [(Optics(), 2e-3), (Optics(leakage=0.05, unmasked=0.1, background=0.02), 0.01)]
+)
 @pytest.mark.parametrize("n_bad", [0, 30])
-def test_phase_is_that_of_the_pipeline(bench, optics, n_bad):
+def test_phase_is_that_of_the_pipeline(bench, optics, apart, n_bad):
+    """But for the light, which a call measures in each frame; with wrong optics it differs more."""
     bad = np.zeros(bench.flat.shape, bool)
     bad.flat[np.random.default_rng(2).choice(bad.size, n_bad, replace=False)] = True
     calibration = bench.calibration(optics, bad, tolerance=1e-5, n_iterations=50)
@@ -113,7 +127,7 @@ def test_phase_is_that_of_the_pipeline(bench, optics, n_bad):
     for phase, counts in zip(found.phase, bench.frames, strict=False):
         one = replace(registered, frames=(bench.image(counts, bad),) * 2)
         expected = pipeline.recover_phase(reduce_frames(one, optics), n_iterations=60).phase
-        assert rms(phase - expected) < 5e-4
+        assert rms(phase - expected) < apart
         np.testing.assert_array_equal(np.isnan(phase), np.isnan(expected))
     assert not found.flags.any()
 
@@ -212,6 +226,42 @@ def test_calibration_replaces_no_other_file(folder, calibration):
 def test_counts_of_another_camera_are_refused(calibration):
     with pytest.raises(ValueError, match=r"counts has shape \(3, 10, 10\): expected \(\.\.\., 56, 112\)"):
         calibration(np.zeros((3, 10, 10)))
+
+
+# Other methods, other light
+
+
+@pytest.mark.parametrize("method", [
+    lambda sensor, modes: Linear(sensor, modes),
+    lambda sensor, modes: PhaseShifted(sensor),
+    lambda sensor, modes: GerchbergSaxton(sensor, n_iterations=100, unmeasured="model"),
+    lambda sensor, modes: GradientDescent(sensor, n_iterations=100),
+    lambda sensor, modes: GradientDescent(sensor, modes, n_iterations=100),
+    lambda sensor, modes: MaximumLikelihood(sensor),
+    lambda sensor, modes: MaximumLikelihood(sensor, photons=PHOTONS),
+    lambda sensor, modes: MaximumLikelihood(sensor, modes, photons=PHOTONS),
+])  # fmt: skip
+def test_each_method_recovers_a_poke(bench, calibration, method):
+    modes = zernike_basis(Pupil.circular(D), 60)
+    poke = 0.3 * modes[3]
+    counts = bench.expose(bench.sensor.measure(np.stack([0 * poke, poke])))
+    wide = zernike_basis(calibration.sensor.pupil, 60, orthonormal=True)
+    found = calibration(counts, method=method(calibration.sensor, wide)).phase
+    change = nearest_good(found[1] - found[0], np.isfinite(found[0]))
+    shape = np.array(calibration.good.shape)
+    first = (shape - D) // 2
+    change = change[first[0] : first[0] + D, first[1] : first[1] + D]
+    assert rms(np.where(bench.pupil.inside, change - poke, np.nan)) < 0.05
+
+
+@pytest.mark.parametrize("faint", [1.0, 0.5, 0.01])
+def test_light_is_measured_in_each_frame(bench, calibration, faint):
+    image = np.concatenate(list(bench.sensor.measure(bench.screens[0])), axis=-1)
+    counts = np.random.default_rng(5).poisson(faint * PHOTONS * image) + DARK
+    found, bright = calibration(counts), calibration(bench.frames[0])
+    assert found.flags == 0
+    assert found.flux == pytest.approx(faint, rel=0.01)
+    assert rms(found.phase - bright.phase) < 1.5 / np.sqrt(faint * PHOTONS)
 
 
 # Flags

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -34,28 +35,38 @@ class Noise:
         Photons that an intensity of 1 puts into a pixel of each frame. None stands for an unknown variance that is
         the same in all pixels: ordinary least squares.
     read_noise : float, electrons rms / pixel
+    recorded : ndarray of bool, shape (ny', nx'), or None
+        Pixels that the frames hold; the others have no weight. None stands for all.
     """
 
     photons: float | None
     read_noise: float
+    recorded: NDArray[np.bool_] | None = None
 
     @classmethod
-    def checked(cls, photons: Any, read_noise: Any) -> Noise:
+    def checked(cls, photons: Any, read_noise: Any, recorded: NDArray[np.bool_] | None = None) -> Noise:
         """Check the arguments."""
         read_noise = _check.number("read_noise", read_noise, 0, 1e6)
         if photons is not None:
-            return cls(_check.number("photons", photons, 1e-18, 1e12), read_noise)
+            return cls(_check.number("photons", photons, 1e-18, 1e12), read_noise, recorded)
         if read_noise:
             raise ValueError(f"read_noise = {read_noise:g}: expected 0, since there is no number of photons")
-        return cls(None, 0.0)
+        return cls(None, 0.0, recorded)
+
+    def n_values(self, frames: NDArray) -> int:
+        """Values that a set of frames (k, n_masks, ny', nx') holds."""
+        return prod(frames.shape[1:] if self.recorded is None else (frames.shape[1], self.recorded.sum()))
 
     def electrons(self, light: NDArray) -> NDArray:
         """Mean of the Poisson distribution in each pixel, above 0."""
         return self.photons * light + (self.read_noise**2 + _DARK)
 
     def weights(self, light: NDArray) -> NDArray | None:
-        """Inverse variance of frames whose mean is `light`; None without a number of photons."""
-        return None if self.photons is None else self.photons**2 / self.electrons(light)
+        """Inverse variance of frames whose mean is `light`; None if it is the same in all pixels."""
+        if self.photons is None:
+            return None if self.recorded is None else 0 * light + Kind.of(light).array(self.recorded)
+        weights = self.photons**2 / self.electrons(light)
+        return weights if self.recorded is None else weights * Kind.of(light).array(self.recorded)
 
     def deviance(self, light: NDArray, frames: NDArray) -> NDArray:
         """Twice the logarithm of the best possible likelihood over that of a mean `light`: (k, ...) to (k,).
@@ -63,8 +74,10 @@ class Noise:
         Read noise may bring a pixel below 0 electrons plus variance, where no mean is the best: that of 1 electron
         takes its place. Without a number of photons it is the sum of squares.
         """
-        terms = self.terms(light, frames)
-        return Kind.of(terms).xp.sum(terms, axis=(-2, -1))
+        terms, kind = self.terms(light, frames), Kind.of(light)
+        if self.recorded is not None:
+            terms = terms * kind.array(self.recorded)
+        return kind.xp.sum(terms, axis=(-2, -1))
 
     def terms(self, light: NDArray, frames: NDArray) -> NDArray:
         """Sum over the masks of the terms of `deviance`: (k, n_masks, ny, nx) to (k, ny, nx)."""
@@ -88,6 +101,9 @@ class Noise:
         difference, scale = self.electrons(frames) - expected, 1 / xp.clip(expected, 1, None)
         expected = expected * scale
         terms = difference * difference * scale, expected, (2 * expected + scale) * expected
+        if self.recorded is not None:
+            recorded = Kind.of(light).array(self.recorded)
+            terms = tuple(term * recorded for term in terms)
         misfit, mean, variance = (xp.sum(term, axis=axes) for term in terms)
         return misfit, mean, variance
 
@@ -98,8 +114,9 @@ class Noise:
         """
         xp, axes = Kind.of(light).xp, tuple(range(1, light.ndim))
         if self.photons is None:
-            difference = light - frames
-            return xp.mean(difference * difference, axis=axes) <= _RESIDUAL**2
+            weights, difference = self.weights(light), light - frames
+            squares = difference * difference * (1 if weights is None else weights)
+            return xp.sum(squares, axis=axes) <= _RESIDUAL**2 * self.n_values(frames)
         misfit, expected, variance = self.misfit(light, frames)
         freedom = xp.clip(expected - n_unknowns, 0, None)
         return misfit <= freedom + _SIGMAS * xp.sqrt(variance)

@@ -74,7 +74,7 @@ def cramer_rao(
     _check.instance("sensor", sensor, ZernikeSensor, PolychromaticSensor)
     if photons is None:
         raise TypeError("photons = None: expected a number, since the bound is that of photon noise")
-    noise = Noise.checked(photons, read_noise)
+    noise = Noise.checked(photons, read_noise, sensor.recorded)
     unknown = not _check.flag("amplitude_known", amplitude_known)
     if unknown and modes is not None:
         raise ValueError("amplitude_known = False: expected True with modes, which describe the phase only")

@@ -98,7 +98,7 @@ class PolychromaticSensor(Sensor):
             else _check.number("reference_wavelength", reference_wavelength, mean / _WIDEST, mean * _WIDEST)
         )
         self.chromatic = _check.flag("chromatic", chromatic)
-        self.reference = sensor
+        self.reference, self.recorded = sensor, sensor.recorded
         ratios = tuple((self.reference_wavelength / self.wavelengths).tolist())
         super().__init__(
             sensor.pupil,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Immutable, Kind, per_kind
+from zwfs._arrays import Immutable, Kind, per_kind, read_only
 from zwfs._lowrank import Factors, Operator, factorise
 from zwfs._propagator import (
     ONE_WAVELENGTH,
@@ -48,6 +48,8 @@ class Sensor(Immutable):
         Rows and columns of a frame.
     window : (slice, slice)
         Rows and columns of a frame in which the grid of the pupil lies.
+    recorded : ndarray of bool, shape (ny_detector, nx_detector), or None
+        Pixels that the frames hold; None stands for all. What a frame holds in the others has no weight.
     channels : Channels
         Ratio and weight of each wavelength.
     factors : Factors
@@ -58,6 +60,7 @@ class Sensor(Immutable):
     """
 
     factors: Factors
+    recorded: NDArray[np.bool_] | None = None
 
     def __init__(
         self, pupil: Pupil, masks: tuple[Mask, ...], extent: float, tolerance: float, channels: Channels
@@ -253,6 +256,9 @@ class ZernikeSensor(Sensor):
     tolerance : float
         Error of the reference wave, relative to the strongest response of the masks (spectral norm). It decides
         the rank; the speed hardly depends on it. At 1e-14 the kernel is exact to rounding.
+    recorded : array_like of bool, shape (ny_detector, nx_detector), optional
+        Pixels that the frames hold, all points of the pupil among them. The reconstructors give no weight to the
+        others, such as those outside the pupil where a camera sees stray light. By default all are recorded.
 
     Raises
     ------
@@ -278,11 +284,21 @@ class ZernikeSensor(Sensor):
     (1, 64, 64)
     """
 
-    def __init__(self, pupil: Pupil, *masks: Mask, extent: float = 1.0, tolerance: float = 1e-10) -> None:
+    def __init__(
+        self, pupil: Pupil, *masks: Mask, extent: float = 1.0, tolerance: float = 1e-10,
+        recorded: ArrayLike | None = None,
+    ) -> None:  # fmt: skip
         _check.instance("pupil", pupil, Pupil)
         if not masks:
             raise ValueError("masks is empty: expected at least one mask, such as Dimple(1.06, np.pi / 2)")
         super().__init__(pupil, masks, extent, tolerance, ONE_WAVELENGTH)
+        if recorded is not None:
+            pixels = _check.flag_map("recorded", recorded, self.detector_shape)
+            if n_missing := int(np.count_nonzero(pupil.inside & ~pixels[self.window])):
+                raise ValueError(
+                    f"recorded is False at {n_missing} points of the pupil: expected True at all of them"
+                )
+            self.recorded = None if pixels.all() else read_only(pixels)
         self.factors = self._factorise()
 
     def __repr__(self) -> str:
@@ -294,7 +310,9 @@ class ZernikeSensor(Sensor):
 
     def with_tolerance(self, tolerance: float) -> ZernikeSensor:
         """Return the same sensor with another error of the reference wave."""
-        return ZernikeSensor(self.pupil, *self.masks, extent=self.extent, tolerance=tolerance)
+        return ZernikeSensor(
+            self.pupil, *self.masks, extent=self.extent, tolerance=tolerance, recorded=self.recorded
+        )
 
     def propagate(self, field: ArrayLike) -> NDArray[np.complexfloating]:
         """Field on the detector behind each mask.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,10 @@ from scipy import fft, ndimage, sparse
 from scipy.interpolate import NdBSpline
 
 from zwfs import _check
+from zwfs._arrays import Kind
 from zwfs._images import nearest_good
 from zwfs._information import Response
+from zwfs._propagator import square
 from zwfs.frames.registration import _TOUCHED
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
@@ -29,13 +31,27 @@ _NOISE = 0.2  # of the signal, in squares: the inverse of a blur goes no further
 _NEGLIGIBLE = 1e-10  # of a weight: smaller ones only slow products down, much so if their products are subnormal
 
 
+class Solved(NamedTuple):
+    """Phases of k frame sets."""
+
+    phase: NDArray[np.float32]  # (k, ny, nx), bad points filled
+    n_iterations: NDArray[np.int64]
+    converged: NDArray[np.bool_]
+
+    def put(self, which: NDArray[np.intp], part: Solved) -> None:
+        """Replace the phases of some frame sets, and add the iterations."""
+        self.phase[which], self.converged[which] = part.phase, part.converged
+        self.n_iterations[which] += part.n_iterations
+
+
 class Grid:
     """Constants of the calls of a calibration, in single precision, on a box of the camera around each pupil."""
 
     def __init__(self, calibration: Calibration) -> None:
         pupil = Pupil.from_amplitude(calibration.amplitude, calibration.diameter, calibration.center)
         masks = (Dimple(calibration.optics.diameter, shift) for shift in calibration.optics.phase_shifts)
-        sensor = ZernikeSensor(pupil, *masks, tolerance=1e-6)
+        # Outside the pupil a camera sees light that the model does not know.
+        sensor = ZernikeSensor(pupil, *masks, tolerance=1e-6, recorded=pupil.inside)
         settings: dict[str, Any] = {"n_iterations": calibration.n_iterations, "tolerance": calibration.tolerance}
         self.reconstruct, self.response = PhaseShifted(sensor, accelerate=True, **settings), Response.of(sensor)
         self.weights, self.offset = calibration.weights.astype(np.float32), calibration.offset.astype(np.float32)
@@ -56,6 +72,7 @@ class Grid:
         self.filters = [_spline_filter(length, calibration.blur) for length in size]  # to their coefficients
         reached = np.stack([one.sum(axis=0) > 0 for one in self.touching])
         self.watched = reached.reshape(bad.shape) & ~bad  # good pixels from which the pupil is made
+        self.dim = ~reached.reshape(bad.shape) & ~bad  # good pixels around it
         # Bad pixels of each box, and bad points of the pupil, with their nearest good ones.
         self.repairs = [_repair(one, ~one) for one in bad]
         self.holes = _repair(pupil.inside & ~calibration.good, calibration.good)
@@ -91,10 +108,9 @@ class Grid:
         return np.ascontiguousarray(values.transpose(2, 0, 1)), good, n_bad, n_saturated
 
     def solve(
-        self, frames: NDArray, good: NDArray, start: NDArray | None = None, judge: bool = True,
-        method: Reconstructor | None = None,
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:  # fmt: skip
-        """Phases with bad points filled, iterations, whether they converged, and residuals of ideal frames.
+        self, frames: NDArray, good: NDArray, start: NDArray | None = None, method: Reconstructor | None = None
+    ) -> Solved:
+        """Phases of ideal frames.
 
         Bad points take no part: in a second iteration their intensity is that of the model. The frames, shape
         (k, 2, ny, nx), are changed.
@@ -112,8 +128,28 @@ class Grid:
             phase[some] = self.filled(np.where(sensor.pupil.inside, found.phase, 0), good[some])
             n_iterations[some] += found.n_iterations
             converged[some] = found.converged
-        blind = np.full(len(phase), np.nan, np.float32)
-        return phase, n_iterations, converged, reconstruct.settings.residual(phase, frames) if judge else blind
+        return Solved(phase, n_iterations, converged)
+
+    def compared(self, phase: NDArray, frames: NDArray, good: NDArray) -> tuple[NDArray, NDArray]:
+        """Rms difference of frames (k, 2, ny, nx) from those of phases, (k,), and the ratio of their light."""
+        model = self.reconstruct.settings.model(Kind.of(frames))
+        psi = model.incoming(phase)
+        modelled = square(model.reference(psi) + psi[:, np.newaxis])
+        squares = np.sum((modelled - frames) ** 2, axis=(1, 2, 3), where=model.pupil.inside)
+        where = good[:, np.newaxis]
+        seen, known = (np.sum(one - self.offset, axis=(1, 2, 3), where=where) for one in (frames, modelled))
+        return np.sqrt(squares / (2 * model.pupil.n_points)), seen / known
+
+    def noise(self, counts: NDArray) -> NDArray[np.float64]:
+        """Noise of a pixel without light, (k, 2), counts rms: the robust scatter around both pupils."""
+        scatter = np.zeros((len(counts), 2))
+        for index, (image, rows, columns) in enumerate(self.boxes):
+            around = (counts[:, image][:, rows][:, :, columns] - self.dark[index])[:, self.dim[index]]
+            if around.shape[1]:
+                around = np.nan_to_num(around.astype(float))
+                middle = np.median(around, axis=1, keepdims=True)
+                scatter[:, index] = 1.4826 * np.median(np.abs(around - middle), axis=1)
+        return scatter
 
     def filled(self, phase: NDArray, good: NDArray) -> NDArray:
         """Phases (k, ny, nx) with bad points replaced by the nearest good one."""

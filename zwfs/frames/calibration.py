@@ -28,7 +28,7 @@ from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._errors import Excess, sideways, slopes_of, unexplained
-from zwfs.frames._grid import Grid
+from zwfs.frames._grid import Grid, Solved
 from zwfs.frames._learnt import learnt, training
 from zwfs.frames.phases import Flag, Phases
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames
@@ -39,7 +39,9 @@ from zwfs.reconstructors.base import Reconstructor
 from zwfs.sensor import ZernikeSensor
 
 FORMAT = 2  # of the file; another number is refused
-_DIM = 0.1  # of the light of the calibration: a frame with less is lost
+_DIM = 0.1  # of the light of the calibration: a frame with less is compared with its noise
+_LIGHTS = 4  # times that the light of a frame follows from its phase
+_SAME_LIGHT = 1e-3  # relative change of the light that needs no other phase
 _FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
 _WIDEST = 2**16  # rows or columns of a camera
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
@@ -74,6 +76,8 @@ class Calibration(Immutable):
         Whether both frames are scaled to the same light.
     light : ndarray, shape (2,)
         Mean intensity of the calibration's frames in the pupil.
+    light_ratio : float
+        Light of the calibration's frames over that of their model, which other frames are taken to share.
     unexplained, slopes : ndarray, shapes (n_states, ny, nx) and (n_states,), radian
         Errors of the phases of the calibration's frames, for `sigma`. They grow with the rms difference of phases
         at neighbouring points.
@@ -112,6 +116,7 @@ class Calibration(Immutable):
     unexplained: NDArray[np.float32]
     slopes: NDArray[np.float64]
     residual: float = 0.0
+    light_ratio: float = 1.0
     saturation: float = np.inf
     blur: float = 0.0
     n_averaged: int = 1
@@ -127,6 +132,7 @@ class Calibration(Immutable):
         _check.instance("bunit", self.bunit, str)
         _check.flag("balance", self.balance)
         _check.number("residual", self.residual, 0)
+        _check.number("light_ratio", self.light_ratio, 0, open_low=True)
         _check.number("blur", self.blur, 0, 10)
         _check.integer("n_averaged", self.n_averaged, 1)
         _check.integer("n_images", self.n_images, 1, 2)
@@ -206,9 +212,11 @@ class Calibration(Immutable):
             np.zeros((0, *pupil.shape), np.float32), np.zeros(0), **settings,
         )  # fmt: skip
         frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
-        phase, *_, residual = made._work.solve(frames, good[np.newaxis])
+        phase = made._work.solve(frames, good[np.newaxis]).phase
         errors = sideways(made.sensor, phase[0], frames[0], good)[np.newaxis]
-        return replace(made, residual=float(residual[0]), unexplained=errors, slopes=slopes_of(phase, good))
+        made = replace(made, unexplained=errors, slopes=slopes_of(phase, good))
+        residual, ratio = made._work.compared(phase, frames, good[np.newaxis])
+        return replace(made, residual=float(residual[0]), light_ratio=float(ratio[0]))
 
     @classmethod
     def from_bench(
@@ -296,7 +304,9 @@ class Calibration(Immutable):
         light = intensity(counts)[..., good].mean(axis=(0, 2))
         made = replace(made, good=good, weights=weights, offset=offset, light=light)
         images = on_camera(np.nan_to_num(counts)) + made.dark
-        found = made(images if n_images == 2 else images[:, 0], saturation=np.inf)
+        images = images if n_images == 2 else images[:, 0]
+        made = replace(made, light_ratio=float(np.mean(made(images, saturation=np.inf).flux)))
+        found = made(images, saturation=np.inf)
         residual, slopes = float(np.sqrt(np.nanmean(found.residual**2))), slopes_of(found.filled, good)
         return replace(made, unexplained=unexplained(found.phase, phases), slopes=slopes, residual=residual)
 
@@ -368,7 +378,9 @@ class Calibration(Immutable):
         largest_residual : float
             Residual above which a frame is inconsistent.
         judge : bool
-            Whether to compute the residual, which takes a tenth of the time; without it the residual is NaN.
+            Whether to compare the frames with their model, which gives the residual and the light, and takes a
+            tenth of the time. Without it the residual is NaN, and the pupil as bright as that of the calibration's
+            frames would be in this light.
         method : Reconstructor, optional
             Replaces the phase-shifted iteration, such as ``zwfs.Linear(calibration.sensor, modes)``.
 
@@ -472,7 +484,9 @@ class Calibration(Immutable):
         photons = _check.number("photons", photons, 1e-6, 1e12)
         pupil, model = self.sensor.pupil, propagator(self.sensor, Kind.numpy())
         basis = None if modes is None else pupil.scatter(_check.modes("modes", modes, pupil), fill=0)
-        estimator = Estimator(self._work.response, Noise.checked(photons, read_noise), False, basis)
+        estimator = Estimator(
+            self._work.response, Noise.checked(photons, read_noise, self.sensor.recorded), False, basis
+        )
 
         def variance(phase: NDArray) -> NDArray:
             psi = split(phase[np.newaxis], model.amplitude)
@@ -513,27 +527,71 @@ class Calibration(Immutable):
         values, good, n_bad, n_saturated = work.on_grid(counts, level, self.good)
         n_good = np.maximum(np.count_nonzero(good, axis=(1, 2)), 1)
         flux = np.vecdot(values, good.reshape(k, 1, -1).astype(np.float32)) / (n_good[:, np.newaxis] * self.unit)
-        relative = flux / self.light
-        with np.errstate(invalid="ignore", divide="ignore"):
-            enough = (relative.min(axis=1) >= _DIM) & (n_good >= (1 - _MOST_BAD) * self.sensor.pupil.n_points)
-            gain = (flux.mean(axis=1, keepdims=True) / flux if self.balance else np.ones_like(flux)) / self.unit
-        values *= np.where(enough[:, np.newaxis], gain, 0).astype(np.float32)[..., np.newaxis]
+        enough = self._lit(counts, flux) & (n_good >= (1 - _MOST_BAD) * self.sensor.pupil.n_points)
+        light = flux.mean(axis=1) / self.light.mean()
+        flux = np.where(enough[:, np.newaxis], flux, self.light)
+        if self.balance:
+            values *= (flux.mean(axis=1, keepdims=True) / flux).astype(np.float32)[..., np.newaxis]
+        values /= self.unit[:, np.newaxis].astype(np.float32)
         values = values.reshape(k, *self.offset.shape)
-        frames = work.weights[:, 0] * values[:, :1]
-        frames += work.weights[:, 1] * values[:, 1:]
-        frames += work.offset
-        if method is None:
-            np.maximum(frames, 0, out=frames)
-        if not enough.all():
-            frames[~enough] = work.flat_frames  # of a flat wavefront: they converge at once
-        filled, n_iterations, converged, residual = work.solve(frames, good, start, judge, method)
+        values[~enough] = 0
+        ideal = work.weights[:, 0] * values[:, :1] + work.weights[:, 1] * values[:, 1:]
+        solved, residual = self._solved(ideal, light, good, enough, start, judge, method)
         flags = _BAD * (n_bad > 0) + _SATURATED * (n_saturated > 0)
-        faults = flags + _INCONSISTENT * (residual > limit) + _NOT_CONVERGED * (~converged & (self.tolerance > 0))
-        flags = np.where(enough, faults, _LOST + flags)
-        phase = np.where(good & enough[:, np.newaxis, np.newaxis], filled, np.float32(np.nan))
-        residual = np.where(enough, residual, np.float32(np.nan))
-        light = relative.mean(axis=1).astype(np.float32)
-        return Phases(phase, filled, light, n_bad, n_saturated, residual, n_iterations, flags)
+        slow = ~solved.converged & (self.tolerance > 0)
+        flags = np.where(enough, flags + _INCONSISTENT * (residual > limit) + _NOT_CONVERGED * slow, _LOST + flags)
+        phase = np.where(good & enough[:, np.newaxis, np.newaxis], solved.phase, np.float32(np.nan))
+        return Phases(phase, solved.phase, light, n_bad, n_saturated, residual, solved.n_iterations, flags)
+
+    def _lit(self, counts: NDArray, flux: NDArray) -> NDArray[np.bool_]:
+        """Whether both images of exposures hold light, (k,): more than the noise of a dark pixel.
+
+        Frames nearly as bright as those of the calibration need no such test.
+        """
+        lit = np.all(flux >= _DIM * self.light, axis=1)
+        dim = np.flatnonzero(~lit & np.all(flux > 0, axis=1))
+        if dim.size:
+            lit[dim] = np.all(flux[dim] * self.unit > self._work.noise(counts[dim]), axis=1)
+        return lit
+
+    def _solved(
+        self, ideal: NDArray, light: NDArray, good: NDArray, enough: NDArray, start: NDArray | None, judge: bool,
+        method: Reconstructor | None,
+    ) -> tuple[Solved, NDArray[np.float32]]:  # fmt: skip
+        """Phases and residuals of frames, (k, 2, ny, nx), whose light over that of the calibration is not known.
+
+        A first phase takes the mean light in the pupil to be that of the calibration's frames. It depends a little
+        on the phase, so that the light follows from the modelled frames, and then a better phase. The values of
+        `light`, (k,), are changed.
+        """
+        work = self._work
+
+        def frames_of(which: NDArray | slice) -> NDArray[np.float32]:
+            scale = np.where(enough[which], light[which], 1).astype(np.float32)
+            frames = ideal[which] / scale[:, np.newaxis, np.newaxis, np.newaxis]
+            frames += work.offset
+            return np.maximum(frames, 0, out=frames) if method is None else frames
+
+        frames = frames_of(slice(None))
+        frames[~enough] = work.flat_frames  # of a flat wavefront: they converge at once
+        solved = work.solve(frames, good, start, method)
+        residual = np.full(len(ideal), np.nan, np.float32)
+        if not judge:
+            return solved, residual
+        which = np.flatnonzero(enough)
+        for _ in range(_LIGHTS):
+            residual[which], ratio = work.compared(solved.phase[which], frames[which], good[which])
+            ratio /= self.light_ratio
+            far = np.abs(ratio - 1) > _SAME_LIGHT
+            which, ratio = which[far], ratio[far]
+            if not which.size or (method is not None and not method.iterative):
+                break
+            light[which] *= ratio
+            frames[which] = frames_of(which)
+            again = frames[which]
+            solved.put(which, work.solve(again, good[which], solved.phase[which], method))
+            frames[which] = again
+        return solved, residual
 
 
 def _is_calibration(path: Path) -> bool:

@@ -15,8 +15,8 @@ class Flag(IntFlag):
     Attributes
     ----------
     LOST
-        The frame has less than a tenth of the light of the calibration, or more than a fifth of the pupil is bad.
-        Its phase is NaN.
+        The mean light of a pupil is less than the noise of a dark pixel, or more than a fifth of the pupil is bad.
+        The phase is NaN.
     BAD_PIXELS
         Pixels are NaN, infinite or saturated that are good in the calibration.
     SATURATED
@@ -51,7 +51,7 @@ class Phases:
     filled : ndarray of float32, shape (..., ny, nx), radian
         The same with bad points filled with the phase of the nearest good one, and 0 outside the pupil.
     flux : ndarray of float32, shape (...)
-        Light of the pupil relative to the calibration, mean of the two images.
+        Light of the exposure relative to that of the calibration, as its own frames show it.
     n_bad, n_saturated : ndarray of int, shape (...)
         Pixels of both images that are bad here and good in the calibration, and those of them that are saturated.
     residual : ndarray of float32, shape (...)

@@ -41,7 +41,7 @@ class GerchbergSaxton(FixedPoint):
     n_iterations, tolerance, amplitude
         As for `PhaseShifted`.
     unmeasured : {"zero", "model"}
-        Field where nothing is measured.
+        Field where nothing is measured; "model" for a sensor with pixels that are not `recorded`.
 
     References
     ----------
@@ -60,6 +60,10 @@ class GerchbergSaxton(FixedPoint):
     ) -> None:
         super().__init__(sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=amplitude)
         _check.choice("unmeasured", unmeasured, ["zero", "model"])
+        if unmeasured == "zero" and sensor.recorded is not None:
+            raise ValueError(
+                "unmeasured = 'zero': expected 'model', since not all pixels of the sensor are recorded"
+            )
         self.unmeasured = unmeasured
 
     def begin(self, frames: NDArray, phasor: NDArray | None, constants: Propagator) -> _State:
@@ -75,7 +79,10 @@ class GerchbergSaxton(FixedPoint):
         if self.unmeasured == "zero":
             return Estimate(constants.adjoint(unit(waves, state.amplitude, xp)))
         modelled = modulus_of(waves, xp)
-        back = constants.adjoint(unit(waves, state.amplitude - modelled, xp, modelled))
+        missing = state.amplitude - modelled
+        if self.sensor.recorded is not None:
+            missing = missing * constants.kind.array(self.sensor.recorded)
+        back = constants.adjoint(unit(waves, missing, xp, modelled))
         back += self.sensor.n_masks * psi
         return Estimate(back)
 

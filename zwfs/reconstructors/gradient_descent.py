@@ -102,6 +102,8 @@ class GradientDescent(Reconstructor):
         psi = model.incoming(pupil.scatter(phase.astype(frames.dtype), fill=0)[np.newaxis])
         waves = model.propagate(psi)
         mismatch = square(waves) - frames
+        if self.sensor.recorded is not None:
+            mismatch *= self.sensor.recorded
         back = model.adjoint(waves * mismatch[:, :, np.newaxis])
         gradient = 2 * parts_sum(along_phase(psi, model.channels.ratios, np) * back)[0] / mismatch.size
         return float(np.vdot(mismatch, mismatch)) / (2 * mismatch.size), pupil.gather(gradient)

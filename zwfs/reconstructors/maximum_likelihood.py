@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from math import prod
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -231,7 +230,7 @@ class MaximumLikelihood(Reconstructor):
         unknown = isinstance(amplitude, str)
         known = None if isinstance(amplitude, str) else amplitude
         super().__init__(sensor, n_iterations=n_iterations, tolerance=tolerance, amplitude=known)
-        noise = Noise.checked(photons, read_noise)
+        noise = Noise.checked(photons, read_noise, sensor.recorded)
         n_starts = _check.integer("n_starts", n_starts, 1, 1000)
         seed = _check.integer("seed", seed, 0)
         if unknown and modes is not None:
@@ -646,7 +645,7 @@ class MaximumLikelihood(Reconstructor):
         """Variance by which the inverse of the information is multiplied, (k,): 1 with a number of photons."""
         if self._exact.noise.photons is not None:
             return 1 + 0 * fit.cost
-        return fit.cost / max(prod(fit.frames.shape[1:]) - self._n_unknowns(), 1)
+        return fit.cost / max(self._exact.noise.n_values(fit.frames) - self._n_unknowns(), 1)
 
     def _first_method(self) -> FixedPoint | None:
         """Method of the first iterations; None for masks that no iteration of this package handles."""

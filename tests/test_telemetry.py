@@ -42,7 +42,6 @@ from zwfs.frames._stack import Stack
 from zwfs.frames.phases import Flag
 from zwfs.frames.pipeline import Optics, reduce_frames
 from zwfs.frames.registration import Image, register_frames
-from zwfs.frames.telemetry import _limit
 
 from .conftest import code_of
 
@@ -232,7 +231,7 @@ def test_counts_of_another_camera_are_refused(calibration):
 
 
 @pytest.mark.parametrize("method", [
-    lambda sensor, modes: Linear(sensor, modes),
+    Linear,
     lambda sensor, modes: PhaseShifted(sensor),
     lambda sensor, modes: GerchbergSaxton(sensor, n_iterations=100, unmeasured="model"),
     lambda sensor, modes: GradientDescent(sensor, n_iterations=100),
@@ -260,7 +259,7 @@ def test_light_is_measured_in_each_frame(bench, calibration, faint):
     counts = np.random.default_rng(5).poisson(faint * PHOTONS * image) + DARK
     found, bright = calibration(counts), calibration(bench.frames[0])
     assert found.flags == 0
-    assert found.flux == pytest.approx(faint, rel=0.01)
+    assert found.flux == pytest.approx(faint, rel=0.03)
     assert rms(found.phase - bright.phase) < 1.5 / np.sqrt(faint * PHOTONS)
 
 
@@ -318,31 +317,24 @@ def test_frames_between_bad_ones_stay_and_none_is_left_out(folder, bench, calibr
     others = np.delete(np.arange(12), [3, 5, 7])
     expected = calibration(bench.frames).phase[others]  # other batches, so the sums are rounded otherwise
     np.testing.assert_allclose(phase[others], expected, rtol=0, atol=1e-6)
-    assert table["RESIDUAL"][5] > found.largest_residual > table["RESIDUAL"][others].max()
+    assert table["RESIDUAL"][5] > 2 * table["RESIDUAL"][others].max()
     strict = reconstruct("wrong.npy", calibration, "strict.fits", largest_residual=0.0, **some)
     assert strict.counts["INCONSISTENT"] == 10
 
 
-def test_limit_of_the_residual_is_that_of_the_page():
-    """Median + 5 times 1.48 median absolute deviations, at least 1.2 times the median, from 10 frames on."""
-    wide = np.repeat([1.0, 2.0, 3.0], [4, 4, 4])
-    assert _limit(wide) == pytest.approx(2 + 5 * 1.4826)
-    narrow = np.full(10, 2.0)
-    assert _limit(narrow) == pytest.approx(1.2 * 2)
-    assert _limit(narrow[:9]) == np.inf
-    assert _limit(np.append(narrow[:9], np.nan)) == np.inf
-
-
 def test_frames_without_a_phase_are_flagged_however_few_they_are(folder, bench, calibration):
-    """Two images that do not belong together, in a single frame, with a known noise."""
+    """Two images that do not belong together, in a single frame."""
     cube, half = bench.frames[:2].copy(), bench.frames.shape[2] // 2
     cube[0, :, half:] = cube[1, :, half:]
     np.save("few.npy", cube)
-    assert reconstruct("few.npy", calibration, "plain.fits").counts["INCONSISTENT"] == 0
-    found = reconstruct("few.npy", calibration, "phase.fits", photons=PHOTONS)
-    assert found.counts["INCONSISTENT"] == 1
-    noise = np.hypot(calibration.residual, np.sqrt(calibration.light.mean() / PHOTONS))
-    assert found.largest_residual == pytest.approx(5 * noise)
+    assert reconstruct("few.npy", calibration, "plain.fits").counts["INCONSISTENT"] == 1
+
+
+@pytest.mark.parametrize(("moved", "flags"), [((0, 0), 0), ((1, 0), Flag.MOVED), ((0, -1), Flag.MOVED)])
+def test_images_that_have_moved_are_flagged(bench, calibration, moved, flags):
+    found = calibration(np.roll(bench.frames, moved, axis=(1, 2)))
+    assert np.all(found.flags & Flag.MOVED == flags)
+    np.testing.assert_allclose(found.displacement, [moved] * 12, atol=0.5)
 
 
 def test_header_states_units_and_the_place_of_the_map(folder, calibration):
@@ -462,7 +454,6 @@ def test_file_holds_phases_table_and_keywords(folder, bench, calibration):
         header, table = units[0].header, units["FRAMES"].data
         assert (header["BUNIT"], header["NFRAMES"], header["NFLAGGED"], header["EXPTIME"]) == ("rad", 12, 0, 0.01)
         assert header["CALIBSHA"] == calibration.sha256
-        assert header["RESLIMIT"] == pytest.approx(found.largest_residual, rel=1e-6)
         np.testing.assert_array_equal(table["INDEX"], np.arange(12))
         np.testing.assert_array_equal(table["RESIDUAL"], expected.residual)
         assert set(table["BUNIT"]) == {"adu"}

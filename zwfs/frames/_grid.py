@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 _FAR = 16  # pixels to which an edge is repeated
 _REACH = 12  # pixels around the pupil that its splines need: farther ones weigh less than 2e-7
-_CUT = _REACH - 1  # of these, those without a coefficient of a spline in the pupil
+_RIM = 2  # pixels on both sides of the edge of the pupil, from which its place follows
+_CUT = _REACH - 1 - _RIM  # of these, those without a coefficient of a spline in the pupil or its rim
 _NOISE = 0.2  # of the signal, in squares: the inverse of a blur goes no further
 _NEGLIGIBLE = 1e-10  # of a weight: smaller ones only slow products down, much so if their products are subnormal
 
@@ -37,11 +38,6 @@ class Solved(NamedTuple):
     phase: NDArray[np.float32]  # (k, ny, nx), bad points filled
     n_iterations: NDArray[np.int64]
     converged: NDArray[np.bool_]
-
-    def put(self, which: NDArray[np.intp], part: Solved) -> None:
-        """Replace the phases of some frame sets, and add the iterations."""
-        self.phase[which], self.converged[which] = part.phase, part.converged
-        self.n_iterations[which] += part.n_iterations
 
 
 class Grid:
@@ -68,7 +64,13 @@ class Grid:
         self.dark, self.bad = dark + calibration.background[:, np.newaxis, np.newaxis].astype(np.float32), bad
         corners, inside = places - low[:, :, np.newaxis], pupil.inside.ravel().astype(float)
         self.touching = [_interpolation(one, size, 1, inside) for one in corners]  # from all pixels of a box
-        self.splines = [_interpolation(one - _CUT, size - 2 * _CUT, 3, inside) for one in corners]
+        near = ndimage.binary_dilation(pupil.inside, iterations=_RIM)
+        self.splines = [
+            _interpolation(one - _CUT, size - 2 * _CUT, 3, near.ravel().astype(float)) for one in corners
+        ]
+        inner = ndimage.binary_erosion(pupil.inside)
+        self.rim = near & ~inner
+        self.edge = _repair(pupil.inside & ~inner, inner)  # points of the edge, and the nearest ones off it
         self.filters = [_spline_filter(length, calibration.blur) for length in size]  # to their coefficients
         reached = np.stack([one.sum(axis=0) > 0 for one in self.touching])
         self.watched = reached.reshape(bad.shape) & ~bad  # good pixels from which the pupil is made
@@ -132,23 +134,45 @@ class Grid:
 
     def compared(self, phase: NDArray, frames: NDArray, good: NDArray) -> tuple[NDArray, NDArray]:
         """Rms difference of frames (k, 2, ny, nx) from those of phases, (k,), and the ratio of their light."""
-        model = self.reconstruct.settings.model(Kind.of(frames))
-        psi = model.incoming(phase)
-        modelled = square(model.reference(psi) + psi[:, np.newaxis])
-        squares = np.sum((modelled - frames) ** 2, axis=(1, 2, 3), where=model.pupil.inside)
+        modelled, pupil = self._modelled(phase), self.reconstruct.sensor.pupil
+        squares = np.sum((modelled - frames) ** 2, axis=(1, 2, 3), where=pupil.inside)
         where = good[:, np.newaxis]
         seen, known = (np.sum(one - self.offset, axis=(1, 2, 3), where=where) for one in (frames, modelled))
-        return np.sqrt(squares / (2 * model.pupil.n_points)), seen / known
+        return np.sqrt(squares / (2 * pupil.n_points)), seen / known
+
+    def displaced(self, phase: NDArray, frames: NDArray, good: NDArray) -> tuple[NDArray, NDArray]:
+        """Displacement of both images on frames (k, 2, ny, nx), (k, 2) in pixels, and its standard error.
+
+        The rim of the pupil moves with the images. A phase at the edge could follow it, so that of points farther
+        inside takes its place. It is wrong by a little, which changes the two images in opposite directions, so
+        only their sum counts.
+        """
+        steady = phase.reshape(len(phase), -1).copy()
+        steady[:, self.edge[0]] = steady[:, self.edge[1]]
+        modelled = self._modelled(steady.reshape(phase.shape)).sum(axis=1, dtype=float)
+        weight = 1.0 * (self.rim & (good | ~self.reconstruct.sensor.pupil.inside))
+        slopes = weight[:, np.newaxis] * np.stack(np.gradient(modelled, axis=(1, 2)), axis=1)
+        missing = weight * (modelled - frames.sum(axis=1, dtype=float))
+        inverse = np.linalg.pinv(np.einsum("kayx,kbyx->kab", slopes, slopes), hermitian=True)
+        shift = np.einsum("kab,kbyx,kyx->ka", inverse, slopes, missing, optimize=True)
+        missing -= np.einsum("ka,kayx->kyx", shift, slopes)
+        variance = np.sum(missing**2, axis=(1, 2)) / np.maximum(weight.sum(axis=(1, 2)) - 2, 1)
+        return shift, np.sqrt(variance[:, np.newaxis] * np.einsum("kaa->ka", inverse))
+
+    def _modelled(self, phase: NDArray) -> NDArray:
+        """Frames of phases on the grid of the pupil, (k, 2, ny, nx)."""
+        model = self.reconstruct.settings.model(Kind.of(phase))
+        psi = model.incoming(phase)
+        return square(model.reference(psi) + psi[:, np.newaxis])
 
     def noise(self, counts: NDArray) -> NDArray[np.float64]:
-        """Noise of a pixel without light, (k, 2), counts rms: the robust scatter around both pupils."""
+        """Noise of a pixel without light, (k, 2), counts rms, from neighbours around both pupils."""
         scatter = np.zeros((len(counts), 2))
         for index, (image, rows, columns) in enumerate(self.boxes):
-            around = (counts[:, image][:, rows][:, :, columns] - self.dark[index])[:, self.dim[index]]
-            if around.shape[1]:
-                around = np.nan_to_num(around.astype(float))
-                middle = np.median(around, axis=1, keepdims=True)
-                scatter[:, index] = 1.4826 * np.median(np.abs(around - middle), axis=1)
+            steps = np.diff(counts[:, image][:, rows][:, :, columns].astype(float), axis=2)
+            steps = steps[:, self.dim[index, :, 1:] & self.dim[index, :, :-1]]
+            if steps.shape[1]:
+                scatter[:, index] = 1.4826 / np.sqrt(2) * np.median(np.abs(np.nan_to_num(steps)), axis=1)
         return scatter
 
     def filled(self, phase: NDArray, good: NDArray) -> NDArray:

@@ -28,8 +28,9 @@ from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._errors import Excess, sideways, slopes_of, unexplained
-from zwfs.frames._grid import Grid, Solved
+from zwfs.frames._grid import Grid
 from zwfs.frames._learnt import learnt, training
+from zwfs.frames._light import Trial, explained
 from zwfs.frames.phases import Flag, Phases
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames
 from zwfs.frames.registration import FRAMES
@@ -40,12 +41,21 @@ from zwfs.sensor import ZernikeSensor
 
 FORMAT = 2  # of the file; another number is refused
 _DIM = 0.1  # of the light of the calibration: a frame with less is compared with its noise
-_LIGHTS = 4  # times that the light of a frame follows from its phase
-_SAME_LIGHT = 1e-3  # relative change of the light that needs no other phase
+_FAINT = 0.5  # of that light, from which down the noise of dark pixels counts
+_UNUSUAL = 2.0  # times the residual of the calibration's frames: a larger one is inconsistent
+_EXACT = 1e-3  # residual of frames without noise
+_MOVED_BY, _SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
+_SAME_LIGHT = 0.01  # relative difference of the light of frames and of their model that means little
+_LAMP = (
+    0.85,
+    1.7,
+)  # light in the pupil, over that of the calibration's frames, that other phases can make of its lamp
 _FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
 _WIDEST = 2**16  # rows or columns of a camera
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
-_LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED = (flag.value for flag in Flag)  # plain, and far quicker
+_LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED, _MOVED = (
+    flag.value for flag in Flag
+)  # plain, and far quicker
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,6 +88,8 @@ class Calibration(Immutable):
         Mean intensity of the calibration's frames in the pupil.
     light_ratio : float
         Light of the calibration's frames over that of their model, which other frames are taken to share.
+    displacement : (float, float), pixels
+        Rows and columns by which the rim of the pupil on the calibration's frames differs from the model.
     unexplained, slopes : ndarray, shapes (n_states, ny, nx) and (n_states,), radian
         Errors of the phases of the calibration's frames, for `sigma`. They grow with the rms difference of phases
         at neighbouring points.
@@ -117,6 +129,7 @@ class Calibration(Immutable):
     slopes: NDArray[np.float64]
     residual: float = 0.0
     light_ratio: float = 1.0
+    displacement: tuple[float, float] = (0.0, 0.0)
     saturation: float = np.inf
     blur: float = 0.0
     n_averaged: int = 1
@@ -133,6 +146,7 @@ class Calibration(Immutable):
         _check.flag("balance", self.balance)
         _check.number("residual", self.residual, 0)
         _check.number("light_ratio", self.light_ratio, 0, open_low=True)
+        _check.pair("displacement", self.displacement, _check.number)
         _check.number("blur", self.blur, 0, 10)
         _check.integer("n_averaged", self.n_averaged, 1)
         _check.integer("n_images", self.n_images, 1, 2)
@@ -216,7 +230,8 @@ class Calibration(Immutable):
         errors = sideways(made.sensor, phase[0], frames[0], good)[np.newaxis]
         made = replace(made, unexplained=errors, slopes=slopes_of(phase, good))
         residual, ratio = made._work.compared(phase, frames, good[np.newaxis])
-        return replace(made, residual=float(residual[0]), light_ratio=float(ratio[0]))
+        row, column = made._work.displaced(phase, frames, good[np.newaxis])[0][0].tolist()
+        return replace(made, residual=float(residual[0]), light_ratio=float(ratio[0]), displacement=(row, column))
 
     @classmethod
     def from_bench(
@@ -308,7 +323,11 @@ class Calibration(Immutable):
         made = replace(made, light_ratio=float(np.mean(made(images, saturation=np.inf).flux)))
         found = made(images, saturation=np.inf)
         residual, slopes = float(np.sqrt(np.nanmean(found.residual**2))), slopes_of(found.filled, good)
-        return replace(made, unexplained=unexplained(found.phase, phases), slopes=slopes, residual=residual)
+        row, column = np.nanmean(found.displacement, axis=0).tolist()
+        return replace(
+            made, unexplained=unexplained(found.phase, phases), slopes=slopes, residual=residual,
+            displacement=(row, column),
+        )  # fmt: skip
 
     def save(self, path: str | Path) -> None:
         """Write the calibration as NPZ, in one step; the same calibration gives the same bytes.
@@ -343,7 +362,7 @@ class Calibration(Immutable):
             found = values.pop("format")
             if found == FORMAT:
                 values |= {name: file[name] for name in file.files if name != "values"}
-                values |= {name: tuple(values[name]) for name in ("center", "shape")}
+                values |= {name: tuple(values[name]) for name in ("center", "shape", "displacement")}
                 shifts = {"phase_shifts": tuple(values["optics"]["phase_shifts"])}
                 made = cls(**values | {"optics": Optics(**values["optics"] | shifts)})
                 trial = made.dark + np.mean(made.background + made.unit * made.light)
@@ -362,8 +381,9 @@ class Calibration(Immutable):
         return self._work.reconstruct.sensor
 
     def __call__(
-        self, counts: ArrayLike, start: NDArray | None = None, *, saturation: float | None = None,
-        largest_residual: float = np.inf, judge: bool = True, method: Reconstructor | None = None,
+        self, counts: ArrayLike, start: NDArray | None = None, *, light: ArrayLike | None = None,
+        saturation: float | None = None,
+        largest_residual: float | None = None, judge: bool = True, method: Reconstructor | None = None,
     ) -> Phases:  # fmt: skip
         """Phases of camera images.
 
@@ -373,14 +393,17 @@ class Calibration(Immutable):
             As the camera gives them, of any real type, the dark included.
         start : ndarray, shape (ny, nx) or (..., ny, nx), radian, optional
             Phase at which the iteration starts, such as `filled` of the frames before; flat if left out.
+        light : float or array_like, shape (...), optional
+            Light relative to that of the calibration, such as `flux` of the frames before. If it is left out, the
+            frames show it, for which strong phases in another light take some twenty times as long.
         saturation : float, counts, optional
             Replaces that of the calibration.
-        largest_residual : float
-            Residual above which a frame is inconsistent.
+        largest_residual : float, optional
+            Residual above which a frame is inconsistent. By default it is twice the residual of the
+            calibration's frames, plus the noise that frames with less light have.
         judge : bool
-            Whether to compare the frames with their model, which gives the residual and the light, and takes a
-            tenth of the time. Without it the residual is NaN, and the pupil as bright as that of the calibration's
-            frames would be in this light.
+            Whether to compare the frames with their model, which takes a fifth of the time. Without it residual
+            and displacement are NaN, and the light follows from the mean of the frames alone.
         method : Reconstructor, optional
             Replaces the phase-shifted iteration, such as ``zwfs.Linear(calibration.sensor, modes)``.
 
@@ -398,7 +421,8 @@ class Calibration(Immutable):
             raise ValueError(f"counts has shape {counts.shape}: expected at least one exposure")
         saturation = self.saturation if saturation is None else _number_or_inf("saturation", saturation)
         level, judge = min(saturation, _check.LARGEST), _check.flag("judge", judge)
-        largest_residual = _number_or_inf("largest_residual", largest_residual)
+        if largest_residual is not None:
+            largest_residual = _number_or_inf("largest_residual", largest_residual)
         counts, grid = counts.reshape(-1, self.n_images, *self.shape), self.good.shape
         if start is not None:
             maps = _check.real_array("start", start)
@@ -412,11 +436,18 @@ class Calibration(Immutable):
                 raise ValueError("method has another sensor: expected `sensor` of this calibration")
             if start is not None and not method.iterative:
                 raise ValueError(f"start with method = {method!r}: expected none, because it does not iterate")
+        if light is not None:
+            lights = _check.real_array("light", light)
+            if lights.shape not in ((), batch) or not np.all((lights > 0) & (lights < np.inf)):
+                raise ValueError(
+                    f"light = {_check.shown(lights.tolist())}: expected finite numbers above 0, one or {batch}"
+                )
+            light = np.broadcast_to(lights, batch).reshape(-1)
         parts = []
         for first in range(0, len(counts), _PIECE):
             piece = slice(first, first + _PIECE)
-            begin = None if start is None else start[piece]
-            parts.append(self._phases(counts[piece], begin, level, largest_residual, judge, method))
+            begin, known = (None if one is None else one[piece] for one in (start, light))
+            parts.append(self._phases(counts[piece], begin, known, level, largest_residual, judge, method))
         return Phases._joined(parts, batch)
 
     def modal_matrix(self, modes: ArrayLike) -> NDArray[np.float64]:
@@ -519,79 +550,68 @@ class Calibration(Immutable):
         return Grid(self)
 
     def _phases(
-        self, counts: NDArray, start: NDArray | None, level: float, limit: float, judge: bool,
-        method: Reconstructor | None,
+        self, counts: NDArray, start: NDArray | None, light: NDArray | None, level: float, limit: float | None,
+        judge: bool, method: Reconstructor | None,
     ) -> Phases:  # fmt: skip
         """Phases of camera images, (k, n_images, ny_camera, nx_camera)."""
         work, k = self._work, len(counts)
         values, good, n_bad, n_saturated = work.on_grid(counts, level, self.good)
         n_good = np.maximum(np.count_nonzero(good, axis=(1, 2)), 1)
         flux = np.vecdot(values, good.reshape(k, 1, -1).astype(np.float32)) / (n_good[:, np.newaxis] * self.unit)
-        enough = self._lit(counts, flux) & (n_good >= (1 - _MOST_BAD) * self.sensor.pupil.n_points)
-        light = flux.mean(axis=1) / self.light.mean()
-        flux = np.where(enough[:, np.newaxis], flux, self.light)
+        relative, noise = flux.mean(axis=1) / self.light.mean(), self._noise(counts, flux)
+        lit = np.all((flux >= _DIM * self.light) | (flux > noise), axis=1)
+        lit &= n_good >= (1 - _MOST_BAD) * self.sensor.pupil.n_points
+        flux = np.where(lit[:, np.newaxis], flux, self.light)
         if self.balance:
             values *= (flux.mean(axis=1, keepdims=True) / flux).astype(np.float32)[..., np.newaxis]
         values /= self.unit[:, np.newaxis].astype(np.float32)
         values = values.reshape(k, *self.offset.shape)
-        values[~enough] = 0
         ideal = work.weights[:, 0] * values[:, :1] + work.weights[:, 1] * values[:, 1:]
-        solved, residual = self._solved(ideal, light, good, enough, start, judge, method)
-        flags = _BAD * (n_bad > 0) + _SATURATED * (n_saturated > 0)
-        slow = ~solved.converged & (self.tolerance > 0)
-        flags = np.where(enough, flags + _INCONSISTENT * (residual > limit) + _NOT_CONVERGED * slow, _LOST + flags)
-        phase = np.where(good & enough[:, np.newaxis, np.newaxis], solved.phase, np.float32(np.nan))
-        return Phases(phase, solved.phase, light, n_bad, n_saturated, residual, solved.n_iterations, flags)
 
-    def _lit(self, counts: NDArray, flux: NDArray) -> NDArray[np.bool_]:
-        """Whether both images of exposures hold light, (k,): more than the noise of a dark pixel.
+        def attempt(which: NDArray[np.intp], light: NDArray[np.float64]) -> Trial:
+            frames = ideal[which] / light[:, np.newaxis, np.newaxis, np.newaxis].astype(np.float32) + work.offset
+            frames[~lit[which]] = work.flat_frames  # of a flat wavefront: they converge at once
+            if method is None:
+                np.maximum(frames, 0, out=frames)
+            begin = None if start is None else start[which]
+            solved = work.solve(frames, good[which], begin, method)
+            residual, ratio = work.compared(solved.phase, frames, good[which])
+            ratio, usual = ratio / self.light_ratio, self._usual(light, noise[which])
+            unsure = np.hypot(_SAME_LIGHT, 2 * usual / np.sqrt(n_good[which]))
+            cost = np.where(lit[which], (residual / usual) ** 2 + ((ratio - 1) / unsure) ** 2, 0)
+            return Trial(light, solved.phase, frames, *solved[1:], residual, ratio, cost)
 
-        Frames nearly as bright as those of the calibration need no such test.
-        """
-        lit = np.all(flux >= _DIM * self.light, axis=1)
-        dim = np.flatnonzero(~lit & np.all(flux > 0, axis=1))
-        if dim.size:
-            lit[dim] = np.all(flux[dim] * self.unit > self._work.noise(counts[dim]), axis=1)
-        return lit
+        same = (relative > _LAMP[0]) & (relative < _LAMP[1]) | ~lit
+        first = np.where(same, 1.0, relative) if light is None else light
+        trial = attempt(np.arange(k), first)
+        if light is None and judge:
+            trial = explained(attempt, trial)
+        residual, displacement, sigma = (np.full((k, *size), np.nan, np.float32) for size in ((), (2,), (2,)))
+        if judge and lit.any():
+            residual[lit] = trial.residual[lit]
+            shift, sigma[lit] = work.displaced(trial.phase[lit], trial.frames[lit], good[lit])
+            displacement[lit] = shift - self.displacement
+        limits = _UNUSUAL * self._usual(trial.light, noise) if limit is None else limit
+        flags = _BAD * (n_bad > 0) + _SATURATED * (n_saturated > 0) + _INCONSISTENT * (residual > limits)
+        flags += np.where(lit, _NOT_CONVERGED * (~trial.converged & (self.tolerance > 0)), _LOST)
+        flags += _MOVED * np.any(np.abs(displacement) > np.fmax(_MOVED_BY, _SURE * sigma), axis=1)
+        phase = np.where(good & lit[:, np.newaxis, np.newaxis], trial.phase, np.float32(np.nan))
+        flux = np.where(lit, trial.light, relative).astype(np.float32)
+        numbers = residual, displacement, trial.n_iterations, flags
+        return Phases(phase, trial.phase, flux, n_bad, n_saturated, *numbers)
 
-    def _solved(
-        self, ideal: NDArray, light: NDArray, good: NDArray, enough: NDArray, start: NDArray | None, judge: bool,
-        method: Reconstructor | None,
-    ) -> tuple[Solved, NDArray[np.float32]]:  # fmt: skip
-        """Phases and residuals of frames, (k, 2, ny, nx), whose light over that of the calibration is not known.
+    def _noise(self, counts: NDArray, flux: NDArray) -> NDArray[np.float64]:
+        """Noise of dark pixels over `unit`, (k, 2), of exposures so faint that it counts; else 0."""
+        noise, faint = np.zeros(flux.shape), np.flatnonzero(np.any(flux < _FAINT * self.light, axis=1))
+        if faint.size:
+            noise[faint] = self._work.noise(counts[faint]) / self.unit
+        return noise
 
-        A first phase takes the mean light in the pupil to be that of the calibration's frames. It depends a little
-        on the phase, so that the light follows from the modelled frames, and then a better phase. The values of
-        `light`, (k,), are changed.
-        """
-        work = self._work
-
-        def frames_of(which: NDArray | slice) -> NDArray[np.float32]:
-            scale = np.where(enough[which], light[which], 1).astype(np.float32)
-            frames = ideal[which] / scale[:, np.newaxis, np.newaxis, np.newaxis]
-            frames += work.offset
-            return np.maximum(frames, 0, out=frames) if method is None else frames
-
-        frames = frames_of(slice(None))
-        frames[~enough] = work.flat_frames  # of a flat wavefront: they converge at once
-        solved = work.solve(frames, good, start, method)
-        residual = np.full(len(ideal), np.nan, np.float32)
-        if not judge:
-            return solved, residual
-        which = np.flatnonzero(enough)
-        for _ in range(_LIGHTS):
-            residual[which], ratio = work.compared(solved.phase[which], frames[which], good[which])
-            ratio /= self.light_ratio
-            far = np.abs(ratio - 1) > _SAME_LIGHT
-            which, ratio = which[far], ratio[far]
-            if not which.size or (method is not None and not method.iterative):
-                break
-            light[which] *= ratio
-            frames[which] = frames_of(which)
-            again = frames[which]
-            solved.put(which, work.solve(again, good[which], solved.phase[which], method))
-            frames[which] = again
-        return solved, residual
+    def _usual(self, light: NDArray, noise: NDArray) -> NDArray[np.float64]:
+        """Residual, (k,), that frames of the calibration would have with less light and with a noise, (k, 2)."""
+        scale = np.maximum(light, 1e-9)
+        own = max(self.residual, _EXACT) * np.sqrt(np.maximum(1 / scale, 1))
+        return np.hypot(own, np.sqrt(np.mean(noise**2, axis=1)) / scale)
 
 
 def _is_calibration(path: Path) -> bool:

@@ -31,10 +31,6 @@ from zwfs.modes import zernike_basis
 
 _CHUNK = 2**24  # bytes of camera images that a thread handles at once
 _LONGEST = 256  # exposures of them
-_SAMPLE = 2**20  # frames from which the limit of the residual is computed, at most
-_FEWEST = 10  # frames from which on that is possible
-_SIGMAS, _MARGIN = 5.0, 0.2  # excess of an inconsistent residual: deviations, and relative to the median
-_MOST = 5.0  # times the residual of the calibration and of the noise: a larger one is inconsistent in any case
 # Cards of the input that describe its own data.
 _OWN = ("SIMPLE", "XTENSION", "BITPIX", "NAXIS", "EXTEND", "EXTNAME", "PCOUNT", "GCOUNT", "BSCALE", "BZERO",
         "BLANK", "BUNIT", "CHECKSUM", "DATASUM", "COMMENT", "HISTORY", "CONTINUE", "END", "")  # fmt: skip
@@ -45,6 +41,7 @@ _COUNTS = {
     "SATURATED": ("NSATURAT", "frames with saturated pixels"),
     "INCONSISTENT": ("NINCONS", "inconsistent frames"),
     "NOT_CONVERGED": ("NNOTCONV", "frames that did not converge"),
+    "MOVED": ("NMOVED", "frames on which the pupil has moved"),
 }
 
 
@@ -58,8 +55,6 @@ class Summary(NamedTuple):
         All frames, and those with a flag.
     counts : dict
         Number of frames with each flag, by its name.
-    largest_residual : float
-        Residual above which a frame is inconsistent.
     n_resumed : int
         Frames that an interrupted run had done.
     """
@@ -68,7 +63,6 @@ class Summary(NamedTuple):
     n_frames: int
     n_flagged: int
     counts: dict[str, int]
-    largest_residual: float
     n_resumed: int
 
 
@@ -112,9 +106,7 @@ def reconstruct(
     saturation : float, counts, optional
         By default that of the calibration, SATURATE of the first header, or the largest number of an integer type.
     largest_residual : float, optional
-        Residual above which a frame is inconsistent. By default it follows from 10 frames or more: median + 5
-        standard deviations (1.48 times the median absolute deviation), and at least 1.2 times the median. With
-        photons it is at most 5 times the residual of the calibration and of the noise, for any number of frames.
+        See `Calibration.__call__`.
     n_workers : int, optional
         Threads; by default one for each core.
     restart : bool
@@ -167,12 +159,13 @@ def reconstruct(
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     n_workers = cores if n_workers is None else _check.integer("n_workers", n_workers, 1, 256)
     stack = Stack(files, second_files, calibration.n_images, calibration.shape)
-    job = _Job(stack, calibration, modes, phases, photons, read_noise, wavelength, keywords, saturation)
     if largest_residual is not None:
-        largest_residual = _check.number("largest_residual", largest_residual, 0)
+        largest_residual = _number_or_inf("largest_residual", largest_residual)
+    settings = modes, phases, photons, read_noise, wavelength, keywords, saturation, largest_residual
+    job = _Job(stack, calibration, *settings)
     report = _check.callback("progress", progress)
     pieces = _spans(stack.n, job.chunk)
-    part = Part(path, job.units, pieces, job.plan(largest_residual), _check.flag("restart", restart))
+    part = Part(path, job.units, pieces, job.plan(), _check.flag("restart", restart))
     try:
         n_resumed = done = sum(stop - first for first, stop in part.done)
         report(done, stack.n)
@@ -182,7 +175,7 @@ def reconstruct(
             part.note(first, stop)
             done += stop - first
             report(done, stack.n)
-        summary = job.judge(part, path, largest_residual, n_resumed)
+        summary = job.counted(part, path, n_resumed)
         check_output(path, inputs, overwrite=overwrite)  # again: the run may have taken hours
         part.finish()
         return summary
@@ -195,9 +188,10 @@ class _Job:
 
     def __init__(
         self, stack: Stack, calibration: Calibration, modes: Any, phases: Any, photons: Any, read_noise: Any,
-        wavelength: Any, keywords: Any, saturation: Any,
+        wavelength: Any, keywords: Any, saturation: Any, largest_residual: float | None,
     ) -> None:  # fmt: skip
         self.stack, self.calibration, pupil = stack, calibration, calibration.sensor.pupil
+        self.largest_residual = largest_residual
         for block in stack.firsts:
             unit, own = str(block.header.get("BUNIT", "")).strip(), calibration.bunit.strip()
             if own and unit and unit.lower() != own.lower():
@@ -238,7 +232,7 @@ class _Job:
     def _row_type(self) -> np.dtype:
         columns: list[tuple] = [
             ("FRAME", ">i8"), ("FILE", ">i4"), ("INDEX", ">i8"), ("FLAGS", ">i2"), ("FLUX", ">f4"),
-            ("RESIDUAL", ">f4"), ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4"),
+            ("RESIDUAL", ">f4"), ("SHIFT", ">f4", (2,)), ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4"),
         ]  # fmt: skip
         columns += [("SIGMA", ">f4")] * self.has_sigma
         if self.matrix is not None:
@@ -262,7 +256,6 @@ class _Job:
             ("NFILES", len(stack.firsts), ""),
             *((key, 0, comment) for key, comment in _COUNTS.values()),
             ("NFLAGGED", 0, "frames with any flag"),
-            ("RESLIMIT", 0.0, "residual above which a frame is inconsistent"),
             ("RESCALIB", calibration.residual, "residual of the frames of the calibration"),
             ("CALIBSHA", calibration.sha256, ""),
             ("MAPFRAME", "commands" if calibration.commanded else "first image", "frame of reference of the maps"),
@@ -290,9 +283,9 @@ class _Job:
                 cards.append((key, value, "of the first file" if len(str(value)) < 40 else ""))
         return cards
 
-    def plan(self, largest_residual: float | None) -> str:
+    def plan(self) -> str:
         """All that decides the bytes of the output."""
-        settings = [self.photons, self.read_noise, self.saturation, largest_residual, self.chunk]
+        settings = [self.photons, self.read_noise, self.saturation, self.largest_residual, self.chunk]
         modes = None if self.modes is None else zlib.crc32(np.ascontiguousarray(self.modes).tobytes())
         headers = [unit.header().hex() for unit in self.units]
         state = self.stack.state(), self.calibration.sha256, settings, modes, headers
@@ -309,33 +302,24 @@ class _Job:
         with one_thread(), ThreadPoolExecutor(n_workers) as pool:
             yield from pool.map(partial(self._reconstruct, part), chunks)
 
-    def judge(self, part: Part, output: Path, limit: float | None, n_resumed: int) -> Summary:
-        """Flag inconsistent frames, count all flags, and put both into the header."""
-        table, n = self.table, self.stack.n
-        blocks, step = _spans(n, max(1, _CHUNK // table.row)), -(-n // _SAMPLE)
-        if limit is None:
-            limit = _limit(np.concatenate([part.read(table, *block)["RESIDUAL"][::step] for block in blocks]))
-            if self.photons is not None:
-                light = float(self.calibration.light.mean())
-                noise = math.sqrt(light / self.photons + (self.read_noise / self.photons) ** 2)
-                limit = min(limit, _MOST * math.hypot(self.calibration.residual, noise))
-        counts, n_flagged = dict.fromkeys(_COUNTS, 0), 0
-        for first, stop in blocks:
-            rows = part.read(table, first, stop)
-            with np.errstate(invalid="ignore"):
-                rows["FLAGS"] |= np.where(rows["RESIDUAL"] > limit, Flag.INCONSISTENT.value, 0).astype(">i2")
-            part.write(table, first, rows)
-            n_flagged += int(np.count_nonzero(rows["FLAGS"]))
+    def counted(self, part: Part, output: Path, n_resumed: int) -> Summary:
+        """Count all flags, and put their numbers into the header."""
+        table, counts, n_flagged = self.table, dict.fromkeys(_COUNTS, 0), 0
+        for first, stop in _spans(self.stack.n, max(1, _CHUNK // table.row)):
+            flags = part.read(table, first, stop)["FLAGS"]
+            n_flagged += int(np.count_nonzero(flags))
             for name in counts:
-                counts[name] += int(np.count_nonzero(rows["FLAGS"] & Flag[name]))
-        values: dict[str, Any] = {key: counts[name] for name, (key, _) in _COUNTS.items()}
-        values |= {"NFLAGGED": n_flagged, "RESLIMIT": limit}
+                counts[name] += int(np.count_nonzero(flags & Flag[name]))
+        values: dict[str, Any] = {key: counts[name] for name, (key, _) in _COUNTS.items()} | {
+            "NFLAGGED": n_flagged
+        }
         self.units[0].cards = [(key, values.get(key, one), text) for key, one, text in self.units[0].cards]
-        return Summary(output, n, n_flagged, counts, limit, n_resumed)
+        return Summary(output, self.stack.n, n_flagged, counts, n_resumed)
 
     def _reconstruct(self, part: Part, chunk: tuple[int, int]) -> tuple[int, int]:
         counts = self.stack.read(*chunk)
-        found = self.calibration(counts[:, 0] if counts.shape[1] == 1 else counts, saturation=self.saturation)
+        limits: dict[str, Any] = {"saturation": self.saturation, "largest_residual": self.largest_residual}
+        found = self.calibration(counts[:, 0] if counts.shape[1] == 1 else counts, **limits)
         values = {"": found.phase}
         if self.has_sigma:
             values["SIGMA"] = self.calibration.sigma(found, self.photons, self.read_noise)
@@ -352,6 +336,7 @@ class _Job:
         for name, values in self.keywords.items():
             rows[name] = values[files]
         rows["FLAGS"], rows["FLUX"], rows["RESIDUAL"] = found.flags, found.flux, found.residual
+        rows["SHIFT"] = found.displacement
         rows["NBAD"], rows["NSATUR"], rows["NITER"] = found.n_bad, found.n_saturated, found.n_iterations
         lost = found.flags & Flag.LOST > 0
         if sigma is not None:
@@ -384,13 +369,3 @@ def _columns(stack: Stack, keywords: Any) -> dict[str, NDArray]:
         strings = [card_value(str(value)).encode() for value in values]
         columns[key] = np.array(values, float) if numbers else np.array(strings)
     return columns
-
-
-def _limit(residuals: NDArray) -> float:
-    """Residual from which on a frame differs from the others."""
-    known = residuals[np.isfinite(residuals)].astype(float)
-    if known.size < _FEWEST:
-        return float("inf")
-    middle = np.median(known)
-    deviation = 1.4826 * np.median(np.abs(known - middle))
-    return float(middle + max(_SIGMAS * deviation, _MARGIN * middle))

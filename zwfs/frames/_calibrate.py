@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from zwfs import _check
 from zwfs._camera.bench import fit_bench
@@ -19,7 +20,7 @@ from zwfs.frames._blocks import FileError, blocks_of
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
 from zwfs.frames.files import CameraFile, images, read, read_all
-from zwfs.frames.pipeline import reduce_frames
+from zwfs.frames.pipeline import Measurement, Optics, reduce_frames
 from zwfs.frames.refine import _check_fit, fit
 from zwfs.frames.registration import Image, check_centers, check_diameter, find_pupils, register_frames
 
@@ -33,7 +34,9 @@ def calibrate(
 ) -> Calibration:  # fmt: skip
     """Calibration from camera files: frames as those to come, and clear frames.
 
-    With known commands of a mirror, `fit_bench` fits a model of the camera to the frames, which takes minutes.
+    With known commands of a mirror, `fit_bench` fits a model of the camera to the frames, which takes minutes. Of
+    three states or more, the last is first left out: if a fit to the others measures it worse than a calibration
+    without commands, a warning says so, and the latter is returned.
 
     Parameters
     ----------
@@ -93,20 +96,12 @@ def calibrate(
                 f"fitted = {_check.shown(fitted)}: expected none with commands, which fit all of them"
             )
         states = _read_states(*files, commands, saturation)
-        header, (n_images, *shape) = states.header, states.dark.shape
-        place = settings.get("pupil_centers"), settings.get("pupil_diameter")
-        (frames, clear), corners, n_pixels = _windows(states, *place)
+        header = states.header
         shifts: Any = tuple(phase_shifts) or (header.get("THETA1", np.pi / 2), header.get("THETA2", -np.pi / 2))
-        found = fit_bench(
-            frames, clear, states.commands, n_pixels=n_pixels, noise=noise, gain=gain, phase_shifts=shifts,
-            diameter=diameter or header.get("DIMPLE", 1.06), progress=progress,
-        )  # fmt: skip
-        for remark in found.remarks:
-            warnings.warn(remark, stacklevel=2)
-        return Calibration.from_bench(
-            found, frames, states.commands, states.dark, corners=corners, shape=tuple(shape), n_images=n_images,
-            saturation=states.saturation, bunit=str(header.get("BUNIT", "")), **kept,
-        )  # fmt: skip
+        optics = Optics(diameter or header.get("DIMPLE", 1.06), shifts)
+        kept |= {"saturation": states.saturation, "bunit": str(header.get("BUNIT", ""))}
+        place = settings.get("pupil_centers"), settings.get("pupil_diameter")
+        return _from_commands(states, optics, *place, {"noise": noise, "gain": gain, "progress": progress}, kept)
     masked, unmasked, sources = read_all(*files, saturation)
     first = len(frame_files) + len(pupil_files)
     darks = [image for source in sources[first : first + len(dark_files)] for image in source.images]
@@ -120,6 +115,82 @@ def calibrate(
         return Calibration.of(reduce_frames(registered, optics), np.stack(darks) if darks else None, **kept)
     except ValueError as error:  # any of the files can be the cause
         raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
+
+
+def _from_commands(
+    states: _States, optics: Optics, centers: Any, diameter: Any, camera: dict[str, Any], kept: dict[str, Any]
+) -> Calibration:
+    """Calibration with a fit of the bench, or without where the fit measures an unseen state no better."""
+    (frames, clear), corners, n_pixels = _windows(states, centers, diameter)
+    n_images, *shape = states.dark.shape
+    design: Any = {"n_pixels": n_pixels, "diameter": optics.diameter, "phase_shifts": optics.phase_shifts}
+
+    def fitted_to(n_states: int) -> tuple[Calibration, tuple[str, ...]]:
+        pairs, commands = frames[:n_states], states.commands[:n_states]
+        fit = fit_bench(pairs, clear, commands, **design, **camera)
+        return Calibration.from_bench(
+            fit,
+            pairs,
+            commands,
+            states.dark,
+            corners=corners,
+            shape=(shape[0], shape[1]),
+            n_images=n_images,
+            **kept,
+        ), fit.remarks
+
+    n_states, errors = len(states.commands), []
+    try:
+        plain = Calibration.of(_measured(states, optics, centers, diameter), states.dark, **kept)
+    except ValueError as error:
+        warnings.warn(f"The fit was not compared with a calibration without commands: {error}", stacklevel=3)
+        n_states = 2
+    if n_states > 2:
+        partial, _ = fitted_to(n_states - 1)
+        errors = [_error_of_last(one, partial, states) for one in (partial, plain)]
+        if errors[0] > errors[1]:
+            warnings.warn(
+                f"The fit of the bench does not help: without the last command, it measures that command to "
+                f"{errors[0]:.3g} rad rms, a calibration without commands to {errors[1]:.3g}. The latter is kept.",
+                stacklevel=3,
+            )
+            return plain
+    calibration, remarks = fitted_to(len(states.commands))
+    for remark in remarks:
+        warnings.warn(remark, stacklevel=3)
+    return calibration
+
+
+def _measured(states: _States, optics: Optics, centers: Any, diameter: Any) -> Measurement:
+    """Frames of the first state, with the clear frames, for a calibration without commands."""
+    frames, clear = (
+        [Image(nearest_good(one, good), ~good, name) for one, good in ((one, np.isfinite(one)) for one in pair)]
+        for pair, name in ((states.frames[0].mean(axis=0), "frame"), (states.clear.mean(axis=0), "clear frame"))
+    )
+    place = {} if centers is None or diameter is None else {"pupil_centers": centers, "pupil_diameter": diameter}
+    return reduce_frames(register_frames(frames, clear, **place), optics)
+
+
+def _error_of_last(calibration: Calibration, grid: Calibration, states: _States) -> float:
+    """Rms error, radian, with which a calibration measures the last command less the first.
+
+    Phases are compared on the grid of the commands, which another calibration has, 2 pixels and more from edges.
+    """
+    images = np.nan_to_num(states.frames[[0, -1]].mean(axis=1)) + states.dark
+    found = calibration(images[:, 0] if calibration.n_images == 1 else images, saturation=np.inf)
+    row, column = grid.places[0] - calibration.places[0, :, :1, :1]
+    waves = np.nan_to_num(np.exp(1j * found.phase.astype(float)))
+    seen = [
+        sum(
+            f * ndimage.map_coordinates(part, (row, column), order=1)
+            for f, part in ((1, one.real), (1j, one.imag))
+        )
+        for one in waves
+    ]
+    change = np.exp(1j * (states.commands[-1] - states.commands[0]))
+    inner = ndimage.binary_erosion(grid.good, iterations=2)
+    left = (seen[1] * np.conj(seen[0] * change))[inner & (np.abs(seen).min(axis=0) > 0.8)]
+    return float(np.angle(left * np.conj(left.mean())).std())
 
 
 class _States(NamedTuple):

@@ -1,30 +1,36 @@
-"""Images of FITS and NPY files, read here only: as blocks of numbers, which need not fit the memory."""
+"""Formats of camera files: arrays of images, which need not fit the memory, read by astropy and NumPy.
+
+A further format is one class more in `_FORMATS`. All sizes that a file claims are checked before a number is read.
+"""
 
 from __future__ import annotations
 
 import gzip
 import io
-import os
 import re
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs.frames._fits import FIRST_BYTES, fits_module
+from zwfs.frames._fits import FIRST_BYTES, fits_module, header_cards
 
-_GZIP, _NPY = b"\x1f\x8b", b"\x93NUMPY"  # first bytes of a file
-_MOST_UNPACKED = 2**29  # bytes of a gzip file, which is unpacked in memory
-# Types of the numbers of a FITS image, by BITPIX.
-_TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
-_KEYWORD = re.compile("[A-Z0-9_ -]*")  # of the standard, with the blanks of the convention HIERARCH
+_GZIP = b"\x1f\x8b"  # first bytes of a packed file
+MOST_BYTES = 2**29  # of an image, of a packed file, which is unpacked in memory, and of a compressed tile
+_DEFLATE = 1032  # bytes to which a byte of a gzip file can unpack, at most
+_UNIT = re.compile(r"(.+)\[([^][]+)\]")  # name of a file, and one of its units
+# Names of units that hold something else than frames.
+_COMPANION = re.compile("DARK|BIAS|FLAT|SKY|MASK|BAD|BPM|DQ|QUAL|HOT|ERR|SIGMA|NOISE|VAR|STAT|WEIGHT|GAIN|BACK")
+_OWN = ("EXTNAME", "BSCALE", "BZERO", "BLANK")  # cards of a unit that say nothing of the others
+
+Source = Path | bytes  # a file, or the unpacked bytes of a packed one
 
 
 class FileError(ValueError):
@@ -32,77 +38,215 @@ class FileError(ValueError):
 
 
 @dataclass(frozen=True)
-class Block:
-    """Numbers of one file that lie side by side: exposures of `per` images each.
+class Images:
+    """Array of images in a file; each format is a class that opens files and reads sections."""
 
-    A value v of the file stands for v * scale + zero, and the value `blank` for no number.
-    """
-
+    first_bytes: ClassVar[bytes]  # of a file of the format
     path: Path
-    name: str
-    offset: int
-    dtype: np.dtype
-    full: tuple[int, ...]  # shape, as the file states it: (ny, nx), (n, ny, nx) or (n, per, ny, nx)
-    packed: bool = False
-    columns_first: bool = False
-    scale: float = 1.0
-    zero: float = 0.0
-    blank: int | None = None
-    per: int = 1
-    header: dict[str, Any] = field(default_factory=dict, repr=False)  # values of the file's header; none for NPY
+    name: str  # for messages; with the unit where a file has several
+    full: tuple[int, ...]  # shape of the array
+    dtype: np.dtype  # of a section, native
+    full_scale: float  # largest value that the type of the file's numbers can hold; infinity for floats
+    header: dict[str, Any] = field(default_factory=dict, repr=False)
+    unit: int = 0  # of the file
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        return self.full[-2:]
+    def title(self) -> str:
+        """Name of the unit."""
+        return str(self.header.get("EXTNAME", "")).strip().upper()
 
-    @property
-    def n(self) -> int:
-        """Number of exposures."""
-        return prod(self.full[:-2]) // self.per
+    @classmethod
+    def open(cls, path: Path, source: Source, verify: bool) -> list[Self]:
+        """Return the arrays of a file, after a check of their sizes; with `verify` also of checksums."""
+        raise NotImplementedError
 
-    @property
-    def row(self) -> int:
-        """Bytes of an exposure."""
-        return self.per * prod(self.shape) * self.dtype.itemsize
+    def section(self, first: int, stop: int) -> NDArray:
+        """Return a part of the first axis, or all of an array of two axes: native numbers, NaN for none."""
+        raise NotImplementedError
 
-    @property
-    def numbers(self) -> tuple[str, float, float, int | None]:
-        """Type of the numbers, and their meaning."""
-        return self.dtype.str, self.scale, self.zero, self.blank
 
-    @property
-    def full_scale(self) -> float:
-        """Largest value that the type of the numbers can hold; infinity for floats."""
-        if self.dtype.kind not in "iu":
-            return np.inf
-        ends = np.iinfo(self.dtype).min, np.iinfo(self.dtype).max
-        return max(float(end) * self.scale + self.zero for end in ends)
+class NpyImages(Images):
+    """Array of an NPY file."""
 
-    def read(self, first: int, stop: int) -> NDArray:
-        """Return some exposures, (stop - first, per, ny, nx): as they are, or scaled in float32 or float64."""
-        with broken(f"{self.name}: it cannot be read"), self.path.open("rb") as file:
-            data = self.take(unpacked(file, self.name) if self.packed else file, first, stop)
-        if (self.scale, self.zero, self.blank) == (1, 0, None):
-            return data
-        return self.scaled(data, np.float32 if self.dtype.itemsize <= 2 else np.float64)
+    first_bytes = b"\x93NUMPY"
 
-    def take(self, content: BinaryIO, first: int, stop: int) -> NDArray:
-        """Return some exposures as they are, from the unpacked bytes of the file."""
-        content.seek(self.offset + first * self.row)
-        data = np.frombuffer(content.read((stop - first) * self.row), np.uint8)
-        if data.size < (stop - first) * self.row:
-            raise self.truncated(first + data.size // self.row)
-        data, shape = data.view(self.dtype), (stop - first, self.per, *self.shape)
-        return data.reshape(self.full, order="F").reshape(shape) if self.columns_first else data.reshape(shape)
+    @classmethod
+    def open(cls, path: Path, source: Source, verify: bool) -> list[Self]:
+        with broken(f"{path.name}: a broken NPY file"):
+            array, surplus = cls._array(source)
+            if surplus > 0 and array.size:
+                raise ValueError(f"{surplus} bytes follow the array of shape {array.shape}: expected none")
+        if array.dtype.kind not in "biuf":
+            raise FileError(f"{path.name}: its numbers are {array.dtype}: expected real ones")
+        highest = float(np.iinfo(array.dtype).max) if array.dtype.kind in "iu" else np.inf
+        return [cls(path, path.name, array.shape, array.dtype.newbyteorder("="), highest)]
 
-    def scaled(self, data: NDArray, wide: Any) -> NDArray:
-        """Return the values that numbers of the file stand for, NaN for none, as floats of a type."""
-        with np.errstate(over="ignore", invalid="ignore"):  # what is too large for the type becomes infinite
-            values = data.astype(wide) * self.scale + self.zero
-        return values if self.blank is None else np.where(data == self.blank, np.nan, values)
+    def section(self, first: int, stop: int) -> NDArray:
+        with broken(f"{self.name}: it cannot be read"):
+            array, _ = self._array(_source(self.path))
+            return np.array(array[first:stop] if array.ndim > 2 else array, self.dtype, order="C")
 
-    def truncated(self, n: int) -> FileError:
-        return FileError(f"{self.name}: truncated: it ends in exposure {n} of {self.n} (counted from 0)")
+    @staticmethod
+    def _array(source: Source) -> tuple[NDArray, int]:
+        """Array, mapped from the disk unless it was packed, and the number of bytes after it."""
+        if isinstance(source, bytes):
+            stream = io.BytesIO(source)
+            array = np.load(stream, allow_pickle=False)
+            return array, len(source) - stream.tell()
+        mapped: Any = np.load(source, mmap_mode="r", allow_pickle=False)
+        return mapped, _size(source) - mapped.offset - mapped.nbytes
+
+
+class FitsImages(Images):
+    """Array of an image unit of a FITS file, which may be compressed."""
+
+    first_bytes = FIRST_BYTES
+
+    @classmethod
+    def open(cls, path: Path, source: Source, verify: bool) -> list[Self]:
+        fits_module()  # without astropy this fails, and not the file
+        arrays, verify = [], verify and _size(source) <= MOST_BYTES
+        whole = {"lazy_load_hdus": False, "checksum": verify}
+        with broken(f"{path.name}: a broken FITS file"), _units(source, **whole) as units:
+            primary = header_cards(units[0].header)
+            for key in _OWN:
+                primary.pop(key, None)
+            for index, unit in enumerate(units):
+                if unit.is_image and unit.shape:
+                    name = f"{path.name}[{index}]" if len(units) > 1 else path.name
+                    _check_size(source, unit, index, name)
+                    cards, full = header_cards(unit.header), tuple(unit.shape)
+                    numbers = cls._numbers(unit, cards)
+                    arrays.append(cls(path, name, full, *numbers, primary | cards, index))
+        if not arrays:
+            raise FileError(f"{path.name}: a FITS file without an image")
+        return arrays
+
+    @staticmethod
+    def _numbers(unit: Any, cards: dict[str, Any]) -> tuple[np.dtype, float]:
+        """Type of the numbers of a section, and the largest number that an integer of the file stands for."""
+        bits, highest = unit.header["BITPIX"], np.inf
+        scale = _check.number("BSCALE", cards.get("BSCALE", 1))
+        zero = _check.number("BZERO", cards.get("BZERO", 0))
+        if bits > 0:
+            ends = (0, 255) if bits == 8 else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+            highest = max(float(end) * scale + zero for end in ends)
+            if "BLANK" in cards:
+                _check.integer("BLANK", cards["BLANK"], -(2**63))
+                return np.dtype(np.float32 if bits <= 16 else np.float64), highest
+        first = unit.section[(slice(0, 1),) * len(unit.shape)] if min(unit.shape) > 0 else np.empty(0)
+        return first.dtype.newbyteorder("="), highest
+
+    def section(self, first: int, stop: int) -> NDArray:
+        # An unsigned integer has no value for a blank: with a blank, the numbers are floats.
+        settings = {"uint": self.dtype.kind != "f"}
+        with broken(f"{self.name}: it cannot be read"), _units(_source(self.path), **settings) as units:
+            section = units[self.unit].section
+            values = (section[first:stop] if len(self.full) > 2 else section[:]).astype(self.dtype, copy=False)
+        if self.header.get("BLANK") == 0 < self.header["BITPIX"]:  # which astropy overlooks
+            values[values == self.header.get("BZERO", 0)] = np.nan
+        return values
+
+
+_FORMATS: tuple[type[Images], ...] = (NpyImages, FitsImages)
+
+
+@contextmanager
+def _units(source: Source, **settings: Any) -> Iterator[Any]:
+    """Units of a FITS file."""
+    with (
+        io.BytesIO(source) if isinstance(source, bytes) else source.open("rb") as file,
+        fits_module().open(file, memmap=False, **settings) as units,
+    ):
+        yield units
+
+
+def _check_size(source: Source, unit: Any, index: int, name: str) -> None:
+    """Require that the data of a unit are in the file, and that no compressed tile is a bomb."""
+    if (tiles := getattr(unit, "tile_shape", None)) is not None:
+        with _units(source, disable_image_compression=True) as tables:
+            table = tables[index]
+            _check_size(source, table, index, name)
+            n_tiles = prod(-(-n // size) for n, size in zip(unit.shape, tiles, strict=True))
+            if table.header["NAXIS2"] != n_tiles:
+                raise ValueError(f"{table.header['NAXIS2']} compressed tiles: expected {n_tiles}")
+            packed = str(table.header["ZCMPTYPE"]).startswith("GZIP")
+            for column in {"GZIP_COMPRESSED_DATA", "COMPRESSED_DATA" * packed} & set(table.columns.names):
+                longest = int(table.data.view(np.ndarray)[column][..., 0].max(initial=0))
+                if longest * _DEFLATE > MOST_BYTES:
+                    raise ValueError(f"a compressed tile of {longest} bytes: expected tiles of a few rows")
+    else:
+        held = max(_size(source) - unit.fileinfo()["datLoc"], 0)
+        if unit.size > held:
+            raise FileError(f"{name}: truncated: it holds {held} of the {unit.size} bytes that its header claims")
+
+
+def _size(source: Source) -> int:
+    return len(source) if isinstance(source, bytes) else source.stat().st_size
+
+
+def blocks_of(path: Path, max_bytes: int = MOST_BYTES, *, verify: bool = False) -> list[Images]:
+    """Return the arrays of a file, without those whose names say that they hold something else than frames.
+
+    Brackets behind the name of a file choose one of its units by number or name: `frame.fits[DARK]`.
+    """
+    file, unit = file_and_unit(path)
+    if not file.is_file():
+        where = "" if file.is_absolute() else f" in {Path.cwd()}"
+        raise FileNotFoundError(f"{path}: no such file{where}")
+    source = _source(file, max_bytes)
+    with broken(f"{file.name}: it cannot be read"), file.open("rb") as stream:
+        start = (source if isinstance(source, bytes) else stream.read(len(FIRST_BYTES)))[: len(FIRST_BYTES)]
+    for kind in _FORMATS:
+        if start and start.startswith(kind.first_bytes[: len(start)]):
+            return _chosen(kind.open(file.resolve(), source, verify), unit)
+    raise FileError(f"{file.name}: its first bytes are those of neither a FITS nor an NPY file")
+
+
+def file_and_unit(path: Path) -> tuple[Path, str]:
+    """Return the path of a file, and the number or name of the unit that brackets behind it choose, if any."""
+    parts = None if path.exists() else _UNIT.fullmatch(path.name)
+    return (path.with_name(parts[1]), parts[2].strip().upper()) if parts else (path, "")
+
+
+def _chosen(arrays: list[Images], unit: str) -> list[Images]:
+    """The array of a unit; without one, those of frames, which must be of one shape and type."""
+    if unit:
+        chosen = [array for array in arrays if unit in (array.title, str(array.unit))]
+        if len(chosen) != 1:
+            raise ambiguous(arrays, f" and {len(chosen)} of them are {unit!r}")
+        return chosen
+    frames = [array for array in arrays if not _COMPANION.search(array.title)] or arrays
+    if len({(array.full[-2:], array.dtype) for array in frames}) > 1:
+        raise ambiguous(frames)
+    return frames
+
+
+def ambiguous(arrays: list[Images], reason: str = "") -> FileError:
+    """Error for a file with several units of which none is chosen."""
+    name = arrays[0].path.name
+    units = ", ".join(f"[{one.unit}] {one.title} {one.full} {one.dtype}".replace("  ", " ") for one in arrays)
+    return FileError(
+        f"{name}: it has {len(arrays)} image units, {units}{reason}: expected one; choose it by its number or "
+        f"name, as '{name}[{arrays[0].unit}]'"
+    )
+
+
+def _source(path: Path, max_bytes: int = MOST_BYTES) -> Source:
+    """Bytes of a packed file, of which never many more than `max_bytes` are in memory, or the path of another."""
+    with broken(f"{path.name}: it cannot be read"), path.open("rb") as file:
+        if file.read(len(_GZIP)) != _GZIP:
+            return path
+        file.seek(0)
+        content, known = io.BytesIO(), tuple(kind.first_bytes for kind in _FORMATS)
+        with broken(f"{path.name}: a broken gzip file"), gzip.GzipFile(fileobj=file) as stream:
+            while content.tell() <= max_bytes and (chunk := stream.read(2**20)):
+                if not content.tell() and not chunk.startswith(known):
+                    break
+                content.write(chunk)
+    if content.tell() > max_bytes:
+        raise FileError(f"{path.name}: unpacked, it is larger than {max_bytes} bytes: expected at most max_bytes")
+    return content.getvalue()
 
 
 @contextmanager
@@ -122,106 +266,3 @@ def broken(message: str) -> Iterator[None]:
     except Exception as error:  # astropy alone raises a dozen different ones
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise FileError(f"{message}: {reason}") from error
-
-
-def unpacked(file: BinaryIO, name: str, max_bytes: int = _MOST_UNPACKED) -> io.BytesIO:
-    """Return the bytes of a FITS or NPY file, unpacked; never much more than `max_bytes` are in memory."""
-    with broken(f"{name}: it cannot be read"):
-        packed = file.read(len(_GZIP)) == _GZIP
-        file.seek(0)
-    size, content = os.fstat(file.fileno()).st_size, io.BytesIO()
-    with broken(f"{name}: a broken gzip file" if packed else f"{name}: it cannot be read"):
-        stream = gzip.GzipFile(fileobj=file) if packed else file
-        while size <= max_bytes and (chunk := stream.read(2**20)):
-            if not content.tell() and not chunk.startswith((_NPY, FIRST_BYTES)):
-                break
-            size = max(size, content.tell() + len(chunk))
-            content.write(chunk)
-    if size > max_bytes:
-        larger = "unpacked, it is" if packed else "it is"
-        raise FileError(f"{name}: {larger} larger than {max_bytes} bytes: expected at most max_bytes")
-    content.seek(0)
-    return content
-
-
-def blocks_of(path: Path) -> list[Block]:
-    with path.open("rb") as file:
-        packed = file.read(len(_GZIP)) == _GZIP
-        file.seek(0)
-        return blocks_in(unpacked(file, path.name) if packed else file, path.resolve(), packed=packed)
-
-
-def blocks_in(content: BinaryIO, path: Path, *, packed: bool = False, verify: bool = False) -> list[Block]:
-    """Return the images in the unpacked bytes of a file.
-
-    Only with `verify` are all bytes read, and their checksums compared with those of the header.
-    """
-    name, first = path.name, content.read(len(_NPY))
-    size = content.seek(0, os.SEEK_END)
-    content.seek(0)
-    if first == _NPY:
-        with broken(f"{name}: a broken NPY file"):
-            blocks = [_npy(content, path, packed)]
-    elif first and FIRST_BYTES.startswith(first):
-        fits_module()  # without astropy this fails, and not the file
-        with broken(f"{name}: a broken FITS file"):
-            blocks = _fits(content, path, packed, verify)
-    else:
-        raise FileError(f"{name}: its first bytes are those of neither a FITS nor an NPY file")
-    for block in blocks:
-        if block.dtype.kind not in "biuf":
-            raise FileError(f"{block.name}: its numbers are {block.dtype}: expected real ones")
-        if len(block.full) > 1 and size < block.offset + block.n * block.row:
-            raise block.truncated(max(size - block.offset, 0) // block.row)
-    return blocks
-
-
-def _npy(content: BinaryIO, path: Path, packed: bool) -> Block:
-    """Return the block of an NPY file, which ends with its data."""
-    version = np.lib.format.read_magic(content)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
-        raise ValueError(f"version {version}: expected 1.0 or 2.0")
-    shape, columns_first, dtype = readers[version](content)
-    if dtype.hasobject:
-        raise ValueError("it holds objects of Python: expected numbers")
-    block = Block(path, path.name, content.tell(), dtype, shape, packed, columns_first)
-    surplus = content.seek(0, os.SEEK_END) - block.offset - prod(shape) * dtype.itemsize
-    if min(shape, default=0) > 0 and surplus > 0:
-        raise ValueError(f"{surplus} bytes follow the array of shape {shape}: expected none")
-    return block
-
-
-def _fits(content: BinaryIO, path: Path, packed: bool, verify: bool) -> list[Block]:
-    """Return the blocks of a FITS file, with the header of its first unit and image."""
-    fits, blocks, header = fits_module(), list[Block](), dict[str, Any]()
-    # Not closed, since that would close `content`.
-    units = fits.open(content, memmap=False, lazy_load_hdus=False, checksum=verify)
-    for index, unit in enumerate(units):
-        name = f"{path.name}[{index}]" if len(units) > 1 else path.name
-        if isinstance(unit, fits.CompImageHDU):
-            raise FileError(f"{name}: compressed: expected plain images; use funpack")
-        if not unit.is_image or not unit.shape:
-            continue
-        cards = header_cards(unit.header)
-        header = header or header_cards(units[0].header) | cards
-        scaling = _check.number("BSCALE", cards.get("BSCALE", 1)), _check.number("BZERO", cards.get("BZERO", 0))
-        blank = cards.get("BLANK") if cards["BITPIX"] > 0 else None
-        blank = None if blank is None else _check.integer("BLANK", blank, -(2**63))
-        offset, dtype = unit.fileinfo()["datLoc"], np.dtype(_TYPES[cards["BITPIX"]])
-        blocks.append(
-            Block(path, name, offset, dtype, tuple(unit.shape), packed, False, *scaling, blank, 1, header)
-        )
-    if not blocks:
-        raise FileError(f"{path.name}: a FITS file without an image")
-    return blocks
-
-
-def header_cards(header: Any) -> dict[str, Any]:
-    """Return the values of a FITS header by keyword; cards that do not follow the standard are left out."""
-    values: dict[str, Any] = {}
-    for card in header.cards:
-        with suppress(fits_module().VerifyError):
-            if _KEYWORD.fullmatch(card.keyword):
-                values.setdefault(card.keyword, card.value)
-    return values

@@ -1,9 +1,11 @@
-"""Astropy, which only FITS files need: `pip install astropy`. And how to write them."""
+"""Headers of FITS files, and how to write these. Only FITS files need astropy: `pip install astropy`."""
 
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FIRST_BYTES = b"SIMPLE  ="
+_KEYWORD = re.compile("[A-Z0-9_ -]*")  # of the standard, with the blanks of the convention HIERARCH
 
 
 def fits_module() -> ModuleType:
@@ -59,3 +62,13 @@ def card_value(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(f"{value:.9g}") if np.isfinite(value) else "NaN"
     return bool(value) if isinstance(value, np.bool_) else value
+
+
+def header_cards(header: Any) -> dict[str, Any]:
+    """Return the values of a FITS header by keyword; cards that do not follow the standard are left out."""
+    values: dict[str, Any] = {}
+    for card in header.cards:
+        with suppress(fits_module().VerifyError):
+            if _KEYWORD.fullmatch(card.keyword):
+                values.setdefault(card.keyword, card.value)
+    return values

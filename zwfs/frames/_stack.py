@@ -1,26 +1,92 @@
-"""Images of many exposures on disk: FITS and NPY files are read in pieces, and need not fit the memory."""
+"""Exposures of camera files, which need not fit the memory: which axis of an array counts them."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
-from itertools import chain
+from math import prod
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zwfs import _check
-from zwfs.frames._blocks import Block, FileError, blocks_of
+from zwfs.frames._blocks import MOST_BYTES, FileError, Images, ambiguous, blocks_of
+
+
+class Segment(NamedTuple):
+    """Exposures of n_images (1 or 2) in an array of a file, or with one image of each in each of two arrays."""
+
+    arrays: tuple[Images, ...]
+    n_images: int
+
+    @property
+    def step(self) -> int:
+        """Places of the first axis that an exposure takes."""
+        return self.n_images // len(self.arrays) if len(self.arrays[0].full) < 4 else 1
+
+    @property
+    def n(self) -> int:
+        full = self.arrays[0].full
+        return (full[0] if len(full) > 2 else 1) // self.step
+
+    def read(self, first: int, stop: int) -> NDArray:
+        """Return some exposures, shape (stop - first, n_images, ny, nx)."""
+        places = first * self.step, stop * self.step
+        images = [array.section(*places).reshape(stop - first, -1, *array.full[-2:]) for array in self.arrays]
+        return images[0] if len(images) == 1 else np.concatenate(images, axis=1)
+
+
+def segments_of(
+    path: Path, n_images: int | None = None, second: Path | None = None, *, verify: bool = False
+) -> list[Segment]:
+    """Exposures of a file.
+
+    An array (ny, nx) is one exposure, (n, ny, nx) are n of one image each, and (n, 2, ny, nx) n of two images. An
+    array (2, ny, nx) holds two exposures, or the two images of one if `n_images` is 2. Two arrays hold one image
+    of each exposure: those of two files, or the two units of a file unless `n_images` is 1.
+    """
+    arrays = blocks_of(path, verify=verify)
+    seconds = blocks_of(second) if second else []
+    for array in (*arrays, *seconds):
+        full, size = array.full, 8 * prod(array.full[-2:])
+        if len(full) not in (2, 3, 4) or min(full) < 1 or (len(full) == 4 and full[1] > 2):
+            raise FileError(f"{array.name}: its shape is {full}: expected (ny, nx), (n, ny, nx) or (n, 2, ny, nx)")
+        if size > MOST_BYTES:
+            raise FileError(
+                f"{array.name}: its shape is {full}, {size} bytes for an image: expected at most {MOST_BYTES}"
+            )
+    if not second and len(arrays) == 2 and n_images != 1 and not any(map(_has_pairs, arrays)):
+        arrays, seconds = arrays[:1], arrays[1:]
+    if not seconds:
+        if len(arrays) > 2 and n_images is None:
+            raise ambiguous(arrays)
+        pairs = [_has_pairs(array) or (n_images == 2 and array.full[:-2] == (2,)) for array in arrays]
+        if len(set(pairs)) > 1:
+            raise ambiguous(arrays)
+        return [Segment((array,), 1 + pair) for array, pair in zip(arrays, pairs, strict=True)]
+    if len(arrays) != len(seconds):
+        raise FileError(f"{seconds[0].name}: {len(seconds)} units: expected {len(arrays)}, as {arrays[0].name}")
+    segments = [Segment(both, 2) for both in zip(arrays, seconds, strict=True)]
+    for (first, other), _ in segments:
+        if first.full != other.full or _has_pairs(first):
+            raise FileError(
+                f"{other.name}: its shape is {other.full}, and {first.full} that of the first images in "
+                f"{first.name}: expected as many second images as first ones"
+            )
+    return segments
+
+
+def _has_pairs(array: Images) -> bool:
+    return len(array.full) == 4 and array.full[1] == 2
 
 
 class Stack:
     """Exposures of all files, one after the other, each of n_images (1 or 2) of a shape.
 
-    A segment is a block with exposures, or two blocks that hold one image of each exposure. There are as many
-    second files, with the second image of each exposure, as files, or none. Raises FileNotFoundError, or FileError
-    if a file is of another kind, broken, truncated, or holds other images.
+    There are as many second files, with the second image of each exposure, as files, or none. Raises
+    FileNotFoundError, or FileError if a file is of another kind, broken, truncated, or holds other images.
     """
 
     def __init__(
@@ -29,23 +95,26 @@ class Stack:
         if second_files and (n_images == 1 or len(second_files) != len(files)):
             expected = "none, since an exposure of the calibration has one image" if n_images == 1 else len(files)
             raise ValueError(f"second_files holds {len(second_files)} files: expected {expected}")
-        self.segments: list[tuple[Block, ...]] = []
+        self.segments: list[Segment] = []
         for index, path in enumerate(files):
-            units = _units(path, shape)
-            seconds = _units(second_files[index], shape) if second_files else []
-            self.segments += _exposures(units, seconds, n_images)
-        self.firsts = [segment[0] for segment in self.segments]
+            self.segments += segments_of(path, n_images, second_files[index] if second_files else None)
+        self.firsts = [segment.arrays[0] for segment in self.segments]
         first = self.firsts[0]
-        for block in chain(*self.segments):
-            if block.numbers != first.numbers:
-                raise FileError(
-                    f"{block.name}: its type, BSCALE, BZERO and BLANK are {block.numbers}: expected "
-                    f"{first.numbers}, those of {first.name}"
-                )
-        self.header, self.bytes_per_exposure = first.header, sum(block.row for block in self.segments[0])
-        lengths = np.array([block.n for block in self.firsts])
-        self.ends = np.cumsum(lengths)
-        self.starts, self.n = self.ends - lengths, int(self.ends[-1])
+        for segment in self.segments:
+            for array in segment.arrays:
+                if array.full[-2:] != shape or segment.n_images != n_images:
+                    expected = f"(n, {'2, ' * (n_images - 1)}{shape[0]}, {shape[1]}), as in the calibration"
+                    other = ", or the second images in an extension or a file" * (n_images - 1)
+                    raise FileError(f"{array.name}: its shape is {array.full}: expected {expected}{other}")
+                if array.dtype != first.dtype:
+                    raise FileError(
+                        f"{array.name}: its numbers are {array.dtype}: expected {first.dtype}, as in {first.name}"
+                    )
+        self.header = first.header
+        self.bytes_per_exposure = n_images * prod(shape) * first.dtype.itemsize
+        self.lengths = np.array([segment.n for segment in self.segments])
+        self.ends = np.cumsum(self.lengths)
+        self.starts, self.n = self.ends - self.lengths, int(self.ends[-1])
 
     @property
     def saturation(self) -> float:
@@ -64,58 +133,14 @@ class Stack:
 
     def read(self, first: int, stop: int) -> NDArray:
         """Return some exposures, shape (stop - first, n_images, ny, nx)."""
-        parts = []
-        for index, start, end in self.places(first, stop):
-            images = [block.read(start, end) for block in self.segments[index]]
-            parts.append(images[0] if len(images) == 1 else np.concatenate(images, axis=1))
+        parts = [self.segments[index].read(start, end) for index, start, end in self.places(first, stop)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def state(self) -> list[tuple[str, int, int, int]]:
-        """Path, exposures, size and time of change of all files: it differs once a file has changed."""
-        found = [(block, os.stat(block.path)) for block in chain(*self.segments)]
-        return [(str(block.path), block.n, stat.st_size, stat.st_mtime_ns) for block, stat in found]
-
-
-def _exposures(units: list[Block], seconds: list[Block], n_images: int) -> list[tuple[Block, ...]]:
-    """Blocks of each segment, from the image units of a file and of its second file."""
-    if n_images == 1:
-        return [(replace(unit, per=1),) for unit in units]
-    if seconds:
-        pairs = list(zip(units, seconds, strict=False))
-        if len(units) != len(seconds):
-            raise FileError(f"{seconds[0].name}: {len(seconds)} images: expected {len(units)}, as {units[0].name}")
-    elif len(units) == 2 and not any(unit.per == 2 or unit.n == 2 for unit in units):
-        pairs = [(units[0], units[1])]  # an extension for each image
-    else:
-        for unit in units:
-            if unit.per == 1 and unit.n != 2:
-                raise FileError(
-                    f"{unit.name}: shape {(unit.n, *unit.shape)}: expected {(unit.n, 2, *unit.shape)}, since an "
-                    "exposure of the calibration has two images, or the second ones in an extension or a file"
-                )
-        return [(replace(unit, per=2),) for unit in units]
-    for one, other in pairs:
-        if (one.n * one.per, 1) != (other.n, other.per):
-            counts = f"{other.n * other.per} second images for {one.n * one.per} first ones"
-            raise FileError(f"{other.name}: {counts} in {one.name}: expected as many")
-    return [(one, other) for one, other in pairs]
-
-
-def _units(path: Path, shape: tuple[int, int]) -> list[Block]:
-    """Image units of a file, which must be of a shape."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    units = []
-    for block in blocks_of(path):
-        n_axes, per = len(block.full), block.full[1] if len(block.full) == 4 else 1
-        if n_axes not in (2, 3, 4) or min(block.full) < 1 or block.shape != shape or per not in (1, 2):
-            raise FileError(
-                f"{block.name}: its shape is {block.full}: expected images of {shape}, as in the calibration"
-            )
-        if block.columns_first:
-            raise FileError(
-                f"{block.name}: its columns come first in the file: expected rows first, as np.save"
-                "(name, np.ascontiguousarray(images)) writes them"
-            )
-        units.append(replace(block, per=per))
-    return units
+    def state(self) -> list[tuple[str, str, int, int, int]]:
+        """Path, name, exposures, size and time of change of all files: it differs once a file has changed."""
+        known = []
+        for segment in self.segments:
+            for array in segment.arrays:
+                stat = os.stat(array.path)
+                known.append((str(array.path), array.name, segment.n, stat.st_size, stat.st_mtime_ns))
+        return known

@@ -8,7 +8,8 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,18 +20,27 @@ from numpy.typing import NDArray
 from zwfs import _check
 from zwfs._images import nearest_good
 from zwfs._system import is_there, path_of, paths_of, write_file
-from zwfs.frames._blocks import FileError, blocks_in, unpacked
+from zwfs.frames._blocks import MOST_BYTES, FileError, Images, ambiguous, blocks_of, file_and_unit
 from zwfs.frames._fits import fits_content, fits_module, has_card
 from zwfs.frames._part import Cards, scratch_of
+from zwfs.frames._stack import segments_of
 from zwfs.frames.pipeline import MeasuredPhase, Optics
 from zwfs.frames.registration import Image
 
 __all__ = ["CameraFile", "check_output", "images", "read", "read_all", "write_phase"]
 
 _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do that, saturation does
+_PIECE = 2**22  # pixels of exposures that are read at once
+_POSITIVE = ("WAVELEN", "DIMPLE", "EGAIN", "SATURATE")  # keywords whose value is above 0
+# Keywords of the exposure time and of the window on the detector, and the relative difference that is none.
+_SETTINGS = ("EXPTIME", "EXPOSURE", "ESO DET DIT", "ESO DET SEQ1 DIT", "DETSEC", "CCDSEC", "SUBRECT", "XORGSUBF",
+             "YORGSUBF", "XSTART", "YSTART", "ESO DET WIN1 STRX", "ESO DET WIN1 STRY", "ESO DET WIN STARTX",
+             "ESO DET WIN STARTY")  # fmt: skip
+_SAME = 0.01
 # Header card of a phase map: no other file is replaced.
 _PHASE_CARD = b"CREATOR = 'zwfs "
 _LONGEST = 240  # bytes of a file name; a partial file has a few more, and most file systems allow 255
+_MANY = 6  # files that a message does not list
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +50,7 @@ class CameraFile:
     Attributes
     ----------
     images : ndarray of float64, shape (n, ny, nx)
+        NaN where a pixel is no number.
     name : str
         Of the file, without its folder.
     sha256 : str
@@ -50,6 +61,10 @@ class CameraFile:
         Largest value that the type of the file's numbers can hold; infinity for floats.
     path : Path, optional
         Of the file, absolute. `write_phase` never replaces it.
+    n_exposures : int
+        Exposures of which the images are the mean.
+    saturated : ndarray of bool, shape (n, ny, nx), optional
+        Pixels that are saturated in one of the exposures; if left out, `images` looks for them.
     """
 
     images: NDArray[np.float64]
@@ -58,6 +73,8 @@ class CameraFile:
     header: Mapping[str, Any] = field(default_factory=dict)
     full_scale: float = np.inf
     path: Path | None = None
+    n_exposures: int = 1
+    saturated: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         images = _check.real_array("images", self.images)
@@ -70,12 +87,14 @@ class CameraFile:
         Raises
         ------
         ValueError
-            If the header lacks the keyword, or its value is not a number.
+            If the header lacks the keyword, or its value is not a number that the keyword can have: WAVELEN,
+            DIMPLE, EGAIN and SATURATE are above 0.
         """
         _check.instance("key", key, str)
         if key not in self.header:
             raise ValueError(f"{self.name}: its header has no {key}: give the value as a parameter")
-        return _check.number(f"{self.name}: {key}", self.header[key])
+        low = 0 if key in _POSITIVE else -np.inf
+        return _check.number(f"{self.name}: {key}", self.header[key], low, open_low=True)
 
     def optics(self, diameter: float = 0.0, phase_shifts: Sequence[float] = ()) -> Optics:
         """Optics with these values, see `Optics`; by default those of the header, DIMPLE, THETA1 and THETA2."""
@@ -85,11 +104,13 @@ class CameraFile:
         return Optics(diameter or self.keyword("DIMPLE"), tuple(shifts))
 
 
-def read(path: str | Path, *, max_bytes: int = 2**29, max_images: int = 2) -> CameraFile:
-    """Read a FITS or NPY file, plain or packed with gzip; the first bytes decide which.
+def read(path: str | Path, *, max_bytes: int = MOST_BYTES, max_images: int = 2) -> CameraFile:
+    """Read all images of a FITS or NPY file, plain or packed with gzip; the first bytes decide which.
 
-    Integers, big-endian numbers, BZERO and BSCALE all become float64. Two images in two extensions of a FITS file
-    are read as an array of two images. Header cards that do not follow the standard are left out.
+    FITS images may be compressed. Brackets behind the name choose a unit of a FITS file by number or name, such as
+    ``frame.fits[1]`` or ``frame.fits[DARK]``. Without them, units whose names say that they are no frames (DARK,
+    MASK, ...) are left out, and images in two units of one shape are read as an array of two images. All numbers
+    become float64. Header cards that do not follow the standard are left out.
 
     Parameters
     ----------
@@ -110,8 +131,9 @@ def read(path: str | Path, *, max_bytes: int = 2**29, max_images: int = 2) -> Ca
     ImportError
         If astropy is needed and missing.
     FileError
-        A ValueError: if the file is of another kind, broken, too large, compressed with fpack, holds no image, too
-        many of them, an array that is neither (ny, nx) nor (n, ny, nx), or numbers that are not real.
+        A ValueError: if the file is of another kind, broken, too large, holds no image, too many of them, several
+        units that do not belong together, an array that is neither (ny, nx) nor (n, ny, nx), or numbers that are
+        not real.
 
     Examples
     --------
@@ -129,28 +151,22 @@ def read(path: str | Path, *, max_bytes: int = 2**29, max_images: int = 2) -> Ca
     """
     path = path_of("path", path)
     max_bytes, max_images = _check.integer("max_bytes", max_bytes, 1), _check.integer("max_images", max_images, 1)
-    if not os.path.isfile(path):
-        where = "" if path.is_absolute() else f" in {Path.cwd()}"
-        raise FileNotFoundError(f"{path}: no such file{where}")
-    name = path.name
-    with path.open("rb") as file:
-        content = unpacked(file, name, max_bytes)
-        file.seek(0)
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    blocks = blocks_in(content, path, verify=True)
-    shapes = [block.full for block in blocks]
-    if len(blocks) > 2 or shapes[0] != shapes[-1] or (len(blocks) == 2 and len(shapes[0]) != 2):
-        raise FileError(f"{name}: images of shapes {shapes}: expected one, or two of the same (ny, nx)")
-    shape = shapes[0] if len(blocks) == 1 else (2, *shapes[0])
+    file, _ = file_and_unit(path)
+    if file.is_file() and file.stat().st_size > max_bytes:
+        raise FileError(f"{file.name}: it is larger than {max_bytes} bytes: expected at most max_bytes")
+    arrays = blocks_of(path, max_bytes, verify=True)
+    first, shapes = arrays[0], [array.full for array in arrays]
+    if len(arrays) > 2 or (len(arrays) == 2 and (shapes[0] != shapes[1] or len(shapes[0]) != 2)):
+        raise ambiguous(arrays)
+    shape = shapes[0] if len(arrays) == 1 else (2, *shapes[0])
     if len(shape) not in (2, 3) or min(shape) < 1 or (len(shape) == 3 and shape[0] > max_images):
         expected = f"(ny, nx), or (n, ny, nx) with n up to {max_images}"
-        raise FileError(f"{name}: its shape is {shape}: expected {expected}")
+        raise FileError(f"{first.name}: its shape is {shape}: expected {expected}")
     if (n_bytes := 8 * math.prod(shape)) > max_bytes:
         expected = f"at most max_bytes = {max_bytes}"
-        raise FileError(f"{name}: its shape is {shape}, {n_bytes} bytes as float64: expected {expected}")
-    images = [block.scaled(block.take(content, 0, block.n), np.float64)[:, 0] for block in blocks]
-    highest = min(block.full_scale for block in blocks)
-    return CameraFile(np.concatenate(images), name, sha256, blocks[0].header, highest, path.resolve())
+        raise FileError(f"{first.name}: its shape is {shape}, {n_bytes} bytes as float64: expected {expected}")
+    images = [array.section(0, shape[0]).reshape(-1, *shape[-2:]) for array in arrays]
+    return _camera_file(first, np.concatenate(images).astype(np.float64))
 
 
 def read_all(
@@ -159,26 +175,68 @@ def read_all(
     dark_files: Sequence[str | Path] = (),
     bad_pixel_files: Sequence[str | Path] = (),
     saturation: float | None = None,
+    *,
+    pupil_dark_files: Sequence[str | Path] = (),
+    n_images: int | None = None,
 ) -> tuple[tuple[Image, ...], tuple[Image, ...], list[CameraFile]]:
-    """Read all files of a measurement: one or two each of frames and clear frames, and optional darks and maps.
+    """Read all files of a measurement: frames and clear frames, and optional darks and maps of bad pixels.
 
-    The parameters are those of `read` and `images`.
+    Exposures are averaged. A file holds one (ny, nx), n of one image each (n, ny, nx), or n of two images
+    (n, 2, ny, nx). Two units of a FITS file are the two images of an exposure, and so are two files. Three files
+    or more are exposures. An array (2, ny, nx) holds two exposures; for the two images of one, set ``n_images=2``.
+
+    A dark or a map belongs to the frames of its shape. Of several darks, a frame gets those with the same exposure
+    time and window, where the headers state them (EXPTIME, EXPOSURE, DETSEC, CCDSEC, SUBRECT, XORGSUBF, ...).
+
+    Parameters
+    ----------
+    frame_files, pupil_files : sequence of paths
+        Frames, and clear frames.
+    dark_files, bad_pixel_files : sequence of paths, optional
+        Counts without light, and maps that are not 0 where a pixel is bad: for all images, or one for each.
+    saturation : float, counts, optional
+        See `images`.
+    pupil_dark_files : sequence of paths, optional
+        Darks of the clear frames; `dark_files` are those of the frames then.
+    n_images : int, optional
+        Images of an exposure: 1, with both pupils on it, or 2. By default as above.
 
     Returns
     -------
     frames, clear_frames : tuple of Image
     sources : list of CameraFile
-        All files; the first is that of the first frame.
+        All files, with the mean of their exposures; the first is that of the first frame.
+
+    Raises
+    ------
+    FileNotFoundError, ImportError, FileError, ValueError
+        As for `read` and `images`, or if a dark or map has the shape of no frame.
     """
-    names = "frame_files", "pupil_files", "dark_files", "bad_pixel_files"
-    given = frame_files, pupil_files, dark_files, bad_pixel_files
+    names = "frame_files", "pupil_files", "dark_files", "bad_pixel_files", "pupil_dark_files"
+    given = frame_files, pupil_files, dark_files, bad_pixel_files, pupil_dark_files
     kinds = [paths_of(name, paths) for name, paths in zip(names, given, strict=True)]
     for name, paths in zip(names[:2], kinds, strict=False):
         if not paths:
-            raise ValueError(f"{name} is empty: expected one file or two")
-    frames, clear, darks, maps = ([read(path) for path in paths] for paths in kinds)
-    shared = darks, maps, saturation
-    return images(frames, *shared), images(clear, *shared), [*frames, *clear, *darks, *maps]
+            raise ValueError(f"{name} is empty: expected one file or more")
+    if n_images is not None:
+        n_images = _check.integer("n_images", n_images, 1, 2)
+    if saturation is not None:
+        saturation = _check.number("saturation", saturation, 0, open_low=True)
+    frames, clear = ([_averaged(path, n_images, saturation) for path in paths] for paths in kinds[:2])
+    darks, maps, pupil_darks = ([_averaged(path, n_images, np.inf) for path in paths] for paths in kinds[2:])
+    shapes = {file.images.shape[1:] for file in (*frames, *clear)}
+    for name, files in zip(names[2:], (darks, maps, pupil_darks), strict=True):
+        for file in files:
+            if file.images.shape[1:] not in shapes:
+                expected = " or ".join(map(str, sorted(shapes)))
+                raise ValueError(
+                    f"{name}: {file.name} has shape {file.images.shape[1:]}: expected {expected}, as the frames"
+                )
+    return (
+        images(frames, darks, maps, saturation, n_images),
+        images(clear, pupil_darks or darks, maps, saturation, n_images),
+        [*frames, *clear, *darks, *maps, *pupil_darks],
+    )
 
 
 def images(
@@ -186,6 +244,7 @@ def images(
     darks: Sequence[CameraFile] = (),
     bad_pixels: Sequence[CameraFile] = (),
     saturation: float | None = None,
+    n_images: int | None = None,
 ) -> tuple[Image, ...]:
     """One or two images from files, less the dark, with their bad pixels.
 
@@ -195,10 +254,13 @@ def images(
 
     Parameters
     ----------
-    files : sequence of one or two CameraFiles
+    files : sequence of CameraFiles
+        One with one or two images, one for each of two images, or exposures of one image.
     darks, bad_pixels : sequence of CameraFiles
-        As many images as `files` hold, one for all of them, or none.
+        For each image, or for all, see `read_all`.
     saturation : float, counts, optional
+    n_images : int, optional
+        Images that are expected: with 1, two files are two exposures.
 
     Returns
     -------
@@ -207,36 +269,41 @@ def images(
     Raises
     ------
     ValueError
-        If the number of images or a shape is wrong, every pixel of an image or of its dark is bad, or the
-        bad-pixel map marks all of them.
+        If the number of images or a shape is wrong, every pixel of an image or of its dark is bad, or a bad-pixel
+        map marks more than half of the pixels.
     """
     for argument, given in (("files", files), ("darks", darks), ("bad_pixels", bad_pixels)):
         _check.sequence(argument, given, CameraFile)
     if saturation is not None:
         saturation = _check.number("saturation", saturation, 0, open_low=True)
-    recorded = [(file, counts) for file in files for counts in file.images]
-    if len(recorded) not in (1, 2):
-        names = ", ".join(dict.fromkeys(file.name for file in files)) or "files"
-        raise ValueError(f"{names}: {len(recorded)} images: expected one or two")
+    recorded = _by_image("files", files, n_images)
+    if n_images and len(recorded) != n_images:
+        raise ValueError(f"{_names(files)}: {len(recorded)} images in an exposure: expected n_images = {n_images}")
     result: list[Image] = []
-    for (file, counts), dark, marked in zip(
-        recorded,
-        _companions("darks", darks, recorded, _usable),
-        _companions("bad_pixels", bad_pixels, recorded, np.logical_not),
-        strict=True,
-    ):
-        bad = ~_usable(counts)
-        level = saturation or _saturation(file, counts[~bad])
-        bad |= np.where(bad, 0, counts) >= level
+    for index, exposures in enumerate(recorded):
+        counts = _mean(exposures)
+        saturated = [
+            _over(file, image := file.images[number], _usable(image), saturation)
+            if file.saturated is None
+            else file.saturated[number]
+            for file, number in exposures
+        ]
+        first = exposures[0][0]
+        dark = _companion("darks", darks, first, index, len(recorded))
+        marked = _companion("bad_pixels", bad_pixels, first, index, len(recorded)) != 0
+        if marked.mean() > 0.5:
+            raise ValueError(
+                f"bad_pixels: {_names(bad_pixels)} marks {marked.mean():.1%} of the pixels as bad: expected 0 for "
+                "good pixels, and less than half bad; it looks like a map with 1 = good"
+            )
         with np.errstate(over="ignore", invalid="ignore"):
             counts = counts - dark
-        bad |= ~_usable(counts) | (marked != 0)
+        bad = ~_usable(counts) | marked | np.any(saturated, axis=0)
         if bad.all():
-            names = ", ".join([file.name, *(one.name for one in (*darks, *bad_pixels))])
-            raise ValueError(
-                f"{names}: all pixels are bad or saturated (saturation = {level:g}): expected an image"
-            )
-        name = file.name if len(file.images) == 1 else f"{file.name}[{len(result)}]"
+            names = _names([*(file for file, _ in exposures), *darks, *bad_pixels])
+            raise ValueError(f"{names}: all pixels are bad or saturated: expected an image")
+        name = _names([file for file, _ in exposures])
+        name = name if len(first.images) == 1 else f"{name}[{index}]"
         result.append(Image(nearest_good(counts, ~bad), bad, name))
     return tuple(result)
 
@@ -267,7 +334,7 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
         did not write, is a folder, or cannot be written, or if an input lies in its scratch folder.
     """
     overwrite = _check.flag("overwrite", overwrite)
-    sources = paths_of("inputs", inputs)
+    sources = [file_and_unit(source)[0] for source in paths_of("inputs", inputs)]
     path = path_of("output", output)
     named = f"output = {str(output)!r}"
     try:
@@ -388,38 +455,103 @@ def _usable(counts: NDArray) -> NDArray[np.bool_]:
     return np.abs(counts) <= _check.LARGEST
 
 
-def _companions(
-    argument: str,
-    files: Sequence[CameraFile],
-    recorded: list[tuple[CameraFile, NDArray]],
-    good: Callable[[NDArray], NDArray],
-) -> list[NDArray]:
-    """Dark or bad-pixel map of each recorded image, with at least one good pixel; 0 everywhere without files."""
-    maps = [(file.name, image) for file in files for image in file.images]
-    if not maps:
-        return [np.zeros(())] * len(recorded)
-    n = len(recorded)
-    if len(maps) not in (1, n):
-        names = ", ".join(dict.fromkeys(file.name for file in files))
-        raise ValueError(
-            f"{argument}: {names}: {len(maps)} images for the {n} of {recorded[0][0].name}: "
-            "expected one, or one for each"
-        )
-    maps = maps * n if len(maps) == 1 else maps
-    for (name, image), (file, counts) in zip(maps, recorded, strict=True):
-        if image.shape != counts.shape:
-            raise ValueError(
-                f"{argument}: {name} has shape {image.shape}: expected {counts.shape}, that of {file.name}"
-            )
-        if not good(image).any():
-            raise ValueError(f"{argument}: {name} has no good pixel: expected some")
-    return [image for _, image in maps]
+_Exposure = tuple[CameraFile, int]  # a file, and the number of the image in it
 
 
-def _saturation(file: CameraFile, counts: NDArray) -> float:
-    """Level at which pixels are saturated, if a file states it."""
-    if "SATURATE" in file.header:
-        return file.keyword("SATURATE")
-    top = counts.max(initial=-np.inf)
-    plateau = np.count_nonzero(counts == top) >= _PLATEAU and top > counts.min(initial=np.inf)
-    return min(file.full_scale, top if plateau else np.inf)
+def _names(files: Sequence[CameraFile]) -> str:
+    """Names of files for a message; of many the first one."""
+    names = list(dict.fromkeys(file.name for file in files)) or ["files"]
+    return ", ".join(names) if len(names) < _MANY else f"{names[0]} and {len(names) - 1} others"
+
+
+def _camera_file(array: Images, images: NDArray, **settings: Any) -> CameraFile:
+    with array.path.open("rb") as file:
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    return CameraFile(images, array.path.name, sha256, array.header, array.full_scale, array.path, **settings)
+
+
+def _averaged(path: Path, n_images: int | None, saturation: float | None) -> CameraFile:
+    """Mean exposure of a file, read in pieces, with the pixels that are saturated in any exposure."""
+    segments = segments_of(path, n_images, verify=True)
+    first = segments[0].arrays[0]
+    shape = segments[0].n_images, *first.full[-2:]
+    total, n_used, saturated = np.zeros(shape), np.zeros(shape, int), np.zeros(shape, bool)
+    step = max(1, _PIECE // math.prod(shape))
+    for segment in segments:
+        for start in range(0, segment.n, step):
+            for exposure in segment.read(start, min(start + step, segment.n)).astype(np.float64):
+                good = _usable(exposure)
+                for image, usable, over in zip(exposure, good, saturated, strict=True):
+                    over |= _over(first, image, usable, saturation)
+                total += np.where(good, exposure, 0)
+                n_used += good
+    mean = np.divide(total, n_used, out=np.full(shape, np.nan), where=n_used > 0)
+    n_exposures = sum(segment.n for segment in segments)
+    return _camera_file(first, mean, n_exposures=n_exposures, saturated=saturated)
+
+
+def _over(
+    source: Images | CameraFile, image: NDArray, usable: NDArray, saturation: float | None
+) -> NDArray[np.bool_]:
+    """Saturated pixels of an exposure: from a level that is given, that a file states, or where many are equal."""
+    counts = image[usable]
+    if saturation is None and "SATURATE" in source.header:
+        saturation = _check.number(f"{source.name}: SATURATE", source.header["SATURATE"], 0, open_low=True)
+    if saturation is None:
+        top = counts.max(initial=-np.inf)
+        plateau = np.count_nonzero(counts == top) >= _PLATEAU and top > counts.min(initial=np.inf)
+        saturation = min(source.full_scale, top if plateau else np.inf)
+    return np.where(usable, image, -np.inf) >= saturation
+
+
+def _by_image(argument: str, files: Sequence[CameraFile], n_images: int | None) -> list[list[_Exposure]]:
+    """Exposures of each image."""
+    sizes = {len(file.images) for file in files}
+    if sizes == {1} and len(files) == 2 and n_images != 1:
+        return [[(file, 0)] for file in files]
+    if sizes not in ({1}, {2}):
+        n = sum(len(file.images) for file in files)
+        raise ValueError(f"{argument}: {_names(files)}: {n} images: expected one or two")
+    if len(shapes := {file.images.shape[1:] for file in files}) > 1:
+        raise ValueError(f"{argument}: {_names(files)}: exposures of shapes {sorted(shapes)}: expected the same")
+    return [[(file, index) for file in files] for index in range(sizes.pop())]
+
+
+def _mean(exposures: Sequence[_Exposure]) -> NDArray[np.float64]:
+    """Mean of files, each by its number of exposures; NaN where none has a number."""
+    values = np.stack([file.images[index] for file, index in exposures])
+    weights = np.array([file.n_exposures for file, _ in exposures])[:, np.newaxis, np.newaxis] * _usable(values)
+    total = np.sum(np.where(weights > 0, values, 0) * weights, axis=0)
+    weight = weights.sum(axis=0)
+    return np.divide(total, weight, out=np.full(total.shape, np.nan), where=weight > 0)
+
+
+def _companion(
+    argument: str, files: Sequence[CameraFile], frame: CameraFile, index: int, n_images: int
+) -> NDArray[np.float64]:
+    """Dark or bad-pixel map of an image of a file: the mean of those that belong to it; 0 without files."""
+    if not files:
+        return np.zeros(())
+    shape, other = frame.images.shape[1:], files[0].images.shape[1:]
+    same = [file for file in files if file.images.shape[1:] == shape]
+    if not same:
+        raise ValueError(f"{argument}: {_names(files)} has shape {other}: expected {shape}, that of {frame.name}")
+    differences = [_difference(file, frame) if argument == "darks" else "" for file in same]
+    fitting = [file for file, difference in zip(same, differences, strict=True) if not difference]
+    if not fitting:
+        warnings.warn(f"darks: {differences[0]}: expected a dark with the same settings", stacklevel=4)
+    by_image = _by_image(argument, fitting or same, 1 if n_images == 1 else None)
+    if len(by_image) > n_images:
+        raise ValueError(f"{argument}: {_names(same)}: 2 images for the 1 of {frame.name}: expected one")
+    return _mean(by_image[index if len(by_image) > 1 else 0])
+
+
+def _difference(dark: CameraFile, frame: CameraFile) -> str:
+    """Exposure time or window in which a dark differs from a frame, where both headers state it."""
+    for key in _SETTINGS:
+        if key in dark.header and key in frame.header:
+            values = dark.header[key], frame.header[key]
+            numbers = all(isinstance(value, int | float) for value in values)
+            if not (math.isclose(*values, rel_tol=_SAME) if numbers else values[0] == values[1]):
+                return f"{key} is {values[0]} in {dark.name} and {values[1]} in {frame.name}"
+    return ""

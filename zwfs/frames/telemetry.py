@@ -85,7 +85,8 @@ def reconstruct(
     ----------
     frames : path, or sequence of paths
         FITS or NPY files: cubes (n, ny, nx), or (n, 2, ny, nx) where an exposure has two images, or single
-        exposures. Two FITS extensions of one image each are the two images of an exposure.
+        exposures. Two FITS units of one shape are the two images of an exposure, if it has two. Brackets choose a
+        unit: ``cube.fits[1]``.
     calibration : Calibration or path
     output : path
         FITS file. An earlier phase map or telemetry file is replaced.
@@ -100,7 +101,7 @@ def reconstruct(
         see `Calibration.sigma`. It takes several times as long as the phases.
     read_noise : float, electrons rms / pixel
     wavelength : float, nm, optional
-        For the header, which then holds the nm of a radian; by default WAVELEN of the first file.
+        For the header, which then holds the nm of a radian; by default WAVELEN of the first file if it is above 0.
     keywords : sequence of str
         Keywords of the headers that become columns of the table; each file must have them.
     saturation : float, counts, optional
@@ -169,7 +170,7 @@ def reconstruct(
     try:
         n_resumed = done = sum(stop - first for first, stop in part.done)
         report(done, stack.n)
-        names = [(card_value(one.name), one.n) for one in stack.firsts]
+        names = [(card_value(one.name), n) for one, n in zip(stack.firsts, stack.lengths, strict=True)]
         part.write(job.files, 0, np.array(names, job.files.dtype))
         for first, stop in job.run(part, n_workers):
             part.note(first, stop)
@@ -205,10 +206,10 @@ class _Job:
         self.photons: Any = None if photons is None else _check.number("photons", photons, 1e-6, 1e12)
         if read_noise and photons is None:
             raise ValueError(f"read_noise = {read_noise:g}: expected a number of photons with it")
-        if wavelength is None and isinstance(stack.header.get("WAVELEN"), int | float):
-            wavelength = stack.header["WAVELEN"]
         if wavelength is not None:
             wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
+        elif isinstance(known := stack.header.get("WAVELEN"), int | float) and 0 < known < np.inf:
+            wavelength = known  # the phases need none, so any other value is left alone
         level = calibration.saturation if saturation is None else saturation
         if saturation is None and level == np.inf:
             level = stack.saturation
@@ -249,7 +250,8 @@ class _Job:
         from zwfs import __version__
 
         stack, calibration = self.stack, self.calibration
-        row, column = calibration.places[0, :, 0, 0].tolist()
+        place = calibration.places[0, :, 0, 0]
+        row, column = np.rint(place).astype(int).tolist()
         cards: list[tuple[str, Any, str]] = [
             ("CREATOR", f"zwfs {__version__}", ""),
             ("NFRAMES", stack.n, "frames, all of them in the table"),
@@ -259,8 +261,10 @@ class _Job:
             ("RESCALIB", calibration.residual, "residual of the frames of the calibration"),
             ("CALIBSHA", calibration.sha256, ""),
             ("MAPFRAME", "commands" if calibration.commanded else "first image", "frame of reference of the maps"),
-            ("CROPROW", row, "[pixel] row of a map's first point, from 0"),
+            ("CROPROW", row, "[pixel] row where maps begin, from 0"),
             ("CROPCOL", column, "[pixel] its column, on the first image"),
+            ("OFFROW", round(place[0] - row, 6), "[pixel] exact row of the first point - CROPROW"),
+            ("OFFCOL", round(place[1] - column, 6), "[pixel] exact column of it - CROPCOL"),
             *sensor_cards(calibration.diameter, calibration.center, calibration.optics),
             ("SATURATE", self.saturation, "[count] pixels that reach it are saturated"),
             ("MAXITER", calibration.n_iterations, "largest number of iterations"),

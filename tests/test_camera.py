@@ -241,6 +241,12 @@ def test_dark_that_does_not_fit_is_named(tmp_path):
     dark = write(tmp_path / "dark.fits", 0.0 * FRAME, EXPTIME=1.0)
     with pytest.warns(UserWarning, match=r"EXPTIME is 1\.0 in dark\.fits and 2\.0 in frame\.fits"):
         camera.read_all([frame], [frame], [dark])
+    noise = np.random.default_rng(1).normal(0, 2, (3, *FRAME.shape))
+    noise[2] += 50
+    darks = [write(tmp_path / f"dark{index}.fits", one) for index, one in enumerate(noise)]
+    camera.read_all([frame], [frame], darks[:2])
+    with pytest.raises(ValueError, match=r"dark2\.fits has .* counts more than dark0\.fits.*pupil_dark_files"):
+        camera.read_all([frame], [frame], [darks[0], darks[2]])
     write(dark, FRAME[1:] + 0.0)
     with pytest.raises(ValueError, match=r"dark_files: dark\.fits has shape \(19, 30\): expected \(20, 30\)"):
         camera.read_all([frame], [frame], [dark])
@@ -256,8 +262,8 @@ def test_unit_of_a_file_is_chosen_or_asked_for(tmp_path):
     asked = r"a\.fits: it has 3 image units, .*\[1\] DARK \(20, 30\) float64.* as 'a\.fits\[0\]'"
     with pytest.raises(camera.FileError, match=asked):
         camera.read(f"{path}[5]")
-    for others in (images, [FRAME] * 3, [FRAME, FRAME[1:]]):
-        write(path, *others)
+    for others in ([images], [[FRAME] * 3], [[FRAME, FRAME[1:]]], [[FRAME] * 2, ["PUPILS"]]):
+        write(path, *others[0], names=others[-1][:1] if len(others) > 1 else ())
         with pytest.raises(
             camera.FileError, match=r"a\.fits: it has \d image units, \[0\] \(20, 30\) .*choose it"
         ):

@@ -1,7 +1,7 @@
 """A FITS file that is written piece by piece: it appears when it is complete, and an interrupted run goes on.
 
-The scratch folder `.NAME.part` holds the pieces at their places in `data`, and a line with the checksum of each in
-`journal`. The next run with the same plan takes over the pieces whose checksums are right, and writes the others.
+The scratch file `.NAME.part` is the output with the finished pieces at their places, then their checksums, and
+then the plan. The next run with the same plan takes over the pieces whose checksums are right.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import stat
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zwfs.frames._fits import fits_module, set_cards
+from zwfs.frames._fits import FIRST_BYTES, fits_module, set_cards
 
 _BLOCK = 2880  # bytes: all parts of a FITS file are multiples of it
-_LINE = 80  # bytes that no line of a journal exceeds
-_MARKER = "output"  # file of a scratch folder that holds the name of the output
+_CREATOR = b"CREATOR = 'zwfs "  # header card of an output
+_MARK = np.dtype("<u8")  # 0, or the checksum of a finished piece + 1
 
 Cards = Sequence[tuple[str, Any, str]]
 
@@ -71,42 +71,40 @@ class Unit:
 
 
 def scratch_of(output: Path) -> Path:
-    """Return the path of the scratch folder of an output: fixed, so that the next run finds it."""
+    """Return the path of the scratch file of an output: fixed, so that the next run finds it."""
     return output.with_name(f".{output.name}.part")
 
 
 class Part:
     """Partial file of an output, with the pieces (first row, and the first row after it) that it gets.
 
-    A piece has rows of all units but the last and those that are empty. Files in the folder are opened without
-    following links. The plan is all that decides the bytes of the output.
+    A piece has rows of all units but the last and those that are empty. The plan is all that decides the bytes of
+    the output.
 
     Raises ValueError if there is a part of another plan, another process writes it, or something else has the name
-    of the folder: it could be data of the user. OSError if there is not enough space.
+    of the scratch file: it could be data of the user. OSError if there is not enough space.
     """
 
     def __init__(
         self, output: Path, units: Sequence[Unit], pieces: Sequence[tuple[int, int]], plan: str, restart: bool
     ) -> None:
         self.output, self.units, self.pieces, self.path = output, units, pieces, scratch_of(output)
-        self._plan = hashlib.sha256(plan.encode()).hexdigest().encode()
-        self._size, self._files, self._keep = 0, list[int](), True
+        self._numbers = {piece: number for number, piece in enumerate(pieces)}
+        self._plan, self._keep, self._size = hashlib.sha256(plan.encode()).digest(), True, 0
         for unit in units:
             unit.offset = self._size + len(unit.header())
             self._size = unit.offset + unit.size
-        try:
-            with self._no_space():
-                output.parent.mkdir(parents=True, exist_ok=True)
-                self._enter()
-                self._data = self._open("data", os.O_RDWR | os.O_CREAT)
+        with self._no_space():
+            output.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self._open()
+            try:
                 self._lock()
-                self._journal = self._open("journal", os.O_RDWR | os.O_CREAT | os.O_APPEND)
-                self.done = {} if restart else self._earlier()
+                self.done = set() if restart else self._earlier()
                 self._keep = bool(self.done)
                 self._begin()
-        except BaseException:
-            self.close()
-            raise
+            except BaseException:
+                self.close()
+                raise
 
     def write(self, unit: Unit, first: int, rows: NDArray) -> None:
         with self._no_space():
@@ -116,101 +114,83 @@ class Part:
         return np.frombuffer(self._read(unit, first, stop), unit.dtype).reshape(-1, *unit.shape).copy()
 
     def note(self, first: int, stop: int) -> None:
-        """Add a finished piece, whose rows are written, to the journal."""
+        """Mark a piece, whose rows are written, as finished."""
+        mark = np.array(self._checksum(first, stop) + 1, _MARK).tobytes()
         with self._no_space():
-            os.write(self._journal, b"%d %d %d\n" % (first, stop, self._checksum(first, stop)))
+            self._write(mark, self._size + self._numbers[first, stop] * _MARK.itemsize)
         self._keep = True
 
     def finish(self) -> None:
         """Write the headers, and give the file its name."""
         with self._no_space():
             self._write_headers()
-            os.fsync(self._data)
-            os.replace("data", self.output, src_dir_fd=self._folder)
-        self._keep = False
+            os.ftruncate(self._file, self._size)
+            os.fsync(self._file)
+            os.replace(self.path, self.output)
+        self._keep = True
 
     def close(self) -> None:
-        """Close the part; its folder is removed unless it holds a finished piece, or is not ours."""
+        """Close the part, and remove it unless it holds a finished piece."""
         if not self._keep:
-            for name in ("data", "journal", _MARKER):
-                with suppress(FileNotFoundError):
-                    os.unlink(name, dir_fd=self._folder)
-            with suppress(OSError):  # a file of somebody else remains
-                self.path.rmdir()
-        while self._files:
-            os.close(self._files.pop())
+            self.path.unlink(missing_ok=True)
+        os.close(self._file)
 
-    def _enter(self) -> None:
-        """Open the folder. A new one gets a marker; that of an earlier one must name the output."""
-        new, name = not os.path.lexists(self.path), os.fsencode(self.output.name)
-        if new:
-            self.path.mkdir(0o700)
+    def _open(self) -> int:
+        """Open the scratch file, without following a link. An earlier one begins as an output does."""
+        reason = "it is a link, a folder or a device"
         try:
-            self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
         except OSError as error:
-            raise self._refusal(str(error.strerror)) from None
-        self._files.append(self._folder)
-        self._keep = not new
-        if new:
-            os.write(self._open(_MARKER, os.O_WRONLY | os.O_CREAT | os.O_EXCL), name)
-        elif os.fstat(self._folder).st_uid != os.geteuid():
-            raise self._refusal("it belongs to another user")
-        elif _MARKER not in os.listdir(self._folder) or os.read(self._open(_MARKER, os.O_RDONLY), 999) != name:
-            raise self._refusal(f"its file {_MARKER!r} does not hold the name of the output")
-
-    def _open(self, name: str, flags: int) -> int:
-        """Open a file of the folder until `close`, and return its descriptor."""
-        reason = f"its file {name!r} is a link or a device"
-        try:
-            file = os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666, dir_fd=self._folder)
-        except OSError as error:
-            raise self._refusal(reason) from None if error.errno == errno.ELOOP else error
-        self._files.append(file)
-        status = os.fstat(file)
-        if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
-            raise self._refusal(reason)
-        return file
+            raise self._refusal(reason) from None if error.errno in (errno.ELOOP, errno.EISDIR) else error
+        status, start = os.fstat(file), b""
+        if stat.S_ISREG(status.st_mode) and status.st_nlink == 1:
+            start = os.pread(file, _BLOCK, 0)
+            reason = "it is no part of an output"
+            if status.st_uid != os.geteuid():
+                reason = "it belongs to another user"
+            elif not start or (start.startswith(FIRST_BYTES) and _CREATOR in start):
+                return file
+        os.close(file)
+        raise self._refusal(reason)
 
     def _refusal(self, reason: str) -> ValueError:
         return ValueError(
-            f"output = {str(self.output)!r} needs the folder {self.path.name}, which is there and which zwfs did "
-            f"not make ({reason}): expected no such file or folder; move it, or choose another output"
+            f"output = {str(self.output)!r} needs the file {self.path.name}, which is there and which zwfs did "
+            f"not make ({reason}): expected no such file; move it, or choose another output"
         )
 
     def _lock(self) -> None:
         import fcntl  # not on Windows, where calibrations work
 
         try:
-            fcntl.flock(self._data, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise ValueError(f"output = {str(self.output)!r} is being written by another process") from None
 
-    def _earlier(self) -> dict[tuple[int, int], int]:
-        """Checksums of the whole pieces of an earlier run."""
-        plan, *lines = os.pread(self._journal, _LINE * (len(self.pieces) + 1), 0).split(b"\n")
-        if not lines:  # the first line was not written to its end
-            return {}
+    def _earlier(self) -> set[tuple[int, int]]:
+        """Pieces that an earlier run has finished."""
+        held = os.fstat(self._file).st_size
+        plan = os.pread(self._file, len(self._plan), max(0, held - len(self._plan)))
+        if not plan.strip(b"\0 "):  # it was stopped before it had a plan
+            return set()
         if plan != self._plan:
             raise ValueError(
                 f"{self.path.name} is part of a run with other frames, another calibration or other settings: "
                 "expected the same; restart to drop it, or choose another output"
             )
-        pieces, done = set(self.pieces), {}
-        for line in lines[:-1]:  # the last one is empty, or cut
-            with suppress(ValueError):
-                first, stop, checksum = map(int, line.split())
-                if (first, stop) in pieces and self._checksum(first, stop) == checksum:
-                    done[first, stop] = checksum
-        if n_damaged := len(lines) - 1 - len(done):
+        marks = np.frombuffer(os.pread(self._file, len(self.pieces) * _MARK.itemsize, self._size), _MARK).tolist()
+        finished = [(piece, mark - 1) for piece, mark in zip(self.pieces, marks, strict=True) if mark]
+        done = {piece for piece, checksum in finished if self._checksum(*piece) == checksum}
+        if n_damaged := len(finished) - len(done):
             warnings.warn(
-                f"{self.path / 'journal'}: {n_damaged} of {len(lines) - 1} lines or the data that they describe "
-                "are damaged: their frames are reconstructed again",
+                f"{self.path}: {n_damaged} of {len(finished)} finished pieces are damaged: their frames are "
+                "reconstructed again",
                 stacklevel=4,
             )
         return done
 
     def _read(self, unit: Unit, first: int, stop: int) -> bytes:
-        return os.pread(self._data, (stop - first) * unit.row, unit.offset + first * unit.row)
+        return os.pread(self._file, (stop - first) * unit.row, unit.offset + first * unit.row)
 
     def _checksum(self, first: int, stop: int) -> int:
         checksum = 0
@@ -220,16 +200,16 @@ class Part:
         return checksum
 
     def _begin(self) -> None:
-        """Reserve the space, and write the headers and the journal of the pieces that are done."""
+        """Write the headers, reserve the space, and write the marks and the plan."""
         if not self.done:
-            os.ftruncate(self._data, 0)
-        os.ftruncate(self._data, self._size)
-        if hasattr(os, "posix_fallocate"):  # not on macOS
-            os.posix_fallocate(self._data, 0, self._size)
-        os.ftruncate(self._journal, 0)
-        rows = (b"%d %d %d\n" % (*piece, checksum) for piece, checksum in self.done.items())
-        os.write(self._journal, b"".join((self._plan + b"\n", *rows)))
+            os.ftruncate(self._file, 0)
         self._write_headers()
+        whole = self._size + len(self.pieces) * _MARK.itemsize + len(self._plan)
+        os.ftruncate(self._file, whole)
+        if hasattr(os, "posix_fallocate"):  # not on macOS
+            os.posix_fallocate(self._file, 0, whole)
+        marks = [self._checksum(*piece) + 1 if piece in self.done else 0 for piece in self.pieces]
+        self._write(np.array(marks, _MARK).tobytes() + self._plan, self._size)
 
     def _write_headers(self) -> None:
         for unit in self.units:
@@ -239,7 +219,7 @@ class Part:
     def _write(self, content: bytes, place: int) -> None:
         view = memoryview(content)
         while view:
-            n = os.pwrite(self._data, view, place)
+            n = os.pwrite(self._file, view, place)
             view, place = view[n:], place + n
 
     @contextmanager

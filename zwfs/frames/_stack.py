@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from math import prod
 from pathlib import Path
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs.frames._blocks import MOST_BYTES, FileError, Images, ambiguous, blocks_of
+
+_NUMBER = re.compile("[0-9]")  # in which the names of units that belong together may differ
 
 
 class Segment(NamedTuple):
@@ -57,6 +60,8 @@ def segments_of(
             raise FileError(
                 f"{array.name}: its shape is {full}, {size} bytes for an image: expected at most {MOST_BYTES}"
             )
+    if n_images is None and len({_NUMBER.sub("", array.title) for array in arrays}) > 1:
+        raise ambiguous(arrays)
     if not second and len(arrays) == 2 and n_images != 1 and not any(map(_has_pairs, arrays)):
         arrays, seconds = arrays[:1], arrays[1:]
     if not seconds:
@@ -124,23 +129,16 @@ class Stack:
         name = f"{first.name}: {'SATURATE' if known else 'largest number of its type'}"
         return level if level == np.inf else _check.number(name, level, 0, open_low=True)
 
-    def places(self, first: int, stop: int) -> list[list[int]]:
-        """Segments that hold some exposures, each with its first exposure and the one after its last."""
-        last = np.searchsorted(self.ends, stop - 1, "right")
-        some = np.arange(np.searchsorted(self.ends, first, "right"), last + 1)
-        low, high = np.maximum(first, self.starts[some]), np.minimum(stop, self.ends[some])
-        return np.transpose([some, low - self.starts[some], high - self.starts[some]]).tolist()
-
     def read(self, first: int, stop: int) -> NDArray:
         """Return some exposures, shape (stop - first, n_images, ny, nx)."""
-        parts = [self.segments[index].read(start, end) for index, start, end in self.places(first, stop)]
+        begin, end = np.searchsorted(self.ends, (first, stop - 1), "right")
+        parts = []
+        for index in range(begin, end + 1):
+            start, segment = self.starts[index], self.segments[index]
+            parts.append(segment.read(max(first - start, 0), min(stop - start, segment.n)))
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def state(self) -> list[tuple[str, str, int, int, int]]:
         """Path, name, exposures, size and time of change of all files: it differs once a file has changed."""
-        known = []
-        for segment in self.segments:
-            for array in segment.arrays:
-                stat = os.stat(array.path)
-                known.append((str(array.path), array.name, segment.n, stat.st_size, stat.st_mtime_ns))
-        return known
+        found = [(segment.n, array, os.stat(array.path)) for segment in self.segments for array in segment.arrays]
+        return [(str(one.path), one.name, n, stat.st_size, stat.st_mtime_ns) for n, one, stat in found]

@@ -37,6 +37,7 @@ _SETTINGS = ("EXPTIME", "EXPOSURE", "ESO DET DIT", "ESO DET SEQ1 DIT", "DETSEC",
              "YORGSUBF", "XSTART", "YSTART", "ESO DET WIN1 STRX", "ESO DET WIN1 STRY", "ESO DET WIN STARTX",
              "ESO DET WIN STARTY")  # fmt: skip
 _SAME = 0.01
+_ALIKE = 5.0  # median absolute deviations by which two darks may differ
 # Header card of a phase map: no other file is replaced.
 _PHASE_CARD = b"CREATOR = 'zwfs "
 _LONGEST = 240  # bytes of a file name; a partial file has a few more, and most file systems allow 255
@@ -331,7 +332,7 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     ------
     TypeError, ValueError
         If `output` is one of the inputs, also under another name or as a hard link, is a file that `write_phase`
-        did not write, is a folder, or cannot be written, or if an input lies in its scratch folder.
+        did not write, is a folder, or cannot be written, or if an input is its scratch file.
     """
     overwrite = _check.flag("overwrite", overwrite)
     sources = [file_and_unit(source)[0] for source in paths_of("inputs", inputs)]
@@ -345,8 +346,8 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
     for source in sources:
         if there and os.path.exists(source) and os.path.samefile(path, source):
             raise ValueError(f"{named} is the input {str(source)!r}: expected another file")
-        if scratch_of(path) in source.resolve().parents:
-            raise ValueError(f"{named}: its scratch folder holds the input {str(source)!r}: expected another file")
+        if source.resolve() == scratch_of(path):
+            raise ValueError(f"{named}: its scratch file is the input {str(source)!r}: expected another file")
     if there and not path.is_file():
         raise ValueError(f"{named}: expected a file, not a folder or a device")
     if there and not overwrite and not has_card(path, _PHASE_CARD):
@@ -543,7 +544,23 @@ def _companion(
     by_image = _by_image(argument, fitting or same, 1 if n_images == 1 else None)
     if len(by_image) > n_images:
         raise ValueError(f"{argument}: {_names(same)}: 2 images for the 1 of {frame.name}: expected one")
-    return _mean(by_image[index if len(by_image) > 1 else 0])
+    exposures = by_image[index if len(by_image) > 1 else 0]
+    if argument == "darks":
+        _check_alike(exposures)
+    return _mean(exposures)
+
+
+def _check_alike(exposures: Sequence[_Exposure]) -> None:
+    """Require that darks of one image differ by no more than their noise."""
+    first, number = exposures[0]
+    for file, other in exposures[1:]:
+        change = file.images[other] - first.images[number]
+        middle = np.nanmedian(change)
+        if abs(middle) > _ALIKE * np.nanmedian(np.abs(change - middle)):
+            raise ValueError(
+                f"darks: {file.name} has {middle:+.6g} counts more than {first.name}, beyond the noise: expected "
+                "equal exposures; the darks of the clear frames are pupil_dark_files"
+            )
 
 
 def _difference(dark: CameraFile, frame: CameraFile) -> str:

@@ -77,8 +77,8 @@ def reconstruct(
     """Reconstruct all frames of camera files, and write phases or coefficients with a table as FITS.
 
     The files may be larger than the memory. The output appears when it is complete. An interrupted run keeps the
-    folder `.NAME.part` next to it. The same call goes on from there, and the file has the same bytes as that of an
-    undisturbed run. Damaged data of that folder are named by a warning, and computed again. No frame is left out:
+    file `.NAME.part` next to it. The same call goes on from there, and the file has the same bytes as that of an
+    undisturbed run. Damaged data of that file are named by a warning, and computed again. No frame is left out:
     frames that cannot be reconstructed are NaN, and flagged in the table.
 
     Parameters
@@ -128,7 +128,7 @@ def reconstruct(
     FileError
         A ValueError: if a file is broken, truncated, of another shape, unit or type, or lacks a keyword.
     ValueError
-        If `check_output` refuses the output, or something that zwfs did not make has the name of the folder.
+        If `check_output` refuses the output, or something that zwfs did not make has the name of that file.
     OSError
         If there is no space for the output.
 

@@ -21,14 +21,6 @@ from zwfs.frames import files as camera
 FRAME = np.arange(600, dtype=np.int64).reshape(20, 30) % 250
 
 
-def test_unsigned_numbers_of_an_extension_are_read_with_their_full_scale(tmp_path):
-    unit = fits.ImageHDU((FRAME + 40_000).astype(np.uint16), fits.Header({"WAVELEN": 633.0}))
-    fits.HDUList([fits.PrimaryHDU(), unit]).writeto(tmp_path / "a.fits")
-    file = camera.read(tmp_path / "a.fits")
-    np.testing.assert_array_equal(file.images[0], FRAME + 40_000.0)
-    assert (file.full_scale, file.keyword("WAVELEN")) == (65535, 633)
-
-
 def fits_bytes(*units):
     stream = io.BytesIO()
     fits.HDUList(list(units)).writeto(stream)

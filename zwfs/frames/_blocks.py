@@ -129,8 +129,8 @@ class FitsImages(Images):
         scale = _check.number("BSCALE", cards.get("BSCALE", 1))
         zero = _check.number("BZERO", cards.get("BZERO", 0))
         if bits > 0:
-            ends = (0, 255) if bits == 8 else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
-            highest = max(float(end) * scale + zero for end in ends)
+            type_ = np.iinfo("u1" if bits == 8 else f"i{bits // 8}")
+            highest = max(float(end) * scale + zero for end in (type_.min, type_.max))
             if "BLANK" in cards:
                 _check.integer("BLANK", cards["BLANK"], -(2**63))
                 return np.dtype(np.float32 if bits <= 16 else np.float64), highest

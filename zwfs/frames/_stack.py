@@ -42,15 +42,16 @@ class Segment(NamedTuple):
 
 
 def segments_of(
-    path: Path, n_images: int | None = None, second: Path | None = None, *, verify: bool = False
-) -> list[Segment]:
+    path: Path, n_images: int | None = None, second: Path | None = None, *, verify: bool = False,
+    max_bytes: int = MOST_BYTES,
+) -> list[Segment]:  # fmt: skip
     """Exposures of a file.
 
     An array (ny, nx) is one exposure, (n, ny, nx) are n of one image each, and (n, 2, ny, nx) n of two images. An
     array (2, ny, nx) holds two exposures, or the two images of one if `n_images` is 2. Two arrays hold one image
     of each exposure: those of two files, or the two units of a file unless `n_images` is 1.
     """
-    arrays = blocks_of(path, verify=verify)
+    arrays = blocks_of(path, max_bytes, verify=verify)
     seconds = blocks_of(second) if second else []
     for array in (*arrays, *seconds):
         full, size = array.full, 8 * prod(array.full[-2:])

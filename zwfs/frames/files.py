@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from zwfs import _check
 from zwfs._images import nearest_good
 from zwfs._system import is_there, path_of, paths_of, write_file
-from zwfs.frames._blocks import MOST_BYTES, FileError, Images, ambiguous, blocks_of, file_and_unit
+from zwfs.frames._blocks import MOST_BYTES, FileError, Images, file_and_unit
 from zwfs.frames._fits import fits_content, fits_module, has_card
 from zwfs.frames._part import Cards, scratch_of
 from zwfs.frames._stack import segments_of
@@ -41,7 +41,6 @@ _ALIKE = 5.0  # median absolute deviations by which two darks may differ
 # Header card of a phase map: no other file is replaced.
 _PHASE_CARD = b"CREATOR = 'zwfs "
 _LONGEST = 240  # bytes of a file name; a partial file has a few more, and most file systems allow 255
-_MANY = 6  # files that a message does not list
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ class CameraFile:
     Attributes
     ----------
     images : ndarray of float64, shape (n, ny, nx)
-        NaN where a pixel is no number.
+        NaN where a pixel is no number, or saturated in one of several exposures.
     name : str
         Of the file, without its folder.
     sha256 : str
@@ -64,8 +63,6 @@ class CameraFile:
         Of the file, absolute. `write_phase` never replaces it.
     n_exposures : int
         Exposures of which the images are the mean.
-    saturated : ndarray of bool, shape (n, ny, nx), optional
-        Pixels that are saturated in one of the exposures; if left out, `images` looks for them.
     """
 
     images: NDArray[np.float64]
@@ -75,7 +72,6 @@ class CameraFile:
     full_scale: float = np.inf
     path: Path | None = None
     n_exposures: int = 1
-    saturated: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         images = _check.real_array("images", self.images)
@@ -132,9 +128,8 @@ def read(path: str | Path, *, max_bytes: int = MOST_BYTES, max_images: int = 2) 
     ImportError
         If astropy is needed and missing.
     FileError
-        A ValueError: if the file is of another kind, broken, too large, holds no image, too many of them, several
-        units that do not belong together, an array that is neither (ny, nx) nor (n, ny, nx), or numbers that are
-        not real.
+        A ValueError: if the file is of another kind, broken, too large, or holds no image, too many of them,
+        units that do not belong together, or numbers that are not real.
 
     Examples
     --------
@@ -155,19 +150,16 @@ def read(path: str | Path, *, max_bytes: int = MOST_BYTES, max_images: int = 2) 
     file, _ = file_and_unit(path)
     if file.is_file() and file.stat().st_size > max_bytes:
         raise FileError(f"{file.name}: it is larger than {max_bytes} bytes: expected at most max_bytes")
-    arrays = blocks_of(path, max_bytes, verify=True)
-    first, shapes = arrays[0], [array.full for array in arrays]
-    if len(arrays) > 2 or (len(arrays) == 2 and (shapes[0] != shapes[1] or len(shapes[0]) != 2)):
-        raise ambiguous(arrays)
-    shape = shapes[0] if len(arrays) == 1 else (2, *shapes[0])
-    if len(shape) not in (2, 3) or min(shape) < 1 or (len(shape) == 3 and shape[0] > max_images):
-        expected = f"(ny, nx), or (n, ny, nx) with n up to {max_images}"
-        raise FileError(f"{first.name}: its shape is {shape}: expected {expected}")
+    segments = segments_of(path, verify=True, max_bytes=max_bytes)
+    first, n = segments[0].arrays[0], sum(segment.n * segment.n_images for segment in segments)
+    shape = n, *first.full[-2:]
+    if n > max_images:
+        raise FileError(f"{file.name}: its shape is {first.full}: expected (ny, nx), or up to {max_images} images")
     if (n_bytes := 8 * math.prod(shape)) > max_bytes:
         expected = f"at most max_bytes = {max_bytes}"
-        raise FileError(f"{first.name}: its shape is {shape}, {n_bytes} bytes as float64: expected {expected}")
-    images = [array.section(0, shape[0]).reshape(-1, *shape[-2:]) for array in arrays]
-    return _camera_file(first, np.concatenate(images).astype(np.float64))
+        raise FileError(f"{file.name}: its shape is {first.full}, {n_bytes} bytes as float64: expected {expected}")
+    images = np.concatenate([segment.read(0, segment.n).reshape(-1, *shape[1:]) for segment in segments])
+    return _camera_file(first, images.astype(np.float64))
 
 
 def read_all(
@@ -234,8 +226,8 @@ def read_all(
                     f"{name}: {file.name} has shape {file.images.shape[1:]}: expected {expected}, as the frames"
                 )
     return (
-        images(frames, darks, maps, saturation, n_images),
-        images(clear, pupil_darks or darks, maps, saturation, n_images),
+        images(frames, darks, maps, _check.LARGEST, n_images),  # saturated pixels are NaN already
+        images(clear, pupil_darks or darks, maps, _check.LARGEST, n_images),
         [*frames, *clear, *darks, *maps, *pupil_darks],
     )
 
@@ -283,28 +275,17 @@ def images(
     result: list[Image] = []
     for index, exposures in enumerate(recorded):
         counts = _mean(exposures)
-        saturated = [
-            _over(file, image := file.images[number], _usable(image), saturation)
-            if file.saturated is None
-            else file.saturated[number]
-            for file, number in exposures
-        ]
+        saturated = [_saturated(file, file.images[number], saturation) for file, number in exposures]
         first = exposures[0][0]
         dark = _companion("darks", darks, first, index, len(recorded))
         marked = _companion("bad_pixels", bad_pixels, first, index, len(recorded)) != 0
-        if marked.mean() > 0.5:
-            raise ValueError(
-                f"bad_pixels: {_names(bad_pixels)} marks {marked.mean():.1%} of the pixels as bad: expected 0 for "
-                "good pixels, and less than half bad; it looks like a map with 1 = good"
-            )
         with np.errstate(over="ignore", invalid="ignore"):
             counts = counts - dark
         bad = ~_usable(counts) | marked | np.any(saturated, axis=0)
         if bad.all():
             names = _names([*(file for file, _ in exposures), *darks, *bad_pixels])
             raise ValueError(f"{names}: all pixels are bad or saturated: expected an image")
-        name = _names([file for file, _ in exposures])
-        name = name if len(first.images) == 1 else f"{name}[{index}]"
+        name = _names([file for file, _ in exposures]) + f"[{index}]" * (len(first.images) > 1)
         result.append(Image(nearest_good(counts, ~bad), bad, name))
     return tuple(result)
 
@@ -460,9 +441,7 @@ _Exposure = tuple[CameraFile, int]  # a file, and the number of the image in it
 
 
 def _names(files: Sequence[CameraFile]) -> str:
-    """Names of files for a message; of many the first one."""
-    names = list(dict.fromkeys(file.name for file in files)) or ["files"]
-    return ", ".join(names) if len(names) < _MANY else f"{names[0]} and {len(names) - 1} others"
+    return ", ".join(dict.fromkeys(file.name for file in files)) or "files"
 
 
 def _camera_file(array: Images, images: NDArray, **settings: Any) -> CameraFile:
@@ -472,7 +451,7 @@ def _camera_file(array: Images, images: NDArray, **settings: Any) -> CameraFile:
 
 
 def _averaged(path: Path, n_images: int | None, saturation: float | None) -> CameraFile:
-    """Mean exposure of a file, read in pieces, with the pixels that are saturated in any exposure."""
+    """Mean exposure of a file, read in pieces: NaN where it is saturated once, or never a number."""
     segments = segments_of(path, n_images, verify=True)
     first = segments[0].arrays[0]
     shape = segments[0].n_images, *first.full[-2:]
@@ -481,28 +460,25 @@ def _averaged(path: Path, n_images: int | None, saturation: float | None) -> Cam
     for segment in segments:
         for start in range(0, segment.n, step):
             for exposure in segment.read(start, min(start + step, segment.n)).astype(np.float64):
+                saturated |= [_saturated(first, image, saturation) for image in exposure]
                 good = _usable(exposure)
-                for image, usable, over in zip(exposure, good, saturated, strict=True):
-                    over |= _over(first, image, usable, saturation)
                 total += np.where(good, exposure, 0)
                 n_used += good
-    mean = np.divide(total, n_used, out=np.full(shape, np.nan), where=n_used > 0)
-    n_exposures = sum(segment.n for segment in segments)
-    return _camera_file(first, mean, n_exposures=n_exposures, saturated=saturated)
+    mean = np.divide(total, n_used, out=np.full(shape, np.nan), where=~saturated & (n_used > 0))
+    return _camera_file(first, mean, n_exposures=sum(segment.n for segment in segments))
 
 
-def _over(
-    source: Images | CameraFile, image: NDArray, usable: NDArray, saturation: float | None
-) -> NDArray[np.bool_]:
-    """Saturated pixels of an exposure: from a level that is given, that a file states, or where many are equal."""
+def _saturated(source: Images | CameraFile, image: NDArray, level: float | None) -> NDArray[np.bool_]:
+    """Saturated pixels of an exposure: above a level that is given or stated, or where many are equal."""
+    usable = _usable(image)
     counts = image[usable]
-    if saturation is None and "SATURATE" in source.header:
-        saturation = _check.number(f"{source.name}: SATURATE", source.header["SATURATE"], 0, open_low=True)
-    if saturation is None:
+    if level is None and "SATURATE" in source.header:
+        level = _check.number(f"{source.name}: SATURATE", source.header["SATURATE"], 0, open_low=True)
+    if level is None:
         top = counts.max(initial=-np.inf)
         plateau = np.count_nonzero(counts == top) >= _PLATEAU and top > counts.min(initial=np.inf)
-        saturation = min(source.full_scale, top if plateau else np.inf)
-    return np.where(usable, image, -np.inf) >= saturation
+        level = min(source.full_scale, top if plateau else np.inf)
+    return usable & (image >= level)
 
 
 def _by_image(argument: str, files: Sequence[CameraFile], n_images: int | None) -> list[list[_Exposure]]:
@@ -537,6 +513,12 @@ def _companion(
     same = [file for file in files if file.images.shape[1:] == shape]
     if not same:
         raise ValueError(f"{argument}: {_names(files)} has shape {other}: expected {shape}, that of {frame.name}")
+    for file in same:
+        if argument == "bad_pixels" and (share := np.mean(file.images != 0)) > 0.5:
+            raise ValueError(
+                f"{argument}: {file.name} marks {share:.1%} of its pixels as bad: expected 0 for good pixels, and "
+                "less than half bad; it looks like a map with 1 = good"
+            )
     differences = [_difference(file, frame) if argument == "darks" else "" for file in same]
     fitting = [file for file, difference in zip(same, differences, strict=True) if not difference]
     if not fitting:

@@ -277,35 +277,26 @@ def test_compressed_images_are_read(tmp_path, dtype, algorithm):
 
 
 HOSTILE = {
-    "compressed bomb": lambda: _tile(gzip.compress(bytes(700 << 20), 9)),
+    "compressed bomb": lambda: _tile(gzip.compress(bytes(700 << 20), 1)),
+    "huge tile": lambda: _tile(b"0", 99_999),
     "more tiles than rows": lambda: fits_bytes(
         fits.PrimaryHDU(), fits.CompImageHDU(FRAME.astype(np.int32))
     ).replace(b"ZNAXIS2 =                   20", b"ZNAXIS2 =             99999999"),
     "larger than the file": lambda: fits_bytes(fits.PrimaryHDU(FRAME)).replace(
         b"NAXIS2  =                   20", b"NAXIS2  =           9999999999"
     ),
-    "larger NPY than the file": lambda: npy_bytes(FRAME).replace(b"(20, 30), }      ", b"(20, 9999999), }"),
+    "larger NPY than the file": lambda: npy_bytes(FRAME).replace(b"(20, 30), }     ", b"(20, 9999999), }"),
     "pickle": lambda: pickle.dumps(FRAME),
     "cut": lambda: fits_bytes(fits.PrimaryHDU(FRAME))[:-4000],
 }
 
 
-def _tile(packed):
-    """A file with one compressed tile, which the header calls small."""
-    table = fits.BinTableHDU.from_columns(
-        [fits.Column("COMPRESSED_DATA", "PB()", array=np.array([np.frombuffer(packed, np.uint8)], object))]
-    )
-    cards = {
-        "ZIMAGE": True,
-        "ZCMPTYPE": "GZIP_1",
-        "ZBITPIX": 16,
-        "ZNAXIS": 2,
-        "ZNAXIS1": 30,
-        "ZNAXIS2": 20,
-        "ZTILE1": 30,
-        "ZTILE2": 20,
-    }
-    table.header.update(cards)
+def _tile(packed, n=20):
+    """A file with one compressed tile that the header calls (n, n)."""
+    data = np.array([np.frombuffer(packed, np.uint8)], object)
+    table = fits.BinTableHDU.from_columns([fits.Column("COMPRESSED_DATA", "PB()", array=data)])
+    cards = {"ZIMAGE": True, "ZCMPTYPE": "GZIP_1", "ZBITPIX": 16, "ZNAXIS": 2}
+    table.header.update(cards | dict.fromkeys(("ZNAXIS1", "ZNAXIS2", "ZTILE1", "ZTILE2"), n))
     return fits_bytes(fits.PrimaryHDU(), table)
 
 

@@ -170,11 +170,12 @@ def _check_size(source: Source, unit: Any, index: int, name: str) -> None:
             n_tiles = prod(-(-n // size) for n, size in zip(unit.shape, tiles, strict=True))
             if table.header["NAXIS2"] != n_tiles:
                 raise ValueError(f"{table.header['NAXIS2']} compressed tiles: expected {n_tiles}")
+            most = 8 * prod(map(min, unit.shape, tiles))
             packed = str(table.header["ZCMPTYPE"]).startswith("GZIP")
             for column in {"GZIP_COMPRESSED_DATA", "COMPRESSED_DATA" * packed} & set(table.columns.names):
-                longest = int(table.data.view(np.ndarray)[column][..., 0].max(initial=0))
-                if longest * _DEFLATE > MOST_BYTES:
-                    raise ValueError(f"a compressed tile of {longest} bytes: expected tiles of a few rows")
+                most = max(most, _DEFLATE * int(table.data.view(np.ndarray)[column][..., 0].max(initial=0)))
+            if most > MOST_BYTES:
+                raise ValueError(f"a compressed tile may unpack to {most} bytes: expected at most {MOST_BYTES}")
     else:
         held = max(_size(source) - unit.fileinfo()["datLoc"], 0)
         if unit.size > held:

@@ -37,22 +37,6 @@ def column(name):
     return fits.BinTableHDU.from_columns([fits.Column(name=name, format="D", array=np.zeros(3))])
 
 
-NO_IMAGES = [
-    (b"not a picture", "its first bytes are those of neither a FITS nor an NPY file"),
-    (lambda: npy_bytes(np.array([{}], dtype=object)), "a broken NPY file"),
-    (lambda: npy_bytes(FRAME + 1j), "its numbers are complex128"),
-    (lambda: fits_bytes(fits.PrimaryHDU(), column("x")), "a FITS file without an image"),
-    (lambda: fits_bytes(fits.PrimaryHDU(np.zeros((5, 20, 30)))), r"its shape is \(5, 20, 30\)"),
-]
-
-
-@pytest.mark.parametrize(("content", "message"), NO_IMAGES)
-def test_files_that_are_no_image_are_refused(tmp_path, content, message):
-    (tmp_path / "a.fits").write_bytes(content if isinstance(content, bytes) else content())
-    with pytest.raises((TypeError, ValueError), match=rf"a\.fits: {message}"):
-        camera.read(tmp_path / "a.fits")
-
-
 def file_of(counts, header=None, full_scale=np.inf):
     return camera.CameraFile(np.asarray(counts, float)[np.newaxis], "a.fits", "", header or {}, full_scale)
 
@@ -276,21 +260,6 @@ def test_compressed_images_are_read(tmp_path, dtype, algorithm):
     assert found.full_scale == (np.inf if level else np.iinfo(dtype).max)
 
 
-HOSTILE = {
-    "compressed bomb": lambda: _tile(gzip.compress(bytes(700 << 20), 1)),
-    "huge tile": lambda: _tile(b"0", 99_999),
-    "more tiles than rows": lambda: fits_bytes(
-        fits.PrimaryHDU(), fits.CompImageHDU(FRAME.astype(np.int32))
-    ).replace(b"ZNAXIS2 =                   20", b"ZNAXIS2 =             99999999"),
-    "larger than the file": lambda: fits_bytes(fits.PrimaryHDU(FRAME)).replace(
-        b"NAXIS2  =                   20", b"NAXIS2  =           9999999999"
-    ),
-    "larger NPY than the file": lambda: npy_bytes(FRAME).replace(b"(20, 30), }     ", b"(20, 9999999), }"),
-    "pickle": lambda: pickle.dumps(FRAME),
-    "cut": lambda: fits_bytes(fits.PrimaryHDU(FRAME))[:-4000],
-}
-
-
 def _tile(packed, n=20):
     """A file with one compressed tile that the header calls (n, n)."""
     data = np.array([np.frombuffer(packed, np.uint8)], object)
@@ -300,11 +269,41 @@ def _tile(packed, n=20):
     return fits_bytes(fits.PrimaryHDU(), table)
 
 
-@pytest.mark.parametrize("kind", HOSTILE)
-def test_hostile_file_is_refused_before_its_numbers_are_read(tmp_path, kind):
-    (tmp_path / "a.fits").write_bytes(HOSTILE[kind]())
+REFUSED = {
+    "no picture": (lambda: b"not a picture", "its first bytes are those of neither a FITS nor an NPY file"),
+    "pickle": (lambda: pickle.dumps(FRAME), "its first bytes are those of neither"),
+    "objects": (lambda: npy_bytes(np.array([{}], dtype=object)), "a broken NPY file: .* Python objects"),
+    "complex": (lambda: npy_bytes(FRAME + 1j), "its numbers are complex128"),
+    "no image": (lambda: fits_bytes(fits.PrimaryHDU(), column("x")), "a FITS file without an image"),
+    "too many": (lambda: fits_bytes(fits.PrimaryHDU(np.zeros((5, 20, 30)))), r"its shape is \(5, 20, 30\)"),
+    "larger FITS than the file": (
+        lambda: fits_bytes(fits.PrimaryHDU(FRAME)).replace(
+            b"NAXIS2  =                   20", b"NAXIS2  =           9999999999"
+        ),
+        "truncated: it holds 5760 of the 2399999999760 bytes",
+    ),
+    "larger NPY than the file": (
+        lambda: npy_bytes(FRAME).replace(b"(20, 30), }     ", b"(20, 9999999), }"),
+        "a broken NPY file: .* greater than file size",
+    ),
+    "cut": (lambda: fits_bytes(fits.PrimaryHDU(FRAME))[:-4000], "truncated: it holds 1760 of the 4800 bytes"),
+    "compressed bomb": (lambda: _tile(gzip.compress(bytes(700 << 20), 1)), ".* a compressed tile may unpack to"),
+    "huge tile": (lambda: _tile(b"0", 99_999), ".* a compressed tile may unpack to 79998400008 bytes"),
+    "missing tiles": (
+        lambda: fits_bytes(fits.PrimaryHDU(), fits.CompImageHDU(FRAME.astype(np.int32))).replace(
+            b"ZNAXIS2 =                   20", b"ZNAXIS2 =             99999999"
+        ),
+        ".* 20 compressed tiles: expected 99999999",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_file_is_refused_before_its_numbers_are_read(tmp_path, kind):
+    content, message = REFUSED[kind]
+    (tmp_path / "a.fits").write_bytes(content())
     tracemalloc.start()
-    with pytest.raises(camera.FileError, match=r"a\.fits(\[1\])?: "):
+    with pytest.raises(camera.FileError, match=rf"a\.fits: {message}"):
         camera.read(tmp_path / "a.fits")
     assert tracemalloc.get_traced_memory()[1] < 32 << 20
     tracemalloc.stop()

@@ -262,6 +262,16 @@ def test_light_is_measured_in_each_frame(bench, calibration, faint):
     assert rms(found.phase - bright.phase) < 1.5 / np.sqrt(faint * PHOTONS)
 
 
+def test_calibration_takes_the_dark_of_the_frames(folder, bench):
+    for name, image in (("long", bench.dark + 100), ("short", bench.dark)):
+        fits.PrimaryHDU(np.stack([image - 1, image + 1])).writeto(f"{name}.fits")
+    fits.PrimaryHDU(bench.flat + 100.0, fits.Header(OPTICS)).writeto("frame.fits", overwrite=True)
+    made = calibrate(["frame.fits"], ["pupils.fits"], ["long.fits"], pupil_dark_files=["short.fits"])
+    np.testing.assert_array_equal(made.dark[0], bench.dark + 100)
+    expected = calibrate(["frame.fits"], ["pupils.fits"], ["long.fits"], pupil_dark_files=["dark.fits"])
+    np.testing.assert_array_equal(made(bench.frames[0] + 100.0).phase, expected(bench.frames[0] + 100.0).phase)
+
+
 # Flags
 
 
@@ -792,7 +802,8 @@ RECONSTRUCT = [
     "--quiet",
 ]  # fmt: skip
 CALIBRATE = [
-    "--dark dark.fits", "--bad-pixels bad.npy", "--diameter 1.1", "--phase-shifts 1.5 -1.5", "--no-registration",
+    "--dark dark.fits", "--pupil-dark dark.fits", "--images 1",
+    "--bad-pixels bad.npy", "--diameter 1.1", "--phase-shifts 1.5 -1.5", "--no-registration",
     "--pupil-centers 27.5 27.5 27.5 83.5 --pupil-diameter 40", "--exposure 1.1", "--saturation 60000",
     "--fit registration", "--iterations 10", "--tolerance 0.01",
 ]  # fmt: skip

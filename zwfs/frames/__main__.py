@@ -55,6 +55,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--frames", dest="frame_files", required=True, help="a frame, or one for each image", **files)
     add("--pupils", dest="pupil_files", required=True, help="clear frames, likewise", **files)
     add("--dark", dest="dark_files", default=(), help="counts without light", **files)
+    add("--pupil-dark", dest="pupil_dark_files", default=(), help="that of the clear frames", **files)
+    add("--images", dest="n_images", type=int, metavar="N", help="of an exposure, 1 or 2; default: from the files")
     add("--bad-pixels", dest="bad_pixel_files", default=(), help="maps, not 0 where bad", **files)
     add("--diameter", type=float, default=0.0, help="of the dimple in lambda/D; default: DIMPLE")
     add("--phase-shifts", type=float, nargs=2, default=(), metavar="RAD", help="default: THETA1, THETA2")

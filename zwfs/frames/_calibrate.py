@@ -19,7 +19,7 @@ from zwfs._system import path_of, paths_of
 from zwfs.frames._blocks import FileError, blocks_of
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
-from zwfs.frames.files import CameraFile, images, read, read_all
+from zwfs.frames.files import CameraFile, averaged, dark_of, images, read, read_all
 from zwfs.frames.pipeline import Measurement, Optics, reduce_frames
 from zwfs.frames.refine import _check_fit, fit
 from zwfs.frames.registration import Image, check_centers, check_diameter, find_pupils, register_frames
@@ -30,6 +30,7 @@ def calibrate(
     bad_pixel_files: Sequence[str | Path] = (), *, diameter: float = 0.0, phase_shifts: Sequence[float] = (),
     saturation: float | None = None, fitted: Sequence[str] = (), commands: str | Path | None = None,
     noise: float | None = None, gain: float = 1.0, n_iterations: int = 25, tolerance: float = 1e-3,
+    pupil_dark_files: Sequence[str | Path] = (), n_images: int | None = None,
     progress: Callable[[str], Any] | None = None, **settings: Any,
 ) -> Calibration:  # fmt: skip
     """Calibration from camera files: frames as those to come, and clear frames.
@@ -55,6 +56,8 @@ def calibrate(
     noise, gain : float, counts rms and electrons / count
         As for `fit_bench`.
     n_iterations, tolerance : int and float, radian
+    pupil_dark_files, n_images : sequence of str or Path, and int, optional
+        See `zwfs.frames.files.read_all`.
     progress : callable, optional
         With commands, called with a short text before each step of the fit.
     **settings
@@ -84,6 +87,8 @@ def calibrate(
     """
     progress = _check.callback("progress", progress)
     files = frame_files, pupil_files, dark_files, bad_pixel_files
+    if n_images is not None:
+        n_images = _check.integer("n_images", n_images, 1, 2)
     kept: dict[str, Any] = {"n_iterations": n_iterations, "tolerance": tolerance}
     diameter = _check.number("diameter", diameter, 0)
     _check.sequence("phase_shifts", phase_shifts, expected="a list of two numbers")
@@ -95,16 +100,16 @@ def calibrate(
             raise ValueError(
                 f"fitted = {_check.shown(fitted)}: expected none with commands, which fit all of them"
             )
-        states = _read_states(*files, commands, saturation)
+        states = _read_states(*files, commands, saturation, pupil_dark_files, n_images)
         header = states.header
         shifts: Any = tuple(phase_shifts) or (header.get("THETA1", np.pi / 2), header.get("THETA2", -np.pi / 2))
         optics = Optics(diameter or header.get("DIMPLE", 1.06), shifts)
         kept |= {"saturation": states.saturation, "bunit": str(header.get("BUNIT", ""))}
         place = settings.get("pupil_centers"), settings.get("pupil_diameter")
         return _from_commands(states, optics, *place, {"noise": noise, "gain": gain, "progress": progress}, kept)
-    masked, unmasked, sources = read_all(*files, saturation)
+    masked, unmasked, sources = read_all(*files, saturation, pupil_dark_files=pupil_dark_files, n_images=n_images)
     first = len(frame_files) + len(pupil_files)
-    darks = [image for source in sources[first : first + len(dark_files)] for image in source.images]
+    dark = dark_of(sources[: len(frame_files)], sources[first : first + len(dark_files)], n_images)
     try:
         optics = sources[0].optics(diameter, phase_shifts)
         _check_fit("fitted", fitted, optics)
@@ -112,7 +117,7 @@ def calibrate(
         if saturation is None:
             saturation = sources[0].keyword("SATURATE") if "SATURATE" in sources[0].header else np.inf
         kept |= {"saturation": saturation, "bunit": str(sources[0].header.get("BUNIT", ""))}
-        return Calibration.of(reduce_frames(registered, optics), np.stack(darks) if darks else None, **kept)
+        return Calibration.of(reduce_frames(registered, optics), dark, **kept)
     except ValueError as error:  # any of the files can be the cause
         raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
 
@@ -207,11 +212,12 @@ class _States(NamedTuple):
 def _read_states(
     frame_files: Sequence[str | Path], pupil_files: Sequence[str | Path], dark_files: Sequence[str | Path],
     bad_pixel_files: Sequence[str | Path], commands: str | Path, saturation: float | None,
+    pupil_dark_files: Sequence[str | Path] = (), n_images: int | None = None,
 ) -> _States:  # fmt: skip
     """Read camera files of known states; the parameters are those of `calibrate`."""
     phases = read(commands, max_images=2**20).images
-    frames, stack = _cube("frame_files", frame_files, 0)
-    clear, _ = _cube("pupil_files", pupil_files, frames.shape[1])
+    frames, stack = _cube("frame_files", frame_files, n_images or 0)
+    clear, clear_stack = _cube("pupil_files", pupil_files, frames.shape[1])
     if frames.shape[1:] != clear.shape[1:]:
         raise FileError(
             f"{stack.firsts[0].name}: exposures of shape {frames.shape[1:]}: expected {clear.shape[1:]}"
@@ -221,12 +227,26 @@ def _read_states(
             f"{Path(commands).name}: {len(phases)} commands for {len(frames)} exposures: expected an exposure for "
             "each, or the same number for each"
         )
-    darks, maps = ([read(path) for path in paths] for paths in (dark_files, bad_pixel_files))
-    mean = CameraFile(clear.mean(axis=0), Path(pupil_files[0]).name, "")
-    bad = np.stack([image.bad for image in images([mean], darks, maps, _check.LARGEST)])
-    dark = np.zeros(clear.shape[1:]) + (np.concatenate([one.images for one in darks]) if darks else 0)
+    n_images = clear.shape[1]
+    kinds = {"dark_files": dark_files, "bad_pixel_files": bad_pixel_files, "pupil_dark_files": pupil_dark_files}
+    darks, maps, pupil_darks = (
+        [averaged(path, n_images, np.inf) for path in paths_of(name, paths)] for name, paths in kinds.items()
+    )
+    means = [
+        CameraFile(cube.mean(axis=0), source.firsts[0].name, "", source.header)
+        for cube, source in ((frames, stack), (clear, clear_stack))
+    ]
+    bad = np.stack([image.bad for image in images(means[1:], (), maps, _check.LARGEST)])
+    dark, clear_dark = (
+        np.zeros(clear.shape[1:]) if values is None else values
+        for values in (dark_of(means[:1], darks), dark_of(means[1:], pupil_darks or darks))
+    )
+    bad |= ~np.isfinite(dark + clear_dark)
     level = stack.saturation if saturation is None else saturation
-    clear, frames = (np.where(bad | ~(one < level), np.nan, one - dark) for one in (clear, frames))
+    clear, frames = (
+        np.where(bad | ~(one < level), np.nan, one - less) for one, less in ((clear, clear_dark), (frames, dark))
+    )
+    dark = np.nan_to_num(dark)
     frames = frames.reshape(len(phases), -1, *frames.shape[1:])
     return _States(frames, clear, phases, dark, stack.header, level)
 

@@ -215,8 +215,8 @@ def read_all(
         n_images = _check.integer("n_images", n_images, 1, 2)
     if saturation is not None:
         saturation = _check.number("saturation", saturation, 0, open_low=True)
-    frames, clear = ([_averaged(path, n_images, saturation) for path in paths] for paths in kinds[:2])
-    darks, maps, pupil_darks = ([_averaged(path, n_images, np.inf) for path in paths] for paths in kinds[2:])
+    frames, clear = ([averaged(path, n_images, saturation) for path in paths] for paths in kinds[:2])
+    darks, maps, pupil_darks = ([averaged(path, n_images, np.inf) for path in paths] for paths in kinds[2:])
     shapes = {file.images.shape[1:] for file in (*frames, *clear)}
     for name, files in zip(names[2:], (darks, maps, pupil_darks), strict=True):
         for file in files:
@@ -288,6 +288,17 @@ def images(
         name = _names([file for file, _ in exposures]) + f"[{index}]" * (len(first.images) > 1)
         result.append(Image(nearest_good(counts, ~bad), bad, name))
     return tuple(result)
+
+
+def dark_of(
+    files: Sequence[CameraFile], darks: Sequence[CameraFile], n_images: int | None = None
+) -> NDArray[np.float64] | None:
+    """Dark that `images` subtracts from the same files, shape (n_images, ny, nx); None without darks."""
+    recorded = _by_image("files", files, n_images)
+    if not darks:
+        return None
+    firsts = [exposures[0][0] for exposures in recorded]
+    return np.stack([_companion("darks", darks, file, index, len(firsts)) for index, file in enumerate(firsts)])
 
 
 def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overwrite: bool = False) -> Path:
@@ -450,7 +461,7 @@ def _camera_file(array: Images, images: NDArray, **settings: Any) -> CameraFile:
     return CameraFile(images, array.path.name, sha256, array.header, array.full_scale, array.path, **settings)
 
 
-def _averaged(path: Path, n_images: int | None, saturation: float | None) -> CameraFile:
+def averaged(path: Path, n_images: int | None, saturation: float | None) -> CameraFile:
     """Mean exposure of a file, read in pieces: NaN where it is saturated once, or never a number."""
     segments = segments_of(path, n_images, verify=True)
     first = segments[0].arrays[0]

@@ -442,7 +442,9 @@ def test_method_of_another_sensor_is_refused(bench, calibration):
 
 
 def test_sigma_without_errors_of_the_calibration_is_the_scatter_of_many_exposures(bench, calibration):
-    calibration = replace(calibration, unexplained=calibration.unexplained[:0], slopes=np.zeros(0))
+    calibration = replace(
+        calibration, unexplained=calibration.unexplained[:0], slopes=np.zeros(0), displacements=np.zeros((0, 2))
+    )
     frames = np.stack([bench.expose(bench.sensor.measure(bench.screens[0])) for _ in range(60)])
     modes = zernike_basis(calibration.sensor.pupil, 9)
     found = calibration(frames)

@@ -69,7 +69,10 @@ class Grid:
             _interpolation(one - _CUT, size - 2 * _CUT, 3, near.ravel().astype(float)) for one in corners
         ]
         inner = ndimage.binary_erosion(pupil.inside)
-        self.rim = near & ~inner
+        rim = near & ~inner
+        rim[[0, -1]] = rim[:, [0, -1]] = False  # a slope needs neighbours
+        self.rim = np.flatnonzero(rim)
+        self.beyond = ~pupil.inside.ravel()[self.rim]  # points of the rim outside the pupil
         self.edge = _repair(pupil.inside & ~inner, inner)  # points of the edge, and the nearest ones off it
         self.filters = [_spline_filter(length, calibration.blur) for length in size]  # to their coefficients
         reached = np.stack([one.sum(axis=0) > 0 for one in self.touching])
@@ -138,7 +141,8 @@ class Grid:
         squares = np.sum((modelled - frames) ** 2, axis=(1, 2, 3), where=pupil.inside)
         where = good[:, np.newaxis]
         seen, known = (np.sum(one - self.offset, axis=(1, 2, 3), where=where) for one in (frames, modelled))
-        return np.sqrt(squares / (2 * pupil.n_points)), seen / known
+        with np.errstate(invalid="ignore", divide="ignore"):  # no point of a lost frame may be good
+            return np.sqrt(squares / (2 * pupil.n_points)), seen / known
 
     def displaced(self, phase: NDArray, frames: NDArray, good: NDArray) -> tuple[NDArray, NDArray]:
         """Displacement of both images on frames (k, 2, ny, nx), (k, 2) in pixels, and its standard error.
@@ -147,17 +151,22 @@ class Grid:
         inside takes its place. It is wrong by a little, which changes the two images in opposite directions, so
         only their sum counts.
         """
-        steady = phase.reshape(len(phase), -1).copy()
+        k, (_, width) = len(phase), phase.shape[1:]
+        steady = phase.reshape(k, -1).copy()
         steady[:, self.edge[0]] = steady[:, self.edge[1]]
-        modelled = self._modelled(steady.reshape(phase.shape)).sum(axis=1, dtype=float)
-        weight = 1.0 * (self.rim & (good | ~self.reconstruct.sensor.pupil.inside))
-        slopes = weight[:, np.newaxis] * np.stack(np.gradient(modelled, axis=(1, 2)), axis=1)
-        missing = weight * (modelled - frames.sum(axis=1, dtype=float))
-        inverse = np.linalg.pinv(np.einsum("kayx,kbyx->kab", slopes, slopes), hermitian=True)
-        shift = np.einsum("kab,kbyx,kyx->ka", inverse, slopes, missing, optimize=True)
-        missing -= np.einsum("ka,kayx->kyx", shift, slopes)
-        variance = np.sum(missing**2, axis=(1, 2)) / np.maximum(weight.sum(axis=(1, 2)) - 2, 1)
-        return shift, np.sqrt(variance[:, np.newaxis] * np.einsum("kaa->ka", inverse))
+        modelled, measured = (
+            one.sum(axis=1).reshape(k, -1) for one in (self._modelled(steady.reshape(phase.shape)), frames)
+        )
+        weight = good.reshape(k, -1)[:, self.rim] | self.beyond
+        around = ((self.rim + step, self.rim - step) for step in (width, 1))
+        slopes = weight * np.stack([(modelled[:, after] - modelled[:, before]) / 2 for after, before in around])
+        missing = weight * (modelled - measured)[:, self.rim]
+        normal = np.vecdot(slopes[:, np.newaxis], slopes).transpose(2, 0, 1)
+        inverse = np.linalg.pinv(normal.astype(float), hermitian=True)
+        shift = (inverse @ np.vecdot(slopes, missing).T[..., np.newaxis])[..., 0]
+        missing -= np.einsum("ka,akp->kp", shift, slopes)
+        variance = np.vecdot(missing, missing) / np.maximum(weight.sum(axis=1) - 2, 1)
+        return shift, np.sqrt(variance[:, np.newaxis] * inverse[:, (0, 1), (0, 1)])
 
     def _modelled(self, phase: NDArray) -> NDArray:
         """Frames of phases on the grid of the pupil, (k, 2, ny, nx)."""

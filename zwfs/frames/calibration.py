@@ -42,7 +42,7 @@ from zwfs.sensor import ZernikeSensor
 FORMAT = 2  # of the file; another number is refused
 _DIM = 0.1  # of the light of the calibration: a frame with less is compared with its noise
 _FAINT = 0.5  # of that light, from which down the noise of dark pixels counts
-_UNUSUAL = 2.0  # times the residual of the calibration's frames: a larger one is inconsistent
+_UNUSUAL = 2.5  # times the residual of the calibration's frames: a larger one is inconsistent
 _EXACT = 1e-3  # residual of frames without noise
 _MOVED_BY, _SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
 _SAME_LIGHT = 0.01  # relative difference of the light of frames and of their model that means little
@@ -88,13 +88,13 @@ class Calibration(Immutable):
         Mean intensity of the calibration's frames in the pupil.
     light_ratio : float
         Light of the calibration's frames over that of their model, which other frames are taken to share.
-    displacement : (float, float), pixels
-        Rows and columns by which the rim of the pupil on the calibration's frames differs from the model.
     unexplained, slopes : ndarray, shapes (n_states, ny, nx) and (n_states,), radian
         Errors of the phases of the calibration's frames, for `sigma`. They grow with the rms difference of phases
         at neighbouring points.
+    displacements : ndarray, shape (n_states, 2), pixels
+        Rows and columns by which the rim of the pupil on the calibration's frames differs from the model.
     residual : float
-        Rms difference of the calibration's frames and their model.
+        Rms difference of the calibration's frames and their model, the largest of all states.
     saturation : float, counts
         Pixels that reach it are saturated, the dark included.
     blur : float, pixels rms
@@ -127,9 +127,9 @@ class Calibration(Immutable):
     light: NDArray[np.float64]
     unexplained: NDArray[np.float32]
     slopes: NDArray[np.float64]
+    displacements: NDArray[np.float64]
     residual: float = 0.0
     light_ratio: float = 1.0
-    displacement: tuple[float, float] = (0.0, 0.0)
     saturation: float = np.inf
     blur: float = 0.0
     n_averaged: int = 1
@@ -146,7 +146,6 @@ class Calibration(Immutable):
         _check.flag("balance", self.balance)
         _check.number("residual", self.residual, 0)
         _check.number("light_ratio", self.light_ratio, 0, open_low=True)
-        _check.pair("displacement", self.displacement, _check.number)
         _check.number("blur", self.blur, 0, 10)
         _check.integer("n_averaged", self.n_averaged, 1)
         _check.integer("n_images", self.n_images, 1, 2)
@@ -166,6 +165,7 @@ class Calibration(Immutable):
         for name, size in {
             "places": (2, 2, *grid), "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2, *grid),
             "offset": (2, *grid), "light": (2,), "unexplained": (n_states, *grid), "slopes": (n_states,),
+            "displacements": (n_states, 2),
         }.items():  # fmt: skip
             array = _check.real_array(name, getattr(self, name))
             if array.shape != size:
@@ -223,15 +223,15 @@ class Calibration(Immutable):
             np.stack([undone(1, 0) - offset, undone(0, 1) - offset], axis=1), offset,
             bool(registered.balance and measurement.optics.opposite),
             (counts[:, good].mean(axis=1) - background) / unit,
-            np.zeros((0, *pupil.shape), np.float32), np.zeros(0), **settings,
+            np.zeros((0, *pupil.shape), np.float32), np.zeros(0), np.zeros((0, 2)), **settings,
         )  # fmt: skip
         frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
         phase = made._work.solve(frames, good[np.newaxis]).phase
         errors = sideways(made.sensor, phase[0], frames[0], good)[np.newaxis]
-        made = replace(made, unexplained=errors, slopes=slopes_of(phase, good))
+        shift = made._work.displaced(phase, frames, good[np.newaxis])[0]
+        made = replace(made, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift)
         residual, ratio = made._work.compared(phase, frames, good[np.newaxis])
-        row, column = made._work.displaced(phase, frames, good[np.newaxis])[0][0].tolist()
-        return replace(made, residual=float(residual[0]), light_ratio=float(ratio[0]), displacement=(row, column))
+        return replace(made, residual=float(residual[0]), light_ratio=float(ratio[0]))
 
     @classmethod
     def from_bench(
@@ -306,7 +306,7 @@ class Calibration(Immutable):
             _dark(dark, (n_images, *shape)),
             on_camera(bad[np.newaxis])[0] > 0, pupil.inside, background, flux * light[pupil.inside].mean(),
             np.zeros((2, 2, n, n)), np.zeros((2, n, n)), False, np.ones(2), np.zeros((0, n, n), np.float32),
-            np.zeros(0), blur=masks["blur"], n_averaged=n_averaged, commanded=True, **settings,
+            np.zeros(0), np.zeros((0, 2)), blur=masks["blur"], n_averaged=n_averaged, commanded=True, **settings,
         )  # fmt: skip
         good = pupil.inside & ~made._work.touched(made._work.bad[np.newaxis])[0]
 
@@ -322,11 +322,9 @@ class Calibration(Immutable):
         images = images if n_images == 2 else images[:, 0]
         made = replace(made, light_ratio=float(np.mean(made(images, saturation=np.inf).flux)))
         found = made(images, saturation=np.inf)
-        residual, slopes = float(np.sqrt(np.nanmean(found.residual**2))), slopes_of(found.filled, good)
-        row, column = np.nanmean(found.displacement, axis=0).tolist()
         return replace(
-            made, unexplained=unexplained(found.phase, phases), slopes=slopes, residual=residual,
-            displacement=(row, column),
+            made, unexplained=unexplained(found.phase, phases), slopes=slopes_of(found.filled, good),
+            displacements=found.displacement.astype(float), residual=float(np.nanmax(found.residual)),
         )  # fmt: skip
 
     def save(self, path: str | Path) -> None:
@@ -362,7 +360,7 @@ class Calibration(Immutable):
             found = values.pop("format")
             if found == FORMAT:
                 values |= {name: file[name] for name in file.files if name != "values"}
-                values |= {name: tuple(values[name]) for name in ("center", "shape", "displacement")}
+                values |= {name: tuple(values[name]) for name in ("center", "shape")}
                 shifts = {"phase_shifts": tuple(values["optics"]["phase_shifts"])}
                 made = cls(**values | {"optics": Optics(**values["optics"] | shifts)})
                 trial = made.dark + np.mean(made.background + made.unit * made.light)
@@ -399,7 +397,7 @@ class Calibration(Immutable):
         saturation : float, counts, optional
             Replaces that of the calibration.
         largest_residual : float, optional
-            Residual above which a frame is inconsistent. By default it is twice the residual of the
+            Residual above which a frame is inconsistent. By default it is 2.5 times the residual of the
             calibration's frames, plus the noise that frames with less light have.
         judge : bool
             Whether to compare the frames with their model, which takes a fifth of the time. Without it residual
@@ -575,7 +573,9 @@ class Calibration(Immutable):
                 np.maximum(frames, 0, out=frames)
             begin = None if start is None else start[which]
             solved = work.solve(frames, good[which], begin, method)
-            residual, ratio = work.compared(solved.phase, frames, good[which])
+            residual, ratio = np.full((2, len(which)), np.nan)
+            if judge:
+                residual, ratio = work.compared(solved.phase, frames, good[which])
             ratio, usual = ratio / self.light_ratio, self._usual(light, noise[which])
             unsure = np.hypot(_SAME_LIGHT, 2 * usual / np.sqrt(n_good[which]))
             cost = np.where(lit[which], (residual / usual) ** 2 + ((ratio - 1) / unsure) ** 2, 0)
@@ -590,11 +590,13 @@ class Calibration(Immutable):
         if judge and lit.any():
             residual[lit] = trial.residual[lit]
             shift, sigma[lit] = work.displaced(trial.phase[lit], trial.frames[lit], good[lit])
-            displacement[lit] = shift - self.displacement
+            displacement[lit] = shift - (self.displacements.mean(axis=0) if len(self.displacements) else 0)
         limits = _UNUSUAL * self._usual(trial.light, noise) if limit is None else limit
         flags = _BAD * (n_bad > 0) + _SATURATED * (n_saturated > 0) + _INCONSISTENT * (residual > limits)
         flags += np.where(lit, _NOT_CONVERGED * (~trial.converged & (self.tolerance > 0)), _LOST)
-        flags += _MOVED * np.any(np.abs(displacement) > np.fmax(_MOVED_BY, _SURE * sigma), axis=1)
+        scatter = self.displacements.std(axis=0) if len(self.displacements) else 0
+        moved = np.abs(displacement) > np.maximum(_MOVED_BY, _SURE * np.hypot(sigma, scatter))
+        flags += _MOVED * np.any(moved, axis=1)
         phase = np.where(good & lit[:, np.newaxis, np.newaxis], trial.phase, np.float32(np.nan))
         flux = np.where(lit, trial.light, relative).astype(np.float32)
         numbers = residual, displacement, trial.n_iterations, flags

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Immutable, read_only
+from zwfs._results import Result
 from zwfs.bounds import cramer_rao
 from zwfs.detector import Detector
 from zwfs.metrics import strehl, without_piston
@@ -281,8 +282,8 @@ def close_loop(
     return LoopRecord(*(np.stack(column, axis=1) for column in zip(*rows, strict=True)))
 
 
-@dataclass(frozen=True, eq=False)
-class HeldDrift:
+@dataclass(frozen=True, eq=False, repr=False)
+class HeldDrift(Result):
     """Residual of an integrator that holds a drift, per mode: see `hold_drift`.
 
     Attributes
@@ -294,6 +295,7 @@ class HeldDrift:
         Share of the photon noise.
     """
 
+    panels = (("gain", "gain"), ("lag", "lag (pm rms)"), ("noise", "noise (pm rms)"))
     gain: NDArray[np.float64]
     lag: NDArray[np.float64]
     noise: NDArray[np.float64]

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
@@ -21,6 +20,7 @@ from zwfs._camera.model import Camera, Exposure, Linearised
 from zwfs._camera.recording import PAD
 from zwfs._camera.solve import MapPrior, PhaseMap, Point, Problem, allowing, fine_phase, minimise
 from zwfs._images import nearest_good
+from zwfs._results import PhaseResult
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
@@ -37,8 +37,8 @@ _ALLOWED = 0.05  # error of the model in the first stage, over the light of a fu
 _DRAWS = 12  # for the error bars of a phase
 
 
-@dataclass(frozen=True, eq=False)
-class FittedPhase(NDArrayOperatorsMixin):
+@dataclass(frozen=True, eq=False, repr=False)
+class FittedPhase(PhaseResult):
     """Phase of a pair of frames; in arithmetic and for NumPy it is the array `phase`.
 
     Attributes
@@ -68,16 +68,6 @@ class FittedPhase(NDArrayOperatorsMixin):
     def exponent(self) -> float:
         """Exponent of the spectrum of the prior."""
         return self.prior.exponent
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
-        return np.array(self.phase, dtype=dtype, copy=True if copy is None else copy)
-
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **settings: Any) -> Any:
-        arrays = [one.phase if isinstance(one, FittedPhase) else one for one in inputs]
-        return getattr(ufunc, method)(*arrays, **settings)
-
-    def __getitem__(self, index: Any) -> Any:
-        return self.phase[index]
 
 
 @dataclass(frozen=True, eq=False)

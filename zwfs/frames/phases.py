@@ -8,6 +8,8 @@ from enum import IntFlag
 import numpy as np
 from numpy.typing import NDArray
 
+from zwfs._results import PhaseResult
+
 
 class Flag(IntFlag):
     """What is wrong with a frame; flags add up.
@@ -43,9 +45,9 @@ class Flag(IntFlag):
     MOVED = 32
 
 
-@dataclass(frozen=True, eq=False)
-class Phases:
-    """Phases of camera images; `...` is the batch of the exposures.
+@dataclass(frozen=True, eq=False, repr=False)
+class Phases(PhaseResult):
+    """Phases of camera images; `...` is the batch of the exposures. For NumPy it is the array `phase`.
 
     Attributes
     ----------

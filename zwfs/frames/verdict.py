@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs._images import nearest_good
+from zwfs._results import Result
 from zwfs.bounds import cramer_rao
 from zwfs.frames.pipeline import (
     NEAR,
@@ -66,8 +67,8 @@ class CameraNoise:
         return float(measurement.counts.mean() * measurement.registered.exposure * self.gain)
 
 
-@dataclass(frozen=True, eq=False)
-class Verdict:
+@dataclass(frozen=True, eq=False, repr=False)
+class Verdict(Result):
     """Judgement of a measured phase.
 
     Attributes
@@ -88,6 +89,7 @@ class Verdict:
         Sentences by their topic: fit, unseen data, scale, light, registration, and warnings if there are any.
     """
 
+    panels = (("sigma", "standard error (rad)"), ("score", "correlation of each frame"))
     score: NDArray[np.float64]
     control: NDArray[np.float64]
     inner: float
@@ -97,6 +99,9 @@ class Verdict:
     scales: tuple[float, float]
     strengths: tuple[float, float]
     findings: dict[str, str]
+
+    def __repr__(self) -> str:
+        return f"Verdict(explained={self.explained}, score={self.score.round(2)}, control={self.control.round(2)})"
 
     @property
     def explained(self) -> bool | None:

@@ -26,6 +26,7 @@ from zwfs import _check
 from zwfs._arrays import Immutable, Kind, per_kind, read_only
 from zwfs._likelihood import Noise
 from zwfs._propagator import Propagator, amplitude_map, angle, propagator, pupil_maps, split, square, unit
+from zwfs._results import PhaseResult
 from zwfs.polychromatic import PolychromaticSensor
 from zwfs.sensor import Sensor, ZernikeSensor
 
@@ -38,8 +39,8 @@ _MOST_ITERATIONS = 2**31 - 1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Reconstruction:
-    """Result of a reconstruction; `...` is the batch of the frames.
+class Reconstruction(PhaseResult):
+    """Result of a reconstruction; `...` is the batch of the frames. For NumPy it is the array `phase`.
 
     The arrays belong to the caller: they are writable and share no memory with the frames or the reconstructor.
 

@@ -1,0 +1,64 @@
+"""Results as arrays, files and figures."""
+
+import json
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import zwfs
+
+
+@pytest.fixture(scope="module")
+def result():
+    pupil = zwfs.Pupil.circular(16)
+    sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
+    screens = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 8), 0.3, 2, seed=1)
+    return zwfs.MaximumLikelihood(sensor, photons=1000.0)(sensor.measure(screens))
+
+
+def test_a_result_is_its_phase_for_numpy(result):
+    np.testing.assert_array_equal(np.asarray(result), result.phase)
+    np.testing.assert_array_equal(2 * result - result, result.phase)
+    np.testing.assert_array_equal(result[0], result.phase[0])
+    assert np.nanstd(result) == np.nanstd(result.phase)
+
+
+@pytest.mark.parametrize("ending", [".fits", ".npz"])
+def test_a_saved_result_holds_all_arrays(tmp_path, result, ending):
+    path = tmp_path / f"result{ending}"
+    result.save(path)
+    if ending == ".fits":
+        with fits.open(path) as units:
+            found = {unit.name: unit.data for unit in units}
+            np.testing.assert_array_equal(units[0].data, result.phase)
+    else:
+        with np.load(path) as file:
+            found = {name.upper(): file[name] for name in file.files}
+            assert json.loads(str(file["values"])) == {}
+    for name in ("phase", "converged", "chi2", "frames"):
+        np.testing.assert_array_equal(found[name.upper()], getattr(result, name))
+
+
+def test_an_existing_file_stays_and_other_endings_are_refused(tmp_path, result):
+    path = tmp_path / "result.npz"
+    path.write_text("mine")
+    with pytest.raises(FileExistsError, match="expected a new name"):
+        result.save(path)
+    assert path.read_text() == "mine"
+    with pytest.raises(ValueError, match=r"ends with \.fits or \.npz"):
+        result.save(tmp_path / "result.txt")
+
+
+def test_plain_values_are_cards_of_the_header(tmp_path):
+    drift = zwfs.loop.HeldDrift(np.ones(3), np.arange(3.0), np.zeros(3))
+    drift.save(tmp_path / "drift.fits")
+    np.testing.assert_array_equal(fits.getdata(tmp_path / "drift.fits", "LAG"), drift.lag)
+
+
+def test_a_figure_shows_phase_and_standard_error(result):
+    figure = result.plot()
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels.count("row (pixel)") == 2
+    assert {"phase (rad)", "standard error (rad)"} <= set(labels)
+    assert len(repr(result).splitlines()) == 1

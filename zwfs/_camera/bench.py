@@ -32,7 +32,6 @@ from zwfs._camera.solve import (
     allowing,
     fine_phase,
     minimise,
-    settle,
 )
 from zwfs._images import radius, turning
 from zwfs.masks import Dimple
@@ -71,7 +70,7 @@ _STAGES = (
     _Stage(0.1, 0.1, 25, focus=False, divide=False),
     _Stage(0.05, 0.1, 25, focus=True, divide=True, signs=True),
     _Stage(0.01, 0.1, 35, focus=True, divide=True),
-    _Stage(0.0, 1e-3, 35, focus=True, divide=False),
+    _Stage(0.0, 4e-3, 25, focus=True, divide=False),
 )
 
 
@@ -116,8 +115,8 @@ class BenchFit:
     noise : float, counts rms
         Noise of a pixel without light, as given or as estimated.
     converged : bool
-        Whether the next step of the estimates, which the maps follow, promises to lower half the sum of squares by
-        less than 1.
+        Whether the last step of the estimates, which the maps follow, promised to lower half the sum of squares by
+        less than 0.3.
     remarks : tuple of str
         What does not fit together, in words.
     """
@@ -253,12 +252,11 @@ def fit_bench(
     report = _check.callback("progress", progress)
     report("dimple and order of the images")
     start = _coarse(data, diameter, shifts)
-    point = _fitted(data, *_problem(data, start, oversampling or 2), range(len(_STAGES)), n_steps, report)
-    if oversampling is None and np.mean(point.misfit) > 1:
-        point = _fitted(data, *_divided(data, point, 3), range(1, len(_STAGES)), n_steps, report)
+    fitted = _fitted(data, *_problem(data, start, oversampling or 2), range(len(_STAGES)), n_steps, report)
+    if oversampling is None and np.mean(fitted[0].misfit) > 1:
+        fitted = _fitted(data, *_divided(data, fitted[0], 3), range(1, len(_STAGES)), n_steps, report)
     report("error bars")
-    settled = settle(point, partial(_report_step, report, "error bars"))
-    return _result(data, *settled, start.reversed)
+    return _result(data, *fitted, start.reversed)
 
 
 class _Start(NamedTuple):
@@ -352,19 +350,21 @@ def _light_maps(light: Light, n_pixels: float) -> tuple[LightMap, ...]:
 def _fitted(
     data: Recording, problem: Problem, x: NDArray, numbers: range, n_steps: int,
     report: Callable[[str], Any],
-) -> Point:  # fmt: skip
-    """Return the point at which these stages of a fit end."""
+) -> tuple[Point, bool]:  # fmt: skip
+    """Return the point at which these stages of a fit end, and whether the last one has converged."""
     for number in numbers:
         stage = _STAGES[number]
         staged = _staged(data, problem, stage)
+        if not stage.allowed:  # with the true noise, steps need to know how the maps follow
+            staged = replace(staged, following=Eliminated(Point(staged, x)))
         name = f"stage {number + 1} of {len(_STAGES)}, {problem.camera.f} points along a pixel"
         settings: Any = n_steps, stage.n_inner, stage.enough, partial(_report_step, report, name)
-        point, _ = minimise(staged, x, *settings)
+        point, converged = minimise(staged, x, *settings)
         if stage.signs and np.mean(point.misfit) > _WRONG * _expected(problem, staged):
             others = [minimise(staged, one, *settings)[0] for one in _other_signs(point)]
             point = min(point, *others, key=lambda one: one.cost)
         problem, x = _next(data, point, stage.divide)
-    return point
+    return point, converged
 
 
 def _report_step(report: Callable[[str], Any], name: str, step: int) -> None:
@@ -411,6 +411,7 @@ def _divided(data: Recording, point: Point, f: int) -> tuple[Problem, NDArray]:
         camera=_camera(data, before.camera, f),
         weights=data.weights(point.model.images),
         light=light,
+        following=None,
         phase_map=PhaseMap(before.camera.n, f, _PHASE_PRIOR, data.n_pixels),
         light_maps=_light_maps(light, f * data.n_pixels),
     )
@@ -448,14 +449,12 @@ def _changes(data: Recording, point: Point) -> NDArray[np.float64]:
     return np.array(changes)
 
 
-def _result(
-    data: Recording, point: Point, converged: bool, equations: Eliminated, is_reversed: bool
-) -> BenchFit:  # fmt: skip
+def _result(data: Recording, point: Point, converged: bool, is_reversed: bool) -> BenchFit:
     images = point.model.images
     residuals = data.weights(images) * (images - data.counts)
     misfit = np.sum(residuals**2, axis=(1, 2)) / np.maximum(np.count_nonzero(data.good, axis=(1, 2)), 1)
     scale = max(1.0, float(np.mean(misfit)))
-    spread = equations.covariance(point, _changes(data, point), scale)
+    spread = Eliminated(point).covariance(point, _changes(data, point), scale)
     values = point.x[point.problem.n_white :]
     kinds = [one.kind for one in point.problem.free]
     blur = kinds.index("blur")
@@ -470,6 +469,7 @@ def _result(
     )
     remarks = tuple(_remarks(data, point, misfit, estimates, is_reversed))
     flat, light = (one[PAD:-PAD, PAD:-PAD] for one in (point.phase_means, point.light_means))
+    point = Point(replace(point.problem, following=None), point.x)  # which takes less memory
     return BenchFit(estimates, spread, flat, light, misfit, data.noise, converged, remarks, point)
 
 

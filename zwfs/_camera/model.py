@@ -499,6 +499,19 @@ class Linearised:
         total = np.sum(camera.turns.conj() * fields, axis=-3) * self._wave.conj()
         return Maps(total.real, rest, self.maps.mean * total.imag)
 
+    def unspread(self, weights: NDArray, mean: NDArray, rest: NDArray) -> NDArray[np.float64]:
+        """Sum of squares of the weighted changes of the images with the light of each point, if no light spread.
+
+        `mean` and `rest` are the derivatives of the maps by the light.
+        """
+        camera, out = self.camera, np.zeros(mean.shape)
+        for group, part in zip(camera.groups, self._parts, strict=True):
+            pixels = (self.arms[group.arm]["flux"] * weights[group.images]) ** 2
+            gain = self.optics.splines[group.arm].adjoint(pixels)[(..., *camera.window)]
+            field = mean * self._wave * camera.turns[group.states]
+            out += np.sum(gain * (_twice(part.ahead[(..., *camera.window)], field) + rest) ** 2, axis=0)
+        return out
+
     def slopes(self, index: int, wanted: Sequence[str]) -> NDArray[np.float64]:
         """Derivatives of one image by numbers of its arm or of the masks, (k, ny, nx)."""
         camera, optics, state = self.camera, self.optics, self.camera.exposures[index].state
@@ -551,4 +564,4 @@ def _differences(images: NDArray) -> NDArray[np.float64]:
 
 def _twice(one: NDArray, other: NDArray) -> NDArray[np.float64]:
     """2 Re(conj(one) other)."""
-    return 2 * (one.real * other.real + one.imag * other.imag)
+    return 2 * (one.conj() * other).real

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, linalg
+from scipy import fft, linalg, ndimage
 from scipy.interpolate import BSpline
 
 from zwfs._camera.light import KnownLight, Light
@@ -20,15 +20,16 @@ if TYPE_CHECKING:
     from zwfs._camera.explicit import Posterior
 
 _BINS = 24  # of spatial frequency, for the preconditioner
+_POINTS = 3.0  # response of the light of a single point that is taken, over the measured one
+_POWER, _WEIGHED = 0.15, (0.1, 1e3)  # of the weight of light at a place in a smooth map, and its limits
 _FAINTEST = 1e-3  # response of a spatial frequency, over the largest: a random probe measures no smaller ones
 _LEAST = 1e-3  # damping
 _DEPENDENT = 1e-12  # eigenvalue over the largest, below which directions depend on each other
 _ALIKE = 1e-13  # eigenvalue over the largest, below which numbers have the same effect
-_LAST = 12  # steps at the end of a fit
-_SHARES = 1.0, 0.5, 0.25, 0.1  # of such a step: the best one is taken
 _TOGETHER = 6  # vectors that are multiplied at once: with more, the arrays exceed the cache
-_N_MAPS = 80  # iterations for the minimum of the maps
-_N_FOLLOWED = 16  # iterations for the maps that follow the numbers
+_N_FOLLOWED = 6  # iterations for the maps that follow the numbers
+_N_CHANGES = 30  # iterations for the maps that follow a change of the images
+_SHARES = 0.0, 0.4, 0.7  # of the maps' own move, by which a step is shortened: the light of edges is not linear
 _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
 MISSED = 0.7
@@ -103,7 +104,7 @@ class LightMap:
     """White numbers to the change of the light on some points of the fine grid, where D has n_pixels points."""
 
     def __init__(self, where: NDArray, prior: MapPrior, n_pixels: float) -> None:
-        self.where, self.n = where, len(where)
+        self.where, self.n, self.prior = where, len(where), prior
         self.size = fft.next_fast_len(round(1.05 * self.n), real=True)
         self.colour = np.sqrt(prior.spectrum(self.size, n_pixels))
 
@@ -159,6 +160,7 @@ class Problem:
     values: NDArray[np.float64]  # all numbers; those that are free do not count
     free: Sequence[Free] = ()
     guide: Posterior | None = None  # explicit matrix; only where the phase alone is unknown
+    following: Eliminated | None = None  # how the maps follow the numbers at a point nearby
 
     @cached_property
     def places(self) -> list[list[int]]:
@@ -273,7 +275,7 @@ class Point:
         gradient = problem.joined(maps.phase, maps.mean * mean + maps.rest * rest)
         gradient[:n] += self.x[:n]
         gradient[n:] = self.excess * problem.prior[1]
-        for image, (which, slopes) in zip(self.residuals, problem.columns(self.model), strict=True):
+        for image, (which, slopes) in zip(self.residuals, self.matrix.columns, strict=True):
             gradient[n + which] += slopes @ image.ravel()
         return gradient
 
@@ -355,8 +357,10 @@ class Matrix:
         return out
 
     @cached_property
-    def _spectra(self) -> list[NDArray[np.float64]]:
-        """Approximate eigenvalues of the matrix for each map, by random vectors."""
+    def filters(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        """Approximate matrix of each map, by random vectors: a factor at each place, and a spectrum between."""
+        if self.problem.following:
+            return self.problem.following.filters
         rng = np.random.default_rng(0)  # the choice hardly changes the number of steps
         problem, zero, (mean, rest) = self.problem, self._zero, self._slopes
         out = []
@@ -364,14 +368,27 @@ class Matrix:
             where: NDArray = one.where if isinstance(one, LightMap) else self._light > 0.3
             probe = rng.choice([-1.0, 1.0], where.shape) * where
             images = self.model.apply(*((probe * mean, probe * rest, zero) if number else (zero, zero, probe)))
-            maps = self.model.adjoint(problem.weights**2 * images)
-            answer = (maps.mean * mean + maps.rest * rest) * where if number else maps.phase
-            response = self._response(probe, answer, one)
+            factor, response = np.ones((one.size,) * 2), np.zeros((one.size, one.size // 2 + 1))
+            if number and not one.prior.exponent:
+                gain = _POINTS * np.sum((problem.weights * images) ** 2) / np.sum(self._local, where=where)
+                factor[: one.n, : one.n] = np.sqrt(1 + gain * one.prior.rms**2 * self._local * where)
+            else:
+                maps = self.model.adjoint(problem.weights**2 * images)
+                answer = (maps.mean * mean + maps.rest * rest) * where if number else maps.phase
+                response = self._response(probe, answer, one)
+                if number:
+                    near = ndimage.gaussian_filter(self._local, problem.camera.f)
+                    factor[: one.n, : one.n] = np.clip(near / np.median(near[where]), *_WEIGHED) ** _POWER
             white = [rng.normal(size=(of.size,) * 2) * (of is one) for of in problem.maps]
-            white[number] = fft.irfft2(fft.rfft2(white[number]) / np.sqrt(1 + response), s=white[number].shape)
+            white[number] = fft.irfft2(fft.rfft2(white[number]) / np.sqrt(1 + response), s=factor.shape) / factor
             d = np.concatenate([*(each.ravel() for each in white), np.zeros(len(problem.free))])
-            out.append(float(d @ self.product(d)) / one.size**2 * (1 + response))
+            out.append((factor, float(d @ self.product(d)) / one.size**2 * (1 + response)))
         return out
+
+    @cached_property
+    def _local(self) -> NDArray[np.float64]:
+        """Response of the images to the light of each point, but for a factor: that of dark pixels is large."""
+        return self.model.unspread(self.problem.weights, *self._slopes) + 1e-300
 
     @cached_property
     def evidence(self) -> tuple[float, float]:
@@ -385,7 +402,7 @@ class Matrix:
         squares = float(np.sum(self.x[: size**2] ** 2))
         if guide:
             return self.cost + guide.log_determinant / 2, squares / max(guide.determined, 1)
-        spectrum = self._spectra[0]
+        spectrum = self.filters[0][1]
         twice = np.full(spectrum.shape[1], 2.0)  # half the plane stands for all of it
         twice[0] = 1
         twice[-1] = 1 + size % 2
@@ -411,29 +428,35 @@ class Matrix:
 
     def _filtered(self, d: NDArray, power: int) -> list[NDArray]:
         white, _ = self.problem.split(d)
-        return [
-            fft.irfft2(fft.rfft2(one) * response**power, s=one.shape[-2:]).reshape(*d.shape[:-1], -1)
-            for one, response in zip(white, self._spectra, strict=True)
-        ]
+        out = []
+        for one, (factor, spectrum) in zip(white, self.filters, strict=True):
+            filtered = fft.irfft2(fft.rfft2(one * factor**power) * spectrum**power, s=factor.shape)
+            out.append((filtered * factor**power).reshape(*d.shape[:-1], -1))
+        return out
 
     @cached_property
-    def _inverse_block(self) -> NDArray[np.float64]:
+    def _numbers(self) -> tuple[NDArray, NDArray]:
+        """How the maps follow the free numbers, and the inverse of the matrix of the numbers then."""
+        following = self.problem.following
+        if following:
+            return following.maps, following.inverse
         unit = np.sqrt(np.diagonal(self.block))
         scaled = self.block / np.outer(unit, unit) + 1e-9 * np.eye(len(unit))
-        return linalg.inv(scaled) / np.outer(unit, unit)
+        return np.zeros((len(unit), self.problem.n_white)), linalg.inv(scaled) / np.outer(unit, unit)
 
-    def precondition(self, r: NDArray) -> NDArray[np.float64]:
-        """Approximate inverse of the matrix times vectors."""
+    def precondition(self, r: NDArray, held: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Approximate inverse of the matrix times vectors, in which what is held stays."""
         if self.problem.guide:
             return self.problem.guide.inverse(r)
-        free = r[..., self.problem.n_white :]
-        return np.concatenate([*self._filtered(r, -1), free @ self._inverse_block if free.size else free], axis=-1)
+        n, (follow, inverse) = self.problem.n_white, self._numbers
+        free = np.where(held[n:], 0, (r[..., n:] - r[..., :n] @ follow.T) @ inverse)
+        return np.concatenate([np.concatenate(self._filtered(r, -1), axis=-1) - free @ follow, free], axis=-1)
 
     def scale(self, d: NDArray) -> NDArray[np.float64]:
         """Matrix of the damping times vectors."""
         if self.problem.guide:
             return self.problem.guide.scale(d)
-        free = np.diagonal(self.block) * d[..., self.problem.n_white :]
+        free = d[..., self.problem.n_white :] / np.diagonal(self._numbers[1])
         return np.concatenate([*self._filtered(d, 1), free], axis=-1)
 
     def solve(
@@ -452,7 +475,7 @@ class Matrix:
             return np.where(held, 0, one)
 
         r = free(np.atleast_2d(right))
-        x, z = np.zeros_like(r), free(self.precondition(r))
+        x, z = np.zeros_like(r), free(self.precondition(r, held))
         d, sizes = z, np.vecdot(r, z)
         goals = tolerance**2 * sizes
         for _ in range(n_inner):
@@ -463,7 +486,7 @@ class Matrix:
             inverse = linalg.pinvh(d @ along.T, rtol=_DEPENDENT)
             step = inverse @ (d @ r.T)
             x, r = x + step.T @ d, r - step.T @ along
-            z = free(self.precondition(r))
+            z = free(self.precondition(r, held))
             d, sizes = z - (inverse @ (along @ z.T)).T @ d, np.vecdot(r, z)
         return x.reshape(np.shape(right))
 
@@ -474,24 +497,29 @@ def minimise(
 ) -> tuple[Point, bool]:  # fmt: skip
     """Levenberg and Marquardt's method on all unknowns, until a step promises no more than a part of 1.
 
-    It ends earlier when a step promises less than `enough` of the cost. `report` is called before each step with
-    its number, from 1 on. Returns whether it has converged, too.
+    It ends earlier when a step promises less than `enough` of the cost. Where it is known how the maps follow the
+    numbers, both must hold, the first for the numbers alone, and the maps may do a part of their own move.
+    `report` is called before each step with its number, from 1 on. Returns whether it has converged, too.
     """
-    point = Point(problem, x)
+    point, following = Point(problem, x), problem.following
     damping, converged, promised = 1e-2, False, math.inf
     for step in range(n_steps):
-        if converged or promised <= enough * point.cost:
+        small = promised <= enough * point.cost
+        if (converged and small) if following else (converged or small):
             break
         report(step + 1)
         for _ in range(10):
             change = point.matrix.solve(-point.gradient, point.stuck, n_inner, 0.03, damping)
             promised = -float(point.gradient @ change) / 2
-            trial = point.moved(change)
+            own = following.own(change) if following else 0.0
+            shares = _SHARES if following else (0.0,)
+            trial = min((point.moved(change - share * own) for share in shares), key=lambda one: one.cost)
             gain = point.cost - trial.cost
             if gain >= 0 or promised < _SETTLED:
                 break
             damping *= 8
-        converged = promised < _SETTLED and damping < 0.1
+        moved = following.promised(change) if following else promised
+        converged = moved < _SETTLED and damping < 0.1
         if gain >= 0:
             point = trial
         share = gain / promised if promised > 0 else 1.0
@@ -505,33 +533,37 @@ class Eliminated:
 
     The maps follow a number by -X, with X = H_mm^-1 H_mp, and the residuals change by its effect E = J_p - J_m X.
     Schur's complement S = E^T E + X^T X + prior is the matrix of the numbers. The error of S is of second order in
-    that of X.
+    that of X. X at a point nearby is the start for that of another one.
     """
 
     def __init__(self, point: Point) -> None:
-        n, n_all, matrix = point.problem.n_white, len(point.x), point.matrix
+        n, n_all, matrix, before = point.problem.n_white, len(point.x), point.matrix, point.problem.following
         held = np.arange(n_all) >= n
         self._unit = np.sqrt(np.diagonal(matrix.block))
         along = np.array([matrix.along(number) / unit for number, unit in enumerate(self._unit)])
-        followed = matrix.solve(matrix.back(along), held, _N_FOLLOWED, 0.01)
+        followed, right = np.zeros((len(along), n_all)), matrix.back(along)
+        if before:
+            followed[:, :n] = before.maps / self._unit[:, None]
+            right -= [matrix.product(one) for one in followed]
+        followed += matrix.solve(right, held, _N_FOLLOWED, 0.01)
         self._effects = along - matrix.change(followed)
         self._x, self._e = followed[:, :n], self._effects.reshape(len(along), -1)
         self._known = self._x @ self._x.T + np.diag((point.problem.prior[1] / self._unit) ** 2)
         self._matrix = self._e @ self._e.T + self._known
+        self._inverse = linalg.pinvh(self._matrix, rtol=_ALIKE)
+        self.filters = matrix.filters
+        self.maps: NDArray[np.float64] = self._x * self._unit[:, None]
+        self.inverse: NDArray[np.float64] = self._inverse / np.outer(self._unit, self._unit)
 
-    def step(self, point: Point) -> tuple[NDArray[np.float64], float]:
-        """Step of all unknowns, and how much that of the numbers promises to lower the cost.
+    def promised(self, step: NDArray) -> float:
+        """How much the numbers of a step of all unknowns lower the cost."""
+        numbers = step[-len(self._unit) :] * self._unit
+        return float(numbers @ self._matrix @ numbers) / 2
 
-        The maps move to their own minimum and follow the numbers. The slope along the numbers is that at this
-        minimum, g_p - H_pm H_mm^-1 g_m.
-        """
-        n, numbers, matrix = point.problem.n_white, np.arange(len(point.x)) >= point.problem.n_white, point.matrix
-        maps = matrix.solve(point.gradient, numbers, _N_MAPS, 0.01)
-        move = ~point.stuck[n:]
-        slope = (point.gradient - matrix.product(maps))[n:] / self._unit * move
-        step = np.zeros_like(slope)
-        step[move] = -linalg.pinvh(self._matrix[np.ix_(move, move)], rtol=_ALIKE) @ slope[move]
-        return np.concatenate([-maps[:n] - self._x.T @ step, step / self._unit]), -float(slope @ step) / 2
+    def own(self, step: NDArray) -> NDArray[np.float64]:
+        """The part of a step of all unknowns in which maps do not follow the numbers."""
+        n = len(step) - len(self._unit)
+        return np.concatenate([step[:n] + step[n:] @ self.maps, np.zeros(len(step) - n)])
 
     def covariance(self, point: Point, changes: NDArray, scale: float) -> NDArray[np.float64]:
         """Covariance of the numbers: of the noise, of what the model misses, and of changes of the images.
@@ -539,39 +571,23 @@ class Eliminated:
         That of the noise is S^-1 times `scale`. Where the model misses something, residuals are alike over some
         pixels, and the scores E^T r of square blocks scatter more than noise makes them:
         S^-1 (sum of their squares + X^T X + prior) S^-1 replaces what is smaller. A change d of the images, over
-        their noise, moves the numbers by S^-1 E^T d. The errors of the model are taken to be a part of the rms of
-        these moves. Few changes are known, so the rms, over the noise, is that of all numbers of a kind, such as
-        the focus of both arms.
+        their noise, moves the numbers by S^-1 E^T d = S^-1 (E^T (d - J_m y) + X^T y), where y = H_mm^-1 J_m^T d
+        makes the error of second order. The errors of the model are taken to be a part of the rms of these moves.
+        Few changes are known, so the rms, over the noise, is that of all numbers of a kind, such as the focus of
+        both arms.
         """
-        inverse = linalg.pinvh(self._matrix, rtol=_ALIKE)
+        inverse, matrix, n = self._inverse, point.matrix, point.problem.n_white
         scores = _block_sums(np.sum(point.residuals * self._effects, axis=1))
         seen = np.diagonal(inverse @ (scores @ scores.T + self._known) @ inverse) / np.diagonal(inverse)
         grow = np.sqrt(np.maximum(scale, seen)) / self._unit
-        moved = inverse @ (self._e @ changes.reshape(len(changes), -1).T)
+        y = matrix.solve(matrix.back(changes), np.arange(len(point.x)) >= n, _N_CHANGES, 0.01)
+        alone = (changes - matrix.change(y)).reshape(len(changes), -1)
+        moved = inverse @ (self._e @ alone.T + self._x @ y[:, :n].T)
         squares = np.mean(moved**2, axis=1) / np.diagonal(inverse)
         kinds = np.array([one.kind for one in point.problem.free])
         alike = np.array([np.mean(squares[kinds == kind]) for kind in kinds])
         missed = MISSED**2 * alike * np.diagonal(inverse) / self._unit**2
         return inverse * np.outer(grow, grow) + np.diag(missed)
-
-
-def settle(point: Point, report: Callable[[int], Any]) -> tuple[Point, bool, Eliminated]:
-    """Take last steps of all unknowns, and judge by what the next one promises whether the fit has converged.
-
-    `report` is called before each step with its number, from 1 on.
-    """
-    equations = Eliminated(point)
-    step, promised = equations.step(point)
-    for number in range(_LAST):
-        report(number + 1)
-        trial = min((point.moved(share * step) for share in _SHARES), key=lambda one: one.cost)
-        if trial.cost >= point.cost:
-            break
-        point = trial
-        step, promised = equations.step(point)
-        if promised < 1:
-            break
-    return point, promised < 1, equations
 
 
 def _block_sums(images: NDArray) -> NDArray[np.float64]:

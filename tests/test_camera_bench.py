@@ -9,14 +9,14 @@ import pytest
 from scipy import ndimage
 
 from zwfs import Dimple, Pupil, ZernikeSensor
-from zwfs._camera import bench as fitting
-from zwfs._camera.bench import fit_bench
-from zwfs._camera.light import Light
-from zwfs._camera.model import Camera, Exposure, Linearised, Maps
-from zwfs._camera.recording import PAD, Recording
-from zwfs._camera.sensor import FittedSensor, unwrapped
-from zwfs._camera.solve import Eliminated, fine_phase
 from zwfs.frames import Calibration
+from zwfs.frames import _fit as fitting
+from zwfs.frames._fit import fit_bench
+from zwfs.frames._fitted import FittedSensor, unwrapped
+from zwfs.frames._light import Light
+from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
+from zwfs.frames._solver import Eliminated, fine_phase
+from zwfs.frames._states import PAD, Recording
 
 from .hcipy_bench import BEFORE, BORDER, CASES, RMS
 
@@ -175,7 +175,7 @@ def test_amplitude_goes_on_along_its_slope_to_the_edge(monkeypatch):
 
     continued = error()
     assert continued < 0.005
-    monkeypatch.setattr("zwfs._camera.light._STIFF", 1e9)
+    monkeypatch.setattr("zwfs.frames._light._STIFF", 1e9)
     assert error() > 3 * continued
 
 
@@ -276,7 +276,7 @@ def test_error_bars_hardly_change_with_more_iterations_for_the_maps(monkeypatch)
     changes = 0.01 * (point.problem.weights * point.model.images)[None]  # a part of which light and fluxes follow
     before = Eliminated(point).covariance(point, changes, 1.0)
     for name in ("_N_FOLLOWED", "_N_CHANGES"):
-        monkeypatch.setattr(f"zwfs._camera.solve.{name}", 24)
+        monkeypatch.setattr(f"zwfs.frames._solver.{name}", 24)
     after = Eliminated(point).covariance(point, changes, 1.0)
     np.testing.assert_allclose(*(np.sqrt(np.diagonal(one)) for one in (before, after)), rtol=0.25)
 
@@ -364,7 +364,7 @@ def test_evidence_chooses_a_prior_as_smooth_as_the_phase(monkeypatch):
     found = measured(smooth)
     assert found.exponent > measured(segments(bench, 0.3)).exponent
     # Control: a prior for rough phases amplifies the noise of the highest frequencies.
-    monkeypatch.setattr("zwfs._camera.sensor._EXPONENTS", (3.0,))
+    monkeypatch.setattr("zwfs.frames._fitted._EXPONENTS", (3.0,))
     assert bench.error(measured(smooth), smooth) > 1.5 * bench.error(found, smooth)
 
 

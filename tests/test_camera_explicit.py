@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from zwfs import Pupil
-from zwfs._camera.explicit import Explicit, Posterior
-from zwfs._camera.light import KnownLight
-from zwfs._camera.model import Camera, Exposure, Maps
-from zwfs._camera.solve import MapPrior, PhaseMap, Point, Problem
+from zwfs.frames._explicit import Explicit, Posterior
+from zwfs.frames._light import KnownLight
+from zwfs.frames._optics import Camera, Exposure, Maps
+from zwfs.frames._solver import MapPrior, PhaseMap, Point, Problem
 
 N, F, SHAPE = 24, 2, (30, 30)
 VALUES = np.array(
@@ -60,5 +60,5 @@ def test_images_without_a_good_pixel_leave_the_prior(guided):
 
 
 def test_large_pupil_has_no_explicit_matrix(guided, monkeypatch):
-    monkeypatch.setattr("zwfs._camera.explicit._MOST", 100)
+    monkeypatch.setattr("zwfs.frames._explicit._MOST", 100)
     assert Explicit.of(guided) is None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from zwfs import Dimple, Pupil, ZernikeSensor
-from zwfs._camera.model import Camera, Exposure, Linearised, Maps, names_of
+from zwfs.frames._optics import Camera, Exposure, Linearised, Maps, names_of
 
 N, F, SHAPE = 20, 2, (28, 28)
 EXPOSURES = [Exposure(0, 0, 0), Exposure(1, 1, 0), Exposure(2, None, 0), Exposure(0, 0, 1), Exposure(1, 1, 1)]

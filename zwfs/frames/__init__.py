@@ -43,11 +43,11 @@ from typing import TYPE_CHECKING
 from zwfs import _lazy
 
 if TYPE_CHECKING:
-    from zwfs._camera.bench import BenchFit, Estimate, fit_bench
-    from zwfs._camera.sensor import FittedPhase, FittedSensor
     from zwfs.frames import calibration, files, phases, pipeline, refine, registration, telemetry, verdict
     from zwfs.frames._blocks import FileError
     from zwfs.frames._calibrate import calibrate
+    from zwfs.frames._fit import BenchFit, Estimate, fit_bench
+    from zwfs.frames._fitted import FittedPhase, FittedSensor
     from zwfs.frames.calibration import Calibration
     from zwfs.frames.telemetry import reconstruct
     from zwfs.frames.verdict import CameraNoise, judge, order_of_images

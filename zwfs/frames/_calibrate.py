@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from zwfs import _check
-from zwfs._camera.bench import fit_bench
 from zwfs._images import nearest_good
 from zwfs._system import path_of, paths_of
 from zwfs.frames._blocks import FileError, blocks_of
+from zwfs.frames._fit import fit_bench
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
 from zwfs.frames.files import CameraFile, averaged, dark_of, images, read, read_all

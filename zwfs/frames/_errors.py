@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import nnls
 
-from zwfs._camera.recording import aligned, unknown_in, with_neighbours
 from zwfs._images import nearest_good
+from zwfs.frames._states import aligned, unknown_in, with_neighbours
 from zwfs.sensor import ZernikeSensor
 
 _GROWTH = 2, 4  # powers of slopes with which squares of errors grow: those of points, and of modes

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from zwfs._camera.bench import BenchFit
-from zwfs._camera.sensor import FittedSensor
+from zwfs.frames._fit import BenchFit
+from zwfs.frames._fitted import FittedSensor
 from zwfs.sensor import ZernikeSensor
 
 _SCREENS = 24  # random phases from which weights are learnt

@@ -21,16 +21,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Immutable, Kind, read_only
-from zwfs._camera.bench import BenchFit, places_of
 from zwfs._images import radius
 from zwfs._likelihood import Estimator, Noise
 from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._errors import Excess, sideways, slopes_of, unexplained
+from zwfs.frames._fit import BenchFit, places_of
+from zwfs.frames._flux import Trial, explained
 from zwfs.frames._grid import Grid
 from zwfs.frames._learnt import learnt, training
-from zwfs.frames._light import Trial, explained
 from zwfs.frames.phases import Flag, Phases
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames
 from zwfs.frames.registration import FRAMES

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg, ndimage, sparse
 
-from zwfs._camera.model import pooled
-from zwfs._camera.solve import PhaseMap, Point
+from zwfs.frames._optics import pooled
+from zwfs.frames._solver import PhaseMap, Point
 
 _MOST = 3000  # coefficients: with more, the factors take longer than conjugate gradients without them
 _APART = 8  # pixels between the coefficients of a comb

@@ -1,6 +1,6 @@
 """Optics of a bench from frames of a mirror in known states.
 
-`fit_bench` finds all unknowns of the model at once. `sensor` keeps what was fitted, and seeks only the phase of a
+`fit_bench` finds all unknowns of the model at once. `FittedSensor` keeps what was fitted, and seeks only the phase of a
 pair of frames.
 """
 
@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from zwfs import _check
-from zwfs._camera.light import Light
-from zwfs._camera.model import Camera, Exposure, Linearised, names_of
-from zwfs._camera.recording import PAD, Recording, aligned, centred
-from zwfs._camera.solve import (
+from zwfs._images import radius, turning
+from zwfs._results import Result
+from zwfs.frames._light import Light
+from zwfs.frames._optics import Camera, Exposure, Linearised, names_of
+from zwfs.frames._solver import (
     MISSED,
     Eliminated,
     Free,
@@ -33,7 +34,7 @@ from zwfs._camera.solve import (
     fine_phase,
     minimise,
 )
-from zwfs._images import radius, turning
+from zwfs.frames._states import PAD, Recording, aligned, centred
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
@@ -94,8 +95,8 @@ class Estimate(NamedTuple):
     at_limit: bool
 
 
-@dataclass(frozen=True, eq=False)
-class BenchFit:
+@dataclass(frozen=True, eq=False, repr=False)
+class BenchFit(Result):
     """Result of `fit_bench`.
 
     Attributes
@@ -121,6 +122,11 @@ class BenchFit:
         What does not fit together, in words.
     """
 
+    panels = (
+        ("flat", "phase without a command (rad)"),
+        ("light", "light, 1 = mean"),
+        ("misfit", "misfit of each image"),
+    )
     estimates: tuple[Estimate, ...]
     covariance: NDArray[np.float64]
     flat: NDArray[np.float64]

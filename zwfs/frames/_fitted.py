@@ -13,14 +13,14 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from zwfs import _check
-from zwfs._camera.bench import EXPLAINED, BenchFit, places_of
-from zwfs._camera.explicit import Explicit, Posterior
-from zwfs._camera.light import KnownLight
-from zwfs._camera.model import Camera, Exposure, Linearised
-from zwfs._camera.recording import PAD
-from zwfs._camera.solve import MapPrior, PhaseMap, Point, Problem, allowing, fine_phase, minimise
 from zwfs._images import nearest_good
 from zwfs._results import PhaseResult
+from zwfs.frames._explicit import Explicit, Posterior
+from zwfs.frames._fit import EXPLAINED, BenchFit, places_of
+from zwfs.frames._light import KnownLight
+from zwfs.frames._optics import Camera, Exposure, Linearised
+from zwfs.frames._solver import MapPrior, PhaseMap, Point, Problem, allowing, fine_phase, minimise
+from zwfs.frames._states import PAD
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
@@ -50,7 +50,7 @@ class FittedPhase(PhaseResult):
     misfit : float
         Mean square of the residuals over the noise.
     consistent : bool
-        Whether the model explains the frames within their noise.
+        Whether the model explains these frames and those of the fit within their noise.
     converged : bool
     prior : MapPrior
         Of the phase: `rms` (radian), `exponent` of the spectrum and `outer_scale` (D), as given or as chosen by
@@ -142,7 +142,8 @@ class FittedSensor:
         point, converged = _lowered(point, self.n_steps)
         misfit, phase = float(np.mean(point.misfit)), point.phase_means[PAD:-PAD, PAD:-PAD]
         bars = _error_bars(point) * math.sqrt(max(1.0, misfit))
-        return FittedPhase(phase, bars, misfit, misfit < EXPLAINED, converged, point.problem.phase_map.prior)
+        explained = misfit < EXPLAINED and self.fit.consistent
+        return FittedPhase(phase, bars, misfit, explained, converged, point.problem.phase_map.prior)
 
     def _chosen(self, start: Point) -> Point:
         """Phase with the prior that the evidence chooses."""

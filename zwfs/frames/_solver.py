@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy import fft, linalg, ndimage
 from scipy.interpolate import BSpline
 
-from zwfs._camera.light import KnownLight, Light
-from zwfs._camera.model import Camera, Linearised, names_of, pooled, symbol
+from zwfs.frames._light import KnownLight, Light
+from zwfs.frames._optics import Camera, Linearised, names_of, pooled, symbol
 
 if TYPE_CHECKING:
-    from zwfs._camera.explicit import Posterior
+    from zwfs.frames._explicit import Posterior
 
 _BINS = 24  # of spatial frequency, for the preconditioner
 _POINTS = 3.0  # response of the light of a single point that is taken, over the measured one

@@ -1,7 +1,7 @@
 """Optics of a bench from frames of a mirror in known states.
 
-`fit_bench` finds all unknowns of the model at once. `FittedSensor` keeps what was fitted, and seeks only the phase of a
-pair of frames.
+`fit_bench` finds all unknowns of the model at once. `FittedSensor` keeps what was fitted, and seeks only the phase
+of a pair of frames.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def noll_to_nm(j: int) -> tuple[int, int]:
 
 
 def zernike_basis(
-    pupil: Pupil, n_modes: int, *, orthonormal: bool = False, dtype: type = np.float64
+    pupil: Pupil, n_modes: int, *, orthonormal: bool | None = None, dtype: type = np.float64
 ) -> NDArray[np.floating]:
     """Zernike modes on a pupil: Noll 2 to `n_modes` + 1.
 
@@ -48,9 +48,9 @@ def zernike_basis(
     pupil : Pupil
     n_modes : int
         Number of modes, piston not counted.
-    orthonormal : bool
+    orthonormal : bool, optional
         Make the modes orthonormal over the sampled pupil (Gram-Schmidt in Noll's order, piston first). On an
-        obscured or segmented pupil the plain modes are not.
+        obscured or segmented pupil the plain modes are not. The default is True for a measured pupil, see `Pupil`.
     dtype : float32 or float64
 
     Returns
@@ -77,7 +77,7 @@ def zernike_basis(
     """
     _check.instance("pupil", pupil, Pupil)
     n_modes = _check.count("n_modes", n_modes, pupil.amplitude.size)
-    orthonormal = _check.flag("orthonormal", orthonormal)
+    orthonormal = pupil.measured if orthonormal is None else _check.flag("orthonormal", orthonormal)
     checked_dtype = _check.float_dtype("dtype", dtype)
     if n_modes >= pupil.n_points:
         raise ValueError(

@@ -38,6 +38,8 @@ class Pupil(Immutable):
         Number of the segment that a point belongs to, 0 outside. A pupil of one piece is segment 1.
     center : (float, float), pixels
         Row and column of the optical axis.
+    measured : bool
+        Whether the amplitude is that of an image (`from_amplitude`); then bases of modes are made orthonormal.
 
     Raises
     ------
@@ -58,12 +60,14 @@ class Pupil(Immutable):
     n_pixels: float
     segments: NDArray[np.int64]
     center: tuple[float, float]
+    measured: bool = False
 
     def __post_init__(self) -> None:
         amplitude = _image("amplitude", self.amplitude)
         inside = amplitude > 0
         _require_light("amplitude", inside)
         n_pixels = _diameter(self.n_pixels)
+        _check.flag("measured", self.measured)
         values = {
             "amplitude": read_only(_normalised(amplitude, inside)),
             "n_pixels": n_pixels,
@@ -198,7 +202,7 @@ class Pupil(Immutable):
         _require_light("image", inside)
         n_pixels = max(image.shape) if n_pixels is None else _check.number("n_pixels", n_pixels)
         center = _middle(image.shape) if center is None else center
-        return cls(np.where(inside, image, 0.0), n_pixels, inside.astype(int), center)
+        return cls(np.where(inside, image, 0.0), n_pixels, inside.astype(int), center, measured=True)
 
     @classmethod
     def from_segments(cls, segments: ArrayLike, amplitude: ArrayLike = 1.0) -> Pupil:

@@ -196,7 +196,7 @@ class FineCamera:
         self._sensor, self._n = ZernikeSensor(self.pupil, *sensor.masks), n
         # The corners of whole pixels reach beyond the unit circle of the modes: a wider circle holds them.
         wider = Pupil.from_amplitude(amplitude, n_pixels=(1 + 2 / sensor.pupil.n_pixels) * self.pupil.n_pixels)
-        self.modes = zernike_basis(wider, len(modes))
+        self.modes = zernike_basis(wider, len(modes), orthonormal=False)
 
     def mean(self, values: NDArray) -> NDArray:
         """Mean of fine values over each pixel."""

@@ -136,7 +136,7 @@ def tilt(pupil, size):
 
 
 def screen(pupil, rms, seed):
-    return rounded(pupil, power_law_screens(zernike_basis(pupil, 60), rms, 1, seed=seed)[0])
+    return rounded(pupil, power_law_screens(zernike_basis(pupil, 60, orthonormal=False), rms, 1, seed=seed)[0])
 
 
 def pistons(pupil, rms, seed):

@@ -12,6 +12,7 @@ from scipy import ndimage, optimize
 from zwfs._images import turning
 
 _NEARLY_ALL = 0.98  # of the points of an outline: a few may be noise
+_LIT = 0.2  # of the light of most rays: one with less ends in the dark
 _OUTER = 0.75  # pixels from the outermost points: those with less are on the circle around the pupil
 
 
@@ -36,8 +37,9 @@ def threshold(image: NDArray) -> float:
 def outline(image: NDArray, region: NDArray, level: float, diameter: float | None) -> Circle:
     """Circle around a pupil, to a fraction of a pixel; its diameter may be known.
 
-    The edge lies where rays from the centre cross half of their bright level for the last time. A region of bright
-    pixels gives the first centre and radius. Each pass then takes both from the circle around the edge points.
+    The edge lies where the light along a ray from the centre, less half of its bright level, sums up to the most:
+    neither a gap nor the noise of one sample moves it. A ray that ends in a missing segment has no edge. A region
+    of bright pixels gives the first centre and radius. Each pass then takes both from the circle around the edges.
     """
     region = ndimage.binary_fill_holes(region)
     row, column = ndimage.center_of_mass(region)
@@ -49,13 +51,12 @@ def outline(image: NDArray, region: NDArray, level: float, diameter: float | Non
         # Not beyond 1.08 radii: the next pupil may begin close to this one.
         reach = np.arange(0.7 * size, 1.08 * size, 0.05)
         rays = np.array([row + np.outer(sine, reach), column + np.outer(cosine, reach)])
-        light = ndimage.map_coordinates(image, rays, order=1, mode="constant", cval=dark)
+        light = ndimage.map_coordinates(image, rays, order=1, mode="constant", cval=dark) - dark
         # The bright level belongs to the ray, because the pupil may be lit unevenly.
-        bright = np.median(light[:, reach < 0.93 * size], axis=1, keepdims=True)
-        inside = light > (dark + bright) / 2
-        last = reach[inside.shape[1] - 1 - np.argmax(inside[:, ::-1], axis=1)]
-        edge = np.stack([row + last * sine, column + last * cosine], axis=1)
-        if not len(edge := edge[inside.any(axis=1)]):
+        bright = np.median(light[:, reach < 0.93 * size], axis=1)
+        last = reach[np.argmax(np.cumsum(light - bright[:, np.newaxis] / 2, axis=1), axis=1)]
+        edge = np.stack([row + last * sine, column + last * cosine], axis=1)[bright > _LIT * np.median(bright)]
+        if not len(edge):
             break
         row, column, size = _circle_along(edge, size) if diameter else _circle_around(edge)
     return Circle(float(row), float(column), float(2 * size))

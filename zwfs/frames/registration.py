@@ -32,6 +32,9 @@ _BLUR = 2.0  # pixels rms: finest detail that counts for registration
 # below this part of its value.
 _SURE, _SIGNIFICANT = 0.05, 0.1
 _EDGE, _AROUND = 3, 8  # pixels around the pupil: those that take part where the surroundings are there, and all
+# A pixel beyond all neighbours but one, by so many times their spread and noise: on frame and clear frame, on one.
+_ODD_ON_BOTH, _ODD = 0.5, 3.0
+_FAINT = 0.01  # of the brightest light: a pixel that is off by less does no harm
 FRAMES, CLEAR_FRAMES = slice(0, 2), slice(2, 4)  # of the four images
 _LARGEST_TURN, _LARGEST_STRETCH = 6.0, 0.06  # degrees, and relative, of the second image
 
@@ -123,6 +126,8 @@ class RegisteredFrames:
     placement : Placement
         Of the second clear frame with respect to the first. Its rotation and magnification are also those of the
         second frame.
+    n_odd : int
+        Hot and dead pixels of all images that were not marked as bad when given, and now are.
     """
 
     frames: tuple[Image, Image]
@@ -133,6 +138,7 @@ class RegisteredFrames:
     balance: bool = True
     exposure: float = 1.0
     placement: Placement = Placement(np.zeros(2))
+    n_odd: int = 0
 
     @property
     def images(self) -> tuple[Image, ...]:
@@ -228,6 +234,9 @@ def register_frames(
     them, too, and each is registered to its clear frame. That is less reliable, because the phase changes the look
     of gaps and edges.
 
+    Hot and dead pixels that are not yet marked as bad are found and marked: they are brighter or darker than all
+    their neighbours but one, by much on one image or by less on frame and clear frame alike.
+
     Parameters
     ----------
     frames : sequence of one or two Images
@@ -261,6 +270,11 @@ def register_frames(
         _check.sequence(name, given, Image)
         if len(given) not in (1, 2):
             raise ValueError(f"{name} holds {len(given)} images: expected 1 or 2")
+    given = *frames, *clear_frames
+    # The clear frames are judged alone, so that a pupil stands at the same place for all frames.
+    frames, clear_frames = _without_odd(frames, clear_frames), _without_odd(clear_frames)
+    marked = zip((*frames, *clear_frames), given, strict=True)
+    n_odd = sum(int(np.count_nonzero(image.bad & ~before.bad)) for image, before in marked)
     shape = clear_frames[0].counts.shape
     diameter = None if pupil_diameter is None else check_diameter(pupil_diameter, shape)
     centers = None if pupil_centers is None else check_centers(pupil_centers)
@@ -283,7 +297,8 @@ def register_frames(
         if not np.ptp(image.counts) > 0:
             raise ValueError(f"{image.name}: every pixel is {image.counts.flat[0]:.6g}: expected light")
     places = np.array([circle[:2] for circle in (*seen, *pupils)])
-    rough = RegisteredFrames(masked, clear, pupils, np.round(places - places[2]), background, balance, exposure)
+    origins = np.round(places - places[2])
+    rough = RegisteredFrames(masked, clear, pupils, origins, background, balance, exposure, n_odd=n_odd)
     return _register(rough, frames_too=moved) if subpixel else rough
 
 
@@ -307,8 +322,11 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> l
     diameter, in pixels, may be given.
     """
     smooth = ndimage.gaussian_filter(image.counts, 1.0)
+    remark = ""
+    if image.bad.mean() > 0.5:
+        remark = f" ({image.bad.mean():.4g} of its pixels are marked as bad: expected a map that is 0 where good)"
     if np.ptp(smooth) <= 1e-9 * np.abs(smooth).max(initial=1e-300):
-        raise ValueError(f"{image.name}: every pixel is {smooth.flat[0]:.6g}: expected light in a pupil")
+        raise ValueError(f"{image.name}: every pixel is {smooth.flat[0]:.6g}: expected light in a pupil{remark}")
     level = threshold(smooth)
     bright = ndimage.binary_opening(smooth > level, iterations=2)
     # Gaps between segments, and vanes, divide a pupil.
@@ -318,8 +336,9 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> l
     largest = np.flatnonzero((areas > 0.25 * areas.max(initial=0)) & (areas.max(initial=0) >= 50)) + 1
     if len(largest) != n_pupils:
         raise ValueError(
-            f"{image.name}: {len(largest)} bright regions as large as a pupil: expected {n_pupils}; "
-            "give the positions, or look for stray light"
+            f"{image.name}: {len(largest)} bright regions as large as a pupil: expected {n_pupils}"
+            f"{', because two images are needed, with different phase shifts' if n_pupils > 1 else ''}; "
+            f"give the positions, or look for stray light{remark}"
         )
     circles = [outline(smooth, labels == label, level, diameter) for label in largest]
     axis = int(np.argmax(np.ptp([circle[:2] for circle in circles], axis=0)))
@@ -397,6 +416,29 @@ def _locate(
             )
     first = _extend(pair[0], circles if shared else circles[:1])
     return (first, first if shared else _extend(pair[1], circles[1:])), (circles[0], circles[1])
+
+
+def _without_odd(images: Sequence[Image], others: Sequence[Image] = ()) -> tuple[Image, ...]:
+    """Images with hot and dead pixels marked as bad; `others` show the same pixels without or with the mask."""
+    shapes = [[image.counts.shape for image in given] for given in (images, others)]
+    marked = []
+    for index, image in enumerate(images):
+        sizes = _outstanding(image)
+        odd = sizes.max(axis=0) > _ODD
+        if shapes[0] == shapes[1]:
+            odd |= (np.minimum(sizes, _outstanding(others[index])) > _ODD_ON_BOTH).any(axis=0)
+        bad = image.bad | odd
+        marked.append(replace(image, counts=nearest_good(image.counts, ~bad), bad=bad) if odd.any() else image)
+    return tuple(marked)
+
+
+def _outstanding(image: Image) -> NDArray[np.float64]:
+    """How far each pixel is above, and below, its neighbours, (2, ny, nx), in units of their spread and noise."""
+    counts, ring = image.counts, np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
+    # One neighbour may be as hot.
+    low, middle, high = (ndimage.rank_filter(counts, rank, footprint=ring) for rank in (1, 4, -2))
+    unit = high - low + ndimage.uniform_filter(np.abs(counts - middle), 7) + _FAINT * np.ptp(middle)
+    return np.array([counts - high, low - counts]) / np.maximum(unit, 1e-300)
 
 
 def _extend(image: Image, circles: Sequence[Circle]) -> Image:

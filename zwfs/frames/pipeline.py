@@ -6,7 +6,7 @@ sensor are parameters of `Optics`, which `zwfs.frames.refine` fits. `predict_oth
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -36,6 +36,8 @@ _DARK = 0.1  # of the largest amplitude: a point with less is outside
 NEAR = 2  # pixels from a gap, vane or edge that count as near it
 _LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
 _HALF = 0.7  # of the amplitude around it: a point with less is lit in half or less
+_DEGREE = 4  # of the polynomials that describe how unlike the two arms are
+_CERTAIN = 3.0  # standard errors: less of a difference between the arms is noise
 _MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
 
 
@@ -120,6 +122,8 @@ class Measurement:
     flux_ratio : (float, float)
         Light of the first image in the pupil over that of the second: with the mask in, before the balance, and
         with the mask out.
+    gain : ndarray, shape (2, ny', nx') or (2, 1, 1)
+        Smooth gain of each arm, by the ratio of the clear frames; `intensity` still contains it.
     """
 
     registered: RegisteredFrames
@@ -132,6 +136,7 @@ class Measurement:
     counts: NDArray[np.float64]
     background: NDArray[np.float64]
     flux_ratio: tuple[float, float]
+    gain: NDArray[np.float64] = field(default_factory=lambda: np.ones((2, 1, 1)))
 
     @cached_property
     def good(self) -> NDArray[np.bool_]:
@@ -224,7 +229,10 @@ def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | No
     """Bring frames on the grid of the pupil and normalise them.
 
     The amplitude is common to both images, and follows from the mean of the clear frames, each scaled to the same
-    flux. A pixel that is lit in part has an area s with the amplitude A of its neighbours. With the reference wave
+    flux. If their ratio varies smoothly over the pupil, the arms are lit differently: all images of an arm are
+    divided by its gain, the square root of that ratio or its inverse.
+
+    A pixel that is lit in part has an area s with the amplitude A of its neighbours. With the reference wave
     r its mean intensity is s |A exp(i phi) + r|^2 + (1 - s) |r|^2, which is |s A exp(i phi) + r|^2 plus the
     constant `rest` = s (1 - s) A^2: the amplitude of the pixel is s A, and s A^2 is its light in the clear frames.
 
@@ -267,6 +275,7 @@ class ClearLight(NamedTuple):
     bad: NDArray[np.bool_]  # (ny, nx), points of the pupil at which a clear frame has a bad pixel
     counts: NDArray[np.float64]  # (2,), see `Measurement`
     background: NDArray[np.float64]  # (4,), see `Measurement`
+    gain: NDArray[np.float64]  # (2, ny, nx), of the arms
 
 
 def clear_light(registered: RegisteredFrames, pupil_background: float) -> ClearLight:
@@ -275,13 +284,15 @@ def clear_light(registered: RegisteredFrames, pupil_background: float) -> ClearL
     clear, bad = registered._on_grid(CLEAR_FRAMES)
     background = _backgrounds(registered) if registered.background else np.zeros(4)
     stop = radius((n, n), center) <= registered.diameter / 2
-    light, scale = mean_light(clear - background[2:, None, None], stop)
+    clear -= background[2:, None, None]
+    gain = _gains(clear, stop & ~bad.any(axis=0), center, registered.diameter)
+    light, scale = mean_light(clear / gain, stop)
     light = np.where(stop, np.maximum(light - pupil_background, 0), 0)
     amplitude = _amplitude(light, registered.diameter)
     pupil = Pupil.from_amplitude(amplitude, registered.diameter, center, _DARK)
     unit = float(np.mean(amplitude[pupil.inside] ** 2))
     rest = np.where(pupil.inside, light / unit - pupil.amplitude**2, 0)
-    return ClearLight(pupil, rest, bad.any(axis=0) & pupil.inside, scale * unit, background)
+    return ClearLight(pupil, rest, bad.any(axis=0) & pupil.inside, scale * unit, background, gain)
 
 
 def reduce_with(clear: ClearLight, registered: RegisteredFrames, optics: Optics, margin: int) -> Measurement:
@@ -299,16 +310,43 @@ def reduce_with(clear: ClearLight, registered: RegisteredFrames, optics: Optics,
             f"expected at most {_MOST_BAD:.0%}"
         )
     intensity = frames / (counts[:, None, None] * registered.exposure)
-    flux = intensity[inner][:, good].mean(axis=1)
+    flux = (intensity[inner] / clear.gain)[:, good].mean(axis=1)
     if np.any(flux <= 0):
         raise ValueError(f"the frames hold {flux} of the light of the clear frames: expected more than 0")
     if registered.balance and optics.opposite:
         intensity = intensity * (flux.mean() / flux)[:, None, None]
     flux = flux * counts
     ratio = flux[0] / flux[1], counts[0] / counts[1]
+    around = (0, 0), (margin, margin), (margin, margin)
     return Measurement(
-        registered, optics, intensity, pupil, clear.rest, bad, margin, counts, clear.background, ratio
-    )
+        registered, optics, intensity, pupil, clear.rest, bad, margin, counts, clear.background, ratio,
+        np.pad(clear.gain, around, "edge"),
+    )  # fmt: skip
+
+
+def _gains(images: NDArray, inside: NDArray, center: tuple[float, float], diameter: float) -> NDArray[np.float64]:
+    """Gains of two arms, (2, ny, nx), whose product is 1 and whose ratio is that of their clear frames.
+
+    The logarithm of the ratio is a polynomial in the pupil, and constant along a ray beyond it. Coefficients of
+    orthonormal polynomials shrink by their noise, to 0 below 3 standard errors.
+    """
+    mean = np.where(inside, images.mean(axis=0), 0)
+    lit = ndimage.binary_erosion(mean > np.median(mean[inside]) / 2, np.ones((3, 3)), NEAR)
+    lit &= (images > 0).all(axis=0)
+    rows, columns = (np.indices(lit.shape) - np.reshape(center, (2, 1, 1))) * 2 / diameter
+    beyond = np.maximum(np.hypot(rows, columns), 1)
+    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    terms = np.stack([(rows / beyond) ** i * (columns / beyond) ** j for i, j in powers], axis=-1)
+    if np.count_nonzero(lit) < 4 * len(powers):
+        return np.ones_like(images)
+    ratio = np.log(images[1, lit] / images[0, lit])
+    basis, triangle = np.linalg.qr(terms[lit])
+    found = basis.T @ ratio
+    noise = 1.48 * np.median(np.abs(ratio - basis @ found))  # robust standard deviation
+    found *= np.maximum(1 - (_CERTAIN * noise) ** 2 / np.maximum(found**2, 1e-300), 0)
+    found[0] = 0  # the scale of each image is measured apart
+    half = terms @ np.linalg.solve(triangle, found) / 2
+    return np.exp([-half, half])
 
 
 def mean_light(images: NDArray, inside: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -432,8 +470,9 @@ def prediction_error(measurement: Measurement, where: NDArray, n_iterations: int
 def upside_down(measurement: Measurement) -> Measurement:
     """Control of a measurement: its second frame upside down, so that the frames no longer belong together."""
     _check.instance("measurement", measurement, Measurement)
-    (first, second), (bad, other) = measurement.intensity, measurement.bad
-    return replace(measurement, intensity=np.stack([first, second[::-1]]), bad=np.stack([bad, other[::-1]]))
+    maps = measurement.intensity, measurement.bad, measurement.gain
+    intensity, bad, gain = (np.stack([first, second[::-1]]) for first, second in maps)
+    return replace(measurement, intensity=intensity, bad=bad, gain=gain)
 
 
 def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:
@@ -451,8 +490,8 @@ def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:
 
 
 def _scaled(measurement: Measurement) -> NDArray[np.float64]:
-    """Frames with the scale and the background of the optics."""
-    return measurement.intensity * measurement.optics.scale - measurement.optics.background
+    """Frames as those of equal arms, with the scale and the background of the optics."""
+    return measurement.intensity / measurement.gain * measurement.optics.scale - measurement.optics.background
 
 
 def _mix(frames: NDArray, measurement: Measurement) -> NDArray[np.float64]:

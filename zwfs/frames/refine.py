@@ -30,7 +30,7 @@ from zwfs.frames.pipeline import (
     reduce_with,
     upside_down,
 )
-from zwfs.frames.registration import Image, RegisteredFrames, register_frames
+from zwfs.frames.registration import _SURE, Image, RegisteredFrames, register_frames
 
 # Lowest and highest value, and a typical change, of each parameter of `fit`, and of a shift in pixels.
 _SHIFT_RANGE = (-3.0, 3.0, 0.3)
@@ -55,7 +55,8 @@ def fit(
     A least-squares search makes the misfit of the frames small on every second block of pixels, far from edges.
     The light next to the pupil counts as much as that in it: there no phase can hide an error of the model. On the
     other blocks each frame is then predicted from the other frame alone. The values are kept if the squared error
-    of both predictions falls by 15 %, and is also 15 % below that of a control: the second frame upside down.
+    of both predictions falls by 15 %, and is also 15 % below that of a control: the second frame upside down. The
+    misfit of both frames there, edges included, must fall, too.
 
     Parameters
     ----------
@@ -63,8 +64,8 @@ def fit(
     optics : Optics
         Start of the search.
     names : sequence of str
-        Parameters of `Optics` other than the phase shifts; "registration" stands for the shifts of all images
-        but the first clear frame, six numbers.
+        Parameters of `Optics` other than the phase shifts; "registration" stands for the shifts of both frames,
+        and of the second clear frame where registration was not sure of it to 0.05 pixels.
     n_iterations : int
         As for `recover_phase`.
     n_steps : int
@@ -88,7 +89,8 @@ def fit(
         return registered, optics
     # The unknowns are values of the optics, then a shift (rows, columns) of each of these images.
     values = [name for name in names if name in _RANGES]
-    images = [0, 1, 3] if "registration" in names else []
+    sure = np.all(registered.placement.sigma[:2] < _SURE)
+    images = ([0, 1] if sure else [0, 1, 3]) if "registration" in names else []
     n_shifts = 2 * len(images)
     start = [*(getattr(optics, name) for name in values), *[0.0] * n_shifts]
     low, high, step = np.transpose([*(_RANGES[name] for name in values), *[_SHIFT_RANGE] * n_shifts])
@@ -100,6 +102,8 @@ def fit(
     seen = even.copy()
     seen[before.window] &= far | ~before.pupil.inside
     unseen = far & ~even[before.window]
+    hidden = np.zeros_like(even)
+    hidden[before.window] = before.good & ~even[before.window]
 
     def moved(shifts: tuple[float, ...]) -> RegisteredFrames:
         origins = registered.origins.copy()
@@ -114,7 +118,7 @@ def fit(
     def trial(unknowns: tuple[float, ...]) -> Measurement:
         changes: dict[str, Any] = dict(zip(values, unknowns, strict=False))
         changed, shifts = replace(optics, **changes), unknowns[len(values) :]
-        light = clear(shifts[-2:], changed.pupil_background)
+        light = clear(shifts[4:], changed.pupil_background)
         return reduce_with(light, moved(shifts), changed, margin)
 
     @lru_cache(maxsize=1)  # a derivative begins where the search has just been
@@ -138,7 +142,11 @@ def fit(
     old, new, control = (
         prediction_error(one, unseen, n_iterations) for one in (before, after, upside_down(after))
     )
-    kept = after if np.all(new < (1 - _GAIN) * np.minimum(old, control)) else before
+    misfit, smaller = (
+        np.sum(recover_phase(one, n_iterations).mismatch[:, hidden] ** 2) for one in (before, after)
+    )
+    better = smaller < misfit and np.all(new < (1 - _GAIN) * np.minimum(old, control))
+    kept = after if better else before
     return kept.registered, kept.optics
 
 

@@ -43,7 +43,7 @@ _RANGES = {
     "unmasked": (0.0, 0.9, 0.1),
 }
 _BLOCKS = 8  # across the pupil: the search sees every second one
-_GAIN = 0.15  # of the squared error on unseen blocks, by which each frame must be predicted better
+_GAIN = 0.1  # of the squared error on unseen blocks, by which each frame must be predicted better
 _CHANGE = 0.1  # step of a derivative over the typical change: smaller steps amplify the jumps of single points
 
 
@@ -55,7 +55,7 @@ def fit(
     A least-squares search makes the misfit of the frames small on every second block of pixels, far from edges.
     The light next to the pupil counts as much as that in it: there no phase can hide an error of the model. On the
     other blocks each frame is then predicted from the other frame alone. The values are kept if the squared error
-    of both predictions falls by 15 %, and is also 15 % below that of a control: the second frame upside down. The
+    of both predictions falls by 10 %, and is also 10 % below that of a control: the second frame upside down. The
     misfit of both frames there, edges included, must fall, too.
 
     Parameters

@@ -11,7 +11,7 @@ from zwfs import Dimple, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, 
 from zwfs.bench import bench_error, write_bench
 from zwfs.bench.model import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.frames import files as camera
-from zwfs.frames.pipeline import Optics, predict_other, recover_phase, reduce_frames
+from zwfs.frames.pipeline import Optics, phase_of, predict_other, recover_phase, reduce_frames
 from zwfs.frames.refine import fit, steps
 from zwfs.frames.registration import (
     Image,
@@ -518,3 +518,24 @@ def test_seal_frames_that_do_not_belong_together_are_refused(seal, seal_steps):
     left, right = np.hsplit(frame.counts, 2)
     with pytest.raises(ValueError, match=r"the best shift of the images is .* the end of the search"):
         seal_steps(Image(np.hstack([left, right[::-1]]), frame.bad, "nonsense"))
+
+
+def test_first_look_is_that_of_the_single_steps():
+    bench = Bench(n_pixels=40)
+    frames, clear = bench.frames(), bench.clear_frames()
+    found = phase_of(frames + 100, clear + 100, np.full(clear[0].shape, 100.0))
+    images = ([Image(one, np.zeros(one.shape, bool)) for one in pair] for pair in (frames, clear))
+    expected = recover_phase(reduce_frames(register_frames(*images), Optics()))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("frames", "dark", "message"),
+    [
+        (np.ones((3, 10, 10)), None, r"frames has shape \(3, 10, 10\): expected \(ny, nx\), or \(2, ny, nx\)"),
+        (np.ones((2, 10, 10)), np.ones((3, 3)), r"dark has shape \(3, 3\): expected \(2, 10, 10\)"),
+    ],
+)
+def test_first_look_names_a_wrong_shape(frames, dark, message):
+    with pytest.raises(ValueError, match=message):
+        phase_of(frames, np.ones((2, 10, 10)), dark)

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from zwfs.frames._fit import BenchFit, Estimate, fit_bench
     from zwfs.frames._fitted import FittedPhase, FittedSensor
     from zwfs.frames.calibration import Calibration
+    from zwfs.frames.pipeline import phase_of
     from zwfs.frames.telemetry import reconstruct
     from zwfs.frames.verdict import CameraNoise, judge, order_of_images
 else:
@@ -68,6 +69,7 @@ __all__ = [
     "fit_bench",
     "judge",
     "order_of_images",
+    "phase_of",
     "phases",
     "pipeline",
     "reconstruct",

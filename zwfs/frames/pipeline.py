@@ -8,15 +8,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from zwfs import _check
 from zwfs._images import nearest_good, radius
-from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, RegisteredFrames, correlations
+from zwfs._results import PhaseResult
+from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Image, RegisteredFrames, correlations, register_frames
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
@@ -27,6 +28,7 @@ __all__ = [
     "MeasuredPhase",
     "Measurement",
     "Optics",
+    "phase_of",
     "predict_other",
     "recover_phase",
     "reduce_frames",
@@ -161,8 +163,8 @@ class Measurement:
         return ~self.bad & (radius(self.bad.shape[1:], center) > 0.53 * self.registered.diameter)
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredPhase:
+@dataclass(frozen=True, eq=False, repr=False)
+class MeasuredPhase(PhaseResult):
     """Phase of a pair of frames, and the agreement of its modelled frames with the measured ones.
 
     Attributes
@@ -223,6 +225,54 @@ class MeasuredPhase:
 
     def _inside(self, frames: NDArray) -> NDArray:
         return frames[(..., *self.measurement.window)][:, self.measurement.good]
+
+
+def phase_of(
+    frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None = None, **optics: Any
+) -> MeasuredPhase:
+    """Phase of a pair of camera frames, for a first look.
+
+    It does what `register_frames`, `reduce_frames` and `recover_phase` do one after the other.
+
+    Parameters
+    ----------
+    frames, clear_frames : array_like, shape (ny, nx) or (2, ny, nx), counts
+        One camera image with both pupils, or one for each: with the mask in, and with the mask out. NaN marks bad
+        pixels.
+    dark : array_like, shape (ny, nx) or (2, ny, nx), counts, optional
+        Counts without light, which are subtracted from both.
+    **optics
+        Parameters of `Optics`, such as `diameter` and `phase_shifts`.
+
+    Returns
+    -------
+    MeasuredPhase
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a shape is another one, or the pupils are not found.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.frames.pipeline import phase_of
+    >>> bench = Bench(n_pixels=40)
+    >>> phase_of(bench.frames(), bench.clear_frames(), diameter=bench.diameter).converged
+    True
+    """
+    known, less = Optics(**optics), 0 if dark is None else _check.real_array("dark", dark)
+    pair = []
+    for name, counts in (("frames", frames), ("clear_frames", clear_frames)):
+        images = _check.real_array(name, counts)
+        if images.ndim not in (2, 3) or images.shape[:-2] not in ((), (2,)):
+            raise ValueError(f"{name} has shape {images.shape}: expected (ny, nx), or (2, ny, nx) for two images")
+        if np.shape(less) not in ((), images.shape[-2:], images.shape):
+            raise ValueError(f"dark has shape {np.shape(less)}: expected {images.shape}, that of {name}")
+        images = np.atleast_3d(images - less).reshape(-1, *images.shape[-2:])
+        pair.append([Image(nearest_good(one, ok), ~ok, name) for one, ok in ((x, np.isfinite(x)) for x in images)])
+    return recover_phase(reduce_frames(register_frames(*pair), known))
 
 
 def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | None = None) -> Measurement:

@@ -24,6 +24,7 @@ class HcipyBench:
     diameter: float = 1.06
     shifts: tuple[float, float] = (np.pi / 2, -np.pi / 2)
     leakage: float = 0.0
+    unmasked: float = 0.0
     focus: tuple[float, float] = (0.0, 0.0)  # D^2 / lambda
     blur: float = 0.0  # pixels rms
     offsets: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))  # rows, columns
@@ -87,16 +88,26 @@ class HcipyBench:
         import hcipy
 
         field = hcipy.Field((self.amplitude * np.exp(1j * (phase + self.flat))).ravel(), self._grid)
-        waves = [hcipy.Wavefront(field)] * 2
+        waves = clear = [hcipy.Wavefront(field)] * 2
         if masked:
             waves = [self._optics[side].forward(waves[side]) for side in (0, 1)]
+        power = self._relayed(waves)
+        if masked:
+            power = [(1 - self.leakage) * power[k] + self.leakage * power[1 - k] for k in (0, 1)]
+        if masked and self.unmasked:
+            passed = self._relayed(clear)
+            power = [(1 - self.unmasked) * power[k] + self.unmasked * passed[k] for k in (0, 1)]
+        return np.stack([self._recorded(image, side) for side, image in enumerate(power)])
+
+    def _relayed(self, waves):
+        """Intensities of two waves behind the relays."""
+        import hcipy
+
         power = []
         for wave, distance in zip(waves, self.focus, strict=True):
             seen = hcipy.FresnelPropagator(self._grid, distance).forward(wave) if distance else wave
             power.append(np.abs(np.asarray(seen.electric_field).reshape(self._size, -1)) ** 2)
-        if masked:
-            power = [(1 - self.leakage) * power[k] + self.leakage * power[1 - k] for k in (0, 1)]
-        return np.stack([self._recorded(image, side) for side, image in enumerate(power)])
+        return power
 
     @functools.cached_property
     def _optics(self):
@@ -148,7 +159,7 @@ class HcipyBench:
     def truth(self):
         """True values of the numbers of a fit by their names, without flux and background."""
         out = {"diameter": self.diameter, "first": self.shifts[0], "second": self.shifts[1]}
-        out |= {"leakage": self.leakage, "blur": self.blur}
+        out |= {"leakage": self.leakage, "unmasked": self.unmasked, "blur": self.blur}
         for side in (0, 1):
             out[f"arm {side} focus"] = self.focus[side]
             out[f"arm {side} rotation"] = np.radians(self.rotations[side])
@@ -158,10 +169,9 @@ class HcipyBench:
         return out
 
     def pulls(self, fit):
-        """Errors of a fit over its error bars, by name; a leakage or blur of 0 is left out, as it is a limit."""
-        pairs = (
-            (fit[name], value) for name, value in self.truth.items() if value or name not in ("leakage", "blur")
-        )
+        """Errors of a fit over its error bars, by name; a share or blur of 0 is left out, as it is a limit."""
+        limits = "leakage", "unmasked", "blur"
+        pairs = ((fit[name], value) for name, value in self.truth.items() if value or name not in limits)
         return {one.name: (one.value - value) / one.sigma for one, value in pairs}
 
     def recording(self, n_commands=4, rms=0.5, seed=1):

@@ -419,3 +419,14 @@ def test_light_of_vanes_needs_a_finer_grid(monkeypatch):
     assert np.mean(fit.misfit) < 1 < 1.2 < coarse[0]
     for name in ("diameter", "first", "second"):
         assert fit[name].value == pytest.approx(bench.truth[name], rel=2e-3)
+
+
+@pytest.mark.slow
+def test_light_past_the_mask_widens_the_error_bars_of_what_it_resembles():
+    """A pair of opposite phase shifts, their leakage, and a share that no mask shifts have too few images."""
+    bench = HcipyBench(pixels=40, side=56, static=0.1, photons=5e3, unmasked=0.05, blur=0.3)
+    frames, clear, phases = bench.recording(2)
+    fit = fit_bench(frames, clear, phases, n_pixels=bench.pixels, noise=bench.noise, oversampling=2)
+    for name in ("first", "second", "leakage", "unmasked"):
+        assert abs(fit[name].value - bench.truth[name]) < 3 * fit[name].sigma
+    assert 0.01 < fit["first"].sigma < 0.1

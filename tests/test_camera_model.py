@@ -13,10 +13,10 @@ VALUES = np.array(
         *(3e-4, 0.3, -0.4, 0.01, 1.02, 10, 0.2),
         *(-2e-4, -0.2, 0.6, 0.02, 1.01, 12, 0.1),
         *(0, 0.1, 0.1, 0, 1, 9, 0.1),
-        *(1.1, 1.5, -1.4, 0.05, 0.7),
+        *(1.1, 1.5, -1.4, 0.05, 0.03, 0.7),
     ]
 )
-SCALE = np.array([1e-4, *[0.1] * 2, 0.01, 0.01, 1, 1] * 3 + [0.1] * 5)
+SCALE = np.array([1e-4, *[0.1] * 2, 0.01, 0.01, 1, 1] * 3 + [0.1] * 6)
 EDGES = np.random.default_rng(4).random((N * F, N * F)) < 0.2  # points that stand for their cells
 
 
@@ -39,7 +39,7 @@ def test_images_without_errors_are_those_of_the_sensor():
     pupil = Pupil.circular(N)
     phase = 0.4 * np.random.default_rng(2).normal(size=(N, N))
     still = Camera(N, SHAPE, N, EXPOSURES[:3], np.zeros((1, N, N)), 1, 1.5)
-    values = np.array([*[0, 0, 0, 0, 1, 1, 0] * 3, 1.06, np.pi / 2, -np.pi / 2, 0, 0.0])
+    values = np.array([*[0, 0, 0, 0, 1, 1, 0] * 3, 1.06, np.pi / 2, -np.pi / 2, 0, 0, 0.0])
     point = Linearised(still, Maps(pupil.amplitude, np.zeros((N, N)), phase), values)
     sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), extent=SHAPE[0] / N)
     fine = [np.abs(part.field[0]) ** 2 for part in point._parts[2:]]
@@ -53,7 +53,7 @@ def test_images_without_errors_are_those_of_the_sensor():
 
 
 def test_values_in_the_middle_of_a_point_become_means_over_its_cell():
-    values = np.array([*[0, 0, 0, 0, 1, 1, 0] * 3, 1.06, np.pi / 2, -np.pi / 2, 0, 0.0])
+    values = np.array([*[0, 0, 0, 0, 1, 1, 0] * 3, 1.06, np.pi / 2, -np.pi / 2, 0, 0, 0.0])
 
     def image(f, means=True):
         # Waves of six pixels on a square pupil whose edges are those of pixels.

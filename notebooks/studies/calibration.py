@@ -159,7 +159,8 @@ def measure(
 
 def designed(fit: BenchFit) -> BenchFit:
     """Return a fit with the optics of the design: no leakage, no focus, and a blur far below a pixel."""
-    design, optics = Optics(), {"leakage": 0.0, "blur": 0.02, "arm 0 focus": 0.0, "arm 1 focus": 0.0}
+    design, shares = Optics(), {"leakage": 0.0, "unmasked": 0.0}
+    optics = shares | {"blur": 0.02, "arm 0 focus": 0.0, "arm 1 focus": 0.0}
     first, second = design.phase_shifts
     return fit.replaced(optics | {"diameter": design.diameter, "first": first, "second": second})
 
@@ -221,7 +222,7 @@ def _error(phase: NDArray, truth: NDArray, lit: NDArray[np.bool_]) -> NDArray[np
 def known_values(taken: Recording) -> dict[str, float]:
     """Values of the bench by their names in a fit."""
     bench = taken.arrays
-    values = {name: float(bench[name]) for name in ("diameter", "leakage", "blur")}
+    values = {name: float(bench[name]) for name in ("diameter", "leakage", "blur")} | {"unmasked": 0.0}
     values |= {name: float(value) for name, value in zip(("first", "second"), bench["shifts"], strict=True)}
     for arm in (0, 1):
         values[f"arm {arm} focus"] = float(bench["focus"][arm])
@@ -234,6 +235,7 @@ _TITLES = {
     "first": "phase shift of the first image (rad)",
     "second": "phase shift of the second image (rad)",
     "leakage": "leakage",
+    "unmasked": "share of light that no mask shifts",
     "blur": "blur (pixels rms)",
     "arm 0 focus": "focus of the first image (D²/λ)",
     "arm 0 row": "row of the first image (pixels)",

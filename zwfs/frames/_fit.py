@@ -102,10 +102,10 @@ class BenchFit(Result):
     Attributes
     ----------
     estimates : tuple of Estimate
-        Diameter (lambda/D), phase shifts (radian), leakage, blur (pixels rms), and for each arm focus
-        (D^2 / lambda), row and column (pixels), rotation (radian, from x to y), magnification, flux and background
-        (counts). The arms 0 and 1 are the frames behind the masks, 2 and 3 the clear frames, which share focus,
-        rotation and magnification with them.
+        Diameter (lambda/D), phase shifts (radian), leakage, unmasked (share of light that no mask shifts), blur
+        (pixels rms), and for each arm focus (D^2 / lambda), row and column (pixels), rotation (radian, from x
+        to y), magnification, flux and background (counts). The arms 0 and 1 are the frames behind the masks, 2
+        and 3 the clear frames, which share focus, rotation and magnification with them.
     covariance : ndarray, shape (n_estimates, n_estimates)
     flat : ndarray, shape (n, n), radian
         Phase of the optics without a command, mean over each pixel.
@@ -321,6 +321,8 @@ def _free(data: Recording, start: _Start) -> list[Free]:
         "first": (start.shifts[0],),
         "second": (start.shifts[1],),
         "leakage": (0.01, 0.0, 0.45),
+        # Two phase shifts, leakage and this share are hardly told apart: its prior decides their error bars.
+        "unmasked": (0.0, -0.2, 0.45, 0.03),
         "blur": (0.5, 0.02, 5.0),
     }
     return free + [Free(name, ((None, name),), *values) for name, values in limits.items()]

@@ -21,6 +21,7 @@ from zwfs.frames._light import KnownLight
 from zwfs.frames._optics import Camera, Exposure, Linearised
 from zwfs.frames._solver import MapPrior, PhaseMap, Point, Problem, allowing, fine_phase, minimise
 from zwfs.frames._states import PAD
+from zwfs.frames.pipeline import unmixed
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
@@ -240,8 +241,7 @@ class FittedSensor:
         for side, (arm, places) in enumerate(zip(arms, places_of(arms, n, counts.shape[1:]), strict=True)):
             image = (counts[side] - arm["background"]) / arm["flux"] * power
             images[side] = ndimage.map_coordinates(image, places, order=3, mode="nearest")
-        leaked = min(masks["leakage"], 0.4)
-        images = ((1 - leaked) * images - leaked * images[::-1]) / (1 - 2 * leaked)
+        images = unmixed(images, min(masks["leakage"], 0.4), masks["unmasked"], pupil.amplitude**2)
         dimples = (Dimple(masks["diameter"], masks[name]) for name in ("first", "second"))
         sensor = ZernikeSensor(pupil, *dimples, tolerance=1e-5)
         found = PhaseShifted(sensor, n_iterations=25, tolerance=1e-3)(np.maximum(images, 0)).phase

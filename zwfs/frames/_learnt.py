@@ -14,6 +14,7 @@ from scipy import fft, ndimage
 
 from zwfs.frames._fit import BenchFit
 from zwfs.frames._fitted import FittedSensor
+from zwfs.frames.pipeline import Optics, unmixed
 from zwfs.sensor import ZernikeSensor
 
 _SCREENS = 24  # random phases from which weights are learnt
@@ -41,9 +42,9 @@ def training(fit: BenchFit, sensor: ZernikeSensor) -> tuple[NDArray[np.float64],
     return np.array(seen), np.array(ideal)
 
 
-def learnt(values: NDArray, ideal: NDArray, leakage: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def learnt(values: NDArray, ideal: NDArray, optics: Optics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weights (2, 2, ny, nx) and offset (2, ny, nx) that turn intensities (k, 2, ny, nx) into ideal frames."""
-    start = (np.eye(2) - leakage) / (1 - 2 * leakage)
+    start = unmixed(np.eye(2)[..., None, None], optics.leakage, optics.unmasked, 0)[..., 0, 0]
     missing = ideal - np.einsum("ij,kjyx->kiyx", start, values)
     centred, offset = values - values.mean(axis=0), missing.mean(axis=0)
     normal = np.einsum("kiyx,kjyx->yxij", centred, centred) + _STIFFNESS * len(values) * np.eye(2)

@@ -34,8 +34,8 @@ _LONGEST = 4.0  # displacement of light that the grid does not resolve, over tha
 _PLACE = ("row", "column", "rotation", "magnification")
 ARM = ("focus", *_PLACE, "flux", "background")
 """Numbers of an optical path: D^2 / lambda for the focus, pixels, pixels, radian and 1 for the place, counts."""
-MASKS = ("diameter", "first", "second", "leakage", "blur")
-"""Numbers that all images share: lambda/D, radian, radian, fraction of light, pixels rms."""
+MASKS = ("diameter", "first", "second", "leakage", "unmasked", "blur")
+"""Numbers that all images share: lambda/D, radian, radian, fractions of light, pixels rms."""
 
 
 class Exposure(NamedTuple):
@@ -227,20 +227,22 @@ def coefficients(masks: dict[str, float]) -> Coefficients:
     """What the masks do to the light of the dimple: c_1 (amplitude) and c_2 (intensity).
 
     A share q_j of the light carries psi + s_j b, with s_j = exp(i theta_j) - 1: 1 - leakage of this mask, and
-    leakage of the other one. So c_1 = sum q_j s_j and c_2 = sum q_j |s_j|^2.
+    leakage of the other one. A share u, unmasked, carries psi alone. So c_1 = (1 - u) sum q_j s_j and
+    c_2 = (1 - u) sum q_j |s_j|^2.
     """
     turn = np.exp(1j * np.array([masks["first"], masks["second"]]))
-    strength, leakage = turn - 1, masks["leakage"]
-    shares = np.array([[1 - leakage, leakage], [leakage, 1 - leakage]])
+    strength, leakage, masked = turn - 1, masks["leakage"], 1 - masks["unmasked"]
+    split = np.array([[1 - leakage, leakage], [leakage, 1 - leakage]])
+    shares = masked * split
     power = np.abs(strength) ** 2
     slope: Any = np.zeros((2, len(MASKS)), complex)  # of the strengths
     place = MASKS.index
     slope[0, place("first")], slope[1, place("second")] = 1j * turn
     first_slope: Any = shares @ slope
     second_slope: Any = shares @ (2 * (strength.conj()[:, None] * slope).real)
-    change = np.array([[-1, 1], [1, -1]])
-    first_slope[:, place("leakage")] += change @ strength
-    second_slope[:, place("leakage")] += change @ power
+    for name, change in (("leakage", masked * np.array([[-1, 1], [1, -1]])), ("unmasked", -split)):
+        first_slope[:, place(name)] += change @ strength
+        second_slope[:, place(name)] += change @ power
     return Coefficients(shares @ strength, shares @ power, first_slope, second_slope)
 
 

@@ -32,6 +32,7 @@ _N_CHANGES = 30  # iterations for the maps that follow a change of the images
 _SHARES = 0.0, 0.4, 0.7  # of the maps' own move, by which a step is shortened: the light of edges is not linear
 _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
 _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit has converged
+_QUIET = 0.7  # the same of the numbers alone, where it is known
 MISSED = 0.7
 """Errors of fits to frames of HCIPy, over the changes with a finer grid (rms)."""
 _PIXEL_MEAN = 230 / 384, 2 * 76 / 384, 2 / 384  # of a cubic spline over a pixel, as a series of cosines
@@ -519,7 +520,7 @@ def minimise(
                 break
             damping *= 8
         moved = following.promised(change) if following else promised
-        converged = moved < _SETTLED and damping < 0.1
+        converged = moved < (_QUIET if following else _SETTLED) and damping < 0.1
         if gain >= 0:
             point = trial
         share = gain / promised if promised > 0 else 1.0

@@ -295,7 +295,12 @@ class Calibration(Immutable):
             return whole
 
         masks, arms = fit.point.model.masks, fit.point.model.arms[:2]
-        optics = Optics(masks["diameter"], (masks["first"], masks["second"]), leakage=masks["leakage"])
+        optics = Optics(
+            masks["diameter"],
+            (masks["first"], masks["second"]),
+            leakage=masks["leakage"],
+            unmasked=masks["unmasked"],
+        )
         n_pixels, bad = fit.point.problem.camera.n_pixels, ~np.isfinite(counts).all(axis=0)
         light = fit.light * (radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2)
         pupil = Pupil.from_amplitude(np.sqrt(np.maximum(light, 0)), n_pixels, threshold=_FAINTEST)
@@ -315,7 +320,7 @@ class Calibration(Immutable):
             return values.reshape(len(values), 2, n, n) / made.unit[:, np.newaxis, np.newaxis]
 
         seen, ideal = training(fit, made.sensor)
-        weights, offset = learnt(intensity(seen), ideal, optics.leakage)
+        weights, offset = learnt(intensity(seen), ideal, optics)
         light = intensity(counts)[..., good].mean(axis=(0, 2))
         made = replace(made, good=good, weights=weights, offset=offset, light=light)
         images = on_camera(np.nan_to_num(counts)) + made.dark

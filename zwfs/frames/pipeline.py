@@ -477,10 +477,16 @@ def model(measurement: Measurement) -> ZernikeSensor:
 def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:
     """Frames of a measurement as those of an ideal sensor: its optics are undone. They may be negative."""
     _check.instance("measurement", measurement, Measurement)
-    optics, pure = measurement.optics, _scaled(measurement)
-    pure[(..., *measurement.window)] -= measurement.rest + optics.unmasked * measurement.pupil.amplitude**2
-    pure /= 1 - optics.unmasked
-    return ((1 - optics.leakage) * pure - optics.leakage * pure[::-1]) / (1 - 2 * optics.leakage)
+    optics, frames, light = measurement.optics, _scaled(measurement), np.zeros(measurement.intensity.shape[1:])
+    frames[(..., *measurement.window)] -= measurement.rest
+    light[measurement.window] = measurement.pupil.amplitude**2
+    return unmixed(frames, optics.leakage, optics.unmasked, light)
+
+
+def unmixed(frames: NDArray, leakage: float, unmasked: float, light: NDArray | float) -> NDArray[np.float64]:
+    """Frames (..., 2, ny, nx) of ideal masks: without leakage, and unmasked light of a clear frame `light`."""
+    pure = (frames - unmasked * light) / (1 - unmasked)
+    return ((1 - leakage) * pure - leakage * pure[..., ::-1, :, :]) / (1 - 2 * leakage)
 
 
 def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[np.float64]:

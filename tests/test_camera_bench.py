@@ -18,7 +18,7 @@ from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
 from zwfs.frames._solver import Eliminated, fine_phase
 from zwfs.frames._states import PAD, Recording
 
-from .hcipy_bench import BEFORE, BORDER, CASES, RMS
+from .hcipy_bench import BEFORE, BORDER, CASES, RMS, HcipyBench
 
 FINE = 16
 

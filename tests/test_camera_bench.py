@@ -67,7 +67,7 @@ def modelled(partly_lit, f, areas):
     light, mean = blocks(amplitude**2, k), blocks(amplitude, k)
     mean = mean if areas else np.sqrt(light)
     camera = Camera(24, (24, 24), 20, [Exposure(0, 0, 0)], np.zeros((1, 24 * f, 24 * f)), f, 1.5)
-    values = np.array([0, 0, 0, 0, 1, 1, 0, 1.1, 1.5, -1.5, 0, blur])
+    values = np.array([0, 0, 0, 0, 1, 1, 0, 1.1, 1.5, -1.5, 0, 0, blur])
     (image,) = Linearised(camera, Maps(mean, light - mean**2, blocks(phase, k)), values).images
     return image
 
@@ -104,7 +104,7 @@ def test_model_with_the_true_maps_makes_the_frames_of_a_foreign_bench():
     exposures = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
     camera = Camera(n, (bench.side,) * 2, bench.pixels, exposures, np.zeros((1, n * f, n * f)), f, 1.5)
     arms = [[0, *bench.offsets[side], 0, 1, 1, 0] for side in (0, 1)]
-    values = np.array([*arms[0], *arms[1], bench.diameter, *bench.shifts, 0, bench.blur])
+    values = np.array([*arms[0], *arms[1], bench.diameter, *bench.shifts, 0, 0, bench.blur])
     images = Linearised(camera, Maps(bench.amplitude, 0 * phase, phase), values).images
     np.testing.assert_allclose(images, bench.exposed(phase, True), rtol=0, atol=2e-4)
 
@@ -116,7 +116,7 @@ def test_light_that_the_grid_does_not_resolve_spreads_with_the_focus(monkeypatch
     light, mean = (blocks(bench.amplitude**power, bench.fine // f) for power in (2, 1))
     exposures = [Exposure(0, None, 0), Exposure(1, None, 0)]
     arms = [[focus, 0, 0, 0, 1, 1, 0] for focus in bench.focus]
-    values = np.array([*arms[0], *arms[1], bench.diameter, *bench.shifts, 0, 0])
+    values = np.array([*arms[0], *arms[1], bench.diameter, *bench.shifts, 0, 0, 0])
     true = bench.exposed(np.zeros_like(bench.amplitude), False)
 
     def error():

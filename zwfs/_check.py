@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields
+from functools import cache
 from numbers import Integral, Real
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +24,63 @@ def instance(name: str, value: Any, *kinds: type) -> None:
     if not isinstance(value, kinds):
         expected = " or a ".join(kind.__name__ for kind in kinds)
         raise TypeError(f"{name} is a {type(value).__name__}: expected a {expected}")
+
+
+def declared(instance: Any) -> None:
+    """Require that the fields of a dataclass are of the kinds that its annotations state."""
+    of: Any = type(instance)
+    for name, kind in _annotations(of).items():
+        value = getattr(instance, name)
+        if not _is_of(value, kind):
+            held = f"has dtype {value.dtype}" if isinstance(value, np.ndarray) else f"= {shown(value)}"
+            raise TypeError(f"{name} {held}: expected {_readable(kind)}")
+
+
+@cache
+def _annotations(kind: type) -> dict[str, Any]:
+    hints = get_type_hints(kind)
+    return {field.name: hints[field.name] for field in fields(kind)}
+
+
+def _is_of(value: Any, kind: Any) -> bool:
+    origin, parts = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return True
+    if origin in (Union, UnionType):
+        return any(_is_of(value, part) for part in parts)
+    if origin is np.ndarray:
+        [number] = get_args(parts[1])
+        return isinstance(value, np.ndarray) and _same_kind(value.dtype, number)
+    if origin is tuple:
+        return isinstance(value, tuple) and (
+            all(_is_of(one, parts[0]) for one in value)
+            if parts[-1] is Ellipsis
+            else len(value) == len(parts) and all(map(_is_of, value, parts))
+        )
+    if kind in (bool, int, float):
+        plain = value.item() if isinstance(value, np.generic) else value
+        return isinstance(plain, kind if kind is not float else int | float) and (
+            kind is bool or not isinstance(plain, bool)
+        )
+    return isinstance(value, origin or kind)
+
+
+def _same_kind(dtype: np.dtype, number: Any) -> bool:
+    """Whether numbers of a type are of the kind of another: of any size."""
+    kinds = np.bool_, np.integer, np.floating, np.complexfloating
+    return all(np.issubdtype(dtype, kind) for kind in kinds if np.issubdtype(number, kind))
+
+
+def _readable(kind: Any) -> str:
+    origin = get_origin(kind)
+    if origin in (Union, UnionType):
+        return " or ".join(_readable(part) for part in get_args(kind))
+    if origin is np.ndarray:
+        [number] = get_args(get_args(kind)[1])
+        return f"an array of {getattr(number, '__name__', 'number')}"
+    if kind is NoneType:
+        return "None"
+    return f"a {(origin or kind).__name__}"
 
 
 def sequence(name: str, values: Any, kind: type = object, expected: str = "") -> None:

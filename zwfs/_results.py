@@ -35,6 +35,9 @@ class Result:
     panels: ClassVar[tuple[tuple[str, str], ...]] = ()
     """Name of a field and its label with the unit."""
 
+    def __post_init__(self) -> None:
+        _check.declared(self)
+
     def __repr__(self) -> str:
         parts = (f"{name}{value.shape}" for name, value in self._arrays() if value.ndim)
         return f"{type(self).__name__}({', '.join(parts)})"

@@ -381,6 +381,7 @@ def numbers(
             "faint_calibrated": faint_found,
             "faint_gain": faint_plain / faint_found,
             "sigma": errors.column("sigma")[place],
+            "bars_worst": errors.rms[np.argmax(found / errors.column("sigma"))],
             "inside": 100 * float(np.mean([one.inside for one in every])),
             "consistent": sum(one.consistent for one in every),
             "bulk_error": not_smooth[place],

@@ -86,6 +86,8 @@ def calibrate(
     (1.06, 40)
     """
     progress = _check.callback("progress", progress)
+    gain = _check.number("gain", gain, 0, open_low=True)
+    noise = None if noise is None else _check.number("noise", noise, 0, open_low=True)
     files = frame_files, pupil_files, dark_files, bad_pixel_files
     if n_images is not None:
         n_images = _check.integer("n_images", n_images, 1, 2)

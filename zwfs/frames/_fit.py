@@ -52,7 +52,8 @@ _PIXEL = 1 / 12  # pixels squared: variance of the area of a pixel; f points alo
 # (pixels, radian, 1), where light that changes within a pixel aliases.
 _BLURRED = {"phase shift": 3e-4, "focus": 5e-6}
 _SHARP = {"row": 1.2e-3, "column": 1.2e-3, "rotation": 2e-4, "magnification": 4e-5}
-_PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the physics
+_PHYSICAL = "leakage", "unmasked", "blur"  # the lower limit of these numbers is that of the physics
+_MOST = 1e9  # of a number that replaces an estimate
 _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
 
 
@@ -117,7 +118,7 @@ class BenchFit(Result):
         Noise of a pixel without light, as given or as estimated.
     converged : bool
         Whether the last step of the estimates, which the maps follow, promised to lower half the sum of squares by
-        less than 0.3.
+        less than 0.7.
     remarks : tuple of str
         What does not fit together, in words.
     """
@@ -163,15 +164,18 @@ class BenchFit(Result):
 
         Raises
         ------
-        KeyError, TypeError, ValueError
-            If no estimate has the name, or a value is not a finite number.
+        TypeError, ValueError
+            If no estimate has a name, or a value is not a number within 1e9.
         """
         _check.instance("values", values, Mapping)
         x, n = self.point.x.copy(), self.point.problem.n_white
         names = [one.name for one in self.estimates]
-        for name, value in values.items():
-            x[n + names.index(self[name].name)] = _check.number(name, value)
-        estimates = (one._replace(value=values.get(one.name, one.value)) for one in self.estimates)
+        for name in values:
+            _check.choice("values", name, names)
+        numbers = {name: _check.number(name, value, -_MOST, _MOST) for name, value in values.items()}
+        for name, value in numbers.items():
+            x[n + names.index(name)] = value
+        estimates = (one._replace(value=numbers.get(one.name, one.value)) for one in self.estimates)
         return replace(self, estimates=tuple(estimates), point=Point(self.point.problem, x))
 
     def __getitem__(self, name: str) -> Estimate:
@@ -322,7 +326,7 @@ def _free(data: Recording, start: _Start) -> list[Free]:
         "second": (start.shifts[1],),
         "leakage": (0.01, 0.0, 0.45),
         # Two phase shifts, leakage and this share are hardly told apart: its prior decides their error bars.
-        "unmasked": (0.0, -0.2, 0.45, 0.03),
+        "unmasked": (0.0, 0.0, 0.45, 0.03),
         "blur": (0.5, 0.02, 5.0),
     }
     return free + [Free(name, ((None, name),), *values) for name, values in limits.items()]

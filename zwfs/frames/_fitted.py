@@ -35,6 +35,7 @@ _STATIONARY = 0.1  # logarithm of the factor on the variance of a prior, below w
 _POWERS = 0.5, 2.0  # least and most power of this factor in an update of the rms
 _STRONGER = 4.5  # factor on the first rms for each unit of the exponent: the same density at about 10 cycles / D
 _ALLOWED = 0.05  # error of the model in the first stage, over the light of a full pixel
+_LEAST = 1e-12  # counts, of a noise
 _DRAWS = 12  # for the error bars of a phase
 
 
@@ -125,9 +126,11 @@ class FittedSensor:
         sigma = _check.real_array("sigma", sigma)
         if sigma.shape not in ((), shape):
             raise ValueError(f"sigma has shape {sigma.shape}: expected {shape}, or a number")
-        if not np.all((sigma > 0) & (sigma < np.inf)):
+        _check.moderate("frames", np.nan_to_num(counts, posinf=0, neginf=0))
+        if not np.all((sigma > _LEAST) & (sigma < np.inf)):
             raise ValueError(
-                f"sigma reaches from {sigma.min():.6g} to {sigma.max():.6g}: expected finite values above 0"
+                f"sigma reaches from {sigma.min():.6g} to {sigma.max():.6g}: expected finite values above "
+                f"{_LEAST:g}"
             )
         sigma = np.broadcast_to(sigma, shape)
         good = np.isfinite(counts)

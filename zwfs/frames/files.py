@@ -77,6 +77,14 @@ class CameraFile:
         images = _check.real_array("images", self.images)
         if images.ndim != 3 or not images.size:
             raise ValueError(f"images has shape {images.shape}: expected (n, ny, nx)")
+        for name in ("name", "sha256"):
+            _check.instance(name, getattr(self, name), str)
+        _check.instance("header", self.header, Mapping)
+        _check.integer("n_exposures", self.n_exposures, 1)
+        if self.full_scale != np.inf:
+            _check.number("full_scale", self.full_scale, 0, open_low=True)
+        if self.path is not None:
+            _check.instance("path", self.path, Path)
 
     def keyword(self, key: str) -> float:
         """Number under a keyword of the header.
@@ -89,7 +97,8 @@ class CameraFile:
         """
         _check.instance("key", key, str)
         if key not in self.header:
-            raise ValueError(f"{self.name}: its header has no {key}: give the value as a parameter")
+            name = _check.shown(key)[1:-1]
+            raise ValueError(f"{self.name}: its header has no {name} (key): give the value as a parameter")
         low = 0 if key in _POSITIVE else -np.inf
         return _check.number(f"{self.name}: {key}", self.header[key], low, open_low=True)
 

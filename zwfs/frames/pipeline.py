@@ -34,6 +34,7 @@ __all__ = [
     "reduce_frames",
 ]
 
+MOST_ITERATIONS = 10_000  # of a pair of frames: more take minutes and change nothing
 _DARK = 0.1  # of the largest amplitude: a point with less is outside
 NEAR = 2  # pixels from a gap, vane or edge that count as near it
 _LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
@@ -139,6 +140,9 @@ class Measurement:
     background: NDArray[np.float64]
     flux_ratio: tuple[float, float]
     gain: NDArray[np.float64] = field(default_factory=lambda: np.ones((2, 1, 1)))
+
+    def __post_init__(self) -> None:
+        _check.declared(self)
 
     @cached_property
     def good(self) -> NDArray[np.bool_]:
@@ -446,7 +450,7 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: f
     -------
     MeasuredPhase
     """
-    n_iterations = _check.integer("n_iterations", n_iterations, 1)
+    n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
     sensor = model(measurement)
     iterate = PhaseShifted(sensor, n_iterations=n_iterations, tolerance=tolerance)
     frames = np.maximum(ideal_frames(measurement), 0)
@@ -506,7 +510,7 @@ def predicted_frames(measurement: Measurement, n_iterations: int = 25) -> NDArra
     The phase-shifted iteration sees both frames, and could explain part of their noise. Here the arcsine
     reconstruction sees one frame, and the model predicts the other one from its phase.
     """
-    n_iterations = _check.integer("n_iterations", n_iterations, 1)
+    n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
     both, frames = model(measurement), np.maximum(ideal_frames(measurement), 0)
     predicted = []
     for seen in (1, 0):

@@ -17,6 +17,7 @@ from scipy import optimize
 
 from zwfs import _check
 from zwfs.frames.pipeline import (
+    MOST_ITERATIONS,
     ClearLight,
     MeasuredPhase,
     Measurement,
@@ -83,7 +84,7 @@ def fit(
     """
     _check.instance("registered", registered, RegisteredFrames)
     _check_fit("names", names, optics)
-    n_iterations = _check.integer("n_iterations", n_iterations, 1)
+    n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
     n_steps = _check.integer("n_steps", n_steps, 1)
     if not names:
         return registered, optics
@@ -187,6 +188,9 @@ class Step:
     predicted: NDArray[np.float64]
     control: NDArray[np.float64]
 
+    def __post_init__(self) -> None:
+        _check.declared(self)
+
 
 def steps(
     frames: Sequence[Image],
@@ -221,7 +225,7 @@ def steps(
         As `register_frames`, `reduce_frames` and `fit` do.
     """
     _check_fit("fitted", fitted, optics)
-    n_iterations = _check.integer("n_iterations", n_iterations, 1)
+    n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
     work = []
 
     def add(name: str, registered: RegisteredFrames, optics: Optics) -> None:

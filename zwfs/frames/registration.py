@@ -98,6 +98,9 @@ class Placement:
     magnification: float = 1.0
     sigma: NDArray[np.float64] = field(default_factory=lambda: np.full(4, np.nan))
 
+    def __post_init__(self) -> None:
+        _check.declared(self)
+
     @property
     def matrix(self) -> NDArray[np.float64]:
         """Rotation and magnification, for (row, column), shape (2, 2)."""
@@ -139,6 +142,9 @@ class RegisteredFrames:
     exposure: float = 1.0
     placement: Placement = Placement(np.zeros(2))
     n_odd: int = 0
+
+    def __post_init__(self) -> None:
+        _check.declared(self)
 
     @property
     def images(self) -> tuple[Image, ...]:

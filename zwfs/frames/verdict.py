@@ -367,6 +367,9 @@ class ImageOrder:
     score: float
     other: float
 
+    def __post_init__(self) -> None:
+        _check.declared(self)
+
 
 def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iterations: int = 25) -> ImageOrder:
     """Find which image has which phase shift, from a poke of known sign.

@@ -1,12 +1,17 @@
 """Results as arrays, files and figures."""
 
 import json
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from astropy.io import fits
 
 import zwfs
+from zwfs.bench import Bench
+from zwfs.frames import Calibration, judge, phase_of
+from zwfs.frames.pipeline import Optics
+from zwfs.frames.verdict import ImageOrder
 
 
 @pytest.fixture(scope="module")
@@ -62,3 +67,35 @@ def test_a_figure_shows_phase_and_standard_error(result):
     assert labels.count("row (pixel)") == 2
     assert {"phase (rad)", "standard error (rad)"} <= set(labels)
     assert len(repr(result).splitlines()) == 1
+
+
+@pytest.fixture(scope="module")
+def results():
+    """Results of camera frames."""
+    bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
+    frames, clear = bench.frames(), bench.clear_frames()
+    phase = phase_of(frames, clear)
+    calibration = Calibration.of(phase.measurement)
+    made = [phase, phase.measurement, phase.measurement.registered, phase.measurement.registered.placement]
+    made += [judge(phase), calibration(frames), ImageOrder(Optics(), False, 1.0, 0.0)]
+    return {type(one).__name__: one for one in made}
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["MeasuredPhase", "Measurement", "RegisteredFrames", "Placement", "Verdict", "Phases", "ImageOrder"],
+)
+def test_fields_of_another_kind_are_named(results, name):
+    for field in fields(results[name]):
+        for wrong in (object(), {}, b"1"):
+            if field.name == "findings" and wrong == {}:
+                continue
+            with pytest.raises(TypeError, match=rf"^{field.name} "):
+                replace(results[name], **{field.name: wrong})
+
+
+def test_numbers_of_another_kind_are_named(results):
+    phases = results["Phases"]
+    with pytest.raises(TypeError, match="phase has dtype complex128: expected an array of float32"):
+        replace(phases, phase=phases.phase.astype(complex))
+    assert replace(phases, phase=phases.phase.astype(float)).phase.dtype == float

@@ -324,9 +324,11 @@ class Calibration(Immutable):
         light = intensity(counts)[..., good].mean(axis=(0, 2))
         made = replace(made, good=good, weights=weights, offset=offset, light=light)
         images = on_camera(np.nan_to_num(counts)) + made.dark
-        images = images if n_images == 2 else images[:, 0]
-        made = replace(made, light_ratio=float(np.mean(made(images, saturation=np.inf).flux)))
-        found = made(images, saturation=np.inf)
+        # The lamp is that of the calibration, so its light is known.
+        found = made(images if n_images == 2 else images[:, 0], light=1.0, saturation=np.inf)
+        ideal = np.einsum("ijyx,kjyx->kiyx", weights, intensity(counts)) + offset
+        _, ratios = made._work.compared(found.filled, ideal, np.broadcast_to(good, found.phase.shape))
+        made = replace(made, light_ratio=float(ratios.mean()))
         return replace(
             made, unexplained=unexplained(found.phase, phases), slopes=slopes_of(found.filled, good),
             displacements=found.displacement.astype(float), residual=float(np.nanmax(found.residual)),

@@ -4,7 +4,6 @@ from dataclasses import replace
 from importlib import import_module
 from itertools import combinations
 from pathlib import Path
-from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -38,6 +37,7 @@ from studies.zernike_sensor import lowest_pixel
 from zwfs.bench.model import Bench
 from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics
 from zwfs.frames.refine import Step
+from zwfs.frames.registration import Circle, Image, RegisteredFrames
 
 
 @pytest.fixture(autouse=True)
@@ -102,7 +102,8 @@ def drawn_methods(curves, pupil, classic, shifted):
     saxton = zwfs.GerchbergSaxton(shifted)
     bad = np.zeros(frames.shape, bool)
     bad[:, 10, 10] = True
-    recording = SimpleNamespace(diameter=float(pupil.n_pixels))
+    image, circle = Image(frames[0], bad[0]), Circle(11.5, 11.5, float(pupil.n_pixels))
+    recording = RegisteredFrames((image, image), (image, image), (circle, circle), np.zeros((4, 2)))
     measurement = Measurement(
         recording, Optics(), frames, pupil, 0 * phase, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0)
     )

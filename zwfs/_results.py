@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -122,8 +122,10 @@ def _plain(name: str, value: Any) -> Iterator[tuple[str, bool | int | float | st
     elif isinstance(value, dict):
         for key, one in value.items():
             yield from _plain(f"{name} {key}", one)
-    elif hasattr(value, "_fields"):
-        yield from _plain(name, value._asdict())
+    elif is_dataclass(value) or hasattr(value, "_fields"):
+        keys = value._fields if hasattr(value, "_fields") else [field.name for field in fields(value)]
+        for key in keys:
+            yield from _plain(f"{name} {key}", getattr(value, key))
     elif isinstance(value, Sequence):
         for index, one in enumerate(value):
             yield from _plain(f"{name} {index}", one)

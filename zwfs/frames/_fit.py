@@ -76,7 +76,8 @@ _STAGES = (
 )
 
 
-class Estimate(NamedTuple):
+@dataclass(frozen=True)
+class Estimate:
     """Value of a number of the bench.
 
     Attributes
@@ -94,6 +95,9 @@ class Estimate(NamedTuple):
     value: float
     sigma: float
     at_limit: bool
+
+    def __post_init__(self) -> None:
+        _check.declared(self)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -175,7 +179,7 @@ class BenchFit(Result):
         numbers = {name: _check.number(name, value, -_MOST, _MOST) for name, value in values.items()}
         for name, value in numbers.items():
             x[n + names.index(name)] = value
-        estimates = (one._replace(value=numbers.get(one.name, one.value)) for one in self.estimates)
+        estimates = (replace(one, value=numbers.get(one.name, one.value)) for one in self.estimates)
         return replace(self, estimates=tuple(estimates), point=Point(self.point.problem, x))
 
     def __getitem__(self, name: str) -> Estimate:

@@ -278,6 +278,8 @@ def images(
         _check.sequence(argument, given, CameraFile)
     if saturation is not None:
         saturation = _check.number("saturation", saturation, 0, open_low=True)
+    if n_images is not None:
+        n_images = _check.integer("n_images", n_images, 1, 2)
     recorded = _by_image("files", files, n_images)
     if n_images and len(recorded) != n_images:
         raise ValueError(f"{_names(files)}: {len(recorded)} images in an exposure: expected n_images = {n_images}")

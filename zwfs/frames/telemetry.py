@@ -11,9 +11,10 @@ import os
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,7 +46,8 @@ _COUNTS = {
 }
 
 
-class Summary(NamedTuple):
+@dataclass(frozen=True)
+class Summary:
     """Result of `reconstruct`.
 
     Attributes
@@ -64,6 +66,9 @@ class Summary(NamedTuple):
     n_flagged: int
     counts: dict[str, int]
     n_resumed: int
+
+    def __post_init__(self) -> None:
+        _check.declared(self)
 
 
 def reconstruct(

@@ -99,3 +99,8 @@ def test_numbers_of_another_kind_are_named(results):
     with pytest.raises(TypeError, match="phase has dtype complex128: expected an array of float32"):
         replace(phases, phase=phases.phase.astype(complex))
     assert replace(phases, phase=phases.phase.astype(float)).phase.dtype == float
+
+
+def test_a_figure_of_a_verdict_shows_the_control(results):
+    [axes] = (one for one in results["Verdict"].plot().axes if one.get_xlabel() == "image")
+    assert [line.get_label() for line in axes.lines] == ["score", "control"]

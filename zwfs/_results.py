@@ -80,7 +80,8 @@ class Result:
 
         known = ((getattr(self, name, None), label) for name, label in self.panels)
         panels = [(values, label) for values, label in known if values is not None]
-        figure = Figure((_SIDE * 1.25 * len(panels), _SIDE), layout="constrained")
+        figure = Figure((_SIDE * 1.35 * len(panels), _SIDE))
+        figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.05)
         for axes, (values, label) in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
             _draw(axes, np.asarray(values), label)
         return figure
@@ -158,8 +159,9 @@ def _image(array: NDArray) -> NDArray:
 def _draw(axes: Axes, values: NDArray, label: str) -> None:
     """Draw a curve, or the first map of a batch."""
     if values.ndim < 2:
-        axes.plot(values, ".")
+        axes.plot(np.arange(1, values.size + 1), np.atleast_2d(values.T).T, "o")
         axes.set(xlabel="number", ylabel=label)
+        axes.locator_params("x", integer=True)
         return
     image = values.reshape(-1, *values.shape[-2:])[0]
     largest = float(np.nanmax(np.abs(image), initial=0)) or 1.0

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,9 @@ from zwfs.frames.pipeline import (
     upside_down,
 )
 from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Placement, RegisteredFrames
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["CameraNoise", "ImageOrder", "Verdict", "judge", "order_of_images"]
 
@@ -89,7 +92,7 @@ class Verdict(Result):
         Sentences by their topic: fit, unseen data, scale, light, registration, and warnings if there are any.
     """
 
-    panels = (("sigma", "standard error (rad)"), ("score", "correlation of each frame"))
+    panels = (("sigma", "standard error (rad)"), ("score", "correlation with the prediction"))
     score: NDArray[np.float64]
     control: NDArray[np.float64]
     inner: float
@@ -102,6 +105,16 @@ class Verdict(Result):
 
     def __repr__(self) -> str:
         return f"Verdict(explained={self.explained}, score={self.score.round(2)}, control={self.control.round(2)})"
+
+    def plot(self) -> Figure:
+        """Draw the scores of both images next to those of the control, which must fail, and the error bar."""
+        figure = super().plot()
+        [axes] = (one for one in figure.axes if one.get_xlabel() == "number")
+        axes.plot([1, 2], self.control, "s", mfc="none", label="control")
+        axes.lines[0].set_label("score")
+        axes.set(xlabel="image", xlim=(0.5, 2.5), ylim=(min(-0.1, *self.control), 1))
+        axes.legend()
+        return figure
 
     @property
     def explained(self) -> bool | None:

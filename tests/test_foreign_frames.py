@@ -4,8 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
-from zwfs.frames.pipeline import Optics, near_edges, recover_phase, reduce_frames
+from zwfs.frames.__main__ import main
+from zwfs.frames.pipeline import Optics, near_edges, phase_of, recover_phase, reduce_frames
+from zwfs.frames.refine import steps
 from zwfs.frames.registration import Image, register_frames
 from zwfs.frames.verdict import CameraNoise, judge
 
@@ -113,3 +116,61 @@ def test_pupils_with_many_edges_are_measured(aperture, given, least):
     left = np.exp(1j * (found[window] - bench.on_pupil(screen)))[lit]
     assert np.count_nonzero(lit) > 0.98 * np.count_nonzero(bench.fully_lit)
     assert np.angle(left * np.conj(left.mean())).std() < least
+
+
+# One mask, one image
+
+
+@pytest.fixture(scope="module")
+def single():
+    """A bench with one image, its screen (40 nm rms at 635 nm), frame and clear frame."""
+    bench = HcipyBench(pixels=50, side=70, photons=2e4, blur=0.3)
+    screen = bench.smooth(0.4, 3)
+    return bench, screen, bench.counts(screen, (1, 1))[0], bench.counts(0 * screen, (1, 2), masked=False)[0]
+
+
+def single_error(single, phase, corner):
+    """Rms error at fully lit pixels, radian."""
+    bench, screen, *_ = single
+    whole, start = np.full((bench.side, bench.side), np.nan), (bench.side - bench.pixels) // 2
+    window = (slice(start, start + bench.pixels),) * 2
+    whole[window] = np.where(bench.fully_lit, bench.on_pupil(screen), np.nan)
+    row, column = corner
+    truth = whole[row : row + phase.shape[0], column : column + phase.shape[1]]
+    return np.nanstd(phase - truth)
+
+
+def test_one_image_gives_the_phase_and_no_verdict(single):
+    found = phase_of(*single[2:], phase_shifts=(np.pi / 2,))
+    assert single_error(single, found.phase, found.measurement.registered.corner) < 0.015  # 1.5 nm
+    verdict = judge(found, NOISE)
+    assert verdict.explained is None
+    assert np.isnan(verdict.score).all()
+    assert "one image" in verdict.findings["fit"]
+    assert np.nanmedian(verdict.sigma) == pytest.approx(0.006, rel=0.2)
+
+
+def test_one_image_takes_the_road_of_two(single, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, image in (
+        ("frame", single[2]),
+        ("clear", single[3]),
+        ("cube", np.stack([single[2], 0.1 * single[2]])),
+    ):
+        np.save(f"{name}.npy", image)
+    known = ["--phase-shifts", "1.5708", "--diameter", "1.06"]
+    assert main(["calibrate", "one.npz", "--frames", "frame.npy", "--pupils", "clear.npy", *known]) == 0
+    assert main(["reconstruct", "cube.npy", "--calibration", "one.npz", "-o", "phase.fits", "--quiet"]) == 0
+    phases, header = fits.getdata("phase.fits"), fits.getheader("phase.fits")
+    corner = header["CROPROW"], header["CROPCOL"]
+    assert single_error(single, phases[0].astype(float), corner) < 0.015
+    np.testing.assert_allclose(phases[1], phases[0], rtol=0, atol=0.03)  # a tenth of the light
+    assert "THETA2" not in header
+
+
+def test_one_image_cannot_test_a_fit(single):
+    images = [[Image(one, np.zeros(one.shape, bool))] for one in single[2:]]
+    with pytest.raises(ValueError, match="expected none with one image"):
+        steps(*images, Optics(1.06, (np.pi / 2,)), ["scale"])
+    with pytest.raises(ValueError, match=r"leakage = 0\.1: expected 0 with one phase shift"):
+        Optics(1.06, (np.pi / 2,), leakage=0.1)

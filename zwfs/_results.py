@@ -45,8 +45,9 @@ class Result:
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write all arrays and plain values as FITS or NPZ, in one step.
 
-        A FITS file holds an image for each array, with its name, the main one first, and the plain values as cards
-        of the first header. In an NPZ file they are one array, JSON text with the name `values`.
+        A FITS file holds an image for each array, with its name, and the plain values as cards of the first
+        header. An NPZ file holds the arrays by name, and one more, `values`: the plain values as JSON text. What
+        is None is left out.
 
         Parameters
         ----------

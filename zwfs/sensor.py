@@ -257,8 +257,8 @@ class ZernikeSensor(Sensor):
         Error of the reference wave, relative to the strongest response of the masks (spectral norm). It decides
         the rank; the speed hardly depends on it. At 1e-14 the kernel is exact to rounding.
     recorded : array_like of bool, shape (ny_detector, nx_detector), optional
-        Pixels that the frames hold, all points of the pupil among them. The reconstructors give no weight to the
-        others, such as those outside the pupil where a camera sees stray light. By default all are recorded.
+        True where a pixel of the frames counts, as it must at all points of the pupil. The reconstructors ignore
+        the others, such as those outside the pupil where a camera sees stray light. By default all count.
 
     Raises
     ------

@@ -59,8 +59,15 @@ def _parser() -> argparse.ArgumentParser:
     add("--images", dest="n_images", type=int, metavar="N", help="of an exposure, 1 or 2; default: from the files")
     add("--bad-pixels", dest="bad_pixel_files", default=(), help="maps, not 0 where bad", **files)
     add("--diameter", type=float, default=0.0, help="of the dimple in lambda/D; default: DIMPLE")
-    add("--phase-shifts", type=float, nargs=2, default=(), metavar="RAD", help="default: THETA1, THETA2")
-    add("--pupil-centers", type=float, nargs=4, metavar="PIXEL", help="row, column of both pupils")
+    add(
+        "--phase-shifts",
+        type=float,
+        nargs="+",
+        default=(),
+        metavar="RAD",
+        help="default: THETA1, THETA2",
+    )
+    add("--pupil-centers", type=float, nargs="+", metavar="PIXEL", help="row, column of each pupil")
     add("--pupil-diameter", type=float, metavar="PIXEL", help="default: from the clear frames")
     add(
         "--no-registration",
@@ -102,7 +109,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _calibrate(output: str, pupil_centers: Sequence[float] | None, quiet: bool, **settings: Any) -> int:
-    centers = None if pupil_centers is None else [pupil_centers[:2], pupil_centers[2:]]
+    pairs = range(0, len(pupil_centers or ()), 2)
+    centers = None if pupil_centers is None else [pupil_centers[first : first + 2] for first in pairs]
     with warnings.catch_warnings(record=True) as remarks:
         try:
             found = calibrate(**settings, pupil_centers=centers, progress=None if quiet else _Progress())

@@ -43,8 +43,8 @@ def calibrate(
     ----------
     frame_files, pupil_files, dark_files, bad_pixel_files : sequence of str or Path
         See `zwfs.frames.files.read_all`.
-    diameter, phase_shifts : float, lambda/D, and sequence of two floats, radian
-        Of the dimple; DIMPLE, THETA1 and THETA2 of the header if 0 and empty.
+    diameter, phase_shifts : float, lambda/D, and sequence of one or two floats, radian
+        Of the dimple; DIMPLE, THETA1 and THETA2 of the header if 0 and empty. With one, there is one image.
     saturation : float, counts, optional
         Of the camera, see `zwfs.frames.files.images`. Without it the frames to come are compared with SATURATE of
         the header, or with the largest number of their type.
@@ -93,7 +93,7 @@ def calibrate(
         n_images = _check.integer("n_images", n_images, 1, 2)
     kept: dict[str, Any] = {"n_iterations": n_iterations, "tolerance": tolerance}
     diameter = _check.number("diameter", diameter, 0)
-    _check.sequence("phase_shifts", phase_shifts, expected="a list of two numbers")
+    _check.sequence("phase_shifts", phase_shifts, expected="a list of one or two numbers")
     if commands is not None:
         commands = path_of("commands", commands)
         if others := set(settings) - {"pupil_centers", "pupil_diameter"}:
@@ -106,6 +106,8 @@ def calibrate(
         header = states.header
         shifts: Any = tuple(phase_shifts) or (header.get("THETA1", np.pi / 2), header.get("THETA2", -np.pi / 2))
         optics = Optics(diameter or header.get("DIMPLE", 1.06), shifts)
+        if optics.single:
+            raise ValueError(f"phase_shifts = {_check.shown(shifts)} with commands: expected two")
         kept |= {"saturation": states.saturation, "bunit": str(header.get("BUNIT", ""))}
         place = settings.get("pupil_centers"), settings.get("pupil_diameter")
         return _from_commands(states, optics, *place, {"noise": noise, "gain": gain, "progress": progress}, kept)
@@ -115,6 +117,7 @@ def calibrate(
     try:
         optics = sources[0].optics(diameter, phase_shifts)
         _check_fit("fitted", fitted, optics)
+        settings["n_pupils"] = len(optics.phase_shifts)
         registered, optics = fit(register_frames(masked, unmasked, **settings), optics, fitted)
         if saturation is None:
             saturation = sources[0].keyword("SATURATE") if "SATURATE" in sources[0].header else np.inf

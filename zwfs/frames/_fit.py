@@ -107,10 +107,11 @@ class BenchFit(Result):
     Attributes
     ----------
     estimates : tuple of Estimate
-        Diameter (lambda/D), phase shifts (radian), leakage, unmasked (share of light that no mask shifts), blur
-        (pixels rms), and for each arm focus (D^2 / lambda), row and column (pixels), rotation (radian, from x
-        to y), magnification, flux and background (counts). The arms 0 and 1 are the frames behind the masks, 2
-        and 3 the clear frames, which share focus, rotation and magnification with them.
+        Of "diameter" (lambda/D), "first" and "second" (phase shifts, radian), "leakage", "unmasked" (share of
+        light that no mask shifts), "blur" (pixels rms), and for each arm, as in "arm 0 focus": focus
+        (D^2 / lambda), row and column (pixels), rotation (radian, from x to y), magnification, flux and background
+        (counts). The arms 0 and 1 are the frames behind the masks, 2 and 3 the clear frames, which share focus,
+        rotation and magnification with them. The flux of arm 2 is fixed.
     covariance : ndarray, shape (n_estimates, n_estimates)
     flat : ndarray, shape (n, n), radian
         Phase of the optics without a command, mean over each pixel.

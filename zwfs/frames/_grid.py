@@ -17,8 +17,8 @@ from zwfs._propagator import square
 from zwfs.frames.registration import _TOUCHED
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
-from zwfs.reconstructors import PhaseShifted
-from zwfs.reconstructors.base import Reconstructor
+from zwfs.reconstructors import Arcsine, PhaseShifted
+from zwfs.reconstructors.base import FixedPoint, Reconstructor
 from zwfs.sensor import ZernikeSensor
 
 if TYPE_CHECKING:
@@ -49,9 +49,15 @@ class Grid:
         # Outside the pupil a camera sees light that the model does not know.
         sensor = ZernikeSensor(pupil, *masks, tolerance=1e-6, recorded=pupil.inside)
         settings: dict[str, Any] = {"n_iterations": calibration.n_iterations, "tolerance": calibration.tolerance}
-        self.reconstruct, self.response = PhaseShifted(sensor, accelerate=True, **settings), Response.of(sensor)
+        self.reconstruct: FixedPoint = (
+            Arcsine(sensor, **settings)
+            if calibration.optics.single
+            else PhaseShifted(sensor, accelerate=True, **settings)
+        )
+        self.response = Response.of(sensor)
         self.weights, self.offset = calibration.weights.astype(np.float32), calibration.offset.astype(np.float32)
-        self.flat_frames = sensor.measure(np.zeros(pupil.shape)).astype(np.float32)
+        flat = sensor.measure(np.zeros(pupil.shape)).astype(np.float32)
+        self.flat_frames = np.broadcast_to(flat, (2, *pupil.shape))
         places = calibration.places.reshape(2, 2, -1)
         low = np.floor(places.min(axis=2)).astype(int) - _REACH
         size = (np.floor(places.max(axis=2)).astype(int) + _REACH + 2 - low).max(axis=0)
@@ -121,6 +127,7 @@ class Grid:
         (k, 2, ny, nx), are changed.
         """
         reconstruct, sensor = method or self.reconstruct, self.reconstruct.sensor
+        frames = frames[:, : sensor.n_masks]
         found = reconstruct(frames, start)
         phase, n_iterations, converged = found.phase, found.n_iterations, found.converged
         phase[:, ~sensor.pupil.inside] = 0
@@ -172,7 +179,8 @@ class Grid:
         """Frames of phases on the grid of the pupil, (k, 2, ny, nx)."""
         model = self.reconstruct.settings.model(Kind.of(phase))
         psi = model.incoming(phase)
-        return square(model.reference(psi) + psi[:, np.newaxis])
+        frames = square(model.reference(psi) + psi[:, np.newaxis])
+        return np.broadcast_to(frames, (len(frames), 2, *frames.shape[2:]))
 
     def noise(self, counts: NDArray) -> NDArray[np.float64]:
         """Noise of a pixel without light, (k, 2), counts rms, from neighbours around both pupils."""

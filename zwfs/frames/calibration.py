@@ -399,16 +399,16 @@ class Calibration(Immutable):
         start : ndarray, shape (ny, nx) or (..., ny, nx), radian, optional
             Phase at which the iteration starts, such as `filled` of the frames before; flat if left out.
         light : float or array_like, shape (...), optional
-            Light relative to that of the calibration, such as `flux` of the frames before. If it is left out, the
-            frames show it, for which strong phases in another light take some twenty times as long.
+            Light relative to that of the calibration, such as `flux` of the frames before. By default the frames
+            show it. This takes about 20 times as long if the light is another one and the phase is large.
         saturation : float, counts, optional
             Replaces that of the calibration.
         largest_residual : float, optional
-            Residual above which a frame is inconsistent. By default it is 2.5 times the residual of the
-            calibration's frames, plus the noise that frames with less light have.
+            Residual above which a frame is inconsistent. By default it is 2.5 times the residual that the frames
+            of the calibration would have with the light and the noise of this one.
         judge : bool
-            Whether to compare the frames with their model, which takes a fifth of the time. Without it residual
-            and displacement are NaN, and the light follows from the mean of the frames alone.
+            Whether to compare the frames with their model. Without it residual and displacement are NaN, no frame
+            is inconsistent or moved, and the light follows from the mean of the frames alone.
         method : Reconstructor, optional
             Replaces the phase-shifted iteration, such as ``zwfs.Linear(calibration.sensor, modes)``.
 

@@ -103,10 +103,11 @@ class CameraFile:
         return _check.number(f"{self.name}: {key}", self.header[key], low, open_low=True)
 
     def optics(self, diameter: float = 0.0, phase_shifts: Sequence[float] = ()) -> Optics:
-        """Optics with these values, see `Optics`; by default those of the header, DIMPLE, THETA1 and THETA2."""
+        """Optics with these values, see `Optics`; by default DIMPLE, THETA1 and any THETA2 of the header."""
         diameter = _check.number("diameter", diameter, 0)
-        _check.sequence("phase_shifts", phase_shifts, expected="a list of two numbers")
-        shifts: Any = phase_shifts or [self.keyword(key) for key in ("THETA1", "THETA2")]
+        _check.sequence("phase_shifts", phase_shifts, expected="a list of one or two numbers")
+        keys = ("THETA1", "THETA2") if "THETA2" in self.header else ("THETA1",)
+        shifts: Any = phase_shifts or [self.keyword(key) for key in keys]
         return Optics(diameter or self.keyword("DIMPLE"), tuple(shifts))
 
 

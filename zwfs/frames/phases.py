@@ -24,7 +24,7 @@ class Flag(IntFlag):
     SATURATED
         Some of these are saturated.
     INCONSISTENT
-        No phase explains the frame: the residual exceeds that of the calibration's frames, or the call's limit.
+        The residual exceeds 2.5 times that of the calibration's frames, more in faint light, or the call's limit.
     NOT_CONVERGED
         The iteration used all its steps.
     MOVED
@@ -54,7 +54,8 @@ class Phases(PhaseResult):
     phase : ndarray of float32, shape (..., ny, nx), radian
         In (-pi, pi], NaN outside the pupil, at bad points, and everywhere if the frame is lost.
     filled : ndarray of float32, shape (..., ny, nx), radian
-        The same with bad points filled with the phase of the nearest good one, and 0 outside the pupil.
+        The same with bad points filled with the phase of the nearest good one, and 0 outside the pupil. If the
+        frame is lost, it is the phase of a flat wavefront.
     flux : ndarray of float32, shape (...)
         Light of the exposure relative to that of the calibration, as its own frames show it.
     n_bad, n_saturated : ndarray of int, shape (...)

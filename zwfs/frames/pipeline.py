@@ -52,9 +52,9 @@ class Optics:
     ----------
     diameter : float, lambda/D
         Diameter of the dimple.
-    phase_shifts : (float, float), radian
-        Of the two images. Exchanging them changes the sign of the phase, and nothing else: the frames do not show
-        which image is which.
+    phase_shifts : (float,) or (float, float), radian
+        Of the images. With two, exchanging them changes the sign of the phase, and nothing else: the frames do not
+        show which image is which.
     background : float
         Stray light in the frames that remains after the dark, in units of the mean intensity of the pupil.
     pupil_background : float
@@ -71,11 +71,11 @@ class Optics:
     Raises
     ------
     ValueError
-        If the phase shifts are the same or one of them is 0.
+        If there are not one or two phase shifts, they are the same, or one of them is 0.
     """
 
     diameter: float = 1.06
-    phase_shifts: tuple[float, float] = (np.pi / 2, -np.pi / 2)
+    phase_shifts: tuple[float, ...] = (np.pi / 2, -np.pi / 2)
     background: float = 0.0
     pupil_background: float = 0.0
     scale: float = 1.0
@@ -84,20 +84,31 @@ class Optics:
 
     def __post_init__(self) -> None:
         _check.number("diameter", self.diameter, 1e-3)
-        _check.pair("phase_shifts", self.phase_shifts, _check.number)
-        first, second = np.exp(1j * np.array(self.phase_shifts))
-        if min(abs(first - second), abs(first - 1), abs(second - 1)) < 1e-9:
-            expected = "two that differ by other than 0 mod 2 pi, none of them 0"
+        _check.sequence("phase_shifts", self.phase_shifts, expected="a list of one or two numbers")
+        if len(self.phase_shifts) not in (1, 2):
+            raise ValueError(f"phase_shifts has {len(self.phase_shifts)} values: expected one or two")
+        shifts = tuple(_check.number("phase_shifts", one) for one in self.phase_shifts)
+        object.__setattr__(self, "phase_shifts", shifts)
+        first, second = np.exp(1j * np.array([shifts[0], shifts[-1]]))
+        if min(abs(first - second) if len(shifts) == 2 else 1, abs(first - 1), abs(second - 1)) < 1e-9:
+            expected = "one, or two that differ by other than 0 mod 2 pi, none of them 0"
             raise ValueError(f"phase_shifts = {_check.shown(self.phase_shifts)}: expected {expected}")
         _check.number("scale", self.scale, 0, open_low=True)
         ends = {"background": (-1, 1), "pupil_background": (-1, 1), "leakage": (0, 0.5), "unmasked": (0, 1)}
         for name, limits in ends.items():
             _check.number(name, getattr(self, name), *limits, open_high=True)
+        if len(shifts) == 1 and self.leakage:
+            raise ValueError(f"leakage = {self.leakage:g}: expected 0 with one phase shift, and so one image")
+
+    @property
+    def single(self) -> bool:
+        """Whether there is one mask, and one image."""
+        return len(self.phase_shifts) == 1
 
     @property
     def opposite(self) -> bool:
         """Whether the two phase shifts are +theta and -theta, modulo 2 pi."""
-        return abs(np.exp(1j * sum(self.phase_shifts)) - 1) < 1e-9
+        return not self.single and abs(np.exp(1j * sum(self.phase_shifts)) - 1) < 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,13 +247,13 @@ def phase_of(
 ) -> MeasuredPhase:
     """Phase of a pair of camera frames, for a first look.
 
-    It does what `register_frames`, `reduce_frames` and `recover_phase` do one after the other.
+    It calls `register_frames`, `reduce_frames` and `recover_phase` in turn.
 
     Parameters
     ----------
     frames, clear_frames : array_like, shape (ny, nx) or (2, ny, nx), counts
-        One camera image with both pupils, or one for each: with the mask in, and with the mask out. NaN marks bad
-        pixels.
+        One camera image with both pupils, or one for each: with the mask in, and with the mask out. With one phase
+        shift, one image with one pupil. NaN marks bad pixels.
     dark : array_like, shape (ny, nx) or (2, ny, nx), counts, optional
         Counts without light, which are subtracted from both.
     **optics
@@ -255,7 +266,7 @@ def phase_of(
     Raises
     ------
     TypeError, ValueError
-        If a shape is another one, or the pupils are not found.
+        If a shape is wrong, or the pupils are not found.
 
     Examples
     --------
@@ -276,7 +287,7 @@ def phase_of(
             raise ValueError(f"dark has shape {np.shape(less)}: expected {images.shape}, that of {name}")
         images = np.atleast_3d(images - less).reshape(-1, *images.shape[-2:])
         pair.append([Image(nearest_good(one, ok), ~ok, name) for one, ok in ((x, np.isfinite(x)) for x in images)])
-    return recover_phase(reduce_frames(register_frames(*pair), known))
+    return recover_phase(reduce_frames(register_frames(*pair, n_pupils=len(known.phase_shifts)), known))
 
 
 def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | None = None) -> Measurement:
@@ -435,8 +446,9 @@ def _amplitude(light: NDArray, diameter: float) -> NDArray[np.float64]:
 def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: float = 1e-4) -> MeasuredPhase:
     """Phase of a measurement by the phase-shifted iteration, and its modelled frames.
 
-    Bad pixels take no part: their intensity is that of the model, with the phase of the nearest good point, so
-    that the reference wave has no hole. They are NaN in the result.
+    One image is reconstructed by the iterated arcsine. Bad pixels take no part: their intensity is that of the
+    model, with the phase of the nearest good point, so that the reference wave has no hole. They are NaN in the
+    result.
 
     Parameters
     ----------
@@ -452,8 +464,9 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: f
     """
     n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
     sensor = model(measurement)
-    iterate = PhaseShifted(sensor, n_iterations=n_iterations, tolerance=tolerance)
-    frames = np.maximum(ideal_frames(measurement), 0)
+    method = Arcsine if measurement.optics.single else PhaseShifted
+    iterate = method(sensor, n_iterations=n_iterations, tolerance=tolerance)
+    frames = np.maximum(ideal_frames(measurement), 0)[: sensor.n_masks]
     inner = (..., *sensor.window)
     bad = measurement.pupil.inside & ~measurement.good
     for _ in range(2 if bad.any() else 1):
@@ -463,7 +476,7 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: f
     return MeasuredPhase(
         phase=np.where(measurement.good, estimate.phase, np.nan),
         measured=_scaled(measurement),
-        modelled=_mix(clean, measurement),
+        modelled=_mix(np.broadcast_to(clean, measurement.intensity.shape), measurement),
         measurement=measurement,
         converged=bool(estimate.converged),
         n_unsolved=int(estimate.n_unsolved),
@@ -494,11 +507,13 @@ def unmixed(frames: NDArray, leakage: float, unmasked: float, light: NDArray | f
 
 
 def predict_other(measurement: Measurement, n_iterations: int = 25) -> NDArray[np.float64]:
-    """Correlation of each frame with the one that the other frame alone predicts, (2,).
+    """Correlation of each frame with the one that the other frame alone predicts, (2,); NaN with one image.
 
     Parameters, as for `recover_phase`.
     """
     _check.instance("measurement", measurement, Measurement)
+    if measurement.optics.single:
+        return np.full(2, np.nan)
     good = measurement.good
     frames = np.maximum(ideal_frames(measurement), 0)[(..., *measurement.window)]
     return correlations(frames[:, good], predicted_frames(measurement, n_iterations)[:, good])

@@ -88,6 +88,8 @@ def fit(
     n_steps = _check.integer("n_steps", n_steps, 1)
     if not names:
         return registered, optics
+    if optics.single:
+        raise ValueError(f"names = {_check.shown(names)}: expected none with one image, which cannot test a fit")
     # The unknowns are values of the optics, then a shift (rows, columns) of each of these images.
     values = [name for name in names if name in _RANGES]
     sure = np.all(registered.placement.sigma[:2] < _SURE)
@@ -236,6 +238,7 @@ def steps(
     names = "registration by content", "background around the pupils", "balance of the flux"
     for n_on, name in enumerate(("outlines of the pupils", *names)):
         switches: dict[str, Any] = {"subpixel": n_on > 0, "background": n_on > 1, "balance": n_on > 2}
+        switches["n_pupils"] = len(optics.phase_shifts)
         add(name, register_frames(frames, clear_frames, **settings, **switches), optics)
     for number, name in enumerate(fitted, 1):
         last = work[-1].result.measurement

@@ -232,6 +232,7 @@ def register_frames(
     subpixel: bool = True,
     background: bool = True,
     balance: bool = True,
+    n_pupils: int = 2,
 ) -> RegisteredFrames:
     """Find the pupils on the images and register these to each other.
 
@@ -259,6 +260,8 @@ def register_frames(
         Register to a fraction of a pixel. If not, pupils are put on each other by their outlines, to whole pixels.
     background, balance : bool
         See `RegisteredFrames`.
+    n_pupils : int
+        1 for a sensor with one mask and one image. The result holds this image twice.
 
     Returns
     -------
@@ -271,11 +274,14 @@ def register_frames(
     """
     exposure = _check.number("exposure", exposure, 0, open_low=True)
     subpixel = _check.flag("subpixel", subpixel)
+    n_pupils = _check.integer("n_pupils", n_pupils, 1, 2)
     background, balance = _check.flag("background", background), _check.flag("balance", balance)
     for name, given in (("frames", frames), ("clear_frames", clear_frames)):
         _check.sequence(name, given, Image)
-        if len(given) not in (1, 2):
-            raise ValueError(f"{name} holds {len(given)} images: expected 1 or 2")
+        if len(given) not in (1, n_pupils):
+            raise ValueError(f"{name} holds {len(given)} images: expected 1{' or 2' * (n_pupils == 2)}")
+    if n_pupils == 1:
+        frames, clear_frames = [frames[0]] * 2, [clear_frames[0]] * 2
     given = *frames, *clear_frames
     # The clear frames are judged alone, so that a pupil stands at the same place for all frames.
     frames, clear_frames = _without_odd(frames, clear_frames), _without_odd(clear_frames)
@@ -283,7 +289,7 @@ def register_frames(
     n_odd = sum(int(np.count_nonzero(image.bad & ~before.bad)) for image, before in marked)
     shape = clear_frames[0].counts.shape
     diameter = None if pupil_diameter is None else check_diameter(pupil_diameter, shape)
-    centers = None if pupil_centers is None else check_centers(pupil_centers)
+    centers = None if pupil_centers is None else check_centers(pupil_centers, n_pupils)
     if centers is not None and diameter is None:
         raise ValueError("pupil_centers without a pupil_diameter: expected both, or neither")
     clear, pupils = _locate(clear_frames, centers, diameter)
@@ -308,12 +314,13 @@ def register_frames(
     return _register(rough, frames_too=moved) if subpixel else rough
 
 
-def check_centers(centers: Any) -> NDArray[np.float64]:
-    """Return the centres of two pupils, (2, 2)."""
+def check_centers(centers: Any, n_pupils: int = 2) -> NDArray[np.float64]:
+    """Return the centres of two pupils, (2, 2); one stands there twice."""
     centers = _check.real_map("pupil_centers", centers)
-    if centers.shape != (2, 2):
-        raise ValueError(f"pupil_centers has shape {centers.shape}: expected (row, column) of each of two pupils")
-    return centers
+    if centers.shape != (n_pupils, 2):
+        pupils = "one pupil" if n_pupils == 1 else "each of two pupils"
+        raise ValueError(f"pupil_centers has shape {centers.shape}: expected (row, column) of {pupils}")
+    return np.concatenate([centers] * (3 - n_pupils))
 
 
 def check_diameter(diameter: Any, shape: tuple[int, ...]) -> float:

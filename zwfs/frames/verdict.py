@@ -44,6 +44,11 @@ _UNEVEN = 0.03  # difference of the two flux ratios that is worth a word
 _EXCESS = 0.02  # light around the pupil, 1 = mean of the pupil, that is worth a word
 _MANY = 0.01  # of the points
 _TURNED = 5.0  # standard errors: a rotation or magnification beyond them is real
+_ONE_IMAGE = (
+    "Not decided: one image fits nearly any phase. It cannot show whether the phase is on the right branch of the "
+    "arcsine, nor an error of dimple, light or background. Poke a known phase, or take a second image with "
+    "another phase shift."
+)
 _LEAST_SKEW = 0.5  # skewness of the change of phase: that of noise is about 0, that of one poke 1
 
 
@@ -165,14 +170,21 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
     measurement = result.measurement
     score = predict_other(measurement, n_iterations)
     control = predict_other(upside_down(measurement), n_iterations)
-    near = near_edges(measurement)
+    near, single = near_edges(measurement), measurement.optics.single
     inner, edge, sigma = np.nan, np.nan, None
     if noise is not None:
         _check.instance("noise", noise, CameraNoise)
+        sigma = error_bar(result, noise)
+    if noise is not None and not single:
         ratio = _over_noise(result, noise)
         inner, edge = _rms(ratio[measurement.good & ~near]), _rms(ratio[measurement.good & near])
-        sigma = error_bar(result, noise)
     placed = not np.isnan(measurement.registered.placement.sigma[2:]).any()
+    if single:
+        strength = float(np.nanstd(result.phase))
+        one = {"fit": _ONE_IMAGE}
+        if warnings := " ".join(_warnings(result)):
+            one["warnings"] = warnings
+        return Verdict(score, control, inner, edge, sigma, placed, (1.0, 1.0), (strength, strength), one)
     scales, strengths = _scales(measurement, n_iterations)
     findings = {
         "fit": _of_fit(result, inner, edge, near, placed),
@@ -433,6 +445,8 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
     _check.instance("poked", poked, Measurement)
     if not (sign := _check.integer("sign", sign, -1, 1)):
         raise ValueError("sign = 0: expected 1 or -1")
+    if flat.optics.single:
+        raise ValueError("flat has one image: expected two, whose order is sought")
     if flat.pupil.shape != poked.pupil.shape or flat.optics != poked.optics:
         raise ValueError("flat and poked differ in optics or in the grid of the pupil: expected the same")
     optics = flat.optics

@@ -8,7 +8,7 @@ from astropy.io import fits
 
 from zwfs.frames.__main__ import main
 from zwfs.frames.pipeline import Optics, near_edges, phase_of, recover_phase, reduce_frames
-from zwfs.frames.refine import steps
+from zwfs.frames.refine import fit, steps
 from zwfs.frames.registration import Image, register_frames
 from zwfs.frames.verdict import CameraNoise, judge
 
@@ -170,7 +170,9 @@ def test_one_image_takes_the_road_of_two(single, tmp_path, monkeypatch):
 
 def test_one_image_cannot_test_a_fit(single):
     images = [[Image(one, np.zeros(one.shape, bool))] for one in single[2:]]
+    optics = Optics(1.06, (np.pi / 2,))
+    assert steps(*images, optics, ["scale"])[-1].name == "no fit: one image cannot test it"
     with pytest.raises(ValueError, match="expected none with one image"):
-        steps(*images, Optics(1.06, (np.pi / 2,)), ["scale"])
+        fit(register_frames(*images, n_pupils=1), optics, ["scale"])
     with pytest.raises(ValueError, match=r"leakage = 0\.1: expected 0 with one phase shift"):
         Optics(1.06, (np.pi / 2,), leakage=0.1)

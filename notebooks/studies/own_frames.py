@@ -181,7 +181,8 @@ def draw_signs(measurement: Measurement, height: float = 0.4) -> Figure:
     apart = np.hypot(x - 0.64 * nx, y - 0.62 * ny) / measurement.registered.diameter
     poke = np.where(sensor.pupil.inside, height * np.exp(-((apart / 0.1) ** 2)), 0)
     change = (sensor.measure(poke) - sensor.measure(np.zeros_like(poke)))[(..., *sensor.window)]
-    figure, panels = plt.subplots(1, 4, figsize=(7.8, 3.4), width_ratios=(1.1, 1, 1, 1))
+    n_images = len(change)
+    figure, panels = plt.subplots(1, 2 + n_images, figsize=(7.8, 3.4), width_ratios=(1.1, *[1] * (1 + n_images)))
     figure.set_layout_engine("constrained", wspace=0.06)
     _pulled_mirror(panels[0])
     maps = [(poke, height, "phase of the poke\nabove 0 (red)")]
@@ -252,7 +253,8 @@ def step_columns(work: Sequence[Step], errors: Sequence[float] | None) -> dict[s
 
 def sign_columns(measurement: Measurement) -> dict[str, NDArray]:
     """Phase shifts of the images."""
-    return {"image": np.array([1, 2]), "phase shift (rad)": np.array(measurement.optics.phase_shifts)}
+    shifts = np.array(measurement.optics.phase_shifts)
+    return {"image": np.arange(1, shifts.size + 1), "phase shift (rad)": shifts}
 
 
 def verdict_table(verdict: Verdict) -> Table:

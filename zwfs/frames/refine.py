@@ -210,7 +210,7 @@ def steps(
     optics : Optics
     fitted : sequence of str
         Parameters to fit, see `fit`: with each step one more, and all earlier ones again. The name of a step says
-        if its values were not kept.
+        if its values were not kept. One image is not fitted, and the last step says so.
     n_iterations : int
         As for `recover_phase`.
     **settings
@@ -240,6 +240,10 @@ def steps(
         switches: dict[str, Any] = {"subpixel": n_on > 0, "background": n_on > 1, "balance": n_on > 2}
         switches["n_pupils"] = len(optics.phase_shifts)
         add(name, register_frames(frames, clear_frames, **settings, **switches), optics)
+    if optics.single and fitted:
+        last = work[-1].result.measurement
+        add("no fit: one image cannot test it", last.registered, last.optics)
+        return work
     for number, name in enumerate(fitted, 1):
         last = work[-1].result.measurement
         found = fit(last.registered, last.optics, fitted[:number], n_iterations)

@@ -50,12 +50,17 @@ def _is_of(value: Any, kind: Any) -> bool:
         return any(_is_of(value, part) for part in parts)
     if origin is np.ndarray:
         [number] = get_args(parts[1])
-        return isinstance(value, np.ndarray) and _same_kind(value.dtype, number)
+        plain = isinstance(value, np.ndarray) and not isinstance(value, np.ma.MaskedArray)
+        return plain and _same_kind(value.dtype, number)
     if origin is tuple:
         return isinstance(value, tuple) and (
             all(_is_of(one, parts[0]) for one in value)
             if parts[-1] is Ellipsis
             else len(value) == len(parts) and all(map(_is_of, value, parts))
+        )
+    if origin is dict:
+        return isinstance(value, dict) and all(
+            _is_of(one, part) for pair in value.items() for one, part in zip(pair, parts, strict=True)
         )
     if kind in (bool, int, float):
         plain = value.item() if isinstance(value, np.generic) else value
@@ -68,7 +73,7 @@ def _is_of(value: Any, kind: Any) -> bool:
 def _same_kind(dtype: np.dtype, number: Any) -> bool:
     """Whether numbers of a type are of the kind of another: of any size."""
     kinds = np.bool_, np.integer, np.floating, np.complexfloating
-    return all(np.issubdtype(dtype, kind) for kind in kinds if np.issubdtype(number, kind))
+    return dtype.kind != "m" and all(np.issubdtype(dtype, kind) for kind in kinds if np.issubdtype(number, kind))
 
 
 def _readable(kind: Any) -> str:

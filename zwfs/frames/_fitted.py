@@ -35,7 +35,7 @@ _STATIONARY = 0.1  # logarithm of the factor on the variance of a prior, below w
 _POWERS = 0.5, 2.0  # least and most power of this factor in an update of the rms
 _STRONGER = 4.5  # factor on the first rms for each unit of the exponent: the same density at about 10 cycles / D
 _ALLOWED = 0.05  # error of the model in the first stage, over the light of a full pixel
-_LEAST = 1e-12  # counts, of a noise
+_LEAST, _MOST = 1e-12, 1e12  # counts: least of a noise, and most of a frame
 _DRAWS = 12  # for the error bars of a phase
 
 
@@ -126,7 +126,8 @@ class FittedSensor:
         sigma = _check.real_array("sigma", sigma)
         if sigma.shape not in ((), shape):
             raise ValueError(f"sigma has shape {sigma.shape}: expected {shape}, or a number")
-        _check.moderate("frames", np.nan_to_num(counts, posinf=0, neginf=0))
+        if np.nanmax(np.abs(counts), initial=0, where=np.isfinite(counts)) > _MOST:
+            raise ValueError(f"frames reaches {np.nanmax(np.abs(counts)):.3g}: expected counts up to {_MOST:g}")
         if not np.all((sigma > _LEAST) & (sigma < np.inf)):
             raise ValueError(
                 f"sigma reaches from {sigma.min():.6g} to {sigma.max():.6g}: expected finite values above "

@@ -650,7 +650,7 @@ def _check_sizes(path: Path) -> None:
 def _number_or_inf(name: str, value: Any, *, open_low: bool = False) -> float:
     """Return a number of at least 0, or infinity."""
     is_inf = isinstance(value, float) and value == np.inf
-    return value if is_inf else _check.number(name, value, 0, open_low=open_low)
+    return value if is_inf else _check.number(name, value, 0, _check.LARGEST, open_low=open_low)
 
 
 def _dark(dark: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32]:

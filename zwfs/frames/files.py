@@ -81,7 +81,7 @@ class CameraFile:
             _check.instance(name, getattr(self, name), str)
         _check.instance("header", self.header, Mapping)
         _check.integer("n_exposures", self.n_exposures, 1)
-        if self.full_scale != np.inf:
+        if not (isinstance(self.full_scale, float) and self.full_scale == np.inf):
             _check.number("full_scale", self.full_scale, 0, open_low=True)
         if self.path is not None:
             _check.instance("path", self.path, Path)
@@ -296,7 +296,8 @@ def images(
         bad = ~_usable(counts) | marked | np.any(saturated, axis=0)
         if bad.all():
             names = _names([*(file for file, _ in exposures), *darks, *bad_pixels])
-            raise ValueError(f"{names}: all pixels are bad or saturated: expected an image")
+            level = "" if saturation is None else f" with saturation = {saturation:g}"
+            raise ValueError(f"{names}: all pixels are bad or saturated{level}: expected an image")
         name = _names([file for file, _ in exposures]) + f"[{index}]" * (len(first.images) > 1)
         result.append(Image(nearest_good(counts, ~bad), bad, name))
     return tuple(result)

@@ -338,7 +338,7 @@ def test_calibrated_phase_has_half_the_error_that_the_plain_route_had(calibrated
     bench, fit = calibrated
     screen = bench.smooth(rms, seed=1)
     counts = bench.counts(screen, (7, 1))
-    found = FittedSensor(fit)(counts, np.sqrt(np.maximum(counts, 0) + bench.noise**2))
+    found = FittedSensor(fit)(counts)
     asked = BEFORE["VLT" if bench is TURNED else "disc"]["plain"][number] / 2
     assert bench.error(found, screen) < (min(0.02, asked) if rms <= 0.8 else asked)
     left = (found - bench.on_pupil(screen + bench.flat))[bench.fully_lit]

@@ -791,6 +791,14 @@ def test_pixels_that_are_not_recorded_have_no_weight(pupil, modes, method):
     assert reconstruction_error(pupil, found.phase, phase) < 2e-5
 
 
+def test_one_mask_needs_no_axis_of_masks(pupil, modes):
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2))
+    frame = sensor.measure(0.2 * modes[3])
+    np.testing.assert_array_equal(Arcsine(sensor)(frame[0]).phase, Arcsine(sensor)(frame).phase)
+    with pytest.raises(ValueError, match="frames has shape"):
+        Arcsine(sensor)(frame[0][1:])
+
+
 def test_recorded_pixels_hold_the_pupil_and_suit_the_method(pupil):
     mask, most = Dimple(1.06, np.pi / 2), pupil.inside.copy()
     most[np.nonzero(pupil.inside)[0][0], np.nonzero(pupil.inside)[1][0]] = False

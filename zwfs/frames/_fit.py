@@ -119,8 +119,8 @@ class BenchFit(Result):
         Light of each pixel of the pupil, 1 = mean of the first clear frame.
     misfit : ndarray, shape (2 + 2 n_states,)
         Mean square of the residuals over the noise, over all pixels: of the clear frames, then of each pair.
-    noise : float, counts rms
-        Noise of a pixel without light, as given or as estimated.
+    noise, gain : float, counts rms and electrons / count
+        Noise of a pixel without light, as given or as estimated, and the gain as given.
     converged : bool
         Whether the last step of the estimates, which the maps follow, promised to lower half the sum of squares by
         less than 0.7.
@@ -139,6 +139,7 @@ class BenchFit(Result):
     light: NDArray[np.float64]
     misfit: NDArray[np.float64]
     noise: float
+    gain: float
     converged: bool
     remarks: tuple[str, ...]
     point: Point
@@ -487,7 +488,7 @@ def _result(data: Recording, point: Point, converged: bool, is_reversed: bool) -
     remarks = tuple(_remarks(data, point, misfit, estimates, is_reversed))
     flat, light = (one[PAD:-PAD, PAD:-PAD] for one in (point.phase_means, point.light_means))
     point = Point(replace(point.problem, following=None), point.x)  # which takes less memory
-    return BenchFit(estimates, spread, flat, light, misfit, data.noise, converged, remarks, point)
+    return BenchFit(estimates, spread, flat, light, misfit, data.noise, data.gain, converged, remarks, point)
 
 
 def _remarks(

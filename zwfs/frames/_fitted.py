@@ -100,15 +100,18 @@ class FittedSensor:
         """Phase of the optics at a flat command, (n, n)."""
         return self.fit.flat
 
-    def __call__(self, frames: ArrayLike, sigma: ArrayLike, prior: MapPrior | None = None) -> FittedPhase:
+    def __call__(
+        self, frames: ArrayLike, sigma: ArrayLike | None = None, prior: MapPrior | None = None
+    ) -> FittedPhase:
         """Phase of one pair of frames.
 
         Parameters
         ----------
         frames : array_like, shape (2, ny, nx), counts
             Less the dark, with the exposure of the fit's frames. NaN marks bad pixels.
-        sigma : array_like, shape (2, ny, nx) or a number, counts rms
-            Noise of the pixels: ``sqrt(maximum(frames, 0) / gain + noise**2)`` with those of `fit_bench`.
+        sigma : array_like, shape (2, ny, nx) or a number, counts rms, optional
+            Noise of the pixels, by default ``sqrt(maximum(frames, 0) / gain + noise**2)`` with those of the fit;
+            that of means of several frames is smaller.
         prior : MapPrior, optional
             That of an earlier result. It saves half of the time, and fits phases of the same roughness
             and strength only. By default the evidence chooses one.
@@ -123,6 +126,8 @@ class FittedSensor:
         shape = (2, *self._fitted.camera.shape)
         if counts.shape != shape:
             raise ValueError(f"frames has shape {counts.shape}: expected {shape}")
+        if sigma is None:
+            sigma = np.sqrt(np.maximum(np.nan_to_num(counts), 0) / self.fit.gain + self.fit.noise**2)
         sigma = _check.real_array("sigma", sigma)
         if sigma.shape not in ((), shape):
             raise ValueError(f"sigma has shape {sigma.shape}: expected {shape}, or a number")

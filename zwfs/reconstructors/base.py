@@ -344,8 +344,8 @@ class Reconstructor(Immutable, ABC):
         Parameters
         ----------
         frames : array_like, shape (..., n_masks, ny', nx')
-            Intensity, 1 = mean of the pupil with the mask out. Keep the values below 0 that noise causes after the
-            dark is subtracted: to raise them to 0 would bias the phase.
+            Intensity, 1 = mean of the pupil with the mask out; with one mask also (ny', nx'). Keep the values
+            below 0 that noise causes after the dark is subtracted: to raise them to 0 would bias the phase.
         start : array_like, shape (ny, nx) or (..., ny, nx), radian, optional
             Phase at which the iteration starts; flat if left out. A method that does not iterate refuses it.
         history : bool
@@ -599,9 +599,11 @@ def check_frames(
         Sum of a clear frame over the pupil. Frames that are more than 10 times as bright cause a warning.
     """
     frames = _check.real_any(name, frames)
-    shape = (sensor.n_masks, *sensor.detector_shape)
+    shape, xp = (sensor.n_masks, *sensor.detector_shape), Kind.of(frames).xp
+    if sensor.n_masks == 1 and frames.ndim == 2:
+        frames = frames[np.newaxis, ...]
     _check.trailing_shape(name, frames, shape, "masks and detector of the sensor")
-    batch, xp = tuple(frames.shape[:-3]), Kind.of(frames).xp
+    batch = tuple(frames.shape[:-3])
     flat = xp.reshape(frames, (-1, *shape))
     if not prod(batch):
         raise ValueError(f"{name} has shape {tuple(frames.shape)}: expected at least one frame")

@@ -305,7 +305,7 @@ def test_other_values_replace_those_of_a_fit_and_explain_its_frames_worse():
     assert (wrong["diameter"].value, wrong["leakage"].value) == (1.06, 0.0)
     assert wrong["first"] == fit["first"]
     assert wrong.point.cost > 2 * fit.point.cost
-    with pytest.raises(KeyError, match="'size': expected one of"):
+    with pytest.raises(ValueError, match="values = 'size': expected one of"):
         fit.replaced({"size": 1.0})
     with pytest.raises(TypeError, match="diameter = 'large'"):
         fit.replaced({"diameter": "large"})

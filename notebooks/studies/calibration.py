@@ -250,7 +250,8 @@ def estimate_table(taken: Recording, fit: BenchFit) -> Table:
         value, sigma = fit[name].value, fit[name].sigma
         deviation = (value - true[name]) / sigma
         digits = max(1 - int(np.floor(np.log10(sigma))), 0)
-        fitted = f"{value:.{digits}f} ± {sigma:.{digits}f}"
+        shown = f"{value:.{digits}f}"
+        fitted = f"{shown if float(shown) else 0} ± {sigma:.{digits}f}"
         rows.append([title, f"{true[name]:.5g}", fitted, f"{deviation:+.1f}"])
     return Table(["parameter", "of the bench", "fitted", "deviation (error bars)"], rows)
 

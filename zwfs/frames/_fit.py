@@ -52,7 +52,7 @@ _PIXEL = 1 / 12  # pixels squared: variance of the area of a pixel; f points alo
 # (pixels, radian, 1), where light that changes within a pixel aliases.
 _BLURRED = {"phase shift": 3e-4, "focus": 5e-6}
 _SHARP = {"row": 1.2e-3, "column": 1.2e-3, "rotation": 2e-4, "magnification": 4e-5}
-_PHYSICAL = "leakage", "unmasked", "blur"  # the lower limit of these numbers is that of the physics
+_PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the physics
 _MOST = 1e9  # of a number that replaces an estimate
 _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
 
@@ -331,8 +331,9 @@ def _free(data: Recording, start: _Start) -> list[Free]:
         "first": (start.shifts[0],),
         "second": (start.shifts[1],),
         "leakage": (0.01, 0.0, 0.45),
-        # Two phase shifts, leakage and this share are hardly told apart: its prior decides their error bars.
-        "unmasked": (0.0, 0.0, 0.45, 0.03),
+        # Two phase shifts, leakage and this share are hardly told apart: its prior decides their error bars. Noise
+        # may bring it below 0, where a limit would stop the fit.
+        "unmasked": (0.0, -0.2, 0.45, 0.03),
         "blur": (0.5, 0.02, 5.0),
     }
     return free + [Free(name, ((None, name),), *values) for name, values in limits.items()]

@@ -299,7 +299,7 @@ class Calibration(Immutable):
             masks["diameter"],
             (masks["first"], masks["second"]),
             leakage=masks["leakage"],
-            unmasked=masks["unmasked"],
+            unmasked=max(masks["unmasked"], 0.0),
         )
         n_pixels, bad = fit.point.problem.camera.n_pixels, ~np.isfinite(counts).all(axis=0)
         light = fit.light * (radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2)

@@ -214,7 +214,7 @@ def fit_bench(
     diameter: float = 1.06,
     phase_shifts: tuple[float, float] = (np.pi / 2, -np.pi / 2),
     oversampling: int | None = None,
-    n_steps: int = 10,
+    n_steps: int = 15,
     progress: Callable[[str], Any] | None = None,
 ) -> BenchFit:
     """Fit a model of the optics to frames of a mirror in known states, and to clear frames.

@@ -79,8 +79,8 @@ class Result:
         """
         from matplotlib.figure import Figure
 
-        known = ((getattr(self, name, None), label) for name, label in self.panels)
-        panels = [(values, label) for values, label in known if values is not None]
+        fields_of = ((getattr(self, name, None), label) for name, label in self.panels)
+        panels = [(values, label) for values, label in fields_of if values is not None]
         figure = Figure((_SIDE * 1.35 * len(panels), _SIDE))
         figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.05)
         for axes, (values, label) in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
@@ -108,7 +108,7 @@ class PhaseResult(Result, NDArrayOperatorsMixin):
         return np.array(self.phase, dtype=dtype, copy=True if copy is None else copy)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **settings: Any) -> Any:
-        arrays = [one.phase if isinstance(one, PhaseResult) else one for one in inputs]
+        arrays = [value.phase if isinstance(value, PhaseResult) else value for value in inputs]
         return getattr(ufunc, method)(*arrays, **settings)
 
     def __getitem__(self, index: Any) -> Any:
@@ -116,7 +116,7 @@ class PhaseResult(Result, NDArrayOperatorsMixin):
 
 
 def _plain(name: str, value: Any) -> Iterator[tuple[str, bool | int | float | str]]:
-    """Plain values in a field, by their names; what is none is left out."""
+    """Numbers, flags and texts in a field, by their names. Arrays and other objects are skipped."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, _PLAIN):

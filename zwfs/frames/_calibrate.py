@@ -149,7 +149,7 @@ def _from_commands(
             **kept,
         ), fit.remarks
 
-    n_states, errors = len(states.commands), []
+    n_states = len(states.commands)
     try:
         plain = Calibration.of(_measured(states, optics, centers, diameter), states.dark, **kept)
     except ValueError as error:
@@ -157,11 +157,12 @@ def _from_commands(
         n_states = 2
     if n_states > 2:
         partial, _ = fitted_to(n_states - 1)
-        errors = [_error_of_last(one, partial, states) for one in (partial, plain)]
-        if errors[0] > errors[1]:
+        error_fitted, error_plain = (_error_of_last(bench, partial, states) for bench in (partial, plain))
+        if error_fitted > error_plain:
             warnings.warn(
-                f"The fit of the bench does not help: without the last command, it measures that command to "
-                f"{errors[0]:.3g} rad rms, a calibration without commands to {errors[1]:.3g}. The latter is kept.",
+                f"The fit of the bench does not help: fitted to the other commands, it measures the last one to "
+                f"{error_fitted:.3g} rad rms, a calibration without commands to {error_plain:.3g} rad rms. The "
+                "calibration without commands is kept.",
                 stacklevel=3,
             )
             return plain
@@ -174,7 +175,7 @@ def _from_commands(
 def _measured(states: _States, optics: Optics, centers: Any, diameter: Any) -> Measurement:
     """Frames of the first state, with the clear frames, for a calibration without commands."""
     frames, clear = (
-        [Image(nearest_good(one, good), ~good, name) for one, good in ((one, np.isfinite(one)) for one in pair)]
+        [Image(nearest_good(counts, np.isfinite(counts)), ~np.isfinite(counts), name) for counts in pair]
         for pair, name in ((states.frames[0].mean(axis=0), "frame"), (states.clear.mean(axis=0), "clear frame"))
     )
     place = {} if centers is None or diameter is None else {"pupil_centers": centers, "pupil_diameter": diameter}
@@ -187,20 +188,17 @@ def _error_of_last(calibration: Calibration, grid: Calibration, states: _States)
     Phases are compared on the grid of the commands, which another calibration has, 2 pixels and more from edges.
     """
     images = np.nan_to_num(states.frames[[0, -1]].mean(axis=1)) + states.dark
-    found = calibration(images[:, 0] if calibration.n_images == 1 else images, saturation=np.inf)
+    phases = calibration(images[:, 0] if calibration.n_images == 1 else images, saturation=np.inf).phase
     row, column = grid.places[0] - calibration.places[0, :, :1, :1]
-    waves = np.nan_to_num(np.exp(1j * found.phase.astype(float)))
-    seen = [
-        sum(
-            f * ndimage.map_coordinates(part, (row, column), order=1)
-            for f, part in ((1, one.real), (1j, one.imag))
-        )
-        for one in waves
-    ]
+    waves = np.nan_to_num(np.exp(1j * phases.astype(float)))
+    first, last = (ndimage.map_coordinates(wave, (row, column), order=1) for wave in waves)
     change = np.exp(1j * (states.commands[-1] - states.commands[0]))
     inner = ndimage.binary_erosion(grid.good, iterations=2)
-    left = (seen[1] * np.conj(seen[0] * change))[inner & (np.abs(seen).min(axis=0) > 0.8)]
-    return float(np.angle(left * np.conj(left.mean())).std())
+    known = inner & (
+        np.minimum(np.abs(first), np.abs(last)) > 0.8
+    )  # next to a point without a phase it is smaller
+    error = (last * np.conj(first * change))[known]
+    return float(np.angle(error * np.conj(error.mean())).std())
 
 
 class _States(NamedTuple):

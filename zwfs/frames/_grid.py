@@ -147,9 +147,9 @@ class Grid:
         modelled, pupil = self._modelled(phase), self.reconstruct.sensor.pupil
         squares = np.sum((modelled - frames) ** 2, axis=(1, 2, 3), where=pupil.inside)
         where = good[:, np.newaxis]
-        seen, known = (np.sum(one - self.offset, axis=(1, 2, 3), where=where) for one in (frames, modelled))
+        light, expected = (np.sum(pair - self.offset, axis=(1, 2, 3), where=where) for pair in (frames, modelled))
         with np.errstate(invalid="ignore", divide="ignore"):  # no point of a lost frame may be good
-            return np.sqrt(squares / (2 * pupil.n_points)), seen / known
+            return np.sqrt(squares / (2 * pupil.n_points)), light / expected
 
     def displaced(self, phase: NDArray, frames: NDArray, good: NDArray) -> tuple[NDArray, NDArray]:
         """Displacement of both images on frames (k, 2, ny, nx), (k, 2) in pixels, and its standard error.
@@ -162,7 +162,7 @@ class Grid:
         steady = phase.reshape(k, -1).copy()
         steady[:, self.edge[0]] = steady[:, self.edge[1]]
         modelled, measured = (
-            one.sum(axis=1).reshape(k, -1) for one in (self._modelled(steady.reshape(phase.shape)), frames)
+            pair.sum(axis=1).reshape(k, -1) for pair in (self._modelled(steady.reshape(phase.shape)), frames)
         )
         weight = good.reshape(k, -1)[:, self.rim] | self.beyond
         around = ((self.rim + step, self.rim - step) for step in (width, 1))

@@ -325,13 +325,13 @@ class Calibration(Immutable):
         made = replace(made, good=good, weights=weights, offset=offset, light=light)
         images = on_camera(np.nan_to_num(counts)) + made.dark
         # The lamp is that of the calibration, so its light is known.
-        found = made(images if n_images == 2 else images[:, 0], light=1.0, saturation=np.inf)
+        measured = made(images if n_images == 2 else images[:, 0], light=1.0, saturation=np.inf)
         ideal = np.einsum("ijyx,kjyx->kiyx", weights, intensity(counts)) + offset
-        _, ratios = made._work.compared(found.filled, ideal, np.broadcast_to(good, found.phase.shape))
+        _, ratios = made._work.compared(measured.filled, ideal, np.broadcast_to(good, measured.phase.shape))
         made = replace(made, light_ratio=float(ratios.mean()))
         return replace(
-            made, unexplained=unexplained(found.phase, phases), slopes=slopes_of(found.filled, good),
-            displacements=found.displacement.astype(float), residual=float(np.nanmax(found.residual)),
+            made, unexplained=unexplained(measured.phase, phases), slopes=slopes_of(measured.filled, good),
+            displacements=measured.displacement.astype(float), residual=float(np.nanmax(measured.residual)),
         )  # fmt: skip
 
     def save(self, path: str | Path) -> None:

@@ -277,17 +277,19 @@ def phase_of(
     >>> phase_of(bench.frames(), bench.clear_frames(), diameter=bench.diameter).converged
     True
     """
-    known, less = Optics(**optics), 0 if dark is None else _check.real_array("dark", dark)
+    sensor, unlit = Optics(**optics), 0 if dark is None else _check.real_array("dark", dark)
     pair = []
     for name, counts in (("frames", frames), ("clear_frames", clear_frames)):
         images = _check.real_array(name, counts)
         if images.ndim not in (2, 3) or images.shape[:-2] not in ((), (2,)):
             raise ValueError(f"{name} has shape {images.shape}: expected (ny, nx), or (2, ny, nx) for two images")
-        if np.shape(less) not in ((), images.shape[-2:], images.shape):
-            raise ValueError(f"dark has shape {np.shape(less)}: expected {images.shape}, that of {name}")
-        images = np.atleast_3d(images - less).reshape(-1, *images.shape[-2:])
-        pair.append([Image(nearest_good(one, ok), ~ok, name) for one, ok in ((x, np.isfinite(x)) for x in images)])
-    return recover_phase(reduce_frames(register_frames(*pair, n_pupils=len(known.phase_shifts)), known))
+        if np.shape(unlit) not in ((), images.shape[-2:], images.shape):
+            raise ValueError(f"dark has shape {np.shape(unlit)}: expected {images.shape}, that of {name}")
+        images = (images - unlit).reshape(-1, *images.shape[-2:])
+        pair.append(
+            [Image(nearest_good(image, np.isfinite(image)), ~np.isfinite(image), name) for image in images]
+        )
+    return recover_phase(reduce_frames(register_frames(*pair, n_pupils=len(sensor.phase_shifts)), sensor))
 
 
 def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | None = None) -> Measurement:

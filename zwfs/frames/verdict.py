@@ -114,7 +114,7 @@ class Verdict(Result):
     def plot(self) -> Figure:
         """Draw the scores of both images next to those of the control, which must fail, and the error bar."""
         figure = super().plot()
-        [axes] = (one for one in figure.axes if one.get_xlabel() == "number")
+        [axes] = (panel for panel in figure.axes if panel.get_xlabel() == "number")
         axes.plot([1, 2], self.control, "s", mfc="none", label="control")
         axes.lines[0].set_label("score")
         axes.set(xlabel="image", xlim=(0.5, 2.5), ylim=(min(-0.1, *self.control), 1))
@@ -181,10 +181,10 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
     placed = not np.isnan(measurement.registered.placement.sigma[2:]).any()
     if single:
         strength = float(np.nanstd(result.phase))
-        one = {"fit": _ONE_IMAGE}
+        findings = {"fit": _ONE_IMAGE}
         if warnings := " ".join(_warnings(result)):
-            one["warnings"] = warnings
-        return Verdict(score, control, inner, edge, sigma, placed, (1.0, 1.0), (strength, strength), one)
+            findings["warnings"] = warnings
+        return Verdict(score, control, inner, edge, sigma, placed, (1.0, 1.0), (strength, strength), findings)
     scales, strengths = _scales(measurement, n_iterations)
     findings = {
         "fit": _of_fit(result, inner, edge, near, placed),

@@ -337,6 +337,10 @@ def test_frames_without_two_equal_pupils_are_refused(recorded):
         register_frames([image(masked)], [image(np.zeros_like(bare), "empty.fits")])
     with pytest.raises(ValueError, match="1 bright regions as large as a pupil: expected 2, because two images"):
         register_frames([image(masked)], [image(np.hsplit(bare, 2)[0])])
+    with pytest.raises(
+        ValueError, match=r"expected 1, because another image holds .* or phase_shifts has one value"
+    ):
+        register_frames([image(masked)], [image(bare)], n_pupils=1)
     good = np.zeros(bare.shape, bool)
     good[40, 50] = True
     with pytest.raises(ValueError, match="pixels are marked as bad: expected a map that is 0 where good"):

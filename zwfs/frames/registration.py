@@ -35,6 +35,11 @@ _EDGE, _AROUND = 3, 8  # pixels around the pupil: those that take part where the
 # A pixel beyond all neighbours but one, by so many times their spread and noise: on frame and clear frame, on one.
 _ODD_ON_BOTH, _ODD = 0.5, 3.0
 _FAINT = 0.01  # of the brightest light: a pixel that is off by less does no harm
+# Why an image holds one pupil, or two.
+_WHY = {
+    1: "because another image holds the other pupil, or phase_shifts has one value",
+    2: "because two images are needed, with different phase shifts",
+}
 FRAMES, CLEAR_FRAMES = slice(0, 2), slice(2, 4)  # of the four images
 _LARGEST_TURN, _LARGEST_STRETCH = 6.0, 0.06  # degrees, and relative, of the second image
 
@@ -349,9 +354,8 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> l
     largest = np.flatnonzero((areas > 0.25 * areas.max(initial=0)) & (areas.max(initial=0) >= 50)) + 1
     if len(largest) != n_pupils:
         raise ValueError(
-            f"{image.name}: {len(largest)} bright regions as large as a pupil: expected {n_pupils}"
-            f"{', because two images are needed, with different phase shifts' if n_pupils > 1 else ''}; "
-            f"give the positions, or look for stray light{remark}"
+            f"{image.name}: {len(largest)} bright regions as large as a pupil: expected {n_pupils}, "
+            f"{_WHY[n_pupils]}; give the positions, or look for stray light{remark}"
         )
     circles = [outline(smooth, labels == label, level, diameter) for label in largest]
     axis = int(np.argmax(np.ptp([circle[:2] for circle in circles], axis=0)))

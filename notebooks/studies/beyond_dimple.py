@@ -171,7 +171,8 @@ def draw_dimple_limits(limits: DimpleLimits, rms: float) -> Figure:
     screens = limits.factor[:, 1:]
     left.plot(limits.diameters, limits.factor[:, 0], color=flat, ls="--", label="flat wavefront")
     left.plot(limits.diameters, screens.mean(axis=1), color=color, label=f"{rms:g} rad rms")
-    left.fill_between(limits.diameters, screens.min(axis=1), screens.max(axis=1), color=color, alpha=0.25, lw=0)
+    low, high = screens.min(axis=1), screens.max(axis=1)
+    left.fill_between(limits.diameters, low, high, color=color, alpha=0.25, lw=0, label="_all screens")
     left.axhline(1, color=_INK, lw=1)
     left.text(0.52, 1.015, "diverges above", color=_INK, fontsize=9)
     left.set(ylabel="error after / before an iteration", ylim=(0, 1.2))
@@ -206,32 +207,9 @@ def _mark_instruments(axes: Axes) -> None:
         axes.axvspan(low - 0.01, high + 0.01, color="#d0d0d0", lw=0, zorder=0.4)
 
 
-def recovery_columns(curves: Mapping[float, DiameterCurves], threshold: float) -> dict[str, NDArray]:
-    """Columns of the figure: share of recovered screens and mean error of each method, for each input."""
-    columns = {}
-    for rms, curve in curves.items():
-        columns["diameter (lambda/D)"] = curve.diameters
-        for name in curve.errors:
-            columns[f"{name}, {rms:g} rad rms: share recovered"] = curve.recovered(name, threshold)
-            columns[f"{name}, {rms:g} rad rms: mean error (rad rms)"] = curve.mean(name)
-    return columns
-
-
 def recovery_screens(curves: Mapping[float, DiameterCurves]) -> dict[str, NDArray]:
     """Columns with a row for each screen of the first figure."""
     return stacked("input (rad rms)", {rms: curve.screens() for rms, curve in curves.items()})
-
-
-def limits_columns(limits: DimpleLimits) -> dict[str, NDArray]:
-    """Columns of the figure on the reasons."""
-    columns = {"diameter (lambda/D)": limits.diameters}
-    for index in range(limits.factor.shape[1]):
-        wavefront = f"screen {index}" if index else "flat wavefront"
-        columns[f"factor, {wavefront}"] = limits.factor[:, index]
-        columns[f"bound of tilt / ideal, {wavefront}"] = limits.tilt[:, index]
-        columns[f"bound of other modes / ideal, {wavefront}"] = limits.others[:, index]
-        columns[f"bound of all modes / ideal, {wavefront}"] = limits.total[:, index]
-    return columns
 
 
 def failing_table(curves: Mapping[float, DiameterCurves], threshold: float) -> Table:

@@ -17,7 +17,6 @@ from studies.kit.tables import Table
 from studies.kit.variants import add_narrow
 from zwfs.masks import Mask
 from zwfs.metrics import strehl
-from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
 LIMITS = parameter_limits("n_pixels diameter rms", phase_shift=(-6.2832, 6.2832))
@@ -73,7 +72,7 @@ def _wide(sensor: ZernikeSensor, planes: list[Plane], terms: list[_Term]) -> Fig
         scene.label(x, y - 1.5, "lens")
     scene.arrows(2.28, 2.66, y, 0.4)
     for x, plane in zip((1.25, 4.5, 7.75), planes, strict=True):
-        shown = scene.picture(x, y, 2.0, plane.image, plane.colors, plane.low, plane.high)
+        shown = scene.show(x, y, 2.0, plane)
         scene.label(x, y + 1.64, plane.name, weight="bold")
         scene.label(x, y + 1.3, plane.scale)
         scene.scale(shown, (x - 0.75, y - 1.2, 1.5, 0.08))
@@ -103,7 +102,7 @@ def _narrow(sensor: ZernikeSensor, planes: list[Plane], terms: list[_Term]) -> F
     left, mask = x + 0.9, sensor.masks[0]
     for along, plane in zip((0.8, focus, end), planes, strict=True):
         y = scene.place(along, 0)[1]
-        shown = scene.picture(x, y, size, plane.image, plane.colors, plane.low, plane.high)
+        shown = scene.show(x, y, size, plane)
         top = y + 0.42
         scene.label(left, top, plane.name, ha="left", va="center", weight="bold")
         scene.label(left, top - 0.28, plane.scale, ha="left", va="center")
@@ -140,24 +139,10 @@ def _draw_terms(scene: Scene, terms: list[_Term], places: list[Point], size: flo
     gap = (places[1][0] - places[0][0] - size) / 2
     for (x, y), term in zip(places, terms, strict=True):
         shown = scene.picture(x, y, size, term.image, term.colors, term.low, high, edge=None)
+        shown.set_label(f"_{term.name}")
         scene.label(x, y - size / 2 - 0.12, term.name, va="top")
         scene.label(x + size / 2 + gap, y, term.sign, size=20, va="center")
         scene.scale(shown, (x - size / 2, y - size / 2 - 0.53, size, 0.08), ticks=3)
-
-
-def sensor_layout_columns(
-    pupil: Pupil, phase: NDArray, measured: NDArray, incoming: NDArray, reference: NDArray
-) -> dict[str, NDArray]:
-    """Columns along the middle of the pupil: phase, and the intensities whose sum is measured."""
-    middle = pupil.shape[0] // 2
-    return {
-        "x at the middle of the pupil (D)": pupil.x,
-        "phase of psi_in (rad)": np.where(pupil.inside, phase, np.nan)[middle],
-        "I_out": measured[middle],
-        "I_in": incoming[middle],
-        "I_ref": reference[middle],
-        "interference": (measured - incoming - reference)[middle],
-    }
 
 
 def identity_table(

@@ -29,7 +29,6 @@ from studies.kit.style import INTENSITY_MAP, PHASE_MAP
 from studies.kit.tables import Table
 from studies.kit.variants import add_narrow
 from zwfs.masks import Dimple, Mask
-from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
 LIMITS = parameter_limits("n_pixels diameter phase_shift rms")
@@ -136,6 +135,7 @@ def _vector_row(scene: Scene, y: float, computed: _Computed, kind: _Kind) -> Non
     scene.label(at.second, y + 0.72, "lens")
 
     shown = scene.picture(pupil_x, y, 1.05, computed.phase, PHASE_MAP, -computed.limit, computed.limit)
+    shown.set_label("_phase (rad)")
     scene.label(pupil_x, y + 0.6, r"pupil: $\phi_{in}$ (rad)")
     scene.scale(shown, (pupil_x - 0.45, y - 0.66, 0.9, 0.06), ticks=2)
     scene.label(0.12, y - 1.2, "unpolarised light", ha="left")
@@ -159,6 +159,7 @@ def _vector_row(scene: Scene, y: float, computed: _Computed, kind: _Kind) -> Non
         center = y + sign * (at.apart + 0.05)
         frame, high = computed.frames[index], computed.frames.max()
         shown = scene.picture(images, center, 1.02, frame, INTENSITY_MAP, 0, high, edge=look.color)
+        shown.set_label(f"_image {index + 1}")
         scene.label(images - 0.36, center + sign * 0.64, f"image {index + 1}", va="center", color=look.color)
     scene.scale(shown, (images + 0.15, y - 1.31, 0.38, 0.06), ticks=2)
 
@@ -273,18 +274,6 @@ def _focus_marks(scene: Scene, at: _Places, y: float) -> None:
         scene.line([(where, center - sign * at.half), (where, y)], color=look.color, lw=0.9)
     for start, end in ((planes[0] - 0.28, planes[0]), (planes[1] + 0.28, planes[1])):
         scene.arrow((start, y), (end, y), color="#000000")
-
-
-def vector_sensor_columns(pupil: Pupil, phase: NDArray, frames: NDArray) -> dict[str, NDArray]:
-    """Columns of the phase and both images at the points of the pupil."""
-    x, y = pupil.points.T
-    return {
-        "x (D)": x,
-        "y (D)": y,
-        "input phase (rad)": pupil.gather(phase),
-        "image 1 (mean of the pupil)": pupil.gather(frames[0]),
-        "image 2 (mean of the pupil)": pupil.gather(frames[1]),
-    }
 
 
 def pair_table(plus: Dimple, minus: Dimple, turn: NDArray, images: NDArray) -> Table:

@@ -227,8 +227,9 @@ def draw_linearity(
             reach = f": always above {percent(threshold)}".replace(" %", "\N{NO-BREAK SPACE}%")
         plain.plot(rms, mean[drawn], label=textwrap.fill(look.label + reach, 44), **line)
         low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
-        plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
-        ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], **line)
+        scatter = f"_{look.label}, scatter"
+        plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0, label=scatter)
+        ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], label=f"_{look.label}", **line)
         if found:
             ratio.plot(limits[name].value, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
         if name in STATED:
@@ -258,11 +259,12 @@ def draw_saxton_widths(
         for (name, method), color, line, marker in zip(drawn.items(), colors, *map(cycle, lines), strict=False):
             ratio = curves.mean(name) / curves.rms
             label = f"{method.settings.n_iterations} iterations"
-            axes.semilogy(curves.rms, ratio, color=color, linestyle=line, marker=marker, label=label)
             if kind == "zero":
                 place: dict[str, Any] = {"xytext": (-7, 0), "textcoords": "offset points", "va": "center"}
                 text = f"{method.sensor.extent:g} D"
+                label = f"{text}, {label}"
                 axes.annotate(text, (curves.rms[0], ratio[0]), color="#333333", fontsize=9, ha="right", **place)
+            axes.semilogy(curves.rms, ratio, color=color, linestyle=line, marker=marker, label=label)
         axes.plot(curves.rms, curves.mean("Linear") / curves.rms, label="linear", **LOOKS["Linear"].style)
         axes.axhline(threshold, color="#555555", lw=1)
         axes.set(xlabel="input phase (rad rms)", xlim=(0, None))
@@ -280,17 +282,6 @@ def _shades(color: str, count: int) -> list[tuple[float, ...]]:
     """Return shades of a colour, from dark to light."""
     ends = LinearSegmentedColormap.from_list("shades", ["black", color, "white"])
     return [ends(level) for level in np.linspace(0.3, 0.65, count)] if count != 1 else [to_rgba(color)]
-
-
-def width_columns(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurves) -> dict[str, Any]:
-    """Columns of the mean errors of Gerchberg-Saxton on each detector, and of the linear method."""
-    names = {
-        name: f"{method.sensor.extent:g} D, {method.unmeasured}, {method.settings.n_iterations} iterations"
-        for name, method in variants.items()
-    } | {"Linear": "linear"}
-    return {"input (rad rms)": curves.rms} | {
-        f"{title}: mean error (rad rms)": curves.mean(name) for name, title in names.items()
-    }
 
 
 # The methods with one image, and Gerchberg-Saxton: no candidates for a long range.

@@ -334,7 +334,8 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
         low, high = (np.maximum(mean + sign * std, bottom) for sign in (-1, 1))
         drawn = np.maximum(mean, bottom)
         axes.plot(curve.diameters, drawn, color=look.color, marker=look.marker, ms=4, label=f"{number} iterations")
-        axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0)
+        scatter = f"_{number} iterations, scatter"
+        axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0, label=scatter)
         _diameters(axes, curve.diameters[-1], claimed)
         axes.set_ylabel("error (rad rms)")
     for index, ((number, other), style) in enumerate(zip(others, OTHER_STYLES[1:], strict=False)):
@@ -407,38 +408,6 @@ def _diameters(axes: Axes, end: float, claimed: float) -> None:
         axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5)
         axes.text(DARK_RING, 1.005, " dark ring", ha="left", color="#555555", **above)
     axes.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=(0, end))
-
-
-def iteration_columns(curves: Mapping[int, DiameterCurves]) -> dict[str, NDArray]:
-    """Columns of the figure of the paper, by the number of iterations; NaN where a curve was not computed."""
-    diameters = next(iter(curves.values())).diameters
-    columns = {"diameter (lambda/D)": diameters}
-    for n, curve in curves.items():
-        computed = np.isin(diameters, curve.diameters)
-        both = {"mean error": curve.mean(ITERATION), "standard deviation": curve.std(ITERATION)}
-        for quantity, values in both.items():
-            column = columns[f"{n} iterations: {quantity} (rad rms)"] = np.full(diameters.size, np.nan)
-            column[computed] = values
-    return columns
-
-
-def reason_columns(reasons: Contraction) -> dict[str, NDArray]:
-    """Columns of the figure on the causes."""
-    return {
-        "diameter (lambda/D)": reasons.diameters,
-        "factor, flat wavefront": reasons.flat,
-        **{f"factor, screen {i}": row for i, row in enumerate(reasons.aberrated.T, start=1)},
-        **{f"sensitivity, {name} (1/rad)": row for name, row in reasons.sensitivity.items()},
-    }
-
-
-def method_columns(curves: Mapping[str, DiameterCurves]) -> dict[str, ArrayLike]:
-    """Columns of the comparison of the methods."""
-    few = min((curve.diameters for curve in curves.values()), key=len)
-    return {
-        "diameter (lambda/D)": few,
-        **{f"{name}, mean error (rad rms)": [curve.at(name, d) for d in few] for name, curve in curves.items()},
-    }
 
 
 def limits_table(curves: Mapping[int, DiameterCurves], threshold: float, limits: Mapping[int, Limit]) -> Table:

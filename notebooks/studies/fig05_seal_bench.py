@@ -149,15 +149,19 @@ class _Pictures:
         stop, pistons, quilting, dimple, *images = places
         for (x, y), size, name in zip(places, sizes, names, strict=False):
             scene.label(x, y + size / 2 + 0.08, name)
-        scene.picture(*stop, sizes[0], self.amplitude**2, "gray", 0, self.amplitude.max() ** 2)
+        shown = scene.picture(*stop, sizes[0], self.amplitude**2, "gray", 0, self.amplitude.max() ** 2)
+        shown.set_label("_segments in stop")
         shown = scene.picture(*pistons, sizes[1], self.phase, PHASE_MAP, -limit, limit)
+        shown.set_label("_pistons (rad)")
         x, y = pistons
         scene.scale(shown, (x - 0.48 * sizes[1], y - sizes[1] / 2 - 0.11, 0.96 * sizes[1], 0.06), ticks=2)
-        scene.picture(*quilting, sizes[2], self.quilted, INTENSITY_MAP, 0, self.quilted.max())
+        shown = scene.picture(*quilting, sizes[2], self.quilted, INTENSITY_MAP, 0, self.quilted.max())
+        shown.set_label("_quilting")
         mask_picture(scene, *dimple, sizes[3], self.mask, self.halo, 4, PLUS)
         shown_images = zip(self.frames, images, sizes[4:], (PLUS, MINUS), (1, 2), strict=True)
         for frame, (x, y), size, look, number in shown_images:
-            scene.picture(x, y, size, frame, INTENSITY_MAP, 0, self.frames.max(), edge=look.color)
+            shown = scene.picture(x, y, size, frame, INTENSITY_MAP, 0, self.frames.max(), edge=look.color)
+            shown.set_label(f"_image {number}")
             scene.label(x, y + size / 2 + 0.07, f"image {number}", color=look.color)
 
 
@@ -260,11 +264,6 @@ def _solid(
     turn = np.array([[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]])
     points = size * np.asarray(corners) @ turn.T + center
     scene.axes.add_patch(Polygon(points, closed=True, fc=color, ec=edge, lw=0.8, zorder=3))
-
-
-def piston_columns(bench: Bench, pistons: NDArray) -> dict[str, NDArray]:
-    """Piston of each segment."""
-    return {"segment": bench.numbers, "piston (rad)": pistons}
 
 
 def layout_table(bench: Bench, pistons: NDArray, wavelength: float) -> Table:

@@ -47,8 +47,10 @@ def draw_bench_linearity(curves: BenchCurves) -> Figure:
         look, mean, std = LOOKS[name], curves.mean(name), curves.std(name)
         plain.plot(curves.rms, mean, markersize=4, label=look.label, **look.style)
         low, high = np.maximum(mean - std, 0), mean + std
-        plain.fill_between(curves.rms, low, high, color=look.color, alpha=0.15, lw=0)
-        gain.plot(curves.rms, curves.gain(name), markersize=4, **look.style)
+        plain.fill_between(
+            curves.rms, low, high, color=look.color, alpha=0.15, lw=0, label=f"_{look.label}, scatter"
+        )
+        gain.plot(curves.rms, curves.gain(name), markersize=4, label=f"_{look.label}", **look.style)
     plain.plot(
         curves.rms, _SHARE * curves.rms, color="#555555", lw=1, ls=":", label=f"{percent(_SHARE)} of the input"
     )
@@ -58,17 +60,6 @@ def draw_bench_linearity(curves: BenchCurves) -> Figure:
     gain.set(xlim=(0, None), ylim=(0, 1.5))
     figure.legend(loc="outside lower center", ncols=3, fontsize=9, columnspacing=1.0, handletextpad=0.5)
     return figure
-
-
-def curve_columns(curves: BenchCurves) -> dict[str, NDArray]:
-    """Mean error, standard deviation and gain of each reconstructor."""
-    names = curves.residuals
-    return {
-        "input (rad rms)": curves.rms,
-        **{f"{name}, mean error (rad rms)": curves.mean(name) for name in names},
-        **{f"{name}, standard deviation (rad rms)": curves.std(name) for name in names},
-        **{f"{name}, gain": curves.gain(name) for name in names},
-    }
 
 
 def reach_table(curves: BenchCurves) -> Table:

@@ -131,7 +131,7 @@ def _draw_step(
     scene: Scene, step: Plane, at: Point, size: float, sensor: ZernikeSensor, pixel: Pixel
 ) -> AxesImage:
     """Picture with the edge of the dimple or the mark of the pixel."""
-    shown = scene.picture(*at, size, step.image, step.colors, step.low, step.high)
+    shown = scene.show(*at, size, step)
     if step.colors == FOCUS_MAP:
         middle = (step.image.shape[0] - 1) / 2
         dashed_circle(shown.axes, (middle, middle), sensor.masks[0].diameter / 2 * middle / _REACH)
@@ -150,7 +150,7 @@ def draw_pixel_phasors(pixel: Pixel) -> Figure:
     for k, (name, color, line) in enumerate(IMAGES):
         _phasors(panels[name], pixel, k)
         level = pixel.intensities(pixel.phase)[k]
-        curves.plot(angles, pixel.intensities(angles)[k], color=color, ls=line, lw=2)
+        curves.plot(angles, pixel.intensities(angles)[k], color=color, ls=line, lw=2, label=f"_image {name}")
         curves.axhline(level, color=color, ls=line, lw=0.8)
         curves.plot(pixel.mirrored[k], level, "o", color=color, mfc="white", mew=2, ms=9, zorder=4)
         top = int(np.argmax(pixel.intensities(angles)[k]))
@@ -211,35 +211,6 @@ def draw_one_or_two_images(pupil: Pupil, truth: NDArray, phases: Mapping[str, ND
 
 def _error(value: float) -> str:
     return f"error {value:.2f} rad rms" if value >= 5e-3 else "no error"
-
-
-def sensor_steps_columns(pupil: Pupil, phase: NDArray, frames: NDArray, pixel: Pixel) -> dict[str, NDArray]:
-    """Columns along the row of the pixel."""
-    return {
-        "x (D)": pupil.x,
-        "phase (rad)": np.where(pupil.inside, phase, np.nan)[pixel.row],
-        "image 1": frames[0, pixel.row],
-        "image 2": frames[1, pixel.row],
-    }
-
-
-def pixel_phasors_columns(pixel: Pixel) -> dict[str, NDArray]:
-    """Columns of both intensities against the phase of the pixel."""
-    phases = np.linspace(-np.pi, np.pi, 361)
-    first, second = pixel.intensities(phases)
-    return {"phase of the pixel (rad)": phases, "image 1": first, "image 2": second}
-
-
-def one_or_two_images_columns(
-    pupil: Pupil, truth: NDArray, one: NDArray, two: NDArray, pixel: Pixel
-) -> dict[str, NDArray]:
-    """Columns of the reconstructed phases along the row of the pixel."""
-    return {
-        "x (D)": pupil.x,
-        "true phase (rad)": np.where(pupil.inside, truth, np.nan)[pixel.row],
-        "phase from one image (rad)": one[pixel.row],
-        "phase from two images (rad)": two[pixel.row],
-    }
 
 
 def numbers(one: NDArray, pixel: Pixel) -> dict[str, float | str]:

@@ -36,14 +36,6 @@ class ErrorCurves:
         """Fraction of the screens with an error of at most `threshold` times the input, shape (n,)."""
         return np.mean(self.errors[name] <= threshold * self.rms[:, np.newaxis], axis=1)
 
-    def columns(self) -> dict[str, NDArray[np.floating]]:
-        """Input, and mean and standard deviation of every reconstructor, as columns for `publish`."""
-        columns = {"input (rad rms)": self.rms}
-        for name in self.errors:
-            columns[f"{name}: mean error (rad rms)"] = self.mean(name)
-            columns[f"{name}: standard deviation (rad rms)"] = self.std(name)
-        return columns
-
     def screens(self) -> dict[str, NDArray]:
         """Input and errors of every single screen, as columns for `publish`."""
         return screen_errors("input (rad rms)", self.rms, self.errors)

@@ -97,6 +97,12 @@ class Scene:
         )
         return axes.imshow(image, cmap=colors, vmin=low, vmax=high, origin="lower", interpolation="none")
 
+    def show(self, x: float, y: float, size: float, plane: Plane) -> AxesImage:
+        """Picture in a plane, centred on (x, y)."""
+        shown = self.picture(x, y, size, plane.image, plane.colors, plane.low, plane.high)
+        shown.set_label(f"_{plane.name}: {plane.scale}")
+        return shown
+
     def scale(
         self, shown: AxesImage, box: tuple[float, float, float, float], name: str = "", ticks: int = 4
     ) -> None:

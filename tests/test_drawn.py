@@ -1,9 +1,10 @@
-"""The numbers of drawn figures."""
+"""The numbers of drawn figures, and drawings from SVG files."""
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
+from studies.kit.drawings import draw_layout
 from studies.kit.drawn import drawn_columns
 
 THREE = np.array([0.1, 0.2, 0.3])
@@ -104,3 +105,10 @@ def test_second_axes_have_columns():
     axes.set(xlabel="input", ylabel="error")
     axes.secondary_xaxis("top", functions=(lambda x: x**2, np.sqrt)).set_xlabel("$D/r_0$")
     np.testing.assert_allclose(drawn_columns(figure)["D/r_0"], THREE**2)
+
+
+def test_an_element_that_is_not_read_is_named(tmp_path):
+    file = tmp_path / "layout.svg"
+    file.write_text('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 90 90"><path d="M0,0"/></svg>')
+    with pytest.raises(ValueError, match="<path> in a drawing: expected one of the simple elements"):
+        draw_layout(str(file), str(file), {})

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from studies.fig04_dimple_diameter import iteration_spectrum
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, crossing, percent, reach_text
+from studies.kit.curves import ErrorCurves, crossing, percent
 from studies.kit.parameters import SETUP, Fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.setups import SCREENS, Noise, Screens, screens_at
@@ -484,38 +484,6 @@ def draw_causes(found: Causes, threshold: float) -> Figure:
     return figure
 
 
-def _exact_text(noiseless: NoiseCurves, threshold: float) -> str:
-    """Inputs up to which maximum likelihood recovers every screen without noise, in words."""
-    exact = noiseless.complete_up_to(LIKELY, threshold)
-    n_screens = noiseless.errors[LIKELY][noiseless.rms <= exact].size
-    if not exact:
-        return f"loses screens already at {noiseless.rms[0]:.2g} rad rms"
-    each = noiseless.errors[LIKELY].shape[-1]
-    return f"recovers all {n_screens} simulated screens ({each} for each input) of up to {exact:.2g} rad rms"
-
-
-def _flag_text(right: NDArray[np.bool_], consistent: NDArray[np.bool_]) -> str:
-    """Say how often the flag is right about solutions without noise."""
-    if np.all(right & consistent):
-        return f"All {right.size} solutions without noise are right, and the flag accepts all of them."
-    wrong, refused = np.count_nonzero(consistent & ~right), np.count_nonzero(right & ~consistent)
-    return (
-        f"Of {right.size} solutions without noise, {np.count_nonzero(right)} are right. "
-        f"The flag accepts {wrong} wrong and refuses {refused} right ones."
-    )
-
-
-def _half_text(found: Causes, threshold: float) -> str:
-    """Input at which the plain iteration recovers half of the screens, in words."""
-    half, error = found.half(PLAIN, threshold)
-    rms = found.curves.rms
-    if 0 < half < np.inf:
-        return f"recovers only half of the screens at {Limit(half, error)} rad rms"
-    if half:
-        return f"recovers at least half of the screens up to {rms[-1]:.2g} rad rms"
-    return f"recovers less than half of the screens at {rms[0]:.2g} rad rms"
-
-
 def numbers(
     curves: Sequence[NoiseCurves],
     model: Mapping[str, ErrorCurves],
@@ -530,6 +498,7 @@ def numbers(
     few = min(noisy, key=lambda curve: abs(np.log(curve.photons / 1e3)))
     one, two, three = (int(np.argmin(np.abs(chosen.rms - rms))) for rms in (1.0, 2.0, 3.0))
     limit = int(np.argmin(np.abs(found.curves.rms - 2.0)))
+    exact = noiseless.complete_up_to(LIKELY, threshold)
     right = noiseless.errors[LIKELY] <= threshold * noiseless.rms[:, np.newaxis]
     usual = (chosen.rms >= 0.1) & (chosen.rms <= 2)
     usual |= not usual.any()
@@ -543,12 +512,15 @@ def numbers(
         "modes_from": chosen.rms[usual][0],
         "modes_to": chosen.rms[usual][-1],
         "contracting_at_2": np.mean(found.factor[limit] < 1),
-        "exact_text": _exact_text(noiseless, threshold),
-        "half_text": _half_text(found, threshold),
-        "flag_text": _flag_text(right, noiseless.consistent),
-        "pixels_text": reach_text(
-            area.rms, pixels, PIXEL_ERROR, Limit(crossing(area.rms, pixels, PIXEL_ERROR)), f"{PIXEL_ERROR:g} rad"
-        ),
+        "exact": exact,
+        "exact_screens": right[noiseless.rms <= exact].size,
+        "half": found.half(PLAIN, threshold)[0],
+        "solutions": right.size,
+        "solutions_right": np.count_nonzero(right),
+        "solutions_missed": np.count_nonzero(noiseless.consistent & ~right),
+        "solutions_refused": np.count_nonzero(right & ~noiseless.consistent),
+        "pixels_limit": crossing(area.rms, pixels, PIXEL_ERROR),
+        "pixels_error": PIXEL_ERROR,
         "model_input": area.rms[place],
         "amplitude_1": np.median(amplitude.errors[LIKELY][place]),
         "offset_1": np.median(offset.errors[LIKELY][place]),

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, percent, reach_text, refined_limit
+from studies.kit.curves import ErrorCurves, Limit, percent, refined_limit
 from studies.kit.parameters import SETUP, parameter_limits
 from studies.kit.results import rounded, screen_columns
 from studies.kit.setups import NOISELESS, Noise, Screens, check_setup, screens_at
@@ -293,13 +293,6 @@ def _indices(curves: LinearityCurves, values: Sequence[float]) -> dict[float, in
     return {value: int(np.flatnonzero(curves.rms == value)[0]) for value in values if value in curves.rms}
 
 
-def _reach(curves: LinearityCurves, name: str, threshold: float, limit: Limit) -> str:
-    """Inputs above 0 at which an error stays within the threshold, in words."""
-    bright = curves.rms > 0
-    rms, error = curves.rms[bright], curves.mean(name)[bright]
-    return reach_text(rms, error, threshold * rms, f"{limit.value:.2g}", f"{percent(threshold)} of the input")
-
-
 def _place(curves: LinearityCurves, limit: Limit) -> str:
     """Input at which a curve exceeds the threshold, in words."""
     if limit.value == 0:
@@ -365,23 +358,6 @@ def work_table(passes: Mapping[str, int]) -> Table:
     return Table(
         ["reconstructor", "passes through the model"], [[LOOKS[name].name, n] for name, n in passes.items()]
     )
-
-
-def _phrases(curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float) -> dict[str, str]:
-    """Sentences, and parts of them, that hold for any parameters: a limit need not exist."""
-    rms, gain = curves.rms, limits["PhaseShifted"].over(limits["Linear"])
-    alike, onset = _alike_up_to(curves), _wrap_onset(curves)
-    return {
-        "linear_reach": _reach(curves, "Linear", threshold, limits["Linear"]),
-        "shifted_reach": _reach(curves, "PhaseShifted", threshold, limits["PhaseShifted"]),
-        "gain_text": f", {gain.value:.2g} times as far" if 0 < gain.value < np.inf else "",
-        "alike_text": f"Up to {alike:.2g} rad rms its error is below 10⁻⁶ rad, like that of the iteration."
-        if alike
-        else "Its error and that of the iteration are not below 10⁻⁶ rad.",
-        "wrap_text": f"on at least half of the screens from {onset:.2g} rad rms on"
-        if onset < np.inf
-        else f"on less than half of the screens up to {rms[-1]:.2g} rad rms",
-    }
 
 
 _SHORT = {
@@ -476,7 +452,6 @@ def numbers(
     }
     for name, short in _SHORT.items():
         found[f"{short}_limit"] = limits[name].value
-    found |= _phrases(curves, limits, threshold)
+    found["threshold"] = threshold
     found["saxton_model_limit_longer"] = longer.value
-    found["saxton_model_reach_longer"] = _reach(by_width, repaired, threshold, longer)
     return rounded(found)

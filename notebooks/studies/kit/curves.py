@@ -61,27 +61,6 @@ class Limit(NamedTuple):
         return Limit(ratio, float(np.hypot(self.error, ratio * other.error) / other.value))
 
 
-def reach_text(
-    x: ArrayLike,
-    error: ArrayLike,
-    bound: ArrayLike,
-    limit: Limit | str,
-    words: str = "5 % of the input",
-    unit: str = "rad rms",
-) -> str:
-    """Where an error stays within a bound, in words that follow "the error" and hold for any curve."""
-    x, within = np.asarray(x, float), np.asarray(error) <= bound
-    if within.all():
-        return f"stays within {words} everywhere up to {x[-1]:.3g} {unit}"
-    if not within.any():
-        return f"exceeds {words} everywhere from {x[0]:.3g} to {x[-1]:.3g} {unit}"
-    if within[0]:
-        return f"stays within {words} up to {limit} {unit}"
-    low, high = x[within][[0, -1]]
-    span = f"at {low:.3g}" if low == high else f"from {low:.3g} to {high:.3g}"
-    return f"stays within {words} only {span} {unit}"
-
-
 def percent(share: float) -> str:
     """Share as text without needless digits."""
     return f"{100 * share:.3g} %"

@@ -33,7 +33,7 @@ def test_a_card_says_how_a_figure_was_made(carded):
     cells = carded(
         "fig03_range",
         "rms = 0.5  # input, rad rms\nseed = 3",
-        'publish(figure, "fig03_range", {})',
+        'publish(figure, "fig03_range")',
         "x = 1",
         links={"fig03_range.png": "../run/fig03_range.png"},
         versions="Python 3.12.1",

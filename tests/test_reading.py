@@ -6,7 +6,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_output
 
 from book._ext.reading import COMPUTING, put_in_order
 
-PARAMETERS, SET_UP, DRAW = "rms = 0.5", "import zwfs", 'publish(figure, "range", {})'
+PARAMETERS, SET_UP, DRAW = "rms = 0.5", "import zwfs", 'publish(figure, "range")'
 
 
 def code(source, *tags, output=False):

@@ -76,7 +76,7 @@ def columns(text):
     made = {}
     for name, column in zip(header, zip(*rows, strict=True), strict=True):
         try:
-            made[name] = np.array(column, float)
+            made[name] = np.array([cell for cell in column if cell], float)  # others are longer
         except ValueError:
             made[name] = np.array(column)
     return made

@@ -102,10 +102,9 @@ def test_without_a_strength_inputs_stay():
     source = make_screens(make_pupil(24), 10, -2.0, kind="kolmogorov")
     assert source.largest(1.3) == 1.3
     assert source.inputs([0.1, 0.5]) == [0.1, 0.5]
-    assert source.columns([0.1, 0.5]) == {}
 
 
-def test_a_figure_of_a_strength_has_an_axis_and_a_column_of_it():
+def test_a_figure_of_a_strength_has_an_axis_of_it():
     source = make_screens(make_pupil(24), 10, -2.0, kind="kolmogorov", d_over_r0=5.0)
     figure, (input_, other) = plt.subplots(1, 2)
     input_.set(xlabel="input (rad rms)", xlim=(0, source.largest(1.0)))
@@ -113,9 +112,6 @@ def test_a_figure_of_a_strength_has_an_axis_and_a_column_of_it():
     source.mark(figure).canvas.draw()
     [axis] = [one for axes in figure.axes for one in axes.child_axes]
     assert axis.get_xlim() == pytest.approx((0, 5), rel=1e-3)
-    assert {"D/r0": [0, source.d_over_r0_of(1.0)]} == {
-        name: list(one) for name, one in source.columns([0, 1]).items()
-    }
     plt.close(figure)
 
 

@@ -26,7 +26,7 @@ use_style()
 warnings.warn("no error")
 print(plt.rcParams["figure.figsize"], numpy.__name__, sys.flags.optimize, sys.flags.hash_randomization)"""
 DRAW = """figure, _ = plt.subplots(figsize=(2, 2))
-publish(figure, "square", {"x": [1]})"""
+publish(figure, "square")"""
 PRINTED = "[6.4, 4.8] numpy 0 0\n"
 
 

@@ -17,7 +17,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 numbers: dict[str, Any] = {}  # that the notebook glued
-figures: dict[str, tuple[Any, Any, Any]] = {}  # that the notebook published, with their columns
+figures: dict[str, tuple[Any, Any]] = {}  # that the notebook published, with their numbers of single screens
 variants: dict[str, dict[str, Any]] = {}  # of the figures, once they are asked for
 names: dict[str, Any] = {}  # of the notebook
 
@@ -50,9 +50,9 @@ def _repair_svd() -> None:
     vars(np.linalg)["svd"] = svd
 
 
-def _keep(figure: Any, name: str, columns: Any, screens: Any = None) -> None:
+def _keep(figure: Any, name: str, screens: Any = None) -> None:
     """Stand for `publish`: files are drawn when the page asks for them."""
-    figures[name] = figure, columns, screens
+    figures[name] = figure, screens
 
 
 def _provide(module: str, **members: Any) -> None:
@@ -149,7 +149,7 @@ def versions() -> str:
 
 def kinds(name: str) -> list[str]:
     """Return the kinds of files of a published figure: those for which `draw` needs no variant come first."""
-    figure, _, screens = figures[name]
+    figure, screens = figures[name]
     has_narrow = import_module("studies.kit.variants").has_narrow
     narrow = ["narrow.png", "narrow-dark.png"] if has_narrow(figure) else []
     tables = ["csv"] if screens is None else ["csv", "screens.csv"]
@@ -159,9 +159,9 @@ def kinds(name: str) -> list[str]:
 def draw(name: str, kind: str) -> bytes:
     """Return the content of a file of a published figure."""
     results = import_module("studies.kit.results")
-    figure, columns, screens = figures[name]
+    figure, screens = figures[name]
     if kind in ("csv", "screens.csv"):
-        return results.csv_bytes(columns if kind == "csv" else screens)
+        return results.csv_bytes(results.drawn_columns(figure) if kind == "csv" else screens)
     if "." not in kind:
         return results.picture_bytes(figure, kind)
     if name not in variants:

@@ -68,12 +68,13 @@ class Project:
     def modules(self) -> list[Path]:
         """Return the files of the package and of the studies, with the data of a study."""
         files = (file for folder in ("zwfs", "notebooks") for file in (self.root / folder).rglob("*.py"))
-        return sorted([*files, *self.studies.glob("*.npz")])
+        data = (file for kind in ("npz", "svg") for file in self.studies.glob(f"*.{kind}"))
+        return sorted([*files, *data])
 
     def depends_on(self, name: str) -> set[Path]:
         """Return what a notebook depends on: the modules that it imports, directly or not, and their data."""
         modules = {}
-        for file in self.modules():
+        for file in (file for file in self.modules() if file.suffix == ".py"):
             folder = self.notebooks if file.is_relative_to(self.notebooks) else self.root
             modules[".".join(file.relative_to(folder).with_suffix("").parts).removesuffix(".__init__")] = file
         return dependencies(self.source(name), modules)

@@ -82,13 +82,6 @@ def _error(rms: float) -> str:
     return f"error: below $10^{{{np.ceil(np.log10(max(rms, _ROUNDING))):.0f}}}$ rad"
 
 
-def steps_columns(pupil: Pupil, phase: NDArray, estimates: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """Columns of the maps, one row for each point of the pupil."""
-    maps = {"input": phase} | {LOOKS[name].name: estimate for name, estimate in estimates.items()}
-    places = {"x (D)": pupil.points[:, 0], "y (D)": pupil.points[:, 1]}
-    return places | {f"{name} (rad)": np.round(pupil.gather(values), 5) for name, values in maps.items()}
-
-
 def numbers(pupil: Pupil, phase: NDArray, estimates: Mapping[str, NDArray]) -> dict[str, float | str]:
     """Wavefront error and error of each method, radian rms."""
     rms = {"input": float(pupil.rms(phase))}

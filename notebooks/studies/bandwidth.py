@@ -158,18 +158,6 @@ def _kind(chromatic: bool) -> str:
     return "chromatic" if chromatic else "achromatic"
 
 
-def band_columns(curves: CaseCurves) -> dict[str, NDArray]:
-    """Columns of the errors and the bound."""
-    columns = {}
-    for (rms, chromatic), one in curves.items():
-        kind = f"{rms:g} rad rms, {_kind(chromatic)}"
-        columns["bandwidth"] = one.bandwidths
-        columns[f"{kind}: bound (rad rms)"] = one.bound
-        columns |= {f"{kind}: {way}: error (rad rms)": one.error(way) for way in WAYS}
-        columns |= {f"{kind}: {way}: error without noise (rad rms)": one.bias(way) for way in IGNORANT}
-    return columns
-
-
 def band_screens(curves: CaseCurves) -> dict[str, NDArray]:
     """Errors of every single screen."""
     tables = {}

@@ -31,7 +31,7 @@ from studies.fig04_dimple_diameter import (
     iteration_spectrum,
 )
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, crossing, percent, reach_text
+from studies.kit.curves import ErrorCurves, Limit, crossing, percent
 from studies.kit.methods import MASKS, opposite_dimples
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded, stacked
@@ -171,7 +171,8 @@ def draw_dimple_limits(limits: DimpleLimits, rms: float) -> Figure:
     screens = limits.factor[:, 1:]
     left.plot(limits.diameters, limits.factor[:, 0], color=flat, ls="--", label="flat wavefront")
     left.plot(limits.diameters, screens.mean(axis=1), color=color, label=f"{rms:g} rad rms")
-    left.fill_between(limits.diameters, screens.min(axis=1), screens.max(axis=1), color=color, alpha=0.25, lw=0)
+    low, high = screens.min(axis=1), screens.max(axis=1)
+    left.fill_between(limits.diameters, low, high, color=color, alpha=0.25, lw=0, label="_all screens")
     left.axhline(1, color=_INK, lw=1)
     left.text(0.52, 1.015, "diverges above", color=_INK, fontsize=9)
     left.set(ylabel="error after / before an iteration", ylim=(0, 1.2))
@@ -206,64 +207,22 @@ def _mark_instruments(axes: Axes) -> None:
         axes.axvspan(low - 0.01, high + 0.01, color="#d0d0d0", lw=0, zorder=0.4)
 
 
-def recovery_columns(curves: Mapping[float, DiameterCurves], threshold: float) -> dict[str, NDArray]:
-    """Columns of the figure: share of recovered screens and mean error of each method, for each input."""
-    columns = {}
-    for rms, curve in curves.items():
-        columns["diameter (lambda/D)"] = curve.diameters
-        for name in curve.errors:
-            columns[f"{name}, {rms:g} rad rms: share recovered"] = curve.recovered(name, threshold)
-            columns[f"{name}, {rms:g} rad rms: mean error (rad rms)"] = curve.mean(name)
-    return columns
-
-
 def recovery_screens(curves: Mapping[float, DiameterCurves]) -> dict[str, NDArray]:
     """Columns with a row for each screen of the first figure."""
     return stacked("input (rad rms)", {rms: curve.screens() for rms, curve in curves.items()})
 
 
-def limits_columns(limits: DimpleLimits) -> dict[str, NDArray]:
-    """Columns of the figure on the reasons."""
-    columns = {"diameter (lambda/D)": limits.diameters}
-    for index in range(limits.factor.shape[1]):
-        wavefront = f"screen {index}" if index else "flat wavefront"
-        columns[f"factor, {wavefront}"] = limits.factor[:, index]
-        columns[f"bound of tilt / ideal, {wavefront}"] = limits.tilt[:, index]
-        columns[f"bound of other modes / ideal, {wavefront}"] = limits.others[:, index]
-        columns[f"bound of all modes / ideal, {wavefront}"] = limits.total[:, index]
-    return columns
-
-
 def failing_table(curves: Mapping[float, DiameterCurves], threshold: float) -> Table:
     """Failing point of each method, for each input."""
     exceeded = f"mean error exceeds {percent(threshold)} from about (λ/D)"
-    return Table(
-        ["input (rad rms)", "method", "recovers every screen up to (λ/D)", exceeded],
-        [
-            [
-                f"{rms:g}",
-                method_look(name).name,
-                _complete_up_to(curve, name, threshold),
-                _fails_above(curve, name, threshold),
-            ]
-            for rms, curve in curves.items()
-            for name in curve.errors
-        ],
-    )
-
-
-def _complete_up_to(curve: DiameterCurves, name: str, threshold: float) -> str:
-    """Largest diameter up to which a method recovers every screen."""
-    lost = np.flatnonzero(curve.recovered(name, threshold) < 1)
-    if not lost.size:
-        return f"{curve.diameters[-1]:g}, the largest tried"
-    return f"{curve.diameters[lost[0] - 1]:g}" if lost[0] else "none"
-
-
-def _fails_above(curve: DiameterCurves, name: str, threshold: float) -> str:
-    """Diameter at which the mean error exceeds the threshold."""
-    passed = curve.exceeds(name, threshold * curve.rms[0])
-    return f"{passed:.2g}" if passed < np.inf else "never"
+    rows = []
+    for rms, curve in curves.items():
+        for name in curve.errors:
+            lost = curve.diameters[curve.recovered(name, threshold) < 1]
+            complete = curve.diameters[curve.diameters < lost.min(initial=np.inf)]
+            limit = curve.exceeds(name, threshold * rms)
+            rows.append([rms, method_look(name).name, float(complete[-1]) if complete.size else np.nan, limit])
+    return Table(["input (rad rms)", "method", "recovers every screen up to (λ/D)", exceeded], rows)
 
 
 def instruments_table(curves: Mapping[str, ErrorCurves], threshold: float) -> Table:
@@ -289,7 +248,6 @@ def numbers(
     """Return the settings and the numbers of the text, with the failing point at the first input."""
     first, last = (list(curves.values())[place] for place in (0, -1))
     ring = int(np.argmin(np.abs(limits.diameters - DARK_RING)))
-    allowed, words = threshold * first.rms[0], f"{percent(threshold)} of the input"
     found = dict(settings) | {
         "first_input": first.rms[0],
         "last_input": list(curves)[-1],
@@ -300,6 +258,7 @@ def numbers(
         "tilt_flat_ring": limits.tilt[ring, 0],
         "others_flat_ring": limits.others[ring, 0],
         "tilt_screens_most": _rms(limits.tilt[:, 1:]).max(),  # of each diameter, rms over the screens
-        "plain_reach": reach_text(first.diameters, first.mean(PLAIN), allowed, fails, words, "λ/D"),
+        "threshold": threshold,
+        "plain_limit": fails.value,
     }
     return rounded(found, ".4g")

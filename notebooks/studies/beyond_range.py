@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from studies.fig04_dimple_diameter import iteration_spectrum
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, crossing, percent, reach_text
+from studies.kit.curves import ErrorCurves, crossing, percent
 from studies.kit.parameters import SETUP, Fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.setups import SCREENS, Noise, Screens, screens_at
@@ -404,10 +404,11 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
         methods.plot(chosen.rms, chosen.median(name), **method_line(name))
     methods.set_title(f"{_spaced(chosen.photons)} photons per point and image", fontsize=10)
     methods.set_ylabel("median error (rad rms)")
-    line = method_line(LIKELY) | {"label": "_", "linestyle": ""}
+    line = method_line(LIKELY) | {"linestyle": ""}
     for curve in noisy:
-        light.plot(curve.rms, curve.median(LIKELY), **line)
-        light.plot(curve.rms, curve.bound[LIKELY], label="_", **_BOUND)
+        name = f"_{_spaced(curve.photons)} photons per point and image"
+        light.plot(curve.rms, curve.median(LIKELY), **line | {"label": name})
+        light.plot(curve.rms, curve.bound[LIKELY], label=f"{name}, bound", **_BOUND)
         light.annotate(
             _spaced(curve.photons), (curve.rms[-1], curve.median(LIKELY)[-1]), (7, 0),
             textcoords="offset points", fontsize=9, va="center",
@@ -463,95 +464,24 @@ def draw_causes(found: Causes, threshold: float) -> Figure:
     figure, (share, example) = plt.subplots(1, 2, figsize=(7, 4.4))
     color = LOOKS[PLAIN].color
     contracts = 100 * np.mean(found.factor < 1, axis=1)
-    [line] = share.plot(found.curves.rms, contracts, color=_INK, lw=4, alpha=0.4)
-    handles, labels = [line], ["plain, from close to the true phase"]
+    close = "plain, from close to the true phase"
+    share.plot(found.curves.rms, contracts, color=_INK, lw=4, alpha=0.4, label=close)
     for name, (label, dashes, marker) in _CAUSES.items():
         tone = color if name in (PLAIN, ACCELERATED) else OTHER_STYLES[1 if name == SECANT else 2]["color"]
         style: dict[str, Any] = {"color": tone, "ls": dashes, "marker": marker, "ms": 5, "mfc": "#ffffff"}
         recovered = found.curves.recovered(name, threshold)
         error = np.sqrt(recovered * (1 - recovered) / found.curves.errors[name].shape[1])  # of a binomial share
-        handles += share.plot(found.curves.rms, 100 * recovered, **style)
-        share.errorbar(found.curves.rms, 100 * recovered, 100 * error, fmt="none", ecolor=tone, lw=1)
-        labels.append(label)
-        example.semilogy(np.maximum(found.example[name], _FLOOR), **style)
+        share.plot(found.curves.rms, 100 * recovered, label=label, **style)
+        bars = {"fmt": "none", "ecolor": tone, "lw": 1, "label": f"_{label}"}
+        share.errorbar(found.curves.rms, 100 * recovered, 100 * error, **bars)
+        example.semilogy(np.maximum(found.example[name], _FLOOR), label=f"_{label}", **style)
     share.set(xlabel="input (rad rms)", ylabel="screens (%)", ylim=(-4, 104))
     example.axhline(threshold * found.example_rms, color=_INK, lw=1, ls=":")
     example.set(xlabel="iterations", ylabel="error (rad rms)", ylim=(_FLOOR / 2, 5))
     example.set_title(f"one screen of {found.example_rms:g} rad rms", fontsize=10)
     share.set_title("screens recovered", fontsize=10)
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     return figure
-
-
-def range_columns(curves: Sequence[NoiseCurves]) -> dict[str, NDArray]:
-    """Columns of the first figure: median and largest error of each method, and the bounds."""
-    columns: dict[str, list[Any]] = {"photons per point and image": [], "input (rad rms)": []}
-    for curve in curves:
-        n_rms = curve.rms.size
-        columns["photons per point and image"] += [curve.photons] * n_rms
-        columns["input (rad rms)"] += list(curve.rms)
-        for name in curve.errors:
-            for kind, values in (("median", curve.median(name)), ("largest", curve.errors[name].max(axis=1))):
-                columns.setdefault(f"{name}: {kind} error (rad rms)", []).extend(np.maximum(values, _FLOOR))
-        for name in (LIKELY, MODES):
-            bound = curve.bound.get(name, np.zeros(n_rms))
-            columns.setdefault(f"{name}: bound (rad rms)", []).extend(bound)
-    return {name: np.array(values) for name, values in columns.items()}
-
-
-def model_columns(curves: Mapping[str, ErrorCurves]) -> dict[str, NDArray]:
-    """Columns of the second figure: median error of each method, for each error of the model."""
-    columns = {"input (rad rms)": next(iter(curves.values())).rms}
-    return columns | {
-        f"{name}, {kind}: median error (rad rms)": np.median(values, axis=1)
-        for kind, curve in curves.items()
-        for name, values in curve.errors.items()
-    }
-
-
-def causes_columns(found: Causes, threshold: float) -> dict[str, NDArray]:
-    """Columns of the third figure: shares of the screens."""
-    shares = {
-        f"{label}: share recovered": found.curves.recovered(name, threshold)
-        for name, (label, *_) in _CAUSES.items()
-    }
-    columns = {
-        "input (rad rms)": found.curves.rms,
-        "share with a contraction factor below 1": np.mean(found.factor < 1, axis=1),
-    }
-    return columns | shares
-
-
-def _exact_text(noiseless: NoiseCurves, threshold: float) -> str:
-    """Inputs up to which maximum likelihood recovers every screen without noise, in words."""
-    exact = noiseless.complete_up_to(LIKELY, threshold)
-    n_screens = noiseless.errors[LIKELY][noiseless.rms <= exact].size
-    if not exact:
-        return f"loses screens already at {noiseless.rms[0]:.2g} rad rms"
-    each = noiseless.errors[LIKELY].shape[-1]
-    return f"recovers all {n_screens} simulated screens ({each} for each input) of up to {exact:.2g} rad rms"
-
-
-def _flag_text(right: NDArray[np.bool_], consistent: NDArray[np.bool_]) -> str:
-    """Say how often the flag is right about solutions without noise."""
-    if np.all(right & consistent):
-        return f"All {right.size} solutions without noise are right, and the flag accepts all of them."
-    wrong, refused = np.count_nonzero(consistent & ~right), np.count_nonzero(right & ~consistent)
-    return (
-        f"Of {right.size} solutions without noise, {np.count_nonzero(right)} are right. "
-        f"The flag accepts {wrong} wrong and refuses {refused} right ones."
-    )
-
-
-def _half_text(found: Causes, threshold: float) -> str:
-    """Input at which the plain iteration recovers half of the screens, in words."""
-    half, error = found.half(PLAIN, threshold)
-    rms = found.curves.rms
-    if 0 < half < np.inf:
-        return f"recovers only half of the screens at {Limit(half, error)} rad rms"
-    if half:
-        return f"recovers at least half of the screens up to {rms[-1]:.2g} rad rms"
-    return f"recovers less than half of the screens at {rms[0]:.2g} rad rms"
 
 
 def numbers(
@@ -568,6 +498,7 @@ def numbers(
     few = min(noisy, key=lambda curve: abs(np.log(curve.photons / 1e3)))
     one, two, three = (int(np.argmin(np.abs(chosen.rms - rms))) for rms in (1.0, 2.0, 3.0))
     limit = int(np.argmin(np.abs(found.curves.rms - 2.0)))
+    exact = noiseless.complete_up_to(LIKELY, threshold)
     right = noiseless.errors[LIKELY] <= threshold * noiseless.rms[:, np.newaxis]
     usual = (chosen.rms >= 0.1) & (chosen.rms <= 2)
     usual |= not usual.any()
@@ -581,12 +512,15 @@ def numbers(
         "modes_from": chosen.rms[usual][0],
         "modes_to": chosen.rms[usual][-1],
         "contracting_at_2": np.mean(found.factor[limit] < 1),
-        "exact_text": _exact_text(noiseless, threshold),
-        "half_text": _half_text(found, threshold),
-        "flag_text": _flag_text(right, noiseless.consistent),
-        "pixels_text": reach_text(
-            area.rms, pixels, PIXEL_ERROR, Limit(crossing(area.rms, pixels, PIXEL_ERROR)), f"{PIXEL_ERROR:g} rad"
-        ),
+        "exact": exact,
+        "exact_screens": right[noiseless.rms <= exact].size,
+        "half": found.half(PLAIN, threshold)[0],
+        "solutions": right.size,
+        "solutions_right": np.count_nonzero(right),
+        "solutions_missed": np.count_nonzero(noiseless.consistent & ~right),
+        "solutions_refused": np.count_nonzero(right & ~noiseless.consistent),
+        "pixels_limit": crossing(area.rms, pixels, PIXEL_ERROR),
+        "pixels_error": PIXEL_ERROR,
         "model_input": area.rms[place],
         "amplitude_1": np.median(amplitude.errors[LIKELY][place]),
         "offset_1": np.median(offset.errors[LIKELY][place]),

@@ -323,24 +323,11 @@ def draw_calibration_errors(errors: Errors, not_smooth: NDArray) -> Figure:
     axes.plot(errors.rms, found, "*-", color=best, ms=9, label="calibrated, smooth phases")
     axes.plot(errors.rms, stated, "o", color=best, mfc="none", ms=8, label="error bar that this fit states")
     for name, color in (("plain", LOOKS["PhaseShifted"].color), ("calibrated", best)):
-        axes.plot(errors.rms, errors.single(name), "_", color=color, ms=9)
+        axes.plot(errors.rms, errors.single(name), "_", color=color, ms=9, label=f"_{name}, single screens")
     axes.set(xlabel="input (rad rms)", ylabel="error (rad rms)", yscale="log", xlim=(0, None))
     axes.yaxis.set(major_formatter="{x:g}", minor_locator=LogLocator(subs=(2, 4, 6)), minor_formatter="{x:g}")
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     return figure
-
-
-def error_columns(errors: Errors, not_smooth: NDArray) -> dict[str, NDArray]:
-    """Errors, error bars and misfits."""
-    return {
-        "input (rad rms)": errors.rms,
-        "plain route: error (rad rms)": errors.column("plain"),
-        "calibrated: error (rad rms)": errors.column("calibrated"),
-        "calibrated, phases not assumed smooth: error (rad rms)": not_smooth,
-        "values of the design with the same prior: error (rad rms)": errors.column("same_prior"),
-        "calibrated: error bar (rad rms)": errors.column("sigma"),
-        "calibrated: misfit": np.array([np.mean([one.misfit for one in row]) for row in errors.measured]),
-    }
 
 
 def _verdict(fit: BenchFit) -> str:

@@ -335,8 +335,11 @@ def draw_linear_loops(found: Divergence) -> Figure:
     figure, panels = plt.subplots(1, len(found.runs), figsize=(7, 3), sharex=True, sharey=True, squeeze=False)
     for axes, (name, run) in zip(panels[0], found.runs.items(), strict=True):
         closed = run.closed()
-        axes.semilogy(1e3 * run.times, run.residual[closed].T, lw=0.8, color="#999999")
-        axes.semilogy(1e3 * run.times, run.residual[~closed].T, lw=2, color=LOOKS["Linear"].color)
+        for screen in np.argsort(~closed, kind="stable"):  # those that do not close last
+            style = (
+                {"lw": 0.8, "color": "#999999"} if closed[screen] else {"lw": 2, "color": LOOKS["Linear"].color}
+            )
+            axes.semilogy(1e3 * run.times, run.residual[screen], label=f"_screen {screen}", **style)
         axes.set_title(f"{name}:\n{closed.sum()} of {closed.size} close", fontsize=10)
         axes.set(xlabel="time (ms)", xlim=(0, 1e3 * run.times[-1]))
     panels[0, 0].set_ylabel("residual (rad rms)")
@@ -395,27 +398,6 @@ def _mark_closed(axes: Axes, some: Sequence[TunedLoops]) -> None:
             closed = sorted({one.closed(name).sum() for name in names if name in one.settled})
             lines.append(f"{label}: " + "\N{EN DASH}".join(map(str, dict.fromkeys((closed[0], closed[-1])))))
         axes.text(number, 1.02, "\n".join(lines), transform=place, ha="center", fontsize=9)
-
-
-def linear_columns(found: Divergence) -> dict[str, NDArray]:
-    """Columns of the figure: the residual of each loop, and the share of points with a reversed response."""
-    columns = {"time (s)": found.runs["the sensor"].times}
-    for name, run in found.runs.items():
-        columns |= {f"{name}, screen {k}: residual (rad rms)": one for k, one in enumerate(run.residual)}
-    return columns | {f"screen {k}: reversed points": one for k, one in enumerate(found.reversed)}
-
-
-def tuned_columns(trials: Sequence[TunedLoops]) -> dict[str, Sequence[float]]:
-    """Columns of the figure: gain, residual and closed loops of each method, for each input and star."""
-    columns: dict[str, Sequence[float]] = {
-        "start (rad rms)": [one.start for one in trials],
-        "photons per point and image": [one.photons for one in trials],
-    }
-    for name in trials[0].settled:
-        columns[f"{name}: gain"] = [one.gains[name] for one in trials]
-        columns[f"{name}: residual (rad rms)"] = [typical(one.settled[name]) for one in trials]
-        columns[f"{name}: loops that close"] = [float(one.closed(name).sum()) for one in trials]
-    return columns
 
 
 def tuned_screens(trials: Sequence[TunedLoops]) -> dict[str, NDArray]:

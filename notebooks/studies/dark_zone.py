@@ -157,8 +157,9 @@ def draw_held_drift(curves: DriftCurves) -> Figure:
     left.axhline(drift.rms, color="#999999", lw=1)
     left.plot(many, kalman_limit(errors[IDEAL], drift, many), color="#777777", ls=":", label=IDEAL)
     for name, style in styles.items():
-        left.plot(many, kalman_limit(errors[name], drift, many), **style | {"marker": ""})
-        left.plot(photons, held[name], **style | {"linestyle": ""})
+        limit = style | {"marker": "", "label": f"_{name}, limit"}
+        left.plot(many, kalman_limit(errors[name], drift, many), **limit)
+        left.plot(photons, held[name], **style | {"linestyle": "", "label": f"_{name}, simulated"})
         left.plot([], [], **style, label=name)
     left.set(xscale="log", yscale="log", xlabel="photons per cycle", ylabel="residual (pm rms)")
     *_, last = held
@@ -169,8 +170,11 @@ def draw_held_drift(curves: DriftCurves) -> Figure:
     left.text(many[0], 0.95 * drift.rms, "step of the drift", va="top")
     dense = np.linspace(min(gains) / 1.3, 1.05 * max(gains), 100)
     for (light, simulated), (gray, marker) in zip(curves.by_gain.items(), cycle(_LIGHTS), strict=False):
-        right.plot(dense, integrator_residual(errors[last], drift, light, dense), color=gray)
-        right.plot(gains, simulated, marker, color=gray, label=f"$10^{{{np.log10(light):.2g}}}$ photons")
+        name = f"$10^{{{np.log10(light):.2g}}}$ photons"
+        right.plot(
+            dense, integrator_residual(errors[last], drift, light, dense), color=gray, label=f"_{name}, model"
+        )
+        right.plot(gains, simulated, marker, color=gray, label=name)
         right.axhline(kalman_limit(errors[last], drift, light), color=gray, lw=0.8, ls=":")
     right.set_xlabel("gain of the integrator")
     right.set_title(f"against the gain, {last}", fontsize=10)
@@ -190,16 +194,6 @@ def _mark_factor(axes: Axes, less: float, more: float, level: float) -> None:
     axes.annotate("", (less, level), (more, level), arrowprops=arrow)
     text = f"{more / less:.2f} times the photons"
     axes.annotate(text, (more, level), (3, 3), textcoords="offset points", fontsize=9)
-
-
-def drift_columns(curves: DriftCurves) -> dict[str, NDArray]:
-    """Columns of the simulated residuals and their limits."""
-    columns = {"photons per cycle": np.array(curves.photons)}
-    for name, errors in curves.errors.items():
-        columns[f"{name}: limit (pm rms)"] = kalman_limit(errors, curves.drift, curves.photons)
-        if name in curves.held:
-            columns[f"{name}: simulated (pm rms)"] = curves.held[name]
-    return columns
 
 
 def photons_table(curves: DriftCurves) -> Table:

@@ -450,29 +450,6 @@ def _label(row: Row) -> str:
     return f"{first}{row.at.rms:g} rad, {light}"
 
 
-def comparison_columns(open_loop: Sequence[Row], loops: Sequence[Row]) -> dict[str, list | NDArray]:
-    """Errors, their ratio with two standard errors either way, and loops that close in each row of the figure."""
-    rows = in_order(open_loop) + in_order(loops)
-    cells = [row.cell for row in rows]
-    one, two = np.transpose([cell.typical for cell in cells])
-    closed = [cell.closed or ("", "") for cell in cells]
-    return {
-        "loop": ["closed" if cell.closed else "open" for cell in cells],
-        "bench": [row.bench or BENCHES["real"] for row in rows],
-        "wavefront error (rad rms)": [row.at.rms for row in rows],
-        "photons per point and image": [row.at.photons for row in rows],
-        "method, two images": [cell.two for cell in cells],
-        "method, one image": [cell.one for cell in cells],
-        "error, two images (rad rms)": two,
-        "error, one image (rad rms)": one,
-        "one over two": np.array([1 / cell.ratio for cell in cells]),
-        "one over two, low": np.array([1 / cell.high for cell in cells]),
-        "one over two, high": np.array([1 / cell.low for cell in cells]),
-        "loops that close, two images": [pair[1] for pair in closed],
-        "loops that close, one image": [pair[0] for pair in closed],
-    }
-
-
 def open_table(rows: Sequence[Row]) -> Table:
     """Error of the best method with two images and with one, and their ratio, for each bench and wavefront."""
     header = ["situation", "photons per point and image", "error, two images", "error, one image", "one over two"]

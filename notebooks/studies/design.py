@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FormatStrFormatter
+from matplotlib.ticker import FixedLocator, MultipleLocator
 from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
@@ -145,7 +145,7 @@ def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[
     Designs whose phase shifts are of equal size are marked with their cost, and a star marks the best one.
     """
     figure, panels = plt.subplots(1, len(maps.costs), figsize=(7, 3.8), sharey=True, squeeze=False)
-    x, y = maps.diameters, maps.angles / np.pi
+    x, y = maps.diameters, maps.angles
     colors = {"cmap": COST_MAP, "norm": LogNorm(1, 10)}
     for axes, (name, grid) in zip(panels[0], maps.costs.items(), strict=True):
         axes.grid(False)
@@ -156,24 +156,29 @@ def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[
         marked = []
         for design, cost in zip(designs, costs[name], strict=True):
             if np.isclose(design.theta_a, -design.theta_b):
-                place = design.diameter, design.theta_a / np.pi
+                place = design.diameter, design.theta_a
                 marked.append(place)
                 axes.plot(*place, "o", mfc="#ffffff", mec="#000000", ms=8, zorder=7)
                 axes.annotate(f"{design.name}: {cost:.2f}", place, (8, 0), textcoords="offset points", **_LABEL)
         best = maps.best(name)
-        axes.plot(best.diameter, best.theta_a / np.pi, "*", mfc="#ffffff", mec="#000000", ms=13, zorder=6)
+        axes.plot(best.diameter, best.theta_a, "*", mfc="#ffffff", mec="#000000", ms=13, zorder=6)
         axes.set(xscale="log", xlim=x[[0, -1]], ylim=y[[0, -1]], xlabel="diameter (λ/D)")
         axes.spines[:].set(visible=True, color="#888888")
         axes.clabel(lines, fmt="%g", fontsize=9, manual=_free_places(lines, x, y, marked))
         axes.xaxis.set(major_locator=FixedLocator([1, 2, 3, 5, 7]), major_formatter="{x:g}", minor_formatter="")
         axes.set_title(name, fontsize=10)
-        axes.yaxis.set_major_formatter(FormatStrFormatter("±%gπ"))
+        axes.yaxis.set(major_locator=MultipleLocator(np.pi / 5), major_formatter=_both_signs)
     panels[0, 0].set_ylabel("phase shifts (rad)")
     label = "photons / photons of an ideal sensor"
     bar = figure.colorbar(shown, ax=list(panels[0]), label=label, extend="max", aspect=25)
     bar.set_ticks([1, *CONTOURS, 10], labels=[f"{level:g}" for level in (1, *CONTOURS, 10)])
     bar.minorticks_off()
     return figure
+
+
+def _both_signs(angle: float, place: int) -> str:
+    """Phase shifts of equal size, as a label."""
+    return f"±{angle / np.pi:.2g}π"
 
 
 def _free_places(
@@ -211,14 +216,6 @@ def _apart(points: NDArray, others: ArrayLike) -> NDArray[np.float64]:
 
 _BOX = {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0.15"}
 _LABEL: dict[str, Any] = {"va": "center", "fontsize": 9, "bbox": _BOX, "zorder": 6}  # of designs
-
-
-def design_maps_columns(maps: DesignMap) -> dict[str, NDArray]:
-    """Columns of the maps."""
-    return {
-        "diameter (lambda/D)": np.repeat(maps.diameters, maps.angles.size),
-        "phase shift (rad)": np.tile(maps.angles, maps.diameters.size),
-    } | {f"photons, ideal 1, {name}": cost.ravel() for name, cost in maps.costs.items()}
 
 
 def _shifts(design: Design) -> str:

@@ -97,18 +97,6 @@ def draw_budget(budget: Curves, name: str) -> Figure:
     return figure
 
 
-def effect_columns(budget: Curves) -> dict[str, NDArray | list[str]]:
-    """Offset, and gain and error at the first input after 0."""
-    offsets, gains, errors = effects(budget)
-    value = next(iter(budget.values())).rms[1]
-    return {
-        "error": [_words(error) for error in budget],
-        "offset (rad rms)": offsets,
-        f"gain at {value} rad rms": gains,
-        f"error at {value} rad rms (rad rms)": errors,
-    }
-
-
 def effect_table(budget: Curves, bench: Bench) -> Table:
     """Size of each error of a bench, and offset, gains and errors with this error alone."""
     sizes = {name: f" ({getattr(bench, name):g} {unit})" for name, unit in UNITS.items()}

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, percent, reach_text, refined_limit
+from studies.kit.curves import ErrorCurves, Limit, percent, refined_limit
 from studies.kit.parameters import SETUP, parameter_limits
 from studies.kit.results import rounded, screen_columns
 from studies.kit.setups import NOISELESS, Noise, Screens, check_setup, screens_at
@@ -227,8 +227,9 @@ def draw_linearity(
             reach = f": always above {percent(threshold)}".replace(" %", "\N{NO-BREAK SPACE}%")
         plain.plot(rms, mean[drawn], label=textwrap.fill(look.label + reach, 44), **line)
         low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
-        plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0)
-        ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], **line)
+        scatter = f"_{look.label}, scatter"
+        plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0, label=scatter)
+        ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], label=f"_{look.label}", **line)
         if found:
             ratio.plot(limits[name].value, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
         if name in STATED:
@@ -258,11 +259,12 @@ def draw_saxton_widths(
         for (name, method), color, line, marker in zip(drawn.items(), colors, *map(cycle, lines), strict=False):
             ratio = curves.mean(name) / curves.rms
             label = f"{method.settings.n_iterations} iterations"
-            axes.semilogy(curves.rms, ratio, color=color, linestyle=line, marker=marker, label=label)
             if kind == "zero":
                 place: dict[str, Any] = {"xytext": (-7, 0), "textcoords": "offset points", "va": "center"}
                 text = f"{method.sensor.extent:g} D"
+                label = f"{text}, {label}"
                 axes.annotate(text, (curves.rms[0], ratio[0]), color="#333333", fontsize=9, ha="right", **place)
+            axes.semilogy(curves.rms, ratio, color=color, linestyle=line, marker=marker, label=label)
         axes.plot(curves.rms, curves.mean("Linear") / curves.rms, label="linear", **LOOKS["Linear"].style)
         axes.axhline(threshold, color="#555555", lw=1)
         axes.set(xlabel="input phase (rad rms)", xlim=(0, None))
@@ -282,17 +284,6 @@ def _shades(color: str, count: int) -> list[tuple[float, ...]]:
     return [ends(level) for level in np.linspace(0.3, 0.65, count)] if count != 1 else [to_rgba(color)]
 
 
-def width_columns(variants: Mapping[str, GerchbergSaxton], curves: LinearityCurves) -> dict[str, Any]:
-    """Columns of the mean errors of Gerchberg-Saxton on each detector, and of the linear method."""
-    names = {
-        name: f"{method.sensor.extent:g} D, {method.unmeasured}, {method.settings.n_iterations} iterations"
-        for name, method in variants.items()
-    } | {"Linear": "linear"}
-    return {"input (rad rms)": curves.rms} | {
-        f"{title}: mean error (rad rms)": curves.mean(name) for name, title in names.items()
-    }
-
-
 # The methods with one image, and Gerchberg-Saxton: no candidates for a long range.
 _SHORT_RANGE = ("Linear", "Arcsine", "GerchbergSaxton", "GerchbergSaxtonModel")
 
@@ -300,13 +291,6 @@ _SHORT_RANGE = ("Linear", "Arcsine", "GerchbergSaxton", "GerchbergSaxtonModel")
 def _indices(curves: LinearityCurves, values: Sequence[float]) -> dict[float, int]:
     """Index of each of these inputs that the curves have."""
     return {value: int(np.flatnonzero(curves.rms == value)[0]) for value in values if value in curves.rms}
-
-
-def _reach(curves: LinearityCurves, name: str, threshold: float, limit: Limit) -> str:
-    """Inputs above 0 at which an error stays within the threshold, in words."""
-    bright = curves.rms > 0
-    rms, error = curves.rms[bright], curves.mean(name)[bright]
-    return reach_text(rms, error, threshold * rms, f"{limit.value:.2g}", f"{percent(threshold)} of the input")
 
 
 def _place(curves: LinearityCurves, limit: Limit) -> str:
@@ -374,23 +358,6 @@ def work_table(passes: Mapping[str, int]) -> Table:
     return Table(
         ["reconstructor", "passes through the model"], [[LOOKS[name].name, n] for name, n in passes.items()]
     )
-
-
-def _phrases(curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float) -> dict[str, str]:
-    """Sentences, and parts of them, that hold for any parameters: a limit need not exist."""
-    rms, gain = curves.rms, limits["PhaseShifted"].over(limits["Linear"])
-    alike, onset = _alike_up_to(curves), _wrap_onset(curves)
-    return {
-        "linear_reach": _reach(curves, "Linear", threshold, limits["Linear"]),
-        "shifted_reach": _reach(curves, "PhaseShifted", threshold, limits["PhaseShifted"]),
-        "gain_text": f", {gain.value:.2g} times as far" if 0 < gain.value < np.inf else "",
-        "alike_text": f"Up to {alike:.2g} rad rms its error is below 10⁻⁶ rad, like that of the iteration."
-        if alike
-        else "Its error and that of the iteration are not below 10⁻⁶ rad.",
-        "wrap_text": f"on at least half of the screens from {onset:.2g} rad rms on"
-        if onset < np.inf
-        else f"on less than half of the screens up to {rms[-1]:.2g} rad rms",
-    }
 
 
 _SHORT = {
@@ -485,7 +452,6 @@ def numbers(
     }
     for name, short in _SHORT.items():
         found[f"{short}_limit"] = limits[name].value
-    found |= _phrases(curves, limits, threshold)
+    found["threshold"] = threshold
     found["saxton_model_limit_longer"] = longer.value
-    found["saxton_model_reach_longer"] = _reach(by_width, repaired, threshold, longer)
     return rounded(found)

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, crossing, percent, reach_text, refined_limit
+from studies.kit.curves import ErrorCurves, Limit, crossing, percent, refined_limit
 from studies.kit.methods import opposite_dimples, own_reconstructors, paper_reconstructors
 from studies.kit.parameters import SETUP, parameter_limits
 from studies.kit.results import rounded, screen_errors
@@ -334,7 +334,8 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
         low, high = (np.maximum(mean + sign * std, bottom) for sign in (-1, 1))
         drawn = np.maximum(mean, bottom)
         axes.plot(curve.diameters, drawn, color=look.color, marker=look.marker, ms=4, label=f"{number} iterations")
-        axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0)
+        scatter = f"_{number} iterations, scatter"
+        axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0, label=scatter)
         _diameters(axes, curve.diameters[-1], claimed)
         axes.set_ylabel("error (rad rms)")
     for index, ((number, other), style) in enumerate(zip(others, OTHER_STYLES[1:], strict=False)):
@@ -409,47 +410,9 @@ def _diameters(axes: Axes, end: float, claimed: float) -> None:
     axes.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=(0, end))
 
 
-def iteration_columns(curves: Mapping[int, DiameterCurves]) -> dict[str, NDArray]:
-    """Columns of the figure of the paper, by the number of iterations; NaN where a curve was not computed."""
-    diameters = next(iter(curves.values())).diameters
-    columns = {"diameter (lambda/D)": diameters}
-    for n, curve in curves.items():
-        computed = np.isin(diameters, curve.diameters)
-        both = {"mean error": curve.mean(ITERATION), "standard deviation": curve.std(ITERATION)}
-        for quantity, values in both.items():
-            column = columns[f"{n} iterations: {quantity} (rad rms)"] = np.full(diameters.size, np.nan)
-            column[computed] = values
-    return columns
-
-
-def reason_columns(reasons: Contraction) -> dict[str, NDArray]:
-    """Columns of the figure on the causes."""
-    return {
-        "diameter (lambda/D)": reasons.diameters,
-        "factor, flat wavefront": reasons.flat,
-        **{f"factor, screen {i}": row for i, row in enumerate(reasons.aberrated.T, start=1)},
-        **{f"sensitivity, {name} (1/rad)": row for name, row in reasons.sensitivity.items()},
-    }
-
-
-def method_columns(curves: Mapping[str, DiameterCurves]) -> dict[str, ArrayLike]:
-    """Columns of the comparison of the methods."""
-    few = min((curve.diameters for curve in curves.values()), key=len)
-    return {
-        "diameter (lambda/D)": few,
-        **{f"{name}, mean error (rad rms)": [curve.at(name, d) for d in few] for name, curve in curves.items()},
-    }
-
-
 def limits_table(curves: Mapping[int, DiameterCurves], threshold: float, limits: Mapping[int, Limit]) -> Table:
     """Diameters at which the error exceeds 1e-3 rad and the threshold, by the number of iterations."""
-
-    def reached(n: int, curve: DiameterCurves) -> str:
-        if np.isfinite(limits[n].value):
-            return f"{limits[n].value:.2f}"
-        return f"not up to {curve.diameters[-1]:g}"
-
-    rows = [[n, _place(curve, ITERATION, 1e-3, form=".2f"), reached(n, curve)] for n, curve in curves.items()]
+    rows = [[n, curve.exceeds(ITERATION, 1e-3), limits[n].value] for n, curve in curves.items()]
     return Table(
         ["iterations", "exceeds 10⁻³ rad above about (λ/D)", f"exceeds {percent(threshold)} above about (λ/D)"],
         rows,
@@ -476,29 +439,9 @@ def factors_table(reasons: Contraction, curve: DiameterCurves, n_iterations: int
     )
 
 
-def _start(curve: DiameterCurves, name: str, threshold: float) -> str:
-    """Diameter, from the usual one on, at which the error exceeds the threshold, in words."""
-    limit = threshold * curve.rms[0]
-    if curve.at(name, _usual(curve)) > limit:
-        return "at all diameters"
-    return _place(curve, name, limit, _usual(curve))
-
-
-def _doubled(curve: DiameterCurves, name: str) -> str:
-    """Diameter at which the error exceeds twice that at the usual one, in words."""
-    error = curve.at(name, _usual(curve))
-    return "–" if error < 1e-6 else _place(curve, name, 2 * error, _usual(curve))
-
-
 def _usual(curve: DiameterCurves) -> float:
     """Diameter of the paper's other figures, or the largest one if that is smaller (lambda/D)."""
     return min(USUAL, float(curve.diameters[-1]))
-
-
-def _place(curve: DiameterCurves, name: str, limit: float, start: float = 0.0, form: str = ".2g") -> str:
-    """Diameter, from `start` on, at which an error exceeds a limit (radian rms), in words."""
-    diameter = curve.exceeds(name, limit, start)
-    return f"{diameter:{form}}" if diameter < np.inf else f"not up to {curve.diameters[-1]:g}"
 
 
 def _rise(curve: DiameterCurves, name: str, allowed: float) -> float:
@@ -506,21 +449,6 @@ def _rise(curve: DiameterCurves, name: str, allowed: float) -> float:
     start = _usual(curve)
     error = curve.at(name, start)
     return curve.exceeds(name, 2 * error if error > allowed else allowed, start)
-
-
-def _reach(
-    curve: DiameterCurves,
-    name: str,
-    allowed: float,
-    words: str,
-    limit: str = "",
-    start: float = 0.0,
-    form: str = ".3g",
-) -> str:
-    """Diameters, from `start` on, at which an error stays within what is allowed (radian rms), in words."""
-    used = curve.diameters >= start - 1e-9
-    limit = limit or f"about {curve.exceeds(name, allowed, start):{form}}"
-    return reach_text(curve.diameters[used], curve.mean(name)[used], allowed, limit, words, "λ/D")
 
 
 def methods_table(curves: Mapping[str, DiameterCurves], threshold: float) -> Table:
@@ -532,15 +460,13 @@ def methods_table(curves: Mapping[str, DiameterCurves], threshold: float) -> Tab
             "at 2",
             "at 2.6",
             "at 3.5 (λ/D)",
-            f"passes {percent(threshold)} at about (λ/D)",
-            "exceeds twice the error at 1.06 above about (λ/D)",
+            f"exceeds {percent(threshold)}, or twice the error at 1.06, above about (λ/D)",
         ],
         [
             [
                 LOOKS[name].name,
                 *(small(curve.at(name, diameter)) for diameter in (USUAL, 2.0, 2.6, 3.5)),
-                _start(curve, name, threshold),
-                _doubled(curve, name),
+                _rise(curve, name, threshold * curve.rms[0]),
             ]
             for name, curve in curves.items()
         ],
@@ -555,7 +481,7 @@ def numbers(
 ) -> dict[str, float | str]:
     """Numbers of the text and of the claims of section 4.2 on the diameter."""
     paper = by_method[ITERATION]
-    of_input, allowed = f"{percent(threshold)} of the input", threshold * paper.rms[0]
+    allowed = threshold * paper.rms[0]
     descent = by_method["GradientDescent"]
     limit, last = (list(limits.values())[place] for place in (0, -1))
     found: dict[str, Any] = {
@@ -569,8 +495,8 @@ def numbers(
         "n_few": by_method["Linear"].errors["Linear"].shape[-1],
         **{f"claim17_{short}_rise": _rise(by_method[name], name, allowed) for name, short in SHORT.items()},
         "longest": list(by_iterations)[-1],
-        "reach": _reach(paper, ITERATION, allowed, of_input, f"{limit.value:.2f}"),
-        "reach_1e3": _reach(paper, ITERATION, 1e-3, "10⁻³ rad"),
-        "descent_reach": _reach(descent, "GradientDescent", allowed, of_input, start=_usual(descent), form=".3g"),
+        "threshold": threshold,
+        "diameter_1e3": paper.exceeds(ITERATION, 1e-3),
+        "descent_limit": descent.exceeds("GradientDescent", allowed, _usual(descent)),
     }
     return rounded(found, ".4g")

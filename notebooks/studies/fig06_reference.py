@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies.kit.bench import ARMS, check_bench, middle_rows
+from studies.kit.bench import ARMS, check_bench
 from studies.kit.parameters import bench_fields, parameter_limits
 from studies.kit.style import show_intensity
 from studies.kit.tables import Table
@@ -41,11 +41,6 @@ def draw_reference_intensities(frames: NDArray, clear_frames: NDArray) -> Figure
             axes.set_title(f"{label},\nimage {arm}", fontsize=10)
         figure.colorbar(shown, ax=pair, label="intensity", location="bottom", shrink=0.7, aspect=30)
     return figure
-
-
-def frame_columns(frames: NDArray, clear_frames: NDArray) -> dict[str, NDArray]:
-    """Middle rows of the images of Figure 6."""
-    return middle_rows({"mask in": frames, "mask out": clear_frames})
 
 
 def error_table(bench: Bench) -> Table:

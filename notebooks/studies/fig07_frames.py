@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies.kit.bench import ARMS, check_bench, middle_rows
+from studies.kit.bench import ARMS, check_bench
 from studies.kit.parameters import bench_fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import show_intensity, show_phase
@@ -53,11 +53,6 @@ def draw_measured_and_modelled(measured: NDArray, modelled: NDArray, phase: NDAr
     figure.colorbar(difference, ax=[panels["d0"], panels["d1"]], label="intensity", extend="both", **bars)
     figure.colorbar(found, ax=panels["phase"], label="phase (rad)", **bars)
     return figure
-
-
-def frame_columns(measured: NDArray, modelled: NDArray) -> dict[str, NDArray]:
-    """Middle rows of the frames of Figure 7."""
-    return middle_rows({"measured": measured, "modelled": modelled})
 
 
 def agreement_table(correlation: list[float], estimate: Reconstruction, error: NDArray) -> Table:

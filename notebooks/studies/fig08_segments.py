@@ -59,12 +59,6 @@ def draw_segment_errors(bench: Bench, commanded: NDArray, errors: Mapping[str, N
     return figure
 
 
-def error_columns(bench: Bench, commanded: NDArray, errors: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """Command and errors of each segment."""
-    columns = {"segment": bench.numbers, "commanded (rad)": commanded}
-    return columns | {f"error, {name} (rad)": values for name, values in errors.items()}
-
-
 def numbers(errors: Mapping[str, NDArray], commanded: NDArray) -> dict[str, float | str]:
     """Numbers for the text: input, rms of the errors of both methods; arrays are (n_segments,), rad."""
     linear, shifted = errors["Linear"], errors["PhaseShifted"]

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from studies.kit.bench import BenchCurves, check_bench
-from studies.kit.curves import Limit, percent, reach_text
+from studies.kit.curves import percent
 from studies.kit.parameters import bench_fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS
@@ -47,8 +47,10 @@ def draw_bench_linearity(curves: BenchCurves) -> Figure:
         look, mean, std = LOOKS[name], curves.mean(name), curves.std(name)
         plain.plot(curves.rms, mean, markersize=4, label=look.label, **look.style)
         low, high = np.maximum(mean - std, 0), mean + std
-        plain.fill_between(curves.rms, low, high, color=look.color, alpha=0.15, lw=0)
-        gain.plot(curves.rms, curves.gain(name), markersize=4, **look.style)
+        plain.fill_between(
+            curves.rms, low, high, color=look.color, alpha=0.15, lw=0, label=f"_{look.label}, scatter"
+        )
+        gain.plot(curves.rms, curves.gain(name), markersize=4, label=f"_{look.label}", **look.style)
     plain.plot(
         curves.rms, _SHARE * curves.rms, color="#555555", lw=1, ls=":", label=f"{percent(_SHARE)} of the input"
     )
@@ -58,17 +60,6 @@ def draw_bench_linearity(curves: BenchCurves) -> Figure:
     gain.set(xlim=(0, None), ylim=(0, 1.5))
     figure.legend(loc="outside lower center", ncols=3, fontsize=9, columnspacing=1.0, handletextpad=0.5)
     return figure
-
-
-def curve_columns(curves: BenchCurves) -> dict[str, NDArray]:
-    """Mean error, standard deviation and gain of each reconstructor."""
-    names = curves.residuals
-    return {
-        "input (rad rms)": curves.rms,
-        **{f"{name}, mean error (rad rms)": curves.mean(name) for name in names},
-        **{f"{name}, standard deviation (rad rms)": curves.std(name) for name in names},
-        **{f"{name}, gain": curves.gain(name) for name in names},
-    }
 
 
 def reach_table(curves: BenchCurves) -> Table:
@@ -104,22 +95,9 @@ def numbers(curves: BenchCurves) -> dict[str, float | str]:
     mean = {short: curves.mean(name) for short, name in SHORT.items()}
     large = curves.rms >= 0.3
     alike = curves.mean("Arcsine")[large] / mean["linear"][large]
-    bright, worse = curves.rms > 0, curves.rms[mean["saxton"] > mean["linear"]].max(initial=0.0)
-    inputs, linear = curves.rms[bright], mean["linear"][bright]
-    texts = {
-        "linear_reach": reach_text(
-            inputs, linear, _SHARE * inputs, Limit(reach(curves, "Linear")), "25 % of the input"
-        ),
-        "alike_text": f"From {curves.rms[large][0]:.2g} rad rms on, the median ratio of the arcsine's error to "
-        f"that of the linear method is {np.median(alike):.2f}."
-        if alike.size
-        else "No input is large enough for a comparison.",
-        "saxton_text": f"worse than the linear method up to {worse:.2g} rad rms"
-        if worse
-        else "at no input above 0 worse than the linear method",
-    }
-    return texts | rounded(
+    return rounded(
         {
+            "saxton_worse": curves.rms[mean["saxton"] > mean["linear"]].max(initial=0.0),
             "offset_shifted": mean["shifted"][0],
             "arcsine_over_linear": round(np.median(alike), 3) if alike.size else np.nan,
             **{f"reach_{short}": reach(curves, name) for short, name in SHORT.items()},

@@ -244,15 +244,6 @@ def draw_approximation(rms: Sequence[float], wave: Curves, steps: Curves) -> Fig
     return figure
 
 
-def approximation_columns(inputs: Sequence[float], wave: Curves, steps: Curves) -> dict[str, Sequence[float]]:
-    """Columns of the curves of both panels."""
-    return (
-        {"input (rad rms)": inputs}
-        | {f"reference wave: {name}": values for name, values in wave.items()}
-        | {f"phase over input: {name}": values for name, values in steps.items()}
-    )
-
-
 def numbers(
     wave_errors: Mapping[str, tuple[float, float]],
     inputs: Sequence[float],

@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from studies.kit.bench import middle_rows
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import ALONE, show_intensity, show_phase
@@ -193,6 +192,7 @@ def draw_signs(measurement: Measurement, height: float = 0.4) -> Figure:
         )
     for axes, (values, limit, title) in zip(panels[1:], maps, strict=True):
         shown = show_phase(axes, np.where(sensor.pupil.inside, values, np.nan), limit)
+        shown.set_label(f"_{title}")
         axes.set_title(title, fontsize=10)
         if axes is panels[1]:
             figure.colorbar(shown, ax=axes, location="bottom", label="phase (rad)", aspect=12)
@@ -221,40 +221,6 @@ def _pulled_mirror(axes: Axes) -> None:
     axes.set_title("mirror pulled back by h:\nOPD = +2 h, phase above 0", fontsize=10)
     axes.grid(False)
     axes.spines[:].set_visible(False)
-
-
-def frame_columns(result: MeasuredPhase) -> dict[str, NDArray]:
-    """Middle rows of the frames."""
-    return middle_rows({"measured": result.measured, "modelled": result.modelled})
-
-
-def phase_columns(result: MeasuredPhase, verdict: Verdict, wavelength: float) -> dict[str, NDArray]:
-    """Phase and its error bar on the middle row."""
-    middle = result.phase.shape[0] // 2
-    row = result.phase[middle]
-    return {
-        "column (pixel)": np.arange(row.size),
-        "phase on the middle row (rad)": row,
-        "the same (nm)": phase_to_opd(row, wavelength),
-        "error bar (rad)": np.full(row.shape, np.nan) if verdict.sigma is None else verdict.sigma[middle],
-    }
-
-
-def step_columns(work: Sequence[Step], errors: Sequence[float] | None) -> dict[str, Any]:
-    """Scores of each step, and the fitted optics."""
-    columns: dict[str, Any] = {"step": [step.name for step in work]}
-    columns |= {f"score, image {i + 1}": [step.predicted[i] for step in work] for i in range(2)}
-    columns |= {f"control, image {i + 1}": [step.control[i] for step in work] for i in range(2)}
-    columns |= {"misfit over contrast": [step.result.misfit for step in work]}
-    optics = [step.result.measurement.optics for step in work]
-    columns |= {name: [getattr(one, name) for one in optics] for name in ("scale", "diameter", "leakage")}
-    return columns | {"difference from the commands (rad rms)": errors or np.nan}
-
-
-def sign_columns(measurement: Measurement) -> dict[str, NDArray]:
-    """Phase shifts of the images."""
-    shifts = np.array(measurement.optics.phase_shifts)
-    return {"image": np.arange(1, shifts.size + 1), "phase shift (rad)": shifts}
 
 
 def verdict_table(verdict: Verdict) -> Table:

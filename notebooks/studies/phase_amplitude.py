@@ -250,33 +250,12 @@ def draw_phase_and_amplitude(
     return figure
 
 
-def amplitude_columns(curves: Mapping[str, AmplitudeCurves]) -> dict[str, NDArray]:
-    """Columns of the errors and the bound."""
-    columns = {}
-    for kind, one in curves.items():
-        columns["variation of the amplitude"] = one.variations
-        columns[f"{kind}: bound (rad rms)"] = one.bound
-        columns |= {f"{kind}: {way}: error (rad rms)": one.error(way) for way in WAYS}
-    return columns
-
-
 def amplitude_screens(curves: Mapping[str, AmplitudeCurves]) -> dict[str, NDArray]:
     """Errors of every single screen."""
     variation = "variation of the amplitude"
     return stacked(
         "kind", {kind: screen_errors(variation, one.variations, one.errors) for kind, one in curves.items()}
     )
-
-
-def map_columns(
-    pupil: Pupil, phase: NDArray, amplitude: NDArray, estimate: LikelihoodReconstruction
-) -> dict[str, NDArray]:
-    """Columns of the maps, one row for each point of the pupil."""
-    columns = {"x (D)": pupil.points[:, 0], "y (D)": pupil.points[:, 1]}
-    columns |= {"phase (rad)": pupil.gather(phase), "amplitude": pupil.gather(amplitude)}
-    for name, (error, sigma) in _errors(pupil, phase, amplitude, estimate).items():
-        columns |= {f"error of the {name}": error, f"standard error of the {name}": sigma}
-    return columns
 
 
 def _errors(

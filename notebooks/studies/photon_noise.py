@@ -226,23 +226,6 @@ def draw_error_bars(rows: Sequence[ErrorBars]) -> Figure:
 TABLED = "MaximumLikelihood", "PhaseShifted"
 
 
-def photon_noise_columns(curves: PhotonCurves) -> dict[str, NDArray]:
-    """Columns of the errors and the bound, medians over the screens."""
-    size = curves.rms.size, curves.photons.size
-    grid = {
-        "input (rad rms)": np.repeat(curves.rms, size[1]),
-        "photons per point and image": np.tile(curves.photons, size[0]),
-        "bound: error (rad rms)": np.median(curves.bound, axis=-1).ravel(),
-    }
-    return grid | {f"{name}: error (rad rms)": curves.error(name).ravel() for name in curves.errors}
-
-
-def error_bars_columns(rows: Sequence[ErrorBars]) -> dict[str, NDArray]:
-    """Columns of the shares of the points within error bars."""
-    shares = {f"share, {row.assumed:g} times the photons assumed": row.within for row in rows}
-    return {"standard errors": SIGMAS, "share, Gaussian errors": EXPECTED} | shares
-
-
 def ratio_table(curves: Mapping[float, PhotonCurves]) -> Table:
     """Error over the bound of two methods, by the diameter of the dimples."""
     photons = next(iter(curves.values())).photons

@@ -65,7 +65,9 @@ def draw_convergence(errors: Mapping[str, Mapping[float, NDArray]]) -> Figure:
             axes.semilogy(
                 steps, middle, color=look.color, linestyle=look.line, marker=look.marker, ms=3.5, label=look.label
             )
-            axes.fill_between(steps, low, high, color=look.color, alpha=0.15, lw=0)
+            axes.fill_between(
+                steps, low, high, color=look.color, alpha=0.15, lw=0, label=f"_{look.label}, scatter"
+            )
         axes.set(xlabel="iteration", title=f"input {value:g} rad")
         axes.xaxis.get_major_locator().set_params(integer=True)
     panels[0, 0].set_ylabel("error (rad rms)")
@@ -98,38 +100,10 @@ def draw_estimates(pupil: Pupil, truth: NDArray, phases: Mapping[str, NDArray]) 
     return figure
 
 
-def convergence_columns(errors: Mapping[str, Mapping[float, NDArray]]) -> dict[str, NDArray]:
-    """Columns of the errors after each iteration: median and middle 80 % of the screens."""
-    n_steps = max(error.shape[1] for by_input in errors.values() for error in by_input.values())
-    columns = {"iteration": np.arange(n_steps)}
-    for name, by_input in errors.items():
-        for value, error in by_input.items():
-            for level in (0.1, 0.5, 0.9):
-                curve = np.quantile(error, level, axis=0)
-                # A method without iterations: before and after.
-                curve = curve[-1] if curve.size == 2 else curve
-                columns[f"{name} at {value:g} rad: quantile {level:g} (rad rms)"] = curve
-    return columns
-
-
 def convergence_screens(errors: Mapping[str, Mapping[float, NDArray]]) -> dict[str, NDArray]:
     """Errors of every single screen at the end."""
     last = {name: np.stack([error[:, -1] for error in one.values()]) for name, one in errors.items()}
     return screen_errors("input (rad rms)", list(next(iter(errors.values()))), last)
-
-
-def cut_columns(pupil: Pupil, screen: NDArray, phases: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """Columns of the estimates and the residuals along the middle of the pupil."""
-    row = pupil.shape[0] // 2
-    return {
-        "x at the middle of the pupil (D)": pupil.x,
-        "input (rad)": np.where(pupil.inside, screen, np.nan)[row],
-        **{f"{name} (rad)": phase[row] for name, phase in phases.items()},
-        **{
-            f"{name}, residual (rad)": wrapped_residual(pupil, phase, screen)[row]
-            for name, phase in phases.items()
-        },
-    }
 
 
 def results_table(pupil: Pupil, screen: NDArray, found: Mapping[str, Reconstruction]) -> Table:

@@ -12,15 +12,13 @@ import numpy as np
 from IPython.display import HTML
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
 from numpy.typing import ArrayLike, NDArray
 
-from studies.kit.drawings import FOCUS_MAP, NARROW, NARROW_LETTERS, Plane, Point, Scene, focal_light
+from studies.kit.drawings import FOCUS_MAP, Picture, draw_layout, focal_light
 from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
 from studies.kit.style import INTENSITY_MAP, LOOKS, PHASE_MAP, dashed_circle, show_phase
-from studies.kit.variants import add_narrow
 from zwfs.metrics import wrapped_residual
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
@@ -73,7 +71,6 @@ IMAGES = ("1", "#B2182B", "-"), ("2", "#313695", "--")
 _WIDTH = 6.8  # inches: names of 10 points are then as large as the prose
 _REACH = 3.0  # of the picture of the focal plane, lambda/D
 _GREY = "#707070"
-_MARKS = {"1. pupil": "black", "4. image": "white"}  # of the pixel: colour by the name of the picture
 
 
 def draw_sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Figure:
@@ -85,59 +82,21 @@ def draw_sensor_steps(sensor: ZernikeSensor, phase: NDArray, pixel: Pixel) -> Fi
     inside = np.where(pupil.inside, phase, np.nan)
     limit = np.nanmax(np.abs(inside))
     focus = focal_light(pupil, field, _REACH)
-    steps = [
-        Plane("1. pupil", "phase (rad)", inside, PHASE_MAP, -limit, limit),
-        Plane("2. focus, dimple", "intensity (log$_{10}$)", focus, FOCUS_MAP, -3, 0),
-        Plane("3. reference wave", "intensity", wave, INTENSITY_MAP, 0, wave.max()),
-        Plane("4. image", "intensity", image, INTENSITY_MAP, 0, image.max()),
-    ]
-    return add_narrow(_steps_across(sensor, steps, pixel), _steps_down(sensor, steps, pixel))
+    pictures = {
+        "pupil": Picture(inside, PHASE_MAP, -limit, limit, "phase (rad)"),
+        "focus": Picture(focus, FOCUS_MAP, -3, 0, "intensity in the focus (log10)"),
+        "wave": Picture(wave, INTENSITY_MAP, 0, wave.max(), "intensity of the reference wave"),
+        "image": Picture(image, INTENSITY_MAP, 0, image.max(), "intensity of the image"),
+    }
 
+    def mark(shown: dict[str, Axes], narrow: bool) -> None:
+        """Edge of the dimple, and the pixel."""
+        middle = (len(focus) - 1) / 2
+        dashed_circle(shown["focus"], (middle, middle), sensor.masks[0].diameter / 2 * middle / _REACH)
+        for name, color in (("pupil", "black"), ("image", "white")):
+            shown[name].plot(pixel.column, pixel.row, "s", mfc="none", mec=color, ms=7, mew=1.5)
 
-def _steps_across(sensor: ZernikeSensor, steps: list[Plane], pixel: Pixel) -> Figure:
-    """Light from left to right."""
-    scene = Scene(9, 3.5)
-    y, size, lenses = 1.62, 1.8, (2.2, 4.8)
-    scene.path(0.1, lenses, 8.0, y, half=0.7, height=1.7)
-    for x in lenses:
-        scene.label(x, 0.16, "lens")
-    scene.label(7.02, 0.16, "on the camera")
-    for x, step in zip((1.05, 3.5, 6.03, 8.02), steps, strict=True):
-        shown = _draw_step(scene, step, (x, y), size, sensor, pixel)
-        scene.label(x, y + 1.35, step.name, weight="bold")
-        scene.label(x, y + 1.05, step.scale)
-        scene.scale(shown, (x - 0.7, y - 1.06, 1.4, 0.08), ticks=3)
-    return scene.figure
-
-
-def _steps_down(sensor: ZernikeSensor, steps: list[Plane], pixel: Pixel) -> Figure:
-    """Light from top to bottom."""
-    height, x, size, lenses = 8.0, 0.95, 1.4, (1.85, 4.05)
-    scene = Scene(NARROW, height, NARROW_LETTERS, down=(x, height - 0.05))
-    scene.path(0, lenses, 7.2, 0, half=0.7, height=1.7)
-    for along in lenses:
-        scene.label(x + 0.95, scene.place(along, 0)[1], "lens", ha="left", va="center")
-    left = x + 0.85
-    for along, step in zip((0.8, 2.95, 5.5, 7.2), steps, strict=True):
-        y = scene.place(along, 0)[1]
-        shown = _draw_step(scene, step, (x, y), size, sensor, pixel)
-        scene.label(left, y + 0.42, step.name, ha="left", va="center", weight="bold")
-        scene.label(left, y + 0.14, step.scale, ha="left", va="center")
-        scene.scale(shown, (left + 0.1, y - 0.14, 1.4, 0.08), ticks=3)
-    return scene.figure
-
-
-def _draw_step(
-    scene: Scene, step: Plane, at: Point, size: float, sensor: ZernikeSensor, pixel: Pixel
-) -> AxesImage:
-    """Picture with the edge of the dimple or the mark of the pixel."""
-    shown = scene.picture(*at, size, step.image, step.colors, step.low, step.high)
-    if step.colors == FOCUS_MAP:
-        middle = (step.image.shape[0] - 1) / 2
-        dashed_circle(shown.axes, (middle, middle), sensor.masks[0].diameter / 2 * middle / _REACH)
-    if color := _MARKS.get(step.name):
-        shown.axes.plot(pixel.column, pixel.row, "s", mfc="none", mec=color, ms=7, mew=1.5)
-    return shown
+    return draw_layout("zernike_sensor.svg", "zernike_sensor_narrow.svg", pictures, marks=mark)
 
 
 def draw_pixel_phasors(pixel: Pixel) -> Figure:
@@ -150,7 +109,7 @@ def draw_pixel_phasors(pixel: Pixel) -> Figure:
     for k, (name, color, line) in enumerate(IMAGES):
         _phasors(panels[name], pixel, k)
         level = pixel.intensities(pixel.phase)[k]
-        curves.plot(angles, pixel.intensities(angles)[k], color=color, ls=line, lw=2)
+        curves.plot(angles, pixel.intensities(angles)[k], color=color, ls=line, lw=2, label=f"_image {name}")
         curves.axhline(level, color=color, ls=line, lw=0.8)
         curves.plot(pixel.mirrored[k], level, "o", color=color, mfc="white", mew=2, ms=9, zorder=4)
         top = int(np.argmax(pixel.intensities(angles)[k]))
@@ -211,35 +170,6 @@ def draw_one_or_two_images(pupil: Pupil, truth: NDArray, phases: Mapping[str, ND
 
 def _error(value: float) -> str:
     return f"error {value:.2f} rad rms" if value >= 5e-3 else "no error"
-
-
-def sensor_steps_columns(pupil: Pupil, phase: NDArray, frames: NDArray, pixel: Pixel) -> dict[str, NDArray]:
-    """Columns along the row of the pixel."""
-    return {
-        "x (D)": pupil.x,
-        "phase (rad)": np.where(pupil.inside, phase, np.nan)[pixel.row],
-        "image 1": frames[0, pixel.row],
-        "image 2": frames[1, pixel.row],
-    }
-
-
-def pixel_phasors_columns(pixel: Pixel) -> dict[str, NDArray]:
-    """Columns of both intensities against the phase of the pixel."""
-    phases = np.linspace(-np.pi, np.pi, 361)
-    first, second = pixel.intensities(phases)
-    return {"phase of the pixel (rad)": phases, "image 1": first, "image 2": second}
-
-
-def one_or_two_images_columns(
-    pupil: Pupil, truth: NDArray, one: NDArray, two: NDArray, pixel: Pixel
-) -> dict[str, NDArray]:
-    """Columns of the reconstructed phases along the row of the pixel."""
-    return {
-        "x (D)": pupil.x,
-        "true phase (rad)": np.where(pupil.inside, truth, np.nan)[pixel.row],
-        "phase from one image (rad)": one[pixel.row],
-        "phase from two images (rad)": two[pixel.row],
-    }
 
 
 def numbers(one: NDArray, pixel: Pixel) -> dict[str, float | str]:

@@ -36,14 +36,6 @@ class ErrorCurves:
         """Fraction of the screens with an error of at most `threshold` times the input, shape (n,)."""
         return np.mean(self.errors[name] <= threshold * self.rms[:, np.newaxis], axis=1)
 
-    def columns(self) -> dict[str, NDArray[np.floating]]:
-        """Input, and mean and standard deviation of every reconstructor, as columns for `publish`."""
-        columns = {"input (rad rms)": self.rms}
-        for name in self.errors:
-            columns[f"{name}: mean error (rad rms)"] = self.mean(name)
-            columns[f"{name}: standard deviation (rad rms)"] = self.std(name)
-        return columns
-
     def screens(self) -> dict[str, NDArray]:
         """Input and errors of every single screen, as columns for `publish`."""
         return screen_errors("input (rad rms)", self.rms, self.errors)
@@ -67,27 +59,6 @@ class Limit(NamedTuple):
             return Limit(np.nan)
         ratio = self.value / other.value
         return Limit(ratio, float(np.hypot(self.error, ratio * other.error) / other.value))
-
-
-def reach_text(
-    x: ArrayLike,
-    error: ArrayLike,
-    bound: ArrayLike,
-    limit: Limit | str,
-    words: str = "5 % of the input",
-    unit: str = "rad rms",
-) -> str:
-    """Where an error stays within a bound, in words that follow "the error" and hold for any curve."""
-    x, within = np.asarray(x, float), np.asarray(error) <= bound
-    if within.all():
-        return f"stays within {words} everywhere up to {x[-1]:.3g} {unit}"
-    if not within.any():
-        return f"exceeds {words} everywhere from {x[0]:.3g} to {x[-1]:.3g} {unit}"
-    if within[0]:
-        return f"stays within {words} up to {limit} {unit}"
-    low, high = x[within][[0, -1]]
-    span = f"at {low:.3g}" if low == high else f"from {low:.3g} to {high:.3g}"
-    return f"stays within {words} only {span} {unit}"
 
 
 def percent(share: float) -> str:

@@ -1,242 +1,171 @@
-"""Drawings of optical layouts with computed pictures in their planes."""
+"""Drawings of optical layouts: SVG files, with pictures, colour scales and texts that a study computes.
+
+Only simple elements are read, each with its own colours: ``rect``, ``polygon``, ``polyline``, ``line``,
+``circle``, ``ellipse`` and ``text``. The class of a ``rect`` names the picture in it, and a second word, scale,
+says that it holds the colour scale of that picture. A ``line`` is an arrow. Texts may hold TeX.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.image import AxesImage
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
 from matplotlib.layout_engine import PlaceHolderLayoutEngine
-from matplotlib.patches import Ellipse, FancyArrowPatch, Polygon
+from matplotlib.patches import Ellipse, FancyArrowPatch, Patch, Polygon
 from numpy.typing import NDArray
 
 from studies.kit.style import PHASE_MAP
+from studies.kit.variants import add_narrow
 from zwfs.masks import Mask, focal_field
 from zwfs.pupil import Pupil
 
+_FOLDER = Path(__file__).parent.parent
+_UNITS = 100  # of an SVG file in an inch
+_POINTS = 72 / _UNITS  # in a unit
 _MASK_SAMPLES = 161
-_BEAM, _RAY, _EDGE = "#e0a030", "#7a4d0c", "#33658a"
-_CLEAR = 0.18  # opacity of a beam: arrows, axes and edges must stay visible on it
-_GLASS, _CRYSTAL = ("#3f8fc8", 0.28), ("#3f8fc8", 0.5)
-METAL, RETARDER = "#444444", "#7a5195"
 FOCUS_MAP = "magma"
-LETTERS = 14.2
-"""Size of the letters of a drawing 9 inches wide, points: on a page they are as large as its prose."""
-NARROW, NARROW_LETTERS = 3.7, 11.5
-"""Width of a drawing for a phone, inches, and size of its letters."""
-Point = tuple[float, float]  # inches
-Profile = list[tuple[float, float]]  # distance along a beam and half of its width, inches
+_NUMBERS = "x1", "y1", "x2", "y2", "cx", "cy", "r", "rx", "ry"
+_SIDES = {"start": "left", "middle": "center", "end": "right"}
+Marks = Callable[[dict[str, Axes], bool], None]
+"""Draws on the axes of pictures, by their names; the second argument says whether the drawing is narrow."""
 
 
 @dataclass(frozen=True)
-class Polarisation:
-    """How one of the two polarisations is drawn: colour, and dashes for those who do not see it."""
+class Picture:
+    """Picture in a drawing, its colours and their ends, its name with its unit, and a picture on top of it."""
 
-    color: str
-    line: str | tuple[float, tuple[float, ...]]
-
-
-# Red and indigo, close to the ends of the phase map for +theta and -theta. They are far from the colours of the
-# methods, and colour-blind readers can distinguish them.
-PLUS, MINUS = Polarisation("#B2182B", "-"), Polarisation("#313695", (0, (4, 2)))
-
-
-@dataclass(frozen=True)
-class Plane:
-    """Picture in a plane of a sensor, its name, and the name, colours and ends of its colour scale."""
-
-    name: str
-    scale: str
     image: NDArray
     colors: str
     low: float
     high: float
+    name: str = ""
+    over: Picture | None = None
 
 
-class Scene:
-    """Figure without visible axes: positions in inches from its lower left corner, text of `size` points.
+def draw_layout(
+    wide: str,
+    narrow: str,
+    pictures: Mapping[str, Picture],
+    texts: Mapping[str, str] | None = None,
+    marks: Marks | None = None,
+) -> Figure:
+    """Draw two SVG files, for screens and for phones, with these pictures, and texts for names in brackets."""
+    drawings = []
+    for file in (wide, narrow):
+        figure, insets = _draw(_FOLDER / file, pictures, texts or {})
+        if marks:
+            marks(insets, file == narrow)
+        drawings.append(figure)
+    return add_narrow(*drawings)
 
-    With `down`, the light goes down from this point, and parts of the optics have positions along and to the left
-    of it.
-    """
 
-    def __init__(self, width: float, height: float, size: float = LETTERS, down: Point | None = None) -> None:
-        # Not "none": after it, a figure that is saved twice gets the layout engine of the style.
-        self.figure = plt.figure(figsize=(width, height), layout=PlaceHolderLayoutEngine(True, True))
-        self.width, self.height, self.size, self.down = width, height, size, down
-        self.axes = self.figure.add_axes((0, 0, 1, 1))
-        self.axes.set(xlim=(0, width), ylim=(0, height))
-        self.axes.set_axis_off()
+def _draw(file: Path, pictures: Mapping[str, Picture], texts: Mapping[str, str]) -> tuple[Figure, dict[str, Axes]]:
+    root = ElementTree.parse(file).getroot()
+    *_, width, height = map(float, root.attrib["viewBox"].split())
+    # Not "none": after it, a figure that is saved twice gets the layout engine of the style.
+    figure = plt.figure(figsize=(width / _UNITS, height / _UNITS), layout=PlaceHolderLayoutEngine(True, True))
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
+    axes.set_axis_off()
+    insets: dict[str, Axes] = {}
+    for order, element in enumerate(root):
+        kind = element.tag.rpartition("}")[2]
+        if kind == "rect":
+            x, y, w, h = (float(element.attrib[name]) for name in ("x", "y", "width", "height"))
+            inset = figure.add_axes((x / width, 1 - (y + h) / height, w / width, h / height))
+            name, *scale = element.attrib["class"].split()
+            if scale:
+                _show_scale(inset, insets[name], element)
+            else:
+                insets[name] = inset
+                _show_picture(inset, pictures[name], element)
+        elif kind == "text":
+            _write(axes, element, texts)
+        elif kind != "defs":
+            axes.add_artist(_shape(kind, element, order))
+    return figure, insets
 
-    def _part(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        return self.figure.add_axes(
-            (left / self.width, bottom / self.height, width / self.width, height / self.height)
+
+def _style(element: Any) -> dict[str, Any]:
+    """Colours, width and dashes of an element, as keywords of a patch."""
+    read = element.attrib.get
+    face, edge = (
+        "none" if read(part, "none") == "none" else to_rgba(read(part), float(read(f"{part}-opacity", 1)))
+        for part in ("fill", "stroke")
+    )
+    width = float(read("stroke-width", 0)) * _POINTS
+    dashes = [float(length) * _POINTS / width for length in read("stroke-dasharray", "").split()]
+    return {"fc": face, "ec": edge, "lw": width, "ls": (0, dashes) if dashes else "-"}
+
+
+def _shape(kind: str, element: Any, order: int) -> Patch:
+    """Element of a drawing; later ones cover earlier ones."""
+    style = _style(element) | {"zorder": 1 + order / 1000}
+    values = {name: float(value) for name, value in element.attrib.items() if name in _NUMBERS}
+    if kind in ("polygon", "polyline"):
+        points = [tuple(map(float, point.split(","))) for point in element.attrib["points"].split()]
+        return Polygon(points, closed=kind == "polygon", capstyle="butt", **style)
+    if kind == "line":
+        heads = "<|-|>" if "marker-start" in element.attrib else "-|>"
+        style |= {"fc": style["ec"], "mutation_scale": 8 if heads == "<|-|>" else 11, "shrinkA": 0, "shrinkB": 0}
+        start, end = (values["x1"], values["y1"]), (values["x2"], values["y2"])
+        return FancyArrowPatch(start, end, arrowstyle=heads, **style)
+    if kind not in ("circle", "ellipse"):
+        raise ValueError(f"<{kind}> in a drawing: expected one of the simple elements of {__name__}")
+    width, height = (2 * values.get(name, values.get("r", 0)) for name in ("rx", "ry"))
+    turn = re.match(r"rotate\(([-\d.]+)", element.attrib.get("transform", ""))
+    return Ellipse((values["cx"], values["cy"]), width, height, angle=float(turn[1]) if turn else 0, **style)
+
+
+def _write(axes: Axes, element: Any, texts: Mapping[str, str]) -> None:
+    read = element.attrib.get
+    text = re.sub(r"\[(\w+)\]", lambda name: texts[name[1]], element.text)
+    style = {"color": read("fill", "#000000"), "weight": read("font-weight", "normal")}
+    style["ha"] = _SIDES[read("text-anchor", "start")]
+    axes.text(float(read("x")), float(read("y")), text, fontsize=float(read("font-size")) * _POINTS, **style)
+
+
+def _show_picture(axes: Axes, picture: Picture, element: Any) -> None:
+    """Show a picture and those on top of it, its first row at the bottom, with the frame of the element."""
+    edge = _style(element)
+    axes.set(xticks=[], yticks=[])
+    axes.grid(False)
+    axes.spines[:].set(visible=edge["lw"] > 0, color=edge["ec"], linewidth=edge["lw"])
+    layer: Picture | None = picture
+    while layer:
+        shown = axes.imshow(
+            layer.image, cmap=layer.colors, vmin=layer.low, vmax=layer.high, origin="lower", interpolation="none"
         )
-
-    def picture(
-        self,
-        x: float,
-        y: float,
-        size: float,
-        image: NDArray,
-        colors: str,
-        low: float,
-        high: float,
-        edge: str | None = "black",
-    ) -> AxesImage:
-        """Picture centred on (x, y), its first row at the bottom, with a frame unless `edge` is None."""
-        axes = self._part(x - size / 2, y - size / 2, size, size)
-        axes.set(xticks=[], yticks=[])
-        axes.grid(False)
-        axes.spines[:].set(
-            visible=edge is not None, color=edge or "none", linewidth=0.8 if edge == "black" else 1.6
-        )
-        return axes.imshow(image, cmap=colors, vmin=low, vmax=high, origin="lower", interpolation="none")
-
-    def scale(
-        self, shown: AxesImage, box: tuple[float, float, float, float], name: str = "", ticks: int = 4
-    ) -> None:
-        """Colour scale of a picture in a box (left, bottom, width, height), along its longer side."""
-        axes = self._part(*box)
-        flat = box[2] > box[3]
-        bar = self.figure.colorbar(shown, cax=axes, orientation="horizontal" if flat else "vertical")
-        bar.set_label(name, fontsize=self.size)
-        axes.tick_params(labelsize=self.size, length=2, pad=1)
-        axes.locator_params(nbins=ticks)
-        if ticks == 2:  # a third label, 0, would touch the others
-            bar.set_ticks([one for one in bar.get_ticks() if one and abs(one) <= shown.get_clim()[1]])
-
-    def label(
-        self, x: float, y: float, text: str, size: float | None = None, ha: str = "center", **style: Any
-    ) -> None:
-        """Text, centred on x unless said otherwise, in points; the size is that of the scene if None."""
-        self.axes.text(x, y, text, ha=ha, fontsize=size or self.size, **style)
-
-    def place(self, along: float, across: float) -> Point:
-        """Position of a point of the optics."""
-        return (self.down[0] - across, self.down[1] - along) if self.down else (along, across)
-
-    def _fill(self, points: Profile, **style: Any) -> None:
-        corners = [self.place(*point) for point in points]
-        self.axes.add_patch(Polygon(corners, closed=True, **style))
-
-    def line(self, points: Sequence[Point], **style: Any) -> None:
-        """Line through points of the optics."""
-        self.axes.plot(*np.transpose([self.place(*point) for point in points]), **style)
-
-    def beam(self, profile: Profile, origin: Point, angle: float = 0.0) -> None:
-        """Beam of light: (distance along the axis, half of the width) at its corners."""
-        low, high = _turned(profile, origin, angle)
-        self._fill([*low, *high[::-1]], fc=(_BEAM, _CLEAR), ec="none")
-
-    def edges(self, profile: Profile, origin: Point) -> None:
-        """Edges of a beam that holds both polarisations, in both of their colours."""
-        for look in (PLUS, MINUS):
-            for side in _turned(profile, origin, 0.0):
-                self.line(side, color=look.color, ls=look.line, lw=1.6)
-
-    def axis(self, start: Point, end: Point) -> None:
-        """Optical axis."""
-        self.line([start, end], color="#666666", lw=0.9, ls=(0, (8, 3, 2, 3)))
-
-    def arrows(self, start: float, end: float, y: float, apart: float) -> None:
-        """Two arrows along the light."""
-        for height in (y - apart, y + apart):
-            self.arrow((start, height), (end, height))
-
-    def arrow(self, start: Point, end: Point, color: str = _RAY) -> None:
-        """Arrow from one point to another."""
-        style: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 11, "shrinkA": 0, "shrinkB": 0, "lw": 1.4}
-        self.axes.add_patch(FancyArrowPatch(self.place(*start), self.place(*end), color=color, zorder=4, **style))
-
-    def lens(self, x: float, y: float, height: float, angle: float = 0.0) -> None:
-        """Lens; `angle` (radian) is that of the light."""
-        width = min(0.22, 0.13 * height)
-        turn = np.degrees(angle) + (90 if self.down else 0)
-        self.axes.add_patch(Ellipse(self.place(x, y), width, height, angle=turn, fc=_GLASS, ec=_EDGE, lw=1.2))
-
-    def plate(self, x: float, y: float, width: float, height: float, color: str, edge: str = "none") -> None:
-        """Plate across the light."""
-        left, right, low, high = x - width / 2, x + width / 2, y - height / 2, y + height / 2
-        corners = [(left, low), (right, low), (right, high), (left, high)]
-        self._fill(corners, fc=color, ec=edge, zorder=3)
-
-    def path(
-        self, start: float, lenses: tuple[float, float], end: float, y: float, half: float, height: float
-    ) -> None:
-        """Beam of a width of twice `half` through two lenses of some height, with a focus between them."""
-        profile = [(start, half), (lenses[0], half), (sum(lenses) / 2, 0.0), (lenses[1], half), (end, half)]
-        self.beam(profile, origin=(0, y))
-        self.axis((start, y), (end, y))
-        for along in lenses:
-            self.lens(along, y, height)
-
-    def corner(self, *points: Point) -> None:
-        """Light in front of a mirror that folds the beam."""
-        self._fill(list(points), fc=(_BEAM, _CLEAR), ec="none")
-
-    def stop(self, x: float, y: float, half: float, reach: float) -> None:
-        """Two blades that leave an opening of twice `half`."""
-        for sign in (-1, 1):
-            self.plate(x, y + sign * (half + reach) / 2, 0.06, reach - half, METAL)
-
-    def wollaston(self, x: float, y: float, width: float, height: float) -> None:
-        """Wollaston prism: two wedges of crystal with their axes crossed."""
-        left, right, low, high = x - width / 2, x + width / 2, y - height / 2, y + height / 2
-        for corners, color in (
-            ([(left, low), (right, low), (left, high)], _GLASS),
-            ([(right, low), (right, high), (left, high)], _CRYSTAL),
-        ):
-            self._fill(corners, fc=color, ec=_EDGE, lw=1.1, zorder=3)
-
-    def split_beam(self, start: Point, end: float, half: float, apart: float) -> None:
-        """Beams of the two polarisations from a Wollaston prism to their images `apart` from the axis."""
-        x, y = start
-        for look, sign in ((PLUS, 1), (MINUS, -1)):
-            low, high = ([(x, y + edge), (end, y + sign * apart + edge)] for edge in (-half, half))
-            self._fill([*low, *high[::-1]], fc=(look.color, 0.13), ec="none")
-            for side in (low, high):
-                self.line(side, color=look.color, ls=look.line, lw=1.6)
-
-    def detector(self, x: float, y: float, height: float) -> None:
-        """Detector, from the side."""
-        self.plate(x + 0.04, y, 0.08, height, METAL)
-
-    def key(self, x: float, y: float, look: Polarisation, text: str) -> None:
-        """Line of a polarisation, and what it means."""
-        self.axes.plot([x, x + 0.4], [y + 0.05, y + 0.05], color=look.color, ls=look.line, lw=1.6)
-        self.label(x + 0.47, y, text, ha="left")
-
-    def callout(self, *points: Point) -> None:
-        """Thin line from an element to its picture."""
-        self.axes.plot(*np.transpose(points), color="#888888", lw=0.8, zorder=1)
+        shown.set_label(f"_{layer.name}")
+        layer = layer.over
 
 
-def _turned(profile: Profile, origin: Point, angle: float) -> tuple[list[Point], list[Point]]:
-    """Lower and upper edge of a beam along a direction (radian)."""
-    along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
-    start = np.asarray(origin)
+def _show_scale(axes: Axes, inset: Axes, element: Any) -> None:
+    """Show the colour scale of a picture."""
+    shown, size = inset.images[0], float(element.attrib["font-size"]) * _POINTS
+    bar = axes.figure.colorbar(shown, cax=axes, orientation="horizontal")
+    axes.tick_params(labelsize=size, length=2, pad=1)
+    ticks = int(element.attrib["data-ticks"])
+    axes.locator_params(nbins=ticks)
+    if ticks == 2:  # a third label, 0, would touch the others
+        bar.set_ticks([tick for tick in bar.get_ticks() if tick and abs(tick) <= shown.get_clim()[1]])
 
-    def edge(sign: int) -> list[Point]:
-        return [(x, y) for x, y in (start + s * along + sign * half * across for s, half in profile)]
 
-    return edge(-1), edge(1)
-
-
-def mask_picture(
-    scene: Scene, x: float, y: float, size: float, mask: Mask, halo: NDArray, reach: float, look: Polarisation
-) -> None:
+def mask_picture(mask: Mask, halo: NDArray, reach: float) -> Picture:
     """Phase map of a mask, in the colours of phase, over the image of the source, in faint grey."""
-    axes = scene.picture(x, y, size, halo, "Greys", -4, 3, edge=look.color).axes
     u = np.linspace(-reach, reach, _MASK_SAMPLES)
     inside = np.hypot(u, u[:, np.newaxis]) <= mask.diameter / 2
     phase = np.where(inside, np.angle(mask.transmission(*np.meshgrid(u, u))), np.nan)
     # Same sampling as the image below it: one pixel of the map is one of the picture.
-    axes.imshow(phase, cmap=PHASE_MAP, vmin=-np.pi, vmax=np.pi, origin="lower", interpolation="none")
+    return Picture(halo, "Greys", -4, 3, over=Picture(phase, PHASE_MAP, -np.pi, np.pi))
 
 
 def focal_light(pupil: Pupil, field: NDArray, reach: float) -> NDArray:

@@ -150,7 +150,7 @@ def draw_slice(
         return figure
     for number, row in enumerate(np.atleast_2d(mean)):
         label = f"{lines} {known[0][number]} {known_units.get(lines, '')}".strip() if lines else None
-        axes.plot(known[-1], row, label=label, **OTHER_STYLES[number % len(OTHER_STYLES)])
+        axes.plot(known[-1], row, label=label or "_mean", **OTHER_STYLES[number % len(OTHER_STYLES)])
     axes.set_ylabel(f"mean of {_label(value, known_units)}")
     if lines:
         axes.legend()

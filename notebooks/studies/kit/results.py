@@ -8,6 +8,7 @@ import io
 import os
 import re
 from collections.abc import Mapping
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
+from studies.kit.drawn import drawn_columns
 from studies.kit.variants import variants
 
 FOLDER = "ZWFS_RESULTS"  # environment variable that names the folder
@@ -36,15 +38,15 @@ _RC: dict[Any, Any] = {
 }
 
 
-def publish(
-    figure: Figure, name: str, columns: Mapping[str, ArrayLike], screens: Mapping[str, ArrayLike] | None = None
-) -> None:
-    """Write a figure and its numbers, also of single screens, to the folder that ZWFS_RESULTS names."""
+def publish(figure: Figure, name: str, screens: Mapping[str, ArrayLike] | None = None) -> None:
+    """Write a figure, its numbers and those of single screens to the folder that ZWFS_RESULTS names."""
     if not re.fullmatch(r"[a-z0-9][a-z0-9_-]*", name):
         raise ValueError(f"name = {name!r}: expected lower-case letters, digits, - and _")
-    contents = {".csv": csv_bytes(columns)} | ({} if screens is None else {f"{SCREENS}.csv": csv_bytes(screens)})
+    contents = {}
     folder = os.environ.get(FOLDER)
     if folder:
+        contents = {".csv": csv_bytes(drawn_columns(figure))}
+        contents |= {} if screens is None else {f"{SCREENS}.csv": csv_bytes(screens)}
         contents |= {f".{kind}.png": picture_bytes(one, "png") for kind, one in variants(figure).items()}
     for kind in METADATA if folder else ("png",):  # the first one fixes the layout
         contents[f".{kind}"] = picture_bytes(figure, kind)
@@ -112,16 +114,12 @@ def picture_bytes(figure: Figure, kind: str) -> bytes:
 
 
 def csv_bytes(columns: Mapping[str, ArrayLike]) -> bytes:
-    """Columns as the bytes of a CSV file; a scalar stands in every row."""
-    arrays = {header: np.asarray(column) for header, column in columns.items()}
-    if len({array.shape for array in arrays.values()} - {()}) > 1:
-        sizes = ", ".join(f"{header!r}: {array.size}" for header, array in arrays.items())
-        raise ValueError(f"columns differ in length: {sizes}")
+    """Columns as the bytes of a CSV file; the short ones end with empty cells."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(arrays)
-    filled = np.broadcast_arrays(*map(np.atleast_1d, arrays.values()))
-    writer.writerows(zip(*(map(_text, array) for array in filled), strict=True))
+    writer.writerow(columns)
+    texts = (map(_text, np.asarray(column)) for column in columns.values())
+    writer.writerows(zip_longest(*texts, fillvalue=""))
     return stream.getvalue().encode()
 
 

@@ -133,10 +133,6 @@ class Screens:
         largest = self.largest(max(rms))
         return sorted({*(one for one in rms if one < largest), largest})
 
-    def columns(self, rms: ArrayLike) -> dict[str, NDArray[np.float64]]:
-        """Return a column of the D/r0 of some inputs for `publish`, if the screens have one."""
-        return {"D/r0": self.d_over_r0_of(rms)} if self.d_over_r0 else {}
-
     def mark(self, figure: Figure) -> Figure:
         """Add an axis of D/r0 to the panels of a figure against the input, if the screens have one."""
         panels = [axes for axes in figure.axes if axes.get_xlabel().startswith("input")] if self.d_over_r0 else []

@@ -123,7 +123,7 @@ def valid() -> dict:
         "wavelength": 635.0, "n_actuators": 9, "n_cycles": 1, "wavelengths": [600.0, 650.0],
         "weights": [1.0, 2.0], "bandwidth": 0.1, "n_wavelengths": 2, "n_iterations": 3, "tolerance": 1e-3,
         "time": 0.01, "speed": 1.0, "cutoff": 3.0,
-        "bench": BENCH, "folder": ".", "pistons": pistons, "commanded": pistons, "found": pistons,
+        "bench": BENCH, "folder": ".", "pistons": pistons, "commanded": pistons,
         "numbers": BENCH.numbers,
         # of one callable
         "Pupil.amplitude": pupil.amplitude,

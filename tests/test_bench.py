@@ -493,7 +493,7 @@ def test_numbers_of_other_types_are_kept_as_plain_ones():
     ("call", "message"),
     [
         (lambda m, b: m.pistons(np.full((N, N), np.nan)), "phase is NaN all over a segment"),
-        (lambda m, b: segment_residual([0.0, 1], [0.0, 1, 2]), "found and commanded have shapes"),
+        (lambda m, b: segment_residual([0.0, 1], [0.0, 1, 2]), "pistons and commanded have shapes"),
         (lambda m, b: segment_screens(b, -1, 2), "rms = -1"),
         (lambda m, b: segment_screens(b, 1, 0), "n_screens = 0"),
     ],

@@ -198,6 +198,22 @@ def test_error_of_a_square_patch_is_estimated(n_samples):
     assert stated / 4 < error < 4 * stated
 
 
+class Grating(Dimple):
+    """Dimple with a transmission of its own, which varies faster than its quadrature follows."""
+
+    def transmission(self, u, v):
+        return np.exp(40j * np.pi * np.hypot(u, v - 0.2))
+
+
+def test_dimple_with_a_transmission_of_its_own_is_integrated_and_its_error_estimated():
+    pupil = Pupil.circular(12)
+    with pytest.warns(UserWarning, match=r"masks\[0\]: .* error of about .*`n_samples`"):
+        grating = ZernikeSensor(pupil, Grating(1.5, 0.0))
+    with pytest.warns(UserWarning, match=r"masks\[0\]: .* error of about"):
+        patch = ZernikeSensor(pupil, Patch(1.5, Grating(1.5, 0.0).transmission))
+    np.testing.assert_array_equal(*(sensor.measure(0 * pupil.amplitude) for sensor in (grating, patch)))
+
+
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-10, 1e-14])
 def test_no_patch_that_is_exact_draws_a_warning(tolerance):
     def rings(u, v):

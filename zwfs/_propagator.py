@@ -96,7 +96,7 @@ class Propagator:
             stop=stop,
             no_data=read_only(kind.array(np.where(pupil.inside, 0, np.nan))),
             amplitude=stop,
-            flat=read_only(kind.xp.stack((stop, 0 * stop))[np.newaxis, ...]),
+            flat=read_only(kind.xp.stack((stop, kind.xp.zeros_like(stop)))[np.newaxis, ...]),
             channels=sensor.channels,
         )
         return model.with_amplitude(pupil.amplitude)
@@ -267,7 +267,7 @@ def unit(field: NDArray, modulus: NDArray, xp: Any, before: NDArray | None = Non
 def count(points: NDArray[np.bool_], kind: Kind) -> NDArray[np.int64]:
     """Number of points that are true in each map: (k, ny, nx) to (k,)."""
     if kind.xp is np:  # along an axis NumPy turns all of them into integers first
-        return np.array([np.count_nonzero(one) for one in points])
+        return np.array([np.count_nonzero(flags) for flags in points])
     return kind.xp.sum(kind.xp.astype(points, kind.xp.int64), axis=(-2, -1))
 
 

@@ -89,8 +89,8 @@ def cramer_rao(
     if amplitude is not None:
         model = model.with_amplitude(amplitude_map(amplitude, sensor))
     sigma = []
-    for one in maps.astype(np.float64):  # one at a time: the memory does not grow with the batch
-        psi = model.incoming(one[np.newaxis])
+    for single in maps.astype(np.float64):  # one at a time: the memory does not grow with the batch
+        psi = model.incoming(single[np.newaxis])
         points, coefficients = estimator.variance(psi, model.propagate(psi))
         sigma.append(np.sqrt(points[0, 0] if coefficients is None else coefficients[0]))
     result = np.array(sigma)

@@ -99,7 +99,7 @@ def measure(sensor: ZernikeSensor | PolychromaticSensor) -> Callable[..., Any]:
             _check.broadcast(phase=maps, amplitude=strength)
             strength = xp.where(model.inside, strength, 0)
         maps, strength = xp.broadcast_arrays(xp.where(model.inside, maps, 0), strength)
-        flat: Any = [xp.reshape(one, (-1, *shape)) for one in (maps, strength)]
+        flat: Any = [xp.reshape(values, (-1, *shape)) for values in (maps, strength)]
         result = square(model.propagate(model.incoming(*flat)))
         return xp.reshape(result, (*maps.shape[:-2], *result.shape[1:]))
 

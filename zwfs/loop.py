@@ -262,19 +262,19 @@ def close_loop(
             n = len(screens)
             figures.extend([(np.zeros((n, pupil.n_points)), np.zeros((n, mirror.n_actuators)))] * delay)
         figure, commands = figures[0]
-        left = pupil.scatter(screens - figure, fill=0)
-        frames, photons = plant.measure(left), np.full(len(screens), np.nan)
+        residual = pupil.scatter(screens - figure, fill=0)
+        frames, photons = plant.measure(residual), np.full(len(screens), np.nan)
         if camera is not None:
             counts = camera.expose(frames, rng)
             photons = counts.sum(axis=(-3, -2, -1)) * (camera.gain or 1.0)
             frames = camera.normalise(counts)
-        rows.append((screens.std(axis=-1), pupil.rms(left), strehl(pupil, left), commands, photons))
-        found = np.zeros(screens.shape)
+        rows.append((screens.std(axis=-1), pupil.rms(residual), strehl(pupil, residual), commands, photons))
+        measured = np.zeros(screens.shape)
         # A frame without a photon holds no information: the mirror keeps its shape.
-        seen = (frames.max(axis=(-2, -1)) > 0).all(axis=-1)
-        if seen.any():
-            found[seen] = without_piston(pupil.gather(reconstructor(frames[seen]).phase))
-        step, (figure, commands) = gain * (found @ mirror.inverse), figures[-1]
+        lit = (frames.max(axis=(-2, -1)) > 0).all(axis=-1)
+        if lit.any():
+            measured[lit] = without_piston(pupil.gather(reconstructor(frames[lit]).phase))
+        step, (figure, commands) = gain * (measured @ mirror.inverse), figures[-1]
         figure = (1 - leak) * figure + step @ mirror.influence
         excess = np.maximum(figure.std(axis=-1, keepdims=True) / stroke, 1)
         figures.append((figure / excess, ((1 - leak) * commands + step) / excess))

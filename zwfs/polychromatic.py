@@ -214,7 +214,9 @@ class _Scaled:
 
     @property
     def breaks(self) -> tuple[float | Outline, ...]:
-        return tuple(self._wider(one) if callable(one) else one * self.ratio for one in self.mask.breaks)
+        return tuple(
+            self._wider(outline) if callable(outline) else outline * self.ratio for outline in self.mask.breaks
+        )
 
     @property
     def n_samples(self) -> int:

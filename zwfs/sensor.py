@@ -115,7 +115,9 @@ class Sensor(Immutable):
             xp, shape = kind.xp, self.pupil.shape
             maps, strength = xp.reshape(maps, (*batch, *shape)), xp.reshape(strength, (*strength_batch, *shape))
             full = _check.broadcast(phase=maps, amplitude=strength)
-            maps, strength = (xp.reshape(xp.broadcast_to(one, full), (-1, *shape)) for one in (maps, strength))
+            maps, strength = (
+                xp.reshape(xp.broadcast_to(values, full), (-1, *shape)) for values in (maps, strength)
+            )
             batch = full[:-2]
         model = propagator(self, kind)
         frames = square(model.propagate(model.incoming(maps, strength)))
@@ -139,11 +141,11 @@ class Sensor(Immutable):
         """
         maps, batch = pupil_maps("phase", phase, self)
         kind = Kind.of(maps)
-        changes, other = pupil_maps(
+        changes, change_batch = pupil_maps(
             "change", _check.in_kind("change", _check.real_any("change", change), kind), self
         )
-        if other != batch:
-            raise ValueError(f"change has shape {(*other, *self.pupil.shape)}: expected that of phase")
+        if change_batch != batch:
+            raise ValueError(f"change has shape {(*change_batch, *self.pupil.shape)}: expected that of phase")
         model, psi, waves = self._waves(maps)
         turned = along_phase(psi, self.channels.ratios, kind.xp) * changes[:, np.newaxis, ...]
         result = 2 * parts_sum(waves * model.propagate(turned))

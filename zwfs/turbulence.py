@@ -177,7 +177,7 @@ def karhunen_loeve_basis(
         return product - product.mean()
 
     vectors, values = np.empty((n_points, 0)), np.empty(0)
-    start, other = np.random.default_rng(0).normal(size=(2, n_points))
+    start, reference = np.random.default_rng(0).normal(size=(2, n_points))
     # One run of Lanczos may miss one of two modes of equal variance: search what is left until nothing is larger.
     for wanted in (n_modes, *[2] * n_modes):
 
@@ -194,7 +194,7 @@ def karhunen_loeve_basis(
     order = np.argsort(-values, kind="stable")[:n_modes]
     modes = vectors[:, order].T * sqrt(n_points)
     # The sign of an eigenvector is free. The second one of two equal variances is orthogonal to the start.
-    modes *= np.sign(modes @ other)[:, np.newaxis]
+    modes *= np.sign(modes @ reference)[:, np.newaxis]
     return pupil.scatter(modes, fill=0.0), values[order] / n_points
 
 

@@ -266,7 +266,7 @@ class Bench:
         rng = _check.generator("seed", seed)
         field = self._field * (1.0 if pistons is None else self._commanded(pistons))
         flat = field.reshape(-1, *field.shape[-2:])
-        images = np.stack([self._image(one) for one in flat])
+        images = np.stack([self._image(single) for single in flat])
         return self._expose(images.reshape(*field.shape[:-2], *images.shape[1:]), rng)
 
     def _commanded(self, pistons: ArrayLike) -> NDArray[np.complex128]:
@@ -360,12 +360,12 @@ class Bench:
 
     def _behind_mask(self, waves: NDArray, light: NDArray) -> NDArray[np.float64]:
         """Intensity of both images: the light of the dimple is shifted, and joins the waves past it."""
-        shifted, kept = np.sqrt(1 - self.coherent), 1j * np.sqrt(self.coherent)
-        own, other = (
-            np.abs((shifted + kept) * waves + shifted * (np.exp(1j * sign * _SIGNS * self.phase) - 1) * light) ** 2
+        shifted, past = np.sqrt(1 - self.coherent), 1j * np.sqrt(self.coherent)
+        own, crossed = (
+            np.abs((shifted + past) * waves + shifted * (np.exp(1j * sign * _SIGNS * self.phase) - 1) * light) ** 2
             for sign in (1, -1)
         )
-        return (1 - self.leakage) * own + self.leakage * other
+        return (1 - self.leakage) * own + self.leakage * crossed
 
     def _halo(self) -> NDArray[np.float64]:
         """Light of the neighbour on each image, (2, ny', nx')."""
@@ -406,8 +406,8 @@ class BenchModel(Immutable):
     >>> model = BenchModel.from_images(bench, seed=1)
     >>> pistons = np.linspace(-0.5, 0.5, bench.n_segments)
     >>> frames = model.normalise(bench.frames(pistons, seed=2))
-    >>> found = model.pistons(PhaseShifted(model.shifted)(frames).phase)
-    >>> float(np.std(found - pistons)) < 0.05
+    >>> measured = model.pistons(PhaseShifted(model.shifted)(frames).phase)
+    >>> float(np.std(measured - pistons)) < 0.05
     True
     """
 
@@ -444,8 +444,8 @@ class BenchModel(Immutable):
         dark = bench.dark(rng)
         images = bench.clear_frames(rng) - dark
         ny, nx = bench.segments.shape
-        top, left = (images.shape[-2] - ny) // 2, (images.shape[-1] - nx) // 2
-        inner = images[:, top : top + ny, left : left + nx]
+        top, side = (images.shape[-2] - ny) // 2, (images.shape[-1] - nx) // 2
+        inner = images[:, top : top + ny, side : side + nx]
         # The stop of the bench is known; what is dark within it, gaps and missing segments, the images show.
         light, scale = mean_light(inner, bench.segments > 0)
         stop = radius((ny, nx), ((ny - 1) / 2, (nx - 1) / 2)) <= bench.n_pixels / 2
@@ -564,22 +564,22 @@ def segment_pistons(phase: ArrayLike, segments: NDArray, numbers: NDArray) -> ND
     return np.angle(sums)
 
 
-def segment_residual(found: ArrayLike, commanded: ArrayLike) -> NDArray[np.float64]:
+def segment_residual(pistons: ArrayLike, commanded: ArrayLike) -> NDArray[np.float64]:
     """Difference of segment pistons on the circle, without their common piston.
 
     Parameters
     ----------
-    found, commanded : array_like, shapes (..., n_segments) that broadcast, radian
+    pistons, commanded : array_like, shapes (..., n_segments) that broadcast, radian
 
     Returns
     -------
     ndarray, shape (..., n_segments), radian
         In (-pi, pi].
     """
-    found, commanded = _check.real_array("found", found), _check.real_array("commanded", commanded)
-    shape = _check.broadcast(found=found, commanded=commanded)
+    pistons, commanded = _check.real_array("pistons", pistons), _check.real_array("commanded", commanded)
+    shape = _check.broadcast(pistons=pistons, commanded=commanded)
     if not shape or 0 in shape:
-        raise ValueError(f"found and commanded have shape {shape}: expected (..., n_segments), at least one")
-    _check.finite("found", found)
+        raise ValueError(f"pistons and commanded have shape {shape}: expected (..., n_segments), at least one")
+    _check.finite("pistons", pistons)
     _check.finite("commanded", commanded)
-    return without_piston(found - commanded)
+    return without_piston(pistons - commanded)

@@ -27,7 +27,7 @@ def pair(pupil, diameter, *shifts, **options):
 
 def exposed(pupil, frames, photons, n_draws, seed=5):
     """Noisy frames, n_draws of each."""
-    camera = Detector(pupil, photons * pupil.n_points)
+    camera = Detector(photons)
     return camera.normalise(camera.expose(np.broadcast_to(frames, (n_draws, *frames.shape)), seed))
 
 
@@ -80,7 +80,7 @@ def test_negative_pixels_bias_nothing(pupil, modes):
     photons, read_noise = 5, 1.0
     sensor, basis = pair(pupil, 1.06, 0.5, -0.5), modes[:20]
     true = np.random.default_rng(3).normal(0, 0.05, (50, 20))
-    camera = Detector(pupil, photons * pupil.n_points, read_noise=read_noise)
+    camera = Detector(photons, read_noise=read_noise)
     frames = sensor.measure(np.tensordot(true, np.where(pupil.inside, basis, 0), 1))
     frames = camera.normalise(camera.expose(frames, 1))
     method = MaximumLikelihood(sensor, basis, photons=photons, read_noise=read_noise, n_starts=1)
@@ -163,7 +163,7 @@ def test_modes_and_their_errors(pupil, modes):
     exact = MaximumLikelihood(sensor, basis)(sensor.measure(truth))
     np.testing.assert_allclose(exact.coefficients, true, atol=1e-6)
     np.testing.assert_allclose(pupil.gather(exact.phase), pupil.gather(truth), atol=1e-6)  # it is not wrapped
-    camera = Detector(pupil, 30 * pupil.n_points)
+    camera = Detector(30)
     noisy = MaximumLikelihood(sensor, basis, photons=30)(camera.normalise(camera.expose(sensor.measure(truth), 4)))
     pull = (noisy.coefficients - true) / noisy.sigma_coefficients
     assert np.std(pull) == pytest.approx(1, abs=0.1)
@@ -180,7 +180,7 @@ def test_modes_are_at_least_as_good_as_points(rms, photons):
     truth = power_law_screens(basis, rms, 5, exponent=-2, seed=41)
     frames = sensor.measure(truth)
     if photons is not None:
-        camera = Detector(pupil, photons * pupil.n_points)
+        camera = Detector(photons)
         frames = camera.normalise(camera.expose(frames, 8))
     points, fitted = (MaximumLikelihood(sensor, some, photons=photons) for some in (None, basis))
     result = fitted(frames)
@@ -215,7 +215,7 @@ def test_a_prior_helps_faint_frames_and_does_not_bias_bright_ones(pupil):
     true = np.random.default_rng(6).normal(0, np.sqrt(variance), (20, 60))
     frames = sensor.measure(np.tensordot(true, np.where(pupil.inside, basis, 0), 1))
     for photons, gain in ((1, 0.8), (3000, 1.01)):
-        camera = Detector(pupil, photons * pupil.n_points)
+        camera = Detector(photons)
         noisy = camera.normalise(camera.expose(frames, 7))
         plain, prior = (
             MaximumLikelihood(sensor, basis, photons=photons, prior=covariance, n_starts=1)(noisy)
@@ -238,7 +238,7 @@ def test_phase_and_amplitude_together(pupil, screens):
     assert exact.residual.max() < 1e-6
     ignorant = MaximumLikelihood(sensor, n_starts=1)(frames)
     assert not ignorant.consistent.any()
-    camera = Detector(pupil, 1000 * pupil.n_points)
+    camera = Detector(1000)
     noisy = MaximumLikelihood(sensor, photons=1000, amplitude="unknown")(
         camera.normalise(camera.expose(frames, 3))
     )

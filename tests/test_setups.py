@@ -235,7 +235,6 @@ def test_a_bad_nested_value_is_refused_with_its_path(values, message):
     ("figure", "given", "message"),
     [
         ("3", ["n_pixels=16", "n_modes=300"], "n_modes = 300: expected at most 207 with the 208 points of pupil"),
-        ("3", ["n_pixels=24", "screens={basis: kl}"], "n_modes = 200: expected at most 112 with the 448 points"),
         ("3", ["pupil={kind: keck, missing: [40]}"], r"pupil.missing = \[40\]"),
         ("4", ["pupil={vanes: [[0.0, 3.0], [3.1416, 3.0]]}"], r"pupil: spiders\[0\] width = 3.0"),
         ("3", ["screens={kind: segments}"], "screens.kind = .segments.: expected a pupil of two or more segments"),

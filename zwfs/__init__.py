@@ -11,7 +11,7 @@ from zwfs import _lazy
 if TYPE_CHECKING:
     from zwfs.bounds import cramer_rao
     from zwfs.detector import Detector
-    from zwfs.loop import LoopRecord, Mirror, close_loop, hold_drift
+    from zwfs.loop import LoopRecord, Mirror, close_loop
     from zwfs.masks import Dimple, Patch
     from zwfs.metrics import dynamic_range, reconstruction_error, strehl, wrapped_residual
     from zwfs.modes import noll_to_nm, power_law_screens, zernike_basis
@@ -56,7 +56,6 @@ __all__ = [
     "close_loop",
     "cramer_rao",
     "dynamic_range",
-    "hold_drift",
     "noll_to_nm",
     "opd_to_phase",
     "phase_to_opd",

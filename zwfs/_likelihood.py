@@ -32,7 +32,7 @@ class Noise:
     Attributes
     ----------
     photons : float or None
-        Photons that an intensity of 1 puts into a pixel of each frame. None stands for an unknown variance that is
+        Photons per pupil point and image. None stands for an unknown variance that is
         the same in all pixels: ordinary least squares.
     read_noise : float, electrons rms / pixel
     recorded : ndarray of bool, shape (ny', nx'), or None

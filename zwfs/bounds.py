@@ -37,7 +37,7 @@ def cramer_rao(
     phase : array_like, shape (..., ny, nx), radian
         True phase; only the points of the pupil count.
     photons : float
-        Photons that an intensity of 1 puts into a pixel of each frame: `Detector.photons_per_pixel`.
+        Photons per pupil point and image, `Detector.photons`.
     read_noise : float, electrons rms / pixel
     modes : array_like, shape (n_modes, ny, nx), optional
         Modes whose coefficients are estimated; the phases of all points if left out.

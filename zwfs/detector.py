@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs.pupil import Pupil
 
 _BRIGHTEST = 9e18  # electrons in a pixel: 64 bits count no more
-_FAINTEST = 1e-12  # photons in a frame, or electrons in a count: other numbers are divided by them
+_FAINTEST = 1e-12  # photons of a point, or electrons in a count: other numbers are divided by them
 
 
 @dataclass(frozen=True)
@@ -23,10 +22,8 @@ class Detector:
 
     Parameters
     ----------
-    pupil : Pupil
-    photons : float, photons / frame
-        Photons detected within the pupil in one frame with the mask taken out; those of one mask's image. At least
-        1e-12.
+    photons : float
+        Photons per pupil point and image: those that an intensity of 1 puts into a pixel. At least 1e-12.
     photon_noise : bool
         Draw the number of electrons of each pixel from the Poisson distribution.
     read_noise : float, electrons rms / pixel
@@ -42,15 +39,12 @@ class Detector:
     >>> import numpy as np, zwfs
     >>> pupil = zwfs.Pupil.circular(32)
     >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2))
-    >>> camera = zwfs.Detector(pupil, photons=1e6, read_noise=1.0)
+    >>> camera = zwfs.Detector(photons=1000, read_noise=1.0)
     >>> counts = camera.expose(sensor.measure(np.zeros(pupil.shape)), seed=1)
     >>> camera.normalise(counts).shape
     (1, 32, 32)
-    >>> round(camera.photons_per_pixel)
-    1232
     """
 
-    pupil: Pupil
     photons: float
     photon_noise: bool = True
     read_noise: float = 0.0
@@ -59,7 +53,6 @@ class Detector:
     gain: float = 0.0
 
     def __post_init__(self) -> None:
-        _check.instance("pupil", self.pupil, Pupil)
         _check.number_field(self, "photons", _FAINTEST, _check.LARGEST)
         _check.flag("photon_noise", self.photon_noise)
         _check.number_field(self, "read_noise", 0, _BRIGHTEST)
@@ -69,11 +62,6 @@ class Detector:
         _check.number_field(self, "gain", 0, _BRIGHTEST)
         if self.gain:
             _check.number_field(self, "gain", _FAINTEST, _BRIGHTEST)
-
-    @property
-    def photons_per_pixel(self) -> float:
-        """Photons that an intensity of 1 puts into a pixel."""
-        return self.photons / self.pupil.n_points
 
     def expose(
         self, frames: ArrayLike, seed: int | np.random.Generator | np.random.SeedSequence | None = None
@@ -101,7 +89,7 @@ class Detector:
         _check.non_negative("frames", frames)
         rng = _check.generator("seed", seed)
         with np.errstate(over="ignore"):
-            electrons = frames.astype(np.float64) * self.photons_per_pixel + self.background
+            electrons = frames.astype(np.float64) * self.photons + self.background
         brightest = electrons.max(initial=0.0)
         if not brightest < _BRIGHTEST:
             raise ValueError(
@@ -136,5 +124,5 @@ class Detector:
         """
         counts = _check.real_array("counts", counts).astype(np.float64, copy=False)
         _check.moderate("counts", counts)
-        frames = (counts * (self.gain or 1.0) - self.background) / self.photons_per_pixel
+        frames = (counts * (self.gain or 1.0) - self.background) / self.photons
         return frames if floor is None else np.maximum(frames, _check.number("floor", floor))

@@ -377,7 +377,8 @@ class Bench:
         flux = np.array([1 + self.flux_imbalance, 1 - self.flux_imbalance])[:, np.newaxis, np.newaxis]
         if not self.photons:
             return images * flux
-        camera = Detector(self._pupil, self.photons, read_noise=self.read_noise, background=self.background)
+        photons = self.photons / self._pupil.n_points
+        camera = Detector(photons, read_noise=self.read_noise, background=self.background)
         return camera.expose(images * flux, rng)
 
 

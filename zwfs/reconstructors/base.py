@@ -128,7 +128,7 @@ class Reconstruction(PhaseResult):
         Parameters
         ----------
         photons : float, optional
-            Photons that an intensity of 1 puts into a pixel of each frame, `Detector.photons_per_pixel`. Left out
+            Photons per pupil point and image, `Detector.photons`. Left out
             for frames without noise.
         read_noise : float, electrons rms / pixel
             That of the frames, with the noise of a background that was subtracted.

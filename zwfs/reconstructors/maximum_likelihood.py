@@ -154,7 +154,7 @@ class MaximumLikelihood(Reconstructor):
     modes : array_like, shape (n_modes, ny, nx), optional
         Modes whose coefficients are estimated; the phases of all points if left out.
     photons : float, optional
-        Photons that an intensity of 1 puts into a pixel of each frame, `Detector.photons_per_pixel`. If left out,
+        Photons per pupil point and image, `Detector.photons`. If left out,
         all pixels have the same weight, and `sigma` follows from the residual of the frames.
     read_noise : float, electrons rms / pixel
         That of the frames, with the noise of a background that was subtracted.

@@ -122,7 +122,7 @@ def example(limits: Any) -> Any:
 
 _CUT = {"obstruction": (0.0, 0.9), "vanes": [[(-6.2832, 6.2832)], ...]}
 _RINGS = _CUT | {"n_rings": (1, 50), "gap": (0.0, 0.1), "missing": [(1, 10000), ...], "stop": (0.1, 1.0)}
-_BASIS = {"basis": ("zernike", "fourier", "hexagonal", "kl")}
+_BASIS = {"basis": ("zernike", "fourier", "hexagonal")}
 _STRENGTH = {"d_over_r0": (0.0, 20.0)}
 SETUP: dict[str, Any] = {
     "pupil": Fields(

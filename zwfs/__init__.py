@@ -1,7 +1,7 @@
 """Sensor models and reconstructors for the phase-shifted Zernike wavefront sensor.
 
-`zwfs.turbulence`, `zwfs.bench`, `zwfs.frames` and `zwfs.jax` are imported by their own names. Every public
-function checks its arguments: a TypeError or a ValueError names the argument, its value and what was expected.
+`zwfs.turbulence`, `zwfs.bench` and `zwfs.frames` are imported by their own names. Every public function checks its
+arguments: a TypeError or a ValueError names the argument, its value and what was expected.
 """
 
 from typing import TYPE_CHECKING

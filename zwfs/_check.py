@@ -333,8 +333,8 @@ def _of_any_library(name: str, value: Any) -> tuple[Any, Any]:
     """Return an array and its namespace; those of JAX, which cannot be changed in place, are refused."""
     if is_jax(value):
         raise TypeError(
-            f"{name} is an array of JAX: expected np.asarray({name}); zwfs.jax.measure(sensor) returns the frames "
-            "in JAX, with gradients"
+            f"{name} is an array of JAX: expected np.asarray({name}); only `measure` of a sensor takes arrays of "
+            "JAX, with gradients"
         )
     array, xp = _converted(name, value, any_array)
     if xp is np and array.dtype.kind == "V":  # which xp.isdtype does not know

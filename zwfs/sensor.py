@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Immutable, Kind, per_kind, read_only
+from zwfs._arrays import Immutable, Kind, is_jax, per_kind, read_only
 from zwfs._lowrank import Factors, Operator, factorise
 from zwfs._propagator import (
     ONE_WAVELENGTH,
@@ -101,12 +101,17 @@ class Sensor(Immutable):
         Warns
         -----
         UserWarning
-            If the rms of a phase is above 20 rad: it may be in degrees or nanometres.
+            If the rms of a phase is above 20 rad: it may be in degrees or nanometres. If JAX makes every array
+            float32, with an error of the frames of about 1e-6.
 
         References
         ----------
         Chambouleyron et al. 2024, equation (5).
         """
+        if is_jax(phase) or is_jax(amplitude):
+            from zwfs import _jax
+
+            return _jax.measure(self, phase, amplitude)
         maps, batch = pupil_maps("phase", phase, self)
         kind = Kind.of(maps)
         warn_of_degrees(maps, self.pupil, stacklevel=3)
@@ -241,7 +246,7 @@ class ZernikeSensor(Sensor):
 
     Fields and phases may be arrays of NumPy or of any library that follows the Python array API and lets arrays be
     changed in place, such as PyTorch and CuPy; results are of the same library and on the same device. Gradients
-    of PyTorch pass through all methods. JAX needs the function `zwfs.jax.measure`.
+    of PyTorch pass through all methods. Those of JAX pass through `measure`, also in `jax.jit` and `jax.vmap`.
 
     One mask makes the classic sensor, two make the phase-shifted one. Detector pixels are as large as pupil
     pixels and stand at the same places, so the detector of an extent of 1 D is the grid of the pupil.

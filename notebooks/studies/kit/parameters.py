@@ -175,12 +175,6 @@ _BENCH = {
     "read_noise": (0.0, 1e6),
     "background": (0.0, 1e12),
     "seed": (0, 4294967295),
-    "focus": [(-0.01, 0.01), ...],
-    "astigmatism": (-0.01, 0.01),
-    "unmodulated": (0.0, 0.9),
-    "coherent": (0.0, 0.49),
-    "halo": (0.0, 10.0),
-    "subpixels": (1, 16),
 }
 
 

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from zwfs._arrays import Immutable, Kind, per_kind
 from zwfs._lowrank import Factors
-from zwfs._propagator import Optics
+from zwfs._propagator import SensorParts
 from zwfs.pupil import Pupil
 
 _SMALLEST = 1e-12  # of the diagonal, relative to its mean: a point that no frame shows has no information
@@ -143,7 +143,7 @@ class Response(Immutable):
         self._factors, self._window, self._pupil, self._ratios = factors, window, pupil, ratios
 
     @classmethod
-    def of(cls, sensor: Optics) -> Response:
+    def of(cls, sensor: SensorParts) -> Response:
         """Response of a sensor."""
         return cls(sensor.factors, sensor.window, sensor.pupil, sensor.channels.ratios)
 
@@ -166,11 +166,18 @@ class Response(Immutable):
         columns[:n_parts, :, :n_inputs] = _side_by_side([inner.combine[np.newaxis]] * n_parts)
         columns[n_parts:, :, n_inputs:] = to_inner @ split
         return _Constants(
-            kind, self._pupil.n_points, self._window, self._ratios,
-            kind.array(self._pupil.inside), kind.array(np.where(self._pupil.inside, _SMALLEST, 1.0)),
-            _Pairs.of(inner.along_y, inner.along_x, kind), _Pairs.of(outer.along_y, outer.along_x, kind),
-            _Columns.of(columns, kind), _Columns.of(outer.combine @ split, kind), turns,
-        )  # fmt: skip
+            kind=kind,
+            n_points=self._pupil.n_points,
+            window=self._window,
+            ratios=self._ratios,
+            stop=kind.array(self._pupil.inside),
+            outside=kind.array(np.where(self._pupil.inside, _SMALLEST, 1.0)),
+            inner=_Pairs.of(inner.along_y, inner.along_x, kind),
+            outer=_Pairs.of(outer.along_y, outer.along_x, kind),
+            columns=_Columns.of(columns, kind),
+            detector=_Columns.of(outer.combine @ split, kind),
+            turns=turns,
+        )
 
     def information(self, tangents: NDArray, waves: NDArray, weights: NDArray | None) -> Information:
         """Information at a field.

@@ -12,10 +12,10 @@ import numpy as np
 
 from zwfs import _check
 from zwfs._arrays import Kind
-from zwfs._propagator import Optics, amplitude_maps, propagator, pupil_maps, square, warn_of_degrees
+from zwfs._propagator import SensorParts, amplitude_maps, propagator, pupil_maps, square, warn_of_degrees
 
 
-def measure(sensor: Optics, phase: Any, amplitude: Any = None) -> Any:
+def measure(sensor: SensorParts, phase: Any, amplitude: Any = None) -> Any:
     """Return the frames, as products with the factors of the sensor, which JAX differentiates to any order.
 
     Parameters and result are those of `Sensor.measure`. Gradients are 0 outside the pupil. Shapes are always

@@ -273,7 +273,9 @@ def close_loop(
         excess = np.maximum(figure.std(axis=-1, keepdims=True) / stroke, 1)
         figures.append((figure / excess, ((1 - leak) * commands + step) / excess))
         figures.popleft()
-    return LoopRecord(*(np.stack(column, axis=1) for column in zip(*rows, strict=True)))
+    names = "open_loop", "residual", "strehl", "commands", "electrons"
+    columns = (np.stack(column, axis=1) for column in zip(*rows, strict=True))
+    return LoopRecord(**dict(zip(names, columns, strict=True)))
 
 
 def _checked_screens(disturbance: Any, pupil: Pupil) -> Iterator[NDArray[np.float64]]:

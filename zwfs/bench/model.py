@@ -379,12 +379,12 @@ class BenchModel(Immutable):
         unit = scale * np.mean(light[pupil.inside])
         plus, minus = Dimple(bench.diameter, bench.phase), Dimple(bench.diameter, -bench.phase)
         return cls(
-            ZernikeSensor(pupil, plus, minus, extent=bench.extent),
-            ZernikeSensor(pupil, plus, extent=bench.extent),
-            bench.segments,
-            bench.numbers,
-            unit[:, np.newaxis, np.newaxis],
-            dark,
+            shifted=ZernikeSensor(pupil, plus, minus, extent=bench.extent),
+            classic=ZernikeSensor(pupil, plus, extent=bench.extent),
+            segments=bench.segments,
+            numbers=bench.numbers,
+            scale=unit[:, np.newaxis, np.newaxis],
+            dark=dark,
         )
 
     def normalise(self, counts: ArrayLike) -> NDArray[np.float64]:

@@ -31,8 +31,8 @@ class Position(NamedTuple):
     phase: NDArray[np.floating] | None = None  # (k, ny, nx), not wrapped
 
 
-class Step(NamedTuple):
-    """Step of k fits."""
+class Proposal(NamedTuple):
+    """Step that k fits may take."""
 
     position: Position
     maps: NDArray[np.floating]  # (k, c, ny, nx), change of the phase and of the amplitude
@@ -56,13 +56,13 @@ class Points(Immutable):
         absolute = damping[:, np.newaxis, np.newaxis] * information.scale
         return Hessian(information.scale[:, 0, 0], absolute, information.inverse(absolute))
 
-    def step(self, fit: Fit, hessian: Hessian, gradient: NDArray, change: NDArray, model: Propagator) -> Step:
-        """Return the step for the gradient, (k, c, ny, nx), and the changes of the field per unit of it."""
+    def step(self, fit: Fit, hessian: Hessian, gradient: NDArray, change: NDArray, model: Propagator) -> Proposal:
+        """Propose the step for the gradient, (k, c, ny, nx), and the changes of the field per unit of it."""
         xp = model.kind.xp
         slopes = [gradient[:, c, ...] for c in range(gradient.shape[1])]
         maps = -xp.stack(hessian.inverse @ slopes, axis=1)
         promised = xp.sum(maps * (hessian.damping[..., np.newaxis] * maps - gradient), axis=(1, 2, 3))
-        return Step(self._moved(fit, maps, change, model), maps, promised)
+        return Proposal(self._moved(fit, maps, change, model), maps, promised)
 
     def prior_cost(self, coefficients: NDArray | None) -> NDArray | float:
         """Part of the cost that does not depend on the frames, (k,)."""
@@ -170,8 +170,8 @@ class Modes(Points):
         absolute = (damping * kind.xp.sum(matrix * eye, axis=(1, 2)) / modes.shape[0])[:, np.newaxis, np.newaxis]
         return Hessian(information.scale[:, 0, 0], absolute, matrix + absolute * eye)
 
-    def step(self, fit: Fit, hessian: Hessian, gradient: NDArray, change: NDArray, model: Propagator) -> Step:
-        """Return the step of the coefficients for the gradient of the phase, (k, 1, ny, nx)."""
+    def step(self, fit: Fit, hessian: Hessian, gradient: NDArray, change: NDArray, model: Propagator) -> Proposal:
+        """Propose the step of the coefficients for the gradient of the phase, (k, 1, ny, nx)."""
         assert fit.coefficients is not None
         kind = model.kind
         xp, modes = kind.xp, kind.array(self.modes)
@@ -182,7 +182,7 @@ class Modes(Points):
         promised = xp.vecdot(jump, hessian.damping[:, 0, ...] * jump - slope)
         coefficients = fit.coefficients + jump
         position = Position(model.incoming(self.sum(coefficients)), coefficients)
-        return Step(position, self.sum(jump)[:, np.newaxis, ...], promised)
+        return Proposal(position, self.sum(jump)[:, np.newaxis, ...], promised)
 
     def prior_cost(self, coefficients: NDArray | None) -> NDArray | float:
         """Twice the negative logarithm of the prior, (k,)."""

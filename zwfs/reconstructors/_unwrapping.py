@@ -48,7 +48,16 @@ class Unwrapping(NamedTuple):
         inverse = np.linalg.pinv(np.concatenate([flat, piston]), rcond=1e-10)[:, :-1]
         places = np.argwhere(inside)
         radius = np.linalg.norm(places - places.mean(axis=0), axis=1) / max(inside.shape)
-        return cls(inside, radius, pairs, basis.T.copy(), turn, flat, inverse, np.linalg.pinv(slopes, rcond=1e-10))
+        return cls(
+            inside=inside,
+            radius=radius,
+            pairs=pairs,
+            basis=basis.T.copy(),
+            turn=turn,
+            modes=flat,
+            inverse=inverse,
+            from_slopes=np.linalg.pinv(slopes, rcond=1e-10),
+        )
 
     def fit(self, phase: NDArray, kind: Kind, sigma: NDArray | None = None) -> NDArray:
         """Coefficients of phases, (k, ny, nx), with standard errors sigma, 0 if left out: (k, m).

@@ -400,7 +400,9 @@ class Reconstructor(Immutable, ABC):
             # A single frame is the case of a control loop: no need to compute its shape.
             return kind.xp.reshape(values, (*batch, *values.shape[1:])) if batch else values[0, ...]
 
-        return Reconstruction(*solution.map_arrays(shaped), settings=self._settings, frames=shaped(window))
+        return Reconstruction(
+            **solution.map_arrays(shaped)._asdict(), settings=self._settings, frames=shaped(window)
+        )
 
     @abstractmethod
     def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:

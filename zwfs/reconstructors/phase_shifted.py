@@ -182,15 +182,15 @@ class PhaseShifted(FixedPoint):
         flat_waves = exact.operator.split_expand(flat @ core, in_window=True)
         inside = np.tile(exact.stop.ravel(), self.sensor.n_masks)
         return _Constants(
-            self.settings.model(kind),
-            kind.array(core),
-            kind.array(weights),
-            kind.array(offset),
-            kind.array(flat),
-            kind.array(flat_waves),
-            kind.array(inside),
-            self.sensor.n_masks * self.settings.light,
-            self._acceleration and self._acceleration.to(kind),
+            model=self.settings.model(kind),
+            core=kind.array(core),
+            weights=kind.array(weights),
+            offset=kind.array(offset),
+            flat=kind.array(flat),
+            flat_waves=kind.array(flat_waves),
+            inside=kind.array(inside),
+            incoming=self.sensor.n_masks * self.settings.light,
+            acceleration=self._acceleration and self._acceleration.to(kind),
         )
 
     def _accelerated(self) -> Acceleration:

@@ -433,17 +433,3 @@ def test_numbers_of_other_types_are_kept_as_plain_ones():
     other = Bench(**small, seed=np.uint8(1), focus_difference=Fraction(1, 10**4))
     plain = Bench(**SMALL, seed=1, focus_difference=1e-4)
     np.testing.assert_array_equal(other.frames(seed=2), plain.frames(seed=2))
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda m, b: m.pistons(np.full((N, N), np.nan)), "phase is NaN all over a segment"),
-        (lambda m, b: segment_residual([0.0, 1], [0.0, 1, 2]), "pistons and commanded have shapes"),
-        (lambda m, b: segment_screens(b, -1, 2), "rms = -1"),
-        (lambda m, b: segment_screens(b, 1, 0), "n_screens = 0"),
-    ],
-)
-def test_bad_input_is_named(perfect, model, call, message):
-    with pytest.raises(ValueError, match=message):
-        call(model, perfect)

@@ -160,25 +160,3 @@ def test_read_noise_does_not_lower_the_gain_of_the_loop(mirror, modes, sensor):
     still = np.broadcast_to(0.2 * modes[4], (2, 80, *sensor.pupil.shape))
     record = close_loop(sensor, mirror, likely, still, gain=0.5, camera=camera, seed=1)
     assert record.commands[:, 1, 4].mean() == pytest.approx(0.1, rel=0.03)
-
-
-OTHER = Pupil.circular(16)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"mirror": 1}, "mirror is a int"),
-        ({"mirror": Mirror(OTHER, zernike_basis(OTHER, 3))}, "mirror has Pupil"),
-        ({"gain": 2.0}, "gain = 2"),
-        ({"leak": 1.0}, "leak = 1"),
-        ({"delay": 0}, "delay = 0"),
-        ({"stroke": 0.0}, "stroke = 0"),
-        ({"disturbance": []}, "disturbance is empty"),
-        ({"disturbance": [np.zeros((20, 20)), np.zeros((2, 20, 20))]}, "disturbance.1. has shape"),
-    ],
-)
-def test_bad_input_is_refused(mirror, sensor, shifted, change, message):
-    arguments = {"mirror": mirror, "disturbance": np.zeros((2, 20, 20))} | change
-    with pytest.raises((TypeError, ValueError), match=message):
-        close_loop(sensor, reconstructor=shifted, **arguments)

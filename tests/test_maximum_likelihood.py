@@ -283,29 +283,3 @@ def test_masks_that_no_iteration_takes(pupil, screens):
         sensor = pair(pupil, 1.06, *shifts)
         result = MaximumLikelihood(sensor)(sensor.measure(truth))
         assert reconstruction_error(pupil, result.phase, truth).max() < 1e-4
-
-
-def test_what_it_refuses(pupil, modes):
-    sensor, few = pair(pupil, 1.06, 0.5, -0.5), modes[:3]
-    one = np.eye(3)
-    for options, message in (
-        ({"photons": 0}, "photons = 0"),
-        ({"read_noise": 1}, "read_noise = 1: expected 0"),
-        ({"amplitude": "unknown"}, "2 different masks: expected at least 3"),
-        ({"amplitude": "measured"}, "amplitude = 'measured'"),
-        ({"amplitude": "unknown", "modes": few}, "amplitude = 'unknown'"),
-        ({"prior": one, "photons": 10}, "prior: expected None without modes"),
-        ({"prior": one, "modes": few}, "prior: expected a number of photons"),
-        ({"prior": np.diag([1.0, 1.0, -0.5]), "modes": few, "photons": 10}, "from -0.5 to 1: .*definite"),
-        ({"prior": np.diag([1.0, 1.0, 0.0]), "modes": few, "photons": 10}, "from 0 to 1: .*definite"),
-        ({"prior": one + np.eye(3, k=1), "modes": few, "photons": 10}, "not symmetric"),
-        ({"modes": np.ones((pupil.n_points + 1, *pupil.shape))}, "at most the"),
-        ({"n_starts": 0}, "n_starts = 0"),
-    ):
-        with pytest.raises((TypeError, ValueError), match=message):
-            MaximumLikelihood(sensor, **options)
-    for shifts in ((0.5, -0.5, 0.5), (0.5, 0.5, -0.5), (0.5, -0.5, -0.5, 0.5)):
-        with pytest.raises(ValueError, match="2 different masks: expected at least 3"):
-            MaximumLikelihood(pair(pupil, 1.06, *shifts), amplitude="unknown")
-    with pytest.raises(ValueError, match="none of its masks changes the light"):
-        MaximumLikelihood(ZernikeSensor(pupil, CLEAR))

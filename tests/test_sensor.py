@@ -135,20 +135,6 @@ def test_outline_scales_with_the_wavelength(complex_field):
     np.testing.assert_allclose(band.measure(phase), both, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("outline", "message"),
-    [
-        (lambda angle: np.full(3, 0.5), r"breaks\[0\]\(angle\) has shape \(3,\)"),
-        (lambda angle: np.nan * angle, r"breaks\[0\]\(angle\) holds .* NaN"),
-        (lambda angle: "wide", r"breaks\[0\]\(angle\) has dtype"),
-        (lambda angle: 0.9 + 0.2 * np.cos(angle), r"breaks\[0\]\(angle\) reaches from 0\.7.* to 1\.1: "),
-    ],
-)
-def test_bad_outline_is_named(outline, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        ZernikeSensor(Pupil.circular(8), Patch(1.0, lambda u, v: 1, breaks=[outline]))
-
-
 def test_samples_are_refused_by_their_own_name_and_the_others_work():
     with pytest.raises(ValueError, match=r"n_samples = 2048: expected an integer in \[0, 1024\]"):
         Patch(1.0, ramp, n_samples=2048)
@@ -263,24 +249,6 @@ def test_any_mask_of_the_protocol(pupil, complex_field):
         complex_field(pupil)
     )
     np.testing.assert_allclose(waves[0], waves[1] - waves[2], rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize(
-    ("attribute", "value"),
-    [
-        ("breaks", 1.0),
-        ("breaks", (3.0,)),
-        ("diameter", np.nan),
-        ("n_samples", 1.5),
-        ("transmission", lambda u, v: np.nan * u),
-        ("transmission", lambda u, v: 1),
-    ],
-)
-def test_bad_masks_of_the_protocol_are_named(pupil, attribute, value):
-    mask = Ring()
-    setattr(mask, attribute, value)
-    with pytest.raises((TypeError, ValueError), match=rf"masks\[0\]\.{attribute}|{attribute} of masks\[0\]"):
-        ZernikeSensor(pupil, mask)
 
 
 def attributes(thing):
@@ -492,31 +460,6 @@ def test_phase_in_degrees_draws_a_warning(shifted, screens):
 
 
 FLAT = np.zeros((40, 40))
-REFUSED = {
-    "masks is empty": lambda s: ZernikeSensor(s.pupil),
-    "extent = 0.9": lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), extent=0.9),
-    "tolerance = 0": lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), tolerance=0),
-    "tolerance = 1": lambda s: ZernikeSensor(s.pupil, Dimple(1, 1), tolerance=1.0),
-    "reaches a modulus of 2": lambda s: ZernikeSensor(s.pupil, Patch(1, lambda u, v: 2.0)),
-    "amplitude reaches down to -1": lambda s: s.measure(FLAT, FLAT - 1),
-    "amplitude is 0 everywhere": lambda s: s.measure(FLAT, FLAT),
-    "amplitude reaches a modulus of 1e": lambda s: s.measure(FLAT.astype(np.float32), FLAT + 1e30),
-    "phase and amplitude have shapes": lambda s: s.measure(np.zeros((2, 40, 40)), np.ones((3, 40, 40))),
-    "phase reaches a modulus": lambda s: s.measure(FLAT + 1e200),
-    "phase has shape": lambda s: s.measure(np.empty((0, 40, 40))),
-    "field has shape": lambda s: s.propagate(np.empty((0, 40, 40))),
-}
-
-
-@pytest.mark.parametrize("message", REFUSED)
-def test_bad_input_is_named(shifted, message):
-    with pytest.raises(ValueError, match=message):
-        REFUSED[message](shifted)
-
-
-def test_diameter_derivative_needs_dimples(pupil):
-    with pytest.raises(TypeError, match=r"masks\[1\] is a Patch: expected a Dimple"):
-        ZernikeSensor(pupil, Dimple(1, 1), Patch(1, ramp)).diameter_derivative(FLAT)
 
 
 def test_pupil_of_a_single_row_is_a_pupil():

@@ -71,9 +71,3 @@ def test_screens_scale_with_r0_and_the_seed_decides(pupil):
     np.testing.assert_array_equal(one[:1], turbulent_screens(pupil, 1.0, 1, 5.0, seed=4))
     assert not one[:, ~pupil.inside].any()
     np.testing.assert_allclose(pupil.gather(one).mean(axis=-1), 0, atol=1e-12)
-
-
-def test_bad_input_is_named(pupil):
-    for change in ({"r0": 0}, {"outer_scale": 0.1}, {"n_screens": 0}):
-        with pytest.raises(ValueError, match=f"{next(iter(change))} = "):
-            turbulent_screens(**{"pupil": pupil, "r0": 0.1, "n_screens": 1} | change)

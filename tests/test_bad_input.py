@@ -484,6 +484,10 @@ def bound(sensor=SENSOR, **options):
     return zwfs.cramer_rao(sensor, FLAT, **{"photons": 10} | options)
 
 
+def calibrated(*frames):
+    return zwfs.Linear(SENSOR, MODES, calibration=frames)
+
+
 def looped(**changes):
     arguments = {"mirror": zwfs.Mirror(PUPIL, MODES), "disturbance": np.zeros((2, 8, 8))} | changes
     return zwfs.close_loop(SENSOR, reconstructor=zwfs.PhaseShifted(SENSOR), **arguments)
@@ -493,6 +497,7 @@ FLAT, MODES = np.zeros((8, 8)), zwfs.zernike_basis(PUPIL, 4)
 ONES, WHOLE, WIDE = np.ones((4, 4)), np.ones((4, 4), int), zwfs.Pupil.from_amplitude(np.ones((9, 9)))
 POINTS, FOUR = np.ones(zwfs.Pupil.circular(4).n_points), zwfs.Pupil.circular(4)
 GLASS, CLEAR = zwfs.Patch(1, lambda u, v: np.exp(1j * u)), zwfs.ZernikeSensor(PUPIL, zwfs.Dimple(1, 0))
+MOVED = SENSOR.measure(0.01 * MODES)
 BAND = zwfs.PolychromaticSensor(SENSOR, [600.0, 700.0])
 TWICE = zwfs.ZernikeSensor(PUPIL, *(zwfs.Dimple(1.06, phase) for phase in (1.5, 1.5, -1.5)))
 REFUSED |= {
@@ -629,6 +634,13 @@ REFUSED |= {
     "modes: .* at most": lambda: bound(modes=np.ones((PUPIL.n_points + 1, 8, 8))),
     "the sensor has 2 wavelengths: expected a known amplitude": lambda: likely(BAND, amplitude="unknown"),
     "the sensor has 2 wavelengths": lambda: bound(BAND, amplitude_known=False),
+    # a recorded calibration
+    "calibration flat has a batch": lambda: calibrated(MOVED, MOVED, MOVED),
+    "calibration pushed has a batch": lambda: calibrated(MOVED[0], MOVED[:-1], MOVED),
+    "calibration pulled has shape": lambda: calibrated(MOVED[0], MOVED, MOVED[:, :1]),
+    "calibration pulled: 8 of 8 hold no light": lambda: calibrated(MOVED[0], MOVED, -MOVED),
+    "sensor sees none of them": lambda: calibrated(MOVED[0], MOVED, MOVED),
+    "calibration has 2 parts: expected .flat, pushed, pulled": lambda: calibrated(MOVED[0], MOVED),
     # loops
     "mirror is a int": lambda: looped(mirror=1),
     "mirror has Pupil": lambda: looped(mirror=zwfs.Mirror(FOUR, zwfs.zernike_basis(FOUR, 3))),

@@ -13,10 +13,10 @@ def flat(pupil):
 
 
 def test_photons_are_those_of_the_pupil_without_a_mask(pupil, flat):
-    detector = Detector(1e5 / pupil.n_points, photon_noise=False)
-    np.testing.assert_allclose(detector.expose(flat).sum(axis=(-2, -1)), 1e5)
+    detector = Detector(1e5 / pupil.n_points)
+    assert detector.expose(flat, seed=1).sum(axis=(-2, -1)).mean() == pytest.approx(1e5, rel=1e-3)
     no_mask = ZernikeSensor(pupil, Dimple(1.06, 0)).measure(np.zeros(pupil.shape))
-    assert detector.expose(no_mask).sum() == pytest.approx(1e5)
+    np.testing.assert_allclose(no_mask, pupil.inside[np.newaxis], atol=1e-12)
 
 
 def test_photon_noise_is_poissonian(pupil, flat):
@@ -41,37 +41,11 @@ def test_noise_of_neighbouring_pixels_is_independent(pupil, flat):
     assert abs(np.corrcoef(counts[..., :-1].ravel(), counts[..., 1:].ravel())[0, 1]) < 0.01
 
 
-def test_full_well_saturates(pupil):
-    detector = Detector(1.0, photon_noise=False, full_well=2.5)
-    counts = detector.expose([0.0, 2.4, 2.5, 9.0])
-    np.testing.assert_allclose(counts, [0, 2.4, 2.5, 2.5])
-    np.testing.assert_array_equal(detector.saturated(counts), [False, False, True, True])
-
-
-def test_saturation_is_seen_in_counts(pupil):
-    detector = Detector(1.0, photon_noise=False, full_well=100, gain=8.0)
-    np.testing.assert_array_equal(detector.saturated(detector.expose([80.0, 101, 500])), [False, True, True])
-    assert not Detector(1.0, gain=8.0).saturated([1e9])
-
-
-def test_gain_rounds_to_whole_counts(pupil):
-    detector = Detector(1.0, photon_noise=False, gain=4.0)
-    np.testing.assert_array_equal(detector.expose([0.0, 1.9, 2.1, 4.0, 9.9]), [0, 0, 1, 1, 2])
-
-
 def test_normalise_undoes_expose(pupil):
     frames = np.random.default_rng(0).uniform(0, 4, (2, 3, *pupil.shape))
-    detector = Detector(1e3, photon_noise=False, background=11)
-    np.testing.assert_allclose(detector.normalise(detector.expose(frames)), frames, atol=1e-12)
-    coarse = Detector(1e3, photon_noise=False, background=11, gain=5)
-    error = coarse.normalise(coarse.expose(frames)) - frames
-    assert np.abs(error).max() <= 2.5 / coarse.photons * (1 + 1e-9)
-
-
-def test_floor_is_applied_only_on_request(pupil):
-    detector = Detector(1.0, background=2)
-    np.testing.assert_array_equal(detector.normalise([0.0, 3]), [-2, 1])
-    np.testing.assert_array_equal(detector.normalise([0.0, 3], floor=0), [0, 1])
+    detector = Detector(1e12, background=1e11)
+    np.testing.assert_allclose(detector.normalise(detector.expose(frames, 1)), frames, atol=2e-5)
+    np.testing.assert_array_equal(Detector(1.0, background=2).normalise([0.0, 3]), [-2, 1])
 
 
 def test_seed_decides_the_noise(pupil, flat):

@@ -101,7 +101,7 @@ def test_any_plant_can_be_measured(mirror, modes, sensor, shifted):
 
 
 def test_electrons_of_each_cycle_are_counted(mirror, modes, sensor, shifted):
-    camera = Detector(5000 / sensor.pupil.n_points, gain=2.0)
+    camera = Detector(5000 / sensor.pupil.n_points)
     still = np.zeros((8, 3, *sensor.pupil.shape))
     record = close_loop(sensor, mirror, shifted, still, camera=camera, seed=1)
     expected = 5000 * sensor.measure(still[0, 0]).sum() / sensor.pupil.n_points

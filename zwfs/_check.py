@@ -209,14 +209,6 @@ def integer_field(owner: Any, name: str, low: int, high: float = _INT64) -> None
     object.__setattr__(owner, name, integer(name, getattr(owner, name), low, high))
 
 
-def float_dtype(name: str, value: Any) -> np.dtype:
-    """Return `value` as the dtype float32 or float64."""
-    name_of = np.dtype(value).name if isinstance(value, type | np.dtype) else value
-    if not isinstance(name_of, str) or name_of not in ("float32", "float64"):
-        raise TypeError(f"{name} = {shown(value)}: expected float32 or float64")
-    return np.dtype(name_of)
-
-
 def plain_array(name: str, value: Any) -> NDArray:
     """Return `value` as an array of NumPy of any dtype."""
     return _converted(name, value, np.asarray)

@@ -215,8 +215,6 @@ def factorise(
     detector_axes: tuple[NDArray, NDArray],
     pixel_area: float,
     tolerance: float,
-    *,
-    rim: bool = False,
 ) -> Factors:
     """Factors of the reference-wave operators of several masks, with functions common to all of them.
 
@@ -230,8 +228,6 @@ def factorise(
         Coordinates y of the rows and x of the columns.
     pixel_area : float, D^2
     tolerance : float
-    rim : bool
-        Factors of the derivatives with respect to the diameters instead; the masks are dimples (`eq-rim`).
 
     Returns
     -------
@@ -254,12 +250,10 @@ def factorise(
     same = all(map(np.array_equal, pupil_axes, detector_axes))
     to_detector = from_pupil if same else along(detector_axes)
 
-    nodes = _rim if rim else _quadrature
-
     @cache
     def disc(diameter: float) -> NDArray[np.float64]:
         """Core of a dimple that adds 1 to the transmission: half of the nodes, as opposite ones are conjugate."""
-        u, v, weights = nodes(Dimple(diameter, 0.0), reach, tolerance)
+        u, v, weights = _quadrature(Dimple(diameter, 0.0), reach, tolerance)
         half = np.flatnonzero(np.cos(1) * u + np.sin(1) * v > 0)  # 1 rad from u: no node lies on the border
         total: Any = 0
         for part in (half[first : first + _NODES] for first in range(0, half.size, _NODES)):
@@ -273,7 +267,7 @@ def factorise(
         if _is_uniform(masks[index]):
             change = _transmission(index, masks[index], np.zeros(1), np.zeros(1)) - 1
             return change * disc(masks[index].diameter)
-        u, v, weights = nodes(masks[index], reach, tolerance, refinement)
+        u, v, weights = _quadrature(masks[index], reach, tolerance, refinement)
         change = pixel_area * weights * (_transmission(index, masks[index], u, v) - 1)
         total: Any = 0
         for part in (slice(first, first + _NODES) for first in range(0, u.size, _NODES)):

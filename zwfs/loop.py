@@ -260,7 +260,7 @@ def close_loop(
         frames, electrons = plant.measure(residual), np.full(len(screens), np.nan)
         if camera is not None:
             counts = camera.expose(frames, rng)
-            electrons = counts.sum(axis=(-3, -2, -1)) * (camera.gain or 1.0)
+            electrons = counts.sum(axis=(-3, -2, -1))
             frames = camera.normalise(counts)
         rows.append((screens.std(axis=-1), pupil.rms(residual), strehl(pupil, residual), commands, electrons))
         measured = np.zeros(screens.shape)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from functools import cached_property
 from math import prod
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Immutable, Kind, is_jax, per_kind, read_only
-from zwfs._lowrank import Factors, Operator, factorise
+from zwfs._arrays import Immutable, Kind, is_jax, read_only
+from zwfs._lowrank import Factors, factorise
 from zwfs._propagator import (
     ONE_WAVELENGTH,
     Channels,
@@ -24,7 +23,7 @@ from zwfs._propagator import (
     square,
     warn_of_degrees,
 )
-from zwfs.masks import Dimple, Mask
+from zwfs.masks import Mask
 from zwfs.pupil import Pupil
 
 _MOST_PIXELS = 2**14  # across the detector: a frame of them takes 2 GiB
@@ -184,49 +183,9 @@ class Sensor(Immutable):
         gradient = 2 * parts_sum(along_phase(psi, self.channels.ratios, kind.xp) * back)
         return kind.xp.reshape(gradient, (*batch, *self.pupil.shape))
 
-    def diameter_derivative(self, phase: ArrayLike) -> NDArray[np.floating]:
-        """Change of the frames per change of the diameters of the dimples.
-
-        The derivative is analytical, and as accurate as the frames: the rim of a dimple is the only place at which
-        its transmission changes with the diameter, so the change of its reference wave is an integral around the
-        rim. The frame of a mask depends on the diameter of that mask only.
-
-        Parameters
-        ----------
-        phase : array_like, shape (..., ny, nx), radian
-
-        Returns
-        -------
-        ndarray, shape (..., n_masks, ny_detector, nx_detector), 1 / (lambda/D)
-
-        Raises
-        ------
-        TypeError
-            If a mask is not a `Dimple`.
-
-        References
-        ----------
-        `eq-rim` of the book.
-        """
-        for index, mask in enumerate(self.masks):
-            _check.instance(f"masks[{index}]", mask, Dimple)
-        maps, batch = pupil_maps("phase", phase, self)
-        model, psi, waves = self._waves(maps)
-        result = 2 * parts_sum(waves * self._rim(model.kind).split_reference(psi))
-        return model.kind.xp.reshape(result, (*batch, *result.shape[1:]))
-
     @abstractmethod
-    def _factorise(self, *, rim: bool = False) -> Factors:
-        """Factors of the reference waves, or of their derivatives with respect to the diameters of the dimples."""
-
-    @cached_property
-    def _rim_factors(self) -> Factors:
-        return self._factorise(rim=True)
-
-    @per_kind
-    def _rim(self, kind: Kind) -> Operator:
-        """Operator to the derivatives of the reference waves with respect to the diameters of the dimples."""
-        return Operator(self._rim_factors, self.window, kind)
+    def _factorise(self) -> Factors:
+        """Factors of the reference waves."""
 
     def _waves(self, maps: NDArray) -> tuple[Propagator, NDArray, NDArray]:
         """Model, and the fields of checked phases in the pupil and on the detector."""
@@ -312,8 +271,8 @@ class ZernikeSensor(Sensor):
         masks = ", ".join(map(repr, self.masks))
         return f"ZernikeSensor({self.pupil.n_points} points, {masks}, extent={self.extent:g}, rank={self.rank})"
 
-    def _factorise(self, *, rim: bool = False) -> Factors:
-        return factorise(self.masks, *self._axes(), self.pupil.n_pixels**-2.0, self.tolerance, rim=rim)
+    def _factorise(self) -> Factors:
+        return factorise(self.masks, *self._axes(), self.pupil.n_pixels**-2.0, self.tolerance)
 
     def with_tolerance(self, tolerance: float) -> ZernikeSensor:
         """Return the same sensor with another error of the reference wave."""

@@ -81,7 +81,7 @@ def targets():
     return found | RESULTS
 
 
-BENCH = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
+BENCH = Bench(n_pixels=40, n_rings=1, missing=(), photons_per_image=1e8)
 
 
 @cache

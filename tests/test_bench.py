@@ -255,7 +255,7 @@ def test_illumination_shows_in_the_pupil_images(illumination):
 
 def test_counts_scatter_as_those_of_a_camera(perfect):
     photons, read_noise, background = 1e6, 20.0, 300.0
-    bench = ideal(photons=photons, read_noise=read_noise, background=background, flux_imbalance=0.2)
+    bench = ideal(photons_per_image=photons, read_noise=read_noise, background=background, flux_imbalance=0.2)
     share = np.array([1.2, 0.8])[:, np.newaxis, np.newaxis]
     expected = perfect.frames() * share * photons / LAYOUT.n_points + background
     frames = bench.frames(np.zeros((200, 36)), seed=3)
@@ -347,7 +347,7 @@ def test_model_amplitude_is_close_to_the_truth_on_the_bench_as_it_is():
 
 
 def test_normalised_counts_are_1_on_average_in_the_pupil():
-    bench = ideal(photons=1e9, read_noise=30, background=5000, flux_imbalance=0.2)
+    bench = ideal(photons_per_image=1e9, read_noise=30, background=5000, flux_imbalance=0.2)
     found = BenchModel.from_images(bench, 1)
     off = found.normalise(bench.clear_frames(2))
     np.testing.assert_allclose(inner(off)[:, LAYOUT.inside].mean(axis=1), 1, atol=1e-3)
@@ -417,8 +417,8 @@ def test_segment_screens_are_averaged_power_law_screens(perfect):
 @pytest.mark.parametrize(
     "change",
     [
-        {"leakage": 0.6}, {"flux_imbalance": 1}, {"photons": -1}, {"photons": 0}, {"read_noise": -1},
-        {"background": -1}, {"static": -0.1}, {"focus_difference": 1}, {"misregistration": -1},
+        {"leakage": 0.6}, {"flux_imbalance": 1}, {"photons_per_image": -1}, {"photons_per_image": 0},
+        {"read_noise": -1}, {"background": -1}, {"static": -0.1}, {"focus_difference": 1}, {"misregistration": -1},
         {"dimple_error": -1}, {"illumination": 2}, {"n_rings": -1}, {"gap": 0.5}, {"stop": 0}, {"missing": (38,)},
         {"seed": -1}, {"diameter": -1}, {"extent": 0.5},
     ],

@@ -9,7 +9,7 @@ from .conftest import SMALL
 from .conftest import ideal_bench as ideal
 
 RMS = (0, 0.05, 0.5)
-ERRORS = {"static": 0.1, "quilting": 0.1, "leakage": 0.05, "photons": 1e9}
+ERRORS = {"static": 0.1, "quilting": 0.1, "leakage": 0.05, "photons_per_image": 1e9}
 
 
 @pytest.fixture(scope="module")

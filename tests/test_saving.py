@@ -66,7 +66,7 @@ def test_a_figure_shows_phase_and_standard_error(result):
 @pytest.fixture(scope="module")
 def results():
     """Results of camera frames."""
-    bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
+    bench = Bench(n_pixels=40, n_rings=1, missing=(), photons_per_image=1e8)
     frames, clear = bench.frames(), bench.clear_frames()
     phase = phase_of(frames, clear)
     calibration = Calibration.of(phase.measurement)

@@ -242,7 +242,11 @@ def test_a_bad_nested_value_is_refused_with_its_path(values, message):
         ("3", ["pupil={kind: file, file: nowhere.fits}"], "nowhere.fits"),
         ("5", ["bench={missing: [38]}"], r"bench.missing = \[38\]: expected segment numbers from 1 to 37"),
         ("9", ["n_pixels=32", "bench={diameter: 8.0, dimple_error: 9.0}"], "bench.diameter = 8"),
-        ("7", ["bench={photons: 0.0, read_noise: 1.0}"], "bench.photons = 0 with read_noise = 1"),
+        (
+            "7",
+            ["bench={photons_per_image: 0.0, read_noise: 1.0}"],
+            "bench.photons_per_image = 0 with read_noise",
+        ),
     ],
 )
 def test_values_that_contradict_each_other_are_refused_before_a_kernel_starts(figure, given, message):

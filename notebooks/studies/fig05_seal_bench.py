@@ -165,7 +165,7 @@ def _pictures(bench: Bench, pistons: NDArray, frames: NDArray) -> _Pictures:
     """Pictures of Figure 5, from the fields of the bench."""
     pupil = Pupil.from_segments(bench.segments)
     phase = np.where(bench.segments > 0, bench.commanded_phase(pistons), np.nan)
-    none: dict[str, Any] = dict.fromkeys((*bench.errors(), "photons", "read_noise", "background"), 0)
+    none: dict[str, Any] = dict.fromkeys((*bench.errors(), "photons_per_image", "read_noise", "background"), 0)
     quilted = replace(bench, **none | {"quilting": bench.quilting}).frames()[0]
     halo = focal_light(pupil, pupil.field(phase), 4)
     return _Pictures(pupil.amplitude, phase, halo, Dimple(bench.diameter, bench.phase), quilted, frames)

@@ -28,6 +28,7 @@ from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
+_NOISE = "photons_per_image", "read_noise", "background"
 _N_MODES = 200  # that random segment commands are made of
 _REACH = 6.0  # standard deviations of the blur
 _SIGNS = np.array([1, -1])[:, np.newaxis, np.newaxis]  # of the mask's phase shift for the two polarisations
@@ -85,7 +86,7 @@ class Bench:
     quilting : float, radian rms
         Grid that the actuators print on the surface of the deformable mirror; 22 of them across the pupil, as seen
         in the real frames. 6 nm at 635 nm is 0.06 rad.
-    photons : float, photons
+    photons_per_image : float
         Photons of each image with the mask out, in all the exposures that make a frame: a hundred of 1e8 each, for
         the high signal-to-noise ratio of the paper. 0 for frames without noise.
     read_noise : float, electrons rms
@@ -126,7 +127,7 @@ class Bench:
     dimple_error: float = _error(0.04)
     static: float = _error(0.05)
     quilting: float = _error(0.06)
-    photons: float = 1e10
+    photons_per_image: float = 1e10
     read_noise: float = 30.0
     background: float = 60000.0
     seed: int = 0
@@ -145,13 +146,13 @@ class Bench:
         _check.number_field(self, "misregistration", 0, 10)
         _check.number_field(self, "flux_imbalance", -1, 1, open_low=True, open_high=True)
         _check.number_field(self, "blur", 0, self.n_pixels)
-        for name in ("static", "quilting", "photons", "read_noise", "background"):
+        for name in ("static", "quilting", *_NOISE):
             _check.number_field(self, name, 0)
         _check.integer_field(self, "seed", 0, math.inf)
-        if not self.photons and (self.read_noise or self.background):
+        if not self.photons_per_image and (self.read_noise or self.background):
             raise ValueError(
-                f"photons = 0 with read_noise = {self.read_noise:g} and background = {self.background:g}: "
-                "expected 0 for both where frames are to be without noise"
+                f"photons_per_image = 0 with read_noise = {self.read_noise:g} and background = "
+                f"{self.background:g}: expected 0 for both where frames are to be without noise"
             )
         self._make_parts()
 
@@ -168,7 +169,9 @@ class Bench:
     @classmethod
     def ideal(cls, **changes: Any) -> Bench:
         """A bench without any error or noise, but for the `changes`."""
-        perfect: dict[str, Any] = dict.fromkeys((*cls.errors(), "photons", "read_noise", "background"), 0)
+        perfect: dict[str, Any] = dict.fromkeys(
+            (*cls.errors(), "photons_per_image", "read_noise", "background"), 0
+        )
         return cls(**{**perfect, **changes})
 
     def single_errors(self) -> dict[str, Bench]:
@@ -176,7 +179,7 @@ class Bench:
         layout = {field.name: getattr(self, field.name) for field in fields(self) if field.init}
         cases: dict[str, dict[str, float]] = {"none": {}}
         cases |= {name: {name: layout.pop(name)} for name in self.errors()}
-        cases["noise"] = {name: layout.pop(name) for name in ("photons", "read_noise", "background")}
+        cases["noise"] = {name: layout.pop(name) for name in _NOISE}
         return {name: Bench.ideal(**layout, **case) for name, case in cases.items()} | {"all": self}
 
     @cached_property
@@ -300,9 +303,9 @@ class Bench:
 
     def _expose(self, images: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         flux = np.array([1 + self.flux_imbalance, 1 - self.flux_imbalance])[:, np.newaxis, np.newaxis]
-        if not self.photons:
+        if not self.photons_per_image:
             return images * flux
-        photons = self.photons / self._pupil.n_points
+        photons = self.photons_per_image / self._pupil.n_points
         camera = Detector(photons, read_noise=self.read_noise, background=self.background)
         return camera.expose(images * flux, rng)
 

@@ -171,7 +171,7 @@ _BENCH = {
     "dimple_error": (-0.9, 10.0),
     "static": (0.0, 3.0),
     "quilting": (0.0, 3.0),
-    "photons": (0.0, 1e18),
+    "photons_per_image": (0.0, 1e18),
     "read_noise": (0.0, 1e6),
     "background": (0.0, 1e12),
     "seed": (0, 4294967295),

@@ -22,7 +22,8 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import zwfs
-from zwfs.bench import Bench, BenchModel, segment_pistons, segment_residual, segment_screens, write_bench
+from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens, write_bench
+from zwfs.bench.model import segment_pistons
 from zwfs.frames import BenchFit, Calibration, FittedSensor, calibrate, fit_bench, pipeline, reconstruct
 from zwfs.frames.files import read_all
 from zwfs.frames.registration import register_frames

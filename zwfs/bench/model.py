@@ -28,6 +28,8 @@ from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
+__all__ = ["Bench", "BenchModel", "segment_residual", "segment_screens"]
+
 _NOISE = "photons_per_image", "read_noise", "background"
 _N_MODES = 200  # that random segment commands are made of
 _REACH = 6.0  # standard deviations of the blur

@@ -92,6 +92,7 @@ def test_amplitudes_in_jax(jax, sensor, problem):
     measure, step = sensor.measure, 1e-5
     amplitude = sensor.pupil.amplitude * np.linspace(0.5, 1.5, 3)[:, np.newaxis, np.newaxis]
     agrees(jax.jit(measure)(phase, amplitude), sensor.measure(phase, amplitude))
+    agrees(jax.jit(measure)(phase, amplitude + ~sensor.pupil.inside), sensor.measure(phase, amplitude))
     agrees(measure(phase[0], jax.numpy.asarray(amplitude)), sensor.measure(phase[0], amplitude))
     found = jax.jit(jax.grad(lambda amplitude: (measure(phase, amplitude) * weights).sum()))(amplitude)
     ahead, behind = ((sensor.measure(phase, (1 + s) * amplitude) * weights).sum() for s in (step, -step))

@@ -148,8 +148,6 @@ def test_jacobian_is_the_derivative_of_the_frames(any_sensor, phases):
     plus, minus = (any_sensor.measure(phases + sign * step * change) for sign in (1, -1))
     expected = (plus - minus) / (2 * step)
     np.testing.assert_allclose(any_sensor.jacobian(phases, change), expected, atol=1e-8)
-    with pytest.raises(ValueError, match="change has shape"):
-        any_sensor.jacobian(phases, change[0])
 
 
 def test_adjoint_of_the_jacobian_has_the_same_products(any_sensor, phases):
@@ -207,6 +205,15 @@ def test_likelihood_follows_a_phase_beyond_pi(sensor, modes):
     assert np.abs(difference).max() < 1e-5  # without wrapping
     assert result.consistent.all()
     assert result.residual.max() < 1e-6
+
+
+def test_likelihood_turns_single_points_that_start_a_wave_off(sensor, phases):
+    band = PolychromaticSensor.flat_band(sensor, 0.25)
+    start, phase = phases[0].copy(), phases[0]
+    start[12, 8:11] += 2 * np.pi
+    start[6, 14] -= 2 * np.pi
+    found = band.pupil.gather(MaximumLikelihood(band, n_starts=1)(band.measure(phase), start).phase - phase)
+    assert np.ptp(found) < 1e-5
 
 
 def test_standard_errors_in_a_band_are_right(sensor, phases):

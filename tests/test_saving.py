@@ -55,12 +55,6 @@ def test_an_existing_file_stays_and_other_endings_are_refused(tmp_path, result):
         result.save(tmp_path / "result.txt")
 
 
-def test_plain_values_are_cards_of_the_header(tmp_path):
-    drift = zwfs.loop.HeldDrift(np.ones(3), np.arange(3.0), np.zeros(3))
-    drift.save(tmp_path / "drift.fits")
-    np.testing.assert_array_equal(fits.getdata(tmp_path / "drift.fits", "LAG"), drift.lag)
-
-
 def test_a_figure_shows_phase_and_standard_error(result):
     figure = result.plot()
     labels = [axes.get_ylabel() for axes in figure.axes]
@@ -72,7 +66,7 @@ def test_a_figure_shows_phase_and_standard_error(result):
 @pytest.fixture(scope="module")
 def results():
     """Results of camera frames."""
-    bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
+    bench = Bench(n_pixels=40, n_rings=1, missing=(), photons_per_image=1e8)
     frames, clear = bench.frames(), bench.clear_frames()
     phase = phase_of(frames, clear)
     calibration = Calibration.of(phase.measurement)

@@ -221,16 +221,16 @@ CASES = {
         diameter=[0.1, 8.0], phase_shift=[3.13], extent=[1.0], exponent=[0.0]),
     ),
     "fig09_bench_linearity": (BENCH | {"n_screens": 1, "n_rms": 2, "rms_fine": [], "n_iterations": 3},
-        {}, {"rms_fine": [0.1, 0.3], "poke": 1.5}, *each(rms_max=[4.0, 0.05], bench=[{"photons": 1e7},
+        {}, {"rms_fine": [0.1, 0.3], "poke": 1.5}, *each(rms_max=[4.0, 0.05], bench=[{"photons_per_image": 1e7},
         {"static": 0.0}, {"n_rings": 1, "missing": []}, {"leakage": 0.5}], n_iterations=[1], extent=[1.0]),
     ),
     "fig08_segments": (BENCH,
-        {}, *each(rms=[0.0, 4.0], bench=[{"photons": 1e7}, {"static": 3.0}, {"n_rings": 1, "missing": []},
-        {"blur": 20.0}, {"diameter": 8.0}], n_iterations=[1], exponent=[0.0]),
+        {}, *each(rms=[0.0, 4.0], bench=[{"photons_per_image": 1e7}, {"static": 3.0},
+        {"n_rings": 1, "missing": []}, {"blur": 20.0}, {"diameter": 8.0}], n_iterations=[1], exponent=[0.0]),
     ),
     "error_budget": (BENCH | {"n_screens": 1, "n_iterations": 2, "inputs": [0.3], "leakages": [0.1]},
         {}, *each(inputs=[[0.001], [4.0]], leakages=[[], [0.49]],
-        bench=[{"static": 0.0}, {"photons": 1e7}, {"n_rings": 1, "missing": []}, {"blur": 20.0}],
+        bench=[{"static": 0.0}, {"photons_per_image": 1e7}, {"n_rings": 1, "missing": []}, {"blur": 20.0}],
         n_iterations=[1]),
     ),
     "calibration": (
@@ -252,7 +252,7 @@ LAYOUT = (
     *each(n_pixels=[16, 33], diameter=[0.1, 8.0], phase_shift=[0.01, 3.13], rms=[0.0, 4.0], seed=[0, 7]),
 )
 CASES |= {"fig01_sensor_layout": LAYOUT, "fig02_vector_sensor": LAYOUT}
-ODD_BENCHES = [{"static": 0.0}, {"photons": 1e7}, {"n_rings": 1, "missing": []}, {"leakage": 0.5}]
+ODD_BENCHES = [{"static": 0.0}, {"photons_per_image": 1e7}, {"n_rings": 1, "missing": []}, {"leakage": 0.5}]
 CASES["fig05_seal_bench"] = (
     {},
     *each(bench=ODD_BENCHES, rms=[0.0, 4.0], exponent=[0.0, -4.0], wavelength=[100.0, 2e4]),

@@ -1,7 +1,7 @@
 """Sensor models and reconstructors for the phase-shifted Zernike wavefront sensor.
 
-`zwfs.turbulence`, `zwfs.bench`, `zwfs.frames` and `zwfs.jax` are imported by their own names. Every public
-function checks its arguments: a TypeError or a ValueError names the argument, its value and what was expected.
+`zwfs.turbulence`, `zwfs.bench` and `zwfs.frames` are imported by their own names. Every public function checks its
+arguments: a TypeError or a ValueError names the argument, its value and what was expected.
 """
 
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ from zwfs import _lazy
 if TYPE_CHECKING:
     from zwfs.bounds import cramer_rao
     from zwfs.detector import Detector
-    from zwfs.loop import LoopRecord, Mirror, close_loop, hold_drift
+    from zwfs.loop import LoopRecord, Mirror, close_loop
     from zwfs.masks import Dimple, Patch
     from zwfs.metrics import dynamic_range, reconstruction_error, strehl, wrapped_residual
     from zwfs.modes import noll_to_nm, power_law_screens, zernike_basis
@@ -56,7 +56,6 @@ __all__ = [
     "close_loop",
     "cramer_rao",
     "dynamic_range",
-    "hold_drift",
     "noll_to_nm",
     "opd_to_phase",
     "phase_to_opd",

@@ -82,14 +82,14 @@ def per_kind(make: Callable[[Owner, Kind], Constants]) -> Callable[[Owner, Kind]
     """
 
     @wraps(make)
-    def kept(owner: Owner, kind: Kind) -> Constants:
+    def cached(owner: Owner, kind: Kind) -> Constants:
         results = owner.__dict__.setdefault(_KEPT, {})
         try:
             return results[make, kind]
         except KeyError:
             return results.setdefault((make, kind), make(owner, kind))
 
-    return kept
+    return cached
 
 
 def is_array(value: Any) -> bool:

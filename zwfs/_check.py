@@ -54,13 +54,13 @@ def _is_of(value: Any, kind: Any) -> bool:
         return plain and _same_kind(value.dtype, number)
     if origin is tuple:
         return isinstance(value, tuple) and (
-            all(_is_of(one, parts[0]) for one in value)
+            all(_is_of(item, parts[0]) for item in value)
             if parts[-1] is Ellipsis
             else len(value) == len(parts) and all(map(_is_of, value, parts))
         )
     if origin is dict:
         return isinstance(value, dict) and all(
-            _is_of(one, part) for pair in value.items() for one, part in zip(pair, parts, strict=True)
+            _is_of(item, part) for pair in value.items() for item, part in zip(pair, parts, strict=True)
         )
     if kind in (bool, int, float):
         plain = value.item() if isinstance(value, np.generic) else value
@@ -91,14 +91,14 @@ def _readable(kind: Any) -> str:
 def sequence(name: str, values: Any, kind: type = object, expected: str = "") -> None:
     """Require a sequence of objects of a class; a string is none."""
     listed = isinstance(values, Sequence) and not isinstance(values, str | bytes)
-    if not listed or not all(isinstance(one, kind) for one in values):
+    if not listed or not all(isinstance(item, kind) for item in values):
         raise TypeError(f"{name} = {shown(values)}: expected {expected or f'a sequence of {kind.__name__}s'}")
 
 
-def choice(name: str, value: Any, known: dict[str, Any] | list[str] | tuple[str, ...]) -> None:
+def choice(name: str, value: Any, names: dict[str, Any] | list[str] | tuple[str, ...]) -> None:
     """Require that `value` is one of the names in `known`."""
-    if not isinstance(value, str) or value not in known:
-        raise ValueError(f"{name} = {shown(value)}: expected one of {list(known)}")
+    if not isinstance(value, str) or value not in names:
+        raise ValueError(f"{name} = {shown(value)}: expected one of {list(names)}")
 
 
 def sensor_of(name: str, reconstructor: Any) -> Any:
@@ -180,8 +180,10 @@ def number(
     too_low = plain <= low if open_low else plain < low
     too_high = plain >= high if open_high else plain > high
     if not math.isfinite(plain) or too_low or too_high:
-        left, right = "(" if open_low else "[", ")" if open_high else "]"
-        raise ValueError(f"{name} = {shown(value)}: expected a finite number in {left}{low:g}, {high:g}{right}")
+        opening, closing = "(" if open_low else "[", ")" if open_high else "]"
+        raise ValueError(
+            f"{name} = {shown(value)}: expected a finite number in {opening}{low:g}, {high:g}{closing}"
+        )
     return plain
 
 
@@ -207,17 +209,9 @@ def integer_field(owner: Any, name: str, low: int, high: float = _INT64) -> None
     object.__setattr__(owner, name, integer(name, getattr(owner, name), low, high))
 
 
-def float_dtype(name: str, value: Any) -> np.dtype:
-    """Return `value` as the dtype float32 or float64."""
-    name_of = np.dtype(value).name if isinstance(value, type | np.dtype) else value
-    if not isinstance(name_of, str) or name_of not in ("float32", "float64"):
-        raise TypeError(f"{name} = {shown(value)}: expected float32 or float64")
-    return np.dtype(name_of)
-
-
 def plain_array(name: str, value: Any) -> NDArray:
     """Return `value` as an array of NumPy of any dtype."""
-    return _made(name, value, np.asarray)
+    return _converted(name, value, np.asarray)
 
 
 def real_array(name: str, value: Any) -> NDArray:
@@ -256,8 +250,10 @@ def array_of(name: str, value: Any, kind: str, shape: tuple[int | str, ...] | No
     if not xp.isdtype(array.dtype, kind):
         raise TypeError(f"{name} has dtype {array.dtype}: expected {kind}")
     if shape is not None:
-        known = [length if isinstance(n, str) else n for n, length in zip(shape, array.shape, strict=False)]
-        if len(shape) != array.ndim or known != list(array.shape):
+        expected_shape = [
+            length if isinstance(n, str) else n for n, length in zip(shape, array.shape, strict=False)
+        ]
+        if len(shape) != array.ndim or expected_shape != list(array.shape):
             expected = str(shape).replace("'", "")
             raise ValueError(f"{name} has shape {tuple(array.shape)}: expected {expected}")
 
@@ -280,14 +276,14 @@ def complex_any(name: str, value: Any) -> NDArray:
 
 def in_kind(name: str, array: Any, kind: Kind) -> NDArray:
     """Return real numbers as an array of the kind that goes with it."""
-    return _made(name, array, kind.array)
+    return _converted(name, array, kind.array)
 
 
 def pair(name: str, value: Any, check: Callable[..., Any], *limits: float) -> tuple[Any, Any]:
     """Return a sequence of two numbers, each of which passes a check such as `number`."""
     if not isinstance(value, Sequence | np.ndarray) or getattr(value, "ndim", 1) == 0 or len(value) != 2:
         raise ValueError(f"{name} = {shown(value)}: expected two numbers")
-    return tuple(check(f"{name}[{index}]", one, *limits) for index, one in enumerate(value))
+    return tuple(check(f"{name}[{index}]", item, *limits) for index, item in enumerate(value))
 
 
 def real_map(name: str, value: Any, n_axes: int = 2) -> NDArray:
@@ -302,15 +298,13 @@ def real_map(name: str, value: Any, n_axes: int = 2) -> NDArray:
     return array
 
 
-def flag_map(name: str, value: Any, shape: tuple[int, ...], *, some: bool = False) -> NDArray[np.bool_]:
-    """Return `value` as an array of bool of a shape, with `some` at least one of them True."""
-    array = _made(name, value, np.asarray)
+def flag_map(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return `value` as an array of bool of a shape."""
+    array = _converted(name, value, np.asarray)
     if array.dtype != bool:
         raise TypeError(f"{name} has dtype {array.dtype}: expected bool")
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}: expected {shape}")
-    if some and not array.any():
-        raise ValueError(f"{name} is False everywhere: expected at least one True")
     return array
 
 
@@ -331,10 +325,10 @@ def _of_any_library(name: str, value: Any) -> tuple[Any, Any]:
     """Return an array and its namespace; those of JAX, which cannot be changed in place, are refused."""
     if is_jax(value):
         raise TypeError(
-            f"{name} is an array of JAX: expected np.asarray({name}); zwfs.jax.measure(sensor) returns the frames "
-            "in JAX, with gradients"
+            f"{name} is an array of JAX: expected np.asarray({name}); only `measure` of a sensor takes arrays of "
+            "JAX, with gradients"
         )
-    array, xp = _made(name, value, any_array)
+    array, xp = _converted(name, value, any_array)
     if xp is np and array.dtype.kind == "V":  # which xp.isdtype does not know
         raise TypeError(
             f"{name} is a table, of dtype {shown(array.dtype)}: expected numbers, as one of its columns"
@@ -342,7 +336,7 @@ def _of_any_library(name: str, value: Any) -> tuple[Any, Any]:
     return array, xp
 
 
-def _made(name: str, value: Any, make: Callable[[Any], Any]) -> Any:
+def _converted(name: str, value: Any, make: Callable[[Any], Any]) -> Any:
     """Make an array of `value`, which must hold nothing that it would lose: masked values, or a unit."""
     if np.ma.is_masked(value):
         raise ValueError(
@@ -473,18 +467,18 @@ def items(name: str, values: Any, expected: str) -> Iterable[Any]:
 
 def breaks(name: str, values: Any, diameter: float) -> tuple[Any, ...]:
     """Return the checked breaks of a mask, circles in order; outlines are checked where they are used."""
-    known = list(items(name, values, "diameters, such as (1.0,), or functions of the angle"))
+    listed = list(items(name, values, "diameters, such as (1.0,), or functions of the angle"))
     circles = sorted(
         number(f"{name}[{index}]", value, 0, diameter, open_low=True, open_high=True)
-        for index, value in enumerate(known)
+        for index, value in enumerate(listed)
         if not callable(value)
     )
-    return (*circles, *filter(callable, known))
+    return (*circles, *filter(callable, listed))
 
 
 def any_numbers(name: str, value: Any) -> NDArray:
     """Return `value` as an array of NumPy of bools, integers, real or complex numbers; the dtype is kept."""
-    array = _made(name, value, np.asarray)
+    array = _converted(name, value, np.asarray)
     if array.dtype.kind not in "biufc":
         raise TypeError(f"{name} has dtype {array.dtype}: expected numbers")
     return array

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from zwfs._arrays import Immutable, Kind, per_kind
 from zwfs._lowrank import Factors
-from zwfs._propagator import Optics
+from zwfs._propagator import SensorParts
 from zwfs.pupil import Pupil
 
 _SMALLEST = 1e-12  # of the diagonal, relative to its mean: a point that no frame shows has no information
@@ -98,16 +98,18 @@ class _Columns:
     @classmethod
     def of(cls, sets: NDArray, kind: Kind) -> _Columns:
         """Sets of columns from an array (s, n, m)."""
-        used = [np.flatnonzero(np.any(one, axis=0)) for one in sets]
-        spans = [slice(int(one.min(initial=0)), int(one.max(initial=-1)) + 1) for one in used]
-        blocks = [kind.array(np.ascontiguousarray(one[:, span])) for one, span in zip(sets, spans, strict=True)]
+        used = [np.flatnonzero(np.any(columns, axis=0)) for columns in sets]
+        spans = [slice(int(places.min(initial=0)), int(places.max(initial=-1)) + 1) for places in used]
+        blocks = [
+            kind.array(np.ascontiguousarray(columns[:, span])) for columns, span in zip(sets, spans, strict=True)
+        ]
         return cls(blocks, spans, sets.shape[-1])
 
     def products(self, coefficients: Sequence[NDArray], kind: Kind) -> NDArray:
         """Sum over the sets of coefficients times columns: (..., n) for each set to (..., m)."""
         total = kind.zeros(*coefficients[0].shape[:-1], self.size)
-        for one, block, span in zip(coefficients, self.blocks, self.spans, strict=True):
-            total[..., span] += one @ block
+        for factors, block, span in zip(coefficients, self.blocks, self.spans, strict=True):
+            total[..., span] += factors @ block
         return total
 
     def congruent(self, pairs: NDArray, kind: Kind) -> NDArray:
@@ -141,7 +143,7 @@ class Response(Immutable):
         self._factors, self._window, self._pupil, self._ratios = factors, window, pupil, ratios
 
     @classmethod
-    def of(cls, sensor: Optics) -> Response:
+    def of(cls, sensor: SensorParts) -> Response:
         """Response of a sensor."""
         return cls(sensor.factors, sensor.window, sensor.pupil, sensor.channels.ratios)
 
@@ -153,22 +155,29 @@ class Response(Immutable):
         cores = self._factors.core.reshape(-1, len(self._ratios), q, r)
         turns, bases = zip(*(_bases(cores[:, index]) for index in range(len(self._ratios))), strict=True)
         n_inputs = 2 * r * len(self._ratios)
-        split = _side_by_side([one.reshape(-1, q, 2 * r) for one in bases])  # (n_sets, q, n_inputs)
+        split = _side_by_side([base.reshape(-1, q, 2 * r) for base in bases])  # (n_sets, q, n_inputs)
         # The functions of the detector, on the grid of the pupil, are sums of those of the pupil.
         cut = outer.cut(*self._window)
         to_y, to_x = cut.along_y @ inner.along_y.T, cut.along_x @ inner.along_x.T
-        left = np.einsum("ia,jb,ijq->abq", to_y, to_x, outer.combine.reshape(len(to_y), len(to_x), q))
-        left = left.reshape(-1, q)
+        to_inner = np.einsum("ia,jb,ijq->abq", to_y, to_x, outer.combine.reshape(len(to_y), len(to_x), q))
+        to_inner = to_inner.reshape(-1, q)
         n_parts = 2 * len(self._ratios)
         columns = np.zeros((n_parts + len(split), len(inner.combine), 2 * n_inputs))
         columns[:n_parts, :, :n_inputs] = _side_by_side([inner.combine[np.newaxis]] * n_parts)
-        columns[n_parts:, :, n_inputs:] = left @ split
+        columns[n_parts:, :, n_inputs:] = to_inner @ split
         return _Constants(
-            kind, self._pupil.n_points, self._window, self._ratios,
-            kind.array(self._pupil.inside), kind.array(np.where(self._pupil.inside, _SMALLEST, 1.0)),
-            _Pairs.of(inner.along_y, inner.along_x, kind), _Pairs.of(outer.along_y, outer.along_x, kind),
-            _Columns.of(columns, kind), _Columns.of(outer.combine @ split, kind), turns,
-        )  # fmt: skip
+            kind=kind,
+            n_points=self._pupil.n_points,
+            window=self._window,
+            ratios=self._ratios,
+            stop=kind.array(self._pupil.inside),
+            outside=kind.array(np.where(self._pupil.inside, _SMALLEST, 1.0)),
+            inner=_Pairs.of(inner.along_y, inner.along_x, kind),
+            outer=_Pairs.of(outer.along_y, outer.along_x, kind),
+            columns=_Columns.of(columns, kind),
+            detector=_Columns.of(outer.combine @ split, kind),
+            turns=turns,
+        )
 
     def information(self, tangents: NDArray, waves: NDArray, weights: NDArray | None) -> Information:
         """Information at a field.
@@ -231,15 +240,16 @@ class Information:
             ]  # fmt: skip
             n_sets = len(along)
             weight: Any = None if weights is None else weights[:, mask, ...]
-            weighted = along if weight is None else [weight * one for one in along]
+            weighted = along if weight is None else [weight * slope for slope in along]
             inside = 2 * wave[(..., *window)]
             change = [
-                reduce(add, (inside[:, part, ...] * one[c] for part, one in enumerate(parts))) for c in unknowns
+                reduce(add, (inside[:, part, ...] * tangent[c] for part, tangent in enumerate(parts)))
+                for c in unknowns
             ]
-            seen = change if weight is None else [weight[(..., *window)] * one for one in change]
+            heavy = change if weight is None else [weight[(..., *window)] * slope for slope in change]
             _accumulate(pairs, [along[i] * weighted[j] for i, j in _pairs_of(n_sets)])
-            _accumulate(local, [change[i] * seen[j] for i in unknowns for j in unknowns])
-            _accumulate(mixed, [along[s][(..., *window)] * seen[c] for s in range(n_sets) for c in unknowns])
+            _accumulate(local, [change[i] * heavy[j] for i in unknowns for j in unknowns])
+            _accumulate(mixed, [along[s][(..., *window)] * heavy[c] for s in range(n_sets) for c in unknowns])
         gram = constants.detector.congruent(constants.outer.gram(xp.stack(pairs, axis=1), xp), constants.kind)
         scale = xp.sum(local[0], axis=(-2, -1))[:, np.newaxis, np.newaxis] / constants.n_points
         blocks = [local[c * n_unknowns : (c + 1) * n_unknowns] for c in unknowns]
@@ -256,7 +266,7 @@ class Information:
         """
         constants, xp = self.constants, self.constants.kind.xp
         local = _inverse_blocks(self.local, damping)
-        scaled = [_times(local, one) for one in self.sets]
+        scaled = [_times(local, maps) for maps in self.sets]
         pairs = [_dot(self.sets[i], scaled[j]) for i, j in _pairs_of(len(self.sets))]
         products = constants.inner.gram(xp.stack(pairs, axis=1), xp)
         capacitance = constants.columns.congruent(products, constants.kind)
@@ -283,8 +293,8 @@ class Information:
         constants, xp = self.constants, self.constants.kind.xp
         flat = xp.reshape(modes, (modes.shape[0], -1))
         local = xp.reshape(self.local[0][0], (self.gram.shape[0], 1, -1))
-        seen = [constants.inner.project(modes * one[0][:, np.newaxis, ...], xp) for one in self.sets]
-        columns = constants.columns.products(seen, constants.kind)  # (k, m, 4 r), of K and B with the modes
+        products = [constants.inner.project(modes * maps[0][:, np.newaxis, ...], xp) for maps in self.sets]
+        columns = constants.columns.products(products, constants.kind)  # (k, m, 4 r), of K and B with the modes
         rank = self.gram.shape[-1]
         inputs, mixed = columns[..., :rank], columns[..., rank:]
         cross = mixed @ xp.matrix_transpose(inputs)
@@ -294,8 +304,8 @@ class Information:
     def _project(self, unknowns: list[NDArray]) -> NDArray:
         """Products of the columns of K and B with maps of the unknowns: (k, 4 r)."""
         constants = self.constants
-        seen = [constants.inner.project(_dot(one, unknowns), constants.kind.xp) for one in self.sets]
-        return constants.columns.products(seen, constants.kind)
+        products = [constants.inner.project(_dot(maps, unknowns), constants.kind.xp) for maps in self.sets]
+        return constants.columns.products(products, constants.kind)
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,7 +326,7 @@ class Inverse:
         piston = xp.sum(self.gauge * first[0], axis=(-2, -1))[:, np.newaxis]
         sides = xp.concat([info._project(first), piston], axis=1)
         weights = xp.linalg.solve(self.capacitance, sides[..., np.newaxis])[..., 0]
-        return [one - other for one, other in zip(first, self._expand(weights), strict=True)]
+        return [local - shared for local, shared in zip(first, self._expand(weights), strict=True)]
 
     def variance(self) -> list[NDArray]:
         """Diagonal of F^-1 without the piston: a list of maps, without meaning outside the pupil."""
@@ -328,24 +338,24 @@ class Inverse:
             block = columns.blocks[i] @ inverse[:, columns.spans[i], columns.spans[j]] @ columns.blocks[j].T
             forms.append(block if i == j else block + xp.matrix_transpose(block))  # a form of a symmetric matrix
         maps = constants.inner.forms(xp.stack(forms, axis=1), xp)
-        cross = self._expand(xp.concat([inverse[:, :-1, -1], 0 * inverse[:, :1, -1]], axis=1))
+        cross = self._expand(xp.concat([inverse[:, :-1, -1], xp.zeros_like(inverse[:, :1, -1])], axis=1))
         variance = []
-        for c, (own, one) in enumerate(zip(self.piston, cross, strict=True)):
-            total = self.local[c][c] - own * (2 * one + inverse[:, -1:, -1:] * own)
+        for c, (own, crossed) in enumerate(zip(self.piston, cross, strict=True)):
+            total = self.local[c][c] - own * (2 * crossed + inverse[:, -1:, -1:] * own)
             for index, (i, j) in enumerate(_pairs_of(len(columns.blocks))):
                 total = total - self.scaled[i][c] * self.scaled[j][c] * maps[:, index, ...]
             variance.append(total)
         variance[0] = variance[0] - 1 / (info.scale * constants.n_points)
         # Where the frames show nothing, rounding decides even the sign.
-        return [xp.where(one >= 0, one, constants.kind.array(np.inf)) for one in variance]
+        return [xp.where(values >= 0, values, constants.kind.array(np.inf)) for values in variance]
 
     def _expand(self, weights: NDArray) -> list[NDArray]:
         """Sum of the columns times the inverse of the diagonal: (k, 4 r + 1) to a list of maps."""
         constants = self.information.constants
-        total = [weights[:, -1:, np.newaxis] * one for one in self.piston]
-        for one, block, span in zip(self.scaled, constants.columns.blocks, constants.columns.spans, strict=True):
+        total = [weights[:, -1:, np.newaxis] * column for column in self.piston]
+        for maps, block, span in zip(self.scaled, constants.columns.blocks, constants.columns.spans, strict=True):
             wave = constants.inner.expand(weights[:, span] @ block.T, constants.kind.xp)
-            _accumulate(total, [new * wave for new in one])
+            _accumulate(total, [values * wave for values in maps])
         return total
 
 
@@ -379,9 +389,9 @@ def _pairs_of(n: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(n) for j in range(i, n)]
 
 
-def _dot(left: list[NDArray], right: list[NDArray]) -> NDArray:
+def _dot(first: list[NDArray], second: list[NDArray]) -> NDArray:
     """Sum over the unknowns of a point."""
-    return reduce(add, map(mul, left, right))
+    return reduce(add, map(mul, first, second))
 
 
 def _accumulate(totals: list[Any], terms: list[Any]) -> None:

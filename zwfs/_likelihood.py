@@ -32,7 +32,7 @@ class Noise:
     Attributes
     ----------
     photons : float or None
-        Photons that an intensity of 1 puts into a pixel of each frame. None stands for an unknown variance that is
+        Photons per pupil point and image. None stands for an unknown variance that is
         the same in all pixels: ordinary least squares.
     read_noise : float, electrons rms / pixel
     recorded : ndarray of bool, shape (ny', nx'), or None
@@ -64,7 +64,8 @@ class Noise:
     def weights(self, light: NDArray) -> NDArray | None:
         """Inverse variance of frames whose mean is `light`; None if it is the same in all pixels."""
         if self.photons is None:
-            return None if self.recorded is None else 0 * light + Kind.of(light).array(self.recorded)
+            kind = Kind.of(light)
+            return None if self.recorded is None else kind.xp.broadcast_to(kind.array(self.recorded), light.shape)
         weights = self.photons**2 / self.electrons(light)
         return weights if self.recorded is None else weights * Kind.of(light).array(self.recorded)
 
@@ -85,9 +86,9 @@ class Noise:
         if self.photons is None:
             difference = light - frames
             return xp.sum(difference * difference, axis=1)
-        expected, seen = self.electrons(light), self.electrons(frames)
-        best = xp.where(seen > 0, seen, 1.0)
-        return 2 * xp.sum(expected - seen + seen * xp.log(best / expected), axis=1)
+        expected, measured = self.electrons(light), self.electrons(frames)
+        best = xp.where(measured > 0, measured, 1.0)
+        return 2 * xp.sum(expected - measured + measured * xp.log(best / expected), axis=1)
 
     def misfit(self, light: NDArray, frames: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Sum of squared differences over the variance, its expectation, and the variance of the sum: (k,) each.
@@ -135,7 +136,7 @@ def tangents(
     modulus = xp.sqrt(square(psi))[:, np.newaxis, ...]
     dark = modulus == 0
     # The phase of a dark point is undefined: any direction will do.
-    flat = xp.stack([stop, 0 * stop])[np.newaxis, ...]
+    flat = xp.stack([stop, xp.zeros_like(stop)])[np.newaxis, ...]
     return xp.stack([turned, xp.where(dark, flat, psi / xp.where(dark, modulus + 1, modulus))], axis=1)
 
 
@@ -156,7 +157,7 @@ def require_information(sensor: Sensor, unknown_amplitude: bool) -> None:
         raise ValueError("sensor: none of its masks changes the light: expected at least one that does")
     different: list[NDArray] = []
     for core in cores:
-        if all(np.linalg.norm(core - other) > _DISTINCT * strongest for other in different):
+        if all(np.linalg.norm(core - earlier) > _DISTINCT * strongest for earlier in different):
             different.append(core)
     if unknown_amplitude and len(different) < 3:
         raise ValueError(

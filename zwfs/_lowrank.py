@@ -104,17 +104,17 @@ class Plane(Immutable):
         """The same functions in another library, precision or device."""
         return Plane(*(kind.array(array) for array in (self.along_y, self.along_x, self.combine)))
 
-    def products(self, other: Plane, weight: NDArray) -> NDArray:
+    def products(self, partner: Plane, weight: NDArray) -> NDArray:
         """Weighted inner products of these functions with those of another plane on the same grid, (r, r')."""
         along_y, along_x = (
             (mine[:, np.newaxis] * others).reshape(-1, mine.shape[1])
-            for mine, others in ((self.along_y, other.along_y), (self.along_x, other.along_x))
+            for mine, others in ((self.along_y, partner.along_y), (self.along_x, partner.along_x))
         )
         pairs = (along_y @ weight @ along_x.T).reshape(
-            len(self.along_y), len(other.along_y), len(self.along_x), len(other.along_x)
+            len(self.along_y), len(partner.along_y), len(self.along_x), len(partner.along_x)
         )
-        pairs = pairs.transpose(0, 2, 1, 3).reshape(len(self.combine), len(other.combine))
-        return self.combine.T @ pairs @ other.combine
+        pairs = pairs.transpose(0, 2, 1, 3).reshape(len(self.combine), len(partner.combine))
+        return self.combine.T @ pairs @ partner.combine
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,8 +215,6 @@ def factorise(
     detector_axes: tuple[NDArray, NDArray],
     pixel_area: float,
     tolerance: float,
-    *,
-    rim: bool = False,
 ) -> Factors:
     """Factors of the reference-wave operators of several masks, with functions common to all of them.
 
@@ -230,8 +228,6 @@ def factorise(
         Coordinates y of the rows and x of the columns.
     pixel_area : float, D^2
     tolerance : float
-    rim : bool
-        Factors of the derivatives with respect to the diameters instead; the masks are dimples (`eq-rim`).
 
     Returns
     -------
@@ -254,46 +250,44 @@ def factorise(
     same = all(map(np.array_equal, pupil_axes, detector_axes))
     to_detector = from_pupil if same else along(detector_axes)
 
-    nodes = _rim if rim else _quadrature
-
     @cache
     def disc(diameter: float) -> NDArray[np.float64]:
         """Core of a dimple that adds 1 to the transmission: half of the nodes, as opposite ones are conjugate."""
-        u, v, weights = nodes(Dimple(diameter, 0.0), reach, tolerance)
+        u, v, weights = _quadrature(Dimple(diameter, 0.0), reach, tolerance)
         half = np.flatnonzero(np.cos(1) * u + np.sin(1) * v > 0)  # 1 rad from u: no node lies on the border
         total: Any = 0
-        for some in (half[first : first + _NODES] for first in range(0, half.size, _NODES)):
-            spectra = _spectra(from_pupil, u[some], v[some])
-            seen = spectra if same else _spectra(to_detector, u[some], v[some])
-            strength = 2 * pixel_area * weights[some]
-            total = total + (seen.real * strength) @ spectra.real.T + (seen.imag * strength) @ spectra.imag.T
+        for part in (half[first : first + _NODES] for first in range(0, half.size, _NODES)):
+            spectra = _spectra(from_pupil, u[part], v[part])
+            onto = spectra if same else _spectra(to_detector, u[part], v[part])
+            strength = 2 * pixel_area * weights[part]
+            total = total + (onto.real * strength) @ spectra.real.T + (onto.imag * strength) @ spectra.imag.T
         return total
 
     def core_of(index: int, refinement: float = 1.0) -> NDArray[np.complex128]:
-        if type(masks[index]) is Dimple:  # the same everywhere on the mask
+        if _is_uniform(masks[index]):
             change = _transmission(index, masks[index], np.zeros(1), np.zeros(1)) - 1
             return change * disc(masks[index].diameter)
-        u, v, weights = nodes(masks[index], reach, tolerance, refinement)
+        u, v, weights = _quadrature(masks[index], reach, tolerance, refinement)
         change = pixel_area * weights * (_transmission(index, masks[index], u, v) - 1)
         total: Any = 0
-        for some in (slice(first, first + _NODES) for first in range(0, u.size, _NODES)):
-            spectra = _spectra(from_pupil, u[some], v[some])
-            seen = spectra if same else _spectra(to_detector, u[some], v[some])
-            total = total + seen.conj() * change[some] @ spectra.T
+        for part in (slice(first, first + _NODES) for first in range(0, u.size, _NODES)):
+            spectra = _spectra(from_pupil, u[part], v[part])
+            onto = spectra if same else _spectra(to_detector, u[part], v[part])
+            total = total + onto.conj() * change[part] @ spectra.T
         return total
 
     core = np.array([core_of(index) for index in range(len(masks))])
-    varied = [index for index, mask in enumerate(masks) if not isinstance(mask, Dimple)]
+    varied = [index for index, mask in enumerate(masks) if not _is_uniform(mask)]
     if varied:  # the nodes are enough for a uniform mask
-        strongest = max(float(np.linalg.norm(one, 2)) for one in core)
+        strongest = max(float(np.linalg.norm(response, 2)) for response in core)
         for index in varied:
             error = float(np.linalg.norm(core_of(index, 1.5) - core[index], 2))
             if error > max(tolerance * strongest, _ROUNDING):
                 _warn_of_quadrature(index, masks[index], error / strongest, tolerance)
-    left, core, right = _compress(core, tolerance)
+    combine_out, core, combine_in = _compress(core, tolerance)
     pupil, detector = (
         Plane(along_y, along_x, combine)
-        for ((along_y, _), (along_x, _)), combine in ((from_pupil, right), (to_detector, left))
+        for ((along_y, _), (along_x, _)), combine in ((from_pupil, combine_in), (to_detector, combine_out))
     )
     return Factors(pupil, detector, core)
 
@@ -326,6 +320,11 @@ def _check_mask(index: int, mask: Mask, n_pixels: float, axes: Sequence[NDArray]
             f"{np.ptp(axes[-1]):.3g} D wide: expected a smaller mask or a smaller extent, for which the factors "
             "are small"
         )
+
+
+def _is_uniform(mask: Mask) -> bool:
+    """Whether the transmission is the same everywhere on a mask: a dimple, but no subclass with its own."""
+    return getattr(type(mask), "transmission", None) is Dimple.transmission
 
 
 def _transmission(index: int, mask: Mask, u: NDArray, v: NDArray) -> NDArray[np.complex128]:
@@ -372,7 +371,7 @@ def _quadrature(
     asked = max(mask.n_samples + mask.n_samples % 2, _OUTLINED * any(map(callable, mask.breaks)))
     n_angles = max(_bandwidth(np.pi * mask.diameter * reach, tolerance), asked)
     n_angles = 2 * round(n_angles * refinement / 2)
-    unit, unit_weights = (one[:, np.newaxis] for one in gauss_legendre(n_angles // 2))
+    unit, unit_weights = (column[:, np.newaxis] for column in gauss_legendre(n_angles // 2))
     angle = 2 * np.pi * np.arange(n_angles) / n_angles
     edges = _radii(mask, angle)[:, np.newaxis]
     low, high = edges[:-1], edges[1:]
@@ -385,8 +384,10 @@ def _quadrature(
 def _radii(mask: Mask, angle: NDArray) -> NDArray[np.float64]:
     """Radii of the centre, the breaks and the rim of a mask at angles: (n,) to (n_breaks + 2, n), in order."""
     widths = [np.zeros(angle.shape)]
-    for index, one in enumerate(mask.breaks):
-        widths.append(_width(f"breaks[{index}]", one, angle, mask.diameter) if callable(one) else one + widths[0])
+    for index, edge in enumerate(mask.breaks):
+        widths.append(
+            _width(f"breaks[{index}]", edge, angle, mask.diameter) if callable(edge) else edge + widths[0]
+        )
     return np.sort([*widths, mask.diameter + widths[0]], axis=0) / 2
 
 
@@ -438,11 +439,11 @@ def _compress(core: NDArray[np.complex128], tolerance: float) -> tuple[NDArray, 
     the tolerance are dropped each time.
     """
     parts = np.concatenate([core.real, core.imag])
-    left, strength, _ = np.linalg.svd(np.concatenate(list(parts), axis=1), full_matrices=False)
-    left = np.ascontiguousarray(left[:, : _rank(strength, tolerance)])
-    _, strength, right = np.linalg.svd(np.concatenate(list(left.T @ parts)), full_matrices=False)
-    right = right[: _rank(strength, tolerance)].T
-    return left, left.T @ core @ right, right
+    outputs, strength, _ = np.linalg.svd(np.concatenate(list(parts), axis=1), full_matrices=False)
+    outputs = np.ascontiguousarray(outputs[:, : _rank(strength, tolerance)])
+    _, strength, inputs = np.linalg.svd(np.concatenate(list(outputs.T @ parts)), full_matrices=False)
+    inputs = inputs[: _rank(strength, tolerance)].T
+    return outputs, outputs.T @ core @ inputs, inputs
 
 
 def _rank(strength: NDArray, tolerance: float) -> int:

@@ -51,7 +51,7 @@ class Channels(NamedTuple):
 ONE_WAVELENGTH = Channels()
 
 
-class Optics(Protocol):
+class SensorParts(Protocol):
     """Parts of a sensor from which its model is made."""
 
     @property
@@ -83,7 +83,7 @@ class Propagator:
     channels: Channels
 
     @classmethod
-    def of(cls, sensor: Optics, kind: Kind) -> Propagator:
+    def of(cls, sensor: SensorParts, kind: Kind) -> Propagator:
         """Convert the factors of a sensor and the maps of its pupil."""
         pupil = sensor.pupil
         stop = read_only(kind.array(pupil.inside))
@@ -96,7 +96,7 @@ class Propagator:
             stop=stop,
             no_data=read_only(kind.array(np.where(pupil.inside, 0, np.nan))),
             amplitude=stop,
-            flat=read_only(kind.xp.stack((stop, 0 * stop))[np.newaxis, ...]),
+            flat=read_only(kind.xp.stack((stop, kind.xp.zeros_like(stop)))[np.newaxis, ...]),
             channels=sensor.channels,
         )
         return model.with_amplitude(pupil.amplitude)
@@ -146,12 +146,12 @@ class Propagator:
 
 
 @per_kind
-def propagator(sensor: Optics, kind: Kind) -> Propagator:
+def propagator(sensor: SensorParts, kind: Kind) -> Propagator:
     """Return the model of a sensor for arrays of one kind."""
     return Propagator.of(sensor, kind)
 
 
-def pupil_maps(name: str, maps: ArrayLike, sensor: Optics) -> tuple[NDArray[np.floating], tuple[int, ...]]:
+def pupil_maps(name: str, maps: ArrayLike, sensor: SensorParts) -> tuple[NDArray[np.floating], tuple[int, ...]]:
     """Return checked real maps, (k, ny, nx) with 0 outside the pupil, and the shape of their batch."""
     shape = sensor.pupil.shape
     maps = _check.real_any(name, maps)
@@ -166,7 +166,7 @@ def pupil_maps(name: str, maps: ArrayLike, sensor: Optics) -> tuple[NDArray[np.f
 
 
 def amplitude_maps(
-    amplitude: ArrayLike | None, sensor: Optics, kind: Kind
+    amplitude: ArrayLike | None, sensor: SensorParts, kind: Kind
 ) -> tuple[NDArray[np.floating], tuple[int, ...]]:
     """Return checked amplitudes, (k, ny, nx) with 0 outside, and the shape of their batch; None: the pupil's."""
     if amplitude is None:
@@ -182,7 +182,7 @@ def amplitude_maps(
     return maps, batch
 
 
-def amplitude_map(amplitude: ArrayLike | None, sensor: Optics) -> NDArray[np.float64]:
+def amplitude_map(amplitude: ArrayLike | None, sensor: SensorParts) -> NDArray[np.float64]:
     """Return one checked amplitude, (ny, nx) with 0 outside, of a moderate brightness; None: the pupil's."""
     maps, batch = amplitude_maps(amplitude, sensor, Kind.numpy())
     if batch:
@@ -267,7 +267,7 @@ def unit(field: NDArray, modulus: NDArray, xp: Any, before: NDArray | None = Non
 def count(points: NDArray[np.bool_], kind: Kind) -> NDArray[np.int64]:
     """Number of points that are true in each map: (k, ny, nx) to (k,)."""
     if kind.xp is np:  # along an axis NumPy turns all of them into integers first
-        return np.array([np.count_nonzero(one) for one in points])
+        return np.array([np.count_nonzero(flags) for flags in points])
     return kind.xp.sum(kind.xp.astype(points, kind.xp.int64), axis=(-2, -1))
 
 

@@ -122,15 +122,15 @@ def _plain(name: str, value: Any) -> Iterator[tuple[str, bool | int | float | st
     if isinstance(value, _PLAIN):
         yield name, value
     elif isinstance(value, dict):
-        for key, one in value.items():
-            yield from _plain(f"{name} {key}", one)
+        for key, item in value.items():
+            yield from _plain(f"{name} {key}", item)
     elif is_dataclass(value) or hasattr(value, "_fields"):
         keys = value._fields if hasattr(value, "_fields") else [field.name for field in fields(value)]
         for key in keys:
             yield from _plain(f"{name} {key}", getattr(value, key))
     elif isinstance(value, Sequence):
-        for index, one in enumerate(value):
-            yield from _plain(f"{name} {index}", one)
+        for index, item in enumerate(value):
+            yield from _plain(f"{name} {index}", item)
 
 
 def _npz(arrays: dict[str, NDArray], values: dict[str, Any]) -> bytes:
@@ -146,7 +146,7 @@ def _fits(arrays: dict[str, NDArray], values: dict[str, Any]) -> bytes:
     first = next(names)
     cards = [
         ("EXTNAME", first.upper(), ""),
-        *((f"HIERARCH {name.upper()}", one, "") for name, one in values.items()),
+        *((f"HIERARCH {name.upper()}", value, "") for name, value in values.items()),
     ]
     others = [(_image(arrays[name]), name.upper(), ()) for name in names]
     return fits_content((_image(arrays[first]), "", cards), *others)

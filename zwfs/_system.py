@@ -56,7 +56,7 @@ def path_of(name: str, value: Any) -> Path:
 def paths_of(name: str, values: Any) -> list[Path]:
     """Paths that the operating system accepts, from a sequence of them."""
     _check.sequence(name, values, expected="a sequence of paths")
-    return [path_of(f"{name}[{index}]", one) for index, one in enumerate(values)]
+    return [path_of(f"{name}[{index}]", path) for index, path in enumerate(values)]
 
 
 def is_there(path: Path) -> bool:

@@ -37,7 +37,7 @@ def cramer_rao(
     phase : array_like, shape (..., ny, nx), radian
         True phase; only the points of the pupil count.
     photons : float
-        Photons that an intensity of 1 puts into a pixel of each frame: `Detector.photons_per_pixel`.
+        Photons per pupil point and image, `Detector.photons`.
     read_noise : float, electrons rms / pixel
     modes : array_like, shape (n_modes, ny, nx), optional
         Modes whose coefficients are estimated; the phases of all points if left out.
@@ -89,8 +89,8 @@ def cramer_rao(
     if amplitude is not None:
         model = model.with_amplitude(amplitude_map(amplitude, sensor))
     sigma = []
-    for one in maps.astype(np.float64):  # one at a time: the memory does not grow with the batch
-        psi = model.incoming(one[np.newaxis])
+    for single in maps.astype(np.float64):  # one at a time: the memory does not grow with the batch
+        psi = model.incoming(single[np.newaxis])
         points, coefficients = estimator.variance(psi, model.propagate(psi))
         sigma.append(np.sqrt(points[0, 0] if coefficients is None else coefficients[0]))
     result = np.array(sigma)

@@ -1,4 +1,4 @@
-"""Closed loops: any sensor, a mirror of influence functions, an integrator, and the drift that a loop holds."""
+"""Closed loops: any sensor, a mirror of influence functions, and an integrator."""
 
 from __future__ import annotations
 
@@ -13,17 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Immutable, read_only
-from zwfs._results import Result
-from zwfs.bounds import cramer_rao
 from zwfs.detector import Detector
 from zwfs.metrics import strehl, without_piston
-from zwfs.polychromatic import PolychromaticSensor
 from zwfs.pupil import Pupil
-from zwfs.sensor import ZernikeSensor
 
 _LONGEST_DELAY = 1000  # cycles: beyond it only a gain below 0.0016 is stable
-_FASTEST = 1e12  # pm / cycle: a metre
-_LOWEST_GAIN = 1e-9
 
 
 class Mirror(Immutable):
@@ -156,15 +150,15 @@ class LoopRecord:
         Of the residual.
     commands : ndarray, shape (n_screens, n_cycles, n_actuators)
         Of the mirror during each cycle.
-    photons : ndarray, shape (n_screens, n_cycles)
-        Electrons in all frames of a cycle; NaN without a camera.
+    electrons : ndarray, shape (n_screens, n_cycles)
+        In all frames of a cycle; NaN without a camera.
     """
 
     open_loop: NDArray[np.float64]
     residual: NDArray[np.float64]
     strehl: NDArray[np.float64]
     commands: NDArray[np.float64]
-    photons: NDArray[np.float64]
+    electrons: NDArray[np.float64]
 
     def __post_init__(self) -> None:
         cycles: tuple[int | str, ...] = "n_screens", "n_cycles"
@@ -262,143 +256,26 @@ def close_loop(
             n = len(screens)
             figures.extend([(np.zeros((n, pupil.n_points)), np.zeros((n, mirror.n_actuators)))] * delay)
         figure, commands = figures[0]
-        left = pupil.scatter(screens - figure, fill=0)
-        frames, photons = plant.measure(left), np.full(len(screens), np.nan)
+        residual = pupil.scatter(screens - figure, fill=0)
+        frames, electrons = plant.measure(residual), np.full(len(screens), np.nan)
         if camera is not None:
             counts = camera.expose(frames, rng)
-            photons = counts.sum(axis=(-3, -2, -1)) * (camera.gain or 1.0)
+            electrons = counts.sum(axis=(-3, -2, -1))
             frames = camera.normalise(counts)
-        rows.append((screens.std(axis=-1), pupil.rms(left), strehl(pupil, left), commands, photons))
-        found = np.zeros(screens.shape)
+        rows.append((screens.std(axis=-1), pupil.rms(residual), strehl(pupil, residual), commands, electrons))
+        measured = np.zeros(screens.shape)
         # A frame without a photon holds no information: the mirror keeps its shape.
-        seen = (frames.max(axis=(-2, -1)) > 0).all(axis=-1)
-        if seen.any():
-            found[seen] = without_piston(pupil.gather(reconstructor(frames[seen]).phase))
-        step, (figure, commands) = gain * (found @ mirror.inverse), figures[-1]
+        lit = (frames.max(axis=(-2, -1)) > 0).all(axis=-1)
+        if lit.any():
+            measured[lit] = without_piston(pupil.gather(reconstructor(frames[lit]).phase))
+        step, (figure, commands) = gain * (measured @ mirror.inverse), figures[-1]
         figure = (1 - leak) * figure + step @ mirror.influence
         excess = np.maximum(figure.std(axis=-1, keepdims=True) / stroke, 1)
         figures.append((figure / excess, ((1 - leak) * commands + step) / excess))
         figures.popleft()
-    return LoopRecord(*(np.stack(column, axis=1) for column in zip(*rows, strict=True)))
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class HeldDrift(Result):
-    """Residual of an integrator that holds a drift, per mode: see `hold_drift`.
-
-    Attributes
-    ----------
-    gain : ndarray, shape (n_modes,)
-    lag : ndarray, shape (n_modes,), pm rms
-        Share of the drift.
-    noise : ndarray, shape (n_modes,), pm rms
-        Share of the photon noise.
-    """
-
-    panels = (("gain", "gain"), ("lag", "lag (pm rms)"), ("noise", "noise (pm rms)"))
-    gain: NDArray[np.float64]
-    lag: NDArray[np.float64]
-    noise: NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        shape: tuple[int | str, ...] = ("n_modes",)
-        for name, values in vars(self).items():
-            _check.array_of(name, values, "real floating", shape)
-            shape = values.shape
-
-    @property
-    def residual(self) -> float:
-        """Rms of the wavefront, all modes together, pm."""
-        return float(np.sqrt(np.sum(self.lag**2 + self.noise**2)))
-
-
-def hold_drift(
-    sensor: ZernikeSensor | PolychromaticSensor,
-    modes: ArrayLike,
-    *,
-    drift: float,
-    photons: float,
-    wavelength: float,
-    speed: float = 0.0,
-    gain: float | None = None,
-    phase: ArrayLike | None = None,
-) -> HeldDrift:
-    """Return the residual at which an integrator holds a drift, as in the maintenance of a dark zone.
-
-    In each cycle every mode moves by a random step of rms w and by a constant step v. The sensor measures the
-    residual r with an error of rms s, the Cramer-Rao bound of `cramer_rao` for the photons of one cycle, and the
-    mirror corrects g times that in the next cycle: r' = (1 - g) r + step - g error. The steady state has
-
-        mean square of r = (v / g)^2 + w^2 / (g (2 - g)) + g s^2 / (2 - g).
-
-    The first two terms are the lag, the last one is the noise. Without a constant drift the best gain solves
-    g^2 + q g - q = 0 with q = w^2 / s^2. The residual is then the smallest of all integrators on this sensor: no
-    unbiased reconstruction of the frames of one cycle has an error below the bound. The modes are taken to be
-    independent, and the mirror to make exactly these modes.
-
-    Parameters
-    ----------
-    sensor : ZernikeSensor or PolychromaticSensor
-    modes : array_like, shape (n_modes, ny, nx)
-        Modes that drift, of unit rms to 1 % and nearly orthogonal, as those of `zernike_basis`.
-    drift : float, pm rms / cycle
-        Random step of the wavefront, all modes together, divided equally among them; at most 1e12, a metre.
-    photons : float, photons / cycle
-        Detected within the pupil with the mask out, divided equally among the masks.
-    wavelength : float, nm
-        At which the phase is in radian: that of the sensor, or its reference wavelength.
-    speed : float, pm rms / cycle
-        Constant step of the wavefront, divided equally among the modes; at most 1e12.
-    gain : float, optional
-        In [1e-9, 2), the same for all modes. If left out, the one that is best for the random drift of each mode.
-    phase : array_like, shape (ny, nx), radian, optional
-        Static wavefront around which the loop works; flat if left out.
-
-    Returns
-    -------
-    HeldDrift
-
-    Raises
-    ------
-    ValueError
-        If there is neither a gain nor a random drift.
-
-    Examples
-    --------
-    >>> import numpy as np, zwfs
-    >>> pupil = zwfs.Pupil.circular(32)
-    >>> sensor = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
-    >>> held = zwfs.hold_drift(sensor, zwfs.zernike_basis(pupil, 20), drift=5.0, photons=1e9, wavelength=635.0)
-    >>> round(held.residual, 1)  # pm rms
-    8.4
-    """
-    _check.instance("sensor", sensor, ZernikeSensor, PolychromaticSensor)
-    rms = _check.modes("modes", modes, sensor.pupil).std(axis=1)
-    if np.abs(rms - 1).max() > 0.01:
-        raise ValueError(f"modes have an rms from {rms.min():.3g} to {rms.max():.3g}: expected unit rms")
-    drift = _check.number("drift", drift, 0, _FASTEST)
-    photons = _check.number("photons", photons, 1e-6)
-    wavelength = _check.wavelength(wavelength)
-    speed = _check.number("speed", speed, 0, _FASTEST)
-    if gain is None and not drift:
-        raise ValueError("gain = None: expected a gain, since drift = 0 has no best one")
-    around = np.zeros(sensor.pupil.shape) if phase is None else _check.map_inside("phase", phase, sensor.pupil)
-    per_point = photons / (sensor.n_masks * sensor.pupil.n_points)
-    sigma = cramer_rao(sensor, around, photons=per_point, modes=modes) * (1e3 * wavelength / (2 * np.pi))
-    step, constant = drift / math.sqrt(sigma.size), speed / math.sqrt(sigma.size)
-    if gain is None:
-        gains = _best_gains(step, sigma)
-        if gains.min() < _LOWEST_GAIN:
-            raise ValueError(f"drift = {drift:g}: expected more or a gain, as its best one is {gains.min():.1g}")
-    else:
-        gains = np.full(sigma.size, _check.number("gain", gain, _LOWEST_GAIN, 2, open_high=True))
-    lag = np.sqrt((constant / gains) ** 2 + step**2 / (gains * (2 - gains)))
-    return HeldDrift(gains, lag, sigma * np.sqrt(gains / (2 - gains)))
-
-
-def _best_gains(step: float, noise: ArrayLike) -> NDArray[np.float64]:
-    """Gain of the smallest residual: g^2 + q g - q = 0, where q is the step over the noise, both squared."""
-    return 2 * step / (step + np.hypot(step, 2 * np.asarray(noise)))
+    names = "open_loop", "residual", "strehl", "commands", "electrons"
+    columns = (np.stack(column, axis=1) for column in zip(*rows, strict=True))
+    return LoopRecord(**dict(zip(names, columns, strict=True)))
 
 
 def _checked_screens(disturbance: Any, pupil: Pupil) -> Iterator[NDArray[np.float64]]:

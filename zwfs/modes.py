@@ -35,9 +35,7 @@ def noll_to_nm(j: int) -> tuple[int, int]:
     return n, m if j % 2 == 0 else -m
 
 
-def zernike_basis(
-    pupil: Pupil, n_modes: int, *, orthonormal: bool | None = None, dtype: type = np.float64
-) -> NDArray[np.floating]:
+def zernike_basis(pupil: Pupil, n_modes: int, *, orthonormal: bool | None = None) -> NDArray[np.float64]:
     """Zernike modes on a pupil: Noll 2 to `n_modes` + 1.
 
     The radial part comes from the three-term recurrence of the Jacobi polynomials, the angular part from powers
@@ -51,7 +49,6 @@ def zernike_basis(
     orthonormal : bool, optional
         Make the modes orthonormal over the sampled pupil (Gram-Schmidt in Noll's order, piston first). On an
         obscured or segmented pupil the plain modes are not. The default is True for a measured pupil, see `Pupil`.
-    dtype : float32 or float64
 
     Returns
     -------
@@ -78,7 +75,6 @@ def zernike_basis(
     _check.instance("pupil", pupil, Pupil)
     n_modes = _check.count("n_modes", n_modes, pupil.amplitude.size)
     orthonormal = pupil.measured if orthonormal is None else _check.flag("orthonormal", orthonormal)
-    checked_dtype = _check.float_dtype("dtype", dtype)
     if n_modes >= pupil.n_points:
         raise ValueError(
             f"n_modes = {n_modes}: expected fewer modes than the {pupil.n_points} points of the pupil"
@@ -99,7 +95,7 @@ def zernike_basis(
         raise ValueError(
             f"n_modes = {n_modes}: the modes are not independent on the {pupil.n_points} points of the pupil"
         )
-    return pupil.scatter((values / scale).astype(checked_dtype), fill=0.0)
+    return pupil.scatter(values / scale, fill=0.0)
 
 
 def power_law_screens(

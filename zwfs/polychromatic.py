@@ -148,13 +148,11 @@ class PolychromaticSensor(Sensor):
             f"{high:g}, {shifts})"
         )
 
-    def _factorise(self, *, rim: bool = False) -> Factors:
+    def _factorise(self) -> Factors:
         ratios = self.channels.ratios
         masks = [_at(mask, ratio, self.chromatic) for mask in self.masks for ratio in ratios]
-        factors = factorise(masks, *self._axes(), self.pupil.n_pixels**-2.0, self.tolerance, rim=rim)
+        factors = factorise(masks, *self._axes(), self.pupil.n_pixels**-2.0, self.tolerance)
         core = factors.core.reshape(self.n_masks, len(ratios), *factors.core.shape[1:])
-        if rim:  # the diameter at each wavelength is that at the reference wavelength times the ratio
-            core = core * np.array(ratios)[:, np.newaxis, np.newaxis]
         return Factors(factors.pupil, factors.detector, core)
 
     def with_tolerance(self, tolerance: float) -> PolychromaticSensor:
@@ -214,7 +212,9 @@ class _Scaled:
 
     @property
     def breaks(self) -> tuple[float | Outline, ...]:
-        return tuple(self._wider(one) if callable(one) else one * self.ratio for one in self.mask.breaks)
+        return tuple(
+            self._wider(outline) if callable(outline) else outline * self.ratio for outline in self.mask.breaks
+        )
 
     @property
     def n_samples(self) -> int:

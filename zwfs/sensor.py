@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from functools import cached_property
 from math import prod
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
-from zwfs._arrays import Immutable, Kind, per_kind, read_only
-from zwfs._lowrank import Factors, Operator, factorise
+from zwfs._arrays import Immutable, Kind, is_jax, read_only
+from zwfs._lowrank import Factors, factorise
 from zwfs._propagator import (
     ONE_WAVELENGTH,
     Channels,
@@ -24,7 +23,7 @@ from zwfs._propagator import (
     square,
     warn_of_degrees,
 )
-from zwfs.masks import Dimple, Mask
+from zwfs.masks import Mask
 from zwfs.pupil import Pupil
 
 _MOST_PIXELS = 2**14  # across the detector: a frame of them takes 2 GiB
@@ -101,12 +100,17 @@ class Sensor(Immutable):
         Warns
         -----
         UserWarning
-            If the rms of a phase is above 20 rad: it may be in degrees or nanometres.
+            If the rms of a phase is above 20 rad: it may be in degrees or nanometres. If JAX makes every array
+            float32, with an error of the frames of about 1e-6.
 
         References
         ----------
         Chambouleyron et al. 2024, equation (5).
         """
+        if is_jax(phase) or is_jax(amplitude):
+            from zwfs import _jax
+
+            return _jax.measure(self, phase, amplitude)
         maps, batch = pupil_maps("phase", phase, self)
         kind = Kind.of(maps)
         warn_of_degrees(maps, self.pupil, stacklevel=3)
@@ -115,7 +119,9 @@ class Sensor(Immutable):
             xp, shape = kind.xp, self.pupil.shape
             maps, strength = xp.reshape(maps, (*batch, *shape)), xp.reshape(strength, (*strength_batch, *shape))
             full = _check.broadcast(phase=maps, amplitude=strength)
-            maps, strength = (xp.reshape(xp.broadcast_to(one, full), (-1, *shape)) for one in (maps, strength))
+            maps, strength = (
+                xp.reshape(xp.broadcast_to(values, full), (-1, *shape)) for values in (maps, strength)
+            )
             batch = full[:-2]
         model = propagator(self, kind)
         frames = square(model.propagate(model.incoming(maps, strength)))
@@ -139,11 +145,11 @@ class Sensor(Immutable):
         """
         maps, batch = pupil_maps("phase", phase, self)
         kind = Kind.of(maps)
-        changes, other = pupil_maps(
+        changes, change_batch = pupil_maps(
             "change", _check.in_kind("change", _check.real_any("change", change), kind), self
         )
-        if other != batch:
-            raise ValueError(f"change has shape {(*other, *self.pupil.shape)}: expected that of phase")
+        if change_batch != batch:
+            raise ValueError(f"change has shape {(*change_batch, *self.pupil.shape)}: expected that of phase")
         model, psi, waves = self._waves(maps)
         turned = along_phase(psi, self.channels.ratios, kind.xp) * changes[:, np.newaxis, ...]
         result = 2 * parts_sum(waves * model.propagate(turned))
@@ -177,49 +183,9 @@ class Sensor(Immutable):
         gradient = 2 * parts_sum(along_phase(psi, self.channels.ratios, kind.xp) * back)
         return kind.xp.reshape(gradient, (*batch, *self.pupil.shape))
 
-    def diameter_derivative(self, phase: ArrayLike) -> NDArray[np.floating]:
-        """Change of the frames per change of the diameters of the dimples.
-
-        The derivative is analytical, and as accurate as the frames: the rim of a dimple is the only place at which
-        its transmission changes with the diameter, so the change of its reference wave is an integral around the
-        rim. The frame of a mask depends on the diameter of that mask only.
-
-        Parameters
-        ----------
-        phase : array_like, shape (..., ny, nx), radian
-
-        Returns
-        -------
-        ndarray, shape (..., n_masks, ny_detector, nx_detector), 1 / (lambda/D)
-
-        Raises
-        ------
-        TypeError
-            If a mask is not a `Dimple`.
-
-        References
-        ----------
-        `eq-rim` of the book.
-        """
-        for index, mask in enumerate(self.masks):
-            _check.instance(f"masks[{index}]", mask, Dimple)
-        maps, batch = pupil_maps("phase", phase, self)
-        model, psi, waves = self._waves(maps)
-        result = 2 * parts_sum(waves * self._rim(model.kind).split_reference(psi))
-        return model.kind.xp.reshape(result, (*batch, *result.shape[1:]))
-
     @abstractmethod
-    def _factorise(self, *, rim: bool = False) -> Factors:
-        """Factors of the reference waves, or of their derivatives with respect to the diameters of the dimples."""
-
-    @cached_property
-    def _rim_factors(self) -> Factors:
-        return self._factorise(rim=True)
-
-    @per_kind
-    def _rim(self, kind: Kind) -> Operator:
-        """Operator to the derivatives of the reference waves with respect to the diameters of the dimples."""
-        return Operator(self._rim_factors, self.window, kind)
+    def _factorise(self) -> Factors:
+        """Factors of the reference waves."""
 
     def _waves(self, maps: NDArray) -> tuple[Propagator, NDArray, NDArray]:
         """Model, and the fields of checked phases in the pupil and on the detector."""
@@ -239,7 +205,7 @@ class ZernikeSensor(Sensor):
 
     Fields and phases may be arrays of NumPy or of any library that follows the Python array API and lets arrays be
     changed in place, such as PyTorch and CuPy; results are of the same library and on the same device. Gradients
-    of PyTorch pass through all methods. JAX needs the function `zwfs.jax.measure`.
+    of PyTorch pass through all methods. Those of JAX pass through `measure`, also in `jax.jit` and `jax.vmap`.
 
     One mask makes the classic sensor, two make the phase-shifted one. Detector pixels are as large as pupil
     pixels and stand at the same places, so the detector of an extent of 1 D is the grid of the pupil.
@@ -305,8 +271,8 @@ class ZernikeSensor(Sensor):
         masks = ", ".join(map(repr, self.masks))
         return f"ZernikeSensor({self.pupil.n_points} points, {masks}, extent={self.extent:g}, rank={self.rank})"
 
-    def _factorise(self, *, rim: bool = False) -> Factors:
-        return factorise(self.masks, *self._axes(), self.pupil.n_pixels**-2.0, self.tolerance, rim=rim)
+    def _factorise(self) -> Factors:
+        return factorise(self.masks, *self._axes(), self.pupil.n_pixels**-2.0, self.tolerance)
 
     def with_tolerance(self, tolerance: float) -> ZernikeSensor:
         """Return the same sensor with another error of the reference wave."""

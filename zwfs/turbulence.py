@@ -1,4 +1,4 @@
-"""Phase screens and modes of turbulence, with the covariance of Kolmogorov or von Karman, and frozen flow."""
+"""Phase screens of turbulence, with the covariance of Kolmogorov or von Karman, and frozen flow."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from math import ceil, gamma, inf, pi, sqrt
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
-from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.special import kv
 
 from zwfs import _check
@@ -122,80 +121,6 @@ def turbulent_screens(
         screens[pair : pair + 2] = np.stack([field.real, field.imag]) + rng.standard_normal((2, 2)) @ places
     values = screens[:n_screens]
     return pupil.scatter(values - values.mean(axis=1, keepdims=True), fill=0.0)
-
-
-def karhunen_loeve_basis(
-    pupil: Pupil, n_modes: int, outer_scale: float = inf
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Karhunen-Loeve modes: the eigenvectors of the covariance of turbulence on the pupil, piston removed.
-
-    Their coefficients in a turbulent screen are uncorrelated. No other basis of `n_modes` modes describes more of
-    the turbulence.
-
-    Parameters
-    ----------
-    pupil : Pupil
-    n_modes : int
-        Number of modes, at most a quarter of the points of the pupil.
-    outer_scale : float, D
-        From 0.2 to 1e5; infinity for Kolmogorov's spectrum.
-
-    Returns
-    -------
-    modes : ndarray, shape (n_modes, ny, nx)
-        By falling variance, 0 outside. The modes are orthonormal over the points inside: zero mean, unit rms.
-    variances : ndarray, shape (n_modes,), radian^2
-        Of the coefficients for r0 = D; multiply by r0^(-5/3) for another r0.
-
-    References
-    ----------
-    Fried 1978, J. Opt. Soc. Am. 68, 1651; Roddier 1990, Opt. Eng. 29, 1174.
-
-    Examples
-    --------
-    >>> import zwfs
-    >>> from zwfs.turbulence import karhunen_loeve_basis
-    >>> modes, variances = karhunen_loeve_basis(zwfs.Pupil.circular(32), 20)
-    >>> modes.shape, variances[:3].round(2)  # the first two are tilts
-    ((20, 32, 32), array([0.45, 0.45, 0.02]))
-    """
-    _check.instance("pupil", pupil, Pupil)
-    n_modes, n_points = _check.count("n_modes", n_modes, pupil.amplitude.size), pupil.n_points
-    if 4 * n_modes > n_points:
-        raise ValueError(f"n_modes = {n_modes}: expected at most {n_points // 4}, a quarter of the pupil's points")
-    _, outer_scale = _scales(1.0, outer_scale, smallest=0.2)
-    n = [fft.next_fast_len(2 * length, real=True) for length in pupil.shape]
-    steps = [np.minimum(np.arange(m), m - np.arange(m)) / pupil.n_pixels for m in n]
-    kernel = -structure_function(np.hypot(steps[0][:, np.newaxis], steps[1]), 1.0, outer_scale) / 2
-    spectrum = fft.rfft2(kernel).real
-
-    def covariance(vector: NDArray) -> NDArray:
-        """Product of the covariance and a vector: without piston, -D / 2 is as good as the covariance."""
-        vector = vector.ravel() - vector.mean()
-        field = fft.irfft2(fft.rfft2(pupil.scatter(vector, fill=0), n) * spectrum, n)
-        product = field[: pupil.shape[0], : pupil.shape[1]].ravel()[pupil.indices]
-        return product - product.mean()
-
-    vectors, values = np.empty((n_points, 0)), np.empty(0)
-    start, other = np.random.default_rng(0).normal(size=(2, n_points))
-    # One run of Lanczos may miss one of two modes of equal variance: search what is left until nothing is larger.
-    for wanted in (n_modes, *[2] * n_modes):
-
-        def rest(vector: NDArray, known: NDArray = vectors) -> NDArray:
-            vector = vector.ravel() - known @ (known.T @ vector.ravel())
-            product = covariance(vector)
-            return product - known @ (known.T @ product)
-
-        found, new = eigsh(LinearOperator((n_points, n_points), rest, dtype=float), wanted, which="LA", v0=start)
-        complete = len(values) and found.max() <= np.sort(values)[-n_modes]
-        vectors, values = np.hstack([vectors, new]), np.append(values, found)
-        if complete:
-            break
-    order = np.argsort(-values, kind="stable")[:n_modes]
-    modes = vectors[:, order].T * sqrt(n_points)
-    # The sign of an eigenvector is free. The second one of two equal variances is orthogonal to the start.
-    modes *= np.sign(modes @ other)[:, np.newaxis]
-    return pupil.scatter(modes, fill=0.0), values[order] / n_points
 
 
 class FrozenFlow(Immutable):

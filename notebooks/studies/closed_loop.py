@@ -97,7 +97,7 @@ def follow_flow(
     sensor = reconstructor.sensor
     camera = None
     if photons is not None:
-        camera = Detector(sensor.pupil, photons / sensor.n_masks, read_noise=read_noise)
+        camera = Detector(photons / sensor.n_masks / sensor.pupil.n_points, read_noise=read_noise)
     times = np.arange(n_steps) / rate
     mirror = Mirror(sensor.pupil, modes)
     record = close_loop(plant or sensor, mirror, reconstructor, map(flow, times), camera=camera, **settings)

@@ -18,8 +18,9 @@ from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import OTHER_STYLES
 from studies.kit.tables import Table
+from zwfs.bounds import cramer_rao
 from zwfs.detector import Detector
-from zwfs.loop import Mirror, close_loop, hold_drift
+from zwfs.loop import Mirror, close_loop
 from zwfs.reconstructors import MaximumLikelihood
 from zwfs.sensor import ZernikeSensor
 
@@ -73,10 +74,11 @@ class DriftCurves:
 
 def errors_of_one_photon(sensors: Mapping[str, ZernikeSensor], drift: Drift) -> dict[str, NDArray[np.float64]]:
     """Cramer-Rao bound of each mode for one photon, pm rms: of each sensor by its name, and of an ideal one."""
-    bounds = {
-        name: hold_drift(sensor, drift.modes, drift=0, gain=1.0, photons=1.0, wavelength=drift.wavelength).noise
-        for name, sensor in sensors.items()
-    }
+    flat = np.zeros(drift.modes.shape[1:])
+    bounds = {}
+    for name, sensor in sensors.items():
+        photons = 1 / (sensor.n_masks * sensor.pupil.n_points)
+        bounds[name] = drift.scale * cramer_rao(sensor, flat, photons=photons, modes=drift.modes)
     return bounds | {IDEAL: np.full(len(drift.modes), drift.scale / 2)}
 
 
@@ -112,8 +114,8 @@ def simulate(sensor: ZernikeSensor, drift: Drift, photons: float, gains: Iterabl
     rng = np.random.default_rng(drift.seed)
     steps = rng.standard_normal((drift.n_cycles, drift.n_screens, n)) * drift.rms / drift.scale / np.sqrt(n)
     walks = np.tensordot(np.cumsum(steps, axis=0), drift.modes, 1)
-    camera, mirror = Detector(pupil, photons / sensor.n_masks), Mirror(pupil, drift.modes)
-    likely = MaximumLikelihood(sensor, drift.modes, photons=camera.photons_per_pixel, n_starts=1)
+    camera, mirror = Detector(photons / sensor.n_masks / pupil.n_points), Mirror(pupil, drift.modes)
+    likely = MaximumLikelihood(sensor, drift.modes, photons=camera.photons, n_starts=1)
     found = []
     for gain in gains:
         record = close_loop(sensor, mirror, likely, walks, gain=gain, camera=camera, seed=drift.seed)

@@ -105,7 +105,7 @@ class Camera(NamedTuple):
     def of(cls, known: Known, photons: float, n_images: int) -> Camera:
         """Return the camera with photons per point and image of two; one image gets those of both."""
         light = photons if n_images == 2 else 2 * photons / (1 + known.bench.flux_imbalance)
-        share = light * np.count_nonzero(known.bench.segments) / known.bench.photons
+        share = light * np.count_nonzero(known.bench.segments) / known.bench.photons_per_image
         return cls(dimmed(known.bench, light), share * known.dark, share, n_images)
 
     def shot(self, commands: NDArray, seed: np.random.SeedSequence | np.random.Generator) -> Shot:
@@ -144,9 +144,9 @@ def know_bench(bench: Bench, photons: float, poke: float, *, seed: int) -> Known
 def dimmed(bench: Bench, photons: float) -> Bench:
     """Return the bench with other exposures: photons per pixel of the pupil, and background and noise to match."""
     total = photons * np.count_nonzero(bench.segments)
-    share = total / bench.photons
+    share = total / bench.photons_per_image
     background, read_noise = share * bench.background, np.sqrt(share) * bench.read_noise
-    return replace(bench, photons=total, background=background, read_noise=read_noise)
+    return replace(bench, photons_per_image=total, background=background, read_noise=read_noise)
 
 
 def shots(known: Known, photons: float, commands: NDArray, seed: np.random.SeedSequence) -> list[Shot]:
@@ -207,7 +207,7 @@ def _errors(
 def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
     """Return the methods that know the design of the mask, the clear frames, and the response to pokes."""
     one, two, modes = known.model.classic, known.model.shifted, known.model.modes
-    share = photons * np.count_nonzero(known.bench.segments) / known.bench.photons
+    share = photons * np.count_nonzero(known.bench.segments) / known.bench.photons_per_image
     noise = np.sqrt(share) * known.noise  # of a pixel without light, as in `shots`
     # Of maximum likelihood, the first start explains the frames or no start does.
     return {

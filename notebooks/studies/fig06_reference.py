@@ -25,7 +25,7 @@ UNITS = {
     "dimple_error": "of the diameter",
     "static": "rad rms",
     "quilting": "rad rms",
-    "photons": "photons in an image",
+    "photons_per_image": "photons in an image",
     "read_noise": "electrons rms",
     "background": "electrons in a pixel",
 }

@@ -179,7 +179,7 @@ def noisy_frames(
     sensor: ZernikeSensor, phases: ArrayLike, amplitudes: ArrayLike, photons: float, seed: Any = 0
 ) -> NDArray[np.float64]:
     """Frames with photon noise, for a number of photons per point and image."""
-    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points)
+    camera = Detector(photons)
     return camera.normalise(camera.expose(sensor.measure(phases, amplitudes), seed))
 
 

@@ -144,7 +144,7 @@ def drawn_noise(
     sensor: ZernikeSensor, phase: NDArray, photons: float, n_draws: int, seed: int = 0
 ) -> tuple[float, float]:
     """Photon noise of the phase-shifted iteration on frames with drawn noise, and its standard error."""
-    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points)
+    camera = Detector(photons)
     frames = np.repeat(sensor.measure(phase)[np.newaxis], n_draws, axis=0)
     estimate = PhaseShifted(sensor)(camera.normalise(camera.expose(frames, seed)))
     power = photons * reconstruction_error(sensor.pupil, estimate.phase, phase) ** 2

@@ -154,7 +154,7 @@ def error_bars(
 
 def _noisy(sensor: ZernikeSensor, screens: NDArray, photons: float, seed: Any) -> NDArray[np.float64]:
     """Frames with photon noise, for a number of photons per point and image."""
-    camera = Detector(sensor.pupil, photons * sensor.pupil.n_points)
+    camera = Detector(photons)
     return camera.normalise(camera.expose(sensor.measure(screens), seed))
 
 

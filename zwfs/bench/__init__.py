@@ -6,7 +6,7 @@ from zwfs import _lazy
 
 if TYPE_CHECKING:
     from zwfs.bench.files import bench_error, write_bench
-    from zwfs.bench.model import Bench, BenchModel, segment_pistons, segment_residual, segment_screens
+    from zwfs.bench.model import Bench, BenchModel, segment_residual, segment_screens
 else:
     __getattr__, __dir__ = _lazy.offer(__name__)
 
@@ -14,7 +14,6 @@ __all__ = [
     "Bench",
     "BenchModel",
     "bench_error",
-    "segment_pistons",
     "segment_residual",
     "segment_screens",
     "write_bench",

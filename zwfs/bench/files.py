@@ -35,7 +35,7 @@ def write_bench(
     folder : str or Path
         It must exist. Files that `write_bench` wrote earlier are replaced.
     bench : Bench
-        With photons.
+        With a number of photons.
     pistons : as for `Bench.commanded_phase`, optional
         Flat if left out.
     wavelength : float, nm

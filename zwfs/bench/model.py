@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage, sparse
+from scipy import ndimage
 
 from zwfs import _check
 from zwfs._arrays import Immutable
@@ -28,7 +28,9 @@ from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
 
-_LATER = "focus", "astigmatism", "unmodulated", "coherent", "halo", "subpixels"
+__all__ = ["Bench", "BenchModel", "segment_residual", "segment_screens"]
+
+_NOISE = "photons_per_image", "read_noise", "background"
 _N_MODES = 200  # that random segment commands are made of
 _REACH = 6.0  # standard deviations of the blur
 _SIGNS = np.array([1, -1])[:, np.newaxis, np.newaxis]  # of the mask's phase shift for the two polarisations
@@ -45,9 +47,7 @@ def _error(size: float) -> Any:
 class Bench:
     """A vector-Zernike sensor with a segmented mirror, imperfect in ways that can be switched on one by one.
 
-    The first group of parameters is the layout, the second the errors: 0 is ideal for each of them. The last
-    group, from `focus` on, is 0 by default: effects that the real frames show, and the published figures
-    lack.
+    The first group of parameters is the layout, the second the errors: 0 is ideal for each of them.
 
     Parameters
     ----------
@@ -57,8 +57,8 @@ class Bench:
         Width of what the camera records of each pupil image, at most 10: 180 pixels of 136 on the real bench.
     n_rings, gap, missing, stop
         Layout of the segmented mirror, see `Pupil.hexagonal`. The defaults look like the real one: 37 segments,
-        5.5 across the stop, gaps of two pixels (those of the real mirror are narrower, which takes `subpixels`),
-        and one segment missing at the top right.
+        5.5 across the stop, gaps of two pixels (those of the real mirror are narrower), and one segment missing
+        at the top right.
     diameter : float, lambda/D
         Diameter of the dimple by design.
     phase : float, radian
@@ -88,7 +88,7 @@ class Bench:
     quilting : float, radian rms
         Grid that the actuators print on the surface of the deformable mirror; 22 of them across the pupil, as seen
         in the real frames. 6 nm at 635 nm is 0.06 rad.
-    photons : float, photons
+    photons_per_image : float
         Photons of each image with the mask out, in all the exposures that make a frame: a hundred of 1e8 each, for
         the high signal-to-noise ratio of the paper. 0 for frames without noise.
     read_noise : float, electrons rms
@@ -97,23 +97,6 @@ class Bench:
         Stray light and dark current of a pixel, 7 % of the light of one in the pupil; darks show it.
     seed : int
         Of the static aberration, which belongs to the bench.
-    focus : sequence of four floats
-        Distance from the pupil to the plane in focus in each image, times lambda / D^2, in addition to + and -
-        half of `focus_difference`: two frames, then two clear frames. The real ones differ by about 5e-4.
-    astigmatism : float
-        Difference of focus between light that is spread along x and along y, times lambda / D^2: + and - half of
-        it in the two images. On the real bench, 2e-4 to 6e-4.
-    unmodulated : float
-        Fraction of the light that the mask does not shift. It does not interfere, as in unpolarised light.
-    coherent : float
-        The same fraction for linearly polarised light, where it interferes in quadrature.
-    halo : float
-        Light of the neighbour in the middle of each image, over the mean of the pupil. It falls with the square of
-        the distance, and the neighbour stands to the right of the first image and to the left of the second one.
-    subpixels : int
-        Parts of a pixel along each side. The field of a pixel is the mean of its parts, so gaps below a pixel are
-        grey, and finer structure is lost. 1 for pixels that are open or closed; 8 resolves a gap of a fifth of a
-        pixel.
 
     References
     ----------
@@ -146,20 +129,14 @@ class Bench:
     dimple_error: float = _error(0.04)
     static: float = _error(0.05)
     quilting: float = _error(0.06)
-    photons: float = 1e10
+    photons_per_image: float = 1e10
     read_noise: float = 30.0
     background: float = 60000.0
     seed: int = 0
-    focus: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
-    astigmatism: float = 0.0
-    unmodulated: float = 0.0
-    coherent: float = 0.0
-    halo: float = 0.0
-    subpixels: int = 1
+    _dimples: ZernikeSensor = field(init=False, repr=False)  # its reference waves are the light of the dimple
 
     def __post_init__(self) -> None:
         _check.integer_field(self, "n_pixels", 2)
-        _check.integer_field(self, "subpixels", 1, 16)
         _check.number_field(self, "extent", 1, 10)
         _check.sequence("missing", self.missing, expected="segment numbers, such as (21,)")
         _check.number_field(self, "dimple_error", -0.9, 10)
@@ -170,27 +147,21 @@ class Bench:
         _check.number_field(self, "focus_difference", 0, 1e-2)
         _check.number_field(self, "misregistration", 0, 10)
         _check.number_field(self, "flux_imbalance", -1, 1, open_low=True, open_high=True)
-        _check.sequence("focus", self.focus, expected="four numbers, one for each image")
-        if len(self.focus) != 4:
-            raise ValueError(f"focus has {len(self.focus)} values: expected four, one for each image")
-        distances = [
-            _check.number(f"focus[{index}]", value, -1e-2, 1e-2) for index, value in enumerate(self.focus)
-        ]
-        object.__setattr__(self, "focus", tuple(distances))
-        _check.number_field(self, "astigmatism", -1e-2, 1e-2)
-        _check.number_field(self, "unmodulated", 0, 1, open_high=True)
-        _check.number_field(self, "coherent", 0, 0.5, open_high=True)
         _check.number_field(self, "blur", 0, self.n_pixels)
-        for name in ("halo", "static", "quilting", "photons", "read_noise", "background"):
+        for name in ("static", "quilting", *_NOISE):
             _check.number_field(self, name, 0)
         _check.integer_field(self, "seed", 0, math.inf)
-        if not self.photons and (self.read_noise or self.background):
+        if not self.photons_per_image and (self.read_noise or self.background):
             raise ValueError(
-                f"photons = 0 with read_noise = {self.read_noise:g} and background = {self.background:g}: "
-                "expected 0 for both where frames are to be without noise"
+                f"photons_per_image = 0 with read_noise = {self.read_noise:g} and background = "
+                f"{self.background:g}: expected 0 for both where frames are to be without noise"
             )
-        # Whatever else is out of range shows when the parts are made.
-        _ = self._dimples
+        self._make_parts()
+
+    def _make_parts(self) -> None:
+        """Make the pupil and the sensor of the light of the dimple, which refuse what else is out of range."""
+        dimples = ZernikeSensor(self._pupil, *self._relays, extent=1 + 2 * self._margin / self.n_pixels)
+        object.__setattr__(self, "_dimples", dimples)
 
     @classmethod
     def errors(cls) -> tuple[str, ...]:
@@ -200,15 +171,17 @@ class Bench:
     @classmethod
     def ideal(cls, **changes: Any) -> Bench:
         """A bench without any error or noise, but for the `changes`."""
-        perfect: dict[str, Any] = dict.fromkeys((*cls.errors(), "photons", "read_noise", "background"), 0)
+        perfect: dict[str, Any] = dict.fromkeys(
+            (*cls.errors(), "photons_per_image", "read_noise", "background"), 0
+        )
         return cls(**{**perfect, **changes})
 
     def single_errors(self) -> dict[str, Bench]:
         """Benches with each error of this one alone, "none" of them (first), the "noise", and "all" (last)."""
-        layout = {field.name: getattr(self, field.name) for field in fields(self) if field.name not in _LATER}
+        layout = {field.name: getattr(self, field.name) for field in fields(self) if field.init}
         cases: dict[str, dict[str, float]] = {"none": {}}
         cases |= {name: {name: layout.pop(name)} for name in self.errors()}
-        cases["noise"] = {name: layout.pop(name) for name in ("photons", "read_noise", "background")}
+        cases["noise"] = {name: layout.pop(name) for name in _NOISE}
         return {name: Bench.ideal(**layout, **case) for name, case in cases.items()} | {"all": self}
 
     @cached_property
@@ -264,18 +237,10 @@ class Bench:
             Image of the polarisation that sees +`phase`, then of the other one.
         """
         rng = _check.generator("seed", seed)
-        field = self._field * (1.0 if pistons is None else self._commanded(pistons))
+        field = self._field * (1.0 if pistons is None else np.exp(1j * self.commanded_phase(pistons)))
         flat = field.reshape(-1, *field.shape[-2:])
-        images = np.stack([self._image(one) for one in flat])
+        images = np.stack([self._image(single) for single in flat])
         return self._expose(images.reshape(*field.shape[:-2], *images.shape[1:]), rng)
-
-    def _commanded(self, pistons: ArrayLike) -> NDArray[np.complex128]:
-        """Mean phasor of each pixel that segment commands ask for, (..., ny, nx)."""
-        phase = self.commanded_phase(pistons)
-        phasors = np.exp(1j * np.asarray(pistons, float)).reshape(-1, self.n_segments)
-        parts = self._parts[:, self.numbers]
-        mean = (parts @ phasors.T) / np.maximum(parts.sum(axis=1), 1)[:, np.newaxis]
-        return mean.T.reshape(phase.shape)
 
     def clear_frames(self, seed: Seed = None) -> NDArray:
         """Counts of the camera with the mask taken out and a flat command, shape (2, ny', nx')."""
@@ -288,39 +253,15 @@ class Bench:
 
     @cached_property
     def _pupil(self) -> Pupil:
-        parts = self._parts
-        covered = parts.sum(axis=1).reshape((self.n_pixels,) * 2)
-        segments = np.where(covered > 0, np.reshape(parts.argmax(axis=1), covered.shape), 0)
-        x = (np.arange(self.n_pixels) - (self.n_pixels - 1) / 2) / self.n_pixels
-        brightness = np.sqrt(1 + self.illumination * x)
-        return Pupil.from_segments(segments, covered / self.subpixels**2 * brightness)
-
-    @cached_property
-    def _parts(self) -> sparse.csr_array:
-        """Sub-pixels of each pixel that lie on each segment, (n_pixels^2, 1 + largest number)."""
-        n, k = self.n_pixels, self.subpixels
-        fine = Pupil.hexagonal(n * k, self.n_rings, self.gap, self.missing, self.stop).segments
-        index = np.arange(n * k) // k
-        lit, pixel = fine > 0, np.add.outer(n * index, index)
-        shape = n * n, int(fine.max()) + 1
-        return sparse.coo_array((np.ones(np.count_nonzero(lit)), (pixel[lit], fine[lit])), shape=shape).tocsr()
+        layout = Pupil.hexagonal(self.n_pixels, self.n_rings, self.gap, self.missing, self.stop)
+        return Pupil.from_segments(layout.segments, np.sqrt(1 + self.illumination * layout.x))
 
     @cached_property
     def _relays(self) -> list[Relay]:
-        """Relays of the four images: the frames, then the clear frames."""
+        """Relays of the two images."""
         diameter = self.diameter * (1 + self.dimple_error)
-        relays = []
-        for index, focus in enumerate(self.focus):
-            sign = 1 - 2 * (index % 2)
-            focus = focus + sign * self.focus_difference / 2
-            oval, shift = sign * self.astigmatism / 2, sign * self.misregistration / 2 / self.n_pixels
-            relays.append(Relay(diameter, focus + oval, focus - oval, shift))
-        return relays
-
-    @cached_property
-    def _dimples(self) -> ZernikeSensor:
-        """Its reference waves are the light of the dimple in the two images."""
-        return ZernikeSensor(self._pupil, *self._relays[:2], extent=1 + 2 * self._margin / self.n_pixels)
+        shift = self.misregistration / 2 / self.n_pixels
+        return [Relay(diameter, sign * self.focus_difference / 2, sign * shift) for sign in (1, -1)]
 
     @property
     def _spill(self) -> int:
@@ -349,35 +290,25 @@ class Bench:
     def _image(self, field: NDArray[np.complexfloating], *, clear: bool = False) -> NDArray[np.float64]:
         """Intensity on the camera of the two polarisations, (ny, nx) to (2, ny', nx')."""
         size = self.n_pixels + 2 * self._margin
-        waves = [relay.direct(field, size, self.n_pixels) for relay in self._relays[2 * clear :][:2]]
-        unshifted = np.abs(waves) ** 2
-        images = unshifted if clear else self._behind_mask(np.array(waves), self._dimples.reference_wave(field))
-        if not clear and self.unmodulated:
-            images = (1 - self.unmodulated) * images + self.unmodulated * unshifted
+        waves = np.array([relay.direct(field, size, self.n_pixels) for relay in self._relays])
+        images = np.abs(waves) ** 2 if clear else self._behind_mask(waves, self._dimples.reference_wave(field))
         blurred = ndimage.gaussian_filter(images, (0, self.blur, self.blur), mode="nearest", truncate=_REACH)
         camera = slice(self._spill, size - self._spill)
-        return blurred[:, camera, camera] + (self._halo() if self.halo else 0)
+        return blurred[:, camera, camera]
 
     def _behind_mask(self, waves: NDArray, light: NDArray) -> NDArray[np.float64]:
         """Intensity of both images: the light of the dimple is shifted, and joins the waves past it."""
-        shifted, kept = np.sqrt(1 - self.coherent), 1j * np.sqrt(self.coherent)
-        own, other = (
-            np.abs((shifted + kept) * waves + shifted * (np.exp(1j * sign * _SIGNS * self.phase) - 1) * light) ** 2
-            for sign in (1, -1)
+        own, crossed = (
+            np.abs(waves + (np.exp(1j * sign * _SIGNS * self.phase) - 1) * light) ** 2 for sign in (1, -1)
         )
-        return (1 - self.leakage) * own + self.leakage * other
-
-    def _halo(self) -> NDArray[np.float64]:
-        """Light of the neighbour on each image, (2, ny', nx')."""
-        y, x = ((np.arange(n) - (n - 1) / 2) / self.n_pixels for n in self._camera_shape)
-        away = np.array([self.extent, -self.extent])[:, np.newaxis, np.newaxis]
-        return self.halo * self.extent**2 / np.maximum((x - away) ** 2 + y[:, np.newaxis] ** 2, 0.25)
+        return (1 - self.leakage) * own + self.leakage * crossed
 
     def _expose(self, images: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         flux = np.array([1 + self.flux_imbalance, 1 - self.flux_imbalance])[:, np.newaxis, np.newaxis]
-        if not self.photons:
+        if not self.photons_per_image:
             return images * flux
-        camera = Detector(self._pupil, self.photons, read_noise=self.read_noise, background=self.background)
+        photons = self.photons_per_image / self._pupil.n_points
+        camera = Detector(photons, read_noise=self.read_noise, background=self.background)
         return camera.expose(images * flux, rng)
 
 
@@ -406,8 +337,8 @@ class BenchModel(Immutable):
     >>> model = BenchModel.from_images(bench, seed=1)
     >>> pistons = np.linspace(-0.5, 0.5, bench.n_segments)
     >>> frames = model.normalise(bench.frames(pistons, seed=2))
-    >>> found = model.pistons(PhaseShifted(model.shifted)(frames).phase)
-    >>> float(np.std(found - pistons)) < 0.05
+    >>> measured = model.pistons(PhaseShifted(model.shifted)(frames).phase)
+    >>> float(np.std(measured - pistons)) < 0.05
     True
     """
 
@@ -444,8 +375,8 @@ class BenchModel(Immutable):
         dark = bench.dark(rng)
         images = bench.clear_frames(rng) - dark
         ny, nx = bench.segments.shape
-        top, left = (images.shape[-2] - ny) // 2, (images.shape[-1] - nx) // 2
-        inner = images[:, top : top + ny, left : left + nx]
+        top, side = (images.shape[-2] - ny) // 2, (images.shape[-1] - nx) // 2
+        inner = images[:, top : top + ny, side : side + nx]
         # The stop of the bench is known; what is dark within it, gaps and missing segments, the images show.
         light, scale = mean_light(inner, bench.segments > 0)
         stop = radius((ny, nx), ((ny - 1) / 2, (nx - 1) / 2)) <= bench.n_pixels / 2
@@ -453,12 +384,12 @@ class BenchModel(Immutable):
         unit = scale * np.mean(light[pupil.inside])
         plus, minus = Dimple(bench.diameter, bench.phase), Dimple(bench.diameter, -bench.phase)
         return cls(
-            ZernikeSensor(pupil, plus, minus, extent=bench.extent),
-            ZernikeSensor(pupil, plus, extent=bench.extent),
-            bench.segments,
-            bench.numbers,
-            unit[:, np.newaxis, np.newaxis],
-            dark,
+            shifted=ZernikeSensor(pupil, plus, minus, extent=bench.extent),
+            classic=ZernikeSensor(pupil, plus, extent=bench.extent),
+            segments=bench.segments,
+            numbers=bench.numbers,
+            scale=unit[:, np.newaxis, np.newaxis],
+            dark=dark,
         )
 
     def normalise(self, counts: ArrayLike) -> NDArray[np.float64]:
@@ -564,22 +495,22 @@ def segment_pistons(phase: ArrayLike, segments: NDArray, numbers: NDArray) -> ND
     return np.angle(sums)
 
 
-def segment_residual(found: ArrayLike, commanded: ArrayLike) -> NDArray[np.float64]:
+def segment_residual(pistons: ArrayLike, commanded: ArrayLike) -> NDArray[np.float64]:
     """Difference of segment pistons on the circle, without their common piston.
 
     Parameters
     ----------
-    found, commanded : array_like, shapes (..., n_segments) that broadcast, radian
+    pistons, commanded : array_like, shapes (..., n_segments) that broadcast, radian
 
     Returns
     -------
     ndarray, shape (..., n_segments), radian
         In (-pi, pi].
     """
-    found, commanded = _check.real_array("found", found), _check.real_array("commanded", commanded)
-    shape = _check.broadcast(found=found, commanded=commanded)
+    pistons, commanded = _check.real_array("pistons", pistons), _check.real_array("commanded", commanded)
+    shape = _check.broadcast(pistons=pistons, commanded=commanded)
     if not shape or 0 in shape:
-        raise ValueError(f"found and commanded have shape {shape}: expected (..., n_segments), at least one")
-    _check.finite("found", found)
+        raise ValueError(f"pistons and commanded have shape {shape}: expected (..., n_segments), at least one")
+    _check.finite("pistons", pistons)
     _check.finite("commanded", commanded)
-    return without_piston(found - commanded)
+    return without_piston(pistons - commanded)

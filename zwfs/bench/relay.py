@@ -27,22 +27,21 @@ class Relay:
     ----------
     diameter : float, lambda/D
         Of the dimple.
-    along_x, along_y : float, D^2 / lambda
-        Distance from the pupil to the plane in focus, for light that is spread along x and along y.
+    distance : float, D^2 / lambda
+        From the pupil to the plane in focus.
     shift : float, D
         Of the image, along both axes.
     """
 
     diameter: float
-    along_x: float
-    along_y: float
+    distance: float
     shift: float
     breaks = ()
     n_samples = 0
 
     def transmission(self, u: NDArray, v: NDArray) -> NDArray[np.complex128]:
         """1 + the transfer function of the relay at focal coordinates, lambda/D."""
-        return 1 + _transfer(u, self.along_x, self.shift) * _transfer(v, self.along_y, self.shift)
+        return 1 + _transfer(u, self.distance, self.shift) * _transfer(v, self.distance, self.shift)
 
     def direct(self, field: NDArray, n_camera: int, n_pixels: int) -> NDArray[np.complex128]:
         """Field of n_camera x n_camera pixels of a field on the pupil, whose middle is the same.
@@ -60,10 +59,8 @@ class Relay:
         -------
         ndarray, shape (n_camera, n_camera)
         """
-        sizes = n_camera, len(field), n_pixels
-        rows = _kernel(*sizes, self.along_y, self.shift)
-        columns = rows if self.along_x == self.along_y else _kernel(*sizes, self.along_x, self.shift)
-        return rows @ field @ columns.T
+        kernel = _kernel(n_camera, len(field), n_pixels, self.distance, self.shift)
+        return kernel @ field @ kernel.T
 
 
 def _transfer(u: NDArray, distance: float, shift: float) -> NDArray[np.complex128]:

@@ -155,7 +155,7 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
     >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
     >>> from zwfs.frames.registration import Image, register_frames
     >>> from zwfs.frames.verdict import CameraNoise, judge
-    >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons=1e8)
+    >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons_per_image=1e8)
     >>> pistons = 0.5 * np.arange(-3, 4) / 3
     >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
     >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))

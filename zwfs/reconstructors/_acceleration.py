@@ -63,7 +63,7 @@ class Acceleration:
         """Light that is lost in frames, (k,), kept between what flat and strongly aberrated wavefronts lose."""
         return xp.minimum(xp.maximum(light, _DIMMEST * self.lost), self.lost)
 
-    def taken(self, coefficients: NDArray, xp: Any) -> NDArray:
+    def light_taken(self, coefficients: NDArray, xp: Any) -> NDArray:
         """Light (k,) that the reference waves of coefficients (k, 2 r) take out of the pupil."""
         return xp.vecdot(coefficients @ self.form, coefficients)
 
@@ -74,8 +74,8 @@ class Acceleration:
             path.tried = new
         elif path.lost is not None:  # the second step from a flat start, whose first one was dimmed
             relaxed = tried + self.relaxation * (new - tried)
-            taken = xp.maximum(self.taken(relaxed, xp), _DIMMEST * path.lost)
-            path.tried, path.lost = relaxed * dimming(path.lost, taken, xp), None
+            dimmed = xp.maximum(self.light_taken(relaxed, xp), _DIMMEST * path.lost)
+            path.tried, path.lost = relaxed * dimming(path.lost, dimmed, xp), None
         else:
             # A piston that turns in each iteration would be a change that never ends, which the secant magnifies.
             path.tried = self._secant(tried, with_piston_of(tried, new, xp) - tried, path, xp)
@@ -98,6 +98,6 @@ class Acceleration:
         return new
 
 
-def dimming(lost: NDArray, taken: NDArray | float, xp: Any) -> NDArray:
+def dimming(lost: NDArray, light_taken: NDArray | float, xp: Any) -> NDArray:
     """Factor (k, 1) by which reference waves that take out some light (k,) take out the lost light (k,)."""
-    return xp.sqrt(lost / taken)[:, np.newaxis]
+    return xp.sqrt(lost / light_taken)[:, np.newaxis]

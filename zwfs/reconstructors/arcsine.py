@@ -83,9 +83,13 @@ class Arcsine(FixedPoint):
         dark = inside & ~lit
         coefficients, wave, side = _start(model.field(model.flat), model, core)
         return _Constants(
-            self.settings.model(kind), kind.array(core), kind.array(gain), kind.flags(dark), int(dark.sum()),
-            (kind.array(coefficients), kind.array(wave), kind.array(side)),
-        )  # fmt: skip
+            model=self.settings.model(kind),
+            core=kind.array(core),
+            gain=kind.array(gain),
+            dark=kind.flags(dark),
+            n_dark=int(dark.sum()),
+            flat=(kind.array(coefficients), kind.array(wave), kind.array(side)),
+        )
 
 
 @dataclass

@@ -2,7 +2,7 @@
 
 A reconstructor without iteration derives from `ClosedForm` and computes a phase from frames. One that improves a
 field step by step derives from `FixedPoint`. Anything else derives from `Reconstructor`. A new method is a module
-in `zwfs.reconstructors` with such a class, and an entry in `RECONSTRUCTORS`; `load` finds a class anywhere else.
+in `zwfs.reconstructors` with such a class, and an entry in `RECONSTRUCTORS`.
 
 Frames arrive checked, with one batch axis: shape (k, n_masks, ny', nx') on the detector. Phases have shape
 (k, ny, nx) and are 0 outside the pupil; the base class puts NaN there.
@@ -128,7 +128,7 @@ class Reconstruction(PhaseResult):
         Parameters
         ----------
         photons : float, optional
-            Photons that an intensity of 1 puts into a pixel of each frame, `Detector.photons_per_pixel`. Left out
+            Photons per pupil point and image, `Detector.photons`. Left out
             for frames without noise.
         read_noise : float, electrons rms / pixel
             That of the frames, with the noise of a background that was subtracted.
@@ -145,8 +145,8 @@ class Reconstruction(PhaseResult):
         noise, kind = Noise.checked(photons, read_noise), Kind.of(self.frames)
         double = kind._replace(dtype=kind.xp.float64)
         fine = kind.xp.concat([noise.explains(*pair) for pair in self._compared(double)])
-        stopped = self.converged if self.settings.tolerance else self.converged | True
-        return self._shaped(fine) & stopped
+        explained = self._shaped(fine)
+        return explained & self.converged if self.settings.tolerance else explained
 
     def _compared(self, kind: Kind) -> Iterator[tuple[NDArray[np.floating], NDArray[np.floating]]]:
         """Modelled and measured frames at the points of the pupil, (1, n_masks, n_points) for each frame set."""
@@ -155,8 +155,8 @@ class Reconstruction(PhaseResult):
         frames = xp.reshape(xp.astype(self.frames, kind.dtype), (-1, *self.frames.shape[-3:]))
         for index, psi in enumerate(self._fields(model)):
             light = square(model.reference(psi) + psi[:, np.newaxis, ...])
-            pair = (xp.reshape(one, (*one.shape[:2], -1)) for one in (light, frames[index : index + 1, ...]))
-            modelled, measured = (xp.take(one, inside, axis=2) for one in pair)
+            flat = (xp.reshape(maps, (*maps.shape[:2], -1)) for maps in (light, frames[index : index + 1, ...]))
+            modelled, measured = (xp.take(maps, inside, axis=2) for maps in flat)
             yield modelled, measured
 
     def _fields(self, model: Propagator) -> Iterator[NDArray[np.floating]]:
@@ -206,8 +206,8 @@ class Settings(Immutable):
         _check.instance("sensor", sensor, ZernikeSensor, PolychromaticSensor)
         n_iterations = _check.integer("n_iterations", n_iterations, 1, _MOST_ITERATIONS)
         tolerance = _check.number("tolerance", tolerance, 0)
-        known = amplitude_map(amplitude, sensor).copy()
-        return cls(sensor, n_iterations, tolerance, read_only(known), float(np.sum(known * known)))
+        checked = amplitude_map(amplitude, sensor).copy()
+        return cls(sensor, n_iterations, tolerance, read_only(checked), float(np.sum(checked * checked)))
 
     @per_kind
     def model(self, kind: Kind) -> Propagator:
@@ -233,7 +233,9 @@ class Solution(NamedTuple):
 
     def empty(self, k: int, kind: Kind) -> Solution:
         """Return arrays of the same shapes and types for k frame sets, yet to be filled."""
-        return self.each(lambda array: kind.xp.empty((k, *array.shape[1:]), dtype=array.dtype, device=kind.device))
+        return self.map_arrays(
+            lambda array: kind.xp.empty((k, *array.shape[1:]), dtype=array.dtype, device=kind.device)
+        )
 
     @classmethod
     def joined(cls, parts: list[tuple[NDArray[np.int64], Solution]], kind: Kind) -> Solution:
@@ -246,11 +248,11 @@ class Solution(NamedTuple):
 
     def take(self, which: NDArray[np.int64], kind: Kind) -> Solution:
         """Return the results of some frame sets: integers, (j,)."""
-        return self.each(lambda array: kind.xp.take(array, which, axis=0))
+        return self.map_arrays(lambda array: kind.xp.take(array, which, axis=0))
 
     def at(self, index: int) -> Solution:
         """Return the result of one frame set, without the batch axis."""
-        return self.each(lambda array: array[index, ...])
+        return self.map_arrays(lambda array: array[index, ...])
 
     def put(self, which: slice | int, part: Solution) -> None:
         """Write the results of some frame sets to their places."""
@@ -259,7 +261,7 @@ class Solution(NamedTuple):
             if array is not None:
                 array[which, ...] = values
 
-    def each(self, function: Callable[[NDArray], NDArray]) -> Solution:
+    def map_arrays(self, function: Callable[[NDArray], NDArray]) -> Solution:
         """Apply a function to each array."""
         return Solution._make(None if array is None else function(array) for array in self)
 
@@ -398,7 +400,9 @@ class Reconstructor(Immutable, ABC):
             # A single frame is the case of a control loop: no need to compute its shape.
             return kind.xp.reshape(values, (*batch, *values.shape[1:])) if batch else values[0, ...]
 
-        return Reconstruction(*solution.each(shaped), settings=self._settings, frames=shaped(window))
+        return Reconstruction(
+            **solution.map_arrays(shaped)._asdict(), settings=self._settings, frames=shaped(window)
+        )
 
     @abstractmethod
     def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
@@ -557,7 +561,7 @@ class FixedPoint(Reconstructor):
             if last or n_done == done.shape[0]:
                 break
             if n_done:
-                n_unsolved = n_unsolved + 0 * places
+                n_unsolved = n_unsolved + xp.zeros_like(places)
                 ended.append((places[done], result(phasor[done], done[done], n_unsolved[done])))
                 places, phasor = places[~done], phasor[~done]
                 state.keep(~done)

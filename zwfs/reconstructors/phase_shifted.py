@@ -114,16 +114,16 @@ class PhaseShifted(FixedPoint):
         kind = Kind.of(frames)
         failed = [index for index in range(frames.shape[0]) if not solution.converged[index]]
         if failed:
-            some = kind.integers(failed)
-            frames = kind.xp.take(frames, some, axis=0)
-            start = None if start is None else kind.xp.take(start, some, axis=0)
-            other = self._plain.solve(frames, start, history)
+            places = kind.integers(failed)
+            frames = kind.xp.take(frames, places, axis=0)
+            start = None if start is None else kind.xp.take(start, places, axis=0)
+            plain = self._plain.solve(frames, start, history)
             light = frames[(..., *self.sensor.window)]
-            accelerated = self.settings.residual(kind.xp.take(solution.phase, some, axis=0), light)
-            better = self.settings.residual(other.phase, light) < accelerated
+            accelerated = self.settings.residual(kind.xp.take(solution.phase, places, axis=0), light)
+            better = self.settings.residual(plain.phase, light) < accelerated
             for index, place in enumerate(failed):
                 if better[index]:
-                    solution.put(place, other.at(index))
+                    solution.put(place, plain.at(index))
         return solution
 
     def begin(self, frames: NDArray, phasor: NDArray | None, constants: _Constants) -> _State:
@@ -182,15 +182,15 @@ class PhaseShifted(FixedPoint):
         flat_waves = exact.operator.split_expand(flat @ core, in_window=True)
         inside = np.tile(exact.stop.ravel(), self.sensor.n_masks)
         return _Constants(
-            self.settings.model(kind),
-            kind.array(core),
-            kind.array(weights),
-            kind.array(offset),
-            kind.array(flat),
-            kind.array(flat_waves),
-            kind.array(inside),
-            self.sensor.n_masks * self.settings.light,
-            self._acceleration and self._acceleration.to(kind),
+            model=self.settings.model(kind),
+            core=kind.array(core),
+            weights=kind.array(weights),
+            offset=kind.array(offset),
+            flat=kind.array(flat),
+            flat_waves=kind.array(flat_waves),
+            inside=kind.array(inside),
+            incoming=self.sensor.n_masks * self.settings.light,
+            acceleration=self._acceleration and self._acceleration.to(kind),
         )
 
     def _accelerated(self) -> Acceleration:

@@ -122,7 +122,7 @@ def example(limits: Any) -> Any:
 
 _CUT = {"obstruction": (0.0, 0.9), "vanes": [[(-6.2832, 6.2832)], ...]}
 _RINGS = _CUT | {"n_rings": (1, 50), "gap": (0.0, 0.1), "missing": [(1, 10000), ...], "stop": (0.1, 1.0)}
-_BASIS = {"basis": ("zernike", "fourier", "hexagonal", "kl")}
+_BASIS = {"basis": ("zernike", "fourier", "hexagonal")}
 _STRENGTH = {"d_over_r0": (0.0, 20.0)}
 SETUP: dict[str, Any] = {
     "pupil": Fields(
@@ -171,16 +171,10 @@ _BENCH = {
     "dimple_error": (-0.9, 10.0),
     "static": (0.0, 3.0),
     "quilting": (0.0, 3.0),
-    "photons": (0.0, 1e18),
+    "photons_per_image": (0.0, 1e18),
     "read_noise": (0.0, 1e6),
     "background": (0.0, 1e12),
     "seed": (0, 4294967295),
-    "focus": [(-0.01, 0.01), ...],
-    "astigmatism": (-0.01, 0.01),
-    "unmodulated": (0.0, 0.9),
-    "coherent": (0.0, 0.49),
-    "halo": (0.0, 10.0),
-    "subpixels": (1, 16),
 }
 
 

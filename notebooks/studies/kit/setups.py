@@ -17,7 +17,7 @@ from zwfs.detector import Detector
 from zwfs.modes import fourier_basis, mode_frequencies, noll_to_nm, power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
-from zwfs.turbulence import karhunen_loeve_basis, structure_function, turbulent_screens
+from zwfs.turbulence import structure_function, turbulent_screens
 
 _CROSS = [[0.785, 0.005], [2.356, 0.005], [3.927, 0.005], [5.498, 0.005]]
 _MAX_BYTES = 2**31  # of a file of screens: 1000 of them on 512 pixels
@@ -201,7 +201,7 @@ def make_screens(
     """
     _require_segments(pupil, kind)
     scale = outer_scale if kind == "von_karman" else inf
-    modes, frequencies = _modes(pupil, n_modes, basis, scale)
+    modes, frequencies = _modes(pupil, n_modes, basis)
     recorded = _screens_of_file(pupil, file) if kind == "file" else None
     return Screens(pupil, modes, frequencies, kind, exponent, scale, recorded, d_over_r0)
 
@@ -232,7 +232,7 @@ def check_setup(
         if screens.get("basis", "zernike") in ("zernike", "hexagonal"):
             zernike_basis(aperture, 1)  # the pupil of a file may be larger than their circle
     _require_segments(aperture, screens.get("kind", SCREENS[0]))
-    most = aperture.n_points // 4 if screens.get("basis") == "kl" else aperture.n_points - 1
+    most = aperture.n_points - 1
     if n_modes > most:
         raise ValueError(
             f"n_modes = {n_modes}: expected at most {most} with the {aperture.n_points} points of pupil"
@@ -248,15 +248,12 @@ def _require_segments(pupil: Pupil, kind: str) -> None:
         raise ValueError('screens.kind = "segments": expected a pupil of two or more segments')
 
 
-def _modes(pupil: Pupil, n_modes: int, basis: str, outer_scale: float) -> tuple[NDArray, NDArray]:
+def _modes(pupil: Pupil, n_modes: int, basis: str) -> tuple[NDArray, NDArray]:
     """Return the modes of a basis and their spatial frequencies."""
     if basis in ("zernike", "hexagonal"):
         modes = zernike_basis(pupil, n_modes, orthonormal=basis == "hexagonal")
         return modes, np.array([noll_to_nm(j)[0] for j in range(2, n_modes + 2)]) / 2
-    if basis == "kl":
-        modes, _ = karhunen_loeve_basis(pupil, n_modes, outer_scale)
-    else:
-        modes = fourier_basis(pupil, n_modes)
+    modes = fourier_basis(pupil, n_modes)
     return modes, mode_frequencies(pupil, modes)
 
 
@@ -287,15 +284,13 @@ def _require_screens(recorded: NDArray, n_screens: int) -> None:
 
 SCREENS = ("power_law", "kolmogorov", "von_karman", "segments", "file")
 """Kinds of screens."""
-BASES = ("zernike", "fourier", "hexagonal", "kl")
+BASES = ("zernike", "fourier", "hexagonal")
 """Bases of modes, each of unit rms and without piston.
 
 - "zernike": Zernike modes in Noll's order, on any pupil those of the circle around it;
 - "fourier": cosines and sines of whole cycles per D;
 - "hexagonal": the hexagonal polynomials of Mahajan and Dai (2006, Opt. Lett. 31, 2462), which are Zernike modes
-  made orthonormal on the pupil in Noll's order. The pupil may have any shape;
-- "kl": Karhunen-Loeve modes of turbulence, see `zwfs.turbulence.karhunen_loeve_basis`. The turbulence is that of
-  von Karman for screens of kind "von_karman", and that of Kolmogorov for all others.
+  made orthonormal on the pupil in Noll's order. The pupil may have any shape.
 """
 
 
@@ -324,8 +319,7 @@ class Noise:
         frames = sensor.measure(phase)
         if not self.photons:
             return frames
-        pupil = sensor.pupil
-        camera = Detector(pupil, 2 * self.photons * pupil.n_points / sensor.n_masks, read_noise=self.read_noise)
+        camera = Detector(2 * self.photons / sensor.n_masks, read_noise=self.read_noise)
         return camera.normalise(camera.expose(frames, seed))
 
 

@@ -48,16 +48,13 @@ unexport FIGURE ARGS
 QUICK := --numprocesses auto --dist loadfile --benchmark-disable -m "not slow"
 
 .DELETE_ON_ERROR:
-.PHONY: help book pdf lab test test-fast test-slow coverage fuzz figures rerun lint bench release-check pythons address lock clean
+.PHONY: help book lab test test-fast test-slow coverage fuzz figures rerun lint bench release-check pythons lock clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 21
 
 book: $(READY) ## run the notebooks that changed and build the book in _build/html
 	@$(BIN)/python -m book._tools book
-
-pdf: $(READY) ## build the book and its PDF, _build/html/zwfs.pdf: needs Chromium
-	@$(BIN)/python -m book._tools pdf
 
 lab: $(READY) ## open the notebooks in JupyterLab
 	$(BIN)/jupyter lab notebooks
@@ -101,9 +98,6 @@ release-check: $(READY) ## build the package, and test it in an empty environmen
 
 pythons: $(READY) ## run examples and core tests on every supported Python, and with the oldest dependencies
 	@$(BIN)/python -m book._tools pythons $(PYTHONS)
-
-address: $(READY) ## write the public address in pyproject.toml to every file that names it
-	@$(BIN)/python -m book._tools address
 
 lock: $(BIN)/uv ## pin the newest allowed version of every dependency, or of one: make lock PACKAGE=numpy
 	$(PIN) pyproject.toml --extra book --extra cluster --extra lab --extra test \

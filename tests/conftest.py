@@ -2,6 +2,7 @@ import functools
 import inspect
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -56,7 +57,6 @@ SLOW = {
     "cluster",
     "foreign_cluster",
     "plain_book",
-    "published_book",
     "real",
     "seal",
     "template",
@@ -194,20 +194,25 @@ def complex_field():
 
 
 def watch(page):
-    """Everything that a page of the browser says, and every address that it asks for."""
+    """The errors and warnings of a page of the browser, and every address that it asks for."""
     said, asked = [], []
-    page.on("console", lambda message: said.append(message.text))
+    page.on("console", lambda message: said.append(message.text) if message.type in ("error", "warning") else None)
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda request: asked.append(request.url))
     return said, asked
+
+
+def find_chromium():
+    """Return the path of a Chromium: the one in ``ZWFS_CHROMIUM``, else that of the system."""
+    named = os.environ.get("ZWFS_CHROMIUM")
+    programs = [named] if named else ["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"]
+    return next(filter(None, map(shutil.which, programs)), None)
 
 
 @pytest.fixture(scope="module")
 def browser():
     """A Chromium, driven by Playwright; it is closed with the module, whose event loop others could not share."""
     from playwright.sync_api import sync_playwright
-
-    from book._tools.pdf import find_chromium
 
     program = find_chromium()
     if program is None:

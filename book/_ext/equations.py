@@ -76,7 +76,7 @@ def docstrings() -> Iterator[tuple[str, str]]:
         for own in api.own_names(module):
             thing, path = getattr(module, own), api.path(module, own)
             yield path, inspect.getdoc(thing) or ""
-            listed = api.methods(thing) if inspect.isclass(thing) else []
+            listed = api.members(thing) if inspect.isclass(thing) else []
             for member in vars(thing) if inspect.isclass(thing) else ():
                 value = getattr(thing, member)
                 if not (member.startswith("_") or inspect.isclass(value)):

@@ -36,7 +36,6 @@ REPOSITORY = "_static/zwfs.zip"
 KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the version that this book uses
 FOLDERS = ("book", "environment", "notebooks", "tests", "zwfs")
 SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
-SKIPPED = "colab"  # tag of cells that the page leaves out
 POLICY = '<meta http-equiv="Content-Security-Policy" content="{}"/>'
 
 
@@ -82,7 +81,6 @@ def described(notebook: NotebookNode, name: str) -> dict[str, Any]:
             for number, cell in enumerate(cells)
             for figure in (published(cell.source) if cell.cell_type == "code" else [])
         },
-        "skipped": SKIPPED,
         # Files in FITS need it, and no study imports it.
         "extra": ["astropy"] if any(c.cell_type == "code" and "zwfs.frames" in c.source for c in cells) else [],
         "notebook": {"cells": cells, "metadata": notebook.metadata, "nbformat": 4, "nbformat_minor": 5},

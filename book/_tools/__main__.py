@@ -22,9 +22,7 @@ USAGE = """usage: python -m book._tools COMMAND
 
   book      run the notebooks that changed and build the book
   figures   replace the committed notebooks and the front figure by freshly run ones
-  rerun     run one notebook with other parameters: rerun --help lists the options
-  release-check   build the package and test it in an empty environment
-  pythons   run examples and core tests: pythons 3.12 lowest; all by default"""
+  rerun     run one notebook with other parameters: rerun --help lists the options"""
 
 
 def main(arguments: list[str], project: Project | None = None) -> int:
@@ -45,11 +43,6 @@ def main(arguments: list[str], project: Project | None = None) -> int:
             with one_at_a_time(project.build):
                 remove_abandoned(project.build)
                 getattr(book, command)(project)
-        elif command == "pythons" or (command == "release-check" and not options):
-            from . import release
-
-            end_cleanly_on_signals()
-            release.pythons(project, options) if command == "pythons" else release.release_check(project)
         else:
             print(USAGE, file=sys.stderr)
             return 2

@@ -10,8 +10,6 @@ import json
 import os
 import re
 import shutil
-from hashlib import sha256
-from html import unescape
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -36,7 +34,6 @@ REPOSITORY = "_static/zwfs.zip"
 KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the version that this book uses
 FOLDERS = ("book", "environment", "notebooks", "tests", "zwfs")
 SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
-POLICY = '<meta http-equiv="Content-Security-Policy" content="{}"/>'
 
 
 class MarkedText(PasteTextRole):
@@ -168,46 +165,8 @@ def write(app: Sphinx, exception: Exception | None) -> None:
         write_script(folder / f"{source.stem}.js", "zwfsNotebook", described(notebook, source.stem))
     write_script(folder / "files.js", "zwfsFiles", base64.b64encode(site(project)).decode())
     Path(app.outdir, REPOSITORY).write_bytes(zipped(repository(project)))  # pip installs it
-    known, where = json.loads(KNOWN.read_text("utf-8")), place(app)
-    write_script(folder / "settings.js", "zwfsPython", known | {"place": where})
-    add_policies(Path(app.outdir), where)
-
-
-def add_policies(html: Path, place: str) -> None:
-    """Put a content security policy into each page of the book."""
-    pages = [page for page in html.rglob("*.html") if not page.is_relative_to(html / "_static")]
-    # The search reads other pages, with their handlers.
-    found = (re.findall(r"\son[a-z]+=\"([^\"]*)\"", page.read_text("utf-8")) for page in pages)
-    handlers = {unescape(code) for of_page in found for code in of_page}
-    for page in pages:
-        add_policy(page, place, handlers)
-
-
-def add_policy(file: Path, place: str, handlers: set[str]) -> None:
-    """Put a content security policy into a page: its own files and inline scripts, and Python where it can run.
-
-    The loader of Pyodide evaluates code, and a worker made from a Blob inherits the policy of its page. MathJax
-    writes styles into the page.
-    """
-    html = re.sub(POLICY.format(".*?"), "", file.read_text("utf-8"))  # of an earlier build
-    inline = re.findall(r"<script(?![^>]*\ssrc=)[^>]*>(.*?)</script>", html, re.DOTALL)
-    digests = sorted({base64.b64encode(sha256(code.encode()).digest()).decode() for code in {*inline, *handlers}})
-    runs = "/run.js" in html
-    scripts = ["'self'", "'unsafe-hashes'", *(f"'sha256-{one}'" for one in digests)]
-    remote = [place] if runs and "://" in place else []
-    policy = {
-        "default-src": ["'none'"],
-        "script-src": [*scripts, *(["blob:", "'unsafe-eval'"] if runs else [])],
-        "worker-src": ["blob:"] if runs else ["'none'"],
-        "connect-src": ["'self'", *remote],
-        "style-src": ["'self'", "'unsafe-inline'"],
-        "img-src": ["'self'", "data:", "blob:"],
-        "font-src": ["'self'", "data:"],
-        "base-uri": ["'none'"],
-        "form-action": ["'self'"],
-    }
-    text = "; ".join(f"{name} {' '.join(allowed)}" for name, allowed in policy.items())
-    file.write_text(re.sub(r"(<head[^>]*>)", rf"\1{POLICY.format(text)}", html, count=1), "utf-8")
+    known = json.loads(KNOWN.read_text("utf-8"))
+    write_script(folder / "settings.js", "zwfsPython", known | {"place": place(app)})
 
 
 def write_script(file: Path, name: str, value: Any) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 
 from nbformat import NotebookNode
 from ruamel.yaml import YAML
-from ruamel.yaml.composer import MaxDepthExceededError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from studies.kit.parameters import Fields, check_parameters, example, typed
@@ -22,10 +21,6 @@ from .project import ToolError, one_line
 # A unit is one of these behind the last comma of a parameter's comment; other words there belong to the meaning.
 UNITS = ("rad", "rad rms", "lambda/D", "D", "D²/lambda", "nm", "m", "s", "Hz", "pixels", "electrons", "photons")
 UNIT_NAMES = {"radian": "rad", "radian rms": "rad rms", "pixels rms": "pixels", "electrons rms": "electrons"}
-
-# Limits of the YAML of parameters: a list of 1000 numbers is half as long, and no list is nested more than twice.
-LONGEST = 16384  # characters, read in a second
-DEEPEST = 8
 
 
 class ParameterError(ToolError):
@@ -193,19 +188,14 @@ def nearest(name: str, known: Any) -> str:
 
 def load(text: str, origin: str) -> Any:
     """Read YAML 1.2: numbers, strings, lists and mappings."""
-    if len(text) > LONGEST:
-        raise ParameterError(f"{origin}: {len(text)} characters: expected at most {LONGEST}")
     yaml = YAML(typ="safe", pure=True)  # not the C parser: it reads YAML 1.1, in which yes is True and 010 is 8
-    yaml.max_depth = DEEPEST
     try:
         return yaml.load(text)
-    except MaxDepthExceededError:
-        raise ParameterError(f"{origin}: expected lists and mappings at most {DEEPEST} deep") from None
     except MarkedYAMLError as error:
         where = f", line {error.problem_mark.line + 1}" if "\n" in text else ""
         context = f" ({error.context})" if error.context else ""
         raise ParameterError(f"{origin}{where}: {error.problem}{context}") from None
-    except (YAMLError, ValueError) as error:  # an invalid character, or a number with too many digits
+    except (YAMLError, ValueError, RecursionError) as error:  # an odd character, too many digits, too deep lists
         raise ParameterError(f"{origin}: {error}") from None
 
 

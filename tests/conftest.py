@@ -24,11 +24,7 @@ ROOT = Path(__file__).parent.parent
 os.environ.pop("ZWFS_SWEEPS", None)  # a test computes, and reads no stored results
 
 
-def new_reconstructor():
-    """Return the path and the code of the reconstructor in CONTRIBUTING."""
-    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
-    path = r"`(zwfs/reconstructors/(?!_)\w+\.py)`"
-    return re.search(rf"{path}.*?^```python\n(.*?)^```", text, re.M | re.S).groups()
+EXAMPLES = ROOT / "tests" / "examples"  # of CONTRIBUTING
 
 
 def code_of(page, language="python"):

@@ -37,8 +37,8 @@ class Modules(SphinxDirective):
         lines = []
         for name in self.arguments[0].split():
             package = name.removesuffix(".*")
-            below = [one for one in modules() if name != package and one.startswith(f"{package}.")]
-            for module in (package, *below):
+            inside = [module for module in modules() if name != package and module.startswith(f"{package}.")]
+            for module in (package, *inside):
                 lines += section(module)
         self.state.nested_parse(StringList(lines, self.env.docname), 0, nodes.container(), match_titles=True)
         return []
@@ -62,8 +62,8 @@ def section(name: str) -> list[str]:
 def modules() -> list[str]:
     """Return the names of the public modules of the package, in order."""
     package = importlib.import_module(PACKAGE)
-    found = (module.name for module in pkgutil.walk_packages(package.__path__, f"{PACKAGE}."))
-    named = (name for name in found if not any(part.startswith("_") for part in name.split(".")))
+    walked = (module.name for module in pkgutil.walk_packages(package.__path__, f"{PACKAGE}."))
+    named = (name for name in walked if not any(part.startswith("_") for part in name.split(".")))
     # A module with an empty list of public names is a part of the package.
     return sorted(name for name in named if getattr(importlib.import_module(name), "__all__", True))
 
@@ -99,10 +99,10 @@ def members(thing: type) -> list[str]:
 
 def path(module: ModuleType, name: str) -> str:
     """Return the shortest path from which a name can be imported; a path can also be that of a module."""
-    parts, taken = module.__name__.split("."), modules()
+    parts, of_modules = module.__name__.split("."), modules()
     for package in (importlib.import_module(".".join(parts[:depth])) for depth in range(1, len(parts))):
         same = getattr(package, name, None) is getattr(module, name)
-        if same and name in package.__all__ and f"{package.__name__}.{name}" not in taken:
+        if same and name in package.__all__ and f"{package.__name__}.{name}" not in of_modules:
             return f"{package.__name__}.{name}"
     return f"{module.__name__}.{name}"
 
@@ -123,7 +123,7 @@ def link_equations(app: Sphinx, what: str, name: str, thing: Any, options: Any, 
 
     text = NUMBERED.sub(lambda cited: re.sub(r"\((\d+)\)", label, cited[0]), "\n".join(lines))
     # A bar is a modulus and no substitution; code in double backticks stays as it is.
-    text = re.sub(r"``[^`]*``|\|", lambda found: "\\|" if found[0] == "|" else found[0], text)
+    text = re.sub(r"``[^`]*``|\|", lambda part: "\\|" if part[0] == "|" else part[0], text)
     lines[:] = text.splitlines()
 
 

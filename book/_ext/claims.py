@@ -108,18 +108,18 @@ def glued(notebook: Path) -> dict[str, float]:
 
 def judge(claim: Claim, numbers: Mapping[str, Any]) -> Finding:
     """Judge a claim by the numbers of its notebook, see `glued`."""
-    known = dict(numbers)
+    values = dict(numbers)
 
     def find(expression: str) -> Any:
-        return RULES.compile_expression(expression, undefined_to_none=False)(known)
+        return RULES.compile_expression(expression, undefined_to_none=False)(values)
 
     try:
         for name, expression in claim.given.items():
-            known[name] = find(expression)
-        measured = RULES.from_string(claim.measured).render(known)
+            values[name] = find(expression)
+        measured = RULES.from_string(claim.measured).render(values)
         for case in claim.verdicts:
             if find(case["if"]):
-                remark = RULES.from_string(case.get("remark", "")).render(known)
+                remark = RULES.from_string(case.get("remark", "")).render(values)
                 return Finding(case["verdict"], measured, remark, case.get("because", ""))
     except UndefinedError as error:
         needed = f"{error.message}: the notebook does not glue it"
@@ -150,9 +150,9 @@ def by_verdict(judged: dict[int, Finding]) -> str:
     for verdict in SIGNS:
         for reason in REASONS if verdict == PARTLY else ("",):
             groups[verdict, reason] = [
-                f"[{one.number}\u00a0{one.title}](#claim-{one.number})"
-                for one in CLAIMS
-                if (judged[one.number].verdict, judged[one.number].because) == (verdict, reason)
+                f"[{claim.number}\u00a0{claim.title}](#claim-{claim.number})"
+                for claim in CLAIMS
+                if (judged[claim.number].verdict, judged[claim.number].because) == (verdict, reason)
             ]
     return "\n".join(
         f"- {_marked(verdict)}{f', {reason}' if reason else ''}: {', '.join(rows) or 'none'}"

@@ -69,19 +69,19 @@ def name_cells(body: Tag) -> None:
 
 def link_code(app: Sphinx, page: str, body: Tag) -> None:
     """Link names of the package in code to their entries of the API, which link to the source."""
-    known: dict[str, str] = {}
+    entries: dict[str, str] = {}
     objects = app.env.domaindata["py"]["objects"]
     for path in sorted(objects, key=lambda path: (len(path), path)):
         entry = objects[path]
         if entry.objtype in ("class", "function") and page != entry.docname:
             address = f"{app.builder.get_relative_uri(page, entry.docname)}#{entry.node_id}"
-            known.setdefault(path.rpartition(".")[2], address)
+            entries.setdefault(path.rpartition(".")[2], address)
     code = "\n".join(block.get_text() for block in body.select(".highlight pre"))
     imported = {name for names in IMPORTED.findall(code) for name in re.findall(r"\w+", names)}
     for name in body.select(".highlight .n"):
         before = "".join(part.get_text() for part in reversed(list(name.previous_siblings)[:2]))
-        if name.string in known and (name.string in imported or before == "zwfs."):
-            name.wrap(body.new_tag("a", href=known[name.string], title="Open its entry in the API"))
+        if name.string in entries and (name.string in imported or before == "zwfs."):
+            name.wrap(body.new_tag("a", href=entries[name.string], title="Open its entry in the API"))
 
 
 def write_numbers(body: Tag) -> None:

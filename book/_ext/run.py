@@ -41,11 +41,11 @@ class MarkedText(PasteTextRole):
 
     def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
         """Return the text, marked."""
-        made, messages = super().run()
-        for node in made:
+        shown, messages = super().run()
+        for node in shown:
             if isinstance(node, nodes.inline):
                 node["classes"].append(f"glued:{self.text if ':' in self.text else f'{self.text}:s'}")
-        return made, messages
+        return shown, messages
 
 
 def form(figure: str, first: bool) -> str:
@@ -71,7 +71,7 @@ def described(notebook: NotebookNode, name: str) -> dict[str, Any]:
             cell.outputs, cell.execution_count = [], None
     return {
         "name": name,
-        "parameters": {key: field(one) for key, one in declared.parameters(notebook).items()},
+        "parameters": {key: field(parameter) for key, parameter in declared.parameters(notebook).items()},
         "quick": getattr(study, "QUICK", {}),
         "figures": {
             figure: number
@@ -97,11 +97,11 @@ def field(parameter: Parameter) -> dict[str, Any]:
 def limits(parameter: Parameter) -> dict[str, Any]:
     """Return the limits of a parameter for the form."""
     match parameter.limits:
-        case Fields() as known:
-            fields = {name: field(one) for name, one in parameter.fields().items() if name != "kind"}
-            return {"kinds": {kind: list(of) for kind, of in known.kinds.items()}, "fields": fields}
-        case [each, *more] if isinstance(parameter.limits, list):
-            return {"list": limits(Parameter(None, "", "", each)), "empty": bool(more)}
+        case Fields(kinds=kinds):
+            fields = {name: field(value) for name, value in parameter.fields().items() if name != "kind"}
+            return {"kinds": {kind: list(of) for kind, of in kinds.items()}, "fields": fields}
+        case [item, *more] if isinstance(parameter.limits, list):
+            return {"list": limits(Parameter(None, "", "", item)), "empty": bool(more)}
         case (str(), *_) as choices:
             return {"choices": choices}
         case (low, high):
@@ -165,8 +165,8 @@ def write(app: Sphinx, exception: Exception | None) -> None:
         write_script(folder / f"{source.stem}.js", "zwfsNotebook", described(notebook, source.stem))
     write_script(folder / "files.js", "zwfsFiles", base64.b64encode(site(project)).decode())
     Path(app.outdir, REPOSITORY).write_bytes(zipped(repository(project)))  # pip installs it
-    known = json.loads(KNOWN.read_text("utf-8"))
-    write_script(folder / "settings.js", "zwfsPython", known | {"place": place(app)})
+    version = json.loads(KNOWN.read_text("utf-8"))
+    write_script(folder / "settings.js", "zwfsPython", version | {"place": place(app)})
 
 
 def write_script(file: Path, name: str, value: Any) -> None:

@@ -83,7 +83,7 @@ def _digest(project: Project) -> str:
 def _write_pages(project: Project, output: Path) -> Path:
     """Run ``jupyter-book build .`` with the executed notebooks, and return the folder of the pages."""
     executed = {EXECUTED: str(project.executed.relative_to(project.root))}
-    command = [JUPYTER_BOOK, "build", *OPTIONS, "--path-output", output, "."]
+    command: list[str | Path] = [JUPYTER_BOOK, "build", *OPTIONS, "--path-output", output, "."]
     pipe, both = subprocess.PIPE, subprocess.STDOUT
     build = subprocess.run(
         command, cwd=project.root, env=os.environ | executed, stdout=pipe, stderr=both, text=True

@@ -155,7 +155,7 @@ class Run:
 def _complete(notebook: NotebookNode) -> bool:
     """Return whether every cell of code has run to its end; papermill takes sys.exit(0) for an end."""
     cells = [cell for cell in notebook.cells if cell.cell_type == "code" and cell.source.strip()]
-    return all(c.execution_count and all(one.output_type != "error" for one in c.outputs) for c in cells)
+    return all(c.execution_count and all(output.output_type != "error" for output in c.outputs) for c in cells)
 
 
 class Engine(NBClientEngine):

@@ -75,8 +75,8 @@ def _stage(project: Project, name: str, notebook: NotebookNode, files: list[Path
         shutil.copyfile(file, source / file.relative_to(root))
     downloads = source / "notebooks" / "downloads"
     downloads.mkdir(parents=True)
-    for other in project.sources():
-        shutil.copyfile(other, source / "notebooks" / other.name)
+    for notebook_of_book in project.sources():
+        shutil.copyfile(notebook_of_book, source / "notebooks" / notebook_of_book.name)
     (source / "notebooks" / f"{name}.ipynb").write_bytes(to_bytes(_with_downloads(notebook, files)))
     for file in files:
         shutil.copyfile(file, downloads / file.name)

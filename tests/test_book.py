@@ -24,7 +24,7 @@ def read(file):
 def addresses(soup):
     """Files that a page loads, and its links."""
     found = {tag[key] for key in ("src", "poster", "data", "href") for tag in soup.find_all(attrs={key: True})}
-    moved = soup.select("meta[http-equiv=refresh]")
+    moved = soup.select("meta[http-equiv=refresh i]")
     return found | {tag["content"].split("url=")[1] for tag in moved}
 
 

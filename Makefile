@@ -147,7 +147,8 @@ clean: ## remove the results of these commands, except those of make rerun
 
 $(BIN)/uv:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-		{ echo "zwfs needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) --version 2>&1)." \
+		{ echo "zwfs needs Python 3.11 or newer (tested: $(filter 3.%,$(PYTHONS)));" \
+		"$(PYTHON) is $$($(PYTHON) --version 2>&1)." \
 		"Choose another: make PYTHON=python3.12" >&2; exit 1; }
 	@echo "setting up $(VENV)"
 	@$(PYTHON) -m venv --clear $(VENV)

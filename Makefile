@@ -47,17 +47,29 @@ unexport FIGURE ARGS
 
 QUICK := --numprocesses auto --dist loadfile --benchmark-disable -m "not slow"
 
+# A command in an environment of its own: the built package with an extra, in the versions of a file, in a folder
+# without the source. uv looks for Pythons on the path; pyenv has them elsewhere.
+alone = cd _build/alone && ../../$(UV) tool run --isolated --constraints ../../$(2) --with "$$(echo ../dist/*.whl)[$(1)]"
+CORE := --doctest-modules --pyargs zwfs $(patsubst %,tests/test_%.py,detector masks metrics modes pupil sensor)
+PYTHONS ?= 3.11 3.12 3.13 lowest
+pythons: export PATH := $(PATH):$(subst $() ,:,$(wildcard $(HOME)/.pyenv/versions/3.1[1-9]*/bin))
+define IMPORT_STUDIES
+import pkgutil, sys
+sys.path.append("../../notebooks")
+import studies
+for module in pkgutil.walk_packages(studies.__path__, "studies."):
+    __import__(module.name)
+endef
+release-check: export IMPORT_STUDIES := $(IMPORT_STUDIES)
+
 .DELETE_ON_ERROR:
-.PHONY: help book pdf lab test test-fast test-slow coverage fuzz figures rerun lint bench release-check pythons address lock clean
+.PHONY: help book lab test test-fast test-slow coverage fuzz figures rerun lint bench dist release-check pythons lock clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 21
 
 book: $(READY) ## run the notebooks that changed and build the book in _build/html
 	@$(BIN)/python -m book._tools book
-
-pdf: $(READY) ## build the book and its PDF, _build/html/zwfs.pdf: needs Chromium
-	@$(BIN)/python -m book._tools pdf
 
 lab: $(READY) ## open the notebooks in JupyterLab
 	$(BIN)/jupyter lab notebooks
@@ -96,14 +108,30 @@ bench: $(READY) ## time the reconstructors, next to other packages, for the perf
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only --benchmark-json=_build/measured.json
 	$(BIN)/python -m tests.benchmarks.report _build/measured.json
 
-release-check: $(READY) ## build the package, and test it in an empty environment
-	@$(BIN)/python -m book._tools release-check
+dist: $(READY)
+	@rm -rf _build/dist _build/alone
+	@$(UV) build --no-build-isolation --python $(BIN)/python --out-dir _build/dist
+	@mkdir -p _build/alone
+	@cp -R tests pyproject.toml _build/alone
 
-pythons: $(READY) ## run examples and core tests on every supported Python, and with the oldest dependencies
-	@$(BIN)/python -m book._tools pythons $(PYTHONS)
+release-check: dist ## build the package in _build/dist, and test it in an empty environment
+	@$(call alone,test,$(LOCK)) pytest $(QUICK) $(CORE)
+	@$(call alone,notebooks,$(LOCK)) python -c "$$IMPORT_STUDIES"
 
-address: $(READY) ## write the public address in pyproject.toml to every file that names it
-	@$(BIN)/python -m book._tools address
+pythons: dist ## run examples and core tests on every supported Python, and with the oldest dependencies
+	@for python in $(PYTHONS); do \
+		version=$$(echo $$python | sed s/lowest/3.11/); \
+		$(UV) python find $$version >/dev/null 2>&1 || $(UV) python install $$version 2>/dev/null || \
+			{ echo "Python $$python: not tested, because it is not installed and uv cannot fetch it here"; continue; }; \
+		pins=$(LOCK); \
+		if test $$python = lowest; then \
+			pins=_build/alone/lowest.txt; \
+			$(UV) pip compile --resolution lowest-direct --extra test --python-version 3.11 --no-header \
+				--output-file $$pins pyproject.toml >/dev/null || exit 1; \
+		fi; \
+		($(call alone,test,$$pins) --python $$version pytest $(QUICK) $(CORE)) || exit 1; \
+		echo "Python $$python: passed"; \
+	done
 
 lock: $(BIN)/uv ## pin the newest allowed version of every dependency, or of one: make lock PACKAGE=numpy
 	$(PIN) pyproject.toml --extra book --extra cluster --extra lab --extra test \
@@ -112,14 +140,15 @@ lock: $(BIN)/uv ## pin the newest allowed version of every dependency, or of one
 
 # Other files in _build belong to the user, above all the results of make rerun.
 clean: ## remove the results of these commands, except those of make rerun
-	rm -rf $(addprefix _build/,home html html.json jupyter_execute measured.json notebooks performance dist building-* running-* rerunning-* releasing-*)
+	rm -rf $(addprefix _build/,alone home html html.json jupyter_execute measured.json notebooks performance dist building-* running-* rerunning-*)
 	rm -rf build $(VENV) *.egg-info .benchmarks .coverage* .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name _build -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 	@if [ -d _build ] && ! rmdir _build 2>/dev/null; then echo "kept: $$(echo _build/*)"; fi
 
 $(BIN)/uv:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-		{ echo "zwfs needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) --version 2>&1)." \
+		{ echo "zwfs needs Python 3.11 or newer (tested: $(filter 3.%,$(PYTHONS)));" \
+		"$(PYTHON) is $$($(PYTHON) --version 2>&1)." \
 		"Choose another: make PYTHON=python3.12" >&2; exit 1; }
 	@echo "setting up $(VENV)"
 	@$(PYTHON) -m venv --clear $(VENV)

@@ -2,6 +2,7 @@ import functools
 import inspect
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,11 +24,7 @@ ROOT = Path(__file__).parent.parent
 os.environ.pop("ZWFS_SWEEPS", None)  # a test computes, and reads no stored results
 
 
-def new_reconstructor():
-    """Return the path and the code of the reconstructor in CONTRIBUTING."""
-    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
-    path = r"`(zwfs/reconstructors/(?!_)\w+\.py)`"
-    return re.search(rf"{path}.*?^```python\n(.*?)^```", text, re.M | re.S).groups()
+EXAMPLES = ROOT / "tests" / "examples"  # of CONTRIBUTING
 
 
 def code_of(page, language="python"):
@@ -56,7 +53,6 @@ SLOW = {
     "cluster",
     "foreign_cluster",
     "plain_book",
-    "published_book",
     "real",
     "seal",
     "template",
@@ -194,20 +190,25 @@ def complex_field():
 
 
 def watch(page):
-    """Everything that a page of the browser says, and every address that it asks for."""
+    """The errors and warnings of a page of the browser, and every address that it asks for."""
     said, asked = [], []
-    page.on("console", lambda message: said.append(message.text))
+    page.on("console", lambda message: said.append(message.text) if message.type in ("error", "warning") else None)
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda request: asked.append(request.url))
     return said, asked
+
+
+def find_chromium():
+    """Return the path of a Chromium: the one in ``ZWFS_CHROMIUM``, else that of the system."""
+    named = os.environ.get("ZWFS_CHROMIUM")
+    programs = [named] if named else ["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"]
+    return next(filter(None, map(shutil.which, programs)), None)
 
 
 @pytest.fixture(scope="module")
 def browser():
     """A Chromium, driven by Playwright; it is closed with the module, whose event loop others could not share."""
     from playwright.sync_api import sync_playwright
-
-    from book._tools.pdf import find_chromium
 
     program = find_chromium()
     if program is None:

@@ -12,7 +12,8 @@ WIDTHS = (1280, 390)
 PAGES = sorted(
     file.relative_to(HTML).as_posix()
     for file in HTML.rglob("*.html")
-    if file.relative_to(HTML).parts[0] != "_static" and 'http-equiv="refresh"' not in file.read_text("utf-8")
+    if file.relative_to(HTML).parts[0] != "_static"
+    and 'http-equiv="refresh"' not in file.read_text("utf-8").lower()
 )
 
 pytestmark = [
@@ -57,11 +58,7 @@ def opened(request, window):
     """A page, and what it said, asked and moved while it was loaded."""
     page = window.new_page()
     said, asked = watch(page)
-    narrow = page.viewport_size["width"] < max(WIDTHS)
-    query = "?q=x" * (
-        narrow and request.param != "search.html"
-    )  # it does not change a page that searches for nothing
-    page.goto(address(request.param) + query)
+    page.goto(address(request.param))
     settle(page)
     moved = page.evaluate("window.moved")
     loaded = SimpleNamespace(page=page, said=list(said), asked=list(asked), moved=moved)

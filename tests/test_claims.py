@@ -10,7 +10,7 @@ from book._ext import claims
 from book._ext.claims import FAILS, HOLDS, PARTLY, UNTESTED, Claim, ClaimError, Finding
 from studies.fig04_dimple_diameter import SHORT
 
-from .conftest import glued
+from .conftest import ROOT, glued
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 VERDICTS = json.loads((Path(__file__).parent / "claims.json").read_text())
@@ -136,18 +136,11 @@ def test_missing_number_is_named():
         claims.judge(claim, {"gain": 2.0})
 
 
-@pytest.mark.parametrize("number", [number for number, claim in CLAIMS.items() if claim.notebook])
-def test_the_marked_lines_compute_the_numbers_of_a_claim(number):
-    code = (NOTEBOOKS / "studies" / f"{CLAIMS[number].notebook}.py").read_text()
-    options = claims.marked_lines(CLAIMS[number], code)
-    first, last = map(int, options["lines"].split("-"))
-    marked = [code.splitlines()[first - 2 + int(line)] for line in options["emphasize-lines"].split(",")]
-    assert any('"' in line for line in marked)
-    assert last <= len(code.splitlines())
-    names = CLAIMS[number].code
-    assert names
-    assert all(re.search(rf"(?m)^(?:def|class) {name}\(", code) for name in names)
-    if number == 10:
-        assert [line.split()[0] for line in marked[:2]] == ["alike", "recovered"]
-    if number == 13:
-        assert [line.split('"')[1] for line in marked] == ["fourier_functions"]
+def test_rules_show_each_function_that_a_claim_names():
+    text = claims.rules()
+    for claim in CLAIMS.values():
+        for path in claim.code:
+            file, _, name = path.rpartition(" ")
+            code = (ROOT / (file or f"notebooks/studies/{claim.notebook}.py")).read_text("utf-8")
+            assert re.search(rf"(?m)^(?:def|class) {name}\(", code), (claim.number, name)
+            assert f":pyobject: {name}\n" in text

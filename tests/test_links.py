@@ -1,24 +1,24 @@
 """Links of the book: from equations to code and tests, and from the first use of a term to the glossary."""
 
+import re
+
 import pytest
 from bs4 import BeautifulSoup
 from docutils import nodes
 from docutils.utils import new_document
 
-from book._ext import equations, glossary
+from book._ext import api, glossary
 
 from .conftest import ROOT
 
 
-def test_equations_lead_to_the_code_that_cites_them_and_to_its_tests():
-    found = equations.implementations(ROOT)
-    assert found["eq-phase-shifted"] == ["zwfs.PhaseShifted"]
-    assert found["eq-reference"] == ["zwfs.ZernikeSensor.reference_wave"], "the method, not its class"
-    assert len(found) >= 25
-    assert equations.tests(ROOT, "zwfs.ZernikeSensor.adjoint") == ["test_sensor.py"]
-    assert equations.tests(ROOT, "zwfs.cramer_rao") == ["test_bounds.py"]
-    for paths in found.values():
-        assert all((ROOT / "tests" / file).is_file() for path in paths for file in equations.tests(ROOT, path))
+def test_equations_of_the_paper_name_their_code_and_its_tests():
+    text = "\n".join((ROOT / "book" / page).read_text("utf-8") for page in api.PAPER)
+    lines = re.findall(r"^Code: (.*)", text, re.MULTILINE)
+    assert len(lines) >= 8
+    for line in lines:
+        assert re.match(r"\{py:obj\}`zwfs\.[\w.]+`", line)
+        assert all((ROOT / "tests" / name).is_file() for name in re.findall(r"`(test_\w+\.py)`", line))
 
 
 @pytest.mark.parametrize(

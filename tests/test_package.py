@@ -17,7 +17,7 @@ from book._ext.run import package, repository, zipped
 from book._tools.project import Project
 from zwfs._lazy import offered
 
-from .conftest import ROOT, new_reconstructor
+from .conftest import EXAMPLES, ROOT
 
 
 def run(*command, folder=ROOT):
@@ -68,7 +68,7 @@ def test_type_checkers_know_modules_and_results_and_accept_a_new_reconstructor(t
     )
     file.write_text(code)
     example = tmp_path / "second_order.py"
-    example.write_text(new_reconstructor()[1])
+    shutil.copy(EXAMPLES / "wirtinger_flow.py", example)
     count, read, unknown, errors = run("-m", "mypy", str(file), str(example)).stdout.splitlines()
     assert 'Revealed type is "int"' in count
     assert 'Revealed type is "def (path: ' in read

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from importlib import import_module
-from urllib.parse import urlsplit
 
 import pytest
 from bs4 import BeautifulSoup
@@ -16,20 +15,18 @@ import zwfs
 from book._ext import api
 
 from .conftest import ROOT
-from .test_address import NOWHERE, PUBLISHED, give
 
 
 def read(file):
     return BeautifulSoup(file.read_text("utf-8"), "html.parser")
 
 
-def build(root, public=NOWHERE):
+def build(root):
     """Run Jupyter Book on a copy of the tracked files, warnings as errors, and return the folder of pages."""
     listed = subprocess.run(["git", "-C", ROOT, "ls-files"], capture_output=True, text=True, check=True).stdout
     for name in filter(lambda name: (ROOT / name).is_file(), listed.splitlines()):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / name, root / name)
-    give(root, public)
     jupyter_book = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()"]
     command = [*jupyter_book, "build", "-W", "-n", "--keep-going", "."]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True)
@@ -64,7 +61,6 @@ def test_figures_have_cards_with_their_notebooks_and_the_address_leads_to_the_fr
             assert (page.parent / link["href"]).resolve().is_file()
     assert (plain_book / "_static" / "mathjax" / "tex-chtml-full.js").is_file()
     assert 'url=book/index.html"' in (plain_book / "index.html").read_text("utf-8")
-    assert 'url=claims.html"' in (plain_book / "book" / "differences.html").read_text("utf-8")
 
 
 def test_names_of_the_package_in_code_lead_to_the_api(plain_book):
@@ -86,76 +82,11 @@ def test_equations_are_numbered_through_the_book_and_those_of_the_paper_as_there
     assert found == list(range(1, len(found) + 1))
 
 
-# The address of the project
-
-
-MADE = "claims", "live", "performance"
-
-
-@pytest.fixture(scope="module")
-def published_book(tmp_path_factory):
-    return build(tmp_path_factory.mktemp("published in another folder"), PUBLISHED)
-
-
-def article(file):
-    """The article of a page, without the addresses of its links."""
-    found = read(file).article
-    for link in found.select("a[href]"):
-        del link["href"]
-    return str(found)
-
-
-def test_a_build_in_another_folder_gives_the_same_pages_and_pictures(plain_book, published_book):
-    """Of what our extensions make; most other pages name the address."""
-    made = [*plain_book.glob("book/api_*.html"), *(plain_book / f"book/{name}.html" for name in MADE)]
-    assert len(made) > len(MADE)
-    for page in made:
-        assert article(page) == article(published_book / page.relative_to(plain_book)), page.name
-    pictures = [file for file in plain_book.glob("_images/*") if file.is_file()]
-    assert pictures
-    for file in pictures:
-        assert file.read_bytes() == (published_book / file.relative_to(plain_book)).read_bytes(), file.name
-
-
-def links(page):
-    return {link["href"] for link in page.find_all("a", href=True)}
-
-
-def launches(page):
-    return {link for link in links(page) if urlsplit(link).netloc in ("mybinder.org", "colab.research.google.com")}
-
-
-def test_book_without_an_address_promises_none(plain_book):
+def test_book_names_no_public_address(plain_book):
     for file in plain_book.glob("**/*.html"):
-        page = read(file)
-        public = [link for link in links(page) if re.search("executablebooks|/issues/new|/blob/", link)]
-        assert not launches(page) | {*public}, file.name
-        assert not page.select("link[rel=canonical], meta[property='og:url'], meta[property='og:image']")
-    front = read(plain_book / "book" / "index.html")
-    (archive,) = (link for link in links(front) if link.endswith(".zip"))
-    assert f"pip install {archive.rpartition('/')[2]}\n" in front.article.get_text()
-    assert (plain_book / "book" / archive).is_file()
-    assert "git clone" not in read(plain_book / "book" / "checking.html").article.get_text()
-
-
-def test_book_with_an_address_has_buttons_links_and_a_card(published_book):
-    notebook = "notebooks/fig03_dynamic_range"
-    assert launches(read(published_book / f"{notebook}.html")) == {
-        f"https://mybinder.org/v2/gh/reader/sensor/main?urlpath=lab/tree/{notebook}.ipynb",
-        f"https://colab.research.google.com/github/reader/sensor/blob/main/{notebook}.ipynb",
-    }
-    place = published_book / "book"
-    front = read(place / "index.html")
-    assert not launches(front)
-    assert {PUBLISHED.repository, f"{PUBLISHED.repository}/edit/main/book/index.md"} <= links(front)
-    assert [link for link in links(front) if link.startswith(f"{PUBLISHED.repository}/issues/new")]
-    assert 'pip install "zwfs @ git+https://github.com/reader/sensor"' in front.article.get_text()
-    assert f"git clone {PUBLISHED.repository}\n" in read(place / "checking.html").article.get_text()
-    assert f"{PUBLISHED.repository}/blob/main/tests/test_sensor.py" in links(read(place / "methods.html"))
-    told = {tag["property"]: tag["content"] for tag in front.head.select("meta[property]")}
-    assert told["og:url"] == f"{PUBLISHED.book}book/index.html"
-    assert told["og:image"] == f"{PUBLISHED.book}_static/front.png"
-    assert (published_book / "_static" / "front.png").is_file()
+        addresses = [link["href"] for link in read(file).find_all("a", href=True)]
+        assert not re.search("executablebooks|/issues/new|/blob/|mybinder", " ".join(addresses)), file.name
+    assert (plain_book / "_static" / "zwfs.zip").is_file()
 
 
 # The API pages

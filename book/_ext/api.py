@@ -14,23 +14,16 @@ from docutils.statemachine import StringList
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
-from sphinx.pycode import ModuleAnalyzer
-from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import make_refnode
 
-from zwfs._lazy import offered
-
 PACKAGE = "zwfs"
-PAGE = "book/api"
 KINDS = ("class", "data", "exception", "function")
 # The pages with the equations of the paper, in its order.
 PAPER = ("sensor.md", "phase_shifted.md", "methods.md")
 
 BACK = re.compile(r'<a class="viewcode-back".*?</a>')
 NUMBERED = re.compile(r"(?<=Chambouleyron)[^;]*?equations?\s[^;.\n]*")
-
-logger = logging.getLogger(__name__)
 
 
 class Modules(SphinxDirective):
@@ -44,8 +37,8 @@ class Modules(SphinxDirective):
         lines = []
         for name in self.arguments[0].split():
             package = name.removesuffix(".*")
-            below = [one for one in modules() if name != package and one.startswith(f"{package}.")]
-            for module in (package, *below):
+            inside = [module for module in modules() if name != package and module.startswith(f"{package}.")]
+            for module in (package, *inside):
                 lines += section(module)
         self.state.nested_parse(StringList(lines, self.env.docname), 0, nodes.container(), match_titles=True)
         return []
@@ -58,11 +51,10 @@ def section(name: str) -> list[str]:
     for own in own_names(module):
         thing = getattr(module, own)
         kind = "class" if inspect.isclass(thing) else "function"
-        listed = methods(thing) if inspect.isclass(thing) else []
+        listed = members(thing) if inspect.isclass(thing) else []
         options = [f"   :members: {', '.join(listed)}"] if listed else []
+        options += ["   :special-members: __call__"] if "__call__" in listed else []
         directives += [f".. auto{kind}:: {path(module, own)}", *options, ""]
-    for own, text in constants(module).items():
-        directives += [f".. py:data:: {own}", f"   :module: {name}", "", f"   {text}", ""]
     return [f"## `{name}`", "", "```{eval-rst}", f".. automodule:: {name}", "", *directives, "```", ""]
 
 
@@ -70,8 +62,8 @@ def section(name: str) -> list[str]:
 def modules() -> list[str]:
     """Return the names of the public modules of the package, in order."""
     package = importlib.import_module(PACKAGE)
-    found = (module.name for module in pkgutil.walk_packages(package.__path__, f"{PACKAGE}."))
-    named = (name for name in found if not any(part.startswith("_") for part in name.split(".")))
+    walked = (module.name for module in pkgutil.walk_packages(package.__path__, f"{PACKAGE}."))
+    named = (name for name in walked if not any(part.startswith("_") for part in name.split(".")))
     # A module with an empty list of public names is a part of the package.
     return sorted(name for name in named if getattr(importlib.import_module(name), "__all__", True))
 
@@ -94,67 +86,23 @@ def own_names(module: ModuleType) -> list[str]:
     ]
 
 
-def methods(thing: type) -> list[str]:
-    """Return the methods that have entries of their own: public ones that repeat no method of a class above."""
+def members(thing: type) -> list[str]:
+    """Return the methods and properties that have entries of their own: they repeat none of a class above."""
     return [
         name
         for name, value in vars(thing).items()
-        if isinstance(value, FunctionType | classmethod | staticmethod)
-        and not (name.startswith("_") or any(hasattr(base, name) for base in thing.__bases__))
+        if isinstance(value, FunctionType | classmethod | staticmethod | property | cached_property)
+        and (name == "__call__" or not name.startswith("_"))
+        and not any(name in dir(base) for base in thing.__bases__)
     ]
-
-
-def list_properties(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Append the properties of a class and their summaries to its docstring."""
-    found = {key: value for key, value in vars(thing).items() if is_property(value)} if what == "class" else {}
-    if found := {key: value for key, value in found.items() if not key.startswith("_")}:
-        lines += ["", "Properties", "----------"]
-        for key, value in found.items():
-            summary = (inspect.getdoc(value) or "").partition("\n\n")[0]
-            lines += [key, f"    {' '.join(summary.split())}"]
-
-
-def list_call(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Append the call of the objects of a class to its docstring: what it does, its parameters and its result."""
-    call = vars(thing).get("__call__") if what == "class" else None
-    text = inspect.getdoc(call)
-    if call is None or not text:
-        return
-    summary, *parts = re.split(r"^(Parameters|Returns)\n-+\n", text, flags=re.MULTILINE)
-    found = dict(zip(parts[::2], (re.split(r"\n+\S.*\n-+\n", part)[0] for part in parts[1::2]), strict=True))
-    names = ", ".join(list(inspect.signature(call).parameters)[1:])
-    lines += ["", "Call", "----", f"{thing.__name__}(...)({names})"]
-    lines += [f"    {line}".rstrip() for line in summary.strip().splitlines()]
-    lines += found.get("Parameters", "").strip().splitlines()
-    if returned := found.get("Returns", "").strip():
-        lines += f"returns : {returned}".splitlines()
-
-
-def is_property(value: Any) -> bool:
-    """Return whether a member of a class is computed when it is read."""
-    return isinstance(value, property | cached_property)
-
-
-def constants(module: ModuleType) -> dict[str, str]:
-    """Return the docstrings of the public constants of a module: the strings after the assignments.
-
-    A package may also offer constants of a private part.
-    """
-    offers = offered(inspect.getsource(module))
-    found = {}
-    for part in (module.__name__, *sorted({home for home, _ in offers.values() if "._" in home})):
-        for (owner, name), lines in ModuleAnalyzer.for_module(part).find_attr_docs().items():
-            if not owner and not name.startswith("_") and (part == module.__name__ or name in offers):
-                found[name] = " ".join(lines).strip()
-    return found
 
 
 def path(module: ModuleType, name: str) -> str:
     """Return the shortest path from which a name can be imported; a path can also be that of a module."""
-    parts, taken = module.__name__.split("."), modules()
+    parts, of_modules = module.__name__.split("."), modules()
     for package in (importlib.import_module(".".join(parts[:depth])) for depth in range(1, len(parts))):
         same = getattr(package, name, None) is getattr(module, name)
-        if same and name in package.__all__ and f"{package.__name__}.{name}" not in taken:
+        if same and name in package.__all__ and f"{package.__name__}.{name}" not in of_modules:
             return f"{package.__name__}.{name}"
     return f"{module.__name__}.{name}"
 
@@ -175,7 +123,7 @@ def link_equations(app: Sphinx, what: str, name: str, thing: Any, options: Any, 
 
     text = NUMBERED.sub(lambda cited: re.sub(r"\((\d+)\)", label, cited[0]), "\n".join(lines))
     # A bar is a modulus and no substitution; code in double backticks stays as it is.
-    text = re.sub(r"``[^`]*``|\|", lambda found: "\\|" if found[0] == "|" else found[0], text)
+    text = re.sub(r"``[^`]*``|\|", lambda part: "\\|" if part[0] == "|" else part[0], text)
     lines[:] = text.splitlines()
 
 
@@ -206,19 +154,10 @@ def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, An
         context["body"] = BACK.sub("", context["body"])
 
 
-def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
-    """Warn of public modules that are missing on the API pages."""
-    if PAGE in env.found_docs and (missing := set(modules()) - set(env.domains["py"].modules)):
-        logger.warning("no directive names %s", ", ".join(sorted(missing)), location=PAGE)
-
-
 def setup(app: Sphinx) -> dict[str, bool]:
     """Add the directive and the links."""
     app.add_directive("modules", Modules)
-    app.connect("autodoc-process-docstring", list_properties, priority=300)
-    app.connect("autodoc-process-docstring", list_call, priority=310)
     app.connect("autodoc-process-docstring", link_equations, priority=400)
     app.connect("missing-reference", link_name)
     app.connect("html-page-context", drop_links_back)
-    app.connect("env-check-consistency", check_complete)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

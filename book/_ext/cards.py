@@ -56,7 +56,7 @@ def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions
         cells.append(cell)
         for figure in published(cell.source) if cell.cell_type == "code" else []:
             cell.metadata.setdefault("mystnb", {}).setdefault("figure", {})["classes"] = VARIANTS + figure
-            first = not any(one.id.startswith(CARD) for one in cells)
+            first = not any(cell_above.id.startswith(CARD) for cell_above in cells)
             text = ["::::{div} run-card", files(name, figure, links), "", run.form(figure, first), "::::"]
             cells.append(new_markdown_cell("\n".join(text), id=f"{CARD}{figure}"[:64]))
     if not any(cell.id.startswith(CARD) for cell in cells):  # the page shows tables only
@@ -64,8 +64,8 @@ def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions
         text = ["::::{div} run-card", files(name, "", links), "", run.form("", True), "::::"]
         cells.insert(place, new_markdown_cell("\n".join(text), id=f"{CARD}{name}"[:64]))
     if versions:
-        made = f"::::{{div}} run-card\nCommit: {commit}. Versions: {versions}.\n::::"
-        cells.append(new_markdown_cell(made, id=f"{CARD}made"))
+        origin = f"::::{{div}} run-card\nCommit: {commit}. Versions: {versions}.\n::::"
+        cells.append(new_markdown_cell(origin, id=f"{CARD}made"))
     notebook.cells = cells
 
 
@@ -89,10 +89,10 @@ def files(name: str, figure: str, links: dict[str, str]) -> str:
 def versions(run: Path) -> str:
     """List the versions of Python and packages of a run, from its record; nothing without one."""
     try:
-        known: dict[str, Any] = json.loads(run.with_suffix(".json").read_bytes()).get("versions", {})
+        recorded: dict[str, Any] = json.loads(run.with_suffix(".json").read_bytes()).get("versions", {})
     except (OSError, ValueError):
-        known = {}
-    return ", ".join(f"{package} {version}" for package, version in known.items())
+        recorded = {}
+    return ", ".join(f"{package} {version}" for package, version in recorded.items())
 
 
 def commit(root: Path) -> str:
@@ -114,8 +114,8 @@ def write_archives(app: Sphinx, exception: Exception | None) -> None:
 
 def archive(project: Project, notebook: Path) -> bytes:
     """Return a ZIP of a notebook, the studies that it imports and their data."""
-    studies = (one for one in project.depends_on(notebook.stem) if one.is_relative_to(project.studies))
-    files = {one.relative_to(project.notebooks).as_posix(): one.read_bytes() for one in studies}
+    studies = (file for file in project.depends_on(notebook.stem) if file.is_relative_to(project.studies))
+    files = {file.relative_to(project.notebooks).as_posix(): file.read_bytes() for file in studies}
     return run.zipped(files | {notebook.name: notebook.read_bytes()})
 
 

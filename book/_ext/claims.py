@@ -1,6 +1,5 @@
 """The paper's claims: their table, with measured values and verdicts, and the rules that give these."""
 
-import ast
 import json
 import math
 import re
@@ -23,8 +22,6 @@ HOLDS, PARTLY, FAILS, UNTESTED = "holds", "holds in part", "does not hold", "not
 # The signs differ in shape, for readers who do not see the colours.
 SIGNS = {HOLDS: "✔", PARTLY: "◐", FAILS: "✘", UNTESTED: "○"}
 REASONS = ("a part does not hold", "a number differs", "the paper leaves a condition open")  # of `PARTLY`
-STUDIES = Path(__file__).parents[2] / "notebooks" / "studies"
-BENCHMARKS = Path(__file__).parents[2] / "tests" / "benchmarks"
 PARTS = {"sensor": range(1, 7), "range": range(7, 14), "choices": range(14, 18), "bench": range(18, 22)}
 
 
@@ -80,13 +77,12 @@ class Claim:
     statement: str
     verdicts: list[dict[str, str]]  # the first whose condition applies; otherwise the claim holds
     source: str = ""  # the notebook that measures it, and the heading to link to: ``notebook#its-words``
-    code: list[str] = field(default_factory=list)  # functions and classes in its study that compute its numbers
+    # The functions and classes that compute its numbers; those outside of its study with their file.
+    code: list[str] = field(default_factory=list)
     rule: str = ""  # the conditions of the verdicts, in plain words
     given: dict[str, str] = field(default_factory=dict)  # names for expressions
     measured: str = ""  # template of the measured values
-    timed: list[dict[str, str]] = field(default_factory=list)  # functions of the benchmarks that measure its times
     also: str = ""  # another notebook whose numbers the rule uses
-    refined: list[str] = field(default_factory=list)  # functions in `kit/curves.py` that its code calls
 
     @property
     def notebook(self) -> str:
@@ -112,18 +108,18 @@ def glued(notebook: Path) -> dict[str, float]:
 
 def judge(claim: Claim, numbers: Mapping[str, Any]) -> Finding:
     """Judge a claim by the numbers of its notebook, see `glued`."""
-    known = dict(numbers)
+    values = dict(numbers)
 
     def find(expression: str) -> Any:
-        return RULES.compile_expression(expression, undefined_to_none=False)(known)
+        return RULES.compile_expression(expression, undefined_to_none=False)(values)
 
     try:
         for name, expression in claim.given.items():
-            known[name] = find(expression)
-        measured = RULES.from_string(claim.measured).render(known)
+            values[name] = find(expression)
+        measured = RULES.from_string(claim.measured).render(values)
         for case in claim.verdicts:
             if find(case["if"]):
-                remark = RULES.from_string(case.get("remark", "")).render(known)
+                remark = RULES.from_string(case.get("remark", "")).render(values)
                 return Finding(case["verdict"], measured, remark, case.get("because", ""))
     except UndefinedError as error:
         needed = f"{error.message}: the notebook does not glue it"
@@ -154,9 +150,9 @@ def by_verdict(judged: dict[int, Finding]) -> str:
     for verdict in SIGNS:
         for reason in REASONS if verdict == PARTLY else ("",):
             groups[verdict, reason] = [
-                f"[{one.number}\u00a0{one.title}](#claim-{one.number})"
-                for one in CLAIMS
-                if (judged[one.number].verdict, judged[one.number].because) == (verdict, reason)
+                f"[{claim.number}\u00a0{claim.title}](#claim-{claim.number})"
+                for claim in CLAIMS
+                if (judged[claim.number].verdict, judged[claim.number].because) == (verdict, reason)
             ]
     return "\n".join(
         f"- {_marked(verdict)}{f', {reason}' if reason else ''}: {', '.join(rows) or 'none'}"
@@ -199,76 +195,25 @@ def rules() -> str:
     for notebook in dict.fromkeys(claim.notebook for claim in CLAIMS if claim.notebook):
         text += f"::::{{dropdown}} Rules and numbers: {_title(notebook)}\n"
         text += ":class-container: d-print-none claim-code\n\n"
-        code = f"../notebooks/studies/{notebook}.py"
-        for claim in CLAIMS:
-            if claim.notebook == notebook:
-                ends = {"start-at": f"- number: {claim.number}", "end-before": f"- number: {claim.number + 1}"}
-                row = f"[Claim {claim.number}](#claim-{claim.number})"
-                text += f"(rule-{claim.number})=\n**{row}.** {claim.rule}\n\n"
-                text += _include("_ext/claims.yml", language="yaml", **ends)
-                text += f"(code-{claim.number})=\n"
-                for timed in claim.timed:
-                    file, options = timing_lines(**timed)
-                    text += f"**Its times**, `tests/benchmarks/{timed['file']}`:\n\n" + _include(file, **options)
-                text += "**Code that computes its numbers**, "
-                text += f"`notebooks/studies/{notebook}.py`:\n\n"
-                for name in claim.code:
-                    text += _include(code, pyobject=name)
-                if claim.refined:
-                    text += "From `notebooks/studies/kit/curves.py`:\n\n"
-                for function in claim.refined:
-                    text += _include("../notebooks/studies/kit/curves.py", pyobject=function)
-                text += f"**Its numbers**, the marked lines of `notebooks/studies/{notebook}.py`:\n\n"
-                text += _include(code, **marked_lines(claim, (STUDIES / f"{notebook}.py").read_text("utf-8")))
-                if claim.also:
-                    text += f"The others are from [{_title(claim.also)}](../notebooks/{claim.also}.ipynb).\n\n"
-        text += "**All numbers:**\n\n"
-        text += _include(code, name=f"numbers-{notebook}", pyobject="numbers") + "::::\n\n"
+        study = f"notebooks/studies/{notebook}.py"
+        text += "".join(_rule(claim, study) for claim in CLAIMS if claim.notebook == notebook)
+        text += f"**All numbers**, `{study}`:\n\n"
+        text += _include(f"../{study}", name=f"numbers-{notebook}", pyobject="numbers") + "::::\n\n"
     return text
 
 
-def marked_lines(claim: Claim, code: str) -> dict[str, str]:
-    """Return the lines of a study that compute the numbers of a claim, as options of ``literalinclude``."""
-    [function] = [
-        one for one in ast.parse(code).body if isinstance(one, ast.FunctionDef) and one.name == "numbers"
-    ]
-    expressions = [*claim.given.values(), claim.measured]
-    expressions += [text for case in claim.verdicts for text in (case["if"], case.get("remark", ""))]
-    names = set(re.findall(r"[a-z]\w+", " ".join(expressions)))
-    found = set()
-    for number, line in enumerate(code.splitlines(), 1):
-        if function.lineno <= number <= (function.end_lineno or 0):
-            # A name as a key, of which a part may be filled in.
-            keys = [re.sub(r"{\w+}", r"\\w*", key) for key in re.findall(r'"([\w{}]+)"(?::|\] =)', line)]
-            if any(re.fullmatch(key, name) for key in keys for name in names):
-                found.add(number)
-    # And the lines of local names on them.
-    lines = code.splitlines()
-    used = set(re.findall(r"\w+", " ".join(re.sub(r'^ *\S*":', "", lines[number - 1]) for number in found)))
-    for one in (one for one in function.body if found and isinstance(one, ast.Assign)):
-        named = (name for target in one.targets for name in ast.walk(target) if isinstance(name, ast.Name))
-        targets = {name.id for name in named if isinstance(name.ctx, ast.Store)}
-        if targets & (used - {"mean", "rms"}):
-            found |= set(range(one.lineno, (one.end_lineno or one.lineno) + 1))
-    if not found:
-        raise ClaimError(f"claim {claim.number}, {claim.notebook}: no line of its study computes its numbers")
-    loops = [node for node in ast.walk(function) if isinstance(node, ast.For)]
-    found |= {one.lineno for one in loops if found & set(range(one.lineno, (one.end_lineno or 0) + 1))}
-    first, last = min(found), max(found)
-    marked = ",".join(str(number - first + 1) for number in sorted(found))
-    return {"lines": f"{first}-{last}", "emphasize-lines": marked}
-
-
-def timing_lines(file: str, function: str, marks: str) -> tuple[str, dict[str, str]]:
-    """Return the file and the options of ``literalinclude`` for a function of the benchmarks.
-
-    Lines in which the pattern `marks` is found are emphasized.
-    """
-    code = (BENCHMARKS / file).read_text("utf-8")
-    [found] = [one for one in ast.parse(code).body if getattr(one, "name", "") == function]
-    lines = enumerate(code.splitlines()[found.lineno - 1 : found.end_lineno], 1)
-    marked = [str(number) for number, line in lines if re.search(marks, line)]
-    return f"../tests/benchmarks/{file}", {"pyobject": function, "emphasize-lines": ",".join(marked)}
+def _rule(claim: Claim, study: str) -> str:
+    """Return the rule of a claim and the code of its numbers."""
+    number = claim.number
+    ends = {"language": "yaml", "start-at": f"- number: {number}", "end-before": f"- number: {number + 1}"}
+    text = f"(rule-{number})=\n**[Claim {number}](#claim-{number}).** {claim.rule}\n\n"
+    text += _include("_ext/claims.yml", **ends) + f"(code-{number})=\n**Code that computes its numbers:**\n\n"
+    for path in claim.code:
+        file, _, name = path.rpartition(" ")
+        text += f"`{file or study}`\n\n" + _include(f"../{file or study}", pyobject=name)
+    if claim.also:
+        text += f"The others are from [{_title(claim.also)}](../notebooks/{claim.also}.ipynb).\n\n"
+    return text
 
 
 def _include(file: str, **options: str) -> str:

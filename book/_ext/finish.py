@@ -1,11 +1,9 @@
-"""Finish of the pages: numbers, sizes of pictures, descriptions for links, MathJax without the network."""
+"""Finish of the pages: numbers, variants and sizes of pictures, MathJax without the network."""
 
 import copy
 import importlib.util
-import os
 import re
 import struct
-import textwrap
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -13,55 +11,24 @@ from urllib.parse import unquote
 from bs4 import BeautifulSoup, Tag
 from docutils import nodes
 from sphinx.application import Sphinx
-from sphinx.config import Config
 from sphinx.util.fileutil import copy_asset_file
 
 from book._ext.glossary import GLOSSARY, define
 from book._ext.performance import PICTURES
-from book._tools.address import setting
-from book._tools.project import PDF
 from studies.kit.tables import MISSING
 
 VARIANTS = "variants-"  # with which the class of a figure begins that may have dark and narrow variants
 PHONE = "(max-width: 600px)"
 BY_ROW = "table:is(.claims, .decision), :is(.tag_decision, .tag_closed-loop) table"
-CARD = "_static/front.png"
-CARD_ALT = "A wavefront, its two images, and three reconstructions."
-LENGTH = 200  # characters of a description
-MATH = {"lambda": "λ", "theta": "θ", "pi": "π", "pm": "±"}
-TEX = re.compile(r"\\(?:[()]|([a-z]+))")
 POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e([+-])0*(\d+)\b")
 MINUS = re.compile(r"(?<![\w.)-])-(?=\d)")
 PERCENT = re.compile(r"(?:(?<=\d)|^) ?%")  # the number may be in the element before
 DIGITS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 IMPORTED = re.compile(r"^from zwfs[\w.]* import (\([^)]*\)|.*)$", re.MULTILINE)
-CONSOLE = re.compile(r"\bconsole\.(?:log|info|debug)\(")
-FORWARD = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"/><title>{title}</title>
-<meta http-equiv="refresh" content="0; url={address}"/>
-{tags}</head>
-<body><main><h1><a href="{address}">{title}</a></h1></main></body></html>
-"""
-CHANGES = {  # of the scripts of the search
-    # Browsers block pages from the file system from reading other files, so a search cannot show summaries there.
-    "else if (showSearchSummary)": 'else if (showSearchSummary && location.protocol !== "file:")',
-    # Every page loads the search, which fails on pages that have no place for its results.
-    "if (query) Search": 'if (query && document.getElementById("search-results")) Search',
-}
-
-
-def add_substitutions(app: Sphinx, config: Config) -> None:
-    """Add what the address of the project brings, and ``{{ pdf_link }}``: empty if the book gets no PDF."""
-    public, name = setting(Path(app.srcdir)), os.environ.get(PDF)
-    link = f'<p class="d-print-none"><a href="../{name}">The whole book as one PDF</a>, to print or to keep.</p>'
-    config.html_baseurl = public.book
-    config.html_theme_options = config.html_theme_options | public.theme()
-    added = {"address": public.texts(), "pdf_link": link if name else ""}
-    config.myst_substitutions = config.myst_substitutions | added
 
 
 def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: nodes.document) -> None:
-    """Finish the body of a page, and describe the page in its head.
+    """Finish the body of a page.
 
     Each picture gets its size, so that the text does not move when the picture arrives. Each figure links to its
     file, and scrolls on narrow screens.
@@ -86,37 +53,35 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
         app.add_css_file("phasor.css")
         app.add_js_file("phasor.js", loading_method="defer")
     context["body"] = str(body)
-    given = context.get("metatags", "")
-    context["metatags"] = given + tags(app.config, page, body, given)
 
 
 def name_cells(body: Tag) -> None:
     """Give the cells of the tables in `BY_ROW` the heads of their columns, for narrow screens."""
     for table in body.select(BY_ROW):
         table["class"] = " ".join([*table.get_attribute_list("class"), "rows"])
-        heads = [plain(head) for head in table.select("thead th")]
+        heads = [head.get_text().strip() for head in table.select("thead th")]
         for row in table.select("tbody tr"):
             for head, cell in list(zip(heads, row.find_all("td", recursive=False), strict=True))[1:]:
                 cell["data-head"] = head[:1].upper() + head[1:]
-                if plain(cell) == MISSING:
+                if cell.get_text().strip() == MISSING:
                     cell["class"] = " ".join([*cell.get_attribute_list("class"), "missing"])
 
 
 def link_code(app: Sphinx, page: str, body: Tag) -> None:
     """Link names of the package in code to their entries of the API, which link to the source."""
-    known: dict[str, str] = {}
+    entries: dict[str, str] = {}
     objects = app.env.domaindata["py"]["objects"]
     for path in sorted(objects, key=lambda path: (len(path), path)):
         entry = objects[path]
         if entry.objtype in ("class", "function") and page != entry.docname:
             address = f"{app.builder.get_relative_uri(page, entry.docname)}#{entry.node_id}"
-            known.setdefault(path.rpartition(".")[2], address)
+            entries.setdefault(path.rpartition(".")[2], address)
     code = "\n".join(block.get_text() for block in body.select(".highlight pre"))
     imported = {name for names in IMPORTED.findall(code) for name in re.findall(r"\w+", names)}
     for name in body.select(".highlight .n"):
         before = "".join(part.get_text() for part in reversed(list(name.previous_siblings)[:2]))
-        if name.string in known and (name.string in imported or before == "zwfs."):
-            name.wrap(body.new_tag("a", href=known[name.string], title="Open its entry in the API"))
+        if name.string in entries and (name.string in imported or before == "zwfs."):
+            name.wrap(body.new_tag("a", href=entries[name.string], title="Open its entry in the API"))
 
 
 def write_numbers(body: Tag) -> None:
@@ -166,41 +131,6 @@ def shown(app: Sphinx, image: Tag, file: Path, name: str) -> dict[str, str]:
     return {name: f"{image['src'].rpartition('/')[0]}/{file.name}", "width": width, "height": height}
 
 
-def tags(config: Config, page: str, body: BeautifulSoup, given: str) -> str:
-    """Return the tags for search engines and social networks; a description in the `given` tags is kept."""
-    own = BeautifulSoup(given, "html.parser").find("meta", attrs={"name": "description"})
-    first = body.select_one("section > p")
-    text = own["content"] if own else plain(first) if first else ""
-    described = {
-        "og:type": "website",
-        "og:site_name": config.html_title,
-        "og:title": plain(body.h1) if body.h1 else config.html_title,
-        "og:description": text,
-    }
-    if config.html_baseurl:
-        described |= {
-            "og:url": f"{config.html_baseurl}{page}.html",
-            "og:image": f"{config.html_baseurl}{CARD}",
-            "og:image:alt": CARD_ALT,
-            "twitter:card": "summary_large_image",
-        }
-    if not own:
-        described["description"] = text
-    made = (
-        body.new_tag("meta", attrs={"property" if name.startswith("og:") else "name": name, "content": content})
-        for name, content in described.items()
-        if content
-    )
-    return "".join(f"\n{tag}" for tag in made)
-
-
-def plain(tag: Tag) -> str:
-    """Return the text of a heading or paragraph, shortened, without its permalink."""
-    words = "".join(part for part in tag.strings if "headerlink" not in part.parent.get("class", ()))
-    words = TEX.sub(lambda found: MATH.get(found[1], found[1] or ""), words)
-    return textwrap.shorten(words, LENGTH, placeholder=" …")
-
-
 def size(picture: Path) -> tuple[int, int]:
     """Return width and height of a PNG or SVG file in CSS pixels; PNG files hold two pixels for each."""
     head = picture.read_bytes()
@@ -212,49 +142,19 @@ def size(picture: Path) -> tuple[int, int]:
     return tuple(round(float(length)) for length in box[1].split()[2:])
 
 
-def finish_files(app: Sphinx, exception: Exception | None) -> None:
-    """Add MathJax and the index page, and silence the scripts."""
+def copy_mathjax(app: Sphinx, exception: Exception | None) -> None:
+    """Copy the part of MathJax that pages load: mathematics needs no network."""
     if exception is not None or app.builder.format != "html":
         return
-    html = Path(app.outdir)
-    copy_mathjax(html / "_static" / "mathjax")
-    for script in (html / "search.html", *sorted((html / "_static").rglob("*.js"))):
-        if "mathjax" not in script.parts:
-            text = CONSOLE.sub("void(", script.read_text("utf-8"))
-            for old, new in CHANGES.items():
-                text = text.replace(old, new)
-            script.write_text(text, "utf-8")
-    forward(html, "index", app.config.root_doc)
-    for old, new in app.config.moved_pages.items():
-        if new in app.env.found_docs:  # not so in a part of the book
-            forward(html, old, new)
-
-
-def forward(html: Path, old: str, new: str) -> None:
-    """Write a page that describes a different page and forwards to it."""
-    head = BeautifulSoup((html / f"{new}.html").read_text("utf-8"), "html.parser").head
-    kept = head.select("meta[property^='og:'], meta[name='description'], meta[name^='twitter:']")
-    described = "".join(str(tag).replace(f"/{new}.html", f"/{old}.html") for tag in kept)
-    address = os.path.relpath(f"{new}.html", os.path.dirname(old))
-    (html / f"{old}.html").write_text(
-        FORWARD.format(title=head.title.string, address=address, tags=described), "utf-8"
-    )
-
-
-def copy_mathjax(folder: Path) -> None:
-    """Copy the part of MathJax that pages load: mathematics needs no network."""
     package = Path(importlib.util.find_spec("sphinx-mathjax-offline").origin).parent / "static" / "mathjax"
     for file in (package / "tex-chtml-full.js", *(package / "output" / "chtml" / "fonts").rglob("*.woff")):
-        target = folder / file.relative_to(package)
+        target = Path(app.outdir, "_static", "mathjax") / file.relative_to(package)
         target.parent.mkdir(parents=True, exist_ok=True)
         copy_asset_file(file, target)
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Finish each page, and their folder at the end."""
-    app.add_config_value("moved_pages", {}, "html")  # old to new address of each page that merged into another
-    app.connect("config-inited", add_substitutions)
     app.connect("html-page-context", finish_page)
-    # Before the extension that would write another index.html.
-    app.connect("build-finished", finish_files, priority=400)
+    app.connect("build-finished", copy_mathjax)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -39,13 +39,13 @@ class LinkTerms(SphinxTransform):
 
     def linked(self, text: str, missing: dict[str, str]) -> Iterator[nodes.Node]:
         """Yield the parts of a text, with links to the missing terms, which are missing no longer."""
-        while missing and (found := pattern(missing).search(text)):
-            term = missing.pop(found[1].lower())
-            yield nodes.Text(text[: found.start()])
-            shown = nodes.inline("", found[0], classes=["xref", "std", "std-term"])
+        while missing and (use := pattern(missing).search(text)):
+            term = missing.pop(use[1].lower())
+            yield nodes.Text(text[: use.start()])
+            shown = nodes.inline("", use[0], classes=["xref", "std", "std-term"])
             about = {"refdomain": "std", "reftype": "term", "reftarget": term, "refdoc": self.env.docname}
             yield pending_xref("", shown, refexplicit=True, refwarn=True, **about)
-            text = text[found.end() :]
+            text = text[use.end() :]
         yield nodes.Text(text)
 
 
@@ -63,9 +63,9 @@ def definitions(glossary: Path) -> dict[str, str]:
 
 def define(body: BeautifulSoup, glossary: Path) -> None:
     """Give each link to a term its definition, which shows on hover and on focus."""
-    known = {f"term-{nodes.make_id(term)}": text for term, text in definitions(glossary).items()}
+    texts = {f"term-{nodes.make_id(term)}": text for term, text in definitions(glossary).items()}
     for link in body.select("a:has(> .std-term)"):
-        if text := known.get(str(link["href"]).partition("#")[2].lower()):
+        if text := texts.get(str(link["href"]).partition("#")[2].lower()):
             link["data-definition"] = link["aria-description"] = text
 
 

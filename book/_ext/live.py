@@ -139,15 +139,15 @@ def label_places(
     paths: Mapping[float, Sequence[NDArray]], marks: NDArray, extent: Sequence[float], size: Sequence[float]
 ) -> dict[float, NDArray]:
     """Choose a place for the label of each contour: far from other contours, marks, labels and the frame."""
-    left, right, low, high = extent
-    scale = np.divide(size, (right - left, high - low))
-    frame = _dense(np.array([(left, low), (right, low), (right, high), (left, high), (left, low)]))
+    start, end, low, high = extent
+    scale = np.divide(size, (end - start, high - low))
+    frame = _dense(np.array([(start, low), (end, low), (end, high), (start, high), (start, low)]))
     points = {level: np.concatenate([np.empty((0, 2)), *parts]) for level, parts in paths.items()}
     places: dict[float, NDArray] = {}
     for level, own in points.items():
-        others = [other for key, other in points.items() if key != level]
-        taken = np.concatenate([frame, marks, *others, *(place[np.newaxis] for place in places.values())])
-        distances = cdist(own * scale, taken * scale).min(axis=1)
+        other_paths = [path for key, path in points.items() if key != level]
+        avoided = np.concatenate([frame, marks, *other_paths, *(place[np.newaxis] for place in places.values())])
+        distances = cdist(own * scale, avoided * scale).min(axis=1)
         if distances.size and distances.max() > NEAREST:
             places[level] = own[distances.argmax()]
     return places

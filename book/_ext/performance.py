@@ -31,24 +31,24 @@ INTENSITY = "largest error of the intensity"
 
 def add_substitutions(app: Sphinx, config: Config) -> None:
     """Define the tables of the page, as in ``{{ performance.rates }}``, and draw its figures."""
-    kept = json.loads(Path(app.srcdir, MEASURED).read_text("utf-8"))
-    added = tables(kept["speed"]) | {
-        "peers": peers([row for row in kept["peers"] if row["task"] == "one frame"]),
-        "machine": kept["machine"],
-        "pages": pages(kept.get("pages", [])),
+    measured = json.loads(Path(app.srcdir, MEASURED).read_text("utf-8"))
+    added = tables(measured["speed"]) | {
+        "peers": peers([row for row in measured["peers"] if row["task"] == "one frame"]),
+        "machine": measured["machine"],
+        "pages": pages(measured.get("pages", [])),
     }
     config.myst_substitutions = config.myst_substitutions | {"performance": added}
     with plt.rc_context():
         use_style()
         figures = {
-            "peers": error_against_time(kept["peers"]),
-            "growth": time_against_pixels(kept["speed"]["slope"]),
+            "peers": error_against_time(measured["peers"]),
+            "growth": time_against_pixels(measured["speed"]["slope"]),
         }
         for name, figure in figures.items():
-            drawn = {name: figure} | {f"{name}.{kind}": one for kind, one in variants(figure).items()}
-            for file, one in drawn.items():
+            drawn = {name: figure} | {f"{name}.{kind}": drawing for kind, drawing in variants(figure).items()}
+            for file, drawing in drawn.items():
                 stream = io.BytesIO()
-                one.savefig(stream, format="png", dpi=200, metadata={"Software": None})
+                drawing.savefig(stream, format="png", dpi=200, metadata={"Software": None})
                 write_file(Path(app.srcdir, PICTURES, f"{file}.png"), stream.getvalue())
             plt.close(figure)
 
@@ -134,25 +134,25 @@ def latency(rows: list[dict[str, Any]]) -> str:
 def late(rows: list[dict[str, Any]]) -> str:
     """Return a sentence on the median and the share of late calls, with the garbage collector off."""
     frozen = [row for row in rows if row["frozen"]]
-    found = " and ".join(f"{1e6 * row['p50']:.0f} μs at {row['n_pixels']} pixels" for row in frozen)
+    medians = " and ".join(f"{1e6 * row['p50']:.0f} μs at {row['n_pixels']} pixels" for row in frozen)
     shares = " and ".join(f"{100 * row['late']:.1f} % at {row['n_pixels']} pixels" for row in frozen)
     slow = [f"{row['n_pixels']}" for row in frozen if row["p99"] > 1e-3]
     missed = f" At {' and '.join(slow)} pixels more than 1 % of the results take longer than 1 ms." if slow else ""
     defined = "A result is *late* if it takes more than 1.3 times the median"
-    return f"The median is {found}. {defined}: {shares} are late.{missed}"
+    return f"The median is {medians}. {defined}: {shares} are late.{missed}"
 
 
 def telemetry(measured: dict[str, Any]) -> str:
     """Return sentences on the time of a long cube."""
-    one = {name: 1e3 * time for name, time in measured["parts"].items()}
+    parts = {name: 1e3 * time for name, time in measured["parts"].items()}
     files = f"{measured['frames']} simulated frame pairs of {measured['n_pixels']} pixels"
-    sigma, of_modes = (one[name] / one["whole"] for name in ("sigma", "sigma of 50 modes"))
+    sigma, of_modes = (parts[name] / parts["whole"] for name in ("sigma", "sigma of 50 modes"))
     return (
         f"{files} took {measured['time']:.1f} s with {measured['threads']} threads, files included: "
         f"{1e3 * measured['processor time'] / measured['frames']:.2f} ms of processor time for each pair. "
-        f"The computation alone takes {one['whole']:.2f} ms: "
-        f"{one['resampling']:.2f} ms for resampling, {one['iteration']:.2f} ms for the iteration and "
-        f"{one['residual']:.2f} ms for the residual. The memory grew by {measured['memory'] / 1e6:.0f} MB. "
+        f"The computation alone takes {parts['whole']:.2f} ms: "
+        f"{parts['resampling']:.2f} ms for resampling, {parts['iteration']:.2f} ms for the iteration and "
+        f"{parts['residual']:.2f} ms for the residual. The memory grew by {measured['memory'] / 1e6:.0f} MB. "
         f"Standard errors of all points take {sigma:.0f} times as long as the phase, those of 50 modes "
         f"{of_modes:.0f} times.\n"
     )

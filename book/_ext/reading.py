@@ -57,6 +57,6 @@ def fold(code: list[NotebookNode]) -> NotebookNode:
 def without_code(cell: NotebookNode) -> NotebookNode:
     """Return a cell that shows its output only."""
     cell = copy.deepcopy(cell)
-    kept = [tag for tag in cell.metadata.get("tags", []) if tag != "hide-input"]
-    cell.metadata["tags"] = [*kept, "remove-input"]
+    tags = [tag for tag in cell.metadata.get("tags", []) if tag != "hide-input"]
+    cell.metadata["tags"] = [*tags, "remove-input"]
     return cell

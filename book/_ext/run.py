@@ -10,8 +10,6 @@ import json
 import os
 import re
 import shutil
-from hashlib import sha256
-from html import unescape
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -36,8 +34,6 @@ REPOSITORY = "_static/zwfs.zip"
 KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the version that this book uses
 FOLDERS = ("book", "environment", "notebooks", "tests", "zwfs")
 SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
-SKIPPED = "colab"  # tag of cells that the page leaves out
-POLICY = '<meta http-equiv="Content-Security-Policy" content="{}"/>'
 
 
 class MarkedText(PasteTextRole):
@@ -45,11 +41,11 @@ class MarkedText(PasteTextRole):
 
     def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
         """Return the text, marked."""
-        made, messages = super().run()
-        for node in made:
+        shown, messages = super().run()
+        for node in shown:
             if isinstance(node, nodes.inline):
                 node["classes"].append(f"glued:{self.text if ':' in self.text else f'{self.text}:s'}")
-        return made, messages
+        return shown, messages
 
 
 def form(figure: str, first: bool) -> str:
@@ -75,14 +71,13 @@ def described(notebook: NotebookNode, name: str) -> dict[str, Any]:
             cell.outputs, cell.execution_count = [], None
     return {
         "name": name,
-        "parameters": {key: field(one) for key, one in declared.parameters(notebook).items()},
+        "parameters": {key: field(parameter) for key, parameter in declared.parameters(notebook).items()},
         "quick": getattr(study, "QUICK", {}),
         "figures": {
             figure: number
             for number, cell in enumerate(cells)
             for figure in (published(cell.source) if cell.cell_type == "code" else [])
         },
-        "skipped": SKIPPED,
         # Files in FITS need it, and no study imports it.
         "extra": ["astropy"] if any(c.cell_type == "code" and "zwfs.frames" in c.source for c in cells) else [],
         "notebook": {"cells": cells, "metadata": notebook.metadata, "nbformat": 4, "nbformat_minor": 5},
@@ -102,11 +97,11 @@ def field(parameter: Parameter) -> dict[str, Any]:
 def limits(parameter: Parameter) -> dict[str, Any]:
     """Return the limits of a parameter for the form."""
     match parameter.limits:
-        case Fields() as known:
-            fields = {name: field(one) for name, one in parameter.fields().items() if name != "kind"}
-            return {"kinds": {kind: list(of) for kind, of in known.kinds.items()}, "fields": fields}
-        case [each, *more] if isinstance(parameter.limits, list):
-            return {"list": limits(Parameter(None, "", "", each)), "empty": bool(more)}
+        case Fields(kinds=kinds):
+            fields = {name: field(value) for name, value in parameter.fields().items() if name != "kind"}
+            return {"kinds": {kind: list(of) for kind, of in kinds.items()}, "fields": fields}
+        case [item, *more] if isinstance(parameter.limits, list):
+            return {"list": limits(Parameter(None, "", "", item)), "empty": bool(more)}
         case (str(), *_) as choices:
             return {"choices": choices}
         case (low, high):
@@ -170,46 +165,8 @@ def write(app: Sphinx, exception: Exception | None) -> None:
         write_script(folder / f"{source.stem}.js", "zwfsNotebook", described(notebook, source.stem))
     write_script(folder / "files.js", "zwfsFiles", base64.b64encode(site(project)).decode())
     Path(app.outdir, REPOSITORY).write_bytes(zipped(repository(project)))  # pip installs it
-    known, where = json.loads(KNOWN.read_text("utf-8")), place(app)
-    write_script(folder / "settings.js", "zwfsPython", known | {"place": where})
-    add_policies(Path(app.outdir), where)
-
-
-def add_policies(html: Path, place: str) -> None:
-    """Put a content security policy into each page of the book."""
-    pages = [page for page in html.rglob("*.html") if not page.is_relative_to(html / "_static")]
-    # The search reads other pages, with their handlers.
-    found = (re.findall(r"\son[a-z]+=\"([^\"]*)\"", page.read_text("utf-8")) for page in pages)
-    handlers = {unescape(code) for of_page in found for code in of_page}
-    for page in pages:
-        add_policy(page, place, handlers)
-
-
-def add_policy(file: Path, place: str, handlers: set[str]) -> None:
-    """Put a content security policy into a page: its own files and inline scripts, and Python where it can run.
-
-    The loader of Pyodide evaluates code, and a worker made from a Blob inherits the policy of its page. MathJax
-    writes styles into the page.
-    """
-    html = re.sub(POLICY.format(".*?"), "", file.read_text("utf-8"))  # of an earlier build
-    inline = re.findall(r"<script(?![^>]*\ssrc=)[^>]*>(.*?)</script>", html, re.DOTALL)
-    digests = sorted({base64.b64encode(sha256(code.encode()).digest()).decode() for code in {*inline, *handlers}})
-    runs = "/run.js" in html
-    scripts = ["'self'", "'unsafe-hashes'", *(f"'sha256-{one}'" for one in digests)]
-    remote = [place] if runs and "://" in place else []
-    policy = {
-        "default-src": ["'none'"],
-        "script-src": [*scripts, *(["blob:", "'unsafe-eval'"] if runs else [])],
-        "worker-src": ["blob:"] if runs else ["'none'"],
-        "connect-src": ["'self'", *remote],
-        "style-src": ["'self'", "'unsafe-inline'"],
-        "img-src": ["'self'", "data:", "blob:"],
-        "font-src": ["'self'", "data:"],
-        "base-uri": ["'none'"],
-        "form-action": ["'self'"],
-    }
-    text = "; ".join(f"{name} {' '.join(allowed)}" for name, allowed in policy.items())
-    file.write_text(re.sub(r"(<head[^>]*>)", rf"\1{POLICY.format(text)}", html, count=1), "utf-8")
+    version = json.loads(KNOWN.read_text("utf-8"))
+    write_script(folder / "settings.js", "zwfsPython", version | {"place": place(app)})
 
 
 def write_script(file: Path, name: str, value: Any) -> None:

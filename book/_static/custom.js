@@ -5,6 +5,9 @@ addEventListener("load", async () => {
   document.documentElement.classList.remove("setting");
 });
 
+// Browsers block pages from the file system from reading other files: a search there shows no summaries.
+if (location.protocol === "file:") DOCUMENTATION_OPTIONS.SHOW_SEARCH_SUMMARY = false;
+
 // Tables that are wider than the page scroll: only those are a stop for the Tab key, with a name.
 function nameWideTables() {
   for (const box of document.querySelectorAll(".pst-scrollable-table-container")) {

@@ -274,7 +274,7 @@
 
     runs(cell) {
       const tags = cell.metadata.tags ?? [];
-      return cell.cell_type === "code" && !tags.includes("parameters") && !tags.includes(notebook.skipped);
+      return cell.cell_type === "code" && !tags.includes("parameters");
     }
 
     // Tell the progress of the tasks of a cell, and the time that is left to its sweep.

@@ -20,13 +20,9 @@ from .scratch import end_cleanly_on_signals, one_at_a_time, remove_abandoned
 ROOT = Path(__file__).resolve().parents[2]
 USAGE = """usage: python -m book._tools COMMAND
 
-  book      run the notebooks that changed and build the book, with its PDF where there is a Chromium
-  pdf       the same, but fail without a Chromium
+  book      run the notebooks that changed and build the book
   figures   replace the committed notebooks and the front figure by freshly run ones
-  address   write the address in pyproject.toml to all files that name it, or remove it
-  rerun     run one notebook with other parameters: rerun --help lists the options
-  release-check   build the package and test it in an empty environment
-  pythons   run examples and core tests: pythons 3.12 lowest; all by default"""
+  rerun     run one notebook with other parameters: rerun --help lists the options"""
 
 
 def main(arguments: list[str], project: Project | None = None) -> int:
@@ -40,22 +36,13 @@ def main(arguments: list[str], project: Project | None = None) -> int:
 
             end_cleanly_on_signals()
             rerun(project, options)
-        elif command in ("book", "pdf", "figures") and not options:
+        elif command in ("book", "figures") and not options:
             from . import book
 
             end_cleanly_on_signals()
             with one_at_a_time(project.build):
                 remove_abandoned(project.build)
                 getattr(book, command)(project)
-        elif command == "address" and not options:
-            from .address import address
-
-            address(project)
-        elif command == "pythons" or (command == "release-check" and not options):
-            from . import release
-
-            end_cleanly_on_signals()
-            release.pythons(project, options) if command == "pythons" else release.release_check(project)
         else:
             print(USAGE, file=sys.stderr)
             return 2

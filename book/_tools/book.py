@@ -5,17 +5,13 @@ import os
 import re
 import subprocess
 import sys
-import time
 from contextlib import suppress
 from pathlib import Path
 
-from sphinx_external_toc.parsing import MalformedError, parse_toc_yaml
-
 from zwfs._system import write_file
 
-from . import pdf as printing
-from .execute import SILENCE, TRACEBACK_LINES, tell
-from .project import EXECUTED, PDF, PYODIDE, Project, ToolError
+from .execute import TRACEBACK_LINES, tell
+from .project import EXECUTED, PYODIDE, Project, ToolError
 from .record import commit, digest, digest_files
 from .run import refresh, run
 from .scratch import scratch_folder, swap
@@ -27,9 +23,6 @@ NEXT = """next:
   make rerun FIGURE=3 ARGS="-p n_screens=5"   run a notebook with other parameters
   make lab                                    open the notebooks
   make help                                   list all commands"""
-NO_PDF = (
-    "the PDF needs Chromium: install one, run .venv/bin/playwright install chromium, or name one in ZWFS_CHROMIUM"
-)
 
 
 class BookError(ToolError):
@@ -37,23 +30,11 @@ class BookError(ToolError):
 
 
 def book(project: Project) -> None:
-    """Run the notebooks that changed and build the book, with its PDF where there is a browser."""
-    chromium = printing.find_chromium()
-    check_contents(project)
+    """Run the notebooks that changed and build the book."""
     run(project)
-    print(f"book: {'built' if build(project, chromium) else 'unchanged'}")
-    if not chromium:
-        print(NO_PDF)
+    print(f"book: {'built' if build(project) else 'unchanged'}")
     print(f"open {(project.build / 'html' / 'index.html').relative_to(project.root)}")
     print(NEXT)
-
-
-def pdf(project: Project) -> None:
-    """Build the book with its PDF."""
-    if not printing.find_chromium():
-        raise BookError(NO_PDF)
-    book(project)
-    print(f"open {(project.build / 'html' / printing.NAME).relative_to(project.root)}")
 
 
 def figures(project: Project) -> None:
@@ -63,38 +44,20 @@ def figures(project: Project) -> None:
         print(f"{name} is new")
 
 
-def check_contents(project: Project) -> None:
-    """Check that _toc.yml lists every page and notebook, and nothing else: Sphinx would omit a page silently."""
-    try:
-        contents = parse_toc_yaml(project.root / "_toc.yml")
-    except MalformedError as error:
-        raise BookError(f"the book was not built: _toc.yml: {error}") from None
-    listed = {name.removesuffix(".md").removesuffix(".ipynb") for name in contents}
-    pages = [*sorted((project.root / "book").glob("[!_]*.md")), *project.sources()]
-    known = {page.relative_to(project.root).with_suffix("").as_posix(): page.suffix for page in pages}
-    wrong = [f"{name}{known[name]} is not listed in _toc.yml" for name in known if name not in listed]
-    wrong += [f"_toc.yml lists {name}, which does not exist" for name in sorted(listed - known.keys())]
-    if wrong:
-        raise BookError("\n".join(["the book was not built:", *wrong]))
-
-
-def build(project: Project, chromium: str | None = None) -> bool:
+def build(project: Project) -> bool:
     """Build the book in _build/html unless it is current, and return whether it was built.
 
-    With the path of a browser it gets a PDF. After an error or a warning the earlier book stays.
+    After an error or a warning the earlier book stays.
     """
     html, record = project.build / "html", project.build / "html.json"
-    made_from = _digest(project, bool(chromium))
+    made_from = _digest(project)
     with suppress(OSError, ValueError):  # the book was never built, or not to its end
         if html.is_dir() and json.loads(record.read_bytes()) == made_from:
             return False
     record.unlink(missing_ok=True)  # a failure from here on must be followed by a build
     tell("building the pages")
     with scratch_folder(project.build, "building-") as scratch:
-        pages = _write_pages(project, scratch, {PDF: printing.NAME} if chromium else {})
-        if chromium:
-            tell("making the PDF")
-            (pages / printing.NAME).write_bytes(printing.print_book(project.root, pages, chromium))
+        pages = _write_pages(project, scratch)
         # Sphinx needs it for a later build in the same place. Its digest depends on the place.
         (pages / ".buildinfo").unlink(missing_ok=True)
         swap(pages, html, scratch / "earlier")
@@ -102,20 +65,7 @@ def build(project: Project, chromium: str | None = None) -> bool:
     return True
 
 
-def _output(process: subprocess.Popen[str]) -> str:
-    """Wait for a process, with a line after each `SILENCE`, and return its output; an interruption ends it."""
-    begin = time.monotonic()
-    try:
-        while True:
-            with suppress(subprocess.TimeoutExpired):
-                return process.communicate(timeout=SILENCE)[0]
-            tell(f"building the pages: {time.monotonic() - begin:.0f} s")
-    except BaseException:
-        process.kill()
-        raise
-
-
-def _digest(project: Project, printed: bool) -> str:
+def _digest(project: Project) -> str:
     """Return a digest of everything that the book depends on."""
     root = project.root
     files = [root / name for name in ("_config.yml", "_toc.yml", "pyproject.toml")]
@@ -126,21 +76,20 @@ def _digest(project: Project, printed: bool) -> str:
         files += [executed, executed.with_suffix(".json"), *project.published(notebook.stem)]
     named = {file.relative_to(root).as_posix(): file for file in files if file.is_file()}
     # The pages name the commit.
-    about = json.dumps([sys.version_info[:2], printed, os.environ.get(PYODIDE), commit(root)])
+    about = json.dumps([sys.version_info[:2], os.environ.get(PYODIDE), commit(root)])
     return digest([digest_files(named).encode(), about.encode()])
 
 
-def _write_pages(project: Project, output: Path, environment: dict[str, str]) -> Path:
+def _write_pages(project: Project, output: Path) -> Path:
     """Run ``jupyter-book build .`` with the executed notebooks, and return the folder of the pages."""
     executed = {EXECUTED: str(project.executed.relative_to(project.root))}
     command: list[str | Path] = [JUPYTER_BOOK, "build", *OPTIONS, "--path-output", output, "."]
-    variables, pipe = os.environ | executed | environment, subprocess.PIPE
-    with subprocess.Popen(
-        command, cwd=project.root, env=variables, stdout=pipe, stderr=subprocess.STDOUT, text=True
-    ) as build:
-        log = _output(build)
+    pipe, both = subprocess.PIPE, subprocess.STDOUT
+    build = subprocess.run(
+        command, cwd=project.root, env=os.environ | executed, stdout=pipe, stderr=both, text=True
+    )
     if build.returncode:
-        said = COLOUR.sub("", log).replace(f"{project.root}{os.sep}", "")
+        said = COLOUR.sub("", build.stdout).replace(f"{project.root}{os.sep}", "")
         lines = said.partition("\nThe above exception was the direct cause")[0].strip().splitlines()
         marked = [line for line in lines if "WARNING:" in line or "ERROR:" in line]
         raise BookError("\n".join(["the book was not built:", *(marked or lines[-TRACEBACK_LINES:])]))

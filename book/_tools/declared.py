@@ -12,7 +12,6 @@ from typing import Any
 
 from nbformat import NotebookNode
 from ruamel.yaml import YAML
-from ruamel.yaml.composer import MaxDepthExceededError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from studies.kit.parameters import Fields, check_parameters, example, typed
@@ -22,10 +21,6 @@ from .project import ToolError, one_line
 # A unit is one of these behind the last comma of a parameter's comment; other words there belong to the meaning.
 UNITS = ("rad", "rad rms", "lambda/D", "D", "D²/lambda", "nm", "m", "s", "Hz", "pixels", "electrons", "photons")
 UNIT_NAMES = {"radian": "rad", "radian rms": "rad rms", "pixels rms": "pixels", "electrons rms": "electrons"}
-
-# Limits of the YAML of parameters: a list of 1000 numbers is half as long, and no list is nested more than twice.
-LONGEST = 16384  # characters, read in a second
-DEEPEST = 8
 
 
 class ParameterError(ToolError):
@@ -67,7 +62,7 @@ class Parameter:
         if not isinstance(self.limits, Fields):
             return {}
         of = resolve_name(self.limits.of)
-        defaults = {name: one.default for name, one in inspect.signature(of).parameters.items()}
+        defaults = {name: argument.default for name, argument in inspect.signature(of).parameters.items()}
         documented = _documented(of)
         return {
             name: Parameter(defaults.get(name), *documented.get(name, ("", "")), limit)
@@ -77,14 +72,14 @@ class Parameter:
 
 def _documented(of: Any) -> dict[str, tuple[str, str]]:
     """Return meaning, in a sentence, and unit of each parameter in a docstring of numpydoc."""
-    found = {}
+    entries_by_name = {}
     entries = r"^([\w, ]+?)(?: : (.*))?\n((?:    .+\n?)+)"
     for names, kind, text in re.findall(entries, inspect.getdoc(of) or "", re.MULTILINE):
         sentence = re.split(r"(?<=\w)[.;:](?:\s|$)", " ".join(text.split()))[0]
         unit = kind.rpartition(",")[2].strip()
         for name in names.split(", "):
-            found[name] = sentence, unit if unit in UNITS else UNIT_NAMES.get(unit, "")
-    return found
+            entries_by_name[name] = sentence, unit if unit in UNITS else UNIT_NAMES.get(unit, "")
+    return entries_by_name
 
 
 def _unlisted(limits: Any) -> tuple[int, Any]:
@@ -113,7 +108,8 @@ def assigned(notebook: NotebookNode) -> dict[str, tuple[str, str]]:
 
     python = papermill_translators.find_translator("python3", "python")
     cells = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", ())]
-    return {one.name: (one.default, one.help) for cell in cells[:1] for one in python.inspect(cell)}
+    inspected = python.inspect(cells[0]) if cells else ()
+    return {parameter.name: (parameter.default, parameter.help) for parameter in inspected}
 
 
 def _evaluated(text: str, **names: Any) -> Any:
@@ -148,32 +144,32 @@ def study_of(notebook: NotebookNode) -> ModuleType | None:
     return import_module(f"studies.{named[1]}") if named else None
 
 
-def joined(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]:
+def joined(values: dict[str, Any], parameters: dict[str, Parameter]) -> dict[str, Any]:
     """Return values in which ``pupil.kind`` has replaced a field of `pupil`, the given one or else the default."""
-    whole = dict(given)
-    for name in given:
+    whole = dict(values)
+    for name in values:
         parameter, dot, field = name.partition(".")
-        if dot and parameter in known and isinstance(known[parameter].limits, Fields):
-            others = whole.get(parameter, known[parameter].default)
+        if dot and parameter in parameters and isinstance(parameters[parameter].limits, Fields):
+            others = whole.get(parameter, parameters[parameter].default)
             if isinstance(others, dict):
                 whole[parameter] = others | {field: whole.pop(name)}
     return whole
 
 
-def accept(given: dict[str, Any], known: dict[str, Parameter]) -> dict[str, Any]:
+def accept(values: dict[str, Any], parameters: dict[str, Parameter]) -> dict[str, Any]:
     """Check values, and return those that are not the defaults."""
-    for name in given:
-        if name not in known:
-            raise ParameterError(f"unknown parameter {name!r}: {nearest(name, known)}")
-        if known[name].limits is None:
+    for name in values:
+        if name not in parameters:
+            raise ParameterError(f"unknown parameter {name!r}: {nearest(name, parameters)}")
+        if parameters[name].limits is None:
             raise ParameterError(f"parameter {name!r} has no limits: add them to the notebook's check_parameters")
     try:
-        check_parameters(given, **{name: known[name].limits for name in given})
+        check_parameters(values, **{name: parameters[name].limits for name in values})
     except (TypeError, ValueError) as error:
         raise ParameterError(str(error)) from None
     # In the order of the notebook: the order on the command line makes no difference.
-    checked = {name: typed(given[name], one.limits) for name, one in known.items() if name in given}
-    return {name: value for name, value in checked.items() if value != known[name].default}
+    checked = {name: typed(values[name], parameters[name].limits) for name in parameters if name in values}
+    return {name: value for name, value in checked.items() if value != parameters[name].default}
 
 
 def accept_together(notebook: NotebookNode, values: dict[str, Any]) -> None:
@@ -185,46 +181,41 @@ def accept_together(notebook: NotebookNode, values: dict[str, Any]) -> None:
             raise ParameterError(str(error)) from None
 
 
-def nearest(name: str, known: Any) -> str:
+def nearest(name: str, names: Any) -> str:
     """Suggest the known name that is most like a given one, or list all known names."""
-    similar = difflib.get_close_matches(str(name), known, n=1)
-    return f"did you mean {similar[0]!r}?" if similar else f"expected one of {', '.join(known) or '(none)'}"
+    similar = difflib.get_close_matches(str(name), names, n=1)
+    return f"did you mean {similar[0]!r}?" if similar else f"expected one of {', '.join(names) or '(none)'}"
 
 
 def load(text: str, origin: str) -> Any:
     """Read YAML 1.2: numbers, strings, lists and mappings."""
-    if len(text) > LONGEST:
-        raise ParameterError(f"{origin}: {len(text)} characters: expected at most {LONGEST}")
     yaml = YAML(typ="safe", pure=True)  # not the C parser: it reads YAML 1.1, in which yes is True and 010 is 8
-    yaml.max_depth = DEEPEST
     try:
         return yaml.load(text)
-    except MaxDepthExceededError:
-        raise ParameterError(f"{origin}: expected lists and mappings at most {DEEPEST} deep") from None
     except MarkedYAMLError as error:
         where = f", line {error.problem_mark.line + 1}" if "\n" in text else ""
         context = f" ({error.context})" if error.context else ""
         raise ParameterError(f"{origin}{where}: {error.problem}{context}") from None
-    except (YAMLError, ValueError) as error:  # an invalid character, or a number with too many digits
+    except (YAMLError, ValueError, RecursionError) as error:  # an odd character, too many digits, too deep lists
         raise ParameterError(f"{origin}: {error}") from None
 
 
 def mapping(text: str, origin: str) -> dict[str, Any]:
     """Return the parameters that a file in YAML gives, by name."""
-    given = load(text, origin)
-    if not isinstance(given, dict) or not all(isinstance(name, str) for name in given):
+    values = load(text, origin)
+    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
         raise ParameterError(f"{origin}: expected a mapping of names to values, as in 'n_screens: 50'")
-    return given
+    return values
 
 
 def assignments(texts: list[str]) -> dict[str, Any]:
     """Return the parameters that texts of the form ``name=value`` give, the value in YAML."""
-    given: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals or not name:
             raise ParameterError(f"-p {text}: expected name=value, as in n_screens=50")
-        if name in given:
+        if name in values:
             raise ParameterError(f"-p {text}: {name!r} is given twice")
-        given[name] = load(value, f"-p {text}")
-    return given
+        values[name] = load(value, f"-p {text}")
+    return values

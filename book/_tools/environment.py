@@ -12,14 +12,14 @@ LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECL
 REMOVED = ("MPLBACKEND", "PYTHON")
 
 
-def clean(given: Mapping[str, str]) -> dict[str, str]:
+def clean(variables: Mapping[str, str]) -> dict[str, str]:
     """Return an environment without the variables that change results, and with those that fix them."""
     matplotlib = find_spec("matplotlib")
     fixed = dict.fromkeys(LIBRARIES, "1") | {"LC_ALL": "C.UTF-8", "PYTHONHASHSEED": "0", "PYTHONUTF8": "1"}
     fixed["IPYTHONDIR"] = str(Path(sys.prefix, ".ipython"))  # not that of the user, with files that run at a start
     if matplotlib and matplotlib.origin:  # its own settings, not those of the user
         fixed["MATPLOTLIBRC"] = str(Path(matplotlib.origin).with_name("mpl-data") / "matplotlibrc")
-    return {name: value for name, value in given.items() if not name.startswith(REMOVED)} | fixed
+    return {name: value for name, value in variables.items() if not name.startswith(REMOVED)} | fixed
 
 
 def enter_clean() -> None:

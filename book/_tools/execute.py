@@ -13,7 +13,6 @@ from typing import Any
 
 import joblib
 import papermill
-import psutil
 from nbformat import NotebookNode
 from papermill.clientwrap import PapermillNotebookClient
 from papermill.engines import NBClientEngine, papermill_engines
@@ -32,7 +31,6 @@ CORES = "LOKY_MAX_CPU_COUNT"  # the number of cores for the sweeps of a notebook
 
 PERIOD = 0.2  # of the progress bar, second
 SILENCE = 30.0  # longest without a line of output where there is no progress bar, second
-PICTURES = ("image/png", "image/svg+xml")  # a cell shows a figure as one of them
 TRACEBACK_LINES = 12
 LOG_CHARACTERS = 2000
 
@@ -47,7 +45,6 @@ class Run:
     error: NotebookError | None = None
     key: str | None = None  # see `record.key`; None if the inputs changed during the run
     seconds = 0.0
-    processor = 0.0  # seconds of user and system time of the kernel and of what it starts
     cell = 0  # the cell that runs, from 1; 0 before the first one
     _client: Any = None
     _stopped = False
@@ -90,7 +87,6 @@ class Run:
                 self._papermill(source, cores)
             if not _complete(self.notebook):
                 raise RuntimeError("the cell ended Python: expected all cells to run")
-            self._check_pictures()
             # The result of a notebook that is edited during the run is not current.
             self.key = made_from if key(self.project, self.name) == made_from else None
         except Exception as error:
@@ -112,15 +108,6 @@ class Run:
             environment=clean(os.environ) | own,
         )
 
-    def _check_pictures(self) -> None:
-        """Refuse a run in which a cell publishes a figure that it does not show."""
-        for number, cell in enumerate(self.notebook.cells, 1):
-            figures = results.published(cell.source) if cell.cell_type == "code" else []
-            kinds = [kind for output in cell.get("outputs", ()) for kind in output.get("data", ())]
-            if sum(kind in PICTURES for kind in kinds) < len(figures):
-                self.cell = number
-                raise RuntimeError(f"no picture of {', '.join(figures)}: expected each figure in the output")
-
     def start_kernel(self, client: PapermillNotebookClient, environment: dict[str, str]) -> None:
         """Run the cells in a kernel with this environment; its messages go to a log."""
         self._client = client
@@ -133,14 +120,6 @@ class Run:
             raise InterruptedError
         self._progress.unlink(missing_ok=True)
         self.cell = number
-
-    def end_cell(self) -> None:
-        """Note the processor time so far."""
-        with suppress(psutil.Error):  # a process has just ended
-            kernel = psutil.Process(self._client.km.provisioner.pid)
-            # User and system time, and those of its children that have ended.
-            times = [process.cpu_times()[:4] for process in (kernel, *kernel.children(recursive=True))]
-            self.processor = max(self.processor, round(sum(map(sum, times)), 1))
 
     def stop(self) -> None:
         """End the kernel and all processes that it started, at once."""
@@ -176,7 +155,7 @@ class Run:
 def _complete(notebook: NotebookNode) -> bool:
     """Return whether every cell of code has run to its end; papermill takes sys.exit(0) for an end."""
     cells = [cell for cell in notebook.cells if cell.cell_type == "code" and cell.source.strip()]
-    return all(c.execution_count and all(one.output_type != "error" for one in c.outputs) for c in cells)
+    return all(c.execution_count and all(output.output_type != "error" for output in c.outputs) for c in cells)
 
 
 class Engine(NBClientEngine):
@@ -187,17 +166,13 @@ class Engine(NBClientEngine):
         cls, nb_man: Any, kernel_name: str, *, run: Run, environment: dict[str, str], **_: Any
     ) -> None:
         """Run the cells of a notebook."""
-        begin, end, run.cells = nb_man.cell_start, nb_man.cell_complete, list(nb_man.nb.cells)
+        begin, run.cells = nb_man.cell_start, list(nb_man.nb.cells)
 
         def cell_start(cell: NotebookNode, cell_index: int, **options: Any) -> None:
             run.begin_cell(cell_index + 1)
             begin(cell, cell_index, **options)
 
-        def cell_complete(cell: NotebookNode, cell_index: int, **options: Any) -> None:
-            run.end_cell()
-            end(cell, cell_index, **options)
-
-        nb_man.cell_start, nb_man.cell_complete = cell_start, cell_complete
+        nb_man.cell_start = cell_start
         client = PapermillNotebookClient(
             nb_man, kernel_name=kernel_name, timeout=None, shutdown_kernel="immediate"
         )

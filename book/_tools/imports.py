@@ -13,10 +13,8 @@ from pathlib import Path
 
 from zwfs._lazy import offered
 
-ALL = "*"  # after a package: all of its modules
-IMPORTERS = ("find_spec", "import_module", "resolve_name")  # functions that take the name of a module
-CLASS = re.compile(r"\w+(\.\w+)*:\w+")  # how a string names a class, see `zwfs.reconstructors.base.load`
 MAGIC = re.compile(r"^(\s*)[%!].*", re.MULTILINE)
+FOR_CHECKERS = re.compile(r"^if TYPE_CHECKING:\n(?: .*(?:\n|\Z)|\n)+", re.MULTILINE)
 NO_DATA = {".py", ".pyc", ".toml"}
 homes = cache(offered)
 
@@ -46,55 +44,28 @@ def code_of(notebook: Path) -> str:
 
 @cache
 def imported(code: str) -> frozenset[str]:
-    """Return the full names of all that code imports or uses of an import, also within functions.
-
-    A package that is used as a whole, as in ``getattr(zwfs, name)``, has `ALL` behind its name.
-    """
-    try:
-        nodes = list(_run_nodes(ast.parse(code)))
-    except SyntaxError:
-        return frozenset({ALL})
+    """Return the full names of all that code imports or uses of an import, also within functions."""
+    nodes = list(ast.walk(ast.parse(FOR_CHECKERS.sub("if True:\n    pass\n", code))))
     names: set[str] = set()
     meanings: dict[str, set[str]] = {}  # of the names that imports bind
     for node in nodes:
-        if isinstance(node, ast.Import):
-            for one in node.names:
-                names.add(one.name)
-                meaning = one.name if one.asname else one.name.partition(".")[0]
-                meanings.setdefault(one.asname or meaning, set()).add(meaning)
-        elif isinstance(node, ast.ImportFrom):
-            origin = f"{node.module}." if not node.level else ALL  # no module here imports from its relatives
-            for one in node.names:
-                names.add(origin + one.name)
-                meanings.setdefault(one.asname or one.name, set()).add(origin + one.name)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and CLASS.fullmatch(node.value):
-            names.add(node.value.replace(":", "."))
-        elif isinstance(node, ast.Call) and _parts(node.func)[-1] in IMPORTERS and node.args:
-            names |= {str(one.value) for one in node.args[:1] if isinstance(one, ast.Constant)}
-    inner = {id(node.value) for node in nodes if isinstance(node, ast.Attribute)}
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            package = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
+            for alias in node.names:
+                names.add(package + alias.name)
+                meanings.setdefault(alias.asname or alias.name, set()).add(package + alias.name)
     for node in nodes:
-        if isinstance(node, ast.Attribute | ast.Name) and id(node) not in inner:
-            first, *rest = _parts(node)
-            names |= {".".join([meaning, *(rest or [ALL])]) for meaning in meanings.get(first, ())}
+        if isinstance(node, ast.Attribute):
+            first, _, rest = dotted(node).partition(".")
+            names |= {f"{meaning}.{rest}" for meaning in meanings.get(first, ())}
     return frozenset(names)
 
 
-def _run_nodes(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield the nodes of a tree, but those for type checkers only."""
-    yield node
-    for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.If) and _parts(child.test)[-1] == "TYPE_CHECKING":
-            for other in child.orelse:
-                yield from _run_nodes(other)
-        else:
-            yield from _run_nodes(child)
-
-
-def _parts(node: ast.AST) -> list[str]:
-    """Return the names in ``a.b.c``; an empty name stands for the result of an expression."""
+def dotted(node: ast.AST) -> str:
+    """Return an expression such as ``a.b.c``; it begins with a dot if ``a`` is not a name."""
     if isinstance(node, ast.Attribute):
-        return [*_parts(node.value), node.attr]
-    return [node.id if isinstance(node, ast.Name) else ""]
+        return f"{dotted(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else ""
 
 
 def files_of(name: str, modules: Mapping[str, Path]) -> Iterator[Path]:
@@ -105,10 +76,6 @@ def files_of(name: str, modules: Mapping[str, Path]) -> Iterator[Path]:
         if file := modules.get(".".join(parts[: depth + 1])):
             yield file
             continue
-        if part.startswith(ALL):
-            yield from (
-                file for module, file in modules.items() if not package or module.startswith(f"{package}.")
-            )
-        elif package and (home := homes(modules[package].read_bytes()).get(part)):
+        if package and (home := homes(modules[package].read_bytes()).get(part)):
             yield from files_of(".".join([*home, *parts[depth + 1 :]]), modules)
         return

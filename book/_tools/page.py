@@ -6,12 +6,9 @@ import html
 import importlib.util
 import io
 import mimetypes
-import os
 import re
 import shutil
-from hashlib import sha256
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote, unquote, urlsplit
 
 import bs4
@@ -32,7 +29,6 @@ FRAME = """<!DOCTYPE html>
 <html lang="en" data-theme="light">
 <head>
 <meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <link rel="icon" href="data:,">
 <title>{title}</title>
@@ -79,8 +75,8 @@ def _stage(project: Project, name: str, notebook: NotebookNode, files: list[Path
         shutil.copyfile(file, source / file.relative_to(root))
     downloads = source / "notebooks" / "downloads"
     downloads.mkdir(parents=True)
-    for other in project.sources():
-        shutil.copyfile(other, source / "notebooks" / other.name)
+    for notebook_of_book in project.sources():
+        shutil.copyfile(notebook_of_book, source / "notebooks" / notebook_of_book.name)
     (source / "notebooks" / f"{name}.ipynb").write_bytes(to_bytes(_with_downloads(notebook, files)))
     for file in files:
         shutil.copyfile(file, downloads / file.name)
@@ -125,21 +121,8 @@ def _sphinx(source: Path, output: Path, document: str) -> str:
         app = Sphinx(
             source, None, output, output.with_name("doctrees"), "html", config, status=None, warning=warnings
         )
-        app.connect("env-updated", _drop_foreign)
         app.build(filenames=[str(source / document)])
     return COLOUR.sub("", warnings.getvalue())
-
-
-def _drop_foreign(app: Any, env: Any) -> None:
-    """Drop pictures outside the scratch folder: Sphinx would copy any file of the computer."""
-    for picture in list(env.images):
-        if not _is_within(Path(app.srcdir).parent, Path(app.srcdir) / picture):
-            del env.images[picture]
-
-
-def _is_within(folder: Path, file: Path) -> bool:
-    """Return whether a file lies in a folder once all symbolic links are resolved."""
-    return Path(os.path.realpath(file)).is_relative_to(os.path.realpath(folder))
 
 
 def _embed(output: Path, document: str, published: set[str], changed: bool) -> str:
@@ -153,7 +136,7 @@ def _embed(output: Path, document: str, published: set[str], changed: bool) -> s
         leave_out(body)
     for picture in body.find_all("img"):
         source = file.parent / unquote(picture.get("src", ""))
-        if _is_within(output, source) and source.is_file():
+        if source.is_file():
             picture["src"] = _data(source)
         else:
             picture.replace_with(picture.get("alt", ""))
@@ -168,7 +151,6 @@ def _embed(output: Path, document: str, published: set[str], changed: bool) -> s
     style = [(file.parent / sheet).read_text("utf-8") for sheet in sheets if not urlsplit(sheet).scheme]
     scripts = [MATHJAX, _mathjax()] if body.find(class_="math") else []
     return FRAME.format(
-        policy=_policy(scripts),
         title=html.escape(body.find("h1").get_text()),
         style="\n".join([*style, STYLE.read_text("utf-8")]),
         scripts="\n".join(f"<script>{script}</script>" for script in scripts),
@@ -187,16 +169,6 @@ def leave_out(body: bs4.Tag) -> None:
             element.decompose()
     for picture in body.select("img[alt]"):
         picture["alt"] = "Figure of this run; the CSV file has its numbers."
-
-
-def _policy(scripts: list[str]) -> str:
-    """Return the content security policy: nothing from outside the page, and of scripts only these."""
-    digests = (base64.b64encode(sha256(script.encode()).digest()).decode() for script in scripts)
-    allowed = " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
-    return (
-        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; img-src data:; font-src data:; "
-        "base-uri 'none'; form-action 'none'"
-    )
 
 
 def _data(file: Path) -> str:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from .imports import dependencies
 
-# Environment variables for the extensions of the book: the folder of the executed notebooks from the root, the
-# name of the PDF, and a folder with Pyodide to copy into the book.
-EXECUTED, PDF, PYODIDE = "ZWFS_EXECUTED", "ZWFS_PDF", "ZWFS_PYODIDE"
+# Environment variables for the extensions of the book: the folder of the executed notebooks from the root, and a
+# folder with Pyodide to copy into the book.
+EXECUTED, PYODIDE = "ZWFS_EXECUTED", "ZWFS_PYODIDE"
 
 
 class ToolError(Exception):

@@ -2,12 +2,9 @@
 
 import argparse
 import json
-import os
 import re
 import shlex
 import shutil
-import stat
-import subprocess
 import sys
 from contextlib import chdir
 from datetime import UTC, datetime
@@ -29,10 +26,8 @@ from .scratch import scratch_folder, swap
 RECORD = "record.json"
 MAKER = "zwfs rerun"  # marks the record of a folder with results
 COMMAND = ".venv/bin/python -m book._tools rerun"
+LINE = "--line="  # before all arguments in one string, as make passes them
 READABLE = 60  # characters of a folder's name for the parameters
-ROOM = 50_000_000  # bytes on the disk for the scratch files of a run
-# Ends with this line of output only if the notebook can import all classes.
-CHECK = "import sys; from studies.kit.methods import check_own; check_own(sys.argv[1:]); print('accepted')"
 EXAMPLES = """examples:
   rerun                                     list the notebooks
   rerun 3 --list                            list the parameters of Figure 3
@@ -52,27 +47,20 @@ class Parser(argparse.ArgumentParser):
 
 def parse(arguments: list[str]) -> argparse.Namespace:
     """Read the command line."""
-    for argument in arguments:
-        if re.search("[\ud800-\udfff]", argument):  # bytes that are not UTF-8
-            raise ParameterError(f"{argument}: expected UTF-8")
+    if len(arguments) == 1 and arguments[0].startswith(LINE):
+        try:
+            arguments = shlex.split(arguments[0].removeprefix(LINE))
+        except ValueError as error:  # a quotation without an end
+            raise ParameterError(f"{arguments[0]}: {error}") from None
     layout = argparse.RawDescriptionHelpFormatter
     parser = Parser("rerun", description=__doc__, epilog=EXAMPLES, formatter_class=layout)
     add = parser.add_argument
     add("figure", nargs="?", help="number of a figure, or name of a notebook")
     add("-p", metavar="NAME=VALUE", action="append", default=[], help="a parameter, in YAML")
-    add("-f", metavar="FILE", type=Path, action="append", default=[], help="YAML file of parameters; -p overrides")
+    add("-f", metavar="FILE", type=Path, help="YAML file of parameters; -p overrides")
     add("--list", action="store_true", help="list parameters, and run nothing")
     add("--output", metavar="DIR", type=Path, help="folder for the results")
-    add("--line", metavar="TEXT", help="all arguments in one string, quoted as for a shell")
-    asked = parser.parse_args(arguments)
-    if asked.line is None:
-        return asked
-    if any(value for name, value in vars(asked).items() if name != "line"):
-        raise ParameterError("--line replaces all other arguments: expected no other")
-    try:
-        return parse(shlex.split(asked.line))
-    except ValueError as error:  # a quotation without an end
-        raise ParameterError(f"{asked.line}: {error}") from None
+    return parser.parse_args(arguments)
 
 
 def rerun(project: Project, arguments: list[str]) -> None:
@@ -90,15 +78,17 @@ def rerun(project: Project, arguments: list[str]) -> None:
         print(description(project, name))
         return
     notebook = read(project.source(name))
-    known = declared.parameters(notebook)
-    changed = declared.accept(declared.joined(_given(asked), known), known)
+    parameters = declared.parameters(notebook)
+    from_file = declared.mapping(_text(asked.f), str(asked.f)) if asked.f else {}
+    changed = declared.accept(declared.joined(from_file | declared.assignments(asked.p), parameters), parameters)
     with chdir(project.notebooks):  # as the notebook runs: its files are named from there
-        declared.accept_together(notebook, {key: one.default for key, one in known.items()} | changed)
-        if classes := changed.get("reconstructors"):
-            _check_classes(classes)
-    folder = _folder(project, asked.output or project.build / "rerun" / folder_name(name, changed))
-    check_folder(folder, name)
-    print(f"{name}: {make(project, name, changed, known, folder):.1f} s")
+        declared.accept_together(
+            notebook, {key: parameter.default for key, parameter in parameters.items()} | changed
+        )
+        _check_classes(changed.get("reconstructors", []))
+    folder = (asked.output or project.build / "rerun" / folder_name(name, changed)).resolve()
+    check_folder(folder, name, project.build)
+    print(f"{name}: {make(project, name, changed, parameters, folder):.1f} s")
     page = folder / f"{name}.html"
     print(f"open {page.relative_to(Path.cwd()) if page.is_relative_to(Path.cwd()) else page}")
 
@@ -113,8 +103,8 @@ def resolve(project: Project, figure: str) -> str:
         numbers = {_number(name): name for name in names if _number(name)}
         if number[1] in numbers:
             return numbers[number[1]]
-        known = ", ".join(numbers) or "none"
-        raise ParameterError(f"no notebook makes Figure {number[1]}: expected one of {known}")
+        expected = ", ".join(numbers) or "none"
+        raise ParameterError(f"no notebook makes Figure {number[1]}: expected one of {expected}")
     raise ParameterError(f"unknown notebook {wanted!r}: {declared.nearest(wanted, names)}")
 
 
@@ -124,47 +114,27 @@ def _number(name: str) -> str:
     return number[1] if number else ""
 
 
-def _given(asked: argparse.Namespace) -> dict[str, Any]:
-    """Return the parameters of the file and of the command line."""
-    if len(asked.f) > 1:
-        raise ParameterError(f"-f {' -f '.join(map(str, asked.f))}: expected one file")
-    from_file = declared.mapping(_text(asked.f[0]), str(asked.f[0])) if asked.f else {}
-    return from_file | declared.assignments(asked.p)
-
-
 def _text(file: Path) -> str:
     """Return the content of a file of parameters."""
     try:
-        about = file.stat()
-        if not stat.S_ISREG(about.st_mode):
-            raise ParameterError(f"-f {file}: expected a regular file")
-        if about.st_size > declared.LONGEST:
-            raise ParameterError(f"-f {file}: expected at most {declared.LONGEST} bytes")
         return file.read_text("utf-8")
-    except OSError as error:
-        raise ParameterError(f"-f {file}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise ParameterError(f"-f {file}: expected text in UTF-8") from None
-
-
-def _folder(project: Project, asked: Path) -> Path:
-    """Return the folder for the results without symbolic links; its parent exists or is within _build."""
-    folder = Path(os.path.realpath(asked))  # Path.resolve fails in a circle of links
-    if not folder.is_relative_to(project.build.resolve()) and not folder.parent.is_dir():
-        raise ParameterError(f"--output {asked}: {folder.parent} is not a folder")
-    return folder
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterError(f"-f {file}: {getattr(error, 'strerror', 'expected text in UTF-8')}") from None
 
 
 def _check_classes(paths: list[str]) -> None:
-    """Refuse classes that the notebook could not use. Their modules run here first, in a process of their own."""
-    command = [sys.executable, "-c", CHECK, *paths]
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace")
-    if done.returncode == 0 and done.stdout.endswith("accepted\n"):
+    """Refuse classes that the notebook could not use; their modules run here first."""
+    if not paths:
         return
-    reason = f"a module ends Python with exit status {done.returncode}"
-    if done.returncode == 1 and "Traceback" in done.stderr:
-        reason = re.sub("^(Type|Value)Error: ", "", done.stderr.strip().splitlines()[-1])
-    raise ParameterError(f"reconstructors = {json.dumps(paths)}: {reason}")
+    from studies.kit.methods import check_own  # it takes a second
+
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        check_own(paths)
+    except (TypeError, ValueError) as error:
+        raise ParameterError(f"reconstructors = {json.dumps(paths)}: {error}") from None
+    finally:
+        sys.path.pop(0)
 
 
 def titles(project: Project) -> str:
@@ -176,11 +146,11 @@ def titles(project: Project) -> str:
 def description(project: Project, name: str) -> str:
     """List the parameters of a notebook."""
     listed: dict[str, Parameter] = {}
-    for key, one in declared.parameters(read(project.source(name))).items():
-        listed |= {key: one} | {f"{key}.{field}": value for field, value in one.fields().items()}
+    for key, parameter in declared.parameters(read(project.source(name))).items():
+        listed |= {key: parameter} | {f"{key}.{field}": value for field, value in parameter.fields().items()}
     rows = [
-        [key, one.kind, "" if one.default is None else json.dumps(one.default), one.allowed, one.unit, one.meaning]
-        for key, one in listed.items()
+        [key, row.kind, "" if row.default is None else json.dumps(row.default), row.allowed, row.unit, row.meaning]
+        for key, row in listed.items()
     ]
     return f"{name}\n\n{table(['parameter', 'type', 'default', 'allowed', 'unit', 'meaning'], rows)}"
 
@@ -201,29 +171,30 @@ def folder_name(name: str, changed: dict[str, Any]) -> str:
     return f"{name}-{readable}-{sha256(json.dumps(changed, sort_keys=True).encode()).hexdigest()[:8]}"
 
 
-def check_folder(folder: Path, name: str) -> None:
-    """Refuse a folder that holds anything but an earlier result of a notebook."""
+def check_folder(folder: Path, name: str, build: Path) -> None:
+    """Refuse a folder that holds anything but an earlier result of a notebook, or that has no parent."""
+    if not folder.is_relative_to(build.resolve()) and not folder.parent.is_dir():
+        raise ParameterError(f"--output {folder}: {folder.parent} is not a folder")
     if not folder.exists():
         return
-    if not folder.is_dir():
-        raise ParameterError(f"{folder} is not a folder")
-    files = {file.name for file in folder.glob("[!.]*")}
     try:
+        files = {file.name for file in folder.iterdir()}
         earlier = json.loads((folder / RECORD).read_bytes()) if files else {}
-        if files and (earlier["made_by"], earlier["notebook"]) != (MAKER, name):
-            raise KeyError
         foreign = files - {RECORD, *earlier.get("files", ())}
-    except (OSError, ValueError, KeyError, TypeError):
-        raise ParameterError(f"{folder} holds no result of {name}: name another folder") from None
+        ours = not files or (earlier["made_by"], earlier["notebook"]) == (MAKER, name)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        ours = False
+    if not ours:
+        raise ParameterError(f"{folder} holds no result of {name}: name another folder")
     if foreign:
         raise ParameterError(f"{folder} holds other files, such as {min(foreign)}: move them first")
 
 
-def notice(changed: dict[str, Any], known: dict[str, Parameter]) -> NotebookNode:
+def notice(changed: dict[str, Any], parameters: dict[str, Parameter]) -> NotebookNode:
     """Return a cell that lists the parameters that are not the defaults."""
     rows = [
-        f"| `{name}` | {_code(value)} | {_code(known[name].default)} "
-        f"| {plain(known[name].unit)} | {plain(known[name].meaning)} |"
+        f"| `{name}` | {_code(value)} | {_code(parameters[name].default)} "
+        f"| {plain(parameters[name].unit)} | {plain(parameters[name].meaning)} |"
         for name, value in changed.items()
     ]
     text = [
@@ -242,39 +213,39 @@ def _code(value: Any) -> str:
     return "`" + json.dumps(value).replace("`", r"\u0060").replace("|", r"\u007c") + "`"
 
 
-def make(project: Project, name: str, changed: dict[str, Any], known: dict[str, Parameter], folder: Path) -> float:
+def make(
+    project: Project, name: str, changed: dict[str, Any], parameters: dict[str, Parameter], folder: Path
+) -> float:
     """Run a notebook, move all its results into a folder in one step, and return the seconds.
 
     The folder is absent or holds an earlier result, which is replaced.
     """
-    within = project.build if folder.is_relative_to(project.build) else folder.parent
-    commit, changed_since = record.commit(project.root)
-    with scratch_folder(within, "rerunning-") as scratch:
-        if (free := shutil.disk_usage(scratch).free) < ROOM:
-            raise ParameterError(f"{within}: {free / 1e6:.0f} MB are free: expected at least {ROOM / 1e6:.0f} MB")
-        # Not at the top: these imports take seconds, and only a run needs them.
-        from . import page
-        from .execute import Run, execute
+    # Not at the top: these imports take seconds, and only a run needs them.
+    from . import page
+    from .execute import Run, execute
 
+    commit, changed_since = record.commit(project.root)
+    within = project.build if folder.is_relative_to(project.build.resolve()) else folder.parent
+    with scratch_folder(within, "rerunning-") as scratch:
         run, new = Run(project, name, scratch, changed), scratch / "new"
         execute([run], lambda _: None)
         notebook = run.notebook
         if changed:
-            notebook.cells.insert(title_cell(notebook) + 1, notice(changed, known))
+            notebook.cells.insert(title_cell(notebook) + 1, notice(changed, parameters))
         notebook = without_gaps(normalise(notebook))
         shutil.copytree(run.folder, new)
         (new / f"{name}.ipynb").write_bytes(to_bytes(notebook))
         html, warnings = page.page(project, name, notebook, run.files, scratch / "page", changed=bool(changed))
         (new / f"{name}.html").write_text(html, "utf-8")
-        parameters = {key: one.default for key, one in known.items()} | changed
+        values = {key: parameter.default for key, parameter in parameters.items()} | changed
         about = {
             "made_by": MAKER,
             "made": datetime.now(UTC).isoformat(timespec="seconds"),
             "notebook": name,
             "command": command(name, changed),
-            "parameters": parameters,
+            "parameters": values,
             "changed": changed,
-            "seed": parameters.get("seed"),
+            "seed": values.get("seed"),
             "versions": record.versions(),
             "commit": commit,
             "changed_since": changed_since,

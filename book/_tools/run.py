@@ -18,7 +18,7 @@ from .scratch import scratch_folder
 
 FRONT_FIGURE, FRONT = "at_a_glance", "book/_static/front.png"  # shown in the README and on the front page
 MANIFEST = "codecheck.yml"
-SECONDS = "book/_tools/seconds.json"  # of a processor that each notebook takes, for those that have never run here
+SECONDS = "book/_tools/seconds.json"  # that each notebook takes, for those that have never run here
 UNKNOWN = 30.0  # seconds of a new notebook
 SAME = 1.5  # ratio of two measured times that may be chance
 
@@ -28,15 +28,14 @@ def run(project: Project, say: Callable[[str], None] = tell) -> list[str]:
     names = [path.stem for path in project.sources()]
     records = {name: read_record(project, name) for name in names}
     stale = [name for name in names if records[name].get("key") != key(project, name)]
-    expected = _stored_seconds(project) | {name: one["processor"] for name, one in records.items() if one}
+    expected = _stored_seconds(project) | {name: last["seconds"] for name, last in records.items() if last}
     needed = {name: expected.get(name, UNKNOWN) for name in stale}
     stale.sort(key=lambda name: -needed[name])  # the longest first: the others fill the gaps
 
     def finished(run: Run) -> None:
         if not run.error:
             _store(run)
-        took = f"{run.seconds:.1f} s, {run.processor:.1f} s of a processor"
-        say(f"{run.name}: {'failed' if run.error else took}")
+        say(f"{run.name}: {'failed' if run.error else f'{run.seconds:.1f} s'}")
 
     if stale:
         cores = joblib.cpu_count()
@@ -55,7 +54,6 @@ def _store(run: Run) -> None:
         "key": run.key,
         "result": digest_result(result, run.files),
         "seconds": run.seconds,
-        "processor": run.processor,
         "versions": versions(),
     }
     # Parts of two results may lie together for a moment; only the record, which comes last, makes them a result.
@@ -70,17 +68,17 @@ def _words(seconds: float) -> str:
 
 
 def _stored_seconds(project: Project) -> dict[str, float]:
-    """Return the seconds of a processor that notebooks take, as stored in the repository."""
+    """Return the seconds that notebooks take, as stored in the repository."""
     file = project.root / SECONDS
     return json.loads(file.read_bytes()) if file.exists() else {}
 
 
 def _seconds(project: Project) -> bytes:
-    """Return the seconds of a processor for the repository; only large changes replace those that are stored."""
+    """Return the seconds for the repository; only large changes replace those that are stored."""
     stored, seconds = _stored_seconds(project), {}
     for name in (source.stem for source in project.sources()):
         old = stored.get(name, 0)
-        new = round(read_record(project, name).get("processor", old))
+        new = round(read_record(project, name).get("seconds", old))
         seconds[name] = old if new < SAME * old and old < SAME * new else new
     return f"{json.dumps(seconds, indent=1)}\n".encode()
 

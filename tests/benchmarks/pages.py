@@ -10,9 +10,9 @@ from time import perf_counter
 
 from playwright.sync_api import sync_playwright
 
-from book._tools.pdf import find_chromium
 from zwfs._system import write_file
 
+from ..conftest import find_chromium
 from ..test_run_in_page import HTML, Page, serving, settings
 from .report import KEPT, fingerprint, rounded
 

@@ -20,9 +20,9 @@ import pytest
 import yaml
 from distributed import Client, LocalCluster
 
-from studies.fig03_dynamic_range import linearity_curves
 from studies.kit import sweeps
 from studies.kit.bench import bench_curves, bench_reconstructors
+from studies.kit.experiments import linearity_curves
 from studies.kit.grids import Recovery, grid
 from studies.kit.setups import make_screens
 from tests.conftest import ROOT, code_of, heed_signals

@@ -210,10 +210,11 @@ def rules() -> str:
                 for timed in claim.timed:
                     file, options = timing_lines(**timed)
                     text += f"**Its times**, `tests/benchmarks/{timed['file']}`:\n\n" + _include(file, **options)
-                text += "**Code that computes its numbers**, "
-                text += f"`notebooks/studies/{notebook}.py`:\n\n"
-                for name in claim.code:
-                    text += _include(code, pyobject=name)
+                files = {name: _defining(notebook, name) for name in claim.code}
+                shown = " and ".join(f"`{file.removeprefix('../')}`" for file in dict.fromkeys(files.values()))
+                text += f"**Code that computes its numbers**, {shown}:\n\n"
+                for name, file in files.items():
+                    text += _include(file, pyobject=name)
                 if claim.refined:
                     text += "From `notebooks/studies/kit/curves.py`:\n\n"
                 for function in claim.refined:
@@ -225,6 +226,12 @@ def rules() -> str:
         text += "**All numbers:**\n\n"
         text += _include(code, name=f"numbers-{notebook}", pyobject="numbers") + "::::\n\n"
     return text
+
+
+def _defining(notebook: str, name: str) -> str:
+    """Return the file that defines a function or class: the study, or the experiments that studies share."""
+    own = re.search(rf"(?m)^(def|class) {name}\b", (STUDIES / f"{notebook}.py").read_text("utf-8"))
+    return f"../notebooks/studies/{notebook if own else 'kit/experiments'}.py"
 
 
 def marked_lines(claim: Claim, code: str) -> dict[str, str]:

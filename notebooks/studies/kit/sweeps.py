@@ -25,7 +25,7 @@ import os
 import stat
 import sys
 import sysconfig
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from contextvars import ContextVar
 from functools import partial
@@ -55,6 +55,18 @@ def run(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str
         done[index] = result
         report_progress(name, len(done), len(inputs))
     return [done[index] for index in range(len(inputs))]
+
+
+def table(task: Callable[..., Any], inputs: Iterable[Any], *shared: Any, name: str) -> dict[str, Any]:
+    """Run a task that returns a mapping, as `run` does; its arrays get the inputs as their first axis."""
+    return stacked(run(task, inputs, *shared, name=name))
+
+
+def stacked(results: Sequence[Any]) -> Any:
+    """Stack the results of several tasks by name, also within mappings."""
+    if isinstance(results[0], Mapping):
+        return {name: stacked([result[name] for result in results]) for name in results[0]}
+    return np.array(results)
 
 
 def report_progress(name: str, done: int, total: int) -> None:

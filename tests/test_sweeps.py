@@ -409,7 +409,7 @@ def foreign_cluster(tmp_path_factory):
             assert container["command"][0] == f"{home}/.venv/bin/dask"
             own = " ".join(container["command"][1:]).replace("8786", port).replace("//zwfs:", "//127.0.0.1:")
             run = [str(Path(sys.executable).parent / "dask"), *own.split()]
-            variables = {one["name"]: one["value"].replace(home, str(ROOT)) for one in container["env"]}
+            variables = {item["name"]: item["value"].replace(home, str(ROOT)) for item in container["env"]}
             start = {"cwd": elsewhere, "env": os.environ | variables, "stderr": subprocess.DEVNULL}
             processes.append(subprocess.Popen(run, **start))
         processes.append(subprocess.Popen(run, **start))

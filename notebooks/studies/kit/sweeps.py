@@ -80,7 +80,7 @@ def _results(call: tuple[Any, ...], inputs: list[Any], name: str) -> Iterator[tu
     """Yield number and result of each task: first those that are kept, then each one as it finishes."""
     numbered = list(enumerate(inputs))
     if not find_spec("joblib"):
-        yield from (_work(call, one, name) for one in numbered)
+        yield from (_work(call, task, name) for task in numbered)
         return
     from joblib import Memory  # here, as a sweep in a page has no joblib
 
@@ -135,7 +135,7 @@ def _keys(call: tuple[Any, ...], inputs: list[Any]) -> list[str]:
 def _computed(call: tuple[Any, ...], waiting: list[tuple[int, Any]], name: str) -> Iterator[tuple[int, Any]]:
     """Yield number and result of each task as a worker finishes it."""
     if len(waiting) < 2:
-        yield from (_work(call, one, name) for one in waiting)
+        yield from (_work(call, task, name) for task in waiting)
         return
     from cloudpickle import dumps
     from joblib import Parallel, delayed
@@ -152,7 +152,7 @@ def _computed(call: tuple[Any, ...], waiting: list[tuple[int, Any]], name: str) 
         parallel = Parallel(
             n_jobs=n_jobs or -1, return_as="generator_unordered", pre_dispatch="all" if client else "2 * n_jobs"
         )
-        yield from parallel(delayed(_work)(shared, one, name) for one in waiting)
+        yield from parallel(delayed(_work)(shared, task, name) for task in waiting)
 
 
 def _cluster() -> AbstractContextManager[Any]:

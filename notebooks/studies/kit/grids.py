@@ -133,7 +133,7 @@ def draw_slice(grid: Grid, value: str, x: str, y: str = "") -> Figure:
         axes.set_ylabel(_label(y))
         figure.colorbar(mesh, label=f"mean of {_label(value)}")
     else:
-        axes.plot(values[0], mean, **OTHER_STYLES[0])
+        axes.plot(values[0], mean, label="_mean", **OTHER_STYLES[0])
         axes.set_ylabel(f"mean of {_label(value)}")
     return figure
 

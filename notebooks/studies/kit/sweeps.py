@@ -26,7 +26,7 @@ import stat
 import sys
 import sysconfig
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import partial
 from importlib.util import find_spec
@@ -155,17 +155,20 @@ def _computed(call: tuple[Any, ...], waiting: list[tuple[int, Any]], name: str) 
         yield from parallel(delayed(_work)(shared, task, name) for task in waiting)
 
 
-def _cluster() -> AbstractContextManager[Any]:
+@contextmanager
+def _cluster() -> Iterator[None]:
     """Use the cluster that the environment names, unless other workers were chosen."""
     from joblib import parallel_config
     from joblib.parallel import get_active_backend
 
     address, (backend, n_jobs) = os.environ.get(CLUSTER), get_active_backend()
     if not address or n_jobs is not None or getattr(backend, "client", None) is not None:
-        return nullcontext()
+        yield
+        return
     from distributed import Client
 
-    return parallel_config(backend="dask", client=Client(address, set_as_default=False))
+    with Client(address, set_as_default=False) as client, parallel_config(backend="dask", client=client):
+        yield
 
 
 def _work(call: Any, numbered: tuple[int, Any], name: str) -> tuple[int, Any]:

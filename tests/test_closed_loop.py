@@ -3,7 +3,6 @@ import pytest
 
 from studies.closed_loop import (
     AlteredSensor,
-    TunedLoops,
     best_methods,
     compare_dimples,
     follow_flow,
@@ -11,6 +10,7 @@ from studies.closed_loop import (
     loop_growth,
     tuned_loops,
 )
+from studies.kit.loops import TunedLoops
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis
 from zwfs.turbulence import FrozenFlow
 

@@ -94,7 +94,8 @@ def test_a_new_reconstructor_is_a_file_and_an_entry(copy):
 
 FIGURE_3 = """
 import api, numpy as np, zwfs
-from studies.fig03_dynamic_range import draw_linearity, error_limits, linearity_curves
+from studies.fig03_dynamic_range import draw_linearity, error_limits
+from studies.kit.experiments import linearity_curves
 from studies.kit.methods import own_reconstructors, paper_reconstructors
 from studies.kit.style import LOOKS
 from zwfs.reconstructors import RECONSTRUCTORS

@@ -6,7 +6,7 @@ import nbformat
 import numpy as np
 import pytest
 
-from studies.closed_loop import two_digits
+from studies.kit.loops import two_digits
 from zwfs.bench import Bench, write_bench
 
 from .conftest import ROOT

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from joblib import parallel_config
 
-from studies.fig03_dynamic_range import linearity_curves
+from studies.kit.experiments import linearity_curves
 from studies.kit.methods import own_reconstructors, paper_reconstructors
 from studies.kit.setups import screens_at
 from zwfs import RECONSTRUCTORS, Arcsine, Linear, PhaseShifted, reconstruction_error

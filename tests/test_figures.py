@@ -18,15 +18,16 @@ from studies.bandwidth import BandCurves
 from studies.beyond_dimple import DimpleLimits
 from studies.beyond_range import DIMMED, SECANT, Causes, NoiseCurves
 from studies.calibration import Errors, Measured
-from studies.closed_loop import PLANTS, Divergence, LoopRun, TunedLoops
+from studies.closed_loop import PLANTS, Divergence, LoopRun
 from studies.dark_zone import IDEAL, Drift, DriftCurves
 from studies.design import PUBLISHED, DesignMap
-from studies.fig03_dynamic_range import linearity_curves
-from studies.fig04_dimple_diameter import Contraction, DiameterCurves
+from studies.fig04_dimple_diameter import Contraction
 from studies.kit import grids
 from studies.kit.bench import BenchCurves
 from studies.kit.curves import ErrorCurves, Limit
+from studies.kit.experiments import DiameterCurves, linearity_curves
 from studies.kit.grids import Grid
+from studies.kit.loops import TunedLoops
 from studies.kit.style import ALONE, DARK_PHASE_MAP, LOOKS, OTHER_STYLES, show_phase, use_style
 from studies.kit.variants import dark_color, variants
 from studies.phase_amplitude import AmplitudeCurves

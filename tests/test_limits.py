@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 import zwfs
-from studies.beyond_dimple import PLAIN, dimple_curves, failing_limit
-from studies.fig03_dynamic_range import error_limits, linearity_curves
+from studies.beyond_dimple import dimple_curves, failing_limit
+from studies.fig03_dynamic_range import error_limits
 from studies.kit.curves import Limit, fitted_limit, refined_limit
+from studies.kit.experiments import linearity_curves
+from studies.kit.methods import PLAIN
 from studies.kit.setups import screens_at
 
 TRUE = 1.6  # where 5 % of the screens fail

@@ -6,11 +6,7 @@ import pytest
 import zwfs
 from studies.beyond_dimple import dimple_limits
 from studies.beyond_range import (
-    ACCELERATED,
     DIMMED,
-    LIKELY,
-    MODES,
-    PLAIN,
     SECANT,
     FineCamera,
     ModelErrors,
@@ -19,8 +15,8 @@ from studies.beyond_range import (
     model_curves,
     noise_curves,
 )
-from studies.fig04_dimple_diameter import DARK_RING, iteration_spectrum
-from studies.kit.methods import opposite_dimples
+from studies.kit.iteration import DARK_RING, iteration_spectrum
+from studies.kit.methods import ACCELERATED, LIKELY, MODES, PLAIN, opposite_dimples
 from studies.kit.setups import make_screens, screens_at
 
 

@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from book._tools import declared, rerun
 from book._tools.notebook import read
 from book._tools.project import Project
-from studies.fig03_dynamic_range import linearity_curves
+from studies.kit.experiments import linearity_curves
 from studies.kit.parameters import Fields, check_parameters
 from studies.kit.setups import BASES, PUPILS, SCREENS, Noise, make_pupil, make_screens, turbulent_rms
 from zwfs import Dimple, Linear, PhaseShifted, Pupil, ZernikeSensor, zernike_basis

@@ -3,14 +3,9 @@ import pytest
 from scipy.special import j1, jn_zeros
 
 import zwfs
-from studies.fig04_dimple_diameter import (
-    DARK_RING,
-    DimpleLight,
-    iteration_spectrum,
-    measured_factor,
-    mode_sensitivity,
-)
+from studies.fig04_dimple_diameter import measured_factor
 from studies.kit.curves import crossing
+from studies.kit.iteration import DARK_RING, DimpleLight, iteration_spectrum, mode_sensitivity
 from studies.phase_shift_pairs import close_pairs, drawn_noise, pair_maps, phase_noise
 
 HALF = np.pi / 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -81,19 +82,13 @@ def band_curves(
     """Reconstruct frames of a flat spectrum, with and without photon noise."""
     widths = np.asarray(bandwidths, float)
     shared = sensor, screens, photons, chromatic, seed
-    errors, clean, bounds = zip(*sweeps.run(_band_point, widths.tolist(), *shared, name="bandwidth"), strict=True)
-    return BandCurves(
-        widths,
-        {way: np.array([error[way] for error in errors]) for way in WAYS},
-        {way: np.array([error[way] for error in clean]) for way in IGNORANT},
-        np.array(bounds),
-        photons,
-    )
+    points = sweeps.table(_band_point, widths.tolist(), *shared, name="bandwidth")
+    return BandCurves(widths, **points, photons=photons)
 
 
 def _band_point(
     bandwidth: float, sensor: ZernikeSensor, screens: NDArray, photons: float, chromatic: bool, seed: int
-) -> tuple[dict[str, NDArray], dict[str, NDArray], float]:
+) -> dict[str, Any]:
     """Errors with and without noise, (n_screens,) each, and the bound, at one bandwidth."""
     light = PolychromaticSensor.flat_band(sensor, bandwidth, _WAVELENGTHS, chromatic=chromatic)
     known = PolychromaticSensor.flat_band(sensor, bandwidth, _KNOWN_WAVELENGTHS, chromatic=chromatic)
@@ -112,7 +107,7 @@ def _band_point(
         sensor.with_tolerance(_TOLERANCE), bandwidth, _KNOWN_WAVELENGTHS, chromatic=chromatic
     )
     bound = float(_rms(sensor.pupil.gather(cramer_rao(rough, screens, photons=photons)).ravel()))
-    return errors(tuple(WAYS), noisy), errors(IGNORANT, clean), bound
+    return {"errors": errors(tuple(WAYS), noisy), "biases": errors(IGNORANT, clean), "bound": bound}
 
 
 def _rms(values: NDArray) -> NDArray[np.float64]:

@@ -15,24 +15,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from studies.beyond_range import (
+from studies.kit import sweeps
+from studies.kit.curves import ErrorCurves, Limit, crossing, percent
+from studies.kit.experiments import DiameterCurves, diameter_curves, diameter_limit
+from studies.kit.iteration import DARK_RING, iteration_spectrum
+from studies.kit.methods import (
     ACCELERATED,
     LIKELY,
+    MASKS,
     PLAIN,
     compared_methods,
     method_line,
     method_look,
+    opposite_dimples,
 )
-from studies.fig04_dimple_diameter import (
-    DARK_RING,
-    DiameterCurves,
-    diameter_curves,
-    diameter_limit,
-    iteration_spectrum,
-)
-from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, crossing, percent
-from studies.kit.methods import MASKS, opposite_dimples
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded, stacked
 from studies.kit.style import LOOKS, OTHER_STYLES
@@ -115,19 +111,20 @@ def dimple_limits(
     diameters = np.union1d(diameters, DARK_RING)
     phases = np.concatenate([np.zeros((1, *pupil.shape)), screens])
     shared = pupil, modes, phase_shift, phases
-    rows = sweeps.run(_limits_point, diameters.tolist(), *shared, name="dimple_limits")
-    return DimpleLimits(diameters, *map(np.array, zip(*rows, strict=True)))
+    return DimpleLimits(
+        diameters, **sweeps.table(_limits_point, diameters.tolist(), *shared, name="dimple_limits")
+    )
 
 
 def _limits_point(
     diameter: float, pupil: Pupil, modes: NDArray, phase_shift: float, phases: NDArray
-) -> tuple[list[float], NDArray]:
+) -> dict[str, Any]:
     """One diameter of `dimple_limits`: factor, (k,), and bounds, (k, n_modes), around each phase."""
     sensor = opposite_dimples(pupil, diameter, phase_shift)
     factor = [float(np.abs(iteration_spectrum(pupil, diameter, phase)[0])) for phase in phases]
     photons = 1e4  # per point and frame; the ratio does not depend on it
     ideal = 1 / (2 * np.sqrt(sensor.n_masks * photons * pupil.n_points))
-    return factor, cramer_rao(sensor, phases, photons=photons, modes=modes) / ideal
+    return {"factor": factor, "bound": cramer_rao(sensor, phases, photons=photons, modes=modes) / ideal}
 
 
 def _rms(values: NDArray) -> NDArray[np.float64]:

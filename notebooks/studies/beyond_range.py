@@ -15,13 +15,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies.fig04_dimple_diameter import iteration_spectrum
 from studies.kit import sweeps
 from studies.kit.curves import ErrorCurves, crossing, percent
+from studies.kit.iteration import iteration_spectrum
+from studies.kit.methods import ACCELERATED, LIKELY, MODES, PLAIN, compared_methods, method_line, method_look
 from studies.kit.parameters import SETUP, Fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.setups import SCREENS, Noise, Screens, screens_at
-from studies.kit.style import LOOKS, OTHER_STYLES, Look
+from studies.kit.style import LOOKS, OTHER_STYLES
 from zwfs.bounds import cramer_rao
 from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error
@@ -53,10 +54,6 @@ QUICK = {
     "n_screens": 2,
     "n_screens_limit": 10,
 }
-PLAIN, ACCELERATED, LIKELY, MODES = (
-    "PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood", "MaximumLikelihoodModes",
-)  # fmt: skip
-"""Names of the compared methods."""
 PIXEL_ERROR = 0.01  # rad rms, from which the text calls the size of the pixels important
 _WITHOUT_NOISE = 0.0  # photons
 
@@ -72,17 +69,6 @@ class Trials:
     def screens(self, pupil: Pupil, modes: NDArray, rms: float, n_screens: int, task: int) -> NDArray[np.floating]:
         """Screens of one task on a pupil with these modes, see `screens_at`."""
         return screens_at(replace(self.source, pupil=pupil, modes=modes), rms, n_screens, self.seed, task)
-
-
-def compared_methods(
-    sensor: ZernikeSensor, n_iterations: int, photons: float = 0.0, n_starts: int = 8
-) -> dict[str, Any]:
-    """Return the paper's iteration, its accelerated form, and maximum likelihood, by name."""
-    return {
-        PLAIN: PhaseShifted(sensor, n_iterations=n_iterations),
-        ACCELERATED: PhaseShifted(sensor, n_iterations=n_iterations, accelerate=True),
-        LIKELY: MaximumLikelihood(sensor, photons=photons or None, n_starts=n_starts),
-    }
 
 
 def all_methods(sensor: ZernikeSensor, modes: NDArray, n_iterations: int, photons: float) -> dict[str, Any]:
@@ -131,20 +117,12 @@ def noise_curves(
     points = [(level, task) for level in levels for task in reversed(range(len(rms[level])))]
     tasks = [(level, task, rms[level][task]) for level, task in points]
     methods = {level: all_methods(sensor, modes, trials.n_iterations, level) for level in levels}
-    found = sweeps.run(_noise_point, tasks, methods, modes, n_screens, trials, name="noise_curves")
-    by_point = dict(zip(points, found, strict=True))
+    results = sweeps.run(_noise_point, tasks, methods, modes, n_screens, trials, name="noise_curves")
+    by_point = dict(zip(points, results, strict=True))
     curves = []
     for level in levels:
-        errors, bounds, consistent = zip(*(by_point[level, task] for task in range(len(rms[level]))), strict=True)
-        curves.append(
-            NoiseCurves(
-                np.array(rms[level]),
-                {name: np.array([point[name] for point in errors]) for name in errors[0]},
-                level,
-                {name: np.array([point[name] for point in bounds]) for name in bounds[0]},
-                np.array(consistent),
-            )
-        )
+        stacked = sweeps.stacked([by_point[level, task] for task in range(len(rms[level]))])
+        curves.append(NoiseCurves(np.array(rms[level]), **stacked, photons=level))
     return curves
 
 
@@ -154,7 +132,7 @@ def _noise_point(
     modes: NDArray,
     n_screens: int,
     trials: Trials,
-) -> tuple[dict[str, NDArray], dict[str, float], NDArray]:
+) -> dict[str, Any]:
     """One number of photons and input: errors, (n_screens,), bounds, and consistent, (n_screens,)."""
     photons, task, rms = point
     sensor = methods[photons][LIKELY].sensor
@@ -166,14 +144,14 @@ def _noise_point(
         errors[name] = reconstruction_error(sensor.pupil, result.phase, screens)
         consistent = result.consistent if name == LIKELY else consistent
     if not photons:
-        return errors, {}, consistent
+        return {"errors": errors, "bound": {}, "consistent": consistent}
     points = sensor.pupil.gather(cramer_rao(sensor, screens, photons=photons))
     coefficients = cramer_rao(sensor, screens, photons=photons, modes=modes)
     bounds = {
         LIKELY: float(np.median(np.sqrt(np.mean(points**2, axis=-1)))),
         MODES: float(np.median(np.sqrt(np.sum(coefficients**2, axis=-1)))),  # modes of unit rms
     }
-    return errors, bounds, consistent
+    return {"errors": errors, "bound": bounds, "consistent": consistent}
 
 
 @dataclass(frozen=True)
@@ -223,12 +201,8 @@ def model_curves(
     """Errors of the two best methods on noiseless frames that their model does not describe, by its error."""
     tasks = list(enumerate(inputs))[::-1]
     shared = sensor, modes, errors, n_screens, trials
-    found = sweeps.run(_model_point, tasks, *shared, name="model_curves")[::-1]
-    names = (ACCELERATED, LIKELY)
-    return {
-        kind: ErrorCurves(np.array(inputs), {name: np.array([one[kind, name] for one in found]) for name in names})
-        for kind in dict.fromkeys(kind for kind, _ in found[0])
-    }
+    points = sweeps.run(_model_point, tasks, *shared, name="model_curves")[::-1]
+    return {kind: ErrorCurves(np.array(inputs), by_name) for kind, by_name in sweeps.stacked(points).items()}
 
 
 def _model_point(
@@ -238,7 +212,7 @@ def _model_point(
     errors: ModelErrors,
     n_screens: int,
     trials: Trials,
-) -> dict[tuple[str, str], NDArray]:
+) -> dict[str, dict[str, NDArray]]:
     """Errors of one input, (n_screens,) by the error of the model and the method."""
     task, rms = point
     camera = FineCamera(sensor, modes, errors.n_subpixels)
@@ -246,9 +220,11 @@ def _model_point(
     screens = camera.mean(fine)
     methods = compared_methods(sensor, trials.n_iterations, n_starts=1)  # no phase explains the frames
     return {
-        (kind, name): reconstruction_error(sensor.pupil, methods[name](frames).phase, screens)
+        kind: {
+            name: reconstruction_error(sensor.pupil, methods[name](frames).phase, screens)
+            for name in (ACCELERATED, LIKELY)
+        }
         for kind, frames in wrong_frames(sensor, errors, camera, fine, screens, trials.seed).items()
-        for name in (ACCELERATED, LIKELY)
     }
 
 
@@ -308,21 +284,20 @@ def causes(
 ) -> Causes:
     """Separate the two ingredients of the acceleration on noiseless frames."""
     shared = sensor, modes, n_screens, trials
-    found = sweeps.run(_causes_point, list(enumerate(inputs)), *shared, name="causes")
-    errors, factor = zip(*found, strict=True)
-    rms = np.array(inputs)
-    curves = ErrorCurves(rms, {name: np.array([one[name] for one in errors]) for name in errors[0]})
+    points = sweeps.table(_causes_point, enumerate(inputs), *shared, name="causes")
+    rms, factor = np.array(inputs), points["factor"]
+    curves = ErrorCurves(rms, points["errors"])
     # An example that only the acceleration recovers, and whose iteration contracts near the truth.
     lost = curves.errors[PLAIN] > threshold * rms[:, np.newaxis]
     kept = curves.errors[ACCELERATED] <= threshold * rms[:, np.newaxis]
-    places = np.argwhere(lost & kept & (np.array(factor) < 1))
+    places = np.argwhere(lost & kept & (factor < 1))
     task, index = places[len(places) // 2] if len(places) else (len(rms) - 1, 0)
     screen = trials.screens(sensor.pupil, modes, rms[task], n_screens, int(task))[[index]]
     example = {
         name: reconstruction_error(sensor.pupil, result.history[0], screen[0])
         for name, result in _variants(sensor, sensor.measure(screen), trials.n_iterations, history=True).items()
     }
-    return Causes(curves, np.array(factor), example, float(rms[task]))
+    return Causes(curves, factor, example, float(rms[task]))
 
 
 def _variants(sensor: ZernikeSensor, frames: NDArray, n_iterations: int, **options: Any) -> dict[str, Any]:
@@ -340,7 +315,7 @@ def _variants(sensor: ZernikeSensor, frames: NDArray, n_iterations: int, **optio
 
 def _causes_point(
     point: tuple[int, float], sensor: ZernikeSensor, modes: NDArray, n_screens: int, trials: Trials
-) -> tuple[dict[str, NDArray], list[float]]:
+) -> dict[str, Any]:
     """Errors, (n_screens,) by variant, and contraction factors, (n_screens,), of one input."""
     task, rms = point
     pupil = sensor.pupil
@@ -348,30 +323,13 @@ def _causes_point(
     results = _variants(sensor, sensor.measure(screens), trials.n_iterations)
     errors = {name: reconstruction_error(pupil, result.phase, screens) for name, result in results.items()}
     diameter = sensor.masks[0].diameter
-    return errors, [float(np.abs(iteration_spectrum(pupil, diameter, one)[0])) for one in screens]
+    factor = [float(np.abs(iteration_spectrum(pupil, diameter, screen)[0])) for screen in screens]
+    return {"errors": errors, "factor": factor}
 
 
 _INK = "#555555"
 _BOUND: dict[str, Any] = {"color": "#888888", "lw": 2, "zorder": 1.5}
 _FLOOR = 1e-7  # of a drawn error: below it digits are rounding errors
-
-
-def method_look(name: str) -> Look:
-    """Look of a compared method: variants of a method have its colour."""
-    if name == ACCELERATED:
-        return replace(LOOKS[PLAIN], name="phase-shifted, accelerated", line="-")
-    if name == MODES:
-        return replace(LOOKS[LIKELY], name="maximum likelihood on modes", line="--", marker="o")
-    return LOOKS[name]
-
-
-def method_line(name: str) -> dict[str, Any]:
-    """How a method is drawn: maximum likelihood wide and below, the accelerated iteration with hollow marks."""
-    look = method_look(name)
-    style = look.style | {"label": look.label}
-    if name == LIKELY:
-        return style | {"ms": 8, "lw": 3, "zorder": 1.9}
-    return style | {"ms": 5, "lw": 1.6, "mfc": "#ffffff" if name == ACCELERATED else look.color}
 
 
 def _input_axes(axes: Axes, threshold: float, bottom: float, *, named: bool = True) -> None:

@@ -13,6 +13,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
+from studies.kit.loops import (
+    ALIKE,
+    ONE_IMAGE,
+    TWO_IMAGES,
+    BestMethods,
+    TunedLoops,
+    method_name,
+    one_over_two,
+    paired_ratio,
+    short_name,
+    two_digits,
+    typical,
+)
 from studies.kit.parameters import USUAL, parameter_limits
 from studies.kit.results import rounded, screen_columns
 from studies.kit.style import LOOKS
@@ -44,8 +57,6 @@ LIMITS = parameter_limits(
 )
 QUICK = {"inputs": [0.7], "n_screens": 3, "n_screens_linear": 4}
 
-ONE_IMAGE = "Linear", "Arcsine"
-TWO_IMAGES = "LinearTwo", "PhaseShifted", "MaximumLikelihood"
 PLANTS = {
     "the sensor": {},
     "reference wave kept": {"keep_wave": True},
@@ -53,8 +64,6 @@ PLANTS = {
 }
 """Keywords of `AlteredSensor`, for each panel of the figure."""
 
-ALIKE = 1.05
-"""Ratio of errors up to which the simpler one of two methods is named."""
 
 _SIDEWAYS = 0.085  # between the markers of one start, over the distance of two starts
 _GRAY = "#666666"
@@ -204,39 +213,6 @@ def loop_methods(
     return dict(zip((*ONE_IMAGE, *TWO_IMAGES), methods, strict=True))
 
 
-@dataclass(frozen=True)
-class TunedLoops:
-    """Loops of all methods for one input and one star, each with its best gain."""
-
-    start: float  # wavefront error at the start, radian rms
-    photons: float  # per point, step and image of two; one image gets the light of both
-    gains: Mapping[str, float]
-    chosen: Mapping[str, float]  # residual with that gain on the screens that chose it, radian rms
-    settled: Mapping[str, NDArray]  # (n_screens,) residual on new screens, radian rms
-
-    def closed(self, method: str) -> NDArray[np.bool_]:
-        """Whether each loop settled below half of the error at its start, shape (n_screens,)."""
-        return self.settled[method] < self.start / 2
-
-
-def typical(settled: NDArray) -> float:
-    """Geometric mean of residuals, which counts loops that diverged without ignoring the others."""
-    return float(np.exp(np.mean(np.log(settled))))
-
-
-def two_digits(error: float) -> str:
-    """Error with two significant digits, trailing zeros included."""
-    return f"{error:#.2g}".rstrip(".")
-
-
-def paired_ratio(first: NDArray, second: NDArray) -> tuple[float, float, float]:
-    """Ratio of two errors, screen by screen: geometric mean, and this less and plus twice its standard error."""
-    logs = np.log(first / second)
-    error = 2 * logs.std(ddof=1) / np.sqrt(logs.size) if logs.size > 1 else np.inf
-    middle, low, high = np.exp([logs.mean(), logs.mean() - error, logs.mean() + error])
-    return float(middle), float(low), float(high)
-
-
 def tuned_loops(
     sensors: Sequence[ZernikeSensor],
     modes: NDArray,
@@ -270,30 +246,6 @@ def tuned_loops(
     return TunedLoops(start, photons, best, chosen, settled)
 
 
-@dataclass(frozen=True)
-class BestMethods:
-    """Best method with one and with two images, for one input and one star."""
-
-    loops: TunedLoops
-    one: str
-    two: str
-    ratio: float  # residual with two images over that with one, geometric mean over the screens
-    low: float  # the ratio less and plus twice its standard error
-    high: float
-
-    @classmethod
-    def of(cls, loops: TunedLoops, one: str, two: str) -> BestMethods:
-        """Compare two methods screen by screen."""
-        return cls(loops, one, two, *paired_ratio(loops.settled[two], loops.settled[one]))
-
-    @property
-    def best(self) -> str | None:
-        """Best method, None if the two differ by less than twice the standard error or `ALIKE`."""
-        if max(self.ratio, 1 / self.ratio) <= ALIKE:
-            return None
-        return self.two if self.high < 1 else self.one if self.low > 1 else None
-
-
 def best_methods(trials: Iterable[TunedLoops]) -> list[BestMethods]:
     """Compare the best method with one image to that with two, screen by screen.
 
@@ -318,16 +270,6 @@ def _simplest(residual: Mapping[str, float], names: Sequence[str]) -> str:
     tried = [name for name in names if name in residual]
     limit = ALIKE * min(residual[name] for name in tried)
     return next(name for name in tried if residual[name] <= limit)
-
-
-_NAMES = {"Linear": "linear, one image", "LinearTwo": "linear, two images"}
-
-
-def method_name(method: str) -> str:
-    """Name of a method for readers, with the number of its images."""
-    if method in _NAMES:  # `LOOKS` would add a look for a name that it does not know
-        return _NAMES[method]
-    return f"{LOOKS[method].name}, {'one image' if method in ONE_IMAGE else 'two images'}"
 
 
 def draw_linear_loops(found: Divergence) -> Figure:
@@ -425,20 +367,6 @@ def best_table(rows: Sequence[BestMethods]) -> Table:
         light = f"{loops.photons:g} photon{'s' * (loops.photons != 1)}"
         cells.append([f"{loops.start:g} rad rms; {light}", *ends, one_over_two(row)])
     return Table(header, cells)
-
-
-def one_over_two(row: Any) -> str:
-    """Error with one image over that with two, and in brackets two standard errors either way."""
-    if np.isinf(row.high):
-        return f"{1 / row.ratio:.2g} (one loop)"
-    low, high = 1 / row.high, 1 / row.low
-    digits = 0 if row.ratio <= 0.1 else 2 if high - low < 0.2 else 1
-    return f"{1 / row.ratio:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
-
-
-def short_name(method: str) -> str:
-    """Name of a method without the number of its images."""
-    return method_name(method).partition(",")[0]
 
 
 def numbers(

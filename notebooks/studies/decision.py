@@ -13,7 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies.closed_loop import (
+from studies.kit import sweeps
+from studies.kit.bench import poked_frames, poked_linear
+from studies.kit.loops import (
     ALIKE,
     BestMethods,
     TunedLoops,
@@ -23,8 +25,6 @@ from studies.closed_loop import (
     two_digits,
     typical,
 )
-from studies.kit import sweeps
-from studies.kit.bench import poked_frames, poked_linear
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import OTHER_STYLES, TALL

@@ -111,8 +111,8 @@ def design_map(
 ) -> DesignMap:
     """Photon costs for all diameters and all pairs of opposite phase shifts."""
     diameters, angles = np.asarray(diameters), np.asarray(angles)
-    rows = sweeps.run(_row, diameters.tolist(), pupil, angles.tolist(), dict(wavefronts), name="design_map")
-    return DesignMap(diameters, angles, {name: np.array([row[name] for row in rows]) for name in wavefronts})
+    shared = pupil, angles.tolist(), dict(wavefronts)
+    return DesignMap(diameters, angles, sweeps.table(_row, diameters.tolist(), *shared, name="design_map"))
 
 
 def _row(

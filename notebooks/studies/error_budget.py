@@ -10,9 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from studies.fig06_reference import UNITS
 from studies.kit import sweeps
-from studies.kit.bench import BenchCurves, bench_curves, check_bench
+from studies.kit.bench import UNITS, BenchCurves, bench_curves, check_bench
 from studies.kit.parameters import bench_fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS

@@ -6,7 +6,6 @@ import cProfile
 import pstats
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import cycle
 from typing import Any
 
@@ -14,16 +13,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, percent, refined_limit
+from studies.kit.curves import Limit, percent, refined_limit
+from studies.kit.experiments import LinearityCurves, linearity_curves
 from studies.kit.parameters import SETUP, parameter_limits
-from studies.kit.results import rounded, screen_columns
-from studies.kit.setups import NOISELESS, Noise, Screens, check_setup, screens_at
+from studies.kit.results import rounded
+from studies.kit.setups import Screens, check_setup
 from studies.kit.style import LOOKS, looks_of
 from studies.kit.tables import Table, small
-from zwfs.metrics import reconstruction_error, strehl
 from zwfs.reconstructors import GerchbergSaxton
 from zwfs.sensor import ZernikeSensor
 
@@ -41,74 +39,6 @@ QUICK = {"n_pixels": 64, "n_rms": 6, "rms_fine": [0.05], "rms_beyond": [1.6, 2.0
 STATED = {"Arcsine": 0.3, "PhaseShifted": 1.0}
 """Limits of two methods in the text of section 4.1, about, rad rms."""
 _PASSES = ("split_expand", "split_adjoint")  # functions that pass through the low-rank model of the sensor
-
-
-@dataclass(frozen=True)
-class LinearityCurves(ErrorCurves):
-    """Errors of several reconstructors against the input, and properties of the screens."""
-
-    converged: dict[str, NDArray[np.bool_]]  # (n_rms, n_screens) by name
-    wrapped: NDArray[np.float64]  # (n_rms, n_screens), share of the points beyond +-pi
-    folded: NDArray[np.float64]  # (n_rms, n_screens), share of the points below -pi/4
-    strehl: NDArray[np.float64]  # (n_rms, n_screens)
-    size: NDArray[np.float64]  # (n_rms, n_screens), rms of each screen, radian
-
-    def screens(self) -> dict[str, NDArray]:
-        """Input, rms, Strehl ratio and errors of every single screen, as columns for `publish`."""
-        own = {"rms of the screen (rad)": self.size, "Strehl ratio": self.strehl}
-        return screen_columns({"input (rad rms)": self.rms}, own) | super().screens()
-
-
-def linearity_curves(
-    reconstructors: Mapping[str, Any],
-    modes: NDArray | Screens,
-    rms: ArrayLike,
-    n_screens: int,
-    *,
-    exponent: float = -2.0,
-    seed: int = 0,
-    noise: Noise = NOISELESS,
-    first_task: int = 0,
-) -> LinearityCurves:
-    """Error of reconstructors on random screens of growing rms (radian): the experiment of section 4.1.
-
-    With `d_over_r0` of the screens, an input is the root mean square over all screens of turbulence. Each input
-    has a task number from `first_task` on; screens and noise depend on this number and on the seed.
-    """
-    rms = np.asarray(rms, float)
-    shared = dict(reconstructors), modes, n_screens, exponent, seed, noise
-    points = sweeps.run(_linearity_point, enumerate(rms.tolist(), first_task), *shared, name="linearity_curves")
-    errors, converged, *light = zip(*points, strict=True)
-    return LinearityCurves(
-        rms,
-        {name: np.array([point[name] for point in errors]) for name in reconstructors},
-        {name: np.array([point[name] for point in converged]) for name in reconstructors},
-        *map(np.array, light),
-    )
-
-
-def _linearity_point(
-    point: tuple[int, float],
-    reconstructors: Mapping[str, Any],
-    modes: NDArray | Screens,
-    n_screens: int,
-    exponent: float,
-    seed: int,
-    noise: Noise,
-) -> tuple[dict[str, NDArray], dict[str, NDArray], NDArray, NDArray, NDArray, NDArray]:
-    """One input of the linearity curves: errors, converged, wrapped, folded, Strehl and rms, (n_screens,) each."""
-    task, rms = point
-    screens = screens_at(modes, rms, n_screens, seed, task, exponent)
-    pupil = next(iter(reconstructors.values())).sensor.pupil
-    phase = pupil.gather(screens)
-    errors, converged = {}, {}
-    for name, reconstructor in reconstructors.items():
-        drawn = np.random.SeedSequence(seed, spawn_key=(task, 0))
-        estimate = reconstructor(noise(reconstructor.sensor, screens, drawn))
-        errors[name] = reconstruction_error(pupil, estimate.phase, screens)
-        converged[name] = estimate.converged
-    wrapped, folded = np.mean(np.abs(phase) > np.pi, axis=-1), np.mean(phase < -np.pi / 4, axis=-1)
-    return errors, converged, wrapped, folded, strehl(pupil, screens), pupil.rms(screens)
 
 
 def curves_at(

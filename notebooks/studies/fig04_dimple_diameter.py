@@ -12,9 +12,8 @@ estimate before, and keeps its phase: the phase shifts drop out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -23,16 +22,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, Limit, crossing, percent, refined_limit
+from studies.kit.curves import Limit, percent
+from studies.kit.experiments import TABLED, DiameterCurves, diameter_curves, up_to
+from studies.kit.iteration import DARK_RING, iteration_spectrum, mode_sensitivity
 from studies.kit.methods import opposite_dimples, own_reconstructors, paper_reconstructors
 from studies.kit.parameters import SETUP, parameter_limits
-from studies.kit.results import rounded, screen_errors
+from studies.kit.results import rounded
 from studies.kit.setups import NOISELESS, Noise, check_setup
 from studies.kit.style import LOOKS, OTHER_STYLES, TALL, looks_of
 from studies.kit.tables import Table, small
 from zwfs.masks import Dimple
-from zwfs.metrics import reconstruction_error, wrapped_residual
+from zwfs.metrics import wrapped_residual
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
@@ -53,10 +53,6 @@ LIMITS = parameter_limits(
 CHECK_TOGETHER = check_setup
 QUICK = {"n_pixels": 64, "n_screens": 4, "step": 0.5, "step_fine": 0.2, "n_screens_few": 2, "n_screens_methods": 4}
 
-DARK_RING = 2 * 1.2196698912665045
-"""Diameter of the first dark ring of the Airy pattern, lambda/D: twice the first zero of J1(pi r)."""
-TABLED = (1.06, 1.5, 2.0, 2.2, 2.4, 2.6, 3.0, 3.5)
-"""Diameters of the table on the causes of Figure 4, lambda/D."""
 FEW = (0.5, 1.0, 1.06, 1.5, 1.6, 1.75, 2.0, 2.2, 2.4, 2.6, 3.0, 3.5, 4.0)
 """Diameters at which the costly methods are compared, lambda/D."""
 ITERATION = "PhaseShifted"
@@ -71,76 +67,12 @@ SHORT = {
 }
 """Names of the methods in the numbers for the text."""
 _MODES = {"tilt": 0, "defocus": 2, "high order (Noll 150)": 148}  # by their place among the modes
-_TOLERANCE = 1e-12  # of the low-rank factors, as the spectrum is to be exact where the iteration is
-
-
-@dataclass(frozen=True)
-class DiameterCurves(ErrorCurves):
-    """Errors of several reconstructors against the diameter of the dimple, on screens of one rms."""
-
-    diameters: NDArray[np.floating]  # (n_diameters,), lambda/D
-
-    def at(self, name: str, diameter: float) -> float:
-        """Mean error at a sampled diameter (lambda/D), radian rms; NaN if it was not sampled."""
-        found = self.mean(name)[np.abs(self.diameters - diameter) < 1e-9]
-        return float(found[0]) if found.size else np.nan
-
-    def exceeds(self, name: str, limit: float, start: float = 0.0) -> float:
-        """Diameter, from `start` on, at which the mean error exceeds `limit` (radian rms); see `crossing`."""
-        used = self.diameters >= start - 1e-9
-        return crossing(self.diameters[used], self.mean(name)[used], limit)
-
-    def screens(self) -> dict[str, NDArray]:
-        """Diameter and errors of every single screen, as columns for `publish`."""
-        return screen_errors("diameter (lambda/D)", self.diameters, self.errors)
-
-
-def diameter_curves(
-    make: Callable[[float], Mapping[str, Any]],
-    diameters: ArrayLike,
-    screens: NDArray,
-    *,
-    noise: Noise = NOISELESS,
-    seed: int = 0,
-) -> DiameterCurves:
-    """Errors of the reconstructors that `make` returns for each diameter (lambda/D), on the same screens."""
-    diameters = np.asarray(diameters, float)
-    points = sweeps.run(_diameter_point, diameters.tolist(), make, screens, noise, seed, name="diameter_curves")
-    rms, errors = zip(*points, strict=True)
-    return DiameterCurves(
-        np.array(rms), {name: np.array([point[name] for point in errors]) for name in errors[0]}, diameters
-    )
-
-
-def _diameter_point(
-    diameter: float, make: Callable[[float], Mapping[str, Any]], screens: NDArray, noise: Noise, seed: int
-) -> tuple[float, dict[str, NDArray[np.floating]]]:
-    """One diameter of the curves: rms of the screens, and errors on each of them, (n_screens,)."""
-    errors = {}
-    for name, reconstructor in make(diameter).items():
-        sensor = reconstructor.sensor
-        estimate = reconstructor(noise(sensor, screens, seed))
-        errors[name] = reconstruction_error(sensor.pupil, estimate.phase, screens)
-    return float(np.mean(sensor.pupil.rms(screens))), errors
-
-
-def sampled_diameters(step: float, diameter_max: float, step_fine: float) -> NDArray[np.float64]:
-    """Diameters of Figure 4 (lambda/D): every `step`, every `step_fine` from 2 to 2.6, those tabled, the end."""
-    coarse = np.arange(step, diameter_max, step)
-    fine = np.arange(2.0, 2.6 + step_fine / 2, step_fine)
-    return _up_to(diameter_max, [*coarse, *fine, *TABLED])
 
 
 def near_limit(diameters: NDArray, low: float = 1.75, high: float = 2.5) -> NDArray[np.float64]:
     """Diameters for more iterations: fewer suffice below, and more lead away above; all if none is near."""
     near = diameters[(diameters >= low) & (diameters <= high)]
     return near if near.size else diameters
-
-
-def _up_to(end: float, diameters: ArrayLike) -> NDArray[np.float64]:
-    """Diameters below an end, and the end."""
-    listed = np.unique(np.round([*np.ravel(diameters), end], 9))
-    return listed[listed <= end + 1e-9]
 
 
 def iteration_curves(
@@ -153,21 +85,6 @@ def iteration_curves(
         return {ITERATION: PhaseShifted(sensor, n_iterations=n_iterations, tolerance=0.0)}
 
     return diameter_curves(make, diameters, screens, **noise)
-
-
-def diameter_limit(
-    curve: DiameterCurves, name: str, make: Callable[[NDArray], DiameterCurves], threshold: float
-) -> Limit:
-    """Diameter at which a mean error exceeds `threshold` times the input; `make` tries other screens."""
-    coarse = curve.exceeds(name, threshold * curve.rms[0])
-    if not curve.diameters[0] < coarse < np.inf:
-        return Limit(coarse)
-
-    def ratios(diameters: NDArray) -> NDArray:
-        found = make(diameters)
-        return found.errors[name] / found.rms[:, np.newaxis]
-
-    return refined_limit(ratios, coarse, threshold, width=0.025)
 
 
 def other_curves(
@@ -190,48 +107,8 @@ def other_curves(
         del methods[ITERATION]
         return methods
 
-    few = _up_to(diameter_max, [*FEW, *np.arange(5.0, diameter_max)])
+    few = up_to(diameter_max, [*FEW, *np.arange(5.0, diameter_max)])
     return diameter_curves(make, few, screens, noise=noise, seed=seed)
-
-
-class DimpleLight:
-    """The part of a field that passes through a dimple (lambda/D), beta, at the points of the pupil.
-
-    It is beta = expand(project(field) @ core): a few coefficients lie between the two planes.
-    """
-
-    def __init__(self, pupil: Pupil, diameter: float) -> None:
-        # For a phase shift of pi the reference wave is -2 beta.
-        factors = ZernikeSensor(pupil, Dimple(diameter, np.pi), tolerance=_TOLERANCE).factors
-        self.core = factors.core[0].T.real / -2
-        self._pupil, self._factors = pupil, factors
-
-    def __call__(self, field: NDArray) -> NDArray[np.complex128]:
-        """Beta of complex fields at the points of the pupil, (k, n_points) to (k, n_points)."""
-        return self.expand(self.project(field) @ self.core)
-
-    def project(self, field: NDArray) -> NDArray[np.complex128]:
-        """Coefficients of fields, (k, n_points) to (k, rank)."""
-        return self._factors.pupil.project(self._pupil.scatter(np.asarray(field, complex), fill=0))
-
-    def expand(self, coefficients: NDArray) -> NDArray:
-        """Fields of coefficients behind the dimple, (k, rank) to (k, n_points)."""
-        return self._pupil.gather(self._factors.detector.expand(coefficients))
-
-
-def iteration_spectrum(pupil: Pupil, diameter: float, phase: NDArray | None = None) -> NDArray[np.complex128]:
-    """Eigenvalues of the linearised phase-shifted step, piston left out."""
-    light, psi, beta = _linearised(pupil, diameter, phase)
-    # A step maps an error to the few coefficients of the change of beta, and these to the next error. Its
-    # eigenvalues other than 0 are those of the two maps in the opposite order: a small matrix.
-    unit = light.expand(light.core)
-    # The map is linear over the real numbers only: real and imaginary parts of the coefficients count separately.
-    errors = _error_after(psi, beta, np.concatenate([unit, 1j * unit]))
-    coefficients = light.project(1j * psi * errors)
-    values = np.linalg.eigvals(np.concatenate([coefficients.real, coefficients.imag], axis=1))
-    # A piston returns unchanged: its eigenvalue is exactly 1, and no frame shows a piston.
-    values = np.delete(values, np.argmin(np.abs(values - 1)))
-    return values[np.argsort(-np.abs(values), kind="stable")]
 
 
 def measured_factor(
@@ -248,25 +125,6 @@ def measured_factor(
         factors.append(float(pupil.rms(error)) / size)
         error /= factors[-1]
     return float(np.exp(np.mean(np.log(factors[n_iterations // 2 :]))))
-
-
-def mode_sensitivity(
-    pupil: Pupil,
-    diameter: float,
-    modes: NDArray,
-    phase_shifts: tuple[float, ...] = (np.pi / 2, -np.pi / 2),
-    phase: NDArray | None = None,
-) -> NDArray[np.float64]:
-    """Sensitivity of the frames to each mode, the change of the reference wave included."""
-    light, psi, beta = _linearised(pupil, diameter, phase)
-    direct = 1j * psi * pupil.gather(modes)
-    through = light(direct)
-    power = np.zeros(len(direct))
-    for theta in phase_shifts:
-        strength = np.exp(1j * theta) - 1
-        out = psi + strength * beta
-        power += np.mean((2 * np.real(out.conj() * (direct + strength * through))) ** 2, axis=-1)
-    return np.sqrt(power)
 
 
 @dataclass(frozen=True)
@@ -305,22 +163,6 @@ def contraction(
         observed,
         dict(zip(_MODES, sensitivity, strict=True)),
     )
-
-
-_light = lru_cache(maxsize=64)(DimpleLight)  # one for all wavefronts
-
-
-def _linearised(pupil: Pupil, diameter: float, phase: NDArray | None) -> tuple[DimpleLight, NDArray, NDArray]:
-    """Light in the dimple, and the field and its beta at the points of the pupil, (n_points,) each."""
-    psi = pupil.gather(pupil.field(np.zeros(pupil.shape) if phase is None else phase))
-    light = _light(pupil, float(diameter))
-    return light, psi, light(psi[np.newaxis])[0]
-
-
-def _error_after(psi: NDArray, beta: NDArray, change: NDArray) -> NDArray[np.float64]:
-    """Error of the phase after a step that uses beta + change in place of beta."""
-    relative = change / beta
-    return relative.imag - 2 * relative.real * np.imag(beta.conj() * psi) / np.abs(psi) ** 2
 
 
 def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float, claimed: float) -> Figure:

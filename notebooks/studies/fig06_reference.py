@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies.kit.bench import ARMS, check_bench
+from studies.kit.bench import ARMS, UNITS, check_bench
 from studies.kit.parameters import bench_fields, parameter_limits
 from studies.kit.style import show_intensity
 from studies.kit.tables import Table
@@ -15,20 +15,6 @@ from zwfs.bench import Bench
 
 LIMITS = parameter_limits(n_pixels=(32, 1024), bench=bench_fields("n_pixels"))
 CHECK_TOGETHER = check_bench
-
-UNITS = {
-    "leakage": "of the light",
-    "focus_difference": "D²/λ",
-    "misregistration": "pixels",
-    "blur": "pixels rms",
-    "flux_imbalance": "of the mean flux",
-    "dimple_error": "of the diameter",
-    "static": "rad rms",
-    "quilting": "rad rms",
-    "photons_per_image": "photons in an image",
-    "read_noise": "electrons rms",
-    "background": "electrons in a pixel",
-}
 
 
 def draw_reference_intensities(frames: NDArray, clear_frames: NDArray) -> Figure:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
@@ -131,18 +131,19 @@ def amplitude_curves(
     """Error of the phase against the variation of the amplitude, for each way and kind of amplitude."""
     variations = np.asarray(variations, float)
     shared = sensor, modes, rms, n_screens, photons, exponent, seed
-    cells = list(product(KINDS, enumerate(variations.tolist())))
-    points = dict(zip(cells, sweeps.run(_point, cells, *shared, name="amplitude_curves"), strict=True))
-    curves = {}
-    for kind in KINDS:
-        errors, consistent, bound = zip(*(point for (of, _), point in points.items() if of == kind), strict=True)
-        curves[kind] = AmplitudeCurves(variations, _by_way(errors), _by_way(consistent), np.array(bound))
-    return curves
-
-
-def _by_way(points: Sequence[dict[str, NDArray]]) -> dict[str, NDArray]:
-    """Arrays of each way, (n, n_screens), from those of each variation, (n_screens,)."""
-    return {way: np.array([point[way] for point in points]) for way in points[0]}
+    cells = product(KINDS, enumerate(variations.tolist()))
+    points = sweeps.table(_point, cells, *shared, name="amplitude_curves")
+    n = variations.size
+    parts = {kind: slice(n * place, n * (place + 1)) for place, kind in enumerate(KINDS)}
+    return {
+        kind: AmplitudeCurves(
+            variations,
+            {way: error[part] for way, error in points["errors"].items()},
+            {way: consistent[part] for way, consistent in points["consistent"].items()},
+            points["bound"][part],
+        )
+        for kind, part in parts.items()
+    }
 
 
 def _point(
@@ -154,7 +155,7 @@ def _point(
     photons: float,
     exponent: float,
     seed: int,
-) -> tuple[dict[str, NDArray], dict[str, NDArray], float]:
+) -> dict[str, Any]:
     """One kind and variation: errors and consistent, (n_screens,) each, by way, and the bound."""
     kind, (place, variation) = cell
     phases = screens_at(modes, rms, n_screens, seed, 0, exponent)
@@ -172,7 +173,8 @@ def _point(
         cramer_rao(sensor, phase, photons=photons, amplitude=amplitude, amplitude_known=False)
         for phase, amplitude in zip(phases, amplitudes, strict=True)
     ]
-    return errors, consistent, float(np.sqrt(np.nanmean(np.square(bounds))))
+    bound = float(np.sqrt(np.nanmean(np.square(bounds))))
+    return {"errors": errors, "consistent": consistent, "bound": bound}
 
 
 def noisy_frames(

@@ -83,16 +83,11 @@ def photon_curves(
     rms, photons = np.asarray(rms, float), np.asarray(photons, float)
     shared = sensor, dict(reconstructors), modes, n_screens, exponent, seed
     cells = product(enumerate(rms.tolist()), enumerate(photons.tolist()))
-    points = sweeps.run(_photon_point, cells, *shared, name="photon_curves")
-    errors, bound, within = zip(*points, strict=True)
+    points = sweeps.table(_photon_point, cells, *shared, name="photon_curves")
     shape = rms.size, photons.size
-    return PhotonCurves(
-        rms,
-        photons,
-        {name: np.reshape([one[name] for one in errors], (*shape, n_screens)) for name in errors[0]},
-        np.reshape(bound, (*shape, n_screens)),
-        np.reshape(within, shape),
-    )
+    errors = {name: error.reshape(*shape, n_screens) for name, error in points["errors"].items()}
+    bound, within = points["bound"].reshape(*shape, n_screens), points["within"].reshape(shape)
+    return PhotonCurves(rms, photons, errors, bound, within)
 
 
 def _photon_point(
@@ -103,7 +98,7 @@ def _photon_point(
     n_screens: int,
     exponent: float,
     seed: int,
-) -> tuple[dict[str, NDArray], NDArray, float]:
+) -> dict[str, Any]:
     """One input and number of photons: errors by name, and bound, (n_screens,), and share within one sigma."""
     (task, rms), (place, photons) = cell
     screens = screens_at(modes, rms, n_screens, seed, task, exponent)
@@ -116,7 +111,7 @@ def _photon_point(
         errors[name] = reconstruction_error(sensor.pupil, estimate.phase, screens)
     within = np.mean(_in_sigmas(sensor, estimate, screens) < 1)
     bound = sensor.pupil.gather(cramer_rao(sensor, screens, photons=photons))
-    return errors, np.sqrt(np.mean(bound**2, axis=-1)), float(within)
+    return {"errors": errors, "bound": np.sqrt(np.mean(bound**2, axis=-1)), "within": float(within)}
 
 
 class ErrorBars(NamedTuple):

@@ -17,6 +17,21 @@ from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 
 ARMS = ("1 (+θ)", "2 (−θ)")  # of the bench, for labels
 
+UNITS = {
+    "leakage": "of the light",
+    "focus_difference": "D²/λ",
+    "misregistration": "pixels",
+    "blur": "pixels rms",
+    "flux_imbalance": "of the mean flux",
+    "dimple_error": "of the diameter",
+    "static": "rad rms",
+    "quilting": "rad rms",
+    "photons_per_image": "photons in an image",
+    "read_noise": "electrons rms",
+    "background": "electrons in a pixel",
+}
+"""Units of the errors of the bench."""
+
 # Smallest singular value of the interaction matrix that is inverted, over the largest. No sensor sees the piston
 # of all segments together: its singular value is the noise of the calibration, and is left out. That of the mode
 # that dimples of 1.8 lambda/D see least, on a bench with blur, is 0.07.
@@ -99,11 +114,7 @@ def bench_curves(
     """Errors of reconstructors on random segment commands of growing rms: the experiment of section 5.2."""
     rms = np.asarray(rms, dtype=float)
     shared = bench, model, dict(reconstructors), n_screens, exponent, seed
-    points = sweeps.run(_bench_point, enumerate(rms.tolist()), *shared, name="bench_curves")
-    commanded, residuals = zip(*points, strict=True)
-    return BenchCurves(
-        rms, np.array(commanded), {name: np.array([point[name] for point in residuals]) for name in reconstructors}
-    )
+    return BenchCurves(rms, **sweeps.table(_bench_point, enumerate(rms.tolist()), *shared, name="bench_curves"))
 
 
 def _bench_point(
@@ -114,13 +125,14 @@ def _bench_point(
     n_screens: int,
     exponent: float,
     seed: int,
-) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+) -> dict[str, Any]:
     """One input of the bench curves: what is commanded, and the residuals, (n_screens, n_segments) each."""
     task, rms = point
     screens, noise = np.random.SeedSequence(seed, spawn_key=(task,)).spawn(2)
     commanded = segment_screens(bench, rms, n_screens, exponent, screens)
     frames = model.normalise(bench.frames(commanded, noise))
-    return commanded, {
+    residuals = {
         name: segment_residual(find_pistons(reconstructor, model, frames), commanded)
         for name, reconstructor in reconstructors.items()
     }
+    return {"commanded": commanded, "residuals": residuals}

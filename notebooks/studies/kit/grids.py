@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import pickle
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -23,7 +22,6 @@ from zwfs import Dimple, PhaseShifted, ZernikeSensor, reconstruction_error
 # Relative error of the reference waves, by the precision of the frames.
 _TOLERANCES = {"float64": 1e-10, "float32": 1e-6}
 _UNITS = {"diameter": "λ/D", "phase_shift": "rad", "rms": "rad rms", "error": "rad rms"}
-_BUILT: dict[tuple[Any, ...], Any] = {}  # reconstructors that tasks of the same process share
 
 
 @dataclass(frozen=True)
@@ -45,23 +43,13 @@ class Recovery:
         phase_shift: float = np.pi / 2,
     ) -> dict[str, NDArray]:
         """Return "error" (radian rms) and "converged" of each screen."""
-        method = self._built(diameter, phase_shift)
+        masks = Dimple(diameter, phase_shift), Dimple(diameter, -phase_shift)
+        method = self.method(ZernikeSensor(self.source.pupil, *masks, tolerance=_TOLERANCES[self.dtype]))
         screens = self.source(rms, n_screens, seed).astype(self.dtype)
         drawn = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 0))
         estimate = method(self.noise(method.sensor, screens, drawn))
         error = reconstruction_error(self.source.pupil, estimate.phase, screens)
         return {"error": error, "converged": np.asarray(estimate.converged)}
-
-    def _built(self, diameter: float, phase_shift: float) -> Any:
-        """Return the reconstructor of a dimple."""
-        key = self.method, pickle.dumps(self.source.pupil), diameter, phase_shift, self.dtype
-        if key not in _BUILT:
-            if len(_BUILT) >= 64:
-                _BUILT.clear()
-            masks = Dimple(diameter, phase_shift), Dimple(diameter, -phase_shift)
-            sensor = ZernikeSensor(self.source.pupil, *masks, tolerance=_TOLERANCES[self.dtype])
-            _BUILT[key] = self.method(sensor)
-        return _BUILT[key]
 
 
 @dataclass(frozen=True)
@@ -123,42 +111,35 @@ def _grid_block(
     """Results of one block of screens at one point of a grid."""
     point, (start, n) = value
     drawn = task(**dict(point), n_screens=n, seed=np.random.SeedSequence(seed, spawn_key=(start,)))
-    arrays = {name: np.asarray(one) for name, one in drawn.items()}
-    for name, one in arrays.items():
-        if one.shape != (n,):
-            raise ValueError(f"the task returns {name} of shape {one.shape}: expected ({n},)")
+    arrays = {name: np.asarray(result) for name, result in drawn.items()}
+    for name, result in arrays.items():
+        if result.shape != (n,):
+            raise ValueError(f"the task returns {name} of shape {result.shape}: expected ({n},)")
     return arrays
 
 
-def draw_slice(
-    grid: Grid, value: str, x: str, y: str = "", *, lines: str = "", units: Mapping[str, str] | None = None
-) -> Figure:
+def draw_slice(grid: Grid, value: str, x: str, y: str = "") -> Figure:
     """Mean over the screens of a result of a grid, against one or two axes; results that are NaN do not count."""
-    shown = [name for name in (y or lines, x) if name]
+    shown = [name for name in (y, x) if name]
     others = [name for name in grid.axes if name not in shown and len(np.unique(grid.columns[name])) > 1]
     if others:
         raise ValueError(f"axes {others} have several values: expected one each, as after grid.select")
-    known_units = _UNITS | dict(units or {})
-    known, places = zip(*(np.unique(grid.columns[name], return_inverse=True) for name in shown), strict=True)
-    mean = _mean(places, grid.columns[value], tuple(map(len, known)))
+    values, places = zip(*(np.unique(grid.columns[name], return_inverse=True) for name in shown), strict=True)
+    mean = _mean(places, grid.columns[value], tuple(map(len, values)))
     figure, axes = plt.subplots(figsize=(6.5, 4))
-    axes.set_xlabel(_label(x, known_units))
+    axes.set_xlabel(_label(x))
     if y:
-        mesh = axes.pcolormesh(known[1], known[0], mean, shading="nearest")
-        axes.set_ylabel(_label(y, known_units))
-        figure.colorbar(mesh, label=f"mean of {_label(value, known_units)}")
-        return figure
-    for number, row in enumerate(np.atleast_2d(mean)):
-        label = f"{lines} {known[0][number]} {known_units.get(lines, '')}".strip() if lines else None
-        axes.plot(known[-1], row, label=label or "_mean", **OTHER_STYLES[number % len(OTHER_STYLES)])
-    axes.set_ylabel(f"mean of {_label(value, known_units)}")
-    if lines:
-        axes.legend()
+        mesh = axes.pcolormesh(values[1], values[0], mean, shading="nearest")
+        axes.set_ylabel(_label(y))
+        figure.colorbar(mesh, label=f"mean of {_label(value)}")
+    else:
+        axes.plot(values[0], mean, label="_mean", **OTHER_STYLES[0])
+        axes.set_ylabel(f"mean of {_label(value)}")
     return figure
 
 
-def _label(name: str, units: Mapping[str, str]) -> str:
-    return f"{name} ({units[name]})" if name in units else name
+def _label(name: str) -> str:
+    return f"{name} ({_UNITS[name]})" if name in _UNITS else name
 
 
 def _mean(places: tuple[NDArray, ...], values: NDArray, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from studies.kit.style import LOOKS, Look
 from zwfs import _check
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
@@ -19,6 +21,7 @@ from zwfs.reconstructors import (
     GerchbergSaxton,
     GradientDescent,
     Linear,
+    MaximumLikelihood,
     PhaseShifted,
 )
 from zwfs.sensor import ZernikeSensor
@@ -133,3 +136,38 @@ Keck's are those of Salama et al. 2024, OZIRIIS's those of its telemetry softwar
 def opposite_dimples(pupil: Pupil, diameter: float, phase_shift: float) -> ZernikeSensor:
     """Return the sensor with two dimples of one diameter (lambda/D) and opposite phase shifts (radian)."""
     return ZernikeSensor(pupil, Dimple(diameter, phase_shift), Dimple(diameter, -phase_shift))
+
+
+PLAIN, ACCELERATED, LIKELY, MODES = (
+    "PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood", "MaximumLikelihoodModes",
+)  # fmt: skip
+"""Names of the compared methods."""
+
+
+def compared_methods(
+    sensor: ZernikeSensor, n_iterations: int, photons: float = 0.0, n_starts: int = 8
+) -> dict[str, Any]:
+    """Return the paper's iteration, its accelerated form, and maximum likelihood, by name."""
+    return {
+        PLAIN: PhaseShifted(sensor, n_iterations=n_iterations),
+        ACCELERATED: PhaseShifted(sensor, n_iterations=n_iterations, accelerate=True),
+        LIKELY: MaximumLikelihood(sensor, photons=photons or None, n_starts=n_starts),
+    }
+
+
+def method_look(name: str) -> Look:
+    """Look of a compared method: variants of a method have its colour."""
+    if name == ACCELERATED:
+        return replace(LOOKS[PLAIN], name="phase-shifted, accelerated", line="-")
+    if name == MODES:
+        return replace(LOOKS[LIKELY], name="maximum likelihood on modes", line="--", marker="o")
+    return LOOKS[name]
+
+
+def method_line(name: str) -> dict[str, Any]:
+    """How a method is drawn: maximum likelihood wide and below, the accelerated iteration with hollow marks."""
+    look = method_look(name)
+    style = look.style | {"label": look.label}
+    if name == LIKELY:
+        return style | {"ms": 8, "lw": 3, "zorder": 1.9}
+    return style | {"ms": 5, "lw": 1.6, "mfc": "#ffffff" if name == ACCELERATED else look.color}

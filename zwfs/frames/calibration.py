@@ -490,8 +490,8 @@ class Calibration(Immutable):
         Raises
         ------
         FileNotFoundError, TypeError, ValueError
-            If frames are of a wrong type or shape. If pokes do not move the frames, push and pull of one contradict
-            each other, or two move the frames in the same way: the message names them by number, from 0.
+            If frames are of a wrong type or shape. If pokes do not move the frames, push and pull of one
+            contradict each other, or two move the frames in the same way: the message names them, from 0.
         """
         return make_controller(self, flat, pushed, pulled, **settings)
 

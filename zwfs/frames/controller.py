@@ -12,10 +12,10 @@ where r is x of the flat mirror. `Controller` is this product: the pixels of the
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import replace
-from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,34 +25,22 @@ from zwfs._arrays import Kind, read_only
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import broken
 from zwfs.frames._fits import FIRST_BYTES, fits_content, fits_module
-from zwfs.frames._stack import Stack
-from zwfs.frames.phases import Flag
+from zwfs.frames._pokes import Inverse, Pokes, Signals, faintest, image_shape, roughness
 from zwfs.reconstructors import MaximumLikelihood
 
 if TYPE_CHECKING:
     from zwfs.frames.calibration import Calibration
-    from zwfs.frames.phases import Phases
 
-_UNMOVED = 1.2  # response to a poke, in squares and over its noise, below which it shows nothing
-_CONTRARY = 0.8  # mean change of push and pull over half their difference: 1 if one of the two did not move
-_ALIKE = 0.05  # difference of two responses over their sizes, in squares
-_CLEAR = 4.0  # response over its noise, in squares, from which on two responses can be compared
-_SILENT = 1e-6  # response to a poke over that of a typical one, in squares: nothing, where there is no noise
-_UNSEEN = 1.05  # singular value over that of noise alone, below which a direction is noise
 _STILL = 1e-3  # radian rms of the flat mirror's phase, below which it needs no mode
-_DIMMEST = 0.05  # variance of the noise of dark pixels, over the mean
-_LOST = 5.0  # standard errors of the light, below which a frame has none
-_BINS = 4  # of brightness, for the noise
-_FEWEST = 0.8  # of the pixels that the pupil covers, which are good in all frames of the pokes
 _METHODS = "linear", "phase-shifted", "likelihood"
-_NAMES = (
-    "matrix",
-    "reference",
-    "mask",
-    "dark",
-    "interaction",
-    "noise",
-)  # arrays of a file, by the names of its units
+_ARRAYS = "matrix", "reference", "mask", "dark", "interaction"  # of a file
+_SCALARS = {
+    "light": np.inf,
+    "noise": 0.0,
+    "gain": 1.0,
+    "n_kept": 1.0,
+    "saturation": np.inf,
+}  # FITS has no infinity
 
 
 def make_controller(
@@ -67,8 +55,8 @@ def make_controller(
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
     if method not in _METHODS:
         raise ValueError(f"method = {_check.shown(method)}: expected one of {', '.join(_METHODS)}")
-    pokes = _Pokes.of(calibration, flat, pushed, pulled)
-    signals = _Signals.of(calibration, pokes)
+    pokes = Pokes.of(calibration, flat, pushed, pulled)
+    signals = Signals.of(calibration, pokes)
     signals.check()
     if method != "linear":
         return PhaseController(
@@ -76,11 +64,10 @@ def make_controller(
             likelihood=method == "likelihood", n_iterations=n_iterations,
         )  # fmt: skip
     interaction = signals.difference.T / poke
-    weight, error = signals.weights()
-    inverse = Inverse.of(weight[:, np.newaxis] * interaction, rcond, error / poke)
+    inverse = Inverse.of(interaction, rcond, signals.noise * math.sqrt(signals.shares[0]) / poke)
     return Controller(
-        gain * inverse.matrix * weight, signals.reference, signals.mask, signals.dark, interaction, signals.noise,
-        light=signals.light, gain=gain, n_kept=len(inverse.directions), saturation=calibration.saturation,
+        gain * inverse.matrix, signals.reference, signals.mask, signals.dark, interaction, light=signals.light,
+        noise=signals.noise, gain=gain, n_kept=len(inverse.directions), saturation=calibration.saturation,
     )  # fmt: skip
 
 
@@ -106,10 +93,10 @@ class Controller:
         Counts without light of these pixels.
     interaction : array_like, shape (n_pixels, n_commands)
         Change of the signal by a unit of each command.
-    noise : array_like, shape (n_pixels,)
-        Standard error of the signal of one frame of the flat mirror.
     light : float, counts
-        Sum of the frame of the flat mirror.
+        Sum of the frame of the flat mirror, less the dark.
+    noise : float
+        Standard error of the signal of one pixel, in one frame of the flat mirror.
     gain : float
     n_kept : int
         Directions of the commands that are inverted.
@@ -128,42 +115,26 @@ class Controller:
 
     def __init__(
         self, matrix: ArrayLike, reference: ArrayLike, mask: ArrayLike, dark: ArrayLike, interaction: ArrayLike,
-        noise: ArrayLike, *, light: float, gain: float, n_kept: int, saturation: float = np.inf,
+        *, light: float, noise: float, gain: float, n_kept: int, saturation: float = np.inf,
     ) -> None:  # fmt: skip
-        whole = _check.plain_array("mask", mask)
-        self.mask = read_only(_check.flag_map("mask", whole, whole.shape, some=True).copy())
+        flags = _check.plain_array("mask", mask)
+        self.mask = read_only(_check.flag_map("mask", flags, flags.shape, some=True).copy())
         if self.mask.ndim not in (2, 3):
             raise ValueError(f"mask has shape {self.mask.shape}: expected (ny, nx) or (2, ny, nx)")
-        n_pixels, n_commands = int(np.count_nonzero(self.mask)), len(_check.real_array("matrix", matrix))
-        arrays = {
-            "matrix": matrix,
-            "reference": reference,
-            "dark": dark,
-            "interaction": interaction,
-            "noise": noise,
-        }
-        shapes = {"matrix": (n_commands, n_pixels), "interaction": (n_pixels, n_commands)}
-        for name, values in arrays.items():
-            array = _check.real_array(name, values).astype(np.float32, order="C")
-            if array.shape != shapes.get(name, (n_pixels,)):
-                raise ValueError(f"{name} has shape {array.shape}: expected {shapes.get(name, (n_pixels,))}")
-            _check.finite(name, array)
-            setattr(self, name, read_only(array))
-        self.matrix: NDArray[np.float32]
-        self.reference: NDArray[np.float32]
-        self.dark: NDArray[np.float32]
-        self.interaction: NDArray[np.float32]
-        self.noise: NDArray[np.float32]
+        self._pixels = np.flatnonzero(self.mask)
+        n, n_commands = len(self._pixels), len(np.atleast_1d(matrix))
+        self.matrix = _single("matrix", matrix, (n_commands, n))
+        self.reference, self.dark = _single("reference", reference, (n,)), _single("dark", dark, (n,))
+        self.interaction = _single("interaction", interaction, (n, n_commands))
         self.light = _check.number("light", light, 0, open_low=True)
+        self.noise = _check.number("noise", noise, 0)
         self.gain = _check.number("gain", gain, 0, 2, open_low=True)
         self.n_kept = _check.integer("n_kept", n_kept, 1, n_commands)
-        self.saturation = float(saturation)
+        self.saturation = saturation if saturation == np.inf else _check.number("saturation", saturation, 0)
         self.flux, self.n_bad, self.lost = 1.0, 0, False
-        self._faintest = max(_LOST * float(np.linalg.norm(self.noise)) * self.light, 1e-30)
-        self._pixels = np.flatnonzero(self.mask)
-        self._ones = np.ones(n_pixels, np.float32)
-        self._signal, self._expected = np.empty((2, n_pixels), np.float32)
-        self._raw = np.empty(n_pixels, np.float32)
+        self._faintest = faintest(self.noise, n) * self.light
+        self._ones = np.ones(n, np.float32)
+        self._raw, self._signal, self._expected = np.empty((3, n), np.float32)
 
     def __repr__(self) -> str:
         return (
@@ -179,7 +150,7 @@ class Controller:
     @property
     def sigma(self) -> NDArray[np.float32]:
         """Standard error of each command that the noise of one frame causes, in the light of the flat mirror."""
-        return np.linalg.norm(self.matrix * self.noise, axis=1) / self.gain
+        return self.noise * np.linalg.norm(self.matrix, axis=1) / self.gain
 
     @property
     def expected_residual(self) -> float:
@@ -242,26 +213,23 @@ class Controller:
     def save(self, path: str | Path) -> None:
         """Write the controller as NPZ or, where the name ends with .fits, as FITS, in one step.
 
-        Both hold the arrays `matrix`, `reference`, `mask`, `dark`, `interaction` and `noise` of this object under
-        their names: the members of the NPZ file are NPY files, and the units of the FITS file images with the
-        matrix first. Scalars are 0-dimensional arrays of NPZ, and the keywords LIGHT, GAIN, NKEPT and SATURATE of
-        the first header.
+        Both hold `matrix`, `reference`, `mask` (1 and 0), `dark` and `interaction` of this object under their
+        names: as the NPY files of which an NPZ file consists, or as images of FITS units, with the matrix first.
+        The numbers `light`, `noise`, `gain`, `n_kept` and `saturation` are arrays without an axis in NPZ, and
+        keywords of the first header in FITS.
         """
         path = path_of("path", path)
-        arrays = {name: getattr(self, name) for name in _NAMES}
-        arrays["mask"] = self.mask.astype(np.uint8)
-        scalars = {"light": self.light, "gain": self.gain, "nkept": self.n_kept, "saturate": self.saturation}
+        arrays = {name: getattr(self, name) for name in _ARRAYS} | {"mask": self.mask.astype(np.uint8)}
+        scalars = {name: getattr(self, name) for name in _SCALARS}
         if path.suffix.lower() in (".fits", ".fit"):
-            cards = [(name.upper(), value, "") for name, value in scalars.items() if np.isfinite(value)]
-            units = [
-                (array, name.upper(), [] if number else cards)
-                for number, (name, array) in enumerate(arrays.items())
-            ]
-            write_file(path, fits_content(*units))
-            return
-        stream = io.BytesIO()
-        np.savez(stream, **arrays, **{name: np.array(value) for name, value in scalars.items()})
-        write_file(path, stream.getvalue())
+            cards = [(name[:8], value, "") for name, value in scalars.items() if value != np.inf]
+            units = [(array, name.upper(), cards if name == "matrix" else []) for name, array in arrays.items()]
+            content = fits_content(*units)
+        else:
+            stream = io.BytesIO()
+            np.savez(stream, **arrays, **{name: np.array(value) for name, value in scalars.items()})
+            content = stream.getvalue()
+        write_file(path, content)
 
     @classmethod
     def load(cls, path: str | Path) -> Controller:
@@ -275,29 +243,20 @@ class Controller:
         path = path_of("path", path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file: expected a controller")
-        with broken(f"{path.name}: not a controller, or a broken one"):
+        with broken(f"{path.name}: a broken controller, or none"):
+            values: dict[str, Any]
             with path.open("rb") as file:
                 is_fits = file.read(len(FIRST_BYTES)) == FIRST_BYTES
-            values: dict[str, Any]
             if is_fits:
-                with fits_module().open(path) as units:
-                    values = {name: np.asarray(units[name.upper()].data) for name in _NAMES}
-                    header = units[0].header
-                    values |= {name: header[name] for name in ("light", "gain", "nkept")}
-                    values["saturate"] = header.get("saturate", np.inf)
+                with fits_module().open(path, memmap=False) as units:
+                    values = {name: units[name.upper()].data for name in _ARRAYS}
+                    scalars = {name: units[0].header.get(name[:8], missing) for name, missing in _SCALARS.items()}
             else:
-                with np.load(path, allow_pickle=False) as file:
-                    values = {name: file[name] for name in (*_NAMES, "light", "gain", "nkept", "saturate")}
-            scalars = {name: float(values.pop(name)) for name in ("light", "gain", "saturate")}
-            n_kept = int(values.pop("nkept"))
-            values["mask"] = values["mask"] > 0
-            return cls(
-                **values,
-                light=scalars["light"],
-                gain=scalars["gain"],
-                n_kept=n_kept,
-                saturation=scalars["saturate"],
-            )
+                with np.load(path, allow_pickle=False) as stored:
+                    values = {name: stored[name] for name in _ARRAYS}
+                    scalars = {name: float(stored[name]) for name in _SCALARS}
+            values |= scalars | {"mask": values["mask"] > 0, "n_kept": int(scalars["n_kept"])}
+            return cls(**values)
 
 
 class PhaseController:
@@ -323,7 +282,7 @@ class PhaseController:
     """
 
     def __init__(
-        self, calibration: Calibration, pokes: _Pokes, faintest: float, *, poke: float, rcond: float, gain: float,
+        self, calibration: Calibration, pokes: Pokes, faintest: float, *, poke: float, rcond: float, gain: float,
         likelihood: bool, n_iterations: int,
     ) -> None:  # fmt: skip
         self._calibration = replace(calibration, n_iterations=n_iterations, tolerance=0.0)
@@ -331,7 +290,8 @@ class PhaseController:
         flat, modes = pokes.phases(calibration)
         modes /= poke
         self._points = np.flatnonzero(calibration.good)
-        inverse = Inverse.of(modes.reshape(len(modes), -1)[:, self._points].T, rcond)
+        responses = modes.reshape(len(modes), -1)[:, self._points]
+        inverse = Inverse.of(responses.T, rcond, roughness(responses, self._points))
         self.matrix = read_only((gain * inverse.matrix).astype(np.float32))
         self.gain, self.n_kept, self.n_commands = gain, len(inverse.directions), len(modes)
         self._weights = (calibration.weights / calibration.unit[:, np.newaxis, np.newaxis]).astype(np.float32)
@@ -358,7 +318,7 @@ class PhaseController:
 
     def __call__(self, counts: ArrayLike, out: NDArray | None = None) -> NDArray[np.floating]:
         """Commands that a frame shows, times the gain: as those of `Controller`, whose parameters these are."""
-        counts, out = _checked(counts, _image_shape(self._calibration), out, self.n_commands)
+        counts, out = _checked(counts, image_shape(self._calibration), out, self.n_commands)
         frames, self.flux, self.n_bad = self._frames(counts)
         self.lost = not self.flux > self._faintest
         if self.lost:
@@ -431,209 +391,13 @@ class PhaseController:
         return np.nan_to_num(result.phase, nan=0.0)
 
 
-class Inverse(NamedTuple):
-    """Inverse of an interaction matrix, without the directions that it hardly shows."""
-
-    matrix: NDArray[np.float64]  # (n_commands, n_values)
-    directions: NDArray[np.float64]  # (n_kept, n_commands), orthonormal
-
-    @classmethod
-    def of(cls, interaction: NDArray, rcond: float, noise: float = 0.0) -> Inverse:
-        """Inverse of a matrix (n_values, n_commands) whose numbers have an error of `noise`.
-
-        The error adds noise**2 * n_values to each eigenvalue of J^T J. That is subtracted, because it would lower
-        the gain of weak directions. A direction that is no stronger than that is left out, as is one below `rcond`
-        times the strongest.
-        """
-        values, vectors = np.linalg.eigh(interaction.T @ interaction)
-        floor = noise**2 * len(interaction)
-        strength = values - floor
-        least = max(rcond**2 * strength[-1], (_UNSEEN**2 - 1) * floor, 1e-14 * values[-1])
-        shown = strength > least
-        ways = vectors[:, shown].T
-        return cls((ways.T / strength[shown]) @ (ways @ interaction.T), ways)
-
-
-class _Pokes(NamedTuple):
-    """Mean frames of a flat mirror and of pokes, counts, the dark included."""
-
-    flat: NDArray[np.float64]  # (..., ny, nx)
-    pushed: NDArray[np.float64]  # (n_commands, ..., ny, nx)
-    pulled: NDArray[np.float64]
-    n_flat: int  # frames of the mean
-    n_averaged: int
-    good: NDArray[np.bool_]  # (..., ny, nx), pixels that are good in all frames
-
-    @classmethod
-    def of(cls, calibration: Calibration, flat: Any, pushed: Any, pulled: Any) -> _Pokes:
-        """Check and average frames, which are arrays or files."""
-        image = _image_shape(calibration)
-        frames = [
-            _frames_of(name, value, calibration)
-            for name, value in (("flat", flat), ("pushed", pushed), ("pulled", pulled))
-        ]
-        for name, one in zip(("pushed", "pulled"), frames[1:], strict=True):
-            if one.ndim == len(image) or one.shape != frames[1].shape:
-                expected = ", ".join(map(str, image))
-                raise ValueError(
-                    f"{name} has shape {one.shape}: expected (n_commands, {expected}), as many as the other"
-                )
-        good = np.ones(image, bool)
-        with np.errstate(invalid="ignore"):
-            for one in frames:
-                usable = (one < calibration.saturation) & (one > -_check.LARGEST)
-                good &= usable.reshape(-1, *image).all(axis=0)
-        n_commands = len(frames[1])
-        means = [one.reshape(*lead, -1, *image).mean(axis=len(lead), dtype=float) for one, lead in
-                 zip(frames, ((), (n_commands,), (n_commands,)), strict=True)]  # fmt: skip
-        return cls(
-            *means, prod(frames[0].shape[: -len(image)]), frames[1].size // (n_commands * prod(image)), good
-        )
-
-    def phases(self, calibration: Calibration) -> tuple[Phases, NDArray[np.float64]]:
-        """Phases of the flat mirror, and half the difference of push and pull without its mean, (n, ny, nx)."""
-        flat, pushed, pulled = (
-            calibration(np.where(self.good, images, np.nan)) for images in (self.flat, self.pushed, self.pulled)
-        )
-        for name, phases in (("flat", flat), ("pushed", pushed), ("pulled", pulled)):
-            if np.any(phases.flags & Flag.LOST):
-                lost = np.flatnonzero(np.atleast_1d(phases.flags & Flag.LOST))
-                raise ValueError(f"{name}: its frames {lost.tolist()} are lost: expected light in all of them")
-        half = np.angle(np.exp(1j * (pushed.filled.astype(float) - pulled.filled))) / 2
-        mean = half[:, calibration.good].mean(axis=1)
-        return flat, np.where(calibration.amplitude > 0, half - mean[:, np.newaxis, np.newaxis], 0)
-
-
-class _Signals(NamedTuple):
-    """Frames over their own light, at the pixels that count."""
-
-    mask: NDArray[np.bool_]
-    dark: NDArray[np.float64]  # (n_pixels,), counts
-    light: float  # of the flat mirror, counts
-    reference: NDArray[np.float64]  # (n_pixels,)
-    difference: NDArray[np.float64]  # (n_commands, n_pixels), half of that of push and pull
-    asymmetry: NDArray[np.float64]  # their mean, less the reference
-    noise: NDArray[np.float64]  # (n_pixels,), of one frame of the flat mirror
-    shares: tuple[float, float]  # of the variance of a frame, in those of difference and asymmetry
-
-    @classmethod
-    def of(cls, calibration: Calibration, pokes: _Pokes) -> _Signals:
-        """Signals of pokes."""
-        mask = _pixels(calibration)
-        n_pixels = np.count_nonzero(mask)
-        mask &= pokes.good
-        if np.count_nonzero(mask) < _FEWEST * n_pixels:
-            raise ValueError(
-                f"flat, pushed, pulled: {np.count_nonzero(mask)} of the {n_pixels} pixels of the pupils are good "
-                f"in all frames: expected {100 * _FEWEST:.0f} % of them, none of them NaN or saturated"
-            )
-        stray = calibration.background if calibration.n_images == 2 else calibration.background.mean(keepdims=True)
-        dark = (calibration.dark + stray[:, np.newaxis, np.newaxis]).reshape(mask.shape)[mask]
-        signals, lights = [], []
-        for name, images in (("flat", pokes.flat[np.newaxis]), ("pushed", pokes.pushed), ("pulled", pokes.pulled)):
-            values = images[:, mask] - dark
-            light = values.sum(axis=1)
-            if np.any(dim := light <= 0):
-                raise ValueError(
-                    f"{name}: frames {np.flatnonzero(dim).tolist()} have no light: expected some in all"
-                )
-            signals.append(values / light[:, np.newaxis])
-            lights.append(light)
-        [reference], pushed, pulled = signals
-        asymmetry = (pushed + pulled) / 2 - reference
-        shares = 1 / (2 * pokes.n_averaged), 1 / (2 * pokes.n_averaged) + 1 / pokes.n_flat
-        noise = _noise(asymmetry, reference, mask) / np.sqrt(shares[1])
-        return cls(mask, dark, float(lights[0][0]), reference, (pushed - pulled) / 2, asymmetry, noise, shares)
-
-    @property
-    def faintest(self) -> float:
-        """Light, over that of the flat mirror, below which a frame is lost."""
-        return max(_LOST * float(np.linalg.norm(self.noise)), 1e-12)
-
-    def weights(self) -> tuple[NDArray[np.float64], float]:
-        """Weight of each pixel, one over its noise, and the error of half a difference times that."""
-        typical = np.sqrt(np.mean(self.noise**2))
-        if not typical > 0:
-            return np.ones_like(self.noise), 0.0
-        return typical / self.noise, typical * np.sqrt(self.shares[0])
-
-    def check(self) -> None:
-        """Refuse pokes that do not move the frames, contradict themselves, or equal each other."""
-        variance = np.sum(self.noise**2)
-        size, skew = (np.sum(one**2, axis=1) for one in (self.difference, self.asymmetry))
-        noise, noise_skew = (share * variance for share in self.shares)
-        still = size < max(_UNMOVED * noise, _SILENT * np.median(size))
-        _refuse(still, "do not move the frames beyond their noise", "pokes that do, or brighter frames")
-        moved = size - noise
-        contrary = skew - noise_skew > _CONTRARY**2 * moved + 0.1 * (noise + noise_skew)
-        _refuse(contrary, "contradict each other", "opposite changes of the frames of the flat mirror")
-        product = np.abs(self.difference @ self.difference.T)
-        both = np.add.outer(moved, moved)
-        apart = np.add.outer(size, size) - 2 * product - 2 * noise
-        clear = np.minimum.outer(moved, moved) > _CLEAR * noise
-        alike = np.triu(clear & (apart < _ALIKE * both), 1)
-        if alike.any():
-            first, second = np.argwhere(alike)[0]
-            raise ValueError(
-                f"pushed and pulled: pokes {first} and {second} move the frames in the same way: expected "
-                "different actuators, each of them once"
-            )
-
-
-def _refuse(which: NDArray[np.bool_], what: str, expected: str) -> None:
-    if which.any():
-        raise ValueError(
-            f"pushed and pulled of pokes {np.flatnonzero(which).tolist()} {what}: expected {expected}"
-        )
-
-
-def _noise(asymmetry: NDArray, reference: NDArray, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Standard error of each pixel of frames (n, n_pixels), a constant plus a part that grows with the light.
-
-    Second differences of three neighbours on a row show it, since a wavefront is smoother.
-    """
-    pixels = np.flatnonzero(mask)
-    middle = np.flatnonzero(pixels[2:] - pixels[:-2] == 2) + 1
-    rough = (asymmetry[:, middle - 1] - 2 * asymmetry[:, middle] + asymmetry[:, middle + 1]) / np.sqrt(6)
-    parts = np.array_split(np.argsort(reference[middle]), _BINS)
-    level = np.array([reference[middle[part]].mean() for part in parts])
-    variance = np.array([(1.4826 * np.median(np.abs(rough[:, part]))) ** 2 for part in parts])
-    mean = level.mean()
-    slope = np.clip(
-        (level - mean) @ (variance - variance.mean()) / max(np.sum((level - mean) ** 2), 1e-300),
-        0,
-        variance.mean() / mean,
-    )
-    return np.sqrt(np.maximum(variance.mean() + slope * (reference - mean), _DIMMEST * variance.mean()))
-
-
-def _pixels(calibration: Calibration) -> NDArray[np.bool_]:
-    """Good pixels of the camera next to a point of the pupil, in either image."""
-    mask = np.zeros((calibration.n_images, *calibration.shape), bool)
-    for index, places in enumerate(calibration.places):
-        low = np.floor(places[:, calibration.amplitude > 0]).astype(int)
-        for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            row, column = (low.T + step).T
-            seen = (row >= 0) & (row < calibration.shape[0]) & (column >= 0) & (column < calibration.shape[1])
-            mask[min(index, calibration.n_images - 1), row[seen], column[seen]] = True
-    return (mask & ~calibration.bad).reshape(_image_shape(calibration))
-
-
-def _frames_of(name: str, value: Any, calibration: Calibration) -> NDArray:
-    """Camera images from an array or a file."""
-    if isinstance(value, str | Path):
-        stack = Stack([path_of(name, value)], [], calibration.n_images, calibration.shape)
-        value = stack.read(0, stack.n).reshape(stack.n, *_image_shape(calibration))
-    array = _check.plain_array(name, value)
-    if array.dtype.kind not in "biuf":
-        raise TypeError(f"{name} has dtype {array.dtype}: expected real numbers")
-    _check.maps(name, array, _image_shape(calibration), "the camera image of the calibration")
-    return array
-
-
-def _image_shape(calibration: Calibration) -> tuple[int, ...]:
-    """Shape of one exposure."""
-    return calibration.shape if calibration.n_images == 1 else (2, *calibration.shape)
+def _single(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Checked constants in single precision."""
+    array = _check.real_array(name, value).astype(np.float32, order="C")
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}: expected {shape}")
+    _check.finite(name, array)
+    return read_only(array)
 
 
 def _checked(counts: Any, shape: tuple[int, ...], out: Any, n_commands: int) -> tuple[NDArray, NDArray]:

@@ -51,13 +51,12 @@ class Inverse(NamedTuple):
 
 
 class Pokes(NamedTuple):
-    """Mean frames of a flat mirror and of pokes, counts, the dark included."""
+    """Frames of a flat mirror, and means of those of pokes, counts, the dark included."""
 
-    flat: NDArray[np.float64]  # (..., ny, nx)
+    flats: NDArray  # (n, ..., ny, nx)
     pushed: NDArray[np.float64]  # (n_commands, ..., ny, nx)
     pulled: NDArray[np.float64]
-    n_flat: int  # frames of the mean
-    n_averaged: int
+    n_averaged: int  # frames of each poke
     good: NDArray[np.bool_]  # (..., ny, nx), pixels that are good in all frames
 
     @classmethod
@@ -77,10 +76,14 @@ class Pokes(NamedTuple):
             for frames in (flat, pushed, pulled):
                 usable = (frames < calibration.saturation) & (frames > -_check.LARGEST)
                 good &= usable.reshape(-1, *image).all(axis=0)
-        flat = flat.reshape(-1, *image)
         pushed, pulled = (frames.reshape(len(frames), -1, *image) for frames in (pushed, pulled))
-        means = flat.mean(axis=0, dtype=float), *(frames.mean(axis=1, dtype=float) for frames in (pushed, pulled))
-        return cls(*means, len(flat), pushed.shape[1], good)
+        means = (frames.mean(axis=1, dtype=float) for frames in (pushed, pulled))
+        return cls(flat.reshape(-1, *image), *means, pushed.shape[1], good)
+
+    @property
+    def flat(self) -> NDArray[np.float64]:
+        """Mean frame of the flat mirror."""
+        return self.flats.mean(axis=0, dtype=float)
 
     def phases(self, calibration: Calibration) -> tuple[Phases, NDArray[np.float64]]:
         """Phases of the flat mirror, and half the difference of push and pull without its mean, (n, ny, nx)."""
@@ -122,7 +125,7 @@ class Signals(NamedTuple):
         stray = calibration.background if calibration.n_images == 2 else calibration.background.mean(keepdims=True)
         dark = (calibration.dark + stray[:, np.newaxis, np.newaxis]).reshape(mask.shape)[mask]
         signals, lights = [], []
-        for name, images in (("flat", pokes.flat[np.newaxis]), ("pushed", pokes.pushed), ("pulled", pokes.pulled)):
+        for name, images in (("flat", pokes.flats), ("pushed", pokes.pushed), ("pulled", pokes.pulled)):
             values = images[:, mask] - dark
             light = values.sum(axis=1)
             if np.any(dim := light <= 0):
@@ -131,11 +134,16 @@ class Signals(NamedTuple):
                 )
             signals.append(values / light[:, np.newaxis])
             lights.append(light)
-        [reference], pushed, pulled = signals
+        flats, pushed, pulled = signals
+        reference = lights[0] @ flats / lights[0].sum()
         asymmetry = (pushed + pulled) / 2 - reference
-        shares = 1 / (2 * pokes.n_averaged), 1 / (2 * pokes.n_averaged) + 1 / pokes.n_flat
-        noise = roughness(asymmetry, np.flatnonzero(mask)) / np.sqrt(shares[1])
-        return cls(mask, dark, float(lights[0][0]), reference, (pushed - pulled) / 2, asymmetry, noise, shares)
+        shares = 1 / (2 * pokes.n_averaged), 1 / (2 * pokes.n_averaged) + 1 / len(flats)
+        if len(flats) > 2:
+            noise = float(np.sqrt(flats.var(axis=0, ddof=1).mean()))
+        else:
+            noise = roughness(asymmetry, np.flatnonzero(mask)) / np.sqrt(shares[1])
+        light = float(lights[0].mean())
+        return cls(mask, dark, light, reference, (pushed - pulled) / 2, asymmetry, noise, shares)
 
     @property
     def faintest(self) -> float:
@@ -177,13 +185,12 @@ def _refuse(which: NDArray[np.bool_], what: str, expected: str) -> None:
 
 
 def roughness(values: NDArray, pixels: NDArray) -> float:
-    """Noise of maps, (n, n_pixels), at flat places of the pixels, rms: second differences along rows show it.
-
-    A wavefront is smoother than that, but at few pixels.
-    """
+    """Noise of maps, (n, n_pixels), rms: second differences along rows of the smoothest map show it."""
     middle = np.flatnonzero(pixels[2:] - pixels[:-2] == 2) + 1
+    if not middle.size:
+        return 0.0
     rough = values[:, middle - 1] - 2 * values[:, middle] + values[:, middle + 1]
-    return float(1.4826 * np.median(np.abs(rough)) / np.sqrt(6)) if rough.size else 0.0
+    return float(1.4826 * np.median(np.abs(rough), axis=1).min() / np.sqrt(6))
 
 
 def faintest(noise: float, n_pixels: int) -> float:

@@ -96,7 +96,7 @@ class Controller:
     light : float, counts
         Sum of the frame of the flat mirror, less the dark.
     noise : float
-        Standard error of the signal of one pixel, in one frame of the flat mirror.
+        Standard error of the signal of a pixel, in one frame of the flat mirror, rms.
     gain : float
     n_kept : int
         Directions of the commands that are inverted.
@@ -149,8 +149,9 @@ class Controller:
 
     @property
     def sigma(self) -> NDArray[np.float32]:
-        """Standard error of each command that the noise of one frame causes, in the light of the flat mirror."""
-        return self.noise * np.linalg.norm(self.matrix, axis=1) / self.gain
+        """Standard error of each command before the gain, by the photon noise of a frame of the flat mirror."""
+        share = np.sqrt(np.maximum(self.reference, 0) * len(self.reference))
+        return self.noise * np.linalg.norm(self.matrix * share, axis=1) / self.gain
 
     @property
     def expected_residual(self) -> float:
@@ -185,7 +186,8 @@ class Controller:
             self._raw = np.empty(len(self._pixels), counts.dtype)
         signal = self._signal
         counts.take(self._pixels, out=self._raw, mode="clip")
-        np.subtract(self._raw, self.dark, out=signal, casting="same_kind")
+        signal[:] = self._raw
+        signal -= self.dark
         light = float(signal @ self._ones)
         self.n_bad = 0
         if not (abs(light) < _check.LARGEST and self._raw.max() < self.saturation):
@@ -249,7 +251,7 @@ class Controller:
                 is_fits = file.read(len(FIRST_BYTES)) == FIRST_BYTES
             if is_fits:
                 with fits_module().open(path, memmap=False) as units:
-                    values = {name: units[name.upper()].data for name in _ARRAYS}
+                    values = {name: unit.data for name, unit in zip(_ARRAYS, units, strict=True)}
                     scalars = {name: units[0].header.get(name[:8], missing) for name, missing in _SCALARS.items()}
             else:
                 with np.load(path, allow_pickle=False) as stored:

@@ -8,6 +8,8 @@ A call is late if it takes more than 1.3 times the median. For the late calls th
 the operating system and Python report: the scheduler took the core away, memory pages were mapped, the garbage
 collector ran. The other late calls had the core for all of their time: an interrupt of the hardware or of the host
 of a virtual machine, a change of the clock rate, or caches that another process has filled.
+
+The roads from counts to 50 commands are compared in turns: a bare product, the controllers, and the linear method.
 """
 
 import gc
@@ -15,14 +17,14 @@ import json
 import resource
 import sys
 from dataclasses import replace
-from time import perf_counter_ns
+from time import perf_counter_ns, thread_time_ns
 
 import numpy as np
 
-from zwfs import zernike_basis
+from zwfs import Linear, zernike_basis
 from zwfs.metrics import without_piston
 
-from .telemetry import camera
+from .telemetry import POKE, camera
 
 LATE = 1.3  # times the median
 REAL_TIME = {"n_iterations": 3, "tolerance": 0.0}
@@ -33,7 +35,7 @@ def latency(n_pixels, n_frames=10_000, *, frozen=True):
 
     `frozen` takes the garbage collector out of the loop.
     """
-    calibration, frames = camera(n_pixels, 16)
+    calibration, frames, _ = camera(n_pixels, 16)
     calibration = replace(calibration, **REAL_TIME)
     matrix = calibration.modal_matrix(zernike_basis(calibration.sensor.pupil, 50)).astype(np.float32)
     gather = calibration.sensor.pupil.gather
@@ -74,6 +76,46 @@ def latency(n_pixels, n_frames=10_000, *, frozen=True):
     return {"n_pixels": n_pixels, "n_frames": n_frames, "frozen": frozen} | _report(measured)
 
 
+def controllers(n_pixels=100, n_frames=2000):
+    """Time of the processor and of the clock, p50 and p99 in seconds, of each road from counts to 50 commands.
+
+    The bare product takes the pixels of the controller out of the image, and multiplies them by a matrix.
+    """
+    calibration, frames, pokes = camera(n_pixels, 16, poked=50)
+    settings = {"poke": POKE, "gain": 0.5}
+    product = calibration.controller(*pokes, **settings)
+    iterated = calibration.controller(*pokes, **settings, method="phase-shifted", n_iterations=3)
+    modes = zernike_basis(calibration.sensor.pupil, 50)
+    linear, modal = Linear(calibration.sensor, modes), calibration.modal_matrix(modes).astype(np.float32)
+    pixels, out = np.flatnonzero(product.mask), np.empty(50, np.float32)
+    roads = {
+        "bare product": lambda counts: product.matrix @ counts.take(pixels).astype(np.float32),
+        "controller": lambda counts: product(counts, out=out),
+        "three iterations": lambda counts: iterated(counts, out=out),
+        "method=Linear": lambda counts: calibration.coefficients(
+            calibration(counts, judge=False, method=linear), modal
+        ),
+    }
+    times = {name: np.zeros((n_frames, 2)) for name in roads}
+    for index in range(-32, n_frames):
+        counts = frames[index % len(frames)]
+        for name, road in roads.items():
+            for _ in range(2):  # the first call of a turn finds the caches of the other roads
+                clock, processor = perf_counter_ns(), thread_time_ns()
+                road(counts)
+                elapsed = thread_time_ns() - processor, perf_counter_ns() - clock
+            if index >= 0:
+                times[name][index] = elapsed
+    rows = []
+    for name, measured in times.items():
+        (p50, wall50), (p99, wall99) = np.percentile(measured * 1e-9, (50, 99), axis=0).tolist()
+        rows.append({
+            "road": name, "n_pixels": n_pixels, "processor p50": p50, "processor p99": p99, "clock p50": wall50,
+            "clock p99": wall99,
+        })  # fmt: skip
+    return rows
+
+
 def _report(measured):
     clock, switches, pages, collections = measured.T
     median, p99, p999 = np.percentile(clock, (50, 99, 99.9)) * 1e-9
@@ -96,4 +138,5 @@ def results(n_frames=10_000):
 
 
 if __name__ == "__main__":
-    print(json.dumps(results(*map(int, sys.argv[1:2])), indent=1))
+    number = list(map(int, sys.argv[1:2]))
+    print(json.dumps({"controllers": controllers(100, *number), "latency": results(*number)}, indent=1))

@@ -341,12 +341,14 @@ class PhaseController:
         """Counts on the grid, (2, ny, nx), their light over that of the flat mirror, (2,), and bad pixels."""
         calibration = self._calibration
         images = counts.reshape(1, calibration.n_images, *calibration.shape)
-        values, _, n_bad, _ = self._work.on_grid(images, calibration.saturation, calibration.good)
-        return (
-            values[0].reshape(2, *self._work.offset.shape[1:]),
-            values[0] @ self._mean / self._light,
-            int(n_bad[0]),
-        )
+        work, level, good = self._work, calibration.saturation, calibration.good
+        if work.axes is None:
+            values, _, n_bad, _ = work.on_grid(images, level, good)
+        else:
+            raw, _, n_bad, _ = work.cleaned(images, level, good)
+            values = work.axes[0] @ raw[0] @ work.axes[1].transpose(0, 2, 1)
+        values = values.reshape(2, *good.shape)
+        return values, values.reshape(2, -1) @ self._mean / self._light, int(n_bad[0])
 
     def _frames(self, counts: NDArray) -> tuple[NDArray[np.float32], float, int]:
         """Ideal frames, (1, n_masks, ny, nx), light over that of the flat mirror, and bad pixels."""

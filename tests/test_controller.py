@@ -11,6 +11,7 @@ from zwfs.frames.controller import Controller
 from zwfs.frames.pipeline import Optics, reduce_frames
 from zwfs.frames.registration import Image, register_frames
 
+from .conftest import code_of
 from .hcipy_loop import LoopBench
 
 POKE, DARK = 0.2, 100
@@ -259,3 +260,15 @@ def test_loop_on_a_bench_of_hcipy_is_as_good_as_with_perfect_knowledge(kind):
         print(kind, method, loop.round(4), perfect.round(4))
         assert np.all(loop < 1.2 * perfect)
         assert loop[0] < 0.12  # of 0.5
+
+
+def test_page_on_real_time_closes_a_loop(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    loop, bench, result, fit = code_of("real_time.md")
+    names: dict = {}
+    for code in (bench, loop, result):
+        exec(code, names)
+    assert capsys.readouterr().out == code_of("real_time.md", "text")[0]
+    exec(fit, names)
+    assert names["residuals"][-1] < 0.04
+    assert np.std(names["shape"]) < 0.1

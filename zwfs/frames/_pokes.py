@@ -155,12 +155,13 @@ class Signals(NamedTuple):
         variance = self.noise**2 * len(self.reference)
         size, skew = (np.sum(one**2, axis=1) for one in (self.difference, self.asymmetry))
         noise, noise_skew = (share * variance for share in self.shares)
-        still = size < max(_UNMOVED * noise, _SILENT * np.median(size))
-        _refuse(
-            still,
-            "do not move the frames beyond their noise",
-            "pokes that do, brighter frames, or that they are left out",
-        )
+        # Noise of three neighbours on a row averages out; a response does not.
+        middle = _middles(np.flatnonzero(self.mask))
+        smooth = sum(self.difference[:, middle + step] for step in (-1, 0, 1)) / 3
+        response, expected = np.sum(smooth**2, axis=1), noise * len(middle) / (3 * len(self.reference))
+        still = response < max(_UNMOVED * expected, _SILENT * np.median(response))
+        what = "pokes that do, brighter frames, more of them, or none of these commands"
+        _refuse(still, "do not move the frames beyond their noise", what)
         moved = size - noise
         contrary = skew - noise_skew > _CONTRARY**2 * moved + 0.1 * (noise + noise_skew)
         _refuse(contrary, "contradict each other", "opposite changes of the frames of the flat mirror")
@@ -184,9 +185,14 @@ def _refuse(which: NDArray[np.bool_], what: str, expected: str) -> None:
         )
 
 
+def _middles(pixels: NDArray) -> NDArray[np.intp]:
+    """Numbers of those pixels, given in order, whose neighbours on both sides of the row are among them."""
+    return np.flatnonzero(pixels[2:] - pixels[:-2] == 2) + 1
+
+
 def roughness(values: NDArray, pixels: NDArray) -> float:
     """Noise of maps, (n, n_pixels), rms: second differences along rows of the smoothest map show it."""
-    middle = np.flatnonzero(pixels[2:] - pixels[:-2] == 2) + 1
+    middle = _middles(pixels)
     if not middle.size:
         return 0.0
     rough = values[:, middle - 1] - 2 * values[:, middle] + values[:, middle + 1]

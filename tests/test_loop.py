@@ -74,6 +74,25 @@ def test_segments_have_pistons_and_slopes():
     assert Mirror.segments(pupil, tilts=False).n_actuators == 7
 
 
+@pytest.mark.parametrize("gap", [0.01, 0.04])
+def test_segments_of_a_measured_pupil_are_found(gap):
+    fine = Pupil.hexagonal(4 * 48, n_rings=3, gap=gap, missing=[1])
+    light = fine.inside.reshape(48, 4, 48, 4).mean(axis=(1, 3))
+    image = np.sqrt(np.random.default_rng(1).poisson(1000 * light) / 1000)
+    assert Mirror.segments(Pupil.from_amplitude(image, threshold=0.2)).n_actuators == 3 * 36
+    disc = np.sqrt(np.random.default_rng(2).poisson(300 * Pupil.circular(48).inside) / 300)
+    assert Mirror.segments(Pupil.from_amplitude(disc, threshold=0.2)).n_actuators == 3
+
+
+def test_bad_points_take_no_part_in_a_fit(pupil, mirror, modes):
+    commands = np.random.default_rng(3).standard_normal((2, 6))
+    phase = mirror.wavefront(commands)
+    phase[1][pupil.inside & (np.random.default_rng(4).random(pupil.shape) < 0.3)] = np.nan
+    np.testing.assert_allclose(mirror.fit(phase), commands, atol=1e-10)
+    with pytest.raises(ValueError, match="phase has 0 points that are not NaN: expected at least the 6"):
+        mirror.fit(np.full(pupil.shape, np.nan))
+
+
 def test_a_leak_keeps_a_share_of_a_still_screen(mirror, modes, sensor, shifted):
     still = np.repeat(0.1 * modes[np.newaxis, 4:5], 60, axis=0)
     record = close_loop(sensor, mirror, shifted, still, gain=0.4, leak=0.1)

@@ -26,7 +26,7 @@ DIMPLES = (Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
 _DISTINCT = 64  # frame pairs, which a cube repeats
 
 
-def camera(n_pixels, n_frames, rms=0.5, poked=0):
+def camera(n_pixels, n_frames, rms=0.5, poked=1):
     """Calibration of a simulated bench, and camera images of screens, 16 bit, both pupils on one image.
 
     The third result is the images of the flat mirror, and of so many modes pushed and pulled by `POKE`.
@@ -48,9 +48,8 @@ def camera(n_pixels, n_frames, rms=0.5, poked=0):
     registered = register_frames([image(flat)], [image(clear)])
     dark = np.full(flat.shape, float(DARK))
     calibration = Calibration.of(reduce_frames(registered, Optics()), dark, saturation=65535)
-    steps = POKE * zernike_basis(pupil, max(poked, 1))[:poked]
-    pokes = flat, exposed(sensor.measure(steps)), exposed(sensor.measure(-steps))
-    return calibration, exposed(sensor.measure(screens)), pokes
+    images, steps = exposed(sensor.measure(screens)), POKE * zernike_basis(pupil, poked)
+    return calibration, images, (flat, exposed(sensor.measure(steps)), exposed(sensor.measure(-steps)))
 
 
 def write_cube(path, frames, n):

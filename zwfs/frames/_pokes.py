@@ -77,8 +77,8 @@ class Pokes(NamedTuple):
                 usable = (frames < calibration.saturation) & (frames > -_check.LARGEST)
                 good &= usable.reshape(-1, *image).all(axis=0)
         pushed, pulled = (frames.reshape(len(frames), -1, *image) for frames in (pushed, pulled))
-        means = (frames.mean(axis=1, dtype=float) for frames in (pushed, pulled))
-        return cls(flat.reshape(-1, *image), *means, pushed.shape[1], good)
+        push, pull = (frames.mean(axis=1, dtype=float) for frames in (pushed, pulled))
+        return cls(flat.reshape(-1, *image), push, pull, pushed.shape[1], good)
 
     @property
     def flat(self) -> NDArray[np.float64]:
@@ -224,7 +224,9 @@ def _frames_of(name: str, value: Any, calibration: Calibration) -> NDArray:
     array = _check.plain_array(name, value)
     if array.dtype.kind not in "biuf":
         raise TypeError(f"{name} has dtype {array.dtype}: expected real numbers")
-    _check.maps(name, array, image_shape(calibration), "the camera image of the calibration")
+    _check.trailing_shape(name, array, image_shape(calibration), "the camera image of the calibration")
+    if not array.size:
+        raise ValueError(f"{name} has shape {array.shape}: expected at least one frame")
     return array
 
 

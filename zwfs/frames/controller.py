@@ -221,15 +221,16 @@ class Controller:
         keywords of the first header in FITS.
         """
         path = path_of("path", path)
-        arrays = {name: getattr(self, name) for name in _ARRAYS} | {"mask": self.mask.astype(np.uint8)}
-        scalars = {name: getattr(self, name) for name in _SCALARS}
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
+        arrays["mask"] = self.mask.astype(np.uint8)
+        scalars: dict[str, Any] = {name: getattr(self, name) for name in _SCALARS}
         if path.suffix.lower() in (".fits", ".fit"):
             cards = [(name[:8], value, "") for name, value in scalars.items() if value != np.inf]
             units = [(array, name.upper(), cards if name == "matrix" else []) for name, array in arrays.items()]
             content = fits_content(*units)
         else:
             stream = io.BytesIO()
-            np.savez(stream, **arrays, **{name: np.array(value) for name, value in scalars.items()})
+            np.savez(stream, **arrays, **scalars)
             content = stream.getvalue()
         write_file(path, content)
 

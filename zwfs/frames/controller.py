@@ -267,7 +267,7 @@ class PhaseController:
 
     Make one with `Calibration.controller`. The phase-shifted iteration starts from the phase of the frame before.
     With the likelihood, the directions of the commands are the unknowns, and the commands have error bars. The
-    light of a frame is the mean of its pupil over that of the flat mirror.
+    light of a frame is the mean of its pupil over that which the model expects of the phase before.
 
     Attributes
     ----------
@@ -309,8 +309,9 @@ class PhaseController:
         if likelihood:
             self._directions = inverse.directions
             self._likelihood = self._of_directions(np.tensordot(inverse.directions, modes, 1))
-            self.phase = self._most_likely(self._frames(pokes.flat)[0])
+            self.phase = self._most_likely(self._frames(pokes.flat, 1.0)[0])
         self._flat = self.phase.ravel()[self._points]
+        self._flat_brightness = self._brightness()
 
     def __repr__(self) -> str:
         how = "likelihood" if self._likelihood else f"{self._calibration.n_iterations} iterations"
@@ -322,7 +323,7 @@ class PhaseController:
     def __call__(self, counts: ArrayLike, out: NDArray | None = None) -> NDArray[np.floating]:
         """Commands that a frame shows, times the gain: as those of `Controller`, whose parameters these are."""
         counts, out = _checked(counts, image_shape(self._calibration), out, self.n_commands)
-        frames, self.flux, self.n_bad = self._frames(counts)
+        frames, self.flux, self.n_bad = self._frames(counts, self._brightness() / self._flat_brightness)
         self.lost = not self.flux > self._faintest
         if self.lost:
             out[:] = 0
@@ -351,12 +352,19 @@ class PhaseController:
         values = values.reshape(2, *good.shape)
         return values, values.reshape(2, -1) @ self._mean / self._light, int(n_bad[0])
 
-    def _frames(self, counts: NDArray) -> tuple[NDArray[np.float32], float, int]:
-        """Ideal frames, (1, n_masks, ny, nx), light over that of the flat mirror, and bad pixels."""
+    def _brightness(self) -> float:
+        """Mean light of modelled frames with the phase of the last frame, in the pupil."""
+        frames = self._work._modelled(self.phase[np.newaxis])[0] - self._work.offset
+        return float(np.mean(frames.reshape(2, -1) @ self._mean))
+
+    def _frames(self, counts: NDArray, brightness: float) -> tuple[NDArray[np.float32], float, int]:
+        """Ideal frames, (1, n_masks, ny, nx), light over that of the flat mirror, and bad pixels.
+
+        The light would be `brightness` if the star were that of the flat mirror.
+        """
         work, (values, light, n_bad) = self._work, self._on_grid(counts)
-        flux = float(light.mean())
-        if not self._calibration.balance:
-            light = np.full(2, flux, np.float32)
+        flux = float(light.mean()) / brightness
+        light = light / brightness if self._calibration.balance else np.full(2, flux, np.float32)
         values /= np.maximum(light, 1e-30)[:, np.newaxis, np.newaxis]
         frames = self._weights[:, 0] * values[0]
         frames += self._weights[:, 1] * values[1]

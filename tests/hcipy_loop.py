@@ -95,7 +95,7 @@ class LoopBench:
         field = hcipy.Field(self.amplitude * np.exp(1j * (phase + self.static)), _grid())
         wave = hcipy.Wavefront(field)
         waves = [optics.forward(wave) if masked else wave for optics in self._optics]
-        fine = [np.asarray(one.intensity).reshape(SIDE, FINE, SIDE, FINE) for one in waves]
+        fine = [np.asarray(behind.intensity).reshape(SIDE, FINE, SIDE, FINE) for behind in waves]
         return np.concatenate([image.mean(axis=(1, 3)) for image in fine], axis=1)
 
     def counts(self, phase, photons, rng, masked=True):

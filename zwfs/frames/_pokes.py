@@ -153,7 +153,7 @@ class Signals(NamedTuple):
     def check(self) -> None:
         """Refuse pokes that do not move the frames, contradict themselves, or equal each other."""
         variance = self.noise**2 * len(self.reference)
-        size, skew = (np.sum(one**2, axis=1) for one in (self.difference, self.asymmetry))
+        size, skew = (np.sum(signal**2, axis=1) for signal in (self.difference, self.asymmetry))
         noise, noise_skew = (share * variance for share in self.shares)
         # Noise of three neighbours on a row averages out; a response does not.
         middle = _middles(np.flatnonzero(self.mask))
@@ -211,8 +211,8 @@ def _pixels(calibration: Calibration) -> NDArray[np.bool_]:
         low = np.floor(places[:, calibration.amplitude > 0]).astype(int)
         for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
             row, column = (low.T + step).T
-            seen = (row >= 0) & (row < calibration.shape[0]) & (column >= 0) & (column < calibration.shape[1])
-            mask[min(index, calibration.n_images - 1), row[seen], column[seen]] = True
+            inside = (row >= 0) & (row < calibration.shape[0]) & (column >= 0) & (column < calibration.shape[1])
+            mask[min(index, calibration.n_images - 1), row[inside], column[inside]] = True
     return (mask & ~calibration.bad).reshape(image_shape(calibration))
 
 

@@ -31,6 +31,8 @@ from zwfs.reconstructors import MaximumLikelihood
 if TYPE_CHECKING:
     from zwfs.frames.calibration import Calibration
 
+__all__ = ["Controller", "PhaseController"]
+
 _STILL = 1e-3  # radian rms of the flat mirror's phase, below which it needs no mode
 _METHODS = "linear", "phase-shifted", "likelihood"
 _ARRAYS = "matrix", "reference", "mask", "dark", "interaction"  # of a file

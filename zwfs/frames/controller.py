@@ -35,6 +35,7 @@ __all__ = ["Controller", "PhaseController"]
 
 _STILL = 1e-3  # radian rms of the flat mirror's phase, below which it needs no mode
 _METHODS = "linear", "phase-shifted", "likelihood"
+_SUFFIXES = ".npz", ".fits"
 _ARRAYS = "matrix", "reference", "mask", "dark", "interaction"  # of a file
 _SCALARS = {
     "light": np.inf,
@@ -215,18 +216,32 @@ class Controller:
         return light
 
     def save(self, path: str | Path) -> None:
-        """Write the controller as NPZ or, where the name ends with .fits, as FITS, in one step.
+        """Write the controller as NPZ or FITS, by the end of the name, in one step.
 
         Both hold `matrix`, `reference`, `mask` (1 and 0), `dark` and `interaction` of this object under their
         names: as the NPY files of which an NPZ file consists, or as images of FITS units, with the matrix first.
-        The numbers `light`, `noise`, `gain`, `n_kept` and `saturation` are arrays without an axis in NPZ, and
-        keywords of the first header in FITS.
+        The numbers `light`, `noise`, `gain`, `n_kept` and `saturation` are arrays without an axis in NPZ. In FITS
+        they are keywords of the first header, cut to 8 letters; one that is infinite is left out.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the name ends differently, or is that of a file that holds no controller.
         """
         path = path_of("path", path)
+        if path.suffix.lower() not in _SUFFIXES:
+            raise ValueError(f"path = {str(path)!r}: expected a name that ends with {' or '.join(_SUFFIXES)}")
+        if path.exists():
+            try:
+                Controller.load(path)
+            except (ValueError, FileNotFoundError):
+                raise ValueError(
+                    f"path = {str(path)!r} exists and is no controller: expected a new name"
+                ) from None
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
         arrays["mask"] = self.mask.astype(np.uint8)
         scalars: dict[str, Any] = {name: getattr(self, name) for name in _SCALARS}
-        if path.suffix.lower() in (".fits", ".fit"):
+        if path.suffix.lower() == ".fits":
             cards = [(name[:8], value, "") for name, value in scalars.items() if value != np.inf]
             units = [(array, name.upper(), cards if name == "matrix" else []) for name, array in arrays.items()]
             content = fits_content(*units)

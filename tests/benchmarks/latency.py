@@ -1,6 +1,6 @@
 """Time of single frames in a process that runs for long: python -m tests.benchmarks.latency [frames] prints JSON.
 
-Each frame pair goes from camera counts to the phase, by three iterations, and to 50 modes. The
+Each frame pair goes from camera counts to the phase, by three iterations, and to the commands of 50 modes. The
 process is warm and uses one core. Set OMP_NUM_THREADS=1, as `make bench` does, and keep the computer quiet: unlike
 the other benchmarks this one takes the time of the clock, since a control loop waits for it.
 
@@ -16,18 +16,16 @@ import gc
 import json
 import resource
 import sys
-from dataclasses import replace
 from time import perf_counter_ns, thread_time_ns
 
 import numpy as np
 
 from zwfs import Linear, zernike_basis
-from zwfs.metrics import without_piston
 
 from .telemetry import POKE, camera
 
 LATE = 1.3  # times the median
-REAL_TIME = {"n_iterations": 3, "tolerance": 0.0}
+SETTINGS = {"poke": POKE, "gain": 0.5}
 
 
 def latency(n_pixels, n_frames=10_000, *, frozen=True):
@@ -35,14 +33,8 @@ def latency(n_pixels, n_frames=10_000, *, frozen=True):
 
     `frozen` takes the garbage collector out of the loop.
     """
-    calibration, frames, _ = camera(n_pixels, 16)
-    calibration = replace(calibration, **REAL_TIME)
-    matrix = calibration.modal_matrix(zernike_basis(calibration.sensor.pupil, 50)).astype(np.float32)
-    gather = calibration.sensor.pupil.gather
-
-    def step(counts):
-        return without_piston(gather(calibration(counts, judge=False).filled)) @ matrix
-
+    calibration, frames, pokes = camera(n_pixels, 16, poked=50)
+    step = calibration.controller(*pokes, **SETTINGS, method="phase-shifted", n_iterations=3)
     for index in range(min(n_frames, 500)):
         step(frames[index % len(frames)])
     collections = []
@@ -82,9 +74,8 @@ def controllers(n_pixels=100, n_frames=2000):
     The bare product takes the pixels of the controller out of the image, and multiplies them by a matrix.
     """
     calibration, frames, pokes = camera(n_pixels, 16, poked=50)
-    settings = {"poke": POKE, "gain": 0.5}
-    product = calibration.controller(*pokes, **settings)
-    iterated = calibration.controller(*pokes, **settings, method="phase-shifted", n_iterations=3)
+    product = calibration.controller(*pokes, **SETTINGS)
+    iterated = calibration.controller(*pokes, **SETTINGS, method="phase-shifted", n_iterations=3)
     modes = zernike_basis(calibration.sensor.pupil, 50)
     linear, modal = Linear(calibration.sensor, modes), calibration.modal_matrix(modes).astype(np.float32)
     pixels, out = np.flatnonzero(product.mask), np.empty(50, np.float32)

@@ -41,25 +41,6 @@ def shifted(sensor):
     return PhaseShifted(sensor, accelerate=True)
 
 
-def test_gaussian_influence_functions_couple_to_their_neighbours():
-    pupil = Pupil.circular(41)
-    mirror = Mirror.gaussian(pupil, 97, coupling=0.2)
-    assert mirror.n_actuators == 97
-    middle = np.argmin(np.abs(mirror.influence.max(axis=1) - 1) + np.abs(mirror.influence @ pupil.points[:, 0]))
-    wave = mirror.wavefront(np.eye(97)[middle])
-    row, column = np.unravel_index(np.argmax(wave), wave.shape)
-    assert wave[row, column] == pytest.approx(1)
-    assert wave[row, column + 4] == pytest.approx(0.2 ** (0.97561**2), rel=0.01)  # 4 of 41 pixels, pitch 0.1 D
-
-
-def test_a_gaussian_mirror_makes_smooth_wavefronts(pupil, modes):
-    mirror = Mirror.gaussian(pupil, 97)
-    left = modes - mirror.wavefront(mirror.fit(modes))
-    assert pupil.rms(left).max() < 0.1
-    with pytest.raises(ValueError, match=r"n_actuators = 98: expected .* \[97, "):
-        Mirror.gaussian(pupil, 98)
-
-
 def test_segments_have_pistons_and_slopes():
     pupil = Pupil.hexagonal(40, n_rings=1)
     mirror = Mirror.segments(pupil)
@@ -70,6 +51,25 @@ def test_segments_have_pistons_and_slopes():
     assert not one[~inside].any()
     assert np.ptp(np.diff(one, axis=1)[inside[:, 1:] & inside[:, :-1]]) < 1e-12
     assert Mirror.segments(pupil, tilts=False).n_actuators == 7
+
+
+@pytest.mark.parametrize("gap", [0.01, 0.04])
+def test_segments_of_a_measured_pupil_are_found(gap):
+    fine = Pupil.hexagonal(4 * 48, n_rings=3, gap=gap, missing=[1])
+    light = fine.inside.reshape(48, 4, 48, 4).mean(axis=(1, 3))
+    image = np.sqrt(np.random.default_rng(1).poisson(1000 * light) / 1000)
+    assert Mirror.segments(Pupil.from_amplitude(image, threshold=0.2)).n_actuators == 3 * 36
+    disc = np.sqrt(np.random.default_rng(2).poisson(300 * Pupil.circular(48).inside) / 300)
+    assert Mirror.segments(Pupil.from_amplitude(disc, threshold=0.2)).n_actuators == 3
+
+
+def test_bad_points_take_no_part_in_a_fit(pupil, mirror, modes):
+    commands = np.random.default_rng(3).standard_normal((2, 6))
+    phase = mirror.wavefront(commands)
+    phase[1][pupil.inside & (np.random.default_rng(4).random(pupil.shape) < 0.3)] = np.nan
+    np.testing.assert_allclose(mirror.fit(phase), commands, atol=1e-10)
+    with pytest.raises(ValueError, match="phase has 0 points that are not NaN: expected at least the 6"):
+        mirror.fit(np.full(pupil.shape, np.nan))
 
 
 def test_a_leak_keeps_a_share_of_a_still_screen(mirror, modes, sensor, shifted):

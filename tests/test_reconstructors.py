@@ -806,3 +806,15 @@ def test_recorded_pixels_hold_the_pupil_and_suit_the_method(pupil):
         ZernikeSensor(pupil, mask, recorded=most)
     with pytest.raises(ValueError, match="unmeasured = 'zero'"):
         GerchbergSaxton(ZernikeSensor(pupil, mask, recorded=pupil.inside))
+
+
+def test_linear_coefficients_are_those_of_its_phase():
+    pupil = zwfs.Pupil.circular(24)
+    sensor, modes = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2)), zwfs.zernike_basis(pupil, 8)
+    method, truth = Linear(sensor, modes), 0.01 * np.arange(16.0).reshape(2, 8) / 8
+    frames = sensor.measure(np.tensordot(truth, np.where(pupil.inside, modes, 0), 1))
+    coefficients = method.coefficients(frames)
+    np.testing.assert_allclose(coefficients, truth, atol=1e-3)
+    phases = np.tensordot(coefficients, modes, 1)
+    np.testing.assert_allclose(method(frames).phase[:, pupil.inside], phases[:, pupil.inside], atol=1e-12)
+    np.testing.assert_allclose(method.inverse @ method.interaction_matrix, np.eye(8), atol=1e-10)

@@ -1,6 +1,5 @@
 """A calibrated bench and its telemetry: phases, flags, what is refused, and that no frame is lost."""
 
-import gc
 import gzip
 import json
 import os
@@ -933,18 +932,3 @@ def test_page_on_telemetry_does_what_it_says(tmp_path, monkeypatch, capsys):
     assert (names["table"]["FLAGS"] > 0).sum() == 2
     assert names["phase"].shape[0] == 38
     assert fits.getdata("modes.fits", "FRAMES")["SIGCOEFF"].shape == (40, 20)
-
-
-def test_page_on_real_time_runs_its_loop(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    names: dict = {}
-    try:
-        for code in code_of("real_time.md"):
-            exec(code, names)
-    finally:
-        gc.enable()
-        gc.unfreeze()
-    assert names["flags"] == 0
-    assert names["residual"] < names["residuals"][0] / 10
-    assert capsys.readouterr().out.strip() in code_of("real_time.md", "text")[0]
-    assert Path("bench.npz").exists()

@@ -6,10 +6,12 @@ import math
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from zwfs import _check
 from zwfs._arrays import Immutable, read_only
@@ -18,6 +20,10 @@ from zwfs.metrics import strehl, without_piston
 from zwfs.pupil import Pupil
 
 _LONGEST_DELAY = 1000  # cycles: beyond it only a gain below 0.0016 is stable
+_GAPS = 0.0, 0.5, 0.7, 0.8, 0.9, 0.95  # amplitude of gaps over that of their surroundings
+_BRIDGES = 0, 1, 2  # points by which parts shrink while they are counted
+_LEAST_PART = 0.2  # points of a part, over those of the largest
+_ALIKE = 0.35  # standard deviation of the sizes of parts, over their mean
 
 
 class Mirror(Immutable):
@@ -55,41 +61,8 @@ class Mirror(Immutable):
         conditioning = _check.number("conditioning", conditioning, 0, 1, open_high=True)
         self.pupil = pupil
         self.influence = _check.modes("influence", influence, pupil)
+        self._conditioning = conditioning
         self.inverse = read_only(np.linalg.pinv(self.influence, rcond=conditioning))
-
-    @classmethod
-    def gaussian(
-        cls, pupil: Pupil, n_actuators: int, *, coupling: float = 0.3, conditioning: float = 1e-3
-    ) -> Mirror:
-        """Mirror of Gaussian influence functions on a square grid, cut to a circle.
-
-        The outermost actuators of the middle rows stand on the rim of the circle of diameter D, or half a pitch
-        from the axis of an even grid.
-
-        Parameters
-        ----------
-        pupil : Pupil
-        n_actuators : int
-            A number of points of the grid within a circle: 4, 5, 9, 12, ..., 97 for 11 across, ...
-        coupling : float
-            Influence at the neighbouring actuator, in (0, 1).
-        conditioning : float
-            Singular values below this times the largest are left out of the fit, in [0, 1).
-
-        Raises
-        ------
-        ValueError
-            If no circle holds so many actuators.
-        """
-        _check.instance("pupil", pupil, Pupil)
-        n_actuators = _check.integer("n_actuators", n_actuators, 4, pupil.n_points)
-        _check.count("n_actuators", n_actuators, 2 * pupil.n_points)
-        coupling = _check.number("coupling", coupling, 0, 1, open_low=True, open_high=True)
-        places = _actuators(n_actuators)
-        pitch = 0.5 / np.abs(places).max()
-        square = (pupil.points[:, np.newaxis] - pitch * places) ** 2 / pitch**2
-        influence = np.exp(math.log(coupling) * square.sum(axis=-1)).T
-        return cls(pupil, pupil.scatter(influence, fill=0), conditioning=conditioning)
 
     @classmethod
     def segments(cls, pupil: Pupil, *, tilts: bool = True) -> Mirror:
@@ -100,13 +73,14 @@ class Mirror(Immutable):
         Parameters
         ----------
         pupil : Pupil
-            With segments, such as `Pupil.hexagonal`.
+            With segments, such as `Pupil.hexagonal`. In a measured pupil, segments are the parts between which the
+            light falls.
         tilts : bool
             Whether the segments tilt, too.
         """
         _check.instance("pupil", pupil, Pupil)
         tilts = _check.flag("tilts", tilts)
-        numbers = pupil.segments[pupil.inside]
+        numbers = (_parts(pupil) if pupil.measured else pupil.segments)[pupil.inside]
         own = (numbers == np.unique(numbers)[:, np.newaxis]).astype(float)
         rows = [own]
         for coordinate in pupil.points.T if tilts else ():
@@ -132,8 +106,27 @@ class Mirror(Immutable):
         return self.pupil.scatter(commands @ self.influence, fill=0)
 
     def fit(self, phase: ArrayLike) -> NDArray[np.float64]:
-        """Return the commands whose wavefront is nearest to a phase: (..., ny, nx) to (..., n_actuators)."""
-        return _check.values_inside("phase", phase, self.pupil) @ self.inverse
+        """Return the commands whose wavefront is nearest to a phase: (..., ny, nx) to (..., n_actuators).
+
+        Points that are NaN take no part.
+        """
+        phase = _check.real_array("phase", phase)
+        _check.maps("phase", phase, self.pupil.shape)
+        values = self.pupil.gather(phase)
+        good = ~np.isnan(values)
+        values = np.where(good, values, 0)
+        _check.moderate("phase", values, " inside the pupil")
+        commands = values @ self.inverse
+        for index in np.argwhere(~good.all(axis=-1)):
+            where = good[tuple(index)]
+            if np.count_nonzero(where) < self.n_actuators:
+                raise ValueError(
+                    f"phase has {np.count_nonzero(where)} points that are not NaN: expected at least the "
+                    f"{self.n_actuators} actuators"
+                )
+            inverse = np.linalg.pinv(self.influence[:, where], rcond=self._conditioning)
+            commands[tuple(index)] = values[tuple(index)][where] @ inverse
+        return commands
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,18 +287,26 @@ def _checked_screens(disturbance: Any, pupil: Pupil) -> Iterator[NDArray[np.floa
         raise ValueError("disturbance is empty: expected one wavefront for each cycle")
 
 
-def _actuators(n_actuators: int) -> NDArray[np.float64]:
-    """Points of a square grid of pitch 1 within a circle, (n_actuators, 2)."""
-    counts = []
-    for offset in (0.0, 0.5):
-        half = np.arange(math.isqrt(n_actuators) + 2) + offset
-        line = np.unique(np.concatenate([-half, half]))
-        points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        radius = (points**2).sum(axis=1).round(6)
-        for limit in np.unique(radius):
-            inside = radius <= limit
-            counts.append(int(inside.sum()))
-            if counts[-1] == n_actuators:
-                return points[inside]
-    near = sorted(set(counts), key=lambda count: abs(count - n_actuators))[:2]
-    raise ValueError(f"n_actuators = {n_actuators}: expected a number of grid points in a circle, such as {near}")
+def _parts(pupil: Pupil) -> NDArray[np.intp]:
+    """Number of the part of a measured pupil that each point belongs to, from 1 on; 0 outside.
+
+    A gap is where the amplitude is less than a share of that of its surroundings; an erosion cuts bridges across
+    it. Of several shares and erosions, those count that make the most parts of similar sizes. Points of gaps go to
+    the nearest part.
+    """
+    around, most = ndimage.median_filter(pupil.amplitude, 5), 1
+    best = pupil.inside.astype(int)
+    for share, cut in product(_GAPS, _BRIDGES):
+        bright = pupil.inside & (pupil.amplitude > share * around)
+        parts, n = ndimage.label(ndimage.binary_erosion(bright, iterations=cut) if cut else bright)
+        sizes = np.bincount(parts.ravel(), minlength=n + 1)
+        large = (sizes > _LEAST_PART * sizes[1:].max(initial=0)) & (np.arange(n + 1) > 0)
+        if np.count_nonzero(large) <= most:
+            continue
+        numbers = np.where(large, np.cumsum(large), 0)[parts]
+        nearest = ndimage.distance_transform_edt(numbers == 0, return_distances=False, return_indices=True)
+        grown = np.where(pupil.inside, numbers[tuple(nearest)], 0)
+        sizes = np.bincount(grown.ravel())[1:]
+        if sizes.min() > _LEAST_PART * sizes.max() and sizes.std() < _ALIKE * sizes.mean():
+            best, most = grown, len(sizes)
+    return best

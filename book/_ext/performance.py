@@ -87,6 +87,7 @@ def tables(speed: dict[str, Any]) -> dict[str, str]:
         "telemetry": telemetry(speed["telemetry"]),
         "latency": latency(speed["latency"]),
         "late": late(speed["latency"]),
+        "controllers": controllers(speed["controllers"]),
     }
 
 
@@ -129,6 +130,13 @@ def latency(rows: list[dict[str, Any]]) -> str:
         for setting, row in zip(settings, rows, strict=True)
     ]
     return table([f"{rows[0]['n_frames']} frames", *(f"{name} (μs)" for name in quantiles), "late (%)"], times)
+
+
+def controllers(rows: list[dict[str, Any]]) -> str:
+    """Return a table of the processor time of each road to commands, over that of the bare product, the first."""
+    unit = rows[0]["processor p50"]
+    lines = [[row["road"], *(f"{row[f'processor {name}'] / unit:.2g}" for name in ("p50", "p99"))] for row in rows]
+    return table([f"processor time, {rows[0]['n_pixels']} pixels to 50 commands", "p50", "p99"], lines)
 
 
 def late(rows: list[dict[str, Any]]) -> str:

@@ -1,6 +1,6 @@
 """Time of single frames in a process that runs for long: python -m tests.benchmarks.latency [frames] prints JSON.
 
-Each frame pair goes from camera counts to the phase, by three iterations, and to 50 modes. The
+Each frame pair goes from camera counts to the phase, by three iterations, and to the commands of 50 modes. The
 process is warm and uses one core. Set OMP_NUM_THREADS=1, as `make bench` does, and keep the computer quiet: unlike
 the other benchmarks this one takes the time of the clock, since a control loop waits for it.
 
@@ -8,24 +8,24 @@ A call is late if it takes more than 1.3 times the median. For the late calls th
 the operating system and Python report: the scheduler took the core away, memory pages were mapped, the garbage
 collector ran. The other late calls had the core for all of their time: an interrupt of the hardware or of the host
 of a virtual machine, a change of the clock rate, or caches that another process has filled.
+
+The roads from counts to 50 commands are compared in turns: a bare product, the controllers, and the linear method.
 """
 
 import gc
 import json
 import resource
 import sys
-from dataclasses import replace
-from time import perf_counter_ns
+from time import perf_counter_ns, thread_time_ns
 
 import numpy as np
 
-from zwfs import zernike_basis
-from zwfs.metrics import without_piston
+from zwfs import Linear, zernike_basis
 
-from .telemetry import camera
+from .telemetry import POKE, camera
 
 LATE = 1.3  # times the median
-REAL_TIME = {"n_iterations": 3, "tolerance": 0.0}
+SETTINGS = {"poke": POKE, "gain": 0.5}
 
 
 def latency(n_pixels, n_frames=10_000, *, frozen=True):
@@ -33,14 +33,8 @@ def latency(n_pixels, n_frames=10_000, *, frozen=True):
 
     `frozen` takes the garbage collector out of the loop.
     """
-    calibration, frames = camera(n_pixels, 16)
-    calibration = replace(calibration, **REAL_TIME)
-    matrix = calibration.modal_matrix(zernike_basis(calibration.sensor.pupil, 50)).astype(np.float32)
-    gather = calibration.sensor.pupil.gather
-
-    def step(counts):
-        return without_piston(gather(calibration(counts, judge=False).filled)) @ matrix
-
+    calibration, frames, pokes = camera(n_pixels, 16, poked=50)
+    step = calibration.controller(*pokes, **SETTINGS, method="phase-shifted", n_iterations=3)
     for index in range(min(n_frames, 500)):
         step(frames[index % len(frames)])
     collections = []
@@ -74,6 +68,45 @@ def latency(n_pixels, n_frames=10_000, *, frozen=True):
     return {"n_pixels": n_pixels, "n_frames": n_frames, "frozen": frozen} | _report(measured)
 
 
+def controllers(n_pixels=100, n_frames=2000):
+    """Time of the processor and of the clock, p50 and p99 in seconds, of each road from counts to 50 commands.
+
+    The bare product takes the pixels of the controller out of the image, and multiplies them by a matrix.
+    """
+    calibration, frames, pokes = camera(n_pixels, 16, poked=50)
+    product = calibration.controller(*pokes, **SETTINGS)
+    iterated = calibration.controller(*pokes, **SETTINGS, method="phase-shifted", n_iterations=3)
+    modes = zernike_basis(calibration.sensor.pupil, 50)
+    linear, modal = Linear(calibration.sensor, modes), calibration.modal_matrix(modes).astype(np.float32)
+    pixels, out = np.flatnonzero(product.mask), np.empty(50, np.float32)
+    roads = {
+        "bare product": lambda counts: product.matrix @ counts.take(pixels).astype(np.float32),
+        "controller": lambda counts: product(counts, out=out),
+        "three iterations": lambda counts: iterated(counts, out=out),
+        "method=Linear": lambda counts: calibration.coefficients(
+            calibration(counts, judge=False, method=linear), modal
+        ),
+    }
+    times = {name: np.zeros((n_frames, 2)) for name in roads}
+    for index in range(-32, n_frames):
+        counts = frames[index % len(frames)]
+        for name, road in roads.items():
+            for _ in range(2):  # the first call of a turn finds the caches of the other roads
+                clock, processor = perf_counter_ns(), thread_time_ns()
+                road(counts)
+                elapsed = thread_time_ns() - processor, perf_counter_ns() - clock
+            if index >= 0:
+                times[name][index] = elapsed
+    rows = []
+    for name, measured in times.items():
+        (p50, wall50), (p99, wall99) = np.percentile(measured * 1e-9, (50, 99), axis=0).tolist()
+        rows.append({
+            "road": name, "n_pixels": n_pixels, "processor p50": p50, "processor p99": p99, "clock p50": wall50,
+            "clock p99": wall99,
+        })  # fmt: skip
+    return rows
+
+
 def _report(measured):
     clock, switches, pages, collections = measured.T
     median, p99, p999 = np.percentile(clock, (50, 99, 99.9)) * 1e-9
@@ -96,4 +129,5 @@ def results(n_frames=10_000):
 
 
 if __name__ == "__main__":
-    print(json.dumps(results(*map(int, sys.argv[1:2])), indent=1))
+    number = list(map(int, sys.argv[1:2]))
+    print(json.dumps({"controllers": controllers(100, *number), "latency": results(*number)}, indent=1))

@@ -184,6 +184,7 @@ def results(seconds=2.0):
         "others": others(seconds),
         "likelihood": likelihood(seconds),
         "latency": latency.results(),
+        "controllers": latency.controllers(),
         "telemetry": telemetry.telemetry(),
     }
 

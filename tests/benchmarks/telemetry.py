@@ -21,12 +21,16 @@ from zwfs.frames.pipeline import Optics, reduce_frames
 from zwfs.frames.registration import Image, register_frames
 
 PHOTONS, MARGIN, DARK = 1e4, 12, 500
+POKE = 0.1  # rad
 DIMPLES = (Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
 _DISTINCT = 64  # frame pairs, which a cube repeats
 
 
-def camera(n_pixels, n_frames, rms=0.5):
-    """Calibration of a simulated bench, and camera images of screens, 16 bit, both pupils on one image."""
+def camera(n_pixels, n_frames, rms=0.5, poked=1):
+    """Calibration of a simulated bench, and camera images of screens, 16 bit, both pupils on one image.
+
+    The third result is the images of the flat mirror, and of so many modes pushed and pulled by `POKE`.
+    """
     pupil = Pupil.hexagonal(n_pixels, 3, 0.03, (21,), 0.8)
     sensor = ZernikeSensor(pupil, *DIMPLES, extent=1 + 2 * MARGIN / n_pixels)
     screens = screens_at(zernike_basis(Pupil.circular(n_pixels), 200), rms, n_frames, 2024, 7)
@@ -44,7 +48,8 @@ def camera(n_pixels, n_frames, rms=0.5):
     registered = register_frames([image(flat)], [image(clear)])
     dark = np.full(flat.shape, float(DARK))
     calibration = Calibration.of(reduce_frames(registered, Optics()), dark, saturation=65535)
-    return calibration, exposed(sensor.measure(screens))
+    images, steps = exposed(sensor.measure(screens)), POKE * zernike_basis(pupil, poked)
+    return calibration, images, (flat, exposed(sensor.measure(steps)), exposed(sensor.measure(-steps)))
 
 
 def write_cube(path, frames, n):
@@ -88,7 +93,7 @@ def parts(calibration, frames):
 
 def telemetry(n=10_000, n_workers=2, n_pixels=90, **settings):
     """Times of a cube: by the clock, of the processor, of its parts for each frame pair; and memory, bytes."""
-    calibration, frames = camera(n_pixels, _DISTINCT)
+    calibration, frames, _ = camera(n_pixels, _DISTINCT)
     with tempfile.TemporaryDirectory() as folder:
         cube, output = Path(folder, "cube.fits"), Path(folder, "phase.fits")
         write_cube(cube, frames, n)

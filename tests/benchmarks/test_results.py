@@ -37,6 +37,12 @@ def test_causes_of_late_calls_are_shares_of_all_calls():
     assert all(0 <= row[name] <= row["late"] <= 1 for name in row if name.startswith("late"))
 
 
+def test_controller_takes_little_more_than_a_bare_product():
+    rows = {row["road"]: row for row in latency.controllers(40, 200)}
+    assert rows["controller"]["processor p50"] < rows["three iterations"]["processor p50"]
+    assert all(row["processor p50"] <= row["processor p99"] for row in rows.values())
+
+
 def test_long_cube_is_reconstructed_without_a_flag():
     found = telemetry.telemetry(70, 1, 40)
     assert found["output"] > 70 * 4 * 40**2

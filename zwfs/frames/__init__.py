@@ -4,6 +4,7 @@
 fits single parameters of the optics to it, and `verdict` judges the result and finds which image has which phase
 shift. `calibration` keeps the constants of a bench, and `telemetry` reconstructs files of any length with them, to
 `phases` with flags. The command is `python -m zwfs.frames`.
+`Calibration.controller` turns camera counts into commands of a mirror.
 `fit_bench` takes a model of a bench from frames of a mirror in known states. `FittedSensor` measures phases with
 that model, with error bars and a verdict.
 
@@ -43,12 +44,23 @@ from typing import TYPE_CHECKING
 from zwfs import _lazy
 
 if TYPE_CHECKING:
-    from zwfs.frames import calibration, files, phases, pipeline, refine, registration, telemetry, verdict
+    from zwfs.frames import (
+        calibration,
+        controller,
+        files,
+        phases,
+        pipeline,
+        refine,
+        registration,
+        telemetry,
+        verdict,
+    )
     from zwfs.frames._blocks import FileError
     from zwfs.frames._calibrate import calibrate
     from zwfs.frames._fit import BenchFit, Estimate, fit_bench
     from zwfs.frames._fitted import FittedPhase, FittedSensor
     from zwfs.frames.calibration import Calibration
+    from zwfs.frames.controller import Controller
     from zwfs.frames.pipeline import phase_of
     from zwfs.frames.telemetry import reconstruct
     from zwfs.frames.verdict import CameraNoise, judge, order_of_images
@@ -59,12 +71,14 @@ __all__ = [
     "BenchFit",
     "Calibration",
     "CameraNoise",
+    "Controller",
     "Estimate",
     "FileError",
     "FittedPhase",
     "FittedSensor",
     "calibrate",
     "calibration",
+    "controller",
     "files",
     "fit_bench",
     "judge",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage, sparse
-from scipy.interpolate import NdBSpline
+from scipy.interpolate import BSpline, NdBSpline
 
 from zwfs import _check
 from zwfs._arrays import Kind
@@ -29,6 +30,7 @@ _REACH = 12  # pixels around the pupil that its splines need: farther ones weigh
 _RIM = 2  # pixels on both sides of the edge of the pupil, from which its place follows
 _CUT = _REACH - 1 - _RIM  # of these, those without a coefficient of a spline in the pupil or its rim
 _NOISE = 0.2  # of the signal, in squares: the inverse of a blur goes no further
+_STRAIGHT = 0.02  # pixels by which the places of a row or a column may differ from its mean
 _NEGLIGIBLE = 1e-10  # of a weight: smaller ones only slow products down, much so if their products are subnormal
 
 
@@ -70,6 +72,7 @@ class Grid:
         self.dark, self.bad = dark + calibration.background[:, np.newaxis, np.newaxis].astype(np.float32), bad
         corners, inside = places - low[:, :, np.newaxis], pupil.inside.ravel().astype(float)
         self.touching = [_interpolation(one, size, 1, inside) for one in corners]  # from all pixels of a box
+        self._corners = corners.reshape(calibration.places.shape)
         near = ndimage.binary_dilation(pupil.inside, iterations=_RIM)
         self.splines = [
             _interpolation(one - _CUT, size - 2 * _CUT, 3, near.ravel().astype(float)) for one in corners
@@ -90,15 +93,26 @@ class Grid:
 
     def on_grid(self, counts: NDArray, level: float, good: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Counts on the grid, (k, 2, n), good points, (k, ny, nx), and bad and saturated pixels, (k,)."""
+        raw, good, n_bad, n_saturated = self.cleaned(counts, level, good)
+        coefficients = self.filters[0] @ raw @ self.filters[1].T
+        values = np.stack(
+            [spline @ coefficients[:, index].reshape(len(raw), -1).T for index, spline in enumerate(self.splines)]
+        )
+        return np.ascontiguousarray(values.transpose(2, 0, 1)), good, n_bad, n_saturated
+
+    def cleaned(self, counts: NDArray, level: float, good: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Counts of the boxes, (k, 2, h, w), less the dark and with bad pixels filled; the rest as `on_grid`."""
         k = len(counts)
         raw = np.empty((k, *self.dark.shape), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):  # larger numbers become infinite: bad pixels
             for index, (image, rows, columns) in enumerate(self.boxes):
                 raw[:, index] = counts[:, image][:, rows][:, :, columns]
-            odd = ~((raw < level) & (raw > -_check.LARGEST) | self.bad)
             good = np.broadcast_to(good, (k, *good.shape))
             n_bad = n_saturated = np.zeros(k, int)
-            strange = odd.any(axis=(1, 2, 3))
+            strange = np.zeros(k, bool)
+            if not (raw.max() < level and raw.min() > -_check.LARGEST):  # takes a tenth of the full test
+                odd = ~((raw < level) & (raw > -_check.LARGEST) | self.bad)
+                strange = odd.any(axis=(1, 2, 3))
             if strange.any():
                 spoiled = odd & self.watched
                 n_bad = np.count_nonzero(spoiled, axis=(1, 2, 3))
@@ -112,11 +126,25 @@ class Grid:
             for index, one in enumerate(odd[place]):
                 usable = ~(one | self.bad[index])
                 raw[place, index] = nearest_good(raw[place, index], usable) if usable.any() else 0
-        coefficients = self.filters[0] @ raw @ self.filters[1].T
-        values = np.stack(
-            [spline @ coefficients[:, index].reshape(k, -1).T for index, spline in enumerate(self.splines)]
+        return raw, good, n_bad, n_saturated
+
+    @cached_property
+    def axes(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Matrices, (2, ny, h) and (2, nx, w), from counts of the boxes to the grid; None if that is turned.
+
+        Both products take half the time of `on_grid`.
+        """
+        lines = self._corners[:, 0].mean(axis=2), self._corners[:, 1].mean(axis=1)
+        apart = self._corners - np.stack(
+            np.broadcast_arrays(lines[0][..., np.newaxis], lines[1][:, np.newaxis]), 1
         )
-        return np.ascontiguousarray(values.transpose(2, 0, 1)), good, n_bad, n_saturated
+        if np.abs(apart).max() > _STRAIGHT:
+            return None
+        rows, columns = (
+            np.stack([_line(places - _CUT, len(along)) @ along for places in pairs]).astype(np.float32)
+            for pairs, along in zip(lines, self.filters, strict=True)
+        )
+        return rows, columns
 
     def solve(
         self, frames: NDArray, good: NDArray, start: NDArray | None = None, method: Reconstructor | None = None
@@ -236,6 +264,12 @@ def _spline_filter(size: int, blur: float) -> NDArray[np.float32]:
     matrix = ndimage.spline_filter1d(matrix, 3, axis=0, mode="nearest")
     matrix = np.where(np.abs(matrix) > _NEGLIGIBLE, matrix, 0).astype(np.float32)
     return np.ascontiguousarray(matrix[_CUT:-_CUT])
+
+
+def _line(places: NDArray, size: int) -> NDArray[np.float64]:
+    """Matrix from coefficients of a cubic spline, 1 pixel apart, to places along a line."""
+    knots = np.arange(-2, size + 2, dtype=float)
+    return np.asarray(BSpline.design_matrix(places, knots, 3).toarray())
 
 
 def _interpolation(places: NDArray, size: NDArray, degree: int, inside: NDArray) -> sparse.csr_array:

@@ -31,6 +31,7 @@ from zwfs.frames._fit import BenchFit, places_of
 from zwfs.frames._flux import Trial, explained
 from zwfs.frames._grid import Grid
 from zwfs.frames._learnt import learnt, training
+from zwfs.frames.controller import Controller, PhaseController, make_controller
 from zwfs.frames.phases import Flag, Phases
 from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames
 from zwfs.frames.registration import FRAMES
@@ -454,6 +455,45 @@ class Calibration(Immutable):
             begin, known = (None if one is None else one[piece] for one in (start, light))
             parts.append(self._phases(counts[piece], begin, known, level, largest_residual, judge, method))
         return Phases._joined(parts, batch)
+
+    def controller(
+        self, flat: ArrayLike | str | Path, pushed: ArrayLike | str | Path, pulled: ArrayLike | str | Path,
+        **settings: Any,
+    ) -> Controller | PhaseController:  # fmt: skip
+        """Return what turns camera counts into commands of a mirror, from frames of pokes of its actuators.
+
+        Only this method needs the pokes; the mirror and its modes follow from them: actuators, or piston, tip and
+        tilt of segments.
+
+        Parameters
+        ----------
+        flat : array_like, shape (..., ny, nx) or (..., 2, ny, nx), counts, or path
+            Frames of the shape that the loop holds, the dark included; leading axes are averaged.
+        pushed, pulled : array_like, shape (n_commands, ..., ny, nx), counts, or path
+            Frames with each command at `poke` and at -`poke` from there. Axes after the first are averaged.
+        **settings
+            poke : float, 1 by default
+                Size of the pokes, in units of the commands.
+            rcond : float, 0.05 by default
+                Directions of the commands are left out that are weaker than this, relative to the strongest.
+            gain : float, 0.5 by default
+                Of the integrator, in (0, 2].
+            method : {"linear", "phase-shifted", "likelihood"}
+                By default the linear `Controller`. The others return a `PhaseController`.
+            n_iterations : int, 3 by default
+                Of each frame, of the phase-shifted iteration.
+
+        Returns
+        -------
+        Controller or PhaseController
+
+        Raises
+        ------
+        FileNotFoundError, TypeError, ValueError
+            If frames are of a wrong type or shape. If pokes do not move the frames, push and pull of one
+            contradict each other, or two move the frames in the same way: the message names them, from 0.
+        """
+        return make_controller(self, flat, pushed, pulled, **settings)
 
     def modal_matrix(self, modes: ArrayLike) -> NDArray[np.float64]:
         """Matrix that fits modes to a phase: least squares over the good points, without the piston.

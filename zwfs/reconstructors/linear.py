@@ -46,6 +46,8 @@ class Linear(ClosedForm):
     modes : ndarray, shape (n_modes, n_points)
         At the points of the pupil.
     interaction_matrix : ndarray, shape (n_masks * n_points, n_modes), 1 / radian
+    inverse : ndarray, shape (n_modes, n_masks * n_points), radian
+        Pseudo-inverse of the interaction matrix.
     n_inverted : int
         Singular values above the conditioning.
 
@@ -100,13 +102,21 @@ class Linear(ClosedForm):
             raise ValueError(f"modes: the sensor sees none of them{around}: expected modes other than piston")
         self.n_inverted = int(np.count_nonzero(strength > conditioning * strength[0]))
         kept = slice(0, self.n_inverted)
-        self._inverse = (vt[kept].T / strength[kept]) @ u[:, kept].T
+        self.inverse = read_only((vt[kept].T / strength[kept]) @ u[:, kept].T)
+
+    def coefficients(self, frames: ArrayLike) -> NDArray[np.floating]:
+        """Return the coefficients of the modes: (..., n_masks, ny', nx') to (..., n_modes), radian."""
+        checked, batch, _ = self.accept(frames, None)
+        return self._coefficients(checked).reshape(*batch, -1)
 
     def invert(self, frames: NDArray) -> tuple[NDArray, int]:
         """Return the phase of the modes that explain the difference to the frames of the reference best."""
-        coefficients = (self._signal(frames) - self._reference_signal) @ self._inverse.T
         pupil = self.sensor.pupil
-        return pupil.scatter(coefficients @ self.modes + pupil.gather(self._reference), fill=0), 0
+        phase = self._coefficients(frames) @ self.modes + pupil.gather(self._reference)
+        return pupil.scatter(phase, fill=0), 0
+
+    def _coefficients(self, frames: NDArray) -> NDArray[np.floating]:
+        return (self._signal(frames) - self._reference_signal) @ self.inverse.T
 
     def _before(self) -> NDArray[np.float64]:
         return self._reference

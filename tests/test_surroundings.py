@@ -12,6 +12,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 
 from book._tools import run
 from book._tools.environment import clean
+from book._tools.execute import NotebookError
 from book._tools.project import Project
 
 from .conftest import ROOT
@@ -70,6 +71,16 @@ def test_a_run_shows_its_figures_whatever_surrounds_it(hostile, tmp_path, monkey
     load, draw = nbformat.read(project.executed / "one.ipynb", 4).cells[1:]
     assert [output.text for output in load.outputs if output.get("name") == "stdout"] == [PRINTED]
     assert ["image/png" in output.data for output in draw.outputs] == [True]
+
+
+def test_a_run_without_the_picture_of_a_figure_has_failed(tmp_path):
+    project = Project(tmp_path)
+    write(project, LOAD, f"plt.switch_backend('agg')\n{DRAW}")
+    with pytest.raises(
+        NotebookError, match=r"one.ipynb failed in cell 3 of 3(.|\n)*no picture of square: expected"
+    ):
+        run.run(project, lambda text: None)
+    assert not project.executed.exists()
 
 
 def test_nbval_does_not_depend_on_the_environment(hostile, tmp_path):

@@ -5,12 +5,13 @@ import os
 import re
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 
 from zwfs._system import write_file
 
-from .execute import TRACEBACK_LINES, tell
+from .execute import SILENCE, TRACEBACK_LINES, tell
 from .project import EXECUTED, PYODIDE, Project, ToolError
 from .record import commit, digest, digest_files
 from .run import refresh, run
@@ -65,6 +66,19 @@ def build(project: Project) -> bool:
     return True
 
 
+def _output(process: subprocess.Popen[str]) -> str:
+    """Wait for a process, with a line after each `SILENCE`, and return its output; an interruption ends it."""
+    begin = time.monotonic()
+    try:
+        while True:
+            with suppress(subprocess.TimeoutExpired):
+                return process.communicate(timeout=SILENCE)[0]
+            tell(f"building the pages: {time.monotonic() - begin:.0f} s")
+    except BaseException:
+        process.kill()
+        raise
+
+
 def _digest(project: Project) -> str:
     """Return a digest of everything that the book depends on."""
     root = project.root
@@ -85,11 +99,12 @@ def _write_pages(project: Project, output: Path) -> Path:
     executed = {EXECUTED: str(project.executed.relative_to(project.root))}
     command: list[str | Path] = [JUPYTER_BOOK, "build", *OPTIONS, "--path-output", output, "."]
     pipe, both = subprocess.PIPE, subprocess.STDOUT
-    build = subprocess.run(
+    with subprocess.Popen(
         command, cwd=project.root, env=os.environ | executed, stdout=pipe, stderr=both, text=True
-    )
+    ) as build:
+        log = _output(build)
     if build.returncode:
-        said = COLOUR.sub("", build.stdout).replace(f"{project.root}{os.sep}", "")
+        said = COLOUR.sub("", log).replace(f"{project.root}{os.sep}", "")
         lines = said.partition("\nThe above exception was the direct cause")[0].strip().splitlines()
         marked = [line for line in lines if "WARNING:" in line or "ERROR:" in line]
         raise BookError("\n".join(["the book was not built:", *(marked or lines[-TRACEBACK_LINES:])]))

@@ -30,6 +30,7 @@ from .record import key
 CORES = "LOKY_MAX_CPU_COUNT"  # the number of cores for the sweeps of a notebook, see `studies.kit.sweeps`
 
 PERIOD = 0.2  # of the progress bar, second
+PICTURES = ("image/png", "image/svg+xml")  # a cell shows a figure as one of them
 SILENCE = 30.0  # longest without a line of output where there is no progress bar, second
 TRACEBACK_LINES = 12
 LOG_CHARACTERS = 2000
@@ -87,6 +88,7 @@ class Run:
                 self._papermill(source, cores)
             if not _complete(self.notebook):
                 raise RuntimeError("the cell ended Python: expected all cells to run")
+            self._check_pictures()
             # The result of a notebook that is edited during the run is not current.
             self.key = made_from if key(self.project, self.name) == made_from else None
         except Exception as error:
@@ -107,6 +109,15 @@ class Run:
             run=self,
             environment=clean(os.environ) | own,
         )
+
+    def _check_pictures(self) -> None:
+        """Refuse a run in which a cell publishes a figure that it does not show."""
+        for number, cell in enumerate(self.notebook.cells, 1):
+            figures = results.published(cell.source) if cell.cell_type == "code" else []
+            kinds = [kind for output in cell.get("outputs", ()) for kind in output.get("data", ())]
+            if sum(kind in PICTURES for kind in kinds) < len(figures):
+                self.cell = number
+                raise RuntimeError(f"no picture of {', '.join(figures)}: expected each figure in the output")
 
     def start_kernel(self, client: PapermillNotebookClient, environment: dict[str, str]) -> None:
         """Run the cells in a kernel with this environment; its messages go to a log."""

@@ -26,7 +26,7 @@ def draw_bench_layout(bench: Bench, pistons: NDArray, frames: NDArray, wavelengt
     pupil = Pupil.from_segments(bench.segments)
     phase = np.where(bench.segments > 0, bench.commanded_phase(pistons), np.nan)
     limit = np.nanmax(np.abs(phase))
-    none: dict[str, Any] = dict.fromkeys((*bench.errors(), "photons", "read_noise", "background"), 0)
+    none: dict[str, Any] = dict.fromkeys((*bench.errors(), "photons_per_image", "read_noise", "background"), 0)
     quilted = replace(bench, **none | {"quilting": bench.quilting}).frames()[0]
     plus, minus = (Dimple(bench.diameter, sign * bench.phase) for sign in (1, -1))
     pictures = {

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from zwfs.frames._calibrate import calibrate
+from zwfs.frames.calibration import Calibration
 from zwfs.frames.telemetry import reconstruct
 
 _PERIOD = 10.0  # second between two lines of progress where there is no terminal
@@ -113,26 +113,30 @@ def _calibrate(output: str, pupil_centers: Sequence[float] | None, quiet: bool, 
     centers = None if pupil_centers is None else [pupil_centers[first : first + 2] for first in pairs]
     with warnings.catch_warnings(record=True) as remarks:
         try:
-            found = calibrate(**settings, pupil_centers=centers, progress=None if quiet else _Progress())
+            calibration = Calibration.from_files(
+                **settings, pupil_centers=centers, progress=None if quiet else _Progress()
+            )
         finally:
             if settings["commands"] and not quiet and sys.stderr.isatty():
                 print(file=sys.stderr)
-    for one in remarks:
-        print(f"warning: {one.message}", file=sys.stderr)
-    found.save(output)
+    for remark in remarks:
+        print(f"warning: {remark.message}", file=sys.stderr)
+    calibration.save(output)
     print(
-        f"{output}: pupil {found.diameter:.2f} pixels wide, residual of the frames {found.residual:.3f}, "
-        f"counts at an intensity of 1: {found.unit[0]:.6g} and {found.unit[1]:.6g}"
+        f"{output}: pupil {calibration.diameter:.2f} pixels wide, residual of the frames "
+        f"{calibration.residual:.3f}, counts at an intensity of 1: {calibration.unit[0]:.6g} and "
+        f"{calibration.unit[1]:.6g}"
     )
     return 0
 
 
 def _reconstruct(output: str, strict: bool, quiet: bool, **settings: Any) -> int:
-    found = reconstruct(output=output, progress=None if quiet else _Progress().frames, **settings)
+    summary = reconstruct(output=output, progress=None if quiet else _Progress().frames, **settings)
     if not quiet:
-        flags = ", ".join(f"{n} {name.lower().replace('_', ' ')}" for name, n in found.counts.items() if n)
-        print(f"{Path(output)}: {found.n_frames} frames, {found.n_flagged} flagged{f': {flags}' if flags else ''}")
-    return 3 if strict and found.n_flagged else 0
+        flags = ", ".join(f"{n} {name.lower().replace('_', ' ')}" for name, n in summary.counts.items() if n)
+        flags = f": {flags}" if flags else ""
+        print(f"{Path(output)}: {summary.n_frames} frames, {summary.n_flagged} flagged{flags}")
+    return 3 if strict and summary.n_flagged else 0
 
 
 class _Progress:

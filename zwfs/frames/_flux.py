@@ -27,6 +27,7 @@ class Trial(NamedTuple):
     frames: NDArray[np.float32]  # (k, 2, ny, nx), ideal frames
     n_iterations: NDArray[np.int64]  # (k,)
     converged: NDArray[np.bool_]  # (k,)
+    n_unsolved: NDArray[np.int64]  # (k,)
     residual: NDArray[np.float32]  # (k,), NaN if not judged
     ratio: NDArray[np.float64]  # (k,), light of the frames over that of their model
     cost: NDArray[np.float64]  # (k,), of both: 1 for frames like those of the calibration

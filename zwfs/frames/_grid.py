@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -35,9 +36,43 @@ _NEGLIGIBLE = 1e-10  # of a weight: smaller ones only slow products down, much s
 class Solved(NamedTuple):
     """Phases of k frame sets."""
 
-    phase: NDArray[np.float32]  # (k, ny, nx), bad points filled
+    phase: NDArray  # (k, ny, nx), bad points filled
     n_iterations: NDArray[np.int64]
     converged: NDArray[np.bool_]
+    n_unsolved: NDArray[np.int64]
+
+
+def iterated(
+    reconstruct: Reconstructor, frames: NDArray, good: NDArray, start: NDArray | None = None,
+    fill: Callable[[NDArray, NDArray], NDArray] | None = None,
+) -> Solved:  # fmt: skip
+    """Phases of ideal frames, (k, n_masks, ny, nx), which are changed, from good points (k, ny, nx).
+
+    Bad points take no part: in a second iteration their intensity is that of the model, so that the reference wave
+    has no hole.
+    """
+    sensor, fill = reconstruct.sensor, fill or _filled
+    result = reconstruct(frames, start)
+    phase, n_iterations, converged, n_unsolved = (
+        getattr(result, name) for name in ("phase", "n_iterations", "converged", "n_unsolved")
+    )
+    phase[:, ~sensor.pupil.inside] = 0
+    holes = sensor.pupil.inside & ~good
+    spoiled = np.flatnonzero(holes.any(axis=(1, 2)))
+    if spoiled.size:
+        phase[spoiled] = fill(phase[spoiled], good[spoiled])
+        model = sensor.measure(phase[spoiled])[(..., *sensor.window)]
+        frames[spoiled] = np.where(holes[spoiled, np.newaxis], model, frames[spoiled])
+        again = reconstruct(frames[spoiled], phase[spoiled] if reconstruct.iterative else None)
+        phase[spoiled] = fill(np.where(sensor.pupil.inside, again.phase, 0), good[spoiled])
+        n_iterations[spoiled] += again.n_iterations
+        converged[spoiled], n_unsolved[spoiled] = again.converged, again.n_unsolved
+    return Solved(phase, n_iterations, converged, n_unsolved)
+
+
+def _filled(phase: NDArray, good: NDArray) -> NDArray:
+    """Phases (k, ny, nx) with bad points replaced by the nearest good one."""
+    return np.stack([nearest_good(*pair) for pair in zip(phase, good, strict=True)])
 
 
 class Grid:
@@ -121,26 +156,9 @@ class Grid:
     def solve(
         self, frames: NDArray, good: NDArray, start: NDArray | None = None, method: Reconstructor | None = None
     ) -> Solved:
-        """Phases of ideal frames.
-
-        Bad points take no part: in a second iteration their intensity is that of the model. The frames, shape
-        (k, 2, ny, nx), are changed.
-        """
-        reconstruct, sensor = method or self.reconstruct, self.reconstruct.sensor
-        frames = frames[:, : sensor.n_masks]
-        found = reconstruct(frames, start)
-        phase, n_iterations, converged = found.phase, found.n_iterations, found.converged
-        phase[:, ~sensor.pupil.inside] = 0
-        holes = sensor.pupil.inside & ~good
-        some = np.flatnonzero(holes.any(axis=(1, 2)))
-        if some.size:
-            phase[some] = self.filled(phase[some], good[some])
-            frames[some] = np.where(holes[some, np.newaxis], sensor.measure(phase[some]), frames[some])
-            found = reconstruct(frames[some], phase[some] if reconstruct.iterative else None)
-            phase[some] = self.filled(np.where(sensor.pupil.inside, found.phase, 0), good[some])
-            n_iterations[some] += found.n_iterations
-            converged[some] = found.converged
-        return Solved(phase, n_iterations, converged)
+        """Phases of ideal frames, shape (k, 2, ny, nx), which are changed."""
+        reconstruct = method or self.reconstruct
+        return iterated(reconstruct, frames[:, : self.reconstruct.sensor.n_masks], good, start, self.filled)
 
     def compared(self, phase: NDArray, frames: NDArray, good: NDArray) -> tuple[NDArray, NDArray]:
         """Rms difference of frames (k, 2, ny, nx) from those of phases, (k,), and the ratio of their light."""

@@ -24,8 +24,10 @@ from zwfs.frames._blocks import MOST_BYTES, FileError, Images, file_and_unit
 from zwfs.frames._fits import fits_content, fits_module, has_card
 from zwfs.frames._part import Cards, scratch_of
 from zwfs.frames._stack import segments_of
-from zwfs.frames.pipeline import MeasuredPhase, Optics
+from zwfs.frames.phases import Phases
+from zwfs.frames.pipeline import Measurement, Optics
 from zwfs.frames.registration import Image
+from zwfs.units import phase_to_opd
 
 __all__ = ["CameraFile", "check_output", "images", "read", "read_all", "write_phase"]
 
@@ -369,7 +371,8 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
 
 def write_phase(
     output: str | Path,
-    phase: MeasuredPhase,
+    measurement: Measurement,
+    phases: Phases,
     wavelength: float,
     sources: Sequence[CameraFile] = (),
     *,
@@ -384,7 +387,8 @@ def write_phase(
     ----------
     output : str or Path
         See `check_output`. An earlier phase map is replaced.
-    phase : MeasuredPhase
+    measurement, phases : Measurement and Phases
+        Of `recover_phase`.
     wavelength : float, nm
     sources : sequence of CameraFiles
         Their names and checksums go into the header. None of these files is replaced.
@@ -401,11 +405,12 @@ def write_phase(
     from zwfs import __version__
 
     fits_module()
-    _check.instance("phase", phase, MeasuredPhase)
+    _check.instance("measurement", measurement, Measurement)
+    _check.instance("phases", phases, Phases)
     _check.sequence("sources", sources, CameraFile)
     path = check_output(output, [source.path for source in sources if source.path], overwrite=overwrite)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-    measurement, registered, optics = phase.measurement, phase.measurement.registered, phase.measurement.optics
+    registered, optics, agreement = measurement.registered, measurement.optics, measurement.agreement(phases.phase)
     placement = registered.placement
     cards = [
         ("BUNIT", "rad", "in (-pi, pi]; NaN outside and at bad points"),
@@ -419,11 +424,11 @@ def write_phase(
         ("UNMASKED", optics.unmasked, "fraction of light the mask does not shift"),
         ("FLUXMASK", measurement.flux_ratio[0], "light of image 1 over image 2, frames"),
         ("FLUXOUT", measurement.flux_ratio[1], "the same, clear frames"),
-        *((f"CORR{i}", value, "measured with modelled frame") for i, value in enumerate(phase.correlation, 1)),
-        *((f"RESID{i}", value, "rms difference of them") for i, value in enumerate(phase.residual, 1)),
+        *((f"CORR{i}", value, "measured with modelled frame") for i, value in enumerate(agreement.correlation, 1)),
+        *((f"RESID{i}", value, "rms difference of them") for i, value in enumerate(agreement.residual, 1)),
         ("NPOINTS", measurement.pupil.n_points, "points of the pupil"),
         ("NBAD", measurement.n_bad, "of these, bad"),
-        ("CONVERGE", phase.converged, "the iteration converged"),
+        ("CONVERGE", bool(phases.converged), "the iteration converged"),
         ("ROTATE", placement.rotation, "[deg] image 2 from image 1, x to y"),
         ("ROTERR", placement.sigma[2], "[deg] standard error; NaN: not determined"),
         ("MAGNIF", placement.magnification, "size of image 2 over that of image 1"),
@@ -441,8 +446,8 @@ def write_phase(
         cards.append(("DATE-OBS", str(sources[0].header["DATE-OBS"]), f"of {sources[0].name}"))
     cards.append(("CREATOR", f"zwfs {__version__}", ""))
     bad = (measurement.pupil.inside & ~measurement.good).astype(np.uint8)
-    units = (phase.opd(wavelength), "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
-    write_file(path, fits_content((phase.phase, "", cards), *units))
+    units = (phase_to_opd(phases.phase, wavelength), "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
+    write_file(path, fits_content((phases.phase, "", cards), *units))
 
 
 def sensor_cards(diameter: float, center: tuple[float, float], optics: Optics) -> Cards:

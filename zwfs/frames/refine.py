@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from zwfs import _check
+from zwfs.frames.calibration import recover_phase
+from zwfs.frames.phases import Phases
 from zwfs.frames.pipeline import (
     MOST_ITERATIONS,
     ClearLight,
-    MeasuredPhase,
     Measurement,
     Optics,
     clear_light,
+    iterated_phase,
     near_edges,
     predict_other,
     prediction_error,
-    recover_phase,
     reduce_frames,
     reduce_with,
     upside_down,
@@ -127,7 +128,7 @@ def fit(
     @lru_cache(maxsize=1)  # a derivative begins where the search has just been
     def residuals(unknowns: tuple[float, ...]) -> NDArray:
         # Finite differences need a smooth function, so no trial may end an iteration earlier than its neighbours.
-        return recover_phase(trial(unknowns), n_iterations, 1e-8).mismatch[:, seen].ravel()
+        return _mismatch(trial(unknowns), n_iterations, 1e-8)[:, seen].ravel()
 
     def jacobian(unknowns: NDArray) -> NDArray:
         base = residuals(tuple(unknowns.tolist()))
@@ -145,12 +146,14 @@ def fit(
     old, new, control = (
         prediction_error(one, unseen, n_iterations) for one in (before, after, upside_down(after))
     )
-    misfit, smaller = (
-        np.sum(recover_phase(one, n_iterations).mismatch[:, hidden] ** 2) for one in (before, after)
-    )
+    misfit, smaller = (np.sum(_mismatch(one, n_iterations, 1e-4)[:, hidden] ** 2) for one in (before, after))
     better = smaller < misfit and np.all(new < (1 - _GAIN) * np.minimum(old, control))
     kept = after if better else before
     return kept.registered, kept.optics
+
+
+def _mismatch(measurement: Measurement, n_iterations: int, tolerance: float) -> NDArray[np.float64]:
+    return measurement.agreement(iterated_phase(measurement, n_iterations, tolerance)).mismatch
 
 
 def _check_fit(argument: str, names: Any, optics: Any) -> None:
@@ -178,7 +181,8 @@ class Step:
     Attributes
     ----------
     name : str
-    result : MeasuredPhase
+    measurement : Measurement
+    phases : Phases
     predicted : ndarray, shape (2,)
         Correlation of each frame with the prediction from the other one alone, see `predict_other`.
     control : ndarray, shape (2,)
@@ -186,7 +190,8 @@ class Step:
     """
 
     name: str
-    result: MeasuredPhase
+    measurement: Measurement
+    phases: Phases
     predicted: NDArray[np.float64]
     control: NDArray[np.float64]
 
@@ -233,7 +238,7 @@ def steps(
     def add(name: str, registered: RegisteredFrames, optics: Optics) -> None:
         measurement = reduce_frames(registered, optics)
         scores = (predict_other(one, n_iterations) for one in (measurement, upside_down(measurement)))
-        work.append(Step(name, recover_phase(measurement, n_iterations), *scores))
+        work.append(Step(name, measurement, recover_phase(measurement, n_iterations), *scores))
 
     names = "registration by content", "background around the pupils", "balance of the flux"
     for n_on, name in enumerate(("outlines of the pupils", *names)):
@@ -241,11 +246,11 @@ def steps(
         switches["n_pupils"] = len(optics.phase_shifts)
         add(name, register_frames(frames, clear_frames, **settings, **switches), optics)
     if optics.single and fitted:
-        last = work[-1].result.measurement
+        last = work[-1].measurement
         add("no fit: one image cannot test it", last.registered, last.optics)
         return work
     for number, name in enumerate(fitted, 1):
-        last = work[-1].result.measurement
+        last = work[-1].measurement
         found = fit(last.registered, last.optics, fitted[:number], n_iterations)
         kept = "" if found[1] is not last.optics else " (not kept)"
         add(f"fit of {name.replace('_', ' ')}{kept}", *found)

@@ -72,6 +72,12 @@ class Image:
         _check.instance("name", self.name, str)
         _check.flag("cut", self.cut)
 
+    @classmethod
+    def of(cls, counts: NDArray, name: str) -> Image:
+        """Image of counts, (ny, nx), in which bad pixels are not finite."""
+        good = np.isfinite(counts)
+        return cls(nearest_good(counts, good), ~good, name)
+
 
 @dataclass(frozen=True, eq=False)
 class Placement:
@@ -150,6 +156,11 @@ class RegisteredFrames:
     def images(self) -> tuple[Image, ...]:
         """Frames, then clear frames."""
         return self.frames + self.clear_frames
+
+    @property
+    def camera_images(self) -> tuple[Image, ...]:
+        """Frames, one of them if it holds both pupils."""
+        return self.frames[: 1 if self.frames[0] is self.frames[1] else 2]
 
     @cached_property
     def diameter(self) -> float:

@@ -141,10 +141,10 @@ def reconstruct(
     --------
     >>> import tempfile
     >>> from zwfs.bench import Bench, write_bench
-    >>> from zwfs.frames import calibrate, reconstruct
+    >>> from zwfs.frames import Calibration, reconstruct
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)
-    ...     calibration = calibrate([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...     calibration = Calibration.from_files([files["frame"]], [files["pupils"]], [files["dark"]])
     ...     summary = reconstruct(files["frame"], calibration, f"{folder}/phases.fits", n_workers=1)
     ...
     >>> summary.n_frames, summary.n_flagged

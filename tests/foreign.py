@@ -62,18 +62,19 @@ def recorded(seed=1, flux=1.0, **moved):
     return images[:2], images[2:]
 
 
-def phase_difference(registered, phases):
+def phase_difference(found):
     """Measured phase less the true one, without piston, (ny, nx); NaN at pixels that are not fully lit."""
     phase, _, clear = fine_images()
+    registered = found.measurement.registered
     window = tuple(slice(first, first + registered.n_pixels) for first in registered.corner)
     lit = (_blocks(clear).min(axis=(1, 3)) > 0.5)[window]
-    left = np.where(lit, np.exp(1j * (phases - on_camera(phase)[window])), np.nan)
+    left = np.where(lit, np.exp(1j * (found.phase - on_camera(phase)[window])), np.nan)
     return np.angle(left * np.conj(np.nanmean(left)))
 
 
-def phase_error(registered, phases):
+def phase_error(found):
     """Rms error of a measured phase at the camera pixels that are fully lit, radian."""
-    return np.nanstd(phase_difference(registered, phases))
+    return np.nanstd(phase_difference(found))
 
 
 def _blocks(fine):

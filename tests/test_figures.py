@@ -36,7 +36,7 @@ from studies.reconstructors import draw_convergence
 from studies.zernike_sensor import lowest_pixel
 from zwfs.bench.model import Bench
 from zwfs.frames.phases import Phases
-from zwfs.frames.pipeline import Agreement, Measurement, Optics
+from zwfs.frames.pipeline import Measurement, Optics
 from zwfs.frames.refine import Step
 from zwfs.frames.registration import Circle, Image, RegisteredFrames
 
@@ -108,8 +108,9 @@ def drawn_methods(curves, pupil, classic, shifted):
     measurement = Measurement(
         recording, Optics(), frames, pupil, 0 * phase, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0)
     )
-    agreement, whole, real = Agreement(measurement, frames, 0.9 * frames), np.array(0), np.array(0.0)
-    found = Phases(phase, phase, real, whole, whole, real, np.zeros(2), whole, whole, whole)
+    whole, real = np.array(0), np.array(0.0)
+    numbers = real, whole, whole, real, np.zeros(2), whole, whole, whole
+    found = Phases(phase, phase, *numbers, measurement=measurement)
     varied = AmplitudeCurves(three, dict.fromkeys(phase_amplitude.WAYS, np.full((3, 2), 0.1)), {}, three)
     drift, pair, falling = Drift(np.ones((6, 2, 2)), 10.0, 500.0), np.ones(6), np.array([20.0, 10.0])
     held = DriftCurves(
@@ -121,7 +122,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         three, three, dict.fromkeys(LOOKS, np.ones((3, 3, 2))), np.full((3, 3, 2), 2.0), np.eye(3)
     )
     designs = DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5})
-    step = Step("outlines", measurement, found, np.ones(2), np.zeros(2))
+    step = Step("outlines", found, np.ones(2), np.zeros(2))
     banded = BandCurves(three, dict.fromkeys(bandwidth.WAYS, three[:, np.newaxis]), {}, three, 1.0)
     triple = zwfs.ZernikeSensor(pupil, *shifted.masks, zwfs.Dimple(1, 0))
     both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(triple.measure(phase))
@@ -169,8 +170,8 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_comparison": (([decided], [decided._replace(cell=looped)]), ()),
         "draw_budget": ((dict.fromkeys(["none", "blur"], bench_curves), "PhaseShifted"), shifted_only),
         "draw_calibration_errors": ((calibrated, three), shifted_only),
-        "draw_explained": ((agreement,), ()),
-        "draw_phase_map": ((measurement, phase, 635.0), ()),
+        "draw_explained": ((found,), ()),
+        "draw_phase_map": ((found, 635.0), ()),
         "draw_gains": (([step] * 2, [0.1, 0.2]), ()),
         "draw_signs": ((measurement,), ()),
         "draw_linear_loops": ((Divergence(dict.fromkeys(PLANTS, loop), three, three, three),), ["Linear"]),

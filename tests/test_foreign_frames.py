@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from zwfs.frames import phase_of, recover_phase
 from zwfs.frames.__main__ import main
-from zwfs.frames.pipeline import Optics, near_edges, reduce_frames
+from zwfs.frames.pipeline import Optics, near_edges, phase_of, recover_phase, reduce_frames
 from zwfs.frames.refine import fit, steps
 from zwfs.frames.registration import Image, register_frames
 from zwfs.frames.verdict import CameraNoise, judge
@@ -25,7 +24,7 @@ def case(request):
 
 def test_phase_is_recovered_however_the_second_image_stands(case):
     _, registered = case
-    assert foreign.phase_error(registered, recover_phase(reduce_frames(registered, Optics()))) < 0.015
+    assert foreign.phase_error(recover_phase(reduce_frames(registered, Optics()))) < 0.015
 
 
 def test_placement_of_the_second_image_is_measured_within_its_errors(case):
@@ -63,31 +62,26 @@ def test_bad_pixel_of_the_second_image_spoils_the_points_around_its_place():
 NOISE = CameraNoise(1.0, foreign.READ_NOISE)
 
 
-def judged(measurement, *noise):
-    return judge(measurement, recover_phase(measurement), *noise)
-
-
 def test_noise_explains_the_frames_and_its_error_bar_holds(case):
-    measurement = reduce_frames(case[1], Optics())
-    found = recover_phase(measurement)
-    verdict = judge(measurement, found, NOISE)
+    found = recover_phase(reduce_frames(case[1], Optics()))
+    verdict = judge(found, NOISE)
     assert verdict.explained
     assert np.all(verdict.score > verdict.control + 0.5)
-    far = measurement.good & ~near_edges(measurement)
-    pulls = (foreign.phase_difference(case[1], found) / verdict.sigma)[far]
+    far = found.measurement.good & ~near_edges(found.measurement)
+    pulls = (foreign.phase_difference(found) / verdict.sigma)[far]
     assert 0.8 < pulls.std() < 1.4
 
 
 @pytest.mark.parametrize("wrong", [Optics(1.3), Optics(scale=1.1), Optics(unmasked=0.1), Optics(background=0.05)])
 def test_wrong_model_is_not_explained(wrong):
     registered = register_frames(*foreign.recorded())
-    assert not judged(reduce_frames(registered, wrong), NOISE).explained
+    assert not judge(recover_phase(reduce_frames(registered, wrong)), NOISE).explained
 
 
 def test_frames_that_do_not_belong_together_score_like_the_control():
     frames, clear_frames = foreign.recorded()
     upside_down = [frames[0], replace(frames[1], counts=frames[1].counts[::-1])]
-    verdict = judged(reduce_frames(register_frames(upside_down, clear_frames), Optics()))
+    verdict = judge(recover_phase(reduce_frames(register_frames(upside_down, clear_frames), Optics())))
     assert np.all(verdict.score < 0.3)
     assert verdict.explained is None
     assert verdict.sigma is None
@@ -148,10 +142,8 @@ def single_error(single, phase, corner):
 
 def test_one_image_gives_the_phase_and_no_verdict(single):
     found = phase_of(*single[2:], phase_shifts=(np.pi / 2,))
-    images = ([Image.of(counts, "image")] for counts in single[2:])
-    measurement = reduce_frames(register_frames(*images, n_pupils=1), Optics(phase_shifts=(np.pi / 2,)))
-    assert single_error(single, found.phase, measurement.registered.corner) < 0.015  # 1.5 nm
-    verdict = judge(measurement, found, NOISE)
+    assert single_error(single, found.phase, found.measurement.registered.corner) < 0.015  # 1.5 nm
+    verdict = judge(found, NOISE)
     assert verdict.explained is None
     assert np.isnan(verdict.score).all()
     assert "one image" in verdict.findings["fit"]

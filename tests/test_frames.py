@@ -10,9 +10,9 @@ from scipy import ndimage
 from zwfs import Dimple, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, zernike_basis
 from zwfs.bench import bench_error, write_bench
 from zwfs.bench.model import Bench, BenchModel, segment_residual, segment_screens
+from zwfs.frames import Calibration
 from zwfs.frames import files as camera
-from zwfs.frames import judge, order_of_images, phase_of, recover_phase
-from zwfs.frames.pipeline import Optics, predict_other, reduce_frames
+from zwfs.frames.pipeline import Optics, phase_of, predict_other, recover_phase, reduce_frames
 from zwfs.frames.refine import fit, steps
 from zwfs.frames.registration import (
     Image,
@@ -20,6 +20,7 @@ from zwfs.frames.registration import (
     register,
     register_frames,
 )
+from zwfs.frames.verdict import judge, order_of_images
 
 SEAL = "ZWFS_SEAL_FRAMES"
 D, MARGIN = 68, 12
@@ -141,11 +142,10 @@ def test_stacked_pupils_and_given_centers(recorded):
 def test_phase_is_recovered(recorded, screen):
     _, masked, bare = recorded
     registered = register_frames([image(masked)], [image(bare)])
-    measurement = reduce_frames(registered, Optics())
-    found = recover_phase(measurement)
+    found = recover_phase(reduce_frames(registered, Optics()))
     # Blur and interpolation, which the model knows nothing of, leave most of it, at the gaps.
     assert error(found, registered, screen) < 0.1
-    assert measurement.agreement(found).correlation.min() > 0.97
+    assert found.agreement.correlation.min() > 0.97
     worse = register_frames([image(masked)], [image(bare)], subpixel=False)
     assert error(recover_phase(reduce_frames(worse, Optics())), worse, screen) > error(found, registered, screen)
 
@@ -222,11 +222,12 @@ def test_opposite_masks_send_the_same_light_into_the_pupil(screen):
 def test_exchanged_phase_shifts_change_the_sign(recorded):
     _, masked, bare = recorded
     registered = register_frames([image(masked)], [image(bare)])
-    both = [reduce_frames(registered, Optics(phase_shifts=(angle, -angle))) for angle in (np.pi / 2, -np.pi / 2)]
-    phases = [recover_phase(measurement) for measurement in both]
-    np.testing.assert_allclose(*(np.nan_to_num(signed) for signed in (phases[0], -phases[1])), atol=1e-5)
-    scores = (one.agreement(phase).correlation for one, phase in zip(both, phases, strict=True))
-    np.testing.assert_allclose(*scores, atol=1e-6)
+    optics = Optics()
+    found = recover_phase(reduce_frames(registered, optics))
+    swapped = replace(optics, phase_shifts=optics.phase_shifts[::-1])
+    other = recover_phase(reduce_frames(registered, swapped))
+    np.testing.assert_allclose(np.nan_to_num(other.phase), -np.nan_to_num(found.phase), atol=1e-5)
+    np.testing.assert_allclose(other.agreement.correlation, found.agreement.correlation, atol=1e-6)
 
 
 def test_masked_pixels_are_left_out_and_do_little_harm(recorded, screen):
@@ -253,10 +254,9 @@ def test_leakage_and_unmasked_light_are_undone(screen):
     bare = np.stack([np.pad(pupil.amplitude**2, MARGIN)] * 2)
     mixed = 0.8 * (0.9 * ideal + 0.1 * ideal[::-1]) + 0.2 * bare
     registered = register_frames([image(np.hstack(mixed))], [image(np.hstack(bare))], subpixel=False, **EXACT)
-    measurement = reduce_frames(registered, optics)
-    found = recover_phase(measurement, 100)
+    found = recover_phase(reduce_frames(registered, optics), 100)
     assert error(found, registered, screen) < 1e-3
-    np.testing.assert_allclose(measurement.agreement(found).correlation, 1, atol=1e-5)
+    np.testing.assert_allclose(found.agreement.correlation, 1, atol=1e-5)
     plain = Optics()
     assert error(recover_phase(reduce_frames(registered, plain), 100), registered, screen) > 0.03
 
@@ -288,7 +288,7 @@ def test_prediction_tells_a_pair_from_a_mere_juxtaposition(recorded):
     for frame in (masked, np.hstack([left, right[::-1]])):
         measurement = reduce_frames(register_frames([image(frame)], [image(bare)]), Optics())
         scores.append((predict_other(measurement).min(),
-                       measurement.agreement(recover_phase(measurement)).correlation.min()))  # fmt: skip
+                       recover_phase(measurement).agreement.correlation.min()))  # fmt: skip
     (right_pair, correlation), (wrong_pair, spurious) = scores
     assert right_pair > 0.9
     assert wrong_pair < 0.7
@@ -418,16 +418,15 @@ def test_bench_writes_what_the_pipeline_reads(tmp_path):
     # The bench sets the images half a pixel apart.
     np.testing.assert_allclose(registered.origins[3], [-0.5, 89.5], atol=0.1)
     found = recover_phase(reduce_frames(registered, Optics()))
-    error = bench_error(bench, commanded, registered, found)
+    error = bench_error(bench, commanded, found)
     model = BenchModel.from_images(bench, 1)
     known = PhaseShifted(model.shifted)(model.normalise(bench.frames(commanded, 1))).phase
     # As good as one who knows where the pupils stand.
     assert error < segment_residual(model.pistons(known), commanded).std() + 0.03 < 0.18
     written = write_bench(tmp_path, bench, seed=2)
     flat = camera.read_all([written["frame"]], [written["pupils"]], [written["dark"]])[:2]
-    flat = register_frames(*flat)
-    flat = flat, recover_phase(reduce_frames(flat, Optics()))
-    assert bench_error(bench, commanded, registered, found, flat) < 0.7 * error
+    flat = recover_phase(reduce_frames(register_frames(*flat), Optics()))
+    assert bench_error(bench, commanded, found, flat) < 0.7 * error
 
 
 def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
@@ -438,21 +437,20 @@ def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
     bad[40, 50] = True
     registered = register_frames([image(masked, bad=bad)], [image(bare)])
     optics = Optics(diameter=1.1)
-    measurement = reduce_frames(registered, optics)
-    found = recover_phase(measurement)
+    found = recover_phase(reduce_frames(registered, optics))
     source = camera.CameraFile(masked[np.newaxis], "frame.fits", "ab" * 32, {"DATE-OBS": "2023-05-01"})
     for name in ("a.fits", "b.fits"):
-        camera.write_phase(tmp_path / name, measurement, found, 635.0, [source])
+        camera.write_phase(tmp_path / name, found, 635.0, [source])
     assert (tmp_path / "a.fits").read_bytes() == (tmp_path / "b.fits").read_bytes()
     with fits.open(tmp_path / "a.fits") as units:
         units.verify("exception")
         header = units[0].header
         np.testing.assert_array_equal(units[0].data, found.phase)
         np.testing.assert_allclose(units["PHASE_NM"].data, found.phase * 635 / (2 * np.pi), rtol=1e-6)
-        assert units["BAD"].data.sum() == measurement.n_bad == header["NBAD"] > 0
+        assert units["BAD"].data.sum() == found.measurement.n_bad == header["NBAD"] > 0
         assert (header["BUNIT"], units["PHASE_NM"].header["BUNIT"]) == ("rad", "nm")
         assert (header["WAVELEN"], header["DIMPLE"]) == (635, 1.1)
-        assert [header[f"CORR{i}"] for i in (1, 2)] == pytest.approx(measurement.agreement(found).correlation)
+        assert [header[f"CORR{i}"] for i in (1, 2)] == pytest.approx([*found.agreement.correlation])
         left, right = (np.split(frame - 500, 2, axis=1) for frame in (masked, bare))
         light = [first.sum() / second.sum() for first, second in (left, right)]
         assert [header["FLUXMASK"], header["FLUXOUT"]] == pytest.approx(light, rel=0.02)
@@ -460,11 +458,11 @@ def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
         assert (header["FILE1"], header["SHA1"], header["DATE-OBS"]) == ("frame.fits", "ab" * 32, "2023-05-01")
         assert header["CREATOR"].startswith("zwfs ")
     with pytest.raises(ValueError, match="wavelength = 0"):
-        camera.write_phase(tmp_path / "c.fits", measurement, found, 0)
+        camera.write_phase(tmp_path / "c.fits", found, 0)
     assert not (tmp_path / "c.fits").exists()
     (tmp_path / "mine.fits").write_text("precious")
     with pytest.raises(ValueError, match=r"mine\.fits' exists and is not a phase map"):
-        camera.write_phase(tmp_path / "mine.fits", measurement, found, 635.0)
+        camera.write_phase(tmp_path / "mine.fits", found, 635.0)
 
 
 # The real bench
@@ -494,23 +492,23 @@ def seal_work(seal, seal_steps):
 
 @pytest.mark.slow
 def test_seal_frames_are_explained(seal_work):
-    named = {step.name: step.measurement.agreement(step.phases).correlation for step in seal_work}
+    named = {step.name: step.result for step in seal_work}
     # Already the light of the two frames, balanced, and nothing fitted.
-    assert named["balance of the flux"] == pytest.approx([0.83, 0.90], abs=0.02)
-    left, right = named[seal_work[-1].name]
+    assert named["balance of the flux"].agreement.correlation == pytest.approx([0.83, 0.90], abs=0.02)
+    left, right = seal_work[-1].result.agreement.correlation
     assert left > 0.87
     assert right > 0.91
-    assert seal_work[-1].measurement.n_bad == 0
+    assert seal_work[-1].result.measurement.n_bad == 0
     # One frame predicts the other one far better than the outlines alone let it.
     assert np.all(seal_work[-1].predicted > seal_work[0].predicted + 0.05)
     assert np.all(seal_work[-1].predicted > seal_work[-1].control + 0.25)
     # Their light is uneven, and they do not show a rotation.
-    measurement = seal_work[-1].measurement
+    measurement = seal_work[-1].result.measurement
     assert measurement.flux_ratio == pytest.approx((1.22, 1.02), abs=0.01)
     assert np.isnan(measurement.registered.placement.sigma[2:]).all()
     assert np.all(measurement.registered.placement.sigma[:2] < 0.5)
     for step in (seal_work[3], seal_work[-1]):
-        verdict = judge(step.measurement, step.phases)
+        verdict = judge(step.result)
         assert "The scale of the phase is not determined" in verdict.findings["scale"]
         assert verdict.strengths[1] > 2 * verdict.strengths[0]
 
@@ -527,10 +525,11 @@ def test_first_look_is_that_of_the_single_steps():
     bench = Bench(n_pixels=40)
     frames, clear = bench.frames(), bench.clear_frames()
     found = phase_of(frames + 100, clear + 100, np.full(clear[0].shape, 100.0))
-    images = ([image(counts) for counts in pair] for pair in (frames, clear))
+    images = ([Image(one, np.zeros(one.shape, bool)) for one in pair] for pair in (frames, clear))
     expected = recover_phase(reduce_frames(register_frames(*images), Optics()))
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
     np.testing.assert_array_equal(phase_of(frames, clear), expected)
+    np.testing.assert_array_equal(Calibration.from_arrays(frames, clear)(frames), expected)
 
 
 @pytest.mark.parametrize(

@@ -78,8 +78,8 @@ def results():
     registered = register_frames(*([Image.of(counts, "image") for counts in pair] for pair in (frames, clear)))
     measurement = reduce_frames(registered, Optics())
     phases = recover_phase(measurement)
-    made = [phases, measurement, measurement.agreement(phases), registered, registered.placement]
-    made += [judge(measurement, phases), ImageOrder(Optics(), False, 1.0, 0.0)]
+    made = [phases, measurement, phases.agreement, registered, registered.placement]
+    made += [judge(phases), ImageOrder(Optics(), False, 1.0, 0.0)]
     return {type(one).__name__: one for one in made}
 
 

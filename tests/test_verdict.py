@@ -5,8 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from zwfs.frames import recover_phase
-from zwfs.frames.pipeline import Agreement, Optics, iterated_phase, near_edges, reduce_frames, upside_down
+from zwfs.frames.pipeline import (
+    Agreement,
+    Optics,
+    iterated_phase,
+    near_edges,
+    recover_phase,
+    reduce_frames,
+    upside_down,
+)
 from zwfs.frames.refine import fit, steps
 from zwfs.frames.registration import FRAMES, Image, Placement, RegisteredFrames, register_frames
 from zwfs.frames.verdict import CameraNoise, _of_fit, _of_place, _of_score, judge
@@ -29,12 +36,12 @@ def registered(bench, **settings):
     return register_frames(frames, clear_frames, **settings)
 
 
-def error(bench, step, screen):
-    """Rms error of the phase of a step at fully lit pixels, radian."""
+def error(bench, found, screen):
+    """Rms error of a phase at fully lit pixels, radian."""
     canvas = np.full((bench.side,) * 2, np.nan)
-    row, column = step.measurement.registered.corner
-    n = len(step.phases.phase)
-    canvas[row : row + n, column : column + n] = step.phases
+    row, column = found.measurement.registered.corner
+    n = len(found.phase)
+    canvas[row : row + n, column : column + n] = found.phase
     start = (bench.side - bench.pixels) // 2
     phase = canvas[start : start + bench.pixels, start : start + bench.pixels]
     left = np.exp(1j * (phase - bench.on_pupil(screen)))[bench.fully_lit & np.isfinite(phase)]
@@ -47,12 +54,8 @@ def disc():
 
 
 @pytest.fixture(scope="module")
-def measurement(disc):
-    return reduce_frames(disc, Optics())
-
-
-def judged(measurement, *noise):
-    return judge(measurement, recover_phase(measurement), *noise)
+def found(disc):
+    return recover_phase(reduce_frames(disc, Optics()))
 
 
 # Fits
@@ -74,7 +77,7 @@ def test_last_step_on_a_shifted_disc_is_not_worse_than_one_before():
     bench = HcipyBench(**SHIFTED)
     frames, clear_frames, screen = recorded(bench)
     work = steps(frames, clear_frames, Optics(), ["registration", "diameter"])
-    errors = [error(bench, step, screen) for step in work]
+    errors = [error(bench, step.result, screen) for step in work]
     assert [step.name for step in work[-2:]] == ["fit of registration (not kept)", "fit of diameter (not kept)"]
     assert errors[-1] == min(errors) < 0.015 < errors[0]
 
@@ -93,7 +96,7 @@ def test_last_step_on_a_shifted_disc_is_not_worse_than_one_before():
 def test_steps_lower_the_error_or_keep_it(bench, optics):
     frames, clear_frames, screen = recorded(bench)
     work = steps(frames, clear_frames, optics, ["registration", "scale", "diameter", "leakage"])
-    first, last = (error(bench, step, screen + bench.flat) for step in (work[3], work[-1]))
+    first, last = (error(bench, step.result, screen + bench.flat) for step in (work[3], work[-1]))
     assert last < 1.05 * first
     if optics.diameter > 1.1 or bench.leakage == 0.05:
         assert last < first / 3
@@ -104,7 +107,7 @@ def test_steps_lower_the_error_or_keep_it(bench, optics):
 
 def test_rotation_that_is_not_determined_is_named_and_the_misfit_is_not_called_explained():
     bench = HcipyBench("VLT", rotations=(0.0, 1.5), photons=300.0)
-    verdict = judged(reduce_frames(registered(bench), Optics()), CameraNoise(1.0, bench.noise))
+    verdict = judge(recover_phase(reduce_frames(registered(bench), Optics())), CameraNoise(1.0, bench.noise))
     assert verdict.inner < 1.25
     assert not verdict.placed
     assert verdict.explained is None
@@ -113,19 +116,20 @@ def test_rotation_that_is_not_determined_is_named_and_the_misfit_is_not_called_e
     assert "its rotation is not determined" in verdict.findings["registration"]
 
 
-def test_scale_of_the_phase_is_determined_by_frames_that_belong_together_only(measurement):
-    verdict = judged(measurement)
+def test_scale_of_the_phase_is_determined_by_frames_that_belong_together_only(found):
+    verdict = judge(found)
     assert verdict.scales == (1.0, 1.0)
     assert verdict.findings["scale"].startswith("Determined")
-    control, phases = upside_down(measurement), recover_phase(measurement)
-    nonsense = judge(control, replace(phases, phase=iterated_phase(control, 25, 1e-4)))
+    control = upside_down(found.measurement)
+    nonsense = judge(replace(found, phase=iterated_phase(control, 25, 1e-4), measurement=control))
     assert "The scale of the phase is not determined" in nonsense.findings["scale"]
     assert f"{nonsense.strengths[0]:.2f} to {nonsense.strengths[1]:.2f} rad rms" in nonsense.findings["scale"]
     assert nonsense.strengths[1] > 1.5 * nonsense.strengths[0]
 
 
 @pytest.mark.parametrize(("factor", "words"), [(1.19, "look at dimple"), (1.21, "look at registration")])
-def test_edges_are_to_blame_if_their_share_exceeds_their_area_by_a_fifth(measurement, factor, words):
+def test_edges_are_to_blame_if_their_share_exceeds_their_area_by_a_fifth(found, factor, words):
+    measurement = found.measurement
     near = near_edges(measurement)
     area = np.mean(near[measurement.good])
     misfit = np.zeros_like(measurement.measured)
@@ -158,7 +162,7 @@ def test_photons_are_those_of_the_mean_of_the_clear_frames_and_their_noise_is_th
     even = replace(bench, fluxes=(1.0, 1.0))
     frames, clear_frames, _ = recorded(even, clear_photons=3e3)
     measurement = reduce_frames(register_frames(frames, clear_frames, exposure=1e3), Optics())
-    assert judged(measurement, CameraNoise(1.0)).inner == pytest.approx(1, abs=0.12)
+    assert judge(recover_phase(measurement), CameraNoise(1.0)).inner == pytest.approx(1, abs=0.12)
 
 
 # Places

@@ -23,11 +23,11 @@ from studies.kit.style import ALONE, show_intensity, show_phase
 from studies.kit.tables import Table
 from zwfs import opd_to_phase, phase_to_opd
 from zwfs.bench import Bench, write_bench
-from zwfs.frames import CameraNoise, Phases, recover_phase
+from zwfs.frames import CameraNoise, Phases
 from zwfs.frames.files import CameraFile, read_all
-from zwfs.frames.pipeline import Agreement, Measurement, Optics, model, reduce_frames
+from zwfs.frames.pipeline import Measurement, model, recover_phase, reduce_frames
 from zwfs.frames.refine import Step
-from zwfs.frames.registration import Image, RegisteredFrames, register_frames
+from zwfs.frames.registration import Image, register_frames
 from zwfs.frames.verdict import Verdict
 
 _FITTED = "registration", "scale", "background", "diameter", "leakage", "unmasked", "pupil_background"
@@ -76,22 +76,23 @@ def header_noise(source: CameraFile, gain: float, read_noise: float) -> CameraNo
     return CameraNoise(gain, read_noise) if gain else None
 
 
-def simulated_flat(bench: Bench, optics: Optics, n_iterations: int, seed: int) -> tuple[RegisteredFrames, Phases]:
-    """Frames of the flat mirror of a simulated bench, and their phase."""
+def simulated_flat(bench: Bench, phase: Phases, n_iterations: int, seed: int) -> Phases:
+    """Phase of frames of the flat mirror of a simulated bench, with the optics of another phase."""
     with tempfile.TemporaryDirectory() as folder:
         paths = write_bench(folder, bench, seed=np.random.default_rng([seed, 1]))
         frames, clear_frames, _ = read_all([paths["frame"]], [paths["pupils"]], [paths["dark"]])
         registered = register_frames(frames, clear_frames)
-    return registered, recover_phase(reduce_frames(registered, optics), n_iterations)
+    return recover_phase(reduce_frames(registered, phase.agreement.measurement.optics), n_iterations)
 
 
-def draw_explained(agreement: Agreement) -> Figure:
+def draw_explained(result: Phases) -> Figure:
     """Measured frames, modelled frames and their difference; bad pixels are marked."""
     figure, panels = plt.subplots(2, 3, figsize=(7.2, 5.2))
-    measurement = agreement.measurement
+    agreement, measurement = result.agreement, result.agreement.measurement
     top = np.quantile(agreement.measured[..., *measurement.window][:, measurement.good], 0.999)
-    triples = zip(agreement.measured, agreement.modelled, measurement.bad, strict=True)
-    for row, (measured, modelled, bad) in enumerate(triples):
+    for row, (measured, modelled, bad) in enumerate(
+        zip(agreement.measured, agreement.modelled, measurement.bad, strict=True)
+    ):
         shown = show_intensity(panels[row, 0], measured, top)
         show_intensity(panels[row, 1], modelled, top)
         left = np.where(bad, np.nan, measured - modelled)
@@ -109,16 +110,15 @@ def draw_explained(agreement: Agreement) -> Figure:
     return figure
 
 
-def draw_phase_map(
-    measurement: Measurement, phase: NDArray, wavelength: float, sigma: NDArray | None = None
-) -> Figure:
+def draw_phase_map(result: Phases, wavelength: float, sigma: NDArray | None = None) -> Figure:
     """Phase in radian, with a second scale in nm, and its error bar; bad points are marked."""
     n_panels = 1 if sigma is None else 2
     figure, panels = plt.subplots(1, n_panels, figsize=((4.7, 7.2)[n_panels - 1], 4.2), squeeze=False)
     axes = panels[0, 0]
     # Single points at gaps may be off by a turn: they do not set the scale.
-    shown = show_phase(axes, phase, np.nanquantile(np.abs(phase), 0.99))
+    shown = show_phase(axes, result.phase, np.nanquantile(np.abs(result.phase), 0.99))
     axes.set_title("phase", fontsize=10)
+    measurement = result.agreement.measurement
     bad = measurement.pupil.inside & ~measurement.good
     if bad.any():
         axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=2, label=f"{bad.sum()} bad points")
@@ -159,8 +159,7 @@ def draw_gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> F
             )  # fmt: skip
     panels[0].set(xlabel="score and control\n(correlation)")
     panels[0].margins(x=0.08)
-    misfits = [step.measurement.agreement(step.phases).misfit for step in work]
-    panels[1].plot(misfits, rows, color="#444444", marker="o", ms=5)
+    panels[1].plot([step.result.agreement.misfit for step in work], rows, color="#444444", marker="o", ms=5)
     panels[1].set(xlabel="misfit /\ncontrast")
     if errors is not None:
         panels[2].plot(errors, rows, color="#444444", marker="o", ms=5)
@@ -226,15 +225,16 @@ def _pulled_mirror(axes: Axes) -> None:
     axes.spines[:].set_visible(False)
 
 
-def frame_columns(agreement: Agreement) -> dict[str, NDArray]:
+def frame_columns(result: Phases) -> dict[str, NDArray]:
     """Middle rows of the frames."""
+    agreement = result.agreement
     return middle_rows({"measured": agreement.measured, "modelled": agreement.modelled})
 
 
-def phase_columns(phase: NDArray, verdict: Verdict, wavelength: float) -> dict[str, NDArray]:
+def phase_columns(result: Phases, verdict: Verdict, wavelength: float) -> dict[str, NDArray]:
     """Phase and its error bar on the middle row."""
-    middle = len(phase) // 2
-    row = phase[middle]
+    middle = result.phase.shape[0] // 2
+    row = result.phase[middle]
     return {
         "column (pixel)": np.arange(row.size),
         "phase on the middle row (rad)": row,
@@ -248,8 +248,8 @@ def step_columns(work: Sequence[Step], errors: Sequence[float] | None) -> dict[s
     columns: dict[str, Any] = {"step": [step.name for step in work]}
     columns |= {f"score, image {i + 1}": [step.predicted[i] for step in work] for i in range(2)}
     columns |= {f"control, image {i + 1}": [step.control[i] for step in work] for i in range(2)}
-    columns |= {"misfit over contrast": [step.measurement.agreement(step.phases).misfit for step in work]}
-    optics = [step.measurement.optics for step in work]
+    columns |= {"misfit over contrast": [step.result.agreement.misfit for step in work]}
+    optics = [step.result.agreement.measurement.optics for step in work]
     columns |= {name: [getattr(one, name) for one in optics] for name in ("scale", "diameter", "leakage")}
     return columns | {"difference from the commands (rad rms)": errors or np.nan}
 
@@ -265,9 +265,10 @@ def verdict_table(verdict: Verdict) -> Table:
     return Table(["question", "answer"], [[topic, sentence] for topic, sentence in verdict.findings.items()])
 
 
-def result_table(agreement: Agreement, phases: Phases) -> Table:
+def result_table(result: Phases) -> Table:
     """Places of the pupils, counts, and agreement of the frames."""
-    measurement, registered = agreement.measurement, agreement.measurement.registered
+    agreement, measurement = result.agreement, result.agreement.measurement
+    registered = measurement.registered
     placement = registered.placement
     pupils = [f"{one.row:.2f}, {one.column:.2f}, {one.diameter:.2f}" for one in registered.pupils]
     return Table(
@@ -287,7 +288,7 @@ def result_table(agreement: Agreement, phases: Phases) -> Table:
             ["the same, without the mask", f"{measurement.flux_ratio[1]:.3f}"],
             ["points of the pupil", measurement.pupil.n_points],
             ["bad points of the pupil", measurement.n_bad],
-            ["points without a unique solution", int(phases.n_unsolved)],
+            ["points without a unique solution", int(result.n_unsolved)],
             ["correlation of the frames with their fit (too optimistic)", _pair(agreement.correlation, 3)],
             ["rms difference of the frames (mean = 1)", _pair(agreement.residual, 3)],
             ["excess light around the pupil (mean = 1)", f"{agreement.excess_light:.3f}"],

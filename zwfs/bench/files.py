@@ -14,7 +14,6 @@ from zwfs._system import is_there, path_of, write_file
 from zwfs.bench.model import Bench, Seed, segment_pistons, segment_residual
 from zwfs.frames._fits import fits_content, fits_module, has_card
 from zwfs.frames.phases import Phases
-from zwfs.frames.registration import RegisteredFrames
 
 _BENCH_CARD = b"ORIGIN  = 'zwfs"  # header card of the files: no others are replaced
 _FULL = 50_000  # counts of the brightest pixel of a simulated 16-bit camera
@@ -115,37 +114,31 @@ def write_bench(
     return paths
 
 
-def bench_error(
-    bench: Bench, commanded: ArrayLike, registered: RegisteredFrames, phases: Phases,
-    flat: tuple[RegisteredFrames, Phases] | None = None,
-) -> float:  # fmt: skip
+def bench_error(bench: Bench, commanded: ArrayLike, phase: Phases, flat: Phases | None = None) -> float:
     """Rms error of the segment pistons in the phase of frames that `write_bench` wrote, radian.
 
     Parameters
     ----------
     bench : Bench
     commanded : array_like, shape (n_segments,), radian
-    registered : RegisteredFrames
-    phases : Phases
-        Of the registered frames, without a batch.
-    flat : (RegisteredFrames, Phases), optional
-        The same of the flat mirror, whose pistons are subtracted.
+    phase : Phases
+    flat : Phases, optional
+        Phase of the flat mirror, whose pistons are subtracted.
     """
     _check.instance("bench", bench, Bench)
-    pistons = _pistons(bench, registered, phases)
+    _check.instance("phase", phase, Phases)
+    pistons = _pistons(bench, phase)
     if flat is not None:
-        if not isinstance(flat, tuple) or len(flat) != 2:
-            raise TypeError(f"flat = {_check.shown(flat)}: expected a tuple of RegisteredFrames and Phases")
-        pistons = pistons - _pistons(bench, *flat)
+        _check.instance("flat", flat, Phases)
+        pistons = pistons - _pistons(bench, flat)
     return float(segment_residual(pistons, commanded).std())
 
 
-def _pistons(bench: Bench, registered: RegisteredFrames, phases: Phases) -> NDArray[np.float64]:
-    _check.instance("registered", registered, RegisteredFrames)
-    _check.instance("phases", phases, Phases)
+def _pistons(bench: Bench, phase: Phases) -> NDArray[np.float64]:
+    registered = phase.agreement.measurement.registered
     canvas = np.full(registered.clear_frames[0].counts.shape, np.nan)
     row, column = registered.corner
-    canvas[row : row + registered.n_pixels, column : column + registered.n_pixels] = phases.phase
+    canvas[row : row + registered.n_pixels, column : column + registered.n_pixels] = phase.phase
     # The pupil stands in the middle of the left half of the image.
     ny, nx = bench.segments.shape
     top = (len(canvas) - ny) // 2

@@ -32,7 +32,7 @@ True
 >>> phases = recover_phase(measurement)
 >>> bool(phases.converged), phases.phase.shape
 (True, (43, 43))
->>> write_phase(f"{folder.name}/phase.fits", measurement, phases, 635.0, sources)
+>>> write_phase(f"{folder.name}/phase.fits", phases, 635.0, sources)
 >>> bool(0.8 < fit(registered, optics, ["scale"], n_steps=2)[1].scale < 1.2)
 True
 >>> [step.name for step in steps(frames, clear_frames, optics, fitted=())][-1]
@@ -48,8 +48,9 @@ if TYPE_CHECKING:
     from zwfs.frames import calibration, files, phases, pipeline, refine, registration, telemetry, verdict
     from zwfs.frames._blocks import FileError
     from zwfs.frames._fit import BenchFit, Estimate
-    from zwfs.frames.calibration import Calibration, phase_of, recover_phase
+    from zwfs.frames.calibration import Calibration
     from zwfs.frames.phases import Phases
+    from zwfs.frames.pipeline import phase_of, recover_phase
     from zwfs.frames.telemetry import reconstruct
     from zwfs.frames.verdict import CameraNoise, judge, order_of_images
 else:

@@ -2,7 +2,7 @@
 
 `Calibration.from_files` makes it from camera files, `Calibration.from_arrays` from arrays of frames and clear
 frames, `Calibration.fit` from frames of a mirror in known states, and `Calibration.of` from a measurement that was
-registered and reduced step by step. `phase_of` and `recover_phase` calibrate with a pair and call it on that pair.
+registered and reduced step by step.
 """
 
 from __future__ import annotations
@@ -28,34 +28,21 @@ from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._errors import Excess, sideways, slopes_of
+from zwfs.frames._exposures import Exposures
 from zwfs.frames._fit import BenchFit, fit_bench
-from zwfs.frames._flux import Trial, explained
 from zwfs.frames._grid import Grid
 from zwfs.frames._learnt import WIDEST, Windows, of_bench
 from zwfs.frames._smooth import smooth_phases
 from zwfs.frames._solver import MapPrior
 from zwfs.frames.phases import Flag, Phases
-from zwfs.frames.pipeline import MOST_BAD, MOST_ITERATIONS, Measurement, Optics, ideal_frames, reduce_frames
-from zwfs.frames.registration import FRAMES, Image, register_frames
+from zwfs.frames.pipeline import Measurement, Optics, ideal_frames, measured
+from zwfs.frames.registration import FRAMES
 from zwfs.metrics import without_piston
 from zwfs.reconstructors.base import Reconstructor
 from zwfs.sensor import ZernikeSensor
 
 FORMAT = 2  # of the file; another number is refused
-_DIM = 0.1  # of the light of the calibration: a frame with less is compared with its noise
-_FAINT = 0.5  # of that light, from which down the noise of dark pixels counts
-_UNUSUAL = 2.5  # times the residual of the calibration's frames: a larger one is inconsistent
-_EXACT = 1e-3  # residual of frames without noise
-_MOVED_BY, _SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
-_SAME_LIGHT = 0.01  # relative difference of the light of frames and of their model that means little
-_LAMP = (
-    0.85,
-    1.7,
-)  # light in the pupil, over that of the calibration's frames, that other phases can make of its lamp
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
-_LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED, _MOVED = (
-    flag.value for flag in Flag
-)  # plain, and far quicker
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -299,21 +286,8 @@ class Calibration(Immutable):
         TypeError, ValueError
             If a shape is wrong, or the pupils are not found.
         """
-        sensor, unlit = Optics(**optics), 0 if dark is None else _check.real_array("dark", dark)
-        pair = []
-        for name, counts in (("frames", frames), ("clear_frames", clear_frames)):
-            images = _check.real_array(name, counts)
-            if images.ndim not in (2, 3) or images.shape[:-2] not in ((), (2,)):
-                raise ValueError(
-                    f"{name} has shape {images.shape}: expected (ny, nx), or (2, ny, nx) for two images"
-                )
-            if np.shape(unlit) not in ((), images.shape[-2:], images.shape):
-                raise ValueError(f"dark has shape {np.shape(unlit)}: expected {images.shape}, that of {name}")
-            images = (images - unlit).reshape(-1, *images.shape[-2:])
-            pair.append([Image.of(image, name) for image in images])
-        registered = register_frames(*pair, n_pupils=len(sensor.phase_shifts))
         kept = {"saturation": saturation, "n_iterations": n_iterations, "tolerance": tolerance}
-        return cls.of(reduce_frames(registered, sensor), dark, **kept)
+        return cls.of(measured(frames, clear_frames, dark, Optics(**optics)), dark, **kept)
 
     @classmethod
     def fit(
@@ -563,8 +537,9 @@ class Calibration(Immutable):
         parts = []
         for first in range(0, len(counts), _PIECE):
             piece = slice(first, first + _PIECE)
-            begin, known = (None if one is None else one[piece] for one in (start, light))
-            parts.append(self._phases(counts[piece], begin, known, level, largest_residual, judge, method))
+            begin, lamp = (None if values is None else values[piece] for values in (start, light))
+            exposures = Exposures(self, counts[piece], level, begin, method, judge)
+            parts.append(exposures.phases(lamp, largest_residual))
         return Phases._joined(parts, batch)
 
     def modal_matrix(self, modes: ArrayLike) -> NDArray[np.float64]:
@@ -665,122 +640,6 @@ class Calibration(Immutable):
     @cached_property
     def _work(self) -> Grid:
         return Grid(self)
-
-    def _phases(
-        self, counts: NDArray, start: NDArray | None, light: NDArray | None, level: float, limit: float | None,
-        judge: bool, method: Reconstructor | None,
-    ) -> Phases:  # fmt: skip
-        """Phases of camera images, (k, n_images, ny_camera, nx_camera)."""
-        work, k = self._work, len(counts)
-        values, good, n_bad, n_saturated = work.on_grid(counts, level, self.good)
-        n_good = np.maximum(np.count_nonzero(good, axis=(1, 2)), 1)
-        flux = np.vecdot(values, good.reshape(k, 1, -1).astype(np.float32)) / (n_good[:, np.newaxis] * self.unit)
-        relative, noise = flux.mean(axis=1) / self.light.mean(), self._noise(counts, flux)
-        lit = np.all((flux >= _DIM * self.light) | (flux > noise), axis=1)
-        lit &= n_good >= (1 - MOST_BAD) * self.sensor.pupil.n_points
-        flux = np.where(lit[:, np.newaxis], flux, self.light)
-        if self.balance:
-            values *= (flux.mean(axis=1, keepdims=True) / flux).astype(np.float32)[..., np.newaxis]
-        values /= self.unit[:, np.newaxis].astype(np.float32)
-        values = values.reshape(k, *self.offset.shape)
-        ideal = work.weights[:, 0] * values[:, :1] + work.weights[:, 1] * values[:, 1:]
-
-        def attempt(which: NDArray[np.intp], light: NDArray[np.float64]) -> Trial:
-            frames = ideal[which] / light[:, np.newaxis, np.newaxis, np.newaxis].astype(np.float32) + work.offset
-            frames[~lit[which]] = work.flat_frames  # of a flat wavefront: they converge at once
-            if method is None:
-                np.maximum(frames, 0, out=frames)
-            begin = None if start is None else start[which]
-            solved = work.solve(frames, good[which], begin, method)
-            residual, ratio = np.full((2, len(which)), np.nan)
-            if judge:
-                residual, ratio = work.compared(solved.phase, frames, good[which])
-            ratio, usual = ratio / self.light_ratio, self._usual(light, noise[which])
-            unsure = np.hypot(_SAME_LIGHT, 2 * usual / np.sqrt(n_good[which]))
-            cost = np.where(lit[which], (residual / usual) ** 2 + ((ratio - 1) / unsure) ** 2, 0)
-            return Trial(light, solved.phase, frames, *solved[1:], residual, ratio, cost)
-
-        same = (relative > _LAMP[0]) & (relative < _LAMP[1]) | ~lit
-        first = np.where(same, 1.0, relative) if light is None else light
-        trial = attempt(np.arange(k), first)
-        if light is None and judge:
-            trial = explained(attempt, trial)
-        residual, displacement, sigma = (np.full((k, *size), np.nan, np.float32) for size in ((), (2,), (2,)))
-        if judge and lit.any():
-            residual[lit] = trial.residual[lit]
-            shift, sigma[lit] = work.displaced(trial.phase[lit], trial.frames[lit], good[lit])
-            displacement[lit] = shift - (self.displacements.mean(axis=0) if len(self.displacements) else 0)
-        limits = _UNUSUAL * self._usual(trial.light, noise) if limit is None else limit
-        flags = _BAD * (n_bad > 0) + _SATURATED * (n_saturated > 0) + _INCONSISTENT * (residual > limits)
-        flags += np.where(lit, _NOT_CONVERGED * (~trial.converged & (self.tolerance > 0)), _LOST)
-        scatter = self.displacements.std(axis=0) if len(self.displacements) else 0
-        moved = np.abs(displacement) > np.maximum(_MOVED_BY, _SURE * np.hypot(sigma, scatter))
-        flags += _MOVED * np.any(moved, axis=1)
-        phase = np.where(good & lit[:, np.newaxis, np.newaxis], trial.phase, np.float32(np.nan))
-        flux = np.where(lit, trial.light, relative).astype(np.float32)
-        numbers = residual, displacement, trial.n_iterations, trial.n_unsolved, flags
-        return Phases(phase, trial.phase, flux, n_bad, n_saturated, *numbers)
-
-    def _noise(self, counts: NDArray, flux: NDArray) -> NDArray[np.float64]:
-        """Noise of dark pixels over `unit`, (k, 2), of exposures so faint that it counts; else 0."""
-        noise, faint = np.zeros(flux.shape), np.flatnonzero(np.any(flux < _FAINT * self.light, axis=1))
-        if faint.size:
-            noise[faint] = self._work.noise(counts[faint]) / self.unit
-        return noise
-
-    def _usual(self, light: NDArray, noise: NDArray) -> NDArray[np.float64]:
-        """Residual, (k,), that frames of the calibration would have with less light and with a noise, (k, 2)."""
-        scale = np.maximum(light, 1e-9)
-        own = max(self.residual, _EXACT) * np.sqrt(np.maximum(1 / scale, 1))
-        return np.hypot(own, np.sqrt(np.mean(noise**2, axis=1)) / scale)
-
-
-def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: float = 1e-3) -> Phases:
-    """Phase of a measurement: that of its own frames by its own calibration.
-
-    Bad pixels take no part, and are NaN in the result. One image is reconstructed by the iterated arcsine.
-
-    Parameters
-    ----------
-    measurement : Measurement
-    n_iterations : int
-        Largest number of iterations.
-    tolerance : float, radian
-        Rms of the change of the phase at which the iteration ends.
-
-    Returns
-    -------
-    Phases
-        Of shape (), without a batch.
-    """
-    n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
-    calibration = Calibration.of(measurement, n_iterations=n_iterations, tolerance=tolerance)
-    counts = np.stack([image.counts for image in measurement.registered.camera_images])
-    return calibration(counts if len(counts) == 2 else counts[0])
-
-
-def phase_of(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None = None, **optics: Any) -> Phases:
-    """Phase of a pair of camera frames, for a first look.
-
-    Parameters
-    ----------
-    frames, clear_frames, dark, **optics
-        As for `Calibration.from_arrays`, which is called on the same frames.
-
-    Returns
-    -------
-    Phases
-        Of shape (), without a batch.
-
-    Examples
-    --------
-    >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames import phase_of
-    >>> bench = Bench(n_pixels=40)
-    >>> bool(phase_of(bench.frames(), bench.clear_frames(), diameter=bench.diameter).converged)
-    True
-    """
-    return Calibration.from_arrays(frames, clear_frames, dark, **optics)(frames)
 
 
 def _undone(measurement: Measurement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

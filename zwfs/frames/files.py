@@ -25,7 +25,7 @@ from zwfs.frames._fits import fits_content, fits_module, has_card
 from zwfs.frames._part import Cards, scratch_of
 from zwfs.frames._stack import segments_of
 from zwfs.frames.phases import Phases
-from zwfs.frames.pipeline import Measurement, Optics
+from zwfs.frames.pipeline import Optics
 from zwfs.frames.registration import Image
 from zwfs.units import phase_to_opd
 
@@ -371,7 +371,6 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
 
 def write_phase(
     output: str | Path,
-    measurement: Measurement,
     phases: Phases,
     wavelength: float,
     sources: Sequence[CameraFile] = (),
@@ -387,8 +386,8 @@ def write_phase(
     ----------
     output : str or Path
         See `check_output`. An earlier phase map is replaced.
-    measurement, phases : Measurement and Phases
-        Of `recover_phase`.
+    phases : Phases
+        Of `recover_phase` or `phase_of`.
     wavelength : float, nm
     sources : sequence of CameraFiles
         Their names and checksums go into the header. None of these files is replaced.
@@ -405,12 +404,13 @@ def write_phase(
     from zwfs import __version__
 
     fits_module()
-    _check.instance("measurement", measurement, Measurement)
     _check.instance("phases", phases, Phases)
     _check.sequence("sources", sources, CameraFile)
     path = check_output(output, [source.path for source in sources if source.path], overwrite=overwrite)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-    registered, optics, agreement = measurement.registered, measurement.optics, measurement.agreement(phases.phase)
+    agreement = phases.agreement
+    measurement, registered = agreement.measurement, agreement.measurement.registered
+    optics = measurement.optics
     placement = registered.placement
     cards = [
         ("BUNIT", "rad", "in (-pi, pi]; NaN outside and at bad points"),

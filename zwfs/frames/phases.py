@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zwfs._results import PhaseResult
 from zwfs.frames._solver import MapPrior
+from zwfs.frames.pipeline import Agreement, Measurement
 
 
 class Flag(IntFlag):
@@ -76,6 +79,8 @@ class Phases(PhaseResult):
         With a smooth prior: mean square of the residuals over the noise.
     priors : tuple of MapPrior
         With a smooth prior: rms (radian), exponent of the spectrum and outer scale (D) of each exposure.
+    measurement : Measurement or None
+        Of `recover_phase` and `phase_of`: that of the pair, which `judge` and `write_phase` need.
     """
 
     phase: NDArray[np.float32]
@@ -91,16 +96,27 @@ class Phases(PhaseResult):
     sigma: NDArray[np.float64] | None = None
     misfit: NDArray[np.float64] | None = None
     priors: tuple[MapPrior, ...] = ()
+    measurement: Measurement | None = None
+
+    def __repr__(self) -> str:
+        return f"Phases(phase {self.phase.shape}, {np.count_nonzero(self.flags)} of {self.flags.size} flagged)"
 
     @property
     def converged(self) -> NDArray[np.bool_]:
         """Whether each iteration ended within its steps, shape (...)."""
         return (self.flags & Flag.NOT_CONVERGED.value) == 0
 
+    @cached_property
+    def agreement(self) -> Agreement:
+        """Agreement of the frames of `measurement` with those of the phase."""
+        if self.measurement is None:
+            raise ValueError("measurement = None: expected phases of `recover_phase` or `phase_of`")
+        return self.measurement.agreement(self.phase)
+
     @classmethod
     def _joined(cls, parts: list[Phases], batch: tuple[int, ...]) -> Phases:
         """Join parts of a batch, with one axis each, and return them in its shape."""
-        arrays = {}
+        arrays: dict[str, Any] = {}
         for name, first in parts[0]._arrays():
             whole = np.concatenate([getattr(part, name) for part in parts]) if len(parts) > 1 else first
             arrays[name] = whole.reshape((*batch, *whole.shape[1:]))

@@ -1,4 +1,4 @@
-"""Reduced camera frames: normalise them, model the sensor from its own pupil, and compare frames with their model.
+"""Camera frames to phase: normalise them, model the sensor from its own pupil, compare frames with the model.
 
 The images come from `zwfs.frames.files`, their places from `zwfs.frames.registration`. Uncertain properties of the
 sensor are parameters of `Optics`, which `zwfs.frames.refine` fits. `predict_other` tests a phase on unseen data.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,13 +17,24 @@ from scipy import ndimage
 from zwfs import _check
 from zwfs._images import nearest_good, radius
 from zwfs.frames._grid import iterated
-from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, RegisteredFrames, correlations
+from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Image, RegisteredFrames, correlations, register_frames
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
-__all__ = ["Agreement", "Measurement", "Optics", "predict_other", "reduce_frames"]
+if TYPE_CHECKING:
+    from zwfs.frames.phases import Phases
+
+__all__ = [
+    "Agreement",
+    "Measurement",
+    "Optics",
+    "phase_of",
+    "predict_other",
+    "recover_phase",
+    "reduce_frames",
+]
 
 MOST_ITERATIONS = 10_000  # of a pair of frames: more take minutes and change nothing
 _DARK = 0.1  # of the largest amplitude: a point with less is outside
@@ -251,6 +262,73 @@ class Agreement:
         return frames[(..., *self.measurement.window)][:, self.measurement.good]
 
 
+def phase_of(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None = None, **optics: Any) -> Phases:
+    """Phase of a pair of camera frames, for a first look.
+
+    Parameters
+    ----------
+    frames, clear_frames, dark, **optics
+        As for `zwfs.frames.Calibration.from_arrays`, whose calibration is called on the same frames.
+
+    Returns
+    -------
+    Phases
+        Of shape (), without a batch.
+
+    Examples
+    --------
+    >>> from zwfs.bench.model import Bench
+    >>> from zwfs.frames import phase_of
+    >>> bench = Bench(n_pixels=40)
+    >>> bool(phase_of(bench.frames(), bench.clear_frames(), diameter=bench.diameter).converged)
+    True
+    """
+    from zwfs.frames.calibration import Calibration  # late: it needs this module
+
+    measurement = measured(frames, clear_frames, dark, Optics(**optics))
+    return replace(Calibration.of(measurement, dark)(frames), measurement=measurement)
+
+
+def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: float = 1e-3) -> Phases:
+    """Phase of a measurement: that of its camera images by its own calibration.
+
+    Bad pixels take no part, and are NaN in the result. One image is reconstructed by the iterated arcsine.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    n_iterations : int
+        Largest number of iterations.
+    tolerance : float, radian
+        Rms of the change of the phase at which the iteration ends.
+
+    Returns
+    -------
+    Phases
+        Of shape (), without a batch.
+    """
+    from zwfs.frames.calibration import Calibration  # late: it needs this module
+
+    n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
+    calibration = Calibration.of(measurement, n_iterations=n_iterations, tolerance=tolerance)
+    counts = np.stack([image.counts for image in measurement.registered.camera_images])
+    return replace(calibration(counts if len(counts) == 2 else counts[0]), measurement=measurement)
+
+
+def measured(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None, optics: Optics) -> Measurement:
+    """Measurement from arrays, see `zwfs.frames.Calibration.from_arrays`."""
+    unlit, pair = 0 if dark is None else _check.real_array("dark", dark), []
+    for name, counts in (("frames", frames), ("clear_frames", clear_frames)):
+        images = _check.real_array(name, counts)
+        if images.ndim not in (2, 3) or images.shape[:-2] not in ((), (2,)):
+            raise ValueError(f"{name} has shape {images.shape}: expected (ny, nx), or (2, ny, nx) for two images")
+        if np.shape(unlit) not in ((), images.shape[-2:], images.shape):
+            raise ValueError(f"dark has shape {np.shape(unlit)}: expected {images.shape}, that of {name}")
+        images = (images - unlit).reshape(-1, *images.shape[-2:])
+        pair.append([Image.of(image, name) for image in images])
+    return reduce_frames(register_frames(*pair, n_pupils=len(optics.phase_shifts)), optics)
+
+
 def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | None = None) -> Measurement:
     """Bring frames on the grid of the pupil and normalise them.
 
@@ -407,7 +485,7 @@ def _amplitude(light: NDArray, diameter: float) -> NDArray[np.float64]:
 def iterated_phase(measurement: Measurement, n_iterations: int, tolerance: float) -> NDArray[np.float64]:
     """Phase of a measurement in double precision, (ny, nx), filled at bad points: a smooth function of the optics.
 
-    The searches use it. `zwfs.frames.calibration.recover_phase` is quicker to converge, in single precision.
+    The searches use it; `recover_phase` converges in fewer steps, in single precision.
     """
     sensor, window = model(measurement), measurement.window
     inside = ZernikeSensor(sensor.pupil, *sensor.masks, tolerance=1e-6)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from zwfs import _check
-from zwfs.frames.calibration import recover_phase
 from zwfs.frames.phases import Phases
 from zwfs.frames.pipeline import (
     MOST_ITERATIONS,
@@ -28,6 +27,7 @@ from zwfs.frames.pipeline import (
     near_edges,
     predict_other,
     prediction_error,
+    recover_phase,
     reduce_frames,
     reduce_with,
     upside_down,
@@ -181,8 +181,8 @@ class Step:
     Attributes
     ----------
     name : str
-    measurement : Measurement
-    phases : Phases
+    result : Phases
+        With its `measurement`.
     predicted : ndarray, shape (2,)
         Correlation of each frame with the prediction from the other one alone, see `predict_other`.
     control : ndarray, shape (2,)
@@ -190,8 +190,7 @@ class Step:
     """
 
     name: str
-    measurement: Measurement
-    phases: Phases
+    result: Phases
     predicted: NDArray[np.float64]
     control: NDArray[np.float64]
 
@@ -238,7 +237,7 @@ def steps(
     def add(name: str, registered: RegisteredFrames, optics: Optics) -> None:
         measurement = reduce_frames(registered, optics)
         scores = (predict_other(one, n_iterations) for one in (measurement, upside_down(measurement)))
-        work.append(Step(name, measurement, recover_phase(measurement, n_iterations), *scores))
+        work.append(Step(name, recover_phase(measurement, n_iterations), *scores))
 
     names = "registration by content", "background around the pupils", "balance of the flux"
     for n_on, name in enumerate(("outlines of the pupils", *names)):
@@ -246,11 +245,11 @@ def steps(
         switches["n_pupils"] = len(optics.phase_shifts)
         add(name, register_frames(frames, clear_frames, **settings, **switches), optics)
     if optics.single and fitted:
-        last = work[-1].measurement
+        last = work[-1].result.agreement.measurement
         add("no fit: one image cannot test it", last.registered, last.optics)
         return work
     for number, name in enumerate(fitted, 1):
-        last = work[-1].measurement
+        last = work[-1].result.agreement.measurement
         found = fit(last.registered, last.optics, fitted[:number], n_iterations)
         kept = "" if found[1] is not last.optics else " (not kept)"
         add(f"fit of {name.replace('_', ' ')}{kept}", *found)

@@ -135,16 +135,13 @@ class Verdict(Result):
         return bool(self.inner <= _EXPLAINED)
 
 
-def judge(
-    measurement: Measurement, phases: Phases, noise: CameraNoise | None = None, n_iterations: int = 25
-) -> Verdict:
+def judge(phases: Phases, noise: CameraNoise | None = None, n_iterations: int = 25) -> Verdict:
     """Judge a measured phase, in words and numbers.
 
     Parameters
     ----------
-    measurement : Measurement
     phases : Phases
-        Of `recover_phase`, or of any other calibration on the same grid, without a batch.
+        Of `recover_phase` or `phase_of`.
     noise : CameraNoise, optional
         Without it there is no error bar, and the misfit is not compared with the noise.
     n_iterations : int
@@ -167,15 +164,15 @@ def judge(
     >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
     >>> measurement = reduce_frames(register_frames([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
     >>> noise = CameraNoise(gain=1.0, read_noise=bench.read_noise)
-    >>> verdict = judge(measurement, recover_phase(measurement), noise)
+    >>> verdict = judge(recover_phase(measurement), noise)
     >>> verdict.score.round(1), bool(np.all(verdict.score > verdict.control + 0.2))
     (array([0.9, 0.9]), True)
     >>> round(float(np.nanmedian(verdict.sigma) * noise.photons(measurement) ** 0.5), 1)
     0.6
     """
-    _check.instance("measurement", measurement, Measurement)
     _check.instance("phases", phases, Phases)
-    phase, agreement = phases.phase, measurement.agreement(phases.phase)
+    phase, agreement = phases.phase, phases.agreement
+    measurement = agreement.measurement
     score = predict_other(measurement, n_iterations)
     control = predict_other(upside_down(measurement), n_iterations)
     near, single = near_edges(measurement), measurement.optics.single

@@ -48,9 +48,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m zwfs.frames", description=about, **shared)
     commands = parser.add_subparsers(required=True, metavar="command")
     files: dict[str, Any] = {"nargs": "+", "metavar": "FILE"}
-    one = commands.add_parser("calibrate", help="make a calibration from frames and clear frames", **shared)
-    one.set_defaults(run=_calibrate)
-    add = one.add_argument
+    calibrate = commands.add_parser("calibrate", help="make a calibration from frames and clear frames", **shared)
+    calibrate.set_defaults(run=_calibrate)
+    add = calibrate.add_argument
     add("output", help="calibration to write, NPZ")
     add("--frames", dest="frame_files", required=True, help="a frame, or one for each image", **files)
     add("--pupils", dest="pupil_files", required=True, help="clear frames, likewise", **files)
@@ -85,9 +85,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--iterations", dest="n_iterations", type=int, default=25, metavar="N", help="default: 25")
     add("--tolerance", type=float, default=1e-3, metavar="RAD", help="that ends them; default: 1e-3")
     add("--quiet", action="store_true", help="no steps of a fit")
-    two = commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared)
-    two.set_defaults(run=_reconstruct)
-    add = two.add_argument
+    reconstruct = commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared)
+    reconstruct.set_defaults(run=_reconstruct)
+    add = reconstruct.add_argument
     add("frames", nargs="+", help="FITS or NPY files with frames")
     add("--calibration", required=True, metavar="FILE", help="that `calibrate` wrote")
     add("--output", "-o", required=True, metavar="FILE", help="FITS file to write")

@@ -58,19 +58,19 @@ class Source(NamedTuple):
 
     def commanded(self, commands: Path, **camera: Any) -> Calibration:
         """Calibration with a fit of the bench, or without where the fit measures an unseen state no better."""
-        if others := set(self.settings) - {"pupil_centers", "pupil_diameter"}:
-            raise TypeError(f"{min(others)} with commands: expected pupil_centers and pupil_diameter only")
+        if excess := set(self.settings) - {"pupil_centers", "pupil_diameter"}:
+            raise TypeError(f"{min(excess)} with commands: expected pupil_centers and pupil_diameter only")
         states = _read_states(self.files, commands, self.saturation, self.n_images)
         header = states.header
         shifts = self.phase_shifts or (header.get("THETA1", np.pi / 2), header.get("THETA2", -np.pi / 2))
         optics = Optics(self.diameter or header.get("DIMPLE", 1.06), shifts)
         if optics.single:
             raise ValueError(f"phase_shifts = {_check.shown(shifts)} with commands: expected two")
-        kept = self.kept | {"saturation": states.saturation, "bunit": str(header.get("BUNIT", ""))}
+        attributes = self.kept | {"saturation": states.saturation, "bunit": str(header.get("BUNIT", ""))}
         place = {name: self.settings.get(name) for name in ("pupil_centers", "pupil_diameter")}
         windows, n_pixels = _windows(states, *place.values())
         frames, clear = windows.cut(states.frames), windows.cut(states.clear)
-        settings = camera | kept | {"n_pixels": n_pixels, "diameter": optics.diameter}
+        settings = camera | attributes | {"n_pixels": n_pixels, "diameter": optics.diameter}
         settings |= {"phase_shifts": optics.phase_shifts, "n_images": windows.n_images}
 
         def fitted_to(n_states: int) -> Calibration:
@@ -78,7 +78,7 @@ class Source(NamedTuple):
             return Calibration.fit(*data, corners=windows.corners, shape=windows.shape, **settings)
 
         try:
-            plain = Calibration.of(_measured(states, optics, place), states.dark, **kept)
+            plain = Calibration.of(_measured(states, optics, place), states.dark, **attributes)
         except ValueError as error:
             warnings.warn(f"The fit was not compared with a calibration without commands: {error}", stacklevel=3)
         else:
@@ -123,10 +123,10 @@ def _error_of_last(calibration: Calibration, grid: Calibration, states: _States)
     first, last = (ndimage.map_coordinates(wave, (row, column), order=1) for wave in waves)
     change = np.exp(1j * (states.commands[-1] - states.commands[0]))
     inner = ndimage.binary_erosion(grid.good, iterations=2)
-    known = inner & (
+    compared = inner & (
         np.minimum(np.abs(first), np.abs(last)) > 0.8
     )  # next to a point without a phase it is smaller
-    error = (last * np.conj(first * change))[known]
+    error = (last * np.conj(first * change))[compared]
     return float(np.angle(error * np.conj(error.mean())).std())
 
 
@@ -175,7 +175,8 @@ def _read_states(
     bad |= ~np.isfinite(dark + clear_dark)
     level = stack.saturation if saturation is None else saturation
     clear, frames = (
-        np.where(bad | ~(one < level), np.nan, one - less) for one, less in ((clear, clear_dark), (frames, dark))
+        np.where(bad | ~(cube < level), np.nan, cube - unlit)
+        for cube, unlit in ((clear, clear_dark), (frames, dark))
     )
     dark = np.nan_to_num(dark)
     frames = frames.reshape(len(phases), -1, *frames.shape[1:])

@@ -51,10 +51,10 @@ class Trial(NamedTuple):
     ratio: NDArray[np.float64]  # (k,), light of the frames over that of their model
     cost: NDArray[np.float64]  # (k,), of both: 1 for frames like those of the calibration
 
-    def improved(self, which: NDArray[np.intp], other: Trial, factor: float = 1.0) -> NDArray[np.bool_]:
+    def improved(self, which: NDArray[np.intp], rival: Trial, factor: float = 1.0) -> NDArray[np.bool_]:
         """Take over those of some exposures that cost less than a part of what they cost here."""
-        better = other.cost < factor * self.cost[which]
-        pairs: zip[tuple[NDArray, NDArray]] = zip(self, other, strict=True)
+        better = rival.cost < factor * self.cost[which]
+        pairs: zip[tuple[NDArray, NDArray]] = zip(self, rival, strict=True)
         for mine, new in pairs:
             mine[which[better]] = new[better]
         return better

@@ -101,13 +101,13 @@ class Grid:
             axes = zip((row, column), size, calibration.shape, strict=True)
             self.boxes.append((min(index, calibration.n_images - 1), *(_span(*axis) for axis in axes)))
         pairs = calibration.dark, calibration.bad
-        dark, bad = (np.stack([one[i][rows][:, columns] for i, rows, columns in self.boxes]) for one in pairs)
+        dark, bad = (np.stack([maps[i][rows][:, columns] for i, rows, columns in self.boxes]) for maps in pairs)
         self.dark, self.bad = dark + calibration.background[:, np.newaxis, np.newaxis].astype(np.float32), bad
         corners, inside = places - low[:, :, np.newaxis], pupil.inside.ravel().astype(float)
-        self.touching = [_interpolation(one, size, 1, inside) for one in corners]  # from all pixels of a box
+        self.touching = [_interpolation(place, size, 1, inside) for place in corners]  # from all pixels of a box
         near = ndimage.binary_dilation(pupil.inside, iterations=_RIM)
         self.splines = [
-            _interpolation(one - _CUT, size - 2 * _CUT, 3, near.ravel().astype(float)) for one in corners
+            _interpolation(place - _CUT, size - 2 * _CUT, 3, near.ravel().astype(float)) for place in corners
         ]
         inner = ndimage.binary_erosion(pupil.inside)
         rim = near & ~inner
@@ -116,11 +116,11 @@ class Grid:
         self.beyond = ~pupil.inside.ravel()[self.rim]  # points of the rim outside the pupil
         self.edge = _repair(pupil.inside & ~inner, inner)  # points of the edge, and the nearest ones off it
         self.filters = [_spline_filter(length, calibration.blur) for length in size]  # to their coefficients
-        reached = np.stack([one.sum(axis=0) > 0 for one in self.touching])
+        reached = np.stack([matrix.sum(axis=0) > 0 for matrix in self.touching])
         self.watched = reached.reshape(bad.shape) & ~bad  # good pixels from which the pupil is made
         self.dim = ~reached.reshape(bad.shape) & ~bad  # good pixels around it
         # Bad pixels of each box, and bad points of the pupil, with their nearest good ones.
-        self.repairs = [_repair(one, ~one) for one in bad]
+        self.repairs = [_repair(pixels, ~pixels) for pixels in bad]
         self.holes = _repair(pupil.inside & ~calibration.good, calibration.good)
 
     def on_grid(self, counts: NDArray, level: float, good: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
@@ -144,8 +144,8 @@ class Grid:
         for index, (pixels, nearest) in enumerate(self.repairs):
             flat[:, index, pixels] = flat[:, index, nearest]
         for place in np.flatnonzero(strange):
-            for index, one in enumerate(odd[place]):
-                usable = ~(one | self.bad[index])
+            for index, spoiled_pixels in enumerate(odd[place]):
+                usable = ~(spoiled_pixels | self.bad[index])
                 raw[place, index] = nearest_good(raw[place, index], usable) if usable.any() else 0
         coefficients = self.filters[0] @ raw @ self.filters[1].T
         values = np.stack(
@@ -225,7 +225,8 @@ class Grid:
         """Points with a bad pixel on one of their sides: (k, 2, h, w) to (k, ny, nx)."""
         k, shape = len(spoiled), self.offset.shape[1:]
         weights = sum(
-            one @ spoiled[:, index].reshape(k, -1).T.astype(np.float32) for index, one in enumerate(self.touching)
+            matrix @ spoiled[:, index].reshape(k, -1).T.astype(np.float32)
+            for index, matrix in enumerate(self.touching)
         )
         return (weights.T > _TOUCHED).reshape(k, *shape)
 

@@ -92,25 +92,25 @@ def of_bench(
 
     The focus of the relay is corrected to first order, around a flat wavefront.
     """
-    made = _unweighted(kind, bench, counts, dark, windows, settings)
-    work, shape = made._work, made.good.shape
-    good = made.good & ~work.touched(work.bad[np.newaxis])[0]
+    calibration = _unweighted(kind, bench, counts, dark, windows, settings)
+    work, shape = calibration._work, calibration.good.shape
+    good = calibration.good & ~work.touched(work.bad[np.newaxis])[0]
 
     def intensity(pairs: NDArray) -> NDArray:
-        values = work.on_grid(windows.on_camera(np.nan_to_num(pairs)) + made.dark, np.inf, good)[0]
-        return values.reshape(len(values), 2, *shape) / made.unit[:, np.newaxis, np.newaxis]
+        values = work.on_grid(windows.on_camera(np.nan_to_num(pairs)) + calibration.dark, np.inf, good)[0]
+        return values.reshape(len(values), 2, *shape) / calibration.unit[:, np.newaxis, np.newaxis]
 
-    seen, ideal = training(bench, made.sensor)
-    weights, offset = learnt(intensity(seen), ideal, made.optics)
+    counts_seen, ideal = training(bench, calibration.sensor)
+    weights, offset = learnt(intensity(counts_seen), ideal, calibration.optics)
     light = intensity(counts)[..., good].mean(axis=(0, 2))
-    made = replace(made, good=good, weights=weights, offset=offset, light=light)
-    images = windows.on_camera(np.nan_to_num(counts)) + made.dark
+    calibration = replace(calibration, good=good, weights=weights, offset=offset, light=light)
+    images = windows.on_camera(np.nan_to_num(counts)) + calibration.dark
     # The lamp is that of the calibration, so its light is known.
-    measured = made(images if windows.n_images == 2 else images[:, 0], light=1.0, saturation=np.inf)
+    measured = calibration(images if windows.n_images == 2 else images[:, 0], light=1.0, saturation=np.inf)
     ideal = np.einsum("ijyx,kjyx->kiyx", weights, intensity(counts)) + offset
-    _, ratios = made._work.compared(measured.filled, ideal, np.broadcast_to(good, measured.phase.shape))
+    _, ratios = calibration._work.compared(measured.filled, ideal, np.broadcast_to(good, measured.phase.shape))
     return replace(
-        made, light_ratio=float(ratios.mean()), unexplained=unexplained(measured.phase, phases),
+        calibration, light_ratio=float(ratios.mean()), unexplained=unexplained(measured.phase, phases),
         slopes=slopes_of(measured.filled, good), displacements=measured.displacement.astype(float),
         residual=float(np.nanmax(measured.residual)),
     )  # fmt: skip
@@ -146,14 +146,14 @@ def training(fit: BenchFit, sensor: ZernikeSensor) -> tuple[NDArray[np.float64],
     n, flat = len(inside), _smooth(fit.flat, inside)
     frequency = np.hypot(*np.meshgrid(*(fft.fftfreq(2 * n) * sensor.pupil.n_pixels,) * 2))
     colour = (frequency**2 + 0.5) ** -0.95 * np.exp(-((frequency / _FINEST) ** 2))
-    seen, ideal = [], []
+    frames, ideal = [], []
     for index in range(_SCREENS):
         screen = fft.ifft2(fft.fft2(rng.normal(size=colour.shape)) * colour).real[:n, :n]
         screen = (screen - screen[inside].mean()) / screen[inside].std()
         phase = flat + _RMS[index % len(_RMS)] * screen
-        seen.append(model.frames(phase))
+        frames.append(model.frames(phase))
         ideal.append(sensor.measure(np.where(inside, phase, 0))[(..., *sensor.window)])
-    return np.array(seen), np.array(ideal)
+    return np.array(frames), np.array(ideal)
 
 
 def learnt(values: NDArray, ideal: NDArray, optics: Optics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -170,5 +170,5 @@ def learnt(values: NDArray, ideal: NDArray, optics: Optics) -> tuple[NDArray[np.
 def _smooth(image: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Mean of neighbours inside, without a trace of a chequerboard."""
     kernel = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25])
-    values, weights = (ndimage.convolve(one, kernel, mode="constant") for one in (inside * image, 1.0 * inside))
+    values, weights = (ndimage.convolve(area, kernel, mode="constant") for area in (inside * image, 1.0 * inside))
     return np.where(inside, values / np.maximum(weights, 1e-9), image)

@@ -248,8 +248,8 @@ class Calibration(Immutable):
         if n_images is not None:
             n_images = _check.integer("n_images", n_images, 1, 2)
         files = frame_files, pupil_files, dark_files, bad_pixel_files, pupil_dark_files
-        kept = {"n_iterations": n_iterations, "tolerance": tolerance}
-        source = Source(files, diameter, tuple(phase_shifts), saturation, n_images, settings, kept)
+        attributes = {"n_iterations": n_iterations, "tolerance": tolerance}
+        source = Source(files, diameter, tuple(phase_shifts), saturation, n_images, settings, attributes)
         if commands is None:
             return source.registered(fitted)
         if fitted:
@@ -286,8 +286,8 @@ class Calibration(Immutable):
         TypeError, ValueError
             If a shape is wrong, or the pupils are not found.
         """
-        kept = {"saturation": saturation, "n_iterations": n_iterations, "tolerance": tolerance}
-        return cls.of(measured(frames, clear_frames, dark, Optics(**optics)), dark, **kept)
+        attributes = {"saturation": saturation, "n_iterations": n_iterations, "tolerance": tolerance}
+        return cls.of(measured(frames, clear_frames, dark, Optics(**optics)), dark, **attributes)
 
     @classmethod
     def fit(
@@ -384,7 +384,7 @@ class Calibration(Immutable):
         counts, _ = registered._on_grid(FRAMES)
         unit, background = measurement.counts * registered.exposure, measurement.background[:2]
         weights, offset = _undone(measurement)
-        made = cls(
+        calibration = cls(
             pupil.amplitude, pupil.n_pixels, pupil.center, measurement.optics, shape, len(images),
             registered.places()[:2], _dark(dark, (len(images), *shape)), np.stack([image.bad for image in images]),
             good, background / registered.areas[:2], unit / registered.areas[:2], weights, offset,
@@ -394,12 +394,12 @@ class Calibration(Immutable):
         )  # fmt: skip
         inner = (..., *measurement.window)
         frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
-        phase = made._work.solve(frames, good[np.newaxis]).phase
-        errors = sideways(made.sensor, phase[0], frames[0], good)[np.newaxis]
-        shift = made._work.displaced(phase, frames, good[np.newaxis])[0]
-        residual, ratio = made._work.compared(phase, frames, good[np.newaxis])
+        phase = calibration._work.solve(frames, good[np.newaxis]).phase
+        errors = sideways(calibration.sensor, phase[0], frames[0], good)[np.newaxis]
+        shift = calibration._work.displaced(phase, frames, good[np.newaxis])[0]
+        residual, ratio = calibration._work.compared(phase, frames, good[np.newaxis])
         return replace(
-            made, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift,
+            calibration, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift,
             residual=float(residual[0]), light_ratio=float(ratio[0]),
         )  # fmt: skip
 
@@ -433,16 +433,18 @@ class Calibration(Immutable):
         _check_sizes(path)
         with broken(f"{path.name}: a broken calibration"), np.load(path, allow_pickle=False) as file:
             values: dict[str, Any] = json.loads(str(file["values"]))
-            found = values.pop("format")
-            if found == FORMAT:
+            file_format = values.pop("format")
+            if file_format == FORMAT:
                 values |= {name: file[name] for name in file.files if name != "values"}
                 values |= {name: tuple(values[name]) for name in ("center", "shape")}
                 shifts = {"phase_shifts": tuple(values["optics"]["phase_shifts"])}
-                made = cls(**values | {"optics": Optics(**values["optics"] | shifts)})
-                trial = made.dark + np.mean(made.background + made.unit * made.light)
-                made(trial[0] if made.n_images == 1 else trial)
-                return made
-        raise FileError(f"{path.name}: a calibration of format {found}: expected format {FORMAT}; make it again")
+                calibration = cls(**values | {"optics": Optics(**values["optics"] | shifts)})
+                trial = calibration.dark + np.mean(calibration.background + calibration.unit * calibration.light)
+                calibration(trial[0] if calibration.n_images == 1 else trial)
+                return calibration
+        raise FileError(
+            f"{path.name}: a calibration of format {file_format}: expected format {FORMAT}; make it again"
+        )
 
     @cached_property
     def sha256(self) -> str:
@@ -508,32 +510,23 @@ class Calibration(Immutable):
         level, judge = min(saturation, _check.LARGEST), _check.flag("judge", judge)
         if largest_residual is not None:
             largest_residual = _number_or_inf("largest_residual", largest_residual)
-        counts, grid = counts.reshape(-1, self.n_images, *self.shape), self.good.shape
+        counts = counts.reshape(-1, self.n_images, *self.shape)
         if smooth is not False or noise is not None:
-            others = {"start": start, "light": light, "largest_residual": largest_residual, "method": method}
-            for name, value in others.items():
+            options = {"start": start, "light": light, "largest_residual": largest_residual, "method": method}
+            for name, value in options.items():
                 if value is not None:
                     raise ValueError(f"{name} with smooth or noise: expected none")
             return Phases._joined([smooth_phases(self, counts, level, smooth, noise)], batch)
         if start is not None:
-            maps = _check.real_array("start", start)
-            if maps.shape not in (grid, (*batch, *grid)):
-                raise ValueError(f"start has shape {maps.shape}: expected {grid} or {(*batch, *grid)}")
-            _check.moderate("start", maps)
-            start = np.broadcast_to(maps, (*batch, *grid)).reshape(-1, *grid)
+            start = _spread_start(start, batch, self.good.shape)
+        if light is not None:
+            light = _spread_light(light, batch)
         if method is not None:
             _check.instance("method", method, Reconstructor)
             if method.sensor is not self.sensor:
                 raise ValueError("method has another sensor: expected `sensor` of this calibration")
             if start is not None and not method.iterative:
                 raise ValueError(f"start with method = {method!r}: expected none, because it does not iterate")
-        if light is not None:
-            lights = _check.real_array("light", light)
-            if lights.shape not in ((), batch) or not np.all((lights > 0) & (lights < np.inf)):
-                raise ValueError(
-                    f"light = {_check.shown(lights.tolist())}: expected finite numbers above 0, one or {batch}"
-                )
-            light = np.broadcast_to(lights, batch).reshape(-1)
         parts = []
         for first in range(0, len(counts), _PIECE):
             piece = slice(first, first + _PIECE)
@@ -651,6 +644,24 @@ def _undone(measurement: Measurement) -> tuple[NDArray[np.float64], NDArray[np.f
 
     offset = ideal(0, 0)
     return np.stack([ideal(1, 0) - offset, ideal(0, 1) - offset], axis=1), offset
+
+
+def _spread_start(start: ArrayLike, batch: tuple[int, ...], grid: tuple[int, ...]) -> NDArray[np.float64]:
+    """Checked phases at which iterations start, (n, ny, nx)."""
+    maps = _check.real_array("start", start)
+    if maps.shape not in (grid, (*batch, *grid)):
+        raise ValueError(f"start has shape {maps.shape}: expected {grid} or {(*batch, *grid)}")
+    _check.moderate("start", maps)
+    return np.broadcast_to(maps, (*batch, *grid)).reshape(-1, *grid)
+
+
+def _spread_light(light: ArrayLike, batch: tuple[int, ...]) -> NDArray[np.float64]:
+    """Checked light of exposures, (n,)."""
+    lights = _check.real_array("light", light)
+    if lights.shape not in ((), batch) or not np.all((lights > 0) & (lights < np.inf)):
+        shown = _check.shown(lights.tolist())
+        raise ValueError(f"light = {shown}: expected finite numbers above 0, one or {batch}")
+    return np.broadcast_to(lights, batch).reshape(-1)
 
 
 def _is_calibration(path: Path) -> bool:

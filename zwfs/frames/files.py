@@ -218,8 +218,8 @@ def read_all(
         As for `read` and `images`, or if a dark or map has the shape of no frame.
     """
     names = "frame_files", "pupil_files", "dark_files", "bad_pixel_files", "pupil_dark_files"
-    given = frame_files, pupil_files, dark_files, bad_pixel_files, pupil_dark_files
-    kinds = [paths_of(name, paths) for name, paths in zip(names, given, strict=True)]
+    lists = frame_files, pupil_files, dark_files, bad_pixel_files, pupil_dark_files
+    kinds = [paths_of(name, paths) for name, paths in zip(names, lists, strict=True)]
     for name, paths in zip(names[:2], kinds, strict=False):
         if not paths:
             raise ValueError(f"{name} is empty: expected one file or more")
@@ -277,8 +277,8 @@ def images(
         If the number of images or a shape is wrong, every pixel of an image or of its dark is bad, or a bad-pixel
         map marks more than half of the pixels.
     """
-    for argument, given in (("files", files), ("darks", darks), ("bad_pixels", bad_pixels)):
-        _check.sequence(argument, given, CameraFile)
+    for argument, listed in (("files", files), ("darks", darks), ("bad_pixels", bad_pixels)):
+        _check.sequence(argument, listed, CameraFile)
     if saturation is not None:
         saturation = _check.number("saturation", saturation, 0, open_low=True)
     if n_images is not None:
@@ -538,10 +538,12 @@ def _companion(
     """Dark or bad-pixel map of an image of a file: the mean of those that belong to it; 0 without files."""
     if not files:
         return np.zeros(())
-    shape, other = frame.images.shape[1:], files[0].images.shape[1:]
+    shape, first_shape = frame.images.shape[1:], files[0].images.shape[1:]
     same = [file for file in files if file.images.shape[1:] == shape]
     if not same:
-        raise ValueError(f"{argument}: {_names(files)} has shape {other}: expected {shape}, that of {frame.name}")
+        raise ValueError(
+            f"{argument}: {_names(files)} has shape {first_shape}: expected {shape}, that of {frame.name}"
+        )
     for file in same:
         if argument == "bad_pixels" and (share := np.mean(file.images != 0)) > 0.5:
             raise ValueError(
@@ -564,8 +566,8 @@ def _companion(
 def _check_alike(exposures: Sequence[_Exposure]) -> None:
     """Require that darks of one image differ by no more than their noise."""
     first, number = exposures[0]
-    for file, other in exposures[1:]:
-        change = file.images[other] - first.images[number]
+    for file, index in exposures[1:]:
+        change = file.images[index] - first.images[number]
         middle = np.nanmedian(change)
         if abs(middle) > _ALIKE * np.nanmedian(np.abs(change - middle)):
             raise ValueError(

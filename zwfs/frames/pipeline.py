@@ -89,7 +89,7 @@ class Optics:
         _check.sequence("phase_shifts", self.phase_shifts, expected="a list of one or two numbers")
         if len(self.phase_shifts) not in (1, 2):
             raise ValueError(f"phase_shifts has {len(self.phase_shifts)} values: expected one or two")
-        shifts = tuple(_check.number("phase_shifts", one) for one in self.phase_shifts)
+        shifts = tuple(_check.number("phase_shifts", shift) for shift in self.phase_shifts)
         object.__setattr__(self, "phase_shifts", shifts)
         first, second = np.exp(1j * np.array([shifts[0], shifts[-1]]))
         if min(abs(first - second) if len(shifts) == 2 else 1, abs(first - 1), abs(second - 1)) < 1e-9:
@@ -445,11 +445,11 @@ def _gains(images: NDArray, inside: NDArray, center: tuple[float, float], diamet
         return np.ones_like(images)
     ratio = np.log(images[1, lit] / images[0, lit])
     basis, triangle = np.linalg.qr(terms[lit])
-    found = basis.T @ ratio
-    noise = 1.48 * np.median(np.abs(ratio - basis @ found))  # robust standard deviation
-    found *= np.maximum(1 - (_CERTAIN * noise) ** 2 / np.maximum(found**2, 1e-300), 0)
-    found[0] = 0  # the scale of each image is measured apart
-    half = terms @ np.linalg.solve(triangle, found) / 2
+    coefficients = basis.T @ ratio
+    noise = 1.48 * np.median(np.abs(ratio - basis @ coefficients))  # robust standard deviation
+    coefficients *= np.maximum(1 - (_CERTAIN * noise) ** 2 / np.maximum(coefficients**2, 1e-300), 0)
+    coefficients[0] = 0  # the scale of each image is measured apart
+    half = terms @ np.linalg.solve(triangle, coefficients) / 2
     return np.exp([-half, half])
 
 
@@ -540,10 +540,10 @@ def predicted_frames(measurement: Measurement, n_iterations: int = 25) -> NDArra
     n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
     both, frames = model(measurement), np.maximum(ideal_frames(measurement), 0)
     predicted = []
-    for seen in (1, 0):
-        sensor = ZernikeSensor(measurement.pupil, both.masks[seen], extent=both.extent, tolerance=1e-6)
-        estimate = Arcsine(sensor, n_iterations=n_iterations, tolerance=1e-4)(frames[seen : seen + 1])
-        predicted.append(both.measure(estimate.phase)[1 - seen][measurement.window])
+    for number in (1, 0):
+        sensor = ZernikeSensor(measurement.pupil, both.masks[number], extent=both.extent, tolerance=1e-6)
+        estimate = Arcsine(sensor, n_iterations=n_iterations, tolerance=1e-4)(frames[number : number + 1])
+        predicted.append(both.measure(estimate.phase)[1 - number][measurement.window])
     return np.stack(predicted)
 
 
@@ -567,8 +567,8 @@ def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:
     levels = []
     for image in registered.clear_frames:
         far = ~image.bad
-        for circle, other in zip(registered.pupils, registered.clear_frames, strict=True):
-            if other is image:  # both pupils may be on one image
+        for circle, holder in zip(registered.pupils, registered.clear_frames, strict=True):
+            if holder is image:  # both pupils may be on one image
                 far &= radius(far.shape, circle[:2]) > 0.58 * circle.diameter
         enough = np.count_nonzero(far) >= 100 and not image.cut
         levels.append(float(np.median(image.counts[far])) if enough else 0.0)

@@ -244,7 +244,7 @@ def _noise_kept(registered: RegisteredFrames) -> tuple[NDArray[np.float64], NDAr
     rng = np.random.default_rng(0)
 
     def noise(images: Any) -> Any:
-        return tuple(replace(one, counts=rng.normal(size=one.counts.shape)) for one in images)
+        return tuple(replace(image, counts=rng.normal(size=image.counts.shape)) for image in images)
 
     white = replace(registered, frames=noise(registered.frames), clear_frames=noise(registered.clear_frames))
     frames, clear = (white._on_grid(which)[0].var(axis=(1, 2)) for which in (FRAMES, CLEAR_FRAMES))
@@ -263,9 +263,9 @@ def _scales(measurement: Measurement, n_iterations: int) -> tuple[tuple[float, f
     """
     errors, strengths = [], []
     for factor in _FACTORS:
-        one = replace(measurement, optics=replace(measurement.optics, scale=factor * measurement.optics.scale))
-        errors.append(float(prediction_error(one, one.good, n_iterations).mean()))
-        waves = np.exp(1j * iterated_phase(one, n_iterations, _TOLERANCE)[one.good])
+        scaled = replace(measurement, optics=replace(measurement.optics, scale=factor * measurement.optics.scale))
+        errors.append(float(prediction_error(scaled, scaled.good, n_iterations).mean()))
+        waves = np.exp(1j * iterated_phase(scaled, n_iterations, _TOLERANCE)[scaled.good])
         strengths.append(float(np.angle(waves * np.conj(waves.mean())).std()))
     least, here = min(errors), errors[_FACTORS.index(1.0)]
     well = np.array(errors) <= max(here, least * (1 + np.clip(least, _AS_WELL, 1)))
@@ -360,20 +360,20 @@ def _of_place(placement: Placement) -> str:
 
 def _warnings(agreement: Agreement, phases: Phases) -> list[str]:
     """Facts that lower the trust in the phase."""
-    measurement, found = agreement.measurement, []
+    measurement, remarks = agreement.measurement, []
     n_points = measurement.pupil.n_points
     if not phases.converged:
-        found.append("The iteration has not converged: raise n_iterations, or the phase is beyond its range.")
+        remarks.append("The iteration has not converged: raise n_iterations, or the phase is beyond its range.")
     if phases.n_unsolved > _MANY * n_points:
-        found.append(f"At {phases.n_unsolved} of {n_points} points the equations have no unique solution.")
+        remarks.append(f"At {phases.n_unsolved} of {n_points} points the equations have no unique solution.")
     if measurement.n_bad > _MANY * n_points:
-        found.append(f"{measurement.n_bad} of {n_points} points are bad and have no phase.")
+        remarks.append(f"{measurement.n_bad} of {n_points} points are bad and have no phase.")
     if abs(agreement.excess_light) > _EXCESS:
-        found.append(
+        remarks.append(
             f"Around the pupil the frames differ from the model by {agreement.excess_light:+.3f} of the mean "
             "light: look at the dark, stray light and the diameter of the dimple."
         )
-    return found
+    return remarks
 
 
 @dataclass(frozen=True)
@@ -471,7 +471,7 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
 
 def _skewness(flat: Measurement, poked: Measurement, n_iterations: int) -> float:
     """How far the change of phase has one sign, in [-1, 1]; the cube weights the poke and not the noise."""
-    first, second = (iterated_phase(one, n_iterations, _TOLERANCE) for one in (flat, poked))
+    first, second = (iterated_phase(measurement, n_iterations, _TOLERANCE) for measurement in (flat, poked))
     waves = np.exp(1j * (second - first)[flat.good & poked.good])
     change: NDArray[np.float64] = np.angle(waves * np.exp(-1j * np.angle(waves.mean())))
     cubes = (change - np.median(change)) ** 3

@@ -13,10 +13,12 @@ from zwfs.frames import Calibration
 from zwfs.frames import _fit as fitting
 from zwfs.frames._fit import fit_bench
 from zwfs.frames._fitted import unwrapped
+from zwfs.frames._learnt import Windows, of_bench
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
 from zwfs.frames._solver import Eliminated, fine_phase
 from zwfs.frames._states import PAD, Recording
+from zwfs.frames.phases import Flag
 
 from .hcipy_bench import BEFORE, BORDER, CASES, RMS, HcipyBench
 
@@ -332,6 +334,25 @@ def test_calibrated_phase_has_half_the_error_that_the_plain_route_had(calibrated
     left = (found - bench.on_pupil(screen + bench.flat))[bench.fully_lit]
     pull = (left - left.mean()) / found.sigma[bench.fully_lit]
     assert 0.5 < pull.std() < 2
+
+
+def test_smooth_phase_of_a_whole_camera_image_is_that_of_its_windows():
+    bench, calibration = BENCH, fitted(BENCH)
+    frames, _, phases = bench.recording(seed=1)
+    windows = Windows.checked((52, 52), [[3, 2], [1, 60]], 1, (60, 120))
+    dark = np.full((1, 60, 120), 50, np.float32)
+    whole = of_bench(Calibration, calibration.bench, frames, phases, dark, windows)
+    counts = bench.counts(bench.smooth(0.3, seed=1), (7, 1))
+    counts[1, 20, 30] = np.nan
+    [image] = windows.on_camera(counts[np.newaxis])[0] + 50
+    [prior] = calibration(counts, smooth=True).priors
+    found, expected = whole(image, smooth=prior), calibration(counts, smooth=prior)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    assert found.flags == expected.flags == Flag.BAD_PIXELS
+    assert not np.isnan(found.phase[calibration.good]).any()
+    lost = whole(0 * image + np.nan, smooth=prior)
+    assert lost.flags & Flag.LOST
+    assert np.isnan(lost.phase).all()
 
 
 def segments(bench, rms, width=6):

@@ -180,6 +180,13 @@ class Measurement:
         return ~self.bad & (radius(self.bad.shape[1:], center) > 0.53 * self.registered.diameter)
 
     @property
+    def light(self) -> NDArray[np.float64]:
+        """Light of a clear frame on the grid of the frames, without that of partly lit pixels, (ny', nx')."""
+        light = np.zeros(self.intensity.shape[1:])
+        light[self.window] = self.pupil.amplitude**2
+        return light
+
+    @property
     def measured(self) -> NDArray[np.float64]:
         """Frames as those of equal arms, with the scale and the background of the optics, (2, ny', nx')."""
         return self.intensity / self.gain * self.optics.scale - self.optics.background
@@ -196,11 +203,10 @@ class Measurement:
         if phase.shape != self.pupil.shape:
             raise ValueError(f"phase has shape {phase.shape}: expected {self.pupil.shape}, the grid of the pupil")
         filled = nearest_good(np.nan_to_num(phase), self.good & np.isfinite(phase))
-        ideal, optics = model(self).measure(filled), self.optics
-        mixed = (1 - optics.leakage) * ideal + optics.leakage * ideal[::-1]
-        mixed = np.broadcast_to((1 - optics.unmasked) * mixed, self.intensity.shape).copy()
-        mixed[(..., *self.window)] += self.rest + optics.unmasked * self.pupil.amplitude**2
-        return mixed
+        frames = mixed(model(self).measure(filled), self.optics.leakage, self.optics.unmasked, self.light)
+        frames = np.broadcast_to(frames, self.intensity.shape).copy()
+        frames[(..., *self.window)] += self.rest
+        return frames
 
     def agreement(self, phase: ArrayLike) -> Agreement:
         """Agreement of the frames with those of a phase, see `modelled`."""
@@ -506,14 +512,22 @@ def model(measurement: Measurement) -> ZernikeSensor:
 def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:
     """Frames of a measurement as those of an ideal sensor: its optics are undone. They may be negative."""
     _check.instance("measurement", measurement, Measurement)
-    optics, frames, light = measurement.optics, measurement.measured, np.zeros(measurement.intensity.shape[1:])
+    frames, optics = measurement.measured, measurement.optics
     frames[(..., *measurement.window)] -= measurement.rest
-    light[measurement.window] = measurement.pupil.amplitude**2
-    return unmixed(frames, optics.leakage, optics.unmasked, light)
+    return unmixed(frames, optics.leakage, optics.unmasked, measurement.light)
+
+
+def mixed(frames: NDArray, leakage: float, unmasked: float, light: NDArray | float) -> NDArray[np.float64]:
+    """Frames (..., 2, ny, nx) with leakage, and unmasked light of a clear frame `light`, from ideal ones.
+
+    It holds for one mask, too, which has no leakage.
+    """
+    leaking = (1 - leakage) * frames + leakage * frames[..., ::-1, :, :]
+    return (1 - unmasked) * leaking + unmasked * light
 
 
 def unmixed(frames: NDArray, leakage: float, unmasked: float, light: NDArray | float) -> NDArray[np.float64]:
-    """Frames (..., 2, ny, nx) of ideal masks: without leakage, and unmasked light of a clear frame `light`."""
+    """Inverse of `mixed`."""
     pure = (frames - unmasked * light) / (1 - unmasked)
     return ((1 - leakage) * pure - leakage * pure[..., ::-1, :, :]) / (1 - 2 * leakage)
 

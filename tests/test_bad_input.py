@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 import zwfs
 from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens, write_bench
 from zwfs.bench.model import segment_pistons
-from zwfs.frames import BenchFit, Calibration, FittedSensor, calibrate, fit_bench, pipeline, reconstruct
+from zwfs.frames import BenchFit, Calibration, pipeline, reconstruct, recover_phase
 from zwfs.frames.files import read_all
 from zwfs.frames.registration import register_frames
 from zwfs.loop import LoopRecord
@@ -94,7 +94,7 @@ def camera():
         frames, clear, _ = read_all(*kinds)
         registered = register_frames(frames, clear)
         measurement = pipeline.reduce_frames(registered, pipeline.Optics(1.06, (1.5, -1.5)))
-        return frames, clear, measurement, calibrate(*kinds)
+        return frames, clear, measurement, Calibration.from_files(*kinds)
 
 
 @cache
@@ -150,7 +150,7 @@ def valid() -> dict:
         "BenchModel.pistons.phase": BENCH.commanded_phase(pistons),
         "segment_pistons.phase": BENCH.commanded_phase(pistons),
         "segment_pistons.segments": BENCH.segments,
-        "bench_error.phase": pipeline.recover_phase(camera()[2]),
+        "bench_error.phase": recover_phase(camera()[2]),
         "MaximumLikelihood.photons": 1e4,
         "MaximumLikelihood.modes": modes,
         "MaximumLikelihood.prior": np.eye(5),
@@ -443,27 +443,40 @@ RECORDING = {"frames": np.ones((2, 2, 8, 8)), "clear_frames": np.ones((2, 8, 8))
 
 
 def fitted(**changes):
-    return fit_bench(**RECORDING | {"n_pixels": 8, "noise": 1.0} | changes)
+    return Calibration.fit(**RECORDING | {"n_pixels": 8, "noise": 1.0} | changes)
+
+
+def from_files(**changes):
+    return Calibration.from_files(["a.fits"], ["b.fits"], **changes)
+
+
+def called(**changes):
+    return camera()[-1](np.zeros(camera()[-1].shape), **changes)
 
 
 REFUSED = {
     r"modes: 1 of 6 are linearly independent": lambda: zwfs.MaximumLikelihood(SENSOR, SAME),
     r"modes: 1 of 6 are linearly": lambda: zwfs.cramer_rao(SENSOR, 0 * PUPIL.amplitude, photons=1e4, modes=SAME),
     "measurement is a int: expected": lambda: pipeline.predict_other(5),
-    "measurement is a str: expected": lambda: pipeline.recover_phase("a"),
+    "measurement is a str: expected": lambda: recover_phase("a"),
     "measurement is a NoneType: expected": lambda: pipeline.upside_down(None),
     "margin = 0.5: expected an integer": lambda: camera()[2].registered.places(0.5),
     r"margin = 1000000: expected an integer in \[0, ": lambda: camera()[2].registered.places(10**6),
     r"pupil_diameter = 65504: expected .* \[8, ": lambda: register_frames(*camera()[:2], pupil_diameter=65504),
     "progress = 5: expected a function": lambda: fitted(progress=5),
-    "progress = 'a': expected a function": lambda: calibrate(["a.fits"], ["b.fits"], progress="a"),
-    "commands = 5: expected a str or a Path": lambda: calibrate(["a.fits"], ["b.fits"], commands=5),
-    "exposure with commands: expected": lambda: calibrate(["a.fits"], ["b.fits"], commands="c.npy", exposure=2.0),
-    "phase_shifts = 5: expected": lambda: calibrate(["a.fits"], ["b.fits"], phase_shifts=5),
+    "progress = 'a': expected a function": lambda: from_files(progress="a"),
+    "commands = 5: expected a str or a Path": lambda: from_files(commands=5),
+    "exposure with commands: expected": lambda: from_files(commands="c.npy", exposure=2.0),
+    "phase_shifts = 5: expected": lambda: from_files(phase_shifts=5),
     "phases is 0 in all states, or NaN": lambda: fitted(phases=np.zeros((2, 8, 8))),
     "phases is 0 in all states, or NaN, at": lambda: fitted(phases=np.full((2, 8, 8), np.nan)),
     r"values is a list: expected a Mapping": lambda: BenchFit.replaced(None, []),
-    "prior is a int: expected a MapPrior": lambda: FittedSensor.__call__(None, [1.0], 1.0, prior=5),
+    "smooth needs the `bench` of a calibration": lambda: called(smooth=True),
+    "light with smooth or noise: expected none": lambda: called(smooth=True, light=1.0),
+    r"corners = \[\[0, 0\]\]: expected two pairs": lambda: fitted(corners=[[0, 0]]),
+    r"corners = \[\[0, 0\], \[0, 1\]\]: expected": lambda: fitted(corners=[[0, 0], [0, 1]]),
+    "shape = 5: expected two numbers": lambda: fitted(shape=5),
+    r"n_images = 3: expected an integer in \[1, 2\]": lambda: fitted(n_images=3),
 }
 
 

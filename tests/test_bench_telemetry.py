@@ -1,6 +1,5 @@
 """Telemetry of a bench that was calibrated with known commands, on frames that HCIPy simulates."""
 
-import functools
 import io
 import sys
 import warnings
@@ -12,9 +11,10 @@ from scipy import ndimage
 
 from zwfs import Linear, zernike_basis
 from zwfs._images import nearest_good
-from zwfs.frames import Calibration, _calibrate, calibrate, fit_bench, pipeline, reconstruct, registration
+from zwfs.frames import Calibration, pipeline, reconstruct, registration
 from zwfs.frames.__main__ import main
 from zwfs.frames._calibrate import _read_states, _windows
+from zwfs.frames._fit import fit_bench
 
 from .hcipy_bench import HcipyBench
 
@@ -38,8 +38,8 @@ class Recorded:
 
     def calibration(self, **settings):
         bench = self.bench
-        fit = fit_bench(self.frames, self.clear, self.phases, n_pixels=bench.pixels, noise=bench.noise, **settings)
-        return Calibration.from_bench(fit, self.frames, self.phases)
+        settings |= {"n_pixels": bench.pixels, "noise": bench.noise}
+        return Calibration.fit(self.frames, self.clear, self.phases, **settings)
 
     def quick(self, frame=None):
         """The calibration from one frame (the flat) alone, and the place of its grid on that of the truth."""
@@ -106,7 +106,10 @@ def command(taken, files):
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(action="ignore"):
         patch.chdir(files)
         patch.setattr(sys, "stderr", said)
-        patch.setattr(_calibrate, "fit_bench", functools.partial(fit_bench, n_steps=4, oversampling=2))  # quick
+        quick = {"n_steps": 4, "oversampling": 2}
+        patch.setattr(
+            "zwfs.frames.calibration.fit_bench", lambda *data, **given: fit_bench(*data, **given | quick)
+        )
         assert main(["calibrate", "bench.npz", *names, *known]) == 0, said.getvalue()
     return Calibration.load(files / "bench.npz"), said.getvalue()
 
@@ -179,14 +182,14 @@ def test_states_are_read_from_every_kind_of_file(tmp_path, kind):
     for path, array in (files | {tmp_path / name: array for name, array in extra.items()}).items():
         np.save(path, array)
     clear, dark, bad, commands = (tmp_path / name for name in extra)
-    states = _read_states(list(files), [clear], [dark], [bad], commands, 1000.0)
+    states = _read_states((list(files), [clear], [dark], [bad], ()), commands, 1000.0, None)
     expected = np.where(np.eye(20, 24) > 0, np.nan, frames - 100)
     expected[2, 1, 5, 6] = np.nan
     np.testing.assert_array_equal(states.frames.reshape(frames.shape), expected)
     assert states.frames.shape[:2] == (3, 2)
-    windows, corners, _ = _windows(states, [(9.5, 10.0), (9.5, 12.0)], 12.0)
-    assert corners.tolist() == [[2, 2], [2, 4]]
-    np.testing.assert_array_equal(windows[0][:, :, 1], states.frames[:, :, 1, 2:18, 4:20])
+    windows, _ = _windows(states, [(9.5, 10.0), (9.5, 12.0)], 12.0)
+    assert windows.corners.tolist() == [[2, 2], [2, 4]]
+    np.testing.assert_array_equal(windows.cut(states.frames)[:, :, 1], states.frames[:, :, 1, 2:18, 4:20])
 
 
 @pytest.mark.parametrize(
@@ -205,7 +208,7 @@ def test_states_that_do_not_belong_together_are_named(tmp_path, settings, messag
         np.save(tmp_path / f"{name}.npy", array)
     frames, clear, commands = (tmp_path / f"{name}.npy" for name in arrays)
     with pytest.raises(ValueError, match=message):
-        calibrate(
+        Calibration.from_files(
             [frames], [clear], commands=commands, pupil_centers=[(9.5, 11.5)] * 2, pupil_diameter=12.0, **settings
         )
 

@@ -19,13 +19,13 @@ def taken():
 
 
 @pytest.fixture(scope="module")
-def fit(taken):
+def calibration(taken):
     return study.calibrate(taken)
 
 
 @pytest.fixture(scope="module")
-def measured(taken, fit):
-    return study.measure_inputs(taken, fit, 0.3, 1)
+def measured(taken, calibration):
+    return study.measure_inputs(taken, calibration, 0.3, 1)
 
 
 def test_recorded_frames_are_those_that_the_script_makes(taken):
@@ -45,7 +45,8 @@ def test_shorter_exposures_have_the_light_of_the_calibration_and_more_noise(take
     assert np.median(more) > 10 * np.median(noise)
 
 
-def test_fit_recovers_the_bench(taken, fit):
+def test_fit_recovers_the_bench(taken, calibration):
+    fit = calibration.bench
     for name, value in study.known_values(taken).items():
         if name in ("diameter", "first", "second"):
             assert fit[name].value == pytest.approx(value, rel=5e-3), name
@@ -58,7 +59,7 @@ def test_fit_recovers_the_bench(taken, fit):
 @pytest.mark.parametrize(("error", "consistent"), [(0.02, True), (0.03, False)])
 def test_verdict_shows_commands_that_are_wrong_by_three_percent(taken, error, consistent):
     wrong = {**taken.arrays, "commands": (1 + error) * taken.arrays["commands"]}
-    assert study.calibrate(replace(taken, arrays=wrong)).consistent == consistent
+    assert study.calibrate(replace(taken, arrays=wrong)).bench.consistent == consistent
 
 
 def test_calibrated_phases_are_better_than_those_of_the_design_and_their_error_bars_hold(measured):
@@ -70,11 +71,13 @@ def test_calibrated_phases_are_better_than_those_of_the_design_and_their_error_b
         assert one.consistent
 
 
-def test_frames_of_a_different_bench_are_flagged(taken, fit):
+def test_frames_of_a_different_bench_are_flagged(taken, calibration):
     [number] = taken.unseen(0.3, taken.photons[0])[:1]
     frames = taken.arrays["unseen_frames"].copy()
     frames[number, 1] = frames[number, 1, ::-1]
-    [[one]] = study.measure(replace(taken, arrays={**taken.arrays, "unseen_frames": frames}), fit, [[number]])
+    [[one]] = study.measure(
+        replace(taken, arrays={**taken.arrays, "unseen_frames": frames}), calibration, [[number]]
+    )
     assert not one.consistent
     assert one.misfit > 10
 

@@ -12,11 +12,13 @@ from zwfs import Dimple, Pupil, ZernikeSensor
 from zwfs.frames import Calibration
 from zwfs.frames import _fit as fitting
 from zwfs.frames._fit import fit_bench
-from zwfs.frames._fitted import FittedSensor, unwrapped
+from zwfs.frames._fitted import unwrapped
+from zwfs.frames._learnt import Windows, of_bench
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
 from zwfs.frames._solver import Eliminated, fine_phase
 from zwfs.frames._states import PAD, Recording
+from zwfs.frames.phases import Flag
 
 from .hcipy_bench import BEFORE, BORDER, CASES, RMS, HcipyBench
 
@@ -238,7 +240,7 @@ SMALL = replace(CASES["disc"], pixels=24, side=32)
 def fitted(bench, seed=1):
     """Fit of a bench to a recording of it, which several tests look at."""
     frames, clear, phases = bench.recording(seed=seed)
-    return fit_bench(frames, clear, phases, n_pixels=bench.pixels, noise=bench.noise)
+    return Calibration.fit(frames, clear, phases, n_pixels=bench.pixels, noise=bench.noise)
 
 
 @pytest.fixture(scope="module", params=[BENCH, TURNED], ids=["disc", "turned VLT"])
@@ -247,7 +249,7 @@ def calibrated(request):
 
 
 def test_calibration_of_a_foreign_bench_explains_its_frames(calibrated):
-    bench, fit = calibrated
+    bench, fit = calibrated[0], calibrated[1].bench
     assert fit.misfit.mean() < 1.2
     assert fit.consistent
     assert max(abs(fit[name].value / bench.truth[name] - 1) for name in ("diameter", "first", "second")) < 3e-3
@@ -263,7 +265,7 @@ def test_calibration_of_a_foreign_bench_explains_its_frames(calibrated):
 
 @pytest.mark.slow
 def test_numbers_of_a_converged_fit_stay_within_their_error_bars_in_a_step_of_all_unknowns():
-    fit = fitted(BENCH)
+    fit = fitted(BENCH).bench
     assert fit.converged
     point = fit.point
     step = point.matrix.solve(-point.gradient, point.stuck, 300, 1e-3)
@@ -272,7 +274,7 @@ def test_numbers_of_a_converged_fit_stay_within_their_error_bars_in_a_step_of_al
 
 @pytest.mark.slow
 def test_error_bars_hardly_change_with_more_iterations_for_the_maps(monkeypatch):
-    point = fitted(BENCH).point
+    point = fitted(BENCH).bench.point
     changes = 0.01 * (point.problem.weights * point.model.images)[None]  # a part of which light and fluxes follow
     before = Eliminated(point).covariance(point, changes, 1.0)
     for name in ("_N_FOLLOWED", "_N_CHANGES"):
@@ -283,7 +285,7 @@ def test_error_bars_hardly_change_with_more_iterations_for_the_maps(monkeypatch)
 
 @pytest.mark.slow
 def test_equations_with_several_right_sides_are_solved_in_fewer_steps():
-    point = fitted(BENCH).point
+    point = fitted(BENCH).bench.point
     matrix = point.matrix
     held = np.arange(len(point.x)) >= point.problem.n_white
     right = np.where(held, 0, [matrix.back(matrix.along(number)) for number in range(4)])
@@ -300,7 +302,7 @@ def test_equations_with_several_right_sides_are_solved_in_fewer_steps():
 
 @pytest.mark.slow
 def test_other_values_replace_those_of_a_fit_and_explain_its_frames_worse():
-    fit = fitted(BENCH)
+    fit = fitted(BENCH).bench
     wrong = fit.replaced({"diameter": 1.06, "leakage": 0.0})
     assert (wrong["diameter"].value, wrong["leakage"].value) == (1.06, 0.0)
     assert wrong["first"] == fit["first"]
@@ -309,18 +311,6 @@ def test_other_values_replace_those_of_a_fit_and_explain_its_frames_worse():
         fit.replaced({"size": 1.0})
     with pytest.raises(TypeError, match="diameter = 'large'"):
         fit.replaced({"diameter": "large"})
-    pair, known = np.ones((2, 52, 52)), np.zeros((2, *fit.light.shape))
-    with pytest.raises(ValueError, match=r"sigma has shape \(3,\): expected \(2, 52, 52\), or a number"):
-        FittedSensor(fit)(pair, np.ones(3))
-    for message, frames, phases, settings in (
-        (r"frames and phases have shapes \(2, 2, 52, 52\) and \(\)", [pair] * 2, 5.0, {}),
-        (r"corners = \[\[0, 0\]\]: expected two pairs", [pair] * 2, known, {"corners": [[0, 0]]}),
-        (r"corners = \[\[0, 0\], \[0, 1\]\]: expected", [pair] * 2, known, {"corners": [[0, 0], [0, 1]]}),
-        (r"shape = 5: expected two numbers", [pair] * 2, known, {"shape": 5}),
-        (r"n_images = 3: expected an integer in \[1, 2\]", [pair] * 2, known, {"n_images": 3}),
-    ):
-        with pytest.raises((TypeError, ValueError), match=message):
-            Calibration.from_bench(fit, frames, phases, **settings)
 
 
 def test_fit_that_ends_early_has_not_converged():
@@ -335,15 +325,34 @@ def test_fit_that_ends_early_has_not_converged():
 
 @pytest.mark.parametrize(("number", "rms"), list(enumerate(RMS)))
 def test_calibrated_phase_has_half_the_error_that_the_plain_route_had(calibrated, number, rms):
-    bench, fit = calibrated
+    bench, calibration = calibrated
     screen = bench.smooth(rms, seed=1)
     counts = bench.counts(screen, (7, 1))
-    found = FittedSensor(fit)(counts)
+    found = calibration(counts, smooth=True)
     asked = BEFORE["VLT" if bench is TURNED else "disc"]["plain"][number] / 2
     assert bench.error(found, screen) < (min(0.02, asked) if rms <= 0.8 else asked)
     left = (found - bench.on_pupil(screen + bench.flat))[bench.fully_lit]
     pull = (left - left.mean()) / found.sigma[bench.fully_lit]
     assert 0.5 < pull.std() < 2
+
+
+def test_smooth_phase_of_a_whole_camera_image_is_that_of_its_windows():
+    bench, calibration = BENCH, fitted(BENCH)
+    frames, _, phases = bench.recording(seed=1)
+    windows = Windows.checked((52, 52), [[3, 2], [1, 60]], 1, (60, 120))
+    dark = np.full((1, 60, 120), 50, np.float32)
+    whole = of_bench(Calibration, calibration.bench, frames, phases, dark, windows)
+    counts = bench.counts(bench.smooth(0.3, seed=1), (7, 1))
+    counts[1, 20, 30] = np.nan
+    [image] = windows.on_camera(counts[np.newaxis])[0] + 50
+    [prior] = calibration(counts, smooth=True).priors
+    found, expected = whole(image, smooth=prior), calibration(counts, smooth=prior)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    assert found.flags == expected.flags == Flag.BAD_PIXELS
+    assert not np.isnan(found.phase[calibration.good]).any()
+    lost = whole(0 * image + np.nan, smooth=prior)
+    assert lost.flags & Flag.LOST
+    assert np.isnan(lost.phase).all()
 
 
 def segments(bench, rms, width=6):
@@ -358,11 +367,11 @@ def test_evidence_chooses_a_prior_as_smooth_as_the_phase(monkeypatch):
 
     def measured(screen):
         counts = bench.counts(screen, (7, 1))
-        return FittedSensor(fitted(bench))(counts, np.sqrt(np.maximum(counts, 0) + bench.noise**2))
+        return fitted(bench)(counts, smooth=True)
 
     smooth = bench.smooth(0.3, seed=1)
     found = measured(smooth)
-    assert found.exponent > measured(segments(bench, 0.3)).exponent
+    assert found.priors[0].exponent > measured(segments(bench, 0.3)).priors[0].exponent
     # Control: a prior for rough phases amplifies the noise of the highest frequencies.
     monkeypatch.setattr("zwfs.frames._fitted._EXPONENTS", (3.0,))
     assert bench.error(measured(smooth), smooth) > 1.5 * bench.error(found, smooth)
@@ -372,7 +381,7 @@ def test_evidence_chooses_a_prior_as_smooth_as_the_phase(monkeypatch):
 def test_error_bars_of_a_fit_cover_the_true_values():
     """Of two benches, and of a second draw of the noise. The error bars also hold what the model misses."""
     draws = (BENCH, 1), (BENCH, 2), (IDEAL, 1)
-    pulls = np.abs([pull for bench, seed in draws for pull in bench.pulls(fitted(bench, seed)).values()])
+    pulls = np.abs([pull for bench, seed in draws for pull in bench.pulls(fitted(bench, seed).bench).values()])
     assert 0.5 < np.mean(pulls < 1) < 0.85
     assert pulls.max() < 4.5
 

@@ -36,7 +36,8 @@ from studies.photon_noise import EXPECTED, ErrorBars, PhotonCurves
 from studies.reconstructors import draw_convergence
 from studies.zernike_sensor import lowest_pixel
 from zwfs.bench.model import Bench
-from zwfs.frames.pipeline import MeasuredPhase, Measurement, Optics
+from zwfs.frames.phases import Phases
+from zwfs.frames.pipeline import Measurement, Optics
 from zwfs.frames.refine import Step
 from zwfs.frames.registration import Circle, Image, RegisteredFrames
 
@@ -108,7 +109,9 @@ def drawn_methods(curves, pupil, classic, shifted):
     measurement = Measurement(
         recording, Optics(), frames, pupil, 0 * phase, bad, 0, np.ones(2), np.zeros(4), (1.0, 1.0)
     )
-    found = MeasuredPhase(phase, frames, 0.9 * frames, measurement, True, 0)
+    whole, real = np.array(0), np.array(0.0)
+    numbers = real, whole, whole, real, np.zeros(2), whole, whole, whole
+    found = Phases(phase, phase, *numbers, measurement=measurement)
     varied = AmplitudeCurves(three, dict.fromkeys(phase_amplitude.WAYS, np.full((3, 2), 0.1)), {}, three)
     drift, pair, falling = Drift(np.ones((6, 2, 2)), 10.0, 500.0), np.ones(6), np.array([20.0, 10.0])
     held = DriftCurves(

@@ -18,7 +18,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from zwfs.bench import Bench, write_bench
-from zwfs.frames import Calibration, calibrate
+from zwfs.frames import Calibration
 from zwfs.frames import __main__ as command
 from zwfs.frames import files as camera
 
@@ -216,7 +216,7 @@ def test_damaged_file_is_read_or_refused_by_name(folder, content):
 def bench(folder):
     """Files of a bench and its calibration."""
     files = write_bench(folder, Bench(n_pixels=32), seed=1)
-    calibrate([files["frame"]], [files["pupils"]], [files["dark"]]).save(folder / "bench.npz")
+    Calibration.from_files([files["frame"]], [files["pupils"]], [files["dark"]]).save(folder / "bench.npz")
     return {name: str(path) for name, path in files.items()}
 
 

@@ -9,8 +9,9 @@ from astropy.io import fits
 
 import zwfs
 from zwfs.bench import Bench
-from zwfs.frames import Calibration, judge, phase_of
-from zwfs.frames.pipeline import Optics
+from zwfs.frames import judge, recover_phase
+from zwfs.frames.pipeline import Optics, reduce_frames
+from zwfs.frames.registration import Image, register_frames
 from zwfs.frames.verdict import ImageOrder
 
 
@@ -68,16 +69,17 @@ def results():
     """Results of camera frames."""
     bench = Bench(n_pixels=40, n_rings=1, missing=(), photons_per_image=1e8)
     frames, clear = bench.frames(), bench.clear_frames()
-    phase = phase_of(frames, clear)
-    calibration = Calibration.of(phase.measurement)
-    made = [phase, phase.measurement, phase.measurement.registered, phase.measurement.registered.placement]
-    made += [judge(phase), calibration(frames), ImageOrder(Optics(), False, 1.0, 0.0)]
+    registered = register_frames(*([Image.of(counts, "image") for counts in pair] for pair in (frames, clear)))
+    measurement = reduce_frames(registered, Optics())
+    phases = recover_phase(measurement)
+    made = [phases, measurement, phases.agreement, registered, registered.placement]
+    made += [judge(phases), ImageOrder(Optics(), False, 1.0, 0.0)]
     return {type(one).__name__: one for one in made}
 
 
 @pytest.mark.parametrize(
     "name",
-    ["MeasuredPhase", "Measurement", "RegisteredFrames", "Placement", "Verdict", "Phases", "ImageOrder"],
+    ["Agreement", "Measurement", "RegisteredFrames", "Placement", "Verdict", "Phases", "ImageOrder"],
 )
 def test_fields_of_another_kind_are_named(results, name):
     for field in fields(results[name]):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,8 +19,9 @@ from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS, OTHER_STYLES
 from studies.kit.tables import Table
-from zwfs.frames import BenchFit, Calibration, FittedSensor, fit_bench
-from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
+from zwfs.frames import BenchFit, Calibration, recover_phase
+from zwfs.frames.phases import Flag
+from zwfs.frames.pipeline import Optics, reduce_frames
 from zwfs.frames.registration import Image, register_frames
 
 LIMITS = {
@@ -112,10 +113,10 @@ class Recording:
         return counts / share, sigma / share
 
 
-def calibrate(taken: Recording, n_commands: int = 4, n_steps: int = 3, oversampling: int = 2) -> BenchFit:
+def calibrate(taken: Recording, n_commands: int = 4, n_steps: int = 3, oversampling: int = 2) -> Calibration:
     """Fit the bench to the frames of the flat and of known commands."""
     states = slice(n_commands + 1)
-    return fit_bench(
+    return Calibration.fit(
         taken.frames[states],
         taken.clear_frames,
         taken.commands[states],
@@ -142,7 +143,7 @@ class Measured(NamedTuple):
 
 def measure(
     taken: Recording,
-    fit: BenchFit,
+    calibration: Calibration,
     series: Sequence[Sequence[int]],
     n_iterations: int = 25,
     *,
@@ -153,29 +154,37 @@ def measure(
     The first screen of each series chooses the prior of the others. A control measures this screen again with the
     maps, places and prior of the fit, and the optics of the design.
     """
-    sensors = FittedSensor(fit), FittedSensor(designed(fit)) if control else None
-    return sweeps.run(_measure_series, series, taken, *sensors, n_iterations, name="calibrated_errors")
+    benches = calibration, designed(calibration) if control else None
+    return sweeps.run(_measure_series, series, taken, *benches, n_iterations, name="calibrated_errors")
 
 
-def designed(fit: BenchFit) -> BenchFit:
-    """Return a fit with the optics of the design: no leakage, no focus, and a blur far below a pixel."""
+def designed(calibration: Calibration) -> Calibration:
+    """Return a calibration with a bench of the design: no leakage, no focus, and a blur far below a pixel."""
     design, shares = Optics(), {"leakage": 0.0, "unmasked": 0.0}
     optics = shares | {"blur": 0.02, "arm 0 focus": 0.0, "arm 1 focus": 0.0}
     first, second = design.phase_shifts
-    return fit.replaced(optics | {"diameter": design.diameter, "first": first, "second": second})
+    values = optics | {"diameter": design.diameter, "first": first, "second": second}
+    return replace(calibration, bench=fitted_bench(calibration).replaced(values))
+
+
+def fitted_bench(calibration: Calibration) -> BenchFit:
+    """Fit of a calibration with known commands."""
+    if calibration.bench is None:
+        raise ValueError("calibration has no bench: expected a fit to known commands")
+    return calibration.bench
 
 
 def _measure_series(
     numbers: Sequence[int],
     taken: Recording,
-    sensor: FittedSensor,
-    design: FittedSensor | None,
+    calibration: Calibration,
+    design: Calibration | None,
     n_iterations: int,
 ) -> list[Measured]:
-    prior: Any = None
+    prior: Any = True
     measured: list[Measured] = []
     for number in numbers:
-        measured.append(_measure(number, taken, sensor, None if measured else design, n_iterations, prior))
+        measured.append(_measure(number, taken, calibration, None if measured else design, n_iterations, prior))
         prior = measured[-1].prior
     return measured
 
@@ -183,22 +192,26 @@ def _measure_series(
 def _measure(
     number: int,
     taken: Recording,
-    sensor: FittedSensor,
-    design: FittedSensor | None,
+    calibration: Calibration,
+    design: Calibration | None,
     n_iterations: int,
     prior: Any,
 ) -> Measured:
     counts, sigma = taken.shot(number)
     truth, lit = taken.arrays["unseen"][number] * _UNIT, taken.arrays["lit"]
-    found = sensor(counts, sigma, prior)
-    left = _error(found.phase, truth, lit)
-    same_prior = float(_error(design(counts, sigma, found.prior).phase, truth, lit).std()) if design else np.nan
-    bars = found.sigma[lit]
+    found = calibration(counts, smooth=prior, noise=sigma)
+    [prior] = found.priors
+    left, bars, same_prior = _error(found.phase, truth, lit), np.asarray(found.sigma)[lit], np.nan
+    if design:
+        same_prior = float(_error(design(counts, smooth=prior, noise=sigma).phase, truth, lit).std())
+    consistent = not found.flags & Flag.INCONSISTENT
     plain = float(_plain(counts, taken, number, n_iterations).std())
     inside = float(np.mean(np.abs(left) < bars))
     stated = float(np.sqrt(np.mean(bars**2)))
     calibrated = float(left.std())
-    return Measured(plain, calibrated, same_prior, stated, inside, found.misfit, found.consistent, found.prior)
+    return Measured(
+        plain, calibrated, same_prior, stated, inside, float(np.asarray(found.misfit)), consistent, prior
+    )
 
 
 def _plain(counts: NDArray, taken: Recording, number: int, n_iterations: int) -> NDArray[np.float64]:
@@ -274,7 +287,7 @@ class Errors:
 
 def measure_inputs(
     taken: Recording,
-    fit: BenchFit,
+    calibration: Calibration,
     largest: float,
     n_screens: int,
     n_iterations: int = 25,
@@ -284,19 +297,18 @@ def measure_inputs(
     """Measure the bright unseen screens up to an error, on demand with a control."""
     inputs = taken.inputs(largest)
     series = [taken.unseen(rms, taken.photons[0])[:n_screens] for rms in inputs]
-    return Errors(inputs, measure(taken, fit, series, n_iterations, control=control))
+    return Errors(inputs, measure(taken, calibration, series, n_iterations, control=control))
 
 
-def measure_faint(taken: Recording, fit: BenchFit, n_screens: int, n_iterations: int = 25) -> Errors:
+def measure_faint(taken: Recording, calibration: Calibration, n_screens: int, n_iterations: int = 25) -> Errors:
     """Measure the unseen screens with the least light."""
     rms = taken.arrays["unseen_rms"][taken.arrays["unseen_photons"] == taken.photons[-1]][:1]
-    return Errors(rms, measure(taken, fit, [taken.unseen(rms[0], taken.photons[-1])[:n_screens]], n_iterations))
+    series = [taken.unseen(rms[0], taken.photons[-1])[:n_screens]]
+    return Errors(rms, measure(taken, calibration, series, n_iterations))
 
 
-def bulk_errors(taken: Recording, fit: BenchFit, errors: Errors) -> NDArray[np.float64]:
-    """Errors of the same screens by `Calibration.from_bench`, as `calibrate --commands`, rad rms."""
-    states = slice(len(fit.misfit) // 2 - 1)
-    calibration = Calibration.from_bench(fit, taken.frames[states], taken.commands[states])
+def bulk_errors(taken: Recording, calibration: Calibration, errors: Errors) -> NDArray[np.float64]:
+    """Errors of the same screens without a prior, as by `reconstruct`, rad rms."""
 
     def error(number: int) -> float:
         phase = calibration(taken.shot(number)[0]).phase.astype(float)

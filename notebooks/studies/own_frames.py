@@ -22,9 +22,9 @@ from studies.kit.style import ALONE, show_intensity, show_phase
 from studies.kit.tables import Table
 from zwfs import opd_to_phase, phase_to_opd
 from zwfs.bench import Bench, write_bench
-from zwfs.frames import CameraNoise
+from zwfs.frames import CameraNoise, Phases
 from zwfs.frames.files import CameraFile, read_all
-from zwfs.frames.pipeline import MeasuredPhase, Measurement, model, recover_phase, reduce_frames
+from zwfs.frames.pipeline import Measurement, model, recover_phase, reduce_frames
 from zwfs.frames.refine import Step
 from zwfs.frames.registration import Image, register_frames
 from zwfs.frames.verdict import Verdict
@@ -75,30 +75,31 @@ def header_noise(source: CameraFile, gain: float, read_noise: float) -> CameraNo
     return CameraNoise(gain, read_noise) if gain else None
 
 
-def simulated_flat(bench: Bench, phase: MeasuredPhase, n_iterations: int, seed: int) -> MeasuredPhase:
+def simulated_flat(bench: Bench, phase: Phases, n_iterations: int, seed: int) -> Phases:
     """Phase of frames of the flat mirror of a simulated bench, with the optics of another phase."""
     with tempfile.TemporaryDirectory() as folder:
         paths = write_bench(folder, bench, seed=np.random.default_rng([seed, 1]))
         frames, clear_frames, _ = read_all([paths["frame"]], [paths["pupils"]], [paths["dark"]])
         registered = register_frames(frames, clear_frames)
-    return recover_phase(reduce_frames(registered, phase.measurement.optics), n_iterations)
+    return recover_phase(reduce_frames(registered, phase.agreement.measurement.optics), n_iterations)
 
 
-def draw_explained(result: MeasuredPhase) -> Figure:
+def draw_explained(result: Phases) -> Figure:
     """Measured frames, modelled frames and their difference; bad pixels are marked."""
     figure, panels = plt.subplots(2, 3, figsize=(7.2, 5.2))
-    top = np.quantile(result.measured[..., *result.measurement.window][:, result.measurement.good], 0.999)
+    agreement, measurement = result.agreement, result.agreement.measurement
+    top = np.quantile(agreement.measured[..., *measurement.window][:, measurement.good], 0.999)
     for row, (measured, modelled, bad) in enumerate(
-        zip(result.measured, result.modelled, result.measurement.bad, strict=True)
+        zip(agreement.measured, agreement.modelled, measurement.bad, strict=True)
     ):
         shown = show_intensity(panels[row, 0], measured, top)
         show_intensity(panels[row, 1], modelled, top)
         left = np.where(bad, np.nan, measured - modelled)
-        difference = show_phase(panels[row, 2], left, _SHOWN * result.residual.max())
+        difference = show_phase(panels[row, 2], left, _SHOWN * agreement.residual.max())
         for axes in panels[row, ::2]:
             axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=1.2)
         panels[row, 0].set_ylabel(f"image {row + 1}")
-        panels[row, 2].set_xlabel(f"rms {result.residual[row]:.3f}")
+        panels[row, 2].set_xlabel(f"rms {agreement.residual[row]:.3f}")
     for axes, title in zip(panels[0], ("measured", "modelled", "measured − modelled"), strict=True):
         axes.set_title(title, fontsize=10)
     figure.colorbar(shown, ax=panels[:, :2], label="intensity", location="bottom", shrink=0.6, aspect=40)
@@ -108,7 +109,7 @@ def draw_explained(result: MeasuredPhase) -> Figure:
     return figure
 
 
-def draw_phase_map(result: MeasuredPhase, wavelength: float, sigma: NDArray | None = None) -> Figure:
+def draw_phase_map(result: Phases, wavelength: float, sigma: NDArray | None = None) -> Figure:
     """Phase in radian, with a second scale in nm, and its error bar; bad points are marked."""
     n_panels = 1 if sigma is None else 2
     figure, panels = plt.subplots(1, n_panels, figsize=((4.7, 7.2)[n_panels - 1], 4.2), squeeze=False)
@@ -116,7 +117,8 @@ def draw_phase_map(result: MeasuredPhase, wavelength: float, sigma: NDArray | No
     # Single points at gaps may be off by a turn: they do not set the scale.
     shown = show_phase(axes, result.phase, np.nanquantile(np.abs(result.phase), 0.99))
     axes.set_title("phase", fontsize=10)
-    bad = result.measurement.pupil.inside & ~result.measurement.good
+    measurement = result.agreement.measurement
+    bad = measurement.pupil.inside & ~measurement.good
     if bad.any():
         axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=2, label=f"{bad.sum()} bad points")
         figure.legend(loc="outside lower left", fontsize=9)
@@ -156,7 +158,7 @@ def draw_gains(work: Sequence[Step], errors: Sequence[float] | None = None) -> F
             )  # fmt: skip
     panels[0].set(xlabel="score and control\n(correlation)")
     panels[0].margins(x=0.08)
-    panels[1].plot([step.result.misfit for step in work], rows, color="#444444", marker="o", ms=5)
+    panels[1].plot([step.result.agreement.misfit for step in work], rows, color="#444444", marker="o", ms=5)
     panels[1].set(xlabel="misfit /\ncontrast")
     if errors is not None:
         panels[2].plot(errors, rows, color="#444444", marker="o", ms=5)
@@ -228,9 +230,10 @@ def verdict_table(verdict: Verdict) -> Table:
     return Table(["question", "answer"], [[topic, sentence] for topic, sentence in verdict.findings.items()])
 
 
-def result_table(result: MeasuredPhase) -> Table:
+def result_table(result: Phases) -> Table:
     """Places of the pupils, counts, and agreement of the frames."""
-    measurement, registered = result.measurement, result.measurement.registered
+    agreement, measurement = result.agreement, result.agreement.measurement
+    registered = measurement.registered
     placement = registered.placement
     pupils = [f"{one.row:.2f}, {one.column:.2f}, {one.diameter:.2f}" for one in registered.pupils]
     return Table(
@@ -250,10 +253,10 @@ def result_table(result: MeasuredPhase) -> Table:
             ["the same, without the mask", f"{measurement.flux_ratio[1]:.3f}"],
             ["points of the pupil", measurement.pupil.n_points],
             ["bad points of the pupil", measurement.n_bad],
-            ["points without a unique solution", result.n_unsolved],
-            ["correlation of the frames with their fit (too optimistic)", _pair(result.correlation, 3)],
-            ["rms difference of the frames (mean = 1)", _pair(result.residual, 3)],
-            ["excess light around the pupil (mean = 1)", f"{result.excess_light:.3f}"],
+            ["points without a unique solution", int(result.n_unsolved)],
+            ["correlation of the frames with their fit (too optimistic)", _pair(agreement.correlation, 3)],
+            ["rms difference of the frames (mean = 1)", _pair(agreement.residual, 3)],
+            ["excess light around the pupil (mean = 1)", f"{agreement.excess_light:.3f}"],
         ],
     )
 

@@ -13,25 +13,23 @@ from time import process_time
 import numpy as np
 
 from tests.hcipy_bench import BEFORE, CASES, RMS
-from zwfs.frames import FittedSensor, fit_bench
+from zwfs.frames import Calibration
 
 
 def fitted(bench, seed=1):
-    """Fit of one recording, and its time on a core in seconds."""
+    """Calibration from one recording, and its time on a core in seconds."""
     frames, clear, phases = bench.recording(seed=seed)
     start = process_time()
-    fit = fit_bench(frames, clear, phases, n_pixels=bench.pixels, noise=bench.noise)
-    return fit, process_time() - start
+    calibration = Calibration.fit(frames, clear, phases, n_pixels=bench.pixels, noise=bench.noise)
+    return calibration, process_time() - start
 
 
-def unseen(bench, fit, seeds=(1, 2)):
+def unseen(bench, calibration, seeds=(1, 2)):
     """Rms errors of unseen screens, radian, (n_rms, n_seeds)."""
-    sensor = FittedSensor(fit)
 
     def error(rms, seed):
         screen = bench.smooth(rms, seed=seed)
-        counts = bench.counts(screen, (7, seed))
-        return bench.error(sensor(counts, np.sqrt(np.maximum(counts, 0) + bench.noise**2)), screen)
+        return bench.error(calibration(bench.counts(screen, (7, seed)), smooth=True), screen)
 
     return np.array([[error(rms, seed) for seed in seeds] for rms in RMS])
 
@@ -55,8 +53,8 @@ def coverage(name, bench, n_draws):
     """Print the share of all numbers within one error bar, and the largest error, over draws of the noise."""
     pulls = []
     for seed in range(n_draws):
-        fit, _ = fitted(bench, seed)
-        pulls.append(np.abs(list(bench.pulls(fit).values())))
+        calibration, _ = fitted(bench, seed)
+        pulls.append(np.abs(list(bench.pulls(calibration.bench).values())))
         print(
             f"{name:20s} draw {seed}: {np.mean(pulls[-1] < 1):.2f} within one, largest {pulls[-1].max():.1f}",
             flush=True,
@@ -78,10 +76,10 @@ def main():
             coverage(name, bench, arguments.draws)
             continue
         for order, one in (("", bench), (" reversed", bench.reversed)):
-            fit, seconds = fitted(one)
-            line(name + order, one, fit, seconds)
+            calibration, seconds = fitted(one)
+            line(name + order, one, calibration.bench, seconds)
             if not order:
-                errors = unseen(one, fit)
+                errors = unseen(one, calibration)
                 before = BEFORE[name.replace("turned VLT", "VLT")]["plain"]
                 pairs = zip(RMS, errors, before, strict=True)
                 print("    unseen:", "; ".join(f"{rms} rad: {e.max():.4f} (before {b})" for rms, e, b in pairs))

@@ -13,7 +13,7 @@ from zwfs import _check
 from zwfs._system import is_there, path_of, write_file
 from zwfs.bench.model import Bench, Seed, segment_pistons, segment_residual
 from zwfs.frames._fits import fits_content, fits_module, has_card
-from zwfs.frames.pipeline import MeasuredPhase
+from zwfs.frames.phases import Phases
 
 _BENCH_CARD = b"ORIGIN  = 'zwfs"  # header card of the files: no others are replaced
 _FULL = 50_000  # counts of the brightest pixel of a simulated 16-bit camera
@@ -114,30 +114,28 @@ def write_bench(
     return paths
 
 
-def bench_error(
-    bench: Bench, commanded: ArrayLike, phase: MeasuredPhase, flat: MeasuredPhase | None = None
-) -> float:
+def bench_error(bench: Bench, commanded: ArrayLike, phase: Phases, flat: Phases | None = None) -> float:
     """Rms error of the segment pistons in the phase of frames that `write_bench` wrote, radian.
 
     Parameters
     ----------
     bench : Bench
     commanded : array_like, shape (n_segments,), radian
-    phase : MeasuredPhase
-    flat : MeasuredPhase, optional
+    phase : Phases
+    flat : Phases, optional
         Phase of the flat mirror, whose pistons are subtracted.
     """
     _check.instance("bench", bench, Bench)
-    _check.instance("phase", phase, MeasuredPhase)
+    _check.instance("phase", phase, Phases)
     pistons = _pistons(bench, phase)
     if flat is not None:
-        _check.instance("flat", flat, MeasuredPhase)
+        _check.instance("flat", flat, Phases)
         pistons = pistons - _pistons(bench, flat)
     return float(segment_residual(pistons, commanded).std())
 
 
-def _pistons(bench: Bench, phase: MeasuredPhase) -> NDArray[np.float64]:
-    registered = phase.measurement.registered
+def _pistons(bench: Bench, phase: Phases) -> NDArray[np.float64]:
+    registered = phase.agreement.measurement.registered
     canvas = np.full(registered.clear_frames[0].counts.shape, np.nan)
     row, column = registered.corner
     canvas[row : row + registered.n_pixels, column : column + registered.n_pixels] = phase.phase

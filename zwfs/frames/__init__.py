@@ -1,12 +1,13 @@
 """Camera files to phase.
 
-`files` reads and writes, `registration` locates the pupils, `pipeline` reconstructs a pair of frames, `refine`
-fits single parameters of the optics to it, and `verdict` judges the result and finds which image has which phase
-shift. `calibration` keeps the constants of a bench, and `telemetry` reconstructs files of any length with them, to
-`phases` with flags. The command is `python -m zwfs.frames`.
-`Calibration.controller` turns camera counts into commands of a mirror.
-`fit_bench` takes a model of a bench from frames of a mirror in known states. `FittedSensor` measures phases with
-that model, with error bars and a verdict.
+A `Calibration` holds all that is known of a bench: made from files, from arrays, or from known commands, it
+reconstructs a pair of frames or a stack, and `reconstruct` with it files of any length. Its result is `Phases`,
+with flags. Its `controller` turns camera counts into commands of a mirror. `phase_of` gives a first look in one
+call. The command is `python -m zwfs.frames`.
+
+Step by step: `files` reads and writes, `registration` locates the pupils, `pipeline` reduces a pair of frames,
+`refine` fits single parameters of the optics to it, `recover_phase` reconstructs it, and `judge` judges the
+result.
 
 Examples
 --------
@@ -14,8 +15,9 @@ From files of the simulated bench to a phase:
 
 >>> import tempfile
 >>> from zwfs.bench import Bench, write_bench
+>>> from zwfs.frames import recover_phase
 >>> from zwfs.frames.files import read_all, write_phase
->>> from zwfs.frames.pipeline import Optics, predict_other, recover_phase, reduce_frames, upside_down
+>>> from zwfs.frames.pipeline import Optics, predict_other, reduce_frames, upside_down
 >>> from zwfs.frames.refine import fit, steps
 >>> from zwfs.frames.registration import register_frames
 >>> bench, folder = Bench(n_pixels=40), tempfile.TemporaryDirectory()
@@ -28,10 +30,10 @@ From files of the simulated bench to a phase:
 >>> measurement = reduce_frames(registered, optics)
 >>> bool((predict_other(measurement) > predict_other(upside_down(measurement))).all())
 True
->>> result = recover_phase(measurement)
->>> result.converged, result.phase.shape
+>>> phases = recover_phase(measurement)
+>>> bool(phases.converged), phases.phase.shape
 (True, (43, 43))
->>> write_phase(f"{folder.name}/phase.fits", result, 635.0, sources)
+>>> write_phase(f"{folder.name}/phase.fits", phases, 635.0, sources)
 >>> bool(0.8 < fit(registered, optics, ["scale"], n_steps=2)[1].scale < 1.2)
 True
 >>> [step.name for step in steps(frames, clear_frames, optics, fitted=())][-1]
@@ -56,12 +58,11 @@ if TYPE_CHECKING:
         verdict,
     )
     from zwfs.frames._blocks import FileError
-    from zwfs.frames._calibrate import calibrate
-    from zwfs.frames._fit import BenchFit, Estimate, fit_bench
-    from zwfs.frames._fitted import FittedPhase, FittedSensor
+    from zwfs.frames._fit import BenchFit, Estimate
     from zwfs.frames.calibration import Calibration
     from zwfs.frames.controller import Controller
-    from zwfs.frames.pipeline import phase_of
+    from zwfs.frames.phases import Phases
+    from zwfs.frames.pipeline import phase_of, recover_phase
     from zwfs.frames.telemetry import reconstruct
     from zwfs.frames.verdict import CameraNoise, judge, order_of_images
 else:
@@ -74,19 +75,17 @@ __all__ = [
     "Controller",
     "Estimate",
     "FileError",
-    "FittedPhase",
-    "FittedSensor",
-    "calibrate",
+    "Phases",
     "calibration",
     "controller",
     "files",
-    "fit_bench",
     "judge",
     "order_of_images",
     "phase_of",
     "phases",
     "pipeline",
     "reconstruct",
+    "recover_phase",
     "refine",
     "registration",
     "telemetry",

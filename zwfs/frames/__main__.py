@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from zwfs.frames._calibrate import calibrate
+from zwfs.frames.calibration import Calibration
 from zwfs.frames.telemetry import reconstruct
 
 _PERIOD = 10.0  # second between two lines of progress where there is no terminal
@@ -48,9 +48,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m zwfs.frames", description=about, **shared)
     commands = parser.add_subparsers(required=True, metavar="command")
     files: dict[str, Any] = {"nargs": "+", "metavar": "FILE"}
-    one = commands.add_parser("calibrate", help="make a calibration from frames and clear frames", **shared)
-    one.set_defaults(run=_calibrate)
-    add = one.add_argument
+    calibrate = commands.add_parser("calibrate", help="make a calibration from frames and clear frames", **shared)
+    calibrate.set_defaults(run=_calibrate)
+    add = calibrate.add_argument
     add("output", help="calibration to write, NPZ")
     add("--frames", dest="frame_files", required=True, help="a frame, or one for each image", **files)
     add("--pupils", dest="pupil_files", required=True, help="clear frames, likewise", **files)
@@ -85,9 +85,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--iterations", dest="n_iterations", type=int, default=25, metavar="N", help="default: 25")
     add("--tolerance", type=float, default=1e-3, metavar="RAD", help="that ends them; default: 1e-3")
     add("--quiet", action="store_true", help="no steps of a fit")
-    two = commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared)
-    two.set_defaults(run=_reconstruct)
-    add = two.add_argument
+    reconstruct = commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared)
+    reconstruct.set_defaults(run=_reconstruct)
+    add = reconstruct.add_argument
     add("frames", nargs="+", help="FITS or NPY files with frames")
     add("--calibration", required=True, metavar="FILE", help="that `calibrate` wrote")
     add("--output", "-o", required=True, metavar="FILE", help="FITS file to write")
@@ -113,26 +113,30 @@ def _calibrate(output: str, pupil_centers: Sequence[float] | None, quiet: bool, 
     centers = None if pupil_centers is None else [pupil_centers[first : first + 2] for first in pairs]
     with warnings.catch_warnings(record=True) as remarks:
         try:
-            found = calibrate(**settings, pupil_centers=centers, progress=None if quiet else _Progress())
+            calibration = Calibration.from_files(
+                **settings, pupil_centers=centers, progress=None if quiet else _Progress()
+            )
         finally:
             if settings["commands"] and not quiet and sys.stderr.isatty():
                 print(file=sys.stderr)
-    for one in remarks:
-        print(f"warning: {one.message}", file=sys.stderr)
-    found.save(output)
+    for remark in remarks:
+        print(f"warning: {remark.message}", file=sys.stderr)
+    calibration.save(output)
     print(
-        f"{output}: pupil {found.diameter:.2f} pixels wide, residual of the frames {found.residual:.3f}, "
-        f"counts at an intensity of 1: {found.unit[0]:.6g} and {found.unit[1]:.6g}"
+        f"{output}: pupil {calibration.diameter:.2f} pixels wide, residual of the frames "
+        f"{calibration.residual:.3f}, counts at an intensity of 1: {calibration.unit[0]:.6g} and "
+        f"{calibration.unit[1]:.6g}"
     )
     return 0
 
 
 def _reconstruct(output: str, strict: bool, quiet: bool, **settings: Any) -> int:
-    found = reconstruct(output=output, progress=None if quiet else _Progress().frames, **settings)
+    summary = reconstruct(output=output, progress=None if quiet else _Progress().frames, **settings)
     if not quiet:
-        flags = ", ".join(f"{n} {name.lower().replace('_', ' ')}" for name, n in found.counts.items() if n)
-        print(f"{Path(output)}: {found.n_frames} frames, {found.n_flagged} flagged{f': {flags}' if flags else ''}")
-    return 3 if strict and found.n_flagged else 0
+        flags = ", ".join(f"{n} {name.lower().replace('_', ' ')}" for name, n in summary.counts.items() if n)
+        flags = f": {flags}" if flags else ""
+        print(f"{Path(output)}: {summary.n_frames} frames, {summary.n_flagged} flagged{flags}")
+    return 3 if strict and summary.n_flagged else 0
 
 
 class _Progress:

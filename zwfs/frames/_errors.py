@@ -30,8 +30,8 @@ def unexplained(phase: NDArray, commands: NDArray) -> NDArray[np.float32]:
         unknown = with_neighbours(unknown)
     waves = np.nan_to_num(np.exp(1j * (phase.astype(float) - np.nan_to_num(commands))))
     waves = aligned(np.where(unknown, 0, waves))
-    left = np.angle(waves * waves.mean(axis=0).conj()) * math.sqrt(len(waves) / (len(waves) - 1))
-    return left.astype(np.float32)
+    errors = np.angle(waves * waves.mean(axis=0).conj()) * math.sqrt(len(waves) / (len(waves) - 1))
+    return errors.astype(np.float32)
 
 
 def sideways(
@@ -46,9 +46,9 @@ def sideways(
         return np.zeros(phase.shape, np.float32)  # one frame is explained by nearly any phase
     chequered = 1e-3 * (-1.0) ** np.indices(phase.shape).sum(axis=0)  # which no reference wave sees
     modelled, changed = (sensor.measure(phase + step)[(..., *sensor.window)] for step in (0, chequered))
-    left, slope = frames - modelled, (changed - modelled) / chequered
+    missing, slope = frames - modelled, (changed - modelled) / chequered
     strength = np.sum(slope**2, axis=0)
-    across = left[0] * slope[1] - left[1] * slope[0]
+    across = missing[0] * slope[1] - missing[1] * slope[0]
     return np.where(good, across / np.maximum(strength, 0.1 * np.median(strength[good])), 0).astype(np.float32)
 
 
@@ -100,5 +100,5 @@ class Excess(NamedTuple):
     def at(self, phase: NDArray, good: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Excess at a phase (ny, nx)."""
         slope = slopes_of(phase[np.newaxis], good)[0]
-        known = min(slope, self.slope)
-        return (self.constant + self.growing * known**self.power) * (slope / known) ** self.power
+        reached = min(slope, self.slope)
+        return (self.constant + self.growing * reached**self.power) * (slope / reached) ** self.power

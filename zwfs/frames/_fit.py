@@ -1,8 +1,4 @@
-"""Optics of a bench from frames of a mirror in known states.
-
-`fit_bench` finds all unknowns of the model at once. `FittedSensor` keeps what was fitted, and seeks only the phase
-of a pair of frames.
-"""
+"""Optics of a bench from frames of a mirror in known states."""
 
 from __future__ import annotations
 
@@ -102,7 +98,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BenchFit(Result):
-    """Result of `fit_bench`.
+    """Fit of a bench to known commands, which `Calibration.fit` makes.
 
     Attributes
     ----------
@@ -217,47 +213,10 @@ def fit_bench(
     n_steps: int = 15,
     progress: Callable[[str], Any] | None = None,
 ) -> BenchFit:
-    """Fit a model of the optics to frames of a mirror in known states, and to clear frames.
+    """Fit a model of the optics to frames of a mirror in known states, see `Calibration.fit`.
 
     Maps of phase and light and all numbers are the unknowns of one least-squares problem. The place of the maps is
     that of the known phases. The flux of the first clear frame is fixed: it defines the map of the light.
-
-    Parameters
-    ----------
-    frames : array_like, shape (n_states, 2, ny, nx) or (n_states, n_frames, 2, ny, nx), counts
-        Less the dark. NaN marks bad pixels. The mean of several frames is taken.
-    clear_frames : array_like, shape (2, ny, nx) or (n_frames, 2, ny, nx), counts
-        Less the dark, with the mask out.
-    phases : array_like, shape (n_states, n, n), radian
-        Phases that the commands add, mean over each pixel, on a grid whose middle is that of the frames. NaN, or 0
-        in all states, marks what is unknown around the pupil; there the phases are continued.
-    n_pixels : float, pixels
-        Diameter D.
-    noise : float, counts rms, optional
-        Of a pixel of one frame without light: read noise, and that of the background and the dark. By default it
-        is estimated from the darkest pixels; the result names it.
-    gain : float, electrons / count
-        For the photon noise.
-    diameter : float, lambda/D
-        Of the dimple, by design. The fit starts from the best of several diameters around it.
-    phase_shifts : (float, float), radian
-        Of the two images, by design. The fit tries both orders, and a remark reports a reversed one.
-    oversampling : int, optional
-        Points of the model along a pixel. By default 2, and if the misfit is above 1 with them, the fit goes on
-        with 3: light at vanes and gaps needs the finer grid.
-    n_steps : int
-        Largest number of steps of each stage.
-    progress : callable, optional
-        Called with a short text before each step.
-
-    Returns
-    -------
-    BenchFit
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not belong together, there are fewer than two states, or a clear frame holds no light.
     """
     data = Recording.of(frames, clear_frames, phases, n_pixels, noise, gain)
     diameter = _check.number("diameter", diameter, 0, open_low=True)

@@ -29,12 +29,12 @@ def fits_module() -> ModuleType:
 def fits_content(*units: tuple[NDArray, str, Sequence[tuple[str, Any, str]]]) -> bytes:
     """Return the content of a file: image, name and header cards (keyword, value, comment) of each unit."""
     fits = fits_module()
-    made = fits.HDUList()
+    units_written = fits.HDUList()
     for image, name, cards in units:
-        made.append(fits.ImageHDU(image, name=name) if made else fits.PrimaryHDU(image))
-        set_cards(made[-1].header, cards)
+        units_written.append(fits.ImageHDU(image, name=name) if units_written else fits.PrimaryHDU(image))
+        set_cards(units_written[-1].header, cards)
     stream = io.BytesIO()
-    made.writeto(stream)
+    units_written.writeto(stream)
     return stream.getvalue()
 
 
@@ -52,7 +52,7 @@ def has_card(path: Path, card: bytes) -> bool:
     except OSError:
         return False
     cards = (header[place : place + 80] for place in range(0, len(header), 80))
-    return header.startswith(FIRST_BYTES) and any(one.startswith(card) for one in cards)
+    return header.startswith(FIRST_BYTES) and any(text.startswith(card) for text in cards)
 
 
 def card_value(value: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,6 @@ from scipy.sparse.linalg import splu
 
 from zwfs import _check
 from zwfs._images import nearest_good
-from zwfs._results import PhaseResult
 from zwfs.frames._explicit import Explicit, Posterior
 from zwfs.frames._fit import EXPLAINED, BenchFit, places_of
 from zwfs.frames._light import KnownLight
@@ -39,37 +38,15 @@ _LEAST, _MOST = 1e-12, 1e12  # counts: least of a noise, and most of a frame
 _DRAWS = 12  # for the error bars of a phase
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class FittedPhase(PhaseResult):
-    """Phase of a pair of frames; in arithmetic and for NumPy it is the array `phase`.
+class PairFit(NamedTuple):
+    """Phase of a pair of frames with the optics of a fit."""
 
-    Attributes
-    ----------
-    phase : ndarray, shape (n, n), radian
-        Mean over each pixel, that of the optics included.
-    sigma : ndarray, shape (n, n), radian
-        Error bar of each pixel.
-    misfit : float
-        Mean square of the residuals over the noise.
-    consistent : bool
-        Whether the model explains these frames and those of the fit within their noise.
-    converged : bool
-    prior : MapPrior
-        Of the phase: `rms` (radian), `exponent` of the spectrum and `outer_scale` (D), as given or as chosen by
-        the evidence.
-    """
-
-    phase: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    misfit: float
-    consistent: bool
+    phase: NDArray[np.float64]  # (n, n), radian: mean over each pixel, that of the optics included
+    sigma: NDArray[np.float64]  # (n, n), error bar of each pixel
+    misfit: float  # mean square of the residuals over the noise
+    consistent: bool  # whether the model explains these frames and those of the fit within their noise
     converged: bool
-    prior: MapPrior
-
-    @property
-    def exponent(self) -> float:
-        """Exponent of the spectrum of the prior."""
-        return self.prior.exponent
+    prior: MapPrior  # as given, or as chosen by the evidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +79,7 @@ class FittedSensor:
 
     def __call__(
         self, frames: ArrayLike, sigma: ArrayLike | None = None, prior: MapPrior | None = None
-    ) -> FittedPhase:
+    ) -> PairFit:
         """Phase of one pair of frames.
 
         Parameters
@@ -118,7 +95,7 @@ class FittedSensor:
 
         Returns
         -------
-        FittedPhase
+        PairFit
         """
         if prior is not None:
             _check.instance("prior", prior, MapPrior)
@@ -153,7 +130,7 @@ class FittedSensor:
         misfit, phase = float(np.mean(point.misfit)), point.phase_means[PAD:-PAD, PAD:-PAD]
         bars = _error_bars(point) * math.sqrt(max(1.0, misfit))
         explained = misfit < EXPLAINED and self.fit.consistent
-        return FittedPhase(phase, bars, misfit, explained, converged, point.problem.phase_map.prior)
+        return PairFit(phase, bars, misfit, explained, converged, point.problem.phase_map.prior)
 
     def _chosen(self, start: Point) -> Point:
         """Phase with the prior that the evidence chooses."""

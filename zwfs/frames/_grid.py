@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -37,9 +38,43 @@ _NEGLIGIBLE = 1e-10  # of a weight: smaller ones only slow products down, much s
 class Solved(NamedTuple):
     """Phases of k frame sets."""
 
-    phase: NDArray[np.float32]  # (k, ny, nx), bad points filled
+    phase: NDArray  # (k, ny, nx), bad points filled
     n_iterations: NDArray[np.int64]
     converged: NDArray[np.bool_]
+    n_unsolved: NDArray[np.int64]
+
+
+def iterated(
+    reconstruct: Reconstructor, frames: NDArray, good: NDArray, start: NDArray | None = None,
+    fill: Callable[[NDArray, NDArray], NDArray] | None = None,
+) -> Solved:  # fmt: skip
+    """Phases of ideal frames, (k, n_masks, ny, nx), which are changed, from good points (k, ny, nx).
+
+    Bad points take no part: in a second iteration their intensity is that of the model, so that the reference wave
+    has no hole.
+    """
+    sensor, fill = reconstruct.sensor, fill or _filled
+    result = reconstruct(frames, start)
+    phase, n_iterations, converged, n_unsolved = (
+        getattr(result, name) for name in ("phase", "n_iterations", "converged", "n_unsolved")
+    )
+    phase[:, ~sensor.pupil.inside] = 0
+    holes = sensor.pupil.inside & ~good
+    spoiled = np.flatnonzero(holes.any(axis=(1, 2)))
+    if spoiled.size:
+        phase[spoiled] = fill(phase[spoiled], good[spoiled])
+        model = sensor.measure(phase[spoiled])[(..., *sensor.window)]
+        frames[spoiled] = np.where(holes[spoiled, np.newaxis], model, frames[spoiled])
+        again = reconstruct(frames[spoiled], phase[spoiled] if reconstruct.iterative else None)
+        phase[spoiled] = fill(np.where(sensor.pupil.inside, again.phase, 0), good[spoiled])
+        n_iterations[spoiled] += again.n_iterations
+        converged[spoiled], n_unsolved[spoiled] = again.converged, again.n_unsolved
+    return Solved(phase, n_iterations, converged, n_unsolved)
+
+
+def _filled(phase: NDArray, good: NDArray) -> NDArray:
+    """Phases (k, ny, nx) with bad points replaced by the nearest good one."""
+    return np.stack([nearest_good(*pair) for pair in zip(phase, good, strict=True)])
 
 
 class Grid:
@@ -68,14 +103,14 @@ class Grid:
             axes = zip((row, column), size, calibration.shape, strict=True)
             self.boxes.append((min(index, calibration.n_images - 1), *(_span(*axis) for axis in axes)))
         pairs = calibration.dark, calibration.bad
-        dark, bad = (np.stack([one[i][rows][:, columns] for i, rows, columns in self.boxes]) for one in pairs)
+        dark, bad = (np.stack([maps[i][rows][:, columns] for i, rows, columns in self.boxes]) for maps in pairs)
         self.dark, self.bad = dark + calibration.background[:, np.newaxis, np.newaxis].astype(np.float32), bad
         corners, inside = places - low[:, :, np.newaxis], pupil.inside.ravel().astype(float)
-        self.touching = [_interpolation(one, size, 1, inside) for one in corners]  # from all pixels of a box
+        self.touching = [_interpolation(place, size, 1, inside) for place in corners]  # from all pixels of a box
         self._corners = corners.reshape(calibration.places.shape)
         near = ndimage.binary_dilation(pupil.inside, iterations=_RIM)
         self.splines = [
-            _interpolation(one - _CUT, size - 2 * _CUT, 3, near.ravel().astype(float)) for one in corners
+            _interpolation(place - _CUT, size - 2 * _CUT, 3, near.ravel().astype(float)) for place in corners
         ]
         inner = ndimage.binary_erosion(pupil.inside)
         rim = near & ~inner
@@ -84,11 +119,11 @@ class Grid:
         self.beyond = ~pupil.inside.ravel()[self.rim]  # points of the rim outside the pupil
         self.edge = _repair(pupil.inside & ~inner, inner)  # points of the edge, and the nearest ones off it
         self.filters = [_spline_filter(length, calibration.blur) for length in size]  # to their coefficients
-        reached = np.stack([one.sum(axis=0) > 0 for one in self.touching])
+        reached = np.stack([matrix.sum(axis=0) > 0 for matrix in self.touching])
         self.watched = reached.reshape(bad.shape) & ~bad  # good pixels from which the pupil is made
         self.dim = ~reached.reshape(bad.shape) & ~bad  # good pixels around it
         # Bad pixels of each box, and bad points of the pupil, with their nearest good ones.
-        self.repairs = [_repair(one, ~one) for one in bad]
+        self.repairs = [_repair(pixels, ~pixels) for pixels in bad]
         self.holes = _repair(pupil.inside & ~calibration.good, calibration.good)
 
     def on_grid(self, counts: NDArray, level: float, good: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
@@ -123,8 +158,8 @@ class Grid:
         for index, (pixels, nearest) in enumerate(self.repairs):
             flat[:, index, pixels] = flat[:, index, nearest]
         for place in np.flatnonzero(strange):
-            for index, one in enumerate(odd[place]):
-                usable = ~(one | self.bad[index])
+            for index, spoiled_pixels in enumerate(odd[place]):
+                usable = ~(spoiled_pixels | self.bad[index])
                 raw[place, index] = nearest_good(raw[place, index], usable) if usable.any() else 0
         return raw, good, n_bad, n_saturated
 
@@ -149,26 +184,9 @@ class Grid:
     def solve(
         self, frames: NDArray, good: NDArray, start: NDArray | None = None, method: Reconstructor | None = None
     ) -> Solved:
-        """Phases of ideal frames.
-
-        Bad points take no part: in a second iteration their intensity is that of the model. The frames, shape
-        (k, 2, ny, nx), are changed.
-        """
-        reconstruct, sensor = method or self.reconstruct, self.reconstruct.sensor
-        frames = frames[:, : sensor.n_masks]
-        found = reconstruct(frames, start)
-        phase, n_iterations, converged = found.phase, found.n_iterations, found.converged
-        phase[:, ~sensor.pupil.inside] = 0
-        holes = sensor.pupil.inside & ~good
-        some = np.flatnonzero(holes.any(axis=(1, 2)))
-        if some.size:
-            phase[some] = self.filled(phase[some], good[some])
-            frames[some] = np.where(holes[some, np.newaxis], sensor.measure(phase[some]), frames[some])
-            found = reconstruct(frames[some], phase[some] if reconstruct.iterative else None)
-            phase[some] = self.filled(np.where(sensor.pupil.inside, found.phase, 0), good[some])
-            n_iterations[some] += found.n_iterations
-            converged[some] = found.converged
-        return Solved(phase, n_iterations, converged)
+        """Phases of ideal frames, shape (k, 2, ny, nx), which are changed."""
+        reconstruct = method or self.reconstruct
+        return iterated(reconstruct, frames[:, : self.reconstruct.sensor.n_masks], good, start, self.filled)
 
     def compared(self, phase: NDArray, frames: NDArray, good: NDArray) -> tuple[NDArray, NDArray]:
         """Rms difference of frames (k, 2, ny, nx) from those of phases, (k,), and the ratio of their light."""
@@ -235,7 +253,8 @@ class Grid:
         """Points with a bad pixel on one of their sides: (k, 2, h, w) to (k, ny, nx)."""
         k, shape = len(spoiled), self.offset.shape[1:]
         weights = sum(
-            one @ spoiled[:, index].reshape(k, -1).T.astype(np.float32) for index, one in enumerate(self.touching)
+            matrix @ spoiled[:, index].reshape(k, -1).T.astype(np.float32)
+            for index, matrix in enumerate(self.touching)
         )
         return (weights.T > _TOUCHED).reshape(k, *shape)
 

@@ -1,4 +1,4 @@
-"""Fast path of a bench that `fit_bench` fitted: linear operators that are learnt from frames of its model.
+"""Calibration of a bench that `fit_bench` fitted: linear operators that are learnt from frames of its model.
 
 `FittedSensor` fits each pair of frames with all of the model. Here the fit gives the places of all points and the
 blur. Weights and an offset of each point turn counts into frames of an ideal sensor: a linear fit to predicted
@@ -8,19 +8,133 @@ focus of the relay to first order.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from zwfs.frames._fit import BenchFit
+from zwfs import _check
+from zwfs._images import radius
+from zwfs.frames._errors import slopes_of, unexplained
+from zwfs.frames._fit import BenchFit, places_of
 from zwfs.frames._fitted import FittedSensor
 from zwfs.frames.pipeline import Optics, unmixed
+from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
+
+if TYPE_CHECKING:
+    from zwfs.frames.calibration import Calibration
 
 _SCREENS = 24  # random phases from which weights are learnt
 _RMS = (0.15, 0.3, 0.5, 0.8)  # radian, of these
 _FINEST = 20  # cycles / D
 _STIFFNESS = 1e-3  # variance of the frames up to which a weight stays what leakage alone makes it
+_FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
+WIDEST = 2**16  # rows or columns of a camera
+
+
+class Windows(NamedTuple):
+    """Windows around the two pupils on one or two images of a camera."""
+
+    corners: NDArray[np.int64]  # (2, 2), row and column of their first pixels
+    size: tuple[int, int]
+    n_images: int
+    shape: tuple[int, int]  # of an image
+
+    @classmethod
+    def checked(cls, size: tuple[int, int], corners: Any, n_images: Any, shape: Any) -> Windows:
+        shape = size if shape is None else _check.pair("shape", shape, _check.integer, 1, WIDEST)
+        n_images = _check.integer("n_images", n_images, 1, 2)
+        corners, most = _check.integer_array("corners", corners), np.subtract(shape, size)
+        if corners.shape != (2, 2) or np.any(corners < 0) or np.any(corners > most):
+            raise ValueError(
+                f"corners = {_check.shown(corners.tolist())}: expected two pairs of a row and a column, from "
+                f"(0, 0) to {tuple(most.tolist())}, so that frames of {size} lie on one of {shape}"
+            )
+        return cls(corners, size, n_images, shape)
+
+    @classmethod
+    def of(cls, calibration: Calibration, bench: BenchFit) -> Windows:
+        """Windows whose frames a calibration was fitted to."""
+        size, n = bench.point.problem.camera.shape, len(bench.light)
+        first = places_of(bench.point.model.arms[:2], n, size)[:, :, 0, 0]
+        corners = np.rint(calibration.places[:, :, 0, 0] - first).astype(int)
+        return cls(corners, size, calibration.n_images, calibration.shape)
+
+    @property
+    def places(self) -> list[tuple[int, slice, slice]]:
+        """Image, rows and columns of each window."""
+        height, width = self.size
+        return [
+            (min(index, self.n_images - 1), slice(row, row + height), slice(column, column + width))
+            for index, (row, column) in enumerate(self.corners)
+        ]
+
+    def cut(self, images: NDArray) -> NDArray:
+        """Windows (..., 2, height, width) of images (..., n_images, ny, nx)."""
+        return np.stack([images[(..., *place)] for place in self.places], axis=-3)
+
+    def on_camera(self, pairs: NDArray) -> NDArray:
+        """Images (k, n_images, ny, nx) with windows (k, 2, height, width), and 0 elsewhere."""
+        images = np.zeros((len(pairs), self.n_images, *self.shape))
+        for index, place in enumerate(self.places):
+            images[(slice(None), *place)] = pairs[:, index]
+        return images
+
+
+def of_bench(
+    kind: type[Calibration], bench: BenchFit, counts: NDArray, phases: NDArray, dark: NDArray, windows: Windows,
+    **settings: Any,
+) -> Calibration:  # fmt: skip
+    """Calibration of a fitted bench, from the mean frames of its states, (n_states, 2, ny, nx), less the dark.
+
+    The focus of the relay is corrected to first order, around a flat wavefront.
+    """
+    calibration = _unweighted(kind, bench, counts, dark, windows, settings)
+    work, shape = calibration._work, calibration.good.shape
+    good = calibration.good & ~work.touched(work.bad[np.newaxis])[0]
+
+    def intensity(pairs: NDArray) -> NDArray:
+        values = work.on_grid(windows.on_camera(np.nan_to_num(pairs)) + calibration.dark, np.inf, good)[0]
+        return values.reshape(len(values), 2, *shape) / calibration.unit[:, np.newaxis, np.newaxis]
+
+    counts_seen, ideal = training(bench, calibration.sensor)
+    weights, offset = learnt(intensity(counts_seen), ideal, calibration.optics)
+    light = intensity(counts)[..., good].mean(axis=(0, 2))
+    calibration = replace(calibration, good=good, weights=weights, offset=offset, light=light)
+    images = windows.on_camera(np.nan_to_num(counts)) + calibration.dark
+    # The lamp is that of the calibration, so its light is known.
+    measured = calibration(images if windows.n_images == 2 else images[:, 0], light=1.0, saturation=np.inf)
+    ideal = np.einsum("ijyx,kjyx->kiyx", weights, intensity(counts)) + offset
+    _, ratios = calibration._work.compared(measured.filled, ideal, np.broadcast_to(good, measured.phase.shape))
+    return replace(
+        calibration, light_ratio=float(ratios.mean()), unexplained=unexplained(measured.phase, phases),
+        slopes=slopes_of(measured.filled, good), displacements=measured.displacement.astype(float),
+        residual=float(np.nanmax(measured.residual)),
+    )  # fmt: skip
+
+
+def _unweighted(
+    kind: type[Calibration], bench: BenchFit, counts: NDArray, dark: NDArray, windows: Windows,
+    settings: dict[str, Any],
+) -> Calibration:  # fmt: skip
+    """Calibration with the geometry of a fit, and weights of 0."""
+    masks, arms, n = bench.point.model.masks, bench.point.model.arms[:2], len(bench.light)
+    shares = {"leakage": masks["leakage"], "unmasked": max(masks["unmasked"], 0.0)}
+    optics = Optics(masks["diameter"], (masks["first"], masks["second"]), **shares)
+    n_pixels, bad = bench.point.problem.camera.n_pixels, ~np.isfinite(counts).all(axis=0)
+    light = bench.light * (radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2)
+    pupil = Pupil.from_amplitude(np.sqrt(np.maximum(light, 0)), n_pixels, threshold=_FAINTEST)
+    background, flux = (np.array([arm[key] for arm in arms]) for key in ("background", "flux"))
+    return kind(
+        pupil.amplitude, n_pixels, pupil.center, optics, windows.shape, windows.n_images,
+        places_of(arms, n, windows.size) + windows.corners[..., None, None], dark,
+        windows.on_camera(bad[np.newaxis])[0] > 0, pupil.inside, background, flux * light[pupil.inside].mean(),
+        np.zeros((2, 2, n, n)), np.zeros((2, n, n)), False, np.ones(2), np.zeros((0, n, n), np.float32),
+        np.zeros(0), np.zeros((0, 2)), blur=masks["blur"], commanded=True, bench=bench, **settings,
+    )  # fmt: skip
 
 
 def training(fit: BenchFit, sensor: ZernikeSensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -32,14 +146,14 @@ def training(fit: BenchFit, sensor: ZernikeSensor) -> tuple[NDArray[np.float64],
     n, flat = len(inside), _smooth(fit.flat, inside)
     frequency = np.hypot(*np.meshgrid(*(fft.fftfreq(2 * n) * sensor.pupil.n_pixels,) * 2))
     colour = (frequency**2 + 0.5) ** -0.95 * np.exp(-((frequency / _FINEST) ** 2))
-    seen, ideal = [], []
+    frames, ideal = [], []
     for index in range(_SCREENS):
         screen = fft.ifft2(fft.fft2(rng.normal(size=colour.shape)) * colour).real[:n, :n]
         screen = (screen - screen[inside].mean()) / screen[inside].std()
         phase = flat + _RMS[index % len(_RMS)] * screen
-        seen.append(model.frames(phase))
+        frames.append(model.frames(phase))
         ideal.append(sensor.measure(np.where(inside, phase, 0))[(..., *sensor.window)])
-    return np.array(seen), np.array(ideal)
+    return np.array(frames), np.array(ideal)
 
 
 def learnt(values: NDArray, ideal: NDArray, optics: Optics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -56,5 +170,5 @@ def learnt(values: NDArray, ideal: NDArray, optics: Optics) -> tuple[NDArray[np.
 def _smooth(image: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Mean of neighbours inside, without a trace of a chequerboard."""
     kernel = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25])
-    values, weights = (ndimage.convolve(one, kernel, mode="constant") for one in (inside * image, 1.0 * inside))
+    values, weights = (ndimage.convolve(area, kernel, mode="constant") for area in (inside * image, 1.0 * inside))
     return np.where(inside, values / np.maximum(weights, 1e-9), image)

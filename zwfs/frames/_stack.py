@@ -110,8 +110,8 @@ class Stack:
             for array in segment.arrays:
                 if array.full[-2:] != shape or segment.n_images != n_images:
                     expected = f"(n, {'2, ' * (n_images - 1)}{shape[0]}, {shape[1]}), as in the calibration"
-                    other = ", or the second images in an extension or a file" * (n_images - 1)
-                    raise FileError(f"{array.name}: its shape is {array.full}: expected {expected}{other}")
+                    addition = ", or the second images in an extension or a file" * (n_images - 1)
+                    raise FileError(f"{array.name}: its shape is {array.full}: expected {expected}{addition}")
                 if array.dtype != first.dtype:
                     raise FileError(
                         f"{array.name}: its numbers are {array.dtype}: expected {first.dtype}, as in {first.name}"
@@ -125,9 +125,9 @@ class Stack:
     @property
     def saturation(self) -> float:
         """Level at which pixels are saturated, as the first file states it or as its type allows."""
-        known, first = "SATURATE" in self.header, self.firsts[0]
-        level = self.header["SATURATE"] if known else first.full_scale
-        name = f"{first.name}: {'SATURATE' if known else 'largest number of its type'}"
+        stated, first = "SATURATE" in self.header, self.firsts[0]
+        level = self.header["SATURATE"] if stated else first.full_scale
+        name = f"{first.name}: {'SATURATE' if stated else 'largest number of its type'}"
         return level if level == np.inf else _check.number(name, level, 0, open_low=True)
 
     def read(self, first: int, stop: int) -> NDArray:
@@ -141,5 +141,5 @@ class Stack:
 
     def state(self) -> list[tuple[str, str, int, int, int]]:
         """Path, name, exposures, size and time of change of all files: it differs once a file has changed."""
-        found = [(segment.n, array, os.stat(array.path)) for segment in self.segments for array in segment.arrays]
-        return [(str(one.path), one.name, n, stat.st_size, stat.st_mtime_ns) for n, one, stat in found]
+        states = [(segment.n, array, os.stat(array.path)) for segment in self.segments for array in segment.arrays]
+        return [(str(array.path), array.name, n, stat.st_size, stat.st_mtime_ns) for n, array, stat in states]

@@ -70,10 +70,10 @@ class Recording:
             )
         gain = _check.number("gain", gain, 0, open_low=True)
         images = [*clear, *masked.reshape(-1, *masked.shape[2:])]
-        good = [np.isfinite(one) for one in images]
+        good = [np.isfinite(image) for image in images]
         if noise is None:
             noise = _dark_noise(images, n_pixels) * math.sqrt(m)
-        counts = [np.where(ok, one, 0) for one, ok in zip(images, good, strict=True)]
+        counts = [np.where(ok, image, 0) for image, ok in zip(images, good, strict=True)]
         noise = _check.number("noise", noise, 0, open_low=True)
         n_frames = [k, k] + [m] * (len(images) - 2)
         return cls(counts, good, n_frames, _continued(phases), n_pixels, noise, gain)
@@ -82,7 +82,7 @@ class Recording:
     def light(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Light of each pixel of the maps, 1 on average where lit, and the counts of 1 in each clear frame."""
         n = self.phases.shape[-1]
-        inner = np.stack([centred(one, n) for one in self.counts[:2]])
+        inner = np.stack([centred(image, n) for image in self.counts[:2]])
         mean = inner.mean(axis=0)
         lit = mean >= 0.5 * np.percentile(mean, 80)
         flux = inner[:, lit].mean(axis=1)
@@ -109,7 +109,7 @@ def _mean_of(name: str, images: ArrayLike, n_axes: int) -> tuple[NDArray[np.floa
 
 def _dark_noise(images: list[NDArray], n_pixels: float) -> float:
     """Noise of the darkest pixels of the clear frames, from differences of neighbours."""
-    found = []
+    levels = []
     for image in images[:2]:
         far = radius(image.shape, tuple((n - 1) / 2 for n in image.shape)) > 0.56 * n_pixels
         step = (np.diff(image, axis=1) / math.sqrt(2))[far[:, 1:] & far[:, :-1]]
@@ -118,8 +118,8 @@ def _dark_noise(images: list[NDArray], n_pixels: float) -> float:
             raise ValueError(
                 "noise = None: expected the noise of a pixel, because the frames hold too few dark pixels"
             )
-        found.append(1.4826 * np.median(np.abs(step - np.median(step))))
-    return float(np.mean(found))
+        levels.append(1.4826 * np.median(np.abs(step - np.median(step))))
+    return float(np.mean(levels))
 
 
 def centred(image: NDArray, n: int) -> NDArray:
@@ -164,7 +164,7 @@ def _continued(phases: NDArray) -> NDArray[np.float64]:
     same, *steps = sparse.eye_array(n), *(sparse.csr_array(np.diff(np.eye(n), k, axis=0)) for k in (1, 2, 3))
     parts = [sparse.kron(steps[2], same), sparse.kron(same, steps[2])]
     parts += [math.sqrt(3) * sparse.kron(*pair) for pair in (steps[:2], steps[1::-1])]
-    bending = sum(one.T @ one for one in parts).tocsc()
+    bending = sum(part.T @ part for part in parts).tocsc()
     flat, rows = wide.reshape(len(wide), -1).copy(), unknown.ravel()
     right = -(bending[rows][:, ~rows] @ flat[:, ~rows].T)
     flat[:, rows] = splu(bending[rows][:, rows].tocsc()).solve(right).T

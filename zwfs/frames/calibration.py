@@ -1,7 +1,8 @@
 """A calibrated bench: what is computed once, so that camera images become phases in one call.
 
-`Calibration.of` takes it from a measurement with clear frames, `Calibration.from_bench` from a fit of the bench. A
-call does the same as `reduce_frames` and `recover_phase` of `zwfs.frames.pipeline`, in single precision.
+`Calibration.from_files` makes it from camera files, `Calibration.from_arrays` from arrays of frames and clear
+frames, `Calibration.fit` from frames of a mirror in known states, and `Calibration.of` from a measurement that was
+registered and reduced step by step.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import io
 import json
 import math
 import zipfile
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,50 +23,35 @@ from numpy.typing import ArrayLike, NDArray
 
 from zwfs import _check
 from zwfs._arrays import Immutable, Kind, read_only
-from zwfs._images import radius
 from zwfs._likelihood import Estimator, Noise
 from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
-from zwfs.frames._errors import Excess, sideways, slopes_of, unexplained
-from zwfs.frames._fit import BenchFit, places_of
-from zwfs.frames._flux import Trial, explained
+from zwfs.frames._errors import Excess, sideways, slopes_of
+from zwfs.frames._exposures import Exposures
+from zwfs.frames._fit import BenchFit, fit_bench
 from zwfs.frames._grid import Grid
-from zwfs.frames._learnt import learnt, training
+from zwfs.frames._learnt import WIDEST, Windows, of_bench
+from zwfs.frames._smooth import smooth_phases
+from zwfs.frames._solver import MapPrior
 from zwfs.frames.controller import Controller, PhaseController, make_controller
 from zwfs.frames.phases import Flag, Phases
-from zwfs.frames.pipeline import _MOST_BAD, Measurement, Optics, ideal_frames
+from zwfs.frames.pipeline import Measurement, Optics, ideal_frames, measured
 from zwfs.frames.registration import FRAMES
 from zwfs.metrics import without_piston
-from zwfs.pupil import Pupil
 from zwfs.reconstructors.base import Reconstructor
 from zwfs.sensor import ZernikeSensor
 
 FORMAT = 2  # of the file; another number is refused
-_DIM = 0.1  # of the light of the calibration: a frame with less is compared with its noise
-_FAINT = 0.5  # of that light, from which down the noise of dark pixels counts
-_UNUSUAL = 2.5  # times the residual of the calibration's frames: a larger one is inconsistent
-_EXACT = 1e-3  # residual of frames without noise
-_MOVED_BY, _SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
-_SAME_LIGHT = 0.01  # relative difference of the light of frames and of their model that means little
-_LAMP = (
-    0.85,
-    1.7,
-)  # light in the pupil, over that of the calibration's frames, that other phases can make of its lamp
-_FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
-_WIDEST = 2**16  # rows or columns of a camera
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
-_LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED, _MOVED = (
-    flag.value for flag in Flag
-)  # plain, and far quicker
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Immutable):
     """Sensor and camera of a bench: called on camera images, it returns their phases.
 
-    Make one with `of`, `from_bench`, `calibrate` or `load`. It cannot be changed. Its pickle is small, and the
-    model of the sensor is made at the first call of each process.
+    Make one with `from_files`, `from_arrays`, `fit`, `of` or `load`. It cannot be changed. Its pickle is small,
+    and the model of the sensor is made at the first call of each process.
 
     Attributes
     ----------
@@ -108,6 +95,8 @@ class Calibration(Immutable):
         Unit of the calibration's frames, BUNIT of their header; empty if unknown.
     n_iterations, tolerance : int and float, radian
         As for `PhaseShifted`: with a tolerance of 0, all iterations are done.
+    bench : BenchFit or None
+        Optics that were fitted to known commands. `save` does not store it.
     """
 
     amplitude: NDArray[np.float64]
@@ -138,6 +127,7 @@ class Calibration(Immutable):
     bunit: str = ""
     n_iterations: int = 25
     tolerance: float = 1e-3
+    bench: BenchFit | None = None
 
     def __post_init__(self) -> None:
         _check.integer("n_iterations", self.n_iterations, 1)
@@ -154,7 +144,9 @@ class Calibration(Immutable):
         _check.pair("center", self.center, _check.number)
         _check.instance("optics", self.optics, Optics)
         _check.flag("commanded", self.commanded)
-        shape = _check.pair("shape", self.shape, _check.integer, 1, _WIDEST)
+        if self.bench is not None:
+            _check.instance("bench", self.bench, BenchFit)
+        shape = _check.pair("shape", self.shape, _check.integer, 1, WIDEST)
         amplitude = _check.real_map("amplitude", self.amplitude)
         _check.non_negative("amplitude", amplitude)
         grid, camera = amplitude.shape, (self.n_images, *shape)
@@ -186,6 +178,188 @@ class Calibration(Immutable):
         return f"Calibration(pupil of {self.diameter:.2f} pixels, {images}, residual={self.residual:.3g})"
 
     @classmethod
+    def from_files(
+        cls, frame_files: Sequence[str | Path], pupil_files: Sequence[str | Path],
+        dark_files: Sequence[str | Path] = (), bad_pixel_files: Sequence[str | Path] = (), *,
+        diameter: float = 0.0, phase_shifts: Sequence[float] = (), saturation: float | None = None,
+        fitted: Sequence[str] = (),
+        commands: str | Path | None = None, noise: float | None = None, gain: float = 1.0, n_iterations: int = 25,
+        tolerance: float = 1e-3, pupil_dark_files: Sequence[str | Path] = (), n_images: int | None = None,
+        progress: Callable[[str], Any] | None = None, **settings: Any,
+    ) -> Calibration:  # fmt: skip
+        """Calibration from camera files: frames as those to come, and clear frames.
+
+        With known commands of a mirror, `fit` fits a model of the camera to the frames, which takes minutes. Of
+        three states or more, the last is first left out: if a fit to the others measures it worse than a
+        calibration without commands, a warning says so, and the latter is returned.
+
+        Parameters
+        ----------
+        frame_files, pupil_files, dark_files, bad_pixel_files : sequence of str or Path
+            See `zwfs.frames.files.read_all`.
+        diameter, phase_shifts : float, lambda/D, and sequence of one or two floats, radian
+            Of the dimple; DIMPLE, THETA1 and THETA2 of the header if 0 and empty. With one, there is one image.
+        saturation : float, counts, optional
+            Of the camera, see `zwfs.frames.files.images`. Without it the frames to come are compared with SATURATE
+            of the header, or with the largest number of their type.
+        fitted : sequence of str
+            Parameters that `zwfs.frames.refine.fit` fits to these frames.
+        commands : str or Path, optional
+            File with known phases (n_states, n, n), radian, as for `fit`. Then the files of frames hold one or
+            more exposures of each state in turn, (n, ny, nx) or (n, 2, ny, nx). Clear frames may be such a cube.
+        noise, gain : float, counts rms and electrons / count
+            As for `fit`.
+        n_iterations, tolerance : int and float, radian
+        pupil_dark_files, n_images : sequence of str or Path, and int, optional
+            See `zwfs.frames.files.read_all`.
+        progress : callable, optional
+            With commands, called with a short text before each step of the fit.
+        **settings
+            Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel. With
+            commands only the first two.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        FileNotFoundError, ImportError, TypeError, ValueError
+            If a file or a value is not as expected, or astropy is needed and missing.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from zwfs.bench import Bench, write_bench
+        >>> from zwfs.frames import Calibration
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)
+        ...     calibration = Calibration.from_files([files["frame"]], [files["pupils"]], [files["dark"]])
+        ...
+        >>> calibration.optics.diameter, round(calibration.diameter)
+        (1.06, 40)
+        """
+        from zwfs.frames._calibrate import Source  # late: it makes calibrations
+
+        progress = _check.callback("progress", progress)
+        gain = _check.number("gain", gain, 0, open_low=True)
+        noise = None if noise is None else _check.number("noise", noise, 0, open_low=True)
+        diameter = _check.number("diameter", diameter, 0)
+        _check.sequence("phase_shifts", phase_shifts, expected="a list of one or two numbers")
+        if n_images is not None:
+            n_images = _check.integer("n_images", n_images, 1, 2)
+        files = frame_files, pupil_files, dark_files, bad_pixel_files, pupil_dark_files
+        attributes = {"n_iterations": n_iterations, "tolerance": tolerance}
+        source = Source(files, diameter, tuple(phase_shifts), saturation, n_images, settings, attributes)
+        if commands is None:
+            return source.registered(fitted)
+        if fitted:
+            raise ValueError(
+                f"fitted = {_check.shown(fitted)}: expected none with commands, which fit all of them"
+            )
+        return source.commanded(path_of("commands", commands), noise=noise, gain=gain, progress=progress)
+
+    @classmethod
+    def from_arrays(
+        cls, frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None = None, *,
+        saturation: float = np.inf, n_iterations: int = 25, tolerance: float = 1e-3, **optics: Any,
+    ) -> Calibration:  # fmt: skip
+        """Calibration from a pair of frames as those to come, and from clear frames.
+
+        Parameters
+        ----------
+        frames, clear_frames : array_like, shape (ny, nx) or (2, ny, nx), counts
+            One camera image with both pupils, or one for each: with the mask in, and with the mask out. With one
+            phase shift, one image with one pupil. NaN marks bad pixels. Average several exposures first.
+        dark : array_like, shape (ny, nx) or (2, ny, nx), counts, optional
+            Counts without light, which are subtracted from both, and from the frames to come.
+        saturation, n_iterations, tolerance : float, counts; int; float, radian
+            Attributes of the calibration.
+        **optics
+            Parameters of `Optics`, such as `diameter` and `phase_shifts`.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a shape is wrong, or the pupils are not found.
+        """
+        attributes = {"saturation": saturation, "n_iterations": n_iterations, "tolerance": tolerance}
+        return cls.of(measured(frames, clear_frames, dark, Optics(**optics)), dark, **attributes)
+
+    @classmethod
+    def fit(
+        cls, frames: ArrayLike, clear_frames: ArrayLike, phases: ArrayLike, dark: ArrayLike | None = None, *,
+        n_pixels: float, corners: ArrayLike = ((0, 0), (0, 0)), shape: tuple[int, int] | None = None,
+        n_images: int = 2, noise: float | None = None, gain: float = 1.0, diameter: float = 1.06,
+        phase_shifts: tuple[float, float] = (np.pi / 2, -np.pi / 2), oversampling: int | None = None,
+        n_steps: int = 15, progress: Callable[[str], Any] | None = None, **settings: Any,
+    ) -> Calibration:  # fmt: skip
+        """Calibration from frames of a mirror in known states: a fit of the bench, and linear operators of it.
+
+        The fit is `bench` of the result: read its `consistent` and `remarks`. The operators hold geometry, blur
+        and leakage, and the focus of the relay to first order. With `smooth`, a call uses all of the fit.
+
+        Parameters
+        ----------
+        frames : array_like, shape (n_states, 2, ny, nx) or (n_states, n_frames, 2, ny, nx), counts
+            Windows around the two pupils, less the dark. NaN marks bad pixels. Several frames are averaged.
+        clear_frames : array_like, shape (2, ny, nx) or (n_frames, 2, ny, nx), counts
+            Less the dark, with the mask out.
+        phases : array_like, shape (n_states, n, n), radian
+            Phases that the commands add, mean over each pixel, on a grid whose middle is that of the frames. The
+            phases of the calibration are on this grid. NaN, or 0 in all states, marks what is unknown around the
+            pupil; there the phases are continued.
+        dark : array_like, shape (ny_camera, nx_camera) or (n_images, ny_camera, nx_camera), counts, optional
+            That was subtracted from the frames; none if left out.
+        n_pixels : float, pixels
+            Diameter D.
+        corners, shape, n_images : array_like of int, shape (2, 2); (int, int); int
+            If the frames were cut out: row and column of their first pixels on the camera, rows and columns of a
+            camera image, and the number of these in an exposure.
+        noise : float, counts rms, optional
+            Of a pixel of one frame without light: read noise, and that of the background and the dark. By default
+            it is estimated from the darkest pixels; `bench` names it.
+        gain : float, electrons / count
+            For the photon noise.
+        diameter : float, lambda/D
+            Of the dimple, by design. The fit starts from the best of several diameters around it.
+        phase_shifts : (float, float), radian
+            Of the two images, by design. The fit tries both orders, and a remark reports a reversed one.
+        oversampling : int, optional
+            Points of the model along a pixel. By default 2, and if the misfit is above 1 with them, the fit goes
+            on with 3: light at vanes and gaps needs the finer grid.
+        n_steps : int
+            Largest number of steps of each stage.
+        progress : callable, optional
+            Called with a short text before each step.
+        **settings
+            Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        TypeError, ValueError
+            If shapes do not belong together, there are fewer than two states, or a clear frame holds no light.
+        """
+        counts, phases = _check.real_array("frames", frames), _check.real_array("phases", phases)
+        windows = Windows.checked(counts.shape[-2:], corners, n_images, shape)
+        lost = _dark(dark, (windows.n_images, *windows.shape))
+        bench = fit_bench(
+            counts, clear_frames, phases, n_pixels=n_pixels, noise=noise, gain=gain, diameter=diameter,
+            phase_shifts=phase_shifts, oversampling=oversampling, n_steps=n_steps, progress=progress,
+        )  # fmt: skip
+        n_averaged = counts.shape[1] if counts.ndim == 5 else 1
+        counts = counts.mean(axis=1) if counts.ndim == 5 else counts
+        return of_bench(cls, bench, counts, phases, lost, windows, n_averaged=n_averaged, **settings)
+
+    @classmethod
     def of(cls, measurement: Measurement, dark: ArrayLike | None = None, **settings: Any) -> Calibration:
         """Calibration of a measurement; pixels that are bad on its frames are ignored from then on.
 
@@ -204,135 +378,30 @@ class Calibration(Immutable):
         """
         _check.instance("measurement", measurement, Measurement)
         registered, pupil, good = measurement.registered, measurement.pupil, measurement.good
-        images = registered.frames[: 1 if registered.frames[0] is registered.frames[1] else 2]
+        images = registered.camera_images
         shape = images[0].counts.shape
         if images[-1].counts.shape != shape:
             raise ValueError(f"the frames have shapes {shape} and {images[-1].counts.shape}: expected the same")
         counts, _ = registered._on_grid(FRAMES)
         unit, background = measurement.counts * registered.exposure, measurement.background[:2]
-        inner = (..., *measurement.window)
-
-        def undone(*light: float) -> NDArray[np.float64]:
-            intensity = np.ones_like(measurement.intensity) * np.reshape(light, (2, 1, 1))
-            return ideal_frames(replace(measurement, intensity=intensity))[inner]
-
-        offset = undone(0, 0)
-        made = cls(
+        weights, offset = _undone(measurement)
+        calibration = cls(
             pupil.amplitude, pupil.n_pixels, pupil.center, measurement.optics, shape, len(images),
             registered.places()[:2], _dark(dark, (len(images), *shape)), np.stack([image.bad for image in images]),
-            good, background / registered.areas[:2], unit / registered.areas[:2],
-            np.stack([undone(1, 0) - offset, undone(0, 1) - offset], axis=1), offset,
+            good, background / registered.areas[:2], unit / registered.areas[:2], weights, offset,
             bool(registered.balance and measurement.optics.opposite),
             (counts[:, good].mean(axis=1) - background) / unit,
             np.zeros((0, *pupil.shape), np.float32), np.zeros(0), np.zeros((0, 2)), **settings,
         )  # fmt: skip
+        inner = (..., *measurement.window)
         frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
-        phase = made._work.solve(frames, good[np.newaxis]).phase
-        errors = sideways(made.sensor, phase[0], frames[0], good)[np.newaxis]
-        shift = made._work.displaced(phase, frames, good[np.newaxis])[0]
-        made = replace(made, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift)
-        residual, ratio = made._work.compared(phase, frames, good[np.newaxis])
-        return replace(made, residual=float(residual[0]), light_ratio=float(ratio[0]))
-
-    @classmethod
-    def from_bench(
-        cls, fit: BenchFit, frames: ArrayLike, phases: ArrayLike, dark: ArrayLike | None = None, *,
-        corners: ArrayLike = ((0, 0), (0, 0)), shape: tuple[int, int] | None = None, n_images: int = 2,
-        **settings: Any,
-    ) -> Calibration:  # fmt: skip
-        """Calibration from a fit of the bench: its geometry, blur and leakage as linear operators.
-
-        The focus of the relay is corrected to first order, around a flat wavefront.
-
-        Parameters
-        ----------
-        fit : BenchFit
-        frames : array_like, shape (n_states, 2, ny, nx) or (n_states, n_frames, 2, ny, nx), counts
-            As for `fit_bench`: less the dark, NaN where bad.
-        phases : array_like, shape (n_states, n, n), radian
-            As for `fit_bench`. The phases of the calibration are on this grid.
-        dark : array_like, shape (ny_camera, nx_camera) or (n_images, ny_camera, nx_camera), counts, optional
-            That was subtracted from the frames; none if left out.
-        corners, shape, n_images : array_like of int, shape (2, 2); (int, int); int
-            If the frames were cut out: row and column of their first pixels on the camera, rows and columns of a
-            camera image, and the number of these in an exposure.
-        **settings
-            Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
-
-        Returns
-        -------
-        Calibration
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the fit is of a wrong type, or shapes do not belong together.
-        """
-        _check.instance("fit", fit, BenchFit)
-        counts, phases = _check.real_array("frames", frames), _check.real_array("phases", phases)
-        n_averaged = counts.shape[1] if counts.ndim == 5 else 1
-        counts = counts.mean(axis=1) if counts.ndim == 5 else counts
-        n = len(fit.light)
-        frame = 2, *fit.point.problem.camera.shape
-        if counts.shape[1:] != frame or phases.shape != (len(counts), n, n):
-            expected = f"(n_states, {', '.join(map(str, frame))}) and (n_states, {n}, {n}), those of the fit"
-            raise ValueError(
-                f"frames and phases have shapes {counts.shape} and {phases.shape}: expected {expected}"
-            )
-        shape = counts.shape[2:] if shape is None else _check.pair("shape", shape, _check.integer, 1, _WIDEST)
-        n_images = _check.integer("n_images", n_images, 1, 2)
-        corners, most = _check.integer_array("corners", corners), np.subtract(shape, counts.shape[2:])
-        if corners.shape != (2, 2) or np.any(corners < 0) or np.any(corners > most):
-            raise ValueError(
-                f"corners = {_check.shown(corners.tolist())}: expected two pairs of a row and a column, from "
-                f"(0, 0) to {tuple(most.tolist())}, so that frames of {counts.shape[2:]} lie on one of {shape}"
-            )
-
-        def on_camera(pairs: NDArray) -> NDArray:
-            whole = np.zeros((len(pairs), n_images, *shape))
-            for index, (row, column) in enumerate(corners):
-                place = slice(row, row + counts.shape[2]), slice(column, column + counts.shape[3])
-                whole[(slice(None), min(index, n_images - 1), *place)] = pairs[:, index]
-            return whole
-
-        masks, arms = fit.point.model.masks, fit.point.model.arms[:2]
-        optics = Optics(
-            masks["diameter"],
-            (masks["first"], masks["second"]),
-            leakage=masks["leakage"],
-            unmasked=max(masks["unmasked"], 0.0),
-        )
-        n_pixels, bad = fit.point.problem.camera.n_pixels, ~np.isfinite(counts).all(axis=0)
-        light = fit.light * (radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2)
-        pupil = Pupil.from_amplitude(np.sqrt(np.maximum(light, 0)), n_pixels, threshold=_FAINTEST)
-        background, flux = (np.array([arm[key] for arm in arms]) for key in ("background", "flux"))
-        made = cls(
-            pupil.amplitude, n_pixels, pupil.center, optics, shape, n_images,
-            places_of(arms, n, counts.shape[2:]) + corners[..., None, None],
-            _dark(dark, (n_images, *shape)),
-            on_camera(bad[np.newaxis])[0] > 0, pupil.inside, background, flux * light[pupil.inside].mean(),
-            np.zeros((2, 2, n, n)), np.zeros((2, n, n)), False, np.ones(2), np.zeros((0, n, n), np.float32),
-            np.zeros(0), np.zeros((0, 2)), blur=masks["blur"], n_averaged=n_averaged, commanded=True, **settings,
-        )  # fmt: skip
-        good = pupil.inside & ~made._work.touched(made._work.bad[np.newaxis])[0]
-
-        def intensity(pairs: NDArray) -> NDArray:
-            values = made._work.on_grid(on_camera(np.nan_to_num(pairs)) + made.dark, np.inf, good)[0]
-            return values.reshape(len(values), 2, n, n) / made.unit[:, np.newaxis, np.newaxis]
-
-        seen, ideal = training(fit, made.sensor)
-        weights, offset = learnt(intensity(seen), ideal, optics)
-        light = intensity(counts)[..., good].mean(axis=(0, 2))
-        made = replace(made, good=good, weights=weights, offset=offset, light=light)
-        images = on_camera(np.nan_to_num(counts)) + made.dark
-        # The lamp is that of the calibration, so its light is known.
-        measured = made(images if n_images == 2 else images[:, 0], light=1.0, saturation=np.inf)
-        ideal = np.einsum("ijyx,kjyx->kiyx", weights, intensity(counts)) + offset
-        _, ratios = made._work.compared(measured.filled, ideal, np.broadcast_to(good, measured.phase.shape))
-        made = replace(made, light_ratio=float(ratios.mean()))
+        phase = calibration._work.solve(frames, good[np.newaxis]).phase
+        errors = sideways(calibration.sensor, phase[0], frames[0], good)[np.newaxis]
+        shift = calibration._work.displaced(phase, frames, good[np.newaxis])[0]
+        residual, ratio = calibration._work.compared(phase, frames, good[np.newaxis])
         return replace(
-            made, unexplained=unexplained(measured.phase, phases), slopes=slopes_of(measured.filled, good),
-            displacements=measured.displacement.astype(float), residual=float(np.nanmax(measured.residual)),
+            calibration, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift,
+            residual=float(residual[0]), light_ratio=float(ratio[0]),
         )  # fmt: skip
 
     def save(self, path: str | Path) -> None:
@@ -365,16 +434,18 @@ class Calibration(Immutable):
         _check_sizes(path)
         with broken(f"{path.name}: a broken calibration"), np.load(path, allow_pickle=False) as file:
             values: dict[str, Any] = json.loads(str(file["values"]))
-            found = values.pop("format")
-            if found == FORMAT:
+            file_format = values.pop("format")
+            if file_format == FORMAT:
                 values |= {name: file[name] for name in file.files if name != "values"}
                 values |= {name: tuple(values[name]) for name in ("center", "shape")}
                 shifts = {"phase_shifts": tuple(values["optics"]["phase_shifts"])}
-                made = cls(**values | {"optics": Optics(**values["optics"] | shifts)})
-                trial = made.dark + np.mean(made.background + made.unit * made.light)
-                made(trial[0] if made.n_images == 1 else trial)
-                return made
-        raise FileError(f"{path.name}: a calibration of format {found}: expected format {FORMAT}; make it again")
+                calibration = cls(**values | {"optics": Optics(**values["optics"] | shifts)})
+                trial = calibration.dark + np.mean(calibration.background + calibration.unit * calibration.light)
+                calibration(trial[0] if calibration.n_images == 1 else trial)
+                return calibration
+        raise FileError(
+            f"{path.name}: a calibration of format {file_format}: expected format {FORMAT}; make it again"
+        )
 
     @cached_property
     def sha256(self) -> str:
@@ -390,8 +461,12 @@ class Calibration(Immutable):
         self, counts: ArrayLike, start: NDArray | None = None, *, light: ArrayLike | None = None,
         saturation: float | None = None,
         largest_residual: float | None = None, judge: bool = True, method: Reconstructor | None = None,
+        smooth: bool | MapPrior = False, noise: ArrayLike | None = None,
     ) -> Phases:  # fmt: skip
         """Phases of camera images.
+
+        With `smooth`, all of the fitted optics and a smooth prior explain each exposure, in seconds. The light is
+        taken to be that of the calibration.
 
         Parameters
         ----------
@@ -412,6 +487,13 @@ class Calibration(Immutable):
             is inconsistent or moved, and the light follows from the mean of the frames alone.
         method : Reconstructor, optional
             Replaces the phase-shifted iteration, such as ``zwfs.Linear(calibration.sensor, modes)``.
+        smooth : bool or MapPrior
+            Whether phases are taken to be smooth, for a calibration with a `bench`. True lets the evidence of each
+            exposure choose the prior: the probability of the frames with all its phases. An item of `priors` of
+            earlier phases saves half of the time, and fits phases of the same roughness and strength only.
+        noise : float or array_like, shape (ny, nx) or (n_images, ny, nx), counts rms, optional
+            Of the pixels, with `smooth`. By default it follows from the counts, and from gain and noise of the
+            `bench`; that of means of several frames is smaller.
 
         Returns
         -------
@@ -429,31 +511,29 @@ class Calibration(Immutable):
         level, judge = min(saturation, _check.LARGEST), _check.flag("judge", judge)
         if largest_residual is not None:
             largest_residual = _number_or_inf("largest_residual", largest_residual)
-        counts, grid = counts.reshape(-1, self.n_images, *self.shape), self.good.shape
+        counts = counts.reshape(-1, self.n_images, *self.shape)
+        if smooth is not False or noise is not None:
+            options = {"start": start, "light": light, "largest_residual": largest_residual, "method": method}
+            for name, value in options.items():
+                if value is not None:
+                    raise ValueError(f"{name} with smooth or noise: expected none")
+            return Phases._joined([smooth_phases(self, counts, level, smooth, noise)], batch)
         if start is not None:
-            maps = _check.real_array("start", start)
-            if maps.shape not in (grid, (*batch, *grid)):
-                raise ValueError(f"start has shape {maps.shape}: expected {grid} or {(*batch, *grid)}")
-            _check.moderate("start", maps)
-            start = np.broadcast_to(maps, (*batch, *grid)).reshape(-1, *grid)
+            start = _spread_start(start, batch, self.good.shape)
+        if light is not None:
+            light = _spread_light(light, batch)
         if method is not None:
             _check.instance("method", method, Reconstructor)
             if method.sensor is not self.sensor:
                 raise ValueError("method has another sensor: expected `sensor` of this calibration")
             if start is not None and not method.iterative:
                 raise ValueError(f"start with method = {method!r}: expected none, because it does not iterate")
-        if light is not None:
-            lights = _check.real_array("light", light)
-            if lights.shape not in ((), batch) or not np.all((lights > 0) & (lights < np.inf)):
-                raise ValueError(
-                    f"light = {_check.shown(lights.tolist())}: expected finite numbers above 0, one or {batch}"
-                )
-            light = np.broadcast_to(lights, batch).reshape(-1)
         parts = []
         for first in range(0, len(counts), _PIECE):
             piece = slice(first, first + _PIECE)
-            begin, known = (None if one is None else one[piece] for one in (start, light))
-            parts.append(self._phases(counts[piece], begin, known, level, largest_residual, judge, method))
+            begin, lamp = (None if values is None else values[piece] for values in (start, light))
+            exposures = Exposures(self, counts[piece], level, begin, method, judge)
+            parts.append(exposures.phases(lamp, largest_residual))
         return Phases._joined(parts, batch)
 
     def controller(
@@ -582,7 +662,7 @@ class Calibration(Immutable):
 
     @cached_property
     def _content(self) -> bytes:
-        plain = {one.name: getattr(self, one.name) for one in fields(self)}
+        plain = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "bench"}
         arrays: dict[str, Any] = {name: value for name, value in plain.items() if isinstance(value, np.ndarray)}
         values = {name: value for name, value in plain.items() if name not in arrays}
         values |= {"format": FORMAT, "optics": asdict(self.optics)}
@@ -594,73 +674,34 @@ class Calibration(Immutable):
     def _work(self) -> Grid:
         return Grid(self)
 
-    def _phases(
-        self, counts: NDArray, start: NDArray | None, light: NDArray | None, level: float, limit: float | None,
-        judge: bool, method: Reconstructor | None,
-    ) -> Phases:  # fmt: skip
-        """Phases of camera images, (k, n_images, ny_camera, nx_camera)."""
-        work, k = self._work, len(counts)
-        values, good, n_bad, n_saturated = work.on_grid(counts, level, self.good)
-        n_good = np.maximum(np.count_nonzero(good, axis=(1, 2)), 1)
-        flux = np.vecdot(values, good.reshape(k, 1, -1).astype(np.float32)) / (n_good[:, np.newaxis] * self.unit)
-        relative, noise = flux.mean(axis=1) / self.light.mean(), self._noise(counts, flux)
-        lit = np.all((flux >= _DIM * self.light) | (flux > noise), axis=1)
-        lit &= n_good >= (1 - _MOST_BAD) * self.sensor.pupil.n_points
-        flux = np.where(lit[:, np.newaxis], flux, self.light)
-        if self.balance:
-            values *= (flux.mean(axis=1, keepdims=True) / flux).astype(np.float32)[..., np.newaxis]
-        values /= self.unit[:, np.newaxis].astype(np.float32)
-        values = values.reshape(k, *self.offset.shape)
-        ideal = work.weights[:, 0] * values[:, :1] + work.weights[:, 1] * values[:, 1:]
 
-        def attempt(which: NDArray[np.intp], light: NDArray[np.float64]) -> Trial:
-            frames = ideal[which] / light[:, np.newaxis, np.newaxis, np.newaxis].astype(np.float32) + work.offset
-            frames[~lit[which]] = work.flat_frames  # of a flat wavefront: they converge at once
-            if method is None:
-                np.maximum(frames, 0, out=frames)
-            begin = None if start is None else start[which]
-            solved = work.solve(frames, good[which], begin, method)
-            residual, ratio = np.full((2, len(which)), np.nan)
-            if judge:
-                residual, ratio = work.compared(solved.phase, frames, good[which])
-            ratio, usual = ratio / self.light_ratio, self._usual(light, noise[which])
-            unsure = np.hypot(_SAME_LIGHT, 2 * usual / np.sqrt(n_good[which]))
-            cost = np.where(lit[which], (residual / usual) ** 2 + ((ratio - 1) / unsure) ** 2, 0)
-            return Trial(light, solved.phase, frames, *solved[1:], residual, ratio, cost)
+def _undone(measurement: Measurement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights and offset with which a measurement becomes frames of an ideal sensor, see `Calibration`."""
 
-        same = (relative > _LAMP[0]) & (relative < _LAMP[1]) | ~lit
-        first = np.where(same, 1.0, relative) if light is None else light
-        trial = attempt(np.arange(k), first)
-        if light is None and judge:
-            trial = explained(attempt, trial)
-        residual, displacement, sigma = (np.full((k, *size), np.nan, np.float32) for size in ((), (2,), (2,)))
-        if judge and lit.any():
-            residual[lit] = trial.residual[lit]
-            shift, sigma[lit] = work.displaced(trial.phase[lit], trial.frames[lit], good[lit])
-            displacement[lit] = shift - (self.displacements.mean(axis=0) if len(self.displacements) else 0)
-        limits = _UNUSUAL * self._usual(trial.light, noise) if limit is None else limit
-        flags = _BAD * (n_bad > 0) + _SATURATED * (n_saturated > 0) + _INCONSISTENT * (residual > limits)
-        flags += np.where(lit, _NOT_CONVERGED * (~trial.converged & (self.tolerance > 0)), _LOST)
-        scatter = self.displacements.std(axis=0) if len(self.displacements) else 0
-        moved = np.abs(displacement) > np.maximum(_MOVED_BY, _SURE * np.hypot(sigma, scatter))
-        flags += _MOVED * np.any(moved, axis=1)
-        phase = np.where(good & lit[:, np.newaxis, np.newaxis], trial.phase, np.float32(np.nan))
-        flux = np.where(lit, trial.light, relative).astype(np.float32)
-        numbers = residual, displacement, trial.n_iterations, flags
-        return Phases(phase, trial.phase, flux, n_bad, n_saturated, *numbers)
+    def ideal(*light: float) -> NDArray[np.float64]:
+        intensity = np.ones_like(measurement.intensity) * np.reshape(light, (2, 1, 1))
+        return ideal_frames(replace(measurement, intensity=intensity))[(..., *measurement.window)]
 
-    def _noise(self, counts: NDArray, flux: NDArray) -> NDArray[np.float64]:
-        """Noise of dark pixels over `unit`, (k, 2), of exposures so faint that it counts; else 0."""
-        noise, faint = np.zeros(flux.shape), np.flatnonzero(np.any(flux < _FAINT * self.light, axis=1))
-        if faint.size:
-            noise[faint] = self._work.noise(counts[faint]) / self.unit
-        return noise
+    offset = ideal(0, 0)
+    return np.stack([ideal(1, 0) - offset, ideal(0, 1) - offset], axis=1), offset
 
-    def _usual(self, light: NDArray, noise: NDArray) -> NDArray[np.float64]:
-        """Residual, (k,), that frames of the calibration would have with less light and with a noise, (k, 2)."""
-        scale = np.maximum(light, 1e-9)
-        own = max(self.residual, _EXACT) * np.sqrt(np.maximum(1 / scale, 1))
-        return np.hypot(own, np.sqrt(np.mean(noise**2, axis=1)) / scale)
+
+def _spread_start(start: ArrayLike, batch: tuple[int, ...], grid: tuple[int, ...]) -> NDArray[np.float64]:
+    """Checked phases at which iterations start, (n, ny, nx)."""
+    maps = _check.real_array("start", start)
+    if maps.shape not in (grid, (*batch, *grid)):
+        raise ValueError(f"start has shape {maps.shape}: expected {grid} or {(*batch, *grid)}")
+    _check.moderate("start", maps)
+    return np.broadcast_to(maps, (*batch, *grid)).reshape(-1, *grid)
+
+
+def _spread_light(light: ArrayLike, batch: tuple[int, ...]) -> NDArray[np.float64]:
+    """Checked light of exposures, (n,)."""
+    lights = _check.real_array("light", light)
+    if lights.shape not in ((), batch) or not np.all((lights > 0) & (lights < np.inf)):
+        shown = _check.shown(lights.tolist())
+        raise ValueError(f"light = {shown}: expected finite numbers above 0, one or {batch}")
+    return np.broadcast_to(lights, batch).reshape(-1)
 
 
 def _is_calibration(path: Path) -> bool:

@@ -24,8 +24,10 @@ from zwfs.frames._blocks import MOST_BYTES, FileError, Images, file_and_unit
 from zwfs.frames._fits import fits_content, fits_module, has_card
 from zwfs.frames._part import Cards, scratch_of
 from zwfs.frames._stack import segments_of
-from zwfs.frames.pipeline import MeasuredPhase, Optics
+from zwfs.frames.phases import Phases
+from zwfs.frames.pipeline import Optics
 from zwfs.frames.registration import Image
+from zwfs.units import phase_to_opd
 
 __all__ = ["CameraFile", "check_output", "images", "read", "read_all", "write_phase"]
 
@@ -216,8 +218,8 @@ def read_all(
         As for `read` and `images`, or if a dark or map has the shape of no frame.
     """
     names = "frame_files", "pupil_files", "dark_files", "bad_pixel_files", "pupil_dark_files"
-    given = frame_files, pupil_files, dark_files, bad_pixel_files, pupil_dark_files
-    kinds = [paths_of(name, paths) for name, paths in zip(names, given, strict=True)]
+    lists = frame_files, pupil_files, dark_files, bad_pixel_files, pupil_dark_files
+    kinds = [paths_of(name, paths) for name, paths in zip(names, lists, strict=True)]
     for name, paths in zip(names[:2], kinds, strict=False):
         if not paths:
             raise ValueError(f"{name} is empty: expected one file or more")
@@ -275,8 +277,8 @@ def images(
         If the number of images or a shape is wrong, every pixel of an image or of its dark is bad, or a bad-pixel
         map marks more than half of the pixels.
     """
-    for argument, given in (("files", files), ("darks", darks), ("bad_pixels", bad_pixels)):
-        _check.sequence(argument, given, CameraFile)
+    for argument, listed in (("files", files), ("darks", darks), ("bad_pixels", bad_pixels)):
+        _check.sequence(argument, listed, CameraFile)
     if saturation is not None:
         saturation = _check.number("saturation", saturation, 0, open_low=True)
     if n_images is not None:
@@ -369,7 +371,7 @@ def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overw
 
 def write_phase(
     output: str | Path,
-    phase: MeasuredPhase,
+    phases: Phases,
     wavelength: float,
     sources: Sequence[CameraFile] = (),
     *,
@@ -384,7 +386,8 @@ def write_phase(
     ----------
     output : str or Path
         See `check_output`. An earlier phase map is replaced.
-    phase : MeasuredPhase
+    phases : Phases
+        Of `recover_phase` or `phase_of`.
     wavelength : float, nm
     sources : sequence of CameraFiles
         Their names and checksums go into the header. None of these files is replaced.
@@ -401,11 +404,13 @@ def write_phase(
     from zwfs import __version__
 
     fits_module()
-    _check.instance("phase", phase, MeasuredPhase)
+    _check.instance("phases", phases, Phases)
     _check.sequence("sources", sources, CameraFile)
     path = check_output(output, [source.path for source in sources if source.path], overwrite=overwrite)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-    measurement, registered, optics = phase.measurement, phase.measurement.registered, phase.measurement.optics
+    agreement = phases.agreement
+    measurement, registered = agreement.measurement, agreement.measurement.registered
+    optics = measurement.optics
     placement = registered.placement
     cards = [
         ("BUNIT", "rad", "in (-pi, pi]; NaN outside and at bad points"),
@@ -419,11 +424,11 @@ def write_phase(
         ("UNMASKED", optics.unmasked, "fraction of light the mask does not shift"),
         ("FLUXMASK", measurement.flux_ratio[0], "light of image 1 over image 2, frames"),
         ("FLUXOUT", measurement.flux_ratio[1], "the same, clear frames"),
-        *((f"CORR{i}", value, "measured with modelled frame") for i, value in enumerate(phase.correlation, 1)),
-        *((f"RESID{i}", value, "rms difference of them") for i, value in enumerate(phase.residual, 1)),
+        *((f"CORR{i}", value, "measured with modelled frame") for i, value in enumerate(agreement.correlation, 1)),
+        *((f"RESID{i}", value, "rms difference of them") for i, value in enumerate(agreement.residual, 1)),
         ("NPOINTS", measurement.pupil.n_points, "points of the pupil"),
         ("NBAD", measurement.n_bad, "of these, bad"),
-        ("CONVERGE", phase.converged, "the iteration converged"),
+        ("CONVERGE", bool(phases.converged), "the iteration converged"),
         ("ROTATE", placement.rotation, "[deg] image 2 from image 1, x to y"),
         ("ROTERR", placement.sigma[2], "[deg] standard error; NaN: not determined"),
         ("MAGNIF", placement.magnification, "size of image 2 over that of image 1"),
@@ -441,8 +446,8 @@ def write_phase(
         cards.append(("DATE-OBS", str(sources[0].header["DATE-OBS"]), f"of {sources[0].name}"))
     cards.append(("CREATOR", f"zwfs {__version__}", ""))
     bad = (measurement.pupil.inside & ~measurement.good).astype(np.uint8)
-    units = (phase.opd(wavelength), "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
-    write_file(path, fits_content((phase.phase, "", cards), *units))
+    units = (phase_to_opd(phases.phase, wavelength), "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
+    write_file(path, fits_content((phases.phase, "", cards), *units))
 
 
 def sensor_cards(diameter: float, center: tuple[float, float], optics: Optics) -> Cards:
@@ -533,10 +538,12 @@ def _companion(
     """Dark or bad-pixel map of an image of a file: the mean of those that belong to it; 0 without files."""
     if not files:
         return np.zeros(())
-    shape, other = frame.images.shape[1:], files[0].images.shape[1:]
+    shape, first_shape = frame.images.shape[1:], files[0].images.shape[1:]
     same = [file for file in files if file.images.shape[1:] == shape]
     if not same:
-        raise ValueError(f"{argument}: {_names(files)} has shape {other}: expected {shape}, that of {frame.name}")
+        raise ValueError(
+            f"{argument}: {_names(files)} has shape {first_shape}: expected {shape}, that of {frame.name}"
+        )
     for file in same:
         if argument == "bad_pixels" and (share := np.mean(file.images != 0)) > 0.5:
             raise ValueError(
@@ -559,8 +566,8 @@ def _companion(
 def _check_alike(exposures: Sequence[_Exposure]) -> None:
     """Require that darks of one image differ by no more than their noise."""
     first, number = exposures[0]
-    for file, other in exposures[1:]:
-        change = file.images[other] - first.images[number]
+    for file, index in exposures[1:]:
+        change = file.images[index] - first.images[number]
         middle = np.nanmedian(change)
         if abs(middle) > _ALIKE * np.nanmedian(np.abs(change - middle)):
             raise ValueError(

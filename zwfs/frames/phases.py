@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zwfs._results import PhaseResult
+from zwfs.frames._solver import MapPrior
+from zwfs.frames.pipeline import Agreement, Measurement
 
 
 class Flag(IntFlag):
@@ -52,7 +56,8 @@ class Phases(PhaseResult):
     Attributes
     ----------
     phase : ndarray of float32, shape (..., ny, nx), radian
-        In (-pi, pi], NaN outside the pupil, at bad points, and everywhere if the frame is lost.
+        In (-pi, pi], NaN outside the pupil, at bad points, and everywhere if the frame is lost. With a smooth
+        prior it is not wrapped, and bad points have the phase that their neighbours predict.
     filled : ndarray of float32, shape (..., ny, nx), radian
         The same with bad points filled with the phase of the nearest good one, and 0 outside the pupil. If the
         frame is lost, it is the phase of a flat wavefront.
@@ -66,8 +71,16 @@ class Phases(PhaseResult):
     displacement : ndarray of float32, shape (..., 2), pixels
         Rows and columns by which the pupil has moved since the calibration, from its rim on both images. It comes
         out at 0.5 to 1.2 times the true value. NaN if the frame is lost, or was not judged.
-    n_iterations, flags : ndarray of int, shape (...)
-        Iterations, and the sum of `Flag`; 0 is a good frame.
+    n_iterations, n_unsolved, flags : ndarray of int, shape (...)
+        Iterations, points whose equations had no unique solution, and the sum of `Flag`; 0 is a good frame.
+    sigma : ndarray, shape (..., ny, nx), radian, or None
+        With a smooth prior: error bar of each point. `Calibration.sigma` gives those of other phases.
+    misfit : ndarray, shape (...), or None
+        With a smooth prior: mean square of the residuals over the noise.
+    priors : tuple of MapPrior
+        With a smooth prior: rms (radian), exponent of the spectrum and outer scale (D) of each exposure.
+    measurement : Measurement or None
+        Of `recover_phase` and `phase_of`: that of the pair, which `judge` and `write_phase` need.
     """
 
     phase: NDArray[np.float32]
@@ -78,11 +91,33 @@ class Phases(PhaseResult):
     residual: NDArray[np.float32]
     displacement: NDArray[np.float32]
     n_iterations: NDArray[np.int64]
+    n_unsolved: NDArray[np.int64]
     flags: NDArray[np.int64]
+    sigma: NDArray[np.float64] | None = None
+    misfit: NDArray[np.float64] | None = None
+    priors: tuple[MapPrior, ...] = ()
+    measurement: Measurement | None = None
+
+    def __repr__(self) -> str:
+        return f"Phases(phase {self.phase.shape}, {np.count_nonzero(self.flags)} of {self.flags.size} flagged)"
+
+    @property
+    def converged(self) -> NDArray[np.bool_]:
+        """Whether each iteration ended within its steps, shape (...)."""
+        return (self.flags & Flag.NOT_CONVERGED.value) == 0
+
+    @cached_property
+    def agreement(self) -> Agreement:
+        """Agreement of the frames of `measurement` with those of the phase."""
+        if self.measurement is None:
+            raise ValueError("measurement = None: expected phases of `recover_phase` or `phase_of`")
+        return self.measurement.agreement(self.phase)
 
     @classmethod
     def _joined(cls, parts: list[Phases], batch: tuple[int, ...]) -> Phases:
         """Join parts of a batch, with one axis each, and return them in its shape."""
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        whole = (column[0] if len(column) == 1 else np.concatenate(column) for column in columns)
-        return cls(*(array.reshape((*batch, *array.shape[1:])) for array in whole))
+        arrays: dict[str, Any] = {}
+        for name, first in parts[0]._arrays():
+            whole = np.concatenate([getattr(part, name) for part in parts]) if len(parts) > 1 else first
+            arrays[name] = whole.reshape((*batch, *whole.shape[1:]))
+        return cls(**arrays, priors=sum((part.priors for part in parts), ()))

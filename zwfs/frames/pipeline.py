@@ -1,4 +1,4 @@
-"""Camera frames to phase: normalise, model the sensor from its own pupil, reconstruct, and judge.
+"""Camera frames to phase: normalise them, model the sensor from its own pupil, compare frames with the model.
 
 The images come from `zwfs.frames.files`, their places from `zwfs.frames.registration`. Uncertain properties of the
 sensor are parameters of `Optics`, which `zwfs.frames.refine` fits. `predict_other` tests a phase on unseen data.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,16 +16,18 @@ from scipy import ndimage
 
 from zwfs import _check
 from zwfs._images import nearest_good, radius
-from zwfs._results import PhaseResult
+from zwfs.frames._grid import iterated
 from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Image, RegisteredFrames, correlations, register_frames
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
 from zwfs.sensor import ZernikeSensor
-from zwfs.units import phase_to_opd
+
+if TYPE_CHECKING:
+    from zwfs.frames.phases import Phases
 
 __all__ = [
-    "MeasuredPhase",
+    "Agreement",
     "Measurement",
     "Optics",
     "phase_of",
@@ -41,7 +43,7 @@ _LIT = 0.85  # of the amplitude around it: a point with less is dark or partly l
 _HALF = 0.7  # of the amplitude around it: a point with less is lit in half or less
 _DEGREE = 4  # of the polynomials that describe how unlike the two arms are
 _CERTAIN = 3.0  # standard errors: less of a difference between the arms is noise
-_MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
+MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class Optics:
         _check.sequence("phase_shifts", self.phase_shifts, expected="a list of one or two numbers")
         if len(self.phase_shifts) not in (1, 2):
             raise ValueError(f"phase_shifts has {len(self.phase_shifts)} values: expected one or two")
-        shifts = tuple(_check.number("phase_shifts", one) for one in self.phase_shifts)
+        shifts = tuple(_check.number("phase_shifts", shift) for shift in self.phase_shifts)
         object.__setattr__(self, "phase_shifts", shifts)
         first, second = np.exp(1j * np.array([shifts[0], shifts[-1]]))
         if min(abs(first - second) if len(shifts) == 2 else 1, abs(first - 1), abs(second - 1)) < 1e-9:
@@ -177,33 +179,57 @@ class Measurement:
         center = self.margin + self.pupil.center[0], self.margin + self.pupil.center[1]
         return ~self.bad & (radius(self.bad.shape[1:], center) > 0.53 * self.registered.diameter)
 
+    @property
+    def light(self) -> NDArray[np.float64]:
+        """Light of a clear frame on the grid of the frames, without that of partly lit pixels, (ny', nx')."""
+        light = np.zeros(self.intensity.shape[1:])
+        light[self.window] = self.pupil.amplitude**2
+        return light
 
-@dataclass(frozen=True, eq=False, repr=False)
-class MeasuredPhase(PhaseResult):
-    """Phase of a pair of frames, and the agreement of its modelled frames with the measured ones.
+    @property
+    def measured(self) -> NDArray[np.float64]:
+        """Frames as those of equal arms, with the scale and the background of the optics, (2, ny', nx')."""
+        return self.intensity / self.gain * self.optics.scale - self.optics.background
+
+    def modelled(self, phase: ArrayLike) -> NDArray[np.float64]:
+        """Frames that the model predicts for a phase, (2, ny', nx').
+
+        Parameters
+        ----------
+        phase : array_like, shape (ny, nx), radian
+            What is NaN, or not good, has the value of the nearest good point.
+        """
+        phase = _check.real_array("phase", phase).astype(float)
+        if phase.shape != self.pupil.shape:
+            raise ValueError(f"phase has shape {phase.shape}: expected {self.pupil.shape}, the grid of the pupil")
+        filled = nearest_good(np.nan_to_num(phase), self.good & np.isfinite(phase))
+        frames = mixed(model(self).measure(filled), self.optics.leakage, self.optics.unmasked, self.light)
+        frames = np.broadcast_to(frames, self.intensity.shape).copy()
+        frames[(..., *self.window)] += self.rest
+        return frames
+
+    def agreement(self, phase: ArrayLike) -> Agreement:
+        """Agreement of the frames with those of a phase, see `modelled`."""
+        return Agreement(self, self.measured, self.modelled(phase))
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Agreement of measured frames with those that a model predicts for a phase.
 
     Attributes
     ----------
-    phase : ndarray, shape (ny, nx), radian
-        Wrapped to (-pi, pi], NaN outside the pupil and at bad pixels.
+    measurement : Measurement
     measured, modelled : ndarray, shape (2, ny', nx')
         Frames: the measured ones as normalised for the optics of the measurement.
-    measurement : Measurement
-    converged : bool
-    n_unsolved : int
-        Points whose equations had no unique solution.
     """
 
-    phase: NDArray[np.float64]
+    measurement: Measurement
     measured: NDArray[np.float64]
     modelled: NDArray[np.float64]
-    measurement: Measurement
-    converged: bool
-    n_unsolved: int
 
-    def opd(self, wavelength: float) -> NDArray[np.float64]:
-        """Optical path difference, shape (ny, nx), nm, at a wavelength in nm; see `zwfs.phase_to_opd`."""
-        return phase_to_opd(self.phase, wavelength)
+    def __post_init__(self) -> None:
+        _check.declared(self)
 
     @cached_property
     def correlation(self) -> NDArray[np.float64]:
@@ -242,43 +268,62 @@ class MeasuredPhase(PhaseResult):
         return frames[(..., *self.measurement.window)][:, self.measurement.good]
 
 
-def phase_of(
-    frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None = None, **optics: Any
-) -> MeasuredPhase:
+def phase_of(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None = None, **optics: Any) -> Phases:
     """Phase of a pair of camera frames, for a first look.
-
-    It calls `register_frames`, `reduce_frames` and `recover_phase` in turn.
 
     Parameters
     ----------
-    frames, clear_frames : array_like, shape (ny, nx) or (2, ny, nx), counts
-        One camera image with both pupils, or one for each: with the mask in, and with the mask out. With one phase
-        shift, one image with one pupil. NaN marks bad pixels.
-    dark : array_like, shape (ny, nx) or (2, ny, nx), counts, optional
-        Counts without light, which are subtracted from both.
-    **optics
-        Parameters of `Optics`, such as `diameter` and `phase_shifts`.
+    frames, clear_frames, dark, **optics
+        As for `zwfs.frames.Calibration.from_arrays`, whose calibration is called on the same frames.
 
     Returns
     -------
-    MeasuredPhase
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a shape is wrong, or the pupils are not found.
+    Phases
+        Of shape (), without a batch.
 
     Examples
     --------
-    >>> import numpy as np
     >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames.pipeline import phase_of
+    >>> from zwfs.frames import phase_of
     >>> bench = Bench(n_pixels=40)
-    >>> phase_of(bench.frames(), bench.clear_frames(), diameter=bench.diameter).converged
+    >>> bool(phase_of(bench.frames(), bench.clear_frames(), diameter=bench.diameter).converged)
     True
     """
-    sensor, unlit = Optics(**optics), 0 if dark is None else _check.real_array("dark", dark)
-    pair = []
+    from zwfs.frames.calibration import Calibration  # late: it needs this module
+
+    measurement = measured(frames, clear_frames, dark, Optics(**optics))
+    return replace(Calibration.of(measurement, dark)(frames), measurement=measurement)
+
+
+def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: float = 1e-3) -> Phases:
+    """Phase of a measurement: that of its camera images by its own calibration.
+
+    Bad pixels take no part, and are NaN in the result. One image is reconstructed by the iterated arcsine.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    n_iterations : int
+        Largest number of iterations.
+    tolerance : float, radian
+        Rms of the change of the phase at which the iteration ends.
+
+    Returns
+    -------
+    Phases
+        Of shape (), without a batch.
+    """
+    from zwfs.frames.calibration import Calibration  # late: it needs this module
+
+    n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
+    calibration = Calibration.of(measurement, n_iterations=n_iterations, tolerance=tolerance)
+    counts = np.stack([image.counts for image in measurement.registered.camera_images])
+    return replace(calibration(counts if len(counts) == 2 else counts[0]), measurement=measurement)
+
+
+def measured(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None, optics: Optics) -> Measurement:
+    """Measurement from arrays, see `zwfs.frames.Calibration.from_arrays`."""
+    unlit, pair = 0 if dark is None else _check.real_array("dark", dark), []
     for name, counts in (("frames", frames), ("clear_frames", clear_frames)):
         images = _check.real_array(name, counts)
         if images.ndim not in (2, 3) or images.shape[:-2] not in ((), (2,)):
@@ -286,10 +331,8 @@ def phase_of(
         if np.shape(unlit) not in ((), images.shape[-2:], images.shape):
             raise ValueError(f"dark has shape {np.shape(unlit)}: expected {images.shape}, that of {name}")
         images = (images - unlit).reshape(-1, *images.shape[-2:])
-        pair.append(
-            [Image(nearest_good(image, np.isfinite(image)), ~np.isfinite(image), name) for image in images]
-        )
-    return recover_phase(reduce_frames(register_frames(*pair, n_pupils=len(sensor.phase_shifts)), sensor))
+        pair.append([Image.of(image, name) for image in images])
+    return reduce_frames(register_frames(*pair, n_pupils=len(optics.phase_shifts)), optics)
 
 
 def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | None = None) -> Measurement:
@@ -371,10 +414,10 @@ def reduce_with(clear: ClearLight, registered: RegisteredFrames, optics: Optics,
     bad[inner] |= clear.bad
     good = pupil.inside & ~bad[inner].any(axis=0)
     n_bad = pupil.n_points - np.count_nonzero(good)
-    if n_bad > _MOST_BAD * pupil.n_points:
+    if n_bad > MOST_BAD * pupil.n_points:
         raise ValueError(
             f"{n_bad} of the {pupil.n_points} points of the pupil are bad or saturated: "
-            f"expected at most {_MOST_BAD:.0%}"
+            f"expected at most {MOST_BAD:.0%}"
         )
     intensity = frames / (counts[:, None, None] * registered.exposure)
     flux = (intensity[inner] / clear.gain)[:, good].mean(axis=1)
@@ -408,11 +451,11 @@ def _gains(images: NDArray, inside: NDArray, center: tuple[float, float], diamet
         return np.ones_like(images)
     ratio = np.log(images[1, lit] / images[0, lit])
     basis, triangle = np.linalg.qr(terms[lit])
-    found = basis.T @ ratio
-    noise = 1.48 * np.median(np.abs(ratio - basis @ found))  # robust standard deviation
-    found *= np.maximum(1 - (_CERTAIN * noise) ** 2 / np.maximum(found**2, 1e-300), 0)
-    found[0] = 0  # the scale of each image is measured apart
-    half = terms @ np.linalg.solve(triangle, found) / 2
+    coefficients = basis.T @ ratio
+    noise = 1.48 * np.median(np.abs(ratio - basis @ coefficients))  # robust standard deviation
+    coefficients *= np.maximum(1 - (_CERTAIN * noise) ** 2 / np.maximum(coefficients**2, 1e-300), 0)
+    coefficients[0] = 0  # the scale of each image is measured apart
+    half = terms @ np.linalg.solve(triangle, coefficients) / 2
     return np.exp([-half, half])
 
 
@@ -445,44 +488,17 @@ def _amplitude(light: NDArray, diameter: float) -> NDArray[np.float64]:
     return np.minimum(root, light / nearest_good(root, full)) if full.any() else root
 
 
-def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: float = 1e-4) -> MeasuredPhase:
-    """Phase of a measurement by the phase-shifted iteration, and its modelled frames.
+def iterated_phase(measurement: Measurement, n_iterations: int, tolerance: float) -> NDArray[np.float64]:
+    """Phase of a measurement in double precision, (ny, nx), filled at bad points: a smooth function of the optics.
 
-    One image is reconstructed by the iterated arcsine. Bad pixels take no part: their intensity is that of the
-    model, with the phase of the nearest good point, so that the reference wave has no hole. They are NaN in the
-    result.
-
-    Parameters
-    ----------
-    measurement : Measurement
-    n_iterations : int
-        Largest number of iterations.
-    tolerance : float, radian
-        Rms of the change of the phase at which the iteration ends.
-
-    Returns
-    -------
-    MeasuredPhase
+    The searches use it; `recover_phase` converges in fewer steps, in single precision.
     """
-    n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
-    sensor = model(measurement)
+    sensor, window = model(measurement), measurement.window
+    inside = ZernikeSensor(sensor.pupil, *sensor.masks, tolerance=1e-6)
     method = Arcsine if measurement.optics.single else PhaseShifted
-    iterate = method(sensor, n_iterations=n_iterations, tolerance=tolerance)
-    frames = np.maximum(ideal_frames(measurement), 0)[: sensor.n_masks]
-    inner = (..., *sensor.window)
-    bad = measurement.pupil.inside & ~measurement.good
-    for _ in range(2 if bad.any() else 1):
-        estimate = iterate(frames)
-        clean = sensor.measure(nearest_good(estimate.phase, measurement.good))
-        frames[inner] = np.where(bad, clean[inner], frames[inner])
-    return MeasuredPhase(
-        phase=np.where(measurement.good, estimate.phase, np.nan),
-        measured=_scaled(measurement),
-        modelled=_mix(np.broadcast_to(clean, measurement.intensity.shape), measurement),
-        measurement=measurement,
-        converged=bool(estimate.converged),
-        n_unsolved=int(estimate.n_unsolved),
-    )
+    frames = np.maximum(ideal_frames(measurement), 0)[np.newaxis, : sensor.n_masks, *window]
+    solver = method(inside, n_iterations=n_iterations, tolerance=tolerance)
+    return iterated(solver, frames, measurement.good[np.newaxis]).phase[0]
 
 
 def model(measurement: Measurement) -> ZernikeSensor:
@@ -496,14 +512,22 @@ def model(measurement: Measurement) -> ZernikeSensor:
 def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:
     """Frames of a measurement as those of an ideal sensor: its optics are undone. They may be negative."""
     _check.instance("measurement", measurement, Measurement)
-    optics, frames, light = measurement.optics, _scaled(measurement), np.zeros(measurement.intensity.shape[1:])
+    frames, optics = measurement.measured, measurement.optics
     frames[(..., *measurement.window)] -= measurement.rest
-    light[measurement.window] = measurement.pupil.amplitude**2
-    return unmixed(frames, optics.leakage, optics.unmasked, light)
+    return unmixed(frames, optics.leakage, optics.unmasked, measurement.light)
+
+
+def mixed(frames: NDArray, leakage: float, unmasked: float, light: NDArray | float) -> NDArray[np.float64]:
+    """Frames (..., 2, ny, nx) with leakage, and unmasked light of a clear frame `light`, from ideal ones.
+
+    It holds for one mask, too, which has no leakage.
+    """
+    leaking = (1 - leakage) * frames + leakage * frames[..., ::-1, :, :]
+    return (1 - unmasked) * leaking + unmasked * light
 
 
 def unmixed(frames: NDArray, leakage: float, unmasked: float, light: NDArray | float) -> NDArray[np.float64]:
-    """Frames (..., 2, ny, nx) of ideal masks: without leakage, and unmasked light of a clear frame `light`."""
+    """Inverse of `mixed`."""
     pure = (frames - unmasked * light) / (1 - unmasked)
     return ((1 - leakage) * pure - leakage * pure[..., ::-1, :, :]) / (1 - 2 * leakage)
 
@@ -530,10 +554,10 @@ def predicted_frames(measurement: Measurement, n_iterations: int = 25) -> NDArra
     n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
     both, frames = model(measurement), np.maximum(ideal_frames(measurement), 0)
     predicted = []
-    for seen in (1, 0):
-        sensor = ZernikeSensor(measurement.pupil, both.masks[seen], extent=both.extent, tolerance=1e-6)
-        estimate = Arcsine(sensor, n_iterations=n_iterations, tolerance=1e-4)(frames[seen : seen + 1])
-        predicted.append(both.measure(estimate.phase)[1 - seen][measurement.window])
+    for number in (1, 0):
+        sensor = ZernikeSensor(measurement.pupil, both.masks[number], extent=both.extent, tolerance=1e-6)
+        estimate = Arcsine(sensor, n_iterations=n_iterations, tolerance=1e-4)(frames[number : number + 1])
+        predicted.append(both.measure(estimate.phase)[1 - number][measurement.window])
     return np.stack(predicted)
 
 
@@ -557,24 +581,10 @@ def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:
     levels = []
     for image in registered.clear_frames:
         far = ~image.bad
-        for circle, other in zip(registered.pupils, registered.clear_frames, strict=True):
-            if other is image:  # both pupils may be on one image
+        for circle, holder in zip(registered.pupils, registered.clear_frames, strict=True):
+            if holder is image:  # both pupils may be on one image
                 far &= radius(far.shape, circle[:2]) > 0.58 * circle.diameter
         enough = np.count_nonzero(far) >= 100 and not image.cut
         levels.append(float(np.median(image.counts[far])) if enough else 0.0)
     dark = np.array(levels) * registered.areas[2:]
     return np.concatenate([dark * registered.exposure, dark])
-
-
-def _scaled(measurement: Measurement) -> NDArray[np.float64]:
-    """Frames as those of equal arms, with the scale and the background of the optics."""
-    return measurement.intensity / measurement.gain * measurement.optics.scale - measurement.optics.background
-
-
-def _mix(frames: NDArray, measurement: Measurement) -> NDArray[np.float64]:
-    """Add leakage, unmasked light, and that of partly lit pixels to ideal frames."""
-    optics = measurement.optics
-    mixed = (1 - optics.leakage) * frames + optics.leakage * frames[::-1]
-    mixed *= 1 - optics.unmasked
-    mixed[(..., *measurement.window)] += measurement.rest + optics.unmasked * measurement.pupil.amplitude**2
-    return mixed

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from zwfs import _check
+from zwfs.frames.phases import Phases
 from zwfs.frames.pipeline import (
     MOST_ITERATIONS,
     ClearLight,
-    MeasuredPhase,
     Measurement,
     Optics,
     clear_light,
+    iterated_phase,
     near_edges,
     predict_other,
     prediction_error,
@@ -102,9 +103,9 @@ def fit(
     before = reduce_frames(registered, optics, margin)
     rows, columns = np.indices(before.bad.shape[1:]) * _BLOCKS // before.pupil.shape[0]
     even, far = (rows + columns) % 2 == 0, before.good & ~near_edges(before)
-    seen = even.copy()
-    seen[before.window] &= far | ~before.pupil.inside
-    unseen = far & ~even[before.window]
+    searched = even.copy()
+    searched[before.window] &= far | ~before.pupil.inside
+    tested = far & ~even[before.window]
     hidden = np.zeros_like(even)
     hidden[before.window] = before.good & ~even[before.window]
 
@@ -127,13 +128,14 @@ def fit(
     @lru_cache(maxsize=1)  # a derivative begins where the search has just been
     def residuals(unknowns: tuple[float, ...]) -> NDArray:
         # Finite differences need a smooth function, so no trial may end an iteration earlier than its neighbours.
-        return recover_phase(trial(unknowns), n_iterations, 1e-8).mismatch[:, seen].ravel()
+        return _mismatch(trial(unknowns), n_iterations, 1e-8)[:, searched].ravel()
 
     def jacobian(unknowns: NDArray) -> NDArray:
         base = residuals(tuple(unknowns.tolist()))
         around = unknowns + np.diag(np.where(unknowns + change > high, -change, change))
         slopes = [
-            (residuals(tuple(one.tolist())) - base) / (one - unknowns)[index] for index, one in enumerate(around)
+            (residuals(tuple(near.tolist())) - base) / (near - unknowns)[index]
+            for index, near in enumerate(around)
         ]
         return np.transpose(slopes)
 
@@ -143,23 +145,25 @@ def fit(
     )  # fmt: skip
     after = trial(tuple(best.x.tolist()))
     old, new, control = (
-        prediction_error(one, unseen, n_iterations) for one in (before, after, upside_down(after))
+        prediction_error(pair, tested, n_iterations) for pair in (before, after, upside_down(after))
     )
-    misfit, smaller = (
-        np.sum(recover_phase(one, n_iterations).mismatch[:, hidden] ** 2) for one in (before, after)
-    )
+    misfit, smaller = (np.sum(_mismatch(pair, n_iterations, 1e-4)[:, hidden] ** 2) for pair in (before, after))
     better = smaller < misfit and np.all(new < (1 - _GAIN) * np.minimum(old, control))
-    kept = after if better else before
-    return kept.registered, kept.optics
+    chosen = after if better else before
+    return chosen.registered, chosen.optics
+
+
+def _mismatch(measurement: Measurement, n_iterations: int, tolerance: float) -> NDArray[np.float64]:
+    return measurement.agreement(iterated_phase(measurement, n_iterations, tolerance)).mismatch
 
 
 def _check_fit(argument: str, names: Any, optics: Any) -> None:
     """Require names of different parameters that `fit` knows, and optics from which it can start."""
     _check.instance("optics", optics, Optics)
-    known = (*_RANGES, "registration")
+    choices = (*_RANGES, "registration")
     listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
-    if not listed or not all(isinstance(name, str) and name in known for name in names):
-        raise ValueError(f"{argument} = {_check.shown(names)}: expected a list with some of {list(known)}")
+    if not listed or not all(isinstance(name, str) and name in choices for name in names):
+        raise ValueError(f"{argument} = {_check.shown(names)}: expected a list with some of {list(choices)}")
     if len(set(names)) < len(names):
         raise ValueError(f"{argument} = {_check.shown(names)}: expected each name once")
     for name in set(names) & set(_RANGES):
@@ -178,7 +182,8 @@ class Step:
     Attributes
     ----------
     name : str
-    result : MeasuredPhase
+    result : Phases
+        With its `measurement`.
     predicted : ndarray, shape (2,)
         Correlation of each frame with the prediction from the other one alone, see `predict_other`.
     control : ndarray, shape (2,)
@@ -186,7 +191,7 @@ class Step:
     """
 
     name: str
-    result: MeasuredPhase
+    result: Phases
     predicted: NDArray[np.float64]
     control: NDArray[np.float64]
 
@@ -232,7 +237,7 @@ def steps(
 
     def add(name: str, registered: RegisteredFrames, optics: Optics) -> None:
         measurement = reduce_frames(registered, optics)
-        scores = (predict_other(one, n_iterations) for one in (measurement, upside_down(measurement)))
+        scores = (predict_other(pair, n_iterations) for pair in (measurement, upside_down(measurement)))
         work.append(Step(name, recover_phase(measurement, n_iterations), *scores))
 
     names = "registration by content", "background around the pupils", "balance of the flux"
@@ -241,12 +246,12 @@ def steps(
         switches["n_pupils"] = len(optics.phase_shifts)
         add(name, register_frames(frames, clear_frames, **settings, **switches), optics)
     if optics.single and fitted:
-        last = work[-1].result.measurement
+        last = work[-1].result.agreement.measurement
         add("no fit: one image cannot test it", last.registered, last.optics)
         return work
     for number, name in enumerate(fitted, 1):
-        last = work[-1].result.measurement
-        found = fit(last.registered, last.optics, fitted[:number], n_iterations)
-        kept = "" if found[1] is not last.optics else " (not kept)"
-        add(f"fit of {name.replace('_', ' ')}{kept}", *found)
+        last = work[-1].result.agreement.measurement
+        fitted_values = fit(last.registered, last.optics, fitted[:number], n_iterations)
+        verdict = "" if fitted_values[1] is not last.optics else " (not kept)"
+        add(f"fit of {name.replace('_', ' ')}{verdict}", *fitted_values)
     return work

@@ -77,6 +77,12 @@ class Image:
         _check.instance("name", self.name, str)
         _check.flag("cut", self.cut)
 
+    @classmethod
+    def of(cls, counts: NDArray, name: str) -> Image:
+        """Image of counts, (ny, nx), in which bad pixels are not finite."""
+        good = np.isfinite(counts)
+        return cls(nearest_good(counts, good), ~good, name)
+
 
 @dataclass(frozen=True, eq=False)
 class Placement:
@@ -155,6 +161,11 @@ class RegisteredFrames:
     def images(self) -> tuple[Image, ...]:
         """Frames, then clear frames."""
         return self.frames + self.clear_frames
+
+    @property
+    def camera_images(self) -> tuple[Image, ...]:
+        """Frames, one of them if it holds both pupils."""
+        return self.frames[: 1 if self.frames[0] is self.frames[1] else 2]
 
     @cached_property
     def diameter(self) -> float:
@@ -281,16 +292,16 @@ def register_frames(
     subpixel = _check.flag("subpixel", subpixel)
     n_pupils = _check.integer("n_pupils", n_pupils, 1, 2)
     background, balance = _check.flag("background", background), _check.flag("balance", balance)
-    for name, given in (("frames", frames), ("clear_frames", clear_frames)):
-        _check.sequence(name, given, Image)
-        if len(given) not in (1, n_pupils):
-            raise ValueError(f"{name} holds {len(given)} images: expected 1{' or 2' * (n_pupils == 2)}")
+    for name, images in (("frames", frames), ("clear_frames", clear_frames)):
+        _check.sequence(name, images, Image)
+        if len(images) not in (1, n_pupils):
+            raise ValueError(f"{name} holds {len(images)} images: expected 1{' or 2' * (n_pupils == 2)}")
     if n_pupils == 1:
         frames, clear_frames = [frames[0]] * 2, [clear_frames[0]] * 2
-    given = *frames, *clear_frames
+    unmarked = *frames, *clear_frames
     # The clear frames are judged alone, so that a pupil stands at the same place for all frames.
     frames, clear_frames = _without_odd(frames, clear_frames), _without_odd(clear_frames)
-    marked = zip((*frames, *clear_frames), given, strict=True)
+    marked = zip((*frames, *clear_frames), unmarked, strict=True)
     n_odd = sum(int(np.count_nonzero(image.bad & ~before.bad)) for image, before in marked)
     shape = clear_frames[0].counts.shape
     diameter = None if pupil_diameter is None else check_diameter(pupil_diameter, shape)
@@ -305,15 +316,15 @@ def register_frames(
             f"{names}: the two pupils are {small:.1f} and {large:.1f} pixels wide: "
             f"expected the same size, to {_LARGEST_STRETCH:.0%}"
         )
-    masked, seen = (frames[0], frames[-1]), pupils
+    masked, circles = (frames[0], frames[-1]), pupils
     formats = [(pair[0] is pair[1], *(image.counts.shape for image in pair)) for pair in (masked, clear)]
     moved = formats[0] != formats[1]
     if moved:
-        masked, seen = _locate(frames, None, diameter or pupils[0].diameter)
+        masked, circles = _locate(frames, None, diameter or pupils[0].diameter)
     for image in masked:
         if not np.ptp(image.counts) > 0:
             raise ValueError(f"{image.name}: every pixel is {image.counts.flat[0]:.6g}: expected light")
-    places = np.array([circle[:2] for circle in (*seen, *pupils)])
+    places = np.array([circle[:2] for circle in (*circles, *pupils)])
     origins = np.round(places - places[2])
     rough = RegisteredFrames(masked, clear, pupils, origins, background, balance, exposure, n_odd=n_odd)
     return _register(rough, frames_too=moved) if subpixel else rough
@@ -389,8 +400,8 @@ def register(
     moves = [(y, x, 0.0, stretch) for y in steps for x in steps]
     start = min(moves, key=lambda move: float(np.sum(coarse.difference(move) ** 2)))
     if max(map(abs, start[:2])) == _REACH:
-        found = f"the best shift of the images is {start[:2]} pixels, the end of the search"
-        raise ValueError(f"{found}: expected less than {_REACH}")
+        reason = f"the best shift of the images is {start[:2]} pixels, the end of the search"
+        raise ValueError(f"{reason}: expected less than {_REACH}")
     turns = np.array([False, False, True, True])
     free = turn | ~turns
     best, _ = coarse.search(np.array(start), free)
@@ -421,13 +432,13 @@ def _locate(
     else:
         circles = [circle for image in images for circle in find_pupils(image, n_pupils, diameter)]
     pair = images[0], images[-1]
-    given = "of pupil_centers " if centers is not None else ""
+    origin = "of pupil_centers " if centers is not None else ""
     for circle, image in zip(circles, pair, strict=True):
         room = [*circle[:2], *np.subtract(image.counts.shape, 1) - circle[:2]]
         if min(room) < circle.diameter / 2 - 2.5:  # it reaches more than 2 pixels beyond the image
             side = ("top", "left", "bottom", "right")[int(np.argmin(room))]
             raise ValueError(
-                f"{image.name}: the pupil {given}at row {circle.row:.1f}, column {circle.column:.1f}, "
+                f"{image.name}: the pupil {origin}at row {circle.row:.1f}, column {circle.column:.1f}, "
                 f"{circle.diameter:.1f} pixels wide, is cut off at the {side} (row 0 is the top): "
                 "expected all of it on the image"
             )
@@ -437,7 +448,7 @@ def _locate(
 
 def _without_odd(images: Sequence[Image], others: Sequence[Image] = ()) -> tuple[Image, ...]:
     """Images with hot and dead pixels marked as bad; `others` show the same pixels without or with the mask."""
-    shapes = [[image.counts.shape for image in given] for given in (images, others)]
+    shapes = [[image.counts.shape for image in pair] for pair in (images, others)]
     marked = []
     for index, image in enumerate(images):
         sizes = _outstanding(image)

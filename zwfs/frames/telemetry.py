@@ -141,10 +141,10 @@ def reconstruct(
     --------
     >>> import tempfile
     >>> from zwfs.bench import Bench, write_bench
-    >>> from zwfs.frames import calibrate, reconstruct
+    >>> from zwfs.frames import Calibration, reconstruct
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     files = write_bench(folder, Bench(n_pixels=40), seed=1)
-    ...     calibration = calibrate([files["frame"]], [files["pupils"]], [files["dark"]])
+    ...     calibration = Calibration.from_files([files["frame"]], [files["pupils"]], [files["dark"]])
     ...     summary = reconstruct(files["frame"], calibration, f"{folder}/phases.fits", n_workers=1)
     ...
     >>> summary.n_frames, summary.n_flagged
@@ -152,8 +152,8 @@ def reconstruct(
     """
     fits_module()
     files, second_files = (
-        [path_of(name, one)] if isinstance(one, str | os.PathLike) else paths_of(name, one)
-        for name, one in (("frames", frames), ("second_frames", second_frames))
+        [path_of(name, paths)] if isinstance(paths, str | os.PathLike) else paths_of(name, paths)
+        for name, paths in (("frames", frames), ("second_frames", second_frames))
     )
     if not files:
         raise ValueError("frames is empty: expected a file")
@@ -175,7 +175,7 @@ def reconstruct(
     try:
         n_resumed = done = sum(stop - first for first, stop in part.done)
         report(done, stack.n)
-        names = [(card_value(one.name), n) for one, n in zip(stack.firsts, stack.lengths, strict=True)]
+        names = [(card_value(block.name), n) for block, n in zip(stack.firsts, stack.lengths, strict=True)]
         part.write(job.files, 0, np.array(names, job.files.dtype))
         for first, stop in job.run(part, n_workers):
             part.note(first, stop)
@@ -213,14 +213,14 @@ class _Job:
             raise ValueError(f"read_noise = {read_noise:g}: expected a number of photons with it")
         if wavelength is not None:
             wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-        elif isinstance(known := stack.header.get("WAVELEN"), int | float) and 0 < known < np.inf:
-            wavelength = known  # the phases need none, so any other value is left alone
+        elif isinstance(stated := stack.header.get("WAVELEN"), int | float) and 0 < stated < np.inf:
+            wavelength = stated  # the phases need none, so any other value is left alone
         level = calibration.saturation if saturation is None else saturation
         if saturation is None and level == np.inf:
             level = stack.saturation
         self.saturation = _number_or_inf("saturation", level, open_low=True)
         self.keywords = _columns(stack, keywords)
-        names = max(len(card_value(one.name)) for one in stack.firsts)
+        names = max(len(card_value(block.name)) for block in stack.firsts)
         of_files = np.dtype([("NAME", f"S{names}"), ("FRAMES", ">i8")])
         self.files = Unit("FILES", of_files, (), len(stack.firsts), [], {})
         self.has_sigma = phases and photons is not None
@@ -285,10 +285,10 @@ class _Job:
                 ("PHOTONS", self.photons, "per pixel at an intensity of 1"),
                 ("RDNOISE", self.read_noise, "[e-] rms"),
             ]
-        known = {key for key, *_ in cards}
+        own = {key for key, *_ in cards}
         for key, value in stack.header.items():
             plain = isinstance(value, str | bool | int | float)
-            if plain and key not in known and key not in _OWN and not key.startswith("NAXIS"):
+            if plain and key not in own and key not in _OWN and not key.startswith("NAXIS"):
                 cards.append((key, value, "of the first file" if len(str(value)) < 40 else ""))
         return cards
 
@@ -322,40 +322,40 @@ class _Job:
         values: dict[str, Any] = {key: counts[name] for name, (key, _) in _COUNTS.items()} | {
             "NFLAGGED": n_flagged
         }
-        self.units[0].cards = [(key, values.get(key, one), text) for key, one, text in self.units[0].cards]
+        self.units[0].cards = [(key, values.get(key, value), text) for key, value, text in self.units[0].cards]
         return Summary(output, self.stack.n, n_flagged, counts, n_resumed)
 
     def _reconstruct(self, part: Part, chunk: tuple[int, int]) -> tuple[int, int]:
         counts = self.stack.read(*chunk)
         limits: dict[str, Any] = {"saturation": self.saturation, "largest_residual": self.largest_residual}
-        found = self.calibration(counts[:, 0] if counts.shape[1] == 1 else counts, **limits)
-        values = {"": found.phase}
+        phases = self.calibration(counts[:, 0] if counts.shape[1] == 1 else counts, **limits)
+        values = {"": phases.phase}
         if self.has_sigma:
-            values["SIGMA"] = self.calibration.sigma(found, self.photons, self.read_noise)
-        values["FRAMES"] = self._rows(found, *chunk, values.get("SIGMA"))
+            values["SIGMA"] = self.calibration.sigma(phases, self.photons, self.read_noise)
+        values["FRAMES"] = self._rows(phases, *chunk, values.get("SIGMA"))
         for unit in self.units[:-1]:
             if unit.n:
                 part.write(unit, chunk[0], values[unit.name])
         return chunk
 
-    def _rows(self, found: Phases, first: int, stop: int, sigma: NDArray | None) -> NDArray:
+    def _rows(self, phases: Phases, first: int, stop: int, sigma: NDArray | None) -> NDArray:
         rows, numbers = np.zeros(stop - first, self.table.dtype), np.arange(first, stop)
         files = np.searchsorted(self.stack.ends, numbers, "right")
         rows["FRAME"], rows["FILE"], rows["INDEX"] = numbers, files, numbers - self.stack.starts[files]
         for name, values in self.keywords.items():
             rows[name] = values[files]
-        rows["FLAGS"], rows["FLUX"], rows["RESIDUAL"] = found.flags, found.flux, found.residual
-        rows["SHIFT"] = found.displacement
-        rows["NBAD"], rows["NSATUR"], rows["NITER"] = found.n_bad, found.n_saturated, found.n_iterations
-        lost = found.flags & Flag.LOST > 0
+        rows["FLAGS"], rows["FLUX"], rows["RESIDUAL"] = phases.flags, phases.flux, phases.residual
+        rows["SHIFT"] = phases.displacement
+        rows["NBAD"], rows["NSATUR"], rows["NITER"] = phases.n_bad, phases.n_saturated, phases.n_iterations
+        lost = phases.flags & Flag.LOST > 0
         if sigma is not None:
             rows["SIGMA"][lost] = np.nan
             rows["SIGMA"][~lost] = np.sqrt(np.nanmean(sigma[~lost] ** 2, axis=(1, 2)))
         if self.matrix is not None:
-            rows["COEFFS"] = self.calibration.coefficients(found, self.matrix)
+            rows["COEFFS"] = self.calibration.coefficients(phases, self.matrix)
             rows["COEFFS"][lost] = np.nan
             if self.photons is not None:
-                rows["SIGCOEFF"] = self.calibration.sigma(found, self.photons, self.read_noise, self.modes)
+                rows["SIGCOEFF"] = self.calibration.sigma(phases, self.photons, self.read_noise, self.modes)
         return rows
 
 

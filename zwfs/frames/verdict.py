@@ -16,16 +16,17 @@ from zwfs import _check
 from zwfs._images import nearest_good
 from zwfs._results import Result
 from zwfs.bounds import cramer_rao
+from zwfs.frames.phases import Phases
 from zwfs.frames.pipeline import (
     NEAR,
-    MeasuredPhase,
+    Agreement,
     Measurement,
     Optics,
+    iterated_phase,
     model,
     near_edges,
     predict_other,
     prediction_error,
-    recover_phase,
     upside_down,
 )
 from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Placement, RegisteredFrames
@@ -49,6 +50,7 @@ _ONE_IMAGE = (
     "arcsine, nor an error of dimple, light or background. Poke a known phase, or take a second image with "
     "another phase shift."
 )
+_TOLERANCE = 1e-4  # radian, of an iteration
 _LEAST_SKEW = 0.5  # skewness of the change of phase: that of noise is about 0, that of one poke 1
 
 
@@ -133,16 +135,17 @@ class Verdict(Result):
         return bool(self.inner <= _EXPLAINED)
 
 
-def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations: int = 25) -> Verdict:
+def judge(phases: Phases, noise: CameraNoise | None = None, n_iterations: int = 25) -> Verdict:
     """Judge a measured phase, in words and numbers.
 
     Parameters
     ----------
-    result : MeasuredPhase
+    phases : Phases
+        Of `recover_phase` or `phase_of`.
     noise : CameraNoise, optional
         Without it there is no error bar, and the misfit is not compared with the noise.
     n_iterations : int
-        As for `recover_phase`.
+        Of the predictions of one frame from the other one.
 
     Returns
     -------
@@ -152,74 +155,75 @@ def judge(result: MeasuredPhase, noise: CameraNoise | None = None, n_iterations:
     --------
     >>> import numpy as np
     >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames.pipeline import Optics, recover_phase, reduce_frames
+    >>> from zwfs.frames import CameraNoise, judge, recover_phase
+    >>> from zwfs.frames.pipeline import Optics, reduce_frames
     >>> from zwfs.frames.registration import Image, register_frames
-    >>> from zwfs.frames.verdict import CameraNoise, judge
     >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons_per_image=1e8)
     >>> pistons = 0.5 * np.arange(-3, 4) / 3
     >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
     >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
     >>> measurement = reduce_frames(register_frames([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
-    >>> verdict = judge(recover_phase(measurement), CameraNoise(gain=1.0, read_noise=bench.read_noise))
+    >>> noise = CameraNoise(gain=1.0, read_noise=bench.read_noise)
+    >>> verdict = judge(recover_phase(measurement), noise)
     >>> verdict.score.round(1), bool(np.all(verdict.score > verdict.control + 0.2))
     (array([0.9, 0.9]), True)
-    >>> round(float(np.nanmedian(verdict.sigma) * CameraNoise(gain=1.0).photons(measurement) ** 0.5), 1)
+    >>> round(float(np.nanmedian(verdict.sigma) * noise.photons(measurement) ** 0.5), 1)
     0.6
     """
-    _check.instance("result", result, MeasuredPhase)
-    measurement = result.measurement
+    _check.instance("phases", phases, Phases)
+    phase, agreement = phases.phase, phases.agreement
+    measurement = agreement.measurement
     score = predict_other(measurement, n_iterations)
     control = predict_other(upside_down(measurement), n_iterations)
     near, single = near_edges(measurement), measurement.optics.single
     inner, edge, sigma = np.nan, np.nan, None
     if noise is not None:
         _check.instance("noise", noise, CameraNoise)
-        sigma = error_bar(result, noise)
+        sigma = error_bar(measurement, phase, noise)
     if noise is not None and not single:
-        ratio = _over_noise(result, noise)
+        ratio = _over_noise(agreement, phase, noise)
         inner, edge = _rms(ratio[measurement.good & ~near]), _rms(ratio[measurement.good & near])
     placed = not np.isnan(measurement.registered.placement.sigma[2:]).any()
     if single:
-        strength = float(np.nanstd(result.phase))
+        strength = float(np.nanstd(phase, dtype=float))
         findings = {"fit": _ONE_IMAGE}
-        if warnings := " ".join(_warnings(result)):
+        if warnings := " ".join(_warnings(agreement, phases)):
             findings["warnings"] = warnings
         return Verdict(score, control, inner, edge, sigma, placed, (1.0, 1.0), (strength, strength), findings)
     scales, strengths = _scales(measurement, n_iterations)
     findings = {
-        "fit": _of_fit(result, inner, edge, near, placed),
+        "fit": _of_fit(agreement, inner, edge, near, placed),
         "unseen data": _of_score(score, control),
         "scale": _of_scale(scales, strengths),
         "light": _of_light(measurement),
         "registration": _of_place(measurement.registered.placement),
     }
-    if warnings := " ".join(_warnings(result)):
+    if warnings := " ".join(_warnings(agreement, phases)):
         findings["warnings"] = warnings
     return Verdict(score, control, inner, edge, sigma, placed, scales, strengths, findings)
 
 
-def error_bar(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64]:
+def error_bar(measurement: Measurement, phase: NDArray, noise: CameraNoise) -> NDArray[np.float64]:
     """Smallest standard error of the phase that photon and read noise allow, at its estimate.
 
     Noise of the clear frames and errors of the model are not part of it. It is NaN outside the pupil and at bad
     points, (ny, nx).
     """
-    measurement = result.measurement
-    phase = nearest_good(np.nan_to_num(result.phase), measurement.good)
+    phase = nearest_good(np.nan_to_num(phase), measurement.good)
     sigma = cramer_rao(model(measurement), phase, photons=noise.photons(measurement), read_noise=noise.read_noise)
     return np.where(measurement.good, sigma, np.nan)
 
 
-def _over_noise(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64]:
+def _over_noise(agreement: Agreement, phase: NDArray, noise: CameraNoise) -> NDArray[np.float64]:
     """Misfit of the two frames at each point over its standard deviation, (ny, nx).
 
     Two intensities share one phase, which takes up the part of the misfit along its slopes. The rest is normal to
     them: one number at each point. It holds the noise of both frames, as interpolation leaves it, and of the clear
     frames, which changes the squared amplitude of the model.
     """
-    measurement = result.measurement
+    measurement = agreement.measurement
     sensor, pupil, photons = model(measurement), measurement.pupil, noise.photons(measurement)
-    phase = nearest_good(np.nan_to_num(result.phase), measurement.good)
+    phase = nearest_good(np.nan_to_num(phase), measurement.good)
     field = np.where(pupil.inside, pupil.amplitude * np.exp(1j * phase), 0)
     waves = sensor.propagate(field)[(..., *sensor.window)]
     slopes = 2 * np.real(np.conj(waves) * 1j * field)
@@ -231,7 +235,7 @@ def _over_noise(result: MeasuredPhase, noise: CameraNoise) -> NDArray[np.float64
     exposure = measurement.registered.exposure
     of_amplitude = clear.sum() / 4 * exposure * (np.abs(field) ** 2 + dark * exposure) / photons
     variance = np.sum(normal**2 * of_frames, axis=0) + np.sum(normal * growth, axis=0) ** 2 * of_amplitude
-    misfit = (result.measured - result.modelled)[(..., *measurement.window)]
+    misfit = (agreement.measured - agreement.modelled)[(..., *measurement.window)]
     return np.sum(normal * misfit, axis=0) / np.sqrt(np.maximum(variance, 1e-300))
 
 
@@ -240,7 +244,7 @@ def _noise_kept(registered: RegisteredFrames) -> tuple[NDArray[np.float64], NDAr
     rng = np.random.default_rng(0)
 
     def noise(images: Any) -> Any:
-        return tuple(replace(one, counts=rng.normal(size=one.counts.shape)) for one in images)
+        return tuple(replace(image, counts=rng.normal(size=image.counts.shape)) for image in images)
 
     white = replace(registered, frames=noise(registered.frames), clear_frames=noise(registered.clear_frames))
     frames, clear = (white._on_grid(which)[0].var(axis=(1, 2)) for which in (FRAMES, CLEAR_FRAMES))
@@ -259,9 +263,9 @@ def _scales(measurement: Measurement, n_iterations: int) -> tuple[tuple[float, f
     """
     errors, strengths = [], []
     for factor in _FACTORS:
-        one = replace(measurement, optics=replace(measurement.optics, scale=factor * measurement.optics.scale))
-        errors.append(float(prediction_error(one, one.good, n_iterations).mean()))
-        waves = np.exp(1j * recover_phase(one, n_iterations).phase[one.good])
+        scaled = replace(measurement, optics=replace(measurement.optics, scale=factor * measurement.optics.scale))
+        errors.append(float(prediction_error(scaled, scaled.good, n_iterations).mean()))
+        waves = np.exp(1j * iterated_phase(scaled, n_iterations, _TOLERANCE)[scaled.good])
         strengths.append(float(np.angle(waves * np.conj(waves.mean())).std()))
     least, here = min(errors), errors[_FACTORS.index(1.0)]
     well = np.array(errors) <= max(here, least * (1 + np.clip(least, _AS_WELL, 1)))
@@ -280,10 +284,10 @@ def _of_scale(scales: tuple[float, float], strengths: tuple[float, float]) -> st
     )
 
 
-def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.bool_], placed: bool) -> str:
+def _of_fit(agreement: Agreement, inner: float, edge: float, near: NDArray[np.bool_], placed: bool) -> str:
     """Whether the model explains the frames, and where it does not."""
-    good = result.measurement.good
-    squares = np.sum((result.measured - result.modelled)[(..., *result.measurement.window)] ** 2, axis=0)
+    good = agreement.measurement.good
+    squares = np.sum((agreement.measured - agreement.modelled)[(..., *agreement.measurement.window)] ** 2, axis=0)
     share, area = squares[good & near].sum() / squares[good].sum(), np.mean(near[good])
     edges = "gaps, vanes and edges"
     look = "dimple, leakage and background"
@@ -295,7 +299,7 @@ def _of_fit(result: MeasuredPhase, inner: float, edge: float, near: NDArray[np.b
         f"look at {look}."
     )
     if np.isnan(inner):
-        size = f"the rms misfit is {np.mean(result.residual):.3f} of the mean light"
+        size = f"the rms misfit is {np.mean(agreement.residual):.3f} of the mean light"
         return f"Not compared with the noise of the camera, which is not known: {size}. {where}"
     far = f"from {edges} the misfit is {inner:.3g} times what noise alone would cause"
     if inner > _EXPLAINED:
@@ -354,22 +358,22 @@ def _of_place(placement: Placement) -> str:
     return "The second image, compared with the first: " + "; ".join(facts) + "."
 
 
-def _warnings(result: MeasuredPhase) -> list[str]:
+def _warnings(agreement: Agreement, phases: Phases) -> list[str]:
     """Facts that lower the trust in the phase."""
-    measurement, found = result.measurement, []
+    measurement, remarks = agreement.measurement, []
     n_points = measurement.pupil.n_points
-    if not result.converged:
-        found.append("The iteration has not converged: raise n_iterations, or the phase is beyond its range.")
-    if result.n_unsolved > _MANY * n_points:
-        found.append(f"At {result.n_unsolved} of {n_points} points the equations have no unique solution.")
+    if not phases.converged:
+        remarks.append("The iteration has not converged: raise n_iterations, or the phase is beyond its range.")
+    if phases.n_unsolved > _MANY * n_points:
+        remarks.append(f"At {phases.n_unsolved} of {n_points} points the equations have no unique solution.")
     if measurement.n_bad > _MANY * n_points:
-        found.append(f"{measurement.n_bad} of {n_points} points are bad and have no phase.")
-    if abs(result.excess_light) > _EXCESS:
-        found.append(
-            f"Around the pupil the frames differ from the model by {result.excess_light:+.3f} of the mean light: "
-            "look at the dark, stray light and the diameter of the dimple."
+        remarks.append(f"{measurement.n_bad} of {n_points} points are bad and have no phase.")
+    if abs(agreement.excess_light) > _EXCESS:
+        remarks.append(
+            f"Around the pupil the frames differ from the model by {agreement.excess_light:+.3f} of the mean "
+            "light: look at the dark, stray light and the diameter of the dimple."
         )
-    return found
+    return remarks
 
 
 @dataclass(frozen=True)
@@ -452,7 +456,7 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
     optics = flat.optics
     choices = [optics, replace(optics, phase_shifts=optics.phase_shifts[::-1])]
     scores = [
-        sign * _skewness(*(recover_phase(replace(one, optics=choice), n_iterations) for one in (flat, poked)))
+        sign * _skewness(replace(flat, optics=choice), replace(poked, optics=choice), n_iterations)
         for choice in choices
     ]
     best = int(np.argmax(scores))
@@ -465,10 +469,10 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
     return ImageOrder(choices[best], best == 1, score, other)
 
 
-def _skewness(flat: MeasuredPhase, poked: MeasuredPhase) -> float:
+def _skewness(flat: Measurement, poked: Measurement, n_iterations: int) -> float:
     """How far the change of phase has one sign, in [-1, 1]; the cube weights the poke and not the noise."""
-    both = np.isfinite(flat.phase) & np.isfinite(poked.phase)
-    waves = np.exp(1j * (poked.phase - flat.phase)[both])
+    first, second = (iterated_phase(measurement, n_iterations, _TOLERANCE) for measurement in (flat, poked))
+    waves = np.exp(1j * (second - first)[flat.good & poked.good])
     change: NDArray[np.float64] = np.angle(waves * np.exp(-1j * np.angle(waves.mean())))
     cubes = (change - np.median(change)) ** 3
     return float(cubes.sum() / max(np.abs(cubes).sum(), 1e-300))

@@ -277,8 +277,8 @@ def test_error_bars_hardly_change_with_more_iterations_for_the_maps(monkeypatch)
     point = fitted(BENCH).bench.point
     changes = 0.01 * (point.problem.weights * point.model.images)[None]  # a part of which light and fluxes follow
     before = Eliminated(point).covariance(point, changes, 1.0)
-    for name in ("_N_FOLLOWED", "_N_CHANGES"):
-        monkeypatch.setattr(f"zwfs.frames._solver.{name}", 24)
+    for name, number in (("_N_FOLLOWED", (24, 24)), ("_N_CHANGES", 24)):
+        monkeypatch.setattr(f"zwfs.frames._solver.{name}", number)
     after = Eliminated(point).covariance(point, changes, 1.0)
     np.testing.assert_allclose(*(np.sqrt(np.diagonal(one)) for one in (before, after)), rtol=0.25)
 

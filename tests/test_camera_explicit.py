@@ -52,6 +52,24 @@ def test_sums_of_the_evidence_are_those_of_the_eigenvalues(guided):
     assert guide.log_determinant == pytest.approx(np.sum(np.log(values)), rel=0.05)
 
 
+def test_evidence_in_closed_form_is_that_of_a_step_to_the_best_phase(guided):
+    """Between two strengths of the prior; what they share does not count."""
+    noise = np.random.default_rng(2).normal(size=(2, *SHAPE)) / guided.problem.weights
+    guided = Point(replace(guided.problem, counts=guided.model.images + noise), guided.x)
+    data, means = guided.problem.guide._data, guided.phase_means
+    closed, stepped = [], []
+    for rms in (0.5, 1.5):
+        phase_map = PhaseMap(N, F, MapPrior(rms, 4.0), 16)
+        guide = Posterior(data, phase_map)
+        closed.append(guide.evidence(data.best(guided))[0])
+        point = Point(replace(guided.problem, phase_map=phase_map, guide=guide), phase_map.white(means))
+        matrix = point.matrix.product(np.eye(len(point.x)))
+        matrix = (matrix + matrix.T) / 2
+        cost = point.cost - point.gradient @ np.linalg.solve(matrix, point.gradient) / 2
+        stepped.append(cost + np.linalg.slogdet(matrix)[1] / 2)
+    assert np.diff(closed) == pytest.approx(np.diff(stepped), abs=0.05 * guide.log_determinant)
+
+
 def test_images_without_a_good_pixel_leave_the_prior(guided):
     problem = replace(guided.problem, weights=np.zeros((2, *SHAPE)))
     posterior = Posterior(Explicit.of(Point(problem, guided.x)), problem.phase_map)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import fft, linalg, ndimage, sparse
 
 from zwfs.frames._optics import pooled
-from zwfs.frames._solver import PhaseMap, Point
+from zwfs.frames._solver import PhaseMap, Point, growth_of
 
 _MOST = 3000  # coefficients: with more, the factors take longer than conjugate gradients without them
 _APART = 8  # pixels between the coefficients of a comb
@@ -43,13 +43,21 @@ class Explicit:
         matrix[np.diag_indices_from(matrix)] += _DAMPED[0] * self.diagonal + _DAMPED[1] * matrix.max() + _UNSEEN
         lower = linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
         self.log_determinant = 2 * float(np.sum(np.log(np.diagonal(lower))))
-        self.inverse = linalg.lapack.dpotri(lower, lower=True)[0]  # its lower triangle
+        self.inverse = linalg.lapack.dpotri(lower, lower=True)[0].T  # its upper triangle, row by row
 
     @classmethod
     def of(cls, point: Point) -> Explicit | None:
         """Matrix at a point, or None for a pupil of too many pixels."""
         lit = ndimage.binary_dilation(pooled(point.light, point.problem.camera.f) > 0.01)
         return cls(point, lit) if np.count_nonzero(lit) <= _MOST else None
+
+    def best(self, point: Point) -> NDArray[np.float64]:
+        """Coefficients that explain the images best without a prior, to first order at a point nearby."""
+        problem, phase_map = point.problem, point.problem.phase_map
+        slope = point.model.adjoint(problem.weights * point.residuals).phase
+        gradient = (phase_map.along.T @ slope @ phase_map.along)[self.where]
+        coefficients = phase_map.coefficients(problem.split(point.x)[0][0])[self.where]
+        return coefficients - linalg.blas.dsymv(1.0, self.inverse.T, gradient, lower=True)
 
     def _near(self) -> sparse.csr_array:
         """Change of the residuals with each coefficient, without the light of the dimple."""
@@ -96,7 +104,7 @@ class Posterior:
         self._data, self._prior = data, prior
         self._covariance = fft.irfft2(prior.spline**2, s=(prior.size,) * 2).take(data.pairs)
         total = data.inverse + self._covariance
-        self._factor = linalg.cho_factor(total, lower=True, overwrite_a=True, check_finite=False)
+        self._factor = linalg.cho_factor(total.T, lower=True, overwrite_a=True, check_finite=False)
         self.log_determinant = data.log_determinant + 2 * float(np.sum(np.log(np.diagonal(self._factor[0]))))
 
     @cached_property
@@ -104,6 +112,15 @@ class Posterior:
         """Number of white numbers that the images determine."""
         probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(self._covariance), _PROBES))
         return float(np.vdot(probes, self._solve(self._covariance @ probes))) / _PROBES
+
+    def evidence(self, best: NDArray) -> tuple[float, float]:
+        """Minus the logarithm of the evidence of the prior but for a constant, and the growth of its variance.
+
+        `best` are the coefficients that explain the images best. With them, the least cost has a closed form.
+        """
+        v = self._solve(best)
+        squares = float(v @ self._covariance @ v)
+        return (float(best @ v) + self.log_determinant) / 2, growth_of(squares, self.determined)
 
     def inverse(self, r: NDArray) -> NDArray[np.float64]:
         """Inverse of the matrix times vectors."""

@@ -123,7 +123,7 @@ class FittedSensor:
         soft = allowing(weights, allowed[:, None, None])
         start = self._start(counts)
         problem = self._problem(counts, soft, MapPrior(_rms_of(start), 3.0))
-        point = minimise(problem, problem.phase_map.white(start), 5, 20)[0]
+        point = minimise(problem, problem.phase_map.white(start), 3, 12)[0]
         point = Point(replace(problem, weights=weights), point.x)
         point = self._chosen(point) if prior is None else self._under(prior, point, Explicit.of(point))
         point, converged = _lowered(point, self.n_steps)
@@ -139,32 +139,40 @@ class FittedSensor:
         point, converged = _lowered(self._under(prior, start, data), 4)
         if not converged:  # the matrix at the start may be far from that of this phase
             data = Explicit.of(point)
-        least, best = math.inf, point
+        best = None if data is None else data.best(point)
+        least = math.inf
         for exponent in _EXPONENTS:
-            prior = _stronger(best, 0.5)
-            prior = MapPrior(prior.rms * _STRONGER ** (exponent - prior.exponent), exponent)
-            point = self._strongest(prior, best, data)
-            evidence = point.matrix.evidence[0]
+            prior = _denser(point.problem.phase_map.prior, exponent)
+            tried, evidence = self._strongest(prior, point, data, best, least)
             if evidence > least:
                 break
-            least, best = evidence, point
-        return best
-
-    def _strongest(self, prior: MapPrior, point: Point, data: Explicit | None) -> Point:
-        """Phase with the strength of the prior at which the evidence is largest."""
-        known: list[tuple[float, float]] = []
-        power = 0.5
-        for _ in range(_UPDATES):
-            point, _ = _lowered(self._under(prior, point, data), 2)
-            strength, growth = math.log(prior.rms), _growth(point)
-            if abs(growth) < _STATIONARY:
-                break
-            if known:  # Newton's step with the slope between the last two
-                before, then = known[-1]
-                power = float(np.clip((strength - before) / (then - growth), *_POWERS)) if then != growth else 0.5
-            known.append((strength, growth))
-            prior = _stronger(point, power)
+            least, point = evidence, tried
         return point
+
+    def _strongest(
+        self, prior: MapPrior, point: Point, data: Explicit | None, best: Any, least: float
+    ) -> tuple[Point, float]:
+        """Point with the strength of the prior at which the evidence is largest, and minus its logarithm.
+
+        With an explicit matrix, the phase stays that of the point. A prior that is clearly worse than one with
+        minus the logarithm `least` is not pursued.
+        """
+        tried: list[tuple[float, float]] = []
+        for _ in range(_UPDATES):
+            point = self._under(prior, point, data)
+            guide = point.problem.guide
+            point = point if guide else _lowered(point, 2)[0]
+            evidence, growth = guide.evidence(best) if guide else point.matrix.evidence
+            if abs(growth) < (_STATIONARY if evidence < least else 3 * _STATIONARY):
+                break
+            strength = math.log(prior.rms)
+            power = 0.5 if growth > 0 else 1.0
+            if tried:  # Newton's step with the slope between the last two
+                before, then = tried[-1]
+                power = float(np.clip((strength - before) / (then - growth), *_POWERS)) if then != growth else 0.5
+            tried.append((strength, growth))
+            prior = prior._replace(rms=prior.rms * math.exp(power * growth))
+        return point, evidence
 
     def frames(self, phase: ArrayLike) -> NDArray[np.float64]:
         """Frames that the model predicts for a phase.
@@ -236,15 +244,9 @@ class FittedSensor:
         return phase - phase[inside].mean()
 
 
-def _growth(point: Point) -> float:
-    """Logarithm of the factor on the variance of the prior that the evidence asks for."""
-    return math.log(max(point.matrix.evidence[1], 0.01))  # an rms of 0 allows no phase
-
-
-def _stronger(point: Point, power: float) -> MapPrior:
-    """Prior with an update of its rms."""
-    prior = point.problem.phase_map.prior
-    return prior._replace(rms=prior.rms * math.exp(power * _growth(point)))
+def _denser(prior: MapPrior, exponent: float) -> MapPrior:
+    """Prior with another exponent, and the same density where images still show it."""
+    return MapPrior(prior.rms * _STRONGER ** (exponent - prior.exponent), exponent)
 
 
 def _lowered(point: Point, n_steps: int) -> tuple[Point, bool]:

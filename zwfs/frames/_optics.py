@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -114,6 +115,7 @@ class Camera:
         samples = _SPLINE(np.arange(_DEGREE // 2 + 1))
         self.prefilter = 1 / symbol([samples[0], *(2 * samples[1:])], size)
 
+        self.double: Camera | None = None  # of which this camera is `single`
         self._optics: Optics | None = None
 
     def complex(self, values: NDArray) -> NDArray:
@@ -134,12 +136,14 @@ class Camera:
     def single(self) -> Camera:
         """Camera with the same settings in single precision."""
         settings: Any = self.exposures, self.commands, self.f, self.largest
-        return Camera(self.n, self.shape, self.n_pixels, *settings, n_arms=self.n_arms, real=np.float32)
+        camera = Camera(self.n, self.shape, self.n_pixels, *settings, n_arms=self.n_arms, real=np.float32)
+        camera.double = self
+        return camera
 
     def optics(self, values: NDArray) -> Optics:
         """Optics with these numbers; those of the last call are kept."""
         if self._optics is None or not np.array_equal(self._optics.values, values):
-            self._optics = Optics(self, values)
+            self._optics = self.double.optics(values).single if self.double else Optics(self, values)
         return self._optics
 
     def defocus_at(self, u: NDArray, v: NDArray) -> NDArray[np.float64]:
@@ -272,6 +276,14 @@ class _Spline:
         self._starts = np.arange(len(rows) + 1) * self._index.shape[1]
         self._pairs = (along_y, along_x), (f * slope_y, along_x), (along_y, f * slope_x)
 
+    @property
+    def single(self) -> _Spline:
+        """The same in single precision."""
+        out = copy(self)
+        out.real, out._matrix = np.float32, self._matrix.astype(np.float32)
+        out.__dict__.pop("_gradient", None)
+        return out
+
     def _of(self, pair: int) -> sparse.csr_array:
         first, second = self._pairs[pair]
         weights = (first[:, :, None] * second[:, None, :]).ravel().astype(self.real)
@@ -354,17 +366,29 @@ class Optics:
         blur = np.exp(-2 * (np.pi * self.masks["blur"]) ** 2 * camera.squares)
         self.blur = (camera.prefilter * blur).astype(real)
 
+    @cached_property
+    def single(self) -> Optics:
+        """The same in single precision."""
+        out = copy(self)
+        out.blur = self.blur.astype(np.float32)
+        out.transfer, out.cores = (
+            {arm: one.astype(np.complex64) for arm, one in parts.items()} for parts in (self.transfer, self.cores)
+        )
+        out.spread = {arm: [one.astype(np.float32) for one in pair] for arm, pair in self.spread.items()}
+        out.splines = {arm: one.single for arm, one in self.splines.items()}
+        return out
+
 
 class _Part(NamedTuple):
     """Intermediate results for images of one group that the derivative needs, (n_images, size, size) each."""
 
     field: NDArray[np.complex128]
-    ahead: NDArray[np.complex128]  # half the derivative of the intensity by the field, conjugated
+    ahead: NDArray[np.complex128]  # derivative of the intensity by the field
     spectrum: NDArray[np.complex128]  # of the intensity
     blurred: NDArray[np.float64]
     seen: NDArray[np.float64]  # before flux and background
     light: NDArray[np.complex128] | None = None  # of the dimple
-    across: NDArray[np.complex128] | None = None  # half the derivative by the light of the dimple, conjugated
+    across: NDArray[np.complex128] | None = None  # derivative by the light of the dimple
 
 
 class Linearised:
@@ -400,13 +424,14 @@ class Linearised:
         optics = self.optics
         field = fft.ifft2(optics.transfer[group.arm] * self._spectra[group.states], overwrite_x=True)
         light = across = None
-        ahead, intensity = field, field.real**2 + field.imag**2
+        ahead = 2 * field.conj()
+        intensity = field.real**2 + field.imag**2
         if group.mask is not None:
             light = self._dimple_light(group, self._inputs[group.states], 0)
             first, second = (numbers[group.mask].item() for numbers in optics.coefficients[:2])
-            ahead = field + first * light
-            across = np.conj(first) * field + second * light
-            intensity = (_twice(field, ahead) + _twice(light, across)) / 2
+            across = first * ahead + 2 * second * light.conj()
+            ahead += 2 * (first * light).conj()
+            intensity = (_real(ahead, field) + _real(across, light)) / 2
         spectrum = fft.rfft2(self._cells(intensity)) + optics.spread[group.arm][0] * self._rest
         blurred = fft.irfft2(optics.blur * spectrum, s=intensity.shape[-2:])
         return _Part(field, ahead, spectrum, blurred, optics.splines[group.arm](blurred), light, across)
@@ -438,9 +463,9 @@ class Linearised:
         self, group: _Group, part: _Part, field: NDArray, dimple: NDArray | None, rest: NDArray | float
     ) -> NDArray[np.float64]:
         """Change of images with the field, the light of the dimple, and the spectrum of what is not resolved."""
-        intensity = _twice(part.ahead, field)
+        intensity = _real(part.ahead, field)
         if part.across is not None and dimple is not None:
-            intensity += _twice(part.across, dimple)
+            intensity = intensity + _real(part.across, dimple)
         return self._on_camera(group.arm, fft.rfft2(self._cells(intensity)) + rest)
 
     def apply(self, mean: NDArray, rest: NDArray, phase: NDArray, *, dimple: bool = True) -> NDArray[np.float64]:
@@ -472,7 +497,7 @@ class Linearised:
         for group, part in zip(self.camera.groups, self._parts, strict=True):
             if part.across is not None:
                 light = self._dimple_light(group, inputs[:, None].astype(self._wave.dtype), 0)
-                change = self._cells(_twice(part.across, light))
+                change = self._cells(_real(part.across, light))
                 out[:, group.images] = self._on_camera(group.arm, fft.rfft2(change))
         return out
 
@@ -489,17 +514,17 @@ class Linearised:
             unresolved = unresolved + optics.spread[arm][0] * spectrum.sum(axis=-3)
             gain = fft.irfft2(spectrum, s=back.shape[-2:])
             gain += _differences(self._smooth * gain)
-            gain *= 2
-            ahead = fft.fft2(gain * part.ahead, overwrite_x=True)
-            spectra[..., group.states, :, :] += optics.transfer[arm].conj() * ahead
+            # All fields are conjugated.
+            ahead = fft.ifft2(gain * part.ahead, overwrite_x=True)
+            spectra[..., group.states, :, :] += optics.transfer[arm] * ahead
             if part.across is not None:
                 across = camera.planes[1].project(gain * part.across)
-                inputs[..., group.states, :] += across @ optics.cores[arm][0].conj()
+                inputs[..., group.states, :] += across @ optics.cores[arm][0]
         window = (..., *camera.window)
         rest = fft.irfft2(unresolved, s=(camera.size,) * 2)[window]
-        fields = fft.ifft2(spectra, overwrite_x=True)[window] + camera.planes[0].expand(inputs)
-        total = np.sum(camera.turns.conj() * fields, axis=-3) * self._wave.conj()
-        return Maps(total.real, rest, self.maps.mean * total.imag)
+        fields = fft.fft2(spectra, overwrite_x=True)[window] + camera.planes[0].expand(inputs)
+        total = np.sum(camera.turns * fields, axis=-3) * self._wave
+        return Maps(total.real, rest, -self.maps.mean * total.imag)
 
     def unspread(self, weights: NDArray, mean: NDArray, rest: NDArray) -> NDArray[np.float64]:
         """Sum of squares of the weighted changes of the images with the light of each point, if no light spread.
@@ -511,7 +536,7 @@ class Linearised:
             pixels = (self.arms[group.arm]["flux"] * weights[group.images]) ** 2
             gain = self.optics.splines[group.arm].adjoint(pixels)[(..., *camera.window)]
             field = mean * self._wave * camera.turns[group.states]
-            out += np.sum(gain * (_twice(part.ahead[(..., *camera.window)], field) + rest) ** 2, axis=0)
+            out += np.sum(gain * (_real(part.ahead[(..., *camera.window)], field) + rest) ** 2, axis=0)
         return out
 
     def slopes(self, index: int, wanted: Sequence[str]) -> NDArray[np.float64]:
@@ -564,6 +589,6 @@ def _differences(images: NDArray) -> NDArray[np.float64]:
     return out
 
 
-def _twice(one: NDArray, other: NDArray) -> NDArray[np.float64]:
-    """2 Re(conj(one) other)."""
-    return 2 * (one.conj() * other).real
+def _real(one: NDArray, other: NDArray) -> NDArray[np.float64]:
+    """Real part of a product."""
+    return (one * other).real

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,7 +28,7 @@ _LEAST = 1e-3  # damping
 _DEPENDENT = 1e-12  # eigenvalue over the largest, below which directions depend on each other
 _ALIKE = 1e-13  # eigenvalue over the largest, below which numbers have the same effect
 _TOGETHER = 6  # vectors that are multiplied at once: with more, the arrays exceed the cache
-_N_FOLLOWED = 6  # iterations for the maps that follow the numbers
+_N_FOLLOWED = 6, 3  # iterations for the maps that follow the numbers: the first time, and from those nearby
 _N_CHANGES = 30  # iterations for the maps that follow a change of the images
 _SHARES = 0.0, 0.4, 0.7  # of the maps' own move, by which a step is shortened: the light of edges is not linear
 _BLOCK = 6  # pixels along the side of a block whose residuals may be alike
@@ -115,9 +116,18 @@ class LightMap:
 
     def adjoint(self, fine: NDArray) -> NDArray[np.float64]:
         """Adjoint of `fine`."""
-        whole = np.zeros((*fine.shape[:-2], self.size, self.size))
+        whole = np.zeros((*fine.shape[:-2], self.size, self.size), fine.dtype)
         whole[..., : self.n, : self.n] = fine * self.where
         return fft.irfft2(self.colour * fft.rfft2(whole), s=whole.shape[-2:])
+
+
+def _single(values: Any) -> Any:
+    """Copy of a map whose numbers have single precision."""
+    out = copy(values)
+    for name, value in vars(values).items():
+        if isinstance(value, np.ndarray) and value.dtype == np.float64:
+            setattr(out, name, value.astype(np.float32))
+    return out
 
 
 def allowing(weights: NDArray, error: float | NDArray) -> NDArray[np.float64]:
@@ -162,6 +172,7 @@ class Problem:
     free: Sequence[Free] = ()
     guide: Posterior | None = None  # explicit matrix; only where the phase alone is unknown
     following: Eliminated | None = None  # how the maps follow the numbers at a point nearby
+    filters: list[tuple[NDArray, NDArray]] = field(default_factory=list, init=False)  # those of its first matrix
 
     @cached_property
     def places(self) -> list[list[int]]:
@@ -180,6 +191,13 @@ class Problem:
     def prior(self) -> tuple[NDArray, NDArray]:
         """Means and inverse standard deviations of the priors of the free numbers."""
         return np.array([one.value for one in self.free]), np.array([1 / one.sigma for one in self.free])
+
+    @cached_property
+    def single(self) -> Problem:
+        """The problem in single precision."""
+        camera, maps = self.camera.single, [_single(one) for one in self.maps]
+        weights = self.weights.astype(camera.real)
+        return replace(self, camera=camera, weights=weights, phase_map=maps[0], light_maps=tuple(maps[1:]))
 
     @property
     def maps(self) -> tuple[PhaseMap | LightMap, ...]:
@@ -211,7 +229,7 @@ class Problem:
     def light_change(self, white: Sequence[NDArray]) -> NDArray[np.float64]:
         """Change of the light on the fine grid."""
         pairs = zip(white[1:], self.light_maps, strict=True)
-        zero = np.zeros((*white[0].shape[:-2], *self.light.start.shape))
+        zero = np.zeros((*white[0].shape[:-2], *self.light.start.shape), white[0].dtype)
         return sum((of.fine(one) for one, of in pairs), zero)
 
     def columns(self, model: Linearised) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
@@ -302,9 +320,10 @@ class Matrix:
     """
 
     def __init__(self, point: Point) -> None:
-        self.problem, self.x, self.cost = point.problem, point.x, point.cost
-        self.model = Linearised(self.problem.camera.single, point.model.maps, point.values)
-        self._light, self._slopes, self._zero = point.light, point.light_slopes, np.zeros_like(point.phase)
+        self.problem, self.x, self.cost = point.problem.single, point.x, point.cost
+        self.model = Linearised(self.problem.camera, point.model.maps, point.values)
+        self._light, self._zero = point.light, np.zeros_like(point.phase)
+        self._slopes = [one.astype(self.problem.camera.real) for one in point.light_slopes]
 
     @cached_property
     def columns(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
@@ -327,7 +346,7 @@ class Matrix:
     def change(self, d: NDArray) -> NDArray[np.float64]:
         """Change of the residuals with the unknowns, (..., n) to (..., n_images, ny, nx)."""
         problem = self.problem
-        white, free = problem.split(d)
+        white, free = problem.split(np.asarray(d, problem.camera.real))
         light = problem.light_change(white)
         mean, rest = (light * one for one in self._slopes)
         changes = problem.weights * self.model.apply(mean, rest, problem.phase_map.fine(white[0]))
@@ -357,11 +376,17 @@ class Matrix:
         out[..., n:] += d[..., n:] * self.problem.prior[1] ** 2
         return out
 
-    @cached_property
-    def filters(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        """Approximate matrix of each map, by random vectors: a factor at each place, and a spectrum between."""
+    @property
+    def filters(self) -> list[tuple[NDArray, NDArray]]:
+        """Approximate matrix of each map, at this point or another one: a factor at each place, and a spectrum."""
         if self.problem.following:
             return self.problem.following.filters
+        if not self.problem.filters:
+            self.problem.filters.extend(self._probed())
+        return self.problem.filters
+
+    def _probed(self) -> list[tuple[NDArray, NDArray]]:
+        """Approximate matrix of each map, by random vectors."""
         rng = np.random.default_rng(0)  # the choice hardly changes the number of steps
         problem, zero, (mean, rest) = self.problem, self._zero, self._slopes
         out = []
@@ -384,7 +409,7 @@ class Matrix:
             white[number] = fft.irfft2(fft.rfft2(white[number]) / np.sqrt(1 + response), s=factor.shape) / factor
             d = np.concatenate([*(each.ravel() for each in white), np.zeros(len(problem.free))])
             out.append((factor, float(d @ self.product(d)) / one.size**2 * (1 + response)))
-        return out
+        return [(factor.astype(np.float32), spectrum.astype(np.float32)) for factor, spectrum in out]
 
     @cached_property
     def _local(self) -> NDArray[np.float64]:
@@ -393,22 +418,20 @@ class Matrix:
 
     @cached_property
     def evidence(self) -> tuple[float, float]:
-        """Minus the logarithm of the evidence of the phase's prior, and a factor on its variance.
+        """Minus the logarithm of the evidence of the phase's prior, and the growth of its variance.
 
-        Laplace's approximation, with approximate eigenvalues e of the matrix: cost + sum(log e) / 2. The
-        factor makes the evidence stationary (MacKay 1992): |x|^2 / sum(1 - 1 / e), with the white numbers x. An
-        explicit matrix gives both sums.
+        Laplace's approximation, with approximate eigenvalues e of the matrix: cost + sum(log e) / 2. The growth
+        is the logarithm of the factor that makes the evidence stationary (MacKay 1992):
+        |x|^2 / sum(1 - 1 / e), with the white numbers x.
         """
-        size, guide = self.problem.phase_map.size, self.problem.guide
+        size = self.problem.phase_map.size
         squares = float(np.sum(self.x[: size**2] ** 2))
-        if guide:
-            return self.cost + guide.log_determinant / 2, squares / max(guide.determined, 1)
         spectrum = self.filters[0][1]
         twice = np.full(spectrum.shape[1], 2.0)  # half the plane stands for all of it
         twice[0] = 1
         twice[-1] = 1 + size % 2
         determined = float(np.sum((1 - 1 / spectrum) * twice))
-        return self.cost + float(np.sum(np.log(spectrum) * twice)) / 2, squares / max(determined, 1)
+        return self.cost + float(np.sum(np.log(spectrum) * twice)) / 2, growth_of(squares, determined)
 
     def _response(self, probe: NDArray, answer: NDArray, of: PhaseMap | LightMap) -> NDArray[np.float64]:
         """Mean response of the images at each spatial frequency of a map."""
@@ -428,7 +451,7 @@ class Matrix:
         return gain * of.colour**2 * spectrum
 
     def _filtered(self, d: NDArray, power: int) -> list[NDArray]:
-        white, _ = self.problem.split(d)
+        white, _ = self.problem.split(np.asarray(d, self.problem.camera.real))
         out = []
         for one, (factor, spectrum) in zip(white, self.filters, strict=True):
             filtered = fft.irfft2(fft.rfft2(one * factor**power) * spectrum**power, s=factor.shape)
@@ -546,7 +569,7 @@ class Eliminated:
         if before:
             followed[:, :n] = before.maps / self._unit[:, None]
             right -= [matrix.product(one) for one in followed]
-        followed += matrix.solve(right, held, _N_FOLLOWED, 0.01)
+        followed += matrix.solve(right, held, _N_FOLLOWED[before is not None], 0.01)
         self._effects = along - matrix.change(followed)
         self._x, self._e = followed[:, :n], self._effects.reshape(len(along), -1)
         self._known = self._x @ self._x.T + np.diag((point.problem.prior[1] / self._unit) ** 2)
@@ -589,6 +612,11 @@ class Eliminated:
         alike = np.array([np.mean(squares[kinds == kind]) for kind in kinds])
         missed = MISSED**2 * alike * np.diagonal(inverse) / self._unit**2
         return inverse * np.outer(grow, grow) + np.diag(missed)
+
+
+def growth_of(squares: float, determined: float) -> float:
+    """Growth of the variance of a prior, from the squares of the white numbers and how many are determined."""
+    return math.log(max(squares / max(determined, 1), 0.01))  # an rms of 0 allows no phase
 
 
 def _block_sums(images: NDArray) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from zwfs.reconstructors.base import Reconstruction
     from zwfs.reconstructors.gerchberg_saxton import GerchbergSaxton
     from zwfs.reconstructors.gradient_descent import GradientDescent
+    from zwfs.reconstructors.learned import LearnedReference
     from zwfs.reconstructors.linear import Linear
     from zwfs.reconstructors.maximum_likelihood import LikelihoodReconstruction, MaximumLikelihood
     from zwfs.reconstructors.phase_shifted import PhaseShifted
@@ -24,6 +25,7 @@ __all__ = [
     "Arcsine",
     "GerchbergSaxton",
     "GradientDescent",
+    "LearnedReference",
     "LikelihoodReconstruction",
     "Linear",
     "MaximumLikelihood",

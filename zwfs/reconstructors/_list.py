@@ -8,4 +8,4 @@ from zwfs.reconstructors.maximum_likelihood import MaximumLikelihood
 from zwfs.reconstructors.phase_shifted import PhaseShifted
 
 RECONSTRUCTORS = (Arcsine, GerchbergSaxton, GradientDescent, Linear, MaximumLikelihood, PhaseShifted)
-"""All reconstructors of the package."""
+"""All reconstructors that need no training."""

@@ -1,0 +1,212 @@
+"""The learned reference wave: its simulation against the sensor, its solve against the truth, and controls."""
+
+import numpy as np
+import pytest
+
+import zwfs
+from zwfs.reconstructors import learned
+from zwfs.reconstructors._simulated import (
+    BenchErrors,
+    BenchValues,
+    Light,
+    Simulation,
+    random_screens,
+    solution_weights,
+)
+from zwfs.reconstructors.learned import LearnedReference
+
+NOMINAL = BenchValues(0.0, 1.0, 0.0, np.zeros(2), 0.0, 0.0)
+BRIGHT = Light((1e12, 1e13), 0.0)
+UNKNOWN = BenchErrors(leakage=(-0.03, 0.09), flux_ratio=(0.85, 1.15))
+
+
+def pair_of(pupil, diameter=1.06, shifts=(np.pi / 2, -np.pi / 2), **options):
+    return zwfs.ZernikeSensor(pupil, *(zwfs.Dimple(diameter, shift) for shift in shifts), **options)
+
+
+def screens_of(pupil, rms, n, seed=1):
+    return zwfs.power_law_screens(zwfs.zernike_basis(pupil, 100), rms, n, seed=seed)
+
+
+def row(**changes):
+    bench = NOMINAL._replace(**changes)
+    return np.hstack([np.atleast_1d(value) for value in bench])
+
+
+@pytest.fixture(scope="module")
+def pupil():
+    return zwfs.Pupil.circular(40)
+
+
+@pytest.fixture(scope="module")
+def sensor(pupil):
+    return pair_of(pupil)
+
+
+@pytest.fixture(scope="module")
+def trained(sensor):
+    """Trained for a bench with errors, on few screens."""
+    return LearnedReference.train(sensor, n_screens=12_000, rms=(0.3, 0.9), errors=UNKNOWN, seed=1)
+
+
+def median_error(reconstruct, pupil, truth, frames):
+    return np.median(zwfs.reconstruction_error(pupil, reconstruct(frames).phase, truth))
+
+
+@pytest.mark.parametrize("shifts", [(np.pi / 2, -np.pi / 2), (2.0, -1.0), (1.0, 2.5, -1.5)])
+def test_the_true_reference_wave_gives_the_true_phase(pupil, shifts):
+    sensor, truth = pair_of(pupil, shifts=shifts, tolerance=1e-12), screens_of(pupil, 1.0, 1)
+    disc = zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi), tolerance=1e-12)
+    plane, core = disc.factors.detector.cut(*disc.window), disc.factors.core[0] / -2
+    field = pupil.field(truth)
+    wave = plane.expand(disc.factors.pupil.project(field) @ core.T)
+    weights, power_weight = solution_weights(np.array(shifts), np.ones(len(shifts)))
+    signal = sensor.measure(truth)[(..., *sensor.window)] - pupil.amplitude**2
+    solved = np.einsum("m,kmyx->kyx", weights, signal) - power_weight * np.abs(wave) ** 2
+    error = np.angle(solved * wave * field.conj())[:, pupil.inside]
+    assert np.abs(error - error.mean()).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("errors", "changes"),
+    [
+        ({}, {}),
+        ({"phase_shift": (-0.2, 0.2)}, {"phase_shift": np.array([0.1, -0.15])}),
+        ({"diameter": (-0.1, 0.1)}, {"diameter": 0.07}),
+    ],
+)
+def test_simulated_frames_are_those_of_the_sensor(pupil, sensor, errors, changes):
+    rng = np.random.default_rng(0)
+    simulation = Simulation(sensor, pupil.amplitude, BenchErrors(**errors), BRIGHT)
+    truth = 0.8 * random_screens(pupil, 2, rng)
+    frames, _ = simulation.frames(truth, np.tile(row(**changes), (2, 1)), rng)
+    bench = NOMINAL._replace(**changes)
+    real = pair_of(pupil, 1.06 + bench.diameter, np.array([np.pi / 2, -np.pi / 2]) + bench.phase_shift)
+    expected = real.measure(truth)[(..., *real.window)]
+    assert np.abs(frames - expected)[..., pupil.inside].max() < 2e-4
+
+
+def test_simulated_leakage_and_light_act_on_the_images(pupil, sensor):
+    rng = np.random.default_rng(0)
+    errors = BenchErrors(leakage=(0, 0.1), flux_ratio=(0.8, 1.2))
+    simulation = Simulation(sensor, pupil.amplitude, errors, BRIGHT)
+    truth = 0.8 * random_screens(pupil, 1, rng)
+    frames, _ = simulation.frames(truth, row(leakage=0.05, flux_ratio=1.25)[np.newaxis], rng)
+    first, second = sensor.measure(truth)[0][(..., *sensor.window)]
+    expected = np.stack([0.95 * first + 0.05 * second, (0.95 * second + 0.05 * first) / 1.25])
+    assert np.abs(frames[0] - expected)[:, pupil.inside].max() < 2e-4
+
+
+def test_random_screens_have_unit_rms_and_are_independent(pupil):
+    values = random_screens(pupil, 6, np.random.default_rng(2))[:, pupil.inside]
+    assert values.std(axis=1) == pytest.approx(1, abs=1e-4)
+    assert np.abs(np.corrcoef(values) - np.eye(6)).max() < 0.8
+
+
+def test_one_solve_reaches_the_noise_of_the_iteration(pupil, sensor):
+    truth = screens_of(pupil, 0.8, 60, seed=7)
+    frames = np.random.default_rng(3).poisson(1000 * sensor.measure(truth)) / 1000
+    converged = median_error(zwfs.PhaseShifted(sensor), pupil, truth, frames)
+    assert median_error(LearnedReference(sensor), pupil, truth, frames) < 1.1 * converged
+    one_solve = zwfs.PhaseShifted(sensor, n_iterations=1, tolerance=0)
+    assert median_error(one_solve, pupil, truth, frames) > 1.5 * converged
+
+
+def test_it_goes_on_where_the_iteration_fails(pupil, sensor):
+    truth = screens_of(pupil, 2.0, 40, seed=7)
+    frames = sensor.measure(truth)
+    assert median_error(zwfs.PhaseShifted(sensor), pupil, truth, frames) > 1
+    assert median_error(LearnedReference(sensor), pupil, truth, frames) < 0.1
+    assert median_error(LearnedReference(sensor, n_iterations=26), pupil, truth, frames) < 1e-4
+
+
+def test_a_pupil_of_other_pixels_needs_no_other_training():
+    pupil = zwfs.Pupil.circular(90)
+    sensor, truth = pair_of(pupil), screens_of(pupil, 0.8, 10)
+    assert median_error(LearnedReference(sensor), pupil, truth, sensor.measure(truth)) < 0.02
+
+
+def test_results_do_not_depend_on_the_batch(pupil, sensor):
+    reconstruct, frames = LearnedReference(sensor), sensor.measure(screens_of(pupil, 0.8, 70))
+    whole, alone = reconstruct(frames), reconstruct(frames[69])
+    assert alone.phase.shape == pupil.shape
+    assert np.nanmax(np.abs(whole.phase[69] - alone.phase)) < 1e-4
+    single = reconstruct(frames.astype(np.float32))
+    assert single.phase.dtype == np.float32
+
+
+def test_a_bench_with_errors_is_read_from_its_frames(trained, pupil, sensor):
+    truth = screens_of(pupil, 0.7, 60, seed=5)
+    first, second = np.moveaxis(sensor.measure(truth), 1, 0)
+    images = np.stack([0.95 * first + 0.05 * second, (0.95 * second + 0.05 * first) / 0.92], axis=1)
+    frames = np.random.default_rng(3).poisson(5000 * images) / 5000
+    values, errors = trained.average(frames)
+    assert abs(values.leakage - 0.05) < 3 * errors.leakage < 0.08
+    assert abs(values.flux_ratio - 0.92) < 3 * errors.flux_ratio < 0.05
+    assert values.diameter == 0
+    learned_error = median_error(trained, pupil, truth, frames)
+    assert learned_error < median_error(zwfs.PhaseShifted(sensor), pupil, truth, frames)
+    assert median_error(trained.with_bench(values), pupil, truth, frames) < 1.05 * learned_error
+
+
+def test_frames_unlike_those_of_the_training_are_unfamiliar(trained, pupil, sensor):
+    truth = screens_of(pupil, 0.8, 20)
+    frames = sensor.measure(truth)
+    assert trained(frames).familiar.mean() > 0.9
+    assert not trained(2 * frames).familiar.any()
+    assert not trained(frames[:, :, ::-1] * [[[1.5]], [[0.6]]]).familiar.any()
+
+
+def test_a_training_with_shuffled_waves_fails(sensor, pupil, monkeypatch):
+    """Control: the network must learn from the frames, not from the distribution of the waves."""
+    example = learned._example
+
+    def shuffled(*arguments):
+        inputs, waves = example(*arguments)
+        return inputs, waves[::-1]
+
+    monkeypatch.setattr(learned, "_example", shuffled)
+    control = LearnedReference.train(sensor, n_screens=3000, rms=(0.5, 1.5), seed=1)
+    truth = screens_of(pupil, 1.0, 20)
+    frames = sensor.measure(truth)
+    assert median_error(control, pupil, truth, frames) > 5 * median_error(
+        LearnedReference(sensor), pupil, truth, frames
+    )
+
+
+def test_a_training_is_reproducible_and_survives_a_file(tmp_path, sensor, pupil):
+    steps = []
+    first, again = (
+        LearnedReference.train(sensor, n_screens=1000, seed=3, progress=lambda *step: steps.append(step))
+        for _ in range(2)
+    )
+    assert np.array_equal(first.training.network.skip, again.training.network.skip)
+    assert steps[-1][0] == steps[-1][1]
+    first.save(tmp_path / "weights.npz")
+    loaded = LearnedReference.load(tmp_path / "weights.npz", sensor)
+    frames = sensor.measure(screens_of(pupil, 0.5, 1))
+    assert np.array_equal(loaded(frames).phase, first(frames).phase, equal_nan=True)
+
+
+def test_bad_input_is_named(tmp_path, pupil, sensor, trained):
+    with pytest.raises(ValueError, match="sensor: the reference wave of a flat wavefront differs"):
+        LearnedReference(pair_of(pupil, 1.4))
+    with pytest.raises(ValueError, match=r"sensor: masks\[1\] = Dimple.*: expected dimples of one diameter"):
+        LearnedReference(zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, 1.5), zwfs.Dimple(1.2, -1.5)))
+    with pytest.raises(ValueError, match=r"leakage = \(0.1, 0.0\): expected a smallest and a largest"):
+        BenchErrors(leakage=(0.1, 0.0))
+    with pytest.raises(ValueError, match=r"errors.leakage = .* for 3 masks"):
+        LearnedReference.train(pair_of(pupil, shifts=(1.0, 2.0, -1.0)), errors=UNKNOWN)
+    with pytest.raises(ValueError, match=r"screens\[1\] is constant"):
+        LearnedReference.train(sensor, screens=[screens_of(pupil, 1.0, 1)[0], np.zeros(pupil.shape)])
+    with pytest.raises(ValueError, match=r"rms = \(1.0, 1.0\): expected"):
+        LearnedReference.train(sensor, rms=(1, 1))
+    with pytest.raises(ValueError, match="expected two or more sets of frames"):
+        trained.average(sensor.measure(np.zeros(pupil.shape)))
+    with pytest.raises(ValueError, match=r"bench holds \(7,\) values: expected \(7,\)|bench holds"):
+        trained.with_bench(NOMINAL._replace(phase_shift=np.zeros(3)))
+    with pytest.raises(ValueError, match="history = True"):
+        trained(sensor.measure(np.zeros(pupil.shape)), history=True)
+    (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04")
+    with pytest.raises(ValueError, match=r"broken\.npz: expected a file that LearnedReference\.save wrote"):
+        LearnedReference.load(tmp_path / "broken.npz", sensor)

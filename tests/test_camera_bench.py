@@ -9,10 +9,10 @@ import pytest
 from scipy import ndimage
 
 from zwfs import Dimple, Pupil, ZernikeSensor
+from zwfs._unwrapping import unwrapped
 from zwfs.frames import Calibration
 from zwfs.frames import _fit as fitting
 from zwfs.frames._fit import fit_bench
-from zwfs.frames._fitted import unwrapped
 from zwfs.frames._learnt import Windows, of_bench
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure, Linearised, Maps

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage, sparse
-from scipy.sparse.linalg import splu
+from scipy import ndimage
 
 from zwfs import _check
 from zwfs._images import nearest_good
+from zwfs._unwrapping import unwrapped
 from zwfs.frames._explicit import Explicit, Posterior
 from zwfs.frames._fit import EXPLAINED, BenchFit, places_of
 from zwfs.frames._light import KnownLight
@@ -271,27 +271,3 @@ def _rms_of(phase: NDArray) -> float:
     """First rms of a prior, from that of a phase in the middle of its map."""
     n = len(phase)
     return max(0.1, 2 * float(phase[n // 4 : -n // 4].std()))
-
-
-def unwrapped(phase: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Phase without jumps of 2 pi between neighbours inside, by least squares."""
-    number = np.full(inside.shape, -1)
-    number[inside] = np.arange(np.count_nonzero(inside))
-    rows, right = [], []
-    for axis in (0, 1):
-        first, second = (np.moveaxis(number, axis, 0)[cut] for cut in (slice(None, -1), slice(1, None)))
-        values = np.moveaxis(phase, axis, 0)
-        both = (first >= 0) & (second >= 0)
-        rows.append(np.stack([first[both], second[both]], axis=1))
-        right.append(np.angle(np.exp(1j * np.diff(values, axis=0)))[both])
-    pairs, step = np.concatenate(rows), np.concatenate(right)
-    k = np.arange(len(pairs))
-    size = (len(pairs), int(number.max()) + 1)
-    slope = sparse.csr_array((np.tile([-1.0, 1.0], len(pairs)), (np.repeat(k, 2), pairs.ravel())), size)
-    normal = (slope.T @ slope + 1e-9 * sparse.eye_array(size[1])).tocsc()
-    smooth = splu(normal).solve(slope.T @ step)
-    out = phase.copy()
-    difference = smooth - phase[inside]
-    difference -= np.median(difference)
-    out[inside] += 2 * np.pi * np.rint(difference / (2 * np.pi))
-    return out

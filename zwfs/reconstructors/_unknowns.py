@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from zwfs._arrays import Immutable, Kind, read_only
 from zwfs._information import Information
 from zwfs._propagator import Propagator, angle
+from zwfs._unwrapping import Unwrapping
 from zwfs.modes import zernike_basis
 from zwfs.pupil import Pupil
 from zwfs.reconstructors._fit import Fit, Hessian, linear_field, reflected, turned
-from zwfs.reconstructors._unwrapping import Unwrapping
 
 _UNWRAPPED_MODES = 40  # of the smooth part of a phase that is known up to multiples of 2 pi
 _LINEAR_ITERATIONS = 5  # of the start of an unknown amplitude

@@ -1,4 +1,4 @@
-"""Fit of modes to phases that are known up to multiples of 2 pi."""
+"""Phases that are known up to multiples of 2 pi: a map without jumps, and a fit of modes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from zwfs._arrays import Kind
 
@@ -18,6 +20,30 @@ _STEEPER = 1.5  # mean square slope in units of the wrapped one
 _MOST_ROUNDS = 100  # in which all points join
 _LEAST_SLOPE = 1e-6  # of a mode, squared, relative to the largest
 _ANY_PISTON = 100.0  # radian
+
+
+def unwrapped(phase: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Phase without jumps of 2 pi between neighbours inside, by least squares."""
+    number = np.full(inside.shape, -1)
+    number[inside] = np.arange(np.count_nonzero(inside))
+    rows, right = [], []
+    for axis in (0, 1):
+        first, second = (np.moveaxis(number, axis, 0)[cut] for cut in (slice(None, -1), slice(1, None)))
+        values = np.moveaxis(phase, axis, 0)
+        both = (first >= 0) & (second >= 0)
+        rows.append(np.stack([first[both], second[both]], axis=1))
+        right.append(np.angle(np.exp(1j * np.diff(values, axis=0)))[both])
+    pairs, step = np.concatenate(rows), np.concatenate(right)
+    k = np.arange(len(pairs))
+    size = (len(pairs), int(number.max()) + 1)
+    slope = sparse.csr_array((np.tile([-1.0, 1.0], len(pairs)), (np.repeat(k, 2), pairs.ravel())), size)
+    normal = (slope.T @ slope + 1e-9 * sparse.eye_array(size[1])).tocsc()
+    smooth = splu(normal).solve(slope.T @ step)
+    out = phase.copy()
+    difference = smooth - phase[inside]
+    difference -= np.median(difference)
+    out[inside] += 2 * np.pi * np.rint(difference / (2 * np.pi))
+    return out
 
 
 class Unwrapping(NamedTuple):

@@ -149,6 +149,15 @@ def test_a_bench_with_errors_is_read_from_its_frames(trained, pupil, sensor):
     assert median_error(trained.with_bench(values), pupil, truth, frames) < 1.05 * learned_error
 
 
+def test_known_phase_shifts_hold_for_further_iterations(pupil, sensor):
+    truth = screens_of(pupil, 0.5, 5)
+    shifts = np.array([0.2, -0.1])
+    frames = pair_of(pupil, shifts=(np.pi / 2 + 0.2, -np.pi / 2 - 0.1)).measure(truth)
+    bench = NOMINAL._replace(phase_shift=shifts)
+    assert median_error(LearnedReference(sensor, n_iterations=20), pupil, truth, frames) > 0.01
+    assert median_error(LearnedReference(sensor, n_iterations=20, bench=bench), pupil, truth, frames) < 1e-4
+
+
 def test_frames_unlike_those_of_the_training_are_unfamiliar(trained, pupil, sensor):
     truth = screens_of(pupil, 0.8, 20)
     frames = sensor.measure(truth)

@@ -540,7 +540,7 @@ class Calibration(Immutable):
         self, flat: ArrayLike | str | Path, pushed: ArrayLike | str | Path, pulled: ArrayLike | str | Path,
         **settings: Any,
     ) -> Controller | PhaseController:  # fmt: skip
-        """Return what turns camera counts into commands of a mirror, from frames of pokes of its actuators.
+        """Return a controller that converts camera counts into mirror commands, from frames of pokes.
 
         Only this method needs the pokes; the mirror and its modes follow from them: actuators, or piston, tip and
         tilt of segments.
@@ -555,7 +555,7 @@ class Calibration(Immutable):
             poke : float, 1 by default
                 Size of the pokes, in units of the commands.
             rcond : float, 0.05 by default
-                Directions of the commands are left out that are weaker than this, relative to the strongest.
+                Relative singular value below which a combination of commands is left out.
             gain : float, 0.5 by default
                 Of the integrator, in (0, 2].
             method : {"linear", "phase-shifted", "likelihood"}

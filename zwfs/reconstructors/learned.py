@@ -12,7 +12,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
@@ -100,30 +100,32 @@ class LearnedReconstruction(Reconstruction):
 class LearnedReference(Reconstructor):
     """Phase from two or more dimples of one diameter, by one solve with a learned reference wave.
 
-    The inputs of the network are the means of the frames times 15 polynomials (for a dimple of 1.06 lambda/D), and
-    the mean squares of the frames. Its outputs are the coefficients of the reference wave in these polynomials,
-    and those errors of the bench that the training has varied.
+    The inputs of the network are the means of the frames, less the incoming light, times 15 polynomials (for a
+    dimple of 1.06 lambda/D), and the means of the products of two such differences. Its outputs are the
+    coefficients of the reference wave in these polynomials, and those errors of the bench that the training has
+    varied.
 
     Parameters
     ----------
     sensor : ZernikeSensor
         Dimples of one diameter; any number of pixels.
     training : Training, optional
-        That of a sensor with the same dimples and a pupil of the same form: `LearnedReference.train` returns a
-        reconstructor with one. If left out, the one that comes with the package: for a circular pupil and the pair
-        of the paper, 1.06 lambda/D and +pi/2 and -pi/2.
+        Training for a sensor with the same dimples and a pupil of the same form: `LearnedReference.train` returns
+        a reconstructor with one. If left out, the one that comes with the package: for a circular pupil, the pair
+        of the paper (1.06 lambda/D, +pi/2 and -pi/2), and a bench without errors.
     n_iterations : int
         Solves: 1 is that of the network. Others are iterations of `PhaseShifted`, which start from its phase.
     tolerance : float, radian
-        Of these, as for `PhaseShifted`.
+        Stopping tolerance of these iterations.
     amplitude : array_like, shape (ny, nx), optional
         Measured amplitude in the pupil; that of the sensor's pupil if left out.
     bench : BenchValues, optional
-        Errors of the bench that are known, for example from `average`, instead of those read from each frame.
+        Errors of the bench that are known, for example from `average`, instead of those read from each frame. The
+        first solve corrects leakage, flux ratio and phase shifts, further iterations the diameter, too.
 
     Notes
     -----
-    Outside of its training the network may be wrong without a sign of it in the phase. `familiar` compares the
+    Outside of its training the network may be wrong although the phase looks plausible. `familiar` compares the
     inputs with those of the training, and `explains` the frames with those that the phase would make.
 
     References
@@ -174,7 +176,10 @@ class LearnedReference(Reconstructor):
         self._iteration: PhaseShifted | None = None
         if n_iterations > 1:
             self._iteration = PhaseShifted(
-                sensor, n_iterations=n_iterations - 1, tolerance=tolerance, amplitude=amplitude
+                sensor if bench is None else _altered(sensor, bench),
+                n_iterations=n_iterations - 1,
+                tolerance=tolerance,
+                amplitude=amplitude,
             )
 
     @classmethod
@@ -200,7 +205,7 @@ class LearnedReference(Reconstructor):
             Smallest and largest number of photons of an intensity of 1 in a pixel of each frame.
         read_noise : float, electrons rms / pixel
         errors : BenchErrors, optional
-            What benches may do that the model does not know; nothing if left out.
+            Ranges of bench errors to train for; none by default.
         seed : int
         progress : callable, optional
             Called with the number of steps that are done, and of all steps.
@@ -281,9 +286,10 @@ class LearnedReference(Reconstructor):
     def average(self, frames: ArrayLike) -> tuple[BenchValues, BenchValues]:
         """Errors of one bench from many sets of frames, and their standard errors.
 
-        A single set of frames gives values that are drawn towards the middle of the training's ranges. This bias,
-        measured on screens that the training has not seen, is taken out before they are averaged. The standard
-        errors contain the part that does not average out, as benches with other values showed it.
+        It needs a training with `errors`. A single set of frames gives values that are biased towards the middle
+        of the training's ranges. This bias, measured on screens that the training has not seen, is taken out
+        before they are averaged. The standard errors contain the part that does not average out, as benches with
+        other values showed it.
 
         Parameters
         ----------
@@ -484,6 +490,15 @@ def _flat_wave(sensor: ZernikeSensor, polynomials: _Polynomials) -> NDArray[np.c
     core = sensor.factors.core[0] / (mask.amplitude * np.exp(1j * mask.phase) - 1)
     wave = plane.expand(sensor.factors.pupil.project(sensor.pupil.amplitude) @ core.T)
     return (wave.ravel() @ polynomials.inverse).astype(np.complex64)
+
+
+def _altered(sensor: ZernikeSensor, bench: BenchValues) -> ZernikeSensor:
+    """Sensor with the dimples of a bench."""
+    dimples = [
+        replace(dimple, diameter=dimple.diameter + float(bench.diameter), phase=dimple.phase + float(shift))
+        for dimple, shift in zip(dimples_of(sensor), bench.phase_shift, strict=True)
+    ]
+    return ZernikeSensor(sensor.pupil, *dimples, extent=sensor.extent, tolerance=sensor.tolerance)
 
 
 def _relative(difference: NDArray, values: NDArray) -> float:

@@ -187,6 +187,12 @@ def number(
     return plain
 
 
+def number_or_inf(name: str, value: Any, *, open_low: bool = False) -> float:
+    """Return a number of at least 0, or infinity."""
+    is_inf = isinstance(value, float) and value == math.inf
+    return value if is_inf else number(name, value, 0, LARGEST, open_low=open_low)
+
+
 def wavelength(value: Any) -> float:
     """Return a wavelength, of gamma rays to radio waves in any unit from nm to m."""
     return number("wavelength", value, 1e-12, 1e12)

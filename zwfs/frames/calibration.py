@@ -132,7 +132,7 @@ class Calibration(Immutable):
     def __post_init__(self) -> None:
         _check.integer("n_iterations", self.n_iterations, 1)
         _check.number("tolerance", self.tolerance, 0, 2 * np.pi)
-        _number_or_inf("saturation", self.saturation, open_low=True)
+        _check.number_or_inf("saturation", self.saturation, open_low=True)
         _check.instance("bunit", self.bunit, str)
         _check.flag("balance", self.balance)
         _check.number("residual", self.residual, 0)
@@ -507,10 +507,10 @@ class Calibration(Immutable):
         batch = counts.shape[: -len(image)]
         if 0 in counts.shape:
             raise ValueError(f"counts has shape {counts.shape}: expected at least one exposure")
-        saturation = self.saturation if saturation is None else _number_or_inf("saturation", saturation)
+        saturation = self.saturation if saturation is None else _check.number_or_inf("saturation", saturation)
         level, judge = min(saturation, _check.LARGEST), _check.flag("judge", judge)
         if largest_residual is not None:
-            largest_residual = _number_or_inf("largest_residual", largest_residual)
+            largest_residual = _check.number_or_inf("largest_residual", largest_residual)
         counts = counts.reshape(-1, self.n_images, *self.shape)
         if smooth is not False or noise is not None:
             options = {"start": start, "light": light, "largest_residual": largest_residual, "method": method}
@@ -726,12 +726,6 @@ def _check_sizes(path: Path) -> None:
                     f"{path.name}: its array {name} has shape {shape} and type {dtype}: expected at most the "
                     f"{size} bytes of the file"
                 )
-
-
-def _number_or_inf(name: str, value: Any, *, open_low: bool = False) -> float:
-    """Return a number of at least 0, or infinity."""
-    is_inf = isinstance(value, float) and value == np.inf
-    return value if is_inf else _check.number(name, value, 0, _check.LARGEST, open_low=open_low)
 
 
 def _dark(dark: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32]:

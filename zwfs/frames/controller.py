@@ -56,8 +56,7 @@ def make_controller(
     rcond = _check.number("rcond", rcond, 0, 1, open_high=True)
     gain = _check.number("gain", gain, 0, 2, open_low=True)
     n_iterations = _check.integer("n_iterations", n_iterations, 1)
-    if method not in _METHODS:
-        raise ValueError(f"method = {_check.shown(method)}: expected one of {', '.join(_METHODS)}")
+    _check.choice("method", method, _METHODS)
     pokes = Pokes.of(calibration, flat, pushed, pulled)
     signals = Signals.of(calibration, pokes)
     signals.check()
@@ -135,7 +134,7 @@ class Controller:
         self.noise = _check.number("noise", noise, 0)
         self.gain = _check.number("gain", gain, 0, 2, open_low=True)
         self.n_kept = _check.integer("n_kept", n_kept, 1, n_commands)
-        self.saturation = saturation if saturation == np.inf else _check.number("saturation", saturation, 0)
+        self.saturation = _check.number_or_inf("saturation", saturation)
         self.flux, self.n_bad, self.lost = 1.0, 0, False
         self._faintest = faintest(self.noise, n) * self.light
         self._ones = np.ones(n, np.float32)

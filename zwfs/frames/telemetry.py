@@ -25,7 +25,7 @@ from zwfs.frames._blocks import FileError
 from zwfs.frames._fits import card_value, fits_module
 from zwfs.frames._part import Cards, Part, Unit
 from zwfs.frames._stack import Stack
-from zwfs.frames.calibration import Calibration, _number_or_inf
+from zwfs.frames.calibration import Calibration
 from zwfs.frames.files import check_output, sensor_cards
 from zwfs.frames.phases import Flag, Phases
 from zwfs.modes import zernike_basis
@@ -166,7 +166,7 @@ def reconstruct(
     n_workers = cores if n_workers is None else _check.integer("n_workers", n_workers, 1, 256)
     stack = Stack(files, second_files, calibration.n_images, calibration.shape)
     if largest_residual is not None:
-        largest_residual = _number_or_inf("largest_residual", largest_residual)
+        largest_residual = _check.number_or_inf("largest_residual", largest_residual)
     settings = modes, phases, photons, read_noise, wavelength, keywords, saturation, largest_residual
     job = _Job(stack, calibration, *settings)
     report = _check.callback("progress", progress)
@@ -218,7 +218,7 @@ class _Job:
         level = calibration.saturation if saturation is None else saturation
         if saturation is None and level == np.inf:
             level = stack.saturation
-        self.saturation = _number_or_inf("saturation", level, open_low=True)
+        self.saturation = _check.number_or_inf("saturation", level, open_low=True)
         self.keywords = _columns(stack, keywords)
         names = max(len(card_value(block.name)) for block in stack.firsts)
         of_files = np.dtype([("NAME", f"S{names}"), ("FRAMES", ">i8")])

@@ -27,7 +27,7 @@ _LARGEST_SCALES = 0.3, 10.0  # D, beyond which a spectrum is flat
 _TILT = 0.5  # mean rms of the tilt that is added to a screen of an rms of 1
 _LOWEST_CUT = 2.0  # cycles / D, where the spectrum of half of the screens may end
 _N_DIAMETERS = 5  # of dimples between which one of another diameter is interpolated
-_LIMITS = {"leakage": (-0.2, 0.4), "flux_ratio": (0.2, 5.0), "diameter": (-0.5, 0.5), "phase_shift": (-1.0, 1.0),
+LIMITS = {"leakage": (-0.2, 0.4), "flux_ratio": (0.2, 5.0), "diameter": (-0.5, 0.5), "phase_shift": (-1.0, 1.0),
            "amplitude": (0.0, 0.5), "blur": (0.0, 5.0)}  # fmt: skip
 
 
@@ -62,7 +62,7 @@ class BenchErrors:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            ends = _check.pair(field.name, getattr(self, field.name), _check.number, *_LIMITS[field.name])
+            ends = _check.pair(field.name, getattr(self, field.name), _check.number, *LIMITS[field.name])
             if ends[0] > ends[1]:
                 raise ValueError(f"{field.name} = {ends}: expected a smallest and a largest value")
             object.__setattr__(self, field.name, ends)

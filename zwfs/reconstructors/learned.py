@@ -30,6 +30,7 @@ from zwfs.pupil import Pupil
 from zwfs.reconstructors import _network
 from zwfs.reconstructors._network import Network
 from zwfs.reconstructors._simulated import (
+    LIMITS,
     BenchErrors,
     BenchValues,
     Light,
@@ -360,14 +361,16 @@ class LearnedReference(Reconstructor):
         return self._ranges[:, 1] > self._ranges[:, 0]
 
     def _checked(self, bench: BenchValues) -> NDArray[np.float64]:
+        """Values of a bench, (n_values,)."""
         _check.instance("bench", bench, BenchValues)
-        values = [np.atleast_1d(_check.real_array(f"bench.{name}", value)) for name, value in
-                  zip(BenchValues._fields, bench, strict=True)]  # fmt: skip
-        whole = np.concatenate(values)
-        if whole.shape != (len(self._ranges),):
-            raise ValueError(f"bench holds {whole.shape} values: expected ({len(self._ranges)},), without a batch")
-        _check.finite("bench", whole)
-        return whole
+        values = []
+        for name, value in zip(BenchValues._fields, bench, strict=True):
+            array = _check.real_array(f"bench.{name}", value)
+            shape = (len(self._shifts),) if name == "phase_shift" else ()
+            if array.shape != shape:
+                raise ValueError(f"bench.{name} has shape {array.shape}: expected {shape}, for one bench")
+            values += [_check.number(f"bench.{name}", number, *LIMITS[name]) for number in array.ravel().tolist()]
+        return np.array(values)
 
     @per_kind
     def _constants(self, kind: Kind) -> _Constants:

@@ -158,6 +158,14 @@ def test_known_phase_shifts_hold_for_further_iterations(pupil, sensor):
     assert median_error(LearnedReference(sensor, n_iterations=20, bench=bench), pupil, truth, frames) < 1e-4
 
 
+def test_history_begins_flat_and_ends_at_the_phase(pupil, sensor):
+    frames = sensor.measure(screens_of(pupil, 0.5, 70))
+    result = LearnedReference(sensor, n_iterations=3)(frames, history=True)
+    assert result.history.shape == (70, 4, *pupil.shape)
+    assert not result.history[:, 0, pupil.inside].any()
+    assert np.array_equal(result.history[:, -1], result.phase, equal_nan=True)
+
+
 def test_frames_unlike_those_of_the_training_are_unfamiliar(trained, pupil, sensor):
     truth = screens_of(pupil, 0.8, 20)
     frames = sensor.measure(truth)
@@ -210,12 +218,16 @@ def test_bad_input_is_named(tmp_path, pupil, sensor, trained):
         LearnedReference.train(sensor, screens=[screens_of(pupil, 1.0, 1)[0], np.zeros(pupil.shape)])
     with pytest.raises(ValueError, match=r"rms = \(1.0, 1.0\): expected"):
         LearnedReference.train(sensor, rms=(1, 1))
+    for name, value in {
+        "n_screens": 10, "photons": (0, 1), "read_noise": -1, "seed": -1, "progress": 5, "n_iterations": 0,
+        "errors": (0, 1), "screens": np.ones((2, 3, 3)), "amplitude": np.ones(3), "tolerance": -1,
+    }.items():  # fmt: skip
+        with pytest.raises((TypeError, ValueError), match=name):
+            LearnedReference.train(sensor, **{name: value})
     with pytest.raises(ValueError, match="expected two or more sets of frames"):
         trained.average(sensor.measure(np.zeros(pupil.shape)))
     with pytest.raises(ValueError, match=r"bench.phase_shift has shape \(3,\): expected \(2,\), for one"):
         trained.with_bench(NOMINAL._replace(phase_shift=np.zeros(3)))
-    with pytest.raises(ValueError, match="history = True"):
-        trained(sensor.measure(np.zeros(pupil.shape)), history=True)
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04")
     with pytest.raises(ValueError, match=r"broken\.npz: expected a file that LearnedReference\.save wrote"):
         LearnedReference.load(tmp_path / "broken.npz", sensor)

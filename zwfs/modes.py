@@ -86,7 +86,7 @@ def zernike_basis(pupil: Pupil, n_modes: int, *, orthonormal: bool | None = None
             f"pupil reaches {reach:.4g} D from its axis: expected at most 0.5 D; "
             "give from_amplitude the n_pixels of the circle around it"
         )
-    values = unnormalised_zernikes(disc, n_modes)
+    values = _unnormalised(disc, n_modes)
     values -= values.mean(axis=1, keepdims=True)
     if orthonormal:
         values = _orthonormalise(values)
@@ -278,7 +278,7 @@ def mode_frequencies(pupil: Pupil, modes: ArrayLike) -> NDArray[np.float64]:
     return np.sqrt(power) / (2 * np.pi * np.nanstd(values, axis=(-2, -1)))
 
 
-def unnormalised_zernikes(disc: NDArray[np.complex128], n_modes: int) -> NDArray[np.float64]:
+def _unnormalised(disc: NDArray[np.complex128], n_modes: int) -> NDArray[np.float64]:
     """Modes without their norm, at the points `disc` = x + iy of the unit disc: (n_modes, n_points)."""
     orders = [noll_to_nm(j) for j in range(2, n_modes + 2)]
     rows: dict[tuple[int, int], list[int]] = {}

@@ -25,7 +25,7 @@ from scipy.linalg import helmert
 from zwfs import _check
 from zwfs._arrays import Immutable, Kind, per_kind, read_only
 from zwfs._system import path_of, write_file
-from zwfs.modes import unnormalised_zernikes
+from zwfs.modes import _unnormalised
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import _network
 from zwfs.reconstructors._network import Network
@@ -51,6 +51,7 @@ _HIDDEN = (256, 256)
 _N_EPOCHS = 80
 _MISSED = 2e-3  # of the reference wave, relative, that its polynomials may miss
 _HIGHEST_ORDER = 10
+_LARGEST_INPUT = 1e6  # times the intensity of a clear frame: far beyond any frame
 _VALUE_WEIGHT = 0.3  # of the error of a value of the bench, relative to that of the reference wave
 _FAR = 0.999  # of the screens held out are less unusual than this limit; it is widened by a factor
 _WIDER = 1.2
@@ -262,12 +263,13 @@ class LearnedReference(Reconstructor):
         -------
         LearnedReconstruction
         """
-        if _check.flag("history", history):
-            raise ValueError("history = True: expected False, since LearnedReference keeps no history")
+        history = _check.flag("history", history)
         checked, batch, _ = self.accept(frames, start)
-        parts = [self._solved(checked[piece]) for piece in pieces(checked, Kind.of(checked))]
+        parts = [self._solved(checked[piece], history) for piece in pieces(checked, Kind.of(checked))]
         solution, corrected, values, distance = _joined(parts)
-        solution.phase[:] += self.settings.model(Kind.of(checked)).no_data
+        for phase in (solution.phase, solution.history):
+            if phase is not None:
+                phase += self.settings.model(Kind.of(checked)).no_data
 
         def shaped(array: NDArray) -> NDArray:
             return np.asarray(array.reshape(*batch, *array.shape[1:]) if batch else array[0])
@@ -282,7 +284,7 @@ class LearnedReference(Reconstructor):
 
     def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
         """Solve checked frames, see `Reconstructor.solve`."""
-        return _joined([self._solved(frames[piece]) for piece in pieces(frames, Kind.of(frames))])[0]
+        return _joined([self._solved(frames[piece], history) for piece in pieces(frames, Kind.of(frames))])[0]
 
     def average(self, frames: ArrayLike) -> tuple[BenchValues, BenchValues]:
         """Errors of one bench from many sets of frames, and their standard errors.
@@ -317,6 +319,7 @@ class LearnedReference(Reconstructor):
 
     def with_bench(self, bench: BenchValues) -> LearnedReference:
         """Reconstructor of the same training for a bench whose errors are known, as from `average`."""
+        _check.instance("bench", bench, BenchValues)
         config = self.settings
         return LearnedReference(
             cast(ZernikeSensor, self.sensor),
@@ -352,7 +355,9 @@ class LearnedReference(Reconstructor):
         """Read a training that `save` wrote, for its sensor; the settings are those of the constructor."""
         path = path_of("path", path)
         if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file: expected one that LearnedReference.save wrote")
+            raise FileNotFoundError(
+                f"path = {str(path)!r}: no such file: expected one that LearnedReference.save wrote"
+            )
         return cls(sensor, _read(path, path.name), **settings)
 
     @cached_property
@@ -394,7 +399,7 @@ class LearnedReference(Reconstructor):
         light = of_light[..., np.newaxis] * self._constants(kind).light
         return _Solve(values, kind.array(mixing), of_frames, light, of_power[..., np.newaxis])
 
-    def _solved(self, frames: NDArray) -> tuple[Solution, NDArray, NDArray, NDArray]:
+    def _solved(self, frames: NDArray, history: bool) -> tuple[Solution, NDArray, NDArray, NDArray]:
         """Solution, corrected frames (k, n_masks, ny, nx), values of the bench and distance of checked frames."""
         kind, training = Kind.of(frames), self.training
         constants, window = self._constants(kind), frames[(..., *self.sensor.window)]
@@ -410,11 +415,15 @@ class LearnedReference(Reconstructor):
         disc = (coefficients * np.float32(np.linalg.norm(training.flat))).astype(kind.dtype) @ constants.maps
         phase = _phase(flat, disc, solve).reshape(len(flat), *self.sensor.pupil.shape)
         corrected = (solve.mixing @ flat).reshape(window.shape) if self._corrects else window.copy()
-        solution = Solution(phase, np.ones(len(flat), int), np.ones(len(flat), bool), np.zeros(len(flat), int))
+        path = np.stack([np.zeros_like(phase), phase], axis=1) if history else None
+        solution = Solution(
+            phase, np.ones(len(flat), int), np.ones(len(flat), bool), np.zeros(len(flat), int), path
+        )
         if self._iteration is not None:
             padded = _in_window(corrected, frames, self.sensor.window)
-            solution = self._iteration.solve(padded, phase, False)
-            solution = solution._replace(n_iterations=solution.n_iterations + 1)
+            further = self._iteration.solve(padded, phase, history)
+            path = None if path is None else np.concatenate([path[:, :1], further.history], axis=1)
+            solution = further._replace(n_iterations=further.n_iterations + 1, history=path)
         return solution, corrected, np.broadcast_to(solve.values, (len(flat), len(self._ranges))), distance
 
     @property
@@ -466,7 +475,7 @@ def _polynomials(sensor: ZernikeSensor, order: int) -> _Polynomials:
     pupil = sensor.pupil
     disc = 2 * (pupil.points[:, 0] + 1j * pupil.points[:, 1])
     n = (order + 1) * (order + 2) // 2
-    values = np.concatenate([np.ones((1, pupil.n_points)), unnormalised_zernikes(disc, n - 1)])
+    values = np.concatenate([np.ones((1, pupil.n_points)), _unnormalised(disc, n - 1)])
     values /= np.sqrt(np.mean(values**2, axis=1, keepdims=True))
     return _Polynomials(pupil.scatter(values, fill=0.0).reshape(n, -1), order)
 
@@ -623,7 +632,8 @@ def _inputs(flat: NDArray, constants: _Constants) -> NDArray[np.float32]:
     means = constants.mixed @ (signal @ constants.means)
     squares = constants.mixed @ (signal @ signal.swapaxes(1, 2)) @ constants.mixed.T
     upper = squares[:, *constants.upper]
-    return np.concatenate([means.reshape(len(flat), -1), upper], axis=1).astype(np.float32)
+    inputs = np.concatenate([means.reshape(len(flat), -1), upper], axis=1)
+    return np.clip(inputs, -_LARGEST_INPUT, _LARGEST_INPUT).astype(np.float32)
 
 
 def _mixing(values: NDArray, n_masks: int) -> NDArray[np.float64]:
@@ -652,7 +662,7 @@ def _joined(parts: list[tuple[Solution, NDArray, NDArray, NDArray]]) -> tuple[So
     if len(parts) == 1:
         return parts[0]
     solutions, corrected, values, distance = zip(*parts, strict=True)
-    columns = (np.concatenate(column) for column in zip(*(solution[:4] for solution in solutions), strict=True))
+    columns = (None if column[0] is None else np.concatenate(column) for column in zip(*solutions, strict=True))
     return Solution(*columns), np.concatenate(corrected), np.concatenate(values), np.concatenate(distance)
 
 

@@ -422,7 +422,8 @@ class LearnedReference(Reconstructor):
         if self._iteration is not None:
             padded = _in_window(corrected, frames, self.sensor.window)
             further = self._iteration.solve(padded, phase, history)
-            path = None if path is None else np.concatenate([path[:, :1], further.history], axis=1)
+            if path is not None and further.history is not None:
+                path = np.concatenate([path[:, :1], further.history], axis=1)
             solution = further._replace(n_iterations=further.n_iterations + 1, history=path)
         return solution, corrected, np.broadcast_to(solve.values, (len(flat), len(self._ranges))), distance
 
@@ -662,7 +663,8 @@ def _joined(parts: list[tuple[Solution, NDArray, NDArray, NDArray]]) -> tuple[So
     if len(parts) == 1:
         return parts[0]
     solutions, corrected, values, distance = zip(*parts, strict=True)
-    columns = (None if column[0] is None else np.concatenate(column) for column in zip(*solutions, strict=True))
+    columns: Any = zip(*solutions, strict=True)
+    columns = (None if column[0] is None else np.concatenate(column) for column in columns)
     return Solution(*columns), np.concatenate(corrected), np.concatenate(values), np.concatenate(distance)
 
 

@@ -88,7 +88,7 @@ def test_the_wheel_says_that_the_package_has_types_and_the_sources_come_without_
     assert done.returncode == 0, done.stderr
     (wheel,) = (tmp_path / "wheels").glob("*.whl")
     held = {name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("zwfs/")}
-    sources = (file for file in (ROOT / "zwfs").rglob("*") if file.suffix in (".py", ".typed"))
+    sources = (file for file in (ROOT / "zwfs").rglob("*") if file.suffix in (".py", ".typed", ".npz"))
     assert held == {file.relative_to(ROOT).as_posix() for file in sources}
     assert "zwfs/py.typed" in held
     (archive,) = tmp_path.glob("*.tar.gz")

@@ -185,7 +185,7 @@ def test_error_of_a_square_patch_is_estimated(n_samples):
 
 
 class Grating(Dimple):
-    """Dimple with a transmission of its own, which varies faster than its quadrature follows."""
+    """Dimple whose transmission varies faster than its quadrature can follow."""
 
     def transmission(self, u, v):
         return np.exp(40j * np.pi * np.hypot(u, v - 0.2))

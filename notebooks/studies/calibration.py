@@ -199,18 +199,18 @@ def _measure(
 ) -> Measured:
     counts, sigma = taken.shot(number)
     truth, lit = taken.arrays["unseen"][number] * _UNIT, taken.arrays["lit"]
-    found = calibration(counts, smooth=prior, noise=sigma)
-    [prior] = found.priors
-    left, bars, same_prior = _error(found.phase, truth, lit), np.asarray(found.sigma)[lit], np.nan
+    estimate = calibration(counts, smooth=prior, noise=sigma)
+    [prior] = estimate.priors
+    residual, bars, same_prior = _error(estimate.phase, truth, lit), np.asarray(estimate.sigma)[lit], np.nan
     if design:
         same_prior = float(_error(design(counts, smooth=prior, noise=sigma).phase, truth, lit).std())
-    consistent = not found.flags & Flag.INCONSISTENT
+    consistent = not estimate.flags & Flag.INCONSISTENT
     plain = float(_plain(counts, taken, number, n_iterations).std())
-    inside = float(np.mean(np.abs(left) < bars))
+    inside = float(np.mean(np.abs(residual) < bars))
     stated = float(np.sqrt(np.mean(bars**2)))
-    calibrated = float(left.std())
+    calibrated = float(residual.std())
     return Measured(
-        plain, calibrated, same_prior, stated, inside, float(np.asarray(found.misfit)), consistent, prior
+        plain, calibrated, same_prior, stated, inside, float(np.asarray(estimate.misfit)), consistent, prior
     )
 
 

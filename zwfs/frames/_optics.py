@@ -374,7 +374,7 @@ class Optics:
         out.transfer, out.cores = (
             {arm: one.astype(np.complex64) for arm, one in parts.items()} for parts in (self.transfer, self.cores)
         )
-        out.spread = {arm: [one.astype(np.float32) for one in pair] for arm, pair in self.spread.items()}
+        out.spread = {arm: [chirp.astype(np.float32) for chirp in pair] for arm, pair in self.spread.items()}
         out.splines = {arm: one.single for arm, one in self.splines.items()}
         return out
 
@@ -589,6 +589,6 @@ def _differences(images: NDArray) -> NDArray[np.float64]:
     return out
 
 
-def _real(one: NDArray, other: NDArray) -> NDArray[np.float64]:
+def _real(first: NDArray, second: NDArray) -> NDArray[np.float64]:
     """Real part of a product."""
-    return (one * other).real
+    return (first * second).real

@@ -195,7 +195,7 @@ class Problem:
     @cached_property
     def single(self) -> Problem:
         """The problem in single precision."""
-        camera, maps = self.camera.single, [_single(one) for one in self.maps]
+        camera, maps = self.camera.single, [_single(unknown) for unknown in self.maps]
         weights = self.weights.astype(camera.real)
         return replace(self, camera=camera, weights=weights, phase_map=maps[0], light_maps=tuple(maps[1:]))
 
@@ -323,7 +323,7 @@ class Matrix:
         self.problem, self.x, self.cost = point.problem.single, point.x, point.cost
         self.model = Linearised(self.problem.camera, point.model.maps, point.values)
         self._light, self._zero = point.light, np.zeros_like(point.phase)
-        self._slopes = [one.astype(self.problem.camera.real) for one in point.light_slopes]
+        self._slopes = [slope.astype(self.problem.camera.real) for slope in point.light_slopes]
 
     @cached_property
     def columns(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:

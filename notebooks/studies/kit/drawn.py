@@ -119,7 +119,9 @@ def _second_axes(axes: Any, places: NDArray) -> dict[str, NDArray]:
     """Places on the second horizontal axes of a panel, by their labels."""
     scaled = axes.xaxis.get_transform().transform(places)
     second = (child for child in axes.child_axes if hasattr(child, "set_functions"))  # no inset
-    return {_joined(one.get_xlabel()): one.xaxis.get_transform().inverted().transform(scaled) for one in second}
+    return {
+        _joined(child.get_xlabel()): child.xaxis.get_transform().inverted().transform(scaled) for child in second
+    }
 
 
 def _pictures(axes: Any, labels: tuple[str, str, str], scales: dict[tuple[str, Any], str]) -> Iterator[Series]:
@@ -142,9 +144,9 @@ def _places(picture: Any, shape: tuple[int, ...]) -> Any:
         coordinates: Any = picture.get_coordinates()
         corners = np.moveaxis(coordinates, -1, 0)
         return corners if corners.shape[1:] == shape else (corners[:, 1:, 1:] + corners[:, :-1, :-1]) / 2
-    left, right, bottom, top = picture.get_extent()
-    width, height = (right - left) / shape[1], (top - bottom) / shape[0]
-    middle = left + width / 2, bottom + height / 2
+    x_low, x_high, y_low, y_high = picture.get_extent()
+    width, height = (x_high - x_low) / shape[1], (y_high - y_low) / shape[0]
+    middle = x_low + width / 2, y_low + height / 2
     return np.meshgrid(middle[0] + width * np.arange(shape[1]), middle[1] + height * np.arange(shape[0]))
 
 

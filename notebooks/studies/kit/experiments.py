@@ -95,8 +95,8 @@ class DiameterCurves(ErrorCurves):
 
     def at(self, name: str, diameter: float) -> float:
         """Mean error at a sampled diameter (lambda/D), radian rms; NaN if it was not sampled."""
-        found = self.mean(name)[np.abs(self.diameters - diameter) < 1e-9]
-        return float(found[0]) if found.size else np.nan
+        means = self.mean(name)[np.abs(self.diameters - diameter) < 1e-9]
+        return float(means[0]) if means.size else np.nan
 
     def exceeds(self, name: str, limit: float, start: float = 0.0) -> float:
         """Diameter, from `start` on, at which the mean error exceeds `limit` (radian rms); see `crossing`."""
@@ -157,7 +157,7 @@ def diameter_limit(
         return Limit(coarse)
 
     def ratios(diameters: NDArray) -> NDArray:
-        found = make(diameters)
-        return found.errors[name] / found.rms[:, np.newaxis]
+        curves = make(diameters)
+        return curves.errors[name] / curves.rms[:, np.newaxis]
 
     return refined_limit(ratios, coarse, threshold, width=0.025)

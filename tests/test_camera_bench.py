@@ -215,6 +215,9 @@ def test_known_phases_go_on_beyond_an_outline_that_cuts_pixels():
         ({"clear_frames": np.ones((2, 20, 20))}, "clear_frames has shape"),
         ({"clear_frames": np.zeros((2, 24, 24))}, "expected light"),
         ({"noise": 0.0}, "noise = 0"),
+        ({"noise": 1e200}, r"noise = 1e\+200"),
+        ({"gain": 1e200}, r"gain = 1e\+200"),
+        ({"diameter": 1e9}, "diameter = 1"),
         ({"frames": np.ones((2, 3, 24, 24))}, "frames has 3 images"),
     ],
 )

@@ -219,7 +219,7 @@ def fit_bench(
     that of the known phases. The flux of the first clear frame is fixed: it defines the map of the light.
     """
     data = Recording.of(frames, clear_frames, phases, n_pixels, noise, gain)
-    diameter = _check.number("diameter", diameter, 0, open_low=True)
+    diameter = _check.number("diameter", diameter, 0, data.n_pixels, open_low=True)
     shifts = _check.pair("phase_shifts", phase_shifts, _check.number)
     if oversampling is not None:
         oversampling = _check.integer("oversampling", oversampling, 1, 8)

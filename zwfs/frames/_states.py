@@ -68,13 +68,13 @@ class Recording:
                 f"phases has shape {phases.shape} and frames {clear.shape[1:]}: expected even differences, so "
                 "that the pixels stand at the same places"
             )
-        gain = _check.number("gain", gain, 0, open_low=True)
+        gain = _check.number("gain", gain, 0, _check.LARGEST, open_low=True)
         images = [*clear, *masked.reshape(-1, *masked.shape[2:])]
         good = [np.isfinite(image) for image in images]
         if noise is None:
             noise = _dark_noise(images, n_pixels) * math.sqrt(m)
         counts = [np.where(ok, image, 0) for image, ok in zip(images, good, strict=True)]
-        noise = _check.number("noise", noise, 0, open_low=True)
+        noise = _check.number("noise", noise, 0, _check.LARGEST, open_low=True)
         n_frames = [k, k] + [m] * (len(images) - 2)
         return cls(counts, good, n_frames, _continued(phases), n_pixels, noise, gain)
 

@@ -16,7 +16,7 @@ from book._tools.declared import accept, accept_together, parameters
 from book._tools.notebook import without_gaps
 from book._tools.page import leave_out
 from studies.kit import results
-from studies.kit.tables import Table
+from studies.kit.tables import Table, Text
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 SMALL = {"n_pixels": 24, "n_screens": 1, "n_modes": 15, "n_iterations": 3}
@@ -25,7 +25,7 @@ NONSENSE = re.compile(r"(?<![\w.])-?(inf|nan)(?!\w)|\b(inf|nan) ?%|\b0\.0+ ?(±|
 
 
 def run(name, given, monkeypatch):
-    """Run the code cells of a notebook in this process; return the text that its page shows, and the tables."""
+    """Run the code cells of a notebook in this process; return the text that its page shows, and what it computes as tables and sentences."""
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
     known = parameters(notebook)
     monkeypatch.chdir(NOTEBOOKS)
@@ -50,8 +50,8 @@ def run(name, given, monkeypatch):
             if "parameters" in cell.metadata.get("tags", ()):
                 space |= changed
             plt.close("all")
-    tables = [one._repr_markdown_() for one in shown if isinstance(one, Table)]
-    return visible(notebook, glued), tables
+    computed = [output._repr_markdown_() for output in shown if isinstance(output, Table | Text)]
+    return visible(notebook, glued), computed
 
 
 def texts(notebook):
@@ -312,6 +312,6 @@ ALONE = [(name, base | odd) for name, (base, *odds) in CASES.items() for odd in 
 @pytest.mark.parametrize(("name", "given"), [*SETS, *(pytest.param(*one, marks=FUZZ) for one in ALONE)])
 @pytest.mark.filterwarnings("ignore")  # of phases beyond what a sensor resolves
 def test_text_of_odd_parameters_names_no_limit_that_does_not_exist(name, given, monkeypatch):
-    text, tables = run(name, given, monkeypatch)
+    text, computed = run(name, given, monkeypatch)
     assert not NONSENSE.findall(text), text
-    assert not [table for table in tables if NONSENSE.search(table)]
+    assert not [output for output in computed if NONSENSE.search(output)]

@@ -1,4 +1,4 @@
-"""Tables of results that notebooks show: few digits, the same on every machine."""
+"""Tables and sentences of results that notebooks show: few digits, the same on every machine."""
 
 from __future__ import annotations
 
@@ -43,6 +43,19 @@ class Table:
         if isinstance(cell, float):
             return f"{cell:.{self.digits}g}" if isfinite(cell) else MISSING
         return plain(str(cell))
+
+
+@dataclass(frozen=True)
+class Text:
+    """Markdown that a cell computes: sentences on its results, which are right for any parameters."""
+
+    markdown: str
+
+    def __repr__(self) -> str:
+        return "Text"
+
+    def _repr_markdown_(self) -> str:
+        return self.markdown
 
 
 def small(value: float) -> str:

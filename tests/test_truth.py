@@ -25,7 +25,7 @@ NONSENSE = re.compile(r"(?<![\w.])-?(inf|nan)(?!\w)|\b(inf|nan) ?%|\b0\.0+ ?(±|
 
 
 def run(name, given, monkeypatch):
-    """Run the code cells of a notebook in this process; return the text that its page shows, and what it computes as tables and sentences."""
+    """Run the code cells of a notebook here; return the text that its page shows, and what it computes."""
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
     known = parameters(notebook)
     monkeypatch.chdir(NOTEBOOKS)

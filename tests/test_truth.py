@@ -224,9 +224,10 @@ CASES = {
         {}, {"rms_fine": [0.1, 0.3], "poke": 1.5}, *each(rms_max=[4.0, 0.05], bench=[{"photons_per_image": 1e7},
         {"static": 0.0}, {"n_rings": 1, "missing": []}, {"leakage": 0.5}], n_iterations=[1], extent=[1.0]),
     ),
-    "fig08_segments": (BENCH,
-        {}, *each(rms=[0.0, 4.0], bench=[{"photons_per_image": 1e7}, {"static": 3.0},
-        {"n_rings": 1, "missing": []}, {"blur": 20.0}, {"diameter": 8.0}], n_iterations=[1], exponent=[0.0]),
+    "bench": (BENCH,
+        {}, *each(rms=[0.0, 4.0], bench=[{"photons_per_image": 1e7}, {"static": 3.0}, {"leakage": 0.5},
+        {"n_rings": 1, "missing": []}, {"blur": 20.0}, {"diameter": 8.0}, {"static": 0.0}], n_iterations=[1],
+        exponent=[0.0, -4.0], wavelength=[100.0, 2e4]),
     ),
     "error_budget": (BENCH | {"n_screens": 1, "n_iterations": 2, "inputs": [0.3], "leakages": [0.1]},
         {}, *each(inputs=[[0.001], [4.0]], leakages=[[], [0.49]],
@@ -246,21 +247,11 @@ CASES = {
         n_iterations=[1]),
     ),
 }  # fmt: skip
-CASES["fig07_frames"] = CASES["fig08_segments"]
 LAYOUT = (
     {"n_pixels": 24},
     *each(n_pixels=[16, 33], diameter=[0.1, 8.0], phase_shift=[0.01, 3.13], rms=[0.0, 4.0], seed=[0, 7]),
 )
 CASES |= {"fig01_sensor_layout": LAYOUT, "fig02_vector_sensor": LAYOUT}
-ODD_BENCHES = [{"static": 0.0}, {"photons_per_image": 1e7}, {"n_rings": 1, "missing": []}, {"leakage": 0.5}]
-CASES["fig05_seal_bench"] = (
-    {},
-    *each(bench=ODD_BENCHES, rms=[0.0, 4.0], exponent=[0.0, -4.0], wavelength=[100.0, 2e4]),
-)
-CASES["fig06_reference"] = (
-    BENCH,
-    *each(bench=[*ODD_BENCHES, {"blur": 20.0}, {"diameter": 8.0}, {"static": 3.0}], n_pixels=[32, 200], seed=[0]),
-)
 CASES["own_frames"] = (
     {"fitted": []},
     {"fitted": ["background"], "n_iterations": 2},

@@ -71,10 +71,10 @@ def add_cards(notebook: NotebookNode, name: str, links: dict[str, str], versions
 
 def files(name: str, figure: str, links: dict[str, str]) -> str:
     """Return the line of a card that names the origin of a figure and links its files."""
-    number = re.match(r"fig(\d+)_", name)
+    number = re.match(r"fig(\d+)_", figure) or re.match(r"fig(\d+)_", name)
     of_paper = f"Figure {int(number[1])} of the paper" if number else ""
     origin = "Not in the paper"
-    if number and figure == name:
+    if number and (figure == name or not name.startswith("fig")):
         origin = of_paper
     elif number:
         origin += f", goes with {of_paper}"

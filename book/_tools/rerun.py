@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell
 
+from studies.kit.results import published
 from studies.kit.tables import plain
 
 from . import declared, record
@@ -100,7 +101,7 @@ def resolve(project: Project, figure: str) -> str:
     if wanted in names:
         return wanted
     if number := re.fullmatch(r"(?:fig(?:ure)?)?[ _]?0*(\d+)", wanted, re.IGNORECASE):
-        numbers = {_number(name): name for name in names if _number(name)}
+        numbers = {digits: path.stem for path in project.sources() for digits in _numbers(path)}
         if number[1] in numbers:
             return numbers[number[1]]
         expected = ", ".join(numbers) or "none"
@@ -108,10 +109,11 @@ def resolve(project: Project, figure: str) -> str:
     raise ParameterError(f"unknown notebook {wanted!r}: {declared.nearest(wanted, names)}")
 
 
-def _number(name: str) -> str:
-    """Return the number of the figure of a notebook; empty if its name has none."""
-    number = re.match(r"fig0*(\d+)_", name)
-    return number[1] if number else ""
+def _numbers(source: Path) -> list[str]:
+    """Return the numbers of the paper's figures that a notebook makes, from its name and those of its figures."""
+    code = (cell.source for cell in read(source).cells if cell.cell_type == "code")
+    names = source.stem, *(figure for lines in code for figure in published(lines))
+    return sorted({number[1] for name in names if (number := re.match(r"fig0*(\d+)_", name))}, key=int)
 
 
 def _text(file: Path) -> str:
@@ -139,8 +141,9 @@ def _check_classes(paths: list[str]) -> None:
 
 def titles(project: Project) -> str:
     """List the notebooks: number, name, title."""
-    lines = [[_number(path.stem), path.stem, title(read(path))] for path in project.sources()]
-    return table(["figure", "notebook", "title"], sorted(lines, key=lambda line: (not line[0], line[1])))
+    rows = [(_numbers(path), path.stem, title(read(path))) for path in project.sources()]
+    rows.sort(key=lambda row: (not row[0], int(next(iter(row[0]), 0)), row[1]))
+    return table(["figure", "notebook", "title"], [[", ".join(numbers), *named] for numbers, *named in rows])
 
 
 def description(project: Project, name: str) -> str:

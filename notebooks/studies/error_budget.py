@@ -15,7 +15,7 @@ from studies.kit.bench import UNITS, BenchCurves, bench_curves, check_bench
 from studies.kit.parameters import bench_fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS
-from studies.kit.tables import Table
+from studies.kit.tables import Table, Text
 from zwfs.bench import Bench, BenchModel
 from zwfs.reconstructors import PhaseShifted
 
@@ -28,6 +28,8 @@ LIMITS = parameter_limits(
 CHECK_TOGETHER = check_bench
 QUICK = {"n_pixels": 68, "inputs": [0.8], "n_screens": 1, "leakages": [0.0, 0.1, 0.3]}
 
+_NO_OFFSET = 1e-6  # rad rms, below which digits are rounding errors
+_LOWERED = 0.99  # gain below which an error counts as lowering it
 NAME = "PhaseShifted"  # the reconstructor of the page
 Curves = Mapping[str, BenchCurves]  # by the error that is switched on
 
@@ -52,21 +54,21 @@ def effects(budget: Curves, name: str = NAME) -> tuple[NDArray, NDArray, NDArray
     """Offset, and gain and error at the first input after 0, of each case."""
     curves = budget.values()
     return (
-        np.array([one.mean(name)[0] for one in curves]),
-        np.array([one.gain(name)[1] for one in curves]),
-        np.array([one.mean(name)[1] for one in curves]),
+        np.array([case.mean(name)[0] for case in curves]),
+        np.array([case.gain(name)[1] for case in curves]),
+        np.array([case.mean(name)[1] for case in curves]),
     )
 
 
 def standard_errors(budget: Curves, name: str = NAME) -> tuple[NDArray, NDArray, NDArray]:
     """Standard errors of `effects`, from the scatter of the screens."""
-    found = []
+    rows = []
     for curves in budget.values():
         commanded = curves.commanded[1]
         residuals = curves.residuals[name][1] - curves.residuals[name][0].mean(axis=0)
         gains = np.sum(commanded * residuals, axis=-1) / np.sum(commanded**2, axis=-1)
-        found.append([values.std() / np.sqrt(len(gains)) for values in (*curves.errors[name][:2], gains)])
-    offset, error, gain = np.array(found).T
+        rows.append([values.std() / np.sqrt(len(gains)) for values in (*curves.errors[name][:2], gains)])
+    offset, error, gain = np.array(rows).T
     return offset, gain, error
 
 
@@ -102,7 +104,7 @@ def effect_table(budget: Curves, bench: Bench) -> Table:
     rows = [
         [
             _words(error) + sizes.get(error, ""),
-            f"{offset:.2g}" if (offset := curves.mean(NAME)[0]) > 1e-6 else "0",
+            f"{offset:.2g}" if (offset := curves.mean(NAME)[0]) > _NO_OFFSET else "0",
             *_cells(curves),
         ]
         for error, curves in budget.items()
@@ -112,11 +114,13 @@ def effect_table(budget: Curves, bench: Bench) -> Table:
 
 def leakage_table(swept: Mapping[float, BenchCurves]) -> Table:
     """Gains and errors with nothing but leakage."""
-    return Table(["leakage", *_header(swept)], [[f"{value:.0%}", *_cells(one)] for value, one in swept.items()])
+    return Table(
+        ["leakage", *_header(swept)], [[f"{value:.0%}", *_cells(curves)] for value, curves in swept.items()]
+    )
 
 
-def _header(some: Mapping[Any, BenchCurves]) -> list[str]:
-    inputs = next((one.rms[one.rms > 0] for one in some.values()), ())
+def _header(cases: Mapping[Any, BenchCurves]) -> list[str]:
+    inputs = next((curves.rms[curves.rms > 0] for curves in cases.values()), ())
     return [f"{quantity} at {value:g} rad rms" for quantity in ("gain", "error (rad rms)") for value in inputs]
 
 
@@ -130,10 +134,30 @@ def _words(error: str) -> str:
     return error.replace("_", " ")
 
 
-def numbers(budget: Curves, swept: Mapping[float, BenchCurves]) -> dict[str, float | str]:
-    """Numbers for the text: offset and gain of some errors, and the gain with 10 % leakage."""
+def findings(budget: Curves) -> Text:
+    """Say which errors alone cause an offset, and which lower the gain."""
     offsets, gains, _ = (dict(zip(budget, values, strict=True)) for values in effects(budget))
-    found: dict[str, Any] = {}
-    for case in ("leakage", "focus_difference", "static", "all"):
-        found |= {f"offset_{case}": offsets[case], f"gain_{case}": gains[case]}
-    return rounded(found | {"gain_leakage_10": swept[0.1].gain(NAME)[1] if 0.1 in swept else np.nan})
+    alone = [error for error in budget if error not in ("none", "all")]
+    worst = max(alone, key=lambda error: offsets[error])
+    lowering = sorted((error for error in alone if gains[error] < _LOWERED), key=lambda error: gains[error])
+    rms = next(iter(budget.values())).rms[1]
+    if offsets[worst] > _NO_OFFSET:
+        text = (
+            f"At a flat command the error of the simulated bench is {offsets['all']:.2g} rad rms; "
+            f"with *{_words(worst)}* alone it is {offsets[worst]:.2g}."
+        )
+    else:
+        text = "No error of the simulated bench alone causes an error at a flat command."
+    if lowering:
+        listed = ", ".join(f"*{_words(error)}* ({gains[error]:.2f})" for error in lowering)
+        text += f" At {rms:.2g} rad rms these errors alone lower the gain to the number in brackets: {listed}."
+    else:
+        text += f" At {rms:.2g} rad rms no error alone lowers the gain by more than 1 %."
+    return Text(text)
+
+
+def numbers(budget: Curves, swept: Mapping[float, BenchCurves]) -> dict[str, float | str]:
+    """Numbers for the claims: gains with single errors, and with 10 % leakage."""
+    gains = dict(zip(budget, effects(budget)[1], strict=True))
+    named = {f"gain_{error}": gains[error] for error in ("leakage", "focus_difference")}
+    return rounded(named | {"gain_leakage_10": swept[0.1].gain(NAME)[1] if 0.1 in swept else np.nan})

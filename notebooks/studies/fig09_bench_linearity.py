@@ -12,7 +12,7 @@ from studies.kit.curves import percent
 from studies.kit.parameters import bench_fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS
-from studies.kit.tables import Table
+from studies.kit.tables import Table, Text
 
 LIMITS = parameter_limits(
     "rms_max n_rms rms_fine n_screens exponent n_iterations",
@@ -90,20 +90,36 @@ def _span(inputs: NDArray, largest: float) -> str:
     return f"{inputs[0]:g} to {'≥ ' if inputs[-1] == largest else ''}{inputs[-1]:g}"
 
 
-def numbers(curves: BenchCurves) -> dict[str, float | str]:
-    """Numbers for the text: offset and reach of the reconstructors, and how they compare."""
+def findings(curves: BenchCurves) -> Text:
+    """Say up to which inputs the methods can be used."""
     mean = {short: curves.mean(name) for short, name in SHORT.items()}
-    large = curves.rms >= 0.3
-    alike = curves.mean("Arcsine")[large] / mean["linear"][large]
+    largest, limit = curves.rms.max(), reach(curves, "Linear")
+    text = (
+        "On the simulated bench the mean error of the phase-shifted iteration is at most "
+        f"{mean['shifted'].max():.2g} rad rms for all inputs up to {largest:.3g} rad rms. The error of the linear method "
+    )
+    if limit:
+        text += f"is below {percent(_SHARE)} of the input up to {limit:.2g} rad rms."
+    else:
+        text += f"exceeds {percent(_SHARE)} of every input."
+    for short, label in (("shifted", "The iteration"), ("saxton", "Gerchberg-Saxton")):
+        worse = curves.rms[(curves.rms > 0) & (mean[short] > mean["linear"])]
+        if worse.size:
+            text += f" {label} has a larger error than the linear method up to {worse.max():.2g} rad rms."
+    return Text(text)
+
+
+def numbers(curves: BenchCurves) -> dict[str, float | str]:
+    """Numbers for the claims: offset and reach of the reconstructors, and how they compare."""
+    shifted, large = curves.mean("PhaseShifted"), curves.rms >= 0.3
+    alike = curves.mean("Arcsine")[large] / curves.mean("Linear")[large]
     return rounded(
         {
-            "saxton_worse": curves.rms[mean["saxton"] > mean["linear"]].max(initial=0.0),
-            "offset_shifted": mean["shifted"][0],
+            "offset_shifted": shifted[0],
             "arcsine_over_linear": round(np.median(alike), 3) if alike.size else np.nan,
             **{f"reach_{short}": reach(curves, name) for short, name in SHORT.items()},
             "lowest_shifted": next(iter(_within(curves, SHORT["shifted"])), np.nan),
-            "shifted_worst": mean["shifted"].max(),
             "largest_input": curves.rms.max(),
-            "shifted_share_at_01": next(iter(mean["shifted"][curves.rms == 0.1]), np.nan) / 0.1,
+            "shifted_share_at_01": next(iter(shifted[curves.rms == 0.1]), np.nan) / 0.1,
         }
     )

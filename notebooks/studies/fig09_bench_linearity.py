@@ -96,12 +96,14 @@ def findings(curves: BenchCurves) -> Text:
     largest, limit = curves.rms.max(), reach(curves, "Linear")
     text = (
         "On the simulated bench the mean error of the phase-shifted iteration is at most "
-        f"{mean['shifted'].max():.2g} rad rms for all inputs up to {largest:.3g} rad rms. The error of the linear method "
+        f"{mean['shifted'].max():.2g} rad rms for all inputs up to {largest:.3g} rad rms."
     )
     if limit:
-        text += f"is below {percent(_SHARE)} of the input up to {limit:.2g} rad rms."
+        text += (
+            f" The error of the linear method is below {percent(_SHARE)} of the input up to {limit:.2g} rad rms."
+        )
     else:
-        text += f"exceeds {percent(_SHARE)} of every input."
+        text += f" The error of the linear method exceeds {percent(_SHARE)} of every input."
     for short, label in (("shifted", "The iteration"), ("saxton", "Gerchberg-Saxton")):
         worse = curves.rms[(curves.rms > 0) & (mean[short] > mean["linear"])]
         if worse.size:

@@ -155,10 +155,12 @@ $(BIN)/uv:
 	@$(BIN)/python -m pip --quiet --disable-pip-version-check install --require-hashes --requirement $(UV_LOCK)
 
 # The compatible mode puts this folder on the path of Python. The default mode fails in a folder with a folder zwfs.
+# studies.pth adds that of the studies, so that notebooks find them from any working directory.
 $(READY): $(LOCK) pyproject.toml $(BIN)/uv
 	@rm -f $@
 	@$(UV) pip sync --python $(BIN)/python --compile-bytecode --require-hashes $(LOCK)
 	@$(UV) pip install --python $(BIN)/python --no-deps --no-build-isolation \
 		--config-settings editable_mode=compat --editable .
+	@echo "$(CURDIR)/notebooks" > "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/studies.pth"
 	@$(BIN)/python -I environment/check.py
 	@$(IDENTITY) > $@

@@ -3,7 +3,6 @@
 import json
 import math
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -18,10 +17,10 @@ from sphinx.errors import ExtensionError
 
 from book._tools.notebook import glued_texts
 
-HOLDS, PARTLY, FAILS, UNTESTED = "holds", "holds in part", "does not hold", "not testable here"
+HOLDS, NOTED, PARTLY = "holds", "holds, with a note", "holds in part"
+FAILS, UNTESTED = "does not hold", "not testable here"
 # The signs differ in shape, for readers who do not see the colours.
-SIGNS = {HOLDS: "✔", PARTLY: "◐", FAILS: "✘", UNTESTED: "○"}
-REASONS = ("a part does not hold", "a number differs", "the paper leaves a condition open")  # of `PARTLY`
+SIGNS = {HOLDS: "✔", NOTED: "◕", PARTLY: "◐", FAILS: "✘", UNTESTED: "○"}
 PARTS = {"sensor": range(1, 7), "range": range(7, 14), "choices": range(14, 18), "bench": range(18, 22)}
 
 
@@ -61,10 +60,9 @@ class ClaimError(ExtensionError):
 class Finding:
     """Result of a rule."""
 
-    verdict: str  # one of `HOLDS`, `PARTLY`, `FAILS` and `UNTESTED`
+    verdict: str  # a key of `SIGNS`
     measured: str = ""  # the measured values in words
     remark: str = ""  # the condition under which the claim holds, or the reason why it does not
-    because: str = ""  # one of `REASONS` for `PARTLY`
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ def judge(claim: Claim, numbers: Mapping[str, Any]) -> Finding:
         for case in claim.verdicts:
             if find(case["if"]):
                 remark = RULES.from_string(case.get("remark", "")).render(values)
-                return Finding(case["verdict"], measured, remark, case.get("because", ""))
+                return Finding(case["verdict"], measured, remark)
     except UndefinedError as error:
         needed = f"{error.message}: the notebook does not glue it"
         raise ClaimError(f"claim {claim.number}, {claim.notebook}: {needed}") from None
@@ -135,30 +133,18 @@ def findings(folder: Path) -> dict[int, Finding]:
     return {claim.number: judge(claim, numbers[claim.also] | numbers[claim.notebook]) for claim in CLAIMS}
 
 
-def count(judged: dict[int, Finding]) -> str:
-    """Return a line with the number of claims of each verdict."""
-    numbers = Counter(finding.verdict for finding in judged.values())
-    open_ones = sum(finding.because == REASONS[-1] for finding in judged.values())
-    verdicts = {verdict: f"{_marked(verdict)}: {numbers[verdict]}" for verdict in SIGNS}
-    counted = f"Of [{len(judged)} claims that we chose from the paper](claims.md): {', '.join(verdicts.values())}."
-    return f"{counted} For {open_ones} of the {numbers[PARTLY]} that hold in part, {REASONS[-1]}."
-
-
 def by_verdict(judged: dict[int, Finding]) -> str:
-    """Return a list of the verdicts, with links to the rows of their claims."""
-    groups: dict[tuple[str, str], list[str]] = {}
+    """Return a list of the verdicts, with their numbers and links to the rows of their claims."""
+    lines = []
     for verdict in SIGNS:
-        for reason in REASONS if verdict == PARTLY else ("",):
-            groups[verdict, reason] = [
-                f"[{claim.number}\u00a0{claim.title}](#claim-{claim.number})"
-                for claim in CLAIMS
-                if (judged[claim.number].verdict, judged[claim.number].because) == (verdict, reason)
-            ]
-    return "\n".join(
-        f"- {_marked(verdict)}{f', {reason}' if reason else ''}: {', '.join(rows) or 'none'}"
-        for (verdict, reason), rows in groups.items()
-        if rows or not reason
-    )
+        rows = [
+            f"[{claim.number}\u00a0{claim.title}](#claim-{claim.number})"
+            for claim in CLAIMS
+            if judged[claim.number].verdict == verdict
+        ]
+        if rows:
+            lines.append(f"- {_marked(verdict)}: {len(rows)} ({', '.join(rows)})")
+    return "\n".join(lines)
 
 
 def table(judged: dict[int, Finding], numbers: range) -> str:
@@ -182,8 +168,7 @@ def _row(claim: Claim, finding: Finding) -> list[str]:
         measured.append(f"*[{_title(claim.notebook)}]({address}), [code](#code-{claim.number})*")
         verdict = _marked(finding.verdict, f"(#rule-{claim.number})")
     return [
-        f"[{claim.number}.]{{#claim-{claim.number}}} **{claim.title}** {verdict}"
-        + (f": {finding.because}" if finding.because else ""),
+        f"[{claim.number}.]{{#claim-{claim.number}}} **{claim.title}** {verdict}",
         f"{claim.statement} *Section {claim.section}*",
         " ".join(measured),
     ]
@@ -229,14 +214,15 @@ def _title(notebook: str) -> str:
 
 def _marked(verdict: str, address: str = "") -> str:
     """Return a verdict with its sign, the class for its colour, and a link if it has an address in brackets."""
-    return f"[{SIGNS[verdict]} {verdict}]{address}{{.verdict-{verdict.replace(' ', '-')}}}"
+    word = re.sub(r"\W+", "-", verdict)
+    return f"[{SIGNS[verdict]} {verdict}]{address}{{.verdict-{word}}}"
 
 
 def add_substitutions(app: Sphinx, config: Config) -> None:
     """Define the tables of the claims, their number and rules, from the notebooks that the book shows."""
     judged = findings(Path(app.srcdir, config.executed_notebooks))
     added = {f"claims_{name}": table(judged, numbers) for name, numbers in PARTS.items()}
-    added |= {"claims_count": count(judged), "claims_list": by_verdict(judged), "claims_rules": rules()}
+    added |= {"claims_list": by_verdict(judged), "claims_rules": rules()}
     config.myst_substitutions = config.myst_substitutions | added
 
 

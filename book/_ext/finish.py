@@ -1,7 +1,8 @@
-"""Finish of the pages: numbers, variants and sizes of pictures, MathJax without the network."""
+"""Finish of the pages: numbers, variants and sizes of pictures, names of folds, MathJax without the network."""
 
 import copy
 import importlib.util
+import os
 import re
 import struct
 from pathlib import Path
@@ -18,6 +19,16 @@ from book._ext.performance import PICTURES
 from studies.kit.tables import MISSING
 
 VARIANTS = "variants-"  # with which the class of a figure begins that may have dark and narrow variants
+MOVED = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<title>This page has moved</title>
+<meta http-equiv="refresh" content="0; url={address}">
+</head>
+<body><p>This page has moved: <a href="{address}">open it</a>.</p></body>
+</html>
+"""
 PHONE = "(max-width: 600px)"
 BY_ROW = "table:is(.claims, .decision), :is(.tag_decision, .tag_closed-loop) table"
 POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e([+-])0*(\d+)\b")
@@ -44,6 +55,8 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
         image.parent.wrap(body.new_tag("div", **{"class": "wide-figure"}))
     for figure in body.select(f"figure[class*={VARIANTS}]"):
         add_variants(app, figure)
+    for fold in body.select("details > summary[aria-label]"):
+        del fold["aria-label"]  # the same for every fold; its title says what it holds
     name_cells(body)
     define(body, Path(app.srcdir, f"{GLOSSARY}.md"))
     for entry in body.select("[role=doc-biblioentry]"):
@@ -142,19 +155,32 @@ def size(picture: Path) -> tuple[int, int]:
     return tuple(round(float(length)) for length in box[1].split()[2:])
 
 
-def copy_mathjax(app: Sphinx, exception: Exception | None) -> None:
-    """Copy the part of MathJax that pages load: mathematics needs no network."""
+def finish_folder(app: Sphinx, exception: Exception | None) -> None:
+    """Copy what pages load, leave out what they do not need, and write a page for each address that moved."""
     if exception is not None or app.builder.format != "html":
         return
+    copy_mathjax(Path(app.outdir, "_static", "mathjax"))
+    # The style sheets of the theme draw the same icons from a font.
+    Path(app.outdir, "_static", "scripts", "fontawesome.js").write_text("", "utf-8")
+    for old, new in app.config.moved_pages.items():
+        page = Path(app.outdir, f"{old}.html")
+        address = os.path.relpath(Path(app.outdir, f"{new}.html"), page.parent)
+        page.write_text(MOVED.format(address=Path(address).as_posix()), "utf-8")
+
+
+def copy_mathjax(folder: Path) -> None:
+    """Copy the part of MathJax that pages load: mathematics needs no network."""
     package = Path(importlib.util.find_spec("sphinx-mathjax-offline").origin).parent / "static" / "mathjax"
-    for file in (package / "tex-chtml-full.js", *(package / "output" / "chtml" / "fonts").rglob("*.woff")):
-        target = Path(app.outdir, "_static", "mathjax") / file.relative_to(package)
+    for file in (package / "tex-chtml.js", *(package / "output" / "chtml" / "fonts").rglob("*.woff")):
+        target = folder / file.relative_to(package)
         target.parent.mkdir(parents=True, exist_ok=True)
         copy_asset_file(file, target)
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Finish each page, and their folder at the end."""
+    app.add_config_value("moved_pages", {}, "html")
+    app.set_html_assets_policy("per_page")  # MathJax where there is mathematics; MyST-NB asks for it on every page
     app.connect("html-page-context", finish_page)
-    app.connect("build-finished", copy_mathjax)
+    app.connect("build-finished", finish_folder)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -48,3 +48,15 @@ addEventListener("click", (event) => {
   }
   tapped = word;
 });
+
+// On paper a fold is open.
+const opened = [];
+addEventListener("beforeprint", () => {
+  for (const fold of document.querySelectorAll(".bd-article details:not([open])")) {
+    fold.open = true;
+    opened.push(fold);
+  }
+});
+addEventListener("afterprint", () => {
+  for (const fold of opened.splice(0)) fold.open = false;
+});

@@ -15,6 +15,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 from book._tools.project import Project
 from book._tools.run import manifest
+from studies.kit.tables import two_digits
 
 from .conftest import EXAMPLES, ROOT
 
@@ -69,7 +70,7 @@ def test_a_new_figure_is_a_study_a_notebook_and_a_line(copy):
     assert lowest == pytest.approx(np.exp(-1), abs=0.1)
     assert (result / "strehl_loss.png").exists()
     text = re.sub("<[^>]*>", "", (result / "strehl_loss.html").read_text())
-    assert f"At the largest input it is {lowest:.2f}" in text
+    assert f"At 1 rad rms, the Strehl ratio is {two_digits(lowest)}." in text
     for folder in ("notebooks/studies", "notebooks/strehl_loss.ipynb"):
         run(copy, "-m", "ruff", "check", folder)
         run(copy, "-m", "ruff", "format", "--check", folder)

@@ -63,6 +63,16 @@ def test_figures_and_text_come_first_and_all_code_is_in_one_fold_at_the_end(read
     assert page == [*first, "## Second", "output", "## Method", fold]
 
 
+def test_sentences_of_a_cell_lead_before_the_figure(reads):
+    page = reads(
+        new_markdown_cell("# Question"),
+        code("curves = compute()"),
+        code("findings(curves)", "hide-input", output=True),
+        code(DRAW, "hide-input", output=True),
+    )
+    assert page[:3] == ["# Question", "output", "output"]
+
+
 def test_a_cell_that_computes_and_prints_keeps_its_code(reads):
     source = "table = compute()\ntable"
     assert reads(code(source, output=True)) == [source, ("folded", source)]

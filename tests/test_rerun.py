@@ -79,6 +79,7 @@ def make_project(root):
             "The product is {glue:text}`product:.2f`, see {eq}`eq-first` and [the other](fig02_works.ipynb).\n\n"
             "{download}`data <downloads/numbers.csv>`"
         ),
+        new_markdown_cell("## With the book's parameters\n\nA slit.", metadata={"tags": ["book-parameters"]}),
     )
     write(project, "fig02_works", new_code_cell(WORK))
     return project
@@ -210,6 +211,7 @@ def test_folder_holds_all_that_was_made(ran):
     assert os.listdir(ran.build) == ["rerun"]
     notebook = read(folder / "fig01_small.ipynb")
     assert notebook.cells[2].source.endswith("| `width` | `3.0` | `1.5` | rad | of the slit |")
+    assert not any("With the book's parameters" in cell.source for cell in notebook.cells)
 
 
 def test_page_has_everything_in_it(ran):

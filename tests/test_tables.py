@@ -2,7 +2,8 @@ import pytest
 from bs4 import BeautifulSoup
 from markdown_it import MarkdownIt
 
-from studies.kit.tables import Table, small
+from book._ext import driver
+from studies.kit.tables import Table, small, two_digits
 
 
 def test_few_digits_are_shown_and_truths_in_words():
@@ -52,3 +53,20 @@ def test_string_of_several_lines_stays_in_its_cell():
 )
 def test_rounding_errors_are_shown_as_a_bound(value, text):
     assert small(value) == text
+
+
+def test_sentences_are_html_and_hold_no_html_of_their_own():
+    said = "**Two** [pages](other.ipynb#part), `1 < 2`, $a < b$, <b>x</b> [y](javascript:x)\n\n- one\n- two"
+    expected = (
+        '<p><strong>Two</strong> <a href="other.html#part">pages</a>, <code>1 &lt; 2</code>, '
+        '<span class="math inline">\\(a &lt; b\\)</span>, &lt;b&gt;x&lt;/b&gt; [y](javascript:x)</p>\n'
+        "<ul>\n<li>one</li>\n<li>two</li>\n</ul>\n"
+    )
+    assert driver.in_html(said) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"), [(1659.0, "1700"), (0.0996, "0.1"), (-0.0374, "-0.037"), (0.0, "0"), (float("nan"), "–")]
+)
+def test_two_digits_are_shown(value, shown):
+    assert two_digits(value) == shown

@@ -1,4 +1,4 @@
-"""Text of a run with other parameters: what holds only for the defaults is hidden, and no limit is infinite."""
+"""Text of a run with other parameters: what holds for the book's alone is hidden, and all numbers make sense."""
 
 import ast
 import re
@@ -9,11 +9,12 @@ from types import ModuleType
 import bs4
 import matplotlib.pyplot as plt
 import nbformat
+import numpy as np
 import pytest
 from joblib import parallel_config
 
 from book._tools.declared import accept, accept_together, parameters
-from book._tools.notebook import without_gaps
+from book._tools.notebook import BOOK, without_gaps
 from book._tools.page import leave_out
 from studies.kit import results
 from studies.kit.tables import Table, Text
@@ -22,10 +23,12 @@ NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 SMALL = {"n_pixels": 24, "n_screens": 1, "n_modes": 15, "n_iterations": 3}
 # NaN, infinity or a limit of zero: no page may show them.
 NONSENSE = re.compile(r"(?<![\w.])-?(inf|nan)(?!\w)|\b(inf|nan) ?%|\b0\.0+ ?(±|rad\b|λ)", re.IGNORECASE)
+NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
+TARGET = re.compile(r"\]\([^)]*\)|`[^`]*`")  # of a link, and code
 
 
 def run(name, given, monkeypatch):
-    """Run the code cells of a notebook here; return the text that its page shows, and what it computes."""
+    """Run the code cells of a notebook here; return the text of its page, what it computes, and its figures."""
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
     known = parameters(notebook)
     monkeypatch.chdir(NOTEBOOKS)
@@ -36,8 +39,9 @@ def run(name, given, monkeypatch):
     stub.glue = lambda name, value, display: glued.update({name: value})
     monkeypatch.setitem(sys.modules, "myst_nb", stub)
     monkeypatch.delenv(results.FOLDER, raising=False)
-    monkeypatch.setattr(results, "picture_bytes", lambda figure, kind: b"")  # drawing takes half of the time
-    shown, space = [], {"__name__": "notebook"}
+    shown, figures, space = [], [], {"__name__": "notebook"}
+    # Drawing takes half of the time.
+    monkeypatch.setattr(results, "publish", lambda figure, name, screens=None: figures.append(figure))
     with parallel_config(backend="sequential"), plt.rc_context():
         for cell in notebook.cells:
             if cell.cell_type != "code":
@@ -50,14 +54,30 @@ def run(name, given, monkeypatch):
             if "parameters" in cell.metadata.get("tags", ()):
                 space |= changed
             plt.close("all")
-    computed = [output._repr_markdown_() for output in shown if isinstance(output, Table | Text)]
-    return visible(notebook, glued), computed
+    return visible(notebook, glued), [output for output in shown if isinstance(output, Table | Text)], figures
+
+
+def long_numbers(markdown):
+    """Numbers of a text with more than three significant digits, but for years, which are whole numbers."""
+    for number in NUMBER.findall(TARGET.sub("", markdown)):
+        digits = number.replace(".", "").lstrip("0") if "." in number else number.strip("0")
+        if len(digits) > 3 and not re.fullmatch(r"(19|20)\d\d", number):
+            yield number
+
+
+def without_data(axes):
+    """Whether a panel has axes but nothing finite on them."""
+    if not (axes.axison and axes.get_visible()) or hasattr(axes, "_colorbar"):
+        return False
+    drawn = (*axes.images, *axes.containers, *(one for one in axes.collections if one.get_paths()))
+    curves = [line.get_xydata() for line in axes.lines if line.get_transform() == axes.transData]
+    return not drawn and not any(np.isfinite(points).all(axis=1).any() for points in curves)
 
 
 def texts(notebook):
     """Markdown and captions of a notebook."""
     for cell in notebook.cells:
-        if cell.cell_type == "markdown":
+        if cell.cell_type == "markdown" and BOOK not in cell.metadata.get("tags", ()):
             yield cell.source
         yield cell.metadata.get("mystnb", {}).get("figure", {}).get("caption", "")
 
@@ -303,6 +323,24 @@ ALONE = [(name, base | odd) for name, (base, *odds) in CASES.items() for odd in 
 @pytest.mark.parametrize(("name", "given"), [*SETS, *(pytest.param(*one, marks=FUZZ) for one in ALONE)])
 @pytest.mark.filterwarnings("ignore")  # of phases beyond what a sensor resolves
 def test_text_of_odd_parameters_names_no_limit_that_does_not_exist(name, given, monkeypatch):
-    text, computed = run(name, given, monkeypatch)
+    text, computed, figures = run(name, given, monkeypatch)
     assert not NONSENSE.findall(text), text
-    assert not [output for output in computed if NONSENSE.search(output)]
+    assert not [output for output in computed if NONSENSE.search(output._repr_markdown_())]
+    sentences = [output.markdown for output in computed if isinstance(output, Text)]
+    assert not [said for said in sentences if any(long_numbers(said))]
+    assert not [figure for figure in figures if any(map(without_data, figure.axes))]
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        ("0.9964 of 1000 photons, 100000 at most, and 1.02", ["0.9964"]),
+        ("[Figure 3](fig03.ipynb#a-1234) of 2024, 12345 screens, 1.5e-05, `1.2345`", ["12345"]),
+    ],
+)
+def test_long_numbers_in_sentences_are_found(said, expected):
+    assert list(long_numbers(said)) == expected
+
+
+def test_every_notebook_is_tried():
+    assert CASES.keys() == {path.stem for path in NOTEBOOKS.glob("*.ipynb")}

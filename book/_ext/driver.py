@@ -4,9 +4,11 @@ Pyodide imports this file in the worker of `book/_static/run-worker.js`. It repl
 """
 
 import ast
+import html
 import io
 import json
 import os
+import re
 import sys
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -88,7 +90,7 @@ def begin(notebook: str, defaults: str, given: str) -> str:
 
 
 def cell(source: str, forms: str) -> str:
-    """Run a cell; return JSON of its output, of the glued numbers as text, and of the error if it failed.
+    """Run a cell; return JSON of its Markdown as HTML, of the glued numbers, and of the error if it failed.
 
     `forms` is JSON of pairs: the name and the format of each number in the text of the page.
     """
@@ -96,14 +98,33 @@ def cell(source: str, forms: str) -> str:
     numbers.clear()
     try:
         value = _run(source, names)
-        for kind in ("markdown", "html"):
-            if represent := getattr(value, f"_repr_{kind}_", None):
-                shown[kind] = represent()
+        if represent := getattr(value, "_repr_markdown_", None):
+            shown["html"] = in_html(represent())
         glued = [(name, form, numbers[name]) for name, form in json.loads(forms) if name in numbers]
         shown["numbers"] = {f"{name}:{form}": _written(value, form) for name, form, value in glued}
     except Exception as error:
         shown["error"] = _message(error)
     return json.dumps(shown)
+
+
+def in_html(markdown: str) -> str:
+    """Return Markdown as HTML: paragraphs, lists, tables, links to pages, formulas; HTML in it stays text."""
+    from markdown_it import MarkdownIt
+    from mdit_py_plugins.dollarmath import dollarmath_plugin
+
+    parser = MarkdownIt("commonmark", {"html": False}).enable("table")
+    dollarmath_plugin(parser, renderer=_formula)
+    tokens = parser.parse(markdown)
+    for token in (part for block in tokens for part in block.children or ()):
+        if address := token.attrs.get("href"):
+            token.attrs["href"] = re.sub(r"\.(ipynb|md)(?=#|$)", ".html", str(address))
+    return parser.renderer.render(tokens, parser.options, {})
+
+
+def _formula(source: str, options: dict[str, Any]) -> str:
+    """Return a formula as MathJax reads it."""
+    begin, end = ("\\[", "\\]") if options["display_mode"] else ("\\(", "\\)")
+    return f"{begin}{html.escape(source)}{end}"
 
 
 def _written(value: Any, form: str) -> str:

@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 from importlib import metadata
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
@@ -24,6 +25,7 @@ from sphinx.application import Sphinx
 
 from book._tools import declared
 from book._tools.declared import Parameter
+from book._tools.notebook import BOOK
 from book._tools.project import PYODIDE, Project
 from studies.kit.parameters import Fields
 from studies.kit.results import published
@@ -33,6 +35,7 @@ DATA = "_static/run"
 REPOSITORY = "_static/zwfs.zip"
 KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the version that this book uses
 FOLDERS = ("book", "environment", "notebooks", "tests", "zwfs")
+PURE = "array-api-compat", "markdown-it-py", "mdit-py-plugins", "mdurl"  # packages that Pyodide does not have
 SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
 
 
@@ -56,10 +59,18 @@ def form(figure: str, first: bool) -> str:
 
 
 def mark_cells(notebook: NotebookNode) -> None:
-    """Give each cell of code with an output its number as a tag, which is a class on the page, in place."""
+    """Mark on the page, in place, what a run in it replaces, and what holds for the parameters of the book only.
+
+    A cell of code gets its number as a tag, which is a class on the page. Markdown has no such class: the text
+    below the heading of a cell with the tag `BOOK` is put into a block.
+    """
     for number, cell in enumerate(notebook.cells):
+        tags = cell.metadata.get("tags", [])
         if cell.cell_type == "code":
-            cell.metadata.tags = [*cell.metadata.get("tags", []), f"run-{number}"]
+            cell.metadata.tags = [*tags, f"run-{number}"]
+        elif BOOK in tags:
+            heading, _, text = cell.source.partition("\n")
+            cell.source = f"{heading}\n\n::::::::{{div}} {BOOK}\n{text.strip()}\n::::::::"
 
 
 def described(notebook: NotebookNode, name: str) -> dict[str, Any]:
@@ -117,7 +128,7 @@ def site(project: Project) -> bytes:
     files["driver.py"] = Path(__file__).with_name("driver.py").read_bytes()
     about = metadata.distribution("zwfs")
     files[f"zwfs-{about.version}.dist-info/METADATA"] = f"Name: zwfs\nVersion: {about.version}\n".encode()
-    for file in metadata.files("array-api-compat") or ():
+    for file in chain.from_iterable(metadata.files(name) or () for name in PURE):
         if file.suffix == ".py" or file.match("*.dist-info/METADATA") or file.match("*.dist-info/licenses/*"):
             files[file.as_posix()] = file.read_binary()
     return zipped(files)

@@ -101,8 +101,8 @@
       .replace(/(?<=\d) ?%/g, "\u00a0%");
   }
 
-  // Both versions stand in the page; an attribute of the article says which of them is seen.
-  // Text that holds for the parameters of the book only is not seen with others (custom.css).
+  // Both versions stand in the page; an attribute of the article says which of them is seen. With other parameters
+  // than those of the book, its results are grey until those of the reader replace them (run.css).
   let altered = false; // whether the parameters of the last run differ from those of the book
   const show = (which) => {
     article.dataset.run = which;
@@ -126,18 +126,26 @@
     }
   }
 
-  // A table of Markdown, as notebooks show them.
-  function table(markdown) {
-    const rows = markdown.trim().split("\n").map((line) => line.split(/(?<!\\)\|/).slice(1, -1).map(plain));
-    const row = (cells, tag) => make("tr", {}, ...cells.map((text) => make(tag, {}, text)));
-    const body = rows.slice(2).map((cells) => row(cells, "td"));
-    return make("table", { class: "table" }, make("thead", {}, row(rows[0], "th")), make("tbody", {}, ...body));
-  }
-  const plain = (text) => written(text.trim().replace(/\[([^\]]*)\]\([^)]*\)/g, "$1").replace(/\\(.)/g, "$1"));
-
-  function putOutput(number, { markdown }) {
-    const output = article.querySelector(`.tag_run-${number} .cell_output`)?.firstElementChild;
-    if (output && markdown?.startsWith("|")) beside(output, make("div", { class: "pst-scrollable-table-container" }, table(markdown)));
+  // Sentences and tables that a cell shows.
+  function putOutput(number, { html }) {
+    const output = article.querySelector(`.tag_run-${number} .cell_output`);
+    if (!output || !html) return;
+    if (!output.querySelector(":scope > .run-whole")) output.replaceChildren(make("div", { class: "run-whole" }, ...output.childNodes));
+    const yours = make("div", {});
+    yours.innerHTML = html; // of Markdown, without any HTML of its own: see driver.py
+    for (const table of yours.querySelectorAll("table")) {
+      table.classList.add("table");
+      const frame = make("div", { class: "pst-scrollable-table-container" });
+      table.replaceWith(frame);
+      frame.append(table);
+    }
+    const texts = document.createTreeWalker(yours, NodeFilter.SHOW_TEXT);
+    while (texts.nextNode()) {
+      const text = texts.currentNode;
+      if (!text.parentElement.closest("code, .math")) text.data = written(text.data);
+    }
+    beside(output.querySelector(":scope > .run-whole"), yours);
+    window.MathJax?.typesetPromise?.([yours]);
   }
 
   // The page of a notebook: the form, the run and its results.
@@ -188,6 +196,7 @@
     preset(values) {
       this.form.put(values);
       this.changed();
+      if (!Object.keys(this.form.changed).length) show("book");
     }
 
     changed() {
@@ -245,9 +254,10 @@
       const given = { notebook: notebook.name, defaults, given: JSON.stringify(this.values) };
       const refused = await python.call("begin", given);
       if (refused) throw new Error(refused);
-      show("book");
-      altered = Object.keys(this.values).length > 0;
       article.querySelectorAll(".run-yours").forEach((old) => old.remove());
+      article.querySelectorAll(".run-book").forEach((book) => book.classList.remove("run-book"));
+      altered = Object.keys(this.values).length > 0;
+      show("yours");
     }
 
     async cells(last) {
@@ -265,7 +275,6 @@
         putOutput(number, shown);
         for (const [figure, at] of Object.entries(notebook.figures)) if (at === number) await this.putFigure(figure);
         this.next = number + 1;
-        show("yours");
       }
       const seconds = Math.round((performance.now() - this.began) / 1000);
       this.rest.hidden = !cells.slice(this.next).some((cell) => this.runs(cell));
@@ -277,16 +286,16 @@
       return cell.cell_type === "code" && !tags.includes("parameters");
     }
 
-    // Tell the progress of the tasks of a cell, and the time that is left to its sweep.
+    // Tell the progress of the sweeps of a cell. How many sweeps follow is not known: the time left is that of one.
     watch(label, before) {
-      let first = null;
-      python.onProgress = ({ name, done, total }) => {
-        const now = performance.now();
-        if (!first || first.name !== name) first = { name, done, now };
-        const each = (now - first.now) / (done - first.done);
-        const left = done > first.done ? `, about ${Math.ceil((each * (total - done)) / 1000)} s left` : "";
-        this.status.textContent = `${label}: task ${done} of ${total}${left}`;
+      let count = 0;
+      let began = performance.now();
+      python.onProgress = ({ done, total }) => {
+        if (done === 1) count += 1;
+        const left = Math.ceil((performance.now() - began) / done * (total - done) / 1000);
+        this.status.textContent = `${label}, sweep ${count}: task ${done} of ${total}, about ${left} s left in this sweep`;
         this.bar.value = before + done / total;
+        if (done === total) began = performance.now();
       };
     }
 

@@ -11,6 +11,9 @@ from nbformat import NotebookNode
 
 from studies.kit.tables import MISSING
 
+BOOK = "book-parameters"
+"""Tag of the cells of text that hold for the parameters of the book only."""
+
 
 def read(path: Path) -> NotebookNode:
     """Read a notebook in its normal form."""

@@ -20,7 +20,7 @@ from studies.kit.tables import plain
 
 from . import declared, record
 from .declared import Parameter, ParameterError
-from .notebook import normalise, read, title, title_cell, to_bytes, without_gaps
+from .notebook import BOOK, normalise, read, title, title_cell, to_bytes, without_gaps
 from .project import Project
 from .scratch import scratch_folder, swap
 
@@ -202,8 +202,7 @@ def notice(changed: dict[str, Any], parameters: dict[str, Parameter]) -> Noteboo
     ]
     text = [
         "> **The parameters of this page are not those of the book.**",
-        "> Pictures, tables and numbers show this run. The page leaves out sentences that hold for the",
-        "> defaults only; in the notebook they are marked `{.defaults}`.",
+        "> Pictures, tables and numbers show this run. Text on the parameters of the book only is left out.",
         "",
         "| parameter | here | default | unit | meaning |",
         "| --- | --- | --- | --- | --- |",
@@ -234,6 +233,7 @@ def make(
         execute([run], lambda _: None)
         notebook = run.notebook
         if changed:
+            notebook.cells = [cell for cell in notebook.cells if BOOK not in cell.metadata.get("tags", ())]
             notebook.cells.insert(title_cell(notebook) + 1, notice(changed, parameters))
         notebook = without_gaps(normalise(notebook))
         shutil.copytree(run.folder, new)

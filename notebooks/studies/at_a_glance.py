@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded
 from studies.kit.style import LOOKS, show_intensity, show_phase
+from studies.kit.tables import Text, small, two_digits
 from studies.kit.variants import add_narrow
 from zwfs.metrics import reconstruction_error, wrapped_residual
 from zwfs.pupil import Pupil
@@ -53,7 +53,7 @@ def _draw_maps(
     limit = 3 * rms
     figure, panels = plt.subplot_mosaic(layout, figsize=size)
     shown = show_phase(panels["input"], truth, limit)
-    panels["input"].set_title(f"Input: {rms:.1f} rad rms", fontsize=letters)
+    panels["input"].set_title(f"Input: {two_digits(rms)} rad rms", fontsize=letters)
     top = np.quantile(list(frames.values()), 0.99)
     for title, frame in frames.items():
         light = show_intensity(panels[title], np.where(pupil.inside, frame, np.nan), top)
@@ -82,11 +82,14 @@ def _error(rms: float) -> str:
     return f"error: below $10^{{{np.ceil(np.log10(max(rms, _ROUNDING))):.0f}}}$ rad"
 
 
-def numbers(pupil: Pupil, phase: NDArray, estimates: Mapping[str, NDArray]) -> dict[str, float | str]:
-    """Wavefront error and error of each method, radian rms."""
-    rms = {"input": float(pupil.rms(phase))}
-    rms |= {f"error_{name}": float(reconstruction_error(pupil, one, phase)) for name, one in estimates.items()}
-    shifted = rms["error_PhaseShifted"]
-    text = "below 10⁻⁶ rad rms" if shifted < 1e-6 else f"{shifted:.2g} rad rms"
-    tiny = {name: value for name, value in rms.items() if value <= 0.01}  # their second digit is rounding
-    return rounded(rms, ".2g") | rounded(tiny, ".1g") | {"error_text": text}
+def findings(pupil: Pupil, phase: NDArray, estimates: Mapping[str, NDArray]) -> Text:
+    """Return the error of each method."""
+    linear, arcsine, shifted = (
+        f"{small(reconstruction_error(pupil, estimates[name], phase).item()).replace('<', 'below ')} rad rms"
+        for name in ("Linear", "Arcsine", "PhaseShifted")
+    )
+    return Text(
+        f"**From one image of a wavefront of {two_digits(pupil.rms(phase).item())} rad rms, the error of the "
+        f"linear method is {linear}, and that of the arcsine {arcsine}. From two images, the error of the "
+        f"phase-shifted iteration is {shifted}.**"
+    )

@@ -16,7 +16,7 @@ from studies.kit import sweeps
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded, screen_errors, stacked
 from studies.kit.style import LOOKS
-from studies.kit.tables import Table
+from studies.kit.tables import Table, Text, two_digits
 from zwfs.bounds import cramer_rao
 from zwfs.metrics import reconstruction_error
 from zwfs.polychromatic import PolychromaticSensor
@@ -61,7 +61,7 @@ class BandCurves:
         return _rms(self.biases[way])
 
     def at(self, bandwidth: float) -> int:
-        """Place of the bandwidth that is nearest."""
+        """Place of the sampled bandwidth nearest to `bandwidth`: text on it names the sampled one."""
         return int(np.argmin(np.abs(self.bandwidths - bandwidth)))
 
     def equal_photons(self, way: str) -> NDArray[np.float64]:
@@ -116,8 +116,6 @@ def _rms(values: NDArray) -> NDArray[np.float64]:
 
 CaseCurves = Mapping[tuple[float, bool], BandCurves]  # of each input, radian rms, and chromatic or not
 _LINES = {"ignored": ("-", None), "known": ("--", "white")}  # and faces of the markers
-TABLED = 0.05, 0.10, 0.25
-"""Bandwidths in the table and in the text."""
 
 
 def draw_band_errors(curves: CaseCurves) -> Figure:
@@ -162,28 +160,57 @@ def band_screens(curves: CaseCurves) -> dict[str, NDArray]:
     return stacked("case", tables)
 
 
+def findings(curves: CaseCurves) -> Text:
+    """Return the cost of an ignored and of a known band."""
+    some_curves = next(iter(curves.values()))
+    costs = []
+    for place in sorted({some_curves.at(0.10), int(np.argmax(some_curves.bandwidths))}):
+        least, most = (two_digits(100 * value) for value in _biases(curves, place))
+        costs.append(f"{least} to {most} % of the input in a band of {_width(some_curves, place)}")
+    known = max((one.error(KNOWN) / one.bound).max() for one in curves.values())
+    text = (
+        "**If the band is ignored, the error of the phase-shifted iteration without noise is "
+        f"{', and '.join(costs)}. A reconstructor that knows the band stays within {known:.3g} times the photon "
+        "limit.**"
+    )
+    rms = max(rms for rms, _ in curves)
+    large = curves[rms, True]
+    if large.bandwidths[place]:
+        photons = two_digits(large.equal_photons(SHIFTED)[place])
+        text += (
+            f" At {rms:g} rad rms, with chromatic shifts and a band of {_width(large, place)}, photon noise is as "
+            f"large as this error at {photons} photons per point and image."
+        )
+    return Text(text)
+
+
+def _biases(curves: CaseCurves, place: int) -> tuple[float, float]:
+    """Smallest and largest error without noise of the phase-shifted iteration, over the input."""
+    shares = [float(one.bias(SHIFTED)[place]) / rms for (rms, _), one in curves.items()]
+    return min(shares), max(shares)
+
+
+def _width(one: BandCurves, place: int) -> str:
+    return f"{100 * one.bandwidths[place]:g} %"
+
+
 def costs_table(curves: CaseCurves) -> Table:
-    """Error without noise of the reconstructors that ignore the bandwidth, over the input."""
+    """Error without noise of the reconstructors that ignore the bandwidth, over the input, at three bandwidths."""
     short = {SHIFTED: "phase-shifted", IGNORED: "max. lik."}
-    header = ["input, shifts", *(f"{short[way]}, {width:.0%}" for way in IGNORANT for width in TABLED)]
+    some_curves = next(iter(curves.values()))
+    places = sorted({some_curves.at(width) for width in (0.05, 0.10, 0.25)})
+    header = [f"{short[way]}, {_width(some_curves, place)}" for way in IGNORANT for place in places]
     rows = [
         [
             f"{rms:g} rad, {_kind(chromatic)}",
-            *(f"{one.bias(way)[one.at(width)] / rms:.2%}" for way in IGNORANT for width in TABLED),
+            *(f"{one.bias(way)[place] / rms:.2%}" for way in IGNORANT for place in places),
         ]
         for (rms, chromatic), one in curves.items()
     ]
-    return Table(header, rows)
+    return Table(["input, shifts", *header], rows)
 
 
 def numbers(curves: CaseCurves) -> dict[str, float | str]:
-    """Return errors over the bound, errors without noise over the input, and photons at which both are equal."""
-    large = curves[max(rms for rms, _ in curves), True]
-    found = {
-        "known_most": max((one.error(KNOWN) / one.bound).max() for one in curves.values()),
-        "photons_shifted_1_chromatic_10": large.equal_photons(SHIFTED)[large.at(0.10)],
-    }
-    for width in TABLED:
-        shares = [one.bias(SHIFTED)[one.at(width)] / rms for (rms, _), one in curves.items()]
-        found |= {f"least_{100 * width:.0f}": min(shares), f"most_{100 * width:.0f}": max(shares)}
-    return rounded(found, ".3g")
+    """Return the largest error without noise over the input, at each bandwidth but 0."""
+    widths = enumerate(next(iter(curves.values())).bandwidths)
+    return rounded({f"most_{100 * width:g}": _biases(curves, place)[1] for place, width in widths if width}, ".3g")

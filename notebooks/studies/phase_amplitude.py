@@ -16,10 +16,10 @@ from scipy.optimize import brentq
 
 from studies.kit import sweeps
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded, screen_errors, stacked
+from studies.kit.results import screen_errors, stacked
 from studies.kit.setups import screens_at
 from studies.kit.style import LOOKS, show_intensity, show_phase
-from studies.kit.tables import Table
+from studies.kit.tables import Table, Text, two_digits
 from zwfs.bounds import cramer_rao
 from zwfs.detector import Detector
 from zwfs.metrics import reconstruction_error, wrapped_residual
@@ -77,7 +77,7 @@ class AmplitudeCurves:
         return np.sqrt(np.mean(self.errors[way] ** 2, axis=1))
 
     def at(self, variation: float) -> int:
-        """Place of the sampled variation that is nearest to `variation`."""
+        """Place of the sampled variation nearest to `variation`: text on it names the sampled value."""
         return int(np.argmin(np.abs(self.variations - variation)))
 
 
@@ -260,24 +260,47 @@ def amplitude_screens(curves: Mapping[str, AmplitudeCurves]) -> dict[str, NDArra
     )
 
 
-def _errors(
-    pupil: Pupil, phase: NDArray, amplitude: NDArray, estimate: LikelihoodReconstruction
-) -> dict[str, tuple[NDArray, NDArray]]:
-    """Error and standard error of each point, by quantity."""
-    maps = {
-        "phase": (wrapped_residual(pupil, estimate.phase, phase), estimate.sigma),
-        "amplitude": (np.asarray(estimate.amplitude) - amplitude, np.asarray(estimate.sigma_amplitude)),
-    }
-    return {name: (pupil.gather(error), pupil.gather(sigma)) for name, (error, sigma) in maps.items()}
+def findings(curves: Mapping[str, AmplitudeCurves], rms: float, photons: float) -> Text:
+    """Return what an ignored and an estimated amplitude cost."""
+    any_curves = next(iter(curves.values()))
+    place = any_curves.at(0.05)
+    ignored = [
+        (one.error(name) / one.bound)[place]
+        for one in curves.values()
+        for name, way in WAYS.items()
+        if way.amplitude == "ignored"
+    ]
+    estimated = max(np.max(one.error(ESTIMATED) / one.bound) for one in curves.values())
+    return Text(
+        f"**If an amplitude variation of {100 * any_curves.variations[place]:g} % is ignored, the phase error is "
+        f"{two_digits(min(ignored))} to {two_digits(max(ignored))} times the photon limit, the Cramér-Rao bound. "
+        f"If maximum likelihood estimates phase and amplitude together, it is at most {estimated:.3g} times this "
+        f"limit.** The input is {rms:g} rad rms, with {photons:g} photons per point and image."
+    )
 
 
-TABLED = 0.05, 0.2
-"""Variations of the amplitude in the table and in the text."""
+def findings_example(pupil: Pupil, phase: NDArray, amplitude: NDArray, estimate: LikelihoodReconstruction) -> Text:
+    """Return the errors of one estimate, and the shares of them within their standard errors."""
+    sizes, shares = [], []
+    for error, sigma in (
+        (wrapped_residual(pupil, estimate.phase, phase), estimate.sigma),
+        (np.asarray(estimate.amplitude) - amplitude, np.asarray(estimate.sigma_amplitude)),
+    ):
+        sizes.append(two_digits(np.sqrt(np.mean(pupil.gather(error) ** 2))))
+        shares.append(f"{np.mean(np.abs(pupil.gather(error)) < pupil.gather(sigma)):.0%}")
+    return Text(
+        f"The error of the phase is {sizes[0]} rad rms, and that of the amplitude {sizes[1]}. {shares[0]} of the "
+        f"phases and {shares[1]} of the amplitudes are within one standard error. Right error bars have 68%."
+    )
 
 
 def costs_table(curves: Mapping[str, AmplitudeCurves]) -> Table:
-    """Return the error over the bound, and the share of consistent frame sets, of each way."""
-    places = [(one, one.at(value), f"{kind}, {value:.0%}") for kind, one in curves.items() for value in TABLED]
+    """Return the error over the bound, and the share of consistent frame sets, of each way, at two variations."""
+    places = [
+        (one, place, f"{kind}, {100 * one.variations[place]:g} %")
+        for kind, one in curves.items()
+        for place in sorted({one.at(0.05), one.at(0.2)})
+    ]
     rows = []
     for name, way in WAYS.items():
         ratios = [f"{one.error(name)[place] / one.bound[place]:.2f}" for one, place, _ in places]
@@ -285,26 +308,3 @@ def costs_table(curves: Mapping[str, AmplitudeCurves]) -> Table:
         consistent = f"{np.mean(known):.0%}" if known else "not tested"
         rows.append([LOOKS[way.method].name, way.amplitude, *ratios, consistent])
     return Table(["method", "amplitude", *(title for _, _, title in places), "consistent"], rows)
-
-
-def numbers(
-    curves: Mapping[str, AmplitudeCurves],
-    example: tuple[Pupil, NDArray, NDArray, LikelihoodReconstruction],
-    settings: Mapping[str, float],
-) -> dict[str, float | str]:
-    """Return the settings, ratios to the bound, shares of consistent frame sets, and errors of the example."""
-    short = {"PhaseShifted": "shifted", "MaximumLikelihood": "likely"}
-    found = dict(settings)
-    for kind, one in curves.items():
-        for name, way in WAYS.items():
-            ratio = one.error(name) / one.bound
-            for value in TABLED:
-                found[f"{short[way.method]}_{way.amplitude}_{kind}_{100 * value:.0f}"] = ratio[one.at(value)]
-    best = np.concatenate([one.error(ESTIMATED) / one.bound for one in curves.values()])
-    found |= {"estimated_lowest": best.min(), "estimated_highest": best.max()}
-    for name in next(iter(curves.values())).consistent:
-        varied = [one.consistent[name][one.at(value)] for one in curves.values() for value in TABLED]
-        found[f"consistent_{WAYS[name].amplitude}"] = np.mean(varied)
-    for name, (error, sigma) in _errors(*example).items():
-        found |= {f"example_{name}": np.sqrt(np.mean(error**2)), f"within_{name}": np.mean(np.abs(error) < sigma)}
-    return rounded(found, ".4g")

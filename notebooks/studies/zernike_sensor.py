@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from studies.kit.drawings import FOCUS_MAP, Picture, draw_layout, focal_light
 from studies.kit.parameters import USUAL
-from studies.kit.results import rounded
 from studies.kit.style import INTENSITY_MAP, LOOKS, PHASE_MAP, dashed_circle, show_phase
+from studies.kit.tables import Text
 from zwfs.metrics import wrapped_residual
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
@@ -172,16 +172,20 @@ def _error(value: float) -> str:
     return f"error {value:.2f} rad rms" if value >= 5e-3 else "no error"
 
 
-def numbers(one: NDArray, pixel: Pixel) -> dict[str, float | str]:
-    """Phases that explain the pixel, and the phase from one image, in radian."""
-    return rounded(
-        {
-            "pixel_phase": pixel.phase,
-            "mirrored_a": pixel.mirrored[0],
-            "mirrored_b": pixel.mirrored[1],
-            "one_at_pixel": one[pixel.row, pixel.column],
-            "fold": np.angle(-np.exp(1j * np.angle(pixel.waves[0]))),
-        }
+def findings_pixel(pixel: Pixel) -> Text:
+    """Return the phases that explain the intensities of the pixel."""
+    first, second = pixel.mirrored
+    return Text(
+        f"The pixel has a phase of {pixel.phase:.2f} rad, but image 1 alone also allows {first:.2f} rad, and "
+        f"image 2 alone {second:.2f} rad. Only {pixel.phase:.2f} rad explains both images."
+    )
+
+
+def findings_arcsine(phase: NDArray, pixel: Pixel) -> Text:
+    """Return the phase from one image at the pixel, next to the other phase that explains this image."""
+    return Text(
+        f"At the pixel of [the figure with the arrows](#fig-zernike-phasors), the arcsine gives "
+        f"{phase[pixel.row, pixel.column]:.2f} rad. The wrong solution of image 1 is {pixel.mirrored[0]:.2f} rad."
     )
 
 

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded
 from studies.kit.style import OTHER_STYLES
+from studies.kit.tables import Text, two_digits
 from zwfs import Pupil, power_law_screens, strehl
 
 LIMITS = parameter_limits("n_pixels inputs n_screens")
@@ -35,6 +35,6 @@ def strehl_columns(inputs: list[float], ratio: NDArray) -> dict[str, NDArray]:
     return {"input (rad rms)": np.array(inputs), "Strehl ratio": ratio}
 
 
-def numbers(ratio: NDArray) -> dict[str, float | str]:
-    """Numbers for the text."""
-    return rounded({"lowest": ratio[-1]}, ".2f")
+def findings(inputs: list[float], ratio: NDArray) -> Text:
+    """Return the Strehl ratio at the last input."""
+    return Text(f"**At {inputs[-1]:g} rad rms, the Strehl ratio is {two_digits(ratio[-1])}.**")

@@ -2,7 +2,7 @@
 # %% [markdown]
 # # How fast does the Strehl ratio fall?
 #
-# At the largest input it is {glue:text}`lowest:.2f`.
+# The Strehl ratio is the peak intensity of a star over that without aberrations.
 # %% tags=["parameters"]
 n_pixels = 64  # samples across the pupil diameter D
 inputs = [0.1, 0.5, 1.0]  # wavefront errors, rad rms
@@ -15,7 +15,7 @@ from studies.kit.parameters import check_parameters
 check_parameters(globals(), **study.LIMITS)
 # %% tags=["hide-input"]
 import zwfs
-from studies.kit.results import glue_numbers, publish
+from studies.kit.results import publish
 from studies.kit.style import use_style
 
 use_style()
@@ -24,7 +24,7 @@ pupil = zwfs.Pupil.circular(n_pixels)
 modes = zwfs.zernike_basis(pupil, 50)
 ratio = study.mean_strehl(pupil, modes, inputs, n_screens, seed)
 # %% tags=["hide-input"]
+study.findings(inputs, ratio)
+# %% tags=["hide-input"]
 figure = study.draw_strehl(inputs, ratio)
 publish(figure, "strehl_loss", study.strehl_columns(inputs, ratio))
-# %% tags=["remove-cell"]
-glue_numbers(study.numbers(ratio))

@@ -58,6 +58,11 @@ class Text:
         return self.markdown
 
 
+def two_digits(value: float) -> str:
+    """Return a number with two significant digits, or a dash if it is not finite."""
+    return f"{float(f'{value:.1e}'):g}" if isfinite(value) else MISSING
+
+
 def small(value: float) -> str:
     """Return a number with two significant digits, or a bound below which digits are rounding errors."""
     if not isfinite(value):

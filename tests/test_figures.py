@@ -18,7 +18,6 @@ from studies.bandwidth import BandCurves
 from studies.beyond_dimple import DimpleLimits
 from studies.beyond_range import DIMMED, SECANT, Causes, NoiseCurves
 from studies.calibration import Errors, Measured
-from studies.closed_loop import PLANTS, Divergence, LoopRun
 from studies.dark_zone import IDEAL, Drift, DriftCurves
 from studies.design import PUBLISHED, DesignMap
 from studies.fig04_dimple_diameter import Contraction
@@ -27,7 +26,6 @@ from studies.kit.bench import BenchCurves
 from studies.kit.curves import ErrorCurves, Limit
 from studies.kit.experiments import DiameterCurves, linearity_curves
 from studies.kit.grids import Grid
-from studies.kit.loops import TunedLoops
 from studies.kit.style import ALONE, DARK_PHASE_MAP, LOOKS, OTHER_STYLES, show_phase, use_style
 from studies.kit.variants import dark_color, variants
 from studies.phase_amplitude import AmplitudeCurves
@@ -98,9 +96,6 @@ def drawn_methods(curves, pupil, classic, shifted):
     variants_of_it = ["PhaseShifted", "PhaseShiftedAccelerated", DIMMED, SECANT]
     ingredients = ErrorCurves(three, dict.fromkeys(variants_of_it, np.full((3, 3), 0.1)))
     limited = Causes(ingredients, np.ones((3, 3)), dict.fromkeys(variants_of_it, three), 1.0)
-    loop = LoopRun(three, *np.full((2, 2, 3), 0.1))
-    in_loops = ["Linear", "LinearTwo", "PhaseShifted", "MaximumLikelihood"]
-    tuned = TunedLoops(0.5, 1.0, {}, {}, dict.fromkeys(in_loops, three))
     saxton = zwfs.GerchbergSaxton(shifted)
     bad = np.zeros(frames.shape, bool)
     bad[:, 10, 10] = True
@@ -130,9 +125,8 @@ def drawn_methods(curves, pupil, classic, shifted):
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
     calibrated = Errors(three, [[Measured(0.2, 0.1, 0.3, 0.1, 0.7, 1.0, True)]] * 3)
-    cell = decision.Cell("one", "two", (0.2, 0.1), 0.5, 0.4, 0.6)
-    decided = decision.Row("row", "perfect model", decision.Situation(0.5, 1.0), cell)
-    looped = replace(cell, closed=(1, 2), n_loops=2)
+    decided = decision.Row("perfect model", decision.Situation(0.5, 1.0), ("one", "two"), (0.2, 0.1))
+    looped = replace(decided, bench="", closed=(1, 2), n_loops=2)
     return {
         "draw_slice": ((sliced, "error", "x"), ()),
         "draw_sensor_layout": ((classic, phase), ()),
@@ -168,15 +162,13 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_measured_and_modelled": ((frames, 0.9 * frames, phase), ()),
         "draw_segment_errors": ((bench, commands, dict.fromkeys(two, commands)), two),
         "draw_bench_linearity": ((BenchCurves(np.array([0.5, 1]), pistons, dict.fromkeys(five, pistons)),), five),
-        "draw_comparison": (([decided], [decided._replace(cell=looped)]), ()),
+        "draw_comparison": (([decided], [looped]), ()),
         "draw_budget": ((dict.fromkeys(["none", "blur"], bench_curves), "PhaseShifted"), shifted_only),
         "draw_calibration_errors": ((calibrated, three), shifted_only),
         "draw_explained": ((found,), ()),
         "draw_phase_map": ((found, 635.0), ()),
         "draw_gains": (([step] * 2, [0.1, 0.2]), ()),
         "draw_signs": ((measurement,), ()),
-        "draw_linear_loops": ((Divergence(dict.fromkeys(PLANTS, loop), three, three, three),), ["Linear"]),
-        "draw_tuned_loops": (([tuned],), [name for name in in_loops if name != "LinearTwo"]),
     }
 
 

@@ -149,10 +149,6 @@ DECISION = BENCH | {
     "n_screens": 2, "n_screens_fine": 2, "n_screens_perfect": 2, "n_loops": 2,
     "n_iterations": 3,
 }  # fmt: skip
-LOOP = {
-    "n_pixels": 16, "n_modes": 6, "n_screens": 1, "n_screens_linear": 2, "n_steps": 8, "inputs": [0.4],
-    "photons": [10.0], "gains": [0.4],
-}  # fmt: skip
 ZONE = {"n_pixels": 16, "n_modes": 3, "n_cycles": 4, "n_screens": 1, "photons": [1e8], "photons_gain": [1e8]}
 
 
@@ -211,10 +207,6 @@ CASES = {
     "phase_amplitude": ({"n_pixels": 16, "n_modes": 3, "n_screens": 1, "variations": [0.0, 0.2]},
         {"variations": [0.4]}, *each(variations=[[0.0]], photons=[1.0, 1e9], rms=[0.0, 4.0], shown=[0.0],
         diameter=[8.0], phase_shift=[0.01], n_modes=[1]),
-    ),
-    "closed_loop": (LOOP,
-        {"inputs": [4.0]}, {"inputs": [0.01], "photons": [1e9]}, {"rms": 4.0, "gain": 1.99},
-        *each(photons=[[0.01]], rms=[0.0, 0.01], delay=[10], stroke=[0.1], speed=[0.0], photons_zero=[1.0]),
     ),
     "dark_zone": (ZONE,
         {"drift": 1e3}, {"wavelength": 20000.0, "photons_gain": [1e4, 1e14]}, *each(drift=[0.001],

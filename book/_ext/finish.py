@@ -30,7 +30,7 @@ MOVED = """<!DOCTYPE html>
 </html>
 """
 PHONE = "(max-width: 600px)"
-BY_ROW = "table:is(.claims, .decision), :is(.tag_decision, .tag_closed-loop) table"
+BY_ROW = "table:is(.claims, .decision), .tag_decision table"
 POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e([+-])0*(\d+)\b")
 MINUS = re.compile(r"(?<![\w.)-])-(?=\d)")
 PERCENT = re.compile(r"(?:(?<=\d)|^) ?%")  # the number may be in the element before

@@ -1,10 +1,10 @@
-"""The method that measures best: one image or two, much light or little, the bench known or only its design."""
+"""One image or two: the best method with each, in open loop and in closed loop, on a bench with errors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -15,20 +15,10 @@ from numpy.typing import NDArray
 
 from studies.kit import sweeps
 from studies.kit.bench import poked_frames, poked_linear
-from studies.kit.loops import (
-    ALIKE,
-    BestMethods,
-    TunedLoops,
-    one_over_two,
-    paired_ratio,
-    short_name,
-    two_digits,
-    typical,
-)
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import OTHER_STYLES, TALL
-from studies.kit.tables import MISSING, Table
+from studies.kit.tables import MISSING, Table, Text
 from zwfs import Arcsine, MaximumLikelihood, PhaseShifted, Pupil
 from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.turbulence import FrozenFlow
@@ -43,8 +33,6 @@ LIMITS = parameter_limits(
     **dict.fromkeys(("photons", "photons_faint"), (10.0, 1e9)),
     **dict.fromkeys(("photons_loop", "photons_loop_faint"), (0.01, 1e9)),
     **dict.fromkeys(("n_screens", "n_screens_fine", "n_screens_perfect", "n_loops"), (2, 1000)),
-    other_diameter=(0.1, 2.2),
-    other_shift=(0.05, 0.95),
 )
 
 QUICK = dict.fromkeys(("n_screens", "n_screens_fine", "n_screens_perfect", "n_loops"), 2)
@@ -60,23 +48,20 @@ TWO_IMAGES = {
     "MaximumLikelihood": "maximum likelihood",
 }
 """Methods, the simplest first, and their names in the table."""
-UNCORRECTED = "PhaseShifted with the offset of its flat"
-
 _N_DARKS = 16  # averaged
 
 
 RATE, DELAY, N_STEPS = 1000.0, 2, 40  # of the loops: 1/s, steps, steps
 WIND = {"speed": 2.5, "cutoff": 3.0, "exponent": -2.0}
 GAINS = 0.1, 0.2, 0.6, 0.8
-"""Settings of the chapter on closed loops."""
+"""Settings of the loops."""
 _ON_BENCH = {"Linear": "classic", "LinearTwo": "shifted"}
 """Methods of the loops, and their sensors in `BenchModel`."""
 _MARKERS: dict[str, dict[str, Any]] = {
     "two images": {"color": OTHER_STYLES[0]["color"], "marker": "o", "ms": 11, "mfc": "none", "mew": 2},
     "one image": {"color": OTHER_STYLES[1]["color"], "marker": "X", "ms": 8},
 }
-_MUCH = 3.0  # ratio of errors beyond which one image fails
-_DIAMETER = 8.0  # of the telescope that the wind speed in m/s belongs to, m
+_ALIKE = 1.1  # ratio of errors up to which two methods count as equal
 
 
 class Situation(NamedTuple):
@@ -134,7 +119,7 @@ def know_bench(bench: Bench, photons: float, poke: float, *, seed: int) -> Known
     """Record what the methods know of a bench, with photons per pixel of the pupil in each frame."""
     bench = dimmed(bench, photons)
     masked, *darks = np.random.SeedSequence(seed).spawn(1 + _N_DARKS)
-    dark = np.mean([bench.dark(one) for one in darks], axis=0)
+    dark = np.mean([bench.dark(draw) for draw in darks], axis=0)
     model = BenchModel.from_images(bench, seed)
     return Known(
         bench, dark, bench.frames(None, masked) - dark, model, poked_frames(bench, model, poke, seed), poke
@@ -181,7 +166,7 @@ def _errors(
     n_iterations: int,
     seed: int,
 ) -> dict[str, NDArray[np.float64]]:
-    """Errors of all methods in a situation, (n_screens,); each subtracts what it finds for the flat command."""
+    """Errors of all methods in a situation, (n_screens,); each subtracts its estimate of the flat command."""
     name, row = task
     known, (rms, photons) = benches[name], situations[name][row]
     draws, noise = np.random.SeedSequence(seed, spawn_key=(row,)).spawn(2)
@@ -189,19 +174,15 @@ def _errors(
     commands = segment_screens(bench, rms, n_screens[name], seed=draws)
     alone, pair = shots(known, photons, commands, noise)
 
-    def errors(pistons: NDArray) -> NDArray[np.float64]:
-        return np.sqrt(np.mean(segment_residual(pistons, commands) ** 2, axis=-1))
-
-    found = {}
+    errors = {}
     for method, reconstruct in _methods(known, photons, n_iterations).items():
         n_images = reconstruct.sensor.n_masks
         shot = alone if n_images == 1 else pair
         counts = np.concatenate([known.flat[np.newaxis, :n_images], shot.counts / shot.share])
         pistons = model.pistons(reconstruct(counts / model.scale[:n_images]).phase)
-        found[method] = errors(pistons[1:] - pistons[0])
-        if method == "PhaseShifted":
-            found[UNCORRECTED] = errors(pistons[1:])
-    return found
+        residual = segment_residual(pistons[1:] - pistons[0], commands)
+        errors[method] = np.sqrt(np.mean(residual**2, axis=-1))
+    return errors
 
 
 def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
@@ -221,50 +202,42 @@ def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
     }
 
 
-def bench_loops(known: Known, situations: Sequence[Situation], n_screens: int, seed: int) -> list[BestMethods]:
-    """Close linear loops on a bench, with the wind, the delay and the gains of the chapter on closed loops.
+class Loops(NamedTuple):
+    """Loops that were closed with one method, at its best gain."""
+
+    gain: float
+    residuals: NDArray[np.float64]  # (n_loops,), rad rms over the segments
+
+    def closed(self, start: float) -> NDArray[np.bool_]:
+        """Whether each loop ends below half of the error at its start."""
+        return self.residuals < start / 2
+
+
+def bench_loops(known: Known, situations: Sequence[Situation], n_loops: int, seed: int) -> list[dict[str, Loops]]:
+    """Close linear loops on a bench in each situation, with one image and with two.
 
     The response to pokes calibrates the method, and the mirror is led to its flat command.
     """
     tasks = [(situation, name) for situation in situations for name in _ON_BENCH]
-    found = iter(sweeps.run(_tuned_on_bench, tasks, known, n_screens, seed, name="bench_loops"))
-    compared = []
-    for rms, photons in situations:
-        each = zip(*islice(found, len(_ON_BENCH)), strict=True)
-        gains, chosen, settled = (dict(zip(_ON_BENCH, some, strict=True)) for some in each)
-        loops = TunedLoops(rms, photons, gains, chosen, settled)
-        compared.append(BestMethods.of(loops, "Linear", "LinearTwo"))
-    return compared
+    loops = sweeps.run(_tuned_on_bench, tasks, known, n_loops, seed, name="bench_loops")
+    size = len(_ON_BENCH)
+    return [
+        dict(zip(_ON_BENCH, loops[first:last], strict=True))
+        for first, last in pairwise(range(0, len(loops) + 1, size))
+    ]
 
 
-def dimple_ratios(loops: Sequence[BestMethods], known: Known, n_screens: int, seed: int) -> list[float]:
-    """Residual of two images on a bench with other dimples over that of these loops, which differ in nothing else.
-
-    Each is the ratio of the geometric means over the loops that close with both; NaN if there are none.
-    """
-    tasks = [(Situation(one.loops.start, one.loops.photons), "LinearTwo") for one in loops]
-    found = sweeps.run(_tuned_on_bench, tasks, known, n_screens, seed, name="dimple_ratios")
-    ratios = []
-    for one, (_, _, other) in zip(loops, found, strict=True):
-        usual = one.loops.settled["LinearTwo"]
-        both = np.maximum(usual, other) < one.loops.start / 2
-        ratios.append(paired_ratio(other[both], usual[both])[0] if both.any() else np.nan)
-    return ratios
-
-
-def _tuned_on_bench(
-    task: tuple[Situation, str], known: Known, n_screens: int, seed: int
-) -> tuple[float, float, NDArray[np.float64]]:
-    """Best gain on a sixth as many screens, the residual there, and the residuals on new screens, rad rms."""
+def _tuned_on_bench(task: tuple[Situation, str], known: Known, n_loops: int, seed: int) -> Loops:
+    """Choose the gain on a sixth as many screens, and close loops on new ones."""
     (rms, photons), name = task
     linear = poked_linear(getattr(known.model, _ON_BENCH[name]), known.model, known.poked, known.poke)
     camera = Camera.of(known, photons, linear.sensor.n_masks)
     first, then = map(int, np.random.SeedSequence(seed).generate_state(2))
-    few = drifting_pistons(known.bench, rms, max(1, n_screens // 6), first)
+    few = drifting_pistons(known.bench, rms, max(1, n_loops // 6), first)
     scores = {gain: typical(_close_loops(known, linear, camera, gain, few, first)) for gain in GAINS}
     best = min(scores, key=lambda gain: scores[gain])
-    many = drifting_pistons(known.bench, rms, n_screens, then)
-    return best, scores[best], _close_loops(known, linear, camera, best, many, then)
+    many = drifting_pistons(known.bench, rms, n_loops, then)
+    return Loops(best, _close_loops(known, linear, camera, best, many, then))
 
 
 def drifting_pistons(bench: Bench, rms: float, n_screens: int, seed: int) -> NDArray[np.float64]:
@@ -290,84 +263,35 @@ def _close_loops(
     flat = model.pistons(linear(known.flat[:k] / model.scale[:k]).phase)
     mirror = [np.zeros(pistons[:, 0].shape)] * DELAY
     residual = []
-    for wanted in pistons.swapaxes(0, 1):
-        residual.append(wanted + mirror[-DELAY])
+    for drifted in pistons.swapaxes(0, 1):
+        residual.append(drifted + mirror[-DELAY])
         counts, share = camera.shot(residual[-1], noise)
-        found = model.pistons(linear(counts / share / model.scale[:k]).phase) - flat
-        mirror.append(mirror[-1] - gain * found)
+        measured = model.pistons(linear(counts / share / model.scale[:k]).phase) - flat
+        mirror.append(mirror[-1] - gain * measured)
     # Not modulo 2 pi: a segment that is a wave off is not flat, though the sensor sees no error.
     return np.sqrt(np.mean(np.var(residual[-(len(residual) // 3) :], axis=-1), axis=0))
 
 
+def typical(errors: NDArray) -> float:
+    """Geometric mean of errors, which counts loops that diverged without ignoring the others."""
+    return float(np.exp(np.mean(np.log(errors))))
+
+
 @dataclass(frozen=True)
-class Cell:
-    """Best method with one image and with two, and how they compare."""
+class Row:
+    """One situation: the best method with one image and with two, in this order."""
 
-    one: str
-    two: str
-    typical: tuple[float, float]  # errors with one and two images, rad rms: geometric mean, of loops that close
-    ratio: float  # error with two images over that with one
-    low: float  # the ratio less and plus twice its standard error
-    high: float
-    closed: tuple[int, int] | None = None  # loops that close with one and two images
-    n_loops: int = 0
-
-    @property
-    def images(self) -> int | None:
-        """Number of images that wins, None if the two differ by less than twice the standard error or `ALIKE`."""
-        if max(self.ratio, 1 / self.ratio) <= ALIKE:
-            return None
-        return 2 if self.high < 1 else 1 if self.low > 1 else None
-
-    @property
-    def texts(self) -> dict[str, str]:
-        """Errors with two images and with one, methods, and loops that close; no error where at most half do."""
-        one, two = self._error(0), self._error(1)
-        alike = self.one == self.two or one == MISSING
-        method = self.two if alike else f"{self.two}; one image: {self.one}"
-        first, both = self.closed or (MISSING, MISSING)
-        closed = {"closed": f"{both} / {first}", "closed_one": f"{first}", "closed_two": f"{both}"}
-        return {"two": two, "one": one, "method": method, **closed}
-
-    def _error(self, place: int) -> str:
-        few = self.closed is not None and self.closed[place] <= self.n_loops / 2
-        return MISSING if few else two_digits(self.typical[place])
-
-
-def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
-    """Name of the first method that agrees with the best one within the scatter, or within `ALIKE`."""
-    known = [name for name in names if name in errors]
-    best = min(known, key=lambda name: typical(errors[name]))
-    return next(name for name in known if name == best or paired_ratio(errors[name], errors[best])[1] <= ALIKE)
-
-
-def open_cell(errors: Mapping[str, NDArray]) -> Cell:
-    """Compare the methods in open loop."""
-    one, two = simplest(errors, ONE_IMAGE), simplest(errors, TWO_IMAGES)
-    both = typical(errors[one]), typical(errors[two])
-    return Cell(ONE_IMAGE[one], TWO_IMAGES[two], both, *paired_ratio(errors[two], errors[one]))
-
-
-def loop_cell(found: BestMethods) -> Cell:
-    """Result of the study of closed loops."""
-    loops, names = found.loops, (found.one, found.two)
-    closed = [loops.closed(name) for name in names]
-    left = [
-        typical(loops.settled[name][ends if ends.any() else ~ends])
-        for name, ends in zip(names, closed, strict=True)
-    ]
-    counts = int(closed[0].sum()), int(closed[1].sum())
-    one, two = (f"{short_name(name)}, gain {loops.gains[name]:g}" for name in names)
-    return Cell(one, two, (left[0], left[1]), found.ratio, found.low, found.high, counts, closed[0].size)
-
-
-class Row(NamedTuple):
-    """A row of the figure and of a table."""
-
-    key: str
     bench: str  # in words; none for a loop
     at: Situation
-    cell: Cell
+    methods: tuple[str, str]
+    errors: tuple[float, float]  # rad rms: geometric means, in loops of those that close
+    closed: tuple[int, int] = (0, 0)  # loops that close
+    n_loops: int = 0  # none in open loop
+
+    @property
+    def gain(self) -> float:
+        """Error with one image over that with two."""
+        return self.errors[0] / self.errors[1]
 
     @property
     def start(self) -> str:
@@ -375,28 +299,54 @@ class Row(NamedTuple):
         return f"{self.at.rms:g} rad rms"
 
     @property
-    def photons(self) -> str:
-        """Photons per point and image of two."""
-        return f"{self.at.photons:g}"
+    def method(self) -> str:
+        """Methods in words."""
+        one, two = self.methods
+        return two if one == two else f"{two}; one image: {one}"
+
+    def error(self, n_images: int) -> str:
+        """Error in words; none where at most half of the loops close."""
+        few = self.n_loops > 0 and self.closed[n_images - 1] <= self.n_loops / 2
+        return MISSING if few else two_digits(self.errors[n_images - 1])
+
+
+def two_digits(error: float) -> str:
+    """Error with two significant digits, trailing zeros included."""
+    return f"{error:#.2g}".rstrip(".")
+
+
+def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
+    """Name of the first method whose error is within `_ALIKE` of the smallest one."""
+    means = {name: typical(errors[name]) for name in names}
+    return next(name for name, mean in means.items() if mean <= _ALIKE * min(means.values()))
 
 
 def open_rows(
     situations: Mapping[str, Sequence[Situation]], errors: Mapping[str, Sequence[Mapping[str, NDArray]]]
 ) -> list[Row]:
     """Rows of the open loop, for each bench."""
-    return [
-        Row(f"{bench}_{index}", BENCHES[bench], situation, open_cell(some))
-        for bench, rows in errors.items()
-        for index, (situation, some) in enumerate(zip(situations[bench], rows, strict=True), 1)
-    ]
+    rows = []
+    for bench, cases in errors.items():
+        for situation, case in zip(situations[bench], cases, strict=True):
+            one, two = simplest(case, ONE_IMAGE), simplest(case, TWO_IMAGES)
+            means = typical(case[one]), typical(case[two])
+            rows.append(Row(BENCHES[bench], situation, (ONE_IMAGE[one], TWO_IMAGES[two]), means))
+    return in_order(rows)
 
 
-def loop_rows(found: Sequence[BestMethods]) -> list[Row]:
+def loop_rows(situations: Sequence[Situation], loops: Sequence[Mapping[str, Loops]]) -> list[Row]:
     """Rows of the closed loops."""
-    return [
-        Row(f"closed_{index}", "", Situation(one.loops.start, one.loops.photons), loop_cell(one))
-        for index, one in enumerate(found, 1)
-    ]
+    rows = []
+    for situation, tuned in zip(situations, loops, strict=True):
+        methods, errors, counts = [], [], []
+        for name in _ON_BENCH:
+            closed = tuned[name].closed(situation.rms)
+            methods.append(f"linear, gain {tuned[name].gain:g}")
+            errors.append(typical(tuned[name].residuals[closed if closed.any() else ~closed]))
+            counts.append(int(closed.sum()))
+        one, two = methods
+        rows.append(Row("", situation, (one, two), (errors[0], errors[1]), (counts[0], counts[1]), closed.size))
+    return in_order(rows)
 
 
 def in_order(rows: Iterable[Row]) -> list[Row]:
@@ -405,16 +355,52 @@ def in_order(rows: Iterable[Row]) -> list[Row]:
     return sorted(rows, key=lambda row: (benches.index(row.bench), row.at.rms, -row.at.photons))
 
 
+def findings(open_loop: Sequence[Row], loops: Sequence[Row]) -> Text:
+    """Say where two images are better than one, and by how much."""
+    better = [row for row in open_loop if row.gain > _ALIKE]
+    text = f"In open loop, two images have the smaller error in {len(better)} of {len(open_loop)} cases"
+    if better:
+        most = max(better, key=lambda row: row.gain)
+        text += f", by a factor of up to {two_digits(most.gain)} ({_case(most)})"
+    alike = [_case(row) for row in open_loop if 1 / _ALIKE <= row.gain <= _ALIKE]
+    worse = [_case(row) for row in open_loop if row.gain < 1 / _ALIKE]
+    text += "." + "".join(
+        f" {words}: {', '.join(cases)}."
+        for words, cases in (("About equal", alike), ("One image is better", worse))
+        if cases
+    )
+    unequal = [row for row in loops if row.closed[0] != row.closed[1]]
+    equal = [f"{row.closed[0]} at {_start(row)}" for row in loops if row not in unequal]
+    text += f"\n\nIn closed loop, of {loops[0].n_loops} loops each, "
+    if unequal:
+        counts = [f"{row.closed[1]} instead of {row.closed[0]} at {_start(row)}" for row in unequal]
+        text += f"these close with two images instead of one: {'; '.join(counts)}. "
+    if equal:
+        text += f"{'E' if unequal else 'e'}qually many close with both: {'; '.join(equal)}."
+    return Text(text.strip())
+
+
+def _start(row: Row) -> str:
+    return f"{row.start} and {_light(row)}"
+
+
+def _case(row: Row) -> str:
+    return f"{row.bench}, {row.start}, {_light(row)}"
+
+
+def _light(row: Row) -> str:
+    return f"{row.at.photons:g} photon{'' if row.at.photons == 1 else 's'}"
+
+
 def draw_comparison(open_loop: Sequence[Row], loops: Sequence[Row]) -> Figure:
     """Errors in open loop and loops that close, with two images and with one."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 5), width_ratios=(1.25, 1))
-    open_loop, loops = in_order(open_loop), in_order(loops)
-    errors = [row.cell.typical for row in open_loop]
+    errors = [row.errors for row in open_loop]
     _pairs(left, open_loop, errors, two_digits)
     room = np.min(errors) / 3, 3 * np.max(errors)  # for the numbers at the markers
     left.set(xscale="log", xlim=room, title="open loop", xlabel="error (rad rms)")
-    n_loops = loops[0].cell.n_loops
-    _pairs(right, loops, [row.cell.closed or (0, 0) for row in loops], str)
+    n_loops = loops[0].n_loops
+    _pairs(right, loops, [row.closed for row in loops], str)
     right.set(xlim=(-0.1 * n_loops, 1.1 * n_loops), xticks=(0, n_loops / 2, n_loops))
     right.set(title="closed loop", xlabel=f"loops that close (of {n_loops})")
     figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=2)
@@ -445,75 +431,48 @@ def _write(axes: Axes, x: float, y: float, text: str, color: str, *, up: bool) -
 
 
 def _label(row: Row) -> str:
-    light = f"{row.photons} photon{'' if row.photons == '1' else 's'}"
     first = f"{row.bench}\n" if row.bench else ""
-    return f"{first}{row.at.rms:g} rad, {light}"
+    return f"{first}{row.at.rms:g} rad, {_light(row)}"
 
 
 def open_table(rows: Sequence[Row]) -> Table:
-    """Error of the best method with two images and with one, and their ratio, for each bench and wavefront."""
-    header = ["situation", "photons per point and image", "error, two images", "error, one image", "one over two"]
-    header += ["method"]
-    return Table(header, [_cells(row, "two", "one", "ratio", "method") for row in in_order(rows)])
+    """Error of the best method with two images and with one, for each bench and wavefront."""
+    header = ["situation", "photons per point and image", "error, two images", "error, one image", "method"]
+    cells = [
+        [f"{row.bench}, {row.start}", f"{row.at.photons:g}", row.error(2), row.error(1), row.method]
+        for row in rows
+    ]
+    return Table(header, cells)
 
 
 def loop_table(rows: Sequence[Row]) -> Table:
     """Loops that close, residual and gain with two images and with one."""
-    n_loops = max((row.cell.n_loops for row in rows), default=0)
-    header = [
-        "initial error",
-        "photons per point, image and step",
-        f"loops that close (of {n_loops}), two / one image",
-    ]
+    header = ["initial error", "photons per point, image and step", "loops that close, two / one image"]
     header += ["error, two images", "error, one image", "method"]
-    return Table(header, [_cells(row, "closed", "two", "one", "method") for row in in_order(rows)])
+    cells = [
+        [
+            row.start,
+            f"{row.at.photons:g}",
+            f"{row.closed[1]} / {row.closed[0]}",
+            row.error(2),
+            row.error(1),
+            row.method,
+        ]
+        for row in rows
+    ]
+    return Table(header, cells)
 
 
-def _cells(row: Row, *names: str) -> list[str]:
-    texts = row.cell.texts | {"ratio": one_over_two(row.cell)}
-    situation = f"{row.bench}, {row.start}" if row.bench else row.start
-    return [situation, row.photons, *(texts[name] for name in names)]
-
-
-def _likelihood_ratios(errors: Sequence[Mapping[str, NDArray]]) -> list[float]:
-    """Error of maximum likelihood over that of the phase-shifted iteration, in each situation of the open loop."""
-    return [paired_ratio(one["MaximumLikelihood"], one["PhaseShifted"])[0] for one in errors]
-
-
-def numbers(
-    rows: Sequence[Row],
-    errors: Mapping[str, Sequence[Mapping[str, NDArray]]],
-    dimples: Sequence[float],
-) -> dict[str, float | str]:
-    """Situations and results in words, and extremes."""
-    found: dict[str, float | str] = {}
-    for row in rows:
-        found |= {f"{row.key}_start": row.start, f"{row.key}_photons": row.photons}
-        found |= {f"{row.key}_{name}": text for name, text in row.cell.texts.items()}
-        found[f"{row.key}_span"] = one_over_two(row.cell)
-    [cell] = (row.cell for row in rows if row.key == "real_3")
-    small, bright = errors["real"][-1], errors["perfect"][0]
-    ratio = bright[simplest(bright, ONE_IMAGE)] / bright[simplest(bright, TWO_IMAGES)]
+def numbers(rms: float, rms_small: float, errors: Mapping[str, Sequence[Mapping[str, NDArray]]]) -> dict[str, Any]:
+    """Numbers that other pages quote: inputs, and errors of two images on the bench with errors."""
+    large, _, small = ({name: typical(values) for name, values in case.items()} for case in errors["real"])
     return rounded(
-        found
-        | {
-            "gain_real_3": 1 / cell.ratio,
-            "gain_real_3_least": 1 / cell.high,
-            "gain_real_3_most": 1 / cell.low,
-            "one_fails": float(np.mean(ratio > _MUCH)),
-            "likelihood_least": min(_likelihood_ratios(errors["perfect"])),
-            "likelihood_most": max(_likelihood_ratios(errors["perfect"])),
-            "offset_ratio": paired_ratio(small[UNCORRECTED], small[simplest(small, ONE_IMAGE)])[0],
-            "flat_ratio": paired_ratio(small["PhaseShifted"], small[simplest(small, ONE_IMAGE)])[0],
-            "fine_iteration": typical(errors["fine"][0]["PhaseShifted"]),
-            "dimple_least": min(dimples),
-            "dimple_most": max(dimples),
-            "loop_rate": RATE / 1e3,
-            "loop_delay": DELAY,
-            "loop_wind": WIND["speed"] * _DIAMETER,
-            "loop_diameter": _DIAMETER,
-            "loop_gain_least": min(GAINS),
-            "loop_gain_most": max(GAINS),
+        {
+            "rms": rms,
+            "rms_small": rms_small,
+            "real_large": min(large[name] for name in TWO_IMAGES),
+            "real_small": small["LinearTwo"],
+            "fine_large": typical(errors["fine"][0]["PhaseShifted"]),
         },
-        ".3g",
+        ".2g",
     )

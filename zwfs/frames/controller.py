@@ -27,6 +27,7 @@ from zwfs.frames._blocks import broken
 from zwfs.frames._fits import FIRST_BYTES, fits_content, fits_module
 from zwfs.frames._pokes import Inverse, Pokes, Signals, faintest, image_shape, roughness
 from zwfs.reconstructors import MaximumLikelihood
+from zwfs.reconstructors._tracking import Tracking
 
 if TYPE_CHECKING:
     from zwfs.frames.calibration import Calibration
@@ -308,6 +309,8 @@ class PhaseController:
     ) -> None:  # fmt: skip
         self._calibration = replace(calibration, n_iterations=n_iterations, tolerance=0.0)
         self._work, self._faintest = self._calibration._work, faintest
+        self._straight = self._work.straight(calibration.saturation)
+        self._tracking = None if likelihood else Tracking.of(self._work.reconstruct)
         flat, modes = pokes.phases(calibration)
         modes /= poke
         self._points = np.flatnonzero(calibration.good)
@@ -315,8 +318,15 @@ class PhaseController:
         inverse = Inverse.of(responses.T, rcond, roughness(responses, self._points))
         self.matrix = read_only((gain * inverse.matrix).astype(np.float32))
         self.gain, self.n_kept, self.n_commands = gain, len(inverse.directions), len(modes)
-        self._weights = (calibration.weights / calibration.unit[:, np.newaxis, np.newaxis]).astype(np.float32)
-        self._mean = (calibration.good.ravel() / len(self._points)).astype(np.float32)
+        weights = (calibration.weights / calibration.unit[:, np.newaxis, np.newaxis]).astype(np.float32)
+        self._own, crossed = weights[(0, 1), (0, 1)], weights[(0, 1), (1, 0)]
+        self._crossed = crossed if crossed.any() else None  # of the other image
+        inside, (holes, nearest) = calibration.sensor.pupil.inside.ravel(), self._work.holes
+        self._mean = inside.astype(np.float32) / np.float32(np.count_nonzero(inside))
+        np.add.at(self._mean, nearest, self._mean[holes])
+        self._mean[holes] = 0
+        self._stop = calibration.sensor.pupil.inside.astype(np.float32)
+        self._stray = float(np.mean(self._work.offset.reshape(2, -1) @ self._mean))
         self._light: NDArray[np.float32] = np.ones(2, np.float32)
         self._light = self._on_grid(pokes.flat)[1] / np.float32(flat.flux)
         self._change, self._turns = np.empty((2, len(self._points)), np.float32)
@@ -351,29 +361,34 @@ class PhaseController:
             phase = self._most_likely(frames)
             np.subtract(phase.ravel()[self._points], self._flat, out=change)
         else:
-            phase = self._work.reconstruct.solve(frames, self.phase[np.newaxis], False).phase[0]
+            if self._tracking:
+                phase = self._tracking(frames[0])
+            else:
+                phase = self._work.reconstruct.solve(frames, self.phase[np.newaxis], False).phase[0]
             self._wrapped(phase)
             phase -= change.mean()  # frames do not show the piston, which noise would move from start to start
+            phase *= self._stop
         self.phase = phase
         return np.dot(self.matrix, change, out=out)
 
     def _on_grid(self, counts: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
         """Counts on the grid, (2, ny, nx), their light over that of the flat mirror, (2,), and bad pixels."""
         calibration = self._calibration
-        images = counts.reshape(1, calibration.n_images, *calibration.shape)
-        work, level, good = self._work, calibration.saturation, calibration.good
-        if work.axes is None:
-            values, _, n_bad, _ = work.on_grid(images, level, good)
-        else:
-            raw, _, n_bad, _ = work.cleaned(images, level, good)
-            values = work.axes[0] @ raw[0] @ work.axes[1].transpose(0, 2, 1)
-        values = values.reshape(2, *good.shape)
+        images, values, n_bad = counts.reshape(-1, *calibration.shape), None, [0]
+        if self._straight:
+            values = self._straight(images)
+        if values is None:
+            level, good = calibration.saturation, calibration.good
+            values, _, n_bad, _ = self._work.on_grid(images[np.newaxis], level, good)
+        values = values.reshape(2, *calibration.good.shape)
         return values, values.reshape(2, -1) @ self._mean / self._light, int(n_bad[0])
 
     def _brightness(self) -> float:
-        """Mean light of modelled frames with the phase of the last frame, in the pupil."""
-        frames = self._work._modelled(self.phase[np.newaxis])[0] - self._work.offset
-        return float(np.mean(frames.reshape(2, -1) @ self._mean))
+        """Mean light of modelled frames with the phase of the last frame, in the pupil; the next one starts there."""
+        if self._tracking:
+            return self._tracking.start(self.phase) - self._stray
+        frames = self._work._modelled(self.phase[np.newaxis])[0]
+        return float(np.mean(frames.reshape(2, -1) @ self._mean)) - self._stray
 
     def _frames(self, counts: NDArray, brightness: float) -> tuple[NDArray[np.float32], float, int]:
         """Ideal frames, (1, n_masks, ny, nx), light over that of the flat mirror, and bad pixels.
@@ -384,8 +399,9 @@ class PhaseController:
         flux = float(light.mean()) / brightness
         light = light / brightness if self._calibration.balance else np.full(2, flux, np.float32)
         values /= np.maximum(light, 1e-30)[:, np.newaxis, np.newaxis]
-        frames = self._weights[:, 0] * values[0]
-        frames += self._weights[:, 1] * values[1]
+        frames = self._own * values
+        if self._crossed is not None:
+            frames += self._crossed * values[::-1]
         frames += work.offset
         frames = frames[: work.reconstruct.sensor.n_masks]
         flat = frames.reshape(len(frames), -1)

@@ -87,6 +87,22 @@ def test_commands_are_those_that_made_the_frame(camera, calibration, pokes, trut
     assert not control.lost
 
 
+def test_fast_road_of_the_phase_agrees_with_the_plain_one(camera, calibration, pokes, truth):
+    fast, plain, straight = (calibration.controller(*pokes, poke=POKE, method="phase-shifted") for _ in range(3))
+    assert fast._tracking and fast._straight
+    straight._straight = plain._tracking = None
+    inside = calibration.sensor.pupil.inside
+    for seed in range(4):
+        counts = camera(5 * truth, (20, seed), light=0.5 + seed)
+        commands = fast(counts)
+        largest = np.abs(commands).max()
+        np.testing.assert_allclose(commands, plain(counts), atol=3e-6 * largest)
+        np.testing.assert_allclose(fast.phase[inside], plain.phase[inside], atol=1e-5)
+        assert not fast.phase[~inside].any()
+        # Rows and columns of the grid lie along those of the camera to 0.02 pixels only.
+        np.testing.assert_allclose(commands, straight(counts), atol=1e-3 * largest)
+
+
 def test_light_is_measured_in_each_frame(camera, controller, truth):
     for light in (3.0, 1.0, 0.01):
         np.testing.assert_allclose(controller(camera(truth, 10, light)), truth, atol=4e-3 / min(light, 1) ** 0.5)

@@ -32,28 +32,28 @@ class Tracking:
         amplitude = settings.amplitude
         self._n_iterations, self._relaxation = settings.n_iterations, acceleration.relaxation
         self._pupil, self._detector = _Plane(sensor.factors.pupil), _Plane(sensor.factors.detector.cut(*sensor.window))
-        self._core, self._darkest = shared.core.astype(np.complex64), shared.darkest
-        self._weights = shared.weights.astype(np.float32)
+        self._core, self._weights = shared.core.astype(np.complex64), shared.weights.astype(np.float32)
         self._offset = np.outer(shared.weights.sum(axis=1), amplitude**2).astype(np.float32)
         n_points = sensor.pupil.n_points
         self._light = float(np.sum(amplitude**2)) / n_points
         self._lost = (light_form(sensor) / (sensor.n_masks * n_points)).astype(np.complex64)
         self._amplitude, self._modulus = amplitude.astype(np.float32), np.empty(amplitude.shape, np.float32)
-        self._psi, self._signal, self._power = np.zeros((3, *amplitude.shape), np.complex64)
+        self._psi, self._signal = np.zeros((2, *amplitude.shape), np.complex64)
+        self._parts = np.empty(self._offset.shape, np.float32)
         self._start = self._pupil.project(self._psi)
 
     def start(self, phase: NDArray[np.float32]) -> float:
         """Start from a phase; return the mean light of its frames in the pupil."""
-        np.cos(phase, out=self._psi.real)
-        np.sin(phase, out=self._psi.imag)
-        self._psi *= self._amplitude
+        for part, function in ((self._psi.real, np.cos), (self._psi.imag, np.sin)):
+            np.multiply(function(phase, out=self._modulus), self._amplitude, out=part)
         self._start = self._pupil.project(self._psi)
         return self._light - float(np.vdot(self._start, self._lost @ self._start).real)
 
     def __call__(self, frames: NDArray[np.float32]) -> NDArray[np.float32]:
         """Phase of frames, (n_masks, ny, nx), from the start."""
-        parts = self._weights @ frames.reshape(len(frames), -1) - self._offset
-        self._signal.real, self._signal.imag = parts.reshape(2, *self._amplitude.shape)
+        parts = np.dot(self._weights, frames.reshape(len(frames), -1), out=self._parts)
+        parts -= self._offset
+        self._signal.real, self._signal.imag = parts.reshape((2, *self._signal.shape))
         coefficients, before = self._start, None
         for iteration in range(self._n_iterations):
             if iteration:
@@ -63,16 +63,12 @@ class Tracking:
         return np.arctan2(self._psi.imag, self._psi.real)
 
     def _solve(self, coefficients: NDArray[np.complex64]) -> None:
-        """Replace the field by that of a wave, but for its modulus; where the wave is dark, it stays."""
-        wave, power = self._detector.expand(coefficients), self._power
-        np.conj(wave, out=power)
-        power *= wave
-        if power.real.min() > self._darkest:
-            power += self._signal
-            np.multiply(power, wave, out=self._psi)
-        else:
-            lit = power.real > self._darkest
-            np.multiply(power + self._signal, wave, out=self._psi, where=lit)
+        """Replace the field by that of a wave, but for its modulus. Of a dark wave, noise decides the phase."""
+        wave = self._detector.expand(coefficients)
+        np.conj(wave, out=self._psi)
+        self._psi *= wave
+        self._psi += self._signal
+        self._psi *= wave
 
     def _normalise(self) -> None:
         """Give the field the amplitude of the pupil."""

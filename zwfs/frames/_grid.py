@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -283,8 +282,9 @@ class _StraightPupil(NamedTuple):
         bad, dark = bad[np.ix_(*firsts)], np.ascontiguousarray(dark[np.ix_(*firsts)])
         repair = _repair(bad, ~bad)
         dark.ravel()[repair[0]] = dark.ravel()[repair[1]]
+        rows, columns = map(_Band.halves, matrices)
         raw, half = np.empty(dark.shape, np.float32), np.empty((len(matrices[0]), dark.shape[1]), np.float32)
-        return cls((box[0], *spans), *map(_Band.halves, matrices), dark, repair, raw, half)
+        return cls((box[0], spans[0], spans[1]), rows, columns, dark, repair, raw, half)
 
 
 class _Band(NamedTuple):

@@ -31,7 +31,8 @@ class Tracking:
         sensor, settings = method.sensor, method.settings
         amplitude = settings.amplitude
         self._n_iterations, self._relaxation = settings.n_iterations, acceleration.relaxation
-        self._pupil, self._detector = _Plane(sensor.factors.pupil), _Plane(sensor.factors.detector.cut(*sensor.window))
+        self._pupil = _Plane(sensor.factors.pupil)
+        self._detector = _Plane(sensor.factors.detector.cut(*sensor.window))
         self._core, self._weights = shared.core.astype(np.complex64), shared.weights.astype(np.float32)
         self._offset = np.outer(shared.weights.sum(axis=1), amplitude**2).astype(np.float32)
         n_points = sensor.pupil.n_points

@@ -100,7 +100,7 @@ class _Plane:
         self._along_y = plane.along_y.astype(np.float32)
         self._along_x, self._combine = plane.along_x.astype(np.complex64), plane.combine.astype(np.complex64)
 
-    def project(self, maps: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    def project(self, maps: NDArray[np.complex64]) -> NDArray[np.complexfloating]:
         """Inner products: (ny, nx) to (r,)."""
         rows = (self._along_y @ maps.view(np.float32)).view(np.complex64)
         return (rows @ self._along_x.T).ravel() @ self._combine

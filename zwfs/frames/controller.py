@@ -185,7 +185,8 @@ class Controller:
         TypeError, ValueError
             If counts or `out` have another shape or type.
         """
-        counts, out = _checked(counts, self.mask.shape, out, self.n_commands)
+        counts = _check.real_frame("counts", counts, self.mask.shape)
+        out = _check.destination("out", out, (self.n_commands,))
         if self._raw.dtype != counts.dtype:  # the first frame of a type
             self._raw = np.empty(len(self._pixels), counts.dtype)
         signal = self._signal
@@ -319,7 +320,8 @@ class PhaseController:
 
     def __call__(self, counts: ArrayLike, out: NDArray | None = None) -> NDArray[np.floating]:
         """Commands that a frame shows, times the gain: as those of `Controller`, whose parameters these are."""
-        counts, out = _checked(counts, image_shape(self._calibration), out, self.n_commands)
+        counts = _check.real_frame("counts", counts, image_shape(self._calibration))
+        out = _check.destination("out", out, (self.n_commands,))
         frames, self.flux, self.n_bad = self._frames(counts, self._brightness() / self._flat_brightness)
         self.lost = not self.flux > self._faintest
         if self.lost:
@@ -491,20 +493,3 @@ def _single(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.f
         raise ValueError(f"{name} has shape {array.shape}: expected {shape}")
     _check.finite(name, array)
     return read_only(array)
-
-
-def _checked(counts: Any, shape: tuple[int, ...], out: Any, n_commands: int) -> tuple[NDArray, NDArray]:
-    """Counts of one exposure, and where the commands go."""
-    if not isinstance(counts, np.ndarray):
-        counts = _check.plain_array("counts", counts)
-    if counts.dtype.kind not in "biuf":
-        raise TypeError(f"counts has dtype {counts.dtype}: expected real numbers")
-    if counts.shape != shape:
-        raise ValueError(f"counts has shape {counts.shape}: expected {shape}, one exposure of the calibration")
-    if out is None:
-        return counts, np.empty(n_commands, np.float32)
-    if not isinstance(out, np.ndarray) or out.dtype != np.float32 or not out.flags.c_contiguous:
-        raise TypeError(f"out is {_check.shown(out)}: expected an array of float32")
-    if out.shape != (n_commands,):
-        raise ValueError(f"out has shape {out.shape}: expected {(n_commands,)}")
-    return counts, out

@@ -30,8 +30,8 @@ class Look:
         How unusual the last frames are; above 1 the training has seen nothing like them.
     """
 
-    # The phase is that of (W s + l A^2 - e |D|^2) D with the disc wave D and s = frames - A^2. With D times the root
-    # of e, and W and l over e / |e|, the factor e is 1.
+    # The phase is that of (W s + l A^2 - e |D|^2) D, with the disc wave D and s = frames - A^2. Here D is scaled by
+    # the root of |e| and turned by the angle of e, and W and l are turned back: then e is 1.
 
     def __init__(self, method: LearnedReference) -> None:
         kind, sensor, training = Kind.numpy(np.float32), method.sensor, method.training
@@ -95,9 +95,10 @@ class Look:
         field[0] -= parts[0]
         field[0] -= parts[1]
         np.multiply(field, disc, out=parts)
-        real = np.subtract(*parts, out=out.reshape(-1))
+        real = np.subtract(parts[0], parts[1], out=out.reshape(-1))
         np.multiply(field, disc[::-1], out=parts)
-        np.arctan2(np.add(*parts, out=parts[0]), real, out=real)
+        imag = np.add(parts[0], parts[1], out=parts[0])
+        np.arctan2(imag, real, out=real)
         out += self._no_data
         return out
 

@@ -30,7 +30,7 @@ class Look:
         How unusual the last frames are; above 1 the training has seen nothing like them.
     """
 
-    # The phase is that of (W s + l A^2 - e |D|^2) D, with the disc wave D and s = frames - A^2. Here D is scaled by
+    # The phase is that of (W s + l A^2 - e |D|^2) D with the disc wave D and s = frames - A^2. Here D is scaled by
     # the root of |e| and turned by the angle of e, and W and l are turned back: then e is 1.
 
     def __init__(self, method: LearnedReference) -> None:

@@ -322,7 +322,7 @@ class Straight:
             with np.errstate(over="ignore", invalid="ignore"):
                 np.copyto(raw, counts[pupil.place], casting="unsafe")
             raw.ravel()[pupil.repair[0]] = raw.ravel()[pupil.repair[1]]
-            if not (raw.max() < self._level and raw.min() > -_check.LARGEST):
+            if not raw.max() < self._level:
                 return None
             np.subtract(raw, pupil.dark, out=raw)
             for onto, read, part in pupil.rows:

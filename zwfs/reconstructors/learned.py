@@ -28,7 +28,6 @@ from zwfs._system import path_of, write_file
 from zwfs.modes import _unnormalised
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import _network
-from zwfs.reconstructors._look import Look, mixed_moments
 from zwfs.reconstructors._network import Network
 from zwfs.reconstructors._simulated import (
     LIMITS,
@@ -41,6 +40,7 @@ from zwfs.reconstructors._simulated import (
     solution_weights,
 )
 from zwfs.reconstructors.base import Reconstruction, Reconstructor, Solution, pieces
+from zwfs.reconstructors.look import Look, mixed_moments
 from zwfs.reconstructors.phase_shifted import PhaseShifted
 from zwfs.sensor import ZernikeSensor
 

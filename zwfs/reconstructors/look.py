@@ -15,6 +15,8 @@ from zwfs.pupil import Pupil
 if TYPE_CHECKING:
     from zwfs.reconstructors.learned import LearnedReference, _Constants
 
+__all__ = ["Look"]
+
 _WEAK = 1e-6  # weight of the power of the disc wave, below which the solve cannot be scaled by it
 
 
@@ -23,11 +25,6 @@ class Look:
 
     The phase is that of `LearnedReference` with one solve, in single precision. No number is checked, and all
     arrays are used again. Frames with NaN have a phase of NaN.
-
-    Attributes
-    ----------
-    distance : float
-        How unusual the last frames are; above 1 the training has seen nothing like them.
     """
 
     # The phase is that of (W s + l A^2 - e |D|^2) D with the disc wave D and s = frames - A^2. Here D is scaled by
@@ -64,6 +61,7 @@ class Look:
 
     @property
     def distance(self) -> float:
+        """How unusual the last frames are; above 1 the training has seen nothing like them."""
         return float(np.sqrt(np.mean((self._scaled @ self._whitening) ** 2)) / self._farthest)
 
     def __call__(self, frames: ArrayLike, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:

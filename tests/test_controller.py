@@ -1,13 +1,14 @@
 """Controllers: counts to commands, from pokes; loops on benches of HCIPy against an integrator that knows all."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
 from zwfs.frames import Calibration, FileError
-from zwfs.frames.controller import Controller
+from zwfs.frames.controller import Controller, PhaseController
 from zwfs.frames.pipeline import Optics, reduce_frames
 from zwfs.frames.registration import Image, register_frames
 
@@ -85,6 +86,23 @@ def test_commands_are_those_that_made_the_frame(camera, calibration, pokes, trut
     np.testing.assert_allclose(out, 0.5 * truth, atol=3e-3)
     assert control.n_kept == control.n_commands == 12
     assert not control.lost
+
+
+def test_fast_road_of_the_phase_agrees_with_the_plain_one(camera, calibration, pokes, truth):
+    fast, plain, straight = (calibration.controller(*pokes, poke=POKE, method="phase-shifted") for _ in range(3))
+    assert fast._tracking
+    assert fast._straight
+    straight._straight = plain._tracking = None
+    inside = calibration.sensor.pupil.inside
+    for seed in range(4):
+        counts = camera(5 * truth, (20, seed), light=0.5 + seed)
+        commands = fast(counts)
+        largest = np.abs(commands).max()
+        np.testing.assert_allclose(commands, plain(counts), atol=3e-6 * largest)
+        np.testing.assert_allclose(fast.phase[inside], plain.phase[inside], atol=1e-5)
+        assert not fast.phase[~inside].any()
+        # Rows and columns of the grid lie along those of the camera to 0.02 pixels only.
+        np.testing.assert_allclose(commands, straight(counts), atol=1e-3 * largest)
 
 
 def test_light_is_measured_in_each_frame(camera, controller, truth):
@@ -171,6 +189,24 @@ def test_file_holds_plain_arrays_and_makes_the_same_controller(tmp_path, camera,
     signal = counts[arrays["mask"] > 0] - arrays["dark"]
     commands = arrays["matrix"] @ (signal / signal.sum() - arrays["reference"])
     np.testing.assert_allclose(commands, controller(counts), atol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "method"), [("phase.npz", "phase-shifted"), ("phase.fits", "likelihood")])
+def test_slower_controller_is_saved(tmp_path, camera, calibration, pokes, truth, name, method):
+    if name.endswith("fits"):
+        pytest.importorskip("astropy.io.fits")
+    control = calibration.controller(*pokes, poke=POKE, gain=0.5, method=method)
+    for _ in range(2):
+        control.save(tmp_path / name)
+    read = PhaseController.load(tmp_path / name, calibration)
+    assert repr(read) == repr(control)
+    for seed in (9, 10):
+        counts = camera(truth, seed)
+        np.testing.assert_array_equal(read(counts), control(counts))
+    with pytest.raises(ValueError, match="calibration: expected the one with which the controller"):
+        PhaseController.load(tmp_path / name, replace(calibration, saturation=60000.0))
+    with pytest.raises(FileError, match=f"{name}: a broken controller"):
+        Controller.load(tmp_path / name)
 
 
 def test_pokes_come_from_files(tmp_path, calibration, pokes, controller):

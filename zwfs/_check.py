@@ -220,6 +220,27 @@ def plain_array(name: str, value: Any) -> NDArray:
     return _converted(name, value, np.asarray)
 
 
+def real_frame(name: str, value: Any, shape: tuple[int, ...]) -> NDArray:
+    """Return `value` as an array of real numbers of any type of NumPy, for a call that may not take long."""
+    array = value if isinstance(value, np.ndarray) else plain_array(name, value)
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"{name} has dtype {array.dtype}: expected real numbers")
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}: expected {shape}")
+    return array
+
+
+def destination(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return an array for results in single precision: `value`, or a new one for None."""
+    if value is None:
+        return np.empty(shape, np.float32)
+    if not isinstance(value, np.ndarray) or value.dtype != np.float32 or not value.flags.c_contiguous:
+        raise TypeError(f"{name} is {shown(value)}: expected an array of float32")
+    if value.shape != shape:
+        raise ValueError(f"{name} has shape {value.shape}: expected {shape}")
+    return value
+
+
 def real_array(name: str, value: Any) -> NDArray:
     """Return `value` as a float32 or float64 array of NumPy; other real numbers become float64."""
     return real_any(name, plain_array(name, value))

@@ -84,6 +84,7 @@ def tables(speed: dict[str, Any]) -> dict[str, str]:
             ["task", "time, in propagations of HCIPy"],
             [[name.replace("lambda/D", "λ/D"), f"{ratio:.2g}"] for name, ratio in speed["likelihood"].items()],
         ),
+        "looks": looks(speed["looks"]),
         "telemetry": telemetry(speed["telemetry"]),
         "latency": latency(speed["latency"]),
         "late": late(speed["latency"]),
@@ -119,6 +120,20 @@ def rates(speed: dict[str, Any]) -> str:
         for row, setting in zip(chosen + speed["closed loop"], settings, strict=True)
     ]
     return table(["setting", "rate (1/s)", "median error (rad)", "largest error (rad)"], rows)
+
+
+def looks(rows: list[dict[str, Any]]) -> str:
+    """Return a table of times from a frame pair to the phase, over that of a propagation of HCIPy, the first."""
+    lines = [
+        [
+            row["road"],
+            f"{row['time'] / rows[0]['time']:.2g}",
+            "" if row["median error"] is None else power(row["median error"]),
+        ]
+        for row in rows
+    ]
+    header = [f"one frame pair, {rows[0]['n_pixels']} pixels", "time, in propagations of HCIPy", "median error (rad)"]
+    return table(header, lines)
 
 
 def latency(rows: list[dict[str, Any]]) -> str:

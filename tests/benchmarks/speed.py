@@ -9,6 +9,7 @@ import sys
 import tracemalloc
 from dataclasses import replace
 from functools import partial
+from itertools import cycle
 from time import perf_counter, thread_time
 
 import numpy as np
@@ -19,6 +20,7 @@ from zwfs import (
     Dimple,
     GerchbergSaxton,
     GradientDescent,
+    LearnedReference,
     Linear,
     MaximumLikelihood,
     PhaseShifted,
@@ -30,6 +32,7 @@ from zwfs import (
 
 from ..reference import HcipySensor
 from . import latency, telemetry
+from .convolution import ConvolutionalNetwork
 
 DIMPLES = (Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
 REAL_TIME = {"n_iterations": 2, "tolerance": 0.0, "accelerate": True}
@@ -170,6 +173,55 @@ def likelihood(seconds, n_pixels=100):
     return {name: time / times["one propagation"] for name, time in times.items()}
 
 
+def looks(seconds, n_pixels=100, rms=0.8):
+    """Time and error of roads from one frame pair to the phase, in single precision, in the same run as HCIPy.
+
+    The bare products are those of one look: frames with polynomials, the layers of the network, and the wave.
+    """
+    pupil = Pupil.circular(n_pixels)
+    sensor = ZernikeSensor(pupil, *DIMPLES)
+    screens = screens_at(zernike_basis(pupil, 200), rms, 20, 2024, 7)
+    peer, frames = HcipySensor(pupil, DIMPLES[0]), sensor.measure(screens).astype(np.float32)
+    incoming = peer.wavefront(pupil.amplitude * np.exp(1j * screens[0]))
+    settings = {"tolerance": 0.0, "accelerate": True}
+    two, three = (PhaseShifted(sensor, n_iterations=n, **settings) for n in (2, 3))
+    learned, convolutional = LearnedReference(sensor), ConvolutionalNetwork()
+    look, out, turn = learned.look(), np.empty(pupil.shape, np.float32), cycle(frames)
+    plane, weights = look._plane, learned.training.network.weights
+    layers = [np.ones(len(weight), np.float32) for weight in weights]
+    wave = np.ones((2, plane.rank), np.float32)
+
+    def products():
+        image = next(turn)
+        plane.project(image)
+        image.reshape(2, -1) @ look._signal.T
+        for layer, weight in zip(layers, weights, strict=True):
+            layer @ weight
+        plane.expand(wave)
+
+    name = f"convolutional network, {1e-6 * convolutional.n_weights:.1f} million weights"
+    roads = {
+        "one propagation of HCIPy": lambda: peer.optics[0].forward(incoming),
+        "bare products": products,
+        "one look": lambda: look(next(turn), out=out),
+        "LearnedReference": lambda: learned(next(turn)),
+        "2 iterations, accelerated": lambda: two(next(turn)),
+        "3 iterations, accelerated": lambda: three(next(turn)),
+        name: lambda: convolutional(next(turn)),
+    }
+    phases = {
+        "one look": np.stack([look(frame) for frame in frames]), "LearnedReference": learned(frames).phase,
+        "2 iterations, accelerated": two(frames).phase, "3 iterations, accelerated": three(frames).phase,
+    }  # fmt: skip
+    errors = {
+        road: float(np.median(reconstruction_error(pupil, phase, screens))) for road, phase in phases.items()
+    }
+    return [
+        {"road": road, "n_pixels": n_pixels, "time": time, "median error": errors.get(road)}
+        for road, time in best_of_each(roads, seconds).items()
+    ]
+
+
 def results(seconds=2.0):
     """All of the above: numbers, lists and dictionaries only."""
     return {
@@ -183,6 +235,7 @@ def results(seconds=2.0):
         "slope": slope(seconds),
         "others": others(seconds),
         "likelihood": likelihood(seconds),
+        "looks": looks(seconds),
         "latency": latency.results(),
         "controllers": latency.controllers(),
         "telemetry": telemetry.telemetry(),

@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from . import latency, speed, telemetry
 from .report import KEPT, fingerprint
 
@@ -51,3 +53,10 @@ def test_long_cube_is_reconstructed_without_a_flag():
 
 def test_likelihood_is_timed_in_propagations():
     assert speed.likelihood(0, n_pixels=32)["one propagation"] == 1
+
+
+def test_roads_to_the_phase_are_timed_together():
+    rows = {row["road"]: row for row in speed.looks(0, n_pixels=32)}
+    assert rows["one look"]["median error"] == pytest.approx(rows["LearnedReference"]["median error"], rel=1e-2)
+    assert rows["3 iterations, accelerated"]["median error"] < rows["one look"]["median error"] < 0.02
+    assert all(row["time"] > 0 for row in rows.values())

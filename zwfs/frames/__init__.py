@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from zwfs.frames._blocks import FileError
     from zwfs.frames._fit import BenchFit, Estimate
     from zwfs.frames.calibration import Calibration
-    from zwfs.frames.controller import Controller
+    from zwfs.frames.controller import Controller, PhaseController
     from zwfs.frames.phases import Phases
     from zwfs.frames.pipeline import phase_of, recover_phase
     from zwfs.frames.telemetry import reconstruct
@@ -75,6 +75,7 @@ __all__ = [
     "Controller",
     "Estimate",
     "FileError",
+    "PhaseController",
     "Phases",
     "calibration",
     "controller",

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cached_property
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -163,23 +162,21 @@ class Grid:
                 raw[place, index] = nearest_good(raw[place, index], usable) if usable.any() else 0
         return raw, good, n_bad, n_saturated
 
-    @cached_property
-    def axes(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Matrices, (2, ny, h) and (2, nx, w), from counts of the boxes to the grid; None if that is turned.
-
-        Both products take half the time of `on_grid`.
-        """
+    def straight(self, level: float) -> Straight | None:
+        """Faster road onto the grid for single exposures of pixels below a level; None if the grid is turned."""
         lines = self._corners[:, 0].mean(axis=2), self._corners[:, 1].mean(axis=1)
         apart = self._corners - np.stack(
             np.broadcast_arrays(lines[0][..., np.newaxis], lines[1][:, np.newaxis]), 1
         )
         if np.abs(apart).max() > _STRAIGHT:
             return None
-        rows, columns = (
-            np.stack([_line(places - _CUT, len(along)) @ along for places in pairs]).astype(np.float32)
-            for pairs, along in zip(lines, self.filters, strict=True)
-        )
-        return rows, columns
+        pupils = []
+        for box, dark, bad, *places in zip(self.boxes, self.dark, self.bad, *lines, strict=True):
+            along = [
+                _line(place - _CUT, len(onto)) @ onto for place, onto in zip(places, self.filters, strict=True)
+            ]
+            pupils.append(_StraightPupil.of(box, along, dark, bad))
+        return Straight(pupils, self.offset.shape[1:], level)
 
     def solve(
         self, frames: NDArray, good: NDArray, start: NDArray | None = None, method: Reconstructor | None = None
@@ -257,6 +254,82 @@ class Grid:
             for index, matrix in enumerate(self.touching)
         )
         return (weights.T > _TOUCHED).reshape(k, *shape)
+
+
+class _StraightPupil(NamedTuple):
+    """Constants and arrays of one pupil, on the pixels of the camera that its box covers."""
+
+    place: tuple[int, slice, slice]  # in an exposure
+    rows: list[_Band]  # (ny, h)
+    columns: list[_Band]  # (nx, w)
+    dark: NDArray[np.float32]  # (h, w)
+    repair: tuple[NDArray, NDArray]  # bad pixels and the nearest good ones
+    raw: NDArray[np.float32]  # (h, w)
+    half: NDArray[np.float32]  # (ny, w)
+
+    @classmethod
+    def of(
+        cls, box: tuple[int, Any, Any], along: Sequence[NDArray], dark: NDArray, bad: NDArray
+    ) -> _StraightPupil:
+        """Cut a box to the camera: a row or column that it repeats counts as often."""
+        spans, firsts, matrices = [], [], []
+        for span, onto in zip(box[1:], along, strict=True):
+            lines = np.arange(span.start, span.stop) if isinstance(span, slice) else span
+            covered, first, places = np.unique(lines, return_index=True, return_inverse=True)
+            matrices.append(onto @ (places[:, np.newaxis] == np.arange(len(covered))))
+            spans.append(slice(covered[0], covered[-1] + 1))
+            firsts.append(first)
+        bad, dark = bad[np.ix_(*firsts)], np.ascontiguousarray(dark[np.ix_(*firsts)])
+        repair = _repair(bad, ~bad)
+        dark.ravel()[repair[0]] = dark.ravel()[repair[1]]
+        rows, columns = map(_Band.halves, matrices)
+        raw, half = np.empty(dark.shape, np.float32), np.empty((len(matrices[0]), dark.shape[1]), np.float32)
+        return cls((box[0], spans[0], spans[1]), rows, columns, dark, repair, raw, half)
+
+
+class _Band(NamedTuple):
+    """Some rows of a matrix that is 0 far from a diagonal, cut to the columns that they need."""
+
+    onto: slice
+    read: slice
+    part: NDArray[np.float32]
+
+    @classmethod
+    def halves(cls, matrix: NDArray) -> list[_Band]:
+        """Both halves: small products run faster than the whole."""
+        middle, bands = len(matrix) // 2, []
+        for onto in (slice(middle), slice(middle, len(matrix))):
+            needed = np.flatnonzero(np.abs(matrix[onto]).max(axis=0) > _NEGLIGIBLE)
+            read = slice(needed[0], needed[-1] + 1)
+            bands.append(cls(onto, read, np.ascontiguousarray(matrix[onto, read], np.float32)))
+        return bands
+
+
+class Straight:
+    """Counts of one exposure on the grid of the pupil, whose rows and columns lie along those of the camera.
+
+    Two products for each pupil take half the time of `Grid.on_grid`. All arrays are used again.
+    """
+
+    def __init__(self, pupils: Sequence[_StraightPupil], shape: tuple[int, ...], level: float) -> None:
+        self._pupils, self._level = pupils, level
+        self._values = np.empty((2, *shape), np.float32)
+
+    def __call__(self, counts: NDArray) -> NDArray[np.float32] | None:
+        """Counts (n_images, ny', nx') on the grid, (2, ny, nx), less the dark; None if a pixel is newly bad."""
+        for pupil, values in zip(self._pupils, self._values, strict=True):
+            raw = pupil.raw
+            with np.errstate(over="ignore", invalid="ignore"):
+                np.copyto(raw, counts[pupil.place], casting="unsafe")
+            raw.ravel()[pupil.repair[0]] = raw.ravel()[pupil.repair[1]]
+            if not raw.max() < self._level:
+                return None
+            np.subtract(raw, pupil.dark, out=raw)
+            for onto, read, part in pupil.rows:
+                np.matmul(part, raw[read], out=pupil.half[onto])
+            for onto, read, part in pupil.columns:
+                np.matmul(pupil.half[:, read], part.T, out=values[:, onto])
+        return self._values
 
 
 def _span(low: int, size: int, length: int) -> Any:

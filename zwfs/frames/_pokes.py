@@ -85,18 +85,24 @@ class Pokes(NamedTuple):
         """Mean frame of the flat mirror."""
         return self.flats.mean(axis=0, dtype=float)
 
-    def phases(self, calibration: Calibration) -> tuple[Phases, NDArray[np.float64]]:
-        """Phases of the flat mirror, and half the difference of push and pull without its mean, (n, ny, nx)."""
-        flat, pushed, pulled = (
-            calibration(np.where(self.good, images, np.nan)) for images in (self.flat, self.pushed, self.pulled)
+    def modes(self, calibration: Calibration) -> NDArray[np.float32]:
+        """Half the difference of the phases of push and pull, without its mean, (n, ny, nx)."""
+        pushed, pulled = (
+            phases_of(name, np.where(self.good, images, np.nan), calibration).filled
+            for name, images in (("pushed", self.pushed), ("pulled", self.pulled))
         )
-        for name, phases in (("flat", flat), ("pushed", pushed), ("pulled", pulled)):
-            if np.any(phases.flags & Flag.LOST):
-                lost = np.flatnonzero(np.atleast_1d(phases.flags & Flag.LOST))
-                raise ValueError(f"{name}: its frames {lost.tolist()} are lost: expected light in all of them")
-        half = np.angle(np.exp(1j * (pushed.filled.astype(float) - pulled.filled))) / 2
-        mean = half[:, calibration.good].mean(axis=1)
-        return flat, np.where(calibration.amplitude > 0, half - mean[:, np.newaxis, np.newaxis], 0)
+        half = np.angle(np.exp(1j * (pushed.astype(float) - pulled))) / 2
+        half -= half[:, calibration.good].mean(axis=1)[:, np.newaxis, np.newaxis]
+        return np.where(calibration.amplitude > 0, half, 0).astype(np.float32)
+
+
+def phases_of(name: str, counts: NDArray, calibration: Calibration) -> Phases:
+    """Phases of frames that must have light."""
+    phases = calibration(counts)
+    lost = np.flatnonzero(np.atleast_1d(phases.flags & Flag.LOST))
+    if lost.size:
+        raise ValueError(f"{name}: its frames {lost.tolist()} are lost: expected light in all of them")
+    return phases
 
 
 class Signals(NamedTuple):

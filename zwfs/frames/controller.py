@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import io
 import math
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,8 +26,9 @@ from zwfs._arrays import Kind, read_only
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import broken
 from zwfs.frames._fits import FIRST_BYTES, fits_content, fits_module
-from zwfs.frames._pokes import Inverse, Pokes, Signals, faintest, image_shape, roughness
+from zwfs.frames._pokes import Inverse, Pokes, Signals, faintest, image_shape, phases_of, roughness
 from zwfs.reconstructors import MaximumLikelihood
+from zwfs.reconstructors._tracking import Tracking
 
 if TYPE_CHECKING:
     from zwfs.frames.calibration import Calibration
@@ -36,14 +38,11 @@ __all__ = ["Controller", "PhaseController"]
 _STILL = 1e-3  # radian rms of the flat mirror's phase, below which it needs no mode
 _METHODS = "linear", "phase-shifted", "likelihood"
 _SUFFIXES = ".npz", ".fits"
-_ARRAYS = "matrix", "reference", "mask", "dark", "interaction"  # of a file
-_SCALARS = {
-    "light": np.inf,
-    "noise": 0.0,
-    "gain": 1.0,
-    "n_kept": 1.0,
-    "saturation": np.inf,
-}  # FITS has no infinity
+# Arrays and numbers of a file; the numbers with the value of one that is missing, since FITS has no infinity.
+_ARRAYS = "matrix", "reference", "mask", "dark", "interaction"
+_NUMBERS = {"light": np.inf, "noise": 0.0, "gain": 1.0, "n_kept": 1.0, "saturation": np.inf}
+_PHASE_ARRAYS = "modes", "flat", "calibration"
+_PHASE_NUMBERS = {"faintest": 0.0, "rcond": 0.0, "gain": 1.0, "likelihood": 0.0, "n_iterations": 1.0}
 
 
 def make_controller(
@@ -61,9 +60,10 @@ def make_controller(
     signals = Signals.of(calibration, pokes)
     signals.check()
     if method != "linear":
+        flat = np.where(pokes.good, pokes.flat, np.nan)
         return PhaseController(
-            calibration, pokes, signals.faintest, poke=poke, rcond=rcond, gain=gain,
-            likelihood=method == "likelihood", n_iterations=n_iterations,
+            calibration, flat, pokes.modes(calibration) / np.float32(poke), faintest=signals.faintest, rcond=rcond,
+            gain=gain, likelihood=method == "likelihood", n_iterations=n_iterations,
         )  # fmt: skip
     interaction = signals.difference.T / poke
     inverse = Inverse.of(interaction, rcond, signals.noise * math.sqrt(signals.shares[0]) / poke)
@@ -185,7 +185,8 @@ class Controller:
         TypeError, ValueError
             If counts or `out` have another shape or type.
         """
-        counts, out = _checked(counts, self.mask.shape, out, self.n_commands)
+        counts = _check.real_frame("counts", counts, self.mask.shape)
+        out = _check.destination("out", out, (self.n_commands,))
         if self._raw.dtype != counts.dtype:  # the first frame of a type
             self._raw = np.empty(len(self._pixels), counts.dtype)
         signal = self._signal
@@ -229,28 +230,8 @@ class Controller:
         TypeError, ValueError
             If the name ends differently, or is that of a file that holds no controller.
         """
-        path = path_of("path", path)
-        if path.suffix.lower() not in _SUFFIXES:
-            raise ValueError(f"path = {str(path)!r}: expected a name that ends with {' or '.join(_SUFFIXES)}")
-        if path.exists():
-            try:
-                Controller.load(path)
-            except (ValueError, FileNotFoundError):
-                raise ValueError(
-                    f"path = {str(path)!r} exists and is no controller: expected a new name"
-                ) from None
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
-        arrays["mask"] = self.mask.astype(np.uint8)
-        scalars: dict[str, Any] = {name: getattr(self, name) for name in _SCALARS}
-        if path.suffix.lower() == ".fits":
-            cards = [(name[:8], value, "") for name, value in scalars.items() if value != np.inf]
-            units = [(array, name.upper(), cards if name == "matrix" else []) for name, array in arrays.items()]
-            content = fits_content(*units)
-        else:
-            stream = io.BytesIO()
-            np.savez(stream, **arrays, **scalars)
-            content = stream.getvalue()
-        write_file(path, content)
+        arrays = {name: getattr(self, name) for name in _ARRAYS} | {"mask": self.mask.astype(np.uint8)}
+        _write(path, arrays, {name: getattr(self, name) for name in _NUMBERS})
 
     @classmethod
     def load(cls, path: str | Path) -> Controller:
@@ -261,23 +242,9 @@ class Controller:
         FileNotFoundError, TypeError, ValueError
             ValueError is a FileError if the file is broken or is not a controller.
         """
-        path = path_of("path", path)
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file: expected a controller")
-        with broken(f"{path.name}: a broken controller, or none"):
-            values: dict[str, Any]
-            with path.open("rb") as file:
-                is_fits = file.read(len(FIRST_BYTES)) == FIRST_BYTES
-            if is_fits:
-                with fits_module().open(path, memmap=False) as units:
-                    values = {name: unit.data for name, unit in zip(_ARRAYS, units, strict=True)}
-                    scalars = {name: units[0].header.get(name[:8], missing) for name, missing in _SCALARS.items()}
-            else:
-                with np.load(path, allow_pickle=False) as stored:
-                    values = {name: stored[name] for name in _ARRAYS}
-                    scalars = {name: float(stored[name]) for name in _SCALARS}
-            values |= scalars | {"mask": values["mask"] > 0, "n_kept": int(scalars["n_kept"])}
-            return cls(**values)
+        values = _read(path, _ARRAYS, _NUMBERS)
+        with _broken(path):
+            return cls(**values | {"mask": values["mask"] > 0, "n_kept": int(values["n_kept"])})
 
 
 class PhaseController:
@@ -303,31 +270,44 @@ class PhaseController:
     """
 
     def __init__(
-        self, calibration: Calibration, pokes: Pokes, faintest: float, *, poke: float, rcond: float, gain: float,
-        likelihood: bool, n_iterations: int,
+        self, calibration: Calibration, flat: NDArray, modes: NDArray, *, faintest: float, rcond: float,
+        gain: float, likelihood: bool, n_iterations: int,
     ) -> None:  # fmt: skip
+        self._saved: dict[str, Any] = {
+            "modes": modes, "flat": flat, "faintest": faintest, "rcond": rcond, "gain": gain,
+            "likelihood": likelihood, "n_iterations": n_iterations,
+        }  # fmt: skip
+        self._of = calibration
         self._calibration = replace(calibration, n_iterations=n_iterations, tolerance=0.0)
         self._work, self._faintest = self._calibration._work, faintest
-        flat, modes = pokes.phases(calibration)
-        modes /= poke
+        self._straight = self._work.straight(calibration.saturation)
+        self._tracking = None if likelihood else Tracking.of(self._work.reconstruct)
+        level = phases_of("flat", flat, calibration)
         self._points = np.flatnonzero(calibration.good)
         responses = modes.reshape(len(modes), -1)[:, self._points]
         inverse = Inverse.of(responses.T, rcond, roughness(responses, self._points))
         self.matrix = read_only((gain * inverse.matrix).astype(np.float32))
         self.gain, self.n_kept, self.n_commands = gain, len(inverse.directions), len(modes)
-        self._weights = (calibration.weights / calibration.unit[:, np.newaxis, np.newaxis]).astype(np.float32)
-        self._mean = (calibration.good.ravel() / len(self._points)).astype(np.float32)
+        weights = (calibration.weights / calibration.unit[:, np.newaxis, np.newaxis]).astype(np.float32)
+        self._own, crossed = weights[(0, 1), (0, 1)], weights[(0, 1), (1, 0)]
+        self._crossed = crossed if crossed.any() else None  # of the other image
+        inside, (holes, nearest) = calibration.sensor.pupil.inside.ravel(), self._work.holes
+        self._mean = inside.astype(np.float32) / np.float32(np.count_nonzero(inside))
+        np.add.at(self._mean, nearest, self._mean[holes])
+        self._mean[holes] = 0
+        self._stop = calibration.sensor.pupil.inside.astype(np.float32)
+        self._stray = float(np.mean(self._work.offset.reshape(2, -1) @ self._mean))
         self._light: NDArray[np.float32] = np.ones(2, np.float32)
-        self._light = self._on_grid(pokes.flat)[1] / np.float32(flat.flux)
+        self._light = self._on_grid(flat)[1] / np.float32(level.flux)
         self._change, self._turns = np.empty((2, len(self._points)), np.float32)
-        self.phase: NDArray[np.float32] = flat.filled
+        self.phase: NDArray[np.float32] = level.filled
         self.sigma = np.full(self.n_commands, np.nan)
-        self.flux, self.n_bad, self.lost = float(flat.flux), 0, False
+        self.flux, self.n_bad, self.lost = float(level.flux), 0, False
         self._likelihood: MaximumLikelihood | None = None
         if likelihood:
             self._directions = inverse.directions
             self._likelihood = self._of_directions(np.tensordot(inverse.directions, modes, 1))
-            self.phase = self._most_likely(self._frames(pokes.flat, 1.0)[0])
+            self.phase = self._most_likely(self._frames(flat, 1.0)[0])
         self._flat = self.phase.ravel()[self._points]
         self._flat_brightness = self._brightness()
 
@@ -340,7 +320,8 @@ class PhaseController:
 
     def __call__(self, counts: ArrayLike, out: NDArray | None = None) -> NDArray[np.floating]:
         """Commands that a frame shows, times the gain: as those of `Controller`, whose parameters these are."""
-        counts, out = _checked(counts, image_shape(self._calibration), out, self.n_commands)
+        counts = _check.real_frame("counts", counts, image_shape(self._calibration))
+        out = _check.destination("out", out, (self.n_commands,))
         frames, self.flux, self.n_bad = self._frames(counts, self._brightness() / self._flat_brightness)
         self.lost = not self.flux > self._faintest
         if self.lost:
@@ -351,29 +332,64 @@ class PhaseController:
             phase = self._most_likely(frames)
             np.subtract(phase.ravel()[self._points], self._flat, out=change)
         else:
-            phase = self._work.reconstruct.solve(frames, self.phase[np.newaxis], False).phase[0]
+            if self._tracking:
+                phase = self._tracking(frames[0])
+            else:
+                phase = self._work.reconstruct.solve(frames, self.phase[np.newaxis], False).phase[0]
             self._wrapped(phase)
             phase -= change.mean()  # frames do not show the piston, which noise would move from start to start
+            phase *= self._stop
         self.phase = phase
         return np.dot(self.matrix, change, out=out)
 
-    def _on_grid(self, counts: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
+    def save(self, path: str | Path) -> None:
+        """Write what the pokes have shown as NPZ or FITS, by the end of the name, in one step.
+
+        The file holds `modes` (n_commands, ny, nx), the phase of a unit of each command in radian, `flat`, the
+        counts of the flat mirror, and a checksum of the calibration, which `Calibration.save` writes.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `Controller.save`.
+        """
+        arrays = {name: self._saved[name] for name in ("modes", "flat")} | {"calibration": _digest(self._of)}
+        _write(path, arrays, {name: float(self._saved[name]) for name in _PHASE_NUMBERS})
+
+    @classmethod
+    def load(cls, path: str | Path, calibration: Calibration) -> PhaseController:
+        """Read a controller that `save` wrote, for the calibration with which it was made.
+
+        Raises
+        ------
+        FileNotFoundError, TypeError, ValueError
+            ValueError is a FileError if the file is broken or is not such a controller.
+        """
+        values = _read(path, _PHASE_ARRAYS, _PHASE_NUMBERS)
+        if not np.array_equal(values.pop("calibration"), _digest(calibration)):
+            raise ValueError(f"calibration: expected the one with which the controller {str(path)!r} was made")
+        with _broken(path):
+            values |= {"modes": values["modes"].astype(np.float32), "flat": values["flat"].astype(float)}
+            values |= {"likelihood": values["likelihood"] > 0, "n_iterations": int(values["n_iterations"])}
+            return cls(calibration, **values)
+
+    def _on_grid(self, counts: NDArray) -> tuple[NDArray[np.floating], NDArray[np.floating], int]:
         """Counts on the grid, (2, ny, nx), their light over that of the flat mirror, (2,), and bad pixels."""
-        calibration = self._calibration
-        images = counts.reshape(1, calibration.n_images, *calibration.shape)
-        work, level, good = self._work, calibration.saturation, calibration.good
-        if work.axes is None:
-            values, _, n_bad, _ = work.on_grid(images, level, good)
-        else:
-            raw, _, n_bad, _ = work.cleaned(images, level, good)
-            values = work.axes[0] @ raw[0] @ work.axes[1].transpose(0, 2, 1)
-        values = values.reshape(2, *good.shape)
-        return values, values.reshape(2, -1) @ self._mean / self._light, int(n_bad[0])
+        calibration, n_bad = self._calibration, 0
+        images = counts.reshape(-1, *calibration.shape)
+        values = self._straight(images) if self._straight else None
+        if values is None:
+            level, good = calibration.saturation, calibration.good
+            on_grid, _, (n_bad,), _ = self._work.on_grid(images[np.newaxis], level, good)
+            values = on_grid.reshape(2, *good.shape)
+        return values, values.reshape(2, -1) @ self._mean / self._light, int(n_bad)
 
     def _brightness(self) -> float:
-        """Mean light of modelled frames with the phase of the last frame, in the pupil."""
-        frames = self._work._modelled(self.phase[np.newaxis])[0] - self._work.offset
-        return float(np.mean(frames.reshape(2, -1) @ self._mean))
+        """Mean light in the pupil of modelled frames of the last phase, from which the next frame starts."""
+        if self._tracking:
+            return self._tracking.start(self.phase) - self._stray
+        frames = self._work._modelled(self.phase[np.newaxis])[0]
+        return float(np.mean(frames.reshape(2, -1) @ self._mean)) - self._stray
 
     def _frames(self, counts: NDArray, brightness: float) -> tuple[NDArray[np.float32], float, int]:
         """Ideal frames, (1, n_masks, ny, nx), light over that of the flat mirror, and bad pixels.
@@ -384,8 +400,9 @@ class PhaseController:
         flux = float(light.mean()) / brightness
         light = light / brightness if self._calibration.balance else np.full(2, flux, np.float32)
         values /= np.maximum(light, 1e-30)[:, np.newaxis, np.newaxis]
-        frames = self._weights[:, 0] * values[0]
-        frames += self._weights[:, 1] * values[1]
+        frames = self._own * values
+        if self._crossed is not None:
+            frames += self._crossed * values[::-1]
         frames += work.offset
         frames = frames[: work.reconstruct.sensor.n_masks]
         flat = frames.reshape(len(frames), -1)
@@ -422,6 +439,53 @@ class PhaseController:
         return np.nan_to_num(result.phase, nan=0.0)
 
 
+def _digest(calibration: Calibration) -> NDArray[np.uint8]:
+    """Checksum of a calibration."""
+    return np.frombuffer(bytes.fromhex(calibration.sha256), np.uint8)
+
+
+def _write(path: str | Path, arrays: dict[str, NDArray], numbers: dict[str, float]) -> None:
+    """Write a controller; another file of that name is not replaced."""
+    path = path_of("path", path)
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ValueError(f"path = {str(path)!r}: expected a name that ends with {' or '.join(_SUFFIXES)}")
+    if path.exists():
+        try:
+            _read(path, tuple(arrays), numbers)
+        except (ValueError, FileNotFoundError):
+            raise ValueError(f"path = {str(path)!r} exists and is no controller: expected a new name") from None
+    if path.suffix.lower() == ".fits":
+        cards = [(name[:8], value, "") for name, value in numbers.items() if value != np.inf]
+        first = next(iter(arrays))
+        units = [(array, name.upper(), cards if name == first else []) for name, array in arrays.items()]
+        content = fits_content(*units)
+    else:
+        stream = io.BytesIO()
+        np.savez(stream, **arrays, **numbers)  # type: ignore[arg-type]
+        content = stream.getvalue()
+    write_file(path, content)
+
+
+def _read(path: str | Path, arrays: tuple[str, ...], numbers: dict[str, float]) -> dict[str, Any]:
+    """Arrays and numbers of a file; numbers that it lacks are those given."""
+    path = path_of("path", path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file: expected a controller")
+    with _broken(path):
+        with path.open("rb") as file:
+            is_fits = file.read(len(FIRST_BYTES)) == FIRST_BYTES
+        if is_fits:
+            with fits_module().open(path, memmap=False) as units:
+                values = {name: unit.data for name, unit in zip(arrays, units, strict=True)}
+                return values | {name: units[0].header.get(name[:8], absent) for name, absent in numbers.items()}
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in arrays} | {name: float(stored[name]) for name in numbers}
+
+
+def _broken(path: str | Path) -> AbstractContextManager[None]:
+    return broken(f"{Path(path).name}: a broken controller, or none")
+
+
 def _single(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Checked constants in single precision."""
     array = _check.real_array(name, value).astype(np.float32, order="C")
@@ -429,20 +493,3 @@ def _single(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.f
         raise ValueError(f"{name} has shape {array.shape}: expected {shape}")
     _check.finite(name, array)
     return read_only(array)
-
-
-def _checked(counts: Any, shape: tuple[int, ...], out: Any, n_commands: int) -> tuple[NDArray, NDArray]:
-    """Counts of one exposure, and where the commands go."""
-    if not isinstance(counts, np.ndarray):
-        counts = _check.plain_array("counts", counts)
-    if counts.dtype.kind not in "biuf":
-        raise TypeError(f"counts has dtype {counts.dtype}: expected real numbers")
-    if counts.shape != shape:
-        raise ValueError(f"counts has shape {counts.shape}: expected {shape}, one exposure of the calibration")
-    if out is None:
-        return counts, np.empty(n_commands, np.float32)
-    if not isinstance(out, np.ndarray) or out.dtype != np.float32 or not out.flags.c_contiguous:
-        raise TypeError(f"out is {_check.shown(out)}: expected an array of float32")
-    if out.shape != (n_commands,):
-        raise ValueError(f"out has shape {out.shape}: expected {(n_commands,)}")
-    return counts, out

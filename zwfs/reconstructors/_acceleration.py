@@ -42,15 +42,7 @@ class Acceleration:
 
         The remainder is the fraction of a small tilt that is still missing after one iteration.
         """
-        pupil, core = sensor.factors.pupil, sensor.factors.core
-        window = sensor.factors.detector.cut(*sensor.window)
-        inside = sensor.pupil.inside.astype(float)
-        # With r = K b the light changes by |r|^2 + 2 Re(conj(r) psi), summed over the pupil: a form of b.
-        cross = window.products(pupil, np.ones_like(inside))
-        power = window.products(window, inside)
-        turned = core.conj().transpose(0, 2, 1)
-        gained = turned @ cross + (turned @ cross).conj().transpose(0, 2, 1) + turned @ power @ core
-        form = -split_core(gained.sum(axis=0, keepdims=True))
+        form = split_core(light_form(sensor)[np.newaxis])
         # An iteration multiplies a small tilt by the remainder: with this relaxation none of it remains.
         relaxation = 1 / (1 - min(max(remainder, 0.0), _MOST))
         return cls(form, float(np.vecdot(flat @ form, flat)[0]), relaxation)
@@ -96,6 +88,19 @@ class Acceleration:
             new -= share[:, np.newaxis] * (x - path.before + self.relaxation * turn)
         path.before, path.change = x, f
         return new
+
+
+def light_form(sensor: ZernikeSensor) -> NDArray[np.complex128]:
+    """Matrix (r, r) of the light that all masks take out of the pupil, from the coefficients of the field."""
+    pupil, core = sensor.factors.pupil, sensor.factors.core
+    window = sensor.factors.detector.cut(*sensor.window)
+    inside = sensor.pupil.inside.astype(float)
+    # With r = K b the light changes by |r|^2 + 2 Re(conj(r) psi), summed over the pupil: a form of b.
+    cross = window.products(pupil, np.ones_like(inside))
+    power = window.products(window, inside)
+    turned = core.conj().transpose(0, 2, 1)
+    gained = turned @ cross + (turned @ cross).conj().transpose(0, 2, 1) + turned @ power @ core
+    return -gained.sum(axis=0)
 
 
 def dimming(lost: NDArray, light_taken: NDArray | float, xp: Any) -> NDArray:

@@ -40,6 +40,7 @@ from zwfs.reconstructors._simulated import (
     solution_weights,
 )
 from zwfs.reconstructors.base import Reconstruction, Reconstructor, Solution, pieces
+from zwfs.reconstructors.look import Look, mixed_moments
 from zwfs.reconstructors.phase_shifted import PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
@@ -285,6 +286,13 @@ class LearnedReference(Reconstructor):
     def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
         """Solve checked frames, see `Reconstructor.solve`."""
         return _joined([self._solved(frames[piece], history) for piece in pieces(frames, Kind.of(frames))])[0]
+
+    def look(self) -> Look:
+        """Return the fastest road for a control loop: one solve of one set of frames in single precision.
+
+        The errors of the bench must be known: a training without errors, or `bench`.
+        """
+        return Look(self)
 
     def average(self, frames: ArrayLike) -> tuple[BenchValues, BenchValues]:
         """Errors of one bench from many sets of frames, and their standard errors.
@@ -630,10 +638,7 @@ def _inputs(flat: NDArray, constants: _Constants) -> NDArray[np.float32]:
     """Inputs of the network, (k, n_inputs), from frames (k, n_masks, ny * nx)."""
     signal = flat - constants.light
     signal *= constants.root
-    means = constants.mixed @ (signal @ constants.means)
-    squares = constants.mixed @ (signal @ signal.swapaxes(1, 2)) @ constants.mixed.T
-    upper = squares[:, *constants.upper]
-    inputs = np.concatenate([means.reshape(len(flat), -1), upper], axis=1)
+    inputs = mixed_moments(signal @ constants.means, signal @ signal.swapaxes(1, 2), constants)
     return np.clip(inputs, -_LARGEST_INPUT, _LARGEST_INPUT).astype(np.float32)
 
 

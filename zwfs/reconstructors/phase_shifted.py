@@ -97,7 +97,7 @@ class PhaseShifted(FixedPoint):
         accelerate = _check.flag("accelerate", accelerate)
         self._pairs = tuple(combinations(range(sensor.n_masks), 2))
         self._refuse_equal_masks()
-        self._shared = _SharedWave.of(sensor.factors.core)
+        self._shared = SharedWave.of(sensor.factors.core)
         self._plain: PhaseShifted | None = None
         self._acceleration: Acceleration | None = None
         if accelerate:
@@ -261,7 +261,7 @@ class _Constants(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _SharedWave:
+class SharedWave:
     """Wave B of which the reference waves of all dimples of one size are multiples.
 
     The linear system of every point then is the same, and its solution is psi conj(B) = |B|^2 + signal, with a
@@ -273,7 +273,7 @@ class _SharedWave:
     darkest: float  # |B|^2 at and below which the system counts as singular
 
     @classmethod
-    def of(cls, cores: NDArray[np.complex128]) -> _SharedWave | None:
+    def of(cls, cores: NDArray[np.complex128]) -> SharedWave | None:
         """Return the wave that masks of these cores share, (n_masks, q, r); None if they share none.
 
         Let R be the strongest reference wave, and r_k = t_k R that of mask k. With u = psi conj(R) its equation

@@ -13,7 +13,8 @@ from zwfs._unwrapping import unwrapped
 from zwfs.frames import Calibration
 from zwfs.frames import _fit as fitting
 from zwfs.frames._fit import fit_bench
-from zwfs.frames._learnt import Windows, of_bench
+from zwfs.frames._fitted import Windows
+from zwfs.frames._learnt import of_bench
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
 from zwfs.frames._solver import Eliminated, fine_phase

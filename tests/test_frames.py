@@ -411,11 +411,10 @@ def test_bench_writes_what_the_pipeline_reads(tmp_path):
     bench = Bench(n_pixels=D, gap=0.02, stop=0.8)
     commanded = segment_screens(bench, 0.3, 1, seed=2)[0]
     written = write_bench(tmp_path, bench, commanded, n_bad=40, seed=1)
-    files = {name: camera.read(path) for name, path in written.items()}
-    shared = [files["dark"]], [files["bad_pixels"]]
-    frames, clear_frames = (camera.images([files[name]], *shared) for name in ("frame", "pupils"))
-    assert files["frame"].keyword("WAVELEN") == 635
-    assert files["frame"].keyword("DIMPLE") == 1.06
+    kinds = ("frame", "pupils", "dark", "bad_pixels")
+    frames, clear_frames, [source, *_] = camera.read_all(*([written[kind]] for kind in kinds))
+    assert source.keyword("WAVELEN") == 635
+    assert source.keyword("DIMPLE") == 1.06
     assert fits.getheader(tmp_path / "frame.fits")["BITPIX"] == 16
     assert np.count_nonzero(frames[0].bad) == 40
     registered = register_frames(frames, clear_frames)
@@ -477,9 +476,9 @@ def seal():
     folder = os.environ.get(SEAL)
     if not folder:
         pytest.skip(f"{SEAL} is not set: the frames of the SEAL bench carry no licence and are not part of this")
-    read = lambda name: camera.read(Path(folder) / f"{name}_ZWFS_SEAL.npy")  # noqa: E731
-    frames = camera.images([read("img_onDimple")])
-    return frames, camera.images([read("img_offDimpleLeft"), read("img_offDimpleRight")])
+    names = ["onDimple"], ["offDimpleLeft", "offDimpleRight"]
+    paths = ([Path(folder) / f"img_{name}_ZWFS_SEAL.npy" for name in kind] for kind in names)
+    return camera.read_all(*paths)[:2]
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,10 @@ from scipy import ndimage
 from zwfs import _check
 from zwfs._system import paths_of
 from zwfs.frames._blocks import FileError, blocks_of
-from zwfs.frames._learnt import Windows
+from zwfs.frames._fitted import Windows
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
-from zwfs.frames.files import CameraFile, averaged, dark_of, images, read, read_all
+from zwfs.frames.files import CameraFile, averaged, combined, dark_of, read, read_all
 from zwfs.frames.pipeline import Measurement, Optics, reduce_frames
 from zwfs.frames.refine import _check_fit, fit
 from zwfs.frames.registration import Image, check_centers, check_diameter, find_pupils, register_frames
@@ -167,7 +167,7 @@ def _read_states(
         CameraFile(cube.mean(axis=0), source.firsts[0].name, "", source.header)
         for cube, source in ((frames, stack), (clear, clear_stack))
     ]
-    bad = np.stack([image.bad for image in images(means[1:], (), maps, _check.LARGEST)])
+    bad = np.stack([image.bad for image in combined(means[1:], (), maps)])
     dark, clear_dark = (
         np.zeros(clear.shape[1:]) if values is None else values
         for values in (dark_of(means[:1], darks), dark_of(means[1:], pupil_darks or darks))

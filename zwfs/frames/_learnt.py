@@ -9,17 +9,16 @@ focus of the relay to first order.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from zwfs import _check
 from zwfs._images import radius
 from zwfs.frames._errors import slopes_of, unexplained
 from zwfs.frames._fit import BenchFit, places_of
-from zwfs.frames._fitted import FittedSensor
+from zwfs.frames._fitted import FittedSensor, Windows
 from zwfs.frames.pipeline import Optics, unmixed
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
@@ -32,56 +31,6 @@ _RMS = (0.15, 0.3, 0.5, 0.8)  # radian, of these
 _FINEST = 20  # cycles / D
 _STIFFNESS = 1e-3  # variance of the frames up to which a weight stays what leakage alone makes it
 _FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
-WIDEST = 2**16  # rows or columns of a camera
-
-
-class Windows(NamedTuple):
-    """Windows around the two pupils on one or two images of a camera."""
-
-    corners: NDArray[np.int64]  # (2, 2), row and column of their first pixels
-    size: tuple[int, int]
-    n_images: int
-    shape: tuple[int, int]  # of an image
-
-    @classmethod
-    def checked(cls, size: tuple[int, int], corners: Any, n_images: Any, shape: Any) -> Windows:
-        shape = size if shape is None else _check.pair("shape", shape, _check.integer, 1, WIDEST)
-        n_images = _check.integer("n_images", n_images, 1, 2)
-        corners, most = _check.integer_array("corners", corners), np.subtract(shape, size)
-        if corners.shape != (2, 2) or np.any(corners < 0) or np.any(corners > most):
-            raise ValueError(
-                f"corners = {_check.shown(corners.tolist())}: expected two pairs of a row and a column, from "
-                f"(0, 0) to {tuple(most.tolist())}, so that frames of {size} lie on one of {shape}"
-            )
-        return cls(corners, size, n_images, shape)
-
-    @classmethod
-    def of(cls, calibration: Calibration, bench: BenchFit) -> Windows:
-        """Windows whose frames a calibration was fitted to."""
-        size, n = bench.point.problem.camera.shape, len(bench.light)
-        first = places_of(bench.point.model.arms[:2], n, size)[:, :, 0, 0]
-        corners = np.rint(calibration.places[:, :, 0, 0] - first).astype(int)
-        return cls(corners, size, calibration.n_images, calibration.shape)
-
-    @property
-    def places(self) -> list[tuple[int, slice, slice]]:
-        """Image, rows and columns of each window."""
-        height, width = self.size
-        return [
-            (min(index, self.n_images - 1), slice(row, row + height), slice(column, column + width))
-            for index, (row, column) in enumerate(self.corners)
-        ]
-
-    def cut(self, images: NDArray) -> NDArray:
-        """Windows (..., 2, height, width) of images (..., n_images, ny, nx)."""
-        return np.stack([images[(..., *place)] for place in self.places], axis=-3)
-
-    def on_camera(self, pairs: NDArray) -> NDArray:
-        """Images (k, n_images, ny, nx) with windows (k, 2, height, width), and 0 elsewhere."""
-        images = np.zeros((len(pairs), self.n_images, *self.shape))
-        for index, place in enumerate(self.places):
-            images[(slice(None), *place)] = pairs[:, index]
-        return images
 
 
 def of_bench(

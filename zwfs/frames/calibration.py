@@ -30,9 +30,9 @@ from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._errors import Excess, sideways, slopes_of
 from zwfs.frames._exposures import Exposures
 from zwfs.frames._fit import BenchFit, fit_bench
+from zwfs.frames._fitted import WIDEST, Windows, smooth_phases
 from zwfs.frames._grid import Grid
-from zwfs.frames._learnt import WIDEST, Windows, of_bench
-from zwfs.frames._smooth import smooth_phases
+from zwfs.frames._learnt import of_bench
 from zwfs.frames._solver import MapPrior
 from zwfs.frames.controller import Controller, PhaseController, make_controller
 from zwfs.frames.phases import Flag, Phases
@@ -200,8 +200,8 @@ class Calibration(Immutable):
         diameter, phase_shifts : float, lambda/D, and sequence of one or two floats, radian
             Of the dimple; DIMPLE, THETA1 and THETA2 of the header if 0 and empty. With one, there is one image.
         saturation : float, counts, optional
-            Of the camera, see `zwfs.frames.files.images`. Without it the frames to come are compared with SATURATE
-            of the header, or with the largest number of their type.
+            Of the camera, see `zwfs.frames.files.read_all`. By default the limit of the frames to come is SATURATE
+            of the header, or the largest number of their type.
         fitted : sequence of str
             Parameters that `zwfs.frames.refine.fit` fits to these frames.
         commands : str or Path, optional

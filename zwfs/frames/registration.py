@@ -296,13 +296,13 @@ def register_frames(
         _check.sequence(name, images, Image)
         if len(images) not in (1, n_pupils):
             raise ValueError(f"{name} holds {len(images)} images: expected 1{' or 2' * (n_pupils == 2)}")
-    if n_pupils == 1:
-        frames, clear_frames = [frames[0]] * 2, [clear_frames[0]] * 2
     unmarked = *frames, *clear_frames
     # The clear frames are judged alone, so that a pupil stands at the same place for all frames.
     frames, clear_frames = _without_odd(frames, clear_frames), _without_odd(clear_frames)
     marked = zip((*frames, *clear_frames), unmarked, strict=True)
     n_odd = sum(int(np.count_nonzero(image.bad & ~before.bad)) for image, before in marked)
+    if n_pupils == 1:
+        frames, clear_frames = frames * 2, clear_frames * 2
     shape = clear_frames[0].counts.shape
     diameter = None if pupil_diameter is None else check_diameter(pupil_diameter, shape)
     centers = None if pupil_centers is None else check_centers(pupil_centers, n_pupils)
@@ -426,7 +426,7 @@ def _locate(
     images: Sequence[Image], centers: NDArray | None, diameter: float | None
 ) -> tuple[tuple[Image, Image], tuple[Circle, Circle]]:
     """Two images and the pupil on each; surroundings that software cut out are continued."""
-    shared, n_pupils = len(images) == 1, 3 - len(images)
+    n_pupils, shared = 3 - len(images), images[0] is images[-1]
     if centers is not None and diameter is not None:
         circles = [Circle(row, column, diameter) for row, column in centers.tolist()]
     else:

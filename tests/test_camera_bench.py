@@ -343,9 +343,9 @@ def test_calibrated_phase_has_half_the_error_that_the_plain_route_had(calibrated
 def test_smooth_phase_of_a_whole_camera_image_is_that_of_its_windows():
     bench, calibration = BENCH, fitted(BENCH)
     frames, _, phases = bench.recording(seed=1)
-    windows = Windows.checked((52, 52), [[3, 2], [1, 60]], 1, (60, 120))
+    windows = Windows(np.array([[3, 2], [1, 60]]), (52, 52), 1, (60, 120))
     dark = np.full((1, 60, 120), 50, np.float32)
-    whole = of_bench(Calibration, calibration.bench, frames, phases, dark, windows)
+    whole = of_bench(Calibration, calibration.bench, frames, phases, windows, dark)
     counts = bench.counts(bench.smooth(0.3, seed=1), (7, 1))
     counts[1, 20, 30] = np.nan
     [image] = windows.on_camera(counts[np.newaxis])[0] + 50

@@ -15,7 +15,9 @@ from scipy import ndimage
 from zwfs import _check
 from zwfs._system import paths_of
 from zwfs.frames._blocks import FileError, blocks_of
+from zwfs.frames._fit import fit_bench
 from zwfs.frames._fitted import Windows
+from zwfs.frames._learnt import of_bench
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
 from zwfs.frames.files import CameraFile, averaged, combined, dark_of, read, read_all
@@ -70,12 +72,12 @@ class Source(NamedTuple):
         place = {name: self.settings.get(name) for name in ("pupil_centers", "pupil_diameter")}
         windows, n_pixels = _windows(states, *place.values())
         frames, clear = windows.cut(states.frames), windows.cut(states.clear)
-        settings = camera | attributes | {"n_pixels": n_pixels, "diameter": optics.diameter}
-        settings |= {"phase_shifts": optics.phase_shifts, "n_images": windows.n_images}
+        design: Any = {"n_pixels": n_pixels, "diameter": optics.diameter, "phase_shifts": optics.phase_shifts}
 
         def fitted_to(n_states: int) -> Calibration:
-            data: Any = frames[:n_states], clear, states.commands[:n_states], states.dark
-            return Calibration.fit(*data, corners=windows.corners, shape=windows.shape, **settings)
+            counts, commands = frames[:n_states], states.commands[:n_states]
+            bench = fit_bench(counts, clear, commands, **design, **camera)
+            return of_bench(Calibration, bench, counts, commands, windows, states.dark, **attributes)
 
         try:
             plain = Calibration.of(_measured(states, optics, place), states.dark, **attributes)

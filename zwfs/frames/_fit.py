@@ -411,11 +411,10 @@ def _changes(data: Recording, point: Point) -> NDArray[np.float64]:
     First, the light is divided anew. Second, each point keeps its light, and is divided as an edge divides it.
     """
     of, f = point.problem, 2 * point.problem.camera.f
-    before: Any = of.light
     finer, twice = _camera(data, of.camera, f), np.ones((2, 2))
     light = Light.sharp(np.maximum(point.light_means, 0), f)
     # Halfway between the amplitude of the fit and a new one, of which it is not known which is better.
-    light = replace(light, amplitude=(np.kron(before.amplitude, twice) + light.amplitude) / 2)
+    light = replace(light, amplitude=(np.kron(of.light.amplitude, twice) + light.amplitude) / 2)
     n = len(point.light)
     sharp = np.kron(light.start.reshape(n, 2, n, 2).mean(axis=(1, 3)), twice)
     share = np.divide(light.start, sharp, out=np.ones_like(sharp), where=sharp > 1e-6)

@@ -15,7 +15,6 @@ from zwfs._images import nearest_good
 from zwfs._unwrapping import unwrapped
 from zwfs.frames._explicit import Explicit, Posterior
 from zwfs.frames._fit import EXPLAINED, BenchFit, places_of
-from zwfs.frames._light import KnownLight
 from zwfs.frames._optics import Camera, Exposure, Linearised
 from zwfs.frames._solver import MapPrior, PhaseMap, Point, Problem, allowing, fine_phase, minimise
 from zwfs.frames._states import PAD
@@ -60,18 +59,6 @@ class Windows(NamedTuple):
     size: tuple[int, int]
     n_images: int
     shape: tuple[int, int]  # of an image
-
-    @classmethod
-    def checked(cls, size: tuple[int, int], corners: Any, n_images: Any, shape: Any) -> Windows:
-        shape = size if shape is None else _check.pair("shape", shape, _check.integer, 1, WIDEST)
-        n_images = _check.integer("n_images", n_images, 1, 2)
-        corners, most = _check.integer_array("corners", corners), np.subtract(shape, size)
-        if corners.shape != (2, 2) or np.any(corners < 0) or np.any(corners > most):
-            raise ValueError(
-                f"corners = {_check.shown(corners.tolist())}: expected two pairs of a row and a column, from "
-                f"(0, 0) to {tuple(most.tolist())}, so that frames of {size} lie on one of {shape}"
-            )
-        return cls(corners, size, n_images, shape)
 
     @classmethod
     def of(cls, calibration: Calibration, bench: BenchFit) -> Windows:
@@ -173,8 +160,7 @@ class FittedSensor:
 
     def __init__(self, fit: BenchFit) -> None:
         self.fit, self._fitted = fit, fit.point.problem
-        light, of = fit.point.light, self._fitted.camera
-        self._light = KnownLight(self._fitted.light.maps(light, 0 * light), light)
+        of, self._light = self._fitted.camera, replace(self._fitted.light, start=fit.point.light)
         flat = np.zeros((1, of.n * of.f, of.n * of.f))
         settings: Any = [Exposure(0, 0, 0), Exposure(1, 1, 0)], flat, of.f, of.largest
         self._camera = Camera(of.n, of.shape, of.n_pixels, *settings, n_arms=of.n_arms)

@@ -34,13 +34,19 @@ _FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
 
 
 def of_bench(
-    kind: type[Calibration], bench: BenchFit, counts: NDArray, phases: NDArray, dark: NDArray, windows: Windows,
-    **settings: Any,
+    kind: type[Calibration], bench: BenchFit, counts: NDArray, phases: NDArray, windows: Windows | None = None,
+    dark: NDArray | None = None, **settings: Any,
 ) -> Calibration:  # fmt: skip
-    """Calibration of a fitted bench, from the mean frames of its states, (n_states, 2, ny, nx), less the dark.
+    """Calibration of a fitted bench, from its frames, (n_states, [n_frames,] 2, ny, nx), less the dark.
 
-    The focus of the relay is corrected to first order, around a flat wavefront.
+    The focus of the relay is corrected to first order, around a flat wavefront. By default the frames are the
+    camera images.
     """
+    settings["n_averaged"] = counts.shape[1] if counts.ndim == 5 else 1
+    counts = counts.mean(axis=1) if counts.ndim == 5 else counts
+    size = counts.shape[-2:]
+    windows = windows or Windows(np.zeros((2, 2), int), (size[0], size[1]), 2, (size[0], size[1]))
+    dark = np.zeros((windows.n_images, *windows.shape)) if dark is None else dark
     calibration = _unweighted(kind, bench, counts, dark, windows, settings)
     work, shape = calibration._work, calibration.good.shape
     good = calibration.good & ~work.touched(work.bad[np.newaxis])[0]
@@ -79,7 +85,7 @@ def _unweighted(
     background, flux = (np.array([arm[key] for arm in arms]) for key in ("background", "flux"))
     return kind(
         pupil.amplitude, n_pixels, pupil.center, optics, windows.shape, windows.n_images,
-        places_of(arms, n, windows.size) + windows.corners[..., None, None], dark,
+        places_of(arms, n, windows.size) + windows.corners[..., None, None], dark.astype(np.float32),
         windows.on_camera(bad[np.newaxis])[0] > 0, pupil.inside, background, flux * light[pupil.inside].mean(),
         np.zeros((2, 2, n, n)), np.zeros((2, n, n)), False, np.ones(2), np.zeros((0, n, n), np.float32),
         np.zeros(0), np.zeros((0, 2)), blur=masks["blur"], commanded=True, bench=bench, **settings,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import fft, linalg, ndimage
 from scipy.interpolate import BSpline
 
-from zwfs.frames._light import KnownLight, Light
+from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Linearised, names_of, pooled, symbol
 
 if TYPE_CHECKING:
@@ -165,7 +165,7 @@ class Problem:
     camera: Camera
     counts: NDArray[np.float64]  # (n_images, ny, nx)
     weights: NDArray[np.float64]  # one over the noise of each pixel; 0 for bad pixels
-    light: Light | KnownLight
+    light: Light
     phase_map: PhaseMap
     light_maps: tuple[LightMap, ...]  # empty if the light is known
     values: NDArray[np.float64]  # all numbers; those that are free do not count

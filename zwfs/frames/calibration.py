@@ -30,7 +30,7 @@ from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._errors import Excess, sideways, slopes_of
 from zwfs.frames._exposures import Exposures
 from zwfs.frames._fit import BenchFit, fit_bench
-from zwfs.frames._fitted import WIDEST, Windows, smooth_phases
+from zwfs.frames._fitted import WIDEST, smooth_phases
 from zwfs.frames._grid import Grid
 from zwfs.frames._learnt import of_bench
 from zwfs.frames._solver import MapPrior
@@ -43,6 +43,10 @@ from zwfs.reconstructors.base import Reconstructor
 from zwfs.sensor import ZernikeSensor
 
 FORMAT = 2  # of the file; another number is refused
+_RANGES = (
+    ("n_iterations", 1, math.inf), ("tolerance", 0, 2 * np.pi), ("residual", 0, math.inf), ("blur", 0, 10),
+    ("light_ratio", 0, math.inf), ("n_averaged", 1, math.inf), ("n_images", 1, 2), ("diameter", 1, math.inf),
+)  # fmt: skip
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 
 
@@ -130,48 +134,32 @@ class Calibration(Immutable):
     bench: BenchFit | None = None
 
     def __post_init__(self) -> None:
-        _check.integer("n_iterations", self.n_iterations, 1)
-        _check.number("tolerance", self.tolerance, 0, 2 * np.pi)
+        _check.declared(self)
+        for name, low, high in _RANGES:
+            _check.number(name, getattr(self, name), low, high, open_low=name == "light_ratio")
         _check.number_or_inf("saturation", self.saturation, open_low=True)
-        _check.instance("bunit", self.bunit, str)
-        _check.flag("balance", self.balance)
-        _check.number("residual", self.residual, 0)
-        _check.number("light_ratio", self.light_ratio, 0, open_low=True)
-        _check.number("blur", self.blur, 0, 10)
-        _check.integer("n_averaged", self.n_averaged, 1)
-        _check.integer("n_images", self.n_images, 1, 2)
-        _check.number("diameter", self.diameter, 1)
-        _check.pair("center", self.center, _check.number)
-        _check.instance("optics", self.optics, Optics)
-        _check.flag("commanded", self.commanded)
-        if self.bench is not None:
-            _check.instance("bench", self.bench, BenchFit)
         shape = _check.pair("shape", self.shape, _check.integer, 1, WIDEST)
-        amplitude = _check.real_map("amplitude", self.amplitude)
-        _check.non_negative("amplitude", amplitude)
-        grid, camera = amplitude.shape, (self.n_images, *shape)
-        n_states = _check.real_array("slopes", self.slopes).size
-        bad, good = _check.flag_map("bad", self.bad, camera), _check.flag_map("good", self.good, grid)
-        if not np.any(good & (amplitude > 0)):
-            raise ValueError("amplitude is 0 at all good points: expected light at some")
-        arrays = {"amplitude": amplitude, "bad": bad, "good": good}
-        for name, size in {
-            "places": (2, 2, *grid), "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2, *grid),
-            "offset": (2, *grid), "light": (2,), "unexplained": (n_states, *grid), "slopes": (n_states,),
-            "displacements": (n_states, 2),
-        }.items():  # fmt: skip
-            array = _check.real_array(name, getattr(self, name))
+        grid, camera = _check.real_map("amplitude", self.amplitude).shape, (self.n_images, *shape)
+        n_states = self.slopes.size
+        sizes: dict[str, tuple[int, ...]] = {
+            "amplitude": grid, "good": grid, "bad": camera, "places": (2, 2, *grid),
+            "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2, *grid), "offset": (2, *grid),
+            "light": (2,), "unexplained": (n_states, *grid), "slopes": (n_states,), "displacements": (n_states, 2),
+        }  # fmt: skip
+        for name, size in sizes.items():
+            array = getattr(self, name)
             if array.shape != size:
                 raise ValueError(f"{name} has shape {array.shape}: expected {size}")
             _check.finite(name, array)
-            arrays[name] = array
             if name in ("unit", "light") and np.any(array <= 0):
                 raise ValueError(f"{name} = {_check.shown(array)}: expected values above 0")
-        if np.any(np.abs(arrays["places"]) > 2 * max(shape)):  # the work grows with the distance
-            reach = np.abs(arrays["places"]).max()
-            raise ValueError(f"places reaches {reach:.3g}: expected pixels of a camera image of {shape}")
-        for name, array in arrays.items():
             object.__setattr__(self, name, read_only(array))
+        _check.non_negative("amplitude", self.amplitude)
+        if not np.any(self.good & (self.amplitude > 0)):
+            raise ValueError("amplitude is 0 at all good points: expected light at some")
+        if np.any(np.abs(self.places) > 2 * max(shape)):  # the work grows with the distance
+            reach = np.abs(self.places).max()
+            raise ValueError(f"places reaches {reach:.3g}: expected pixels of a camera image of {shape}")
 
     def __repr__(self) -> str:
         images = f"{self.n_images} camera image{'s' * (self.n_images > 1)} of {self.shape}"
@@ -292,9 +280,8 @@ class Calibration(Immutable):
 
     @classmethod
     def fit(
-        cls, frames: ArrayLike, clear_frames: ArrayLike, phases: ArrayLike, dark: ArrayLike | None = None, *,
-        n_pixels: float, corners: ArrayLike = ((0, 0), (0, 0)), shape: tuple[int, int] | None = None,
-        n_images: int = 2, noise: float | None = None, gain: float = 1.0, diameter: float = 1.06,
+        cls, frames: ArrayLike, clear_frames: ArrayLike, phases: ArrayLike, *, n_pixels: float,
+        noise: float | None = None, gain: float = 1.0, diameter: float = 1.06,
         phase_shifts: tuple[float, float] = (np.pi / 2, -np.pi / 2), oversampling: int | None = None,
         n_steps: int = 15, progress: Callable[[str], Any] | None = None, **settings: Any,
     ) -> Calibration:  # fmt: skip
@@ -313,13 +300,8 @@ class Calibration(Immutable):
             Phases that the commands add, mean over each pixel, on a grid whose middle is that of the frames. The
             phases of the calibration are on this grid. NaN, or 0 in all states, marks what is unknown around the
             pupil; there the phases are continued.
-        dark : array_like, shape (ny_camera, nx_camera) or (n_images, ny_camera, nx_camera), counts, optional
-            That was subtracted from the frames; none if left out.
         n_pixels : float, pixels
             Diameter D.
-        corners, shape, n_images : array_like of int, shape (2, 2); (int, int); int
-            If the frames were cut out: row and column of their first pixels on the camera, rows and columns of a
-            camera image, and the number of these in an exposure.
         noise : float, counts rms, optional
             Of a pixel of one frame without light: read noise, and that of the background and the dark. By default
             it is estimated from the darkest pixels; `bench` names it.
@@ -348,16 +330,12 @@ class Calibration(Immutable):
         TypeError, ValueError
             If shapes do not belong together, there are fewer than two states, or a clear frame holds no light.
         """
-        counts, phases = _check.real_array("frames", frames), _check.real_array("phases", phases)
-        windows = Windows.checked(counts.shape[-2:], corners, n_images, shape)
-        lost = _dark(dark, (windows.n_images, *windows.shape))
         bench = fit_bench(
-            counts, clear_frames, phases, n_pixels=n_pixels, noise=noise, gain=gain, diameter=diameter,
+            frames, clear_frames, phases, n_pixels=n_pixels, noise=noise, gain=gain, diameter=diameter,
             phase_shifts=phase_shifts, oversampling=oversampling, n_steps=n_steps, progress=progress,
         )  # fmt: skip
-        n_averaged = counts.shape[1] if counts.ndim == 5 else 1
-        counts = counts.mean(axis=1) if counts.ndim == 5 else counts
-        return of_bench(cls, bench, counts, phases, lost, windows, n_averaged=n_averaged, **settings)
+        counts = _check.real_array("frames", frames)
+        return of_bench(cls, bench, counts, _check.real_array("phases", phases), **settings)
 
     @classmethod
     def of(cls, measurement: Measurement, dark: ArrayLike | None = None, **settings: Any) -> Calibration:

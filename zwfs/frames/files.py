@@ -370,13 +370,28 @@ def write_phase(
     _check.sequence("sources", sources, CameraFile)
     path = check_output(output, [source.path for source in sources if source.path], overwrite=overwrite)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-    agreement = phases.agreement
-    measurement, registered = agreement.measurement, agreement.measurement.registered
-    optics = measurement.optics
-    placement = registered.placement
     cards = [
         ("BUNIT", "rad", "in (-pi, pi]; NaN outside and at bad points"),
         ("WAVELEN", wavelength, "[nm] wavelength"),
+        *_agreement_cards(phases),
+    ]
+    for index, source in enumerate(sources, 1):
+        cards += [(f"FILE{index}", source.name, ""), (f"SHA{index}", source.sha256, "")]
+    if sources and "DATE-OBS" in sources[0].header:
+        cards.append(("DATE-OBS", str(sources[0].header["DATE-OBS"]), f"of {sources[0].name}"))
+    cards.append(("CREATOR", f"zwfs {__version__}", ""))
+    measurement = phases.agreement.measurement
+    bad = (measurement.pupil.inside & ~measurement.good).astype(np.uint8)
+    units = (phase_to_opd(phases.phase, wavelength), "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
+    write_file(path, fits_content((phases.phase, "", cards), *units))
+
+
+def _agreement_cards(phases: Phases) -> list[tuple[str, Any, str]]:
+    """Cards of the optics, of the agreement of the frames, and of their places."""
+    agreement, measurement = phases.agreement, phases.agreement.measurement
+    optics, registered = measurement.optics, measurement.registered
+    placement = registered.placement
+    cards = [
         ("PIXSCALE", 1 / registered.diameter, "[D] width of a pixel"),
         *sensor_cards(registered.diameter, measurement.pupil.center, optics),
         ("BACKGRND", optics.background, "background of the frames, 1 = mean of pupil"),
@@ -402,14 +417,7 @@ def write_phase(
             (f"ROW{index}", origin[0], "[pixel] pupil from its place on clear frame 1"),
             (f"COL{index}", origin[1], "[pixel]"),
         ]
-    for index, source in enumerate(sources, 1):
-        cards += [(f"FILE{index}", source.name, ""), (f"SHA{index}", source.sha256, "")]
-    if sources and "DATE-OBS" in sources[0].header:
-        cards.append(("DATE-OBS", str(sources[0].header["DATE-OBS"]), f"of {sources[0].name}"))
-    cards.append(("CREATOR", f"zwfs {__version__}", ""))
-    bad = (measurement.pupil.inside & ~measurement.good).astype(np.uint8)
-    units = (phase_to_opd(phases.phase, wavelength), "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
-    write_file(path, fits_content((phases.phase, "", cards), *units))
+    return cards
 
 
 def sensor_cards(diameter: float, center: tuple[float, float], optics: Optics) -> Cards:

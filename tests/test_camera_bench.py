@@ -17,7 +17,7 @@ from zwfs.frames._fitted import Windows
 from zwfs.frames._learnt import of_bench
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
-from zwfs.frames._solver import Eliminated, fine_phase
+from zwfs.frames._solver import fine_phase
 from zwfs.frames._states import PAD, Recording
 from zwfs.frames.phases import Flag
 
@@ -274,34 +274,6 @@ def test_numbers_of_a_converged_fit_stay_within_their_error_bars_in_a_step_of_al
     point = fit.point
     step = point.matrix.solve(-point.gradient, point.stuck, 300, 1e-3)
     assert np.abs(step[point.problem.n_white :] / fit.sigma).max() < 1
-
-
-@pytest.mark.slow
-def test_error_bars_hardly_change_with_more_iterations_for_the_maps(monkeypatch):
-    point = fitted(BENCH).bench.point
-    changes = 0.01 * (point.problem.weights * point.model.images)[None]  # a part of which light and fluxes follow
-    before = Eliminated(point).covariance(point, changes, 1.0)
-    for name, number in (("_N_FOLLOWED", (24, 24)), ("_N_CHANGES", 24)):
-        monkeypatch.setattr(f"zwfs.frames._solver.{name}", number)
-    after = Eliminated(point).covariance(point, changes, 1.0)
-    np.testing.assert_allclose(*(np.sqrt(np.diagonal(one)) for one in (before, after)), rtol=0.25)
-
-
-@pytest.mark.slow
-def test_equations_with_several_right_sides_are_solved_in_fewer_steps():
-    point = fitted(BENCH).bench.point
-    matrix = point.matrix
-    held = np.arange(len(point.x)) >= point.problem.n_white
-    right = np.where(held, 0, [matrix.back(matrix.along(number)) for number in range(4)])
-
-    def energy(found):
-        """Part of the quadratic form that the equations make small."""
-        return np.array([one @ matrix.product(one) / 2 - one @ b for one, b in zip(found, right, strict=True)])
-
-    together = energy(matrix.solve(right, held, 8, 0))
-    alone = energy([matrix.solve(one, held, 8, 0) for one in right])
-    assert np.all(together < alone)
-    assert np.all(alone < 0)
 
 
 @pytest.mark.slow

@@ -332,14 +332,6 @@ def test_frames_between_bad_ones_stay_and_none_is_left_out(folder, bench, calibr
     assert strict.counts["INCONSISTENT"] == 10
 
 
-def test_frames_without_a_phase_are_flagged_however_few_they_are(folder, bench, calibration):
-    """Two images that do not belong together, in a single frame."""
-    cube, half = bench.frames[:2].copy(), bench.frames.shape[2] // 2
-    cube[0, :, half:] = cube[1, :, half:]
-    np.save("few.npy", cube)
-    assert reconstruct("few.npy", calibration, "plain.fits").counts["INCONSISTENT"] == 1
-
-
 @pytest.mark.parametrize(("moved", "flags"), [((0, 0), 0), ((1, 0), Flag.MOVED), ((0, -1), Flag.MOVED)])
 def test_images_that_have_moved_are_flagged(bench, calibration, moved, flags):
     found = calibration(np.roll(bench.frames, moved, axis=(1, 2)))
@@ -402,22 +394,6 @@ def test_linear_method_replaces_the_iteration(bench):
 
     assert gain(Optics(leakage=leakage)) == pytest.approx(1, abs=0.03)
     assert gain(Optics()) == pytest.approx(1 - 2 * leakage, abs=0.03)
-
-
-@pytest.mark.parametrize("order", [1, -1], ids=["loop", "control: images exchanged"])
-def test_linear_loop_closes_on_camera_images(bench, calibration, order):
-    method, pupil = linear(calibration), calibration.sensor.pupil
-    matrix = calibration.modal_matrix(zernike_basis(pupil, 30))
-    modes = zernike_basis(Pupil.circular(D), 30)
-    start = 0.5 * bench.screens[0] / bench.screens[0][bench.pupil.inside].std()
-    command = np.zeros(30)
-    for _ in range(12):
-        left = start - np.tensordot(command, np.nan_to_num(modes), 1)
-        phases = calibration(bench.expose(bench.sensor.measure(left)[::order]), method=method)
-        command = command + 0.4 * calibration.coefficients(phases, matrix)
-    inside = bench.pupil.inside
-    best = start - np.tensordot(np.linalg.lstsq(modes[:, inside].T, start[inside])[0], np.nan_to_num(modes), 1)
-    assert (rms(left[inside]) < 1.2 * rms(best[inside]) + 0.02) == (order == 1)
 
 
 def test_method_keeps_the_flags_and_fills_bad_pixels(bench, calibration):

@@ -160,10 +160,6 @@ class BenchFit(Result):
         values : mapping of str to float
             By the names of `estimates`, in their units.
 
-        Returns
-        -------
-        BenchFit
-
         Raises
         ------
         TypeError, ValueError

@@ -206,10 +206,6 @@ class Calibration(Immutable):
             Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel. With
             commands only the first two.
 
-        Returns
-        -------
-        Calibration
-
         Raises
         ------
         FileNotFoundError, ImportError, TypeError, ValueError
@@ -266,10 +262,6 @@ class Calibration(Immutable):
         **optics
             Parameters of `Optics`, such as `diameter` and `phase_shifts`.
 
-        Returns
-        -------
-        Calibration
-
         Raises
         ------
         TypeError, ValueError
@@ -321,10 +313,6 @@ class Calibration(Immutable):
         **settings
             Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
 
-        Returns
-        -------
-        Calibration
-
         Raises
         ------
         TypeError, ValueError
@@ -349,10 +337,6 @@ class Calibration(Immutable):
             That was subtracted from the frames of the measurement; none if left out.
         **settings
             Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
-
-        Returns
-        -------
-        Calibration
         """
         _check.instance("measurement", measurement, Measurement)
         registered, pupil, good = measurement.registered, measurement.pupil, measurement.good
@@ -472,10 +456,6 @@ class Calibration(Immutable):
         noise : float or array_like, shape (ny, nx) or (n_images, ny, nx), counts rms, optional
             Of the pixels, with `smooth`. By default it follows from the counts, and from gain and noise of the
             `bench`; that of means of several frames is smaller.
-
-        Returns
-        -------
-        Phases
         """
         counts = _check.plain_array("counts", counts)
         if counts.dtype.kind not in "biuf":
@@ -540,10 +520,6 @@ class Calibration(Immutable):
                 By default the linear `Controller`. The others return a `PhaseController`.
             n_iterations : int, 3 by default
                 Of each frame, of the phase-shifted iteration.
-
-        Returns
-        -------
-        Controller or PhaseController
 
         Raises
         ------

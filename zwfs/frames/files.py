@@ -125,10 +125,6 @@ def read(path: str | Path, *, max_bytes: int = MOST_BYTES, max_images: int = 2) 
     max_images : int
         Largest number of images.
 
-    Returns
-    -------
-    CameraFile
-
     Raises
     ------
     FileNotFoundError

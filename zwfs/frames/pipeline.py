@@ -358,10 +358,6 @@ def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | No
     margin : int, pixels, optional
         Of the frames around the grid of the pupil; by default the largest that both frames hold.
 
-    Returns
-    -------
-    Measurement
-
     Raises
     ------
     ValueError

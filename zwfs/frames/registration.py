@@ -279,10 +279,6 @@ def register_frames(
     n_pupils : int
         1 for a sensor with one mask and one image. The result holds this image twice.
 
-    Returns
-    -------
-    RegisteredFrames
-
     Raises
     ------
     TypeError, ValueError

@@ -147,10 +147,6 @@ def judge(phases: Phases, noise: CameraNoise | None = None, n_iterations: int = 
     n_iterations : int
         Of the predictions of one frame from the other one.
 
-    Returns
-    -------
-    Verdict
-
     Examples
     --------
     >>> from zwfs.bench.model import Bench
@@ -404,10 +400,6 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
         raises the phase; -1 if it shortens it.
     n_iterations : int
         As for `recover_phase`.
-
-    Returns
-    -------
-    ImageOrder
 
     Raises
     ------

@@ -13,7 +13,7 @@ from zwfs._unwrapping import unwrapped
 from zwfs.frames import Calibration
 from zwfs.frames import _fit as fitting
 from zwfs.frames._fit import fit_bench
-from zwfs.frames._fitted import Windows
+from zwfs.frames._fitted import FittedSensor, Windows
 from zwfs.frames._learnt import of_bench
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
@@ -268,21 +268,14 @@ def test_calibration_of_a_foreign_bench_explains_its_frames(calibrated):
 
 
 @pytest.mark.slow
-def test_numbers_of_a_converged_fit_stay_within_their_error_bars_in_a_step_of_all_unknowns():
-    fit = fitted(BENCH).bench
-    assert fit.converged
-    point = fit.point
-    step = point.matrix.solve(-point.gradient, point.stuck, 300, 1e-3)
-    assert np.abs(step[point.problem.n_white :] / fit.sigma).max() < 1
-
-
-@pytest.mark.slow
 def test_other_values_replace_those_of_a_fit_and_explain_its_frames_worse():
     fit = fitted(BENCH).bench
     wrong = fit.replaced({"diameter": 1.06, "leakage": 0.0})
     assert (wrong["diameter"].value, wrong["leakage"].value) == (1.06, 0.0)
     assert wrong["first"] == fit["first"]
-    assert wrong.point.cost > 2 * fit.point.cost
+    recorded = BENCH.recording(seed=1)[0][0]
+    misfit, worse = (np.sum((FittedSensor(one).frames(one.flat) - recorded) ** 2) for one in (fit, wrong))
+    assert worse > 2 * misfit
     with pytest.raises(ValueError, match="values = 'size': expected one of"):
         fit.replaced({"size": 1.0})
     with pytest.raises(TypeError, match="diameter = 'large'"):

@@ -15,7 +15,7 @@ from zwfs._images import nearest_good
 from zwfs._unwrapping import unwrapped
 from zwfs.frames._explicit import Explicit, Posterior
 from zwfs.frames._fit import EXPLAINED, BenchFit, places_of
-from zwfs.frames._optics import Camera, Exposure, Linearised
+from zwfs.frames._optics import Camera, Exposure, Linearised, pooled
 from zwfs.frames._solver import MapPrior, PhaseMap, Point, Problem, allowing, fine_phase, minimise
 from zwfs.frames._states import PAD
 from zwfs.frames.phases import Flag, Phases
@@ -63,8 +63,8 @@ class Windows(NamedTuple):
     @classmethod
     def of(cls, calibration: Calibration, bench: BenchFit) -> Windows:
         """Windows whose frames a calibration was fitted to."""
-        size, n = bench.point.problem.camera.shape, len(bench.light)
-        first = places_of(bench.point.model.arms[:2], n, size)[:, :, 0, 0]
+        size, n = bench.model.shape, len(bench.light)
+        first = places_of(bench.model.arms, n, size)[:, :, 0, 0]
         corners = np.rint(calibration.places[:, :, 0, 0] - first).astype(int)
         return cls(corners, size, calibration.n_images, calibration.shape)
 
@@ -96,8 +96,7 @@ def smooth_phases(
     bench = calibration.bench
     if bench is None:
         raise ValueError(
-            "smooth needs the `bench` of a calibration, and this one has none: expected one from known commands, "
-            "in the process that made it"
+            "smooth needs the `bench` of a calibration, and this one has none: expected one from known commands"
         )
     if not isinstance(prior, MapPrior) and prior is not True:
         raise TypeError(f"smooth = {_check.shown(prior)}: expected True or False, or one of `priors` of phases")
@@ -159,17 +158,17 @@ class FittedSensor:
     """
 
     def __init__(self, fit: BenchFit) -> None:
-        self.fit, self._fitted = fit, fit.point.problem
-        of, self._light = self._fitted.camera, replace(self._fitted.light, start=fit.point.light)
-        flat = np.zeros((1, of.n * of.f, of.n * of.f))
-        settings: Any = [Exposure(0, 0, 0), Exposure(1, 1, 0)], flat, of.f, of.largest
-        self._camera = Camera(of.n, of.shape, of.n_pixels, *settings, n_arms=of.n_arms)
+        self.fit, self._model = fit, fit.model
+        of, side = fit.model, len(fit.model.light.start)
+        pair = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
+        settings: Any = pair, np.zeros((1, side, side)), of.oversampling, of.largest
+        self._camera = Camera(of.n, of.shape, of.n_pixels, *settings, n_arms=4)
 
     def frames(self, phase: NDArray) -> NDArray[np.float64]:
         """Frames (2, ny, nx), counts, of a phase (n, n) that includes that of the optics."""
         fine = fine_phase(np.pad(phase, PAD, "edge"), self._camera.f)
-        maps = self._light.maps(self._light.start, fine)
-        return Linearised(self._camera, maps, self.fit.point.values).images
+        maps = self._model.light.maps(self._model.light.start, fine)
+        return Linearised(self._camera, maps, self._model.values).images
 
     def phase(self, counts: NDArray, sigma: NDArray | None, prior: MapPrior | None) -> PairFit:
         """Phase of a pair of frames (2, ny, nx) less the dark, NaN at bad pixels, with the noise of its pixels."""
@@ -178,11 +177,11 @@ class FittedSensor:
         good = np.isfinite(counts)
         counts, weights = np.where(good, counts, 0), good / sigma
         # Where the start is wrong by a wave, edges of the pupil would hold it there.
-        allowed = _ALLOWED * np.array([arm["flux"] for arm in self.fit.point.model.arms[:2]])
+        allowed = _ALLOWED * np.array([arm["flux"] for arm in self._model.arms])
         soft = allowing(weights, allowed[:, None, None])
         start = self._start(counts)
         phase_map = self._phase_map(MapPrior(_rms_of(start), 3.0))
-        problem = Problem(self._camera, counts, soft, self._light, phase_map, (), self.fit.point.values)
+        problem = Problem(self._camera, counts, soft, self._model.light, phase_map, (), self._model.values)
         point = minimise(problem, phase_map.white(start), 3, 12)[0]
         point = Point(replace(problem, weights=weights), point.x)
         point = self._chosen(point) if prior is None else self._under(prior, point, Explicit.of(point))
@@ -235,8 +234,7 @@ class FittedSensor:
         return point, evidence
 
     def _phase_map(self, prior: MapPrior) -> PhaseMap:
-        of = self._fitted
-        return PhaseMap(of.phase_map.n, of.camera.f, prior, of.camera.n_pixels)
+        return PhaseMap(self._camera.n, self._camera.f, prior, self._camera.n_pixels)
 
     def _under(self, prior: MapPrior, point: Point, data: Explicit | None) -> Point:
         """The same phase with another prior."""
@@ -247,11 +245,11 @@ class FittedSensor:
 
     def _start(self, counts: NDArray) -> NDArray[np.float64]:
         """Phase of the phase-shifted iteration on images brought back to the pupil, unwrapped and continued."""
-        point, n = self.fit.point, self._fitted.phase_map.n
-        light = np.maximum(point.light_means, 0)
-        pupil = Pupil.from_amplitude(np.sqrt(light), self._fitted.camera.n_pixels, threshold=0.3)
+        model, n = self._model, self._model.n
+        light = np.maximum(pooled(model.light.start, model.oversampling), 0)
+        pupil = Pupil.from_amplitude(np.sqrt(light), model.n_pixels, threshold=0.3)
         power = np.mean(pupil.amplitude[pupil.inside] ** 2) / np.mean(light[pupil.inside])
-        masks, arms = point.model.masks, point.model.arms[:2]
+        masks, arms = model.masks, model.arms
         images = np.empty((2, n, n))
         for side, (arm, places) in enumerate(zip(arms, places_of(arms, n, counts.shape[1:]), strict=True)):
             image = (counts[side] - arm["background"]) / arm["flux"] * power

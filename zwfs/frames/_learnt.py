@@ -76,10 +76,10 @@ def _unweighted(
     settings: dict[str, Any],
 ) -> Calibration:  # fmt: skip
     """Calibration with the geometry of a fit, and weights of 0."""
-    masks, arms, n = bench.point.model.masks, bench.point.model.arms[:2], len(bench.light)
+    masks, arms, n = bench.model.masks, bench.model.arms, len(bench.light)
     shares = {"leakage": masks["leakage"], "unmasked": max(masks["unmasked"], 0.0)}
     optics = Optics(masks["diameter"], (masks["first"], masks["second"]), **shares)
-    n_pixels, bad = bench.point.problem.camera.n_pixels, ~np.isfinite(counts).all(axis=0)
+    n_pixels, bad = bench.model.n_pixels, ~np.isfinite(counts).all(axis=0)
     light = bench.light * (radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2)
     pupil = Pupil.from_amplitude(np.sqrt(np.maximum(light, 0)), n_pixels, threshold=_FAINTEST)
     background, flux = (np.array([arm[key] for arm in arms]) for key in ("background", "flux"))

@@ -344,14 +344,19 @@ def _basis(part: NDArray) -> tuple[NDArray, NDArray]:
     return values, before - after
 
 
+def named(values: NDArray) -> tuple[list[dict[str, float]], dict[str, float]]:
+    """Numbers of each arm, and of the masks, by their names."""
+    rows = values[: -len(MASKS)].reshape(-1, len(ARM)).tolist()
+    arms = [dict(zip(ARM, row, strict=True)) for row in rows]
+    return arms, dict(zip(MASKS, values[-len(MASKS) :].tolist(), strict=True))
+
+
 class Optics:
     """The part of the model that depends on the numbers, and not on the maps."""
 
     def __init__(self, camera: Camera, values: NDArray) -> None:
         real, self.values = camera.real, values.copy()
-        split = values[: -len(MASKS)].reshape(camera.n_arms, len(ARM))
-        self.arms = [dict(zip(ARM, row, strict=True)) for row in split.tolist()]
-        self.masks = dict(zip(MASKS, values[-len(MASKS) :].tolist(), strict=True))
+        self.arms, self.masks = named(values)
         self.coefficients = coefficients(self.masks)
         used = {one.arm for one in camera.exposures}
         self.transfer, self.spread, self.splines, self.cores = ({} for _ in range(4))

@@ -47,6 +47,7 @@ _RANGES = (
     ("n_iterations", 1, math.inf), ("tolerance", 0, 2 * np.pi), ("residual", 0, math.inf), ("blur", 0, 10),
     ("light_ratio", 0, math.inf), ("n_averaged", 1, math.inf), ("n_images", 1, 2), ("diameter", 1, math.inf),
 )  # fmt: skip
+_OF_BENCH = "bench_"  # first letters of the names of its arrays in a file
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 
 
@@ -100,7 +101,7 @@ class Calibration(Immutable):
     n_iterations, tolerance : int and float, radian
         As for `PhaseShifted`: with a tolerance of 0, all iterations are done.
     bench : BenchFit or None
-        Optics that were fitted to known commands. `save` does not store it.
+        Optics that were fitted to known commands.
     """
 
     amplitude: NDArray[np.float64]
@@ -155,6 +156,10 @@ class Calibration(Immutable):
                 raise ValueError(f"{name} = {_check.shown(array)}: expected values above 0")
             object.__setattr__(self, name, read_only(array))
         _check.non_negative("amplitude", self.amplitude)
+        if self.bench is not None and any(
+            size > most for size, most in zip(self.bench.model.shape, shape, strict=True)
+        ):
+            raise ValueError(f"bench has frames of {self.bench.model.shape}: expected at most {shape}")
         if not np.any(self.good & (self.amplitude > 0)):
             raise ValueError("amplitude is 0 at all good points: expected light at some")
         if np.any(np.abs(self.places) > 2 * max(shape)):  # the work grows with the distance
@@ -398,7 +403,11 @@ class Calibration(Immutable):
             values: dict[str, Any] = json.loads(str(file["values"]))
             file_format = values.pop("format")
             if file_format == FORMAT:
-                values |= {name: file[name] for name in file.files if name != "values"}
+                bench = {name for name in file.files if name.startswith(_OF_BENCH)}
+                values |= {name: file[name] for name in set(file.files) - bench - {"values"}}
+                if bench:
+                    maps = {name.removeprefix(_OF_BENCH): file[name] for name in bench}
+                    values["bench"] = BenchFit.unpacked(values["bench"], maps)
                 values |= {name: tuple(values[name]) for name in ("center", "shape")}
                 shifts = {"phase_shifts": tuple(values["optics"]["phase_shifts"])}
                 calibration = cls(**values | {"optics": Optics(**values["optics"] | shifts)})
@@ -620,6 +629,9 @@ class Calibration(Immutable):
         arrays: dict[str, Any] = {name: value for name, value in plain.items() if isinstance(value, np.ndarray)}
         values = {name: value for name, value in plain.items() if name not in arrays}
         values |= {"format": FORMAT, "optics": asdict(self.optics)}
+        if self.bench is not None:
+            values["bench"], maps = self.bench.packed()
+            arrays |= {_OF_BENCH + name: array for name, array in maps.items()}
         stream = io.BytesIO()
         np.savez(stream, values=np.array(json.dumps(values, sort_keys=True)), **arrays)
         return stream.getvalue()

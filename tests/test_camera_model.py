@@ -56,7 +56,7 @@ def test_values_in_the_middle_of_a_point_become_means_over_its_cell():
 
 @pytest.mark.parametrize("index", range(len(VALUES)))
 def test_derivatives_are_those_of_finite_differences(camera, maps, index):
-    name = names_of(3)[index]
+    name = names_of(len(VALUES))[index]
     step = np.zeros(VALUES.size)
     step[index] = 1e-4 * SCALE[index]
     point = Linearised(camera, maps, VALUES)

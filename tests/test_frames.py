@@ -7,7 +7,7 @@ import pytest
 from astropy.io import fits
 from scipy import ndimage
 
-from zwfs import Dimple, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, zernike_basis
+from zwfs import Dimple, Patch, PhaseShifted, Pupil, ZernikeSensor, power_law_screens, zernike_basis
 from zwfs.bench import bench_error, write_bench
 from zwfs.bench.model import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.frames import Calibration
@@ -242,6 +242,26 @@ def test_leakage_and_unmasked_light_are_undone(screen):
     np.testing.assert_allclose(found.agreement.correlation, 1, atol=1e-5)
     plain = Optics()
     assert error(recover_phase(reduce_frames(registered, plain), 100), registered, screen) > 0.03
+
+
+def ring(u, v):
+    return np.where(np.hypot(u, v) < 0.4, 1.0, -1j)
+
+
+@pytest.mark.parametrize("second", [Dimple(1.6, -2.0), Patch(1.2, ring, breaks=[0.8])])
+def test_masks_other_than_a_pair_of_dimples_are_taken(tmp_path, screen, second):
+    pupil, *_ = pair()
+    sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), second, extent=1 + 2 * MARGIN / D)
+    frames, bare = sensor.measure(screen), np.stack([np.pad(pupil.amplitude**2, MARGIN)] * 2)
+    registered = register_frames([image(np.hstack(frames))], [image(np.hstack(bare))], subpixel=False, **EXACT)
+    measurement = reduce_frames(registered, Optics(masks=sensor.masks))
+    assert error(recover_phase(measurement, 100), registered, screen) < 0.01
+    with pytest.raises(ValueError, match="masks are objects"):
+        Calibration.of(measurement).save(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match="holds 'diameter'"):
+        fit(registered, measurement.optics, ["diameter"])
+    with pytest.raises(TypeError, match="masks holds a str: expected masks"):
+        Optics(masks=("ring",))
 
 
 def test_fit_finds_the_diameter_and_the_scale(screen):

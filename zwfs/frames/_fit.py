@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ from zwfs import _check
 from zwfs._images import radius, turning
 from zwfs._results import Result
 from zwfs.frames._light import Light
-from zwfs.frames._optics import Camera, Exposure, Linearised, named, names_of
+from zwfs.frames._optics import ARM, MASKS, Camera, Exposure, Linearised, named, names_of
 from zwfs.frames._solver import (
     MISSED,
     Eliminated,
@@ -50,7 +49,7 @@ _BLURRED = {"phase shift": 3e-4, "focus": 5e-6}
 _SHARP = {"row": 1.2e-3, "column": 1.2e-3, "rotation": 2e-4, "magnification": 4e-5}
 _PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the physics
 _MOST = 1e9  # of a number that replaces an estimate
-_N_ARMS = 4  # the frames behind the masks, and the clear frames
+_N_NUMBERS = 4 * len(ARM) + len(MASKS)  # arms of the frames behind the masks, and of the clear frames
 # Fields of a fit and of its model, as they are saved.
 _PLAIN_OF_FIT = "noise", "gain", "converged", "remarks"
 _MAPS_OF_FIT = "covariance", "flat", "light", "misfit"
@@ -119,7 +118,7 @@ class FrameModel:
             _check.number(name, getattr(self, name), low, high)
         side, maps = self.n * self.oversampling, vars(self.light)
         for name, array in {**maps, "values": self.values}.items():
-            size = (side, side) if name in maps else (len(names_of(_N_ARMS)),)
+            size = (side, side) if name in maps else (_N_NUMBERS,)
             if array.shape != size:
                 raise ValueError(f"{name} has shape {array.shape}: expected {size}")
             _check.finite(name, array)
@@ -360,8 +359,8 @@ def _problem(data: Recording, start: _Start, f: int) -> tuple[Problem, NDArray]:
     exposures = [Exposure(2, None, 0), Exposure(3, None, 0)]
     exposures += [Exposure(side, side, state) for state in range(len(data.phases)) for side in (0, 1)]
     camera = Camera(n, shape, data.n_pixels, exposures, fine_phase(data.phases, f), f, 1.9 * start.diameter)
-    values = np.zeros(len(names_of(_N_ARMS)))
-    values[names_of(_N_ARMS).index("arm 2 flux")] = flux[0]  # the only number that is not free
+    values = np.zeros(_N_NUMBERS)
+    values[names_of(_N_NUMBERS).index("arm 2 flux")] = flux[0]  # the only number that is not free
     division = Light.sharp(light, f)
     smooth = [ndimage.uniform_filter(one, 3) for one in data.counts]
     free = _free(data, start)
@@ -390,18 +389,17 @@ def _fitted(
         staged = _staged(data, problem, stage)
         if not stage.allowed:  # with the true noise, steps need to know how the maps follow
             staged = replace(staged, following=Eliminated(Point(staged, x)))
-        name = f"stage {number + 1} of {len(_STAGES)}, {problem.camera.f} points along a pixel"
-        settings: Any = n_steps, stage.n_inner, stage.enough, partial(_report_step, report, name)
+        name = f"stage {number + 1} of {len(_STAGES)}, {problem.camera.f} points along a pixel, step"
+        settings: Any = n_steps, stage.n_inner, stage.enough, lambda step, name=name: report(f"{name} {step}")
         point, converged = minimise(staged, x, *settings)
         if stage.signs and np.mean(point.misfit) > _WRONG * _expected(problem, staged):
             others = [minimise(staged, one, *settings)[0] for one in _other_signs(point)]
             point = min(point, *others, key=lambda one: one.cost)
-        problem, x = _next(data, point, stage.divide)
+        if stage.divide:
+            problem, x = _divided(data, point, problem.camera.f)
+        else:
+            problem, x = replace(point.problem, weights=data.weights(point.model.images)), point.x
     return point, converged
-
-
-def _report_step(report: Callable[[str], Any], name: str, step: int) -> None:
-    report(f"{name}, step {step}")
 
 
 def _expected(problem: Problem, staged: Problem) -> float:
@@ -427,13 +425,6 @@ def _staged(data: Recording, problem: Problem, stage: _Stage) -> Problem:
     ]
     level = stage.allowed * data.light[1][0]
     return replace(problem, weights=allowing(problem.weights, level), free=free)
-
-
-def _next(data: Recording, point: Point, divide: bool) -> tuple[Problem, NDArray]:
-    """Return the next problem and its start, with weights, and on demand the light, by what was fitted."""
-    if divide:
-        return _divided(data, point, point.problem.camera.f)
-    return replace(point.problem, weights=data.weights(point.model.images)), point.x
 
 
 def _divided(data: Recording, point: Point, f: int) -> tuple[Problem, NDArray]:

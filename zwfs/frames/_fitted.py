@@ -162,7 +162,7 @@ class FittedSensor:
         of, side = fit.model, len(fit.model.light.start)
         pair = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
         settings: Any = pair, np.zeros((1, side, side)), of.oversampling, of.largest
-        self._camera = Camera(of.n, of.shape, of.n_pixels, *settings, n_arms=4)
+        self._camera = Camera(of.n, of.shape, of.n_pixels, *settings)
 
     def frames(self, phase: NDArray) -> NDArray[np.float64]:
         """Frames (2, ny, nx), counts, of a phase (n, n) that includes that of the optics."""

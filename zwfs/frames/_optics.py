@@ -68,9 +68,10 @@ class Maps(NamedTuple):
     cells: NDArray[np.bool_] | bool = True
 
 
-def names_of(n_arms: int) -> list[str]:
-    """Names of all numbers in the order of the vector: each arm, then the masks."""
-    return [f"arm {arm} {name}" for arm in range(n_arms) for name in ARM] + list(MASKS)
+def names_of(size: int) -> list[str]:
+    """Names of so many numbers in the order of the vector: each arm, then the masks."""
+    arms = range((size - len(MASKS)) // len(ARM))
+    return [f"arm {arm} {name}" for arm in arms for name in ARM] + list(MASKS)
 
 
 class Camera:
@@ -90,13 +91,10 @@ class Camera:
         commands: NDArray,
         oversampling: int,
         largest: float,
-        *,
-        n_arms: int | None = None,
         real: Any = np.float64,
     ) -> None:
         self.n, self.shape, self.n_pixels, self.f, self.largest = n, shape, n_pixels, oversampling, largest
         self.exposures, self.commands, self.real = tuple(exposures), commands, real
-        self.n_arms = n_arms or 1 + max(one.arm for one in exposures)
         f, inner = oversampling, n * oversampling
         size = max(n, *shape) * f + 2 * _BORDER * f
         while (size - inner) % 2 or fft.next_fast_len(size) != size:
@@ -136,7 +134,7 @@ class Camera:
     def single(self) -> Camera:
         """Camera with the same settings in single precision."""
         settings: Any = self.exposures, self.commands, self.f, self.largest
-        camera = Camera(self.n, self.shape, self.n_pixels, *settings, n_arms=self.n_arms, real=np.float32)
+        camera = Camera(self.n, self.shape, self.n_pixels, *settings, np.float32)
         camera.double = self
         return camera
 

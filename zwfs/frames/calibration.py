@@ -13,7 +13,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -265,7 +265,7 @@ class Calibration(Immutable):
         saturation, n_iterations, tolerance : float, counts; int; float, radian
             Attributes of the calibration.
         **optics
-            Parameters of `Optics`, such as `diameter` and `phase_shifts`.
+            Parameters of `Optics`, such as `diameter` and `phase_shifts`, or `masks`.
 
         Raises
         ------
@@ -377,9 +377,11 @@ class Calibration(Immutable):
         Raises
         ------
         TypeError, ValueError
-            If the path is none, or names a file that is not a calibration.
+            If the path is none, or names a file that is not a calibration, or the optics have `masks`.
         """
         path = path_of("path", path)
+        if self.optics.masks:
+            raise ValueError("optics.masks are objects: expected dimples of one diameter, which a file can hold")
         if path.exists() and not (path.is_file() and _is_calibration(path)):
             raise ValueError(f"path = {str(path)!r} exists and is not a calibration: expected a new name")
         write_file(path, self._content)
@@ -628,7 +630,10 @@ class Calibration(Immutable):
         plain = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "bench"}
         arrays: dict[str, Any] = {name: value for name, value in plain.items() if isinstance(value, np.ndarray)}
         values = {name: value for name, value in plain.items() if name not in arrays}
-        values |= {"format": FORMAT, "optics": asdict(self.optics)}
+        optics = {name: value for name, value in vars(self.optics).items() if name != "masks"}
+        values |= {"format": FORMAT, "optics": optics}
+        if self.optics.masks:
+            values["masks"] = repr(self.optics.masks)
         if self.bench is not None:
             values["bench"], maps = self.bench.packed()
             arrays |= {_OF_BENCH + name: array for name, array in maps.items()}

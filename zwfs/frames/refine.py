@@ -176,6 +176,8 @@ def _check_fit(argument: str, names: Any, optics: Any) -> None:
     listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
     if not listed or not all(isinstance(name, str) and name in choices for name in names):
         raise ValueError(f"{argument} = {_check.shown(names)}: expected a list with some of {list(choices)}")
+    if optics.masks and "diameter" in names:
+        raise ValueError(f"{argument} holds 'diameter': expected a fit of other values with optics.masks")
     if len(set(names)) < len(names):
         raise ValueError(f"{argument} = {_check.shown(names)}: expected each name once")
     for name in set(names) & set(_RANGES):

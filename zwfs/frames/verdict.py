@@ -430,7 +430,7 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
     if flat.pupil.shape != poked.pupil.shape or flat.optics != poked.optics:
         raise ValueError("flat and poked differ in optics or in the grid of the pupil: expected the same")
     optics = flat.optics
-    choices = [optics, replace(optics, phase_shifts=optics.phase_shifts[::-1])]
+    choices = [optics, optics.exchanged]
     scores = [
         sign * _skewness(replace(flat, optics=choice), replace(poked, optics=choice), n_iterations)
         for choice in choices

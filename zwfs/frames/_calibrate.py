@@ -20,7 +20,7 @@ from zwfs.frames._fitted import Windows
 from zwfs.frames._learnt import of_bench
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
-from zwfs.frames.files import CameraFile, averaged, combined, dark_of, read, read_all
+from zwfs.frames.files import CameraFile, averaged, combined, read, read_all
 from zwfs.frames.pipeline import Measurement, Optics, reduce_frames
 from zwfs.frames.refine import _check_fit, fit
 from zwfs.frames.registration import Image, check_centers, check_diameter, find_pupils, register_frames
@@ -43,8 +43,6 @@ class Source(NamedTuple):
         masked, unmasked, sources = read_all(
             frames, pupils, darks, maps, self.saturation, pupil_dark_files=pupil_darks, n_images=self.n_images
         )
-        first = len(frames) + len(pupils)
-        dark = dark_of(sources[: len(frames)], sources[first : first + len(darks)], self.n_images)
         header, saturation = sources[0].header, self.saturation
         try:
             optics = sources[0].optics(self.diameter, self.phase_shifts)
@@ -54,7 +52,7 @@ class Source(NamedTuple):
             if saturation is None:
                 saturation = sources[0].keyword("SATURATE") if "SATURATE" in header else np.inf
             camera = {"saturation": saturation, "bunit": str(header.get("BUNIT", ""))}
-            return Calibration.of(reduce_frames(registered, optics), dark, **self.kept, **camera)
+            return Calibration.of(reduce_frames(registered, optics), **self.kept, **camera)
         except ValueError as error:  # any of the files can be the cause
             raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
 
@@ -80,7 +78,7 @@ class Source(NamedTuple):
             return of_bench(Calibration, bench, counts, commands, windows, states.dark, **attributes)
 
         try:
-            plain = Calibration.of(_measured(states, optics, place), states.dark, **attributes)
+            plain = Calibration.of(_measured(states, optics, place), **attributes)
         except ValueError as error:
             warnings.warn(f"The fit was not compared with a calibration without commands: {error}", stacklevel=3)
         else:
@@ -108,9 +106,9 @@ def _does_not_help(partial: Calibration, plain: Calibration, states: _States) ->
 
 def _measured(states: _States, optics: Optics, place: dict[str, Any]) -> Measurement:
     """Frames of the first state, with the clear frames, for a calibration without commands."""
-    pairs = (states.frames[0].mean(axis=0), "frame"), (states.clear.mean(axis=0), "clear frame")
-    frames, clear = ([Image.of(counts, name) for counts in images] for images, name in pairs)
-    return reduce_frames(register_frames(frames, clear, **({} if None in place.values() else place)), optics)
+    frames = map(Image.of, states.frames[0].mean(axis=0), ["frame"] * 2, states.dark)
+    clear = map(Image.of, states.clear.mean(axis=0), ["clear frame"] * 2)
+    return reduce_frames(register_frames([*frames], [*clear], **({} if None in place.values() else place)), optics)
 
 
 def _error_of_last(calibration: Calibration, grid: Calibration, states: _States) -> float:
@@ -169,12 +167,9 @@ def _read_states(
         CameraFile(cube.mean(axis=0), source.firsts[0].name, "", source.header)
         for cube, source in ((frames, stack), (clear, clear_stack))
     ]
-    bad = np.stack([image.bad for image in combined(means[1:], (), maps)])
-    dark, clear_dark = (
-        np.zeros(clear.shape[1:]) if values is None else values
-        for values in (dark_of(means[:1], darks), dark_of(means[1:], pupil_darks or darks))
-    )
-    bad |= ~np.isfinite(dark + clear_dark)
+    masked, unmasked = combined(means[:1], darks), combined(means[1:], pupil_darks or darks, maps)
+    dark, clear_dark = (np.stack([image.dark for image in pair]) for pair in (masked, unmasked))
+    bad = np.stack([image.bad for image in unmasked]) | ~np.isfinite(dark)
     level = stack.saturation if saturation is None else saturation
     clear, frames = (
         np.where(bad | ~(cube < level), np.nan, cube - unlit)

@@ -114,7 +114,7 @@ class Camera:
         self.prefilter = 1 / symbol([samples[0], *(2 * samples[1:])], size)
 
         self.double: Camera | None = None  # of which this camera is `single`
-        self._optics: Optics | None = None
+        self._optics: Operators | None = None
 
     def complex(self, values: NDArray) -> NDArray:
         """Complex numbers in the precision of the camera."""
@@ -138,10 +138,10 @@ class Camera:
         camera.double = self
         return camera
 
-    def optics(self, values: NDArray) -> Optics:
-        """Optics with these numbers; those of the last call are kept."""
+    def optics(self, values: NDArray) -> Operators:
+        """Operators with these numbers; those of the last call are kept."""
         if self._optics is None or not np.array_equal(self._optics.values, values):
-            self._optics = self.double.optics(values).single if self.double else Optics(self, values)
+            self._optics = self.double.optics(values).single if self.double else Operators(self, values)
         return self._optics
 
     def defocus_at(self, u: NDArray, v: NDArray) -> NDArray[np.float64]:
@@ -349,7 +349,7 @@ def named(values: NDArray) -> tuple[list[dict[str, float]], dict[str, float]]:
     return arms, dict(zip(MASKS, values[-len(MASKS) :].tolist(), strict=True))
 
 
-class Optics:
+class Operators:
     """The part of the model that depends on the numbers, and not on the maps."""
 
     def __init__(self, camera: Camera, values: NDArray) -> None:
@@ -370,7 +370,7 @@ class Optics:
         self.blur = (camera.prefilter * blur).astype(real)
 
     @cached_property
-    def single(self) -> Optics:
+    def single(self) -> Operators:
         """The same in single precision."""
         out = copy(self)
         out.blur = self.blur.astype(np.float32)

@@ -273,7 +273,7 @@ class Calibration(Immutable):
             If a shape is wrong, or the pupils are not found.
         """
         attributes = {"saturation": saturation, "n_iterations": n_iterations, "tolerance": tolerance}
-        return cls.of(measured(frames, clear_frames, dark, Optics(**optics)), dark, **attributes)
+        return cls.of(measured(frames, clear_frames, dark, Optics(**optics)), **attributes)
 
     @classmethod
     def fit(
@@ -331,15 +331,13 @@ class Calibration(Immutable):
         return of_bench(cls, bench, counts, _check.real_array("phases", phases), **settings)
 
     @classmethod
-    def of(cls, measurement: Measurement, dark: ArrayLike | None = None, **settings: Any) -> Calibration:
+    def of(cls, measurement: Measurement, **settings: Any) -> Calibration:
         """Calibration of a measurement; pixels that are bad on its frames are ignored from then on.
 
         Parameters
         ----------
         measurement : Measurement
-            Of frames that are taken as those to come, and of clear frames.
-        dark : array_like, shape (ny, nx) or (n_images, ny, nx), counts, optional
-            That was subtracted from the frames of the measurement; none if left out.
+            Of frames that are taken as those to come, and of clear frames. Its images know the dark.
         **settings
             Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
         """
@@ -349,12 +347,13 @@ class Calibration(Immutable):
         shape = images[0].counts.shape
         if images[-1].counts.shape != shape:
             raise ValueError(f"the frames have shapes {shape} and {images[-1].counts.shape}: expected the same")
+        dark = np.nan_to_num([image.dark for image in images], posinf=0, neginf=0).astype(np.float32)
         counts, _ = registered._on_grid(FRAMES)
         unit, background = measurement.counts * registered.exposure, measurement.background[:2]
         weights, offset = _undone(measurement)
         calibration = cls(
             pupil.amplitude, pupil.n_pixels, pupil.center, measurement.optics, shape, len(images),
-            registered.places()[:2], _dark(dark, (len(images), *shape)), np.stack([image.bad for image in images]),
+            registered.places()[:2], dark, np.stack([image.bad for image in images]),
             good, background / registered.areas[:2], unit / registered.areas[:2], weights, offset,
             bool(registered.balance and measurement.optics.opposite),
             (counts[:, good].mean(axis=1) - background) / unit,
@@ -697,11 +696,3 @@ def _check_sizes(path: Path) -> None:
                     f"{path.name}: its array {name} has shape {shape} and type {dtype}: expected at most the "
                     f"{size} bytes of the file"
                 )
-
-
-def _dark(dark: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Checked counts without light, one map for each camera image."""
-    maps = np.zeros(shape) if dark is None else _check.real_array("dark", dark)
-    if maps.shape not in (shape[1:], (1, *shape[1:]), shape):
-        raise ValueError(f"dark has shape {maps.shape}: expected {shape}")
-    return np.broadcast_to(np.nan_to_num(maps, posinf=0, neginf=0).astype(np.float32), shape)

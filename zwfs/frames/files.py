@@ -10,7 +10,7 @@ import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -248,30 +248,18 @@ def combined(
     if n_images and len(recorded) != n_images:
         raise ValueError(f"{_names(files)}: {len(recorded)} images in an exposure: expected n_images = {n_images}")
     result: list[Image] = []
-    for index, exposures in enumerate(recorded):
-        first, sources = exposures[0][0], [file for file, _ in exposures]
-        dark = _companion("darks", darks, first, index, len(recorded))
-        marked = _companion("bad_pixels", bad_pixels, first, index, len(recorded)) != 0
+    for index, sources in enumerate(recorded):
+        dark = _companion("darks", darks, sources[0], index, len(recorded))
+        marked = _companion("bad_pixels", bad_pixels, sources[0], index, len(recorded)) != 0
         with np.errstate(over="ignore", invalid="ignore"):
-            counts = _mean(exposures) - dark
+            counts = _mean(sources) - dark
         bad = ~_usable(counts) | marked
         if bad.all():
             names = _names([*sources, *darks, *bad_pixels])
             raise ValueError(f"{names}: all pixels are bad or saturated: expected an image")
-        name = _names(sources) + f"[{index}]" * (len(first.images) > 1)
-        result.append(Image(nearest_good(counts, ~bad), bad, name))
+        name = _names(sources) + f"[{index}]" * (len(files[0].images) > 1)
+        result.append(Image(nearest_good(counts, ~bad), bad, name, dark=dark))
     return tuple(result)
-
-
-def dark_of(
-    files: Sequence[CameraFile], darks: Sequence[CameraFile], n_images: int | None = None
-) -> NDArray[np.float64] | None:
-    """Dark that `combined` subtracts from the same files, shape (n_images, ny, nx); None without darks."""
-    recorded = _by_image("files", files, n_images)
-    if not darks:
-        return None
-    firsts = [exposures[0][0] for exposures in recorded]
-    return np.stack([_companion("darks", darks, file, index, len(firsts)) for index, file in enumerate(firsts)])
 
 
 def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overwrite: bool = False) -> Path:
@@ -432,9 +420,6 @@ def _usable(counts: NDArray) -> NDArray[np.bool_]:
     return np.abs(counts) <= _check.LARGEST
 
 
-_Exposure = tuple[CameraFile, int]  # a file, and the number of the image in it
-
-
 def _names(files: Sequence[CameraFile]) -> str:
     return ", ".join(dict.fromkeys(file.name for file in files)) or "files"
 
@@ -476,23 +461,23 @@ def _saturated(source: Images, image: NDArray, level: float | None) -> NDArray[n
     return usable & (image >= level)
 
 
-def _by_image(argument: str, files: Sequence[CameraFile], n_images: int | None) -> list[list[_Exposure]]:
-    """Exposures of each image."""
+def _by_image(argument: str, files: Sequence[CameraFile], n_images: int | None) -> list[list[CameraFile]]:
+    """Files of each image, with this one alone."""
     sizes = {len(file.images) for file in files}
     if sizes == {1} and len(files) == 2 and n_images != 1:
-        return [[(file, 0)] for file in files]
+        return [[file] for file in files]
     if sizes not in ({1}, {2}):
         n = sum(len(file.images) for file in files)
         raise ValueError(f"{argument}: {_names(files)}: {n} images: expected one or two")
     if len(shapes := {file.images.shape[1:] for file in files}) > 1:
         raise ValueError(f"{argument}: {_names(files)}: exposures of shapes {sorted(shapes)}: expected the same")
-    return [[(file, index) for file in files] for index in range(sizes.pop())]
+    return [[replace(file, images=file.images[k : k + 1]) for file in files] for k in range(sizes.pop())]
 
 
-def _mean(exposures: Sequence[_Exposure]) -> NDArray[np.float64]:
+def _mean(files: Sequence[CameraFile]) -> NDArray[np.float64]:
     """Mean of files, each by its number of exposures; NaN where none has a number."""
-    values = np.stack([file.images[index] for file, index in exposures])
-    weights = np.array([file.n_exposures for file, _ in exposures])[:, np.newaxis, np.newaxis] * _usable(values)
+    values = np.concatenate([file.images for file in files])
+    weights = np.array([file.n_exposures for file in files])[:, np.newaxis, np.newaxis] * _usable(values)
     total = np.sum(np.where(weights > 0, values, 0) * weights, axis=0)
     weight = weights.sum(axis=0)
     return np.divide(total, weight, out=np.full(total.shape, np.nan), where=weight > 0)
@@ -523,17 +508,17 @@ def _companion(
     by_image = _by_image(argument, fitting or same, 1 if n_images == 1 else None)
     if len(by_image) > n_images:
         raise ValueError(f"{argument}: {_names(same)}: 2 images for the 1 of {frame.name}: expected one")
-    exposures = by_image[index if len(by_image) > 1 else 0]
+    chosen = by_image[index if len(by_image) > 1 else 0]
     if argument == "darks":
-        _check_alike(exposures)
-    return _mean(exposures)
+        _check_alike(chosen)
+    return _mean(chosen)
 
 
-def _check_alike(exposures: Sequence[_Exposure]) -> None:
+def _check_alike(darks: Sequence[CameraFile]) -> None:
     """Require that darks of one image differ by no more than their noise."""
-    first, number = exposures[0]
-    for file, index in exposures[1:]:
-        change = file.images[index] - first.images[number]
+    first = darks[0]
+    for file in darks[1:]:
+        change = file.images - first.images
         middle = np.nanmedian(change)
         if abs(middle) > _ALIKE * np.nanmedian(np.abs(change - middle)):
             raise ValueError(

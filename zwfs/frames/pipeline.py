@@ -321,7 +321,7 @@ def phase_of(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None 
     from zwfs.frames.calibration import Calibration  # late: it needs this module
 
     measurement = measured(frames, clear_frames, dark, Optics(**optics))
-    return replace(Calibration.of(measurement, dark)(frames), measurement=measurement)
+    return replace(Calibration.of(measurement)(frames), measurement=measurement)
 
 
 def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: float = 1e-3) -> Phases:
@@ -346,6 +346,7 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: f
 
     n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
     calibration = Calibration.of(measurement, n_iterations=n_iterations, tolerance=tolerance)
+    calibration = replace(calibration, dark=np.zeros_like(calibration.dark))  # which the images lack already
     counts = np.stack([image.counts for image in measurement.registered.camera_images])
     return replace(calibration(counts if len(counts) == 2 else counts[0]), measurement=measurement)
 
@@ -359,8 +360,8 @@ def measured(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None,
             raise ValueError(f"{name} has shape {images.shape}: expected (ny, nx), or (2, ny, nx) for two images")
         if np.shape(unlit) not in ((), images.shape[-2:], images.shape):
             raise ValueError(f"dark has shape {np.shape(unlit)}: expected {images.shape}, that of {name}")
-        images = (images - unlit).reshape(-1, *images.shape[-2:])
-        pair.append([Image.of(image, name) for image in images])
+        maps = np.stack(np.broadcast_arrays(images - unlit, unlit)).reshape(2, -1, *images.shape[-2:])
+        pair.append([Image.of(counts, name, lightless) for counts, lightless in zip(*maps, strict=True)])
     return reduce_frames(register_frames(*pair, n_pupils=len(optics.phase_shifts)), optics)
 
 

@@ -58,17 +58,20 @@ class Image:
         For messages.
     cut : bool
         Whether the surroundings of the pupil were set to 0 by software, so that they do not show the background.
+    dark : ndarray, shape (ny, nx), or float
+        Counts without light, which were subtracted; NaN where they are not known.
 
     Raises
     ------
     ValueError
-        If a count is not finite or beyond 1e38.
+        If a count is not finite or beyond 1e38, or the dark has another shape.
     """
 
     counts: NDArray[np.float64]
     bad: NDArray[np.bool_]
     name: str = "image"
     cut: bool = False
+    dark: NDArray[np.float64] | float = 0.0
 
     def __post_init__(self) -> None:
         counts = _check.real_map("counts", self.counts, 2)
@@ -76,12 +79,16 @@ class Image:
         object.__setattr__(self, "bad", _check.flag_map("bad", self.bad, counts.shape))
         _check.instance("name", self.name, str)
         _check.flag("cut", self.cut)
+        dark = _check.real_array("dark", self.dark)
+        if dark.shape not in ((), counts.shape):
+            raise ValueError(f"dark has shape {dark.shape}: expected {counts.shape}, that of counts")
+        object.__setattr__(self, "dark", np.broadcast_to(dark, counts.shape))
 
     @classmethod
-    def of(cls, counts: NDArray, name: str) -> Image:
-        """Image of counts, (ny, nx), in which bad pixels are not finite."""
+    def of(cls, counts: NDArray, name: str, dark: Any = 0.0) -> Image:
+        """Image of counts, (ny, nx), less the dark, in which bad pixels are not finite."""
         good = np.isfinite(counts)
-        return cls(nearest_good(counts, good), ~good, name)
+        return cls(nearest_good(counts, good), ~good, name, dark=dark)
 
 
 @dataclass(frozen=True, eq=False)

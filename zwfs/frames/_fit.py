@@ -231,7 +231,7 @@ class BenchFit(Result):
         settings = {name: values[name] for name in _PLAIN_OF_MODEL} | {"shape": tuple(values["shape"])}
         plain = {name: values[name] for name in _PLAIN_OF_FIT} | {"remarks": tuple(values["remarks"])}
         estimates = tuple(Estimate(*one) for one in values["estimates"])
-        maps = {name: arrays[name] for name in _MAPS_OF_FIT}
+        maps: Any = {name: arrays[name] for name in _MAPS_OF_FIT}
         return cls(estimates, **maps, **plain, model=FrameModel(**settings, light=light, values=arrays["values"]))
 
     def __getitem__(self, name: str) -> Estimate:

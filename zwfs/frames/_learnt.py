@@ -77,7 +77,7 @@ def _unweighted(
 ) -> Calibration:  # fmt: skip
     """Calibration with the geometry of a fit, and weights of 0."""
     masks, arms, n = bench.model.masks, bench.model.arms, len(bench.light)
-    shares = {"leakage": masks["leakage"], "unmasked": max(masks["unmasked"], 0.0)}
+    shares: Any = {"leakage": masks["leakage"], "unmasked": max(masks["unmasked"], 0.0)}
     optics = Optics(masks["diameter"], (masks["first"], masks["second"]), **shares)
     n_pixels, bad = bench.model.n_pixels, ~np.isfinite(counts).all(axis=0)
     light = bench.light * (radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2)

@@ -133,8 +133,8 @@ class Camera:
     @cached_property
     def single(self) -> Camera:
         """Camera with the same settings in single precision."""
-        settings: Any = self.exposures, self.commands, self.f, self.largest
-        camera = Camera(self.n, self.shape, self.n_pixels, *settings, np.float32)
+        settings: Any = self.exposures, self.commands, self.f, self.largest, np.float32
+        camera = Camera(self.n, self.shape, self.n_pixels, *settings)
         camera.double = self
         return camera
 

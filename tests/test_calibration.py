@@ -6,6 +6,7 @@ from dataclasses import replace
 import nbformat
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from studies import calibration as study
 from zwfs import Dimple, Pupil, ZernikeSensor, opd_to_phase
@@ -64,6 +65,8 @@ def test_saved_calibration_keeps_its_fit(tmp_path, taken, calibration):
     found, expected = (one(counts, smooth=MapPrior(0.3, 4.0), noise=noise) for one in (loaded, calibration))
     np.testing.assert_array_equal(found.phase, expected.phase)
     assert loaded.bench.estimates == calibration.bench.estimates
+    loaded.bench.save(tmp_path / "fit.fits")
+    assert "MODEL SHAPE 0" not in fits.getheader(tmp_path / "fit.fits")
     assert (loaded.bench.consistent, loaded.sha256) == (expected.flags == 0, calibration.sha256)
 
 

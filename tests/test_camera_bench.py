@@ -88,16 +88,6 @@ def test_two_areas_describe_a_pixel_that_is_lit_in_part(partly_lit):
     assert errors[1, True] < errors[1, False] / 1.5
 
 
-def test_light_of_a_pixel_that_is_lit_in_part_divides():
-    x = np.mgrid[:20, :20][1]
-    light = np.where(x < 12, 1.21, np.where(x == 12, 0.6 * 1.21, 0.0))
-    division = Light.of(light, light, 1)
-    maps = division.maps(light, 0 * light)
-    np.testing.assert_allclose(maps.mean[4:-4, 12], 0.6 * 1.1, rtol=1e-6)
-    np.testing.assert_allclose(maps.mean[4:-4, 5], 1.1, rtol=1e-6)
-    np.testing.assert_allclose(maps.rest[4:-4, 12], 0.6 * 1.21 - 0.66**2, rtol=1e-6)
-
-
 def test_model_with_the_true_maps_makes_the_frames_of_a_foreign_bench():
     """Its grid is that of the bench, so that every step of the model is compared: mask, blur, pixel and place."""
     bench = replace(
@@ -161,25 +151,6 @@ def test_light_of_vanes_that_does_not_interfere_has_no_bias():
         control.append(others[1] / right)
     assert abs(np.mean(ratios) - 1) < 0.05
     assert np.mean(control) > 1.3
-
-
-def test_amplitude_goes_on_along_its_slope_to_the_edge(monkeypatch):
-    """The mean field of a pixel at the edge, whose light alone is known; a constant continuation must fail."""
-    k, n = 16, 24
-    y, x = (np.mgrid[: n * k, : n * k] + 0.5) / k - n / 2
-    field = (1 + 0.015 * y - 0.01 * x - 0.001 * (x**2 + y**2)) * (np.hypot(y, x) < 8.3)
-    light, true = blocks(field**2, k), blocks(field, k)
-    lit = blocks((field > 0).astype(float), k)
-    edge = (lit > 0) & (lit < 1)
-
-    def error():
-        division = Light.of(light, light, 1)
-        return (division.maps(light, 0 * light).mean - true)[edge].std()
-
-    continued = error()
-    assert continued < 0.005
-    monkeypatch.setattr("zwfs.frames._light._STIFF", 1e9)
-    assert error() > 3 * continued
 
 
 @pytest.mark.parametrize("mottling", [0.0, 0.12])

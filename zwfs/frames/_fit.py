@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -214,6 +214,9 @@ class BenchFit(Result):
             numbers[self.model.places[name]] = _check.number(name, value, -_MOST, _MOST)
         estimates = (replace(one, value=float(values.get(one.name, one.value))) for one in self.estimates)
         return replace(self, estimates=tuple(estimates), model=replace(self.model, values=numbers))
+
+    def _values(self) -> Iterator[tuple[str, bool | int | float | str]]:
+        return (pair for pair in super()._values() if not pair[0].startswith("model "))
 
     def packed(self) -> tuple[dict[str, Any], dict[str, NDArray]]:
         """Plain values and arrays, from which `unpacked` makes the fit again."""

@@ -111,9 +111,9 @@ class LoopBench:
             np.mean([self.counts(np.zeros(SIZE**2), photons, rng, masked) for _ in range(4)], axis=0) - dark
             for masked in (True, False)
         )
-        images = [Image(counts, np.zeros(counts.shape, bool)) for counts in (frame, clear)]
+        images = [Image(counts, np.zeros(counts.shape, bool), dark=dark) for counts in (frame, clear)]
         measurement = reduce_frames(register_frames(images[:1], images[1:]), Optics(1.06, SHIFTS))
-        return Calibration.of(measurement, dark, saturation=65535.0)
+        return Calibration.of(measurement, saturation=65535.0)
 
     def pokes(self, size, photons, seed=2):
         """Frames of the flat mirror, and of each command pushed and pulled."""

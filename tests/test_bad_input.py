@@ -486,10 +486,6 @@ REFUSED = {
     r"values is a list: expected a Mapping": lambda: BenchFit.replaced(None, []),
     "smooth needs the `bench` of a calibration": lambda: called(smooth=True),
     "light with smooth or noise: expected none": lambda: called(smooth=True, light=1.0),
-    r"corners = \[\[0, 0\]\]: expected two pairs": lambda: fitted(corners=[[0, 0]]),
-    r"corners = \[\[0, 0\], \[0, 1\]\]: expected": lambda: fitted(corners=[[0, 0], [0, 1]]),
-    "shape = 5: expected two numbers": lambda: fitted(shape=5),
-    r"n_images = 3: expected an integer in \[1, 2\]": lambda: fitted(n_images=3),
 }
 
 

@@ -107,9 +107,7 @@ def command(taken, files):
         patch.chdir(files)
         patch.setattr(sys, "stderr", said)
         quick = {"n_steps": 4, "oversampling": 2}
-        patch.setattr(
-            "zwfs.frames.calibration.fit_bench", lambda *data, **given: fit_bench(*data, **given | quick)
-        )
+        patch.setattr("zwfs.frames._calibrate.fit_bench", lambda *data, **given: fit_bench(*data, **given | quick))
         assert main(["calibrate", "bench.npz", *names, *known]) == 0, said.getvalue()
     return Calibration.load(files / "bench.npz"), said.getvalue()
 

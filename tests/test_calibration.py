@@ -6,9 +6,12 @@ from dataclasses import replace
 import nbformat
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from studies import calibration as study
 from zwfs import Dimple, Pupil, ZernikeSensor, opd_to_phase
+from zwfs.frames import Calibration
+from zwfs.frames._solver import MapPrior
 
 from . import calibration_frames
 
@@ -53,6 +56,18 @@ def test_fit_recovers_the_bench(taken, calibration):
         elif name.endswith(("row", "column", "leakage")):
             assert fit[name].value == pytest.approx(value, abs=0.02), name
     assert fit.consistent
+
+
+def test_saved_calibration_keeps_its_fit(tmp_path, taken, calibration):
+    calibration.save(tmp_path / "bench.npz")
+    loaded = Calibration.load(tmp_path / "bench.npz")
+    counts, noise = taken.shot(taken.unseen(0.3, taken.photons[0])[0])
+    found, expected = (one(counts, smooth=MapPrior(0.3, 4.0), noise=noise) for one in (loaded, calibration))
+    np.testing.assert_array_equal(found.phase, expected.phase)
+    assert loaded.bench.estimates == calibration.bench.estimates
+    loaded.bench.save(tmp_path / "fit.fits")
+    assert "MODEL SHAPE 0" not in fits.getheader(tmp_path / "fit.fits")
+    assert (loaded.bench.consistent, loaded.sha256) == (expected.flags == 0, calibration.sha256)
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ import io
 import pickle
 import sys
 import tracemalloc
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,57 +36,62 @@ def column(name):
     return fits.BinTableHDU.from_columns([fits.Column(name=name, format="D", array=np.zeros(3))])
 
 
-def file_of(counts, header=None, full_scale=np.inf):
-    return camera.CameraFile(np.asarray(counts, float)[np.newaxis], "a.fits", "", header or {}, full_scale)
+def write(path, *images, names=(), **cards):
+    """A FITS file with images in its units."""
+    units = [fits.PrimaryHDU(images[0], fits.Header(cards)), *map(fits.ImageHDU, images[1:])]
+    for unit, name in zip(units[1:], names, strict=False):
+        unit.name = name
+    fits.HDUList(units).writeto(path, overwrite=True)
+    return path
 
 
-def test_nan_dark_and_bad_pixel_map():
+def test_nan_dark_and_bad_pixel_map(tmp_path):
     counts = FRAME.astype(float)
     counts[3, 4], counts[5, 6] = np.nan, np.inf
     marked = np.zeros(FRAME.shape)
     marked[7, 8] = 1
     dark = np.full(FRAME.shape, 10.0)
     dark[9, 9] = np.nan
-    (found,) = camera.images([file_of(counts)], [file_of(dark)], [file_of(marked)], saturation=1e5)
+    frame, lightless, map_ = (write(tmp_path / f"{k}.fits", one) for k, one in enumerate((counts, dark, marked)))
+    (found,), _, _ = camera.read_all([frame], [frame], [lightless], [map_], saturation=1e5)
     assert np.argwhere(found.bad).tolist() == [[3, 4], [5, 6], [7, 8], [9, 9]]
     assert np.isfinite(found.counts).all()
     assert found.counts[0, 5] == FRAME[0, 5] - 10
 
 
-def test_saturation_is_given_in_the_header_of_the_type_or_seen():
-    counts = FRAME.astype(float)
-    top = counts == 249
-    assert np.count_nonzero(top) == 2
-    (plain,) = camera.images([file_of(counts)])
-    assert not plain.bad.any()
-    for settings in ({"header": {"SATURATE": 249}}, {"full_scale": 249.0}):
-        (found,) = camera.images([file_of(counts, **settings)])
-        np.testing.assert_array_equal(found.bad, top)
-    (found,) = camera.images([file_of(counts)], saturation=240)
-    np.testing.assert_array_equal(found.bad, counts >= 240)
-    clipped = np.minimum(counts, 200)
-    (found,) = camera.images([file_of(clipped)])
-    np.testing.assert_array_equal(found.bad, clipped == 200)
+@pytest.mark.parametrize(
+    ("counts", "settings", "level"),
+    [
+        (FRAME.astype(float), {}, np.inf),
+        (FRAME.astype(float), {"SATURATE": 249}, 249),
+        ((FRAME + 6).astype(np.uint8), {}, 255),
+        (FRAME.astype(float), {"saturation": 240}, 240),
+        (np.minimum(FRAME, 200).astype(float), {}, 200),
+    ],
+)
+def test_saturation_is_given_in_the_header_of_the_type_or_seen(tmp_path, counts, settings, level):
+    cards = {key: value for key, value in settings.items() if key.isupper()}
+    path = write(tmp_path / "a.fits", counts, **cards)
+    (found,), _, _ = camera.read_all([path], [path], saturation=settings.get("saturation"))
+    np.testing.assert_array_equal(found.bad, counts >= level)
 
 
 @pytest.mark.parametrize(
-    ("files", "message"),
+    ("others", "message"),
     [
-        (([],), "files: 0 images: expected one or two"),
-        (([replace(file_of(FRAME), images=np.ones((3, 20, 30)))],), "a.fits: 3 images: expected one or two"),
-        (([file_of(FRAME)], [file_of(FRAME[1:])]), r"darks: a\.fits has shape \(19, 30\)"),
-        (
-            ([file_of(FRAME)], [replace(file_of(FRAME), images=np.stack([FRAME] * 2))]),
-            "a.fits: 2 images for the 1",
-        ),
-        (([file_of(FRAME)], [file_of(FRAME + np.nan)]), r"a\.fits: all pixels are bad"),
-        (([file_of(FRAME)], [], [file_of(FRAME != 7)]), r"bad_pixels: a\.fits marks 99\.5% .* 1 = good"),
-        (([file_of(FRAME)], [], [file_of(FRAME.T)]), r"bad_pixels: a\.fits has shape"),
+        (([FRAME[1:]],), r"dark_files: dark\.fits has shape \(19, 30\)"),
+        (([FRAME] * 2,), r"dark\.fits: 2 images for the 1"),
+        (([FRAME + np.nan],), r"frame\.fits, dark\.fits: all pixels are bad"),
+        (((), [(FRAME != 7).astype(int)]), r"bad_pixels: map\.fits marks 99\.5% .* 1 = good"),
+        (((), [FRAME.T]), r"bad_pixel_files: map\.fits has shape"),
     ],
 )
-def test_files_that_do_not_fit_together(files, message):
+def test_files_that_do_not_fit_together(tmp_path, others, message):
+    frame = write(tmp_path / "frame.fits", FRAME)
+    named = zip(("dark.fits", "map.fits"), others, strict=False)
+    paths = [[write(tmp_path / name, *images)] if images else () for name, images in named]
     with pytest.raises(ValueError, match=message):
-        camera.images(*files)
+        camera.read_all([frame], [frame], *paths)
 
 
 def test_astropy_is_named_where_it_is_missing(monkeypatch, tmp_path):
@@ -132,20 +136,12 @@ def test_cards_that_do_not_follow_the_standard_are_left_out(tmp_path):
 
 def test_keyword_that_no_bench_can_have_is_named_where_it_is_needed():
     for value in (0, -5, np.inf, "red"):
+        file = camera.CameraFile(FRAME[np.newaxis], "a.fits", "", {"WAVELEN": value})
         with pytest.raises((TypeError, ValueError), match=r"a\.fits: WAVELEN = "):
-            file_of(FRAME, {"WAVELEN": value}).keyword("WAVELEN")
+            file.keyword("WAVELEN")
 
 
 # Exposures, darks and units
-
-
-def write(path, *images, names=(), **cards):
-    """A FITS file with images in its units."""
-    units = [fits.PrimaryHDU(images[0], fits.Header(cards)), *map(fits.ImageHDU, images[1:])]
-    for unit, name in zip(units[1:], names, strict=False):
-        unit.name = name
-    fits.HDUList(units).writeto(path, overwrite=True)
-    return path
 
 
 @pytest.fixture
@@ -257,7 +253,6 @@ def test_compressed_images_are_read(tmp_path, dtype, algorithm):
     fits.HDUList([fits.PrimaryHDU(), unit]).writeto(tmp_path / "a.fits")
     found = camera.read(tmp_path / "a.fits")
     np.testing.assert_array_equal(found.images[0], image)
-    assert found.full_scale == (np.inf if level else np.iinfo(dtype).max)
 
 
 def _tile(packed, n=20):

@@ -7,8 +7,8 @@ import pytest
 
 from zwfs import Pupil
 from zwfs.frames._explicit import Explicit, Posterior
-from zwfs.frames._light import KnownLight
-from zwfs.frames._optics import Camera, Exposure, Maps
+from zwfs.frames._light import Light
+from zwfs.frames._optics import Camera, Exposure
 from zwfs.frames._solver import MapPrior, PhaseMap, Point, Problem
 
 N, F, SHAPE = 24, 2, (30, 30)
@@ -27,7 +27,7 @@ def guided():
     exposures = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
     camera = Camera(N, SHAPE, 16, exposures, np.zeros((1, N * F, N * F)), F, 1.5)
     phase_map = PhaseMap(N, F, MapPrior(0.5, 4.0), 16)
-    known = KnownLight(Maps(light, 0 * light, 0 * light, False), light)
+    known = Light(light, np.ones_like(light), light > 0, light > 0)
     images = np.full((2, *SHAPE), 1e4), np.full((2, *SHAPE), 1e-2)
     problem = Problem(camera, *images, known, phase_map, (), VALUES)
     white = 0.5 * np.random.default_rng(0).normal(size=phase_map.size**2)

@@ -38,11 +38,12 @@ class Camera:
 
     def calibration(self):
         flat, clear = self(np.zeros(len(self.modes)), 1), self.exposed(self.clear, 2)
-        images = [Image(counts - float(DARK), np.zeros(counts.shape, bool)) for counts in (flat, clear)]
+        bad, dark = np.zeros(flat.shape, bool), float(DARK)
+        images = [Image(counts - dark, bad, dark=dark) for counts in (flat, clear)]
         shifts = tuple(mask.phase for mask in self.sensor.masks)
         registered = register_frames(images[:1], images[1:], n_pupils=len(shifts))
         measurement = reduce_frames(registered, Optics(1.06, shifts))
-        return Calibration.of(measurement, np.full(flat.shape, float(DARK)), saturation=65535.0)
+        return Calibration.of(measurement, saturation=65535.0)
 
     def pokes(self, size=POKE):
         steps = size * np.eye(len(self.modes))

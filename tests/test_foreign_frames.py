@@ -150,6 +150,14 @@ def test_one_image_gives_the_phase_and_no_verdict(single):
     assert np.nanmedian(verdict.sigma) == pytest.approx(0.006, rel=0.2)
 
 
+def test_one_image_with_hot_pixels_or_cut_surroundings_stays_one(single):
+    _, _, frame, clear = single
+    frame, clear = frame.copy(), clear.copy()
+    frame[[40, 50], [42, 35]] *= 10
+    clear[:5] = 0
+    assert np.isfinite(phase_of(frame, clear, phase_shifts=(np.pi / 2,)).phase).any()
+
+
 def test_one_image_takes_the_road_of_two(single, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, image in (

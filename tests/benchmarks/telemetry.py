@@ -41,13 +41,12 @@ def camera(n_pixels, n_frames, rms=0.5, poked=1):
         return np.rint(rng.poisson(image * PHOTONS) + DARK).astype(np.uint16)
 
     def image(counts):
-        return Image(counts - float(DARK), np.zeros(counts.shape, bool))
+        return Image(counts - float(DARK), np.zeros(counts.shape, bool), dark=float(DARK))
 
     flat = exposed(sensor.measure(np.zeros(pupil.shape)))
     clear = exposed(np.stack([np.pad(pupil.amplitude**2, MARGIN)] * 2))
     registered = register_frames([image(flat)], [image(clear)])
-    dark = np.full(flat.shape, float(DARK))
-    calibration = Calibration.of(reduce_frames(registered, Optics()), dark, saturation=65535)
+    calibration = Calibration.of(reduce_frames(registered, Optics()), saturation=65535)
     images, steps = exposed(sensor.measure(screens)), POKE * zernike_basis(pupil, poked)
     return calibration, images, (flat, exposed(sensor.measure(steps)), exposed(sensor.measure(-steps)))
 

@@ -11,34 +11,15 @@ result.
 
 Examples
 --------
-From files of the simulated bench to a phase:
+From arrays of a simulated bench to a phase:
 
->>> import tempfile
->>> from zwfs.bench import Bench, write_bench
->>> from zwfs.frames import recover_phase
->>> from zwfs.frames.files import read_all, write_phase
->>> from zwfs.frames.pipeline import Optics, predict_other, reduce_frames, upside_down
->>> from zwfs.frames.refine import fit, steps
->>> from zwfs.frames.registration import register_frames
->>> bench, folder = Bench(n_pixels=40), tempfile.TemporaryDirectory()
->>> files = write_bench(folder.name, bench, seed=1)
->>> frames, clear_frames, sources = read_all([files["frame"]], [files["pupils"]], [files["dark"]])
->>> registered = register_frames(frames, clear_frames)
->>> round(registered.diameter), registered.n_pixels
-(40, 43)
->>> optics = Optics(bench.diameter, (bench.phase, -bench.phase))
->>> measurement = reduce_frames(registered, optics)
->>> bool((predict_other(measurement) > predict_other(upside_down(measurement))).all())
-True
->>> phases = recover_phase(measurement)
->>> bool(phases.converged), phases.phase.shape
-(True, (43, 43))
->>> write_phase(f"{folder.name}/phase.fits", phases, 635.0, sources)
->>> bool(0.8 < fit(registered, optics, ["scale"], n_steps=2)[1].scale < 1.2)
-True
->>> [step.name for step in steps(frames, clear_frames, optics, fitted=())][-1]
-'balance of the flux'
->>> folder.cleanup()
+>>> from zwfs.bench import Bench
+>>> from zwfs.frames import Calibration
+>>> bench = Bench(n_pixels=40)
+>>> calibration = Calibration.from_arrays(bench.frames(), bench.clear_frames(), diameter=bench.diameter)
+>>> phases = calibration([bench.frames(seed=seed) for seed in range(3)])
+>>> phases.phase.shape, phases.flags.tolist()
+((3, 43, 43), [0, 0, 0])
 """
 
 from typing import TYPE_CHECKING

@@ -15,6 +15,7 @@ from zwfs.frames.calibration import Calibration
 from zwfs.frames.telemetry import reconstruct
 
 _PERIOD = 10.0  # second between two lines of progress where there is no terminal
+_FILES: Any = {"nargs": "+", "metavar": "FILE"}
 _EXIT_CODES = """exit codes:
   0    complete
   1    a file or a value was refused, or the disk is full; the message names the cause
@@ -47,36 +48,32 @@ def _parser() -> argparse.ArgumentParser:
     about = "Camera files of a phase-shifted Zernike wavefront sensor to phases."
     parser = argparse.ArgumentParser(prog="python -m zwfs.frames", description=about, **shared)
     commands = parser.add_subparsers(required=True, metavar="command")
-    files: dict[str, Any] = {"nargs": "+", "metavar": "FILE"}
-    calibrate = commands.add_parser("calibrate", help="make a calibration from frames and clear frames", **shared)
-    calibrate.set_defaults(run=_calibrate)
-    add = calibrate.add_argument
+    about = "make a calibration from frames and clear frames"
+    _add_calibrate(commands.add_parser("calibrate", help=about, **shared))
+    _add_reconstruct(commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared))
+    return parser
+
+
+def _add_calibrate(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `calibrate`; those without a value stay away from `Calibration.from_files`."""
+    absent: Any = argparse.SUPPRESS
+    parser.set_defaults(run=_calibrate)
+    add = parser.add_argument
     add("output", help="calibration to write, NPZ")
-    add("--frames", dest="frame_files", required=True, help="a frame, or one for each image", **files)
-    add("--pupils", dest="pupil_files", required=True, help="clear frames, likewise", **files)
-    add("--dark", dest="dark_files", default=(), help="counts without light", **files)
-    add("--pupil-dark", dest="pupil_dark_files", default=(), help="that of the clear frames", **files)
+    add("--frames", dest="frame_files", required=True, help="a frame, or one for each image", **_FILES)
+    add("--pupils", dest="pupil_files", required=True, help="clear frames, likewise", **_FILES)
+    add("--dark", dest="dark_files", default=(), help="counts without light", **_FILES)
+    add("--pupil-dark", dest="pupil_dark_files", default=(), help="that of the clear frames", **_FILES)
     add("--images", dest="n_images", type=int, metavar="N", help="of an exposure, 1 or 2; default: from the files")
-    add("--bad-pixels", dest="bad_pixel_files", default=(), help="maps, not 0 where bad", **files)
+    add("--bad-pixels", dest="bad_pixel_files", default=(), help="maps, not 0 where bad", **_FILES)
     add("--diameter", type=float, default=0.0, help="of the dimple in lambda/D; default: DIMPLE")
-    add(
-        "--phase-shifts",
-        type=float,
-        nargs="+",
-        default=(),
-        metavar="RAD",
-        help="default: THETA1, THETA2",
-    )
+    shifts: Any = {"type": float, "nargs": "+", "default": (), "metavar": "RAD"}
+    add("--phase-shifts", help="default: THETA1, THETA2", **shifts)
     add("--pupil-centers", type=float, nargs="+", metavar="PIXEL", help="row, column of each pupil")
     add("--pupil-diameter", type=float, metavar="PIXEL", help="default: from the clear frames")
-    add(
-        "--no-registration",
-        dest="subpixel",
-        action="store_false",
-        default=argparse.SUPPRESS,
-        help="trust the outlines",
-    )
-    add("--exposure", type=float, default=argparse.SUPPRESS, help="of the frames over that of the clear frames: 1")
+    trust: Any = {"dest": "subpixel", "action": "store_false", "default": absent}
+    add("--no-registration", help="trust the outlines", **trust)
+    add("--exposure", type=float, default=absent, help="of the frames over that of the clear frames: 1")
     add("--saturation", type=float, metavar="COUNTS", help="default: SATURATE, or the type's largest")
     add("--fit", dest="fitted", nargs="+", default=(), metavar="NAME", help="parameter to fit")
     add("--commands", metavar="FILE", help="known phases of the frames, radian: fit the bench with them")
@@ -85,13 +82,15 @@ def _parser() -> argparse.ArgumentParser:
     add("--iterations", dest="n_iterations", type=int, default=25, metavar="N", help="default: 25")
     add("--tolerance", type=float, default=1e-3, metavar="RAD", help="that ends them; default: 1e-3")
     add("--quiet", action="store_true", help="no steps of a fit")
-    reconstruct = commands.add_parser("reconstruct", help="reconstruct camera files of any length", **shared)
-    reconstruct.set_defaults(run=_reconstruct)
-    add = reconstruct.add_argument
+
+
+def _add_reconstruct(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_reconstruct)
+    add = parser.add_argument
     add("frames", nargs="+", help="FITS or NPY files with frames")
     add("--calibration", required=True, metavar="FILE", help="that `calibrate` wrote")
     add("--output", "-o", required=True, metavar="FILE", help="FITS file to write")
-    add("--second", dest="second_frames", default=(), help="of the second images", **files)
+    add("--second", dest="second_frames", default=(), help="of the second images", **_FILES)
     add("--modes", type=int, metavar="N", help="write coefficients of N Zernike modes, not phases")
     add("--phases", action="store_true", default=None, help="write phases, too")
     add("--photons", type=float, help="per pixel at an intensity of 1: write standard errors")
@@ -105,7 +104,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--overwrite", action="store_true", help="replace any file")
     add("--strict", action="store_true", help="exit with 3 if frames are flagged")
     add("--quiet", action="store_true", help="no progress and no summary")
-    return parser
 
 
 def _calibrate(output: str, pupil_centers: Sequence[float] | None, quiet: bool, **settings: Any) -> int:

@@ -15,10 +15,12 @@ from scipy import ndimage
 from zwfs import _check
 from zwfs._system import paths_of
 from zwfs.frames._blocks import FileError, blocks_of
-from zwfs.frames._learnt import Windows
+from zwfs.frames._fit import fit_bench
+from zwfs.frames._fitted import Windows
+from zwfs.frames._learnt import of_bench
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
-from zwfs.frames.files import CameraFile, averaged, dark_of, images, read, read_all
+from zwfs.frames.files import CameraFile, averaged, combined, read, read_all
 from zwfs.frames.pipeline import Measurement, Optics, reduce_frames
 from zwfs.frames.refine import _check_fit, fit
 from zwfs.frames.registration import Image, check_centers, check_diameter, find_pupils, register_frames
@@ -41,8 +43,6 @@ class Source(NamedTuple):
         masked, unmasked, sources = read_all(
             frames, pupils, darks, maps, self.saturation, pupil_dark_files=pupil_darks, n_images=self.n_images
         )
-        first = len(frames) + len(pupils)
-        dark = dark_of(sources[: len(frames)], sources[first : first + len(darks)], self.n_images)
         header, saturation = sources[0].header, self.saturation
         try:
             optics = sources[0].optics(self.diameter, self.phase_shifts)
@@ -52,7 +52,7 @@ class Source(NamedTuple):
             if saturation is None:
                 saturation = sources[0].keyword("SATURATE") if "SATURATE" in header else np.inf
             camera = {"saturation": saturation, "bunit": str(header.get("BUNIT", ""))}
-            return Calibration.of(reduce_frames(registered, optics), dark, **self.kept, **camera)
+            return Calibration.of(reduce_frames(registered, optics), **self.kept, **camera)
         except ValueError as error:  # any of the files can be the cause
             raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
 
@@ -70,15 +70,15 @@ class Source(NamedTuple):
         place = {name: self.settings.get(name) for name in ("pupil_centers", "pupil_diameter")}
         windows, n_pixels = _windows(states, *place.values())
         frames, clear = windows.cut(states.frames), windows.cut(states.clear)
-        settings = camera | attributes | {"n_pixels": n_pixels, "diameter": optics.diameter}
-        settings |= {"phase_shifts": optics.phase_shifts, "n_images": windows.n_images}
+        design: Any = {"n_pixels": n_pixels, "diameter": optics.diameter, "phase_shifts": optics.phase_shifts}
 
         def fitted_to(n_states: int) -> Calibration:
-            data: Any = frames[:n_states], clear, states.commands[:n_states], states.dark
-            return Calibration.fit(*data, corners=windows.corners, shape=windows.shape, **settings)
+            counts, commands = frames[:n_states], states.commands[:n_states]
+            bench = fit_bench(counts, clear, commands, **design, **camera)
+            return of_bench(Calibration, bench, counts, commands, windows, states.dark, **attributes)
 
         try:
-            plain = Calibration.of(_measured(states, optics, place), states.dark, **attributes)
+            plain = Calibration.of(_measured(states, optics, place), **attributes)
         except ValueError as error:
             warnings.warn(f"The fit was not compared with a calibration without commands: {error}", stacklevel=3)
         else:
@@ -106,9 +106,9 @@ def _does_not_help(partial: Calibration, plain: Calibration, states: _States) ->
 
 def _measured(states: _States, optics: Optics, place: dict[str, Any]) -> Measurement:
     """Frames of the first state, with the clear frames, for a calibration without commands."""
-    pairs = (states.frames[0].mean(axis=0), "frame"), (states.clear.mean(axis=0), "clear frame")
-    frames, clear = ([Image.of(counts, name) for counts in images] for images, name in pairs)
-    return reduce_frames(register_frames(frames, clear, **({} if None in place.values() else place)), optics)
+    frames = map(Image.of, states.frames[0].mean(axis=0), ["frame"] * 2, states.dark)
+    clear = map(Image.of, states.clear.mean(axis=0), ["clear frame"] * 2)
+    return reduce_frames(register_frames([*frames], [*clear], **({} if None in place.values() else place)), optics)
 
 
 def _error_of_last(calibration: Calibration, grid: Calibration, states: _States) -> float:
@@ -167,12 +167,9 @@ def _read_states(
         CameraFile(cube.mean(axis=0), source.firsts[0].name, "", source.header)
         for cube, source in ((frames, stack), (clear, clear_stack))
     ]
-    bad = np.stack([image.bad for image in images(means[1:], (), maps, _check.LARGEST)])
-    dark, clear_dark = (
-        np.zeros(clear.shape[1:]) if values is None else values
-        for values in (dark_of(means[:1], darks), dark_of(means[1:], pupil_darks or darks))
-    )
-    bad |= ~np.isfinite(dark + clear_dark)
+    masked, unmasked = combined(means[:1], darks), combined(means[1:], pupil_darks or darks, maps)
+    dark, clear_dark = (np.stack([image.dark for image in pair]) for pair in (masked, unmasked))
+    bad = np.stack([image.bad for image in unmasked]) | ~np.isfinite(dark)
     level = stack.saturation if saturation is None else saturation
     clear, frames = (
         np.where(bad | ~(cube < level), np.nan, cube - unlit)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ from zwfs import _check
 from zwfs._images import radius, turning
 from zwfs._results import Result
 from zwfs.frames._light import Light
-from zwfs.frames._optics import Camera, Exposure, Linearised, names_of
+from zwfs.frames._optics import ARM, MASKS, Camera, Exposure, Linearised, named, names_of
 from zwfs.frames._solver import (
     MISSED,
     Eliminated,
@@ -50,6 +49,11 @@ _BLURRED = {"phase shift": 3e-4, "focus": 5e-6}
 _SHARP = {"row": 1.2e-3, "column": 1.2e-3, "rotation": 2e-4, "magnification": 4e-5}
 _PHYSICAL = "leakage", "blur"  # the lower limit of these numbers is that of the physics
 _MOST = 1e9  # of a number that replaces an estimate
+_N_NUMBERS = 4 * len(ARM) + len(MASKS)  # arms of the frames behind the masks, and of the clear frames
+# Fields of a fit and of its model, as they are saved.
+_PLAIN_OF_FIT = "noise", "gain", "converged", "remarks"
+_MAPS_OF_FIT = "covariance", "flat", "light", "misfit"
+_PLAIN_OF_MODEL = "shape", "n_pixels", "oversampling", "largest", "places"
 _DIAMETERS = (0.8, 0.9, 1.0, 1.1, 1.25)  # of the coarse grid, over that of the design
 
 
@@ -96,6 +100,44 @@ class Estimate:
         _check.declared(self)
 
 
+@dataclass(frozen=True, eq=False)
+class FrameModel:
+    """All that predicts the frames of a fitted bench."""
+
+    shape: tuple[int, int]  # of a frame
+    n_pixels: float  # of D
+    oversampling: int
+    largest: float  # lambda/D: the grids are made for dimples up to it
+    light: Light  # fitted, on the fine grid
+    values: NDArray[np.float64]  # all numbers, see `names_of`
+    places: dict[str, list[int]]  # those of an estimate among the values
+
+    def __post_init__(self) -> None:
+        _check.declared(self)
+        for name, low, high in (("n_pixels", 1, 1e4), ("oversampling", 1, 8), ("largest", 1e-3, 1e4)):
+            _check.number(name, getattr(self, name), low, high)
+        side, maps = self.n * self.oversampling, vars(self.light)
+        for name, array in {**maps, "values": self.values}.items():
+            size = (side, side) if name in maps else (_N_NUMBERS,)
+            if array.shape != size:
+                raise ValueError(f"{name} has shape {array.shape}: expected {size}")
+            _check.finite(name, array)
+
+    @property
+    def n(self) -> int:
+        """Pixels along the maps."""
+        return len(self.light.start) // self.oversampling
+
+    @property
+    def arms(self) -> list[dict[str, float]]:
+        """Numbers of the two arms behind a mask."""
+        return named(self.values)[0][:2]
+
+    @property
+    def masks(self) -> dict[str, float]:
+        return named(self.values)[1]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class BenchFit(Result):
     """Fit of a bench to known commands, which `Calibration.fit` makes.
@@ -138,7 +180,7 @@ class BenchFit(Result):
     gain: float
     converged: bool
     remarks: tuple[str, ...]
-    point: Point
+    model: FrameModel
 
     @property
     def consistent(self) -> bool:
@@ -160,25 +202,40 @@ class BenchFit(Result):
         values : mapping of str to float
             By the names of `estimates`, in their units.
 
-        Returns
-        -------
-        BenchFit
-
         Raises
         ------
         TypeError, ValueError
             If no estimate has a name, or a value is not a number within 1e9.
         """
         _check.instance("values", values, Mapping)
-        x, n = self.point.x.copy(), self.point.problem.n_white
-        names = [one.name for one in self.estimates]
-        for name in values:
-            _check.choice("values", name, names)
-        numbers = {name: _check.number(name, value, -_MOST, _MOST) for name, value in values.items()}
-        for name, value in numbers.items():
-            x[n + names.index(name)] = value
-        estimates = (replace(one, value=numbers.get(one.name, one.value)) for one in self.estimates)
-        return replace(self, estimates=tuple(estimates), point=Point(self.point.problem, x))
+        numbers = self.model.values.copy()
+        for name, value in values.items():
+            _check.choice("values", name, self.model.places)
+            numbers[self.model.places[name]] = _check.number(name, value, -_MOST, _MOST)
+        estimates = (replace(one, value=float(values.get(one.name, one.value))) for one in self.estimates)
+        return replace(self, estimates=tuple(estimates), model=replace(self.model, values=numbers))
+
+    def _values(self) -> Iterator[tuple[str, bool | int | float | str]]:
+        return (pair for pair in super()._values() if not pair[0].startswith("model "))
+
+    def packed(self) -> tuple[dict[str, Any], dict[str, NDArray]]:
+        """Plain values and arrays, from which `unpacked` makes the fit again."""
+        values = {name: getattr(self, name) for name in _PLAIN_OF_FIT}
+        values |= {name: getattr(self.model, name) for name in _PLAIN_OF_MODEL}
+        values["estimates"] = [astuple(one) for one in self.estimates]
+        arrays = {name: getattr(self, name) for name in _MAPS_OF_FIT}
+        light = {f"light_{name}": array for name, array in vars(self.model.light).items()}
+        return values, arrays | light | {"values": self.model.values}
+
+    @classmethod
+    def unpacked(cls, values: dict[str, Any], arrays: dict[str, NDArray]) -> BenchFit:
+        """Fit from its plain values and arrays."""
+        light = Light(**{name: arrays[f"light_{name}"] for name in Light.__dataclass_fields__})
+        settings = {name: values[name] for name in _PLAIN_OF_MODEL} | {"shape": tuple(values["shape"])}
+        plain = {name: values[name] for name in _PLAIN_OF_FIT} | {"remarks": tuple(values["remarks"])}
+        estimates = tuple(Estimate(*one) for one in values["estimates"])
+        maps: Any = {name: arrays[name] for name in _MAPS_OF_FIT}
+        return cls(estimates, **maps, **plain, model=FrameModel(**settings, light=light, values=arrays["values"]))
 
     def __getitem__(self, name: str) -> Estimate:
         """Estimate of a name."""
@@ -305,8 +362,8 @@ def _problem(data: Recording, start: _Start, f: int) -> tuple[Problem, NDArray]:
     exposures = [Exposure(2, None, 0), Exposure(3, None, 0)]
     exposures += [Exposure(side, side, state) for state in range(len(data.phases)) for side in (0, 1)]
     camera = Camera(n, shape, data.n_pixels, exposures, fine_phase(data.phases, f), f, 1.9 * start.diameter)
-    values = np.zeros(len(names_of(4)))
-    values[names_of(4).index("arm 2 flux")] = flux[0]  # the only number that is not free
+    values = np.zeros(_N_NUMBERS)
+    values[names_of(_N_NUMBERS).index("arm 2 flux")] = flux[0]  # the only number that is not free
     division = Light.sharp(light, f)
     smooth = [ndimage.uniform_filter(one, 3) for one in data.counts]
     free = _free(data, start)
@@ -335,18 +392,17 @@ def _fitted(
         staged = _staged(data, problem, stage)
         if not stage.allowed:  # with the true noise, steps need to know how the maps follow
             staged = replace(staged, following=Eliminated(Point(staged, x)))
-        name = f"stage {number + 1} of {len(_STAGES)}, {problem.camera.f} points along a pixel"
-        settings: Any = n_steps, stage.n_inner, stage.enough, partial(_report_step, report, name)
+        name = f"stage {number + 1} of {len(_STAGES)}, {problem.camera.f} points along a pixel, step"
+        settings: Any = n_steps, stage.n_inner, stage.enough, lambda step, name=name: report(f"{name} {step}")
         point, converged = minimise(staged, x, *settings)
         if stage.signs and np.mean(point.misfit) > _WRONG * _expected(problem, staged):
             others = [minimise(staged, one, *settings)[0] for one in _other_signs(point)]
             point = min(point, *others, key=lambda one: one.cost)
-        problem, x = _next(data, point, stage.divide)
+        if stage.divide:
+            problem, x = _divided(data, point, problem.camera.f)
+        else:
+            problem, x = replace(point.problem, weights=data.weights(point.model.images)), point.x
     return point, converged
-
-
-def _report_step(report: Callable[[str], Any], name: str, step: int) -> None:
-    report(f"{name}, step {step}")
 
 
 def _expected(problem: Problem, staged: Problem) -> float:
@@ -372,13 +428,6 @@ def _staged(data: Recording, problem: Problem, stage: _Stage) -> Problem:
     ]
     level = stage.allowed * data.light[1][0]
     return replace(problem, weights=allowing(problem.weights, level), free=free)
-
-
-def _next(data: Recording, point: Point, divide: bool) -> tuple[Problem, NDArray]:
-    """Return the next problem and its start, with weights, and on demand the light, by what was fitted."""
-    if divide:
-        return _divided(data, point, point.problem.camera.f)
-    return replace(point.problem, weights=data.weights(point.model.images)), point.x
 
 
 def _divided(data: Recording, point: Point, f: int) -> tuple[Problem, NDArray]:
@@ -411,11 +460,10 @@ def _changes(data: Recording, point: Point) -> NDArray[np.float64]:
     First, the light is divided anew. Second, each point keeps its light, and is divided as an edge divides it.
     """
     of, f = point.problem, 2 * point.problem.camera.f
-    before: Any = of.light
     finer, twice = _camera(data, of.camera, f), np.ones((2, 2))
     light = Light.sharp(np.maximum(point.light_means, 0), f)
     # Halfway between the amplitude of the fit and a new one, of which it is not known which is better.
-    light = replace(light, amplitude=(np.kron(before.amplitude, twice) + light.amplitude) / 2)
+    light = replace(light, amplitude=(np.kron(of.light.amplitude, twice) + light.amplitude) / 2)
     n = len(point.light)
     sharp = np.kron(light.start.reshape(n, 2, n, 2).mean(axis=(1, 3)), twice)
     share = np.divide(light.start, sharp, out=np.ones_like(sharp), where=sharp > 1e-6)
@@ -447,8 +495,11 @@ def _result(data: Recording, point: Point, converged: bool, is_reversed: bool) -
     )
     remarks = tuple(_remarks(data, point, misfit, estimates, is_reversed))
     flat, light = (one[PAD:-PAD, PAD:-PAD] for one in (point.phase_means, point.light_means))
-    point = Point(replace(point.problem, following=None), point.x)  # which takes less memory
-    return BenchFit(estimates, spread, flat, light, misfit, data.noise, data.gain, converged, remarks, point)
+    camera, fitted_light = point.problem.camera, replace(point.problem.light, start=point.light)
+    places = {one.name: at for one, at in zip(point.problem.free, point.problem.places, strict=True)}
+    grids = camera.shape, camera.n_pixels, camera.f, camera.largest
+    model = FrameModel(*grids, fitted_light, point.values, places)
+    return BenchFit(estimates, spread, flat, light, misfit, data.noise, data.gain, bool(converged), remarks, model)
 
 
 def _remarks(

@@ -1,14 +1,13 @@
-"""Phases of pairs of frames with the optics of a fit, their error bars and a verdict."""
+"""Phases of camera images with the fitted optics of a calibration and a smooth prior."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from zwfs import _check
@@ -16,16 +15,21 @@ from zwfs._images import nearest_good
 from zwfs._unwrapping import unwrapped
 from zwfs.frames._explicit import Explicit, Posterior
 from zwfs.frames._fit import EXPLAINED, BenchFit, places_of
-from zwfs.frames._light import KnownLight
-from zwfs.frames._optics import Camera, Exposure, Linearised
+from zwfs.frames._optics import Camera, Exposure, Linearised, pooled
 from zwfs.frames._solver import MapPrior, PhaseMap, Point, Problem, allowing, fine_phase, minimise
 from zwfs.frames._states import PAD
-from zwfs.frames.pipeline import unmixed
+from zwfs.frames.phases import Flag, Phases
+from zwfs.frames.pipeline import MOST_BAD, unmixed
 from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import PhaseShifted
 from zwfs.sensor import ZernikeSensor
 
+if TYPE_CHECKING:
+    from zwfs.frames.calibration import Calibration
+
+WIDEST = 2**16  # rows or columns of a camera
+_N_STEPS = 8  # most steps for a pair
 # Exponents of the spectrum of a phase, of which the evidence chooses. The smooth ones come first: from a rough
 # phase, a smooth one is not found in a few steps.
 _EXPONENTS = 8.0, 5.0, 3.0
@@ -44,12 +48,106 @@ class PairFit(NamedTuple):
     phase: NDArray[np.float64]  # (n, n), radian: mean over each pixel, that of the optics included
     sigma: NDArray[np.float64]  # (n, n), error bar of each pixel
     misfit: float  # mean square of the residuals over the noise
-    consistent: bool  # whether the model explains these frames and those of the fit within their noise
     converged: bool
     prior: MapPrior  # as given, or as chosen by the evidence
 
 
-@dataclass(frozen=True, eq=False)
+class Windows(NamedTuple):
+    """Windows around the two pupils on one or two images of a camera."""
+
+    corners: NDArray[np.int64]  # (2, 2), row and column of their first pixels
+    size: tuple[int, int]
+    n_images: int
+    shape: tuple[int, int]  # of an image
+
+    @classmethod
+    def of(cls, calibration: Calibration, bench: BenchFit) -> Windows:
+        """Windows whose frames a calibration was fitted to."""
+        size, n = bench.model.shape, len(bench.light)
+        first = places_of(bench.model.arms, n, size)[:, :, 0, 0]
+        corners = np.rint(calibration.places[:, :, 0, 0] - first).astype(int)
+        return cls(corners, size, calibration.n_images, calibration.shape)
+
+    @property
+    def places(self) -> list[tuple[int, slice, slice]]:
+        """Image, rows and columns of each window."""
+        height, width = self.size
+        return [
+            (min(index, self.n_images - 1), slice(row, row + height), slice(column, column + width))
+            for index, (row, column) in enumerate(self.corners)
+        ]
+
+    def cut(self, images: NDArray) -> NDArray:
+        """Windows (..., 2, height, width) of images (..., n_images, ny, nx)."""
+        return np.stack([images[(..., *place)] for place in self.places], axis=-3)
+
+    def on_camera(self, pairs: NDArray) -> NDArray:
+        """Images (k, n_images, ny, nx) with windows (k, 2, height, width), and 0 elsewhere."""
+        images = np.zeros((len(pairs), self.n_images, *self.shape))
+        for index, place in enumerate(self.places):
+            images[(slice(None), *place)] = pairs[:, index]
+        return images
+
+
+def smooth_phases(
+    calibration: Calibration, counts: NDArray, level: float, prior: bool | MapPrior, noise: Any
+) -> Phases:
+    """Phases of exposures (k, n_images, ny, nx), one fit each, see `Calibration.__call__`."""
+    bench = calibration.bench
+    if bench is None:
+        raise ValueError(
+            "smooth needs the `bench` of a calibration, and this one has none: expected one from known commands"
+        )
+    if not isinstance(prior, MapPrior) and prior is not True:
+        raise TypeError(f"smooth = {_check.shown(prior)}: expected True or False, or one of `priors` of phases")
+    sensor, windows = FittedSensor(bench), Windows.of(calibration, bench)
+    sigma = None if noise is None else windows.cut(_checked_noise(noise, counts.shape[1:]))
+    _, good, n_bad, n_saturated = calibration._work.on_grid(counts, level, calibration.good)
+    inside = calibration.sensor.pupil.inside
+    lost = np.count_nonzero(good, axis=(1, 2)) < (1 - MOST_BAD) * np.count_nonzero(inside)
+    empty = np.full(inside.shape, np.nan)
+    fits = [PairFit(empty, empty, np.nan, False, MapPrior(np.nan))] * len(counts)
+    for number in np.flatnonzero(~lost):
+        exposure = counts[number].astype(float)
+        usable = (exposure < level) & (exposure > -_check.LARGEST) & ~calibration.bad
+        if np.abs(exposure).max(initial=0, where=usable) > _MOST:
+            raise ValueError(f"counts reaches {exposure[usable].max():.3g}: expected counts up to {_MOST:g}")
+        pair = windows.cut(np.where(usable, exposure - calibration.dark, np.nan))
+        fits[number] = sensor.phase(pair, sigma, None if prior is True else prior)
+    phase, bars, misfit, converged = (np.array([fit[index] for fit in fits]) for index in range(4))
+    consistent = (misfit < EXPLAINED) & bench.consistent
+    flags = Flag.LOST * lost + Flag.BAD_PIXELS * (n_bad > 0) + Flag.SATURATED * (n_saturated > 0)
+    flags += Flag.INCONSISTENT * ~(consistent | lost) + Flag.NOT_CONVERGED * ~(converged | lost)
+    unknown, zero = np.full(len(counts), np.nan, np.float32), np.zeros(len(counts), int)
+    return Phases(
+        phase=np.where(inside, phase, np.nan),
+        filled=np.where(inside, np.nan_to_num(phase), 0),
+        flux=np.where(lost, unknown, 1),
+        n_bad=n_bad,
+        n_saturated=n_saturated,
+        residual=unknown,
+        displacement=np.stack([unknown, unknown], axis=-1),
+        n_iterations=zero,
+        n_unsolved=zero,
+        flags=np.asarray(flags, int),
+        sigma=np.where(inside, bars, np.nan),
+        misfit=misfit,
+        priors=tuple(fit.prior for fit in fits),
+    )
+
+
+def _checked_noise(noise: Any, images: tuple[int, ...]) -> NDArray[np.float64]:
+    """Noise of the pixels of camera images, (n_images, ny, nx)."""
+    noise = _check.real_array("noise", noise)
+    if noise.shape not in ((), images[1:], images):
+        raise ValueError(f"noise has shape {noise.shape}: expected {images[1:]} or {images}, or a number")
+    if not np.all((noise > _LEAST) & (noise < np.inf)):
+        raise ValueError(
+            f"noise reaches from {noise.min():.6g} to {noise.max():.6g}: expected finite values above {_LEAST:g}"
+        )
+    return np.broadcast_to(noise, images)
+
+
 class FittedSensor:
     """A sensor whose optics are those of a fit: pairs of frames in, phases out.
 
@@ -57,80 +155,41 @@ class FittedSensor:
     with all of the model. In the first stage an error of the model adds to the noise, which keeps edges of the
     pupil from holding a wrong start. The prior is smooth to a degree that the evidence chooses: the probability of
     the frames with all phases of the prior.
-
-    Parameters
-    ----------
-    fit : BenchFit
-    n_steps : int
-        Largest number of steps for a pair.
     """
 
-    fit: BenchFit
-    n_steps: int = 8
+    def __init__(self, fit: BenchFit) -> None:
+        self.fit, self._model = fit, fit.model
+        of, side = fit.model, len(fit.model.light.start)
+        pair = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
+        settings: Any = pair, np.zeros((1, side, side)), of.oversampling, of.largest
+        self._camera = Camera(of.n, of.shape, of.n_pixels, *settings)
 
-    def __post_init__(self) -> None:
-        _check.instance("fit", self.fit, BenchFit)
-        _check.integer("n_steps", self.n_steps, 1)
+    def frames(self, phase: NDArray) -> NDArray[np.float64]:
+        """Frames (2, ny, nx), counts, of a phase (n, n) that includes that of the optics."""
+        fine = fine_phase(np.pad(phase, PAD, "edge"), self._camera.f)
+        maps = self._model.light.maps(self._model.light.start, fine)
+        return Linearised(self._camera, maps, self._model.values).images
 
-    @property
-    def flat(self) -> NDArray[np.float64]:
-        """Phase of the optics at a flat command, (n, n)."""
-        return self.fit.flat
-
-    def __call__(
-        self, frames: ArrayLike, sigma: ArrayLike | None = None, prior: MapPrior | None = None
-    ) -> PairFit:
-        """Phase of one pair of frames.
-
-        Parameters
-        ----------
-        frames : array_like, shape (2, ny, nx), counts
-            Less the dark, with the exposure of the fit's frames. NaN marks bad pixels.
-        sigma : array_like, shape (2, ny, nx) or a number, counts rms, optional
-            Noise of the pixels, by default ``sqrt(maximum(frames, 0) / gain + noise**2)`` with those of the fit;
-            that of means of several frames is smaller.
-        prior : MapPrior, optional
-            That of an earlier result. It saves half of the time, and fits phases of the same roughness
-            and strength only. By default the evidence chooses one.
-
-        Returns
-        -------
-        PairFit
-        """
-        if prior is not None:
-            _check.instance("prior", prior, MapPrior)
-        counts = _check.real_array("frames", frames)
-        shape = (2, *self._fitted.camera.shape)
-        if counts.shape != shape:
-            raise ValueError(f"frames has shape {counts.shape}: expected {shape}")
+    def phase(self, counts: NDArray, sigma: NDArray | None, prior: MapPrior | None) -> PairFit:
+        """Phase of a pair of frames (2, ny, nx) less the dark, NaN at bad pixels, with the noise of its pixels."""
         if sigma is None:
             sigma = np.sqrt(np.maximum(np.nan_to_num(counts), 0) / self.fit.gain + self.fit.noise**2)
-        sigma = _check.real_array("sigma", sigma)
-        if sigma.shape not in ((), shape):
-            raise ValueError(f"sigma has shape {sigma.shape}: expected {shape}, or a number")
-        if np.nanmax(np.abs(counts), initial=0, where=np.isfinite(counts)) > _MOST:
-            raise ValueError(f"frames reaches {np.nanmax(np.abs(counts)):.3g}: expected counts up to {_MOST:g}")
-        if not np.all((sigma > _LEAST) & (sigma < np.inf)):
-            raise ValueError(
-                f"sigma reaches from {sigma.min():.6g} to {sigma.max():.6g}: expected finite values above "
-                f"{_LEAST:g}"
-            )
-        sigma = np.broadcast_to(sigma, shape)
         good = np.isfinite(counts)
         counts, weights = np.where(good, counts, 0), good / sigma
         # Where the start is wrong by a wave, edges of the pupil would hold it there.
-        allowed = _ALLOWED * np.array([arm["flux"] for arm in self.fit.point.model.arms[:2]])
+        allowed = _ALLOWED * np.array([arm["flux"] for arm in self._model.arms])
         soft = allowing(weights, allowed[:, None, None])
         start = self._start(counts)
-        problem = self._problem(counts, soft, MapPrior(_rms_of(start), 3.0))
-        point = minimise(problem, problem.phase_map.white(start), 3, 12)[0]
+        phase_map = self._phase_map(MapPrior(_rms_of(start), 3.0))
+        problem = Problem(self._camera, counts, soft, self._model.light, phase_map, (), self._model.values)
+        point = minimise(problem, phase_map.white(start), 3, 12)[0]
         point = Point(replace(problem, weights=weights), point.x)
         point = self._chosen(point) if prior is None else self._under(prior, point, Explicit.of(point))
-        point, converged = _lowered(point, self.n_steps)
-        misfit, phase = float(np.mean(point.misfit)), point.phase_means[PAD:-PAD, PAD:-PAD]
+        point, converged = _lowered(point, _N_STEPS)
+        misfit = float(np.mean(point.misfit))
         bars = _error_bars(point) * math.sqrt(max(1.0, misfit))
-        explained = misfit < EXPLAINED and self.fit.consistent
-        return PairFit(phase, bars, misfit, explained, converged, point.problem.phase_map.prior)
+        inner = slice(PAD, -PAD)
+        return PairFit(point.phase_means[inner, inner], bars, misfit, converged, point.problem.phase_map.prior)
 
     def _chosen(self, start: Point) -> Point:
         """Phase with the prior that the evidence chooses."""
@@ -174,48 +233,8 @@ class FittedSensor:
             prior = prior._replace(rms=prior.rms * math.exp(power * growth))
         return point, evidence
 
-    def frames(self, phase: ArrayLike) -> NDArray[np.float64]:
-        """Frames that the model predicts for a phase.
-
-        Parameters
-        ----------
-        phase : array_like, shape (n, n), radian
-            That of the optics included.
-
-        Returns
-        -------
-        ndarray, shape (2, ny, nx), counts
-        """
-        phase = _check.real_map("phase", phase, 2)
-        _check.trailing_shape("phase", phase, self.flat.shape, "the grid of the pupil")
-        fine = fine_phase(np.pad(phase, PAD, "edge"), self._fitted.camera.f)
-        maps = self._light.maps(self._light.start, fine)
-        return Linearised(self._camera, maps, self.fit.point.values).images
-
-    @property
-    def _fitted(self) -> Problem:
-        return self.fit.point.problem
-
-    @cached_property
-    def _light(self) -> KnownLight:
-        light = self.fit.point.light
-        return KnownLight(self._fitted.light.maps(light, 0 * light), light)
-
-    @cached_property
-    def _camera(self) -> Camera:
-        """The camera behind the two masks alone."""
-        of = self._fitted.camera
-        flat = np.zeros((1, of.n * of.f, of.n * of.f))
-        settings: Any = [Exposure(0, 0, 0), Exposure(1, 1, 0)], flat, of.f, of.largest
-        return Camera(of.n, of.shape, of.n_pixels, *settings, n_arms=of.n_arms)
-
-    def _problem(self, counts: NDArray, weights: NDArray, prior: MapPrior) -> Problem:
-        values = self.fit.point.values
-        return Problem(self._camera, counts, weights, self._light, self._phase_map(prior), (), values)
-
     def _phase_map(self, prior: MapPrior) -> PhaseMap:
-        of = self._fitted
-        return PhaseMap(of.phase_map.n, of.camera.f, prior, of.camera.n_pixels)
+        return PhaseMap(self._camera.n, self._camera.f, prior, self._camera.n_pixels)
 
     def _under(self, prior: MapPrior, point: Point, data: Explicit | None) -> Point:
         """The same phase with another prior."""
@@ -226,11 +245,11 @@ class FittedSensor:
 
     def _start(self, counts: NDArray) -> NDArray[np.float64]:
         """Phase of the phase-shifted iteration on images brought back to the pupil, unwrapped and continued."""
-        point, n = self.fit.point, self._fitted.phase_map.n
-        light = np.maximum(point.light_means, 0)
-        pupil = Pupil.from_amplitude(np.sqrt(light), self._fitted.camera.n_pixels, threshold=0.3)
+        model, n = self._model, self._model.n
+        light = np.maximum(pooled(model.light.start, model.oversampling), 0)
+        pupil = Pupil.from_amplitude(np.sqrt(light), model.n_pixels, threshold=0.3)
         power = np.mean(pupil.amplitude[pupil.inside] ** 2) / np.mean(light[pupil.inside])
-        masks, arms = point.model.masks, point.model.arms[:2]
+        masks, arms = model.masks, model.arms
         images = np.empty((2, n, n))
         for side, (arm, places) in enumerate(zip(arms, places_of(arms, n, counts.shape[1:]), strict=True)):
             image = (counts[side] - arm["background"]) / arm["flux"] * power

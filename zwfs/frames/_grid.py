@@ -16,7 +16,6 @@ from zwfs._images import nearest_good
 from zwfs._information import Response
 from zwfs._propagator import square
 from zwfs.frames.registration import _TOUCHED
-from zwfs.masks import Dimple
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
 from zwfs.reconstructors.base import FixedPoint, Reconstructor
@@ -81,9 +80,8 @@ class Grid:
 
     def __init__(self, calibration: Calibration) -> None:
         pupil = Pupil.from_amplitude(calibration.amplitude, calibration.diameter, calibration.center)
-        masks = (Dimple(calibration.optics.diameter, shift) for shift in calibration.optics.phase_shifts)
         # Outside the pupil a camera sees light that the model does not know.
-        sensor = ZernikeSensor(pupil, *masks, tolerance=1e-6, recorded=pupil.inside)
+        sensor = ZernikeSensor(pupil, *calibration.optics.focal_masks, tolerance=1e-6, recorded=pupil.inside)
         settings: dict[str, Any] = {"n_iterations": calibration.n_iterations, "tolerance": calibration.tolerance}
         self.reconstruct: FixedPoint = (
             Arcsine(sensor, **settings)

@@ -9,17 +9,16 @@ focus of the relay to first order.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from zwfs import _check
 from zwfs._images import radius
 from zwfs.frames._errors import slopes_of, unexplained
 from zwfs.frames._fit import BenchFit, places_of
-from zwfs.frames._fitted import FittedSensor
+from zwfs.frames._fitted import FittedSensor, Windows
 from zwfs.frames.pipeline import Optics, unmixed
 from zwfs.pupil import Pupil
 from zwfs.sensor import ZernikeSensor
@@ -32,66 +31,22 @@ _RMS = (0.15, 0.3, 0.5, 0.8)  # radian, of these
 _FINEST = 20  # cycles / D
 _STIFFNESS = 1e-3  # variance of the frames up to which a weight stays what leakage alone makes it
 _FAINTEST = 0.2  # amplitude of the pupil of a fit, relative to the largest
-WIDEST = 2**16  # rows or columns of a camera
-
-
-class Windows(NamedTuple):
-    """Windows around the two pupils on one or two images of a camera."""
-
-    corners: NDArray[np.int64]  # (2, 2), row and column of their first pixels
-    size: tuple[int, int]
-    n_images: int
-    shape: tuple[int, int]  # of an image
-
-    @classmethod
-    def checked(cls, size: tuple[int, int], corners: Any, n_images: Any, shape: Any) -> Windows:
-        shape = size if shape is None else _check.pair("shape", shape, _check.integer, 1, WIDEST)
-        n_images = _check.integer("n_images", n_images, 1, 2)
-        corners, most = _check.integer_array("corners", corners), np.subtract(shape, size)
-        if corners.shape != (2, 2) or np.any(corners < 0) or np.any(corners > most):
-            raise ValueError(
-                f"corners = {_check.shown(corners.tolist())}: expected two pairs of a row and a column, from "
-                f"(0, 0) to {tuple(most.tolist())}, so that frames of {size} lie on one of {shape}"
-            )
-        return cls(corners, size, n_images, shape)
-
-    @classmethod
-    def of(cls, calibration: Calibration, bench: BenchFit) -> Windows:
-        """Windows whose frames a calibration was fitted to."""
-        size, n = bench.point.problem.camera.shape, len(bench.light)
-        first = places_of(bench.point.model.arms[:2], n, size)[:, :, 0, 0]
-        corners = np.rint(calibration.places[:, :, 0, 0] - first).astype(int)
-        return cls(corners, size, calibration.n_images, calibration.shape)
-
-    @property
-    def places(self) -> list[tuple[int, slice, slice]]:
-        """Image, rows and columns of each window."""
-        height, width = self.size
-        return [
-            (min(index, self.n_images - 1), slice(row, row + height), slice(column, column + width))
-            for index, (row, column) in enumerate(self.corners)
-        ]
-
-    def cut(self, images: NDArray) -> NDArray:
-        """Windows (..., 2, height, width) of images (..., n_images, ny, nx)."""
-        return np.stack([images[(..., *place)] for place in self.places], axis=-3)
-
-    def on_camera(self, pairs: NDArray) -> NDArray:
-        """Images (k, n_images, ny, nx) with windows (k, 2, height, width), and 0 elsewhere."""
-        images = np.zeros((len(pairs), self.n_images, *self.shape))
-        for index, place in enumerate(self.places):
-            images[(slice(None), *place)] = pairs[:, index]
-        return images
 
 
 def of_bench(
-    kind: type[Calibration], bench: BenchFit, counts: NDArray, phases: NDArray, dark: NDArray, windows: Windows,
-    **settings: Any,
+    kind: type[Calibration], bench: BenchFit, counts: NDArray, phases: NDArray, windows: Windows | None = None,
+    dark: NDArray | None = None, **settings: Any,
 ) -> Calibration:  # fmt: skip
-    """Calibration of a fitted bench, from the mean frames of its states, (n_states, 2, ny, nx), less the dark.
+    """Calibration of a fitted bench, from its frames, (n_states, [n_frames,] 2, ny, nx), less the dark.
 
-    The focus of the relay is corrected to first order, around a flat wavefront.
+    The focus of the relay is corrected to first order, around a flat wavefront. By default the frames are the
+    camera images.
     """
+    settings["n_averaged"] = counts.shape[1] if counts.ndim == 5 else 1
+    counts = counts.mean(axis=1) if counts.ndim == 5 else counts
+    size = counts.shape[-2:]
+    windows = windows or Windows(np.zeros((2, 2), int), (size[0], size[1]), 2, (size[0], size[1]))
+    dark = np.zeros((windows.n_images, *windows.shape)) if dark is None else dark
     calibration = _unweighted(kind, bench, counts, dark, windows, settings)
     work, shape = calibration._work, calibration.good.shape
     good = calibration.good & ~work.touched(work.bad[np.newaxis])[0]
@@ -121,16 +76,16 @@ def _unweighted(
     settings: dict[str, Any],
 ) -> Calibration:  # fmt: skip
     """Calibration with the geometry of a fit, and weights of 0."""
-    masks, arms, n = bench.point.model.masks, bench.point.model.arms[:2], len(bench.light)
-    shares = {"leakage": masks["leakage"], "unmasked": max(masks["unmasked"], 0.0)}
+    masks, arms, n = bench.model.masks, bench.model.arms, len(bench.light)
+    shares: Any = {"leakage": masks["leakage"], "unmasked": max(masks["unmasked"], 0.0)}
     optics = Optics(masks["diameter"], (masks["first"], masks["second"]), **shares)
-    n_pixels, bad = bench.point.problem.camera.n_pixels, ~np.isfinite(counts).all(axis=0)
+    n_pixels, bad = bench.model.n_pixels, ~np.isfinite(counts).all(axis=0)
     light = bench.light * (radius((n, n), ((n - 1) / 2,) * 2) <= n_pixels / 2)
     pupil = Pupil.from_amplitude(np.sqrt(np.maximum(light, 0)), n_pixels, threshold=_FAINTEST)
     background, flux = (np.array([arm[key] for arm in arms]) for key in ("background", "flux"))
     return kind(
         pupil.amplitude, n_pixels, pupil.center, optics, windows.shape, windows.n_images,
-        places_of(arms, n, windows.size) + windows.corners[..., None, None], dark,
+        places_of(arms, n, windows.size) + windows.corners[..., None, None], dark.astype(np.float32),
         windows.on_camera(bad[np.newaxis])[0] > 0, pupil.inside, background, flux * light[pupil.inside].mean(),
         np.zeros((2, 2, n, n)), np.zeros((2, n, n)), False, np.ones(2), np.zeros((0, n, n), np.float32),
         np.zeros(0), np.zeros((0, 2)), blur=masks["blur"], commanded=True, bench=bench, **settings,

@@ -78,23 +78,6 @@ class Light:
         return 0.5 * self.amplitude**2
 
 
-@dataclass(frozen=True, eq=False)
-class KnownLight:
-    """Known light, which a fit does not change. It replaces `Light`."""
-
-    known: Maps  # of which the phase does not count
-    start: NDArray[np.float64]
-
-    def changed(self, _: NDArray) -> NDArray[np.float64]:
-        return self.start
-
-    def maps(self, _: NDArray, phase: NDArray) -> Maps:
-        return self.known._replace(phase=phase)
-
-    def slopes(self, light: NDArray) -> tuple[NDArray, NDArray]:
-        return np.zeros_like(light), np.zeros_like(light)
-
-
 def _continued(pixels: NDArray, full: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Smooth light of fully lit pixels, continued along its slope; NaN far from them."""
     if not full.any():  # a pupil of a few pixels

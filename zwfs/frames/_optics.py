@@ -68,9 +68,10 @@ class Maps(NamedTuple):
     cells: NDArray[np.bool_] | bool = True
 
 
-def names_of(n_arms: int) -> list[str]:
-    """Names of all numbers in the order of the vector: each arm, then the masks."""
-    return [f"arm {arm} {name}" for arm in range(n_arms) for name in ARM] + list(MASKS)
+def names_of(size: int) -> list[str]:
+    """Names of so many numbers in the order of the vector: each arm, then the masks."""
+    arms = range((size - len(MASKS)) // len(ARM))
+    return [f"arm {arm} {name}" for arm in arms for name in ARM] + list(MASKS)
 
 
 class Camera:
@@ -90,13 +91,10 @@ class Camera:
         commands: NDArray,
         oversampling: int,
         largest: float,
-        *,
-        n_arms: int | None = None,
         real: Any = np.float64,
     ) -> None:
         self.n, self.shape, self.n_pixels, self.f, self.largest = n, shape, n_pixels, oversampling, largest
         self.exposures, self.commands, self.real = tuple(exposures), commands, real
-        self.n_arms = n_arms or 1 + max(one.arm for one in exposures)
         f, inner = oversampling, n * oversampling
         size = max(n, *shape) * f + 2 * _BORDER * f
         while (size - inner) % 2 or fft.next_fast_len(size) != size:
@@ -116,7 +114,7 @@ class Camera:
         self.prefilter = 1 / symbol([samples[0], *(2 * samples[1:])], size)
 
         self.double: Camera | None = None  # of which this camera is `single`
-        self._optics: Optics | None = None
+        self._optics: Operators | None = None
 
     def complex(self, values: NDArray) -> NDArray:
         """Complex numbers in the precision of the camera."""
@@ -135,15 +133,15 @@ class Camera:
     @cached_property
     def single(self) -> Camera:
         """Camera with the same settings in single precision."""
-        settings: Any = self.exposures, self.commands, self.f, self.largest
-        camera = Camera(self.n, self.shape, self.n_pixels, *settings, n_arms=self.n_arms, real=np.float32)
+        settings: Any = self.exposures, self.commands, self.f, self.largest, np.float32
+        camera = Camera(self.n, self.shape, self.n_pixels, *settings)
         camera.double = self
         return camera
 
-    def optics(self, values: NDArray) -> Optics:
-        """Optics with these numbers; those of the last call are kept."""
+    def optics(self, values: NDArray) -> Operators:
+        """Operators with these numbers; those of the last call are kept."""
         if self._optics is None or not np.array_equal(self._optics.values, values):
-            self._optics = self.double.optics(values).single if self.double else Optics(self, values)
+            self._optics = self.double.optics(values).single if self.double else Operators(self, values)
         return self._optics
 
     def defocus_at(self, u: NDArray, v: NDArray) -> NDArray[np.float64]:
@@ -344,14 +342,19 @@ def _basis(part: NDArray) -> tuple[NDArray, NDArray]:
     return values, before - after
 
 
-class Optics:
+def named(values: NDArray) -> tuple[list[dict[str, float]], dict[str, float]]:
+    """Numbers of each arm, and of the masks, by their names."""
+    rows = values[: -len(MASKS)].reshape(-1, len(ARM)).tolist()
+    arms = [dict(zip(ARM, row, strict=True)) for row in rows]
+    return arms, dict(zip(MASKS, values[-len(MASKS) :].tolist(), strict=True))
+
+
+class Operators:
     """The part of the model that depends on the numbers, and not on the maps."""
 
     def __init__(self, camera: Camera, values: NDArray) -> None:
         real, self.values = camera.real, values.copy()
-        split = values[: -len(MASKS)].reshape(camera.n_arms, len(ARM))
-        self.arms = [dict(zip(ARM, row, strict=True)) for row in split.tolist()]
-        self.masks = dict(zip(MASKS, values[-len(MASKS) :].tolist(), strict=True))
+        self.arms, self.masks = named(values)
         self.coefficients = coefficients(self.masks)
         used = {one.arm for one in camera.exposures}
         self.transfer, self.spread, self.splines, self.cores = ({} for _ in range(4))
@@ -367,7 +370,7 @@ class Optics:
         self.blur = (camera.prefilter * blur).astype(real)
 
     @cached_property
-    def single(self) -> Optics:
+    def single(self) -> Operators:
         """The same in single precision."""
         out = copy(self)
         out.blur = self.blur.astype(np.float32)

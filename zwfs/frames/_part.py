@@ -88,8 +88,7 @@ class Part:
     def __init__(
         self, output: Path, units: Sequence[Unit], pieces: Sequence[tuple[int, int]], plan: str, restart: bool
     ) -> None:
-        self.output, self.units, self.pieces, self.path = output, units, pieces, scratch_of(output)
-        self._numbers = {piece: number for number, piece in enumerate(pieces)}
+        self.output, self.units, self.pieces, self.path = output, units, list(pieces), scratch_of(output)
         self._plan, self._keep, self._size = hashlib.sha256(plan.encode()).digest(), True, 0
         for unit in units:
             unit.offset = self._size + len(unit.header())
@@ -115,9 +114,9 @@ class Part:
 
     def note(self, first: int, stop: int) -> None:
         """Mark a piece, whose rows are written, as finished."""
-        mark = np.array(self._checksum(first, stop) + 1, _MARK).tobytes()
+        place = self._size + self.pieces.index((first, stop)) * _MARK.itemsize
         with self._no_space():
-            self._write(mark, self._size + self._numbers[first, stop] * _MARK.itemsize)
+            self._write(np.array(self._checksum(first, stop) + 1, _MARK).tobytes(), place)
         self._keep = True
 
     def finish(self) -> None:

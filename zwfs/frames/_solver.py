@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import fft, linalg, ndimage
 from scipy.interpolate import BSpline
 
-from zwfs.frames._light import KnownLight, Light
+from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Linearised, names_of, pooled, symbol
 
 if TYPE_CHECKING:
@@ -165,7 +165,7 @@ class Problem:
     camera: Camera
     counts: NDArray[np.float64]  # (n_images, ny, nx)
     weights: NDArray[np.float64]  # one over the noise of each pixel; 0 for bad pixels
-    light: Light | KnownLight
+    light: Light
     phase_map: PhaseMap
     light_maps: tuple[LightMap, ...]  # empty if the light is known
     values: NDArray[np.float64]  # all numbers; those that are free do not count
@@ -177,7 +177,7 @@ class Problem:
     @cached_property
     def places(self) -> list[list[int]]:
         """Places of each free number in the vector of all."""
-        index = {name: place for place, name in enumerate(names_of(self.camera.n_arms))}
+        index = {name: place for place, name in enumerate(names_of(len(self.values)))}
         return [
             [index[name if arm is None else f"arm {arm} {name}"] for arm, name in one.places] for one in self.free
         ]
@@ -231,17 +231,6 @@ class Problem:
         pairs = zip(white[1:], self.light_maps, strict=True)
         zero = np.zeros((*white[0].shape[:-2], *self.light.start.shape), white[0].dtype)
         return sum((of.fine(one) for one, of in pairs), zero)
-
-    def columns(self, model: Linearised) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
-        """Free numbers that change each image, and its changes over the noise with each, (k, n_pixels)."""
-        places = [(number, *at) for number, free in enumerate(self.free) for at in free.places]
-        out = []
-        for index, weight in enumerate(self.weights):
-            own = self.camera.exposures[index].arm
-            names = {number: name for number, arm, name in places if arm in (None, own)}
-            slopes = model.slopes(index, list(names.values())) * weight
-            out.append((np.array(list(names), int), slopes.reshape(len(names), weight.size)))
-        return out
 
 
 class Point:
@@ -328,7 +317,14 @@ class Matrix:
     @cached_property
     def columns(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
         """Free numbers that change each image, and its changes over the noise with each, (k, n_pixels)."""
-        return self.problem.columns(self.model)
+        places = [(number, *at) for number, free in enumerate(self.problem.free) for at in free.places]
+        out = []
+        for index, weight in enumerate(self.problem.weights):
+            own = self.problem.camera.exposures[index].arm
+            names = {number: name for number, arm, name in places if arm in (None, own)}
+            slopes = self.model.slopes(index, list(names.values())) * weight
+            out.append((np.array(list(names), int), slopes.reshape(len(names), weight.size)))
+        return out
 
     def along(self, number: int) -> NDArray[np.float64]:
         """Change of the residuals with a free number."""

@@ -13,7 +13,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,9 @@ from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._errors import Excess, sideways, slopes_of
 from zwfs.frames._exposures import Exposures
 from zwfs.frames._fit import BenchFit, fit_bench
+from zwfs.frames._fitted import WIDEST, smooth_phases
 from zwfs.frames._grid import Grid
-from zwfs.frames._learnt import WIDEST, Windows, of_bench
-from zwfs.frames._smooth import smooth_phases
+from zwfs.frames._learnt import of_bench
 from zwfs.frames._solver import MapPrior
 from zwfs.frames.controller import Controller, PhaseController, make_controller
 from zwfs.frames.phases import Flag, Phases
@@ -43,6 +43,11 @@ from zwfs.reconstructors.base import Reconstructor
 from zwfs.sensor import ZernikeSensor
 
 FORMAT = 2  # of the file; another number is refused
+_RANGES = (
+    ("n_iterations", 1, math.inf), ("tolerance", 0, 2 * np.pi), ("residual", 0, math.inf), ("blur", 0, 10),
+    ("light_ratio", 0, math.inf), ("n_averaged", 1, math.inf), ("n_images", 1, 2), ("diameter", 1, math.inf),
+)  # fmt: skip
+_OF_BENCH = "bench_"  # first letters of the names of its arrays in a file
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 
 
@@ -96,7 +101,7 @@ class Calibration(Immutable):
     n_iterations, tolerance : int and float, radian
         As for `PhaseShifted`: with a tolerance of 0, all iterations are done.
     bench : BenchFit or None
-        Optics that were fitted to known commands. `save` does not store it.
+        Optics that were fitted to known commands.
     """
 
     amplitude: NDArray[np.float64]
@@ -130,48 +135,36 @@ class Calibration(Immutable):
     bench: BenchFit | None = None
 
     def __post_init__(self) -> None:
-        _check.integer("n_iterations", self.n_iterations, 1)
-        _check.number("tolerance", self.tolerance, 0, 2 * np.pi)
+        _check.declared(self)
+        for name, low, high in _RANGES:
+            _check.number(name, getattr(self, name), low, high, open_low=name == "light_ratio")
         _check.number_or_inf("saturation", self.saturation, open_low=True)
-        _check.instance("bunit", self.bunit, str)
-        _check.flag("balance", self.balance)
-        _check.number("residual", self.residual, 0)
-        _check.number("light_ratio", self.light_ratio, 0, open_low=True)
-        _check.number("blur", self.blur, 0, 10)
-        _check.integer("n_averaged", self.n_averaged, 1)
-        _check.integer("n_images", self.n_images, 1, 2)
-        _check.number("diameter", self.diameter, 1)
-        _check.pair("center", self.center, _check.number)
-        _check.instance("optics", self.optics, Optics)
-        _check.flag("commanded", self.commanded)
-        if self.bench is not None:
-            _check.instance("bench", self.bench, BenchFit)
         shape = _check.pair("shape", self.shape, _check.integer, 1, WIDEST)
-        amplitude = _check.real_map("amplitude", self.amplitude)
-        _check.non_negative("amplitude", amplitude)
-        grid, camera = amplitude.shape, (self.n_images, *shape)
-        n_states = _check.real_array("slopes", self.slopes).size
-        bad, good = _check.flag_map("bad", self.bad, camera), _check.flag_map("good", self.good, grid)
-        if not np.any(good & (amplitude > 0)):
-            raise ValueError("amplitude is 0 at all good points: expected light at some")
-        arrays = {"amplitude": amplitude, "bad": bad, "good": good}
-        for name, size in {
-            "places": (2, 2, *grid), "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2, *grid),
-            "offset": (2, *grid), "light": (2,), "unexplained": (n_states, *grid), "slopes": (n_states,),
-            "displacements": (n_states, 2),
-        }.items():  # fmt: skip
-            array = _check.real_array(name, getattr(self, name))
+        grid, camera = _check.real_map("amplitude", self.amplitude).shape, (self.n_images, *shape)
+        n_states = self.slopes.size
+        sizes: dict[str, tuple[int, ...]] = {
+            "amplitude": grid, "good": grid, "bad": camera, "places": (2, 2, *grid),
+            "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2, *grid), "offset": (2, *grid),
+            "light": (2,), "unexplained": (n_states, *grid), "slopes": (n_states,), "displacements": (n_states, 2),
+        }  # fmt: skip
+        for name, size in sizes.items():
+            array = getattr(self, name)
             if array.shape != size:
                 raise ValueError(f"{name} has shape {array.shape}: expected {size}")
             _check.finite(name, array)
-            arrays[name] = array
             if name in ("unit", "light") and np.any(array <= 0):
                 raise ValueError(f"{name} = {_check.shown(array)}: expected values above 0")
-        if np.any(np.abs(arrays["places"]) > 2 * max(shape)):  # the work grows with the distance
-            reach = np.abs(arrays["places"]).max()
-            raise ValueError(f"places reaches {reach:.3g}: expected pixels of a camera image of {shape}")
-        for name, array in arrays.items():
             object.__setattr__(self, name, read_only(array))
+        _check.non_negative("amplitude", self.amplitude)
+        if self.bench is not None and any(
+            size > most for size, most in zip(self.bench.model.shape, shape, strict=True)
+        ):
+            raise ValueError(f"bench has frames of {self.bench.model.shape}: expected at most {shape}")
+        if not np.any(self.good & (self.amplitude > 0)):
+            raise ValueError("amplitude is 0 at all good points: expected light at some")
+        if np.any(np.abs(self.places) > 2 * max(shape)):  # the work grows with the distance
+            reach = np.abs(self.places).max()
+            raise ValueError(f"places reaches {reach:.3g}: expected pixels of a camera image of {shape}")
 
     def __repr__(self) -> str:
         images = f"{self.n_images} camera image{'s' * (self.n_images > 1)} of {self.shape}"
@@ -200,8 +193,8 @@ class Calibration(Immutable):
         diameter, phase_shifts : float, lambda/D, and sequence of one or two floats, radian
             Of the dimple; DIMPLE, THETA1 and THETA2 of the header if 0 and empty. With one, there is one image.
         saturation : float, counts, optional
-            Of the camera, see `zwfs.frames.files.images`. Without it the frames to come are compared with SATURATE
-            of the header, or with the largest number of their type.
+            Of the camera, see `zwfs.frames.files.read_all`. By default the limit of the frames to come is SATURATE
+            of the header, or the largest number of their type.
         fitted : sequence of str
             Parameters that `zwfs.frames.refine.fit` fits to these frames.
         commands : str or Path, optional
@@ -217,10 +210,6 @@ class Calibration(Immutable):
         **settings
             Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel. With
             commands only the first two.
-
-        Returns
-        -------
-        Calibration
 
         Raises
         ------
@@ -276,11 +265,7 @@ class Calibration(Immutable):
         saturation, n_iterations, tolerance : float, counts; int; float, radian
             Attributes of the calibration.
         **optics
-            Parameters of `Optics`, such as `diameter` and `phase_shifts`.
-
-        Returns
-        -------
-        Calibration
+            Parameters of `Optics`, such as `diameter` and `phase_shifts`, or `masks`.
 
         Raises
         ------
@@ -288,13 +273,12 @@ class Calibration(Immutable):
             If a shape is wrong, or the pupils are not found.
         """
         attributes = {"saturation": saturation, "n_iterations": n_iterations, "tolerance": tolerance}
-        return cls.of(measured(frames, clear_frames, dark, Optics(**optics)), dark, **attributes)
+        return cls.of(measured(frames, clear_frames, dark, Optics(**optics)), **attributes)
 
     @classmethod
     def fit(
-        cls, frames: ArrayLike, clear_frames: ArrayLike, phases: ArrayLike, dark: ArrayLike | None = None, *,
-        n_pixels: float, corners: ArrayLike = ((0, 0), (0, 0)), shape: tuple[int, int] | None = None,
-        n_images: int = 2, noise: float | None = None, gain: float = 1.0, diameter: float = 1.06,
+        cls, frames: ArrayLike, clear_frames: ArrayLike, phases: ArrayLike, *, n_pixels: float,
+        noise: float | None = None, gain: float = 1.0, diameter: float = 1.06,
         phase_shifts: tuple[float, float] = (np.pi / 2, -np.pi / 2), oversampling: int | None = None,
         n_steps: int = 15, progress: Callable[[str], Any] | None = None, **settings: Any,
     ) -> Calibration:  # fmt: skip
@@ -313,13 +297,8 @@ class Calibration(Immutable):
             Phases that the commands add, mean over each pixel, on a grid whose middle is that of the frames. The
             phases of the calibration are on this grid. NaN, or 0 in all states, marks what is unknown around the
             pupil; there the phases are continued.
-        dark : array_like, shape (ny_camera, nx_camera) or (n_images, ny_camera, nx_camera), counts, optional
-            That was subtracted from the frames; none if left out.
         n_pixels : float, pixels
             Diameter D.
-        corners, shape, n_images : array_like of int, shape (2, 2); (int, int); int
-            If the frames were cut out: row and column of their first pixels on the camera, rows and columns of a
-            camera image, and the number of these in an exposure.
         noise : float, counts rms, optional
             Of a pixel of one frame without light: read noise, and that of the background and the dark. By default
             it is estimated from the darkest pixels; `bench` names it.
@@ -339,42 +318,28 @@ class Calibration(Immutable):
         **settings
             Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
 
-        Returns
-        -------
-        Calibration
-
         Raises
         ------
         TypeError, ValueError
             If shapes do not belong together, there are fewer than two states, or a clear frame holds no light.
         """
-        counts, phases = _check.real_array("frames", frames), _check.real_array("phases", phases)
-        windows = Windows.checked(counts.shape[-2:], corners, n_images, shape)
-        lost = _dark(dark, (windows.n_images, *windows.shape))
         bench = fit_bench(
-            counts, clear_frames, phases, n_pixels=n_pixels, noise=noise, gain=gain, diameter=diameter,
+            frames, clear_frames, phases, n_pixels=n_pixels, noise=noise, gain=gain, diameter=diameter,
             phase_shifts=phase_shifts, oversampling=oversampling, n_steps=n_steps, progress=progress,
         )  # fmt: skip
-        n_averaged = counts.shape[1] if counts.ndim == 5 else 1
-        counts = counts.mean(axis=1) if counts.ndim == 5 else counts
-        return of_bench(cls, bench, counts, phases, lost, windows, n_averaged=n_averaged, **settings)
+        counts = _check.real_array("frames", frames)
+        return of_bench(cls, bench, counts, _check.real_array("phases", phases), **settings)
 
     @classmethod
-    def of(cls, measurement: Measurement, dark: ArrayLike | None = None, **settings: Any) -> Calibration:
+    def of(cls, measurement: Measurement, **settings: Any) -> Calibration:
         """Calibration of a measurement; pixels that are bad on its frames are ignored from then on.
 
         Parameters
         ----------
         measurement : Measurement
-            Of frames that are taken as those to come, and of clear frames.
-        dark : array_like, shape (ny, nx) or (n_images, ny, nx), counts, optional
-            That was subtracted from the frames of the measurement; none if left out.
+            Of frames that are taken as those to come, and of clear frames. Its images know the dark.
         **settings
             Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
-
-        Returns
-        -------
-        Calibration
         """
         _check.instance("measurement", measurement, Measurement)
         registered, pupil, good = measurement.registered, measurement.pupil, measurement.good
@@ -382,12 +347,13 @@ class Calibration(Immutable):
         shape = images[0].counts.shape
         if images[-1].counts.shape != shape:
             raise ValueError(f"the frames have shapes {shape} and {images[-1].counts.shape}: expected the same")
+        dark = np.nan_to_num([image.dark for image in images], posinf=0, neginf=0).astype(np.float32)
         counts, _ = registered._on_grid(FRAMES)
         unit, background = measurement.counts * registered.exposure, measurement.background[:2]
         weights, offset = _undone(measurement)
         calibration = cls(
             pupil.amplitude, pupil.n_pixels, pupil.center, measurement.optics, shape, len(images),
-            registered.places()[:2], _dark(dark, (len(images), *shape)), np.stack([image.bad for image in images]),
+            registered.places()[:2], dark, np.stack([image.bad for image in images]),
             good, background / registered.areas[:2], unit / registered.areas[:2], weights, offset,
             bool(registered.balance and measurement.optics.opposite),
             (counts[:, good].mean(axis=1) - background) / unit,
@@ -410,9 +376,11 @@ class Calibration(Immutable):
         Raises
         ------
         TypeError, ValueError
-            If the path is none, or names a file that is not a calibration.
+            If the path is none, or names a file that is not a calibration, or the optics have `masks`.
         """
         path = path_of("path", path)
+        if self.optics.masks:
+            raise ValueError("optics.masks are objects: expected dimples of one diameter, which a file can hold")
         if path.exists() and not (path.is_file() and _is_calibration(path)):
             raise ValueError(f"path = {str(path)!r} exists and is not a calibration: expected a new name")
         write_file(path, self._content)
@@ -436,7 +404,11 @@ class Calibration(Immutable):
             values: dict[str, Any] = json.loads(str(file["values"]))
             file_format = values.pop("format")
             if file_format == FORMAT:
-                values |= {name: file[name] for name in file.files if name != "values"}
+                bench = {name for name in file.files if name.startswith(_OF_BENCH)}
+                values |= {name: file[name] for name in set(file.files) - bench - {"values"}}
+                if bench:
+                    maps = {name.removeprefix(_OF_BENCH): file[name] for name in bench}
+                    values["bench"] = BenchFit.unpacked(values["bench"], maps)
                 values |= {name: tuple(values[name]) for name in ("center", "shape")}
                 shifts = {"phase_shifts": tuple(values["optics"]["phase_shifts"])}
                 calibration = cls(**values | {"optics": Optics(**values["optics"] | shifts)})
@@ -494,10 +466,6 @@ class Calibration(Immutable):
         noise : float or array_like, shape (ny, nx) or (n_images, ny, nx), counts rms, optional
             Of the pixels, with `smooth`. By default it follows from the counts, and from gain and noise of the
             `bench`; that of means of several frames is smaller.
-
-        Returns
-        -------
-        Phases
         """
         counts = _check.plain_array("counts", counts)
         if counts.dtype.kind not in "biuf":
@@ -562,10 +530,6 @@ class Calibration(Immutable):
                 By default the linear `Controller`. The others return a `PhaseController`.
             n_iterations : int, 3 by default
                 Of each frame, of the phase-shifted iteration.
-
-        Returns
-        -------
-        Controller or PhaseController
 
         Raises
         ------
@@ -665,7 +629,13 @@ class Calibration(Immutable):
         plain = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "bench"}
         arrays: dict[str, Any] = {name: value for name, value in plain.items() if isinstance(value, np.ndarray)}
         values = {name: value for name, value in plain.items() if name not in arrays}
-        values |= {"format": FORMAT, "optics": asdict(self.optics)}
+        optics = {name: value for name, value in vars(self.optics).items() if name != "masks"}
+        values |= {"format": FORMAT, "optics": optics}
+        if self.optics.masks:
+            values["masks"] = repr(self.optics.masks)
+        if self.bench is not None:
+            values["bench"], maps = self.bench.packed()
+            arrays |= {_OF_BENCH + name: array for name, array in maps.items()}
         stream = io.BytesIO()
         np.savez(stream, values=np.array(json.dumps(values, sort_keys=True)), **arrays)
         return stream.getvalue()
@@ -726,11 +696,3 @@ def _check_sizes(path: Path) -> None:
                     f"{path.name}: its array {name} has shape {shape} and type {dtype}: expected at most the "
                     f"{size} bytes of the file"
                 )
-
-
-def _dark(dark: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Checked counts without light, one map for each camera image."""
-    maps = np.zeros(shape) if dark is None else _check.real_array("dark", dark)
-    if maps.shape not in (shape[1:], (1, *shape[1:]), shape):
-        raise ValueError(f"dark has shape {maps.shape}: expected {shape}")
-    return np.broadcast_to(np.nan_to_num(maps, posinf=0, neginf=0).astype(np.float32), shape)

@@ -10,7 +10,7 @@ import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from zwfs.frames.pipeline import Optics
 from zwfs.frames.registration import Image
 from zwfs.units import phase_to_opd
 
-__all__ = ["CameraFile", "check_output", "images", "read", "read_all", "write_phase"]
+__all__ = ["CameraFile", "check_output", "read", "read_all", "write_phase"]
 
 _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do that, saturation does
 _PIECE = 2**22  # pixels of exposures that are read at once
@@ -59,8 +59,6 @@ class CameraFile:
         Of its bytes.
     header : dict
         Of a FITS file; empty for NPY.
-    full_scale : float
-        Largest value that the type of the file's numbers can hold; infinity for floats.
     path : Path, optional
         Of the file, absolute. `write_phase` never replaces it.
     n_exposures : int
@@ -71,7 +69,6 @@ class CameraFile:
     name: str
     sha256: str
     header: Mapping[str, Any] = field(default_factory=dict)
-    full_scale: float = np.inf
     path: Path | None = None
     n_exposures: int = 1
 
@@ -83,8 +80,6 @@ class CameraFile:
             _check.instance(name, getattr(self, name), str)
         _check.instance("header", self.header, Mapping)
         _check.integer("n_exposures", self.n_exposures, 1)
-        if not (isinstance(self.full_scale, float) and self.full_scale == np.inf):
-            _check.number("full_scale", self.full_scale, 0, open_low=True)
         if self.path is not None:
             _check.instance("path", self.path, Path)
 
@@ -130,10 +125,6 @@ def read(path: str | Path, *, max_bytes: int = MOST_BYTES, max_images: int = 2) 
     max_images : int
         Largest number of images.
 
-    Returns
-    -------
-    CameraFile
-
     Raises
     ------
     FileNotFoundError
@@ -147,15 +138,13 @@ def read(path: str | Path, *, max_bytes: int = MOST_BYTES, max_images: int = 2) 
     --------
     >>> import tempfile
     >>> import numpy as np
-    >>> from zwfs.frames.files import images, read
+    >>> from zwfs.frames.files import read
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     np.save(f"{folder}/frame.npy", np.eye(16))
     ...     file = read(f"{folder}/frame.npy")
     ...
     >>> file.name, file.images.shape
     ('frame.npy', (1, 16, 16))
-    >>> images([file], saturation=2.0)[0].counts.shape
-    (16, 16)
     """
     path = path_of("path", path)
     max_bytes, max_images = _check.integer("max_bytes", max_bytes, 1), _check.integer("max_images", max_images, 1)
@@ -193,6 +182,8 @@ def read_all(
     A dark or a map belongs to the frames of its shape. Of several darks, a frame gets those with the same exposure
     time and window, where the headers state them (EXPTIME, EXPOSURE, DETSEC, CCDSEC, SUBRECT, XORGSUBF, ...).
 
+    Bad are pixels that are NaN, infinite or beyond 1e38, are not 0 in a map, or are saturated in one exposure.
+
     Parameters
     ----------
     frame_files, pupil_files : sequence of paths
@@ -200,7 +191,8 @@ def read_all(
     dark_files, bad_pixel_files : sequence of paths, optional
         Counts without light, and maps that are not 0 where a pixel is bad: for all images, or one for each.
     saturation : float, counts, optional
-        See `images`.
+        Level from which on a pixel is saturated. By default it is SATURATE of the header, the largest number that
+        an integer type can hold, or the largest value if ten or more pixels share exactly this value.
     pupil_dark_files : sequence of paths, optional
         Darks of the clear frames; `dark_files` are those of the frames then.
     n_images : int, optional
@@ -215,7 +207,8 @@ def read_all(
     Raises
     ------
     FileNotFoundError, ImportError, FileError, ValueError
-        As for `read` and `images`, or if a dark or map has the shape of no frame.
+        As for `read`; if the number of images is wrong, a dark or map has the shape of no frame, every pixel of an
+        image or of its dark is bad, or a map marks more than half of the pixels.
     """
     names = "frame_files", "pupil_files", "dark_files", "bad_pixel_files", "pupil_dark_files"
     lists = frame_files, pupil_files, dark_files, bad_pixel_files, pupil_dark_files
@@ -238,82 +231,35 @@ def read_all(
                     f"{name}: {file.name} has shape {file.images.shape[1:]}: expected {expected}, as the frames"
                 )
     return (
-        images(frames, darks, maps, _check.LARGEST, n_images),  # saturated pixels are NaN already
-        images(clear, pupil_darks or darks, maps, _check.LARGEST, n_images),
+        combined(frames, darks, maps, n_images),
+        combined(clear, pupil_darks or darks, maps, n_images),
         [*frames, *clear, *darks, *maps, *pupil_darks],
     )
 
 
-def images(
+def combined(
     files: Sequence[CameraFile],
     darks: Sequence[CameraFile] = (),
     bad_pixels: Sequence[CameraFile] = (),
-    saturation: float | None = None,
     n_images: int | None = None,
 ) -> tuple[Image, ...]:
-    """One or two images from files, less the dark, with their bad pixels.
-
-    Bad are pixels that are NaN, infinite or beyond 1e38, are not 0 in the bad-pixel map, or are saturated. Without
-    a level, a pixel is saturated at SATURATE of the header, at the largest number that an integer type can hold,
-    or where ten or more pixels share exactly the largest value.
-
-    Parameters
-    ----------
-    files : sequence of CameraFiles
-        One with one or two images, one for each of two images, or exposures of one image.
-    darks, bad_pixels : sequence of CameraFiles
-        For each image, or for all, see `read_all`.
-    saturation : float, counts, optional
-    n_images : int, optional
-        Images that are expected: with 1, two files are two exposures.
-
-    Returns
-    -------
-    tuple of Image
-
-    Raises
-    ------
-    ValueError
-        If the number of images or a shape is wrong, every pixel of an image or of its dark is bad, or a bad-pixel
-        map marks more than half of the pixels.
-    """
-    for argument, listed in (("files", files), ("darks", darks), ("bad_pixels", bad_pixels)):
-        _check.sequence(argument, listed, CameraFile)
-    if saturation is not None:
-        saturation = _check.number("saturation", saturation, 0, open_low=True)
-    if n_images is not None:
-        n_images = _check.integer("n_images", n_images, 1, 2)
+    """One or two images from means of exposures, less the dark, with their bad pixels, see `read_all`."""
     recorded = _by_image("files", files, n_images)
     if n_images and len(recorded) != n_images:
         raise ValueError(f"{_names(files)}: {len(recorded)} images in an exposure: expected n_images = {n_images}")
     result: list[Image] = []
-    for index, exposures in enumerate(recorded):
-        counts = _mean(exposures)
-        saturated = [_saturated(file, file.images[number], saturation) for file, number in exposures]
-        first = exposures[0][0]
-        dark = _companion("darks", darks, first, index, len(recorded))
-        marked = _companion("bad_pixels", bad_pixels, first, index, len(recorded)) != 0
+    for index, sources in enumerate(recorded):
+        dark = _companion("darks", darks, sources[0], index, len(recorded))
+        marked = _companion("bad_pixels", bad_pixels, sources[0], index, len(recorded)) != 0
         with np.errstate(over="ignore", invalid="ignore"):
-            counts = counts - dark
-        bad = ~_usable(counts) | marked | np.any(saturated, axis=0)
+            counts = _mean(sources) - dark
+        bad = ~_usable(counts) | marked
         if bad.all():
-            names = _names([*(file for file, _ in exposures), *darks, *bad_pixels])
-            level = "" if saturation is None else f" with saturation = {saturation:g}"
-            raise ValueError(f"{names}: all pixels are bad or saturated{level}: expected an image")
-        name = _names([file for file, _ in exposures]) + f"[{index}]" * (len(first.images) > 1)
-        result.append(Image(nearest_good(counts, ~bad), bad, name))
+            names = _names([*sources, *darks, *bad_pixels])
+            raise ValueError(f"{names}: all pixels are bad or saturated: expected an image")
+        name = _names(sources) + f"[{index}]" * (len(files[0].images) > 1)
+        result.append(Image(nearest_good(counts, ~bad), bad, name, dark=dark))
     return tuple(result)
-
-
-def dark_of(
-    files: Sequence[CameraFile], darks: Sequence[CameraFile], n_images: int | None = None
-) -> NDArray[np.float64] | None:
-    """Dark that `images` subtracts from the same files, shape (n_images, ny, nx); None without darks."""
-    recorded = _by_image("files", files, n_images)
-    if not darks:
-        return None
-    firsts = [exposures[0][0] for exposures in recorded]
-    return np.stack([_companion("darks", darks, file, index, len(firsts)) for index, file in enumerate(firsts)])
 
 
 def check_output(output: str | Path, inputs: Sequence[str | Path] = (), *, overwrite: bool = False) -> Path:
@@ -408,13 +354,28 @@ def write_phase(
     _check.sequence("sources", sources, CameraFile)
     path = check_output(output, [source.path for source in sources if source.path], overwrite=overwrite)
     wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-    agreement = phases.agreement
-    measurement, registered = agreement.measurement, agreement.measurement.registered
-    optics = measurement.optics
-    placement = registered.placement
     cards = [
         ("BUNIT", "rad", "in (-pi, pi]; NaN outside and at bad points"),
         ("WAVELEN", wavelength, "[nm] wavelength"),
+        *_agreement_cards(phases),
+    ]
+    for index, source in enumerate(sources, 1):
+        cards += [(f"FILE{index}", source.name, ""), (f"SHA{index}", source.sha256, "")]
+    if sources and "DATE-OBS" in sources[0].header:
+        cards.append(("DATE-OBS", str(sources[0].header["DATE-OBS"]), f"of {sources[0].name}"))
+    cards.append(("CREATOR", f"zwfs {__version__}", ""))
+    measurement = phases.agreement.measurement
+    bad = (measurement.pupil.inside & ~measurement.good).astype(np.uint8)
+    units = (phase_to_opd(phases.phase, wavelength), "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
+    write_file(path, fits_content((phases.phase, "", cards), *units))
+
+
+def _agreement_cards(phases: Phases) -> list[tuple[str, Any, str]]:
+    """Cards of the optics, of the agreement of the frames, and of their places."""
+    agreement, measurement = phases.agreement, phases.agreement.measurement
+    optics, registered = measurement.optics, measurement.registered
+    placement = registered.placement
+    cards = [
         ("PIXSCALE", 1 / registered.diameter, "[D] width of a pixel"),
         *sensor_cards(registered.diameter, measurement.pupil.center, optics),
         ("BACKGRND", optics.background, "background of the frames, 1 = mean of pupil"),
@@ -440,14 +401,7 @@ def write_phase(
             (f"ROW{index}", origin[0], "[pixel] pupil from its place on clear frame 1"),
             (f"COL{index}", origin[1], "[pixel]"),
         ]
-    for index, source in enumerate(sources, 1):
-        cards += [(f"FILE{index}", source.name, ""), (f"SHA{index}", source.sha256, "")]
-    if sources and "DATE-OBS" in sources[0].header:
-        cards.append(("DATE-OBS", str(sources[0].header["DATE-OBS"]), f"of {sources[0].name}"))
-    cards.append(("CREATOR", f"zwfs {__version__}", ""))
-    bad = (measurement.pupil.inside & ~measurement.good).astype(np.uint8)
-    units = (phase_to_opd(phases.phase, wavelength), "PHASE_NM", [("BUNIT", "nm", "")]), (bad, "BAD", ())
-    write_file(path, fits_content((phases.phase, "", cards), *units))
+    return cards
 
 
 def sensor_cards(diameter: float, center: tuple[float, float], optics: Optics) -> Cards:
@@ -466,9 +420,6 @@ def _usable(counts: NDArray) -> NDArray[np.bool_]:
     return np.abs(counts) <= _check.LARGEST
 
 
-_Exposure = tuple[CameraFile, int]  # a file, and the number of the image in it
-
-
 def _names(files: Sequence[CameraFile]) -> str:
     return ", ".join(dict.fromkeys(file.name for file in files)) or "files"
 
@@ -476,7 +427,7 @@ def _names(files: Sequence[CameraFile]) -> str:
 def _camera_file(array: Images, images: NDArray, **settings: Any) -> CameraFile:
     with array.path.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    return CameraFile(images, array.path.name, sha256, array.header, array.full_scale, array.path, **settings)
+    return CameraFile(images, array.path.name, sha256, array.header, array.path, **settings)
 
 
 def averaged(path: Path, n_images: int | None, saturation: float | None) -> CameraFile:
@@ -497,7 +448,7 @@ def averaged(path: Path, n_images: int | None, saturation: float | None) -> Came
     return _camera_file(first, mean, n_exposures=sum(segment.n for segment in segments))
 
 
-def _saturated(source: Images | CameraFile, image: NDArray, level: float | None) -> NDArray[np.bool_]:
+def _saturated(source: Images, image: NDArray, level: float | None) -> NDArray[np.bool_]:
     """Saturated pixels of an exposure: above a level that is given or stated, or where many are equal."""
     usable = _usable(image)
     counts = image[usable]
@@ -510,23 +461,23 @@ def _saturated(source: Images | CameraFile, image: NDArray, level: float | None)
     return usable & (image >= level)
 
 
-def _by_image(argument: str, files: Sequence[CameraFile], n_images: int | None) -> list[list[_Exposure]]:
-    """Exposures of each image."""
+def _by_image(argument: str, files: Sequence[CameraFile], n_images: int | None) -> list[list[CameraFile]]:
+    """Files of each image, with this one alone."""
     sizes = {len(file.images) for file in files}
     if sizes == {1} and len(files) == 2 and n_images != 1:
-        return [[(file, 0)] for file in files]
+        return [[file] for file in files]
     if sizes not in ({1}, {2}):
         n = sum(len(file.images) for file in files)
         raise ValueError(f"{argument}: {_names(files)}: {n} images: expected one or two")
     if len(shapes := {file.images.shape[1:] for file in files}) > 1:
         raise ValueError(f"{argument}: {_names(files)}: exposures of shapes {sorted(shapes)}: expected the same")
-    return [[(file, index) for file in files] for index in range(sizes.pop())]
+    return [[replace(file, images=file.images[k : k + 1]) for file in files] for k in range(sizes.pop())]
 
 
-def _mean(exposures: Sequence[_Exposure]) -> NDArray[np.float64]:
+def _mean(files: Sequence[CameraFile]) -> NDArray[np.float64]:
     """Mean of files, each by its number of exposures; NaN where none has a number."""
-    values = np.stack([file.images[index] for file, index in exposures])
-    weights = np.array([file.n_exposures for file, _ in exposures])[:, np.newaxis, np.newaxis] * _usable(values)
+    values = np.concatenate([file.images for file in files])
+    weights = np.array([file.n_exposures for file in files])[:, np.newaxis, np.newaxis] * _usable(values)
     total = np.sum(np.where(weights > 0, values, 0) * weights, axis=0)
     weight = weights.sum(axis=0)
     return np.divide(total, weight, out=np.full(total.shape, np.nan), where=weight > 0)
@@ -557,17 +508,17 @@ def _companion(
     by_image = _by_image(argument, fitting or same, 1 if n_images == 1 else None)
     if len(by_image) > n_images:
         raise ValueError(f"{argument}: {_names(same)}: 2 images for the 1 of {frame.name}: expected one")
-    exposures = by_image[index if len(by_image) > 1 else 0]
+    chosen = by_image[index if len(by_image) > 1 else 0]
     if argument == "darks":
-        _check_alike(exposures)
-    return _mean(exposures)
+        _check_alike(chosen)
+    return _mean(chosen)
 
 
-def _check_alike(exposures: Sequence[_Exposure]) -> None:
+def _check_alike(darks: Sequence[CameraFile]) -> None:
     """Require that darks of one image differ by no more than their noise."""
-    first, number = exposures[0]
-    for file, index in exposures[1:]:
-        change = file.images[index] - first.images[number]
+    first = darks[0]
+    for file in darks[1:]:
+        change = file.images - first.images
         middle = np.nanmedian(change)
         if abs(middle) > _ALIKE * np.nanmedian(np.abs(change - middle)):
             raise ValueError(

@@ -18,7 +18,7 @@ from zwfs import _check
 from zwfs._images import nearest_good, radius
 from zwfs.frames._grid import iterated
 from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Image, RegisteredFrames, correlations, register_frames
-from zwfs.masks import Dimple
+from zwfs.masks import Dimple, Mask
 from zwfs.pupil import Pupil
 from zwfs.reconstructors import Arcsine, PhaseShifted
 from zwfs.sensor import ZernikeSensor
@@ -69,11 +69,15 @@ class Optics:
         Fraction of the light that the mask does not shift, because its retardance is not half a wave. It is added
         as an intensity, which is right for unpolarised light. In linearly polarised light it interferes with the
         shifted light, which changes the frames by some tenths of the mean intensity and is not modelled.
+    masks : tuple of one or two Mask, optional
+        Masks other than two dimples of one diameter. Their largest diameter and their phase shifts on the axis
+        take the place of `diameter` and `phase_shifts`. The light of their images is not balanced, and a
+        calibration with them cannot be saved.
 
     Raises
     ------
-    ValueError
-        If there are not one or two phase shifts, they are the same, or one of them is 0.
+    TypeError, ValueError
+        If there are not one or two phase shifts or masks, phase shifts are the same, or one of them is 0.
     """
 
     diameter: float = 1.06
@@ -83,8 +87,12 @@ class Optics:
     scale: float = 1.0
     leakage: float = 0.0
     unmasked: float = 0.0
+    masks: tuple[Mask, ...] = ()
 
     def __post_init__(self) -> None:
+        _check.sequence("masks", self.masks)
+        if len(self.masks):
+            self._take_masks()
         _check.number("diameter", self.diameter, 1e-3)
         _check.sequence("phase_shifts", self.phase_shifts, expected="a list of one or two numbers")
         if len(self.phase_shifts) not in (1, 2):
@@ -92,7 +100,8 @@ class Optics:
         shifts = tuple(_check.number("phase_shifts", shift) for shift in self.phase_shifts)
         object.__setattr__(self, "phase_shifts", shifts)
         first, second = np.exp(1j * np.array([shifts[0], shifts[-1]]))
-        if min(abs(first - second) if len(shifts) == 2 else 1, abs(first - 1), abs(second - 1)) < 1e-9:
+        apart = min(abs(first - second) if len(shifts) == 2 else 1, abs(first - 1), abs(second - 1))
+        if apart < 1e-9 and not self.masks:
             expected = "one, or two that differ by other than 0 mod 2 pi, none of them 0"
             raise ValueError(f"phase_shifts = {_check.shown(self.phase_shifts)}: expected {expected}")
         _check.number("scale", self.scale, 0, open_low=True)
@@ -102,6 +111,26 @@ class Optics:
         if len(shifts) == 1 and self.leakage:
             raise ValueError(f"leakage = {self.leakage:g}: expected 0 with one phase shift, and so one image")
 
+    def _take_masks(self) -> None:
+        for mask in self.masks:
+            if not (callable(getattr(mask, "transmission", None)) and hasattr(mask, "diameter")):
+                raise TypeError(f"masks holds a {type(mask).__name__}: expected masks, such as Dimple or Patch")
+        axis = np.zeros(1)
+        shifts = tuple(float(np.angle(mask.transmission(axis, axis))[0]) for mask in self.masks)
+        object.__setattr__(self, "masks", tuple(self.masks))
+        object.__setattr__(self, "phase_shifts", shifts)
+        object.__setattr__(self, "diameter", max(float(mask.diameter) for mask in self.masks))
+
+    @property
+    def focal_masks(self) -> tuple[Mask, ...]:
+        """Masks of the images: `masks`, or dimples."""
+        return self.masks or tuple(Dimple(self.diameter, shift) for shift in self.phase_shifts)
+
+    @property
+    def exchanged(self) -> Optics:
+        """The same with the masks in the other order."""
+        return replace(self, phase_shifts=self.phase_shifts[::-1], masks=self.masks[::-1])
+
     @property
     def single(self) -> bool:
         """Whether there is one mask, and one image."""
@@ -109,8 +138,8 @@ class Optics:
 
     @property
     def opposite(self) -> bool:
-        """Whether the two phase shifts are +theta and -theta, modulo 2 pi."""
-        return not self.single and abs(np.exp(1j * sum(self.phase_shifts)) - 1) < 1e-9
+        """Whether the images are those of two dimples with +theta and -theta, modulo 2 pi."""
+        return not self.single and not self.masks and abs(np.exp(1j * sum(self.phase_shifts)) - 1) < 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,7 +321,7 @@ def phase_of(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None 
     from zwfs.frames.calibration import Calibration  # late: it needs this module
 
     measurement = measured(frames, clear_frames, dark, Optics(**optics))
-    return replace(Calibration.of(measurement, dark)(frames), measurement=measurement)
+    return replace(Calibration.of(measurement)(frames), measurement=measurement)
 
 
 def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: float = 1e-3) -> Phases:
@@ -317,6 +346,7 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: f
 
     n_iterations = _check.integer("n_iterations", n_iterations, 1, MOST_ITERATIONS)
     calibration = Calibration.of(measurement, n_iterations=n_iterations, tolerance=tolerance)
+    calibration = replace(calibration, dark=np.zeros_like(calibration.dark))  # which the images lack already
     counts = np.stack([image.counts for image in measurement.registered.camera_images])
     return replace(calibration(counts if len(counts) == 2 else counts[0]), measurement=measurement)
 
@@ -330,8 +360,8 @@ def measured(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None,
             raise ValueError(f"{name} has shape {images.shape}: expected (ny, nx), or (2, ny, nx) for two images")
         if np.shape(unlit) not in ((), images.shape[-2:], images.shape):
             raise ValueError(f"dark has shape {np.shape(unlit)}: expected {images.shape}, that of {name}")
-        images = (images - unlit).reshape(-1, *images.shape[-2:])
-        pair.append([Image.of(image, name) for image in images])
+        maps = np.stack(np.broadcast_arrays(images - unlit, unlit)).reshape(2, -1, *images.shape[-2:])
+        pair.append([Image.of(counts, name, lightless) for counts, lightless in zip(*maps, strict=True)])
     return reduce_frames(register_frames(*pair, n_pupils=len(optics.phase_shifts)), optics)
 
 
@@ -357,10 +387,6 @@ def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | No
         Of the model; here `pupil_background` is subtracted, and the balance depends on the phase shifts.
     margin : int, pixels, optional
         Of the frames around the grid of the pupil; by default the largest that both frames hold.
-
-    Returns
-    -------
-    Measurement
 
     Raises
     ------
@@ -504,9 +530,8 @@ def iterated_phase(measurement: Measurement, n_iterations: int, tolerance: float
 def model(measurement: Measurement) -> ZernikeSensor:
     """Sensor with the measured pupil, on the detector of the frames."""
     _check.instance("measurement", measurement, Measurement)
-    masks = (Dimple(measurement.optics.diameter, shift) for shift in measurement.optics.phase_shifts)
     extent = 1 + 2 * measurement.margin / measurement.registered.diameter
-    return ZernikeSensor(measurement.pupil, *masks, extent=extent, tolerance=1e-6)
+    return ZernikeSensor(measurement.pupil, *measurement.optics.focal_masks, extent=extent, tolerance=1e-6)
 
 
 def ideal_frames(measurement: Measurement) -> NDArray[np.float64]:

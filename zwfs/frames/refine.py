@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from zwfs import _check
 from zwfs.frames.phases import Phases
 from zwfs.frames.pipeline import (
     MOST_ITERATIONS,
-    ClearLight,
     Measurement,
     Optics,
     clear_light,
@@ -91,66 +89,80 @@ def fit(
         return registered, optics
     if optics.single:
         raise ValueError(f"names = {_check.shown(names)}: expected none with one image, which cannot test a fit")
-    # The unknowns are values of the optics, then a shift (rows, columns) of each of these images.
-    values = [name for name in names if name in _RANGES]
-    sure = np.all(registered.placement.sigma[:2] < _SURE)
-    images = ([0, 1] if sure else [0, 1, 3]) if "registration" in names else []
-    n_shifts = 2 * len(images)
-    start = [*(getattr(optics, name) for name in values), *[0.0] * n_shifts]
-    low, high, step = np.transpose([*(_RANGES[name] for name in values), *[_SHIFT_RANGE] * n_shifts])
-    change = _CHANGE * step
-    margin = registered.margin  # the same in each trial, so that the number of residuals stays
-    before = reduce_frames(registered, optics, margin)
-    rows, columns = np.indices(before.bad.shape[1:]) * _BLOCKS // before.pupil.shape[0]
-    even, far = (rows + columns) % 2 == 0, before.good & ~near_edges(before)
-    searched = even.copy()
-    searched[before.window] &= far | ~before.pupil.inside
-    tested = far & ~even[before.window]
-    hidden = np.zeros_like(even)
-    hidden[before.window] = before.good & ~even[before.window]
+    search = _Search(registered, optics, names, n_iterations)
+    after = search.best(n_steps)
+    return (after.registered, after.optics) if search.is_better(after) else (registered, optics)
 
-    def moved(shifts: tuple[float, ...]) -> RegisteredFrames:
-        origins = registered.origins.copy()
-        origins[images] += np.reshape(shifts, (-1, 2))
-        return replace(registered, origins=origins)
 
-    # Few trials change the clear frames: only the last of the images is one.
-    @lru_cache(maxsize=1)
-    def clear(shift: tuple[float, ...], pupil_background: float) -> ClearLight:
-        return clear_light(moved((0.0,) * (n_shifts - len(shift)) + shift), pupil_background)
+class _Search:
+    """Search of a fit: its unknowns are values of the optics, then a shift (rows, columns) of some images."""
 
-    def trial(unknowns: tuple[float, ...]) -> Measurement:
-        changes: dict[str, Any] = dict(zip(values, unknowns, strict=False))
-        changed, shifts = replace(optics, **changes), unknowns[len(values) :]
-        light = clear(shifts[4:], changed.pupil_background)
-        return reduce_with(light, moved(shifts), changed, margin)
+    def __init__(
+        self, registered: RegisteredFrames, optics: Optics, names: Sequence[str], n_iterations: int
+    ) -> None:
+        self.registered, self.optics, self.n_iterations = registered, optics, n_iterations
+        self.values = [name for name in names if name in _RANGES]
+        sure = np.all(registered.placement.sigma[:2] < _SURE)
+        self.images = ([0, 1] if sure else [0, 1, 3]) if "registration" in names else []
+        n_shifts = 2 * len(self.images)
+        self.start = [*(getattr(optics, name) for name in self.values), *[0.0] * n_shifts]
+        self.ranges = np.transpose([*(_RANGES[name] for name in self.values), *[_SHIFT_RANGE] * n_shifts])
+        self.margin = registered.margin  # the same in each trial, so that the number of residuals stays
+        self.before = before = reduce_frames(registered, optics, self.margin)
+        rows, columns = np.indices(before.bad.shape[1:]) * _BLOCKS // before.pupil.shape[0]
+        even, far = (rows + columns) % 2 == 0, before.good & ~near_edges(before)
+        self.searched = even.copy()
+        self.searched[before.window] &= far | ~before.pupil.inside
+        self.tested = far & ~even[before.window]
+        self.hidden = np.zeros_like(even)
+        self.hidden[before.window] = before.good & ~even[before.window]
+        self._clear: tuple[Any, Any] = None, None
+        self._latest = np.empty(0), np.empty(0)
 
-    @lru_cache(maxsize=1)  # a derivative begins where the search has just been
-    def residuals(unknowns: tuple[float, ...]) -> NDArray:
-        # Finite differences need a smooth function, so no trial may end an iteration earlier than its neighbours.
-        return _mismatch(trial(unknowns), n_iterations, 1e-8)[:, searched].ravel()
+    def best(self, n_steps: int) -> Measurement:
+        """Measurement with the values of the least misfit on the blocks of the search."""
+        low, high, step = self.ranges
+        found = optimize.least_squares(
+            self._residuals, self.start, self._jacobian, bounds=(low, high), x_scale=step, max_nfev=n_steps
+        )
+        return self._trial(found.x)
 
-    def jacobian(unknowns: NDArray) -> NDArray:
-        base = residuals(tuple(unknowns.tolist()))
+    def is_better(self, after: Measurement) -> bool:
+        """Whether a measurement explains the blocks that the search has not seen better than that of the start."""
+        old, new, control = (
+            prediction_error(pair, self.tested, self.n_iterations)
+            for pair in (self.before, after, upside_down(after))
+        )
+        misfit, smaller = (
+            np.sum(_mismatch(pair, self.n_iterations, 1e-4)[:, self.hidden] ** 2) for pair in (self.before, after)
+        )
+        return bool(smaller < misfit and np.all(new < (1 - _GAIN) * np.minimum(old, control)))
+
+    def _trial(self, unknowns: NDArray) -> Measurement:
+        changes: dict[str, Any] = dict(zip(self.values, unknowns.tolist(), strict=False))
+        optics, shifts = replace(self.optics, **changes), unknowns[len(self.values) :].reshape(-1, 2)
+        origins = self.registered.origins.copy()
+        origins[self.images] += shifts
+        registered = replace(self.registered, origins=origins)
+        # Few trials change the clear frames: only the last of the images is one.
+        of_clear = shifts[2:].tolist(), optics.pupil_background
+        if of_clear != self._clear[0]:
+            self._clear = of_clear, clear_light(registered, optics.pupil_background)
+        return reduce_with(self._clear[1], registered, optics, self.margin)
+
+    def _residuals(self, unknowns: NDArray) -> NDArray[np.float64]:
+        if not np.array_equal(unknowns, self._latest[0]):  # a derivative begins where the search has just been
+            # Finite differences need a smooth function: no trial may end an iteration earlier than its neighbours.
+            mismatch = _mismatch(self._trial(unknowns), self.n_iterations, 1e-8)
+            self._latest = unknowns.copy(), mismatch[:, self.searched].ravel()
+        return self._latest[1]
+
+    def _jacobian(self, unknowns: NDArray) -> NDArray[np.float64]:
+        base, (_, high, step) = self._residuals(unknowns), self.ranges
+        change = _CHANGE * step
         around = unknowns + np.diag(np.where(unknowns + change > high, -change, change))
-        slopes = [
-            (residuals(tuple(near.tolist())) - base) / (near - unknowns)[index]
-            for index, near in enumerate(around)
-        ]
+        slopes = [(self._residuals(near) - base) / (near - unknowns)[index] for index, near in enumerate(around)]
         return np.transpose(slopes)
-
-    best = optimize.least_squares(
-        lambda unknowns: residuals(tuple(unknowns.tolist())),
-        start, jacobian, bounds=(low, high), x_scale=step, max_nfev=n_steps,
-    )  # fmt: skip
-    after = trial(tuple(best.x.tolist()))
-    old, new, control = (
-        prediction_error(pair, tested, n_iterations) for pair in (before, after, upside_down(after))
-    )
-    misfit, smaller = (np.sum(_mismatch(pair, n_iterations, 1e-4)[:, hidden] ** 2) for pair in (before, after))
-    better = smaller < misfit and np.all(new < (1 - _GAIN) * np.minimum(old, control))
-    chosen = after if better else before
-    return chosen.registered, chosen.optics
 
 
 def _mismatch(measurement: Measurement, n_iterations: int, tolerance: float) -> NDArray[np.float64]:
@@ -164,6 +176,8 @@ def _check_fit(argument: str, names: Any, optics: Any) -> None:
     listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
     if not listed or not all(isinstance(name, str) and name in choices for name in names):
         raise ValueError(f"{argument} = {_check.shown(names)}: expected a list with some of {list(choices)}")
+    if optics.masks and "diameter" in names:
+        raise ValueError(f"{argument} holds 'diameter': expected a fit of other values with optics.masks")
     if len(set(names)) < len(names):
         raise ValueError(f"{argument} = {_check.shown(names)}: expected each name once")
     for name in set(names) & set(_RANGES):

@@ -58,17 +58,20 @@ class Image:
         For messages.
     cut : bool
         Whether the surroundings of the pupil were set to 0 by software, so that they do not show the background.
+    dark : ndarray, shape (ny, nx), or float
+        Counts without light, which were subtracted; NaN where they are not known.
 
     Raises
     ------
     ValueError
-        If a count is not finite or beyond 1e38.
+        If a count is not finite or beyond 1e38, or the dark has another shape.
     """
 
     counts: NDArray[np.float64]
     bad: NDArray[np.bool_]
     name: str = "image"
     cut: bool = False
+    dark: NDArray[np.float64] | float = 0.0
 
     def __post_init__(self) -> None:
         counts = _check.real_map("counts", self.counts, 2)
@@ -76,12 +79,16 @@ class Image:
         object.__setattr__(self, "bad", _check.flag_map("bad", self.bad, counts.shape))
         _check.instance("name", self.name, str)
         _check.flag("cut", self.cut)
+        dark = _check.real_array("dark", self.dark)
+        if dark.shape not in ((), counts.shape):
+            raise ValueError(f"dark has shape {dark.shape}: expected {counts.shape}, that of counts")
+        object.__setattr__(self, "dark", np.broadcast_to(dark, counts.shape))
 
     @classmethod
-    def of(cls, counts: NDArray, name: str) -> Image:
-        """Image of counts, (ny, nx), in which bad pixels are not finite."""
+    def of(cls, counts: NDArray, name: str, dark: Any = 0.0) -> Image:
+        """Image of counts, (ny, nx), less the dark, in which bad pixels are not finite."""
         good = np.isfinite(counts)
-        return cls(nearest_good(counts, good), ~good, name)
+        return cls(nearest_good(counts, good), ~good, name, dark=dark)
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,10 +286,6 @@ def register_frames(
     n_pupils : int
         1 for a sensor with one mask and one image. The result holds this image twice.
 
-    Returns
-    -------
-    RegisteredFrames
-
     Raises
     ------
     TypeError, ValueError
@@ -296,13 +299,13 @@ def register_frames(
         _check.sequence(name, images, Image)
         if len(images) not in (1, n_pupils):
             raise ValueError(f"{name} holds {len(images)} images: expected 1{' or 2' * (n_pupils == 2)}")
-    if n_pupils == 1:
-        frames, clear_frames = [frames[0]] * 2, [clear_frames[0]] * 2
     unmarked = *frames, *clear_frames
     # The clear frames are judged alone, so that a pupil stands at the same place for all frames.
     frames, clear_frames = _without_odd(frames, clear_frames), _without_odd(clear_frames)
     marked = zip((*frames, *clear_frames), unmarked, strict=True)
     n_odd = sum(int(np.count_nonzero(image.bad & ~before.bad)) for image, before in marked)
+    if n_pupils == 1:
+        frames, clear_frames = frames * 2, clear_frames * 2
     shape = clear_frames[0].counts.shape
     diameter = None if pupil_diameter is None else check_diameter(pupil_diameter, shape)
     centers = None if pupil_centers is None else check_centers(pupil_centers, n_pupils)
@@ -426,7 +429,7 @@ def _locate(
     images: Sequence[Image], centers: NDArray | None, diameter: float | None
 ) -> tuple[tuple[Image, Image], tuple[Circle, Circle]]:
     """Two images and the pupil on each; surroundings that software cut out are continued."""
-    shared, n_pupils = len(images) == 1, 3 - len(images)
+    n_pupils, shared = 3 - len(images), images[0] is images[-1]
     if centers is not None and diameter is not None:
         circles = [Circle(row, column, diameter) for row, column in centers.tolist()]
     else:

@@ -122,10 +122,6 @@ def reconstruct(
     progress : callable, optional
         Called with the number of frames that are done, and of all frames.
 
-    Returns
-    -------
-    Summary
-
     Raises
     ------
     FileNotFoundError, ImportError

@@ -147,28 +147,16 @@ def judge(phases: Phases, noise: CameraNoise | None = None, n_iterations: int = 
     n_iterations : int
         Of the predictions of one frame from the other one.
 
-    Returns
-    -------
-    Verdict
-
     Examples
     --------
-    >>> import numpy as np
     >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames import CameraNoise, judge, recover_phase
-    >>> from zwfs.frames.pipeline import Optics, reduce_frames
-    >>> from zwfs.frames.registration import Image, register_frames
+    >>> from zwfs.frames import CameraNoise, judge, phase_of
     >>> bench = Bench(n_pixels=40, n_rings=1, missing=(), photons_per_image=1e8)
-    >>> pistons = 0.5 * np.arange(-3, 4) / 3
-    >>> pairs = bench.frames(pistons, seed=1), bench.clear_frames(seed=2)
-    >>> frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
-    >>> measurement = reduce_frames(register_frames([frame], [clear]), Optics(1.06, (np.pi / 2, -np.pi / 2)))
-    >>> noise = CameraNoise(gain=1.0, read_noise=bench.read_noise)
-    >>> verdict = judge(recover_phase(measurement), noise)
-    >>> verdict.score.round(1), bool(np.all(verdict.score > verdict.control + 0.2))
-    (array([0.9, 0.9]), True)
-    >>> round(float(np.nanmedian(verdict.sigma) * noise.photons(measurement) ** 0.5), 1)
-    0.6
+    >>> pistons = [-0.5, -0.3, -0.2, 0.0, 0.2, 0.3, 0.5]
+    >>> phases = phase_of(bench.frames(pistons, seed=1), bench.clear_frames(seed=2))
+    >>> verdict = judge(phases, CameraNoise(gain=1.0, read_noise=bench.read_noise))
+    >>> bool((verdict.score > verdict.control + 0.2).all()), verdict.sigma.shape == phases.phase.shape
+    (True, True)
     """
     _check.instance("phases", phases, Phases)
     phase, agreement = phases.phase, phases.agreement
@@ -179,37 +167,34 @@ def judge(phases: Phases, noise: CameraNoise | None = None, n_iterations: int = 
     inner, edge, sigma = np.nan, np.nan, None
     if noise is not None:
         _check.instance("noise", noise, CameraNoise)
-        sigma = error_bar(measurement, phase, noise)
-    if noise is not None and not single:
-        ratio = _over_noise(agreement, phase, noise)
-        inner, edge = _rms(ratio[measurement.good & ~near]), _rms(ratio[measurement.good & near])
+        filled = nearest_good(np.nan_to_num(phase), measurement.good)
+        sigma = _error_bar(measurement, filled, noise)
+        if not single:
+            ratio = _over_noise(agreement, filled, noise)
+            inner, edge = _rms(ratio[measurement.good & ~near]), _rms(ratio[measurement.good & near])
     placed = not np.isnan(measurement.registered.placement.sigma[2:]).any()
     if single:
         strength = float(np.nanstd(phase, dtype=float))
-        findings = {"fit": _ONE_IMAGE}
-        if warnings := " ".join(_warnings(agreement, phases)):
-            findings["warnings"] = warnings
-        return Verdict(score, control, inner, edge, sigma, placed, (1.0, 1.0), (strength, strength), findings)
-    scales, strengths = _scales(measurement, n_iterations)
-    findings = {
-        "fit": _of_fit(agreement, inner, edge, near, placed),
-        "unseen data": _of_score(score, control),
-        "scale": _of_scale(scales, strengths),
-        "light": _of_light(measurement),
-        "registration": _of_place(measurement.registered.placement),
-    }
+        scales, strengths, findings = (1.0, 1.0), (strength, strength), {"fit": _ONE_IMAGE}
+    else:
+        scales, strengths = _scales(measurement, n_iterations)
+        findings = {
+            "fit": _of_fit(agreement, inner, edge, near, placed),
+            "unseen data": _of_score(score, control),
+            "scale": _of_scale(scales, strengths),
+            "light": _of_light(measurement),
+            "registration": _of_place(measurement.registered.placement),
+        }
     if warnings := " ".join(_warnings(agreement, phases)):
         findings["warnings"] = warnings
     return Verdict(score, control, inner, edge, sigma, placed, scales, strengths, findings)
 
 
-def error_bar(measurement: Measurement, phase: NDArray, noise: CameraNoise) -> NDArray[np.float64]:
-    """Smallest standard error of the phase that photon and read noise allow, at its estimate.
+def _error_bar(measurement: Measurement, phase: NDArray, noise: CameraNoise) -> NDArray[np.float64]:
+    """Smallest standard error of a phase without NaN that photon and read noise allow, (ny, nx).
 
-    Noise of the clear frames and errors of the model are not part of it. It is NaN outside the pupil and at bad
-    points, (ny, nx).
+    Noise of the clear frames and errors of the model are not part of it.
     """
-    phase = nearest_good(np.nan_to_num(phase), measurement.good)
     sigma = cramer_rao(model(measurement), phase, photons=noise.photons(measurement), read_noise=noise.read_noise)
     return np.where(measurement.good, sigma, np.nan)
 
@@ -223,7 +208,6 @@ def _over_noise(agreement: Agreement, phase: NDArray, noise: CameraNoise) -> NDA
     """
     measurement = agreement.measurement
     sensor, pupil, photons = model(measurement), measurement.pupil, noise.photons(measurement)
-    phase = nearest_good(np.nan_to_num(phase), measurement.good)
     field = np.where(pupil.inside, pupil.amplitude * np.exp(1j * phase), 0)
     waves = sensor.propagate(field)[(..., *sensor.window)]
     slopes = 2 * np.real(np.conj(waves) * 1j * field)
@@ -417,10 +401,6 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
     n_iterations : int
         As for `recover_phase`.
 
-    Returns
-    -------
-    ImageOrder
-
     Raises
     ------
     ValueError
@@ -431,18 +411,14 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
     --------
     >>> import numpy as np
     >>> from zwfs.bench.model import Bench
-    >>> from zwfs.frames.verdict import order_of_images
-    >>> from zwfs.frames.pipeline import Optics, reduce_frames
-    >>> from zwfs.frames.registration import Image, register_frames
-    >>> bench = Bench(n_pixels=40)
-    >>> wrong = Optics(bench.diameter, (-bench.phase, bench.phase))
-    >>> def measured(pistons):
-    ...     pairs = bench.frames(pistons), bench.clear_frames()
-    ...     frame, clear = (Image(counts, bad=counts < 0) for counts in map(np.hstack, pairs))
-    ...     return reduce_frames(register_frames([frame], [clear]), wrong)
-    ...
+    >>> from zwfs.frames import order_of_images, phase_of
+    >>> bench, wrong = Bench(n_pixels=40), {"phase_shifts": (-np.pi / 2, np.pi / 2)}
     >>> poke = 0.5 * (np.arange(bench.n_segments) == 5)
-    >>> order_of_images(measured(0 * poke), measured(poke)).exchanged
+    >>> flat, poked = (
+    ...     phase_of(bench.frames(pistons), bench.clear_frames(), **wrong).measurement
+    ...     for pistons in (0 * poke, poke)
+    ... )
+    >>> order_of_images(flat, poked).exchanged
     True
     """
     _check.instance("flat", flat, Measurement)
@@ -454,7 +430,7 @@ def order_of_images(flat: Measurement, poked: Measurement, sign: int = 1, n_iter
     if flat.pupil.shape != poked.pupil.shape or flat.optics != poked.optics:
         raise ValueError("flat and poked differ in optics or in the grid of the pupil: expected the same")
     optics = flat.optics
-    choices = [optics, replace(optics, phase_shifts=optics.phase_shifts[::-1])]
+    choices = [optics, optics.exchanged]
     scores = [
         sign * _skewness(replace(flat, optics=choice), replace(poked, optics=choice), n_iterations)
         for choice in choices

@@ -1,4 +1,3 @@
-import json
 import pickle
 from dataclasses import replace
 from importlib import import_module
@@ -28,7 +27,7 @@ from studies.kit.curves import ErrorCurves, Limit
 from studies.kit.experiments import DiameterCurves, linearity_curves
 from studies.kit.grids import Grid
 from studies.kit.loops import TunedLoops
-from studies.kit.style import ALONE, DARK_PHASE_MAP, LOOKS, OTHER_STYLES, show_phase, use_style
+from studies.kit.style import ALONE, LOOKS, OTHER_STYLES, show_phase, use_style
 from studies.kit.variants import dark_color, variants
 from studies.phase_amplitude import AmplitudeCurves
 from studies.phase_shift_pairs import DrawnNoise, PairMaps
@@ -217,15 +216,6 @@ def test_variants_are_dark_or_fit_a_phone(name, drawn_methods):
     assert name in CROWDED or not cut_off(figure)
 
 
-@pytest.mark.parametrize("name", ["draw_sensor_layout", "draw_pairs", "draw_convergence"])
-def test_figure_stays_as_its_variants_are_made(name, drawn_methods):
-    use_style()
-    figure = figure_functions()[name](*drawn_methods[name][0])
-    before = pixels(figure)
-    assert len(variants(figure)) > 1
-    assert np.array_equal(pixels(figure), before)
-
-
 def test_pictures_with_titles_stay_in_the_order_of_reading_on_a_phone():
     figure, panels = plt.subplots(2, 3)
     for number, axes in enumerate(panels.flat):
@@ -255,13 +245,6 @@ def test_phases_of_a_dark_figure_are_dark_at_zero():
     assert bar.get_cmap() == dark.axes[0].images[0].get_cmap()
 
 
-def test_opposite_phases_of_a_dark_figure_are_equally_light():
-    phases = np.linspace(0, 1, 9)
-    lightness = [[lab(DARK_PHASE_MAP(0.5 + sign * one / 2), "normal")[0] for one in phases] for sign in (-1, 1)]
-    np.testing.assert_allclose(*lightness, atol=3)
-    assert np.all(np.diff(lightness) > 0)
-
-
 def cut_off(figure):
     """Titles, labels and entries of legends that do not fit into a painted figure, by more than a pixel."""
     texts = [text for legend in figure.legends for text in legend.get_texts()]
@@ -273,22 +256,6 @@ def cut_off(figure):
     corners = [box.corners() for box in boxes]
     inside = [all(page.contains(*corner) for corner in four) for four in corners]
     return [text for text, fits in zip(texts, inside, strict=True) if not fits]
-
-
-@pytest.mark.parametrize("narrow", [False, True])
-@pytest.mark.parametrize("name", ["draw_sensor_layout", "draw_vector_sensor", "draw_bench_layout"])
-def test_texts_of_a_scene_stay_inside_and_apart(name, narrow, drawn_methods):
-    use_style(vector=True)
-    figure = figure_functions()[name](*drawn_methods[name][0])
-    if narrow:
-        figure = variants(figure)["narrow"]
-    FigureCanvasAgg(figure).draw()
-    boxes = [(text.get_text(), text.get_window_extent()) for text in figure.axes[0].texts]
-    others = [axes.bbox for axes in figure.axes[1:] if axes.images]
-    for index, (text, box) in enumerate(boxes):
-        assert all(figure.bbox.contains(*corner) for corner in box.corners()), text
-        others_of_text = [*others, *(one for _, one in boxes[index + 1 :])]
-        assert not [one for one in others_of_text if box.shrunk(0.98, 0.9).overlaps(one)], text
 
 
 def painted(figure):
@@ -322,13 +289,6 @@ def test_colours_of_methods_stand_for_nothing_else(name, drawn_methods, monkeypa
     shown = colours(figure_functions()[name](*arguments))
     assert {usual[color] for color in shown & set(usual)} == set()
     assert {method for method, color in other.items() if color in shown} == set(methods)
-
-
-def test_notebooks_draw_no_colour_of_a_method():
-    notebooks = (Path(__file__).parent.parent / "notebooks").glob("*.ipynb")
-    cells = (cell for file in notebooks for cell in json.loads(file.read_bytes())["cells"])
-    source = "".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code").upper()
-    assert not [look.color for look in LOOKS.values() if look.color in source]
 
 
 # Linear RGB as it looks without one kind of cones (Machado, Oliveira and Fernandes 2009, severity 1).

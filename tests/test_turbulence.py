@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zwfs import Pupil, zernike_basis
-from zwfs.turbulence import structure_function, turbulent_screens
+from zwfs.turbulence import FrozenFlow, structure_function, turbulent_screens
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +71,30 @@ def test_screens_scale_with_r0_and_the_seed_decides(pupil):
     np.testing.assert_array_equal(one[:1], turbulent_screens(pupil, 1.0, 1, 5.0, seed=4))
     assert not one[:, ~pupil.inside].any()
     np.testing.assert_allclose(pupil.gather(one).mean(axis=-1), 0, atol=1e-12)
+
+
+def test_screens_move_with_the_wind():
+    pupil = Pupil.circular(128)
+    flow = FrozenFlow(pupil, 1.0, 3, speed=2.0, cutoff=1.0, seed=2)
+    step, now, middle = 1e-4, 0.3, np.s_[:, 40:-40, 40:-40]
+    change = (flow(now + step) - flow(now - step)) / (2 * step)
+    slope = np.stack(np.gradient(flow(now), 1 / pupil.n_pixels, axis=(1, 2)), axis=-1)
+    expected = -np.einsum("kyxi,ki->kyx", slope, flow.velocity)
+    np.testing.assert_allclose(np.hypot(*flow.velocity.T), 2.0)
+    # The piston that is taken out of each screen changes with time, too.
+    difference = change[middle] - expected[middle]
+    difference -= difference.mean(axis=(1, 2), keepdims=True)
+    assert np.abs(difference).max() < 2e-3 * np.abs(change).max()
+
+
+@pytest.mark.parametrize("exponent", [-4.0, -2.0, 0.0])
+def test_the_power_falls_with_the_exponent(exponent):
+    whole = Pupil.from_amplitude(np.ones((36, 36)), n_pixels=12)  # 3 D: the screens repeat after that
+    screens = FrozenFlow(whole, 1.0, 200, cutoff=4.0, exponent=exponent, seed=6)(0.0)
+    power = np.mean(np.abs(np.fft.fft2(screens)) ** 2, axis=0)
+    lines = np.fft.fftfreq(36, 1 / 12)
+    frequency = np.hypot(lines[:, np.newaxis], lines)
+    used = (frequency > 0) & (frequency <= 4.0)
+    slope = np.polyfit(np.log(frequency[used]), np.log(power[used]), 1)[0]
+    assert slope == pytest.approx(exponent, abs=0.1)
+    assert power[frequency > 4.01].max() < 1e-20 * power.max()

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from .conftest import ROOT, serving, watch
+from .conftest import ROOT, watch
 
 HTML = ROOT / "_build" / "html"
 WIDTHS = (1280, 390)
@@ -175,16 +175,6 @@ def test_search_leads_from_a_name_to_its_entry_and_from_a_heading_to_its_section
     page.goto(f"{address('search.html')}?q={asked}")
     page.locator(".search-summary", has_text="found").wait_for()
     assert target in page.locator("#search-results li a").first.get_attribute("href")
-
-
-def test_search_shows_excerpts_of_prose(page):
-    with serving(HTML) as place:  # pages in files have no excerpts
-        page.goto(f"{place}search.html?q=latency")
-        page.locator(".search-summary", has_text="found").wait_for()
-        page.locator("#search-results p.context").first.wait_for()
-        excerpts = page.locator("#search-results p.context").all_inner_texts()
-    assert any("latency" in text.lower() for text in excerpts)
-    assert not [text for text in excerpts if "import " in text or "{file" in text]
 
 
 def test_keyboard_alone_reads_switches_and_searches(page):

@@ -47,18 +47,6 @@ def test_a_card_says_how_a_figure_was_made(carded):
     assert "CSV" not in cells[2].source, "there is no such file"
 
 
-def test_a_card_offers_the_files_that_exist_and_no_others():
-    names = ["one.png", "one.svg", "one_screens.csv", "two.csv"]
-    line = cards.files("some", "one", {name: f"../run/{name}" for name in names})
-    assert [name for name in names if f"<../run/{name}>" in line] == names[:3]
-    assert line.count("{download}") == 3
-
-
-def test_a_page_of_tables_has_a_form_too(carded):
-    [_, card, _] = carded("decision", "rms = 0.5")
-    assert 'class="run-form"' in card.source
-
-
 def test_the_commit_is_that_of_this_folder_alone(tmp_path):
     def git(*command):
         names = ("-c", "user.name=Nobody", "-c", "user.email=nobody@example.org")

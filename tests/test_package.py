@@ -49,11 +49,6 @@ def test_a_package_offers_the_names_that_type_checkers_see_and_its_modules(name)
     assert pickle.loads(pickle.dumps(zwfs.Pupil)) is zwfs.pupil.Pupil
 
 
-def test_an_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="module 'zwfs' has no attribute 'cameras'"):
-        _ = zwfs.cameras
-
-
 @pytest.mark.slow
 def test_type_checkers_know_modules_and_results_and_accept_a_new_reconstructor(tmp_path):
     file = tmp_path / "script.py"

@@ -28,11 +28,6 @@ def test_manifest_names_every_notebook_and_no_missing_file():
     assert [one["name"] for one in check["paper"]["authors"]] == authors
 
 
-def test_every_supported_python_is_checked():
-    supported = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text("utf-8"))
-    assert f"PYTHONS ?= {' '.join(supported)} lowest\n" in (ROOT / "Makefile").read_text("utf-8")
-
-
 @pytest.mark.parametrize("name", ["ci.yml", "lock.yml", "release.yml"])
 def test_workflows_pin_actions_and_have_the_least_privileges(name):
     text = (ROOT / ".github" / "workflows" / name).read_text("utf-8")

@@ -135,10 +135,10 @@ def test_axe_finds_no_serious_fault(opened):
     mode = "dark" if page.viewport_size["width"] < max(WIDTHS) else "light"
     page.emulate_media(color_scheme=mode)
     page.wait_for_function("mode => document.documentElement.dataset.theme === mode", arg=mode)
-    found = axe.run(page, options={"resultTypes": ["violations"]}).response["violations"]
+    violations = axe.run(page, options={"resultTypes": ["violations"]}).response["violations"]
     faults = [
         f"{fault['id']}: {node['html'][:120]}: {node['failureSummary']}"
-        for fault in found
+        for fault in violations
         if fault["impact"] in ("serious", "critical")
         for node in fault["nodes"]
     ]
@@ -151,8 +151,8 @@ def test_search_finds_a_chapter_before_the_api(page):
     results = page.locator("#search-results li a")
     results.first.wait_for()
     page.locator(".search-summary", has_text="found").wait_for()
-    found = [link.get_attribute("href") for link in results.all()]
-    api = ["book/api" in one for one in found]
+    links = [link.get_attribute("href") for link in results.all()]
+    api = ["book/api" in link for link in links]
     assert 0 < sum(api) < len(api)
     assert api == sorted(api)
     results.first.click()

@@ -22,9 +22,9 @@ def carded():
         cells = [nbformat.v4.new_code_cell(source) for source in sources]
         cells[0].metadata["tags"] = ["parameters"]
         kernel = {"name": "python3", "language": "python", "display_name": "Python 3"}
-        made = nbformat.v4.new_notebook(cells=cells, metadata={"kernelspec": kernel})
-        cards.add_cards(made, name, dict(links), versions, commit)
-        return made.cells
+        notebook = nbformat.v4.new_notebook(cells=cells, metadata={"kernelspec": kernel})
+        cards.add_cards(notebook, name, dict(links), versions, commit)
+        return notebook.cells
 
     return make
 

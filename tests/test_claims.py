@@ -34,12 +34,12 @@ def test_every_claim_is_there_once():
 
 @pytest.mark.parametrize("number", range(1, 22))
 def test_verdict_is_the_recorded_one_and_any_but_holds_and_fails_is_explained(judged, number):
-    found = judged[number]
-    assert found.verdict == VERDICTS[str(number)], found.measured
-    assert found.remark or found.verdict in (HOLDS, FAILS)
-    assert bool(found.because) == (found.verdict == PARTLY)
-    assert found.because in ("", *claims.REASONS)
-    assert found.measured or found.verdict == UNTESTED
+    finding = judged[number]
+    assert finding.verdict == VERDICTS[str(number)], finding.measured
+    assert finding.remark or finding.verdict in (HOLDS, FAILS)
+    assert bool(finding.because) == (finding.verdict == PARTLY)
+    assert finding.because in ("", *claims.REASONS)
+    assert finding.measured or finding.verdict == UNTESTED
 
 
 @pytest.mark.parametrize(
@@ -74,9 +74,9 @@ def test_another_measurement_changes_the_verdict(number, changed, verdict):
     for notebook in filter(None, (claim.also, claim.notebook)):
         numbers |= claims.glued(NOTEBOOKS / f"{notebook}.ipynb")
     assert changed.keys() <= numbers.keys()
-    found = claims.judge(claim, numbers | changed)
-    assert found.verdict == verdict
-    assert found.measured
+    finding = claims.judge(claim, numbers | changed)
+    assert finding.verdict == verdict
+    assert finding.measured
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,8 @@ def test_another_measurement_changes_the_verdict(number, changed, verdict):
 def test_the_verdict_on_real_time_depends_on_the_measured_times(times, verdict):
     performance = json.loads(json.dumps(claims.RULES.globals["performance"]))
     performance["speed"]["others"]["PhaseShifted"] = times[0]
-    for one in performance["speed"]["real time"]:
-        one |= {"rate": times[1], "median error": times[2]}
+    for case in performance["speed"]["real time"]:
+        case |= {"rate": times[1], "median error": times[2]}
     numbers = claims.glued(NOTEBOOKS / f"{CLAIMS[13].notebook}.ipynb") | {"performance": performance}
     assert claims.judge(CLAIMS[13], numbers).verdict == verdict
 

@@ -42,8 +42,8 @@ def test_example_of_a_loop_prints_the_residuals_of_the_table(capsys):
     ]
     (row,) = re.findall(r"(?m)^\| 0\.5 rad rms; 1000 photons \|(.*?) \|(.*?) \|", "\n".join(outputs))
     for (closed, residual), cell in zip(shown, row, strict=True):
-        some = "" if closed == "24" else f"; {closed} of 24 close"
-        assert cell.strip() == f"linear: {residual}; gain 0.6{some}"
+        share = "" if closed == "24" else f"; {closed} of 24 close"
+        assert cell.strip() == f"linear: {residual}; gain 0.6{share}"
 
 
 def test_table_of_delays_and_winds_is_that_of_the_example(capsys):
@@ -61,9 +61,9 @@ def test_table_of_delays_and_winds_is_that_of_the_example(capsys):
 
     for delay, *cells in rows:
         for speed, cell in zip((20, 10, 5), cells, strict=True):
-            found = {gain: residual(delay, speed, gain) for gain in (0.2, 0.4, 0.6, 0.8)}
-            best = min(found, key=found.get)
-            assert cell == f"{two_digits(found[best])}, gain {best}"
+            residuals = {gain: residual(delay, speed, gain) for gain in (0.2, 0.4, 0.6, 0.8)}
+            best = min(residuals, key=residuals.get)
+            assert cell == f"{two_digits(residuals[best])}, gain {best}"
 
 
 def test_example_of_a_verdict_needs_only_the_package(tmp_path, monkeypatch, capsys):

@@ -96,5 +96,5 @@ def test_the_reconstructor_on_the_page_stands_next_to_the_five(tmp_path):
     studies = os.environ | {"PYTHONPATH": str(ROOT / "notebooks")}  # where a reader keeps the file
     printed = subprocess.run(run, cwd=tmp_path, env=studies, capture_output=True, text=True, check=True).stdout
     assert printed in page
-    errors = {name: [float(one) for one in values] for name, *values in map(str.split, printed.splitlines())}
+    errors = {name: [float(value) for value in values] for name, *values in map(str.split, printed.splitlines())}
     assert errors["PhaseShifted"][1] < 0.001 < errors["FlatReference"][1] < errors["Linear"][1]

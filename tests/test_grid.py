@@ -109,5 +109,5 @@ def test_a_slice_survives_a_failed_column(screens):
     middle = np.nan if screens == slice(None) else 1.0
     shown = np.ma.filled(drawn.axes[0].collections[0].get_array(), np.nan)
     np.testing.assert_array_equal(shown[1], [1.0, middle, 1.0])
-    assert [one.get_ylabel() for one in drawn.axes] == ["rms (rad rms)", "mean of error (rad rms)"]
+    assert [axes.get_ylabel() for axes in drawn.axes] == ["rms (rad rms)", "mean of error (rad rms)"]
     drawn.canvas.draw()

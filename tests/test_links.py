@@ -32,12 +32,12 @@ def test_equations_of_the_paper_name_their_code_and_its_tests():
 def test_terms_are_linked_at_their_first_use(text, terms):
     names = glossary.terms(ROOT / "book" / "glossary.md")
     assert len(names) > 25
-    missing, found = {name.lower(): name for name in names}, []
+    missing, links = {name.lower(): name for name in names}, []
     while match := glossary.pattern(missing).search(text):
         del missing[match[1].lower()]
-        found.append(match[0])
+        links.append(match[0])
         text = text[match.end() :]
-    assert found == terms
+    assert links == terms
 
 
 def test_links_carry_the_definition_of_their_term():

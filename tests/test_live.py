@@ -88,16 +88,16 @@ COMPUTE = """settings => {
         return out;
     };
     const standard = { photons: Infinity, both: false, accelerated: false, likelihood: false };
-    const made = live.compute({ ...standard, ...settings });
-    const found = (one) => one && {
-        errors: one.errors,
-        residual: rows(one.residual),
-        phase: rows(one.estimate[0].map((re, k) => Math.atan2(one.estimate[1][k], re))),
+    const state = live.compute({ ...standard, ...settings });
+    const summary = (estimate) => estimate && {
+        errors: estimate.errors,
+        residual: rows(estimate.residual),
+        phase: rows(estimate.estimate[0].map((re, k) => Math.atan2(estimate.estimate[1][k], re))),
     };
     return {
-        phase: rows(made.phase), frames: made.frames.map(rows), focal: [...made.focal], strehl: made.strehl,
-        linear: found(made.linear), arcsine: found(made.arcsine), shifted: found(made.shifted),
-        accelerated: found(made.accelerated), likelihood: found(made.likelihood),
+        phase: rows(state.phase), frames: state.frames.map(rows), focal: [...state.focal], strehl: state.strehl,
+        linear: summary(state.linear), arcsine: summary(state.arcsine), shifted: summary(state.shifted),
+        accelerated: summary(state.accelerated), likelihood: summary(state.likelihood),
     };
 }"""
 
@@ -108,11 +108,11 @@ def compute(page, pupil):
 
     def call(rms, seed, diameter, shifts, iterations, **others):
         settings = {"rms": rms, "seed": seed, "diameter": diameter, "iterations": iterations}
-        made = page.evaluate(COMPUTE, settings | {"shifts": [shift * np.pi for shift in shifts]} | others)
-        for maps in (made, *(one for one in made.values() if isinstance(one, dict))):
+        state = page.evaluate(COMPUTE, settings | {"shifts": [shift * np.pi for shift in shifts]} | others)
+        for maps in (state, *(value for value in state.values() if isinstance(value, dict))):
             maps |= {name: np.array(maps[name]) for name in ("phase", "residual") if name in maps}
             maps |= {name: maps[name].reshape(pupil.shape) for name in ("phase", "residual") if name in maps}
-        return made | {"frames": np.array(made["frames"]).reshape(-1, *pupil.shape)}
+        return state | {"frames": np.array(state["frames"]).reshape(-1, *pupil.shape)}
 
     return call
 
@@ -125,37 +125,37 @@ def screen_of(modes, rms, seed):
     return zwfs.power_law_screens(modes, rms, 1, seed=seed)[0]
 
 
-def assert_same_phase(pupil, found, expected, tolerance=1e-5):
+def assert_same_phase(pupil, estimate, expected, tolerance=1e-5):
     """Compare phases on the circle, without piston."""
-    difference = pupil.gather(zwfs.wrapped_residual(pupil, found, expected))
+    difference = pupil.gather(zwfs.wrapped_residual(pupil, estimate, expected))
     assert np.all(np.abs(difference) <= tolerance)
 
 
 @pytest.mark.parametrize(("rms", "seed", "diameter", "shifts", "iterations"), SETTINGS)
 def test_sensor_and_reconstructors_agree_with_zwfs(compute, pupil, modes, rms, seed, diameter, shifts, iterations):
-    made = compute(rms, seed, diameter, shifts, iterations)
+    state = compute(rms, seed, diameter, shifts, iterations)
     phase = screen_of(modes, rms, seed)
-    np.testing.assert_allclose(made["phase"], phase, atol=1e-5)
-    np.testing.assert_allclose(made["frames"], sensor_of(pupil, diameter, shifts).measure(phase), atol=1e-5)
-    assert made["strehl"] == pytest.approx(zwfs.strehl(pupil, phase), abs=1e-5)
+    np.testing.assert_allclose(state["phase"], phase, atol=1e-5)
+    np.testing.assert_allclose(state["frames"], sensor_of(pupil, diameter, shifts).measure(phase), atol=1e-5)
+    assert state["strehl"] == pytest.approx(zwfs.strehl(pupil, phase), abs=1e-5)
     axis = 4 * (2 * np.arange(48) - 47) / 48
     focal = np.abs(focal_field(pupil, np.exp(1j * phase), axis, axis)) ** 2
-    np.testing.assert_allclose(np.reshape(made["focal"], focal.shape), focal, atol=1e-5)
-    one, both = sensor_of(pupil, diameter, shifts[:1]), sensor_of(pupil, diameter, shifts)
-    histories = {"linear": zwfs.Linear(one, modes, poke=1e-4)(one.measure(phase)).phase[np.newaxis]}
-    for name, method, sensor in (("arcsine", zwfs.Arcsine, one), ("shifted", zwfs.PhaseShifted, both)):
+    np.testing.assert_allclose(np.reshape(state["focal"], focal.shape), focal, atol=1e-5)
+    single, both = sensor_of(pupil, diameter, shifts[:1]), sensor_of(pupil, diameter, shifts)
+    histories = {"linear": zwfs.Linear(single, modes, poke=1e-4)(single.measure(phase)).phase[np.newaxis]}
+    for name, method, sensor in (("arcsine", zwfs.Arcsine, single), ("shifted", zwfs.PhaseShifted, both)):
         histories[name] = np.zeros((1, *pupil.shape))
         if iterations:
             reconstruct = method(sensor, n_iterations=iterations, tolerance=0.0)
             histories[name] = reconstruct(sensor.measure(phase), history=True).history
-    made["both"] = compute(rms, seed, diameter, shifts, 0, both=True)["linear"]
+    state["both"] = compute(rms, seed, diameter, shifts, 0, both=True)["linear"]
     histories["both"] = zwfs.Linear(both, modes, poke=1e-4)(both.measure(phase)).phase[np.newaxis]
     for name, history in histories.items():
-        assert_same_phase(pupil, made[name]["phase"], history[-1])
+        assert_same_phase(pupil, state[name]["phase"], history[-1])
         residual = zwfs.wrapped_residual(pupil, history[-1], phase)
-        np.testing.assert_allclose(pupil.gather(made[name]["residual"]), pupil.gather(residual), atol=1e-5)
+        np.testing.assert_allclose(pupil.gather(state[name]["residual"]), pupil.gather(residual), atol=1e-5)
         errors = zwfs.reconstruction_error(pupil, history, phase)
-        np.testing.assert_allclose(made[name]["errors"], errors, atol=1e-5)
+        np.testing.assert_allclose(state[name]["errors"], errors, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -170,14 +170,14 @@ def test_accelerated_iteration_agrees_with_zwfs(
     compute, pupil, modes, rms, seed, diameter, shifts, iterations, tolerance
 ):
     phase = screen_of(modes, rms, seed)
-    made = compute(rms, seed, diameter, shifts, iterations, accelerated=True)["accelerated"]
+    state = compute(rms, seed, diameter, shifts, iterations, accelerated=True)["accelerated"]
     options = {"n_iterations": iterations, "tolerance": 0.0, "accelerate": True}
     # The secant weighs all coefficients alike: the path depends on their number, the fixed point does not.
     exact = sensor_of(pupil, diameter, shifts)
     coarse = zwfs.ZernikeSensor(pupil, *exact.masks, tolerance=live.TOLERANCE)
     history = zwfs.PhaseShifted(coarse, **options)(exact.measure(phase), history=True).history
-    np.testing.assert_allclose(made["errors"], zwfs.reconstruction_error(pupil, history, phase), atol=tolerance)
-    assert_same_phase(pupil, made["phase"], zwfs.PhaseShifted(exact, **options)(exact.measure(phase)).phase)
+    np.testing.assert_allclose(state["errors"], zwfs.reconstruction_error(pupil, history, phase), atol=tolerance)
+    assert_same_phase(pupil, state["phase"], zwfs.PhaseShifted(exact, **options)(exact.measure(phase)).phase)
 
 
 @pytest.mark.parametrize(
@@ -190,15 +190,15 @@ def test_accelerated_iteration_agrees_with_zwfs(
 )
 def test_maximum_likelihood_agrees_with_zwfs(compute, pupil, rms, seed, diameter, shifts, photons):
     noise = {} if photons is None else {"photons": photons}
-    made = compute(rms, seed, diameter, shifts, 30, likelihood=True, **noise)
+    state = compute(rms, seed, diameter, shifts, 30, likelihood=True, **noise)
     sensor = sensor_of(pupil, diameter, shifts)
-    result = zwfs.MaximumLikelihood(sensor, photons=photons)(made["frames"])
+    result = zwfs.MaximumLikelihood(sensor, photons=photons)(state["frames"])
     if photons is None:
-        assert_same_phase(pupil, made["likelihood"]["phase"], result.phase)
+        assert_same_phase(pupil, state["likelihood"]["phase"], result.phase)
         return
     # Both stop at a step of a thousandth of the mean standard error: dark points are less certain.
-    assert_same_phase(pupil, made["likelihood"]["phase"], result.phase, 0.1 * pupil.gather(result.sigma))
-    assert zwfs.reconstruction_error(pupil, made["likelihood"]["phase"], result.phase) < 1e-5
+    assert_same_phase(pupil, state["likelihood"]["phase"], result.phase, 0.1 * pupil.gather(result.sigma))
+    assert zwfs.reconstruction_error(pupil, state["likelihood"]["phase"], result.phase) < 1e-5
 
 
 def test_noise_has_the_statistics_of_photons(compute, pupil):
@@ -228,9 +228,9 @@ SINGULAR = [(0.5, 0.5), (0.5, 0.0), (1.0, -1.0), (0.0, 1.0), (0.5 + 3e-7, 0.5), 
 
 @pytest.mark.parametrize("shifts", [*SINGULAR, (0.5 + 4e-6, 0.5), (1e-8 / np.pi, 0.5)])
 def test_singular_shifts_are_refused_as_by_zwfs(compute, pupil, modes, shifts):
-    made = compute(0.5, 7, 1.06, shifts, 1)
+    state = compute(0.5, 7, 1.06, shifts, 1)
     refused = is_refused(zwfs.PhaseShifted, sensor_of(pupil, 1.06, shifts))
-    assert (made["shifted"] is None) == refused == (shifts in SINGULAR)
+    assert (state["shifted"] is None) == refused == (shifts in SINGULAR)
     for n_images, both in ((1, False), (2, True)):
         solution = compute(0.5, 7, 1.06, shifts, 1, both=both)["linear"]
         refused = is_refused(zwfs.Linear, sensor_of(pupil, 1.06, shifts[:n_images]), modes)

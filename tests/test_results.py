@@ -47,8 +47,8 @@ def test_nothing_is_written_without_a_folder_and_the_figure_looks_the_same(figur
     publish(twin, "plot")
     assert os.listdir() == ["files"]
     shown = [io.BytesIO(), io.BytesIO()]
-    for stream, one in zip(shown, (figure, twin), strict=True):
-        one.savefig(stream, format="png", bbox_inches="tight", metadata={"Software": None})
+    for stream, drawing in zip(shown, (figure, twin), strict=True):
+        drawing.savefig(stream, format="png", bbox_inches="tight", metadata={"Software": None})
     assert shown[0].getvalue() == shown[1].getvalue()
 
 
@@ -72,8 +72,8 @@ def test_single_screens_are_written_with_a_row_each(plain, tmp_path, monkeypatch
         n: screen_columns({"input": [0.1, 0.2], "photons": [1, 10]}, {"error": factor * errors})
         for n, factor in (("a", 1), ("b", 2))
     }
-    made = published(tmp_path / "files", monkeypatch, plain, screens=stacked("case", tables))
-    header, *rows = csv.reader(made["plot_screens.csv"].decode().splitlines())
+    files = published(tmp_path / "files", monkeypatch, plain, screens=stacked("case", tables))
+    header, *rows = csv.reader(files["plot_screens.csv"].decode().splitlines())
     assert header == ["case", "input", "photons", "screen", "error"]
     assert len(rows) == 24
     for case, rms, photons, screen, error in rows:

@@ -22,13 +22,16 @@ FIGURE_3 = "fig03_dynamic_range"
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 STUDIES = {path.stem: import_module(f"studies.{path.stem}") for path in sorted(NOTEBOOKS.glob("*.ipynb"))}
 NESTED = [
-    (name, key) for name, study in STUDIES.items() for key, one in study.LIMITS.items() if isinstance(one, Fields)
+    (name, key)
+    for name, study in STUDIES.items()
+    for key, limits in study.LIMITS.items()
+    if isinstance(limits, Fields)
 ]
 
 
 def default(name):
-    known = declared.parameters(read(NOTEBOOKS / f"{name}.ipynb"))
-    return {key: one.default for key, one in known.items()}
+    parameters = declared.parameters(read(NOTEBOOKS / f"{name}.ipynb"))
+    return {key: parameter.default for key, parameter in parameters.items()}
 
 
 def test_a_change_is_made_to_the_preset():
@@ -119,10 +122,10 @@ def test_a_file_gives_pupil_and_screens(tmp_path):
 
 def refusal(**values):
     notebook = read(NOTEBOOKS / f"{FIGURE_3}.ipynb")
-    known = {key: one.default for key, one in declared.parameters(notebook).items()}
+    defaults = {key: parameter.default for key, parameter in declared.parameters(notebook).items()}
     begin = time.process_time()
     with pytest.raises(declared.ParameterError) as caught:
-        declared.accept_together(notebook, known | {"n_pixels": 24, "n_modes": 10} | values)
+        declared.accept_together(notebook, defaults | {"n_pixels": 24, "n_modes": 10} | values)
     assert time.process_time() - begin < 2
     return str(caught.value)
 
@@ -184,7 +187,7 @@ def test_a_bad_nested_value_is_refused_with_its_path(values, message):
 
 
 @pytest.mark.parametrize(
-    ("figure", "given", "message"),
+    ("figure", "settings", "message"),
     [
         ("3", ["n_pixels=16", "n_modes=300"], "n_modes = 300: expected at most 207 with the 208 points of pupil"),
         ("3", ["pupil={kind: keck, missing: [40]}"], r"pupil.missing = \[40\]"),
@@ -193,18 +196,20 @@ def test_a_bad_nested_value_is_refused_with_its_path(values, message):
         ("5", ["bench={missing: [38]}"], r"bench.missing = \[38\]: expected segment numbers from 1 to 37"),
     ],
 )
-def test_values_that_contradict_each_other_are_refused_before_a_kernel_starts(figure, given, message):
+def test_values_that_contradict_each_other_are_refused_before_a_kernel_starts(figure, settings, message):
     begin = time.process_time()
     with pytest.raises(declared.ParameterError, match=message):
-        rerun.rerun(Project(NOTEBOOKS.parent), [figure, *(text for one in given for text in ("-p", one))])
+        rerun.rerun(
+            Project(NOTEBOOKS.parent), [figure, *(text for setting in settings for text in ("-p", setting))]
+        )
     assert time.process_time() - begin < 2
 
 
 @pytest.mark.parametrize(("name", "key"), NESTED)
 def test_every_field_is_listed_with_a_meaning_and_its_default_is_allowed(name, key):
     parameter = declared.parameters(read(NOTEBOOKS / f"{name}.ipynb"))[key]
-    for field, one in parameter.fields().items():
-        assert one.meaning, field
-        if one.default not in (None, "", inspect.Parameter.empty):
-            value = list(one.default) if isinstance(one.default, tuple) else one.default
-            check_parameters({field: value}, **{field: one.limits})
+    for field, limited in parameter.fields().items():
+        assert limited.meaning, field
+        if limited.default not in (None, "", inspect.Parameter.empty):
+            value = list(limited.default) if isinstance(limited.default, tuple) else limited.default
+            check_parameters({field: value}, **{field: limited.limits})

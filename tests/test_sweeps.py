@@ -123,16 +123,16 @@ def test_an_interrupted_sweep_is_taken_up_again(tmp_path):
             time.sleep(0.02)
         os.killpg(stopped.pid, signal.SIGINT)  # as Ctrl-C does: to the workers as well
         assert "KeyboardInterrupt" in stopped.communicate()[1]
-    kept = {file: file.stat().st_mtime_ns for file in store.rglob("output.pkl")}
-    assert 3 <= len(kept) < 8
+    times = {file: file.stat().st_mtime_ns for file in store.rglob("output.pkl")}
+    assert 3 <= len(times) < 8
     for file in log.iterdir():
         file.unlink()
     with start_sweep(log, store) as again:
-        found, errors = again.communicate()
+        printed, errors = again.communicate()
     assert again.returncode == 0, errors
-    assert len(list(log.iterdir())) == 8 - len(kept)
-    assert {file: file.stat().st_mtime_ns for file in kept} == kept
-    assert json.loads(found) == [2.0 * value for value in range(8)]
+    assert len(list(log.iterdir())) == 8 - len(times)
+    assert {file: file.stat().st_mtime_ns for file in times} == times
+    assert json.loads(printed) == [2.0 * value for value in range(8)]
 
 
 def square(value, offset):
@@ -178,9 +178,9 @@ def test_results_of_other_code_are_not_taken(store, tmp_path, monkeypatch):
     """Other code is a changed module of the user or of zwfs, and a lambda that does or holds something else."""
 
     def is_new(task):
-        known = set(store.rglob("output.pkl"))
+        before = set(store.rglob("output.pkl"))
         sweeps.run(task, [1], name="tasks")
-        return set(store.rglob("output.pkl")) != known
+        return set(store.rglob("output.pkl")) != before
 
     module = tmp_path / "users_module.py"
     module.write_text("def task(value):\n    return value\n")

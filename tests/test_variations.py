@@ -51,17 +51,17 @@ def test_spectrum_tells_the_rate(pupil, screens, diameter):
 def test_tilt_is_lost_where_the_dimple_ends_on_the_dark_ring():
     assert pytest.approx(2 * jn_zeros(1, 1)[0] / np.pi) == DARK_RING
     assert abs(j1(np.pi * DARK_RING / 2)) < 1e-12
-    left = []
+    shares = []
     for n_pixels in (40, 160):
         pupil = zwfs.Pupil.circular(n_pixels)
         tilt = zwfs.zernike_basis(pupil, 1)
-        left.append(mode_sensitivity(pupil, DARK_RING, tilt)[0] / mode_sensitivity(pupil, 1.06, tilt)[0])
+        shares.append(mode_sensitivity(pupil, DARK_RING, tilt)[0] / mode_sensitivity(pupil, 1.06, tilt)[0])
         step = derivative_of_a_step(pupil, DARK_RING, np.zeros(pupil.shape), tilt)
         np.testing.assert_allclose(step, pupil.gather(tilt), atol=0.6 / n_pixels)
         assert iteration_spectrum(pupil, DARK_RING)[0] == pytest.approx(1, abs=0.2 / n_pixels)
     # What is left is the staircase of the pupil's edge.
-    assert left[1] < left[0] < 0.02
-    assert left[1] < 0.004
+    assert shares[1] < shares[0] < 0.02
+    assert shares[1] < 0.004
 
 
 @pytest.mark.parametrize("rms", [0.0, 0.5])

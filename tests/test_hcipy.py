@@ -21,8 +21,8 @@ def phases(pupil):
     return np.stack([np.zeros(pupil.shape), power_law_screens(zernike_basis(pupil, 200), 0.8, 1, seed=1)[0]])
 
 
-def difference(pupil, frame, other):
-    return np.abs(frame - other)[pupil.inside].max()
+def difference(pupil, frame, reference):
+    return np.abs(frame - reference)[pupil.inside].max()
 
 
 @pytest.mark.parametrize("dimple", [Dimple(1.06, -np.pi / 2), Dimple(2.0, 0.7)])
@@ -30,8 +30,8 @@ def test_sign_of_the_phase_and_orientation_of_the_pupil_are_the_same(pupil, phas
     ours = ZernikeSensor(pupil, dimple).measure(phases[1])[0]
     theirs = HcipySensor(pupil, dimple, num_pix=256).measure(phases[1])[0]
     for wrong in (Dimple(dimple.diameter, -dimple.phase), dimple):
-        other = ZernikeSensor(pupil, wrong).measure(phases[1] if wrong is not dimple else phases[1][::-1])[0]
-        assert difference(pupil, ours, theirs) < 0.02 * difference(pupil, other, theirs)
+        changed = ZernikeSensor(pupil, wrong).measure(phases[1] if wrong is not dimple else phases[1][::-1])[0]
+        assert difference(pupil, ours, theirs) < 0.02 * difference(pupil, changed, theirs)
 
 
 def test_fields_have_the_same_phase(pupil, phases):

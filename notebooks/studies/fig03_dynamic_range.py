@@ -21,7 +21,7 @@ from studies.kit.experiments import LinearityCurves, linearity_curves
 from studies.kit.parameters import SETUP, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.setups import Screens, check_setup
-from studies.kit.style import LOOKS, looks_of
+from studies.kit.style import LOOKS, TALL, looks_of
 from studies.kit.tables import Table, Text, small, two_digits
 from zwfs.reconstructors import GerchbergSaxton
 from zwfs.sensor import ZernikeSensor
@@ -146,9 +146,7 @@ _UNMEASURED = {
 }
 
 
-def draw_linearity(
-    curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float, rms_max: float
-) -> Figure:
+def draw_linearity(curves: LinearityCurves, threshold: float, rms_max: float) -> Figure:
     """Figure 3: mean error and its standard deviation against the input."""
     figure, axes = plt.subplots(figsize=(7, 4.6))
     drawn = curves.rms <= rms_max
@@ -161,30 +159,32 @@ def draw_linearity(
         axes.fill_between(
             rms, np.maximum(mean - std, 0), mean + std, color=look.color, alpha=0.15, lw=0, label=scatter
         )
-        reach = "" if np.isinf(limits[name].value) else f", {_reach(curves, limits[name])}"
-        ends.append((float(mean[-1]), textwrap.fill(look.label + reach, 30), look.color))
+        ends.append((float(mean[-1]), textwrap.fill(look.label, 22), look.style))
     axes.plot(rms, threshold * rms, color="#555555", lw=1)
-    ends.append((float(threshold * rms[-1]), f"{percent(threshold)} of the input", "#555555"))
+    ends.append((threshold * rms[-1], f"{percent(threshold)} of the input", {"color": "#555555", "marker": ""}))
     axes.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(-0.03, None), ylim=(-0.03, None))
-    _label_ends(axes, rms[-1], ends)
+    _label_ends(axes, ends)
+    axes.set_gid(TALL)
     return figure
 
 
-_LINE = 0.045  # height of a line of a label, over that of the axes
+_LINE = 0.05  # height of a line of a label, over that of the axes
 
 
-def _label_ends(axes: Axes, x: float, ends: list[tuple[float, str, str]]) -> None:
-    """Write labels at the right ends of curves, (height, text, colour) each, upwards without an overlap."""
+def _label_ends(axes: Axes, ends: list[tuple[float, str, dict[str, Any]]]) -> None:
+    """Write the labels of curves next to their right ends, (height, text, style) each, without an overlap."""
     low, high = axes.get_ylim()
-    ends = sorted(ends)
-    needed = [_LINE * (1 + text.count("\n")) for _, text, _ in ends]
-    place = -1.0
-    for number, (height, text, color) in enumerate(ends):
-        room = 1 + _LINE - sum(needed[number:])  # else those above would leave the axes
-        place = max(place, min((height - low) / (high - low) - needed[number] / 2, room))
-        style: dict[str, Any] = {"textcoords": "offset points", "va": "bottom", "fontsize": 9, "color": color}
-        axes.annotate(text, (1, place), (6, 0), xycoords="axes fraction", **style)
-        place += needed[number]
+    ends.sort(key=lambda end: end[0])
+    heights = [_LINE * (1.3 + text.count("\n")) for _, text, _ in ends]
+    lowest = 0.0
+    for number, (value, text, style) in enumerate(ends):
+        half = heights[number] / 2
+        room = 1 - sum(heights[number:]) + half  # else those above would leave the axes
+        middle = max(lowest + half, min((value - low) / (high - low), room))
+        axes.plot(1.03, middle, ms=5, transform=axes.transAxes, clip_on=False, **style)
+        beside: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "center"}
+        axes.annotate(text, (1.03, middle), (6, 0), fontsize=9, **beside)
+        lowest = middle + half
 
 
 def draw_ratios(curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float) -> Figure:
@@ -344,16 +344,6 @@ def findings(curves: LinearityCurves, limits: Mapping[str, Limit], threshold: fl
     )
 
 
-def findings_alike(curves: LinearityCurves) -> Text:
-    """Return up to where the methods differ from the true phase only by when they stop."""
-    alike = _alike_up_to(curves)
-    if not alike:
-        return Text("The errors of the iteration or of gradient descent on modes exceed 10⁻⁶ rad at every input.")
-    return Text(
-        f"The iteration and gradient descent on modes both have errors below 10⁻⁶ rad up to {alike:g} rad rms."
-    )
-
-
 def findings_one_image(curves: LinearityCurves) -> Text:
     """Return up to where the arcsine has a smaller error than the linear method."""
     bright = curves.rms > 0
@@ -384,15 +374,15 @@ def findings_saxton(
     """Return the lost light, the error at the smallest input, and the range with the modelled field."""
     *_, repaired = variants
     zeros = [
-        f"A detector of {method.sensor.extent:g} D loses {light_lost(method.sensor):.0%} of the light, and the "
-        f"error is {two_digits(by_width.mean(name)[0])} rad with zero field."
+        f"{two_digits(by_width.mean(name)[0])} rad on a detector of {method.sensor.extent:g} D, which loses "
+        f"{light_lost(method.sensor):.0%} of the light"
         for name, method in variants.items()
         if method.unmeasured == "zero"
     ]
     return Text(
-        f"At {by_width.rms[0]:g} rad rms: {' '.join(zeros)} With the modelled field and "
-        f"{variants[repaired].settings.n_iterations} iterations, the error stays within {percent(threshold)} of "
-        f"the input {_reach(by_width, longer)}."
+        f"With zero field, the error at {by_width.rms[0]:g} rad rms is {'; '.join(zeros)}. With the modelled "
+        f"field and {variants[repaired].settings.n_iterations} iterations, the error stays within "
+        f"{percent(threshold)} of the input {_reach(by_width, longer)}."
     )
 
 
@@ -412,7 +402,7 @@ def findings_steep(curves: LinearityCurves, limits: Mapping[str, Limit], exponen
     wraps = f"from {onset:.3g} rad rms on" if np.isfinite(onset) else "at no input"
     return Text(
         f"With the exponent {exponent:.3g}, the linear method stays within the threshold {linear}, the arcsine "
-        f"{arcsine}, and the iteration {shifted}. Half of these screens have wraps {wraps}."
+        f"{arcsine}, and the iteration {shifted}. At least half of these screens have wraps {wraps}."
     )
 
 

@@ -338,8 +338,7 @@ def findings_rise(curve: DiameterCurves, n_iterations: int) -> Text:
 def findings_methods(curves: Mapping[str, DiameterCurves], threshold: float) -> Text:
     """Return the diameters at which the error of each method rises."""
     rises = [
-        f"- **{LOOKS[name].name.capitalize()}:** "
-        + _above(_rise(curve, name, threshold * curve.rms[0]), curve.diameters[-1])
+        f"- **{LOOKS[name].name}:** " + _above(_rise(curve, name, threshold * curve.rms[0]), curve.diameters[-1])
         for name, curve in curves.items()
     ]
     rule = (

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from studies.bandwidth import IGNORANT, KNOWN, SHIFTED, WAYS, band_curves
+from studies.bandwidth import IGNORANT, KNOWN, WAYS, band_curves
 from zwfs import Dimple, Pupil, ZernikeSensor, power_law_screens, zernike_basis
 
 
@@ -32,9 +32,3 @@ def test_the_bias_grows_with_the_square_of_the_bandwidth(curves):
     for way in IGNORANT:
         assert curves.bias(way)[0] < 1e-6
         assert curves.bias(way)[2] / curves.bias(way)[1] == pytest.approx(4, rel=0.05)
-
-
-def test_bias_and_noise_are_equal_at_the_stated_photons(sensor, screens, curves):
-    photons = curves.equal_photons(SHIFTED)[2]
-    there = band_curves(sensor, screens, [0.2], photons, chromatic=True)
-    assert there.bound[0] == pytest.approx(curves.bias(SHIFTED)[2], rel=1e-3)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from studies.bandwidth import IGNORANT, KNOWN, WAYS, band_curves
+from studies.bandwidth import IGNORANT, KNOWN, WAYS, band_curves, costs_table, findings
 from zwfs import Dimple, Pupil, ZernikeSensor, power_law_screens, zernike_basis
 
 
@@ -32,3 +32,10 @@ def test_the_bias_grows_with_the_square_of_the_bandwidth(curves):
     for way in IGNORANT:
         assert curves.bias(way)[0] < 1e-6
         assert curves.bias(way)[2] / curves.bias(way)[1] == pytest.approx(4, rel=0.05)
+
+
+def test_text_names_the_bandwidths_that_were_sampled(curves):
+    cases = {(0.5, chromatic): curves for chromatic in (False, True)}
+    assert "in a band of 10 %, and" in findings(cases).markdown
+    assert "in a band of 20 %." in findings(cases).markdown
+    assert costs_table(cases).header[1:3] == ["phase-shifted, 10 %", "phase-shifted, 20 %"]

@@ -1,10 +1,20 @@
 """Phase and amplitude from two masks and a clear frame."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import zwfs
-from studies.phase_amplitude import KINDS, WAYS, amplitude_curves, amplitude_maps, reconstruct
+from studies.phase_amplitude import (
+    KINDS,
+    WAYS,
+    amplitude_curves,
+    amplitude_maps,
+    costs_table,
+    findings,
+    reconstruct,
+)
 
 PUPIL = zwfs.Pupil.circular(24)
 MODES = zwfs.zernike_basis(PUPIL, 30)
@@ -80,3 +90,9 @@ def test_curves_do_not_depend_on_the_other_variations(curves):
     for kind in KINDS:
         for way in WAYS:
             assert np.array_equal(alone[kind].errors[way], curves[kind].errors[way][:2])
+
+
+def test_text_names_the_variations_that_were_sampled(curves):
+    sampled = {kind: replace(one, variations=np.array([0.0, 0.1, 0.3])) for kind, one in curves.items()}
+    assert "variation of 10 % is ignored" in findings(sampled, 0.5, PHOTONS).markdown
+    assert costs_table(sampled).header[2:4] == ["scintillation, 10 %", "scintillation, 30 %"]

@@ -61,8 +61,8 @@ class BandCurves:
         return _rms(self.biases[way])
 
     def at(self, bandwidth: float) -> int:
-        """Place of the sampled bandwidth nearest to `bandwidth`: text on it names the sampled one."""
-        return int(np.argmin(np.abs(self.bandwidths - bandwidth)))
+        """Place of the sampled bandwidth, but 0, nearest to `bandwidth`: text on it names the sampled one."""
+        return int(np.argmin(np.where(self.bandwidths > 0, np.abs(self.bandwidths - bandwidth), np.inf)))
 
 
 def band_curves(

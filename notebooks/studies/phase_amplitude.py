@@ -77,8 +77,8 @@ class AmplitudeCurves:
         return np.sqrt(np.mean(self.errors[way] ** 2, axis=1))
 
     def at(self, variation: float) -> int:
-        """Place of the sampled variation nearest to `variation`: text on it names the sampled value."""
-        return int(np.argmin(np.abs(self.variations - variation)))
+        """Place of the sampled variation, but 0, nearest to `variation`: text on it names the sampled value."""
+        return int(np.argmin(np.where(self.variations > 0, np.abs(self.variations - variation), np.inf)))
 
 
 def amplitude_maps(

@@ -95,7 +95,7 @@ def test_a_new_reconstructor_is_a_file_and_an_entry(copy):
 
 FIGURE_3 = """
 import api, numpy as np, zwfs
-from studies.fig03_dynamic_range import draw_linearity, error_limits
+from studies.fig03_dynamic_range import draw_linearity
 from studies.kit.experiments import linearity_curves
 from studies.kit.methods import own_reconstructors, paper_reconstructors
 from studies.kit.style import LOOKS
@@ -109,7 +109,7 @@ assert type(methods["WirtingerFlow"]) is WirtingerFlow and methods["WirtingerFlo
 assert own_reconstructors(["zwfs:WirtingerFlow"], methods, modes).keys() == {"WirtingerFlow"}
 curves = linearity_curves(methods, modes, [0.3], 2)
 assert curves.mean("WirtingerFlow")[0] < 0.01
-draw_linearity(curves, error_limits(methods, modes, curves, 0.05), 0.05, 0.3)
+draw_linearity(curves, 0.05, 0.3)
 assert WirtingerFlow in RECONSTRUCTORS and WirtingerFlow.__module__ in api.modules()
 assert LOOKS["WirtingerFlow"].label == "wirtinger flow"
 """

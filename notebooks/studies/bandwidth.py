@@ -61,13 +61,8 @@ class BandCurves:
         return _rms(self.biases[way])
 
     def at(self, bandwidth: float) -> int:
-        """Place of the sampled bandwidth nearest to `bandwidth`: text on it names the sampled one."""
-        return int(np.argmin(np.abs(self.bandwidths - bandwidth)))
-
-    def equal_photons(self, way: str) -> NDArray[np.float64]:
-        """Photons per point and image for which the bias of a way is as large as the bound, (n,)."""
-        bias = np.maximum(self.bias(way), np.finfo(float).tiny)
-        return self.photons * (self.bound / bias) ** 2
+        """Place of the sampled bandwidth, but 0, nearest to `bandwidth`: text on it names the sampled one."""
+        return int(np.argmin(np.where(self.bandwidths > 0, np.abs(self.bandwidths - bandwidth), np.inf)))
 
 
 def band_curves(
@@ -166,22 +161,13 @@ def findings(curves: CaseCurves) -> Text:
     costs = []
     for place in sorted({some_curves.at(0.10), int(np.argmax(some_curves.bandwidths))}):
         least, most = (two_digits(100 * value) for value in _biases(curves, place))
-        costs.append(f"{least} to {most} % of the input in a band of {_width(some_curves, place)}")
+        costs.append(f"{least} to {most} % in a band of {_width(some_curves, place)}")
     known = max((one.error(KNOWN) / one.bound).max() for one in curves.values())
-    text = (
-        "**If the band is ignored, the error of the phase-shifted iteration without noise is "
+    return Text(
+        "**If the band is ignored, the error of the phase-shifted iteration without noise is, over the input, "
         f"{', and '.join(costs)}. A reconstructor that knows the band stays within {known:.3g} times the photon "
         "limit.**"
     )
-    rms = max(rms for rms, _ in curves)
-    large = curves[rms, True]
-    if large.bandwidths[place]:
-        photons = two_digits(large.equal_photons(SHIFTED)[place])
-        text += (
-            f" At {rms:g} rad rms, with chromatic shifts and a band of {_width(large, place)}, photon noise is as "
-            f"large as this error at {photons} photons per point and image."
-        )
-    return Text(text)
 
 
 def _biases(curves: CaseCurves, place: int) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -20,8 +21,8 @@ from studies.kit.experiments import LinearityCurves, linearity_curves
 from studies.kit.parameters import SETUP, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.setups import Screens, check_setup
-from studies.kit.style import LOOKS, looks_of
-from studies.kit.tables import Table, small
+from studies.kit.style import LOOKS, TALL, looks_of
+from studies.kit.tables import Table, Text, small, two_digits
 from zwfs.reconstructors import GerchbergSaxton
 from zwfs.sensor import ZernikeSensor
 
@@ -49,9 +50,14 @@ def curves_at(
     **settings: Any,
 ) -> LinearityCurves:
     """Errors of further reconstructors on the screens of `curves` whose input is nearest to `rms`."""
-    place = int(np.argmin(np.abs(curves.rms - rms)))
+    place = _nearest(curves, rms)
     n_screens = curves.strehl.shape[1]
     return linearity_curves(reconstructors, modes, curves.rms[[place]], n_screens, first_task=place, **settings)
+
+
+def _nearest(curves: LinearityCurves, rms: float) -> int:
+    """Place of the input nearest to `rms`: text on it names the sampled input."""
+    return int(np.argmin(np.abs(curves.rms - rms)))
 
 
 # Methods whose limits are refined, with the screens of each input close to the limit, over those of the curves.
@@ -140,40 +146,67 @@ _UNMEASURED = {
 }
 
 
-def draw_linearity(
-    curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float, rms_max: float
-) -> Figure:
-    """Figure 3: mean error and its standard deviation against the input, and their ratio on a logarithmic axis."""
-    figure, (plain, ratio) = plt.subplots(1, 2, figsize=(7, 4.6))
+def draw_linearity(curves: LinearityCurves, threshold: float, rms_max: float) -> Figure:
+    """Figure 3: mean error and its standard deviation against the input."""
+    figure, axes = plt.subplots(figsize=(7, 4.6))
     drawn = curves.rms <= rms_max
-    bright = curves.rms > 0
     rms = curves.rms[drawn]
+    ends = []
     for name, look in looks_of(curves.errors):
-        mean, std = curves.mean(name), curves.std(name)[drawn]
-        line = {"color": look.color, "marker": look.marker, "linestyle": look.line, "markersize": 4}
-        found = 0 < limits[name].value < np.inf
-        reach = f": limit {limits[name].value:.2g} rad" if found else ""
-        if limits[name].value == 0:
-            reach = f": always above {percent(threshold)}".replace(" %", "\N{NO-BREAK SPACE}%")
-        plain.plot(rms, mean[drawn], label=textwrap.fill(look.label + reach, 44), **line)
-        low, high = np.maximum(mean[drawn] - std, 0), mean[drawn] + std
+        mean, std = curves.mean(name)[drawn], curves.std(name)[drawn]
+        axes.plot(rms, mean, label=look.label, ms=4, **look.style)
         scatter = f"_{look.label}, scatter"
-        plain.fill_between(rms, low, high, color=look.color, alpha=0.15, lw=0, label=scatter)
-        ratio.semilogy(curves.rms[bright], mean[bright] / curves.rms[bright], label=f"_{look.label}", **line)
-        if found:
-            ratio.plot(limits[name].value, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
+        axes.fill_between(
+            rms, np.maximum(mean - std, 0), mean + std, color=look.color, alpha=0.15, lw=0, label=scatter
+        )
+        ends.append((float(mean[-1]), textwrap.fill(look.label, 22), look.style))
+    axes.plot(rms, threshold * rms, color="#555555", lw=1)
+    ends.append((threshold * rms[-1], f"{percent(threshold)} of the input", {"color": "#555555", "marker": ""}))
+    axes.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(-0.03, None), ylim=(-0.03, None))
+    _label_ends(axes, ends)
+    axes.set_gid(TALL)
+    return figure
+
+
+_LINE = 0.05  # height of a line of a label, over that of the axes
+
+
+def _label_ends(axes: Axes, ends: list[tuple[float, str, dict[str, Any]]]) -> None:
+    """Write the labels of curves next to their right ends, (height, text, style) each, without an overlap."""
+    low, high = axes.get_ylim()
+    ends.sort(key=lambda end: end[0])
+    heights = [_LINE * (1.3 + text.count("\n")) for _, text, _ in ends]
+    lowest = 0.0
+    for number, (value, text, style) in enumerate(ends):
+        half = heights[number] / 2
+        room = 1 - sum(heights[number:]) + half  # else those above would leave the axes
+        middle = max(lowest + half, min((value - low) / (high - low), room))
+        axes.plot(1.03, middle, ms=5, transform=axes.transAxes, clip_on=False, **style)
+        beside: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "center"}
+        axes.annotate(text, (1.03, middle), (6, 0), fontsize=9, **beside)
+        lowest = middle + half
+
+
+def draw_ratios(curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float) -> Figure:
+    """Mean error over the input on a logarithmic axis, and where it reaches the threshold."""
+    figure, axes = plt.subplots(figsize=(7, 4.6))
+    bright = curves.rms > 0
+    for name, look in looks_of(curves.errors):
+        axes.semilogy(
+            curves.rms[bright],
+            curves.mean(name)[bright] / curves.rms[bright],
+            label=look.label,
+            ms=4,
+            **look.style,
+        )
+        if 0 < limits[name].value < np.inf:
+            axes.plot(limits[name].value, threshold, "o", mfc="none", mec=look.color, mew=1.8, ms=10, zorder=5)
         if name in STATED:
-            ratio.plot(STATED[name], threshold, "*", color=look.color, mec="white", ms=15, zorder=6)
-    plain.plot(rms, threshold * rms, color="#555555", lw=1)
-    plain.annotate(
-        percent(threshold), (rms[-1], threshold * rms[-1]), (4, 0), textcoords="offset points",
-        color="#555555", fontsize=9, va="center",
-    )  # fmt: skip
-    ratio.axhline(threshold, color="#555555", lw=1)
-    end = ratio.get_yaxis_transform()  # the right end of the line, which no curve crosses
-    ratio.text(1.02, threshold, percent(threshold), transform=end, color="#555555", fontsize=9, va="center")
-    plain.set(xlabel="input phase (rad rms)", ylabel="error (rad rms)", xlim=(-0.03, None), ylim=(-0.03, None))
-    ratio.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
+            axes.plot(STATED[name], threshold, "*", color=look.color, mec="white", ms=15, zorder=6)
+    axes.axhline(threshold, color="#555555", lw=1)
+    end = axes.get_yaxis_transform()  # the right end of the line, which no curve crosses
+    axes.text(1.01, threshold, percent(threshold), transform=end, color="#555555", fontsize=9, va="center")
+    axes.set(xlabel="input phase (rad rms)", ylabel="error / input", xlim=(0, None))
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, columnspacing=1)
     return figure
 
@@ -290,6 +323,89 @@ def work_table(passes: Mapping[str, int]) -> Table:
     )
 
 
+def _reach(curves: LinearityCurves, limit: Limit) -> str:
+    """Inputs up to which an error stays within the threshold, in words."""
+    if limit.value == 0:
+        return "at no input"
+    return f"up to {two_digits(min(limit.value, curves.rms[-1]))} rad rms" + (
+        "" if np.isfinite(limit.value) else ", the largest input"
+    )
+
+
+def findings(curves: LinearityCurves, limits: Mapping[str, Limit], threshold: float) -> Text:
+    """Return the ranges of the linear method and of the phase-shifted iteration."""
+    linear, shifted = limits["Linear"], limits["PhaseShifted"]
+    ratio = shifted.over(linear).value
+    further = f", {two_digits(ratio)} times as far" if 0 < ratio < np.inf else ""
+    return Text(
+        f"**With one image, the mean error of the linear method stays within {percent(threshold)} of the input "
+        f"{_reach(curves, linear)}. With two images, that of the phase-shifted iteration does so "
+        f"{_reach(curves, shifted)}{further}.**"
+    )
+
+
+def findings_one_image(curves: LinearityCurves) -> Text:
+    """Return up to where the arcsine has a smaller error than the linear method."""
+    bright = curves.rms > 0
+    better = np.logical_and.accumulate(curves.mean("Arcsine")[bright] < curves.mean("Linear")[bright])
+    if not better[0]:
+        return Text("The arcsine has no smaller error than the linear method at the smallest input.")
+    last = curves.rms[bright][better][-1]
+    return Text(f"The arcsine has a smaller mean error than the linear method up to {last:.3g} rad rms.")
+
+
+def findings_two_images(curves: LinearityCurves, descents: LinearityCurves, threshold: float) -> Text:
+    """Return the shares of recovered screens at the input nearest to 1 rad rms, and where phases wrap."""
+    place, onset = _nearest(curves, 1.0), _wrap_onset(curves)
+    shifted, modes = (curves.recovered(name, threshold)[place] for name in ("PhaseShifted", "GradientDescent"))
+    points = descents.recovered("GradientDescentPoints", threshold)[0]
+    wraps = f"from {onset:.3g} rad rms on" if np.isfinite(onset) else "at no input"
+    return Text(
+        f"At {curves.rms[place]:.3g} rad rms, the iteration recovers {shifted:.0%} of the screens, gradient "
+        f"descent on modes {modes:.0%}, and gradient descent with the phase of each point as an unknown "
+        f"{points:.0%}. The mean Strehl ratio is {two_digits(curves.strehl[place].mean())} there. At least half "
+        f"of the screens have phase wraps, points beyond ±π, {wraps}."
+    )
+
+
+def findings_saxton(
+    by_width: LinearityCurves, variants: Mapping[str, GerchbergSaxton], longer: Limit, threshold: float
+) -> Text:
+    """Return the lost light, the error at the smallest input, and the range with the modelled field."""
+    *_, repaired = variants
+    zeros = [
+        f"{two_digits(by_width.mean(name)[0])} rad on a detector of {method.sensor.extent:g} D, which loses "
+        f"{light_lost(method.sensor):.0%} of the light"
+        for name, method in variants.items()
+        if method.unmeasured == "zero"
+    ]
+    return Text(
+        f"With zero field, the error at {by_width.rms[0]:g} rad rms is {'; '.join(zeros)}. With the modelled "
+        f"field and {variants[repaired].settings.n_iterations} iterations, the error stays within "
+        f"{percent(threshold)} of the input {_reach(by_width, longer)}."
+    )
+
+
+def findings_work(passes: Mapping[str, int], reconstructors: Mapping[str, Any]) -> Text:
+    """Return the passes of two methods, and the coefficients of the reference wave."""
+    return Text(
+        f"At 0.5 rad rms the phase-shifted iteration takes {passes['PhaseShifted']} passes, gradient descent on "
+        f"modes {passes['GradientDescent']}. The reference wave has {reconstructors['PhaseShifted'].sensor.rank} "
+        "coefficients."
+    )
+
+
+def findings_steep(curves: LinearityCurves, limits: Mapping[str, Limit], exponent: float) -> Text:
+    """Return the ranges with another spectrum, and where its screens wrap."""
+    linear, arcsine, shifted = (_reach(curves, limits[name]) for name in ("Linear", "Arcsine", "PhaseShifted"))
+    onset = _wrap_onset(curves)
+    wraps = f"from {onset:.3g} rad rms on" if np.isfinite(onset) else "at no input"
+    return Text(
+        f"With the exponent {exponent:.3g}, the linear method stays within the threshold {linear}, the arcsine "
+        f"{arcsine}, and the iteration {shifted}. At least half of these screens have wraps {wraps}."
+    )
+
+
 _SHORT = {
     "Linear": "linear",
     "Arcsine": "arcsine",
@@ -304,7 +420,6 @@ def steep_numbers(curves: LinearityCurves, limits: Mapping[str, Limit]) -> dict[
     linear, arcsine, shifted = (limits[name] for name in ("Linear", "Arcsine", "PhaseShifted"))
     return rounded(
         {
-            "steep_linear": linear.value,
             "steep_arcsine": arcsine.value,
             "steep_shifted": shifted.value,
             "steep_gain": shifted.over(linear).value,
@@ -342,7 +457,7 @@ def numbers(
     *zeros, _, repaired = variants
     widest = max(zeros, key=lambda name: variants[name].sensor.extent)
     usual, wide = methods["GerchbergSaxton"].sensor, variants[widest].sensor
-    tenth, half, one = (int(np.argmin(np.abs(rms - value))) for value in (0.1, 0.5, 1.0))
+    tenth, half, one = (_nearest(curves, value) for value in (0.1, 0.5, 1.0))
     offset, offset_widest = mean["GerchbergSaxton"][tenth], by_width.mean(widest)[0]
     alike = _alike_up_to(curves)
     low = (rms > 0) & (rms <= 0.3)
@@ -361,7 +476,6 @@ def numbers(
         "points_recovered_at_1": recovered["GradientDescentPoints"],
         "recovered_at_1": recovered["PhaseShifted"],
         "strehl_at_1": curves.strehl[one].mean(),
-        "strehl_at_limit": np.interp(limits["PhaseShifted"].value, rms, curves.strehl.mean(axis=1)),
         "wrapped_screens_at_05": with_wraps[half],
         "wrapped_screens_at_1": with_wraps[one],
         "wrap_onset": _wrap_onset(curves),
@@ -382,6 +496,5 @@ def numbers(
     }
     for name, short in _SHORT.items():
         found[f"{short}_limit"] = limits[name].value
-    found["threshold"] = threshold
     found["saxton_model_limit_longer"] = longer.value
     return rounded(found)

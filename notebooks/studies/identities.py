@@ -16,7 +16,7 @@ from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
 from studies.kit.setups import screens_at
 from studies.kit.style import OTHER_STYLES
-from studies.kit.tables import Table
+from studies.kit.tables import Table, Text, two_digits
 from zwfs.masks import Dimple, Mask
 from zwfs.metrics import reconstruction_error, strehl
 from zwfs.pupil import Pupil
@@ -284,19 +284,43 @@ def numbers(
     return rounded(found, ".5g")
 
 
+IDENTITIES = {
+    "dimple_two_wave_error": "(5): two waves interfere, behind a dimple",
+    "patch_two_wave_error": "(5), behind a patch of uneven phase and amplitude",
+    "patch_model_error": "low-rank model of the reference wave of this patch",
+    "determinant_error": "(10): the determinant is the sine of the difference of the reference phases",
+    "half_difference_error": "reference phases differ by half as much as the phase shifts, modulo π (rad)",
+    "diversity_at_0": "determinant of equal phase shifts",
+    "true_wave_error": "(9): phase from two images and their true reference waves (rad)",
+    "one_step_error": "phase from two images by one iteration from the true phase (rad)",
+}
+"""Titles of the identities, by the names of their errors in `numbers`."""
+
+
+def findings(found: Mapping[str, float | str], resolution: float) -> Text:
+    """Return the largest error of the equations and that of the common approximation."""
+    worst = max(float(found[name]) for name in IDENTITIES)
+    how = (
+        f"hold to rounding error, {resolution:.0e}" if worst <= resolution else f"have errors of up to {worst:.2g}"
+    )
+    return Text(
+        f"**The equations {how}.** The common approximation is not exact: after one step with two images, the "
+        f"error is {two_digits(float(found['step_error_01']))} rad for an input of 0.1 rad rms."
+    )
+
+
+def findings_one_image(found: Mapping[str, float | str]) -> Text:
+    """Return the errors of two images and of one with their true reference waves."""
+    return Text(
+        f"For phases of up to {float(found['largest_phase']):.3g} rad, two images have an error of at most "
+        f"{float(found['true_wave_error']):.2g} rad, and one image an error of "
+        f"{two_digits(float(found['one_image_error']))} rad rms."
+    )
+
+
 def identities_table(found: Mapping[str, float | str], resolution: float) -> Table:
     """Largest error of each identity, from `numbers`."""
-    titles = {
-        "dimple_two_wave_error": "(5): two waves interfere, behind a dimple",
-        "patch_two_wave_error": "(5), behind a patch of uneven phase and amplitude",
-        "patch_model_error": "low-rank model of the reference wave of this patch",
-        "determinant_error": "(10): the determinant is the sine of the difference of the reference phases",
-        "half_difference_error": "reference phases differ by half as much as the phase shifts, modulo π (rad)",
-        "diversity_at_0": "determinant of equal phase shifts",
-        "true_wave_error": "(9): phase from two images and their true reference waves (rad)",
-        "one_step_error": "phase from two images by one iteration from the true phase (rad)",
-    }
-    rows = [[title, _text(float(found[name]), resolution)] for name, title in titles.items()]
+    rows = [[title, _text(float(found[name]), resolution)] for name, title in IDENTITIES.items()]
     return Table(["equation of the paper", "largest error"], rows)
 
 

@@ -77,8 +77,8 @@ class AmplitudeCurves:
         return np.sqrt(np.mean(self.errors[way] ** 2, axis=1))
 
     def at(self, variation: float) -> int:
-        """Place of the sampled variation nearest to `variation`: text on it names the sampled value."""
-        return int(np.argmin(np.abs(self.variations - variation)))
+        """Place of the sampled variation, but 0, nearest to `variation`: text on it names the sampled value."""
+        return int(np.argmin(np.where(self.variations > 0, np.abs(self.variations - variation), np.inf)))
 
 
 def amplitude_maps(
@@ -289,8 +289,8 @@ def findings_example(pupil: Pupil, phase: NDArray, amplitude: NDArray, estimate:
         sizes.append(two_digits(np.sqrt(np.mean(pupil.gather(error) ** 2))))
         shares.append(f"{np.mean(np.abs(pupil.gather(error)) < pupil.gather(sigma)):.0%}")
     return Text(
-        f"The error of the phase is {sizes[0]} rad rms, and that of the amplitude {sizes[1]}. {shares[0]} of the "
-        f"phases and {shares[1]} of the amplitudes are within one standard error. Right error bars have 68%."
+        f"The error of the phase is {sizes[0]} rad rms, and that of the amplitude {sizes[1]}. {shares[0]} and "
+        f"{shares[1]} of the points are within one standard error; 68% are expected."
     )
 
 

@@ -196,9 +196,9 @@ CASES = {
         *each(inputs=[[4.0], [0.001, 0.002]], wrong=[[1.0], [100.0, 0.01]], diameter=[0.1], diameter_wide=[8.0],
         phase_shift=[3.13]),
     ),
-    "design": ({"n_pixels": 16, "n_modes": 3, "n_screens": 1, "n_angles": 2, "step": 0.5},
-        {"diameter_max": 2.0, "step": 1.0}, {"n_angles": 3, "inputs": [1.0, 1.0]}, *each(inputs=[[4.0], [0.001]],
-        diameter_max=[8.0], added=[1.0, 0.0], n_modes=[1], exponent=[0.0, -6.0]),
+    "design": ({"n_pixels": 24, "n_screens": 2, "n_modes": 15, "wanted_error": 10.0},
+        {"input_error": 0.0}, {"read_noise": 0.0, "n_modes": 1}, {"input_error": 635.0, "n_modes": 30},
+        *each(throughput=[1.0], frame_rate=[1e6], wanted_error=[63.0, 0.05], read_noise=[20.0]),
     ),
     "sensors": (
         {"n_pixels": 16, "n_modes": 4, "n_screens": 1, "inputs": [0.0, 0.5], "n_positions": 2, "padding": 2,

@@ -18,7 +18,7 @@ from .conftest import ROOT
 BOOK = Project(ROOT)
 NAMES = [path.stem for path in BOOK.sources()]
 # Together they load most of the package.
-TRIED = ("calibration", "closed_loop", "fig03_dynamic_range", "fig08_segments", "own_frames", "reconstructors")
+TRIED = ("calibration", "closed_loop", "fig03_dynamic_range", "fig08_segments", "one_look", "own_frames")
 # Runs the imports of each notebook in a separate process, which has already imported Matplotlib and SciPy.
 LOADED = """
 import json, os, sys

@@ -14,7 +14,6 @@ from studies import zernike_sensor
 from studies.kit import results
 from studies.kit.style import ALONE, LOOKS, OTHER_STYLES, show_phase, use_style
 from studies.kit.variants import dark_color, variants
-from studies.reconstructors import draw_convergence
 
 from .test_truth import CASES, run
 
@@ -187,5 +186,3 @@ def test_methods_of_a_reader_get_looks_of_their_own(monkeypatch):
     for vision in VISION:
         points = [lab(look.color, vision) for look in LOOKS.values()]
         assert min(np.linalg.norm(a - b) for a, b in combinations(points, 2)) > 15
-    figure = draw_convergence({name: {0.2: np.ones((3, 2))} for name in names})
-    assert {line.get_color() for line in figure.axes[0].lines} >= {LOOKS[name].color for name in names}

@@ -183,8 +183,9 @@ def findings(commanded: NDArray, errors: Mapping[str, NDArray]) -> Text:
     linear, shifted = errors["Linear"], errors["PhaseShifted"]
     text = (
         f"For one random screen of pistons of {_rms(commanded):.2g} rad rms, the error of the phase-shifted "
-        f"iteration (two images and a model without the bench's errors) is {_rms(shifted):.2g} rad rms. That of the "
-        f"linear method (one image and an interaction matrix calibrated on the bench) is {_rms(linear):.2g} rad rms."
+        f"iteration (two images and a model without the bench's errors) is {_rms(shifted):.2g} rad rms. That of "
+        f"the linear method (one image and an interaction matrix calibrated on the bench) is {_rms(linear):.2g} "
+        "rad rms."
     )
     folded = commanded < _FOLDED
     if folded.any():

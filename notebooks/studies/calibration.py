@@ -18,7 +18,7 @@ from studies.kit import sweeps
 from studies.kit.parameters import USUAL
 from studies.kit.results import rounded
 from studies.kit.style import LOOKS, OTHER_STYLES
-from studies.kit.tables import Table
+from studies.kit.tables import Table, Text
 from zwfs.frames import BenchFit, Calibration, recover_phase
 from zwfs.frames.phases import Flag
 from zwfs.frames.pipeline import Optics, reduce_frames
@@ -41,6 +41,7 @@ QUICK = {
 }
 
 _UNIT = 1e-4  # rad, of the phases in the file
+_SHORT = 1.5  # errors over error bars beyond which these count as too small
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +102,8 @@ class Recording:
     def inputs(self, largest: float) -> NDArray[np.float64]:
         """Errors of the bright unseen screens up to the largest, rad rms."""
         bright = self.arrays["unseen_photons"] == self.photons[0]
-        found = np.unique(self.arrays["unseen_rms"][bright])
-        return found[found <= largest]
+        inputs = np.unique(self.arrays["unseen_rms"][bright])
+        return inputs[inputs <= largest]
 
     def shot(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Frames of an unseen screen and their noise, in counts of an exposure as long as the calibration's."""
@@ -217,7 +218,7 @@ def _measure(
 def _plain(counts: NDArray, taken: Recording, number: int, n_iterations: int) -> NDArray[np.float64]:
     """Error of the phase-shifted iteration with the values of the design, on the pixels of the first image."""
     frames, clear = (
-        [Image(one, np.zeros(one.shape, bool)) for one in pair] for pair in (counts, taken.clear_frames)
+        [Image(image, np.zeros(image.shape, bool)) for image in pair] for pair in (counts, taken.clear_frames)
     )
     registered = register_frames(frames, clear)
     phase = recover_phase(reduce_frames(registered, Optics()), n_iterations).phase
@@ -228,8 +229,8 @@ def _plain(counts: NDArray, taken: Recording, number: int, n_iterations: int) ->
 
 def _error(phase: NDArray, truth: NDArray, lit: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Error without piston of the pixels that are fully lit."""
-    left = np.exp(1j * (phase - truth)[lit])
-    return np.angle(left * np.conj(left.mean()))
+    residual = np.exp(1j * (phase - truth)[lit])
+    return np.angle(residual * np.conj(residual.mean()))
 
 
 def known_values(taken: Recording) -> dict[str, float]:
@@ -278,7 +279,7 @@ class Errors:
 
     def single(self, name: str) -> NDArray[np.float64]:
         """Attribute of each screen, (n, n_screens)."""
-        return np.array([[getattr(one, name) for one in row] for row in self.measured])
+        return np.array([[getattr(screen, name) for screen in row] for row in self.measured])
 
     def column(self, name: str) -> NDArray[np.float64]:
         """Root mean square of an attribute over the screens for which it was measured, (n,)."""
@@ -316,7 +317,7 @@ def bulk_errors(taken: Recording, calibration: Calibration, errors: Errors) -> N
         return float(_error(phase, taken.arrays["unseen"][number] * _UNIT, lit).std())
 
     shots = [taken.unseen(rms, taken.photons[0])[: len(errors.measured[0])] for rms in errors.rms]
-    return np.array([np.sqrt(np.mean([error(number) ** 2 for number in some])) for some in shots])
+    return np.array([np.sqrt(np.mean([error(number) ** 2 for number in series])) for series in shots])
 
 
 def draw_calibration_errors(errors: Errors, not_smooth: NDArray) -> Figure:
@@ -346,48 +347,57 @@ def _verdict(fit: BenchFit) -> str:
     return "consistent" if fit.consistent else "not consistent"
 
 
-def numbers(
-    taken: Recording, fit: BenchFit, errors: Errors, faint: Errors, not_smooth: NDArray
-) -> dict[str, float | str]:
-    """Numbers for the text: settings, verdict, errors, and how well the error bars hold."""
-    true, plain, found = known_values(taken), errors.column("plain"), errors.column("calibrated")
-    control = errors.single("same_prior") / errors.single("plain")
-    [faint_plain], [faint_found] = faint.column("plain"), faint.column("calibrated")
-    every = [one for row in errors.measured for one in row]
-    deviations = [(fit[name].value - value) / fit[name].sigma for name, value in true.items()]
+def findings(errors: Errors, faint: Errors, photons: float, not_smooth: NDArray) -> Text:
+    """Say what the fitted model gains on unseen screens, and whether its error bars hold."""
+    plain, calibrated = errors.column("plain"), errors.column("calibrated")
+    gains, bulk = plain / calibrated, plain / not_smooth
+    every = [screen for row in errors.measured for screen in row]
+    [faint_plain], [faint_calibrated] = faint.column("plain"), faint.column("calibrated")
+    short = errors.rms[calibrated > _SHORT * errors.column("sigma")]
+    bars = (
+        f" Their error bars are too small at {', '.join(f'{rms:.2g}' for rms in short)} rad rms: the error "
+        f"exceeds {_SHORT:g} times the bar."
+        if short.size
+        else ""
+    )
+    return Text(
+        "The fitted model and the assumption of smooth phases together change the error of unseen *screens* "
+        f"(random phase maps) by a factor of {1 / gains.max():.2g} to {1 / gains.min():.2g}, compared with the "
+        "phase-shifted iteration and the mask's design values. Without the assumption (`calibrate --commands`, "
+        f"diamonds) the factor is {1 / bulk.max():.2g} to {1 / bulk.min():.2g}. At {faint.rms[0]:.2g} rad rms "
+        f"and {photons:.0f} photons per pixel, the error is {faint_calibrated:.2g} instead of {faint_plain:.2g} "
+        f"rad rms.\n\nOf the pixels of all screens, {np.mean([screen.inside for screen in every]):.0%} have an "
+        f"error below their error bar; 68 % are expected.{bars} The verdict is *consistent* for "
+        f"{sum(screen.consistent for screen in every)} of {len(every)} screens. It tests whether the model "
+        "explains the frames, not whether the phase is right."
+    )
+
+
+def numbers(errors: Errors, not_smooth: NDArray) -> dict[str, float | str]:
+    """Numbers that other pages quote: an input, its errors, and the pixels within their error bars."""
     place = int(np.argmin(np.abs(errors.rms - 0.8)))
     return rounded(
         {
-            "commands": len(fit.misfit) / 2 - 2,
-            "n_screens": len(errors.measured[0]),
-            "photons": float(taken.arrays["photons"]),
-            "misfit": float(np.mean(fit.misfit)),
-            "verdict": _verdict(fit),
-            "remarks": " ".join(fit.remarks) or "none",
-            "deviation_rms": np.sqrt(np.mean(np.square(deviations))),
-            "diameter_error": 100 * abs(fit["diameter"].value / true["diameter"] - 1),
-            "shift_error": 100 * max(abs(fit[name].value / true[name] - 1) for name in ("first", "second")),
             "shown": errors.rms[place],
-            "plain_error": plain[place],
-            "calibrated_error": found[place],
-            "gain": plain[place] / found[place],
-            "gain_least": (plain / found).min(),
-            "gain_most": (plain / found).max(),
-            "control_least": np.nanmin(control),
-            "control_most": np.nanmax(control),
-            "faint_photons": taken.photons[-1],
-            "faint_input": faint.rms[0],
-            "faint_plain": faint_plain,
-            "faint_calibrated": faint_found,
-            "faint_gain": faint_plain / faint_found,
-            "sigma": errors.column("sigma")[place],
-            "bars_worst": errors.rms[np.argmax(found / errors.column("sigma"))],
-            "inside": 100 * float(np.mean([one.inside for one in every])),
-            "consistent": sum(one.consistent for one in every),
+            "plain_error": errors.column("plain")[place],
             "bulk_error": not_smooth[place],
-            "bulk_worst": errors.rms[np.argmax(not_smooth / plain)],
-            "bulk_most": (plain / not_smooth).max(),
-            "unseen": len(every),
+            "calibrated_error": errors.column("calibrated")[place],
+            "inside": 100 * float(np.mean([screen.inside for row in errors.measured for screen in row])),
         },
-        ".4g",
+        ".2g",
+    )
+
+
+def fit_findings(taken: Recording, fit: BenchFit) -> Text:
+    """Say whether the fit explains its frames, and how far its values are from those of the bench."""
+    true = known_values(taken)
+    deviations = [(fit[name].value - value) / fit[name].sigma for name, value in true.items()]
+    diameter = 100 * abs(fit["diameter"].value / true["diameter"] - 1)
+    shift = 100 * max(abs(fit[name].value / true[name] - 1) for name in ("first", "second"))
+    remarks = f" Its remarks: {' '.join(fit.remarks)}" if fit.remarks else ""
+    return Text(
+        f"The misfit is {np.mean(fit.misfit):.2g}, and the verdict is *{_verdict(fit)}*.{remarks} The diameter "
+        f"is wrong by {diameter:.1g} %, and the phase shifts by at most {shift:.1g} %. Divided by their error "
+        f"bars, the deviations of all parameters have an rms of {np.sqrt(np.mean(np.square(deviations))):.2g}; "
+        "correct error bars would give about 1."
     )

@@ -17,9 +17,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded
 from studies.kit.style import ALONE, show_intensity, show_phase
-from studies.kit.tables import Table
+from studies.kit.tables import Table, Text, two_digits
 from zwfs import opd_to_phase, phase_to_opd
 from zwfs.bench import Bench, write_bench
 from zwfs.frames import CameraNoise, Phases
@@ -94,8 +93,8 @@ def draw_explained(result: Phases) -> Figure:
     ):
         shown = show_intensity(panels[row, 0], measured, top)
         show_intensity(panels[row, 1], modelled, top)
-        left = np.where(bad, np.nan, measured - modelled)
-        difference = show_phase(panels[row, 2], left, _SHOWN * agreement.residual.max())
+        remainder = np.where(bad, np.nan, measured - modelled)
+        difference = show_phase(panels[row, 2], remainder, _SHOWN * agreement.residual.max())
         for axes in panels[row, ::2]:
             axes.plot(*np.argwhere(bad)[:, ::-1].T, "s", color=_BAD, ms=1.2)
         panels[row, 0].set_ylabel(f"image {row + 1}")
@@ -235,7 +234,7 @@ def result_table(result: Phases) -> Table:
     agreement, measurement = result.agreement, result.agreement.measurement
     registered = measurement.registered
     placement = registered.placement
-    pupils = [f"{one.row:.2f}, {one.column:.2f}, {one.diameter:.2f}" for one in registered.pupils]
+    pupils = [f"{pupil.row:.2f}, {pupil.column:.2f}, {pupil.diameter:.2f}" for pupil in registered.pupils]
     return Table(
         ["quantity", "value"],
         [
@@ -264,8 +263,8 @@ def result_table(result: Phases) -> Table:
 def image_table(frames: Sequence[Image], clear_frames: Sequence[Image]) -> Table:
     """Size, brightest good pixel and number of bad pixels of each image."""
     rows = [
-        [one.name, *one.counts.shape, f"{one.counts[~one.bad].max():.5g}", int(one.bad.sum())]
-        for one in (*frames, *clear_frames)
+        [image.name, *image.counts.shape, f"{image.counts[~image.bad].max():.5g}", int(image.bad.sum())]
+        for image in (*frames, *clear_frames)
     ]
     return Table(["image", "rows", "columns", "brightest good pixel", "bad pixels"], rows)
 
@@ -294,12 +293,19 @@ def _pair(values: Sequence[float] | NDArray, digits: int) -> str:
     return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
-def numbers(verdict: Verdict, errors: Sequence[float] | None, error_flat: float) -> dict[str, float | str]:
-    """Numbers for the text: error bar and error of the result, and its error less the phase of a flat mirror."""
-    return rounded(
-        {
-            "sigma": np.nan if verdict.sigma is None else np.nanmedian(verdict.sigma),
-            "error": errors[-1] if errors else np.nan,
-            "error_flat": error_flat,
-        }
+def findings(
+    verdict: Verdict, rms: float, errors: Sequence[float] | None = None, error_flat: float | None = None
+) -> Text:
+    """Say how good the phase is: by the verdict, and by the commands of a simulated bench, rad rms."""
+    noise = "Without a gain of the camera, the phase has no error bar."
+    if verdict.sigma is not None:
+        noise = f"Noise alone causes an error of {two_digits(float(np.nanmedian(verdict.sigma)))} rad (median)."
+    if errors is None or error_flat is None:
+        answer = next(iter(verdict.findings.values())).partition(". ")[0].rstrip(".")
+        return Text(f"Your frames: {answer[:1].lower()}{answer[1:]}. {noise}")
+    return Text(
+        f"The frames are simulated: pistons of {rms:.2g} rad rms. The reconstructed pistons are wrong by "
+        f"{two_digits(errors[-1])} rad rms. {noise} [Subtracting the phase of a flat "
+        "mirror](#subtract-the-flat-mirror) removes the static aberration of the bench, and "
+        f"{two_digits(error_flat)} rad rms remain."
     )

@@ -132,8 +132,8 @@ def looks(rows: list[dict[str, Any]]) -> str:
         ]
         for row in rows
     ]
-    header = [f"one frame pair, {rows[0]['n_pixels']} pixels", "time, in propagations of HCIPy", "median error (rad)"]
-    return table(header, lines)
+    pair = f"one frame pair, {rows[0]['n_pixels']} pixels"
+    return table([pair, "time, in propagations of HCIPy", "median error (rad)"], lines)
 
 
 def latency(rows: list[dict[str, Any]]) -> str:

@@ -33,11 +33,11 @@ def rounded(values):
 
 def peers(measured):
     """One row for each contestant: task, package, setting, default, ratio of times, error."""
-    rows = [(one["extra_info"], one["stats"]["min"], one["group"]) for one in measured["benchmarks"]]
+    rows = [(run["extra_info"], run["stats"]["min"], run["group"]) for run in measured["benchmarks"]]
     rows = [row for row in rows if "package" in row[0]]
-    own = {task: seconds for info, seconds, task in rows if info["package"] == "zwfs" and info["default"]}
+    unit = {task: seconds for info, seconds, task in rows if info["package"] == "zwfs" and info["default"]}
     return [
-        {"task": task, **info, "error": digits(info["error"], 2), "ratio": digits(seconds / own[task], 3)}
+        {"task": task, **info, "error": digits(info["error"], 2), "ratio": digits(seconds / unit[task], 3)}
         for info, seconds, task in rows
     ]
 

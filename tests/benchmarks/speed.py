@@ -59,7 +59,7 @@ def best_of_each(functions, seconds):
                 start = thread_time()
                 function()
                 times[name].append(thread_time() - start)
-    return {name: float(np.percentile(found, 5)) for name, found in times.items()}
+    return {name: float(np.percentile(measured, 5)) for name, measured in times.items()}
 
 
 def _reading(method, frames, name):
@@ -90,11 +90,11 @@ def closed_loop(n_pixels, seconds):
     """Rate and error when each estimate starts from the one before, while a screen turns into another one."""
     pupil = Pupil.circular(n_pixels)
     sensor = ZernikeSensor(pupil, *DIMPLES)
-    one, other = screens_at(zernike_basis(pupil, 200), 0.8, 2, 2024, 7)
+    first, last = screens_at(zernike_basis(pupil, 200), 0.8, 2, 2024, 7)
     method = PhaseShifted(sensor, n_iterations=1, tolerance=0.0)
     phase, errors = None, []
     for turn in np.linspace(0, np.pi / 2, 101):
-        truth = np.cos(turn) * one + np.sin(turn) * other
+        truth = np.cos(turn) * first + np.sin(turn) * last
         frames = sensor.measure(truth).astype(np.float32)
         phase = method(frames, phase).phase
         errors.append(float(reconstruction_error(pupil, phase, truth)))
@@ -124,11 +124,11 @@ def batches(seconds, sizes=(1, 10, 100, 1000)):
         frames = np.repeat(frame, n, axis=0)
         time = best(lambda: method(frames), seconds) / n  # noqa: B023
         tracemalloc.start()
-        found = method(frames)
+        result = method(frames)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         rows.append(
-            {"n_frames": n, "time per frame": time, "memory": peak - found.phase.nbytes - found.frames.nbytes}
+            {"n_frames": n, "time per frame": time, "memory": peak - result.phase.nbytes - result.frames.nbytes}
         )
     return rows
 

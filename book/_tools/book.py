@@ -11,7 +11,7 @@ from pathlib import Path
 
 from zwfs._system import write_file
 
-from .execute import SILENCE, TRACEBACK_LINES, tell
+from .execute import TRACEBACK_LINES, tell
 from .project import EXECUTED, PYODIDE, Project, ToolError
 from .record import commit, digest, digest_files
 from .run import refresh, run
@@ -19,6 +19,7 @@ from .scratch import scratch_folder, swap
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 JUPYTER_BOOK = Path(sys.executable).with_name("jupyter-book")
+BEAT = 10.0  # between two lines of output while the pages are built, second
 OPTIONS = ["-W", "-n", "--keep-going"]  # warnings are errors, and all of them are listed
 NEXT = """next:
   make rerun FIGURE=3 ARGS="-p n_screens=5"   run a notebook with other parameters
@@ -67,12 +68,12 @@ def build(project: Project) -> bool:
 
 
 def _output(process: subprocess.Popen[str]) -> str:
-    """Wait for a process, with a line after each `SILENCE`, and return its output; an interruption ends it."""
+    """Wait for a process, with a line after each `BEAT`, and return its output; an interruption ends it."""
     begin = time.monotonic()
     try:
         while True:
             with suppress(subprocess.TimeoutExpired):
-                return process.communicate(timeout=SILENCE)[0]
+                return process.communicate(timeout=BEAT)[0]
             tell(f"building the pages: {time.monotonic() - begin:.0f} s")
     except BaseException:
         process.kill()

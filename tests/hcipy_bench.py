@@ -1,7 +1,7 @@
 """Camera frames of a bench that HCIPy simulates, on a grid that is finer than the pixels of the camera.
 
 Apertures, modes, mask and relay are HCIPy's own. Blur and place of an image are SciPy's, and a pixel is the mean
-of its samples. Nothing here is a line of the package, so that model and bench share no assumption.
+of its samples. No optics here are those of the package, so that model and bench share no assumption.
 """
 
 import functools
@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
+
+from zwfs.frames.registration import Image
 
 BORDER = 4  # pixels that are simulated around the camera
 
@@ -154,6 +156,20 @@ class HcipyBench:
         """Rms error over the fully lit pixels of a phase (pixels) for a true one (fine, without the flat)."""
         residual = np.exp(1j * (np.asarray(phase) - self.on_pupil(truth + self.flat)))[self.fully_lit]
         return np.angle(residual * np.conj(residual.mean())).std()
+
+    def difference(self, phase, corner, truth):
+        """Phase less a true one (fine, without the flat), without piston; NaN at pixels that are not fully lit.
+
+        The phase is on the camera, and begins at a corner: row and column.
+        """
+        window = tuple(slice(first, first + len(phase)) for first in corner)
+        lit = self.pixel_means(self.lit)[window] > 0.999
+        left = np.where(lit, np.exp(1j * (phase - self.pixel_means(truth + self.flat)[window])), np.nan)
+        return np.angle(left * np.conj(np.nanmean(left)))
+
+    def images(self, phase, seed, masked=True):
+        """Two images of a camera as registration takes them."""
+        return [Image(one, np.zeros(one.shape, bool)) for one in self.counts(phase, seed, masked)]
 
     @property
     def truth(self):

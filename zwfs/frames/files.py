@@ -444,6 +444,8 @@ def averaged(path: Path, n_images: int | None, saturation: float | None) -> Came
                 good = _usable(exposure)
                 total += np.where(good, exposure, 0)
                 n_used += good
+    if saturation not in (None, np.inf) and np.any((saturated | (n_used == 0)).all(axis=(1, 2))):
+        raise ValueError(f"{first.name}: all pixels reach saturation = {saturation:g}: expected a higher level")
     mean = np.divide(total, n_used, out=np.full(shape, np.nan), where=~saturated & (n_used > 0))
     return _camera_file(first, mean, n_exposures=sum(segment.n for segment in segments))
 

@@ -299,11 +299,10 @@ def register_frames(
         _check.sequence(name, images, Image)
         if len(images) not in (1, n_pupils):
             raise ValueError(f"{name} holds {len(images)} images: expected 1{' or 2' * (n_pupils == 2)}")
-    unmarked = *frames, *clear_frames
+    n_marked = _n_bad(*frames, *clear_frames)
     # The clear frames are judged alone, so that a pupil stands at the same place for all frames.
     frames, clear_frames = _without_odd(frames, clear_frames), _without_odd(clear_frames)
-    marked = zip((*frames, *clear_frames), unmarked, strict=True)
-    n_odd = sum(int(np.count_nonzero(image.bad & ~before.bad)) for image, before in marked)
+    n_odd = _n_bad(*frames, *clear_frames) - n_marked
     if n_pupils == 1:
         frames, clear_frames = frames * 2, clear_frames * 2
     shape = clear_frames[0].counts.shape
@@ -312,13 +311,7 @@ def register_frames(
     if centers is not None and diameter is None:
         raise ValueError("pupil_centers without a pupil_diameter: expected both, or neither")
     clear, pupils = _locate(clear_frames, centers, diameter)
-    small, large = sorted(circle.diameter for circle in pupils)
-    if large - small > max(2.0, _LARGEST_STRETCH * large):
-        names = " and ".join(dict.fromkeys(image.name for image in clear))
-        raise ValueError(
-            f"{names}: the two pupils are {small:.1f} and {large:.1f} pixels wide: "
-            f"expected the same size, to {_LARGEST_STRETCH:.0%}"
-        )
+    _check_alike(clear, pupils)
     masked, circles = (frames[0], frames[-1]), pupils
     formats = [(pair[0] is pair[1], *(image.counts.shape for image in pair)) for pair in (masked, clear)]
     moved = formats[0] != formats[1]
@@ -331,6 +324,17 @@ def register_frames(
     origins = np.round(places - places[2])
     rough = RegisteredFrames(masked, clear, pupils, origins, background, balance, exposure, n_odd=n_odd)
     return _register(rough, frames_too=moved) if subpixel else rough
+
+
+def _check_alike(images: Sequence[Image], pupils: Sequence[Circle]) -> None:
+    """Require that the pupils on two images are about equally large."""
+    small, large = sorted(circle.diameter for circle in pupils)
+    if large - small > max(2.0, _LARGEST_STRETCH * large):
+        names = " and ".join(dict.fromkeys(image.name for image in images))
+        raise ValueError(
+            f"{names}: the two pupils are {small:.1f} and {large:.1f} pixels wide: "
+            f"expected the same size, to {_LARGEST_STRETCH:.0%}"
+        )
 
 
 def check_centers(centers: Any, n_pupils: int = 2) -> NDArray[np.float64]:
@@ -447,6 +451,10 @@ def _locate(
             )
     first = _extend(pair[0], circles if shared else circles[:1])
     return (first, first if shared else _extend(pair[1], circles[1:])), (circles[0], circles[1])
+
+
+def _n_bad(*images: Image) -> int:
+    return sum(int(np.count_nonzero(image.bad)) for image in images)
 
 
 def _without_odd(images: Sequence[Image], others: Sequence[Image] = ()) -> tuple[Image, ...]:

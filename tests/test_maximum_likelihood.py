@@ -126,6 +126,14 @@ def test_faint_photon_noise_is_consistent(pupil, modes):
     assert np.mean(result.chi2) == pytest.approx(1, abs=0.03)
 
 
+def test_one_photon_in_the_dark_does_not_decide_chi2(pupil, modes):
+    sensor = pair(pupil, 1.06, 0.5, -0.5, extent=2.0)
+    light = sensor.measure(np.zeros(pupil.shape))
+    assert 30 * light.min() < 1e-5
+    result = MaximumLikelihood(sensor, modes[:2], photons=30, n_starts=1)(exposed(pupil, light, 30, 60))
+    np.testing.assert_allclose(result.chi2, 1, atol=0.06)
+
+
 def test_without_a_number_of_photons_sigma_follows_from_the_residual(pupil, screens):
     sensor, truth = pair(pupil, 1.06, 0.5, -0.5), screens(0.3, 1)[0]
     rng = np.random.default_rng(2)

@@ -75,16 +75,6 @@ def test_five_wavelengths_are_enough_for_a_quarter_of_the_centre(sensor, phases)
     np.testing.assert_allclose(few, many, atol=1e-6)
 
 
-def test_only_ratios_of_wavelengths_and_weights_count(sensor, phases):
-    frames = [
-        PolychromaticSensor(sensor, scale * np.array(WAVELENGTHS), scale * np.array(WEIGHTS)).measure(phases)
-        for scale in (1, 1e-3)
-    ]
-    np.testing.assert_allclose(*frames, atol=1e-12)
-    band = PolychromaticSensor(sensor, WAVELENGTHS, WEIGHTS)
-    assert band.reference_wavelength == pytest.approx(np.average(WAVELENGTHS, weights=WEIGHTS))
-
-
 def test_a_patch_keeps_its_size_in_the_focal_plane(sensor, phases):
     def shift(u, v):
         return np.where(np.hypot(u, v) < 0.5, 1j, np.exp(0.3j))

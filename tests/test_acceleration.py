@@ -110,6 +110,12 @@ def test_frames_that_do_not_converge_do_not_depend_on_their_batch(mismatched):
         assert single.n_iterations == whole.n_iterations[index]
 
 
+@pytest.mark.parametrize("flux", [0.01, 0.5, 2.0, 9.0])
+def test_a_wrong_flux_leaves_numbers(shifted, screens, pupil, flux):
+    method = PhaseShifted(shifted, accelerate=True, tolerance=0)
+    assert np.all(np.isfinite(method(flux * shifted.measure(screens(0.5))).phase[:, pupil.inside]))
+
+
 @pytest.mark.parametrize("phases", [(1.5, -1.5), (0.3, -2.0), (1.5, -1.5, 2.5), (0.0, 1.0, -0.4)])
 def test_shared_wave_solves_the_general_system(pupil, screens, phases):
     def masks(change):

@@ -45,6 +45,10 @@ def test_dynamic_range_interpolates_the_ratio():
     assert dynamic_range([0.5, 1, 2], [0, 0.02, 0.2], threshold=0.02) == pytest.approx(1)
 
 
+def test_dynamic_range_ends_at_the_first_crossing():
+    assert dynamic_range([1, 2, 3, 4], [0.025, 0.2, 0, 0.4]) == pytest.approx(1.5)
+
+
 def test_dynamic_range_without_a_crossing():
     assert dynamic_range([1, 2], [0.06, 0]) == 0
     assert dynamic_range([1, 2], [0.05, 0.1]) == np.inf

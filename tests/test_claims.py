@@ -73,27 +73,6 @@ def test_another_measurement_changes_the_verdict(number, changed, verdict):
     assert finding.measured
 
 
-@pytest.mark.parametrize(
-    ("times", "verdict"),
-    [
-        # Time of 25 iterations, and rate and error of fewer.
-        ((2e-3, 500.0, 1e-3), HOLDS),
-        ((2e-3, 2000.0, 1e-3), PARTLY),
-        ((2e-3, 2000.0, 5e-2), HOLDS),
-        ((9e-4, 500.0, 1e-3), FAILS),
-    ],
-)
-def test_the_verdict_on_real_time_depends_on_the_measured_times(times, verdict):
-    performance = json.loads(json.dumps(claims.RULES.globals["performance"]))
-    performance["speed"]["others"]["PhaseShifted"] = times[0]
-    for case in performance["speed"]["real time"]:
-        case |= {"rate": times[1], "median error": times[2]}
-    numbers = {"performance": performance}
-    for notebook in (CLAIMS[13].also, CLAIMS[13].notebook):
-        numbers |= claims.glued(NOTEBOOKS / f"{notebook}.ipynb")
-    assert claims.judge(CLAIMS[13], numbers).verdict == verdict
-
-
 def test_numbers_come_from_the_outputs_of_a_notebook(tmp_path):
     glued(tmp_path / "one.ipynb", gain=12.5, limit=float("inf"), said="at 2 λ/D")
     assert claims.glued(tmp_path / "one.ipynb") == {"gain": 12.5, "limit": float("inf")}

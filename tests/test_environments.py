@@ -9,7 +9,6 @@ import tomllib
 from itertools import chain
 from pathlib import Path
 
-import pybtex.database
 import pytest
 import yaml
 from packaging.requirements import Requirement
@@ -91,18 +90,6 @@ def test_version_of_the_package_is_the_same_everywhere():
     citation = yaml.safe_load(read("CITATION.cff"))
     latest = re.findall(r"(?m)^## \[?(?:Unreleased\] - )?(\d+\.\d+\.\d+)", read("CHANGELOG.md"))[0]
     assert {PROJECT["version"], citation["version"], zwfs.__version__, latest} == {PROJECT["version"]}
-
-
-def test_citation_names_the_paper_as_the_bibliography_does():
-    citation = yaml.safe_load(read("CITATION.cff"))
-    entry = pybtex.database.parse_file(ROOT / "book" / "references.bib").entries["Chambouleyron:24"]
-    paper = citation["preferred-citation"]
-    names = [str(person.rich_last_names[-1]) for person in entry.persons["author"]]
-    assert [author["family-names"] for author in paper["authors"]] == names
-    assert paper["title"] == re.sub("[{}]", "", entry.fields["title"])
-    assert str(paper["year"]) == entry.fields["year"]
-    assert paper["url"].endswith(entry.fields["eprint"])
-    assert paper["doi"].endswith(entry.fields["eprint"])
 
 
 def test_package_can_be_imported_next_to_a_folder_of_its_name(tmp_path):

@@ -74,14 +74,6 @@ def test_an_edit_runs_the_notebooks_that_import_the_file(needs, changed, count):
     assert sum(ROOT / changed in files for files in needs.values()) == count
 
 
-def test_data_belong_to_the_study_of_their_name(needs):
-    data, study = (
-        {name for name in NAMES if BOOK.studies / file in needs[name]}
-        for file in ("calibration.npz", "calibration.py")
-    )
-    assert data == study
-
-
 FILES = {
     "zwfs/__init__.py": """
 from typing import TYPE_CHECKING

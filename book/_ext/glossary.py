@@ -15,6 +15,7 @@ GLOSSARY = "book/glossary"
 WITHOUT = {GLOSSARY, "book/bibliography", "book/notation"}
 TERM = re.compile(r"^(\w.*)\n  (\S.*)", re.MULTILINE)
 ROLE = re.compile(r"\{\w+\}`([^`<]*?)(?: <[^`]*>)?`")
+COMMON = {"phase", "rms"}  # words that every reader knows, in the glossary for their exact meaning
 EMPHASIS = re.compile(r"\*([^*]+)\*")
 PROSE = (nodes.paragraph, nodes.emphasis, nodes.strong, nodes.list_item)
 
@@ -31,7 +32,7 @@ class LinkTerms(SphinxTransform):
         source = Path(self.env.doc2path(GLOSSARY))
         self.env.note_dependency(str(source))
         by_roles = (xref for xref in self.document.findall(pending_xref) if xref["reftype"] == "term")
-        done = {xref["reftarget"].lower() for xref in by_roles}
+        done = COMMON | {xref["reftarget"].lower() for xref in by_roles}
         missing = {term.lower(): term for term in terms(source) if term.lower() not in done}
         for text in list(self.document.findall(nodes.Text)):
             if missing and in_prose(text):

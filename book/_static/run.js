@@ -364,7 +364,7 @@
     }
   }
 
-  // An example of the text: it can be run and edited in place.
+  // An example of the text: it can be run and edited in place. Some need another one, which runs first.
   function addExample(block) {
     const code = block.querySelector("pre");
     const text = code.textContent;
@@ -382,6 +382,7 @@
       if (!edit.hidden) edit.focus();
     } }, "Edit");
     block.after(edit, make("div", { class: "run-buttons run-example" }, start, stop, change), said);
+    block.source = () => (edit.hidden ? text : edit.value);
 
     async function run() {
       if (python.busy) return;
@@ -392,7 +393,8 @@
       try {
         await python.start();
         said.textContent = "Running …";
-        const shown = await python.call("example", { source: edit.hidden ? text : edit.value });
+        const before = block.matches(".needs-set-up") ? `${document.querySelector(".set-up").source()}\n` : "";
+        const shown = await python.call("example", { source: before + block.source() });
         said.textContent = shown.text + (shown.error ?? "") || "Done. The code prints nothing.";
         said.classList.toggle("run-error", Boolean(shown.error));
       } catch (error) {

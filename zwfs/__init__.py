@@ -10,6 +10,7 @@ from zwfs import _lazy
 
 if TYPE_CHECKING:
     from zwfs.bounds import cramer_rao
+    from zwfs.design import SensorDesign, design_sensor
     from zwfs.detector import Detector
     from zwfs.loop import LoopRecord, Mirror, close_loop
     from zwfs.masks import Dimple, Patch
@@ -54,9 +55,11 @@ __all__ = [
     "PolychromaticSensor",
     "Pupil",
     "Reconstruction",
+    "SensorDesign",
     "ZernikeSensor",
     "close_loop",
     "cramer_rao",
+    "design_sensor",
     "dynamic_range",
     "noll_to_nm",
     "opd_to_phase",

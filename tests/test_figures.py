@@ -4,6 +4,7 @@ from dataclasses import replace
 from importlib import import_module
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -19,7 +20,7 @@ from studies.beyond_dimple import DimpleLimits
 from studies.beyond_range import DIMMED, SECANT, Causes, NoiseCurves
 from studies.calibration import Errors, Measured
 from studies.dark_zone import IDEAL, Drift, DriftCurves
-from studies.design import PUBLISHED, DesignMap
+from studies.design import LightCurves
 from studies.fig04_dimple_diameter import Contraction
 from studies.kit import grids
 from studies.kit.bench import BenchCurves
@@ -117,7 +118,8 @@ def drawn_methods(curves, pupil, classic, shifted):
     faint = PhotonCurves(
         three, three, dict.fromkeys(LOOKS, np.ones((3, 3, 2))), np.full((3, 3, 2), 2.0), np.eye(3)
     )
-    designs = DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5})
+    asked = SimpleNamespace(method="Linear", photons_per_exposure=1.0, errors_nm={"Linear": 1.0})
+    light = LightCurves(three, dict.fromkeys(("Linear", "PhaseShifted", "MaximumLikelihood"), three), three)
     step = Step("outlines", found, np.ones(2), np.zeros(2))
     banded = BandCurves(three, dict.fromkeys(bandwidth.WAYS, three[:, np.newaxis]), {}, three, 1.0)
     triple = zwfs.ZernikeSensor(pupil, *shifted.masks, zwfs.Dimple(1, 0))
@@ -153,7 +155,7 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
         "draw_photon_noise": ((faint,), LOOKS),
         "draw_error_bars": (([ErrorBars(k, EXPECTED, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
-        "draw_design_maps": ((designs, PUBLISHED, {"flat": three}), ()),
+        "draw_light": ((light, asked, 1.0), ["Linear", "PhaseShifted", "MaximumLikelihood"]),
         "draw_band_errors": (({(0.1, False): banded, (0.1, True): banded},), [*shifted_only, "MaximumLikelihood"]),
         "draw_held_drift": ((held,), ()),
         "draw_amplitude_errors": (({"dips": varied},), [*shifted_only, "MaximumLikelihood"]),

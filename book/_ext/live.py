@@ -17,11 +17,10 @@ from scipy.spatial.distance import cdist
 from sphinx.application import Sphinx
 
 import zwfs
-from studies.design import COST_MAP, PUBLISHED
 from studies.kit.style import DARK_PHASE_MAP, INTENSITY_MAP, PHASE_MAP
 
 DATA = "_static/live-data.js"
-DESIGNS = Path(__file__).with_name("design.csv")  # the data that the page of notebooks/design.ipynb offers
+DESIGNS = Path(__file__).with_name("design.csv")  # bounds of pairs of opposite shifts
 
 N_PIXELS = 64
 N_MODES = 200
@@ -30,6 +29,9 @@ DIAMETERS = (0.5, 3.0)  # lambda/D
 # The core of a dimple is an entire function of the diameter: 14 samples interpolate it to 1e-7.
 N_DIAMETERS = 14
 TOLERANCE = 1e-7  # of the reference waves, which are stored in single precision
+COST_MAP = "cividis_r"
+PUBLISHED = (1.06, 0.5), (2.4, 0.3, 0.68), (2.05, 0.33, 0.74)
+"""Diameter (lambda/D) and sizes of the phase shifts (pi): paper, Keck, and OZIRIIS with the mean of its masks."""
 MOST = 10  # photon cost at the end of its scale
 MAP_SIZE = 2.9, 2.4  # of the map of designs on a phone, inch
 NEAREST = 0.11  # of a label of a contour to anything else, inch
@@ -115,7 +117,7 @@ def contours(diameters: NDArray, shifts: NDArray, costs: NDArray) -> dict[str, A
     cells = np.arange(diameters.size) + 0.5, shifts.size - np.arange(shifts.size) - 0.5
     lines = Figure().subplots().contour(*cells, costs.T, list(COST_LINES)).allsegs
     parts = dict(zip(COST_LINES, lines, strict=True))
-    ends = [(design.diameter, abs(angle) / np.pi) for design in PUBLISHED for angle in design[2:]]
+    ends = [(diameter, shift) for diameter, *shifts_of in PUBLISHED for shift in shifts_of]
     best = np.unravel_index(costs.argmin(), costs.shape)
     across, up = np.transpose([*ends, (diameters[best[0]], shifts[best[1]])])
     marks = [np.interp(across, diameters, cells[0]), np.interp(up, shifts, cells[1])]

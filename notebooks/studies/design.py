@@ -1,259 +1,165 @@
-"""Photons that sensors of different designs need: diameter of the dimple, and phase shifts. Not in the paper."""
+"""Photons that an error in nanometres takes, with which dimples and which method. Not in the paper."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from math import isfinite
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.colors import LogNorm
-from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, MultipleLocator
-from numpy.typing import ArrayLike, NDArray
+from matplotlib.ticker import LogLocator
+from numpy.typing import NDArray
 
 from studies.kit import sweeps
-from studies.kit.methods import MASKS
 from studies.kit.parameters import parameter_limits
-from studies.kit.results import rounded
-from studies.kit.tables import Table
+from studies.kit.style import LOOKS
+from studies.kit.tables import Table, Text
 from zwfs.bounds import cramer_rao
-from zwfs.masks import Dimple
-from zwfs.pupil import Pupil
-from zwfs.sensor import ZernikeSensor
+from zwfs.design import SensorDesign, method_errors
 
 LIMITS = parameter_limits(
-    "n_modes inputs n_screens exponent",
-    n_pixels=(16, 200),
-    step=(0.05, 1.0),
-    diameter_max=(2.0, 8.0),
-    n_angles=(2, 100),
-    added=(-1.0, 1.0),
+    wanted_error=(0.01, 1000.0),
+    input_error=(0.0, 10000.0),
+    wavelength=(100.0, 20000.0),
+    n_modes=(1, 300),
+    read_noise=(0.0, 100.0),
+    frame_rate=(1e-3, 1e6),
+    telescope=(0.01, 100.0),
+    throughput=(1e-3, 1.0),
+    zero_point=(1e3, 1e15),
+    n_pixels=(24, 64),
+    n_screens=(2, 1000),
 )
-QUICK = {"n_pixels": 32, "n_screens": 2, "step": 0.4, "n_angles": 7}
+QUICK = {"n_pixels": 24, "n_screens": 8}
 
-# Tolerances of the model of the sensor, for dimples up to 3 lambda/D and for larger ones, which take most of the
-# time. They change costs below 10 by less than 1e-3.
-_TOLERANCES = 1e-4, 1e-3
+_LIGHTS = np.logspace(-0.75, 1.25, 7)  # of the figure, over the light of the answer
 
 
-class Design(NamedTuple):
-    """A sensor with two dimples of one diameter (lambda/D) and phase shifts (radian)."""
-
-    name: str
-    diameter: float
-    theta_a: float
-    theta_b: float
-
-
-def _instrument(name: str, *masks: str) -> Design:
-    """Design of an instrument, with the mean diameter of its masks in `MASKS`."""
-    first, second = MASKS[masks[0]]
-    return Design(name, float(np.mean([MASKS[one][0].diameter for one in masks])), first.phase, second.phase)
-
-
-PUBLISHED = (
-    Design("paper", 1.06, np.pi / 2, -np.pi / 2),
-    _instrument("Keck", "Keck"),
-    _instrument("OZIRIIS", "OZIRIIS, on the sky", "OZIRIIS, in the laboratory"),
-)
-"""Design of the paper and of two instruments; the diameter of OZIRIIS is the middle of 1.96 to 2.14 lambda/D."""
-CLASSIC = Design("one dimple", 1.06, np.pi / 2, np.pi / 2)
-"""The classic sensor with one dimple: two equal masks, each with half of the light."""
-
-
-def uneven(design: Design, shift: float) -> Design:
-    """Design with `shift` (radian) added to both phase shifts: their sizes then differ."""
-    return Design("uneven", design.diameter, design.theta_a + shift, design.theta_b + shift)
-
-
-def photon_costs(
-    pupil: Pupil, designs: Sequence[Design], wavefronts: Mapping[str, NDArray]
-) -> dict[str, NDArray[np.float64]]:
-    """Photons that a sensor needs, over those of an ideal sensor with the same error."""
-    costs = [_costs(pupil, design, wavefronts) for design in designs]
-    return {name: np.array([cost[name] for cost in costs]) for name in wavefronts}
+def CHECK_TOGETHER(*, wanted_error: float, input_error: float, wavelength: float, **_: Any) -> None:
+    """Refuse errors that are too large for their wavelength."""
+    for name, value, most in (("wanted_error", wanted_error, 0.1), ("input_error", input_error, 1.0)):
+        if value > most * wavelength:
+            raise ValueError(f"{name} = {value:g}: expected at most {most:g} of the wavelength, {wavelength:g} nm")
 
 
 @dataclass(frozen=True)
-class DesignMap:
-    """Photon costs of sensors with dimples of phase shifts theta and -theta."""
+class LightCurves:
+    """Errors against the light, nm rms."""
 
-    diameters: NDArray[np.float64]  # (n_diameters,), lambda/D
-    angles: NDArray[np.float64]  # (n_angles,), theta, radian
-    costs: dict[str, NDArray[np.float64]]  # (n_diameters, n_angles), by the name of the wavefronts
-
-    def best(self, name: str) -> Design:
-        """Design with the least cost for the wavefronts `name`."""
-        return self._at(f"best, {name}", self.costs[name])
-
-    @property
-    def all_round(self) -> Design:
-        """Design whose cost exceeds the least one by the smallest factor, in the worst case of all wavefronts."""
-        return self._at("all-round", np.max([cost / cost.min() for cost in self.costs.values()], axis=0))
-
-    def _at(self, name: str, values: NDArray) -> Design:
-        row, column = np.unravel_index(np.argmin(values), values.shape)
-        theta = float(self.angles[column])
-        return Design(name, float(self.diameters[row]), theta, -theta)
+    photons: NDArray[np.float64]  # (n,), per exposure
+    errors: dict[str, NDArray[np.float64]]  # (n,) by method, means over screens
+    bound: NDArray[np.float64]  # (n,)
 
 
-def diameters(largest: float, step: float) -> NDArray[np.float64]:
-    """Diameters (lambda/D) from 0.8 on, by a step up to 3 and by ten times the step above."""
-    fine = np.arange(0.8, min(largest, 3.0) + step / 2, step)
-    return np.concatenate([fine, np.arange(fine[-1] + 10 * step, largest + step / 2, 10 * step)]).round(9)
+def light_curves(
+    answer: SensorDesign, wanted_error: float, *, wavelength: float, read_noise: float, seed: int
+) -> LightCurves:
+    """Errors of the methods for the dimples of an answer, with less light and with more."""
+    unit, sensor = wavelength / (2 * np.pi), answer.sensor
+    per_point = sensor.n_masks * sensor.pupil.n_points
+    middle = answer.photons_per_point
+    if not isfinite(middle):  # of the bound alone
+        middle = 3 * (_bound(answer, 1.0, 0.0) * unit / wanted_error) ** 2
+    lights = middle * _LIGHTS
+    points = sweeps.table(_at_light, lights.tolist(), answer, read_noise, seed, name="light_curves")
+    bound = points.pop("bound") * unit
+    return LightCurves(lights * per_point, {name: errors * unit for name, errors in points.items()}, bound)
 
 
-def design_map(
-    pupil: Pupil, diameters: ArrayLike, angles: ArrayLike, wavefronts: Mapping[str, NDArray]
-) -> DesignMap:
-    """Photon costs for all diameters and all pairs of opposite phase shifts."""
-    diameters, angles = np.asarray(diameters), np.asarray(angles)
-    shared = pupil, angles.tolist(), dict(wavefronts)
-    return DesignMap(diameters, angles, sweeps.table(_row, diameters.tolist(), *shared, name="design_map"))
+def _at_light(light: float, answer: SensorDesign, read_noise: float, seed: int) -> dict[str, float]:
+    """Mean error of each method at photons per point and image, and the bound, radian rms."""
+    errors = method_errors(
+        answer.sensor, answer.screens, photons=light, read_noise=read_noise, modes=answer.modes, seed=seed
+    )
+    means = {name: float(np.mean(values)) for name, values in errors.items()}
+    return means | {"bound": _bound(answer, light, read_noise)}
 
 
-def _row(
-    diameter: float, pupil: Pupil, angles: list[float], screens: dict[str, NDArray]
-) -> dict[str, NDArray[np.float64]]:
-    """Costs of one diameter, (n_angles,) each."""
-    costs = [_costs(pupil, Design("", diameter, theta, -theta), screens) for theta in angles]
-    return {name: np.array([cost[name] for cost in costs]) for name in screens}
+def _bound(answer: SensorDesign, light: float, read_noise: float) -> float:
+    """Cramer-Rao bound of the modes, mean over the screens, radian rms."""
+    sigma = cramer_rao(answer.sensor, answer.screens, photons=light, read_noise=read_noise, modes=answer.modes)
+    return float(np.mean(np.sqrt(np.sum(sigma**2, axis=-1))))
 
 
-def _costs(pupil: Pupil, design: Design, screens: Mapping[str, NDArray]) -> dict[str, float]:
-    """Photon cost of one design, by the name of the wavefronts."""
-    masks = [Dimple(design.diameter, theta) for theta in design[2:]]
-    sensor = ZernikeSensor(pupil, *masks, tolerance=_TOLERANCES[design.diameter > 3])
-    together = np.concatenate(list(screens.values()))
-    bounds = pupil.gather(cramer_rao(sensor, together, photons=1 / sensor.n_masks))
-    ends = np.cumsum([len(phases) for phases in screens.values()])[:-1]
-    return {name: 4 * float(np.mean(part**2)) for name, part in zip(screens, np.split(bounds, ends), strict=True)}
-
-
-_LABEL_WIDTH = 0.75  # of the label of a design in a panel, over its width
-_NARROWEST = 0.3  # line that gets a number, over the width of a panel, if there is a longer one of its level
-COST_MAP = "cividis_r"
-CONTOURS = [1.5, 2, 3, 5]  # photon costs of the lines in a map
-
-
-def draw_design_maps(maps: DesignMap, designs: Sequence[Design], costs: Mapping[str, NDArray]) -> Figure:
-    """Photon cost against diameter and phase shift, one panel for each kind of wavefront.
-
-    Designs whose phase shifts are of equal size are marked with their cost, and a star marks the best one.
-    """
-    figure, panels = plt.subplots(1, len(maps.costs), figsize=(7, 3.8), sharey=True, squeeze=False)
-    x, y = maps.diameters, maps.angles
-    colors = {"cmap": COST_MAP, "norm": LogNorm(1, 10)}
-    for axes, (name, grid) in zip(panels[0], maps.costs.items(), strict=True):
-        axes.grid(False)
-        shown = axes.pcolormesh(x, y, grid.T, shading="gouraud", rasterized=True, **colors)
-        lines = axes.contour(
-            x, y, grid.T, CONTOURS, colors=["#000000", "#000000", "#000000", "#ffffff"], linewidths=1
+def findings(answer: SensorDesign, *, wanted_error: float, frame_rate: float, telescope: float) -> Text:
+    """Answer in plain sentences."""
+    shifts = f"phase shifts of ±{answer.phase_shift / np.pi:.2g}π"
+    dimples = f"two dimples of {answer.diameter:.2g} λ/D and {shifts}"
+    if answer.method == "none":
+        closest = min(answer.errors_nm, key=answer.errors_nm.__getitem__)
+        return Text(
+            f"**No light is enough for {wanted_error:.3g} nm.** With {dimples}, none of the three methods reaches "
+            "this error, even with a thousand times the light that the bound asks for. The "
+            f"{_method(closest)} comes closest, with {_two(answer.errors_nm[closest])} nm. Reduce the input, or "
+            "measure at a longer wavelength."
         )
-        marked = []
-        for design, cost in zip(designs, costs[name], strict=True):
-            if np.isclose(design.theta_a, -design.theta_b):
-                place = design.diameter, design.theta_a
-                marked.append(place)
-                axes.plot(*place, "o", mfc="#ffffff", mec="#000000", ms=8, zorder=7)
-                axes.annotate(f"{design.name}: {cost:.2f}", place, (8, 0), textcoords="offset points", **_LABEL)
-        best = maps.best(name)
-        axes.plot(best.diameter, best.theta_a, "*", mfc="#ffffff", mec="#000000", ms=13, zorder=6)
-        axes.set(xscale="log", xlim=x[[0, -1]], ylim=y[[0, -1]], xlabel="diameter (λ/D)")
-        axes.spines[:].set(visible=True, color="#888888")
-        axes.clabel(lines, fmt="%g", fontsize=9, manual=_free_places(lines, x, y, marked))
-        axes.xaxis.set(major_locator=FixedLocator([1, 2, 3, 5, 7]), major_formatter="{x:g}", minor_formatter="")
-        axes.set_title(name, fontsize=10)
-        axes.yaxis.set(major_locator=MultipleLocator(np.pi / 5), major_formatter=_both_signs)
-    panels[0, 0].set_ylabel("phase shifts (rad)")
-    label = "photons / photons of an ideal sensor"
-    bar = figure.colorbar(shown, ax=list(panels[0]), label=label, extend="max", aspect=25)
-    bar.set_ticks([1, *CONTOURS, 10], labels=[f"{level:g}" for level in (1, *CONTOURS, 10)])
-    bar.minorticks_off()
-    return figure
-
-
-def _both_signs(angle: float, place: int) -> str:
-    """Phase shifts of equal size, as a label."""
-    return f"±{angle / np.pi:.2g}π"
-
-
-def _free_places(
-    lines: ContourSet, x: NDArray, y: NDArray, marked: Sequence[tuple[float, float]]
-) -> list[tuple[float, float]]:
-    """Return a point of each long line that is far from the labels of the marked places and from the edges."""
-
-    def fraction(points: ArrayLike) -> NDArray[np.float64]:
-        points = np.asarray(points, float).reshape(-1, 2)
-        across = np.log(points[:, 0] / x[0]) / np.log(x[-1] / x[0])
-        return np.stack([across, (points[:, 1] - y[0]) / (y[-1] - y[0])], axis=-1)
-
-    taken = [
-        np.array([px + shift, py]) for px, py in fraction(marked) for shift in np.arange(0, _LABEL_WIDTH, 0.05)
-    ]
-    levels = [[fraction(one) for one in path.to_polygons(closed_only=False)] for path in lines.get_paths()]
-    every = [one for level in levels for one in level]
-    found: list[NDArray] = []
-    for level in levels:
-        for at in level:
-            if np.ptp(at[:, 0]) < _NARROWEST and len(at) < max(map(len, level)):
-                continue
-            rest = [one for one in every if one is not at] or [at + 1]
-            apart = _apart(at, np.concatenate(rest))
-            room = np.min([np.minimum(at, 1 - at).min(axis=-1), _apart(at, [*taken, *found]), 3 * apart], axis=0)
-            found.append(at[np.argmax(room)])
-    return [(x[0] * (x[-1] / x[0]) ** u, y[0] + v * (y[-1] - y[0])) for u, v in found]
-
-
-def _apart(points: NDArray, others: ArrayLike) -> NDArray[np.float64]:
-    """Distance of each point from the closest of the others; 1 without others."""
-    others = np.asarray(others, float).reshape(-1, 2)
-    return np.linalg.norm(points[:, np.newaxis] - others, axis=-1).min(axis=-1, initial=1)
-
-
-_BOX = {"facecolor": "#ffffff", "edgecolor": "none", "boxstyle": "square,pad=0.15"}
-_LABEL: dict[str, Any] = {"va": "center", "fontsize": 9, "bbox": _BOX, "zorder": 6}  # of designs
-
-
-def _shifts(design: Design) -> str:
-    """Phase shifts in units of pi."""
-    a, b = (theta / np.pi for theta in design[2:])
-    return f"±{a:.3g}π" if np.isclose(a, -b) else f"{a:.3g}π, {b:.3g}π".replace("-", "−")
-
-
-def designs_table(listed: Sequence[Design], costs: Mapping[str, NDArray]) -> Table:
-    """Photon costs of designs. Costs above 100 have no number."""
-    return Table(
-        ["design", "d (λ/D)", "shifts", *(name.removesuffix(" wavefront") for name in costs)],
-        [
-            [
-                design.name,
-                f"{design.diameter:.3g}",
-                _shifts(design),
-                *(f"{cost[index]:.2f}" if cost[index] <= 100 else "over 100" for cost in costs.values()),
-            ]
-            for index, design in enumerate(listed)
-        ],
+    return Text(
+        f"**{_two(answer.photons_per_exposure)} photons per exposure give an error of "
+        f"{_two(answer.errors_nm[answer.method])} nm.** Use {dimples}, and the {_method(answer.method)}. "
+        f"Each pupil point then has {_two(answer.photons_per_point)} photons in each of the two images. "
+        f"At {frame_rate:g} Hz, a telescope of {telescope:g} m collects this light from a star of magnitude "
+        f"{answer.magnitude:.1f}. No unbiased method has an error below {_two(answer.bound_nm)} nm at this light."
     )
 
 
-def numbers(maps: DesignMap, listed: Sequence[Design], costs: Mapping[str, NDArray]) -> dict[str, float | str]:
-    """Costs of designs by their names, and the best designs; 0 stands for the first kind of wavefront."""
-    all_round = maps.all_round
-    found = {"all_round_diameter": all_round.diameter, "all_round_shift": all_round.theta_a / np.pi}
-    for place, (name, cost) in enumerate(costs.items()):
-        for design, value in zip(listed, cost, strict=True):
-            found[f"{design.name.replace(' ', '_').replace('-', '_')}_{place}"] = value
-        best, least = maps.best(name), maps.costs[name].min(axis=1)
-        found |= {
-            f"best_{place}": maps.costs[name].min(),
-            f"best_diameter_{place}": best.diameter,
-            f"best_shift_{place}": best.theta_a / np.pi,
-            f"spread_{place}": least[maps.diameters >= 1.8].max() / least.min() - 1,
-            f"saved_{place}": 1 - maps.costs[name].min() / cost[0],
-            f"saved_all_round_{place}": 1 - found[f"all_round_{place}"] / cost[0],
-        }
-    return rounded(found, ".4g")
+def methods_table(answer: SensorDesign, wanted_error: float) -> Table:
+    """Error of each method at the light of the answer, and whether it is within 10 % of the wanted one."""
+    rows = [
+        [LOOKS[name].name, f"zwfs.{name}", _two(error), error <= 1.1 * wanted_error]
+        for name, error in answer.errors_nm.items()
+    ]
+    return Table(["method", "class", "error (nm rms)", "is enough"], rows)
+
+
+def draw_light(curves: LightCurves, answer: SensorDesign, wanted_error: float) -> Figure:
+    """Error of each method, and the bound, against the photons of an exposure, with the answer."""
+    figure, axes = plt.subplots(figsize=(7, 4))
+    axes.plot(curves.photons, curves.bound, color="#777777", linestyle="--", label="bound")
+    for name, errors in curves.errors.items():
+        axes.plot(curves.photons, errors, label=LOOKS[name].name, **LOOKS[name].style)
+    axes.set(xscale="log", yscale="log", xlabel="photons per exposure", ylabel="error (nm rms)")
+    axes.yaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), major_formatter="{x:g}", minor_formatter="")
+    axes.axhline(wanted_error, color="#777777", linewidth=1)
+    axes.annotate(
+        "wanted error",
+        (curves.photons[0], wanted_error),
+        (0, -4),
+        textcoords="offset points",
+        va="top",
+        fontsize=9,
+    )
+    if answer.method != "none":
+        place = answer.photons_per_exposure, answer.errors_nm[answer.method]
+        axes.plot(*place, "o", ms=13, mfc="none", mec="#000000", mew=2, label="answer")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def numbers(answer: SensorDesign, **question: float) -> dict[str, float | str]:
+    """Question and answer, for other pages."""
+    return question | {
+        "photons": _two(answer.photons_per_exposure),
+        "method": _method(answer.method),
+        "diameter": round(answer.diameter, 2),
+        "shift": round(answer.phase_shift / np.pi, 2),
+    }
+
+
+def _method(name: str) -> str:
+    """Name of a method in a sentence."""
+    return {"Linear": "linear method", "PhaseShifted": "accelerated phase-shifted iteration"}.get(
+        name, "method of maximum likelihood" if name != "none" else "none"
+    )
+
+
+def _two(value: float) -> str:
+    """Two significant digits without a power of ten below a million."""
+    if not isfinite(value):
+        return "–"
+    rounded = float(f"{value:.2g}")
+    if rounded < 1e6:
+        return f"{rounded:.{max(0, 1 - int(np.floor(np.log10(rounded))))}f}" if rounded else "0"
+    digits, power = f"{rounded:.1e}".split("e")
+    return f"{digits}×10{str(int(power)).translate(str.maketrans('0123456789', '⁰¹²³⁴⁵⁶⁷⁸⁹'))}"

@@ -1,5 +1,6 @@
 """Answers of `design_sensor`, against simulations on screens that it has not seen."""
 
+import inspect
 import math
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 
 import zwfs
 from zwfs.design import method_errors
+
+from .test_bad_input import BAD
 
 NM = 2e-9 * np.pi
 N_UNSEEN = 80
@@ -79,6 +82,12 @@ def test_read_noise_takes_light():
     assert light[1] > 2 * light[0]
 
 
+def test_each_image_has_some_light():
+    answer = zwfs.design_sensor(20, 10, 635e-9, n_modes=1, n_pixels=16, n_screens=20)
+    assert answer.photons_per_exposure == pytest.approx(200)
+    assert answer.errors_nm[answer.method] < 20
+
+
 def test_no_light_is_enough_for_an_input_beyond_the_range():
     star = {"frame_rate_hz": 500, "diameter_m": 2, "zero_point": 1e10}
     answer = zwfs.design_sensor(5, 635, 635e-9, n_modes=60, n_pixels=16, n_screens=5, **star)
@@ -103,3 +112,15 @@ def test_questions_without_an_answer_are_refused(changed, message):
     question = {"error_nm": 5, "input_nm": 20, "wavelength_m": 635e-9, "n_modes": 6} | changed
     with pytest.raises(ValueError, match=message):
         zwfs.design_sensor(**question)
+
+
+PARAMETERS = inspect.signature(zwfs.design_sensor).parameters
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_a_bad_value_is_refused_by_its_name(name):
+    question = {"error_nm": 5, "input_nm": 20, "wavelength_m": 635e-9, "n_modes": 6}
+    for value in BAD.values():
+        if value is not None or PARAMETERS[name].default is not None:
+            with pytest.raises((TypeError, ValueError), match=f"^{name}"):
+                zwfs.design_sensor(**question | {name: value})

@@ -27,6 +27,7 @@ _N_SCREENS, _N_NUMBERS = 40, 1000  # least screens of a simulation, and least co
 _MODES_OF_PIXELS = 200  # of the screens if all pixels are estimated
 _ROUGH, _CLOSE = 0.1, 0.03  # tolerances of the error, relative
 _MOST_TRIALS, _MOST_LIGHT = 5, 1000  # of a search for the light, and its end over its start
+_LEAST_PHOTONS = 100.0  # in an image: with fewer, some images would be dark
 _LARGEST_STEP = math.log(10)  # from the light of a trial to that of the next one
 _SLOPES = -1.0, -0.25  # of the error against the light, both in logarithms; photon noise alone: -0.5
 
@@ -107,8 +108,8 @@ def design_sensor(
 
     The dimples are those of the smallest bound (`cramer_rao`) on screens of the input. The bound also gives a
     first number of photons. At this light the methods of `method_errors` are simulated. The light is changed until
-    the best of them has the wanted error to 3 %. If a thousand times as much is not enough, no light is. The
-    model of the sensor is known exactly: errors of a bench are not included.
+    the best of them has the wanted error to 3 %, but each image gets at least 100 photons. If a thousand times as
+    much is not enough, no light is. The model of the sensor is known exactly: errors of a bench are not included.
 
     Parameters
     ----------
@@ -244,7 +245,7 @@ def method_errors(
     _check.instance("sensor", sensor, ZernikeSensor)
     pupil = sensor.pupil
     truth = pupil.scatter(_check.values_inside("screens", screens, pupil), fill=0)
-    camera = Detector(photons, read_noise)
+    camera = Detector(_check.number("photons", photons, 1e-12, 1e18), read_noise)
     frames = camera.normalise(camera.expose(sensor.measure(truth), seed))
     pixels = pupil.scatter(np.eye(pupil.n_points), fill=0)
     methods = (
@@ -330,7 +331,9 @@ class _Question(NamedTuple):
     ) -> tuple[float, dict[str, float]]:
         """Light at which the best method is closest to the wanted error, by secant steps in logarithms."""
         trials: list[tuple[float, float, dict[str, float]]] = []
-        most, screens = light * _MOST_LIGHT, self.screens[:n_screens]
+        least, screens = _LEAST_PHOTONS / self.pupil.n_points, self.screens[:n_screens]
+        light = max(light, least)
+        most = light * _MOST_LIGHT
         while len(trials) < _MOST_TRIALS and light <= most:
             simulated = method_errors(
                 sensor, screens, photons=light, read_noise=self.read_noise, modes=self.modes, seed=self.seed + 1
@@ -338,13 +341,13 @@ class _Question(NamedTuple):
             errors = {name: float(np.mean(values)) for name, values in simulated.items()}
             excess = math.log(min(errors.values()) / self.error)
             trials.append((excess, math.log(light), errors))
-            if abs(excess) < tolerance:
+            if abs(excess) < tolerance or (excess < 0 and light == least):
                 break
             slope = -0.5
             if len(trials) > 1:
                 (y0, x0, _), (y1, x1, _) = trials[-2:]
                 slope = np.clip((y1 - y0) / (x1 - x0), *_SLOPES)
-            light *= math.exp(np.clip(-excess / slope, -_LARGEST_STEP, _LARGEST_STEP))
+            light = max(least, light * math.exp(np.clip(-excess / slope, -_LARGEST_STEP, _LARGEST_STEP)))
         _, closest, errors = min(trials, key=lambda trial: abs(trial[0]))
         return math.exp(closest), errors
 
@@ -368,7 +371,7 @@ def _one_photon(
     """Photons per second at the telescope, and the magnitude, for one photon in an exposure."""
     throughput = _check.number("throughput", throughput, 0, 1, open_low=True)
     named = {"frame_rate_hz": frame_rate_hz, "diameter_m": diameter_m, "zero_point": zero_point}
-    values = {name: _check.number(name, value, 1e-30, 1e30) for name, value in named.items() if value is not None}
+    values = {name: _check.number(name, value, 1e-18, 1e18) for name, value in named.items() if value is not None}
     rate = values["frame_rate_hz"] / throughput if "frame_rate_hz" in values else None
     if "zero_point" not in values:
         return rate, None

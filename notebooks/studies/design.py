@@ -91,13 +91,13 @@ def findings(answer: SensorDesign, *, wanted_error: float, frame_rate: float, te
         closest = min(answer.errors_nm, key=answer.errors_nm.__getitem__)
         return Text(
             f"**No light is enough for {wanted_error:.3g} nm.** With {dimples}, none of the three methods reaches "
-            "this error, even with a thousand times the light that the bound asks for. The "
-            f"{_method(closest)} comes closest, with {_two(answer.errors_nm[closest])} nm. Reduce the input, or "
-            "measure at a longer wavelength."
+            "this error, even with a thousand times the light that the bound asks for. The closest is "
+            f"{_METHODS[closest]}, with {_two(answer.errors_nm[closest])} nm. Reduce the input, or measure at a "
+            "longer wavelength."
         )
     return Text(
         f"**{_two(answer.photons_per_exposure)} photons per exposure give an error of "
-        f"{_two(answer.errors_nm[answer.method])} nm.** Use {dimples}, and the {_method(answer.method)}. "
+        f"{_two(answer.errors_nm[answer.method])} nm.** Use {dimples}, and {_METHODS[answer.method]}. "
         f"Each pupil point then has {_two(answer.photons_per_point)} photons in each of the two images. "
         f"At {frame_rate:g} Hz, a telescope of {telescope:g} m collects this light from a star of magnitude "
         f"{answer.magnitude:.1f}. No unbiased method has an error below {_two(answer.bound_nm)} nm at this light."
@@ -141,17 +141,18 @@ def numbers(answer: SensorDesign, **question: float) -> dict[str, float | str]:
     """Question and answer, for other pages."""
     return question | {
         "photons": _two(answer.photons_per_exposure),
-        "method": _method(answer.method),
+        "method": _METHODS[answer.method],
         "diameter": round(answer.diameter, 2),
         "shift": round(answer.phase_shift / np.pi, 2),
     }
 
 
-def _method(name: str) -> str:
-    """Name of a method in a sentence."""
-    return {"Linear": "linear method", "PhaseShifted": "accelerated phase-shifted iteration"}.get(
-        name, "method of maximum likelihood" if name != "none" else "none"
-    )
+_METHODS = {
+    "Linear": "the linear method",
+    "PhaseShifted": "the accelerated phase-shifted iteration",
+    "MaximumLikelihood": "maximum likelihood",
+    "none": "none",
+}
 
 
 def _two(value: float) -> str:

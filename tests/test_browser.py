@@ -167,7 +167,7 @@ def test_search_finds_a_chapter_before_the_api(page):
         ("PhaseShifted", "book/api_reconstructors.html#zwfs.PhaseShifted"),
         ("zernike_basis", "book/api_sensor.html#zwfs.zernike_basis"),
         ("what limits two images", "notebooks/zernike_sensor.html#what-limits-two-images"),
-        ("which dimples", "notebooks/design.html"),
+        ("how the answer is found", "notebooks/design.html#how-the-answer-is-found"),
         ("phase shifts", "notebooks/phase_shift_pairs.html"),
     ],
 )

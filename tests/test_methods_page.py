@@ -1,4 +1,4 @@
-"""The methods of the page on reconstruction methods, each in a few lines of NumPy, next to those of the package."""
+"""The methods of the page in a few lines of NumPy: they agree with the package."""
 
 import contextlib
 import io

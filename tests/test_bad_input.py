@@ -158,7 +158,7 @@ def valid() -> dict:
         "bench_error.phase": recover_phase(camera()[2]),
         "LearnedReference.__call__.frames": shifted.measure(phase),
         "LearnedReference.average.frames": shifted.measure(modes[:3]),
-        "LearnedReference.with_bench.bench": BenchValues(0.0, 1.0, 0.0, np.zeros(2), 0.0, 0.0),
+        "LearnedReference.bench": BenchValues(0.0, 1.0, 0.0, np.zeros(2), 0.0, 0.0),
         "LearnedReference.save.path": "weights.npz",
         "LearnedReference.load.path": weights,
         "MaximumLikelihood.photons": 1e4,

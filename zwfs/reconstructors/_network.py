@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+STORED = np.float16
+"""Type of weights in a file, to which a training rounds them."""
 _LEAK = 0.1  # slope of the activation below 0
 _RATE = 2e-3  # of Adam at the start; it falls to 0 along a cosine
 _BATCH = 250
@@ -59,7 +61,8 @@ def train(
 ) -> Network:  # fmt: skip
     """Fit a network to inputs (n, n_inputs) and targets (n, n_outputs) by Adam.
 
-    `report` is called with the number of passes through the data that are done.
+    The weights are rounded to half precision. `report` is called with the number of passes through the data that
+    are done.
     """
     network = _random(inputs, targets, hidden, rng)
     values = [*network.weights, *network.biases, network.skip]
@@ -78,6 +81,8 @@ def train(
                 square += (1 - _SQUARE) * (slope * slope - square)
                 value -= np.float32(rate) * mean / (np.sqrt(square) + np.float32(1e-8))
         report(epoch + 1)
+    for value in values:
+        value[...] = value.astype(STORED)
     return network
 
 

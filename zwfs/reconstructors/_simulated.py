@@ -154,9 +154,11 @@ class Simulation:
         """Disc waves (k, ny, nx) of the first solve of frames (k, n_masks, ny * nx), with a flat reference."""
         weights, power_weight = solution_weights(self.shifts, self.strengths)
         light, nominal = (self.amplitude**2).ravel(), self.nominal.ravel()
-        solved = (weights.astype(np.complex64) @ (flat - light)) - np.complex64(power_weight) * np.abs(
-            nominal
-        ) ** 2
+        power = np.abs(nominal) ** 2
+        solved = (weights.astype(np.complex64) @ (flat - light)) - np.complex64(power_weight) * power
+        if len(self.shifts) == 1:
+            unseen = np.sqrt(np.maximum(light * power - np.abs(solved) ** 2, 0))
+            solved += np.complex64(unseen_direction(self.shifts, self.strengths)) * unseen
         field = np.where(self.pupil.inside.ravel(), solved * nominal, 0)
         return self._disc(field.reshape(len(flat), *self.pupil.shape).astype(np.complex64), 0.0)
 
@@ -217,13 +219,24 @@ def solution_weights(
     """Weights p (..., n_masks) of the frames in u = psi conj(D), and the weight e (...) of |D|^2.
 
     With c = t - 1 of each dimple, I = A^2 + |c|^2 |D|^2 + 2 Re(conj(c) u). This is linear in the real and the
-    imaginary part of u. Its least-squares solution is u = sum p (I - A^2) - e |D|^2 with e = sum p |c|^2.
+    imaginary part of u. Its least-squares solution is u = sum p (I - A^2) - e |D|^2 with e = sum p |c|^2. A single
+    image shows only the part of u along c.
     """
     factors = strengths * np.exp(1j * shifts) - 1
-    matrix = 2 * np.stack([factors.real, factors.imag], axis=-1)
-    normal = np.linalg.inv(np.swapaxes(matrix, -1, -2) @ matrix) @ np.swapaxes(matrix, -1, -2)
+    normal = np.linalg.pinv(2 * np.stack([factors.real, factors.imag], axis=-1))
     weights = normal[..., 0, :] + 1j * normal[..., 1, :]
     return weights, np.sum(weights * np.abs(factors) ** 2, axis=-1)
+
+
+def unseen_direction(
+    shifts: NDArray, strengths: Sequence[float] | NDArray
+) -> NDArray[np.complex128]:
+    """Direction (...) of the part of u that a single image (shifts of shape (..., 1)) does not show.
+
+    The length of this part follows from |u| = A |D|. Its sign is that of a flat wavefront, for which u is positive.
+    """
+    factor = (strengths * np.exp(1j * shifts) - 1)[..., 0]
+    return -1j * factor / np.abs(factor) * np.where(factor.imag < 0, -1, 1)
 
 
 def _blur_matrix(n: int, rms: float) -> NDArray[np.float32]:

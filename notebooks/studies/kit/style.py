@@ -70,6 +70,7 @@ LOOKS |= {
     "GradientDescent": Look("gradient descent on modes", "two images", "#CC79A7", "D", (0, (3, 1, 1, 1, 1, 1))),
     "GradientDescentPoints": Look("gradient descent on points", "two images", "#D55E00", "d", "--"),
     "PhaseShifted": Look("phase-shifted", "two images", "#0072B2", "v", ":"),
+    "LearnedReference": Look("learned reference wave", "two images", "#7800F0", "8", "-"),
     "MaximumLikelihood": Look("maximum likelihood", "", "#661100", "*", "-"),
 }
 # Curves that stand for no method have other colours, from Tol's muted palette, and other markers.

@@ -28,10 +28,11 @@ from studies.kit.experiments import DiameterCurves, linearity_curves
 from studies.kit.grids import Grid
 from studies.kit.style import ALONE, DARK_PHASE_MAP, LOOKS, OTHER_STYLES, show_phase, use_style
 from studies.kit.variants import dark_color, variants
+from studies.one_look import SOLVES, WAYS, FoundBench, LookCurves
+from studies.one_look import BenchCurves as LeakyCurves
 from studies.phase_amplitude import AmplitudeCurves
 from studies.phase_shift_pairs import DrawnNoise, PairMaps
-from studies.photon_noise import EXPECTED, ErrorBars, PhotonCurves
-from studies.reconstructors import draw_convergence
+from studies.photon_noise import EXPECTED, ErrorBars, PhotonCurves, draw_photon_noise
 from studies.zernike_sensor import lowest_pixel
 from zwfs.bench.model import Bench
 from zwfs.frames.phases import Phases
@@ -117,6 +118,10 @@ def drawn_methods(curves, pupil, classic, shifted):
     faint = PhotonCurves(
         three, three, dict.fromkeys(LOOKS, np.ones((3, 3, 2))), np.full((3, 3, 2), 2.0), np.eye(3)
     )
+    looks = [*SOLVES, "PhaseShifted", "MaximumLikelihood", "LearnedReference"]
+    looked = LookCurves(three, dict.fromkeys(looks, np.full((3, 2), 0.1)), np.full((3, 2), 0.05))
+    leaky = LeakyCurves(three / 20, 0.5, dict.fromkeys(WAYS, np.full((3, 2), 0.1)))
+    pairs = [dict.fromkeys(("leakage", "flux ratio"), np.full((3, 2), size)) for size in (1.0, 0.1)]
     designs = DesignMap(three, three, {"flat": np.add.outer(three, three) + 0.5})
     step = Step("outlines", found, np.ones(2), np.zeros(2))
     banded = BandCurves(three, dict.fromkeys(bandwidth.WAYS, three[:, np.newaxis]), {}, three, 1.0)
@@ -135,8 +140,9 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_steps": ((pupil, phase, frames, dict.fromkeys([*two, "Arcsine"], phase)), ()),
         "draw_linearity": ((curves, dict.fromkeys(two, Limit(0.2, 0.01)), 0.05, 0.4), two),
         "draw_saxton_widths": (({"narrow": saxton}, widths, 0.05), ["Linear", "GerchbergSaxton"]),
-        "draw_convergence": (({name: {0.2: np.full((3, 8), 0.1)} for name in LOOKS},), LOOKS),
-        "draw_estimates": ((pupil, phase, dict.fromkeys(two, phase)), ()),
+        "draw_look": (({"one": looked, "two": looked},), [*shifted_only, "MaximumLikelihood", "LearnedReference"]),
+        "draw_bench": ((leaky,), [*shifted_only, "LearnedReference"]),
+        "draw_found": ((FoundBench(np.array([1, 9]), three, {"leakage": 0.1, "flux ratio": 1.0}, *pairs),), ()),
         "draw_sensor_steps": ((shifted, phase, lowest_pixel(shifted, phase)), ()),
         "draw_pixel_phasors": ((lowest_pixel(shifted, phase),), ()),
         "draw_one_or_two_images": ((pupil, phase, dict.fromkeys(two, phase)), ()),
@@ -187,7 +193,7 @@ def test_every_figure_is_tested_for_its_colours(drawn_methods):
 
 
 # Drawn here with more methods than in the book.
-CROWDED = "draw_diameter_methods", "draw_convergence", "draw_photon_noise"
+CROWDED = "draw_diameter_methods", "draw_photon_noise"
 
 
 @pytest.mark.slow
@@ -209,7 +215,7 @@ def test_variants_are_dark_or_fit_a_phone(name, drawn_methods):
     assert name in CROWDED or not cut_off(figure)
 
 
-@pytest.mark.parametrize("name", ["draw_sensor_layout", "draw_pairs", "draw_convergence"])
+@pytest.mark.parametrize("name", ["draw_sensor_layout", "draw_pairs", "draw_look"])
 def test_figure_stays_as_its_variants_are_made(name, drawn_methods):
     use_style()
     figure = figure_functions()[name](*drawn_methods[name][0])
@@ -376,5 +382,6 @@ def test_methods_of_a_reader_get_looks_of_their_own(monkeypatch):
     for vision in VISION:
         points = [lab(look.color, vision) for look in LOOKS.values()]
         assert min(np.linalg.norm(a - b) for a, b in combinations(points, 2)) > 15
-    figure = draw_convergence({name: {0.2: np.ones((3, 2))} for name in names})
+    errors = dict.fromkeys(names, np.ones((1, 2, 3)))
+    figure = draw_photon_noise(PhotonCurves(np.ones(1), np.ones(2), errors, np.ones((1, 2, 3)), np.ones((1, 2))))
     assert {line.get_color() for line in figure.axes[0].lines} >= {LOOKS[name].color for name in names}

@@ -18,7 +18,7 @@ from .conftest import ROOT
 BOOK = Project(ROOT)
 NAMES = [path.stem for path in BOOK.sources()]
 # Together they load most of the package.
-TRIED = ("calibration", "decision", "fig03_dynamic_range", "bench", "own_frames", "reconstructors")
+TRIED = ("calibration", "decision", "fig03_dynamic_range", "bench", "one_look", "own_frames")
 # Runs the imports of each notebook in a separate process, which has already imported Matplotlib and SciPy.
 LOADED = """
 import json, os, sys

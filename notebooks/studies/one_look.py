@@ -27,10 +27,10 @@ from zwfs.sensor import ZernikeSensor
 
 LIMITS = parameter_limits(
     "n_modes inputs n_screens exponent n_iterations rms",
-    n_pixels=(16, 200),
+    n_pixels=(24, 200),
     photons=(1.0, 1e9),
-    leakages=[(0.0, 0.45)],
-    leakage=(0.0, 0.45),
+    leakages=[(0.0, 0.4)],
+    leakage=(0.0, 0.4),
     flux_ratio=(0.25, 4.0),
     rms_pairs=[(0.001, 4.0)],
     pairs=[(1, 1000)],

@@ -302,7 +302,9 @@ def test_a_training_is_reproducible_and_survives_a_file(tmp_path, sensor, pupil)
 
 
 def test_bad_input_is_named(tmp_path, pupil, sensor, trained):
-    with pytest.raises(ValueError, match=r"dimples of 1.4 lambda/D .*: expected 1.06 lambda/D and 1.571 rad, 1.06"):
+    with pytest.raises(
+        ValueError, match=r"dimples of 1.4 lambda/D .*: expected 1.06 lambda/D and 1.571 rad, 1.06"
+    ):
         LearnedReference(pair_of(pupil, 1.4))
     for shifts in ((np.pi / 2,), (2.0, -1.0), (1.0, 2.5, -1.5)):
         with pytest.raises(ValueError, match="those of the training"):

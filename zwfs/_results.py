@@ -67,7 +67,7 @@ class Result:
         if path.exists() and not _check.flag("overwrite", overwrite):
             raise FileExistsError(f"path = {str(path)!r} exists: expected a new name, or overwrite=True")
         arrays, values = dict(self._arrays()), dict(self._values())
-        write_file(path, _fits(arrays, values) if path.suffix == ".fits" else _npz(arrays, values))
+        write_file(path, _fits(arrays, values) if path.suffix == ".fits" else npz_bytes(arrays, values))
 
     def plot(self) -> Figure:
         """Draw the result.
@@ -133,7 +133,8 @@ def _plain(name: str, value: Any) -> Iterator[tuple[str, bool | int | float | st
             yield from _plain(f"{name} {index}", item)
 
 
-def _npz(arrays: dict[str, NDArray], values: dict[str, Any]) -> bytes:
+def npz_bytes(arrays: dict[str, NDArray], values: dict[str, Any]) -> bytes:
+    """Content of an NPZ file of arrays by name, and of plain values as JSON text under `values`."""
     stream = io.BytesIO()
     np.savez_compressed(stream, values=np.array(json.dumps(values)), **arrays)  # type: ignore[arg-type]
     return stream.getvalue()

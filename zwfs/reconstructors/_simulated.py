@@ -228,12 +228,10 @@ def solution_weights(
     return weights, np.sum(weights * np.abs(factors) ** 2, axis=-1)
 
 
-def unseen_direction(
-    shifts: NDArray, strengths: Sequence[float] | NDArray
-) -> NDArray[np.complex128]:
+def unseen_direction(shifts: NDArray, strengths: Sequence[float] | NDArray) -> NDArray[np.complex128]:
     """Direction (...) of the part of u that a single image (shifts of shape (..., 1)) does not show.
 
-    The length of this part follows from |u| = A |D|. Its sign is that of a flat wavefront, for which u is positive.
+    Its length follows from |u| = A |D|. Its sign is that of a flat wavefront, for which u is positive.
     """
     factor = (strengths * np.exp(1j * shifts) - 1)[..., 0]
     return -1j * factor / np.abs(factor) * np.where(factor.imag < 0, -1, 1)

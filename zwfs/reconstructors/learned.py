@@ -12,7 +12,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
@@ -24,6 +24,7 @@ from scipy.linalg import helmert
 
 from zwfs import _check
 from zwfs._arrays import Immutable, Kind, per_kind, read_only
+from zwfs._results import npz_bytes
 from zwfs._system import path_of, write_file
 from zwfs.modes import _unnormalised
 from zwfs.pupil import Pupil
@@ -70,7 +71,7 @@ SHIPPED: dict[str, dict[str, Any]] = {
         "errors": BenchErrors(leakage=(-0.04, 0.1), flux_ratio=(0.8, 1.25)),
     },
 }  # fmt: skip
-"""Settings of `LearnedReference.train` for the trainings that come with the package; pupil: a circle of 64 pixels."""
+"""Settings of `LearnedReference.train` for the trainings of the package, with a round pupil of 64 pixels."""
 
 
 class Training(NamedTuple):
@@ -150,8 +151,8 @@ class LearnedReference(Reconstructor):
 
     - The paper's pair, 1000 photons: at most 4 % above the converged iteration up to 1.6 rad rms, also in
       turbulence. Without noise, 0.003 rad at 0.8 rad rms; two further iterations reduce it to 0.0003 rad.
-    - One image, a dimple of 1.06 lambda/D and pi/2: that of the converged `Arcsine` from 0.3 to 0.5 rad rms, and 12 to 17 %
-      less at 0.8 and 1 rad. Phases outside of the range of the arcsine are folded back.
+    - One image, a dimple of 1.06 lambda/D and pi/2: that of the converged `Arcsine` from 0.3 to 0.5 rad rms, and
+      12 to 17 % less at 0.8 and 1 rad. Phases outside of the range of the arcsine are folded back.
     - Two dimples of 2 lambda/D: 0.055 rad at 0.5 rad rms and 0.16 rad at 0.8, without noise. That is less than
       after two accelerated iterations, but far above the photon noise; further iterations are needed. At
       2.4 lambda/D it is 0.078 and 0.16 rad, and even 25 further iterations leave 0.02 rad.
@@ -199,13 +200,13 @@ class LearnedReference(Reconstructor):
         self._polynomials = _polynomials(sensor, training.order)
         if masks.shape != training.masks.shape or np.abs(masks - training.masks).max() > _SAME_MASK:
             raise ValueError(
-                f"sensor: dimples of {_written(masks)}: expected {_written(training.masks)}, those of the training, "
-                "or LearnedReference.train for this sensor"
+                f"sensor: dimples of {_written(masks)}: expected {_written(training.masks)}, those of the "
+                "training, or LearnedReference.train for this sensor"
             )
         if _relative(_flat_wave(sensor, self._polynomials) - training.flat, training.flat) > _SAME_WAVE:
             raise ValueError(
-                "sensor: the reference wave of a flat wavefront differs from that of the training: expected a pupil "
-                "of the same form, or LearnedReference.train for this sensor"
+                "sensor: the reference wave of a flat wavefront differs from that of the training: expected a "
+                "pupil of the same form, or LearnedReference.train for this sensor"
             )
         if sensor.n_masks == 1 and n_iterations > 1:
             raise ValueError(f"n_iterations = {n_iterations}: expected 1 for a sensor with one mask")
@@ -301,26 +302,17 @@ class LearnedReference(Reconstructor):
         """
         history = _check.flag("history", history)
         checked, batch, _ = self.accept(frames, start)
-        parts = [self._solved(checked[piece], history) for piece in pieces(checked, Kind.of(checked))]
-        solution, corrected, values, distance = _joined(parts)
-        for phase in (solution.phase, solution.history):
-            if phase is not None:
-                phase += self.settings.model(Kind.of(checked)).no_data
-
-        def shaped(array: NDArray) -> NDArray:
-            return np.asarray(array.reshape(*batch, *array.shape[1:]) if batch else array[0])
-
+        solution, corrected, values, distance = self._solved_in_parts(checked, history)
+        plain = self.report(corrected, batch, solution)
         return LearnedReconstruction(
-            **solution.map_arrays(shaped)._asdict(),
-            settings=self.settings,
-            frames=shaped(corrected),
-            bench=BenchValues.of(shaped(values)),
-            distance=shaped(distance),
+            **{field.name: getattr(plain, field.name) for field in fields(plain)},
+            bench=BenchValues.of(values.reshape(*batch, -1)),
+            distance=distance.reshape(batch),
         )
 
     def solve(self, frames: NDArray, start: NDArray | None, history: bool) -> Solution:
         """Solve checked frames, see `Reconstructor.solve`."""
-        return _joined([self._solved(frames[piece], history) for piece in pieces(frames, Kind.of(frames))])[0]
+        return self._solved_in_parts(frames, history)[0]
 
     def average(self, frames: ArrayLike) -> tuple[BenchValues, BenchValues]:
         """Errors of one bench from many sets of frames, and their standard errors.
@@ -366,9 +358,7 @@ class LearnedReference(Reconstructor):
         arrays |= {name: getattr(network, name) for name in ("center", "scale", "skip")}
         for index, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
             arrays |= {f"weight{index}": weight.astype(_network.STORED), f"bias{index}": bias}
-        stream = io.BytesIO()
-        np.savez_compressed(stream, values=np.array(json.dumps(values)), **arrays)
-        write_file(path, stream.getvalue())
+        write_file(path, npz_bytes(arrays, values))
 
     @classmethod
     def load(cls, path: str | Path, sensor: ZernikeSensor, **settings: Any) -> LearnedReference:
@@ -422,8 +412,19 @@ class LearnedReference(Reconstructor):
             unseen = kind.array(np.stack([direction.real, direction.imag], axis=1)[..., np.newaxis])
         return _Solve(values, kind.array(mixing), of_frames, light, of_power[..., np.newaxis], unseen)
 
+    def _solved_in_parts(self, frames: NDArray, history: bool) -> tuple[Solution, NDArray, NDArray, NDArray]:
+        """Join the results of `_solved` for parts of a batch."""
+        parts = [self._solved(frames[piece], history) for piece in pieces(frames, Kind.of(frames))]
+        if len(parts) == 1:
+            return parts[0]
+        solutions, *arrays = zip(*parts, strict=True)
+        columns: Any = zip(*solutions, strict=True)
+        columns = (None if column[0] is None else np.concatenate(column) for column in columns)
+        corrected, values, distance = map(np.concatenate, arrays)
+        return Solution(*columns), corrected, values, distance
+
     def _solved(self, frames: NDArray, history: bool) -> tuple[Solution, NDArray, NDArray, NDArray]:
-        """Solution, corrected frames (k, n_masks, ny, nx), values of the bench and distance of checked frames."""
+        """Solution, corrected frames, values of the bench (k, n_values) and distance (k,) of checked frames."""
         kind, training = Kind.of(frames), self.training
         constants, window = self._constants(kind), frames[(..., *self.sensor.window)]
         flat = window.reshape(*window.shape[:2], -1)
@@ -439,14 +440,15 @@ class LearnedReference(Reconstructor):
         coefficients = outputs[:, : 2 * len(training.flat)].reshape(len(flat), 2, -1)
         disc = (coefficients * np.float32(np.linalg.norm(training.flat))).astype(kind.dtype) @ constants.maps
         phase = _phase(flat, disc, solve, constants.light).reshape(len(flat), *self.sensor.pupil.shape)
-        corrected = (solve.mixing @ flat).reshape(window.shape) if self._corrects else window.copy()
+        corrected = frames
+        if self._corrects:
+            corrected = (solve.mixing @ frames.reshape(*frames.shape[:2], -1)).reshape(frames.shape)
         path = np.stack([np.zeros_like(phase), phase], axis=1) if history else None
         solution = Solution(
             phase, np.ones(len(flat), int), np.ones(len(flat), bool), np.zeros(len(flat), int), path
         )
         if self._iteration is not None:
-            padded = _in_window(corrected, frames, self.sensor.window)
-            further = self._iteration.solve(padded, phase, history)
+            further = self._iteration.solve(corrected, phase, history)
             if path is not None and further.history is not None:
                 path = np.concatenate([path[:, :1], further.history], axis=1)
             solution = further._replace(n_iterations=further.n_iterations + 1, history=path)
@@ -630,7 +632,16 @@ def _trained(
         scatter[place] = np.std((read - offsets[place]) / slopes[place] - true)
     farthest = _WIDER * float(np.quantile(distance, _FAR))
     return Training(
-        network, polynomials.order, errors, _masks_of(sensor), flat, whitening, farthest, slopes, offsets, scatter,
+        network,
+        polynomials.order,
+        errors,
+        _masks_of(sensor),
+        flat,
+        whitening,
+        farthest,
+        slopes,
+        offsets,
+        scatter,
         np.zeros(len(low)),
     )
 
@@ -698,25 +709,6 @@ def _phase(flat: NDArray, disc: NDArray, solve: _Solve, light: NDArray) -> NDArr
     return np.arctan2(along * imag + across * real, along * real - across * imag)
 
 
-def _joined(parts: list[tuple[Solution, NDArray, NDArray, NDArray]]) -> tuple[Solution, NDArray, NDArray, NDArray]:
-    """Join the results of parts of a batch."""
-    if len(parts) == 1:
-        return parts[0]
-    solutions, corrected, values, distance = zip(*parts, strict=True)
-    columns: Any = zip(*solutions, strict=True)
-    columns = (None if column[0] is None else np.concatenate(column) for column in columns)
-    return Solution(*columns), np.concatenate(corrected), np.concatenate(values), np.concatenate(distance)
-
-
-def _in_window(corrected: NDArray, frames: NDArray, window: tuple[slice, slice]) -> NDArray:
-    """Frames of the whole detector with corrected ones on the grid of the pupil."""
-    if corrected.shape == frames.shape:
-        return corrected
-    whole = frames.copy()
-    whole[(..., *window)] = corrected
-    return whole
-
-
 def _read(source: Any, name: str) -> Training:
     """Read what `LearnedReference.save` writes."""
     try:
@@ -732,8 +724,8 @@ def _read(source: Any, name: str) -> Training:
             errors = BenchErrors(**{key: tuple(ends) for key, ends in values["errors"].items()})
             arrays = (file[key] for key in ("slopes", "offsets", "scatter", "bias"))
             return Training(
-                network, values["order"], errors, file["masks"], file["flat"], file["whitening"], values["farthest"],
-                *arrays,
+                network, values["order"], errors, file["masks"], file["flat"], file["whitening"],
+                values["farthest"], *arrays,
             )  # fmt: skip
     except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{name}: expected a file that LearnedReference.save wrote: {error}") from error

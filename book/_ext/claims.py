@@ -190,7 +190,9 @@ def rules() -> str:
 def _rule(claim: Claim, study: str) -> str:
     """Return the rule of a claim and the code of its numbers."""
     number = claim.number
-    ends = {"language": "yaml", "start-at": f"- number: {number}", "end-before": f"- number: {number + 1}"}
+    ends = {"language": "yaml", "start-at": f"- number: {number}"}
+    if claim is not CLAIMS[-1]:
+        ends["end-before"] = f"- number: {number + 1}"
     text = f"(rule-{number})=\n**[Claim {number}](#claim-{number}).** {claim.rule}\n\n"
     text += _include("_ext/claims.yml", **ends) + f"(code-{number})=\n**Code that computes its numbers:**\n\n"
     for path in claim.code:

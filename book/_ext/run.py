@@ -136,9 +136,7 @@ def site(project: Project) -> bytes:
 
 def package(project: Project) -> dict[str, bytes]:
     """Return the files of the package by name."""
-    files = (
-        file for file in (project.root / "zwfs").rglob("*") if file.suffix == ".py" or file.name == "py.typed"
-    )
+    files = (file for file in (project.root / "zwfs").rglob("*") if file.suffix in (".py", ".npz", ".typed"))
     return {file.relative_to(project.root).as_posix(): file.read_bytes() for file in files}
 
 

@@ -43,7 +43,7 @@ def main(names):
     known = sorted(file.stem for file in (HTML / "notebooks").glob("*.html"))
     kept = json.loads(KEPT.read_text("utf-8"))
     rows = {row["page"]: row for row in kept.get("pages", [])}
-    with sync_playwright() as driver, serving() as book:
+    with sync_playwright() as driver, serving(HTML) as book:
         browser = driver.chromium.launch(executable_path=find_chromium(), args=["--no-sandbox"])
         for name in names or known:
             if row := measure(browser, book, name):

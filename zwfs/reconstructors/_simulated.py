@@ -37,6 +37,10 @@ class BenchErrors:
 
     A mask that is not centred needs no range: its offset is a tilt of the wavefront.
 
+    One set of frames shows leakage and flux ratio best. A training of 20 000 screens at 0.2 to 1 rad rms and 3000
+    photons or more reads diameter and phase shifts with a scatter of 0.03 lambda/D and 0.03 rad, and the variation
+    of the amplitude hardly at all: average many sets.
+
     Parameters
     ----------
     leakage : (float, float)

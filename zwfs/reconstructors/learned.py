@@ -359,11 +359,8 @@ class LearnedReference(Reconstructor):
             "format": _FORMAT, "order": training.order, "farthest": training.farthest,
             "errors": asdict(training.errors), "n_layers": len(network.weights),
         }  # fmt: skip
-        arrays = {
-            name: getattr(training, name)
-            for name in ("masks", "flat", "whitening", "slopes", "offsets", "scatter", "bias")
-        }
-        arrays |= {name: getattr(network, name) for name in ("center", "scale", "skip")}
+        parts = training._asdict() | network._asdict()
+        arrays = {name: part for name, part in parts.items() if isinstance(part, np.ndarray)}
         for index, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
             arrays |= {f"weight{index}": weight.astype(_network.STORED), f"bias{index}": bias}
         write_file(path, npz_bytes(arrays, values))
@@ -718,19 +715,17 @@ def _read(source: Any, name: str) -> Training:
     """Read what `LearnedReference.save` writes."""
     try:
         with np.load(source, allow_pickle=False) as file:
-            values = json.loads(str(file["values"]))
-            if values["format"] != _FORMAT:
-                raise ValueError(f"format {values['format']}")
-            layers = range(values["n_layers"])
-            weights, biases = (
-                tuple(file[f"{part}{index}"].astype(np.float32) for index in layers) for part in ("weight", "bias")
-            )
-            network = Network(file["center"], file["scale"], weights, biases, file["skip"])
-            errors = BenchErrors(**{key: tuple(ends) for key, ends in values["errors"].items()})
-            arrays = (file[key] for key in ("slopes", "offsets", "scatter", "bias"))
-            return Training(
-                network, values["order"], errors, file["masks"], file["flat"], file["whitening"],
-                values["farthest"], *arrays,
-            )  # fmt: skip
+            arrays = {key: np.asarray(file[key], np.float32 if "weight" in key else None) for key in file.files}
+        values = json.loads(str(arrays["values"]))
+        if values["format"] != _FORMAT:
+            raise ValueError(f"format {values['format']}")
+        layers = range(values["n_layers"])
+        weights, biases = (tuple(arrays[f"{part}{index}"] for index in layers) for part in ("weight", "bias"))
+        network = Network(arrays["center"], arrays["scale"], weights, biases, arrays["skip"])
+        errors = BenchErrors(**{key: tuple(ends) for key, ends in values["errors"].items()})
+        fields_read = {key: arrays[key] for key in Training._fields if key in arrays}
+        return Training(
+            network=network, order=values["order"], errors=errors, farthest=values["farthest"], **fields_read
+        )
     except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{name}: expected a file that LearnedReference.save wrote: {error}") from error

@@ -29,9 +29,10 @@ from studies.kit.grids import Grid
 from studies.kit.style import ALONE, DARK_PHASE_MAP, LOOKS, OTHER_STYLES, show_phase, use_style
 from studies.kit.variants import dark_color, variants
 from studies.phase_amplitude import AmplitudeCurves
-from studies.phase_shift_pairs import DrawnNoise, PairMaps
+from studies.phase_shift_pairs import PairMaps
 from studies.photon_noise import EXPECTED, ErrorBars, PhotonCurves
 from studies.reconstructors import draw_convergence
+from studies.sensors import SensorCurves, compared_sensors
 from studies.zernike_sensor import lowest_pixel
 from zwfs.bench.model import Bench
 from zwfs.frames.phases import Phases
@@ -122,6 +123,9 @@ def drawn_methods(curves, pupil, classic, shifted):
     banded = BandCurves(three, dict.fromkeys(bandwidth.WAYS, three[:, np.newaxis]), {}, three, 1.0)
     triple = zwfs.ZernikeSensor(pupil, *shifted.masks, zwfs.Dimple(1, 0))
     both = zwfs.MaximumLikelihood(triple, amplitude="unknown")(triple.measure(phase))
+    focal = compared_sensors(pupil, (1.06, 1.5), (2.0, 2.2), 3.0, 2, 2)
+    by_sensor = {sensor.name: np.ones((3, 4)) for sensor in focal}
+    costs = SensorCurves(focal, three, by_sensor, by_sensor, by_sensor, {}, {})
     bench = Bench(n_pixels=60)
     commands = np.linspace(-1, 1, bench.n_segments)
     calibrated = Errors(three, [[Measured(0.2, 0.1, 0.3, 0.1, 0.7, 1.0, True)]] * 3)
@@ -129,6 +133,7 @@ def drawn_methods(curves, pupil, classic, shifted):
     looped = replace(decided, bench="", closed=(1, 2), n_loops=2)
     return {
         "draw_slice": ((sliced, "error", "x"), ()),
+        "draw_sensor_photons": ((costs,), ()),
         "draw_sensor_layout": ((classic, phase), ()),
         "draw_vector_sensor": ((shifted, phase), ()),
         "draw_bench_layout": ((bench, commands, bench.frames(commands, seed=1), 635.0), ()),
@@ -150,7 +155,6 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_model_errors": (({"dimple": trials}, ranges[1], 0.05), ()),
         "draw_causes": ((limited, 0.05), shifted_only),
         "draw_pairs": ((PairMaps(three, *np.full((5, 3, 3), 1.0)),), ()),
-        "draw_pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
         "draw_photon_noise": ((faint,), LOOKS),
         "draw_error_bars": (([ErrorBars(k, EXPECTED, 1.0) for k in (1, 2, 0.5)],), ["MaximumLikelihood"]),
         "draw_design_maps": ((designs, PUBLISHED, {"flat": three}), ()),

@@ -1,10 +1,8 @@
-"""Pairs of phase shifts, section 4.2 of the paper: their errors without noise, and their noise."""
+"""Pairs of phase shifts, section 4.2 of the paper: which pairs work, and which have the least noise."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -16,9 +14,7 @@ from numpy.typing import NDArray
 from studies.kit import sweeps
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
-from studies.kit.style import OTHER_STYLES
-from studies.kit.tables import Table, small
-from zwfs.detector import Detector
+from studies.kit.tables import Table, Text
 from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error
 from zwfs.pupil import Pupil
@@ -29,19 +25,10 @@ LIMITS = parameter_limits(
     "n_pixels n_modes diameter rms n_screens exponent",
     n_quarter=(1, 50),
     n_iterations=(2, 10000),
-    photons=(1.0, 1e12),
-    n_draws=(2, 10000),
 )
 QUICK = {"n_pixels": 32, "n_quarter": 5, "n_screens": 1}
 
 HALF = np.pi / 2
-DRAWN = (
-    *((theta * np.pi, -theta * np.pi) for theta in (0.5, 0.8)),
-    (HALF, -1.0),
-    (np.pi, HALF),
-    *((theta * np.pi, -theta * np.pi) for theta in (0.25, 0.65)),
-)
-"""Pairs for which the predicted noise is compared with drawn noise, radian."""
 
 
 @dataclass(frozen=True)
@@ -71,85 +58,9 @@ def phase_noise(sensor: ZernikeSensor, phase: NDArray) -> PhaseNoise:
     return PhaseNoise(*(np.where(np.isnan(values), np.inf, values) for values in (photon, bound, read)))
 
 
-def noise_of_pairs(
-    pupil: Pupil, diameter: float, angles: Sequence[float], wavefronts: Mapping[str, NDArray]
-) -> dict[str, NDArray[np.float64]]:
-    """Predicted noise of pairs (theta, -theta): photon noise for each wavefront, and read noise for the first."""
-    first = next(iter(wavefronts))
-    names = [*(f"photon noise, {name}" for name in wavefronts), f"read noise, {first}"]
-    noise = {name: np.empty(len(angles)) for name in names}
-    for index, theta in enumerate(angles):
-        sensor = _sensor(pupil, diameter, theta, -theta)
-        for name, phases in wavefronts.items():
-            noises = [phase_noise(sensor, phase) for phase in phases]
-            noise[f"photon noise, {name}"][index] = _rms(np.array([one.photon for one in noises]))
-            if name == first:
-                noise[f"read noise, {name}"][index] = _rms(np.array([one.read for one in noises]))
-    return noise
-
-
-class DrawnNoise(NamedTuple):
-    """Photon noise of a pair of phase shifts, radian sqrt(photon): predicted, drawn, and standard error."""
-
-    theta_a: float
-    theta_b: float
-    name: str
-    expected: float
-    drawn: float
-    error: float
-
-
-def compare_noise(
-    pupil: Pupil,
-    diameter: float,
-    wavefronts: Mapping[str, NDArray],
-    photons: float,
-    n_draws: int,
-    *,
-    seed: int = 0,
-) -> list[DrawnNoise]:
-    """Photon noise of the pairs of `DRAWN`, predicted and drawn; see `noise_of_pairs` and `drawn_noise`."""
-    rows = []
-    for theta_a, theta_b in DRAWN:
-        sensor = _sensor(pupil, diameter, theta_a, theta_b)
-        for name, phases in wavefronts.items():
-            draws = np.array(
-                [drawn_noise(sensor, phase, photons, n_draws, seed + i) for i, phase in enumerate(phases)]
-            )
-            expected = _rms(np.array([phase_noise(sensor, phase).photon for phase in phases]))
-            error = float(np.linalg.norm(draws[:, 1]) / len(phases))
-            rows.append(DrawnNoise(theta_a, theta_b, f"photon noise, {name}", expected, _rms(draws[:, 0]), error))
-    return rows
-
-
-def close_pairs(
-    pupil: Pupil, diameter: float, gaps: Sequence[float], screens: NDArray, n_iterations: int = 25
-) -> NDArray[np.float64]:
-    """Error and photon noise of pairs that are nearly equal: pi/2, and pi/2 less a gap (radian)."""
-    rows = []
-    for gap in gaps:
-        sensor = _sensor(pupil, diameter, HALF, HALF - gap)
-        phase = PhaseShifted(sensor, n_iterations=n_iterations)(sensor.measure(screens)).phase
-        noise = _rms(phase_noise(sensor, np.zeros(pupil.shape)).photon)
-        rows.append((gap, reconstruction_error(pupil, phase, screens).mean(), noise))
-    return np.array(rows)
-
-
 def _sensor(pupil: Pupil, diameter: float, theta_a: float, theta_b: float) -> ZernikeSensor:
     """Sensor with two dimples of one diameter."""
     return ZernikeSensor(pupil, Dimple(diameter, theta_a), Dimple(diameter, theta_b))
-
-
-def drawn_noise(
-    sensor: ZernikeSensor, phase: NDArray, photons: float, n_draws: int, seed: int = 0
-) -> tuple[float, float]:
-    """Photon noise of the phase-shifted iteration on frames with drawn noise, and its standard error."""
-    camera = Detector(photons)
-    frames = np.repeat(sensor.measure(phase)[np.newaxis], n_draws, axis=0)
-    estimate = PhaseShifted(sensor)(camera.normalise(camera.expose(frames, seed)))
-    power = photons * reconstruction_error(sensor.pupil, estimate.phase, phase) ** 2
-    noise = float(np.sqrt(power.mean()))
-    return noise, float(power.std(ddof=1) / np.sqrt(n_draws) / (2 * noise))
 
 
 @dataclass(frozen=True)
@@ -257,72 +168,6 @@ def draw_pairs(maps: PairMaps) -> Figure:
     return figure
 
 
-def draw_pair_noise(angles: NDArray, noise: Mapping[str, NDArray], rows: Sequence[DrawnNoise]) -> Figure:
-    """Noise of the pairs (theta, -theta) against theta, relative to its value at pi/2."""
-    figure, axes = plt.subplots(figsize=(7, 4.2))
-    middle = int(np.argmin(np.abs(angles - np.pi / 2)))
-    for (name, values), style in zip(noise.items(), OTHER_STYLES, strict=False):
-        shade, scale = style["color"], values[middle]
-        axes.plot(angles, values / scale, lw=1.8, label=name, **style | {"marker": "none"})
-        least = int(np.argmin(values))
-        axes.plot(angles[least], values[least] / scale, "*", color=shade, ms=12)
-        if drawn := [row for row in rows if row.name == name and row.theta_a == -row.theta_b]:
-            theta, value, error = np.array([(row.theta_a, row.drawn, row.error) for row in drawn]).T
-            style = {"fmt": "o", "mfc": "none", "color": shade, "ms": 6, "capsize": 3}
-            axes.errorbar(theta, value / scale, error / scale, label=f"_{name}, simulated", **style)
-    axes.axhline(1, color="#555555", lw=1)
-    axes.axvline(HALF, color="#555555", lw=1)
-    axes.set_xticks(np.pi * np.linspace(0, 1, 5), ("0", "π/4", "π/2", "3π/4", "π"))
-    axes.set(xlabel=r"$\theta$ of the pair $(\theta, -\theta)$ (rad)", ylabel="noise / noise at ±π/2")
-    axes.set(xlim=(0, np.pi), ylim=(0.6, 2))
-    axes.legend(loc="lower left", fontsize=9)
-    return figure
-
-
-def allowed_table(maps: PairMaps) -> Table:
-    """Pairs that work without noise, and their errors."""
-    worst, least = np.nanmax(maps.error), np.nanmin(maps.error)
-    return Table(
-        ["pairs of the map", "measured"],
-        [
-            ["all, in either order", maps.error.size],
-            ["refused by PhaseShifted", int(maps.singular.sum())],
-            [
-                "refused: exactly those with equal shifts mod 2π or a shift of 0",
-                bool(np.array_equal(maps.singular, maps.forbidden)),
-            ],
-            ["largest error of the others (rad rms)", small(worst)],
-            ["largest error of the others over the smallest, minus 1", small(worst / least - 1)],
-            ["some pair with a shift of 0 works", maps.zero_works],
-        ],
-    )
-
-
-def close_table(rows: NDArray) -> Table:
-    """Errors and noise of pairs that are nearly equal, see `close_pairs`."""
-    return Table(
-        ["θa − θb (rad)", "error without noise (rad rms)", "photon noise (rad √photon)"],
-        [[f"{gap:g}", small(error), f"{noise:.3g}"] for gap, error, noise in rows],
-    )
-
-
-def drawn_table(rows: Sequence[DrawnNoise]) -> Table:
-    """Predicted noise next to that of draws."""
-    return Table(
-        ["pair", "noise", "predicted (rad √photon)", "simulated", "standard error"],
-        [
-            [
-                f"{_pi(row.theta_a)}, {_pi(row.theta_b)}",
-                row.name,
-                f"{row.expected:.4g}",
-                f"{row.drawn:.4g}",
-                f"{row.error:.1g}",
-            ]
-            for row in rows
-        ],
-    )
-
-
 def best_table(maps: PairMaps, rms: float) -> Table:
     """Best pair of the maps for each kind of noise."""
     titles = {
@@ -343,38 +188,48 @@ def _pi(angle: float) -> str:
     return f"{angle / np.pi:.3g}π".replace("-", "−")
 
 
-def gain_errors(maps: PairMaps, pupil: Pupil, diameter: float, screens: NDArray) -> dict[str, float]:
-    """Standard errors over the screens of the gains of the best pairs for the screens, see `numbers`."""
-    usual = [phase_noise(_sensor(pupil, diameter, HALF, -HALF), screen) for screen in screens]
-    found = {}
-    for name, field in (("aberrated", "photon"), ("bound", "bound")):
-        sensor = _sensor(pupil, diameter, *maps.best(name)[:2])
-        best = [phase_noise(sensor, screen) for screen in screens]
-        ratios = [_rms(getattr(a, field)) / _rms(getattr(b, field)) for a, b in zip(best, usual, strict=True)]
-        found[f"gain_{name}_error"] = float(np.std(ratios) / np.sqrt(len(ratios)))
-    return found
+def findings(maps: PairMaps, rms: float) -> Text:
+    """Sentences on the maps: which pairs work, and which are best."""
+    worst, least = np.nanmax(maps.error), np.nanmin(maps.error)
+    errors = f"between {least:.2g} and {worst:.2g}" if worst >= 1e-6 else "below 10⁻⁶"
+    expected = np.array_equal(maps.singular, maps.forbidden)
+    refused = f"{'' if expected else 'not only '}those with equal shifts or a shift of 0"
+    best = {
+        name: f"{_pair_text(maps, name)} ({_gain(maps, name):.0%} less noise than ±π/2)"
+        for name in ("flat", "aberrated", "read")
+    }
+    read = f"the best pair is {best['read']}"
+    if _gain(maps, "read") < 0.005:
+        read = "no pair is better than ±π/2"
+    return Text(
+        f"**Without noise, the error of every pair that the iteration accepts is {errors} rad rms.** It refuses "
+        f"{int(maps.singular.sum())} of the {maps.error.size} pairs of the map, {refused}. **With photon noise the "
+        f"best pair is {best['flat']} on a flat wavefront, and {best['aberrated']} at {rms:g} rad rms.** For read noise on a flat "
+        f"wavefront, {read}."
+    )
 
 
-def numbers(maps: PairMaps, rows: Sequence[DrawnNoise], errors: Mapping[str, float]) -> dict[str, float | str]:
-    """Numbers of the claims of section 4.2 on pairs; `errors` from `gain_errors`."""
-    found = dict(errors) | {
-        "n_allowed": (~maps.singular).sum(),
-        "singular_as_expected": np.array_equal(maps.singular, maps.forbidden),
-        "zero_works": maps.zero_works,
-        "error_max_allowed_pairs": np.nanmax(maps.error),
+def _gain(maps: PairMaps, name: str) -> float:
+    """Noise that the best pair of a map saves, over the noise of the pair +-pi/2."""
+    return 1 - maps.best(name)[2] / maps.at(name, HALF, -HALF)
+
+
+def _pair_text(maps: PairMaps, name: str) -> str:
+    """Best pair of a map in words."""
+    theta_a, theta_b, _ = maps.best(name)
+    return f"±{theta_a / np.pi:.2g}π" if np.isclose(theta_a, -theta_b) else f"({_pi(theta_a)}, {_pi(theta_b)})"
+
+
+def numbers(maps: PairMaps) -> dict[str, float | str]:
+    """Numbers of the claims of section 4.2 on pairs."""
+    values: dict[str, float | str] = {
+        "n_allowed": float((~maps.singular).sum()),
+        "singular_as_expected": float(np.array_equal(maps.singular, maps.forbidden)),
+        "zero_works": float(maps.zero_works),
+        "error_max_allowed_pairs": float(np.nanmax(maps.error)),
+        "best_pi": abs(maps.best("flat")[0]) / np.pi,
     }
     for name, suffix in (("flat", ""), ("aberrated", "_aberrated"), ("bound", "_bound"), ("read", "_read")):
-        theta_a, _, value = maps.best(name)
-        found |= {
-            f"best_noise{suffix}": value,
-            f"noise_at_half_pi{suffix}": maps.at(name, HALF, -HALF),
-            f"best_pi{suffix}": abs(theta_a) / np.pi,
-        }
-    found |= {
-        "gain_flat": 1 - found["best_noise"] / found["noise_at_half_pi"],
-        "photons_saved_flat": 1 - (found["best_noise"] / found["noise_at_half_pi"]) ** 2,
-        "gain_aberrated": 1 - found["best_noise_aberrated"] / found["noise_at_half_pi_aberrated"],
-        "gain_bound": 1 - found["best_noise_bound"] / found["noise_at_half_pi_bound"],
-        "drawn_difference": max(abs(row.drawn / row.expected - 1) for row in rows),
-    }
-    return rounded(found, ".4g")
+        values[f"best_noise{suffix}"] = maps.best(name)[2]
+        values[f"noise_at_half_pi{suffix}"] = maps.at(name, HALF, -HALF)
+    return rounded(values, ".4g")

@@ -203,9 +203,9 @@ def findings(maps: PairMaps, rms: float) -> Text:
         read = "no pair is better than ±π/2"
     return Text(
         f"**Without noise, the error of every pair that the iteration accepts is {errors} rad rms.** It refuses "
-        f"{int(maps.singular.sum())} of the {maps.error.size} pairs of the map, {refused}. **With photon noise the "
-        f"best pair is {best['flat']} on a flat wavefront, and {best['aberrated']} at {rms:g} rad rms.** For read noise on a flat "
-        f"wavefront, {read}."
+        f"{int(maps.singular.sum())} of the {maps.error.size} pairs of the map, {refused}. **With photon noise "
+        f"the best pair is {best['flat']} on a flat wavefront, and {best['aberrated']} at {rms:g} rad rms.** "
+        f"For read noise on a flat wavefront, {read}."
     )
 
 

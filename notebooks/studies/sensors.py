@@ -39,7 +39,7 @@ LIMITS = parameter_limits(
     n_steps=(1, 100),
     shown=(0.0, 3.0),
 )
-QUICK = {"n_pixels": 20, "n_modes": 20, "n_screens": 1, "inputs": [0.0, 0.6, 1.4], "n_positions": 12}
+QUICK = {"n_pixels": 24, "n_modes": 30, "n_screens": 1, "n_positions": 24}
 
 _FLOOR = 1e-12  # of the information of a combination of modes, over the largest: below it rounding decides
 _RECOVERED = 0.01  # error of a recovered screen, rad rms

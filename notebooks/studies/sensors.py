@@ -408,21 +408,24 @@ def findings(curves: SensorCurves) -> Text:
     tilt = {name: _tip_tilt(cost)[0] for name, cost in curves.costs.items()}
     best_tilt = min(tilt, key=lambda name: tilt[name])
     sharp = curves.inputs[higher[PYRAMID] < higher[pairs[-1]]]
-    if not len(sharp):
-        rival = f"The {PYRAMID} needs more photons than the {pairs[-1]} at every input."
-    elif len(sharp) == len(curves.inputs):
-        rival = f"The {PYRAMID} needs fewer photons than the {pairs[-1]} at every input."
-    else:
-        rival = f"The {PYRAMID} needs fewer photons than the {pairs[-1]} only at {_listed(sharp)} rad rms."
     first, last = pairs[0], pairs[-1]
+    rival = f"The {PYRAMID} needs fewer photons than the {last} only at {_listed(sharp)} rad rms."
+    if len(sharp) in (0, len(curves.inputs)):
+        rival = f"The {PYRAMID} needs {'fewer' if len(sharp) else 'more'} photons than the {last} at every input."
     return Text(
-        f"**Of these sensors, the {best} needs the fewest photons at {low:g} rad rms: {_times(higher[best][0])} "
-        f"times those of an ideal sensor. At {high:g} rad rms the {best_high} needs the fewest, "
-        f"{_times(higher[best_high][-1])} times.** The {first} needs {_times(higher[first][0])} and "
-        f"{_times(higher[first][-1])} times. {rival} These numbers are bounds for photon noise alone, and means "
-        f"over the higher modes, all but tip and tilt. For tip and tilt at {low:g} rad rms, the {best_tilt} needs "
-        f"the fewest photons, {_times(tilt[best_tilt])} times, and the {last} needs {_times(tilt[last])} times."
+        f"**Of these sensors, the {best} needs the fewest photons {_place(low)}: {_times(higher[best][0])} times "
+        f"those of an ideal sensor. {_place(high).capitalize()} the {best_high} needs the fewest, "
+        f"{_times(higher[best_high][-1])} times.** The {first} needs {_times(higher[first][0])} times as many as "
+        f"an ideal sensor {_place(low)}, and {_times(higher[first][-1])} times {_place(high)}. {rival} These "
+        "numbers are bounds for photon noise alone, and means over the higher modes, all but tip and tilt. For tip "
+        f"and tilt {_place(low)}, the {best_tilt} needs the fewest photons, {_times(tilt[best_tilt])} times those "
+        f"of an ideal sensor, and the {last} needs {_times(tilt[last])} times."
     )
+
+
+def _place(rms: float) -> str:
+    """Return an input in words."""
+    return f"at {rms:g} rad rms" if rms else "on a flat wavefront"
 
 
 def fit_findings(curves: SensorCurves) -> Text:

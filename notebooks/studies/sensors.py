@@ -417,9 +417,9 @@ def findings(curves: SensorCurves) -> Text:
         f"those of an ideal sensor. {_place(high).capitalize()} the {best_high} needs the fewest, "
         f"{_times(higher[best_high][-1])} times.** The {first} needs {_times(higher[first][0])} times as many as "
         f"an ideal sensor {_place(low)}, and {_times(higher[first][-1])} times {_place(high)}. {rival} These "
-        "numbers are bounds for photon noise alone, and means over the higher modes, all but tip and tilt. For tip "
-        f"and tilt {_place(low)}, the {best_tilt} needs the fewest photons, {_times(tilt[best_tilt])} times those "
-        f"of an ideal sensor, and the {last} needs {_times(tilt[last])} times."
+        "numbers are bounds for photon noise alone, and means over the higher modes, all but tip and tilt. For "
+        f"tip and tilt {_place(low)}, the {best_tilt} needs the fewest photons, {_times(tilt[best_tilt])} times "
+        f"those of an ideal sensor, and the {last} needs {_times(tilt[last])} times."
     )
 
 

@@ -409,9 +409,10 @@ def findings(curves: SensorCurves) -> Text:
     best_tilt = min(tilt, key=lambda name: tilt[name])
     sharp = curves.inputs[higher[PYRAMID] < higher[pairs[-1]]]
     first, last = pairs[0], pairs[-1]
-    rival = f"The {PYRAMID} needs fewer photons than the {last} only at {_listed(sharp)} rad rms."
-    if len(sharp) in (0, len(curves.inputs)):
-        rival = f"The {PYRAMID} needs {'fewer' if len(sharp) else 'more'} photons than the {last} at every input."
+    where = "at every input"
+    if 0 < len(sharp) < len(curves.inputs):
+        where = f"only at {_listed(sharp)} rad rms"
+    rival = f"The {PYRAMID} needs {'fewer' if len(sharp) else 'more'} photons than the {last} {where}."
     return Text(
         f"**Of these sensors, the {best} needs the fewest photons {_place(low)}: {_times(higher[best][0])} times "
         f"those of an ideal sensor. {_place(high).capitalize()} the {best_high} needs the fewest, "

@@ -15,15 +15,14 @@ from matplotlib.text import Text
 import zwfs
 from studies import bandwidth, decision, phase_amplitude, zernike_sensor
 from studies.bandwidth import BandCurves
-from studies.beyond_dimple import DimpleLimits
-from studies.beyond_range import DIMMED, SECANT, Causes, NoiseCurves
+from studies.beyond_range import NoiseCurves
 from studies.calibration import Errors, Measured
 from studies.dark_zone import IDEAL, Drift, DriftCurves
 from studies.design import PUBLISHED, DesignMap
 from studies.fig04_dimple_diameter import Contraction
 from studies.kit import grids
 from studies.kit.bench import BenchCurves
-from studies.kit.curves import ErrorCurves, Limit
+from studies.kit.curves import Limit
 from studies.kit.experiments import DiameterCurves, linearity_curves
 from studies.kit.grids import Grid
 from studies.kit.style import ALONE, DARK_PHASE_MAP, LOOKS, OTHER_STYLES, show_phase, use_style
@@ -89,13 +88,8 @@ def drawn_methods(curves, pupil, classic, shifted):
     five = ["Linear", "Arcsine", "GerchbergSaxton", "GradientDescent", "PhaseShifted"]
     compared = ["PhaseShifted", "PhaseShiftedAccelerated", "MaximumLikelihood"]
     trials = DiameterCurves(np.full(3, 0.5), dict.fromkeys(compared, np.full((3, 3), 0.1)), three)
-    limits = DimpleLimits(three, np.full((3, 2), 0.5), np.full((3, 2, 4), 2.0))
     both_kinds = trials.errors | {"MaximumLikelihoodModes": np.full((3, 3), 0.1)}
-    bounds = dict.fromkeys(["MaximumLikelihood", "MaximumLikelihoodModes"], three)
-    ranges = [NoiseCurves(three, both_kinds, n, bounds, np.ones((3, 3), bool)) for n in (0.0, 1e4)]
-    variants_of_it = ["PhaseShifted", "PhaseShiftedAccelerated", DIMMED, SECANT]
-    ingredients = ErrorCurves(three, dict.fromkeys(variants_of_it, np.full((3, 3), 0.1)))
-    limited = Causes(ingredients, np.ones((3, 3)), dict.fromkeys(variants_of_it, three), 1.0)
+    ranges = [NoiseCurves(three, both_kinds, n, three) for n in (0.0, 1e4)]
     saxton = zwfs.GerchbergSaxton(shifted)
     bad = np.zeros(frames.shape, bool)
     bad[:, 10, 10] = True
@@ -144,11 +138,9 @@ def drawn_methods(curves, pupil, classic, shifted):
         "draw_dimple_diameter": (({25: trial, 100: trial}, 0.05, 2.2), shifted_only),
         "draw_diameter_methods": ((dict.fromkeys(LOOKS, trial), 0.05, 2.2), LOOKS),
         "draw_diameter_reasons": ((reasons, 2.2), shifted_only),
-        "draw_dimple_recovery": (({0.5: trials, 1.0: trials}, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
-        "draw_dimple_limits": ((limits, 0.5), shifted_only),
+        "draw_dimples": ((trials, {"tilt": np.ones((3, 2))}, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
         "draw_range": ((ranges, 1e4, 0.05), ["PhaseShifted", "MaximumLikelihood"]),
         "draw_model_errors": (({"dimple": trials}, ranges[1], 0.05), ()),
-        "draw_causes": ((limited, 0.05), shifted_only),
         "draw_pairs": ((PairMaps(three, *np.full((5, 3, 3), 1.0)),), ()),
         "draw_pair_noise": ((three, lines, [DrawnNoise(1.0, -1.0, "curve 0", 1.0, 1.0, 0.1)]), ()),
         "draw_photon_noise": ((faint,), LOOKS),

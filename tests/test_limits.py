@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 import zwfs
-from studies.beyond_dimple import dimple_curves, failing_limit
 from studies.fig03_dynamic_range import error_limits
 from studies.kit.curves import Limit, fitted_limit, refined_limit
-from studies.kit.experiments import linearity_curves
-from studies.kit.methods import PLAIN
+from studies.kit.experiments import diameter_curves, diameter_limit, linearity_curves
+from studies.kit.methods import PLAIN, opposite_dimples
 from studies.kit.setups import screens_at
 
 TRUE = 1.6  # where 5 % of the screens fail
@@ -86,7 +85,14 @@ def test_other_screens_give_the_same_limits(pupil, modes):
 
 def test_limits_of_the_diameter(pupil, modes):
     screens = screens_at(modes, 0.5, 60, seed=3, task=0)
-    curve = dimple_curves(pupil, np.pi / 2, 25, np.arange(2, 2.7, 0.1), screens[:4], [PLAIN])
-    one, two = (failing_limit(curve, pupil, np.pi / 2, 25, some, 0.05) for some in (screens[:30], screens[30:]))
+
+    def make(diameter):
+        return {PLAIN: zwfs.PhaseShifted(opposite_dimples(pupil, diameter, np.pi / 2))}
+
+    def limit(half):
+        return diameter_limit(curve, PLAIN, lambda diameters: diameter_curves(make, diameters, half), 0.05)
+
+    curve = diameter_curves(make, np.arange(2, 2.7, 0.1), screens[:4])
+    one, two = limit(screens[:30]), limit(screens[30:])
     assert abs(one.value - two.value) < 3 * np.hypot(one.error, two.error)
     assert 0 < one.error < 0.02 * one.value

@@ -187,8 +187,8 @@ def assert_equal_columns(found, expected, tolerance=1e-9):
         ("fig09_bench_linearity", "fig09_bench_linearity", {"n_pixels": 40, "rms_max": 0.4, "n_rms": 2,
          "n_screens": 1}, 1e-6),
         ("beyond_range", "beyond_range", {"n_pixels": 32, "n_modes": 50, "inputs": [0.1, 0.5], "n_screens": 1,
-         "inputs_noiseless": [], "photons": [1e4, 1e10], "n_screens_limit": 10, "inputs_limit": [0.5, 0.8],
-         "photons_shown": 1e4}, 1e-6),
+         "inputs_noiseless": [], "photons": [1e4, 1e10], "n_screens_many": 1, "photons_shown": 1e4,
+         "diameters": [1.0]}, 1e-6),
     ],
 )  # fmt: skip
 def test_figures_of_the_page_are_those_of_this_python(opened, name, figure, values, tolerance):

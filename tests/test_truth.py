@@ -140,10 +140,9 @@ def test_a_dash_stands_for_a_number_that_does_not_exist():
 BENCH = {"n_pixels": 32}
 FIGURE_4 = SMALL | {"n_modes": 149, "step": 0.5, "step_fine": 0.3, "more_iterations": [5], "n_screens_few": 1}
 RANGE = SMALL | {
-    "inputs": [0.1, 1.0], "inputs_noiseless": [2.0], "inputs_limit": [1.0, 2.0], "photons": [1e3],
-    "n_subpixels": 2, "n_screens_model": 1, "n_screens_limit": 10,
+    "inputs": [0.1, 1.0], "inputs_noiseless": [2.0], "photons": [1e3], "n_subpixels": 2, "n_screens_model": 1,
+    "n_screens_many": 2, "diameters": [1.0, 3.5], "n_screens_dimple": 1, "n_screens_bound": 1,
 }  # fmt: skip
-DIMPLE = SMALL | {"inputs": [0.5], "step": 2.0, "step_fine": 0.3, "diameter_max": 3.5, "n_screens_few": 1}
 DECISION = BENCH | {
     "n_pixels_fine": 40,
     "n_screens": 2, "n_screens_fine": 2, "n_screens_perfect": 2, "n_loops": 2,
@@ -179,17 +178,13 @@ CASES = {
         {"rms": 4.0, "more_iterations": [1], "diameter_max": 1.5},
     ),
     "beyond_range": (RANGE,
-        {"inputs": [4.0], "n_iterations": 1}, {"inputs": [0.01], "inputs_noiseless": [], "inputs_limit": [0.1]},
+        {"inputs": [4.0], "n_iterations": 1}, {"inputs": [0.01], "inputs_noiseless": [], "input_many": 0.01},
         {"photons": [1.0], "photons_shown": 1e12},
         {"diameter_error": 0.0, "shift_error": 0.0, "image_shift": 0.0, "amplitude_error": 0.0},
-        {"inputs_limit": [4.0, 3.9], "phase_shift": 0.01},
+        {"diameters": [8.0, 0.1], "n_modes": 3, "input_many": 4.0}, {"diameters": [1.0], "exponent": 0.0},
+        *each(phase_shift=[3.13, 0.01], input_dimple=[4.0, 0.01]),
         *each(screens=[{"kind": "kolmogorov", "d_over_r0": 20.0},
         {"kind": "von_karman", "outer_scale": 0.2, "d_over_r0": 0.1}], threshold=[0.001, 1.0], diameter=[0.1]),
-    ),
-    "beyond_dimple": (DIMPLE,
-        {"n_modes": 3}, {"threshold": 0.001, "n_iterations": 1}, {"inputs": [0.2, 3.0], "n_iterations": 2},
-        {"diameter_min": 0.1, "exponent": 0.0}, *each(inputs=[[4.0], [0.001]], threshold=[1.0],
-        diameter_max=[8.0], phase_shift=[3.13, 0.01]),
     ),
     "photon_noise": (SMALL | {"inputs": [0.5], "photons": [100.0], "wrong": [2.0, 0.5]},
         {"photons": [1.0]}, {"photons": [1e9], "photons_bars": 1e9}, {"n_modes": 1, "extent": 1.0},

@@ -1,6 +1,7 @@
-"""Range of two images, beyond the paper: errors against the input, with photon noise and with errors of the model.
+"""Range of two images, beyond the paper: larger inputs and dimples, photon noise, and errors of the model.
 
-Errors are radian rms over the pupil, without piston and modulo 2 pi.
+Errors are radian rms over the pupil, without piston and modulo 2 pi. A screen is recovered if its error is at most
+a threshold times the input.
 """
 
 from __future__ import annotations
@@ -16,26 +17,40 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from studies.kit import sweeps
-from studies.kit.curves import ErrorCurves, crossing, percent
-from studies.kit.iteration import iteration_spectrum
-from studies.kit.methods import ACCELERATED, LIKELY, MODES, PLAIN, compared_methods, method_line, method_look
+from studies.kit.curves import ErrorCurves, percent
+from studies.kit.experiments import DiameterCurves
+from studies.kit.iteration import DARK_RING
+from studies.kit.methods import (
+    ACCELERATED,
+    LIKELY,
+    MASKS,
+    MODES,
+    PLAIN,
+    compared_methods,
+    method_line,
+    method_look,
+    opposite_dimples,
+)
 from studies.kit.parameters import SETUP, Fields, parameter_limits
 from studies.kit.results import rounded
 from studies.kit.setups import SCREENS, Noise, Screens, screens_at
-from studies.kit.style import LOOKS, OTHER_STYLES
+from studies.kit.style import OTHER_STYLES
+from studies.kit.tables import Table, Text, small, two_digits
 from zwfs.bounds import cramer_rao
 from zwfs.masks import Dimple
 from zwfs.metrics import reconstruction_error
 from zwfs.modes import power_law_screens, zernike_basis
 from zwfs.pupil import Pupil
-from zwfs.reconstructors import Arcsine, Linear, MaximumLikelihood, PhaseShifted
+from zwfs.reconstructors import Arcsine, Linear, MaximumLikelihood
 from zwfs.sensor import ZernikeSensor
 
 LIMITS = parameter_limits(
-    "n_pixels n_modes diameter phase_shift n_screens exponent n_iterations threshold",
+    "n_pixels diameter phase_shift n_screens exponent n_iterations threshold",
+    n_modes=(3, 1000),  # tip, tilt and at least one other mode
     inputs=[(0.01, 4.0)],
     inputs_noiseless=[(0.01, 12.0), ...],
-    inputs_limit=[(0.1, 4.0)],
+    input_many=(0.01, 4.0),
+    n_screens_many=(1, 10000),
     photons=[(1.0, 1e12)],
     photons_shown=(1.0, 1e12),
     diameter_error=(-0.5, 0.5),
@@ -44,7 +59,10 @@ LIMITS = parameter_limits(
     amplitude_error=(0.0, 0.3),
     n_subpixels=(2, 8),
     n_screens_model=(1, 1000),
-    n_screens_limit=(10, 10000),
+    diameters=[(0.1, 8.0)],
+    input_dimple=(0.01, 4.0),
+    n_screens_dimple=(1, 1000),
+    n_screens_bound=(1, 100),
     screens=Fields(SETUP["screens"].of, kinds={kind: SETUP["screens"].kinds[kind] for kind in SCREENS[:3]}),
 )
 QUICK = {
@@ -52,23 +70,34 @@ QUICK = {
     "inputs": [0.1, 0.5, 1.0, 2.0],
     "photons": [1e2, 1e4],
     "n_screens": 2,
-    "n_screens_limit": 10,
+    "n_screens_many": 20,
+    "diameters": [0.5, 1.0, 2.0, 2.4, 3.0, 4.0],
+    "n_screens_dimple": 3,
+    "n_screens_bound": 1,
 }
-PIXEL_ERROR = 0.01  # rad rms, from which the text calls the size of the pixels important
-_WITHOUT_NOISE = 0.0  # photons
 
 
 @dataclass(frozen=True)
 class Trials:
-    """Settings that all experiments of the chapter share."""
+    """Sensor, screens and settings that all experiments of the chapter share."""
 
-    n_iterations: int
+    sensor: ZernikeSensor
     source: Screens
+    n_iterations: int
     seed: int
 
-    def screens(self, pupil: Pupil, modes: NDArray, rms: float, n_screens: int, task: int) -> NDArray[np.floating]:
-        """Screens of one task on a pupil with these modes, see `screens_at`."""
-        return screens_at(replace(self.source, pupil=pupil, modes=modes), rms, n_screens, self.seed, task)
+    def screens(self, rms: float, n_screens: int, task: int, **changed: Any) -> NDArray[np.floating]:
+        """Screens of one task, see `screens_at`; `changed`: a different pupil and its modes."""
+        return screens_at(replace(self.source, **changed), rms, n_screens, self.seed, task)
+
+    def methods(self, diameter: float) -> dict[str, Any]:
+        """Compared methods for a sensor with dimples of a different diameter, lambda/D."""
+        return compared_methods(resized(self.sensor, diameter), self.n_iterations)
+
+
+def resized(sensor: ZernikeSensor, diameter: float) -> ZernikeSensor:
+    """Return a sensor with dimples of a different diameter, lambda/D."""
+    return opposite_dimples(sensor.pupil, diameter, sensor.masks[0].phase)
 
 
 def all_methods(sensor: ZernikeSensor, modes: NDArray, n_iterations: int, photons: float) -> dict[str, Any]:
@@ -84,74 +113,44 @@ def all_methods(sensor: ZernikeSensor, modes: NDArray, n_iterations: int, photon
 
 @dataclass(frozen=True)
 class NoiseCurves(ErrorCurves):
-    """Errors against the input for one number of photons, the bounds, and whether a solution is consistent."""
+    """Errors against the input for one number of photons, and the bound for the phase of every point."""
 
     photons: float  # per point and image; 0 without noise
-    bound: dict[str, NDArray[np.float64]]  # (n_rms,) by name: LIKELY for points, MODES for modes; radian rms
-    consistent: NDArray[np.bool_]  # (n_rms, n_screens), of maximum likelihood
+    bound: NDArray[np.float64]  # (n_rms,), median over the screens, radian rms
 
     def median(self, name: str) -> NDArray[np.float64]:
         """Median error over the screens, shape (n_rms,), radian rms."""
         return np.median(self.errors[name], axis=1)
 
-    def complete_up_to(self, name: str, threshold: float) -> float:
-        """Largest input up to which a method recovers every screen, radian rms; 0 if there is none."""
-        lost = np.flatnonzero(self.recovered(name, threshold) < 1)
-        complete = self.rms[: lost[0]] if lost.size else self.rms
-        return float(complete[-1]) if complete.size else 0.0
-
 
 def noise_curves(
-    sensor: ZernikeSensor,
-    modes: NDArray,
-    photons: Sequence[float],
-    inputs: Sequence[float],
-    inputs_noiseless: Sequence[float],
-    n_screens: int,
-    trials: Trials,
+    trials: Trials, photons: Sequence[float], inputs: Sequence[float], noiseless: Sequence[float], n_screens: int
 ) -> list[NoiseCurves]:
-    """Errors of all methods for each number of photons, and without noise at more inputs."""
-    levels = [_WITHOUT_NOISE, *sorted(photons)]
-    rms = {level: sorted({*inputs, *([] if level else inputs_noiseless)}) for level in levels}
-    # The largest inputs take longest: they begin first, so that all cores end at about the same time.
-    points = [(level, task) for level in levels for task in reversed(range(len(rms[level])))]
-    tasks = [(level, task, rms[level][task]) for level, task in points]
-    methods = {level: all_methods(sensor, modes, trials.n_iterations, level) for level in levels}
-    results = sweeps.run(_noise_point, tasks, methods, modes, n_screens, trials, name="noise_curves")
-    by_point = dict(zip(points, results, strict=True))
+    """Errors of all methods without noise, also at the inputs `noiseless`, and for each number of photons."""
     curves = []
-    for level in levels:
-        stacked = sweeps.stacked([by_point[level, task] for task in range(len(rms[level]))])
-        curves.append(NoiseCurves(np.array(rms[level]), **stacked, photons=level))
+    for level in (0.0, *sorted(photons)):
+        rms = sorted({*inputs, *([] if level else noiseless)})
+        # The largest inputs take longest: they begin first, so that all cores end at about the same time.
+        tasks = list(enumerate(rms))[::-1]
+        points = sweeps.run(_noise_point, tasks, level, trials, n_screens, name="noise_curves")[::-1]
+        curves.append(NoiseCurves(np.array(rms), **sweeps.stacked(points), photons=level))
     return curves
 
 
-def _noise_point(
-    point: tuple[float, int, float],
-    methods: Mapping[float, Mapping[str, Any]],
-    modes: NDArray,
-    n_screens: int,
-    trials: Trials,
-) -> dict[str, Any]:
-    """One number of photons and input: errors, (n_screens,), bounds, and consistent, (n_screens,)."""
-    photons, task, rms = point
-    sensor = methods[photons][LIKELY].sensor
-    screens = trials.screens(sensor.pupil, modes, rms, n_screens, task)
-    noise = Noise(photons)
-    errors, consistent = {}, np.zeros(n_screens, bool)
-    for name, method in methods[photons].items():
-        result = method(noise(method.sensor, screens, np.random.SeedSequence(trials.seed, spawn_key=(task, 0))))
-        errors[name] = reconstruction_error(sensor.pupil, result.phase, screens)
-        consistent = result.consistent if name == LIKELY else consistent
-    if not photons:
-        return {"errors": errors, "bound": {}, "consistent": consistent}
-    points = sensor.pupil.gather(cramer_rao(sensor, screens, photons=photons))
-    coefficients = cramer_rao(sensor, screens, photons=photons, modes=modes)
-    bounds = {
-        LIKELY: float(np.median(np.sqrt(np.mean(points**2, axis=-1)))),
-        MODES: float(np.median(np.sqrt(np.sum(coefficients**2, axis=-1)))),  # modes of unit rms
+def _noise_point(point: tuple[int, float], photons: float, trials: Trials, n_screens: int) -> dict[str, Any]:
+    """One input: errors, (n_screens,) by name, and the bound for the phase of every point."""
+    task, rms = point
+    sensor, modes = trials.sensor, trials.source.modes
+    screens, noise = trials.screens(rms, n_screens, task), Noise(photons)
+    drawn = np.random.SeedSequence(trials.seed, spawn_key=(task, 0))
+    errors = {
+        name: reconstruction_error(sensor.pupil, method(noise(method.sensor, screens, drawn)).phase, screens)
+        for name, method in all_methods(sensor, modes, trials.n_iterations, photons).items()
     }
-    return {"errors": errors, "bound": bounds, "consistent": consistent}
+    bound = 0.0
+    if photons:
+        bound = np.median(_rms(sensor.pupil.gather(cramer_rao(sensor, screens, photons=photons))))
+    return {"errors": errors, "bound": bound}
 
 
 @dataclass(frozen=True)
@@ -168,13 +167,13 @@ class ModelErrors:
 class FineCamera:
     """Camera whose pixels average n x n samples of a finer model of the pupil."""
 
-    def __init__(self, sensor: ZernikeSensor, modes: NDArray, n: int) -> None:
+    def __init__(self, sensor: ZernikeSensor, n_modes: int, n: int) -> None:
         amplitude = np.kron(sensor.pupil.amplitude, np.ones((n, n)))
         self.pupil = Pupil.from_amplitude(amplitude, n_pixels=n * sensor.pupil.n_pixels)
         self._sensor, self._n = ZernikeSensor(self.pupil, *sensor.masks), n
         # The corners of whole pixels reach beyond the unit circle of the modes: a wider circle holds them.
         wider = Pupil.from_amplitude(amplitude, n_pixels=(1 + 2 / sensor.pupil.n_pixels) * self.pupil.n_pixels)
-        self.modes = zernike_basis(wider, len(modes), orthonormal=False)
+        self.modes = zernike_basis(wider, n_modes, orthonormal=False)
 
     def mean(self, values: NDArray) -> NDArray:
         """Mean of fine values over each pixel."""
@@ -191,32 +190,23 @@ class FineCamera:
 
 
 def model_curves(
-    sensor: ZernikeSensor,
-    modes: NDArray,
-    errors: ModelErrors,
-    inputs: Sequence[float],
-    n_screens: int,
-    trials: Trials,
+    trials: Trials, errors: ModelErrors, inputs: Sequence[float], n_screens: int
 ) -> dict[str, ErrorCurves]:
     """Errors of the two best methods on noiseless frames that their model does not describe, by its error."""
     tasks = list(enumerate(inputs))[::-1]
-    shared = sensor, modes, errors, n_screens, trials
-    points = sweeps.run(_model_point, tasks, *shared, name="model_curves")[::-1]
+    points = sweeps.run(_model_point, tasks, trials, errors, n_screens, name="model_curves")[::-1]
     return {kind: ErrorCurves(np.array(inputs), by_name) for kind, by_name in sweeps.stacked(points).items()}
 
 
 def _model_point(
-    point: tuple[int, float],
-    sensor: ZernikeSensor,
-    modes: NDArray,
-    errors: ModelErrors,
-    n_screens: int,
-    trials: Trials,
+    point: tuple[int, float], trials: Trials, errors: ModelErrors, n_screens: int
 ) -> dict[str, dict[str, NDArray]]:
     """Errors of one input, (n_screens,) by the error of the model and the method."""
     task, rms = point
-    camera = FineCamera(sensor, modes, errors.n_subpixels)
-    fine = np.where(camera.pupil.inside, trials.screens(camera.pupil, camera.modes, rms, n_screens, task), 0)
+    sensor = trials.sensor
+    camera = FineCamera(sensor, len(trials.source.modes), errors.n_subpixels)
+    fine = trials.screens(rms, n_screens, task, pupil=camera.pupil, modes=camera.modes)
+    fine = np.where(camera.pupil.inside, fine, 0)
     screens = camera.mean(fine)
     methods = compared_methods(sensor, trials.n_iterations, n_starts=1)  # no phase explains the frames
     return {
@@ -224,15 +214,15 @@ def _model_point(
             name: reconstruction_error(sensor.pupil, methods[name](frames).phase, screens)
             for name in (ACCELERATED, LIKELY)
         }
-        for kind, frames in wrong_frames(sensor, errors, camera, fine, screens, trials.seed).items()
+        for kind, frames in wrong_frames(sensor, errors, camera, fine, trials.seed).items()
     }
 
 
 def wrong_frames(
-    sensor: ZernikeSensor, errors: ModelErrors, camera: FineCamera, fine: NDArray, screens: NDArray, seed: int
+    sensor: ZernikeSensor, errors: ModelErrors, camera: FineCamera, fine: NDArray, seed: int
 ) -> dict[str, NDArray]:
-    """Noiseless frames of screens, given on the fine and on the camera's grid, by the error of the model."""
-    pupil = sensor.pupil
+    """Noiseless frames of screens, which are given on the camera's fine grid, by the error of the model."""
+    pupil, screens = sensor.pupil, camera.mean(fine)
     first, second = (mask for mask in sensor.masks if isinstance(mask, Dimple))
     wider = (Dimple((1 + errors.diameter) * mask.diameter, mask.phase) for mask in (first, second))
     shifted = Dimple(first.diameter, (1 + errors.shift) * first.phase)
@@ -241,95 +231,39 @@ def wrong_frames(
         uneven = power_law_screens(zernike_basis(pupil, 60), errors.amplitude, 1, -2.0, seed)[0]
     amplitude = pupil.amplitude * (1 + np.where(pupil.inside, uneven, 0))
     return {
-        f"amplitude wrong by {errors.amplitude:.0%} rms": sensor.measure(screens, amplitude),
+        f"amplitude wrong by {percent(errors.amplitude)} rms": sensor.measure(screens, amplitude),
         f"second image {errors.image_shift:g} pixel off": camera.frames(fine, errors.image_shift),
-        f"dimples {errors.diameter:.0%} larger": ZernikeSensor(pupil, *wider).measure(screens),
-        f"one phase shift {errors.shift:.0%} off": ZernikeSensor(pupil, shifted, second).measure(screens),
+        f"dimples {percent(errors.diameter)} larger": ZernikeSensor(pupil, *wider).measure(screens),
+        f"one phase shift {percent(errors.shift)} off": ZernikeSensor(pupil, shifted, second).measure(screens),
         "phase varies within a pixel": camera.frames(fine),
     }
 
 
-DIMMED, SECANT = "plain, dimmed start", "secant, flat start"
-"""Variants of the iteration that have one of the two ingredients of the acceleration."""
+TILT, REST = "tilt", "other modes"
 
 
-@dataclass(frozen=True)
-class Causes:
-    """Noiseless screens around the limit of the plain iteration, and what limits it."""
-
-    curves: ErrorCurves  # of PLAIN, DIMMED, SECANT, ACCELERATED
-    factor: NDArray[np.float64]  # (n_rms, n_screens), of a small error in one plain iteration near the truth
-    example: dict[str, NDArray[np.floating]]  # error after each iteration, (n_iterations + 1,) by name
-    example_rms: float
-
-    def half(self, name: str, threshold: float) -> tuple[float, float]:
-        """Input at which a method recovers half of the screens, and its standard error, radian rms."""
-        share, rms = self.curves.recovered(name, threshold), self.curves.rms
-        below = np.flatnonzero(share < 0.5)
-        if not below.size or below[0] == 0:
-            return (0.0 if below.size else np.inf), 0.0
-        low, high = below[0] - 1, below[0]
-        slope = (share[low] - share[high]) / (rms[high] - rms[low])
-        n_screens = self.curves.errors[name].shape[1]
-        return float(rms[low] + (share[low] - 0.5) / slope), float(0.5 / np.sqrt(n_screens) / slope)
+def dimple_bounds(trials: Trials, diameters: NDArray, screens: NDArray) -> dict[str, NDArray[np.float64]]:
+    """Bounds over that of an ideal sensor, (n_diameters, 1 + n_screens), of a flat wavefront and screens."""
+    phases = np.concatenate([np.zeros((1, *trials.sensor.pupil.shape)), screens])
+    return sweeps.table(_bounds_point, diameters.tolist(), trials, phases, name="dimple_bounds")
 
 
-def causes(
-    sensor: ZernikeSensor,
-    modes: NDArray,
-    inputs: Sequence[float],
-    n_screens: int,
-    threshold: float,
-    trials: Trials,
-) -> Causes:
-    """Separate the two ingredients of the acceleration on noiseless frames."""
-    shared = sensor, modes, n_screens, trials
-    points = sweeps.table(_causes_point, enumerate(inputs), *shared, name="causes")
-    rms, factor = np.array(inputs), points["factor"]
-    curves = ErrorCurves(rms, points["errors"])
-    # An example that only the acceleration recovers, and whose iteration contracts near the truth.
-    lost = curves.errors[PLAIN] > threshold * rms[:, np.newaxis]
-    kept = curves.errors[ACCELERATED] <= threshold * rms[:, np.newaxis]
-    places = np.argwhere(lost & kept & (factor < 1))
-    task, index = places[len(places) // 2] if len(places) else (len(rms) - 1, 0)
-    screen = trials.screens(sensor.pupil, modes, rms[task], n_screens, int(task))[[index]]
-    example = {
-        name: reconstruction_error(sensor.pupil, result.history[0], screen[0])
-        for name, result in _variants(sensor, sensor.measure(screen), trials.n_iterations, history=True).items()
-    }
-    return Causes(curves, factor, example, float(rms[task]))
+def _bounds_point(diameter: float, trials: Trials, phases: NDArray) -> dict[str, NDArray[np.float64]]:
+    """One diameter of `dimple_bounds`, (k,) around each of the phases."""
+    sensor = resized(trials.sensor, diameter)
+    photons = 1e4  # per point and image; the ratio does not depend on it
+    ideal = 1 / (2 * np.sqrt(sensor.n_masks * photons * sensor.pupil.n_points))
+    bounds = cramer_rao(sensor, phases, photons=photons, modes=trials.source.modes) / ideal
+    return {TILT: _rms(bounds[:, :2]), REST: _rms(bounds[:, 2:])}  # Noll 2 and 3, and the others
 
 
-def _variants(sensor: ZernikeSensor, frames: NDArray, n_iterations: int, **options: Any) -> dict[str, Any]:
-    """Results of the iteration with none, either and both of the ingredients of the acceleration."""
-    plain, accelerated, _ = compared_methods(sensor, n_iterations).values()
-    one_step = PhaseShifted(sensor, n_iterations=1, tolerance=0.0, accelerate=True)
-    dimmed = np.where(sensor.pupil.inside, one_step(frames).phase, 0)
-    return {
-        PLAIN: plain(frames, **options),
-        SECANT: accelerated(frames, start=0 * dimmed, **options),
-        DIMMED: plain(frames, start=dimmed, **options),
-        ACCELERATED: accelerated(frames, **options),
-    }
-
-
-def _causes_point(
-    point: tuple[int, float], sensor: ZernikeSensor, modes: NDArray, n_screens: int, trials: Trials
-) -> dict[str, Any]:
-    """Errors, (n_screens,) by variant, and contraction factors, (n_screens,), of one input."""
-    task, rms = point
-    pupil = sensor.pupil
-    screens = trials.screens(pupil, modes, rms, n_screens, task)
-    results = _variants(sensor, sensor.measure(screens), trials.n_iterations)
-    errors = {name: reconstruction_error(pupil, result.phase, screens) for name, result in results.items()}
-    diameter = sensor.masks[0].diameter
-    factor = [float(np.abs(iteration_spectrum(pupil, diameter, screen)[0])) for screen in screens]
-    return {"errors": errors, "factor": factor}
+def _rms(values: NDArray) -> NDArray[np.float64]:
+    """Rms over the last axis."""
+    return np.sqrt(np.mean(values**2, axis=-1))
 
 
 _INK = "#555555"
 _BOUND: dict[str, Any] = {"color": "#888888", "lw": 2, "zorder": 1.5}
-_FLOOR = 1e-7  # of a drawn error: below it digits are rounding errors
 
 
 def _input_axes(axes: Axes, threshold: float, bottom: float, *, named: bool = True) -> None:
@@ -353,11 +287,23 @@ def _spaced(number: float) -> str:
     return f"{number:,.0f}".replace(",", " ")
 
 
+def shown_curve(curves: Sequence[NoiseCurves], shown: float) -> NoiseCurves:
+    """Return the curves of the number of photons nearest to `shown`: text on them names the sampled number."""
+    return min(curves[1:], key=lambda curve: abs(np.log(curve.photons / shown)))
+
+
+def _complete(x: NDArray, recovered: NDArray) -> float:
+    """Return the largest value up to which every screen is recovered; 0 if there is none."""
+    lost = np.flatnonzero(recovered < 1)
+    complete = x[: lost[0]] if lost.size else x
+    return float(complete[-1]) if complete.size else 0.0
+
+
 def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) -> Figure:
     """Median error against the input: all methods for one number of photons, and one method for all."""
     figure, (methods, light) = plt.subplots(1, 2, figsize=(7, 4.6), sharey=True)
-    noiseless, *noisy = curves
-    chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
+    _, *noisy = curves
+    chosen = shown_curve(curves, shown)
     for name in chosen.errors:
         methods.plot(chosen.rms, chosen.median(name), **method_line(name))
     methods.set_title(f"{_spaced(chosen.photons)} photons per point and image", fontsize=10)
@@ -366,19 +312,13 @@ def draw_range(curves: Sequence[NoiseCurves], shown: float, threshold: float) ->
     for curve in noisy:
         name = f"_{_spaced(curve.photons)} photons per point and image"
         light.plot(curve.rms, curve.median(LIKELY), **line | {"label": name})
-        light.plot(curve.rms, curve.bound[LIKELY], label=f"{name}, bound", **_BOUND)
+        light.plot(curve.rms, curve.bound, label=f"{name}, bound", **_BOUND)
         light.annotate(
             _spaced(curve.photons), (curve.rms[-1], curve.median(LIKELY)[-1]), (7, 0),
             textcoords="offset points", fontsize=9, va="center",
         )  # fmt: skip
     light.set_title("maximum likelihood, by photons", fontsize=10)
-    exact = noiseless.complete_up_to(LIKELY, threshold)
     bottom = noisy[-1].median(MODES).min() / 3
-    if exact:
-        light.text(
-            0.98, 0.02, f"no noise: all recovered to {exact:g} rad rms", ha="right", fontsize=9, color=_INK,
-            transform=light.transAxes,
-        )  # fmt: skip
     for axes in (methods, light):
         _input_axes(axes, threshold, bottom, named=axes is methods)
     handles, labels = methods.get_legend_handles_labels()
@@ -409,85 +349,101 @@ def draw_model_errors(curves: Mapping[str, ErrorCurves], noise: NoiseCurves, thr
     return figure
 
 
-_CAUSES = {
-    PLAIN: ("plain: flat start", ":", "v"),
-    SECANT: ("secant steps, flat start", "--", "x"),
-    DIMMED: ("plain steps, dimmed start", "-.", "^"),
-    ACCELERATED: ("accelerated: both", "-", "o"),
-}
-
-
-def draw_causes(found: Causes, threshold: float) -> Figure:
-    """Share of recovered screens for the ingredients of the acceleration, and one screen that they decide."""
-    figure, (share, example) = plt.subplots(1, 2, figsize=(7, 4.4))
-    color = LOOKS[PLAIN].color
-    contracts = 100 * np.mean(found.factor < 1, axis=1)
-    close = "plain, from close to the true phase"
-    share.plot(found.curves.rms, contracts, color=_INK, lw=4, alpha=0.4, label=close)
-    for name, (label, dashes, marker) in _CAUSES.items():
-        tone = color if name in (PLAIN, ACCELERATED) else OTHER_STYLES[1 if name == SECANT else 2]["color"]
-        style: dict[str, Any] = {"color": tone, "ls": dashes, "marker": marker, "ms": 5, "mfc": "#ffffff"}
-        recovered = found.curves.recovered(name, threshold)
-        error = np.sqrt(recovered * (1 - recovered) / found.curves.errors[name].shape[1])  # of a binomial share
-        share.plot(found.curves.rms, 100 * recovered, label=label, **style)
-        bars = {"fmt": "none", "ecolor": tone, "lw": 1, "label": f"_{label}"}
-        share.errorbar(found.curves.rms, 100 * recovered, 100 * error, **bars)
-        example.semilogy(np.maximum(found.example[name], _FLOOR), label=f"_{label}", **style)
-    share.set(xlabel="input (rad rms)", ylabel="screens (%)", ylim=(-4, 104))
-    example.axhline(threshold * found.example_rms, color=_INK, lw=1, ls=":")
-    example.set(xlabel="iterations", ylabel="error (rad rms)", ylim=(_FLOOR / 2, 5))
-    example.set_title(f"one screen of {found.example_rms:g} rad rms", fontsize=10)
-    share.set_title("screens recovered", fontsize=10)
-    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
+def draw_dimples(curves: DiameterCurves, bounds: Mapping[str, NDArray], threshold: float) -> Figure:
+    """Share of recovered screens, and `dimple_bounds`, against the diameter of the dimple."""
+    figure, (share, bound) = plt.subplots(1, 2, figsize=(7, 4.6))
+    for name in curves.errors:
+        share.plot(curves.diameters, 100 * curves.recovered(name, threshold), **method_line(name))
+    share.set(ylabel="screens recovered (%)", ylim=(-4, 104))
+    for (kind, values), style in zip(bounds.items(), OTHER_STYLES[::2], strict=False):
+        color, rms = style["color"], f"{curves.rms[0]:.2g} rad rms"
+        bound.semilogy(curves.diameters, values[:, 0], color=color, ls="--", label=f"{kind}, flat wavefront")
+        bound.semilogy(curves.diameters, _rms(values[:, 1:]), color=color, label=f"{kind}, {rms}")
+    bound.set(ylabel="bound / that of an ideal sensor")
+    for axes in (share, bound):
+        label = "first dark ring" if axes is share else "_first dark ring"
+        axes.axvline(DARK_RING, color="#888888", lw=1.2, zorder=0.5, label=label)
+        axes.set(xlabel=r"dimple diameter ($\lambda/D$)", xlim=curves.diameters[[0, -1]])
+    handles = [artist for axes in (share, bound) for artist in axes.get_legend_handles_labels()[0]]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9)
     return figure
 
 
-def numbers(
-    curves: Sequence[NoiseCurves],
-    model: Mapping[str, ErrorCurves],
-    found: Causes,
-    shown: float,
-    threshold: float,
-    settings: Mapping[str, float],
-) -> dict[str, float | str]:
-    """Return the settings and the numbers of the text."""
+def instruments_table(curves: Mapping[str, ErrorCurves], threshold: float) -> Table:
+    """Number of screens that each method recovers on the masks of instruments."""
+    names = list(next(iter(curves.values())).errors)
+    rows = []
+    for mask, curve in curves.items():
+        counts = [np.count_nonzero(curve.errors[name] <= threshold * curve.rms) for name in names]
+        cells = (f"{count} of {curve.errors[LIKELY].size}" for count in counts)
+        rows.append([f"{mask}, {MASKS[mask][0].diameter:g} λ/D", *cells])
+    return Table(["mask", *(method_look(name).name for name in names)], rows)
+
+
+def findings(curves: Sequence[NoiseCurves], many: ErrorCurves, threshold: float) -> Text:
+    """Return how far the methods reach without noise, and the errors that photon noise causes."""
     noiseless, *noisy = curves
-    chosen = min(noisy, key=lambda curve: abs(np.log(curve.photons / shown)))
-    few = min(noisy, key=lambda curve: abs(np.log(curve.photons / 1e3)))
-    one, two, three = (int(np.argmin(np.abs(chosen.rms - rms))) for rms in (1.0, 2.0, 3.0))
-    limit = int(np.argmin(np.abs(found.curves.rms - 2.0)))
-    exact = noiseless.complete_up_to(LIKELY, threshold)
-    right = noiseless.errors[LIKELY] <= threshold * noiseless.rms[:, np.newaxis]
-    usual = (chosen.rms >= 0.1) & (chosen.rms <= 2)
-    usual |= not usual.any()
-    amplitude, offset, *_, area = model.values()
-    place = int(np.argmin(np.abs(area.rms - 1.0)))
-    pixels = np.median(area.errors[LIKELY], axis=1)
-    result = dict(settings) | {
-        "few_photons": few.photons,
-        "shown_photons": chosen.photons,
-        "modes_share": np.median(chosen.median(MODES)[usual] / chosen.median(LIKELY)[usual]),
-        "modes_from": chosen.rms[usual][0],
-        "modes_to": chosen.rms[usual][-1],
-        "contracting_at_2": np.mean(found.factor[limit] < 1),
-        "exact": exact,
-        "exact_screens": right[noiseless.rms <= exact].size,
-        "half": found.half(PLAIN, threshold)[0],
-        "solutions": right.size,
-        "solutions_right": np.count_nonzero(right),
-        "solutions_missed": np.count_nonzero(noiseless.consistent & ~right),
-        "solutions_refused": np.count_nonzero(right & ~noiseless.consistent),
-        "pixels_limit": crossing(area.rms, pixels, PIXEL_ERROR),
-        "pixels_error": PIXEL_ERROR,
-        "model_input": area.rms[place],
-        "amplitude_1": np.median(amplitude.errors[LIKELY][place]),
-        "offset_1": np.median(offset.errors[LIKELY][place]),
-        "input_2": found.curves.rms[limit],
-        "input_3": chosen.rms[three],
-        "few_likely_3": few.median(LIKELY)[three],
-        "shown_likely_1": chosen.median(LIKELY)[one],
-        "shown_likely_2": chosen.median(LIKELY)[two],
+    exact = _complete(noiseless.rms, noiseless.recovered(LIKELY, threshold))
+    n_screens = noiseless.errors[LIKELY][noiseless.rms <= exact].size
+    reach = f"recovers all {n_screens} simulated screens (random phase maps) of up to {exact:.3g} rad rms"
+    if not exact:
+        reach = f"fails on some simulated screens (random phase maps) of {noiseless.rms[0]:.3g} rad rms"
+    plain, accelerated = (f"{many.recovered(name, threshold)[0]:.0%}" for name in (PLAIN, ACCELERATED))
+    errors = (f"{two_digits(curve.median(LIKELY)[-1])} rad with {_spaced(curve.photons)}" for curve in noisy)
+    ratio = np.median([curve.median(MODES) / curve.median(LIKELY) for curve in noisy])
+    return Text(
+        f"**Without noise, maximum likelihood {reach}.** Of {many.errors[PLAIN].size} screens of "
+        f"{many.rms[0]:.3g} rad rms, the paper's iteration recovers {plain}, its accelerated form {accelerated}. "
+        f"Photon noise limits maximum likelihood: at {noisy[0].rms[-1]:.3g} rad rms its median error is "
+        f"{', '.join(errors)} photons per point and image. If it fits modes instead of the phase of every "
+        f"point, the error is {two_digits(ratio)} times as large (median over inputs and photons)."
+    )
+
+
+def findings_model(model: Mapping[str, ErrorCurves], noise: NoiseCurves) -> Text:
+    """Return the errors of maximum likelihood that errors of the model cause, largest first."""
+    rms = next(iter(model.values())).rms
+    lines = ["Median errors of maximum likelihood, largest first:", ""]
+    for place in sorted({int(np.argmin(np.abs(rms - 1))), len(rms) - 1}):
+        errors = {kind: float(np.median(curve.errors[LIKELY][place])) for kind, curve in model.items()}
+        listed = [f"{small(errors[kind])} rad ({kind})" for kind in sorted(errors, key=lambda kind: -errors[kind])]
+        light = f"{_spaced(noise.photons)} photons per point and image: {small(noise.median(LIKELY)[place])} rad"
+        lines.append(f"- **At {rms[place]:.3g} rad rms:** {', '.join(listed)}. Noise of {light}.")
+    return Text("\n".join(lines))
+
+
+def findings_dimples(curves: DiameterCurves, bounds: Mapping[str, NDArray], threshold: float) -> Text:
+    """Return up to which diameter each method recovers every screen, and the bounds at the dark ring."""
+    ends = {name: _complete(curves.diameters, curves.recovered(name, threshold)) for name in curves.errors}
+    shown = {name: f"up to {end:.3g} λ/D" if end else "at no diameter" for name, end in ends.items()}
+    ring = curves.diameters == DARK_RING
+    factors = {
+        kind: f"{two_digits(values[ring, 0].item())} for a flat wavefront, "
+        f"{two_digits(_rms(values[ring, 1:]).item())} around {values.shape[1] - 1} of these screens"
+        for kind, values in bounds.items()
     }
-    for name, method in (("plain", PLAIN), ("dimmed", DIMMED), ("accelerated", ACCELERATED)):
-        result[f"{name}_at_2"] = found.curves.recovered(method, threshold)[limit]
+    return Text(
+        f"**Maximum likelihood recovers all {curves.errors[LIKELY].shape[1]} noiseless screens of "
+        f"{curves.rms[0]:.2g} rad rms {shown[LIKELY]}, the paper's iteration {shown[PLAIN]}, and its accelerated "
+        f"form {shown[ACCELERATED]}.** We tried {curves.diameters[0]:.3g} to {curves.diameters[-1]:.3g} λ/D. "
+        f"At the first dark ring of the Airy pattern, {DARK_RING:.2f} λ/D, the bound for tilt, divided by that of "
+        f"an ideal sensor, is {factors[TILT]}. For the other modes it is {factors[REST]}."
+    )
+
+
+def numbers(
+    curves: Sequence[NoiseCurves], many: ErrorCurves, dimples: DiameterCurves, shown: float, threshold: float
+) -> dict[str, float | str]:
+    """Return the numbers that the claims and pages of the book quote."""
+    chosen = shown_curve(curves, shown)
+    result = {
+        "shown_photons": chosen.photons,
+        "shown_likely_2": chosen.median(LIKELY)[np.argmin(np.abs(chosen.rms - 2))],
+        "plain_at_2": many.recovered(PLAIN, threshold)[0],
+        "accelerated_at_2": many.recovered(ACCELERATED, threshold)[0],
+        "screens_at_2": many.errors[PLAIN].size,
+        "last_input": dimples.rms[0],
+        "plain_last": dimples.exceeds(PLAIN, threshold * dimples.rms[0]),
+        "largest": dimples.diameters[-1],
+    }
     return rounded(result, ".3g")

@@ -29,7 +29,6 @@ from studies.kit.methods import (
     compared_methods,
     method_line,
     method_look,
-    opposite_dimples,
 )
 from studies.kit.parameters import SETUP, Fields, parameter_limits
 from studies.kit.results import rounded
@@ -97,7 +96,8 @@ class Trials:
 
 def resized(sensor: ZernikeSensor, diameter: float) -> ZernikeSensor:
     """Return a sensor with dimples of a different diameter, lambda/D."""
-    return opposite_dimples(sensor.pupil, diameter, sensor.masks[0].phase)
+    masks = (replace(mask, diameter=diameter) for mask in sensor.masks if isinstance(mask, Dimple))
+    return ZernikeSensor(sensor.pupil, *masks)
 
 
 def all_methods(sensor: ZernikeSensor, modes: NDArray, n_iterations: int, photons: float) -> dict[str, Any]:

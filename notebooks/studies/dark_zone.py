@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import OTHER_STYLES
-from studies.kit.tables import Table
+from studies.kit.tables import Table, Text, two_digits
 from zwfs.bounds import cramer_rao
 from zwfs.detector import Detector
 from zwfs.loop import Mirror, close_loop
@@ -116,16 +116,16 @@ def simulate(sensor: ZernikeSensor, drift: Drift, photons: float, gains: Iterabl
     walks = np.tensordot(np.cumsum(steps, axis=0), drift.modes, 1)
     camera, mirror = Detector(photons / sensor.n_masks / pupil.n_points), Mirror(pupil, drift.modes)
     likely = MaximumLikelihood(sensor, drift.modes, photons=camera.photons, n_starts=1)
-    found = []
+    residuals = []
     for gain in gains:
         record = close_loop(sensor, mirror, likely, walks, gain=gain, camera=camera, seed=drift.seed)
-        found.append(drift.scale * np.sqrt(np.mean(record.settled(drift.n_cycles // 2) ** 2)))
-    return np.array(found)
+        residuals.append(drift.scale * np.sqrt(np.mean(record.settled(drift.n_cycles // 2) ** 2)))
+    return np.array(residuals)
 
 
 def hold(sensor: ZernikeSensor, drift: Drift, photons: Iterable[float], errors: ArrayLike) -> NDArray[np.float64]:
     """Residual of simulated loops with the best gain, pm rms, for each number of photons."""
-    return np.array([simulate(sensor, drift, one, [best_gain(errors, drift, one)])[0] for one in photons])
+    return np.array([simulate(sensor, drift, light, [best_gain(errors, drift, light)])[0] for light in photons])
 
 
 def drift_curves(
@@ -209,29 +209,48 @@ def photons_table(curves: DriftCurves) -> Table:
     return Table(["sensor", *(f"{target:g} pm" for target in targets)], rows)
 
 
-def numbers(curves: DriftCurves) -> dict[str, float | str]:
-    """Return photons, residuals and gains; sensors are numbered in their order."""
-    drift, gains, by_gain = curves.drift, curves.gains, curves.by_gain
-    *_, paper, best, ideal = curves.errors.values()
-    target = 1.5 * drift.rms
-    needed, needed_best, needed_ideal = (photons_to_hold(one, drift, target) for one in (paper, best, ideal))
+def findings(curves: DriftCurves) -> Text:
+    """Return the photons that hold the drift, for each of the three sensors."""
+    drift, target = curves.drift, _target(curves.drift)
+    single, paper, best = (f"{photons_to_hold(curves.errors[name], drift, target):.1e}" for name in curves.held)
+    return Text(
+        f"**The simulated wavefront drifts by {drift.rms:.3g} pm rms in each cycle. To hold the residual below "
+        f"{target:.3g} pm rms, the best pair of dimples needs {best} photons per cycle, the pair of the paper "
+        f"{paper} and a single dimple {single}.**"
+    )
+
+
+def findings_loops(curves: DriftCurves) -> Text:
+    """Return how close the best pair is to an ideal sensor, and the loops to the limit."""
+    drift, target = curves.drift, _target(curves.drift)
+    *_, best, ideal = curves.errors.values()
+    more = photons_to_hold(best, drift, target) / photons_to_hold(ideal, drift, target) - 1
     ratios = [
         held / kalman_limit(curves.errors[name], drift, curves.photons) for name, held in curves.held.items()
     ]
-    least, most = min(by_gain), max(by_gain)
-    found = {
-        "drift": drift.rms,
-        "target": target,
-        "photons_1": needed,
-        "photons_2": needed_best,
-        "above_ideal": 100 * (needed_best / needed_ideal - 1),
-        "agreement_least": np.min(ratios),
-        "agreement_most": np.max(ratios),
-        "light_gain": least,
-        "most_light": most,
-        "highest_gain": max(gains),
-        "too_fast": by_gain[least][np.argmax(gains)] / kalman_limit(best, drift, least),
-        "too_slow": by_gain[most][np.argmin(gains)] / kalman_limit(best, drift, most),
-        "lowest_gain": min(gains),
-    }
-    return rounded(found, ".3g")
+    least, most = min(curves.by_gain), max(curves.by_gain)
+    extremes = []
+    for light, gain in ((least, max(curves.gains)), (most, min(curves.gains))):
+        above = curves.by_gain[light][curves.gains.index(gain)] / kalman_limit(best, drift, light)
+        extremes.append(
+            f"a gain of {gain:.3g} and {light:.2g} photons, the residual is {two_digits(above)} times the limit"
+        )
+    return Text(
+        f"The best pair needs {two_digits(100 * more)} % more photons than an ideal sensor. With the best gain, "
+        f"the residuals of the simulated loops are {np.min(ratios):.2f} to {np.max(ratios):.2f} times the limit. "
+        f"With {'; with '.join(extremes)}."
+    )
+
+
+def _target(drift: Drift) -> float:
+    """Residual of the text, pm rms."""
+    return 1.5 * drift.rms
+
+
+def numbers(curves: DriftCurves) -> dict[str, float | str]:
+    """Return the numbers that a page of the book quotes, for the last sensor."""
+    drift = curves.drift
+    *_, best, _ideal = curves.errors.values()
+    target = _target(drift)
+    result = {"drift": drift.rms, "target": target, "photons_2": photons_to_hold(best, drift, target)}
+    return rounded(result, ".3g")

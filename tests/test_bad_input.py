@@ -38,20 +38,8 @@ from .conftest import needs_modes
 
 # What simulates a sensor and reconstructs a phase. Most tests of camera frames are in other files.
 MODULES = (
-    *(
-        "pupil",
-        "modes",
-        "turbulence",
-        "masks",
-        "sensor",
-        "polychromatic",
-        "detector",
-        "bounds",
-        "design",
-        "loop",
-        "metrics",
-    ),
-    *("units", "reconstructors", "bench.files", "bench.model"),
+    *("pupil", "modes", "turbulence", "masks", "sensor", "polychromatic", "detector", "bounds", "loop", "metrics"),
+    *("design", "units", "reconstructors", "bench.files", "bench.model"),
 )
 
 # Results that may be infinite: the limit lies beyond what was sampled, or no limit is set.

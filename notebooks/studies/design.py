@@ -139,7 +139,8 @@ def draw_light(curves: LightCurves, answer: SensorDesign, wanted_error: float) -
 
 def numbers(answer: SensorDesign, **question: float) -> dict[str, float | str]:
     """Question and answer, for other pages."""
-    return question | {
+    return {
+        **question,
         "photons": _two(answer.photons_per_exposure),
         "method": _METHODS[answer.method],
         "diameter": round(answer.diameter, 2),

@@ -45,7 +45,6 @@ _FLOOR = 1e-12  # of the information of a combination of modes, over the largest
 _RECOVERED = 0.01  # error of a recovered screen, rad rms
 _MOST = 1000.0  # a cost above it has no number
 _TIP_TILT = 2  # modes
-PUPIL_IMAGES = "pupil images"
 PYRAMID = "unmodulated pyramid"
 
 
@@ -388,7 +387,7 @@ def draw_sensor_photons(curves: SensorCurves) -> Figure:
         axes.title.set_fontsize(10)
         axes.yaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), major_formatter="{x:g}")
         axes.yaxis.set_minor_locator(NullLocator())
-    panels[0].set(ylabel="variance / variance of an ideal sensor", ylim=(0.9, None))
+    panels[0].set(ylabel="cost (ideal sensor: 1)", ylim=(0.9, None))
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=2, fontsize=9)
     return figure
@@ -409,9 +408,10 @@ def findings(curves: SensorCurves) -> Text:
     best_tilt = min(tilt, key=lambda name: tilt[name])
     sharp = curves.inputs[higher[PYRAMID] < higher[pairs[-1]]]
     first, last = pairs[0], pairs[-1]
-    rival = f"The {PYRAMID} needs fewer photons than the {last} only at {_listed(sharp)} rad rms."
-    if len(sharp) in (0, len(curves.inputs)):
-        rival = f"The {PYRAMID} needs {'fewer' if len(sharp) else 'more'} photons than the {last} at every input."
+    where = "at every input"
+    if 0 < len(sharp) < len(curves.inputs):
+        where = f"only at {_listed(sharp)} rad rms"
+    rival = f"The {PYRAMID} needs {'fewer' if len(sharp) else 'more'} photons than the {last} {where}."
     return Text(
         f"**Of these sensors, the {best} needs the fewest photons {_place(low)}: {_times(higher[best][0])} times "
         f"those of an ideal sensor. {_place(high).capitalize()} the {best_high} needs the fewest, "
@@ -468,7 +468,7 @@ def conditions_table(curves: SensorCurves, rms: float, read_noise: float) -> Tab
         "images",
         f"light beside them, {input_}",
         "cost: all light",
-        f"cost: only {PUPIL_IMAGES}",
+        "cost: only pupil images",
         f"cost: read noise {read_noise:g} e⁻",
         "fit recovers up to (rad rms)",
     ]

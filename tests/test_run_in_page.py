@@ -45,7 +45,7 @@ defaults = next(cell["source"] for cell in cells if "parameters" in cell["metada
 assert driver.begin(about["name"], defaults, json.dumps(given)) == ""
 for cell in cells[: about["figures"][figure] + 1]:
     if cell["cell_type"] == "code" and "parameters" not in cell["metadata"].get("tags", ()):
-        shown = json.loads(driver.cell(cell["source"], "[]"))
+        shown = json.loads(driver.cell(cell["source"]))
         assert "error" not in shown, shown
 print(driver.draw(figure, "csv").decode())
 """

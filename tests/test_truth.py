@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import bs4
 import matplotlib.pyplot as plt
 import nbformat
 import numpy as np
@@ -14,8 +13,7 @@ import pytest
 from joblib import parallel_config
 
 from book._tools.declared import accept, accept_together, parameters
-from book._tools.notebook import BOOK, without_gaps
-from book._tools.page import leave_out
+from book._tools.notebook import BOOK
 from studies.kit import results
 from studies.kit.tables import Table, Text
 
@@ -28,15 +26,14 @@ TARGET = re.compile(r"\]\([^)]*\)|`[^`]*`")  # of a link, and code
 
 
 def run(name, given, monkeypatch):
-    """Run the code cells of a notebook here; return the text of its page, what it computes, and its figures."""
+    """Run the code cells of a notebook here; return the Markdown that they compute, and the figures."""
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
     known = parameters(notebook)
     monkeypatch.chdir(NOTEBOOKS)
     changed = accept(given, known)
     accept_together(notebook, {key: one.default for key, one in known.items()} | changed)
-    glued = {}
     stub = ModuleType("myst_nb")
-    stub.glue = lambda name, value, display: glued.update({name: value})
+    stub.glue = lambda name, value, display: None
     monkeypatch.setitem(sys.modules, "myst_nb", stub)
     monkeypatch.delenv(results.FOLDER, raising=False)
     shown, figures, space = [], [], {"__name__": "notebook"}
@@ -54,7 +51,7 @@ def run(name, given, monkeypatch):
             if "parameters" in cell.metadata.get("tags", ()):
                 space |= changed
             plt.close("all")
-    return visible(notebook, glued), [output for output in shown if isinstance(output, Table | Text)], figures
+    return [output for output in shown if isinstance(output, Table | Text)], figures
 
 
 def long_numbers(markdown):
@@ -72,69 +69,6 @@ def without_data(axes):
     drawn = (*axes.images, *axes.containers, *(one for one in axes.collections if one.get_paths()))
     curves = [line.get_xydata() for line in axes.lines if line.get_transform() == axes.transData]
     return not drawn and not any(np.isfinite(points).all(axis=1).any() for points in curves)
-
-
-def texts(notebook):
-    """Markdown and captions of a notebook."""
-    for cell in notebook.cells:
-        if cell.cell_type == "markdown" and BOOK not in cell.metadata.get("tags", ()):
-            yield cell.source
-        yield cell.metadata.get("mystnb", {}).get("figure", {}).get("caption", "")
-
-
-def visible(notebook, glued):
-    """Text of the page of a run that has other parameters, with the values that it glued."""
-    text = re.sub(
-        r"^:::\{div\} defaults\n.*?^:::$", "", "\n".join(texts(notebook)), flags=re.MULTILINE | re.DOTALL
-    )
-    while (end := text.find("]{.defaults}")) >= 0:
-        start, depth = end, 1
-        while depth:
-            start -= 1
-            depth += {"]": 1, "[": -1}.get(text[start], 0)
-        text = text[:start] + text[end + len("]{.defaults}") :]
-
-    def value(match):
-        one = glued[match[1]]
-        return one if isinstance(one, str) else format(one, match[2] or "")
-
-    return re.sub(r"\{glue:text\}`(\w+)(?::([^`:]*))?`", value, text)
-
-
-PAGE = """<section><h1>Page</h1>
-<p>The error stays small<span class="defaults">, without noise and</span> with a perfect model.</p>
-<ul><li><p><span class="defaults">The peak is caused by slow screens.</span></p></li>
-<li><p>Screens are random.</p></li></ul>
-<section><h2>What differs</h2><div class="defaults"><p>Only here.</p></div></section>
-<section><h2>Picture</h2><figure><img alt="three curves" src="x.png"/>
-<figcaption><span class="defaults">It wins.</span> Error.</figcaption></figure></section></section>"""
-
-
-def test_a_page_of_other_parameters_leaves_out_what_holds_for_the_defaults_only():
-    body = bs4.BeautifulSoup(PAGE, "html.parser")
-    leave_out(body)
-    said = " ".join(body.get_text().split())
-    assert said == "Page The error stays small with a perfect model. Screens are random. Picture Error."
-    assert len(body.find_all("li")) == 1
-    assert body.img["alt"] != "three curves"
-
-
-def test_a_dash_stands_for_a_number_that_does_not_exist():
-    output = nbformat.v4.new_output(
-        "display_data", {"text/plain": "inf"}, metadata={"scrapbook": {"name": "limit"}}
-    )
-    known = nbformat.v4.new_output(
-        "display_data", {"text/plain": "2.5"}, metadata={"scrapbook": {"name": "limits"}}
-    )
-    code = nbformat.v4.new_code_cell(outputs=[output, known])
-    code.metadata["mystnb"] = {"figure": {"caption": "Up to {glue:text}`limit:.2f`."}}
-    text = nbformat.v4.new_markdown_cell(
-        "{glue:text}`limit:.2f` and {glue:text}`limit` and {glue:text}`limits:.1f`"
-    )
-    shown = without_gaps(nbformat.v4.new_notebook(cells=[text, code]))
-    assert shown.cells[0].source == "– and – and {glue:text}`limits:.1f`"
-    assert shown.cells[1].metadata.mystnb.figure.caption == "Up to –."
-    assert text.source.startswith("{glue")
 
 
 BENCH = {"n_pixels": 32}
@@ -318,8 +252,7 @@ ALONE = [(name, base | odd) for name, (base, *odds) in CASES.items() for odd in 
 @pytest.mark.parametrize(("name", "given"), [*SETS, *(pytest.param(*one, marks=FUZZ) for one in ALONE)])
 @pytest.mark.filterwarnings("ignore")  # of phases beyond what a sensor resolves
 def test_text_of_odd_parameters_names_no_limit_that_does_not_exist(name, given, monkeypatch):
-    text, computed, figures = run(name, given, monkeypatch)
-    assert not NONSENSE.findall(text), text
+    computed, figures = run(name, given, monkeypatch)
     assert not [output for output in computed if NONSENSE.search(output._repr_markdown_())]
     sentences = [output.markdown for output in computed if isinstance(output, Text)]
     assert not [said for said in sentences if any(long_numbers(said))]
@@ -335,6 +268,16 @@ def test_text_of_odd_parameters_names_no_limit_that_does_not_exist(name, given, 
 )
 def test_long_numbers_in_sentences_are_found(said, expected):
     assert list(long_numbers(said)) == expected
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_markdown_holds_no_numbers_of_a_run(name):
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    written = [cell.source for cell in notebook.cells if cell.cell_type == "markdown"]
+    written += [cell.metadata.get("mystnb", {}).get("figure", {}).get("caption", "") for cell in notebook.cells]
+    assert not [text for text in written if "{glue:" in text or "defaults}" in text or "} defaults" in text]
+    marked = [cell.source for cell in notebook.cells if BOOK in cell.metadata.get("tags", ())]
+    assert all(text.startswith("## With the book's parameters\n") for text in marked)
 
 
 def test_every_notebook_is_tried():

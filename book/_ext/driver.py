@@ -14,11 +14,9 @@ from collections.abc import Callable
 from contextlib import redirect_stdout
 from importlib import import_module
 from importlib.util import find_spec
-from math import isfinite
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-numbers: dict[str, Any] = {}  # that the notebook glued
 figures: dict[str, tuple[Any, Any]] = {}  # that the notebook published, with their numbers of single screens
 variants: dict[str, dict[str, Any]] = {}  # of the figures, once they are asked for
 names: dict[str, Any] = {}  # of the notebook
@@ -27,7 +25,7 @@ names: dict[str, Any] = {}  # of the notebook
 def prepare(tell: Callable[[str, int, int], None]) -> None:
     """Provide what notebooks expect of Jupyter, and report the progress of sweeps."""
     os.environ["MPLBACKEND"] = "agg"
-    _provide("myst_nb", glue=lambda name, value, display=True: numbers.update({name: value}))
+    _provide("myst_nb", glue=lambda name, value, display=True: None)
     if not find_spec("IPython"):
         _provide("IPython", get_ipython=lambda: None)
         _provide("IPython.display", HTML=lambda text: SimpleNamespace(_repr_html_=lambda: text))
@@ -72,7 +70,7 @@ def begin(notebook: str, defaults: str, given: str) -> str:
     from studies.kit.parameters import check_parameters, typed
 
     plt.close("all")
-    for kept in (numbers, names, figures, variants):
+    for kept in (names, figures, variants):
         kept.clear()
     names["__name__"] = "__main__"
     exec(defaults, names)
@@ -89,19 +87,13 @@ def begin(notebook: str, defaults: str, given: str) -> str:
     return ""
 
 
-def cell(source: str, forms: str) -> str:
-    """Run a cell; return JSON of its Markdown as HTML, of the glued numbers, and of the error if it failed.
-
-    `forms` is JSON of pairs: the name and the format of each number in the text of the page.
-    """
+def cell(source: str) -> str:
+    """Run a cell; return JSON of its Markdown as HTML, and of the error if it failed."""
     shown: dict[str, Any] = {}
-    numbers.clear()
     try:
         value = _run(source, names)
         if represent := getattr(value, "_repr_markdown_", None):
             shown["html"] = in_html(represent())
-        glued = [(name, form, numbers[name]) for name, form in json.loads(forms) if name in numbers]
-        shown["numbers"] = {f"{name}:{form}": _written(value, form) for name, form, value in glued}
     except Exception as error:
         shown["error"] = _message(error)
     return json.dumps(shown)
@@ -125,11 +117,6 @@ def _formula(source: str, options: dict[str, Any]) -> str:
     """Return a formula as MathJax reads it."""
     begin, end = ("\\[", "\\]") if options["display_mode"] else ("\\(", "\\)")
     return f"{begin}{html.escape(source)}{end}"
-
-
-def _written(value: Any, form: str) -> str:
-    """Write a number as the page does; a number that is not finite has no value in the text."""
-    return "–" if isinstance(value, float) and not isfinite(value) else format(value, form)
 
 
 def example(source: str) -> str:

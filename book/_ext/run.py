@@ -18,8 +18,6 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import nbformat
 from docutils import nodes
-from myst_nb.ext.glue.domain import NbGlueDomain
-from myst_nb.ext.glue.roles import PasteTextRole
 from nbformat import NotebookNode
 from sphinx.application import Sphinx
 
@@ -37,18 +35,6 @@ KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the ver
 FOLDERS = ("book", "environment", "notebooks", "tests", "zwfs")
 PURE = "array-api-compat", "markdown-it-py", "mdit-py-plugins", "mdurl"  # packages that Pyodide does not have
 SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
-
-
-class MarkedText(PasteTextRole):
-    """The role ``glue:text``; the number of the same page gets its name and its format as a class."""
-
-    def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
-        """Return the text, marked."""
-        shown, messages = super().run()
-        for node in shown:
-            if isinstance(node, nodes.inline):
-                node["classes"].append(f"glued:{self.text if ':' in self.text else f'{self.text}:s'}")
-        return shown, messages
 
 
 def form(figure: str, first: bool) -> str:
@@ -206,7 +192,6 @@ def add_scripts(app: Sphinx, page: str, template: str, context: dict[str, Any], 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Mark what can run, and write what it needs."""
     app.add_config_value("pyodide", "", "html")
-    NbGlueDomain.roles["text"] = MarkedText()
     app.connect("html-page-context", add_scripts)
     app.connect("build-finished", write)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

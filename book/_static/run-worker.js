@@ -59,7 +59,7 @@ function zwfsWorker() {
   const calls = {
     load,
     begin: ({ notebook, defaults, given }) => driver.begin(notebook, defaults, given),
-    cell: ({ source, forms }) => JSON.parse(driver.cell(source, forms)),
+    cell: ({ source }) => JSON.parse(driver.cell(source)),
     example: ({ source }) => JSON.parse(driver.example(source)),
     kinds: ({ figure }) => driver.kinds(figure).toJs(),
     draw: ({ figure, kind }) => driver.draw(figure, kind).toJs(),

@@ -117,15 +117,6 @@
     book.after(yours);
   }
 
-  function putNumbers(numbers) {
-    for (const element of article.querySelectorAll("[class*='glued:']")) {
-      const name = [...element.classList].find((one) => one.startsWith("glued:")).slice(6);
-      if (!(name in numbers)) continue;
-      if (!element.firstElementChild) element.replaceChildren(make("span", {}, element.textContent));
-      beside(element.firstElementChild, make("span", { class: "run-number", title: "with your parameters" }, written(numbers[name])));
-    }
-  }
-
   // Sentences and tables that a cell shows.
   function putOutput(number, { html }) {
     const output = article.querySelector(`.tag_run-${number} .cell_output`);
@@ -156,8 +147,6 @@
       this.next = 0; // cell
       this.count = 0; // of runs
       this.later = []; // what is drawn after a run
-      this.forms = JSON.stringify([...article.querySelectorAll("[class*='glued:']")].map((element) =>
-        [...element.classList].find((one) => one.startsWith("glued:")).slice(6).split(":")));
       this.build(place);
       if (this.form.readAddress()) this.details.open = true;
       this.form.element.addEventListener("input", () => this.changed());
@@ -269,9 +258,8 @@
         this.bar.max = all.length;
         this.bar.value = all.indexOf(number);
         this.watch(label, all.indexOf(number));
-        const shown = await python.call("cell", { source: cells[number].source, forms: this.forms });
+        const shown = await python.call("cell", { source: cells[number].source });
         if (shown.error) throw new Error(shown.error);
-        putNumbers(shown.numbers);
         putOutput(number, shown);
         for (const [figure, at] of Object.entries(notebook.figures)) if (at === number) await this.putFigure(figure);
         this.next = number + 1;
@@ -406,13 +394,6 @@
       }
     }
   }
-
-  // Paragraphs, items and sections of which nothing else would be left go with their text.
-  const rest = (element) => [...element.childNodes]
-    .filter((node) => !node.classList?.contains("defaults") && !/^H\d$/.test(node.nodeName))
-    .map((node) => node.textContent).join("").replace(/[\s.,:;]/g, "");
-  for (const element of article.querySelectorAll("li:has(.defaults), p:has(.defaults), section:has(.defaults)"))
-    if (!rest(element)) element.classList.add("defaults");
 
   const formPlace = document.querySelector(".run-form");
   if (formPlace && notebook) new Runner(formPlace);

@@ -4,12 +4,9 @@ import copy
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import nbformat
 from nbformat import NotebookNode
-
-from studies.kit.tables import MISSING
 
 BOOK = "book-parameters"
 """Tag of the cells of text that hold for the parameters of the book only."""
@@ -61,26 +58,9 @@ def to_bytes(notebook: NotebookNode) -> bytes:
     return (nbformat.writes(notebook).rstrip("\n") + "\n").encode()
 
 
-def without_gaps(notebook: NotebookNode) -> NotebookNode:
-    """Return a copy of an executed notebook whose text has a dash for a glued number that does not exist."""
-    result = copy.deepcopy(notebook)
-    lost = [name for name, text in _glued(result.cells).items() if text in ("nan", "inf", "-inf")]
-    role = re.compile(rf"{{glue:text}}`(?:{'|'.join(map(re.escape, lost))})(?::[^`]*)?`")
-    for cell in result.cells if lost else ():
-        if cell.cell_type == "markdown":
-            cell.source = role.sub(MISSING, cell.source)
-        figure = cell.metadata.get("mystnb", {}).get("figure", {})
-        if "caption" in figure:
-            figure["caption"] = role.sub(MISSING, figure["caption"])
-    return result
-
-
 def glued_texts(path: Path) -> dict[str, str]:
     """Return what a notebook glues, as text by name."""
-    return _glued(json.loads(path.read_text("utf-8"))["cells"])
-
-
-def _glued(cells: list[Any]) -> dict[str, str]:
+    cells = json.loads(path.read_text("utf-8"))["cells"]
     outputs = (output for cell in cells for output in cell.get("outputs", ()))
     named = ((output.get("metadata", {}).get("scrapbook", {}).get("name"), output) for output in outputs)
     return {name: "".join(next(iter(output["data"].values()))) for name, output in named if name}

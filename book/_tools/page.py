@@ -57,7 +57,7 @@ def page(
     """Build the page of an executed notebook; return it and the warnings of Sphinx, a line each.
 
     Sphinx reads the whole book with its settings and writes this page: equations have the same numbers as in the
-    book. Links to other pages become plain text. With `changed`, text of the class `defaults` is left out.
+    book. Links to other pages become plain text. With `changed`, figures lose their descriptions.
     """
     source, output = scratch / "source", scratch / "html"
     _stage(project, name, notebook, files, source)
@@ -133,7 +133,8 @@ def _embed(output: Path, document: str, published: set[str], changed: bool) -> s
     for element in body.find_all(ACTIVE):
         element.decompose()
     if changed:
-        leave_out(body)
+        for picture in body.select("img[alt]"):
+            picture["alt"] = "Figure of this run; the CSV file has its numbers."
     for picture in body.find_all("img"):
         source = file.parent / unquote(picture.get("src", ""))
         if source.is_file():
@@ -156,19 +157,6 @@ def _embed(output: Path, document: str, published: set[str], changed: bool) -> s
         scripts="\n".join(f"<script>{script}</script>" for script in scripts),
         body="".join(map(str, body.contents)),
     )
-
-
-def leave_out(body: bs4.Tag) -> None:
-    """Remove what holds for the defaults only: marked text, what it leaves empty, and descriptions of figures."""
-    for element in body.select(".defaults"):
-        element.decompose()
-    for element in reversed(body.find_all(["p", "li", "ul", "ol", "section"])):
-        heading = element.find(re.compile("h[1-6]"), recursive=False)
-        said = element.get_text().strip().removeprefix(heading.get_text().strip() if heading else "")
-        if not said and not element.find(["img", "table", "input"]):
-            element.decompose()
-    for picture in body.select("img[alt]"):
-        picture["alt"] = "Figure of this run; the CSV file has its numbers."
 
 
 def _data(file: Path) -> str:

@@ -20,7 +20,7 @@ from studies.kit.tables import plain
 
 from . import declared, record
 from .declared import Parameter, ParameterError
-from .notebook import BOOK, normalise, read, title, title_cell, to_bytes, without_gaps
+from .notebook import BOOK, normalise, read, title, title_cell, to_bytes
 from .project import Project
 from .scratch import scratch_folder, swap
 
@@ -235,7 +235,7 @@ def make(
         if changed:
             notebook.cells = [cell for cell in notebook.cells if BOOK not in cell.metadata.get("tags", ())]
             notebook.cells.insert(title_cell(notebook) + 1, notice(changed, parameters))
-        notebook = without_gaps(normalise(notebook))
+        notebook = normalise(notebook)
         shutil.copytree(run.folder, new)
         (new / f"{name}.ipynb").write_bytes(to_bytes(notebook))
         html, warnings = page.page(project, name, notebook, run.files, scratch / "page", changed=bool(changed))
